@@ -13,6 +13,7 @@ from lowfc.contract.errors import LowfcError
 BENCHMARKS = {
     "step": "benchmarks.step",
     "curves": "benchmarks.curves",
+    "kernels": "benchmarks.kernels",
     "throughput": "benchmarks.throughput",
     "view": "benchmarks.view",
     "peers": "benchmarks.peers.contest",

@@ -24,7 +24,6 @@ RATE_HZ = 1000.0
 SAME_NM = 1e-4
 ROUNDINGS = 5
 """Of float32: numbers of hundreds of nm are not known better."""
-FUSED_KERNEL = compiled.kernel(FUSED)
 pytestmark = pytest.mark.skipif(not compiled.available(), reason="needs the extra `fast`")
 
 
@@ -78,7 +77,7 @@ class Bench:
             leak=(0.01, 0.02),
             guard=bool(rng.random() < 0.5),
             rate_hz=RATE_HZ,
-            kernel=FUSED_KERNEL,
+            kernel=compiled.kernel(FUSED),
         )
         self.state, _ = advance(self.settings, State(), Load(0, self.calibration, "random"))
         self.last, self.count, self.again = self.state, 0, np.zeros(self.shape, np.uint16)

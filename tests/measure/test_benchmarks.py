@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import curves, load, runner, step, throughput, view
+from benchmarks import curves, kernels, load, runner, step, throughput, view
 from benchmarks.peers import contest
 from benchmarks.peers.contest import BARE, CONTESTANTS
 from benchmarks.peers.shared import ACTUATORS, MARKS, NumpyStep, Plan, Problem
@@ -375,3 +375,17 @@ def test_a_contestant_is_really_run(name: str) -> None:
     there, back = found["frame_to_command"], found["frame_to_mirror"]
     assert 0 < there["p50"] <= there["p99"] <= there["max"]
     assert back["max"] > there["p50"]
+
+
+# Kernels
+
+
+def test_kernels_are_measured_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kernels, "set_up", lambda *_, **__: None)
+    found = kernels.measure(Namespace(pixels=[32], repeats=2, seconds=0.01), lambda _: None)
+    (one,) = found["sizes"]
+    assert [set(turn) for turn in one["turns"]] == [{"numpy", "fused", "product", "memory"}] * 2
+    assert one["ratios"]["fused over numpy"][1] == one["turns"][1]["fused"] / one["turns"][1]["numpy"]
+    (lines,) = kernels.tables(found)
+    assert len(lines) == 6
+    assert "product" in kernels.about(found)

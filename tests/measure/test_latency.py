@@ -33,7 +33,7 @@ from lowfc.programs.measure.latency.figures import (
     percentiles,
     repeat_figures,
 )
-from lowfc.programs.measure.latency.summary import compare, ratio, together
+from lowfc.programs.measure.latency.summary import compare, of_kernels, ratio, together
 from lowfc.programs.measure.latency.text import compared, sparkline, table
 from tests.support.loops import lowfc, until
 from tools.law_bench import calibrated
@@ -180,6 +180,18 @@ def test_repeats_come_together_as_medians_with_their_range() -> None:
     assert sum(found["histogram"]["counts"]["frame_to_command"]) == 1500
     assert len(found["histogram"]["edges_us"]) == len(found["histogram"]["counts"]["frame_to_command"]) + 1
     assert ratio(repeat(300), "p99", "ratio_hot") == 4
+
+
+def test_kernels_in_turns_have_the_ratio_of_their_pairs() -> None:
+    pairs = [("numpy", 100), ("fused", 80), ("fused", 60), ("numpy", 120), ("numpy", 100), ("fused", 70)]
+    found = of_kernels([repeat(us, kernel=name) for name, us in pairs])
+    assert (found["kernel"], found["frames"]) == ("both", 1500)
+    assert found["latency_us"]["frame_to_command"]["p50"] == 70
+    assert found["kernel_ratio"]["p99"] == pytest.approx(0.7)
+    assert found["kernel_ratio_spread"]["p50"] == [0.5, 0.8]
+    assert found["numpy_us"]["p50"] == 100
+    alone = of_kernels([repeat(us, kernel="fused") for us in (1, 2)])
+    assert (alone["kernel"], "kernel_ratio" in alone) == ("fused", False)
 
 
 def test_a_difference_is_set_against_the_spread() -> None:

@@ -1,11 +1,13 @@
 """What a loop's latency is set against in one process: the control step without a bus, and the host's timer."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from lowfc.adapters.files.factory import settings
+from lowfc.adapters.process import compiled
 from lowfc.adapters.process.clock import HostClock
 from lowfc.arrays import Long
 from lowfc.contract.codecs import codec
@@ -22,8 +24,8 @@ class ControlStep:
     """The controller's arithmetic: a frame's bytes in, a command's bytes out."""
 
     def __init__(self, config: Configuration, calibration: Calibration, now_ns: int) -> None:
-        """Load the calibration."""
-        self._settings = settings(config)
+        """Load the calibration; the kernel is the configuration's."""
+        self._settings = replace(settings(config), kernel=compiled.kernel(config.realtime.kernel))
         self._valid_ns = round(config.control.command_timeout_ms * 1e6)
         self.state, _ = advance(self._settings, State(), Load(now_ns, calibration, "the run's"))
 

@@ -83,7 +83,7 @@ def _control_step(facts: Facts) -> Check:
     if facts.config.realtime.kernel == FUSED:
         return ok("the fused step") if there else warning("numpy, not the fused step", compiled.missing())
     advice = 'realtime.kernel = "fused"' if there else compiled.missing()
-    return note("numpy", advice, "a frame takes longer to become a command; `lowfc latency` measures how long")
+    return note("numpy", advice, "a frame takes longer to become a command: see `lowfc latency --kernel both`")
 
 
 @CHECKS.check("socket buffers")

@@ -15,7 +15,7 @@ import typer
 
 from lowfc.adapters.files.whole_file import require_folder, write_whole
 from lowfc.adapters.process.terminal import ConfigFile, Json, LogsOrMeasure, configuration
-from lowfc.contract.errors import DataFileError
+from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.programs.cli.output import put
 
 if TYPE_CHECKING:
@@ -24,6 +24,14 @@ if TYPE_CHECKING:
 
 _RATE_HZ = 1000.0
 _LEAK = 0.01
+
+
+class Kernels(StrEnum):
+    """Arithmetic of the control step; both in turns."""
+
+    NUMPY = "numpy"
+    FUSED = "fused"
+    BOTH = "both"
 
 
 class Camera(StrEnum):
@@ -45,6 +53,9 @@ def latency(
         bool,
         typer.Option("--plain-scheduling", help="Without real-time class, own processors, locked memory."),
     ] = False,
+    kernel: Annotated[
+        Kernels | None, typer.Option(help="Arithmetic of the control step; default: the configuration's.")
+    ] = None,
     config: ConfigFile = None,
     plot: Annotated[Path | None, typer.Option(help="Draw histograms and latency against time (PNG).")] = None,
     compare: Annotated[
@@ -75,10 +86,14 @@ def latency(
         figures = _of_log(logs)
     else:
         settings = _configuration(config, rate, camera, plain=plain_scheduling)
+        from lowfc.adapters.process import compiled
         from lowfc.programs.measure.latency.run import Asked
 
         simulated = camera is Camera.SIMULATED
-        figures = _measure(Asked(settings, duration, repeats, simulated, record, view))
+        kernels = ("numpy", "fused") if kernel is Kernels.BOTH else (str(kernel),) if kernel is not None else ()
+        if "fused" in kernels and not compiled.available():
+            raise ConfigurationError(compiled.missing())
+        figures = _measure(Asked(settings, duration, repeats, simulated, record, view, kernels))
     if plot is not None:
         write_whole(plot, picture(figures))
     put(figures, table(figures), as_json=as_json)
@@ -107,16 +122,16 @@ def _measure(asked: "Asked") -> dict[str, Any]:
     from lowfc.adapters.process.progress import passing_bar
     from lowfc.adapters.process.provenance import provenance
     from lowfc.programs.measure.latency.run import prepared, run_repeats
-    from lowfc.programs.measure.latency.summary import together
+    from lowfc.programs.measure.latency.summary import of_kernels
 
     host: dict[str, Any] = {**provenance(), "clock_source": "", "load": os.getloadavg()[0]}
     with contextlib.suppress(OSError):
         host["clock_source"] = Host().clock_source()
     begun = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
     with prepared(asked.config) as run, passing_bar(Console(stderr=True)) as bar:
-        task = bar.add_task("starting", total=1 + 2 * asked.repeats)
+        task = bar.add_task("starting", total=1 + 2 * asked.repeats * max(1, len(asked.kernels)))
         done = run_repeats(asked, run, lambda what: bar.update(task, description=what, advance=1))
-    return together(done) | {
+    return of_kernels(done) | {
         "settings": {
             "rate_hz": asked.config.camera.rate_hz,
             "duration_s": asked.duration_s,

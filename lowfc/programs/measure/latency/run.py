@@ -7,7 +7,7 @@ and the host's timer alone. Nothing else of ours runs beside either.
 import contextlib
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -45,7 +45,7 @@ _LAST_WORDS_S = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """What to run: the options of `lowfc latency`.."""
+    """What to run: the options of `lowfc latency`; with several `kernels`, each in turn."""
 
     config: Configuration
     duration_s: float
@@ -53,6 +53,7 @@ class Asked:
     simulated: bool = False
     record: bool = False
     view: bool = False
+    kernels: tuple[str, ...] = ()
 
 
 def fill(config: Configuration, run: Run) -> None:
@@ -77,19 +78,24 @@ def run_repeats(asked: Asked, run: Run, progress: Callable[[str], None]) -> list
     """Measure; figures of each repeat.
 
     Returns:
-        For each repeat `repeat_figures` and `controllers_account`; granted, refused, logs, messages_lost and
-        commands_late; echo_us, step_us, hot_step_us and timer_us (percentiles) and echo_lost.
+        For each repeat, and in it for each kernel: its name, kernel; `repeat_figures` and `controllers_account`;
+        granted, refused, logs, messages_lost and commands_late; echo_us, step_us, hot_step_us and timer_us
+        (percentiles) and echo_lost.
 
     Raises:
         ProcessDiedError: a process ended by itself.
         BusError: the controller did not report its timing.
     """
-    repeats = []
-    for number in range(1, asked.repeats + 1):
-        progress(f"{number} of {asked.repeats}: the loop")
-        loop = _loop(asked, run)
-        progress(f"{number} of {asked.repeats}: the bare echo, the step and the timer")
-        repeats.append(loop | _alone(asked, run))
+    repeats, kernels = [], asked.kernels or (asked.config.realtime.kernel,)
+    for number in range(asked.repeats):
+        for kernel in kernels[:: -1 if number % 2 else 1]:
+            realtime = asked.config.realtime.model_copy(update={"kernel": kernel})
+            turn = replace(asked, config=asked.config.model_copy(update={"realtime": realtime}))
+            (run.path / "config.toml").write_text(turn.config.to_toml(), encoding="utf-8")
+            progress(f"{number + 1} of {asked.repeats}: the loop by {kernel}")
+            loop = _loop(turn, run)
+            progress(f"{number + 1} of {asked.repeats}: the bare echo, the step by {kernel} and the timer")
+            repeats.append(loop | _alone(turn, run) | {"kernel": kernel})
     return repeats
 
 

@@ -47,6 +47,22 @@ def together(repeats: Repeats) -> dict[str, Any]:
     return found
 
 
+def of_kernels(repeats: Repeats) -> dict[str, Any]:
+    """`together` of the repeats, where they are of one kernel; else of the fused step's, beside numpy's.
+
+    Returns:
+        kernel: numpy, fused or both; with both, kernel_ratio (p50 and p99), frame to command of the fused step over
+        numpy's, the median of those that followed each other, kernel_ratio_spread, and numpy_us, numpy's own.
+    """
+    of = {name: [one for one in repeats if one["kernel"] == name] for name in ("numpy", "fused")}
+    if not all(of.values()):
+        return together(repeats) | {"kernel": repeats[0]["kernel"]}
+    each = [[one["latency_us"]["frame_to_command"] for one in of[name]] for name in ("fused", "numpy")]
+    ratios = [{at: fused[at] / numpy[at] for at in RATIOS_AT} for fused, numpy in zip(*each, strict=True)]
+    beside = {"kernel_ratio": median_of(ratios), "kernel_ratio_spread": spread_of(ratios)}
+    return together(of["fused"]) | {"kernel": "both", "numpy_us": median_of(each[1])} | beside
+
+
 def median_of(repeats: Sequence[Mapping[str, float]]) -> dict[str, float]:
     """Median over the repeats of each percentile; of the largest values, the largest."""
     each = {at: [one[at] for one in repeats] for at in repeats[0]}

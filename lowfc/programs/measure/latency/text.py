@@ -101,6 +101,13 @@ def _remarks(figures: Mapping[str, Any]) -> list[str]:
             spread = figures[f"{name}_spread"]
             parts = [f"{at} {figures[name][at]:.2f} ({low:.2f} to {high:.2f})" for at, (low, high) in spread.items()]
             lines.append(f"frame to command over half a bare echo and one control step{words}: {', '.join(parts)}")
+    if figures.get("kernel_ratio"):
+        spread, numpy_us = figures["kernel_ratio_spread"], figures["numpy_us"]
+        parts = [
+            f"{at} {figures['kernel_ratio'][at]:.2f} ({low:.2f} to {high:.2f}) of {numpy_us[at]:.1f} us"
+            for at, (low, high) in spread.items()
+        ]
+        lines.append(f"all of the fused step; frame to command over numpy's, in turns: {', '.join(parts)}")
     counts = {name: figures.get(name) for name in COUNTS}
     shown = [name for name, count in counts.items() if count or (name in _ALWAYS and count is not None)]
     lines.append(", ".join(f"{counts[name]} {COUNTS[name]}" for name in shown))

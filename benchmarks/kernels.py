@@ -1,0 +1,95 @@
+"""The control step by each kernel, back to back, over one matrix-vector product of its size and over memory's limit.
+
+In every turn the step by numpy, the fused step, the product R x, and reading every byte that a step must touch once
+follow each other; ratios are those of a turn.
+
+Example:
+    python -m benchmarks kernels --pixels 80 256 --repeats 9
+"""
+
+import argparse
+from collections.abc import Callable
+from itertools import cycle
+from statistics import median
+
+import numpy as np
+
+from benchmarks.curves import RATE_HZ, timed
+from benchmarks.runner import Lines, Result, Tell, add_times, ranged
+from benchmarks.sizes import FRAMES, Size, configuration, made_up
+from lowfc.adapters.process.clock import HostClock
+from lowfc.adapters.process.realtime import set_up
+from lowfc.control.kernel.tables import KERNELS
+from lowfc.programs.measure.control_step import ControlStep
+from lowfc.programs.measure.frame_source import Payloads
+
+SIDES = (80, 256, 512)
+PRODUCT, STREAM = "product", "memory"
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    """The sizes, for how long, and how often."""
+    add_times(parser, seconds=0.3, repeats=9)
+    parser.add_argument(
+        "--pixels", type=int, nargs="+", default=SIDES, metavar="N", help="across the frame %(default)s"
+    )
+
+
+def measure(options: argparse.Namespace, tell: Tell) -> Result:
+    """Measure in turns.
+
+    Returns:
+        sizes: of each pixels, modes, actuators, turns (p50 in us of numpy, fused, product and memory) and ratios.
+    """
+    set_up(None, None, lock_memory=False, disable_cpu_idle=False)
+    found = []
+    for side in options.pixels:
+        size = Size(side)
+        works = _works(size)
+        turns = []
+        for number in range(options.repeats):
+            tell(f"{size.pixels} pixels, {number + 1} of {options.repeats}")
+            turns.append({name: timed(work, options.seconds)["p50"] for name, work in works.items()})
+        pairs = [(kernel, other) for kernel in KERNELS for other in (PRODUCT, STREAM)]
+        ratios = {
+            f"{one} over {other}": [turn[one] / turn[other] for turn in turns] for one, other in (*pairs, KERNELS[::-1])
+        }
+        numbers = {"pixels": size.pixels, "modes": size.modes, "actuators": size.actuators}
+        found.append(numbers | {"turns": turns, "ratios": ratios})
+    return {"sizes": found}
+
+
+def tables(found: Result) -> list[Lines]:
+    """One line a size and ratio."""
+    head = ["pixels, modes, actuators", "ratio", "median (range)"]
+    lines = [
+        [f"{one['pixels']}, {one['modes']}, {one['actuators']}", name, ranged(ratios, "{:.2f}".format)]
+        for one in found["sizes"]
+        for name, ratios in one["ratios"].items()
+    ]
+    return [[head, *lines]]
+
+
+def about(found: Result) -> str:
+    """Medians in us."""
+    each = [
+        ", ".join(f"{name} {median(turn[name] for turn in one['turns']):.1f}" for name in one["turns"][0])
+        for one in found["sizes"]
+    ]
+    return f"us, p50, medians over {len(found['sizes'][0]['turns'])} turns: {'; '.join(each)}"
+
+
+def _works(size: Size) -> dict[str, Callable[[], object]]:
+    """What is timed of a size, by name."""
+    calibration, frames = made_up(size, configuration(size, RATE_HZ))
+    made = Payloads(frames)
+    payloads = cycle([made.at(index, HostClock().host_ns()) for index in range(FRAMES)])
+    R, x = calibration.reconstructor, np.random.default_rng(1).standard_normal(size.pixels, np.float32)
+    one_half, other_half = np.ones((2, size.bytes // 8), np.float32)
+
+    def step(kernel: str) -> Callable[[], object]:
+        control_step = ControlStep(configuration(size, RATE_HZ, kernel=kernel), calibration, HostClock().host_ns())
+        return lambda: control_step(next(payloads))
+
+    steps = {kernel: step(kernel) for kernel in KERNELS}
+    return steps | {PRODUCT: lambda: R @ x, STREAM: lambda: one_half.dot(other_half)}
