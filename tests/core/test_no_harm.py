@@ -1,0 +1,27 @@
+"""Automatic gains over the bus, on bright and faint stars: closing the loop harms on none."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tools.no_harm import OF_DARK_ZONE
+
+COMMAND = "lowfc sim-loop --lockstep --rate 250 --duration 20 --disturbance bench --no-record --json"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("magnitude", [0, 5, 8])
+@pytest.mark.parametrize("sensor", ["sam", "zwfs"])
+def test_closing_adds_nothing_to_the_dark_zone(sensor: str, magnitude: int, tmp_path: Path) -> None:
+    words = [*COMMAND.split(), "--star-magnitude", str(magnitude), "--sensor", sensor]
+    done = subprocess.run([sys.executable, "-m", *words], cwd=tmp_path, capture_output=True, text=True, timeout=230)
+    assert not done.returncode, done.stderr
+    found = json.loads(done.stdout)
+    added = found["added_contrast"]
+    assert found["closed_fraction"] > 0.85
+    assert added["closed"] < added["open"] + OF_DARK_ZONE * found["dark_zone_contrast"]
+    if not magnitude:
+        assert added["closed"] < 0.1 * added["open"]
