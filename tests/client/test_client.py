@@ -601,7 +601,13 @@ def test_the_status_says_everything() -> None:
     }
     said = figures(state)
     assert {name: said[name] for name in expected} == expected
-    for words in ("closed, opens after 12 frames", "dark-hole 3.54 nm rms", "12 of 20", "acting: slew"):
+    for words in (
+        "closed, opens after 12 frames",
+        "dark-hole 3.54 nm rms",
+        "12 of 20",
+        "acting: slew",
+        "integrator alone",
+    ):
         assert words in text(figures(state))
     assert text(figures(state)).splitlines()[-1].endswith("abc, the first of a commissioning: without a verdict")
     assert figures(wire.ControllerState())["mode"] == "starting"

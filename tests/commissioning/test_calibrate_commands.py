@@ -19,6 +19,7 @@ from lowfc.contract.errors import CalibrationError, ConfigurationError, DataFile
 from lowfc.control.calibration.alignment import Geometry, align, onto
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.response_fit import cross_talk
+from lowfc.control.loop.camera import CameraSettings
 from lowfc.optics.chain.zernike import zernikes
 from lowfc.optics.twin.twin import Twin, node_radii, reference, response
 from lowfc.programs.commissioning.analytic import analytic
@@ -193,6 +194,19 @@ def test_a_dark_finds_bad_pixels_and_is_not_taken_in_light(loop: FoldedLoop, mon
     found = told("dark", "--dark-taken", "--frames", "50", "--out", "night.fits")
     assert found["dark_dn"] == pytest.approx(100, abs=0.5)
     assert found["hot"] < 5
+
+
+@pytest.mark.parametrize("words", ["", "reference", "align", "dark --dark-taken"])
+def test_frames_of_another_size_than_the_calibration_are_named(
+    loop: FoldedLoop, monkeypatch: pytest.MonkeyPatch, words: str
+) -> None:
+    other = replace(loop.calibration(), shape=(64, 100))
+    monkeypatch.setattr(loop, "calibration", lambda: other)
+    monkeypatch.setattr(loop, "camera", lambda: CameraSettings(0, (80, 80), 100.0, 40100.0))
+    with pytest.raises(
+        CalibrationError, match=r"80 x 80 pixels and are refused as WRONG_SIZE: .* is for 64 x 100: load"
+    ):
+        told(*words.split())
 
 
 def test_the_computed_calibration_is_carried_to_a_sensor_that_lies_otherwise(loop: FoldedLoop) -> None:

@@ -81,7 +81,7 @@ def per_mode(noll: tuple[int, ...], request: Request, before: Single) -> Single:
     if len(request.values) not in (1, len(modes)):
         raise ValueError(f"give one value, or one for each of the {len(modes)} modes; got {len(request.values)}")
     if not np.isfinite(request.values).all():
-        raise ValueError(f"{request.name} must be finite, got {list(request.values)}")
+        raise ValueError(f"{request.name} must be finite, got {' '.join(map('{:g}'.format, request.values))}")
     array = before.copy()
     array[[noll.index(mode) for mode in modes]] = np.asarray(request.values, dtype=np.float32)
     return array

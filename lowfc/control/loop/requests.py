@@ -159,7 +159,8 @@ def _check_camera(state: State) -> None:
 def _step(settings: Settings, state: State, request: Request) -> Handled:
     frames = request.values[0] if len(request.values) == 1 else 0.0
     if not (1 <= frames <= MOST_STEPS and frames == int(frames)):
-        raise ValueError(f"step takes one whole number of frames, 1 or more; got {list(request.values)}")
+        given = " ".join(map("{:g}".format, request.values)) or "none"
+        raise ValueError(f"step takes one whole number of frames, 1 or more; got {given}")
     state = in_mode(
         state,
         _granted(state, "close"),

@@ -40,6 +40,11 @@ class HostsResult(Result):
     run: str = figure("run")
     processes: list[HostProcess] = figure("processes")
 
+    def remarks(self) -> list[str]:
+        """Why no clock is compared."""
+        one = all(each.clock_offset_us is None for each in self.processes)
+        return ["no clock is compared: the run has no router, or none that has a clock"] if one else []
+
 
 def certs(
     folder: Annotated[Path, typer.Argument(help="Folder of the authority; made where there is none.")],

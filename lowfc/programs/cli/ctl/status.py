@@ -146,7 +146,9 @@ def text(known: dict[str, Any]) -> str:
         "offset": f"{known['offset_rms_nm']:.3f} nm rms",
         **_contrast(known),
         "law": law,
-        "gain": _values(known["gain"]) + _automatic(known["gain_automatic"]),
+        "gain": _values(known["gain"])
+        + _automatic(known["gain_automatic"])
+        + ("" if known["law"]["name"] == "integrator" else ", of the integrator alone"),
         "leak": _values(known["leak"]),
         "limit": _values(known["limit_nm"], " nm"),
         "channels": "; ".join(channels) or "none",

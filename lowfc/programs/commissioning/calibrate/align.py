@@ -19,7 +19,7 @@ from lowfc.control.calibration.calibration import Calibration, normalise_flux
 from lowfc.programs.cli.result import Result, figure
 from lowfc.programs.commissioning.analytic import analytic
 from lowfc.programs.commissioning.calibrate.pokes import AMPLITUDE_NM, sequence
-from lowfc.programs.commissioning.calibrate.recording import Player, watch
+from lowfc.programs.commissioning.calibrate.recording import Player, check_size, watch
 from lowfc.programs.commissioning.calibrate.result import reconstructed
 from lowfc.programs.commissioning.calibrate.tasks import reporter, written
 
@@ -56,12 +56,7 @@ def aligned(out: Path, run: str | None, frames: int, *, load: bool) -> AlignResu
     with Client(run) as loop, loop.reserved("lowfc calibrate align"):
         config, before = configuration_of(loop), replace(loop.calibration(), camera=loop.camera())
         pixels = watch(loop, frames)
-        if pixels.shape[1:] != before.shape:
-            raise CalibrationError(
-                f"the frames have {pixels.shape[1]} x {pixels.shape[2]} pixels, the calibration in use is for "
-                f"{before.shape[0]} x {before.shape[1]}, and so are its dark and bad pixels: `lowfc commission` "
-                "measures one for these frames"
-            )
+        check_size(pixels.shape[1:], before)
         dark = before.dark.reshape(before.shape).astype(np.float64)
         computed = analytic(config, console)
         try:

@@ -158,6 +158,20 @@ def watch(loop: Client, count: int) -> Pixels:
     return np.array(received)
 
 
+def check_size(shape: tuple[int, ...], before: Calibration) -> None:
+    """Compare the size of the frames with that of the calibration in use.
+
+    Raises:
+        CalibrationError: they differ, so that every frame is refused.
+    """
+    if shape != before.shape:
+        raise CalibrationError(
+            f"the frames have {shape[0]} x {shape[1]} pixels and are refused as WRONG_SIZE: the calibration in use, "
+            f"with its dark and bad pixels, is for {before.shape[0]} x {before.shape[1]}: load one for these frames, "
+            "or measure one with `lowfc commission`"
+        )
+
+
 @contextlib.contextmanager
 def _streams(loop: Client) -> Iterator[tuple[Iterator[Frame], Iterator[Step]]]:
     """Frames and steps from now on; where anything goes wrong, nothing is played any more."""

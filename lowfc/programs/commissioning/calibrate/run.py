@@ -36,7 +36,7 @@ from lowfc.control.calibration.response_fit import (
 )
 from lowfc.control.loop.wording import counted
 from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest, Pokes, checks
-from lowfc.programs.commissioning.calibrate.recording import Player, Report
+from lowfc.programs.commissioning.calibrate.recording import Player, Report, check_size
 
 _LIKE = 0.3
 """Likeness of the first pokes' picture to the calibration in use below which something is said."""
@@ -70,6 +70,9 @@ class Calibrator:
     ) -> None:
         """Ask the controller what it has.
 
+        Raises:
+            CalibrationError: the frames have another size than the calibration in use.
+
         Args:
             loop: A connection to it.
             request: What is asked for.
@@ -82,6 +85,8 @@ class Calibrator:
         self._report = report
         self.config = configuration_of(loop)
         self.before = replace(loop.calibration(), camera=loop.camera())
+        if self.before.camera is not None:
+            check_size(self.before.camera.shape, self.before)
         self._computed = computed
         self.noise_nm = factory.frame_noise_nm(self.config, self.before)
         self._closed = request.method == "in-loop"

@@ -31,7 +31,7 @@ from lowfc.optics.twin.twin_mirror import TwinMirror, wavefront_nm
 from lowfc.programs.cli.result import Result, figure
 from lowfc.programs.commissioning.analytic import Wavefront, analytic
 from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest
-from lowfc.programs.commissioning.calibrate.recording import Report, watch
+from lowfc.programs.commissioning.calibrate.recording import Report, check_size, watch
 from lowfc.programs.commissioning.calibrate.result import (
     CalibrationResult,
     finished,
@@ -189,9 +189,11 @@ def darkened(out: Path, run: str | None, frames: int, file: Path | None, *, load
     """
     require_folder(out)
     with Client(run) as loop, _in_use(loop) as (before, noise):
-        cube, whose = (watch(loop, frames), "the camera") if file is None else (images(file), str(file))
-        if cube.shape[1:] != before.shape:
-            raise DataFileError(f"{whose}: frames of {cube.shape[1:]}, the calibration has {before.shape}")
+        cube = watch(loop, frames) if file is None else images(file)
+        if file is None:
+            check_size(cube.shape[1:], before)
+        elif cube.shape[1:] != before.shape:
+            raise DataFileError(f"{file}: frames of {cube.shape[1:]}, the calibration has {before.shape}")
         found = dark_of(cube.reshape(len(cube), -1))
         if file is None:
             check_dark(found.dark_dn, before.reference.astype(np.float64), before.flux_dn)
@@ -210,7 +212,9 @@ def referenced(out: Path, run: str | None, frames: int, *, load: bool) -> Refere
     """
     require_folder(out)
     with Client(run) as loop, _in_use(loop) as (before, noise):
-        pixels = watch(loop, frames).reshape(frames, -1)
+        taken = watch(loop, frames)
+        check_size(taken.shape[1:], before)
+        pixels = taken.reshape(frames, -1)
         light, flux = normalised(pixels, before.dark.astype(np.float64), before.good.astype(np.float64))
         image = light.mean(axis=0)
         made = written(with_reference(before, image, float(flux.mean()), *noise), out, loop if load else None)

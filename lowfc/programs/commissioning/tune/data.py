@@ -118,7 +118,7 @@ def of_run(loop: Client, seconds: float, progress: Callable[[float], None] | Non
         needed_s = FEWEST / config.camera.rate_hz
         raise DataFileError(
             f"run {loop.run_id!r}: a law is tuned from at least {FEWEST} frames in a row, {needed_s:.3g} s at "
-            f"{config.camera.rate_hz:g} Hz; asked to listen for {seconds:g} s: --live {np.ceil(1.2 * needed_s):.0f}"
+            f"{config.camera.rate_hz:g} Hz; asked for {seconds:g} s: --live {np.ceil(1.2 * needed_s):.0f}"
         )
     watch = _watched(loop)
     begun_s = time.monotonic()
