@@ -146,6 +146,7 @@ print(json.dumps({{
     "cpus": sorted(os.sched_getaffinity(0)), "collects": gc.isenabled(), "frozen": gc.get_freeze_count(),
     "blas": [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"],
     "locked_kb": [int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("VmLck")][0],
+    "resident_kb": [int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("VmRSS")][0],
     "open": [os.readlink(f"/proc/self/fd/{{number}}") for number in os.listdir("/proc/self/fd")[:-1]],
 }}))
 """
@@ -195,6 +196,15 @@ def test_what_the_host_refuses_is_named_with_its_cost() -> None:
     assert all(len(cost) > 30 for _, cost in found["refused"])
     assert (found["policy"], found["locked_kb"]) == (os.SCHED_OTHER, 0)
     assert found["granted"] == ["one BLAS thread", "garbage collector off"]
+
+
+def test_locked_memory_is_what_is_used_and_not_what_is_reserved() -> None:
+    reserve = "from mmap import *; kept = mmap(-1, 1 << 28, MAP_PRIVATE | MAP_ANONYMOUS)"
+    found = report("set_up(None, None, lock_memory=True, disable_cpu_idle=False)", reserve)
+    if found["refused"]:
+        pytest.skip(str(found["refused"]))
+    assert found["locked_kb"] > 1 << 18
+    assert found["resident_kb"] < 150_000
 
 
 def may_be_real_time() -> bool:

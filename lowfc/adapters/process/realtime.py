@@ -172,17 +172,22 @@ def _stay_awake() -> None:
 
 
 def _lock_memory() -> None:
-    """Lock what is there, and every later page once it is touched.
+    """Lock what is there, and every other page once it is touched; of files all pages now, for reading one takes long.
 
-    Under a limit, later allocations would fail instead of being slow, so nothing is locked then.
+    To lock all of what is only reserved would fill it: most of it are buffers and stacks of threads that BLAS does not
+    use. Under a limit, later allocations would fail instead of being slow, so nothing is locked then.
     """
     limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[1]
     if limit != resource.RLIM_INFINITY and not _capabilities() & _CAP_IPC_LOCK:
         raise _RefusedError(f"the limit is {limit // 1024} kB; set LimitMEMLOCK=infinity")
     libc = ctypes.CDLL(None, use_errno=True)
-    for flags in (_MCL_CURRENT, _MCL_FUTURE | _MCL_ONFAULT):
-        if libc.mlockall(flags) != 0:
-            raise _RefusedError(os.strerror(ctypes.get_errno()))
+    if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT) != 0:
+        raise _RefusedError(os.strerror(ctypes.get_errno()))
+    for line in Path("/proc/self/maps").read_text().splitlines():
+        pages, rights, *_, name = line.split(maxsplit=5)
+        if name.startswith("/") and rights.startswith("r"):
+            begin, end = (int(address, 16) for address in pages.split("-"))
+            libc.mlock(ctypes.c_void_p(begin), ctypes.c_size_t(end - begin))
 
 
 def _capabilities() -> int:
