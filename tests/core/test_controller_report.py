@@ -168,6 +168,10 @@ def test_the_status_line_is_of_the_last_seconds_and_says_nothing_before_the_firs
     recent = wire.WavefrontFigures(residual_rms_nm=2.2, disturbance_rms_nm=30.0)
     watch.health["camera"] = wire.Health(process="camera", rate_hz=250, wavefront=whole, recent_wavefront=recent)
     assert "closed     250 Hz  residual 2.20 of 30.00 nm rms" in status_line(watch, 10.0)
+    received = wire.TopicCount(topic=FRAME.key, received=900)
+    begun = wire.Health(mode=wire.LOOP_MODE_CLOSED, topics=[received], not_closed_ns=2 * SECOND)
+    early = Watch(watch.health | {"controller": begun}, [])
+    assert "closed for 1.6 s     250 Hz" in status_line(early, 5.0), "the residual is of the open loop, too"
     with Console(width=120, file=io.StringIO(), record=True) as console:
         console.print(screen(watch, Configuration(), None, 10.0))
     assert "2.20 nm rms left of 30.00 nm" in console.export_text()

@@ -18,6 +18,8 @@ from lowfc.programs.launch.watch import Watch, mode_name, topic_count, wavefront
 
 SILENT_S = 2.0
 """A process sends Health twice a second: after so long its last figures are no longer shown."""
+_FIGURES_S = 2.5
+"""Time that the last figures of the wavefront are of, and of which they may be late."""
 _EVENTS_SHOWN = 4
 _STYLES = {Level.WARNING: "yellow", Level.ERROR: "red", Level.FATAL: "bold red"}
 
@@ -55,11 +57,19 @@ def status_line(watch: Watch, elapsed_s: float) -> str:
         return f"{elapsed_s:5.0f} s  {mode(controller)}  {silent}"
     frames, recent = topic_count(controller, FRAME.key), wavefront(camera.recent_wavefront)
     return (
-        f"{elapsed_s:5.0f} s  {mode(controller)}  {camera.rate_hz:6.0f} Hz  "
+        f"{elapsed_s:5.0f} s  {mode(controller)}{_only_just(controller, camera.rate_hz)}  {camera.rate_hz:6.0f} Hz  "
         f"residual {recent['residual_rms_nm']:.2f} of {recent['disturbance_rms_nm']:.2f} nm rms  {_added(recent)}"
         f"frame to command {latency(controller.frame_to_command)}  "
         f"skipped {frames.skipped} missing {frames.missing}  {recording(watch.of(Role.RECORDER))}"
     )
+
+
+def _only_just(controller: wire.Health, rate_hz: float) -> str:
+    """For how long a loop has been closed that was not for all of the time its residual is of; else empty."""
+    frames = topic_count(controller, FRAME.key).received
+    closed_s = frames / rate_hz - controller.not_closed_ns * 1e-9 if rate_hz else 0.0
+    just = controller.mode == wire.LOOP_MODE_CLOSED and 0 < closed_s < _FIGURES_S
+    return f" for {closed_s:.1f} s" if just else ""
 
 
 def _silent(watch: Watch) -> str:
