@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import welch
 
 from lowfc.arrays import Array, Sequences, Whole
 
@@ -103,6 +102,8 @@ def spectrum(run: Pieces, rate_hz: float) -> Spectrum | None:
 
     Segments have Hann's window and lose their mean; their length, a power of two, follows from the longest piece.
     """
+    from scipy.signal import welch  # takes half a second, which whoever only reads figures need not wait for
+
     longest = max((len(piece) for piece in run.values), default=0)
     if longest < SHORTEST:
         return None

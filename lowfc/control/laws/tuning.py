@@ -8,8 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import minimize_scalar
-from scipy.signal import periodogram
 
 from lowfc.arrays import Array
 from lowfc.control.laws import margins
@@ -85,6 +83,8 @@ def best_gains(run: Pieces, rate_hz: float, timing: Timing, leak: Array) -> Gain
     Raises:
         ValueError: there are too few frames in a row.
     """
+    from scipy.optimize import minimize_scalar
+
     fine, coarse = _whole_spectrum(run, rate_hz), spectrum(run, rate_hz)
     if fine is None or coarse is None:
         longest = max((len(piece) for piece in run.values), default=0)
@@ -267,6 +267,8 @@ def left_of(law: LinearLaw, run: Pieces, noise_nm2: Array, timing: Timing) -> Ar
 
 def _whole_spectrum(run: Pieces, rate_hz: float) -> Spectrum | None:
     """The periodogram of the longest piece: coarse segments would lose a slow mode's drift."""
+    from scipy.signal import periodogram
+
     longest = max(run.values, key=len, default=None)
     if longest is None or len(longest) < FEWEST:
         return None

@@ -6,8 +6,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lowfc.adapters.files import calibration_file, law_file
-from lowfc.adapters.files.mirror_maps import read_shape
 from lowfc.client import Answer, Client
 from lowfc.client.requests import BY_NAME
 from lowfc.contract.errors import ConfigurationError, RequestRefusedError
@@ -54,13 +52,33 @@ class Action(NamedTuple):
 
 
 LOAD = "load"
+
+
+def _shape(text: str) -> Any:
+    from lowfc.adapters.files.mirror_maps import read_shape  # astropy, which a console needs for files alone
+
+    return read_shape(Path(text)) if text else None
+
+
+def _law(text: str) -> Any:
+    from lowfc.adapters.files import law_file
+
+    return law_file.load(Path(text)) if text else None
+
+
+def _calibration(text: str) -> Any:
+    from lowfc.adapters.files import calibration_file
+
+    return calibration_file.load(Path(text))
+
+
 _READERS: dict[str, tuple[str, Callable[[str], Any]]] = {
     "modes": ("modes", lambda text: noll_of([text] if text else None)),
     "values": ("values", lambda text: numbers(text)),
     "text": ("text", str),
-    "actuators": ("actuators_nm", lambda text: read_shape(Path(text)) if text else None),
-    "law": ("law", lambda text: law_file.load(Path(text)) if text else None),
-    "calibration": ("calibration", lambda text: calibration_file.load(Path(text))),
+    "actuators": ("actuators_nm", _shape),
+    "law": ("law", _law),
+    "calibration": ("calibration", _calibration),
 }
 """The client's argument, and how it is read, of each field of a request."""
 _FILES = {

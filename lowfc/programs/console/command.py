@@ -1,5 +1,6 @@
 """The command `lowfc console`."""
 
+import signal
 import sys
 
 from lowfc.adapters.process.terminal import AnyRun
@@ -47,6 +48,8 @@ def _operated(run_id: str) -> bool:
             moved=lambda: links.exists() and links.stat().st_ctime_ns != made_ns,
             terminal_gone=lambda: not sys.stdin.isatty(),
         )
+        for ends in (signal.SIGTERM, signal.SIGINT):  # textual's threads would outlive an exception
+            signal.signal(ends, lambda *_: app.exit())
         return app.run() == MOVED
     finally:
         bus.close()

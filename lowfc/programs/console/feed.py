@@ -3,6 +3,7 @@
 import threading
 import time
 from collections import deque
+from importlib import import_module
 from typing import NamedTuple
 
 import numpy as np
@@ -148,6 +149,7 @@ class Feed:
         self._asked_s = time.monotonic()
 
         def ask() -> None:
+            import_module("scipy.signal")  # that a verdict uses later: the screen would stand still meanwhile
             self._earlier.extend(states(self._bus, SHOWN))
             try:
                 self._config = configuration_of(Client(self._run_id, bus=self._bus))

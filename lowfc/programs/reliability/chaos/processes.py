@@ -97,30 +97,38 @@ def _stalled_viewer(bench: ChaosBench) -> None:
     compare(bench, partial(bench.stopped, name))
 
 
+class CommandTimes:
+    """Frame-to-command latencies over some spans of a case, among its figures."""
+
+    def __init__(self, bench: ChaosBench) -> None:
+        """Begin to receive them."""
+        assert bench.bus is not None  # noqa: S101  # it has begun
+        self.found: dict[str, dict[str, float]] = {}
+        self._latencies_ns: list[int] = []
+        bench.bus.subscribe(TIMING, self._receive)
+        bench.left.figures["frame_to_command"] = self.found
+
+    def note(self, name: str, seconds: float) -> None:
+        """Listen for so long."""
+        time.sleep(_AFTER_S)  # what is on its way belongs to the time before
+        self._latencies_ns.clear()
+        time.sleep(seconds)
+        if self._latencies_ns:
+            p50, p99 = (np.percentile(self._latencies_ns, (50, 99)) / 1e3).round(1).tolist()
+            self.found[name] = {"frames": len(self._latencies_ns), "p50_us": p50, "p99_us": p99}
+
+    def _receive(self, sample: Sample) -> None:
+        self._latencies_ns.extend(wire.ControlTiming.FromString(sample.payload).frame_to_command_ns)
+
+
 def compare(bench: ChaosBench, stall: Callable[[], contextlib.AbstractContextManager[None]]) -> None:
     """Note frame-to-command latencies before, during and after a stall among the case's figures, with ratios of p99."""
-    latencies_ns: list[int] = []
-    found: dict[str, dict[str, float]] = {}
-
-    def receive(sample: Sample) -> None:
-        latencies_ns.extend(wire.ControlTiming.FromString(sample.payload).frame_to_command_ns)
-
-    def listen(name: str, seconds: float) -> None:
-        time.sleep(_AFTER_S)  # what is on its way belongs to the time before
-        latencies_ns.clear()
-        time.sleep(seconds)
-        if latencies_ns:
-            p50, p99 = (np.percentile(latencies_ns, (50, 99)) / 1e3).round(1).tolist()
-            found[name] = {"frames": len(latencies_ns), "p50_us": p50, "p99_us": p99}
-
-    assert bench.bus is not None  # noqa: S101  # it has begun
-    bench.bus.subscribe(TIMING, receive)
-    listen("before", CALM_S)
+    times = CommandTimes(bench)
+    times.note("before", CALM_S)
     with stall():
-        listen("during", STALL_S)
-    listen("after", CALM_S)
-    bench.left.figures["frame_to_command"] = found
-    if len(found) == 3:
-        before, during, after = (one["p99_us"] for one in found.values())
+        times.note("during", STALL_S)
+    times.note("after", CALM_S)
+    if len(times.found) == 3:
+        before, during, after = (one["p99_us"] for one in times.found.values())
         bench.left.figures["p99_during_over_calm"] = round(during / ((before + after) / 2), 2)
         bench.left.figures["p99_after_over_before"] = round(after / before, 2)
