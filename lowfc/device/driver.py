@@ -215,6 +215,10 @@ class MirrorExtras:
         """
         raise NotImplementedError
 
+    def beside(self) -> Single | None:
+        """(rows, columns) nm that others have on the mirror beside the commands; the stroke holds for the sum."""
+        return None
+
     def settle(self, actuators_nm: Single, elapsed_ns: float) -> Single:
         """Simulated mirrors: `apply` (rows, columns) with the run's time since the last call.
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from lowfc.arrays import Single
 from lowfc.control.loop.command_channels import LONGEST_NAME, MOST_CHANNELS
-from lowfc.control.loop.safety import Limit, Limits, Reason, Rejection, expired, limit
+from lowfc.control.loop.safety import Limit, Limited, Limits, Reason, Rejection, expired, limit
 
 _NONE: Single = np.zeros(0, np.float32)
 
@@ -106,8 +106,13 @@ class Status(NamedTuple):
     clear_id: int = 0
 
 
-def apply_command(guard: Guard, status: Status, told: Command, now_ns: int, move: Move) -> tuple[Status, Reason | None]:
-    """Follow a command that came at `now_ns`; a refused one changes nothing, and the reason is returned."""
+def apply_command(
+    guard: Guard, status: Status, told: Command, now_ns: int, move: Move, beside_nm: Single | None = None
+) -> tuple[Status, Reason | None]:
+    """Follow a command that came at `now_ns`; a refused one changes nothing, and the reason is returned.
+
+    What others have on the mirror, `beside_nm` (rows, columns), leaves less of the stroke.
+    """
     reason = _refusal(guard, status, told)
     if reason is not None:
         return status, reason
@@ -117,7 +122,7 @@ def apply_command(guard: Guard, status: Status, told: Command, now_ns: int, move
     if len(channels) > 1:
         with np.errstate(over="ignore", invalid="ignore"):  # a sum that is not finite is refused by `limit`
             wanted = sum(channels.values(), np.zeros(guard.grid, np.float32))
-    limited = limit(guard.tighter, status.driven_nm, wanted)
+    limited = _limited(guard, status.driven_nm, wanted, beside_nm)
     # From frame to frame, not from the last tick: ticks go by the mirror's own clock, which is ahead of a frame's time.
     elapsed_ns = told.time_ns - status.commanded_ns if status.commanded_ns else np.inf
     if elapsed_ns <= 0:  # the same frame again, while the camera is silent: only the mirror's own clock goes on
@@ -138,6 +143,17 @@ def apply_command(guard: Guard, status: Status, told: Command, now_ns: int, move
         clear_id=told.clear_id or status.clear_id,
     )
     return followed, None
+
+
+def _limited(guard: Guard, previous_nm: Single, wanted_nm: Single, beside_nm: Single | None) -> Limited:
+    """The command in its limits; in a sum with others each actuator goes no further than the stroke, or not at all."""
+    if beside_nm is None or not beside_nm.any() or not np.isfinite(wanted_nm).all():
+        return limit(guard.tighter, previous_nm, wanted_nm)
+    stroke_nm = np.float32(guard.tighter.kept_stroke_nm)
+    room_nm = np.clip(wanted_nm, np.minimum(-stroke_nm - beside_nm, 0), np.maximum(stroke_nm - beside_nm, 0))
+    limited = limit(guard.tighter, previous_nm, room_nm)
+    cut = Limit.STROKE not in limited.reasons and not np.array_equal(room_nm, wanted_nm)
+    return limited._replace(reasons=(Limit.STROKE, *limited.reasons)) if cut else limited
 
 
 def tick(guard: Guard, status: Status, now_ns: int, move: Move) -> Status:

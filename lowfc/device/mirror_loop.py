@@ -80,6 +80,7 @@ class MirrorLoop:
         self._service = service
         self._guard = guard_of(driver, config)
         self._settle = getattr(driver, "settle", None)
+        self._beside = getattr(driver, "beside", _IDLE.beside)
         getattr(driver, "join", _IDLE.join)(service)
         self._fill_extra = getattr(driver, "fill", _IDLE.fill)
         self.watch = DriverWatch(service, PATIENCE_S, self._hang)
@@ -159,7 +160,9 @@ class MirrorLoop:
         refused: Reason | None = Rejection.NO_MIRROR
         if not self._returning:
             with contextlib.suppress(_LostError):
-                self._status, refused = apply_command(self._guard, before, told, clock.now_ns(), self._drive)
+                self._status, refused = apply_command(
+                    self._guard, before, told, clock.now_ns(), self._drive, self._beside()
+                )
         self._refused = refused
         self._publish(self._status.time_ns or clock.now_ns())
         self._service.work += 1

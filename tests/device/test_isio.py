@@ -12,9 +12,12 @@ import pytest
 from lowfc.adapters.image_stream.stream import StreamError
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import ConfigurationError
+from lowfc.control.loop.safety import Limit
 from lowfc.device.drivers.isio import mirror as mirror_module
 from lowfc.device.drivers.isio.camera import IsioCamera
 from lowfc.device.drivers.isio.mirror import IsioMirror
+from lowfc.device.guard import Command, Status, apply_command
+from lowfc.device.mirror_loop import guard_of
 from lowfc.device.plugins import options
 from tests.support.image_streams.plain import PlainStream
 
@@ -203,12 +206,12 @@ def test_the_sum_of_all_channels_says_what_was_reached(folder: Path, monkeypatch
     driver, _ = mirror()
     summing.others.write(shape_nm(3) / 1000 + 0.1)
     assert driver.apply(shape_nm(1)) is None  # as it was written, but for piston
-    assert np.allclose(driver.others(), shape_nm(3) + 100, atol=1e-3)
+    assert np.allclose(driver.beside(), shape_nm(3) - shape_nm(3).mean(), atol=1e-3)
     too_far = shape_nm(2)
     too_far[5, 7] = 600
     reached = driver.apply(too_far)
     assert reached is not None
-    assert reached[5, 7] == pytest.approx(500 - driver.others()[5, 7], abs=0.1)
+    assert reached[5, 7] == pytest.approx(500 - shape_nm(3)[5, 7] - 100, abs=0.1)
     assert np.abs(np.delete(reached - too_far, 5 * GRID[1] + 7)).max() < 0.1
     summing.running = False
     summing.join()
@@ -220,5 +223,25 @@ def test_the_sum_of_all_channels_says_what_was_reached(folder: Path, monkeypatch
         driver.apply(shape_nm(1))
 
 
-def test_without_others_there_is_nothing_beside(folder: Path) -> None:
-    assert not mirror()[0].others().any()
+def test_without_others_there_is_nothing_beside() -> None:
+    assert not mirror()[0].beside().any()
+
+
+def test_the_stroke_holds_for_the_sum_with_others() -> None:
+    guard = guard_of(mirror()[0], CONFIG)
+    flat, beside, wanted = (np.zeros(GRID, np.float32) for _ in range(3))
+    beside[2, 2], beside[4, 4], beside[6, 6], beside[8, 8] = 700, 900, -900, 700
+    wanted[2, 2], wanted[4, 4], wanted[6, 6], wanted[8, 8], wanted[9, 9] = 100, 100, 100, -100, 100
+    told = Command("lowfc", 1, AT_NS, 10**9, wanted, np.ones(2, np.float32))
+    status, reason = apply_command(guard, Status(flat, flat), told, AT_NS, lambda shape, _: shape, beside)
+    assert reason is None
+    assert status.limits_hit == (Limit.STROKE,)
+    assert not status.command_nm.size
+    reached = status.surface_nm
+    assert reached[2, 2] == pytest.approx(50, abs=0.1)
+    assert reached[4, 4] == 0  # beyond the stroke already, and not this loop's doing
+    assert (reached[6, 6], reached[8, 8], reached[9, 9]) == (100, -100, 100)
+    assert np.abs(reached + beside)[2, 2] < CONFIG.mirror.stroke_nm / 2
+    status, _ = apply_command(guard, Status(flat, flat), told, AT_NS, lambda shape, _: shape, flat)
+    assert np.array_equal(status.surface_nm, wanted)
+    assert not status.limits_hit

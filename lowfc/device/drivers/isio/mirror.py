@@ -52,6 +52,7 @@ class IsioMirror:
         self._count = self._channel.count
         self._others = OtherChannels(channel_names(options.stream), self._grid)
         self._total_name = sum_name(options.stream) if options.total is None else options.total
+        self._beside: tuple[Single | None, Single] = None, np.zeros(self._grid, np.float32)
         self._total: Stream | None = None
         self._looked_s = -_LOOK_S
         self._unanswered_s = math.inf
@@ -65,9 +66,12 @@ class IsioMirror:
         held = whole(self._channel)
         return np.zeros(self._grid, np.float32) if held is None else held * np.float32(self._options.nm_per_unit)
 
-    def others(self) -> Single:
-        """What the other channels have on the mirror."""
-        return self._others.sum() * np.float32(self._options.nm_per_unit)
+    def beside(self) -> Single:
+        """What the other channels have on the mirror, but for piston, which is the sum's own affair."""
+        shape = self._others.sum()
+        if shape is not self._beside[0]:
+            self._beside = shape, (shape - shape.mean()) * np.float32(self._options.nm_per_unit)
+        return self._beside[1]
 
     def apply(self, actuators_nm: Single) -> Single | None:
         """Write the channel (rows, columns); where the sum of all has followed, return what of it is this one's."""
