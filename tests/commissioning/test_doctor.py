@@ -21,8 +21,9 @@ from lowfc.adapters.process.clock import boot_file
 from lowfc.adapters.process.host import Host, Synchronisation, Timex
 from lowfc.adapters.process.trial import Trial, lateness_ns, try_out
 from lowfc.contract.configuration import Configuration, Realtime, load
+from lowfc.contract.errors import ConfigurationError
 from lowfc.programs.commissioning.checks import Check, note, ok
-from lowfc.programs.commissioning.doctor import command, room, timing
+from lowfc.programs.commissioning.doctor import command, permissions, room, timing
 from lowfc.programs.commissioning.doctor.facts import Facts, gather, ranges
 from lowfc.programs.core.recording.volume import bytes_per_s
 from tests.support.loops import lowfc, until
@@ -367,3 +368,34 @@ def test_the_document_has_every_check_in_its_own_words() -> None:
     assert [(name.removeprefix("| "), looks_at) for name, looks_at, _ in rows[1:]] == [
         (name, look.__doc__) for name, (_, look) in LOOKS.items()
     ]
+
+
+def test_real_time_rights_are_shown_set_up_and_taken_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[str, ...]] = []
+    monkeypatch.setattr(permissions, "_run", lambda *words: asked.append(words) or " ".join(words))
+    monkeypatch.setattr(permissions.shutil, "chown", lambda path, group: asked.append((str(group),)))
+    monkeypatch.setattr(permissions.os, "geteuid", lambda: 1000)
+    for change in (lambda: permissions.apply(tmp_path, "me"), lambda: permissions.undo(tmp_path)):
+        with pytest.raises(ConfigurationError, match="needs root"):
+            change()
+    monkeypatch.setattr(permissions.os, "geteuid", lambda: 0)
+    device = tmp_path / permissions.DEVICE
+    device.parent.mkdir()
+    device.touch(0o600)
+    permissions.apply(tmp_path, "me")
+    for name, text in permissions.FILES.items():
+        assert (tmp_path / name).read_text() == text
+        assert text in lowfc("doctor", "--setup").stdout
+    assert device.stat().st_mode & 0o777 == 0o660
+    assert [words[0] for words in asked] == ["groupadd", "usermod", "lowfc"]
+    permissions.undo(tmp_path)
+    assert not [path for path in tmp_path.rglob("*") if path.is_file() and path != device]
+    assert device.stat().st_mode & 0o777 == 0o600
+    (tmp_path / next(iter(permissions.FILES))).write_text("somebody's own\n")
+    with pytest.raises(ConfigurationError, match="own"):
+        permissions.apply(tmp_path, "me")
+
+
+def test_the_udev_rule_is_the_one_of_the_services() -> None:
+    shipped = Path(__file__).parents[2] / "deploy/udev/70-lowfc.rules"
+    assert permissions.FILES["etc/udev/rules.d/90-lowfc-user.rules"] == shipped.read_text()

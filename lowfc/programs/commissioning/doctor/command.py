@@ -1,6 +1,8 @@
 """The command `lowfc doctor`: is this host fit for a real-time loop?"""
 
+import os
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -24,11 +26,15 @@ def doctor(
     device: Annotated[
         str | None, typer.Option(help="Driver, by its name: look at what it needs, and at nothing else.")
     ] = None,
+    setup: Annotated[bool, typer.Option("--setup", help="Show what grants a user real-time rights.")] = False,
+    apply: Annotated[bool, typer.Option("--apply", help="As root: set that up.")] = False,
+    undo: Annotated[bool, typer.Option("--undo", help="As root: take it back.")] = False,
     as_json: Json = False,
 ) -> None:
     """Say whether this host is fit for a real-time loop, what to do where it is not, and what it costs otherwise.
 
-    Nothing is changed and nothing needs root: what the loop asks of the host is tried in a process of its own.
+    Nothing is changed but by --apply and --undo, and nothing else needs root: what the loop asks of the host is tried
+    in a process of its own.
 
     Example: lowfc doctor --config lowfc.toml --strict
     """
@@ -36,6 +42,14 @@ def doctor(
     from lowfc.programs.commissioning.doctor.devices import device_checks
     from lowfc.programs.commissioning.doctor.facts import gather
 
+    if setup or apply or undo:
+        from lowfc.programs.commissioning.doctor import permissions
+
+        root = Path("/")
+        user = os.environ.get("SUDO_USER", "")
+        done = permissions.undo(root) if undo else permissions.apply(root, user) if apply else [permissions.shown(root)]
+        sys.stdout.write("\n".join(done) + "\n")
+        return
     settings = configuration(config)
     if device is not None:
         checks = list(device_checks(device, settings))

@@ -19,7 +19,7 @@ CHECKS: Table[Facts] = Table()
 
 _STALL_S = 0.1
 _OPEN_FILES = 256
-_LIMITS = "give the user memlock unlimited in /etc/security/limits.d, or the service LimitMEMLOCK=infinity"
+_LIMITS = "`lowfc doctor --setup` (memlock unlimited in /etc/security/limits.d), or the service LimitMEMLOCK=infinity"
 
 
 @CHECKS.check("locked memory")

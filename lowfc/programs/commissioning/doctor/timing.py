@@ -36,7 +36,7 @@ def _scheduling_class(facts: Facts) -> Check:
         return note("the configuration asks for the normal class: realtime.priority = 0")
     if refused := facts.tried.refused.get("priority"):
         what, cost = refused
-        advice = f"give the user rtprio {priority} in /etc/security/limits.d, or the service LimitRTPRIO={priority}"
+        advice = f"`lowfc doctor --setup` (rtprio {priority} in limits.d), or the service LimitRTPRIO={priority}"
         return warning(f"refused: {what}", advice, cost)
     return ok(f"SCHED_FIFO priority {priority} is granted")
 
@@ -146,7 +146,7 @@ def _idle_states(facts: Facts) -> Check:
             what, cost = refused
             return warning(
                 f"{detail}; not granted: {what}",
-                'a udev rule: KERNEL=="cpu_dma_latency", GROUP="realtime", MODE="0660"; this user in that group',
+                "`lowfc doctor --setup`: a udev rule, and this user in its group",
                 cost,
             )
         return ok(f"{detail}; kept awake while the loop runs")

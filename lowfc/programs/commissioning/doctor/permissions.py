@@ -1,0 +1,87 @@
+"""What grants a user the loop's real-time rights: files, a group, access to a device; shown, applied, undone."""
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+from lowfc.contract.errors import ConfigurationError
+
+GROUP = "lowfc"
+DEVICE = "dev/cpu_dma_latency"
+_LIMITS = f"@{GROUP}  -  rtprio   98\n@{GROUP}  -  memlock  unlimited\n"
+_RULE = f"""# The loop's processes keep idle processors awake (realtime.disable_cpu_idle).
+SUBSYSTEM=="misc", KERNEL=="cpu_dma_latency", GROUP="{GROUP}", MODE="0660"
+"""
+FILES = {"etc/security/limits.d/90-lowfc.conf": _LIMITS, "etc/udev/rules.d/90-lowfc-user.rules": _RULE}
+"""By path below the root of the host; of other names than those of `deploy`, which --undo leaves alone."""
+
+
+def shown(root: Path) -> str:
+    """Files and commands, for a person."""
+    files = [f"# {root / name}\n{text}" for name, text in FILES.items()]
+    user = os.environ.get("SUDO_USER") or os.environ.get("USER", "NAME")
+    commands = f"groupadd --system --force {GROUP}\nusermod -aG {GROUP} {user}\n"
+    device = root / DEVICE
+    return "\n".join([*files, f"# as root\n{commands}chgrp {GROUP} {device}\nchmod 660 {device}"])
+
+
+def apply(root: Path, user: str) -> list[str]:
+    """Write the files, make the group with this user in it, and let it open the device; what was done.
+
+    Raises:
+        ConfigurationError: not root, or a file is there that is another.
+    """
+    _require_root("--apply")
+    for name, text in FILES.items():
+        file = root / name
+        if file.exists() and file.read_text(encoding="utf-8") != text:
+            raise ConfigurationError(f"{file} is not lowfc's own: move it away, or add its lines by hand")
+    done = []
+    for name, text in FILES.items():
+        file = root / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text, encoding="utf-8")
+        done.append(f"wrote {file}")
+    done.append(_run("groupadd", "--prefix", str(root), "--system", "--force", GROUP))
+    if user:
+        done.append(_run("usermod", "--prefix", str(root), "--append", "--groups", GROUP, user))
+    if (root / DEVICE).exists():
+        shutil.chown(root / DEVICE, group=GROUP)
+        (root / DEVICE).chmod(0o660)
+        done.append(f"{root / DEVICE} is open to the group {GROUP}")
+    return [*done, f"in force for {user or 'members of the group ' + GROUP} from the next login on"]
+
+
+def undo(root: Path) -> list[str]:
+    """Take the files, the group and the device's rights back; what was done.
+
+    Raises:
+        ConfigurationError: not root.
+    """
+    _require_root("--undo")
+    done = []
+    for name, text in FILES.items():
+        file = root / name
+        if file.exists() and file.read_text(encoding="utf-8") == text:
+            file.unlink()
+            done.append(f"removed {file}")
+    if (root / DEVICE).exists():
+        shutil.chown(root / DEVICE, group=0)
+        (root / DEVICE).chmod(0o600)
+        done.append(f"{root / DEVICE} is root's alone")
+    return [*done, _run("groupdel", "--prefix", str(root), GROUP)]
+
+
+def _require_root(option: str) -> None:
+    if os.geteuid() != 0:
+        raise ConfigurationError(f"lowfc doctor {option} changes the host and needs root; --setup shows what it does")
+
+
+def _run(*words: str) -> str:
+    """Run a command of the host; it, and what it said where it failed."""
+    program = shutil.which(words[0], path=f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin")
+    if program is None:
+        return f"{' '.join(words)}: not on this host, do it by hand"
+    run = subprocess.run([program, *words[1:]], capture_output=True, text=True, check=False)  # noqa: S603  # as shown
+    return " ".join(words) + (f": {run.stderr.strip()}" if run.returncode else "")
