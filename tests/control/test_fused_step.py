@@ -2,14 +2,17 @@
 
 from collections import Counter
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from lowfc.adapters.process import compiled
+from lowfc.adapters.process.latch import Latch
 from lowfc.arrays import Pixels, Single
+from lowfc.contract.configuration import load
 from lowfc.control.calibration.calibration import Calibration, normalise_flux, reconstructor
-from lowfc.control.kernel import stepping
+from lowfc.control.kernel import functions, stepping
 from lowfc.control.kernel.tables import FUSED
 from lowfc.control.laws.linear_law import LinearLaw, integrator
 from lowfc.control.laws.pi_notch import pi_notch
@@ -18,6 +21,7 @@ from lowfc.control.loop.inputs import Frame, Load, Outputs, Request
 from lowfc.control.loop.requests import prepared
 from lowfc.control.loop.safety import Limit, Limits, Rejection
 from lowfc.control.loop.state import State
+from lowfc.programs.core.start_up import settings_under
 from tests.support import toy
 
 RATE_HZ = 1000.0
@@ -198,6 +202,21 @@ def compared(frames: int, each: int, monkeypatch: pytest.MonkeyPatch) -> tuple[C
         found.update(bench.found)
         largest_nm = max(largest_nm, bench.largest_nm)
     return found, largest_nm
+
+
+def test_which_kernel_computes_is_an_event_and_without_numba_it_is_numpys(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    config, latch, events = load(None, {"realtime.kernel": "fused"}), Latch([tmp_path / "latch"]), []
+    latch.set(False)
+    for there, name, event in ((True, FUSED, "KERNEL"), (False, "numpy", "KERNEL_MISSING")):
+        monkeypatch.setattr(compiled, "available", lambda there=there: there)
+        monkeypatch.setattr(compiled, "kernel", getattr(compiled.kernel, "__wrapped__", compiled.kernel))
+        monkeypatch.setattr(compiled, "_compiled", lambda: (functions.measure, functions.respond))
+        made = settings_under(latch, config, lambda *given, **details: events.append((given, details)))
+        assert made.kernel.name == name
+        assert events[-1][0] == (event,)
+    assert "numba" in events[-1][1]["advice"]
 
 
 def test_random_frames_and_states(monkeypatch: pytest.MonkeyPatch) -> None:
