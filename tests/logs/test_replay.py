@@ -164,11 +164,11 @@ def frames(count: int, first: int = 0) -> list[Input]:
 
 
 @effort(deadline=None)
-@given(inputs(), inputs(), st.sampled_from(["hold", "flat"]), st.sampled_from([1.0, 2.5]))
+@given(*[inputs()] * 2, *map(st.sampled_from, (["hold", "flat"], [1.0, 2.5], ["numpy", "fused"])))
 def test_whatever_happens_is_replayed_to_the_bit(
-    before: list[Input], after: list[Input], silence: str, delay_frames: float
+    before: list[Input], after: list[Input], silence: str, delay_frames: float, kernel: str
 ) -> None:
-    made = night(before, on_frame_timeout=silence, delay_frames=delay_frames)
+    made = night(before, on_frame_timeout=silence, delay_frames=delay_frames, kernel=compiled.kernel(kernel))
     made.restart()
     for one in of_another_camera(after):
         made.take(one)

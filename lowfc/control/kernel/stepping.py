@@ -42,7 +42,7 @@ def respond(
 ) -> Response:
     """What a frame's modal errors (modes,) make; `usual` where they are the fused step's."""
     tables = drive.estimator.tables
-    made = _fused(settings, state, drive, tables, measured_nm, sequence) if usual and tables is not None else None
+    made = _fused(settings, state, drive, tables, measured_nm) if usual and tables is not None else None
     if made is None:
         error_nm, pol_nm, drive = _pseudo_open_loop(state, drive, measured_nm, sequence, events)
         return Response(error_nm, pol_nm, *next_command(settings, state, drive, error_nm, sequence))
@@ -59,7 +59,7 @@ def respond(
 
 
 def _fused(
-    settings: Settings, state: State, drive: ActiveLoop, tables: Tables, measured_nm: Single, sequence: int
+    settings: Settings, state: State, drive: ActiveLoop, tables: Tables, measured_nm: Single
 ) -> tuple[Single, Single, Single, Single, Single] | None:
     """Error, pseudo-open-loop modes, command (modes,), x (states,) and actuators (rows, columns) of the usual frame.
 
