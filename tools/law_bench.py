@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from lowfc.adapters.files import factory
-from lowfc.arrays import Array
+from lowfc.arrays import Array, Pixels, Single
 from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
 from lowfc.contract.sections import sensor_keys
 from lowfc.control.calibration.calibration import Calibration
@@ -17,7 +17,8 @@ from lowfc.control.laws.spectra import Pieces
 from lowfc.control.laws.stability import delay_weights
 from lowfc.control.laws.tuning import Tuned, best_gains, identified, tune_integrator, tune_lqg, tune_pi_notch
 from lowfc.control.loop.advance import advance
-from lowfc.control.loop.inputs import Frame, Load, Outputs, PendingEvent, Request, Step
+from lowfc.control.loop.inputs import Command as Commanded
+from lowfc.control.loop.inputs import Frame, Input, Load, Outputs, PendingEvent, Request, Step
 from lowfc.control.loop.state import Settings, State
 from lowfc.device import DriverOptions
 from lowfc.device.guard import Command, apply_command
@@ -73,24 +74,42 @@ class Bench:
         events: of the controller since the beginning, with the number of the frame.
     """
 
-    def __init__(self, config: Configuration, calibration: Calibration, shaken: Disturbance | None = None) -> None:
-        """Build the optics; `shaken` is another disturbance than the configuration's."""
-        self.config = config
+    def __init__(
+        self,
+        config: Configuration,
+        first: Calibration | Input,
+        shaken: Disturbance | None = None,
+        world: Configuration | None = None,
+    ) -> None:
+        """Build the optics.
+
+        Args:
+            config: the controller's.
+            first: what it begins with: a calibration, or another input.
+            shaken: another disturbance than the configuration's.
+            world: the configuration of optics, detector and mirror, where it is another one.
+        """
+        self.config, self.world = config, config if world is None else world
         self.nm_per_mas = tilt_nm_per_mas(config.star.diameter_m)
         self.refused = 0
         self._other = shaken
-        self._scene = scene(config, shaken)
+        self.scene = scene(self.world, shaken)
         self._settings = factory.settings(config)
         self._watch = GainWatch(self._settings, config.control.on_harm, factory.contrast_of(config).form)
         self.events: list[tuple[int, PendingEvent]] = []
-        self._state = advance(self._settings, State(), Load(0, calibration, "bench"))[0]
-        self._guard, self._mirror = device(config), SimulatedMirror(DriverOptions(), config)
-        self._status = initial(self._guard)
-        self._weights = delay_weights(config.camera.delay_frames).astype(np.float32)
+        begin = Load(0, first, "bench") if isinstance(first, Calibration) else first
+        self._state = advance(self._settings, State(), begin)[0]
+        self._guard = device(self.world)
+        self.start_mirror()
+        self._weights = delay_weights(self.world.camera.delay_frames).astype(np.float32)
         self._shapes = [self._status.surface_nm] * len(self._weights)
-        self._path = MirrorPath(self._status.surface_nm, config.camera.delay_frames - 1)
+        self._path = MirrorPath(self._status.surface_nm, self.world.camera.delay_frames - 1)
         self._index = 0
         self.forget()
+
+    def start_mirror(self) -> None:
+        """A mirror that is flat and knows nothing of the one before."""
+        self._mirror, self._status = SimulatedMirror(DriverOptions(), self.world), initial(self._guard)
 
     def forget(self) -> None:
         """Begin a new record."""
@@ -119,12 +138,11 @@ class Bench:
     def star(self, magnitude: float) -> None:
         """Point at another star."""
         star = self.config.star.model_copy(update={"magnitude": magnitude})
-        self._scene = scene(self.config.model_copy(update={"star": star}), self._other)
+        self.scene = scene(self.world.model_copy(update={"star": star}), self._other)
 
     def ask(self, name: str, **fields: Any) -> None:
         """An operator's request; ValueError where it is refused."""
-        request = Request(self._index * self.config.period_ns, name, **fields)
-        self._state, outputs = advance(self._settings, self._state, request)
+        outputs = self.take(Request(self._index * self.config.period_ns, name, **fields))
         if outputs.reply is None or not outputs.reply.accepted:
             raise ValueError(f"{name}: {outputs.reply}")
 
@@ -132,17 +150,40 @@ class Bench:
         """Let a law drive the mirror."""
         self.ask("law", law=law)
 
+    def expose(self) -> tuple[Single, Pixels]:
+        """The mirror's shape (rows, columns) in the next exposure, and its frame."""
+        self._shapes = [self._status.surface_nm, *self._shapes[:-1]]
+        whole = len(self._weights) == 1
+        seen_nm = self._shapes[0] if whole else np.tensordot(self._weights, np.array(self._shapes), 1)
+        pixels = self.scene.expose(self._index, seen_nm)
+        self._index += 1
+        return seen_nm, pixels
+
+    def take(self, given: Input) -> Outputs:
+        """Give the controller an input."""
+        self._state, outputs = advance(self._settings, self._state, given)
+        return outputs
+
+    def frame(self, pixels: Pixels, start: int = 1 << 32) -> Frame:
+        """The last exposure's."""
+        return Frame(start + self._index - 1, 10**18 + (self._index - 1) * self.config.period_ns, 0, pixels)
+
+    def follow(self, frame: Frame, command: Commanded) -> None:
+        """Move the mirror by the command made from a frame; ValueError where it refuses."""
+        told = Command("lowfc", frame.sequence, frame.time_ns, 10**9, command.actuators_nm, command.command_nm)
+        self._status, refused = apply_command(self._guard, self._status, told, frame.time_ns, self._mirror.settle)
+        if refused is not None:
+            raise ValueError(f"the mirror refused a command: {refused.name}")
+        self._path.applied(self._index, self._status.surface_nm)
+
     def run(self, frames: int) -> None:
         """Expose, control, move the mirror."""
         for _ in range(frames):
-            whole = len(self._weights) == 1
-            seen_nm = self._shapes[0] if whole else np.tensordot(self._weights, np.array(self._shapes), 1)
-            pixels = self._scene.expose(self._index, seen_nm)
-            truth = self._scene.truth(self._index, seen_nm, self._path.over(self._index, self._scene.instants))
-            time_ns = 10**18 + self._index * self.config.period_ns
-            frame = Frame((1 << 32) + self._index, time_ns, 0, pixels)
-            self._index += 1
-            self._state, outputs = advance(self._settings, self._state, frame)
+            index = self._index
+            seen_nm, pixels = self.expose()
+            truth = self.scene.truth(index, seen_nm, self._path.over(index, self.scene.instants))
+            frame = self.frame(pixels)
+            outputs = self.take(frame)
             self._watched(outputs)
             if outputs.step is not None and outputs.step.pol_nm is not None:
                 self.steps.append(outputs.step)
@@ -150,13 +191,7 @@ class Bench:
             else:
                 self.refused += 1
             if outputs.command is not None:
-                command = outputs.command
-                followed = Command("lowfc", frame.sequence, time_ns, 10**9, command.actuators_nm, command.command_nm)
-                self._status, refused = apply_command(self._guard, self._status, followed, time_ns, self._mirror.settle)
-                if refused is not None:
-                    raise ValueError(f"the mirror refused a command: {refused.name}")
-            self._shapes = [self._status.surface_nm, *self._shapes[:-1]]
-            self._path.applied(self._index, self._status.surface_nm)
+                self.follow(frame, outputs.command)
 
     def _watched(self, outputs: Outputs) -> None:
         """Enter what the watch over the gains asks for, as the controller does."""

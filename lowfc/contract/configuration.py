@@ -20,6 +20,7 @@ from lowfc.contract.former_names import renamed_keys
 from lowfc.contract.network import Network as Network
 from lowfc.contract.printable import printable
 from lowfc.contract.sections import (
+    IMPERFECTIONS,
     Camera,
     Disturbance,
     Gateway,
@@ -248,6 +249,12 @@ class Configuration(Section):
     def dark_e(self) -> float:
         """Electrons of a pixel in an exposure without light: clock-induced charge and dark current."""
         return self.camera.clock_induced_charge_e + self.camera.dark_current_e_s * self.exposure_ns * 1e-9
+
+    @property
+    def imperfections(self) -> dict[str, Any]:
+        """Those of the simulated world that are not off, by key."""
+        found = {key: getattr(getattr(self, key.partition(".")[0]), key.partition(".")[2]) for key in IMPERFECTIONS}
+        return {key: value for key, value in found.items() if value}
 
     @property
     def max_frame_age_ns(self) -> int:

@@ -214,6 +214,14 @@ class Disturbance(Section):
         return self
 
 
+IMPERFECTIONS = (
+    *("disturbance.wheel_hz", "disturbance.drift_nm", "disturbance.jitter_mas", "disturbance.shear"),
+    *("mirror.gain_error", "mirror.hysteresis", "mirror.creep"),
+    *("camera.dark_current_e_s", "camera.hot_pixels", "camera.nonlinearity", "camera.nonuniformity"),
+)
+"""Keys by which the simulated world is less kind; each is off by default."""
+
+
 class Mirror(Section):
     """The deformable mirror."""
 

@@ -355,14 +355,14 @@ class Outcome(NamedTuple):
 
 def response_there(loop: FoldedLoop, begun: int, *, closed: bool) -> np.ndarray:
     """The analytic H (pixels, modes) of the commands, mean over where the wavefront was since; pokes do not count."""
-    before, config, scene = loop.calibration(), loop.config, loop._scene
+    before, config, scene = loop.calibration(), loop.config, loop.scene
     optics = factory.twin(config, None, lambda _: None)
     mirror = factory.mirror_on_twin(config, optics, lambda _: None)
     still = scene._screen + wavefront_nm(mirror, np.mean(loop.surfaces_nm[begun:], axis=0).astype(np.float32))
     moving = (
         [0.0]
         if closed
-        else [scene._sampler.at(i)[0] @ scene._basis for i in np.linspace(0, loop._index, 32).astype(int)]
+        else [scene._sampler.at(i)[0] @ scene._basis for i in np.linspace(0, len(loop.surfaces_nm), 32).astype(int)]
     )
     shapes = np.array(
         [wavefront_nm(mirror, each.reshape(before.grid)) for each in before.modes_to_actuators.T], dtype=np.float64

@@ -128,13 +128,13 @@ def test_a_bad_calibration_is_written_not_loaded_and_told(monkeypatch: pytest.Mo
 
 
 def test_frames_that_changed_meanwhile_show_in_the_verdict(loop: FoldedLoop, monkeypatch: pytest.MonkeyPatch) -> None:
-    own, expose = Calibrator.check, loop._scene.expose
+    own, expose = Calibrator.check, loop.scene.expose
 
     def shifted(index: int, surface_nm: np.ndarray) -> Any:
         return np.roll(expose(index, surface_nm), 2, axis=1)
 
     def moved(self: Calibrator, *what: Any) -> Any:
-        monkeypatch.setattr(loop._scene, "expose", shifted)
+        monkeypatch.setattr(loop.scene, "expose", shifted)
         return own(self, *what)
 
     monkeypatch.setattr(Calibrator, "check", moved)

@@ -11,8 +11,10 @@ import tomli_w
 from lowfc.adapters.files.factory import detector, mirror, mirror_limits, settings
 from lowfc.contract.configuration import Configuration, keys, load
 from lowfc.contract.errors import ConfigurationError
+from lowfc.contract.sections import IMPERFECTIONS
 from lowfc.programs.cli.config import commented
 from sim_dm.driver import device
+from tools.world import CASES
 
 KEYS = keys()
 
@@ -147,6 +149,11 @@ def test_values_that_do_not_go_together_are_refused(overrides: dict[str, Any], w
     said = complaint(None, overrides)
     assert all(word in said for word in words), said
     assert "\n" not in said
+
+
+def test_imperfections_of_the_world_are_off_by_default_and_all_of_them_are_measured() -> None:
+    assert load(None).imperfections == {}
+    assert {key for keys in CASES.values() for key in load(None, keys).imperfections} == set(IMPERFECTIONS)
 
 
 def test_an_integer_will_do_for_a_float() -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from lowfc.adapters.logs.recovery import recover
+from lowfc.contract.configuration import load
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.messages import CALIBRATION, CONTROLLER_STATE, EVENT, FRAME, REQUEST, Log, wire
 from lowfc.control.laws.error_budget import sensor_noise
@@ -237,6 +238,13 @@ def test_a_log_without_a_step_still_has_a_page(tmp_path: Path, empty: bool) -> N
     assert made.figures["verdict"]["level"] == "bad"
     assert made.figures["verdict"]["because"] == "no step of the control law is in this log"
     assert "No step of the control law is in this log" in page(made)
+
+
+def test_imperfections_of_the_simulated_world_are_named(tmp_path: Path) -> None:
+    night, unkind = quiet(Night()), {"disturbance.wheel_hz": 40.0, "camera.hot_pixels": 0.01}
+    made = report_of(read_run(night.write(tmp_path / "x.mcap", toml=load(None, unkind).to_toml())))
+    assert made.figures["run"]["imperfections"] == unkind
+    assert "simulated with disturbance.wheel_hz = 40.0, camera.hot_pixels = 0.01;" in page(made)
 
 
 def test_an_error_or_a_safed_loop_is_not_good(tmp_path: Path) -> None:

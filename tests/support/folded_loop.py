@@ -23,16 +23,9 @@ from lowfc.contract.errors import CalibrationError, RequestRefusedError
 from lowfc.contract.messages import MIRROR_STATE, Topic, wire
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.linear_law import LinearLaw
-from lowfc.control.laws.stability import delay_weights
-from lowfc.control.loop.advance import advance
 from lowfc.control.loop.camera import CameraSettings
-from lowfc.control.loop.inputs import Frame, Input, Load, MirrorShape, Request, Step
-from lowfc.control.loop.state import State
-from lowfc.device.guard import Command
+from lowfc.control.loop.inputs import MirrorShape, Request, Step
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub, MemoryRing
-from sim_camera.driver import scene
-from sim_dm.device import apply_command, initial
-from sim_dm.driver import device
 from tools.law_bench import Bench, calibrated
 
 FIRST = 1 << 32
@@ -86,25 +79,17 @@ class FoldedLoop(Client):
 
         Where `cut` is given, frames lack so many pixels at each edge, and the loop begins without a calibration.
         """
-        world = config if world is None else world
         self.config, self.run_id = config, "folded"
         self._cut = cut or 0
-        self._settings = factory.settings(config)
-        if cut is None:
-            if calibration is None:
-                calibration = computed(config.to_toml())
-            first: Input = Load(0, calibration, "test")
-        else:
-            grid = (config.mirror.rows, config.mirror.columns)
-            first = MirrorShape(0, np.zeros(grid, np.float32), np.zeros(0, np.float32))
-        self._state, _ = advance(self._settings, State(), first)
-        self._scene, self._mirror = scene(world), device(world)
+        grid = (config.mirror.rows, config.mirror.columns)
+        none = MirrorShape(0, np.zeros(grid, np.float32), np.zeros(0, np.float32))
+        if cut is None and calibration is None:
+            calibration = computed(config.to_toml())
+        self._bench = Bench(config, none if calibration is None else calibration, world=world)
+        self.scene = self._bench.scene
         self.hub = MemoryHub()
         self._operator = OperatorBus(self)
         self.start_mirror()
-        self._weights = delay_weights(world.camera.delay_frames).astype(np.float32)
-        self._shapes = [self._status.surface_nm] * len(self._weights)
-        self._index = 0
         self._lose = lose
         self._listeners: list[tuple[str, deque[Any]]] = []
         self.surfaces_nm: list[Single] = []
@@ -113,34 +98,28 @@ class FoldedLoop(Client):
 
     def start_mirror(self) -> None:
         """The mirror's process, anew and flat."""
-        self._status = initial(self._mirror)
+        self._bench.start_mirror()
         self.mirror_bus = MemoryBus(self.hub, "mirror-dm", HostClock())
         self._states: Publisher = self.mirror_bus.publisher(MIRROR_STATE, "dm")
 
     def expose(self) -> None:
-        self._shapes = [self._status.surface_nm, *self._shapes[:-1]]
-        seen = np.tensordot(self._weights, np.array(self._shapes), 1)
-        whole = self._scene.expose(self._index, seen)
+        seen, whole = self._bench.expose()
         pixels = whole[self._cut : whole.shape[0] - self._cut, self._cut : whole.shape[1] - self._cut]
         self.surfaces_nm.append(seen)
-        sequence, time_ns = self.first + self._index, 10**18 + self._index * self.config.period_ns
-        self._index += 1
-        if self._lose(self._index - 1):
+        if self._lose(len(self.surfaces_nm) - 1):
             return
-        self._state, outputs = advance(self._settings, self._state, Frame(sequence, time_ns, 0, pixels))
-        step, command = outputs.step, outputs.command
-        told = Command("lowfc", sequence, time_ns, 10**9, command.actuators_nm, command.command_nm)
+        frame = self._bench.frame(pixels, self.first)
+        outputs = self._bench.take(frame)
         if not self.mirror_bus.closed:
-            self._status, refused = apply_command(self._mirror, self._status, told, time_ns)
-            assert refused is None
-            self._states.put(wire.MirrorState(frame_sequence=sequence).SerializeToString())
+            self._bench.follow(frame, outputs.command)
+            self._states.put(wire.MirrorState(frame_sequence=frame.sequence).SerializeToString())
         for kind, waiting in self._listeners:
-            waiting.append(Image(sequence, time_ns, pixels) if kind == "frames" else step)
+            waiting.append(Image(frame.sequence, frame.time_ns, pixels) if kind == "frames" else outputs.step)
 
     def residual_nm(self, first: int, last: int | None = None) -> npt.NDArray[np.float64]:
         """True modes (frames, modes) in the exposures from `first` to before `last`, numbered as of a slice."""
-        frames = range(self._index)[first:last]
-        truths = [self._scene.truth(index, self.surfaces_nm[index]) for index in frames]
+        frames = range(len(self.surfaces_nm))[first:last]
+        truths = [self.scene.truth(index, self.surfaces_nm[index]) for index in frames]
         return np.array([truth.sampled.residual_nm for truth in truths], np.float64)
 
     def run(self, frames: int) -> None:
@@ -157,10 +136,10 @@ class FoldedLoop(Client):
             self.stops += 1
         numbers = tuple(np.atleast_1d(np.asarray(values, float)).tolist())
         asked = Request(0, name, tuple(np.atleast_1d(modes).tolist()) if np.size(modes) else (), numbers, **fields)
-        self._state, outputs = advance(self._settings, self._state, asked)
+        outputs = self._bench.take(asked)
         if not outputs.reply.accepted:
             raise RequestRefusedError(f"{name} refused: {outputs.reply.text}")
-        state = controller_state(self._state, self._settings, 0) if name == "status" else None
+        state = controller_state(self._bench.state, self._bench.settings, 0) if name == "status" else None
         return Answer(True, outputs.reply.text, outputs.reply.frame_sequence, state=state)
 
     def play(self, basis_nm: npt.ArrayLike, table: npt.ArrayLike) -> Answer:
@@ -188,20 +167,20 @@ class FoldedLoop(Client):
                 raise CalibrationError(str(fault)) from None
 
     def calibration(self) -> Calibration:
-        return self._state.drive.calibration
+        return self._bench.state.drive.calibration
 
     def configuration(self) -> str:
         return self.config.to_toml()
 
     def camera(self) -> CameraSettings | None:
-        return self._state.conditions.camera
+        return self._bench.state.conditions.camera
 
     def camera_state(self) -> wire.CameraState:
         side = 80 - 2 * self._cut
         return factory.camera_state(self.config, (side, side), 1)
 
     def laws(self) -> dict[str, LinearLaw]:
-        following = self._state.drive.following
+        following = self._bench.state.drive.following
         return {} if following is None else {following.law.id: following.law}
 
     def frames(self, count: int | None = None) -> Iterator[Image]:

@@ -32,6 +32,7 @@ Table = dict[str, Any]
 _RESIDUAL = "RMS residual, matched input"
 _SCATTER = "std of x tilt, 1 mas, {}"
 _LIGHT = ("paper's electrons", "own photometry")
+_DIMMED = "predicted std of x tilt, 1 mas, own photometry, pupil dimmed to 14.7 %"
 GLANCE = (
     *(
         ("table3", name, modes, estimator, _RESIDUAL)
@@ -46,8 +47,10 @@ GLANCE = (
         for modes in (2, 14)
         for estimator in ("pinv", "weighted")
     ),
+    *(("table4", "sam", 2, estimator, _DIMMED) for estimator in ("pinv", "weighted")),
     *(("fig6", name, 14, "pinv", f"{which} R^2") for name in ("sam", "clowfs", "zwfs") for which in ("least", "mean")),
     *(("fig7", f"sam, coma {coma}", 14, "weighted + 1 iteration", "P-V residual") for coma in ("Z7", "Z8")),
+    ("fig1", "sam, dark zone, 10 samples per lambda/D", None, None, "largest contrast, flat wavefront"),
     *(("fig1", f"sam, coma {coma}", 14, "weighted + 1 iteration", "corrected over flat") for coma in ("Z7", "Z8")),
     *(
         ("fig8", name, 14, "pinv", f"{which} deviation at lambda/20")

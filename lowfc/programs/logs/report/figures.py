@@ -98,6 +98,9 @@ def _run(run: Run) -> Figures:
         "steps": int(steps.sequence.size),
         "steps_s": float(run.step_s[-1]) if steps.sequence.size else 0.0,
         "simulated": bool(history.truths.sequence.size),
+        "imperfections": configuration.imperfections
+        if configuration is not None and history.truths.sequence.size
+        else {},
         "lockstep": configuration.lockstep if configuration is not None else None,
         **{key: about.get(key) for key in _NOT_VERSIONS},
         "versions": {name: value for name, value in about.items() if name not in _NOT_VERSIONS},

@@ -8,7 +8,7 @@ import numpy as np
 
 from lowfc.arrays import Array
 from lowfc.design.trials import residual_pv
-from lowfc.optics.chain.coronagraph import Wedge, contrast, contrast_curve, mean_contrast
+from lowfc.optics.chain.coronagraph import DARK_ZONE, Wedge, contrast, contrast_curve, mean_contrast, wedge_samples
 from lowfc.optics.chain.zernike import NOLLS_14
 from lowfc.programs.paper import plots
 from lowfc.programs.paper.cases import Case, Context, Prepared, Row, assuming, prepared
@@ -30,7 +30,7 @@ COMAS = (7, 8)
 REALISATIONS = 20
 _CORRECTED = (PINV, WEIGHTED_1, WEIGHTED_2)
 _RING = Wedge(4.5, 5.5)
-_VIEW, _VIEW_SAMPLES_PER = 20, 6
+_VIEW, _VIEW_SAMPLES_PER, _FINE_SAMPLES_PER = 20, 6, 10
 _CURVE_EDGES = np.arange(0.25, 20.5, 0.5)
 _LIMIT_DRAWS = 400
 _PAPER_GOAL = 1e-9
@@ -66,6 +66,7 @@ def fig1(context: Context) -> list[Row]:
     """Contrast at 5 lambda/D, Fig. 1(c)."""
     rows = []
     for name in context.names("sam"):
+        rows += _between_samples(prepared(name))
         for coma in COMAS:
             case = _aberrated(context, name, coma)
             ready, what = case.ready, f"{name}, coma Z{coma}"
@@ -89,6 +90,19 @@ def fig1(context: Context) -> list[Row]:
         "figures are its goal, and 'over a factor of 100'; it does not name the coma. Corrected: mean of at most "
         f"{REALISATIONS} exposures; limit: the flat wavefront. {BRIGHT} {FULL_CHAIN}",
     )
+
+
+def _between_samples(ready: Prepared) -> list[Row]:
+    """The flat wavefront's contrast on a grid finer than the one on which the pupil was made."""
+    pupil, wavelength_nm = ready.sensor.pupil, ready.sensor.wavelength_nm
+    columns = 2 * _VIEW * _FINE_SAMPLES_PER
+    image = contrast(pupil, np.zeros_like(pupil), wavelength_nm, columns, samples_per=_FINE_SAMPLES_PER)
+    zone = image[wedge_samples(DARK_ZONE, columns, columns, _FINE_SAMPLES_PER)]
+    what = f"{ready.name}, dark zone, {_FINE_SAMPLES_PER} samples per lambda/D"
+    return [
+        Row(what, "largest contrast, flat wavefront", "", float(zone.max()), _PAPER_GOAL),
+        Row(what, f"samples above 1e-9, of {zone.size}", "", float((zone > _PAPER_GOAL).sum())),
+    ]
 
 
 def plot_fig1(context: Context, path: Path) -> None:

@@ -35,7 +35,7 @@ PAPER_WAVES = {
 NOISE = (
     "40,000 e- in the brightest pixel of the sensor's own flat image (which rewards a mask that wastes light: read it "
     "with Table 4), 3 e- read noise, whole electrons, total known, monochromatic; open area: transmission above 0.5, "
-    "piston removed. limit: root mean square of the residual at the Cramer-Rao bound."
+    "piston removed. RMS and its limit, at the Cramer-Rao bound: root mean square over wavefronts; P-V: mean."
 )
 
 
@@ -180,9 +180,12 @@ def _residual_rows(sensor: Prepared, modes: int, wavefronts: Input, found: Ensem
 
 
 def _rms(sensor: Prepared, coefficients_nm: Array) -> tuple[float, float]:
+    """Root mean square over wavefronts and over the open pupil, and its standard error to first order, waves."""
     modes = coefficients_nm.shape[1]
-    values = random.residual_rms(sensor.gram[:modes, :modes], coefficients_nm)
-    return mean_and_error(values / sensor.sensor.wavelength_nm)
+    values = random.residual_rms(sensor.gram[:modes, :modes], coefficients_nm) / sensor.sensor.wavelength_nm
+    mean, error = mean_and_error(values)
+    rms = float(np.sqrt(np.mean(values**2)))
+    return rms, error * mean / rms
 
 
 def _pv(sensor: Prepared, coefficients_nm: Array) -> tuple[float, float]:

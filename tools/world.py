@@ -1,0 +1,138 @@
+"""What each imperfection of the simulated world costs: residual and contrast with and without it."""
+
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from rich.progress import track
+from threadpoolctl import threadpool_limits
+
+from lowfc.adapters.files import factory
+from lowfc.contract.configuration import Configuration
+from lowfc.control.calibration.calibration import Calibration
+from sim_camera.driver import scene
+from tools.law_bench import Bench, calibrated, configured
+from tools.shared import Figures, markdown
+
+SENSORS, MAGNITUDES = ("sam27d10_bal14", "zwfs"), (2, 5)
+PRESET, RATE_HZ, SECONDS = "bench", 500.0, 4.0
+_UNTIL_GAINS_S = 2.5
+WHEEL = {"disturbance.wheel_hz": 12.0}
+CASES: dict[str, dict[str, Any]] = {
+    "none": {},
+    "a steady wheel": WHEEL,
+    "a wheel whose speed ramps": WHEEL | {"disturbance.wheel_change": 2.0},
+    "a wheel whose speed wanders": WHEEL | {"disturbance.wheel_course": "walk", "disturbance.wheel_change": 0.5},
+    "a wheel that runs down": WHEEL | {"disturbance.wheel_course": "run-down", "disturbance.wheel_change": 3.0},
+    "two wheels that beat": WHEEL | {"disturbance.second_wheel_hz": 0.5},
+    "jitter beyond half the rate": {"disturbance.jitter_mas": 1.0},
+    "drift as a random walk": {"disturbance.drift_nm": {str(noll): 0.2 for noll in range(2, 16)}},
+    "drift as flicker": {
+        "disturbance.drift_nm": {str(noll): 0.2 for noll in range(2, 16)},
+        "disturbance.drift_slope": 1.0,
+    },
+    "shear of the beam": {"disturbance.shear": 1e-3},
+    "gains of the actuators": {"mirror.gain_error": 0.1},
+    "hysteresis": {"mirror.hysteresis": 0.1},
+    "creep": {"mirror.creep": 0.01},
+    "dark current": {"camera.dark_current_e_s": 1000.0},
+    "hot pixels": {"camera.hot_pixels": 0.005},
+    "response not linear": {"camera.nonlinearity": 0.02},
+    "response not uniform": {"camera.nonuniformity": 0.01},
+}
+CALIBRATED = ("hot pixels", "response not linear", "response not uniform")
+"""Those that are measured again with a dark and a reference image of that detector."""
+
+
+def measure(sensors: tuple[str, ...] = SENSORS, seconds: float = SECONDS) -> Figures:
+    """A row for each case, with the figures of each sensor and star."""
+    rows = []
+    with threadpool_limits(1):
+        for name, keys in track(CASES.items(), "cases"):
+            for again in (False, True) if name in CALIBRATED else (False,):
+                pairs = [(sensor, magnitude) for sensor in sensors for magnitude in MAGNITUDES]
+                found = [_left(*pair, keys, seconds, again) | {"of": pair} for pair in pairs]
+                rows.append({"name": name, "keys": keys, "calibrated": again, "figures": found})
+    return {"rows": rows, "seconds": seconds}
+
+
+def _configured(sensor: str, magnitude: float, keys: dict[str, Any]) -> Configuration:
+    usual: dict[str, Any] = {
+        "disturbance.preset": PRESET,
+        "star.magnitude": float(magnitude),
+        "camera.rate_hz": RATE_HZ,
+    }
+    return configured(sensor, **usual | {"control.start_mode": "closed"} | keys)
+
+
+@lru_cache
+def _gains(sensor: str, magnitude: float) -> tuple[float, ...]:
+    """Those that are found automatically, of each mode, in the world without imperfections."""
+    automatic = {"control.tilt_gain": "auto", "control.gain": "auto"}
+    config = _configured(sensor, magnitude, automatic)
+    bench = Bench(config, calibrated(config))
+    bench.run(round(_UNTIL_GAINS_S * RATE_HZ))
+    assert bench.state.drive is not None  # noqa: S101  # a calibration is loaded
+    return tuple(bench.state.drive.law.gain.tolist())
+
+
+def _left(sensor: str, magnitude: float, keys: dict[str, Any], seconds: float, again: bool) -> Figures:
+    """Wavefront over the open pupil and added contrast of the second half, at every moment."""
+    config = _configured(sensor, magnitude, keys)
+    calibration = calibrated(config)
+    bench = Bench(config, _measured(config, calibration) if again else calibration)
+    bench.ask("gain", modes=config.noll, values=_gains(sensor, magnitude))
+    frames = round(seconds * RATE_HZ)
+    bench.run(frames)
+    truths = bench.truths[-frames // 2 :]
+    modes_nm = np.concatenate([truth.instants_nm[1] for truth in truths]).astype(float)
+    modal = factory.contrast_of(config)
+    assert modal is not None  # noqa: S101  # these sensors have a science image
+    squares_nm2 = [truth.continuous.residual_rms_nm**2 for truth in truths if truth.continuous is not None]
+    return {
+        "residual_nm": float(np.sqrt(np.mean(squares_nm2))),
+        "contrast": float(np.einsum("nj,jl,nl->", modes_nm, modal.form, modes_nm)) / len(modes_nm),
+        "refused": bench.refused,
+    }
+
+
+def _measured(config: Configuration, calibration: Calibration) -> Calibration:
+    """With dark and reference image as the detector gives them on average."""
+    still = config.disturbance.model_copy(update={"preset": "quiet"})
+    camera = config.camera.model_copy(update={"noise": False})
+    flat = np.zeros(calibration.grid, np.float32)
+    images = []
+    for magnitude in (20.0, config.star.magnitude):
+        star = config.star.model_copy(update={"magnitude": magnitude})
+        images.append(scene(config.model_copy(update={"disturbance": still, "camera": camera, "star": star})))
+    dark, lit = (each.expose(0, flat).ravel().astype(float) for each in images)
+    light = lit - dark
+    reference = light / light.sum() * calibration.reference.sum()
+    return replace(calibration, dark=dark.astype(np.float32), reference=reference.astype(np.float32))
+
+
+def render(figures: Figures) -> str:
+    """A line for each case."""
+    rows = figures["rows"]
+    head = ["what the world has", "keys"]
+    for sensor, magnitude in (one["of"] for one in rows[0]["figures"]):
+        head += [f"`{sensor}`, V = {magnitude}: nm rms", "added contrast"]
+    lines = []
+    for row in rows:
+        keys = ", ".join(f"`{key} = {_shown(value)}`" for key, value in row["keys"].items())
+        name = row["name"] + (", dark and I0 measured" if row["calibrated"] else "")
+        cells = [(f"{one['residual_nm']:.2f}", f"{one['contrast']:.1e}") for one in row["figures"]]
+        lines.append([name, keys, *(cell for pair in cells for cell in pair)])
+    return (
+        f"{markdown(head, lines)}\nTrue wavefront over the open pupil at every moment, and what the modes add to the "
+        "mean contrast of the dark zone by their quadratic form, over the second half of "
+        f"{figures['seconds']:g} s at {RATE_HZ:g} Hz, disturbance `{PRESET}`, one seed, with the gains that the loop "
+        "finds by itself without any of these; sensor images through the live loop's own `advance` and the simulated "
+        "mirror. The calibration is the analytic one, which knows of dark current and of nothing else, or one with "
+        "the dark and the reference image of that detector."
+    )
+
+
+def _shown(value: object) -> str:
+    return f"{{2..15 = {next(iter(value.values()))}}}" if isinstance(value, dict) else str(value)
