@@ -12,7 +12,7 @@ from lowfc.contract.messages import wire
 from lowfc.programs.reliability.chaos.console import TerminalConsole
 from tests.support.loops import interrupt, start, until
 
-pytestmark = [pytest.mark.exclusive, pytest.mark.slow]
+pytestmark = [pytest.mark.exclusive, pytest.mark.slow, pytest.mark.timeout(480)]
 CONFIG = """
 [camera]
 rate_hz = 200
