@@ -26,7 +26,12 @@ def figures(*residuals_nm: float, nm_per_mas: float = 1.0, recent: int = 1) -> F
         modes = np.full(len(NOLL), residual_nm, np.float32)
         found.add(
             Truth(
-                Wavefront(2 * modes, modes, 2 * residual_nm, residual_nm), None, modes, np.array([[2 * modes], [modes]])
+                Wavefront(2 * modes, modes, 2 * residual_nm, residual_nm),
+                None,
+                modes,
+                np.array([[2 * modes], [modes]]),
+                wheel_speed_hz=np.zeros(0),
+                shear=np.zeros(0),
             )
         )
     return found
