@@ -17,7 +17,7 @@ from lowfc.contract.codecs.codec import actuators, latency
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.envelope import Envelope
 from lowfc.contract.errors import BusError, ConfigurationError
-from lowfc.contract.messages import MIRROR_STATE, TRUTH, fields_of, timestamp, wire
+from lowfc.contract.messages import MIRROR_STATE, TRUTH, timestamp, wire
 from lowfc.control.durations import Durations
 from lowfc.control.laws.stability import delay_weights
 from lowfc.device import CameraSettings, DriverOptions, Exposure, Puts
@@ -38,10 +38,6 @@ PATIENCE_S = 5.0
 RECENT_S = 2.0
 """Over which the wavefront is reported while the loop runs."""
 _REMEMBERED = 256
-_SETTINGS = (
-    *("exposure_ns", "period_ns", "gain_e_per_dn", "bias_dn", "read_noise_e", "saturation_dn", "rows", "columns"),
-    *("bit_depth", "em_gain"),
-)
 
 
 def disturbance_of(config: Configuration) -> Disturbance:
@@ -133,8 +129,7 @@ class SimulatedCamera:
         self._scene = scene(config) if optics is None else optics
         self._contrast: Contrast | None = None
         self._fault = read_fault(Path(options.fault)) if options.fault else None
-        state = factory.camera_state(config, self._scene.shape, 0)
-        self._settings = fields_of(state, _SETTINGS)
+        self._settings = replace(CameraSettings.configured(config, *self._scene.shape), clock="run")
         self._weights = delay_weights(config.camera.delay_frames).astype(np.float32)
         flat = np.zeros((config.mirror.rows, config.mirror.columns), np.float32)
         self._shapes = deque([flat] * len(self._weights), maxlen=len(self._weights))
@@ -180,7 +175,7 @@ class SimulatedCamera:
     def settings(self) -> CameraSettings:
         """Those of the next exposure."""
         time_ns = self._origin_ns and self._start_ns() + self._config.exposure_ns
-        return CameraSettings(clock="run", time_ns=time_ns or None, **self._settings)
+        return replace(self._settings, time_ns=time_ns or None)
 
     def expose(self) -> Exposure | None:
         """Latch the mirror as the next exposure starts, and make its frame before it ends."""

@@ -7,8 +7,8 @@ from lowfc.adapters.process.service import Service
 from lowfc.arrays import Pixels
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BusError
-from lowfc.contract.messages import CAMERA_STATE, FRAME, image, timestamp, wire
-from lowfc.device.driver import Camera, CameraExtras, CameraSettings, Exposure
+from lowfc.contract.messages import CAMERA_STATE, FRAME, image, wire
+from lowfc.device.driver import Camera, CameraExtras, CameraSettings, Exposure, state_of
 from lowfc.device.watch import DriverWatch
 
 WAIT_S = 30.0
@@ -193,23 +193,3 @@ def _checked(pixels: Pixels, settings: CameraSettings) -> Pixels:
             f"{(settings.rows, settings.columns)}, as the settings say"
         )
     return pixels
-
-
-def state_of(settings: CameraSettings, time_ns: int) -> wire.CameraState:
-    """Message of a camera's settings."""
-    saturation_dn = settings.saturation_dn
-    return wire.CameraState(
-        timestamp=timestamp(time_ns),
-        exposure_ns=settings.exposure_ns,
-        period_ns=settings.period_ns,
-        gain_e_per_dn=settings.gain_e_per_dn,
-        bias_dn=settings.bias_dn,
-        read_noise_e=settings.read_noise_e,
-        saturation_dn=2**settings.bit_depth - 1 if saturation_dn is None else saturation_dn,
-        region_row=settings.region_row,
-        region_column=settings.region_column,
-        rows=settings.rows,
-        columns=settings.columns,
-        bit_depth=settings.bit_depth,
-        em_gain=settings.em_gain,
-    )

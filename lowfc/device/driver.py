@@ -6,16 +6,16 @@ raises, and the loop counts it, names it in an event and tries again. A `LowfcEr
 what a user has to put right: the process ends with its sentence.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Literal, NamedTuple, Protocol
 
 from lowfc.adapters.bus.bus import Publisher
-from lowfc.adapters.files.factory import mirror_limits
+from lowfc.adapters.files.factory import camera_state, mirror_limits
 from lowfc.adapters.process.service import Service
 from lowfc.arrays import Pixels, Single
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.envelope import Envelope
-from lowfc.contract.messages import wire
+from lowfc.contract.messages import fields_of, timestamp, wire
 from lowfc.contract.network import Section
 
 
@@ -82,6 +82,22 @@ class CameraSettings:
     clock: Literal["monotonic", "realtime", "run"] = "monotonic"
     number_wrap: int = 1 << 64
     time_ns: int | None = field(default=None, compare=False)
+
+    @classmethod
+    def configured(cls, config: Configuration, rows: int, columns: int) -> "CameraSettings":
+        """What [camera] says of a camera with frames of this size; a driver replaces what its hardware says."""
+        return cls(**fields_of(camera_state(config, (rows, columns), 0), _PUBLISHED))
+
+
+_PUBLISHED = tuple(one.name for one in fields(CameraSettings) if one.name in wire.CameraState.DESCRIPTOR.fields_by_name)
+
+
+def state_of(settings: CameraSettings, time_ns: int) -> wire.CameraState:
+    """Message of a camera's settings."""
+    state = wire.CameraState(timestamp=timestamp(time_ns), **fields_of(settings, _PUBLISHED))
+    if settings.saturation_dn is None:
+        state.saturation_dn = 2**settings.bit_depth - 1
+    return state
 
 
 class Exposure(NamedTuple):

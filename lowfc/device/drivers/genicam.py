@@ -1,15 +1,13 @@
 """What the drivers of GenICam cameras have in common: their options, and settings made of them."""
 
+from dataclasses import replace
 from typing import Literal
 
 from pydantic import Field
 
-from lowfc.adapters.files.factory import camera_state
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.messages import fields_of
 from lowfc.device import CameraSettings, DriverOptions
 
-_CONFIGURED = ("exposure_ns", "period_ns", "gain_e_per_dn", "bias_dn", "read_noise_e", "saturation_dn", "em_gain")
 FRAME_ID_WRAP = 65535
 """GigE Vision counts frames from 1 to 65535 and goes on with 1; 64-bit numbers are as good modulo 65535."""
 WAIT_MS = 500
@@ -41,17 +39,14 @@ class GenicamOptions(DriverOptions):
 
     def settings(self, config: Configuration) -> CameraSettings:
         """Settings as asked for; the converter's bits are the format's."""
-        configured = fields_of(camera_state(config, (self.rows, self.columns), 0), _CONFIGURED)
+        usual = CameraSettings.configured(config, self.rows, self.columns)
         bits = int(self.pixel_format.removeprefix("Mono"))
-        configured["saturation_dn"] = min(configured["saturation_dn"], 2**bits - 1)
-        if self.exposure_us is not None:
-            configured["exposure_ns"] = round(self.exposure_us * 1e3)
-        if self.rate_hz is not None:
-            configured["period_ns"] = round(1e9 / self.rate_hz)
-        return CameraSettings(
-            self.rows,
-            self.columns,
-            **configured,
+        full_dn = 2**bits - 1
+        return replace(
+            usual,
+            exposure_ns=usual.exposure_ns if self.exposure_us is None else round(self.exposure_us * 1e3),
+            period_ns=usual.period_ns if self.rate_hz is None else round(1e9 / self.rate_hz),
+            saturation_dn=min(usual.saturation_dn or full_dn, full_dn),
             bit_depth=bits,
             region_row=self.region_row,
             region_column=self.region_column,

@@ -1,28 +1,22 @@
 """A camera whose images another program writes into an ImageStreamIO stream."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from lowfc.adapters.files.factory import camera_state
 from lowfc.adapters.image_stream.reader import StreamReader
 from lowfc.adapters.image_stream.stream import Stream, StreamError, stream_path
 from lowfc.adapters.process.service import Service
 from lowfc.arrays import Pixels
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.messages import fields_of
 from lowfc.device import CameraSettings, DriverOptions, Exposure
 
 Setting = Literal[
     "exposure_s", "gain_e_per_dn", "bias_dn", "read_noise_e", "saturation_dn", "em_gain", "region_row", "region_column"
 ]
-_CONFIGURED = (
-    *("exposure_ns", "period_ns", "gain_e_per_dn", "bias_dn", "read_noise_e", "saturation_dn", "rows", "columns"),
-    *("bit_depth", "em_gain"),
-)
 _WHOLE = ("region_row", "region_column")
 _WAIT_S = 0.5
 _FULL_DN = 65535
@@ -73,11 +67,10 @@ class IsioCamera:
                 "or set MILK_SHM_DIR to its folder"
             )
         shape = self._reader.stream.layout.shape[1:]
-        configured = fields_of(camera_state(config, shape, 0), _CONFIGURED)
-        given = options.model_dump(include={*_CONFIGURED, "region_row", "region_column"}, exclude_none=True)
+        given = options.model_dump(include={one.name for one in fields(CameraSettings)}, exclude_none=True)
         if options.exposure_us is not None:
             given["exposure_ns"] = round(options.exposure_us * 1e3)
-        self._settings = CameraSettings(clock="realtime", **(configured | given))
+        self._settings = replace(CameraSettings.configured(config, *shape), clock="realtime", **given)
         self._generation = self._reader.generation
         self._silent = False
 
