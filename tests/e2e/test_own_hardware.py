@@ -55,7 +55,7 @@ COUNTING = (
 )
 DOCTOR = "lowfc doctor --device sim"
 DOCUMENTED = (*DEVICES, *CONFORMANCE, *LOOP, *PLAIN, *COUNTING, DOCTOR)
-"""Commands of docs/howto/hardware.md; all are run here."""
+"""Commands of hardware.md and your_camera.md; all are run here."""
 
 SIMULATED = ("sim-camera --run bench --config bench.toml", "sim-dm --run bench --config bench.toml")
 
@@ -155,7 +155,7 @@ def test_the_simulated_devices_and_a_camera_in_plain_zenoh_keep_the_contract(ben
 
 @pytest.mark.slow
 def test_a_camera_written_from_the_page_is_right_at_its_first_run(bench: Path) -> None:
-    (bench / "counting.py").write_text(block("python", (ROOT / "docs/howto/hardware.md").read_text()))
+    (bench / "counting.py").write_text(block("python", (ROOT / "docs/tutorials/your_camera.md").read_text()))
     with going_on(bench, COUNTING[0]):
         until(lambda: (bench / "run/lowfc/counting").exists())
         conformance(bench, COUNTING[1])

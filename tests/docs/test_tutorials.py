@@ -1,0 +1,140 @@
+"""Tutorials: every command of each page, in its order; here in short forms, whole as slow tests.
+
+Commands of a loop in real time, and of views, are run by the tests that `test_docs` names.
+"""
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tests.support.loops import command, going_on, interrupt, recorded_bytes, start, until
+
+ROOT = Path(__file__).parents[2]
+PAGES = ROOT / "docs" / "tutorials"
+SHORTER = {
+    "--duration 20": "--duration 0.5",
+    "--duration 10": "--duration 4.5",
+    "--duration 4": "--duration 0.2",
+    "--steps 40": "--steps 2",
+}
+LIVE = (
+    "lowfc sim-loop --run night --open --star-magnitude 0",
+    "lowfc calibrate --run night --method hadamard --snr 20 --out night.fits",
+    "lowfc calibrate --compare computed.fits night.fits",
+    "lowfc ctl load night.fits --run night",
+    "lowfc ctl close --run night",
+)
+CHAOS = "lowfc chaos --case frames-dark --keep bad"
+BASLER = "lowfc conformance camera --run basler --config basler.toml"
+_LIVE = re.compile(
+    r"^lowfc (ctl|console|runs|chaos|validate|bench|view|config|camera|conformance|controller|record)\b|^sim-|^rerun|"
+    r"--run |--web|--compare|^lowfc sim-loop --rate|--config lowfc|spc|--steps 200"
+)
+
+
+def followed_here(line: str) -> bool:
+    """Whether a command ends by itself, and does not need a loop in real time."""
+    return not _LIVE.search(line)
+
+
+def followed(folder: Path, page: str, *, whole: bool = False) -> dict[str, str]:
+    """What each command of a page prints, run in its order in this folder."""
+    text = (PAGES / f"{page}.md").read_text()
+    for name, content in re.findall(r"Save this as `(\S+)`.*?```\w+\n(.*?)```", text, re.DOTALL):
+        (folder / name).write_text(content)
+    said = {}
+    for found in re.findall(r"^    (\S.*)$", text, re.MULTILINE):
+        line = found.split("  #")[0].strip()
+        if not followed_here(line):
+            continue
+        short = re.sub(r"--\w+ \d+\b", lambda found: SHORTER.get(found[0], found[0]), line)
+        said[line] = command(folder, line if whole else short)
+    return said
+
+
+def tilt_mas(summary: str) -> float:
+    """Residual tilt of a summary."""
+    return float(re.findall(r"tilt per axis +(\S+) mas", summary)[0])
+
+
+@pytest.mark.parametrize("whole", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_first_loop(tmp_path: Path, whole: bool) -> None:
+    first, info, report, replay, what_if, digest = followed(tmp_path, "first_loop", whole=whole).values()
+    assert "frame to command" in first
+    assert "lowfc/camera/frame" in info
+    assert ".html" in report
+    assert "commands identical, largest difference 0 nm" in replay
+    assert "what if" in what_if
+    assert "digest " in digest
+
+
+@pytest.mark.parametrize("whole", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_tuned_law(tmp_path: Path, whole: bool) -> None:
+    computed, integrator, tuned, law = followed(tmp_path, "tuned_law", whole=whole).values()
+    assert "computed.fits" in computed
+    assert "written: lqg.fits" in tuned
+    assert tilt_mas(law) < 0.7 * tilt_mas(integrator)
+    if whole:  # the page's figures
+        assert (tilt_mas(integrator), tilt_mas(law)) == pytest.approx((3.1, 1.2), rel=0.15)
+
+
+@pytest.mark.parametrize("whole", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_design_mask(tmp_path: Path, whole: bool) -> None:
+    design, *flown = followed(tmp_path, "design_mask", whole=whole).values()
+    assert "written to mask.json" in design
+    assert len(flown) == 3
+    assert all("frame to command" in one for one in flown)
+
+
+def test_bad_night(tmp_path: Path) -> None:
+    shutil.copytree(ROOT / "tests" / "golden", tmp_path / "tests" / "golden")
+    info, report, replay, killed, recovered, whole = followed(tmp_path, "bad_night").values()
+    assert "FRAMES_REFUSED 6, NO_FRAMES 3" in info
+    verdict = json.loads(report)["verdict"]
+    assert verdict["heading"] == "Not a good run"
+    assert (tmp_path / "night.html").is_file()
+    assert "163 frames" in replay
+    assert "answered otherwise" in replay
+    assert "makes it complete" in killed
+    assert "whole.mcap" in recovered
+    assert re.search(r"^state +complete$", whole, re.MULTILINE)
+
+
+@pytest.mark.slow
+@pytest.mark.exclusive
+def test_tuned_law_on_a_loop_in_real_time(tmp_path: Path, own_runtime: Path) -> None:
+    command(tmp_path, "lowfc calibrate --method analytic --out computed.fits")
+    loop = start(tmp_path, *LIVE[0].split()[1:])
+    try:
+        until(lambda: recorded_bytes(tmp_path) > 4e6)
+        said = [command(tmp_path, line) for line in LIVE[1:]]
+    finally:
+        _, complaints = interrupt(loop)
+    assert loop.returncode == 0, complaints
+    assert "good" in said[0]
+    assert "loop closed" in said[-1]
+
+
+@pytest.mark.slow
+@pytest.mark.exclusive
+def test_bad_night_of_ones_own(tmp_path: Path, own_runtime: Path) -> None:
+    command(tmp_path, CHAOS)
+    assert list((tmp_path / "bad").rglob("*.mcap"))
+
+
+@pytest.mark.basler
+@pytest.mark.slow
+@pytest.mark.exclusive
+def test_your_camera_by_the_vendors_emulation(
+    tmp_path: Path, own_runtime: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = (PAGES / "your_camera.md").read_text()
+    (line,) = re.findall(r"^    (PYLON_CAMEMU=1 lowfc camera .*)$", text, re.MULTILINE)
+    monkeypatch.setenv("PYLON_CAMEMU", "1")
+    (tmp_path / "basler.toml").write_text(re.findall(r"```toml\n(.*?)```", text, re.DOTALL)[0])
+    with going_on(tmp_path, line.partition(" ")[2]):
+        until(lambda: (own_runtime / "lowfc" / "basler").exists())
+        assert "0 wrong" in command(tmp_path, BASLER)
