@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 export PYTHONDONTWRITEBYTECODE :=  # rewriting and compiling every test anew takes 5 s of each interpreter that collects them
-.PHONY: help sim-loop test test-all bench lint types format proto node docs clean
+.PHONY: help sim-loop test test-all bench lint types format proto node docs release clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
@@ -67,6 +67,16 @@ node: tests/node/node_modules  ## the independent MCAP reader
 tests/node/node_modules: tests/node/package.json
 	npm install --prefix tests/node --no-audit --no-fund --no-package-lock
 	@touch $@
+
+release: $(VENV)/.installed  ## build sdist and wheel, check them, run the wheel in an empty environment
+	$(INSTALL) build twine
+	rm -rf build/dist build/empty && mkdir -p build/dist build/empty
+	$(BIN)/python -m build --outdir build/dist .
+	$(BIN)/twine check --strict build/dist/*
+	$(BIN)/python -m venv build/empty/venv
+	build/empty/venv/bin/pip install --quiet --disable-pip-version-check --constraint constraints.txt build/dist/*.whl
+	cd build/empty && venv/bin/lowfc sim-loop --duration 5
+	ls -l build/dist
 
 docs: $(VENV)/.installed  ## build the site: build/docs/index.html
 	$(INSTALL) --editable '.[docs]'

@@ -23,6 +23,7 @@ ROUTE = "rerun rrd route --application-id $(basename $log .mcap) deploy/layouts/
 ELSEWHERE = {
     "make sim-loop": ".ci/run",
     "make test": ".ci/run",
+    "make release": "tests/house/test_wheel.py",
     "lowfc console": "tests/console/test_console.py",
     "lowfc doctor": "tests/commissioning/test_doctor.py",
     "lowfc gateway epics": "tests/interlocks/test_gateway.py",

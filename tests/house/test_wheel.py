@@ -80,6 +80,13 @@ def test_everything_is_in_it(wheel: Path) -> None:
     assert wanted - held == set()
     assert {name for name in held - wanted if ".dist-info/" not in name} == set()
     assert (metadata["Name"], metadata["Version"]) == ("lowfc", lowfc.__version__)
+    assert wheel.stat().st_size < 3e6
+
+
+def test_the_version_is_said_alike_everywhere() -> None:
+    assert json.loads((ROOT / "codemeta.json").read_text())["version"] == lowfc.__version__
+    assert f"\nversion: {lowfc.__version__}\n" in (ROOT / "CITATION.cff").read_text()
+    assert f"\n## [{lowfc.__version__}]" in (ROOT / "CHANGELOG.md").read_text()
 
 
 def test_what_it_installs_runs_the_loop(installed: Path, tmp_path: Path) -> None:
@@ -93,3 +100,13 @@ def test_what_it_installs_runs_the_loop(installed: Path, tmp_path: Path) -> None
     frames = round(Configuration().camera.rate_hz)
     assert figures["frames_processed"] == figures["commands_applied"] == frames > 0
     assert figures["messages_lost"] == 0
+
+
+@pytest.mark.slow
+@pytest.mark.exclusive
+@pytest.mark.timeout(900)
+def test_make_release_builds_checks_and_runs_it() -> None:
+    done = subprocess.run(["make", "release"], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("PASSED") == 2
+    assert "frame to command" in done.stdout

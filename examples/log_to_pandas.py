@@ -1,0 +1,30 @@
+"""Read a log into pandas: a row for each step, by time; needs `pip install pandas`.
+
+Example: python examples/log_to_pandas.py logs/20270101T220000Z.mcap
+"""
+
+import sys
+from pathlib import Path
+
+import pandas as pd
+
+from lowfc import LogReader, read_history
+
+
+def table(path: Path) -> pd.DataFrame:
+    """Modal error, pseudo-open-loop modes and command of every step, nm rms of wavefront, and the light in DN."""
+    history = read_history(LogReader(path))
+    steps, calibration = history.steps, history.calibration
+    if calibration is None:
+        raise SystemExit(f"{path} has no calibration: are these all files of the recording?")
+    columns = {
+        f"{name}_z{noll}_nm": values[:, place]
+        for name, values in (("error", steps.error_nm), ("pol", steps.pol_nm), ("command", steps.command_nm))
+        for place, noll in enumerate(calibration.noll)
+    }
+    time = pd.to_datetime(steps.time_ns, unit="ns", utc=True)
+    return pd.DataFrame({**columns, "flux_dn": steps.flux_dn}, index=pd.Index(time, name="time"))
+
+
+if __name__ == "__main__":
+    sys.stdout.write(table(Path(sys.argv[1])).describe().T[["count", "mean", "std"]].to_string() + "\n")

@@ -1,0 +1,29 @@
+"""Which gain, at which delay? Margins of an integrator, and what it leaves of a vibration.
+
+Example: python examples/loop_design.py 17 500
+"""
+
+import sys
+from collections.abc import Iterator
+
+import numpy as np
+
+from lowfc.control.laws.stability import highest_gain, limiting_gain, open_loop
+
+
+def design(line_hz: float, rate_hz: float) -> Iterator[str]:
+    """A line for each delay: the highest gain within the margins, and what it leaves of a line at `line_hz`."""
+    yield f"a line of {line_hz:g} Hz, {rate_hz:g} frames per second"
+    yield "delay, frames   oscillates at gain   highest gain   left of the line   bandwidth, Hz"
+    frequency_hz = np.linspace(0.1, rate_hz / 2, 20_000)
+    for delay in (1.0, 1.5, 2.0, 3.0):
+        gain = highest_gain(delay)
+        left = np.abs(
+            1 / (1 + open_loop(2 * np.pi * frequency_hz / rate_hz, gain, 0.0, delay))
+        )  # as the sensor sees it
+        bandwidth_hz, of_line = frequency_hz[np.argmax(left > 1)], np.interp(line_hz, frequency_hz, left)
+        yield f"{delay:13g}   {limiting_gain(delay):18.2f}   {gain:12.2f}   {of_line:16.2f}   {bandwidth_hz:13.1f}"
+
+
+if __name__ == "__main__":
+    sys.stdout.writelines(f"{line}\n" for line in design(float(sys.argv[1]), float(sys.argv[2])))

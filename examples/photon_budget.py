@@ -1,0 +1,34 @@
+"""How faint may the star be? Light, and the noise of one frame in each mode, against V magnitude.
+
+Example: python examples/photon_budget.py 2 5
+"""
+
+import sys
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from lowfc import Configuration
+from lowfc.adapters.files import factory
+from lowfc.optics.detector.photometry import tilt_nm_per_mas
+
+
+def budget(magnitudes: Sequence[float]) -> Iterator[str]:
+    """A line for each magnitude: the default sensor at the default rate, R made for this light."""
+    config = Configuration()
+    optics = factory.twin(config, None, sys.exit)
+    on_nodes = factory.mirror_on_twin(config, optics, sys.exit)
+    nm_per_mas = tilt_nm_per_mas(config.star.diameter_m)
+    yield f"{config.sensor.kind}, {config.camera.rate_hz:g} frames per second: noise of one frame"
+    yield "    V   electrons   tilt, mas rms per axis   other modes, nm rms"
+    for magnitude in magnitudes:
+        at = config.model_copy(update={"star": config.star.model_copy(update={"magnitude": magnitude})})
+        calibration = factory.analytic_calibration(at, optics, on_nodes)
+        noise_nm = factory.frame_noise_nm(at, calibration)
+        tilt_mas, others_nm = (np.sqrt(np.mean(part**2)) for part in (noise_nm[:2] / nm_per_mas, noise_nm[2:]))
+        light_e = calibration.flux_dn * config.camera.gain_e_per_dn
+        yield f"{magnitude:5.1f}   {light_e:9.0f}   {tilt_mas:22.2f}   {others_nm:19.2f}"
+
+
+if __name__ == "__main__":
+    sys.stdout.writelines(f"{line}\n" for line in budget([float(word) for word in sys.argv[1:]]))

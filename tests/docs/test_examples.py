@@ -1,0 +1,66 @@
+"""Example scripts of the numerics and of logs, as their first lines say to run them."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+def run(name: str, log: str = "") -> list[str]:
+    """Lines that an example prints, run with the arguments of its docstring."""
+    script = ROOT / "examples" / f"{name}.py"
+    (words,) = re.findall(rf"^Example: python examples/{name}.py (.*)$", script.read_text(), re.MULTILINE)
+    done = subprocess.run(
+        [sys.executable, script, *(log or words).split()], capture_output=True, text=True, check=False, cwd=ROOT
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+def test_photon_budget() -> None:
+    rows = [[float(word) for word in line.split()] for line in run("photon_budget")[2:]]
+    (magnitude, light_e, tilt_mas, _), (fainter, less_e, more_mas, _) = rows
+    assert (magnitude, fainter) == (2, 5)
+    assert light_e / less_e == pytest.approx(10**1.2, rel=0.02)
+    assert 3 < more_mas / tilt_mas < 10  # between photon noise and read noise
+
+
+def test_loop_design() -> None:
+    rows = [[float(word) for word in line.split()] for line in run("loop_design")[2:]]
+    assert [row[1] for row in rows if row[0] in (1, 2)] == [2, 1]  # 2 sin(pi / (2 (2d - 1)))
+    left = [row[3] for row in rows]
+    assert left == sorted(left)
+
+
+def test_log_to_pandas() -> None:
+    rows = [line.split() for line in run("log_to_pandas", str(ROOT / "tests/golden/0.1/night.mcap"))[1:]]
+    assert [row[0] for row in rows] == [
+        *(f"{name}_z{noll}_nm" for name in ("error", "pol", "command") for noll in (2, 3)),
+        "flux_dn",
+    ]
+    assert rows[0][1] == "156.0"
+    assert rows[-1][1] == "163.0"
+
+
+def test_the_package_offers_few_names_and_imports_them_when_they_are_named() -> None:
+    script = (
+        "import sys, lowfc; assert not [name for name in sys.modules if name.startswith('lowfc.')]\n"
+        "assert {*lowfc.__all__} <= {*dir(lowfc)}\n"
+        "print(*(getattr(lowfc, name).__name__ for name in lowfc.__all__))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == [
+        "Calibration",
+        "Client",
+        "Configuration",
+        "LogReader",
+        "load",
+        "load",
+        "read_history",
+        "running",
+    ]
