@@ -13,7 +13,7 @@ from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import TOPICS
 from lowfc.contract.wire import lowfc_pb2
 from lowfc.programs.cli.main import COMMANDS, PARTS
-from tools.advice import ADVICE, REASONS
+from tools.advice import REASONS
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -45,9 +45,3 @@ def test_all_that_is_declared_is_in_the_reference(site: Path) -> None:
     for page, words in declared.items():
         text = unescape((site / f"{page}.html").read_text())
         assert [word for word in words if word not in text] == []
-
-
-def test_every_event_and_every_reason_has_advice() -> None:
-    assert [*ADVICE] == [*EVENTS]
-    reasons = [value.name.removeprefix("REASON_") for value in lowfc_pb2.Reason.DESCRIPTOR.values]
-    assert [*REASONS] == reasons[1:]

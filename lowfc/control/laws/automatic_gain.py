@@ -233,7 +233,7 @@ def _better(blocks: Array) -> tuple[Array, Mask]:
 
 
 def injected(gain: Single) -> Single:
-    """Of the noise of a frame, what an integrator without delay puts on the mirror."""
+    """Part (modes,) of a frame's noise variance that an integrator of this gain, without delay, puts on the mirror."""
     return gain / (2 - gain)
 
 

@@ -1,4 +1,4 @@
-"""The Python API: every public name has a docstring, and one that takes arrays says their shapes and their unit."""
+"""What must be documented: every public name, with shapes and unit of the arrays that it takes; every event."""
 
 import ast
 import re
@@ -7,13 +7,17 @@ from pathlib import Path
 
 import pytest
 
+from lowfc.contract.events import EVENTS
+from lowfc.contract.wire import lowfc_pb2
+from tools.advice import ADVICE, REASONS
+
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("client", "device", "optics", "design", "control")
 ARRAYS = re.compile(r"\b(Array|Single|Complex|Whole|Long|Mask|Pixels|ArrayLike)\b")
 SHAPE = re.compile(r"\([\w+*/ .-]+,\)|\([\w+*/ .-]+(, ?[\w+*/ .-]+)+\)|shapes? as|any shape")
 UNIT = re.compile(
     r"\b(nm2?|um|mas|DN|electrons?|e-|ns|s|Hz|rad|deg|waves|frames|diameters|lambda0?|"
-    r"radii|(their|any) unit|without unit|"
+    r"radii|(their|any) unit|without unit|variance|"
     r"fractions?|factors?|relative|transmissions?|weights|amplitudes?|indices|contrast|0 or 1|1 where|whether)\b"
 )
 
@@ -56,3 +60,9 @@ def test_who_takes_arrays_says_their_shapes_and_units(package: str) -> None:
             if arrays and not (SHAPE.search(words) and UNIT.search(words)):
                 lacking.append((name, "shape" if not SHAPE.search(words) else "unit", [each.arg for each in arrays]))
     assert lacking == []
+
+
+def test_every_event_and_every_reason_has_advice() -> None:
+    assert [*ADVICE] == [*EVENTS]
+    reasons = [value.name.removeprefix("REASON_") for value in lowfc_pb2.Reason.DESCRIPTOR.values]
+    assert [*REASONS] == reasons[1:]
