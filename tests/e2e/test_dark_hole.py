@@ -8,8 +8,8 @@ import pytest
 from lowfc.arrays import Array
 from lowfc.contract.codecs.calibration_codec import decode_calibration
 from lowfc.contract.messages import CALIBRATION, COMMAND, OFFLOAD, STEP, wire
+from lowfc.programs.paper.dark_hole import PLAIN, SHIFTED, STEPS, Night, dark_hole
 from tests.support.loops import payloads, run
-from tools.dark_hole import PLAIN, SHIFTED, STEPS, Night, dark_hole
 
 GRID = (34, 34)
 DEAD = (352, 561, 595, 757)

@@ -2,7 +2,7 @@
 
 import threading
 import zlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, lru_cache
@@ -275,8 +275,14 @@ class Context:
 
 @dataclass(frozen=True)
 class Case:
-    """A table or a figure of the paper: what it shows, its rows, and its drawing where there is one."""
+    """A table or a figure of the paper: what it shows, its rows, and its drawing where there is one.
+
+    `in_text` says which of the rows, as `plain` has them, stand in the text where they are too many; `about` is what
+    the page of a table that is not the paper's begins with.
+    """
 
     title: str
     run: Callable[[Context], list[Row]]
     plot: Callable[[Context, Path], None] | None = None
+    in_text: Callable[[Mapping[str, Any]], bool] | None = None
+    about: str = ""

@@ -15,6 +15,8 @@ TABLES = (
     *("conditioning", "photometry"),
 )
 
+BEYOND = ("anchors", "tolerance")
+"""Tables of ours that are not among `all`, which are the paper's."""
 OF_THE_PAPER = ("table1", "photometry")
 """What compares the paper's own sensors and takes no others."""
 
@@ -22,7 +24,11 @@ OF_THE_PAPER = ("table1", "photometry")
 def validate(
     tables: Annotated[
         list[str],
-        typer.Argument(help=f"Any of {', '.join(TABLES)}; or all.", metavar="TABLE...", show_default=False),
+        typer.Argument(
+            help=f"Any of {', '.join(TABLES)}; all of these; or {', '.join(BEYOND)}.",
+            metavar="TABLE...",
+            show_default=False,
+        ),
     ],
     trials: Annotated[int, typer.Option(min=2, max=1_000_000, help="Wavefronts, and noise realisations.")] = 100,
     seed: Annotated[int, typer.Option(min=0, help="Of all random numbers.")] = 1,
@@ -41,7 +47,10 @@ def validate(
     ] = None,
     docs: Annotated[
         Path | None,
-        typer.Option(help="Folder to write paper.md, paper.json and the drawings to; with all.", show_default=False),
+        typer.Option(
+            help="Folder to write the pages, their JSON and the drawings to; with all, or without any of the paper.",
+            show_default=False,
+        ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")] = False,
 ) -> None:
@@ -49,22 +58,30 @@ def validate(
 
     Example: lowfc validate table3 table4 --trials 20
     """
-    known = (*TABLES, "all")
+    known = (*TABLES, *BEYOND, "all")
     for name in tables:
         if name not in known:
             raise ConfigurationError(f"there is no table {name!r}{nearest(name, known)}; {', '.join(known)}")
     wanted = [name for name in TABLES if name in tables or "all" in tables]
-    if docs is not None and (tuple(wanted) != TABLES or sensor or plots is not None):
-        raise ConfigurationError("--docs writes the whole document: use it with all, without --sensor and --plots")
+    wanted += [name for name in BEYOND if name in tables]
+    pages = all(name in BEYOND for name in wanted)
+    if docs is not None and (not (pages or tuple(wanted) == TABLES) or sensor or plots is not None):
+        raise ConfigurationError(
+            f"--docs writes whole documents: use it with all, or with {' and '.join(BEYOND)}; without --sensor and "
+            "--plots"
+        )
 
     from lowfc.programs.paper.cases import Context
-    from lowfc.programs.paper.report import PICTURES, run, to_json, to_text, write_document
+    from lowfc.programs.paper.report import PICTURES, run, to_json, to_text, write_document, write_page
 
     context = Context(trials, seed, jobs or len(os.sched_getaffinity(0)), tuple(sensor) if sensor else None)
     fixed = [name for name in wanted if name in OF_THE_PAPER]
     if sensor and fixed:
         typer.echo(f"{', '.join(fixed)}: of the paper's own sensors, --sensor changes nothing there", err=True)
     found = run(wanted, context, plots if docs is None else docs / PICTURES)
-    if docs is not None:
+    if docs is not None and pages:
+        for table in found:
+            write_page(docs, table)
+    elif docs is not None:
         write_document(docs, found)
     sys.stdout.write((to_json(found) if as_json else "\n\n".join(map(to_text, found))) + "\n")

@@ -8,6 +8,7 @@ from lowfc.adapters.files.layouts import load_layout
 from lowfc.contract.sections import SensorSection
 from lowfc.optics.chain.zernike import NOLLS_14, mode_name
 from lowfc.programs.paper.cases import Case, Context, Row, prepared
+from lowfc.programs.paper.tables import anchors, tolerance
 from lowfc.programs.paper.tables.conditioning import conditioning
 from lowfc.programs.paper.tables.photometry import defocus_waves, differential, photometry
 from lowfc.programs.paper.tables.pointing import table4
@@ -83,4 +84,11 @@ TABLES: dict[str, Case] = {
     "table4": Case("Table 4: scatter of tilt estimates", table4),
     "conditioning": Case("Sect. 4: condition numbers", conditioning),
     "photometry": Case("Sect. 3.3: photometry, and the paper's inconsistencies", photometry),
+}
+
+BEYOND: dict[str, Case] = {
+    "anchors": Case("Anchors: the field's figures and ours", anchors.anchors, anchors.plot, None, anchors.ABOUT),
+    "tolerance": Case(
+        "Tolerated drift and lines", tolerance.tolerance, tolerance.plot, tolerance.in_text, tolerance.ABOUT
+    ),
 }

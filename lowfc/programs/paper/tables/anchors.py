@@ -1,0 +1,294 @@
+"""Our figures beside those that a specialist knows by heart, by the definition of each, with what is assumed."""
+
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lowfc.adapters.logs.history import History, read_history
+from lowfc.adapters.logs.reader import LogReader
+from lowfc.arrays import Array
+from lowfc.contract.errors import LowfcError
+from lowfc.control.calibration.calibration import normalise_flux, reconstructor
+from lowfc.control.laws.continuous import Timing
+from lowfc.control.laws.kalman import lqg
+from lowfc.control.laws.spectra import pieces
+from lowfc.control.laws.tuning import identified, predicted_nm
+from lowfc.design.paper import TABLE4_MAS
+from lowfc.design.tolerance import best_gain, left_of_drift_nm2
+from lowfc.design.trials import noisy_e
+from lowfc.optics.chain.zernike import NOLLS_14, mode_name
+from lowfc.optics.detector.photometry import tilt_nm_per_mas
+from lowfc.programs.paper.cases import Context, Row, prepared
+from lowfc.programs.paper.dark_hole import SHIFTED, STEPS, dark_hole
+from lowfc.programs.paper.plots import Line as Curve
+from lowfc.programs.paper.plots import curves, draw
+from lowfc.programs.paper.tables import pointing, tolerance
+
+DRIVEN = ("sam", "zwfs_tuned")
+"""Sensors whose loops are run."""
+RATE_HZ, MAGNITUDE, EXPOSURE = 1000.0, 2.0, 0.5
+OBSERVED_S, CLOSED_S, MEAN_S = 10.0, 24.0, 2.0
+"""Of the loop from which a law is identified, of the one that is judged, and of an exposure of SCExAO's camera."""
+GAINS = "[control]\ntilt_gain = 0.5\ngain = 0.05\n"
+ROMAN_MAS, SCEXAO_MAS = 0.4, {"laboratory": 0.02, "sky": 0.15}
+HELD_S = 100.0
+DRIFT_PM = 20.0
+REACHED, SHORT = "reached", "not reached"
+
+ABOUT = """What a specialist knows by heart, and our figure by the same definition. *paper* is the field's figure,
+*measured* ours, *limit* the same at the quantum limit of the light. Loops are the real processes in lockstep, judged by
+the true wavefront at all times, over the second half of a run. A verdict says whether our figure, as predicted where
+theory gives it, is as good as the field's; where it is not, we fall short.
+"""
+LOOP = (
+    f"lowfc sim-loop --lockstep: V = {MAGNITUDE:g}, 2 m, {RATE_HZ:g} Hz, exposure of half the period, delay of one "
+    "frame, 14 modes, 1 e- read noise, monochromatic with the photons of 110 nm; per axis, true, at all times."
+)
+ROMAN = (
+    "Milestone 6: 14 mas rms of jitter and drift held to below 0.4 mas per axis. Ours: preset reaction-wheel, five "
+    "lines 0.5 % wide to 117 Hz and drift; and reaction-wheel-ideal, lines without a width, as a testbed makes them. "
+    f"LQG, identified from {OBSERVED_S:g} s of the closed loop. limit: LQG of what the log shows, at the quantum "
+    "limit. A mirror that holds its command for a frame leaves 0.72 mas of these lines at 1 kHz, whatever the sensor, "
+    "and 0.36 mas at 2 kHz: this anchor needs a faster loop, or lower lines."
+)
+SCEXAO = (
+    f"Standard deviation of means over {MEAN_S:g} s of the tilt per axis. Theirs: 8.2 m, 1.6 um; ours 2 m, 550 nm, "
+    "where 0.15 mas is 0.0026 lambda/D against their 0.0037. Laboratory: preset bench, integrator; sky: "
+    "reaction-wheel, LQG."
+)
+HICAT = (
+    f"A dark hole is dug on a channel while the loop runs: how much of {STEPS} random steps of 2 nm rms of surface the "
+    "loop undoes (V = -2). Theirs: the loop runs, and nothing of it is in the way; as good here is below 1 %."
+)
+HUNDRED = (
+    f"Standard deviation of a mode's mean over {HELD_S:g} s of frames at {tolerance.RATE_HZ:g} Hz, V = 2, wavefront "
+    "flat, all 14 modes fitted. predicted: by the noise of a frame."
+)
+AGAINST_V = (
+    f"Drift of {DRIFT_PM:g} pm/sqrt(s) in each of 14 modes, integrators of the best gains, {tolerance.RATE_HZ:g} Hz; "
+    "what they leave of drift and noise adds this contrast to the dark zone of the sensor's coronagraph."
+)
+
+
+def anchors(context: Context) -> list[Row]:
+    """Rows of every anchor, each with its verdict where the field has a figure."""
+    names = context.names(*DRIVEN)
+    rows = [row for found in map(partial(_pointing, context), names) for row in found]
+    rows += _hicat(context)
+    rows += _table4(context)
+    rows += [row for name in names for row in _hundred_seconds(context, name)]
+    return rows + [row for name in context.names(*tolerance.HELD) for row in _against_magnitude(name)]
+
+
+def _judged(row: Row, allowed: float | None = None) -> list[Row]:
+    """A row and its verdict: as good as the field's figure, or as what is allowed; predicted where theory says it."""
+    best, ours = row.paper if allowed is None else allowed, row.measured if row.predicted is None else row.predicted
+    assert isinstance(ours, float)  # noqa: S101  # these are
+    assert isinstance(best, float)  # noqa: S101
+    verdict = REACHED if ours <= best else SHORT
+    return [
+        row,
+        replace(
+            row,
+            quantity=f"verdict, {row.quantity}",
+            unit="",
+            measured=verdict,
+            paper=None,
+            error=None,
+            predicted=None,
+            limit=None,
+        ),
+    ]
+
+
+def _pointing(context: Context, name: str) -> list[Row]:
+    """Roman's milestone and SCExAO's sensor."""
+    rows: list[Row] = []
+    nm_per_mas = tilt_nm_per_mas(2.0)
+    made = partial(Row, name, unit="mas", modes=len(NOLLS_14))
+    with tempfile.TemporaryDirectory() as text:
+        folder = Path(text)
+        (folder / "gains.toml").write_text(GAINS)
+        for preset in ("reaction-wheel", "reaction-wheel-ideal"):
+            context.progress(f"anchors {name}, {preset}", len(rows), 12)
+            loop = (name, preset, folder)
+            observed = _history(folder / _sim_loop(*loop, "gains.toml", OBSERVED_S, context.seed)["log"])
+            law = folder / f"{preset}.fits"
+            _lowfc(folder, "tune", str(observed.log.path), "--controller", "lqg", "--out", str(law))
+            (folder / "law.toml").write_text(f'{GAINS}law = "{law}"\n')
+            run = _sim_loop(*loop, "law.toml", CLOSED_S, context.seed + 1000)
+            limit = _quantum_pointing_nm(observed, name) / nm_per_mas
+            driven = partial(made, estimator="LQG")
+            rows.append(made(f"tilt, {preset}, open loop", measured=run["tilt_disturbance_mas"], assumption=LOOP))
+            rows += _judged(
+                driven(
+                    f"tilt, {preset}",
+                    measured=run["tilt_residual_mas"],
+                    paper=ROMAN_MAS,
+                    limit=limit,
+                    assumption=f"{LOOP}\n{ROMAN}",
+                )
+            )
+            if preset == "reaction-wheel":
+                rows += _judged(_means(driven, _history(folder / run["log"]), "sky"))
+        context.progress(f"anchors {name}, bench", 9, 12)
+        run = _sim_loop(name, "bench", folder, "gains.toml", CLOSED_S, context.seed)
+        rows += _judged(_means(partial(made, estimator="integrator"), _history(folder / run["log"]), "laboratory"))
+    return rows
+
+
+def _means(made: Callable[..., Row], history: History, where: str) -> Row:
+    """Standard deviation of means of the true tilt after the first four seconds."""
+    truths = history.true
+    assert truths is not None  # noqa: S101  # a simulated loop's
+    frames = round(MEAN_S * RATE_HZ)
+    tilt_nm = truths.residual_nm[2 * frames :, :2].astype(np.float64)
+    blocks = len(tilt_nm) // frames
+    means = tilt_nm[: blocks * frames].reshape(blocks, frames, 2).mean(axis=1) / tilt_nm_per_mas(2.0)
+    spread = float(np.sqrt(means.var(axis=0, ddof=1).mean()))
+    return made(
+        f"std of means over {MEAN_S:g} s, {where}",
+        measured=spread,
+        paper=SCEXAO_MAS[where],
+        error=spread / np.sqrt(4.0 * (blocks - 1)),
+        assumption=f"{LOOP}\n{SCEXAO}",
+    )
+
+
+def _quantum_pointing_nm(history: History, name: str) -> float:
+    """Tilt per axis that LQG leaves of what this log shows, with the noise of the quantum limit."""
+    steps = history.steps
+    models = identified(pieces(steps.sequence, steps.pol_nm[:, :2]), RATE_HZ)
+    scale = (EXPOSURE / RATE_HZ) / (tolerance.EXPOSURE / tolerance.RATE_HZ)
+    noise = tolerance.quantum_noise_nm2(prepared(name), MAGNITUDE)[:2] / scale
+    models = [replace(model, noise_nm2=float(n)) for model, n in zip(models, noise, strict=True)]
+    timing = Timing.of(1.0, EXPOSURE)
+    return float(np.sqrt(np.mean(predicted_nm(lqg(models, NOLLS_14[:2], timing), models, timing) ** 2)))
+
+
+def _hicat(context: Context) -> list[Row]:
+    context.progress("anchors, a dark hole while the loop runs", 10, 12)
+    with tempfile.TemporaryDirectory() as folder:
+        undone, error = dark_hole(Path(folder), 2.0, seed=context.seed).channels[SHIFTED].undone()
+    row = Row("sam", "of a dark hole's steps undone", "%", abs(100 * undone), error=100 * error, assumption=HICAT)
+    return _judged(row, allowed=1.0)
+
+
+def _table4(context: Context) -> list[Row]:
+    """The paper's Table 4 by its own definition: tip and tilt fitted, 1 mas, 0.05 s of V = 4.83."""
+    names = ("sam", "sam18_sized", "clowfs_tuned", "zwfs_tuned")
+    rows = pointing.table4(replace(context, sensors=names))
+    wanted = "std of x tilt, 1 mas, own photometry"
+    chosen = [row for row in rows if (row.quantity, row.modes, row.estimator) == (wanted, 2, "weighted")]
+    papers = {"clowfs_tuned": TABLE4_MAS["clowfs"][1], "zwfs_tuned": TABLE4_MAS["clowfs"][1]}
+    return [each for row in chosen for each in _judged(replace(row, paper=papers.get(row.name, row.paper)))]
+
+
+def _hundred_seconds(context: Context, name: str) -> Iterator[Row]:
+    """Picometres per mode: the mean of so many exposures is one exposure of their light, with the read noise of all."""
+    frames = HELD_S * tolerance.RATE_HZ
+    sensor, light_e = prepared(name), tolerance.light_e(MAGNITUDE)
+    good, H = np.ones(sensor.I0.size), sensor.H[:, : len(NOLLS_14)]
+    seen, slopes = normalise_flux(sensor.I0, H, good)
+    R = reconstructor(seen, slopes, good, light_e * float(sensor.I0.sum()), tolerance.READ_NOISE_E)
+
+    def trial(i: int) -> Array:
+        rng = context.rng("anchors", name, i)
+        image = noisy_e(rng, sensor.I0 * light_e * frames, tolerance.READ_NOISE_E * np.sqrt(frames))
+        return np.asarray(R @ (image / image.sum() - seen))
+
+    found = np.array(context.map(f"anchors {name}, 100 s", trial, range(context.trials))).std(axis=0, ddof=1)
+    predicted = np.sqrt(np.diag(tolerance.frame_noise_nm2(name, MAGNITUDE)) / frames)
+    limit = np.sqrt(tolerance.quantum_noise_nm2(sensor, MAGNITUDE) / frames)
+    for mode, noll in enumerate(NOLLS_14):
+        pm = 1e3 * np.array([found[mode], predicted[mode], limit[mode]])
+        yield Row(
+            name,
+            f"Z{noll} {mode_name(noll)} over {HELD_S:g} s",
+            "pm",
+            float(pm[0]),
+            error=float(pm[0] / np.sqrt(2 * (context.trials - 1))),
+            predicted=float(pm[1]),
+            limit=float(pm[2]),
+            modes=len(NOLLS_14),
+            estimator="weighted",
+            assumption=HUNDRED,
+        )
+
+
+def added_contrast(name: str, magnitude: float, quantum: bool = False) -> float:
+    """What drift and noise add behind integrators of the best gains."""
+    noise = np.diag(tolerance.frame_noise_nm2(name, magnitude))
+    noise = tolerance.quantum_noise_nm2(prepared(name), magnitude) if quantum else noise
+    step = (DRIFT_PM / 1e3) ** 2 / tolerance.RATE_HZ
+    left = [
+        left_of_drift_nm2(step, n, tolerance.EXPOSURE, best_gain(step, n, tolerance.EXPOSURE)) for n in noise.tolist()
+    ]
+    return float(sum(tolerance.contrasts_of(name).added(mode, each) for mode, each in enumerate(left)))
+
+
+def _against_magnitude(name: str) -> Iterator[Row]:
+    for magnitude in tolerance.MAGNITUDES:
+        yield Row(
+            name,
+            f"added contrast, V = {magnitude:g}",
+            "",
+            added_contrast(name, magnitude),
+            limit=added_contrast(name, magnitude, quantum=True),
+            modes=len(NOLLS_14),
+            estimator="integrator of the best gain",
+            assumption=AGAINST_V,
+        )
+
+
+def plot(context: Context, path: Path) -> None:
+    """Added contrast over magnitude for every sensor, beside the quantum limit."""
+    magnitudes = np.arange(0.0, 10.5, 0.5)
+    names = context.names(*(name for name in tolerance.HELD if name != "aplc"))
+    lines = [
+        Curve(name, magnitudes, np.array([added_contrast(name, V) for V in magnitudes.tolist()])) for name in names
+    ]
+    least = np.array([added_contrast(names[0], V, quantum=True) for V in magnitudes.tolist()])
+    panel = curves(
+        [*lines, Curve("quantum limit", magnitudes, least)],
+        "added contrast",
+        "V",
+        "contrast",
+        "log",
+        legend="upper left",
+    )
+    draw(path, [panel], AGAINST_V, wide=True)
+
+
+def _sim_loop(name: str, preset: str, folder: Path, config: str, duration_s: float, seed: int) -> dict[str, Any]:
+    words = ("--rate", f"{RATE_HZ:g}", "--sensor", name, "--disturbance", preset, "--star-magnitude", f"{MAGNITUDE:g}")
+    timed = ("--lockstep", "--duration", f"{duration_s:g}", "--seed", str(seed), "--config", config)
+    return _lowfc(folder, "sim-loop", *words, *timed)
+
+
+def _lowfc(folder: Path, *words: str) -> dict[str, Any]:
+    """What a command prints with --json.
+
+    Raises:
+        LowfcError: It failed.
+    """
+    command = [sys.executable, "-m", "lowfc", *words, "--json"]
+    done = subprocess.run(  # noqa: S603  # our own program
+        command, cwd=folder, capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        raise LowfcError(f"`lowfc {' '.join(words)}` ended with {done.returncode}: {done.stderr.strip()}")
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
+
+
+def _history(log: Path) -> History:
+    return read_history(LogReader(log))

@@ -1,0 +1,107 @@
+"""A reference star and a target of another colour and roll: the change of the dark zone after subtraction."""
+
+from collections.abc import Iterator
+from functools import lru_cache, partial
+
+import numpy as np
+
+from lowfc.arrays import Array, Mask
+from lowfc.control.calibration.calibration import normalise_flux, reconstructor
+from lowfc.design.tolerance import best_gain, left_of_drift_nm2
+from lowfc.optics.chain.band import Band, gauss_legendre
+from lowfc.optics.chain.coronagraph import DARK_ZONE, contrast, wedge_samples
+from lowfc.optics.chain.sensor import reference, response
+from lowfc.optics.chain.zernike import NOLLS_14
+from lowfc.programs.paper.cases import Row, prepared
+from lowfc.programs.paper.tables import tolerance
+
+STARS = {"reference": (2.0, 20_000.0), "target": (5.0, 5_800.0)}
+"""Magnitude V and temperature in K."""
+DRIFT_PM = 20.0
+"""Of each of 14 modes, per root second."""
+ROLL_NM, ROLLED = 1.0, 1e-11
+"""A roll's step in every mode, and the contrast below which it is gone."""
+_SAMPLES_PER, _SMALL_NM = 2, 0.3  # and amplitude at which maps of second order are taken
+_PLANCK_NM_K = 1.438777e7
+
+ASSUMPTION = (
+    f"Every mode drifts by {DRIFT_PM:g} pm/sqrt(s), each star has the best gain of each mode, {tolerance.RATE_HZ:g} "
+    "Hz; black bodies of 20,000 K (V = 2) and 5,800 K (V = 5) over the band of 20 %, in four wavelengths."
+)
+MAP = "Of the map of the difference of both long exposures, before any photon noise of the science camera."
+
+
+def coloured(temperature_K: float) -> Band:
+    """The band as a black body fills it, by photons."""
+    band = gauss_legendre(prepared("sam").sensor.wavelength_nm, count=4)
+    nm = np.array(band.wavelengths_nm)
+    photons = np.array(band.weights) * nm**-4.0 / np.expm1(_PLANCK_NM_K / (nm * temperature_K))
+    return Band(band.wavelengths_nm, tuple((photons / photons.sum()).tolist()))
+
+
+@lru_cache(maxsize=1)
+def _maps() -> tuple[Array, Array, Mask]:
+    """Second-order maps (modes, samples, samples) of contrast per nm^2, the flat wavefront's, and the dark zone."""
+    samples = 2 * int(np.ceil(DARK_ZONE.outer)) * _SAMPLES_PER
+    flat = _image(np.zeros(len(NOLLS_14)), samples)
+    waves = _SMALL_NM * np.eye(len(NOLLS_14))
+    maps = np.array([(_image(one, samples) + _image(-one, samples)) / 2 - flat for one in waves])
+    return maps / _SMALL_NM**2, flat, wedge_samples(DARK_ZONE, samples, samples, _SAMPLES_PER)
+
+
+def _image(modes_nm: Array, samples: int) -> Array:
+    ready = prepared("sam")
+    return contrast(
+        ready.sensor.pupil, ready.opd_nm(modes_nm), ready.sensor.wavelength_nm, samples, samples_per=_SAMPLES_PER
+    )
+
+
+def zero_point_nm(name: str) -> Array:
+    """Where (14,) a loop with the reference star's I0 and R holds the target, because of its colour."""
+    sensor = prepared(name)
+    reference_star, target = (coloured(kelvin) for _, kelvin in STARS.values())
+    I0, H = reference(sensor.sensor, reference_star).ravel(), response(sensor.sensor, sensor.modes[:14], reference_star)
+    good = np.ones(I0.size)
+    seen, slopes = normalise_flux(I0, H, good)
+    flux_e = tolerance.light_e(STARS["reference"][0]) * float(I0.sum())
+    R = reconstructor(seen, slopes, good, flux_e, tolerance.READ_NOISE_E)
+    other = reference(sensor.sensor, target).ravel()
+    return np.asarray(-R @ (other / other.sum() - seen))
+
+
+def pair_rows(name: str) -> Iterator[Row]:
+    """Rows of one sensor behind the shaped pupil."""
+    maps, flat, zone = _maps()
+    step = (DRIFT_PM / 1e3) ** 2 / tolerance.RATE_HZ
+    made = partial(Row, name, unit="", assumption=ASSUMPTION)
+    left: dict[str, Array] = {}
+    for star, (magnitude, _) in STARS.items():
+        noise = np.diag(tolerance.frame_noise_nm2(name, magnitude)).tolist()
+        gains = np.array([best_gain(step, n, tolerance.EXPOSURE) for n in noise])
+        left[star] = np.array(
+            [left_of_drift_nm2(step, n, tolerance.EXPOSURE, g) for n, g in zip(noise, gains.tolist(), strict=True)]
+        )
+        yield made(
+            f"added contrast, {star}, V = {magnitude:g}", measured=float(tolerance.contrasts_of(name).form @ left[star])
+        )
+    by_noise = np.tensordot(left["target"] - left["reference"], maps, 1)
+    shift = zero_point_nm(name)
+    by_colour = _image(shift, len(flat)) - flat
+    yield made("zero point's shift by colour", unit="nm", measured=float(np.linalg.norm(shift)))
+    for what, change in (("I0 of the reference star", by_noise + by_colour), ("I0 remade", by_noise)):
+        yield made(f"mean change after subtraction, {what}", measured=float(change[zone].mean()))
+        yield made(
+            f"rms change after subtraction, {what}",
+            measured=float(np.sqrt(np.mean(change[zone] ** 2))),
+            assumption=f"{ASSUMPTION}\n{MAP}",
+        )
+    frames = np.arange(1, 1 << 20)
+    form = tolerance.contrasts_of(name).form
+    added = sum(
+        ROLL_NM**2 * q * (1.0 - g) ** (2.0 * frames) for q, g in zip(form.tolist(), gains.tolist(), strict=True)
+    )
+    yield made(
+        f"time until a roll's step of {ROLL_NM:g} nm in every mode adds {ROLLED:g}, target",
+        unit="s",
+        measured=float((1 + np.count_nonzero(added > ROLLED)) / tolerance.RATE_HZ),
+    )

@@ -1,0 +1,243 @@
+"""The drift and the lines that a telescope may have for a contrast that they may add: theory, checked by simulation."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lowfc.adapters.files.sensors import coronagraph_from
+from lowfc.arrays import Array
+from lowfc.contract.errors import ConfigurationError
+from lowfc.contract.sections import SENSORS, SensorSection, sensor_keys
+from lowfc.control.calibration.calibration import noise_nm2, normalise_flux, reconstructor
+from lowfc.control.laws.vibration import Line
+from lowfc.design.drift_trial import DriftTrial
+from lowfc.design.fisher import quantum_information
+from lowfc.design.tolerance import KINDS, Kind, tolerated_drift, tolerated_lines, tolerated_variance
+from lowfc.optics.chain.added_contrast import ModalContrast
+from lowfc.optics.chain.zernike import NOLLS_14, mode_name
+from lowfc.optics.detector.photometry import Photometry, electrons
+from lowfc.programs.paper.cases import Context, Prepared, Row, prepared
+from lowfc.programs.paper.plots import Line as Curve
+from lowfc.programs.paper.plots import curves, draw
+
+HELD = ("sam", "sam18_sized", "bar", "clowfs", "clowfs_tuned", "zwfs", "zwfs_tuned", "aplc")
+MAGNITUDES = (0.0, 2.0, 5.0, 8.0)
+ALLOWED = (1e-9, 1e-10, 1e-11)
+RATE_HZ, EXPOSURE, READ_NOISE_E = 250.0, 0.5, 1.0
+LINE_HZ, LINE_WIDTH = 10.0, 0.005
+ESTIMATORS: dict[Kind, str] = {"integrator": "integrator of the best gain", "lqg": "LQG"}
+
+CHECKED_SENSORS, CHECKED_MODES, CHECKED_MAGNITUDES = ("clowfs_tuned", "zwfs_tuned"), (4, 8, 11), (2.0, 5.0)
+CHECKED_CONTRAST, SHOWN_CONTRAST = 1e-11, 1e-10
+_FRAMES_PER_TRIAL = 20  # over the lowest gain: 100 trials know a variance to 3 %
+_SHOWN, _MIDDLE = (2, 4, 8, 11), f"{SHOWN_CONTRAST:g}"
+_LARGEST = 6e-9  # contrast up to which the fourth order is fitted
+
+ABOUT = """How fast a mode may drift, and how large a line may be, for an added contrast of 1e-9, 1e-10 or 1e-11: by the
+theory of `lowfc/design/tolerance.py`, from the contrast's Hessian (and its fourth order, which counts for tilt) and the
+noise of a frame. `--json` has every mode, star and contrast, this page four modes of two stars at 1e-10. Then twelve
+points by simulation, and the pair of stars that a coronagraph observes: a reference of V = 2 and a target of V = 5 of
+another colour and roll, of which one exposure is subtracted from the other. Behind a symmetric pupil and a real mask a
+colour changes the image evenly, and the zero point of an aperture mask stays; those of the Zernike sensor and of CLOWFS
+move, and I0 has to be made again on the target.
+"""
+LOOP = (
+    f"{RATE_HZ:g} Hz, exposure of half the period, delay of one frame, 1 e- read noise, all 14 modes fitted with "
+    "weights, monochromatic; 2 m, 110 nm, 50 % throughput, quantum efficiency 0.8. Each mode alone adds the contrast, "
+    "on average over the dark zone. limit: the same with the noise of the quantum limit."
+)
+DRIFT = (
+    "A random walk. For drift alone LQG is the integrator of the best gain, but for the margins that bound the latter."
+)
+LINE = f"A line at {LINE_HZ:g} Hz, {100 * LINE_WIDTH:g} % wide between half-power points; LQG knows it."
+CHECK = (
+    "predicted: the contrast whose drift this is; measured: variance left in a simulated loop on noisy images, times "
+    "the contrast per variance."
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Contrasts:
+    """Contrast of each mode alone: form a^2 + quartic a^4, both (modes,)."""
+
+    form: Array
+    quartic: Array
+
+    def variance_nm2(self, mode: int, contrast: float) -> float:
+        """Of a Gaussian mode that adds a contrast."""
+        return tolerated_variance(float(self.form[mode]), float(self.quartic[mode]), contrast)
+
+    def added(self, mode: int, variance_nm2: float) -> float:
+        """By a Gaussian mode."""
+        return float(self.form[mode] * variance_nm2 + 3.0 * self.quartic[mode] * variance_nm2**2)
+
+
+@lru_cache(maxsize=8)
+def contrasts(pupil: str, focal_radius: float) -> Contrasts:
+    """Of a coronagraph; the fourth order from full images.
+
+    Raises:
+        ConfigurationError: A mode adds nothing to the dark zone, so that any of it is tolerated.
+    """
+    section = SensorSection(pupil=pupil, focal_radius=focal_radius)
+    modal = ModalContrast(coronagraph_from(section), NOLLS_14, prepared("sam").sensor.wavelength_nm)
+    own, form = modal.by_image(np.zeros(len(NOLLS_14))), np.diag(modal.form)
+    if not (form > 0).all():
+        raise ConfigurationError(
+            f"behind pupil = {pupil!r} some modes take light out of the dark zone, which is bright: no tolerance there"
+        )
+    quartic = np.zeros(len(NOLLS_14))
+    for mode, each in enumerate(form.tolist()):
+        amplitude = np.sqrt(_LARGEST / each)
+        while True:
+            waves = amplitude * np.eye(len(NOLLS_14))[mode]
+            added = (modal.by_image(waves) + modal.by_image(-waves)) / 2 - own
+            if added < _LARGEST:
+                break
+            amplitude *= 0.7
+        quartic[mode] = max((added - each * amplitude**2) / amplitude**4, 0.0)
+    return Contrasts(form, quartic)
+
+
+def contrasts_of(name: str) -> Contrasts:
+    """Behind a sensor's coronagraph."""
+    section = _section(name)
+    return contrasts(section.pupil, section.focal_radius)
+
+
+def _section(name: str) -> SensorSection:
+    return SensorSection.model_validate(sensor_keys(name) if name in SENSORS else {})
+
+
+def light_e(magnitude: float) -> float:
+    """Electrons of the open circle's light in an exposure."""
+    return electrons(Photometry(magnitude), EXPOSURE / RATE_HZ)
+
+
+@lru_cache(maxsize=256)
+def frame_noise_nm2(name: str, magnitude: float) -> Array:
+    """Covariance (14, 14) of a loop's modes in a frame, at the central wavelength."""
+    sensor = prepared(name)
+    good = np.ones(sensor.I0.size)
+    seen, slopes = normalise_flux(sensor.I0, sensor.H[:, : len(NOLLS_14)], good)
+    flux_e = light_e(magnitude) * float(sensor.I0.sum())
+    return noise_nm2(reconstructor(seen, slopes, good, flux_e, READ_NOISE_E), seen, flux_e, READ_NOISE_E)
+
+
+def quantum_noise_nm2(sensor: Prepared, magnitude: float) -> Array:
+    """Variance (14,) of each mode at the quantum limit, all fitted."""
+    modes = sensor.modes[: len(NOLLS_14)]
+    information = quantum_information(sensor.sensor.pupil, modes, sensor.sensor.wavelength_nm, light_e(magnitude))
+    return np.asarray(np.diag(np.linalg.inv(information)))
+
+
+def tolerance(context: Context) -> list[Row]:
+    """Rows of tolerated drift and lines, of their check by simulation, and of the pair of two stars."""
+    from lowfc.programs.paper.tables.star_pair import pair_rows
+
+    names = context.names(*HELD)
+    lines = {kind: tolerated_lines(kind, Line(LINE_HZ, LINE_WIDTH * LINE_HZ, 1.0), RATE_HZ, EXPOSURE) for kind in KINDS}
+
+    def of(name: str) -> list[Row]:
+        return list(_tolerated(name, lines))
+
+    rows = [row for found in context.map("tolerance", of, names) for row in found]
+    rows += _checked(context)
+    return rows + [row for name in names if _section(name).pupil == "shaped" for row in pair_rows(name)]
+
+
+def _tolerated(name: str, lines: dict[Kind, Callable[[Array], Array]]) -> Iterator[Row]:
+    of_contrast = contrasts_of(name)
+    for magnitude in MAGNITUDES:
+        noise, least = np.diag(frame_noise_nm2(name, magnitude)), quantum_noise_nm2(prepared(name), magnitude)
+        for mode, noll in enumerate(NOLLS_14):
+            for allowed in ALLOWED:
+                left = of_contrast.variance_nm2(mode, allowed)
+                where = f"Z{noll} {mode_name(noll)}, V = {magnitude:g}, {allowed:g}"
+                made = partial(Row, name)
+                for kind in KINDS:
+                    step, limit = (tolerated_drift(left, n[mode], EXPOSURE, kind).step_nm2 for n in (noise, least))
+                    pm = [1e3 * float(np.sqrt(each * RATE_HZ)) for each in (step, limit)]
+                    yield made(
+                        f"drift of {where}",
+                        "pm/sqrt(s)",
+                        pm[0],
+                        limit=pm[1],
+                        estimator=ESTIMATORS[kind],
+                        assumption=f"{LOOP}\n{DRIFT}",
+                    )
+                    over = np.array([left / noise[mode], left / least[mode]])
+                    rms = 1e3 * np.sqrt(lines[kind](over) * np.array([noise[mode], least[mode]]))
+                    yield made(
+                        f"line of {where}",
+                        "pm",
+                        float(rms[0]),
+                        limit=float(rms[1]),
+                        estimator=ESTIMATORS[kind],
+                        assumption=f"{LOOP}\n{LINE}",
+                    )
+
+
+def _checked(context: Context) -> list[Row]:
+    """Twelve points by simulation."""
+    cases = list(product(CHECKED_SENSORS, CHECKED_MAGNITUDES, CHECKED_MODES))
+
+    def simulated(case: tuple[str, float, int]) -> Row:
+        name, magnitude, noll = case
+        mode, of_contrast = NOLLS_14.index(noll), contrasts_of(name)
+        noise = float(np.diag(frame_noise_nm2(name, magnitude))[mode])
+        drift = tolerated_drift(of_contrast.variance_nm2(mode, CHECKED_CONTRAST), noise, EXPOSURE)
+        frames = int(np.ceil(_FRAMES_PER_TRIAL * context.trials / drift.gain))
+        trial = DriftTrial(prepared(name).twin, NOLLS_14, light_e(magnitude), READ_NOISE_E, EXPOSURE)
+        only = np.eye(len(NOLLS_14))[mode]
+        rng = context.rng("tolerance", name, round(magnitude), noll)
+        left = trial.left_nm2(drift.step_nm2 * only, drift.gain * only, frames, rng)
+        return Row(
+            name,
+            f"contrast that Z{noll} {mode_name(noll)} adds at its tolerance, V = {magnitude:g}",
+            "",
+            of_contrast.added(mode, float(left[mode])),
+            error=CHECKED_CONTRAST * float(np.sqrt(2.0 / (frames * drift.gain))),
+            predicted=CHECKED_CONTRAST,
+            estimator=ESTIMATORS["integrator"],
+            assumption=CHECK,
+        )
+
+    return context.map("tolerance by simulation", simulated, cases)
+
+
+def in_text(row: Mapping[str, Any]) -> bool:
+    """Whether a row stands in the text; the rest is in the JSON object."""
+    what = row["quantity"]
+    if not what.startswith(("drift", "line")):
+        return True
+    shown = any(f"of Z{noll} " in what for noll in _SHOWN) and what.endswith((f"V = 2, {_MIDDLE}", f"V = 5, {_MIDDLE}"))
+    return shown and row["estimator"] == ESTIMATORS["lqg"]
+
+
+def plot(context: Context, path: Path) -> None:
+    """Tolerated drift over magnitude for four modes."""
+    magnitudes = np.arange(0.0, 10.5, 0.5)
+    names = context.names(*(name for name in HELD if name != "aplc"))
+
+    def drifts(name: str, mode: int, quantum: bool = False) -> Array:
+        left = contrasts_of(name).variance_nm2(mode, SHOWN_CONTRAST)
+        found = []
+        for magnitude in magnitudes.tolist():
+            of_frame = np.diag(frame_noise_nm2(name, magnitude))
+            noise = quantum_noise_nm2(prepared(name), magnitude) if quantum else of_frame
+            found.append(1e3 * np.sqrt(tolerated_drift(left, float(noise[mode]), EXPOSURE, "lqg").step_nm2 * RATE_HZ))
+        return np.array(found)
+
+    panels = []
+    for noll in _SHOWN:
+        mode = NOLLS_14.index(noll)
+        lines = [Curve(name, magnitudes, drifts(name, mode)) for name in names]
+        lines.append(Curve("quantum limit", magnitudes, drifts(names[0], mode, quantum=True)))
+        panels.append(curves(lines, f"Z{noll} {mode_name(noll)}", "V", "drift, pm/sqrt(s)", "log", legend="lower left"))
+    draw(path, panels, f"Drift of one mode that adds {SHOWN_CONTRAST:g} to the dark zone. {LOOP}", columns=2)

@@ -1,0 +1,74 @@
+"""Tolerated drift and lines: closed forms against the continuous theory, against each other and against simulation."""
+
+import numpy as np
+import pytest
+
+from lowfc.control.laws.continuous import Timing, left_power
+from lowfc.control.laws.linear_law import integrator
+from lowfc.control.laws.margins import noise_gain
+from lowfc.control.laws.vibration import Line
+from lowfc.design.tolerance import (
+    best_gain,
+    left_of_drift_nm2,
+    tolerated_drift,
+    tolerated_lines,
+    tolerated_variance,
+)
+from lowfc.programs.paper.cases import Context
+from lowfc.programs.paper.tables import tolerance
+from lowfc.programs.paper.tables.star_pair import zero_point_nm
+
+EXPOSURE = 0.5
+
+
+@pytest.mark.parametrize("gain", [0.05, 0.4, 1.0])
+def test_what_is_left_of_a_drift_is_that_of_the_continuous_theory(gain):
+    law, omega = integrator([gain], [0.0], (2,), 1.0, 250.0), np.geomspace(1e-6, 300 * np.pi, 200_000)
+    left = left_power(law, omega, Timing.of(1.0, EXPOSURE))[:, 0]
+    expected = 0.3 * np.trapezoid(left / omega**2, omega) / np.pi + 2.0 * noise_gain(law)[0]
+    assert left_of_drift_nm2(0.3, 2.0, EXPOSURE, gain) == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize("noise", [1e-3, 0.3, 30.0])
+def test_a_tolerated_drift_leaves_what_is_allowed_and_no_gain_leaves_less(noise):
+    for kind in ("integrator", "lqg"):
+        found = tolerated_drift(0.5, noise, EXPOSURE, kind)
+        assert left_of_drift_nm2(found.step_nm2, noise, EXPOSURE, found.gain) == pytest.approx(0.5)
+    best = best_gain(found.step_nm2, noise, EXPOSURE)
+    assert found.gain == pytest.approx(best)
+    assert min(left_of_drift_nm2(found.step_nm2, noise, EXPOSURE, best * f) for f in (0.9, 1.1)) > 0.5
+
+
+def test_a_slow_loop_leaves_the_root_of_drift_times_noise():
+    """Kalman and Bucy: where a gain is low, sqrt(D n)."""
+    found = tolerated_drift(1.0, 1e4, EXPOSURE)
+    assert found.step_nm2 * 1e4 == pytest.approx(1.0, rel=1e-3)
+
+
+def test_a_filter_that_knows_a_line_tolerates_more_of_it_than_an_integrator():
+    allowed, line = np.geomspace(1e-3, 1e4, 8), Line(10.0, 0.05, 1.0)
+    plain, knows = (tolerated_lines(kind, line, 250.0, EXPOSURE)(allowed) for kind in ("integrator", "lqg"))
+    assert (knows >= plain * 0.999).all()
+    assert (plain >= allowed * 0.999).all()  # without any loop the line itself may stay
+    assert knows[3] > 10 * plain[3]
+    assert (np.diff(knows) > 0).all()
+
+
+def test_the_fourth_order_bounds_a_mode_that_costs_little():
+    assert tolerated_variance(2e-12, 0.0, 1e-10) == pytest.approx(50.0)
+    variance = tolerated_variance(1e-15, 1e-14, 1e-10)
+    assert 1e-15 * variance + 3e-14 * variance**2 == pytest.approx(1e-10)
+
+
+@pytest.mark.slow
+def test_colour_moves_no_zero_point_of_an_aperture_mask():
+    assert np.linalg.norm(zero_point_nm("sam")) < 1e-9
+    assert np.linalg.norm(zero_point_nm("zwfs_tuned")) > 1.0
+
+
+@pytest.mark.slow
+def test_simulation_agrees_with_the_closed_form():
+    rows = tolerance._checked(Context(trials=100, seed=3))
+    assert len(rows) == 12
+    for row in rows:
+        assert row.measured == pytest.approx(row.predicted, rel=0.1), row
