@@ -176,8 +176,6 @@ def test_a_fit_host_has_no_warning(tmp_path: Path) -> None:
         ),
         ("clock source", "warning", "hpet", {CLOCKSOURCE: "hpet\n"}),
         ("load", "warning", "9.50 in the last minute", {"load": 9.5}),
-        ("control step", "note", 'realtime.kernel = "fused"', {}),
-        ("control step", "ok", "the fused step", {"config": load(None, {"realtime.kernel": "fused"})}),
         ("swap", "ok", "1 MB in use of 2097 MB; the loop's memory is locked", {"swap": (2_097_152_000, 1_048_576)}),
         ("huge pages", "warning", "always", {HUGE_PAGES: "[always] madvise never\n"}),
         ("socket buffers", "warning", "550 kB", {"proc/sys/net/ipv4/tcp_rmem": "4096 131072 550000\n"}),
@@ -368,6 +366,24 @@ def test_the_document_has_every_check_in_its_own_words() -> None:
     assert [(name.removeprefix("| "), looks_at) for name, looks_at, _ in rows[1:]] == [
         (name, look.__doc__) for name, (_, look) in LOOKS.items()
     ]
+
+
+@pytest.mark.parametrize(
+    ("kernel", "there", "status", "said"),
+    [
+        ("fused", True, "ok", "the fused step"),
+        ("fused", False, "warning", "numba"),
+        ("numpy", True, "note", 'realtime.kernel = "fused"'),
+        ("numpy", False, "note", "numba"),
+    ],
+)
+def test_the_kernel_that_computes_is_named(
+    kernel: str, there: bool, status: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(room.compiled, "available", lambda: there)
+    found = examine(facts(tmp_path, config=load(None, {"realtime.kernel": kernel})))["control step"]
+    assert found.status == status
+    assert said in f"{found.got} {found.advice}"
 
 
 def test_real_time_rights_are_shown_set_up_and_taken_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
