@@ -22,7 +22,20 @@ from benchmarks import curves, step, throughput
 from benchmarks.peers import contest
 from benchmarks.runner import Benchmark, in_markdown
 from lowfc.programs.measure.latency import text as latency_text
-from tools import console, dark_hole, guard, laws, layouts, loop, no_harm, pictures, reliability, sensors, slow_modes
+from tools import (
+    console,
+    dark_hole,
+    guard,
+    laws,
+    layouts,
+    loop,
+    no_harm,
+    pictures,
+    reliability,
+    sensors,
+    slow_modes,
+    world,
+)
 from tools.declared import DECLARED
 from tools.shared import ROOT, Figures, host, json_of, where
 
@@ -68,6 +81,7 @@ MEASUREMENTS = {
     "laws": Measurement((), laws.measure, laws.render),
     "no_harm": Measurement((), no_harm.measure, no_harm.render),
     "guard": Measurement((), guard.measure, guard.render),
+    "world": Measurement((), world.measure, world.render),
     "slow_modes": Measurement((), slow_modes.measure, slow_modes.render),
     "zero_point": Measurement((dark_hole.COMMAND,), dark_hole.measure, dark_hole.render),
     "chaos": Measurement((reliability.CHAOS,), reliability.chaos, reliability.render_chaos),

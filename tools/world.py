@@ -18,6 +18,7 @@ from tools.shared import Figures, markdown
 SENSORS, MAGNITUDES = ("sam27d10_bal14", "zwfs"), (2, 5)
 PRESET, RATE_HZ, SECONDS = "bench", 500.0, 4.0
 _UNTIL_GAINS_S = 2.5
+_FRAMES = 2000  # of which a dark and a reference image are means
 WHEEL = {"disturbance.wheel_hz": 12.0}
 CASES: dict[str, dict[str, Any]] = {
     "none": {},
@@ -98,18 +99,17 @@ def _left(sensor: str, magnitude: float, keys: dict[str, Any], seconds: float, a
 
 
 def _measured(config: Configuration, calibration: Calibration) -> Calibration:
-    """With dark and reference image as the detector gives them on average."""
+    """With dark and reference image as means of this detector's frames."""
     still = config.disturbance.model_copy(update={"preset": "quiet"})
-    camera = config.camera.model_copy(update={"noise": False})
     flat = np.zeros(calibration.grid, np.float32)
-    images = []
+    means = []
     for magnitude in (20.0, config.star.magnitude):
         star = config.star.model_copy(update={"magnitude": magnitude})
-        images.append(scene(config.model_copy(update={"disturbance": still, "camera": camera, "star": star})))
-    dark, lit = (each.expose(0, flat).ravel().astype(float) for each in images)
-    light = lit - dark
+        lit = scene(config.model_copy(update={"disturbance": still, "star": star}))
+        means.append(np.mean([lit.expose(index, flat).ravel() for index in range(_FRAMES)], axis=0))
+    light = means[1] - means[0]
     reference = light / light.sum() * calibration.reference.sum()
-    return replace(calibration, dark=dark.astype(np.float32), reference=reference.astype(np.float32))
+    return replace(calibration, dark=means[0].astype(np.float32), reference=reference.astype(np.float32))
 
 
 def render(figures: Figures) -> str:
