@@ -227,6 +227,7 @@ def test_random_frames_and_states(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)
 def test_a_million_random_frames_and_states(monkeypatch: pytest.MonkeyPatch) -> None:
     found, largest_nm = compared(1_000_000, 1000, monkeypatch)
     print(dict(found), f"largest difference {largest_nm:.3g} nm")
