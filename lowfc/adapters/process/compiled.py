@@ -35,6 +35,8 @@ def _compiled() -> list[Any]:
     import numba
     from numba import types
 
+    njit: Any = numba.njit
+
     def array(kind: Any, dimensions: int, *, readonly: bool = True) -> Any:
         return types.Array(kind, dimensions, "C", readonly=readonly)
 
@@ -50,7 +52,7 @@ def _compiled() -> list[Any]:
     found = []
     for function, signature in signatures.items():
         try:
-            found.append(numba.njit(signature, cache=True, **options)(function))
+            found.append(njit(signature, cache=True, **options)(function))
         except RuntimeError:  # no folder in which it may be kept
-            found.append(numba.njit(signature, **options)(function))
+            found.append(njit(signature, **options)(function))
     return found
