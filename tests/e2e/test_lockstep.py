@@ -158,10 +158,10 @@ def test_the_documents_table_is_of_the_sensors_as_they_are() -> None:
 
 def test_a_configuration_that_was_shown_does_not_open_the_loop(tmp_path: Path) -> None:
     shown = run(tmp_path, "config", "show").stdout
-    short = ("sim-loop", "--lockstep", "--duration", "2.4", "--no-record")
+    short = ("sim-loop", "--lockstep", "--duration", "3", "--no-record")
     done = run(tmp_path, *short, config=shown)
-    assert done.stdout.splitlines()[0].split() == ["loop", "closed"], done.stderr
+    assert re.match(r"loop +closed", done.stdout), done.stderr
     assert "starts open" not in done.stderr
     done = run(tmp_path, *short, config=shown.replace('#start_mode = "open"', 'start_mode = "open"'))
-    assert re.match(r"loop +open for 0\.\d s", done.stdout), done.stderr
+    assert re.match(r"loop +open for \d\.\d s", done.stdout), done.stderr
     assert "the loop starts open (control.start_mode of test.toml): `lowfc ctl close` closes it" in done.stderr
