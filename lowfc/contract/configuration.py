@@ -32,6 +32,7 @@ from lowfc.contract.sections import (
     SensorSection,
     Star,
 )
+from lowfc.control.kernel.tables import KernelName
 
 LATE_NS, HOLD_NS = 20_000_000, 50_000_000
 """Least age of a late frame and least silence of a camera, where the configuration leaves them open."""
@@ -169,7 +170,7 @@ class Realtime(Section):
     """Keep idle processors awake while the loop runs: waking one takes longer than a hand-off; it costs power."""
     cache_warmup: bool = True
     """Do each control step a second time for nothing, so that the next frame finds the caches warm; not above 2 kHz."""
-    kernel: Literal["numpy", "fused"] = "numpy"
+    kernel: KernelName = "numpy"
     """Arithmetic of the controller's usual frame: numpy, or the fused step, compiled by numba (extra `fast`)."""
     camera_cpus: list[int] = Field(default_factory=list)
     """Processors of the camera; empty for all. Where the file says nothing, sim-loop gives the controller its own."""

@@ -5,7 +5,6 @@ import os
 import signal
 import sys
 from collections.abc import Callable
-from enum import StrEnum
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
@@ -31,13 +30,6 @@ _IfAny = partial(typer.Argument, metavar="[LOG...]", readable=False, show_defaul
 LogsIfAny = Annotated[list[Path] | None, _IfAny(help=f"{_LOGS} None: a running loop.")]
 LogsOrMeasure = Annotated[list[Path] | None, _IfAny(help=f"{_LOGS} None: a loop that is run for it.")]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="Configuration file (TOML).", show_default=False)]
-
-
-class KernelName(StrEnum):
-    """Arithmetic of the controller's usual frame."""
-
-    numpy = "numpy"
-    fused = "fused"
 
 
 def new_app(help_text: str) -> typer.Typer:

@@ -1,15 +1,17 @@
 """Which arithmetic the step uses, and the arrays of a calibration as its compiled functions read them."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Final, Literal, NamedTuple, get_args
 
 import numpy as np
 
 from lowfc.arrays import Pixels, Single, single
 from lowfc.control.calibration.calibration import Calibration
 
-FUSED = "fused"
-KERNELS = ("numpy", FUSED)
+KernelName = Literal["numpy", "fused"]
+"""Arithmetic of the usual frame."""
+KERNELS: tuple[KernelName, ...] = get_args(KernelName)
+FUSED: Final = "fused"
 BLOCK = 6400
 """Pixels at a time, at most: as float32 they fill half of a processor's first cache."""
 DARK_MARGIN = 1e-3

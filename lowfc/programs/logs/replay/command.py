@@ -11,8 +11,9 @@ from lowfc.adapters.logs.parts import in_order
 from lowfc.adapters.logs.recovery import faults, no_end
 from lowfc.adapters.process.progress import reading_bar
 from lowfc.adapters.process.provenance import provenance
-from lowfc.adapters.process.terminal import Json, KernelName, Logs
+from lowfc.adapters.process.terminal import Json, Logs
 from lowfc.contract.envelope import count_of
+from lowfc.control.kernel.tables import KernelName
 from lowfc.control.loop.wording import counted
 from lowfc.programs.cli.output import put
 

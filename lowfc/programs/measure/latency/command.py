@@ -87,11 +87,12 @@ def latency(
     else:
         settings = _configuration(config, rate, camera, plain=plain_scheduling)
         from lowfc.adapters.process import compiled
+        from lowfc.control.kernel.tables import FUSED, KERNELS
         from lowfc.programs.measure.latency.run import Asked
 
         simulated = camera is Camera.SIMULATED
-        kernels = ("numpy", "fused") if kernel is Kernels.BOTH else (str(kernel),) if kernel is not None else ()
-        if "fused" in kernels and not compiled.available():
+        kernels = KERNELS if kernel is Kernels.BOTH else (str(kernel),) if kernel is not None else ()
+        if FUSED in kernels and not compiled.available():
             raise ConfigurationError(compiled.missing())
         figures = _measure(Asked(settings, duration, repeats, simulated, record, view, kernels))
     if plot is not None:

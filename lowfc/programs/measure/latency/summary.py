@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from lowfc.control.kernel.tables import KERNELS
 from lowfc.programs.measure.latency.figures import ALONE, COUNTS, RATIOS, RATIOS_AT, edges_us
 
 OVER = "over_echo_and_step"
@@ -54,10 +55,10 @@ def of_kernels(repeats: Repeats) -> dict[str, Any]:
         kernel: numpy, fused or both; with both, kernel_ratio (p50 and p99), frame to command of the fused step over
         numpy's, the median of those that followed each other, kernel_ratio_spread, and numpy_us, numpy's own.
     """
-    of = {name: [one for one in repeats if one["kernel"] == name] for name in ("numpy", "fused")}
+    of = {name: [one for one in repeats if one["kernel"] == name] for name in KERNELS}
     if not all(of.values()):
         return together(repeats) | {"kernel": repeats[0]["kernel"]}
-    each = [[one["latency_us"]["frame_to_command"] for one in of[name]] for name in ("fused", "numpy")]
+    each = [[one["latency_us"]["frame_to_command"] for one in of[name]] for name in reversed(KERNELS)]
     ratios = [{at: fused[at] / numpy[at] for at in RATIOS_AT} for fused, numpy in zip(*each, strict=True)]
     beside = {"kernel_ratio": median_of(ratios), "kernel_ratio_spread": spread_of(ratios)}
     return together(of["fused"]) | {"kernel": "both", "numpy_us": median_of(each[1])} | beside
