@@ -3,23 +3,19 @@
 import os
 from dataclasses import fields
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
 from lowfc.adapters.process.terminal import INTERRUPTED, Json, new_app
 from lowfc.contract.errors import ConfigurationError
-from lowfc.design.goal import MERITS, WEIGHTED, Goal
 from lowfc.design.shaped_pupil import Request
 from lowfc.programs.cli.output import put
-from lowfc.programs.design.options import flag, span, with_options_of
+from lowfc.programs.design.full_light_request import Defocus, Spot
+from lowfc.programs.design.options import flag, with_options_of
 from lowfc.programs.design.sam_request import Search
 
-Merit = Annotated[str, typer.Option(help=f"What to minimise: {', '.join(MERITS)}.")]
-Estimator = Annotated[str, typer.Option(help="pinv, or weighted for the Cramer-Rao bound.")]
-Modes = Annotated[int, typer.Option(help="Modes in Table 3 and the condition number: 14 or 20.")]
-Weight = Annotated[float, typer.Option(help="Of Table 4 in paper and pareto, 0 to 1.")]
-Keys = Annotated[Path | None, typer.Option(help="Configuration file. Default: the sensor's name.")]
+Keys = Annotated[Path, typer.Option(help="Configuration file.")]
 Drawn = Annotated[Path | None, typer.Option(help="Draw the figures over the sizes (PNG).")]
 
 design_app = new_app("Design masks and sensors.\n\nExample: lowfc design spc --help")
@@ -87,60 +83,27 @@ def sam(
 
 
 @design_app.command()
-def zwfs(
-    spot: Annotated[str, typer.Option(help="SMALLEST:LARGEST spot, lambda/D.")] = "0.5:3",
-    merit: Merit = "contrast",
-    estimator: Estimator = "weighted",
-    modes: Modes = 14,
-    weight: Weight = 0.5,
-    out: Keys = None,
-    plot: Drawn = None,
-    as_json: Json = False,
-) -> None:
+@with_options_of(Spot)
+def zwfs(request: Spot, out: Keys = Path("zwfs.toml"), plot: Drawn = None, as_json: Json = False) -> None:
     """Find the phase spot of a Zernike sensor.
 
     Example: lowfc design zwfs --merit contrast --out zwfs.toml
     """
-    _sized("zwfs", "--spot", spot, {}, (merit, estimator, modes, weight), out, plot, as_json)
+    _sized(request, out, plot, as_json=as_json)
 
 
 @design_app.command()
-def clowfs(
-    defocus: Annotated[str, typer.Option(help="SMALLEST:LARGEST defocus, mm.")] = "1.5:8",
-    inner_radius: Annotated[float, typer.Option(help="Of the reflecting annulus, lambda/D.")] = 0.0,
-    merit: Merit = "contrast",
-    estimator: Estimator = "weighted",
-    modes: Modes = 14,
-    weight: Weight = 0.5,
-    out: Keys = None,
-    plot: Drawn = None,
-    as_json: Json = False,
-) -> None:
+@with_options_of(Defocus)
+def clowfs(request: Defocus, out: Keys = Path("clowfs.toml"), plot: Drawn = None, as_json: Json = False) -> None:
     """Find the defocus of a coronagraphic low-order sensor.
 
     Example: lowfc design clowfs --merit contrast --out clowfs.toml
     """
-    others = {"inner_radius": inner_radius}
-    _sized("clowfs", "--defocus", defocus, others, (merit, estimator, modes, weight), out, plot, as_json)
+    _sized(request, out, plot, as_json=as_json)
 
 
-def _sized(
-    kind: Literal["zwfs", "clowfs"],
-    option: str,
-    text: str,
-    others: dict[str, float],
-    wanted: tuple[str, str, int, float],
-    out: Path | None,
-    plot: Path | None,
-    as_json: bool,
-) -> None:
+def _sized(request: Spot | Defocus, out: Path, plot: Path | None, *, as_json: bool) -> None:
     from lowfc.programs.cli import result
-    from lowfc.programs.design.full_light import Sizes, design
+    from lowfc.programs.design.full_light import design
 
-    merit, estimator, modes, weight = wanted
-    try:
-        goal = Goal(merit, estimator, modes, weight if merit in WEIGHTED else None)
-        sizes = Sizes(kind, *span(option, text), others)
-    except ValueError as error:
-        raise ConfigurationError(str(error)) from error
-    result.put(design(sizes, goal, out or Path(f"{kind}.toml"), plot), as_json=as_json)
+    result.put(design(request.sizes, request.goal, out, plot), as_json=as_json)

@@ -1,24 +1,22 @@
 """`lowfc design zwfs` and `lowfc design clowfs`: a sensor without a relay mask, over one of its dimensions."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from threadpoolctl import threadpool_limits
 
 from lowfc.adapters.files.drawing import figure_class, png
 from lowfc.adapters.files.sensors import sensor_from
 from lowfc.adapters.files.whole_file import require_folder, write_whole
-from lowfc.contract.errors import ConfigurationError
+from lowfc.contract.configuration import load
 from lowfc.contract.sections import SensorSection
 from lowfc.design.full_light import Focus, FullLight, sweep
 from lowfc.design.goal import Goal, figures, merit
 from lowfc.design.merit import WAVELENGTH_NM
 from lowfc.programs.cli.result import Result, figure
-
-Kind = Literal["zwfs", "clowfs"]
+from lowfc.programs.design.full_light_request import Sizes
 
 KEYS = {"zwfs": "spot_diameter", "clowfs": "defocus_mm"}
 _POINTS = 21
@@ -48,16 +46,6 @@ class Swept(Result):
     file: str = figure("written to")
     points: list[Point] = figure()
     figures_of_best: dict[str, Any] = figure()
-
-
-@dataclass(frozen=True)
-class Sizes:
-    """What is looked at: a kind, one end and the other, and keys of [sensor] that stay."""
-
-    kind: Kind
-    low: float
-    high: float
-    others: dict[str, float]
 
 
 def design(sizes: Sizes, goal: Goal, out: Path, plot: Path | None) -> Swept:
@@ -100,10 +88,8 @@ def design(sizes: Sizes, goal: Goal, out: Path, plot: Path | None) -> Swept:
 
 
 def _section(sizes: Sizes, value: float) -> SensorSection:
-    try:
-        return SensorSection.model_validate({"kind": sizes.kind, **sizes.others, KEYS[sizes.kind]: value})
-    except ValueError as error:
-        raise ConfigurationError(f"{KEYS[sizes.kind]} = {value:g}: {error}") from None
+    keys = {"kind": sizes.kind, **sizes.others, KEYS[sizes.kind]: value}
+    return load(None, {f"sensor.{name}": one for name, one in keys.items()}).sensor
 
 
 def _point(one: FullLight, value: float, merit_of: Callable[[float], float], goal: Goal) -> Point:

@@ -75,6 +75,9 @@ def with_options_of(kind: type[Any]) -> Callable[[Callable[..., None]], Callable
 
 
 def _attributes(kind: type[Any]) -> dict[str, str]:
-    """The sentences of a docstring's attributes, each on one line."""
-    _, _, text = inspect.cleandoc(kind.__doc__ or "").partition("Attributes:\n")
-    return {name: " ".join(help_.split()) for name, help_ in re.findall(r"^    (\w+): ((?:.|\n {5,})+)", text, re.M)}
+    """The sentences of the attributes in the docstrings of a class and those it is made from, each on one line."""
+    found: dict[str, str] = {}
+    for one in kind.__mro__[-2::-1]:
+        _, _, text = inspect.cleandoc(one.__doc__ or "").partition("Attributes:\n")
+        found |= dict(re.findall(r"^    (\w+): ((?:.|\n {5,})+)", text, re.M))
+    return {name: " ".join(help_.split()) for name, help_ in found.items()}

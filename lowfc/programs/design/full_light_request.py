@@ -1,0 +1,84 @@
+"""What a search for the size of a sensor without a relay mask is asked for."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, NamedTuple
+
+from lowfc.design.goal import WEIGHTED, Goal
+from lowfc.programs.design.options import span
+
+Kind = Literal["zwfs", "clowfs"]
+
+
+class Sizes(NamedTuple):
+    """What is looked at: a kind, one end and the other, and keys of [sensor] that stay."""
+
+    kind: Kind
+    low: float
+    high: float
+    others: dict[str, float]
+
+
+@dataclass(frozen=True)
+class _Wanted(ABC):
+    """What the searches have in common.
+
+    Attributes:
+        merit: What to minimise: paper, table3, table4, condition, throughput, pareto or contrast.
+        estimator: pinv, or weighted for the Cramer-Rao bound.
+        modes: Modes in Table 3 and the condition number: 14 or 20.
+        weight: Of Table 4 in paper and pareto, 0 to 1.
+    """
+
+    merit: str = "contrast"
+    estimator: str = "weighted"
+    modes: int = 14
+    weight: float = 0.5
+
+    def __post_init__(self) -> None:
+        _ = self.goal, self.sizes  # what is wrong with them is found now
+
+    @cached_property
+    def goal(self) -> Goal:
+        """What is minimised."""
+        return Goal(self.merit, self.estimator, self.modes, self.weight if self.merit in WEIGHTED else None)
+
+    @property
+    @abstractmethod
+    def sizes(self) -> Sizes:
+        """What is looked at."""
+
+
+@dataclass(frozen=True)
+class Spot(_Wanted):
+    """The options of `lowfc design zwfs`.
+
+    Attributes:
+        spot: SMALLEST:LARGEST spot, lambda/D.
+    """
+
+    spot: str = "0.5:3"
+
+    @property
+    def sizes(self) -> Sizes:
+        """What is looked at."""
+        return Sizes("zwfs", *span("--spot", self.spot), {})
+
+
+@dataclass(frozen=True)
+class Defocus(_Wanted):
+    """The options of `lowfc design clowfs`.
+
+    Attributes:
+        defocus: SMALLEST:LARGEST defocus, mm.
+        inner_radius: Of the reflecting annulus, lambda/D.
+    """
+
+    defocus: str = "1.5:8"
+    inner_radius: float = 0.0
+
+    @property
+    def sizes(self) -> Sizes:
+        """What is looked at."""
+        return Sizes("clowfs", *span("--defocus", self.defocus), {"inner_radius": self.inner_radius})
