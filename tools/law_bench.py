@@ -146,6 +146,12 @@ class Bench:
         if outputs.reply is None or not outputs.reply.accepted:
             raise ValueError(f"{name}: {outputs.reply}")
 
+    def settle(self, frames: int) -> None:
+        """Close the loop, and begin a new record that many frames later."""
+        self.ask("close")
+        self.run(frames)
+        self.forget()
+
     def load(self, law: LinearLaw) -> None:
         """Let a law drive the mirror."""
         self.ask("law", law=law)

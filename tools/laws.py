@@ -50,9 +50,7 @@ def case(config: Configuration) -> Figures:
     bench = Bench(config, calibration)
     if config.camera.delay_frames > 1:
         bench.ask("gain", modes=(2, 3), values=(0.3,))
-    bench.ask("close")
-    bench.run(SETTLE)
-    bench.forget()
+    bench.settle(SETTLE)
     bench.run(IDENTIFY)
     figures: Figures = {"identified_under_mas": bench.tilt_mas(IDENTIFY), "laws": {}}
     noise_nm = frame_noise_nm(config, calibration)[:2]
@@ -90,9 +88,7 @@ def moved(config: Configuration, calibration: Calibration, law: LinearLaw) -> di
     """The lines 2 % higher: under the law of before, and after identifying them again from that closed loop."""
     bench = Bench(config, calibration, with_lines_moved(disturbance_of(config), 1.02))
     bench.load(law)
-    bench.ask("close")
-    bench.run(SETTLE)
-    bench.forget()
+    bench.settle(SETTLE)
     bench.run(IDENTIFY)
     before = bench.tilt_mas(MEASURE)
     bench.load(tuned(bench.pol(), config)["lqg"].law)

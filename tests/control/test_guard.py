@@ -244,9 +244,7 @@ def test_a_wrong_delay_is_noticed_though_it_spoils_what_is_compared() -> None:
     one = case("reaction-wheel", known=True)
     config = one.configured(1, **{"control.delay_frames": 1.0, "camera.delay_frames": 2.0})
     bench = ModalBench(config, one.covariance_nm2)
-    bench.ask("close")
-    bench.run(2000)
-    bench.forget()
+    bench.settle(2000)
     bench.load(one.law)
     bench.run(3000)
     (_, event), *_ = [one for one in bench.events if one[1].name == "LAW_OVERRULED"]

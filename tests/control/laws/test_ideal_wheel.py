@@ -25,9 +25,7 @@ def wheel(**keys: Any) -> tuple[Configuration, Bench]:
     config = configured(**{"disturbance.preset": "reaction-wheel-ideal", "sensor.modes": 2, **keys})
     bench = Bench(config, calibrated(config))
     bench.ask("gain", modes=(2, 3), values=(min(highest_gain(config.camera.delay_frames), 1.11),))
-    bench.ask("close")
-    bench.run(1000)
-    bench.forget()
+    bench.settle(1000)
     return config, bench
 
 

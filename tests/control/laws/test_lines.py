@@ -63,9 +63,7 @@ def test_frames_without_images_are_as_those_with_them() -> None:
     config = configured()
     calibration = calibrated(config)
     bench = Bench(config, calibration)
-    bench.ask("close")
-    bench.run(1000)
-    bench.forget()
+    bench.settle(1000)
     bench.run(lines.FRAMES)
     noise_nm = frame_noise_nm(config, calibration)[:2]
     left = []

@@ -130,9 +130,7 @@ def test_lqg_is_near_its_theory_and_follows_lines_that_moved(delay: float) -> No
     bench = Bench(config, calibration)
     if delay > 1:
         bench.ask("gain", modes=(2, 3), values=(0.3,))
-    bench.ask("close")
-    bench.run(1000)
-    bench.forget()
+    bench.settle(1000)
     bench.run(20_000)
     law = tuned(bench.pol(), config)["lqg"].law
     bench.load(law)
@@ -143,9 +141,7 @@ def test_lqg_is_near_its_theory_and_follows_lines_that_moved(delay: float) -> No
 
     moved = Bench(config, calibration, with_lines_moved(disturbance_of(config), 1.02))
     moved.load(law)
-    moved.ask("close")
-    moved.run(2000)
-    moved.forget()
+    moved.settle(2000)
     moved.run(20_000)
     moved.load(tuned(moved.pol(), config)["lqg"].law)
     moved.run(10_000)
@@ -157,9 +153,7 @@ def test_capture_from_14_mas_on_20_seeds() -> None:
     config = configured()
     calibration = calibrated(config)
     bench = Bench(config, calibration)
-    bench.ask("close")
-    bench.run(600)
-    bench.forget()
+    bench.settle(600)
     bench.run(8192)
     law = tuned(bench.pol(), config)["lqg"].law
     left = {}

@@ -66,7 +66,7 @@ class RunState:
         saturated: good pixels at full well in the newest frame.
         wavefront: of the last second; once the controller was stopped, of the last one with a step. `latest` is the
             end of it. They are `true` in a simulation, otherwise measured.
-        contrast: what the wavefront adds to it: of a simulated camera, or as measured; None where that is not known.
+        contrast: what the wavefront adds to the dark zone, true or as measured; None where that is not known.
         attained: what the loop leaves, and what it could leave.
         latency_us: p50 and p99 from frame to command of the same second.
         stroke_nm: largest deviation of an actuator from flat, of `stroke_limit_nm` (0 where it is not known).
