@@ -8,7 +8,7 @@ from lowfc.arrays import Pixels
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import CAMERA_STATE, FRAME, image, wire
-from lowfc.device.driver import Camera, CameraExtras, CameraSettings, Exposure, state_of
+from lowfc.device.driver import Camera, CameraExtras, CameraSettings, Exposure, camera_state
 from lowfc.device.watch import DriverWatch
 
 WAIT_S = 30.0
@@ -168,7 +168,7 @@ class CameraLoop:
         settings = self._driver.settings()
         time_ns = self._service.clock.now_ns() if settings.time_ns is None else settings.time_ns
         if settings != self._settings or time_ns + settings.period_ns // 2 >= self._due_ns:
-            self._states.put(state_of(settings, time_ns).SerializeToString())
+            self._states.put(camera_state(settings, time_ns).SerializeToString())
             self._settings, self._due_ns = settings, time_ns + SETTINGS_NS
             self._simulated = settings.clock == "run"
             self.watch.patience_s = max(PATIENCE_S, 3e-9 * settings.period_ns)

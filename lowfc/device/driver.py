@@ -10,13 +10,14 @@ from dataclasses import dataclass, field, fields
 from typing import Literal, NamedTuple, Protocol
 
 from lowfc.adapters.bus.bus import Publisher
-from lowfc.adapters.files.factory import camera_state, mirror_limits
+from lowfc.adapters.files.factory import detector, mirror_limits
 from lowfc.adapters.process.service import Service
 from lowfc.arrays import Pixels, Single
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.envelope import Envelope
 from lowfc.contract.messages import fields_of, timestamp, wire
 from lowfc.contract.network import Section
+from lowfc.optics.detector.detector import saturation_dn
 
 
 class DriverOptions(Section):
@@ -86,13 +87,25 @@ class CameraSettings:
     @classmethod
     def configured(cls, config: Configuration, rows: int, columns: int) -> "CameraSettings":
         """What [camera] says of a camera with frames of this size; a driver replaces what its hardware says."""
-        return cls(**fields_of(camera_state(config, (rows, columns), 0), _PUBLISHED))
+        camera = config.camera
+        return cls(
+            rows,
+            columns,
+            exposure_ns=config.exposure_ns,
+            period_ns=config.period_ns,
+            gain_e_per_dn=camera.gain_e_per_dn,
+            bias_dn=camera.bias_dn,
+            read_noise_e=camera.read_noise_e,
+            bit_depth=camera.bit_depth,
+            saturation_dn=saturation_dn(detector(config)),
+            em_gain=camera.em_gain,
+        )
 
 
 _PUBLISHED = tuple(one.name for one in fields(CameraSettings) if one.name in wire.CameraState.DESCRIPTOR.fields_by_name)
 
 
-def state_of(settings: CameraSettings, time_ns: int) -> wire.CameraState:
+def camera_state(settings: CameraSettings, time_ns: int) -> wire.CameraState:
     """Message of a camera's settings."""
     state = wire.CameraState(timestamp=timestamp(time_ns), **fields_of(settings, _PUBLISHED))
     if settings.saturation_dn is None:

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from lowfc.adapters.files import calibration_file
-from lowfc.adapters.files.factory import camera_state
 from lowfc.contract.configuration import Configuration, Control
 from lowfc.contract.errors import BusError, CalibrationError, DataFileError, RequestRefusedError
 from lowfc.contract.messages import wire
 from lowfc.contract.sections import Camera, SensorSection
+from lowfc.device.driver import CameraSettings, camera_state
 from lowfc.programs.commissioning.calibrate.run import partial_of
 from lowfc.programs.commissioning.checks import Status
 from lowfc.programs.commissioning.commission.commissioning import Commission, Commissioning, first_of
@@ -214,8 +214,12 @@ def test_in_safe_mode_nothing_begins(tmp_path: Path) -> None:
         bench.commission()
 
 
+def configured(config: Configuration) -> wire.CameraState:
+    return camera_state(CameraSettings.configured(config, 80, 80), 1)
+
+
 def changed(**fields: float) -> wire.CameraState:
-    state = camera_state(Configuration(), (80, 80), 1)
+    state = configured(Configuration())
     for name, value in fields.items():
         setattr(state, name, value)
     return state
@@ -230,7 +234,7 @@ def faults(config: Configuration, state: wire.CameraState) -> dict[str, Status]:
 @pytest.mark.parametrize("bits", [12, 16])
 def test_the_simulated_camera_agrees_with_its_configuration(em_gain: float, bits: int) -> None:
     config = Configuration(camera=Camera(em_gain=em_gain, bit_depth=bits, full_well_e=2_000.0))
-    assert faults(config, camera_state(config, (80, 80), 1)) == {}
+    assert faults(config, configured(config)) == {}
 
 
 @pytest.mark.parametrize("one", AGREEMENTS, ids=lambda one: one.field)
@@ -259,10 +263,10 @@ def test_a_calibration_that_is_there_is_not_replaced_unasked(own_runtime: Path) 
 def test_the_times_follow_the_rate(rate_hz: float, max_frame_age_ms: float, frame_timeout_ms: float) -> None:
     config = Configuration(camera=Camera(rate_hz=rate_hz))
     assert (config.max_frame_age_ns, config.frame_timeout_ns) == (max_frame_age_ms * 1e6, frame_timeout_ms * 1e6)
-    assert "control.frame_timeout_ms" not in faults(config, camera_state(config, (80, 80), 1))
+    assert "control.frame_timeout_ms" not in faults(config, configured(config))
 
 
 def test_what_was_chosen_holds_and_is_checked() -> None:
     config = Configuration(camera=Camera(rate_hz=20.0), control=Control(max_frame_age_ms=7.0, frame_timeout_ms=50.0))
     assert (config.max_frame_age_ns, config.frame_timeout_ns) == (7_000_000, 50_000_000)
-    assert faults(config, camera_state(config, (80, 80), 1)) == {"control.frame_timeout_ms": Status.WRONG}
+    assert faults(config, configured(config)) == {"control.frame_timeout_ms": Status.WRONG}

@@ -15,7 +15,6 @@ from google.protobuf.message import DecodeError, Message
 
 from lowfc.adapters.bus.run import open_run
 from lowfc.adapters.bus.zenoh_session import session_config
-from lowfc.adapters.files.factory import camera_state
 from lowfc.arrays import Single
 from lowfc.contract.configuration import Configuration, Network, load
 from lowfc.contract.envelope import Envelope, sequence_of
@@ -33,6 +32,7 @@ from lowfc.contract.messages import (
     wire,
 )
 from lowfc.control.loop.safety import Limits
+from lowfc.device.driver import CameraSettings, camera_state
 from lowfc.device.guard import Command, Status
 from lowfc.device.mirror_loop import command_of, state_of
 from lowfc.programs.commissioning.checks import Check, put
@@ -139,7 +139,7 @@ class Camera(Device):
         self._due_ns = now_ns + CONFIG.period_ns
         time_ns = now_ns - 50_000
         if self._index % 50 == 0:
-            state = self.changed("state", camera_state(CONFIG, SHAPE, time_ns), self._index)
+            state = self.changed("state", camera_state(CameraSettings.configured(CONFIG, *SHAPE), time_ns), self._index)
             if state is not None:
                 self.publish(CAMERA_STATE.key, state, now_ns)
         pixels = self._rng.poisson(self._spot).astype(np.uint16)

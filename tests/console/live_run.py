@@ -2,17 +2,17 @@
 
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 from lowfc.adapters.bus.bus import Query, Sample
-from lowfc.adapters.files import factory
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.latch import Latch
 from lowfc.adapters.process.service import Service
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import load
 from lowfc.contract.messages import CAMERA_STATE, FRAME, MIRROR_STATE, RECORD_KEY, REQUEST, image, wire
-from lowfc.device.driver import DriverOptions
+from lowfc.device.driver import CameraSettings, DriverOptions, camera_state
 from lowfc.device.mirror_loop import MirrorLoop
 from lowfc.programs.core.controller import Controller
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
@@ -67,8 +67,9 @@ class LiveRun:
         processes.append(Controller(CONFIG, controller, identified(calibration()), "a test", Latch([folder / "safe"])))
         self._threads = [threading.Thread(target=one.run, daemon=True) for one in processes]
         self._threads.append(threading.Thread(target=self._expose, daemon=True))
-        camera = factory.camera_state(CONFIG, SHAPE, self.clock.now_ns())
-        camera.saturation_dn = SATURATION_DN
+        camera = camera_state(
+            replace(CameraSettings.configured(CONFIG, *SHAPE), saturation_dn=SATURATION_DN), self.clock.now_ns()
+        )
         settings.put(camera.SerializeToString())
         for thread in self._threads:
             thread.start()

@@ -46,6 +46,7 @@ from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.linear_law import integrator
 from lowfc.control.loop.safety import LoopMode
 from lowfc.device import DriverOptions
+from lowfc.device.driver import CameraSettings, camera_state
 from lowfc.device.mirror_loop import MirrorLoop
 from lowfc.programs.core import cache_warmup
 from lowfc.programs.core.controller import Controller
@@ -84,7 +85,7 @@ class Rig:
         self.frames, self.settings = camera.publisher(FRAME), camera.publisher(CAMERA_STATE)
         self.services = [Service(role, "test", self.clock(), self.bus(role)) for role in ("controller", "mirror-dm")]
         self.mirror = MirrorLoop(SimulatedMirror(DriverOptions(), config), self.services[1], config)
-        state = factory.camera_state(config, scene.shape, START_NS)
+        state = camera_state(CameraSettings.configured(config, *scene.shape), START_NS)
         self.settings.put(state.SerializeToString())
         self.latch = Path(tempfile.mkdtemp()) / "safe"
         self.controller = Controller(config, self.services[0], calibration, "a test", Latch([self.latch]))

@@ -30,6 +30,7 @@ from lowfc.contract.messages import CAMERA_STATE, FRAME, MIRROR_STATE, STEP, TRU
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.linear_law import LinearLaw, integrator_block, of_blocks
 from lowfc.device import DriverOptions
+from lowfc.device.driver import CameraSettings, camera_state
 from lowfc.device.mirror_loop import MirrorLoop
 from lowfc.programs.core.controller import Controller
 from lowfc.programs.core.recording.recorder import Recorder
@@ -102,7 +103,7 @@ class Night:
         bus = self.bus("camera")
         self.frames, self.truths = bus.publisher(FRAME), bus.publisher(TRUTH)
         self.settings = bus.publisher(CAMERA_STATE)
-        state = factory.camera_state(self.config, self.scene.shape, self.clock.now_ns())
+        state = camera_state(CameraSettings.configured(self.config, *self.scene.shape), self.clock.now_ns())
         for name, value in changes.items():
             setattr(state, name, value)
         self.settings.put(state.SerializeToString())

@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 
 from lowfc.adapters.bus.bus import Publisher
-from lowfc.adapters.files import factory
 from lowfc.adapters.process.clock import HostClock
 from lowfc.arrays import Single
 from lowfc.client import Answer, Client, MirrorWatch
@@ -25,6 +24,7 @@ from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.loop.camera import CameraSettings
 from lowfc.control.loop.inputs import MirrorShape, Request, Step
+from lowfc.device import driver
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub, MemoryRing
 from tools.law_bench import Bench, calibrated
 
@@ -177,7 +177,7 @@ class FoldedLoop(Client):
 
     def camera_state(self) -> wire.CameraState:
         side = 80 - 2 * self._cut
-        return factory.camera_state(self.config, (side, side), 1)
+        return driver.camera_state(driver.CameraSettings.configured(self.config, side, side), 1)
 
     def laws(self) -> dict[str, LinearLaw]:
         following = self._bench.state.drive.following

@@ -12,13 +12,14 @@ from lowfc.adapters.files.mirror_maps import active_actuators
 from lowfc.adapters.files.sensors import coronagraph_from, sensor_from
 from lowfc.adapters.files.twin_cache import load_or_build, load_or_fit_mirror
 from lowfc.arrays import Array, single
-from lowfc.contract.codecs.calibration_codec import camera_settings, identified
+from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError, ConfigurationError
-from lowfc.contract.messages import timestamp, wire
+from lowfc.contract.messages import fields_of
 from lowfc.contract.sections import InterlockSection
 from lowfc.control.calibration.actuator_response import actuators_to_modes
 from lowfc.control.calibration.calibration import Calibration, noise_nm2, normalise_flux, reconstructor
+from lowfc.control.loop.camera import CameraSettings
 from lowfc.control.loop.interlocks import Action, Interlock
 from lowfc.control.loop.safety import Limits, LoopMode
 from lowfc.control.loop.state import Settings
@@ -34,6 +35,7 @@ from lowfc.optics.twin.twin_mirror import TwinMirror, wavefront_nm
 
 Progress = Callable[[int, int], None]
 
+_OF_CAMERA = ("bias_dn", "gain_e_per_dn", "em_gain", "read_noise_e")
 _TWINS = {spec.nodes: spec for spec in (FAST, ACCURATE)}
 
 
@@ -97,24 +99,6 @@ def detector(config: Configuration) -> Detector:
         )
     except ValueError as error:
         raise ConfigurationError(f"camera: {error}") from None
-
-
-def camera_state(config: Configuration, shape: tuple[int, int], time_ns: int) -> wire.CameraState:
-    """What the camera says of itself; `shape` are the rows and columns of its frames."""
-    camera = config.camera
-    return wire.CameraState(
-        timestamp=timestamp(time_ns),
-        exposure_ns=config.exposure_ns,
-        period_ns=config.period_ns,
-        gain_e_per_dn=camera.gain_e_per_dn,
-        bias_dn=camera.bias_dn,
-        read_noise_e=camera.read_noise_e,
-        saturation_dn=saturation_dn(detector(config)),
-        rows=shape[0],
-        columns=shape[1],
-        bit_depth=camera.bit_depth,
-        em_gain=camera.em_gain,
-    )
 
 
 def mirror(config: Configuration) -> Mirror:
@@ -204,6 +188,7 @@ def analytic_calibration(
             "what shear of the beam does is known at a flat wavefront only: leave it out of control.nuisance"
         )
     camera = detector(config)
+    highest_dn = float(saturation_dn(camera))
     nolls = config.noll
     radii = node_radii(optics)
     I0, H = reference(optics, opd_nm), response(optics, zernikes(nolls, *radii), opd_nm)
@@ -245,13 +230,13 @@ def analytic_calibration(
             shape=(shape[0], shape[1]),
             grid=grid,
             flux_dn=flux_e * camera.em_gain / camera.gain_e_per_dn,
-            saturation_dn=float(saturation_dn(camera)),
+            saturation_dn=highest_dn,
             estimator="+".join((config.control.estimator, *config.control.nuisance)),
             wavelength_nm=config.star.wavelength_nm,
             operator_hash=optics.operator_hash,
             id="",
             actuators_to_modes=single(seen),
-            camera=camera_settings(camera_state(config, (shape[0], shape[1]), 0)),
+            camera=CameraSettings(0, (shape[0], shape[1]), saturation_dn=highest_dn, **fields_of(camera, _OF_CAMERA)),
         )
     )
 

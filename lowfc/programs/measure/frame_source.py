@@ -24,6 +24,7 @@ from lowfc.arrays import Pixels
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import CAMERA_STATE, FRAME, RawImage, Role, image, timestamp
+from lowfc.device.driver import CameraSettings, camera_state
 from lowfc.optics.chain.zernike import zernikes
 from lowfc.optics.detector.detector import expose
 from lowfc.optics.twin.twin import Evaluator, node_radii
@@ -119,7 +120,7 @@ class Source:
         missing = service.wait_for(wait_for, _WAIT_S)
         if missing and service.running:
             raise BusError(f"no sign of {', '.join(missing)} after {_WAIT_S:g} s; no frame is sent without")
-        state = factory.camera_state(self._config, self._payloads.shape, service.clock.now_ns())
+        state = camera_state(CameraSettings.configured(self._config, *self._payloads.shape), service.clock.now_ns())
         self._settings.put(state.SerializeToString())
         service.state = "running"
         self._on_schedule(math.ceil(seconds * self._config.camera.rate_hz))

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from google.protobuf.message import DecodeError
 
-from lowfc.adapters.files.factory import camera_state
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.messages import CAMERA_STATE, from_timestamp, wire
+from lowfc.device import CameraSettings
 from lowfc.programs.commissioning.checks import Check, Table, ok, warning, wrong
 from lowfc.programs.commissioning.conformance.camera import Camera
 
@@ -163,7 +163,7 @@ PERIODS_OF_TIMEOUT = 1.5
 
 def agreement_checks(config: Configuration, state: wire.CameraState) -> Iterator[Check]:
     """Compare a camera's settings with the configuration of its loop."""
-    ours = camera_state(config, (state.rows, state.columns), 0)
+    ours = CameraSettings.configured(config, state.rows, state.columns)
     for one in AGREEMENTS:
         configured, found = float(getattr(ours, one.field)), float(getattr(state, one.field))
         if one.field == "em_gain":
