@@ -1,7 +1,9 @@
 """Loops of any size: random calibrations, frames to go with them, and the real processes run on those."""
 
+import contextlib
 import os
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -102,12 +104,9 @@ def made_up(size: Size, config: Configuration) -> tuple[Calibration, Frames]:
     return identified(calibration), frames.astype(np.uint16).reshape(FRAMES, size.side, size.side)
 
 
-def run_loop(size: Size, config: Configuration, seconds: float) -> dict[str, Any]:
-    """Run the loop of that size once, and then a bare echo of its messages; one repeat's figures of `run_repeats`.
-
-    Raises:
-        LowfcError: a process of the loop ended by itself, or reported nothing.
-    """
+@contextlib.contextmanager
+def laid_out(size: Size, config: Configuration) -> Iterator[Run]:
+    """A run of that size with what its processes share; nothing is left of it afterwards."""
 
     def fill(config: Configuration, run: Run) -> None:
         calibration, frames = made_up(size, config)
@@ -118,6 +117,16 @@ def run_loop(size: Size, config: Configuration, seconds: float) -> dict[str, Any
         np.save(run.path / FRAMES_FILE, frames)
 
     with prepared(config, fill) as run:
+        yield run
+
+
+def run_loop(size: Size, config: Configuration, seconds: float) -> dict[str, Any]:
+    """Run the loop of that size once, and then a bare echo of its messages; one repeat's figures of `run_repeats`.
+
+    Raises:
+        LowfcError: a process of the loop ended by itself, or reported nothing.
+    """
+    with laid_out(size, config) as run:
         (found,) = run_repeats(Asked(config, seconds, 1), run, lambda _: None)
     return found
 

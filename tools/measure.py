@@ -90,7 +90,7 @@ MEASUREMENTS = {
     "latency": _latency("lowfc latency --duration 10 --repeats 5"),
     "watched": _latency("lowfc latency --duration 60 --record --view"),
     "step": _bench("python -m benchmarks step", step),
-    "peers": _bench("python -m benchmarks peers --seconds 4", contest),
+    "peers": _bench("python -m benchmarks peers", contest),
     "curves": _bench("python -m benchmarks curves --seconds 1 --repeats 2", curves),
     "throughput": _bench("python -m benchmarks throughput --seconds 6", throughput),
 }

@@ -1,4 +1,4 @@
-"""The processes of a loop in plain Python and zenoh: python -m benchmarks.peers.plain_zenoh ROLE FOLDER.
+"""The processes of a loop in plain Python and zenoh: see `shared` for its words.
 
 The source is the mirror as well: it notes when a command is back.
 """
@@ -9,15 +9,18 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
 
+import numpy as np
 import zenoh
 from zenoh.handlers import Callback
 
-from benchmarks.peers.shared import DIFFERENT, NumpyStep, Part, Problem
+from benchmarks.peers.shared import NumpyStep, Part, Problem
 from lowfc.adapters.bus.run import Links
 from lowfc.adapters.bus.zenoh_session import session_config
 from lowfc.contract.messages import COMMAND, FRAME, Role
+
+PORTS = "ports.json"
+"""File with the loopback TCP port of each role that listens."""
 
 _NUMBER = struct.Struct("<QQ")  # as long as what lowfc sends with every message
 _ROLES = {"source": Role.CAMERA, "controller": Role.CONTROLLER}
@@ -28,7 +31,7 @@ Message = Callable[[int, bytes], None]
 
 def join(part: Part, receive: Message) -> Message:
     """Join a run with a session set up as lowfc's are; returns what sends."""
-    ports = {str(_ROLES[role]): port for role, port in part.plan.ports.items()}
+    ports = json.loads((part.folder / PORTS).read_text())
     links = Links("contest", ports, "contest", part.folder / "credentials")
     session = zenoh.open(zenoh.Config.from_json5(json.dumps(session_config(links, _ROLES[part.role]))))
     keys = FRAME.key, COMMAND.at("dm")
@@ -52,20 +55,22 @@ def join(part: Part, receive: Message) -> Message:
 def source(part: Part) -> None:
     """Send the frames, and note when commands come back."""
     received, published, now_ns = part.marks("received"), part.marks("published"), time.monotonic_ns
+    last = part.last_actuators()
 
-    def back(number: int, _payload: bytes) -> None:
+    def back(number: int, payload: bytes) -> None:
         received[number] = now_ns()
+        last[:] = np.frombuffer(payload, np.float32)
 
-    payloads = [pixels.tobytes() for pixels in Problem().frames]
+    payloads = [pixels.tobytes() for pixels in Problem(part.folder).frames]
     put = join(part, back)
     for number in part.frames():
         published[number] = now_ns()
-        put(number, payloads[number % DIFFERENT])
+        put(number, payloads[number % len(payloads)])
 
 
 def controller(part: Part) -> None:
     """Answer frames until it is killed."""
-    commanded, step = part.marks("commanded"), NumpyStep(Problem())
+    commanded, step = part.marks("commanded"), NumpyStep(Problem(part.folder))
 
     def answer(number: int, payload: bytes) -> None:
         put(number, step.command(payload))
@@ -77,7 +82,6 @@ def controller(part: Part) -> None:
 
 
 if __name__ == "__main__":
-    role, folder = sys.argv[1:]
-    own = Part(role, Path(folder))
+    own = Part(sys.argv[1:])
     own.settle()
-    {"source": source, "controller": controller}[role](own)
+    {"source": source, "controller": controller}[own.role](own)

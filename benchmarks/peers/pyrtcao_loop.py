@@ -1,32 +1,34 @@
-"""The same loop in pyrtcao, each component a process: python -m benchmarks.peers.pyrtcao_loop ROLE FOLDER.
+"""The same loop in pyrtcao, each component a process; see `shared` for its words.
 
-A component of one's own between its `WavefrontSensor` and its `WavefrontCorrector` does the whole step in one compiled
-function, which is the best that pyrtcao can do. It runs in an interpreter that has pyrtcao, and needs nothing of
-lowfc's. Where pyrtcao may, it sets nice -20 in the normal class by itself.
+Stock, as its users build it: a `WavefrontSensor`, a component of one's own that makes a signal of the pixels,
+`Loop.leaky_integrator`, a `WavefrontCorrector`, which makes actuators of modes. Fused: one component of one's own
+between sensor and corrector does the whole step in one compiled function, which is the best that pyrtcao can do.
+
+It runs in an interpreter that has pyrtcao, and needs nothing of lowfc's. Where pyrtcao may, it sets nice -20 in the
+normal class by itself.
 """
 
 import os
 import sys
 import threading
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from numba import jit
 from pyrtc.component import Component
-from pyrtc.streams import clear_shms, open_stream
+from pyrtc.loop import Loop
+from pyrtc.streams import clear_shms, create_stream, open_stream
 from pyrtc.utils import set_affinity_and_priority
 from pyrtc.wavefront_corrector import WavefrontCorrector
 from pyrtc.wavefront_sensor import WavefrontSensor
 
-from benchmarks.peers.shared import ACTUATORS, DIFFERENT, GAIN, LEAK, LIMIT_NM, MODES, SHAPE, Part, Problem
+from benchmarks.peers.shared import ACTUATORS, GAIN, LEAK, LIMIT_NM, MODES, PIXELS, SIDE, Part, Problem
 
 Array = npt.NDArray[np.float32]
 
-_STREAMS = ("wfs_raw", "wfs", "wfc")
-_PIXELS = SHAPE[0] * SHAPE[1]
+_STREAMS = ("wfs_raw", "wfs", "signal", "wfc")
 
 
 class Sensor(WavefrontSensor):
@@ -36,36 +38,65 @@ class Sensor(WavefrontSensor):
 
     def run(self) -> None:
         """All frames of a run; ends the process."""
-        frames, published = Problem().frames, self.part.marks("published")
+        problem, published = Problem(self.part.folder), self.part.marks("published")
         for number in self.part.frames():
-            self.data = frames[number % DIFFERENT]
+            self.data = problem.frame(number)
             published[number] = time.monotonic_ns()
             self.expose()  # it numbers them from 1, too
         clear(self.part)
         os._exit(0)
 
 
-class FusedLoop(Component):
-    """Everything between frame and actuators."""
+class PixelSignal(Component):
+    """The signal is the pixels without those of the reference image."""
+
+    def __init__(self, conf: dict[str, Any], problem: Problem) -> None:
+        super().__init__(conf)
+        self._reference = problem.I0.reshape(SIDE, SIDE)
+        self._image = np.empty((SIDE, SIDE), np.int32)
+        self._signal = np.empty((SIDE, SIDE), np.float32)
+        self.register_input_stream("wfs", open_stream(self.input_stream_name("wfs")))
+        self.read_stream("wfs", out=self._image)  # what is there before the first frame
+        self.register_output_stream("signal", create_stream(self.output_stream_name("signal"), (PIXELS,), np.float32))
+
+    def compute_signal(self) -> None:
+        """One frame."""
+        image = self.read_stream("wfs", out=self._image)
+        np.subtract(image, self._reference, out=self._signal, dtype=np.float32, casting="unsafe")
+        self.write_stream("signal", self._signal.reshape(-1))
+
+
+class StockLoop(Loop):
+    """Its own loop, with the moment noted when a command is out."""
 
     commanded: memoryview
 
-    def __init__(self, conf: dict[str, Any]) -> None:
+    def send_to_wfc(self, correction: Array, slopes: Array | None = None) -> None:
+        """Its own, then the time."""
+        super().send_to_wfc(correction, slopes=slopes)
+        self.commanded[self.frame_id] = time.monotonic_ns()
+
+
+class FusedLoop(Component):
+    """Everything between frame and actuators."""
+
+    def __init__(self, conf: dict[str, Any], problem: Problem, commanded: memoryview) -> None:
         super().__init__(conf)
-        problem = Problem()
         self._arrays = (problem.I0, problem.R, problem.to_actuators)
-        self._image = np.empty(SHAPE, np.int32)
-        self._difference = np.empty(_PIXELS, np.float32)
+        self._image = np.empty((SIDE, SIDE), np.int32)
+        self._difference = np.empty(PIXELS, np.float32)
         self._command = np.zeros(MODES, np.float32)
+        self._commanded = commanded
         self.register_input_stream("wfs", open_stream(self.input_stream_name("wfs")))
+        self.read_stream("wfs", out=self._image)  # what is there before the first frame
         self.register_output_stream("wfc", open_stream(self.output_stream_name("wfc")))
-        _fused(np.zeros(_PIXELS, np.int32), *self._arrays, self._difference, self._command.copy())  # compiled here
+        _fused(np.zeros(PIXELS, np.int32), *self._arrays, self._difference, self._command.copy())  # compiled here
 
     def step(self) -> None:
         """One frame."""
         image = self.read_stream("wfs", out=self._image).reshape(-1)
         self.write_stream("wfc", _fused(image, *self._arrays, self._difference, self._command))
-        self.commanded[self.frame_id] = time.monotonic_ns()
+        self._commanded[self.frame_id] = time.monotonic_ns()
 
 
 @jit(nopython=True, nogil=True, fastmath=True)
@@ -82,15 +113,32 @@ def _fused(
     return actuators
 
 
-class Corrector(WavefrontCorrector):
+class StockMirror(WavefrontCorrector):
     """Its own corrector without hardware, with the moment noted when the actuators are there."""
 
     received: memoryview
+    last: Array
+
+    def shape(self) -> Array:
+        """Actuators of the next command."""
+        super().send_to_hardware()
+        actuators: Array = self.current_shape
+        return actuators
 
     def send_to_hardware(self) -> None:
         """Its own, then the time."""
-        super().send_to_hardware()
+        actuators = self.shape()
         self.received[self.frame_id] = time.monotonic_ns()
+        self.last[:] = actuators
+
+
+class FusedMirror(StockMirror):
+    """A corrector that receives actuators."""
+
+    def shape(self) -> Array:
+        """As they come."""
+        actuators: Array = self.read_stream("wfc", out=self._wfc_buffer)
+        return actuators
 
 
 def clear(part: Part) -> None:
@@ -113,40 +161,41 @@ def _configuration(part: Part, function: str) -> dict[str, Any]:
     }
 
 
-def _source(part: Part) -> Component:
-    sensor = Sensor(_configuration(part, "run") | {"name": "wfs", "width": SHAPE[1], "height": SHAPE[0]})
-    sensor.part = part
-    return sensor
-
-
-def _mirror(part: Part) -> Component:
+def _component(part: Part) -> Component:
+    problem = Problem(part.folder)
+    if part.role == "source":
+        sensor = Sensor(_configuration(part, "run") | {"name": "wfs", "width": SIDE, "height": SIDE})
+        sensor.part = part
+        return sensor
+    if part.role == "signal":
+        return PixelSignal(_configuration(part, "compute_signal"), problem)
+    if part.role == "fused":
+        return FusedLoop(_configuration(part, "step"), problem, part.marks("commanded"))
+    if part.role == "loop":
+        loop = StockLoop(_configuration(part, "leaky_integrator") | {"leaky_gain": LEAK})
+        loop.cm = problem.R.copy()
+        loop.gain = GAIN
+        loop.commanded = part.marks("commanded")
+        return loop
+    fused = part.role == "mirror"
     matrix = part.folder / "m2c.npy"
-    np.save(matrix, np.eye(ACTUATORS, dtype=np.float32))  # a command's actuators are made already
-    of_its_own = {"name": "wfc", "num_actuators": ACTUATORS, "num_modes": ACTUATORS, "m2c_file": str(matrix)}
-    corrector = Corrector(_configuration(part, "send_to_hardware") | of_its_own)
-    corrector.received = part.marks("received")
+    np.save(matrix, np.eye(ACTUATORS, dtype=np.float32) if fused else problem.to_actuators)
+    of_its_own = {"name": "wfc", "num_actuators": ACTUATORS, "m2c_file": str(matrix)}
+    of_its_own["num_modes"] = ACTUATORS if fused else MODES
+    corrector = (FusedMirror if fused else StockMirror)(_configuration(part, "send_to_hardware") | of_its_own)
+    corrector.received, corrector.last = part.marks("received"), part.last_actuators()
     return corrector
 
 
-def _controller(part: Part) -> Component:
-    loop = FusedLoop(_configuration(part, "step"))
-    loop.commanded = part.marks("commanded")
-    return loop
-
-
-_ROLES = {"source": _source, "mirror": _mirror, "controller": _controller}
-
-
 if __name__ == "__main__":
-    role, folder = sys.argv[1:]
-    own = Part(role, Path(folder))
-    if role == "clear":  # after a run that failed
+    own = Part(sys.argv[1:])
+    if own.role == "clear":  # after a run that failed
         clear(own)
         sys.exit()
-    set_affinity_and_priority(role, own.cpu, own.priority)  # as its launcher does
+    set_affinity_and_priority(own.role, own.cpu, own.priority)  # as its launcher does
     own.quiet()
-    component = _ROLES[role](own)
+    component = _component(own)
     component.start()
-    if role != "source":  # which is ready when it is about to wait for the start
+    if own.role != "source":  # which is ready when it is about to wait for the start
         own.ready()
     threading.Event().wait()

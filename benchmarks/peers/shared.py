@@ -1,17 +1,16 @@
 """What every process of every contestant does alike: its place on the host, its times, its start, its problem.
 
-It needs numpy only. The times of a run are files of int64, one for each frame, in memory that all processes share, so
-that a process may be killed when the last frame is through.
+A process is started with the words ROLE FOLDER RATE_HZ FRAMES PROCESSOR PRIORITY; priority 0 is the normal class. The
+folder is in memory that all processes share, so that a process may be killed when the last frame is through. It needs
+numpy only.
 """
 
 import ctypes
 import gc
-import json
 import mmap
 import os
 import time
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,68 +18,30 @@ import numpy.typing as npt
 
 Single = npt.NDArray[np.float32]
 
-SHAPE = (80, 80)
-MODES = 20
-GRID = (12, 12)
-ACTUATORS = GRID[0] * GRID[1]
+SIDE, MODES, MIRROR_SIDE = 80, 20, 34
+PIXELS, ACTUATORS = SIDE**2, MIRROR_SIDE**2
 GAIN, LEAK, LIMIT_NM = 0.3, 0.01, 100.0
-DIFFERENT = 16  # frames, sent in turn
 
-_DARK_DN, _PEAK_DN = 100.0, 400.0
-_ERROR_NM = 2.0
+MARKS = ("due", "published", "commanded", "received")
+"""Files with the times of each frame in ns, int64: when it was due and sent, and when its command was out and back."""
+
+LAST = "actuators"
+"""File with the actuators that the mirror received last, float32."""
 
 _PR_SET_TIMERSLACK = 29
-_PLAN = "plan.json"
 _GO = "go"
 _LOOK_S = 0.02
 _LAST_COMMAND_S = 0.05
-
-MARKS = ("due", "published", "commanded", "received")
-"""Times of each frame, ns: when it was due and sent, and when its command was out and back."""
-
-
-@dataclass(frozen=True)
-class Plan:
-    """One run of one contestant.
-
-    Attributes:
-        rate_hz: of the frames.
-        frames: all that are sent, numbered from 1.
-        cpus: processor of each role.
-        priority: SCHED_FIFO priority of each role; 0 is the normal class.
-        ports: loopback TCP port of each role that listens.
-    """
-
-    rate_hz: float
-    frames: int
-    cpus: dict[str, int]
-    priority: dict[str, int]
-    ports: dict[str, int] = field(default_factory=dict)
-
-    def write(self, folder: Path) -> None:
-        """Lay out a run in its folder."""
-        (folder / _PLAN).write_text(json.dumps(asdict(self)))
-        for name in MARKS:
-            (folder / name).write_bytes(bytes(8 * (self.frames + 1)))
 
 
 class Part:
     """A role of a run, in its own process."""
 
-    def __init__(self, role: str, folder: Path) -> None:
-        self.role = role
-        self.folder = folder
-        self.plan = Plan(**json.loads((folder / _PLAN).read_text()))
-
-    @property
-    def cpu(self) -> int:
-        """Where this process runs."""
-        return self.plan.cpus[self.role]
-
-    @property
-    def priority(self) -> int:
-        """Its SCHED_FIFO priority, or 0."""
-        return self.plan.priority[self.role]
+    def __init__(self, words: Sequence[str]) -> None:
+        self.role, folder, rate_hz, frames, cpu, priority = words
+        self.folder = Path(folder)
+        self.rate_hz, self.count = float(rate_hz), int(frames)
+        self.cpu, self.priority = int(cpu), int(priority)
 
     def settle(self) -> None:
         """One processor, the class asked for, sleeps without slack, no garbage collection; for threads to come too."""
@@ -101,6 +62,10 @@ class Part:
         with (self.folder / name).open("r+b") as file:
             return memoryview(mmap.mmap(file.fileno(), 0)).cast("q")
 
+    def last_actuators(self) -> Single:
+        """Where the mirror keeps what it received last."""
+        return np.memmap(self.folder / LAST, np.float32, "r+")
+
     def ready(self) -> None:
         """Say that this process has all it needs."""
         ready_file(self.folder, self.role).touch()
@@ -115,8 +80,8 @@ class Part:
             time.sleep(_LOOK_S)
         due = self.marks("due")
         begun_ns, now_ns = time.monotonic_ns(), time.monotonic_ns
-        for number in range(1, self.plan.frames + 1):
-            due[number] = due_ns = begun_ns + round(number * 1e9 / self.plan.rate_hz)
+        for number in range(1, self.count + 1):
+            due[number] = due_ns = begun_ns + round(number * 1e9 / self.rate_hz)
             while (left_ns := due_ns - now_ns()) > 0:
                 time.sleep(left_ns * 1e-9)
             yield number
@@ -134,24 +99,25 @@ def go(folder: Path) -> None:
 
 
 class Problem:
-    """Frames, and the matrices that make actuators of them.
+    """Frames, and the matrices that make actuators of them, each a file of a run's folder.
 
     Attributes:
-        frames: (DIFFERENT, 80, 80) uint16, DN.
+        frames: (frames, 80, 80) uint16, DN, sent in turn.
         I0: (6400,) float32, DN, dark included.
-        R: (20, 6400) float32, nm per DN, scaled so that the noise of a frame is some nm in every mode.
-        to_actuators: (144, 20) float32, nm of surface per nm of wavefront.
+        R: (20, 6400) float32, nm per DN.
+        to_actuators: (1156, 20) float32, nm of surface per nm of wavefront.
     """
 
-    def __init__(self, seed: int = 1) -> None:
-        rng = np.random.default_rng(seed)
-        pixels = SHAPE[0] * SHAPE[1]
-        image = _DARK_DN + _PEAK_DN * rng.random(pixels)
-        self.frames = rng.poisson(image, (DIFFERENT, pixels)).astype(np.uint16).reshape(DIFFERENT, *SHAPE)
-        self.I0: Single = image.astype(np.float32)
-        R = rng.standard_normal((MODES, pixels))
-        self.R: Single = (R * _ERROR_NM / np.sqrt((R**2) @ image)[:, None]).astype(np.float32)
-        self.to_actuators: Single = (rng.standard_normal((ACTUATORS, MODES)) / MODES).astype(np.float32)
+    def __init__(self, folder: Path) -> None:
+        self.frames = np.fromfile(folder / "frames", np.uint16).reshape(-1, SIDE, SIDE)
+        self.I0: Single = np.fromfile(folder / "I0", np.float32)
+        self.R: Single = np.fromfile(folder / "R", np.float32).reshape(MODES, PIXELS)
+        self.to_actuators: Single = np.fromfile(folder / "to_actuators", np.float32).reshape(ACTUATORS, MODES)
+
+    def frame(self, number: int) -> npt.NDArray[np.uint16]:
+        """The frame of a number."""
+        image: npt.NDArray[np.uint16] = self.frames[number % len(self.frames)]
+        return image
 
 
 class NumpyStep:
@@ -162,7 +128,7 @@ class NumpyStep:
 
     def __init__(self, problem: Problem) -> None:
         self._problem = problem
-        self._difference = np.empty(SHAPE[0] * SHAPE[1], np.float32)
+        self._difference = np.empty(PIXELS, np.float32)
         self._error = np.empty(MODES, np.float32)
         self._command = np.zeros(MODES, np.float32)
         self._actuators = np.empty(ACTUATORS, np.float32)

@@ -3,7 +3,7 @@
 import json
 import subprocess
 import sys
-from argparse import Namespace
+from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from benchmarks import curves, kernels, load, runner, step, throughput, view
-from benchmarks.peers import contest
-from benchmarks.peers.contest import BARE, CONTESTANTS
-from benchmarks.peers.shared import ACTUATORS, MARKS, NumpyStep, Plan, Problem
+from benchmarks.peers import contest, contestants
+from benchmarks.peers.contestants import CONTESTANTS, FUSED
+from benchmarks.peers.shared import ACTUATORS, MARKS, NumpyStep, Problem
 from benchmarks.sizes import Size, configuration, made_up
 from lowfc.contract.sections import Camera
 from lowfc.control.kernel import stepping
@@ -293,19 +293,20 @@ def test_the_view_that_is_measured_is_a_real_one() -> None:
 # The contest
 
 
-def one(p50: float, p99: float, without: int = 0, **more: Any) -> dict[str, Any]:
+def rules(*words: str | Path) -> Namespace:
+    parser = ArgumentParser()
+    contest.options(parser)
+    return parser.parse_args(list(map(str, words)))
+
+
+def one(p50: float, p99: float, without: int = 0) -> dict[str, Any]:
     span = {"p50": p50, "p99": p99, "p99_9": 2 * p99, "max": 3 * p99}
-    counts = {"frames": 1000, "without_command": without, "sent_late": 0}
-    return counts | {"frame_to_command": span, "frame_to_mirror": None} | more
-
-
-def row(contestant: str, *runs: dict[str, Any], scheduling: str = "normal", **more: Any) -> dict[str, Any]:
-    fixed = {"contestant": contestant, "what": "what it is", "scheduling": scheduling, "failures": []}
-    return fixed | {"repeats": list(runs)} | more
+    counts = {"frames": 1000, "without_command": without, "sent_late": 0, "off": 1e-6}
+    return counts | {"frame_to_command": span, "frame_to_mirror": None}
 
 
 def test_the_figures_of_a_run_are_those_of_its_times(tmp_path: Path) -> None:
-    Plan(1000.0, 6, {}, {}).write(tmp_path)
+    contest.lay_out(tmp_path, 6)
     due = np.arange(7) * 1_000_000 + 50_000_000
     published = due + 10_000
     published[5] += 1_200_000
@@ -318,44 +319,59 @@ def test_the_figures_of_a_run_are_those_of_its_times(tmp_path: Path) -> None:
     assert found["without_command"] == found["sent_late"] == 1
     assert found["frame_to_command"] == {"p50": 5.0, "p90": 6.0, "p99": 6.0, "p99_9": 6.0, "max": 6.0}
     assert set(found["frame_to_mirror"].values()) == {50.0}
+    assert found["off"] is None
+    commanded.fill(1)
+    commanded.tofile(tmp_path / "commanded")
+    assert contest.figures(tmp_path, 2)["off"] == 1  # no actuators have come
 
 
-def test_the_table_has_ranges_and_ratios_within_a_class_and_who_is_not_there() -> None:
-    rows = [
-        row(BARE, one(100, 200), one(110, 230), one(150, 220)),
-        row("other", one(55, 440, 3), one(66, 110, 9), one(40, 120, 1)),
-        row(BARE, one(1000, 1000), scheduling="FIFO"),
-        row("other", one(500, 100), scheduling="FIFO"),
-        row("pyrtcao", missing="not installed in python: get it"),
-        row("pyrtcao, fused", failures=["it fell"]),
-        row("deaf", one(1, 1, 1000, frame_to_command=None)),
-    ]
-    rules = {"repeats": 1, "seconds": 1.0, "rate_hz": 1000.0, "warm_up": 5}
-    result = {"rows": rows, "rules": rules, "notes": ["a note"], "pinned_to": [0, 1], "versions": {"lowfc": "1"}}
-    (lines,) = contest.tables(result)
-    bare, other, _, fifo, absent, failed, deaf = by_heading(lines)
-    assert bare["p50"] == "110 (100 to 150)"
-    assert bare["max"] == "660 (600 to 690)"
-    assert (other["p50 of zenoh's"], lines[2][7]) == ("0.50", "0.55")
-    assert other["without a command"] == "3 of 1000"
-    assert (fifo["p50 of zenoh's"], lines[4][7]) == ("0.50", "0.10")
-    assert (absent["p50"], failed["p50"], deaf["p50"]) == ("not installed", "failed", "")
-    assert deaf["without a command"] == "1000 of 1000"
+def test_the_tables_have_ranges_and_differences_within_a_turn_and_who_is_not_there() -> None:
+    runs = {
+        "C chain": [one(55, 440, 3), one(66, 110, 9), None],
+        "pyrtcao, stock": [],
+        "pyrtcao, fused": [None, None, None],
+        FUSED: [one(100, 200), one(60, 230), one(150, 220)],
+    }
+    result = {
+        "runs": runs,
+        "missing": {"pyrtcao, stock": "get it"},
+        "rules": {"repeats": 3, "seconds": 1.0, "rate_hz": 1000.0, "warm_up": 5},
+        "priority": 50,
+        "granted": ["processors awake"],
+        "refused": ["that"],
+        "pinned_to": [0, 1],
+        "versions": {"lowfc": "1"},
+        "failed": ["pyrtcao, fused: it fell"],
+    }
+    latencies, differences, does = (by_heading(lines) for lines in contest.tables(json.loads(json.dumps(result))))
+    chain, absent, failed, fused = latencies
+    assert fused["p50"] == "100 (60 to 150)"
+    assert fused["max"] == "660 (600 to 690)"
+    assert chain["without a command"] == "12 of 2000"
+    assert (absent["p50"], failed["p50"]) == ("not installed", "failed")
+    (against,) = differences
+    assert list(against.values()) == ["1 of 2", "1 of 2", "-60 (-240 to +120)", "+20 (-6 to +45)", "C chain"]
+    assert [line["contestant"] for line in does] == list(runs)
     about = contest.about(result)
-    for words in ("CLOCK_MONOTONIC", "get it", "a note", "it fell"):
+    for words in ("CLOCK_MONOTONIC", "get it", "it fell", "refused: that", "SCHED_FIFO 50"):
         assert words in about
 
 
-def test_pyrtcao_is_said_to_be_missing_and_how_to_get_it() -> None:
+def test_who_cannot_take_part_is_said_and_how_it_can(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     done = run("peers", "--only", "pyrtcao", "--pyrtcao", "/no/such/python", "--repeats", "1", "--json")
     assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
-    assert all("/no/such/python" in one["missing"] for one in found["rows"])
+    assert all("/no/such/python" in why for why in json.loads(done.stdout)["missing"].values())
+    chain = CONTESTANTS[0]
+    monkeypatch.setattr(contestants.shutil, "which", lambda _: "cc")
+    assert f"{tmp_path} has no ImageStreamIO.c: git clone" in contestants.missing(chain, rules("--isio", tmp_path))
+    monkeypatch.setattr(contestants.shutil, "which", lambda _: None)
+    assert "no C compiler" in contestants.missing(chain, rules("--isio", tmp_path))
 
 
-def test_the_step_is_an_integrator_with_a_leak() -> None:
-    problem = Problem()
-    plain_step, pixels = NumpyStep(problem), problem.frames[0]
+def test_the_step_is_an_integrator_with_a_leak(tmp_path: Path) -> None:
+    contest.lay_out(tmp_path, 1)
+    problem = Problem(tmp_path)
+    plain_step, pixels = NumpyStep(problem), problem.frame(0)
     error_nm = problem.R @ (pixels.ravel() - problem.I0)
     for command_nm in (-0.3 * error_nm, -0.3 * 1.99 * error_nm):
         actuators = np.frombuffer(plain_step.command(pixels.tobytes()), np.float32)
@@ -364,17 +380,22 @@ def test_the_step_is_an_integrator_with_a_leak() -> None:
 
 
 @pytest.mark.exclusive
-@pytest.mark.parametrize("name", ["zenoh", pytest.param("lowfc", marks=pytest.mark.slow)])
-def test_a_contestant_is_really_run(name: str) -> None:
-    (chosen,) = (one for one in CONTESTANTS if one.name == name)
-    seconds, rate_hz = 0.5, 500.0
-    rules = Namespace(seconds=seconds, warm_up=10, rate_hz=rate_hz, pyrtcao=sys.executable)
-    found = contest.one_run(chosen, rules, 0)
+@pytest.mark.parametrize(
+    "chosen", [pytest.param(one, id=one.name, marks=[pytest.mark.slow] * bool(one.kernel)) for one in CONTESTANTS]
+)
+def test_a_contestant_is_really_run(chosen: contestants.Contestant) -> None:
+    """The C chain where ISIO_DIR is a checkout of ImageStreamIO, pyrtcao where PYRTCAO_PYTHON has it."""
+    seconds, rate_hz = 0.5, 200.0
+    asked = rules("--seconds", str(seconds), "--rate", str(rate_hz), "--warm-up", "10")
+    if why := contestants.missing(chosen, asked):
+        pytest.skip(why)
+    found = contest.one_run(chosen, asked, 0)
     assert found["frames"] == pytest.approx(seconds * rate_hz, abs=10)  # lowfc warms up by time
     assert found["without_command"] < found["frames"]
     there, back = found["frame_to_command"], found["frame_to_mirror"]
     assert 0 < there["p50"] <= there["p99"] <= there["max"]
     assert back["max"] > there["p50"]
+    assert (found["off"] or 0) < 1e-4  # of those whose every frame had a command
 
 
 # Kernels

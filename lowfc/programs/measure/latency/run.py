@@ -93,14 +93,14 @@ def run_repeats(asked: Asked, run: Run, progress: Callable[[str], None]) -> list
             turn = replace(asked, config=asked.config.model_copy(update={"realtime": realtime}))
             (run.path / "config.toml").write_text(turn.config.to_toml(), encoding="utf-8")
             progress(f"{number + 1} of {asked.repeats}: the loop by {kernel}")
-            loop = _loop(turn, run)
+            loop = one_loop(turn, run)
             progress(f"{number + 1} of {asked.repeats}: the bare echo, the step by {kernel} and the timer")
             repeats.append(loop | _alone(turn, run) | {"kernel": kernel})
     return repeats
 
 
-def _loop(asked: Asked, run: Run) -> dict[str, Any]:
-    """One repeat of the loop: figures of its frames, and what its processes reported at their end.
+def one_loop(asked: Asked, run: Run) -> dict[str, Any]:
+    """One repeat of the loop alone: figures of its frames, and what its processes reported at their end.
 
     Python is woken ten times a second, and by Health; frames and mirror states wait in rings.
     """

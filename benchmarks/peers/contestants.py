@@ -1,0 +1,155 @@
+"""Who takes part, what each does and does not do, and what it needs on this host."""
+
+import argparse
+import contextlib
+import importlib.metadata
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks.peers import shared
+from benchmarks.sizes import FRAMES
+from lowfc.adapters.process import compiled
+from lowfc.control.kernel.tables import FUSED as FUSED_KERNEL
+from lowfc.control.kernel.tables import KERNELS
+
+CHAIN, ZENOH, PYRTCAO = "chain.c", "plain_zenoh", "pyrtcao_loop"
+FUSED = f"lowfc, {FUSED_KERNEL}"
+
+_CONSTANTS = ("SIDE", "PIXELS", "MODES", "MIRROR_SIDE", "ACTUATORS", "GAIN", "LEAK", "LIMIT_NM")  # of the C chain
+_LIMIT_ONLY = "limit of each mode"
+
+
+class ContestError(Exception):
+    """A contestant did not start, or did not come to its end."""
+
+
+@dataclass(frozen=True)
+class Contestant:
+    """One way to close the loop.
+
+    Attributes:
+        name: in the tables.
+        what: it is, in a sentence.
+        log: what of a run can be kept.
+        safety: what stands between a bad frame or a dead process and the mirror.
+        elsewhere: whether its processes may be on other machines.
+        roles: its processes in the order in which they start; the source's end is the end of a run.
+        program: that plays the roles: a module of this package, or the C chain.
+        kernel: lowfc's, which has no roles here.
+    """
+
+    name: str
+    what: str
+    log: str
+    safety: str
+    elsewhere: str
+    roles: tuple[str, ...] = ()
+    program: str = ""
+    kernel: str = ""
+
+
+def _pyrtcao(name: str, what: str, safety: str, *roles: str) -> Contestant:
+    log = "its streams keep the newest frame; its telemetry recorder reads them"
+    return Contestant(f"pyrtcao, {name}", what, log, safety, "no; commanded from elsewhere", roles, PYRTCAO)
+
+
+def _lowfc(kernel: str) -> Contestant:
+    return Contestant(
+        f"lowfc, {kernel}",
+        "its controller and mirror as they run, frames made beforehand: the loop of `lowfc latency`, of this size",
+        log="every frame, command, mirror state and step is published for a recorder; replay to the bit",
+        safety="late, dark, saturated, identical and missing frames refused or bridged; limits of mode, stroke, slew "
+        "and neighbours, in the mirror too; command timeout",
+        elsewhere="yes, mutual TLS",
+        kernel=kernel,
+    )
+
+
+CONTESTANTS = (
+    Contestant(
+        "C chain",
+        "four C processes over ImageStreamIO between source and mirror: pixels less those of the reference image, "
+        "6400 x 20 product, integrator, modes to actuators; CACAO's stages without its process control",
+        "its streams keep the newest frame; a logger may read them",
+        _LIMIT_ONLY,
+        "no",
+        ("source", "acquire", "product", "filter", "actuators", "mirror"),
+        CHAIN,
+    ),
+    Contestant(
+        "zenoh",
+        "zenoh as it comes, in sessions set up as lowfc's, the step in numpy, in the subscriber's callback",
+        "any process may subscribe",
+        _LIMIT_ONLY,
+        "yes",
+        ("source", "controller"),
+        ZENOH,
+    ),
+    _pyrtcao(
+        "stock",
+        "WavefrontSensor, a component that makes a signal of the pixels, Loop.leaky_integrator and WavefrontCorrector, "
+        "each a process; its command is modes, of which the corrector makes actuators",
+        "none",
+        *("modal_mirror", "source", "signal", "loop"),
+    ),
+    _pyrtcao(
+        "fused",
+        "WavefrontSensor, one component with all of the step compiled by numba and WavefrontCorrector, each a process",
+        _LIMIT_ONLY,
+        *("mirror", "source", "fused"),
+    ),
+    *map(_lowfc, KERNELS),
+)
+
+
+def program(contestant: Contestant, options: argparse.Namespace, folder: Path) -> list[str]:
+    """The program of a contestant's processes; the C chain is compiled into the folder.
+
+    Raises:
+        ContestError: it does not compile.
+    """
+    if contestant.program != CHAIN:
+        python = options.pyrtcao if contestant.program == PYRTCAO else sys.executable
+        return [python, "-m", f"{__package__}.{contestant.program}"]
+    constants = {name: getattr(shared, name) for name in _CONSTANTS} | {"DIFFERENT": FRAMES}
+    words = ["cc", "-O3", "-march=native", "-ffast-math", *(f"-D{name}={value}" for name, value in constants.items())]
+    sources = [Path(__file__).with_name(CHAIN), options.isio / "ImageStreamIO.c"]
+    words += [f"-I{options.isio}", *map(str, sources), "-o", str(folder / "chain"), "-lpthread", "-lrt", "-lm"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)  # noqa: S603  # the user's own compiler
+    if done.returncode:
+        raise ContestError(f"cc failed: {done.stderr}")
+    return [str(folder / "chain")]
+
+
+def missing(contestant: Contestant, options: argparse.Namespace) -> str:
+    """Why a contestant cannot take part; empty where it can."""
+    if contestant.program == CHAIN:
+        if shutil.which("cc") is None:
+            return "there is no C compiler (cc); Debian: apt install gcc"
+        if options.isio is None or not (options.isio / "ImageStreamIO.c").is_file():
+            what = f"{options.isio} has no ImageStreamIO.c" if options.isio else "no checkout of ImageStreamIO is given"
+            return f"{what}: git clone https://github.com/milk-org/ImageStreamIO DIR, then --isio DIR"
+    if contestant.program == PYRTCAO and "pyrtcao" not in versions(options):
+        how = "python -m venv DIR && DIR/bin/pip install pyrtcao, then --pyrtcao DIR/bin/python"
+        return f"pyrtcao is not installed in {options.pyrtcao}: {how}"
+    if contestant.kernel == FUSED_KERNEL and not compiled.available():
+        return compiled.missing()
+    return ""
+
+
+def versions(options: argparse.Namespace) -> dict[str, str]:
+    """Versions of what is in the contest; pyrtcao's and ImageStreamIO's where they are there."""
+    found = {name: importlib.metadata.version(name) for name in ("lowfc", "eclipse-zenoh", "numpy")}
+    words = [options.pyrtcao, "-c", "import importlib.metadata as m; print(m.version('pyrtcao'))"]
+    with contextlib.suppress(OSError):
+        done = subprocess.run(words, capture_output=True, text=True, check=False)  # noqa: S603  # an interpreter
+        if not done.returncode:
+            found["pyrtcao"] = done.stdout.strip()
+    with contextlib.suppress(OSError, TypeError):
+        header = (options.isio / "ImageStruct.h").read_text()
+        found["ImageStreamIO"] = "".join(re.findall(r'IMAGESTRUCT_VERSION\s+"(.+?)"', header))
+    return found
