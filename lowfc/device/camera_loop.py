@@ -62,6 +62,7 @@ class CameraLoop:
         missing = service.wait_for(wait_for, WAIT_S)
         if missing and service.running:
             raise BusError(f"no sign of {', '.join(missing)} after {WAIT_S:g} s; the camera will not start without")
+        service.awaited = lambda: "" if service.work else "the camera's first frame"
         service.state = "running"
         getattr(self._driver, "start", _IDLE.start)()
         step = getattr(self._driver, "step", _IDLE.step) if service.clock.lockstep else _IDLE.step

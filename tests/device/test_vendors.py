@@ -1,20 +1,27 @@
 """Cameras of vendors against the vendors' own emulators: whole, with losses, and where something is missing."""
 
+import json
 import shutil
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.bus.run import open_run
+from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.process.clock import HostClock
+from lowfc.client import Client
 from lowfc.contract.configuration import load
 from lowfc.contract.errors import ConfigurationError
-from lowfc.contract.messages import CAMERA_STATE, FRAME
+from lowfc.contract.messages import CAMERA_STATE, FRAME, HEALTH, Role, wire
 from lowfc.device import plugins
 from lowfc.device.camera_loop import CameraLoop
 from lowfc.device.drivers import aravis
@@ -23,6 +30,7 @@ from lowfc.device.drivers.basler import BaslerCamera
 from lowfc.device.drivers.genicam import GenicamOptions
 from lowfc.testing.listener import Listener
 from lowfc.testing.memory_bus import MemoryHub
+from tests.support.loops import command, going_on, interrupt, start, until
 
 CONFIG = load(None, {"camera.rate_hz": 200.0})
 OPTIONS = {"rows": 60, "columns": 80, "region_row": 16, "region_column": 32, "rate_hz": 200.0, "exposure_us": 500.0}
@@ -146,8 +154,8 @@ def test_a_basler_camera_is_set_and_its_failed_buffers_are_lost_frames(emulated:
 
 
 @pytest.fixture
-def fake_camera() -> Iterator[None]:
-    """The fake camera of aravis on loopback; it loses 5 of 1000 packets."""
+def fake_camera(request: pytest.FixtureRequest) -> Iterator[None]:
+    """The fake camera of aravis on loopback; it loses 5 of 1000 packets, or as many as the test says."""
     program = shutil.which("arv-fake-gv-camera-0.8")
     if program is None:
         pytest.skip("needs arv-fake-gv-camera-0.8 (Debian: apt install aravis-tools)")
@@ -155,7 +163,9 @@ def fake_camera() -> Iterator[None]:
         found = aravis._aravis()
     except ConfigurationError as fault:
         pytest.skip(str(fault))
-    with subprocess.Popen([program, "-i", "127.0.0.1", "-s", "LOWFC", "-r", "5"]) as process:
+    with subprocess.Popen(
+        [program, "-i", "127.0.0.1", "-s", "LOWFC", "-r", str(getattr(request, "param", 5))]
+    ) as process:
         try:
             for _ in range(50):
                 found.update_device_list()
@@ -186,3 +196,119 @@ def test_a_camera_by_aravis_is_set_and_frames_without_all_packets_are_lost_frame
     for wrong in ({"columns": 9999}, {"pixel_format": "Mono14"}, {"camera": "Nobody-7"}):
         with pytest.raises(ConfigurationError, match=r"^camera "):
             AravisCamera(GenicamOptions(**{**settings, **wrong}), CONFIG)
+
+
+FAILING = """
+from pathlib import Path
+from lowfc.device.drivers.basler import BaslerCamera
+
+class Failing(BaslerCamera):
+    failed = 0
+
+    def expose(self):
+        exposure = super().expose()
+        if exposure is not None and exposure.number // 20 > self.failed:
+            self.failed += 1
+            self._camera.ForceFailedBufferCount.Value = 1
+            self._camera.ForceFailedBuffer.Execute()
+        return exposure
+
+    def close(self):
+        super().close()
+        Path("failed").write_text(str(self.failed))
+"""
+FAST = """
+[camera]
+rate_hz = 600
+bit_depth = 12
+
+[control]
+start_mode = "closed"
+tilt_gain = 0.2
+gain = 0.05
+
+[drivers.failing]
+rows = 80
+columns = 80
+pixel_format = "Mono12"
+"""
+
+
+@pytest.mark.basler
+@pytest.mark.exclusive
+def test_a_closed_loop_counts_every_buffer_that_fails(emulated: None, tmp_path: Path, own_runtime: Path) -> None:
+    """One buffer of twenty, at 600 Hz; the frames are the emulation's own, and the loop refuses those it must."""
+    (tmp_path / "failing.py").write_text(FAILING)
+    (tmp_path / "bench.toml").write_text(FAST)
+    of_bench = "--run failing --config bench.toml"
+    health: dict[str, wire.Health] = {}
+
+    def heard(sample: Sample) -> None:
+        message = wire.Health.FromString(sample.payload)
+        health[message.process] = message
+
+    with (
+        going_on(tmp_path, f"lowfc controller {of_bench}", f"lowfc mirror sim {of_bench}"),
+        Client("failing") as client,
+    ):
+        until(lambda: {"controller", "mirror-dm"} <= set(client.processes()))
+        with closing(ZenohBus(open_run("failing").links, Role.OPERATOR, HostClock())) as bus:
+            bus.subscribe(HEALTH, heard)
+            with going_on(tmp_path, f"lowfc camera failing.py:Failing {of_bench}"):
+                until(lambda: client.status().state.frames_used > 0)
+                time.sleep(5)
+            until(lambda: health["camera"].state == "stopped")
+            time.sleep(1.0)  # a Health of the controller after the last frame
+        status = client.status().state
+    (sent,) = (one for one in health["camera"].topics if one.topic == FRAME.key)
+    (got,) = (one for one in health["controller"].topics if one.topic == FRAME.key)
+    refused = sum(one.count for one in status.counts if one.reason < wire.REASON_MODAL_LIMIT)
+    failed = int((tmp_path / "failed").read_text())
+    assert sent.missing == got.missing >= failed > sent.published // 25
+    assert sent.published - sent.missing == got.received + got.skipped
+    assert got.received == status.frames_used + refused
+
+
+@pytest.mark.basler
+def test_a_camera_without_its_trigger_says_what_it_waits_for_and_ends_by_control_c(
+    emulated: None, tmp_path: Path, own_runtime: Path
+) -> None:
+    options = "--rows 60 --columns 80 --trigger Line1 --camera 0815-0001"
+    process = start(tmp_path, "camera", "basler", "--run", "dark", *options.split())
+    assert process.stderr is not None
+    try:
+        said = [process.stderr.readline() for _ in range(2)]
+    finally:
+        _, complaints = interrupt(process)
+    assert said == ["camera: ready (run dark)\n", "camera: waiting for the camera's first frame (run dark)\n"]
+    assert "after 0 frames: SIGINT" in complaints
+    assert process.returncode in (0, 130)
+
+
+@pytest.mark.basler
+@pytest.mark.exclusive
+@pytest.mark.parametrize("pixel_format", ["Mono8", "Mono12", "Mono16"])
+def test_a_basler_camera_keeps_the_contract(
+    emulated: None, tmp_path: Path, own_runtime: Path, pixel_format: str
+) -> None:
+    _conforms(tmp_path, "basler", f'rate_hz = 500\npixel_format = "{pixel_format}"\n', rate_hz=500)
+
+
+@pytest.mark.aravis
+@pytest.mark.exclusive
+@pytest.mark.parametrize("fake_camera", [0], indirect=True)
+def test_a_camera_by_aravis_keeps_the_contract(fake_camera: None, tmp_path: Path, own_runtime: Path) -> None:
+    _conforms(tmp_path, "aravis", 'camera = "127.0.0.1"\npixel_format = "Mono16"\n', rate_hz=100)
+
+
+def _conforms(folder: Path, driver: str, options: str, rate_hz: float) -> None:
+    exposure = "exposure_fraction = 0.25\n"
+    (folder / "bench.toml").write_text(
+        f"[camera]\nrate_hz = {rate_hz}\n{exposure}[drivers.{driver}]\nrows = 80\ncolumns = 80\n{options}"
+    )
+    words = "--run vendor --config bench.toml"
+    with going_on(folder, f"lowfc camera {driver} {words}"), Client("vendor") as client:
+        until(lambda: "camera" in client.processes() and client.processes()["camera"].state == "running")
+        found = json.loads(command(folder, f"lowfc conformance camera {words} --json"))
+    wrong = [check for check in found["checks"] if check["status"] == "wrong"]
+    assert not wrong

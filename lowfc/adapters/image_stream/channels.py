@@ -53,10 +53,10 @@ class OtherChannels:
         now_s = time.monotonic()
         if now_s - self._looked_s >= _LOOK_S:
             self._looked_s = now_s
+            self._streams = {path: stream for path, stream in self._streams.items() if stream.current()}
             for path in self._paths:
                 if path not in self._streams and (stream := opened(path, self._grid)) is not None:
                     self._streams[path] = stream
-        self._streams = {path: stream for path, stream in self._streams.items() if stream.current()}
         counts = {path: (stream.identity, stream.count) for path, stream in self._streams.items()}
         if counts != self._counts:
             shapes = [shape for stream in self._streams.values() if (shape := whole(stream)) is not None]

@@ -3,6 +3,7 @@
 It is that of `ImageStruct.h` in milk-org/ImageStreamIO. Everything here is arithmetic on a copy of the header.
 """
 
+import struct
 from math import prod
 from typing import NamedTuple
 
@@ -35,6 +36,8 @@ HEADER = np.dtype(
         "itemsize": HEADER_BYTES,
     }
 )
+NEWEST, NEWEST_START = struct.Struct("@2q64x2Q8xB"), 184
+"""What changes with each image, in one reading: `atime`, `cnt0`, `cnt1`, `write`; and where it begins."""
 KEYWORD = np.dtype(
     {
         "names": ["name", "type", "integer", "real", "text"],

@@ -58,8 +58,8 @@ class StreamReader:
             StreamError: the stream that is there now has another layout, or no free semaphore.
         """
         end_s = time.monotonic() + timeout_s
+        there = self._open()
         while True:
-            there = self._open()
             if there and (image := self._image()) is not None:
                 return image
             left_s = end_s - time.monotonic()
@@ -67,8 +67,9 @@ class StreamReader:
                 return None
             if self.stream is None:
                 time.sleep(min(left_s, _ABSENT_TURN_S))
-            else:
-                self.stream.semaphores.wait(self._semaphore, min(left_s, _TURN_S))
+            elif self.stream.semaphores.wait(self._semaphore, min(left_s, _TURN_S)):
+                continue  # its writer has just posted: it is there still
+            there = self._open()
 
     def silence(self) -> str:
         """Why no image comes, as far as the stream shows it."""
@@ -107,12 +108,12 @@ class StreamReader:
         stream = self.stream
         assert stream is not None  # noqa: S101
         for _ in range(_ATTEMPTS):
-            count = stream.count
-            if count == self._seen or stream.writing:
+            newest = stream.newest
+            if newest.number == self._seen or newest.writing:
                 return None
-            pixels, acquired_ns = stream.data[stream.plane].copy(), stream.acquired_ns
-            if stream.count == count and not stream.writing:
-                self._seen = count
-                return StreamImage(pixels, count, acquired_ns, self.generation)
+            pixels = stream.data[newest.plane % stream.layout.shape[0]].copy()
+            if stream.newest == newest:
+                self._seen = newest.number
+                return StreamImage(pixels, newest.number, newest.acquired_ns, self.generation)
             self.torn += 1
         return None

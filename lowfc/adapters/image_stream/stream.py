@@ -6,13 +6,23 @@ import stat
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import psutil
 
-from lowfc.adapters.image_stream.layout import HEADER, HEADER_BYTES, KEYWORD, MATRIX, NUMBERS, VERSION, Layout
+from lowfc.adapters.image_stream.layout import (
+    HEADER,
+    HEADER_BYTES,
+    KEYWORD,
+    MATRIX,
+    NEWEST,
+    NEWEST_START,
+    NUMBERS,
+    VERSION,
+    Layout,
+)
 from lowfc.adapters.image_stream.semaphores import Semaphores
 from lowfc.contract.errors import LowfcError
 
@@ -38,6 +48,28 @@ def stream_path(name: str) -> Path:
         raise StreamError(f"a stream's name has 1 to {_LONGEST_NAME} characters without '/', got {name!r}")
     folders = (Path(one) for one in (os.environ.get("MILK_SHM_DIR"), "/milk/shm", "/tmp") if one)  # noqa: S108
     return next(one for one in folders if one.is_dir() or one == Path("/tmp")) / f"{name}.im.shm"  # noqa: S108
+
+
+class Newest(NamedTuple):
+    """What the header says of the newest image.
+
+    Attributes:
+        seconds: and `nanoseconds` of its `atime`, when it was acquired.
+        number: of the image, which is how many were written.
+        plane: number of the plane that it is in.
+        writing: whether an image is being written, or its writer died in the middle.
+    """
+
+    seconds: int
+    nanoseconds: int
+    number: int
+    plane: int
+    writing: int
+
+    @property
+    def acquired_ns(self) -> int:
+        """When it was acquired, nanoseconds since the epoch."""
+        return _since_epoch_ns(self.seconds, self.nanoseconds)
 
 
 class Stream:
@@ -88,7 +120,7 @@ class Stream:
         self._log = Semaphores(self._mapping, starts["log"], 1)
         self.readers = np.ndarray(count, "<i4", self._mapping, starts["readers"])
         self.writers = np.ndarray(count, "<i4", self._mapping, starts["writers"])
-        self._cnt0, self._cnt1, self._write = (self._header[name] for name in ("cnt0", "cnt1", "write"))
+        self._cnt0, self._write = self._header["cnt0"], self._header["write"]
         if not self.semaphores.usable():
             raise StreamError(f"stream {self.name!r} has semaphores of another C library ({path})")
 
@@ -154,19 +186,14 @@ class Stream:
         return bool(self._write[0])
 
     @property
-    def plane(self) -> int:
-        """The plane of the newest image."""
-        return int(self._cnt1[0]) % self.layout.shape[0]
-
-    @property
-    def acquired_ns(self) -> int:
-        """When the newest image was acquired (`atime`), nanoseconds since the epoch."""
-        return self._time_ns("atime")
+    def newest(self) -> Newest:
+        """The newest image."""
+        return Newest._make(NEWEST.unpack_from(self._mapping, NEWEST_START))
 
     @property
     def written_ns(self) -> int:
         """When the newest image was written, nanoseconds since the epoch."""
-        return self._time_ns("writetime")
+        return _since_epoch_ns(*self._header["writetime"][0].tolist())
 
     def keywords(self) -> dict[str, float | str]:
         """Its keywords, by name."""
@@ -238,12 +265,6 @@ class Stream:
         except psutil.Error:
             return alive(pid)
 
-    def _time_ns(self, name: str) -> int:
-        """A time of the header; the C library writes TAI, which is ahead where the host knows the leap seconds."""
-        seconds, nanoseconds = (int(one) for one in self._header[name][0])
-        time_ns, ahead_ns = seconds * _NS + nanoseconds, _tai_ahead_ns()
-        return time_ns - ahead_ns if ahead_ns and time_ns > time.time_ns() + ahead_ns // 2 else time_ns
-
 
 def alive(pid: int) -> bool:
     """Whether there is a process of that number."""
@@ -262,6 +283,12 @@ def _identity(found: os.stat_result) -> tuple[int, int, int]:
 
 def _text(raw: bytes) -> str:
     return raw.partition(b"\0")[0].decode("ascii", "backslashreplace")
+
+
+def _since_epoch_ns(seconds: int, nanoseconds: int) -> int:
+    """A time of a header; the C library writes TAI, which is ahead where the host knows the leap seconds."""
+    time_ns, ahead_ns = seconds * _NS + nanoseconds, _tai_ahead_ns()
+    return time_ns - ahead_ns if ahead_ns and time_ns > time.time_ns() + ahead_ns // 2 else time_ns
 
 
 def _now() -> tuple[int, int]:
