@@ -6,13 +6,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.bus.run import open_run
@@ -198,6 +199,20 @@ def test_a_camera_by_aravis_is_set_and_frames_without_all_packets_are_lost_frame
             AravisCamera(GenicamOptions(**{**settings, **wrong}), CONFIG)
 
 
+@contextmanager
+def _healths(run_id: str) -> Iterator[dict[str, wire.Health]]:
+    """The last Health of each process of a run."""
+    found: dict[str, wire.Health] = {}
+
+    def heard(sample: Sample) -> None:
+        health = wire.Health.FromString(sample.payload)
+        found[health.process] = health
+
+    with closing(ZenohBus(open_run(run_id).links, Role.OPERATOR, HostClock())) as bus:
+        bus.subscribe(HEALTH, heard)
+        yield found
+
+
 FAILING = """
 from pathlib import Path
 from lowfc.device.drivers.basler import BaslerCamera
@@ -241,30 +256,25 @@ def test_a_closed_loop_counts_every_buffer_that_fails(emulated: None, tmp_path: 
     (tmp_path / "failing.py").write_text(FAILING)
     (tmp_path / "bench.toml").write_text(FAST)
     of_bench = "--run failing --config bench.toml"
-    health: dict[str, wire.Health] = {}
-
-    def heard(sample: Sample) -> None:
-        message = wire.Health.FromString(sample.payload)
-        health[message.process] = message
-
     with (
+        _healths("failing") as health,
         going_on(tmp_path, f"lowfc controller {of_bench}", f"lowfc mirror sim {of_bench}"),
-        Client("failing") as client,
     ):
-        until(lambda: {"controller", "mirror-dm"} <= set(client.processes()))
-        with closing(ZenohBus(open_run("failing").links, Role.OPERATOR, HostClock())) as bus:
-            bus.subscribe(HEALTH, heard)
-            with going_on(tmp_path, f"lowfc camera failing.py:Failing {of_bench}"):
-                until(lambda: client.status().state.frames_used > 0)
-                time.sleep(5)
-            until(lambda: health["camera"].state == "stopped")
-            time.sleep(1.0)  # a Health of the controller after the last frame
-        status = client.status().state
+        until(lambda: {"controller", "mirror-dm"} <= set(health))
+        with going_on(tmp_path, f"lowfc camera failing.py:Failing {of_bench}"):
+            until(lambda: "camera" in health and health["camera"].state == "running")
+            time.sleep(5)
+        until(lambda: health["camera"].state == "stopped")
+        time.sleep(1.0)  # a Health of the controller after the last frame
+        with Client("failing") as client:
+            status = client.status().state
     (sent,) = (one for one in health["camera"].topics if one.topic == FRAME.key)
     (got,) = (one for one in health["controller"].topics if one.topic == FRAME.key)
-    refused = sum(one.count for one in status.counts if one.reason < wire.REASON_MODAL_LIMIT)
+    refusals = (wire.REASON_LATE, wire.REASON_SATURATED, wire.REASON_DARK, wire.REASON_STUCK)
+    refused = sum(one.count for one in status.counts if one.reason in refusals)
     failed = int((tmp_path / "failed").read_text())
-    assert sent.missing == got.missing >= failed > sent.published // 25
+    assert sent.missing == got.missing >= failed - 1  # the last may fail after the last frame
+    assert failed > sent.published // 25
     assert sent.published - sent.missing == got.received + got.skipped
     assert got.received == status.frames_used + refused
 
@@ -285,13 +295,29 @@ def test_a_camera_without_its_trigger_says_what_it_waits_for_and_ends_by_control
     assert process.returncode in (0, 130)
 
 
+PLAYING = """
+from lowfc.device.drivers.basler import BaslerCamera
+
+class Playing(BaslerCamera):
+    def start(self):
+        self._camera.ImageFilename.Value, self._camera.ImageFileMode.Value = "images", "On"
+        self._camera.TestImageSelector.Value = "Off"
+        super().start()
+"""
+
+
 @pytest.mark.basler
 @pytest.mark.exclusive
-@pytest.mark.parametrize("pixel_format", ["Mono8", "Mono12", "Mono16"])
-def test_a_basler_camera_keeps_the_contract(
-    emulated: None, tmp_path: Path, own_runtime: Path, pixel_format: str
-) -> None:
-    _conforms(tmp_path, "basler", f'rate_hz = 500\npixel_format = "{pixel_format}"\n', rate_hz=500)
+def test_a_basler_camera_of_16_bits_keeps_the_contract(emulated: None, tmp_path: Path, own_runtime: Path) -> None:
+    """Pylon plays images of a spot; those of its own have eight bits, whatever the format."""
+    (tmp_path / "playing.py").write_text(PLAYING)
+    (tmp_path / "images").mkdir()
+    y, x = np.mgrid[:80, :80]
+    spot = 100 + 20_000 * np.exp(-((y - 40) ** 2 + (x - 38) ** 2) / 200)
+    for number in range(20):
+        pixels = np.random.default_rng(number).poisson(spot).astype(np.uint16)
+        Image.fromarray(pixels).save(tmp_path / f"images/{number:02}.png")
+    _conforms(tmp_path, "playing.py:Playing", 'pixel_format = "Mono16"\n', rate_hz=500)
 
 
 @pytest.mark.aravis
@@ -304,11 +330,12 @@ def test_a_camera_by_aravis_keeps_the_contract(fake_camera: None, tmp_path: Path
 def _conforms(folder: Path, driver: str, options: str, rate_hz: float) -> None:
     exposure = "exposure_fraction = 0.25\n"
     (folder / "bench.toml").write_text(
-        f"[camera]\nrate_hz = {rate_hz}\n{exposure}[drivers.{driver}]\nrows = 80\ncolumns = 80\n{options}"
+        f"[camera]\nrate_hz = {rate_hz}\n{exposure}"
+        f"[drivers.{plugins.section(driver)}]\nrows = 80\ncolumns = 80\n{options}"
     )
     words = "--run vendor --config bench.toml"
-    with going_on(folder, f"lowfc camera {driver} {words}"), Client("vendor") as client:
-        until(lambda: "camera" in client.processes() and client.processes()["camera"].state == "running")
+    with _healths("vendor") as health, going_on(folder, f"lowfc camera {driver} {words}"):
+        until(lambda: "camera" in health and health["camera"].state == "running")
         found = json.loads(command(folder, f"lowfc conformance camera {words} --json"))
     wrong = [check for check in found["checks"] if check["status"] == "wrong"]
     assert not wrong
