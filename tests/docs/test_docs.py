@@ -160,9 +160,10 @@ def test_the_requests(tmp_path: Path, own_runtime: Path) -> None:
     assert loop.returncode == 0, complaints
     assert said[0].startswith("closed · residual ")
     assert said[1].startswith("gain is now 0.3 0.3 0.0"), "of tip and tilt alone"
-    replies = [text.split(",")[0] for text in said[2:6]]
+    assert said[2].startswith("the gain of Z2"), "of all modes"
+    replies = [text.split(",")[0] for text in said[3:7]]
     assert replies == ["loop open", "loop closed", "loop in safe mode", "loop open"]
-    assert re.match(r"\S+  open at \d+ Hz, up \d+ s; camera, controller, mirror-dm; not recording\n", said[6])
+    assert re.match(r"\S+  open at \d+ Hz, up \d+ s; camera, controller, mirror-dm; not recording\n", said[7])
     assert "frame to command" in out
 
 
