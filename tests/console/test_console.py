@@ -336,9 +336,8 @@ def test_the_words_are_those_of_the_tiles() -> None:
     none = np.zeros(0, np.float32)
     reading = Reading(stage.host_ns, 0.1, stage.watcher.state(), found, None, None, none, {}, [], [], [], [], NOLL)
     assert panels.verdict(reading, RUN) == (found.level, f"CHECK  {found.headline}")
-    lines = panels.tiles(reading).plain.splitlines()
-    for line, tile in zip(lines, found.tiles, strict=True):
-        assert all(word in line for word in (tile.title, tile.value, tile.detail))
+    for line, tile in zip(panels.tiles(reading), found.tiles, strict=True):
+        assert all(word in line.plain for word in (tile.title, tile.value, tile.detail))
 
 
 def test_figures_of_any_size_fit_their_place() -> None:

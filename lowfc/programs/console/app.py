@@ -25,6 +25,7 @@ from lowfc.programs.console.actions import ACTIONS, EVERY, SAFE, Action, Values
 from lowfc.programs.console.feed import Feed, Reading
 from lowfc.programs.console.form import Form, Help
 from lowfc.programs.console.gains import Gains
+from lowfc.programs.console.lines import Lines
 from lowfc.programs.console.task import Task
 from lowfc.programs.view.verdicts.tile import FILL, INK, Level
 
@@ -65,7 +66,7 @@ class Console(App[str]):
     #right {{ width: 1fr; padding: 0 0 0 1; }}
     #tiles {{ height: 8; }}
     #modes, #pictures {{ height: 7; }}
-    #tiles, #sparks, #modes, #gains, #log, #peers, #table {{ text-wrap: nowrap; text-overflow: ellipsis; }}
+    #log, #table {{ text-wrap: nowrap; text-overflow: ellipsis; }}
     #sparks {{ height: 2; }}
     #gains {{ height: 5; }}
     #facts {{ height: 5; }}
@@ -115,7 +116,7 @@ class Console(App[str]):
         self._bus, self._run_id, self._run_clock, self._moved = bus, run_id, clock, moved
         self._terminal_gone = terminal_gone
         self._feed = Feed(bus, run_id, clock)
-        self._lines: deque[Text] = deque(maxlen=_LINES)
+        self._history: deque[Text] = deque(maxlen=_LINES)
         self._shown: dict[str, Text] = {}
         self._tasks: list[Task] = []
         self._mute = False
@@ -129,9 +130,9 @@ class Console(App[str]):
         with Horizontal(id="figures"):
             with Vertical(id="left"):
                 for name in ("tiles", "sparks", "modes"):
-                    yield Static(id=name)
+                    yield Lines(name)
             with Vertical(id="right"):
-                yield Static(id="pictures")
+                yield Lines("pictures")
                 yield Gains()
                 yield Static(id="facts")
         yield Static(id="log")
@@ -142,7 +143,7 @@ class Console(App[str]):
                 for one in ACTIONS:
                     yield Button(Text(f"{one.key} {one.name}"), id=_id(one), compact=True)
             yield Button("SAFE\nkey s or F12", id=_id(SAFE))
-        yield Static(id="peers")
+        yield Lines("peers")
 
     def on_mount(self) -> None:
         """Begin to read."""
@@ -241,7 +242,7 @@ class Console(App[str]):
     @property
     def _torn_down(self) -> bool:
         """Whether the screen is no longer whole: what is under way then has nowhere to go."""
-        return not (self.screen_stack and self.screen_stack[0].query("#peers"))
+        return not (self.screen_stack and any(one.id == "peers" for one in self.screen_stack[0].children))
 
     def _read(self) -> None:
         if self._terminal_gone():  # nobody looks, and what reads the keys would never rest
@@ -263,16 +264,16 @@ class Console(App[str]):
         self._put("clock", Text(f"{panels.clock(reading.host_ns)}\nUTC"))
         self.screen_stack[0].query_one("#figures").set_class(not reading.connected, "cut")
         if reading.connected:
-            self._put("tiles", panels.tiles(reading))
-            self._put("sparks", panels.sparks(reading))
-            self._put("modes", panels.modes(reading, _LEFT))
+            self._drawn("tiles").show(panels.tiles(reading))
+            self._drawn("sparks").show(panels.sparks(reading))
+            self._drawn("modes").show(panels.modes(reading, _LEFT))
             self._put("facts", panels.facts(reading))
             if self._readings % PICTURES_EVERY == 0:
-                self._put("pictures", panels.pictures(reading))
-            self.screen_stack[0].query_one(Gains).show(reading)
-        self._put("peers", panels.peers(reading, self._run_id))
-        self._lines.extend([*map(panels.request_line, reading.requests), *map(panels.event_line, reading.events)])
-        shown = list(self._lines)[-max(1, self._main("#log").size.height) :]
+                self._drawn("pictures").show(panels.pictures(reading))
+            self.screen_stack[0].query_one(Gains).update(reading)
+        self._drawn("peers").show([panels.peers(reading, self._run_id)])
+        self._history.extend([*map(panels.request_line, reading.requests), *map(panels.event_line, reading.events)])
+        shown = list(self._history)[-max(1, self._main("#log").size.height) :]
         self._put("log", Text("\n").join(shown))
         if not self._mute and any(event.level >= Severity.ERROR for event in reading.events):
             self.bell()
@@ -293,6 +294,9 @@ class Console(App[str]):
         if self._shown.get(name) != text:
             self._shown[name] = text
             self._main(f"#{name}").update(text, layout=False)
+
+    def _drawn(self, name: str) -> Lines:
+        return self.screen_stack[0].query_one(f"#{name}", Lines)
 
     def _main(self, name: str) -> Static:
         return self.screen_stack[0].query_one(name, Static)

@@ -28,8 +28,9 @@ CUT_S = 1.5
 """Without a message of any process for so long the console is cut off: each sends Health twice a second."""
 TREND = 60
 """Seconds that the sparklines show, one value each."""
-_WAITING = {EVENT: 200, REQUEST: 200, STEP: 4000, TRUTH: 4000}
+_WAITING = {EVENT: 200, REQUEST: 200, STEP: 4000, TRUTH: 50}  # of the truth so many a reading are enough for an rms
 _TOPICS = (*(topic for topic in SHOWN if topic is not SURFACE), REQUEST)
+_SCIPY_S = 4.0  # after which it is imported: the first figures do without, and a verdict of later would stop the screen
 _AGAIN_S = 5.0  # after which a busy controller is asked again for what it has not answered
 _POINT_NS = 1_000_000_000
 _UNSEEN = frozenset(("status", "configuration", "renew"))
@@ -88,6 +89,9 @@ class Feed:
         self._point_ns = 0
         self._read_s = self._asked_s = time.monotonic()
         self._catch_up()
+        later = threading.Timer(_SCIPY_S, _import_scipy)
+        later.daemon = True
+        later.start()
 
     def read(self) -> Reading:
         """Take in what has come since the last call."""
@@ -149,7 +153,6 @@ class Feed:
         self._asked_s = time.monotonic()
 
         def ask() -> None:
-            import_module("scipy.signal")  # that a verdict uses later: the screen would stand still meanwhile
             self._earlier.extend(states(self._bus, SHOWN))
             try:
                 self._config = configuration_of(Client(self._run_id, bus=self._bus))
@@ -157,6 +160,11 @@ class Feed:
                 return
 
         threading.Thread(target=ask, name="earlier", daemon=True).start()
+
+
+def _import_scipy() -> None:
+    for name in ("lowfc.control.laws.tuning", "scipy.signal"):
+        import_module(name)
 
 
 def _request(sample: Sample) -> wire.Request | None:

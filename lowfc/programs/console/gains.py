@@ -8,10 +8,10 @@ import numpy as np
 from rich.text import Text
 from textual import events
 from textual.message import Message
-from textual.widgets import Static
 
 from lowfc.arrays import Mask
 from lowfc.programs.console.feed import Reading
+from lowfc.programs.console.lines import Lines
 from lowfc.programs.console.panels import BOLD, DIM, style
 from lowfc.programs.view.draw.colours import BLUE, GREY
 
@@ -24,7 +24,7 @@ _BEFORE = 11  # columns before the bar
 _PENDING_S = 1.0  # after which the controller's state has what was asked
 
 
-class Gains(Static):
+class Gains(Lines):
     """The knobs; one is chosen, and turned by keys or by a click on its bar: its modes keep their ratios."""
 
     class Turned(Message):
@@ -35,15 +35,14 @@ class Gains(Static):
             self.modes, self.values = modes, values
 
     def __init__(self) -> None:
-        super().__init__(id="gains")
+        super().__init__("gains")
         self._chosen = 0
         self._noll: tuple[int, ...] = ()
         self._gain = np.zeros(0, np.float32)
         self._automatic: Mask = np.zeros(0, bool)
-        self._shown: Text | None = None
         self._pending: dict[int, tuple[float, float]] = {}
 
-    def show(self, reading: Reading) -> None:
+    def update(self, reading: Reading) -> None:
         """Take in the gains of the run."""
         state = reading.state.controller_state
         if state is None or len(state.gain) != len(reading.noll):
@@ -115,10 +114,7 @@ class Gains(Static):
                     (" auto" if self._automatic[places].all() else "", DIM),
                 )
             )
-        text = Text("\n").join(lines) if lines else Text("gains are not known yet", DIM)
-        if text != self._shown:
-            self._shown = text
-            self.update(text, layout=False)
+        self.show(lines or [Text("gains are not known yet", DIM)])
 
 
 def groups(noll: Sequence[int]) -> list[tuple[str, tuple[int, ...]]]:

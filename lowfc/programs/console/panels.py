@@ -53,7 +53,7 @@ def clock(host_ns: int) -> str:
     return f"{datetime.fromtimestamp(host_ns * 1e-9, UTC):%H:%M:%S}"
 
 
-def tiles(reading: Reading) -> Text:
+def tiles(reading: Reading) -> list[Text]:
     """A line for each tile: its title, word or figure, and what that means."""
     lines = []
     for tile in reading.verdict.tiles:
@@ -61,10 +61,10 @@ def tiles(reading: Reading) -> Text:
         line.append(f" {tile.value:^12} ", style(INK[tile.level], FILL[tile.level], bold=tile.level > Level.GOOD))
         line.append(f" {tile.detail}", style())
         lines.append(line)
-    return Text("\n").join(lines)
+    return lines
 
 
-def pictures(reading: Reading) -> Text:
+def pictures(reading: Reading) -> list[Text]:
     """The newest frame and the mirror, small."""
     lines = [Text() for _ in range(_PIXELS // 2)]
     captions = []
@@ -80,7 +80,7 @@ def pictures(reading: Reading) -> Text:
         for line, text in zip(lines, halves(drawn), strict=True):
             line.append_text(text).append("      ")
         captions.append(f"{caption:18}")
-    return Text("\n").join([*lines, Text("".join(captions), DIM)])
+    return [*lines, Text("".join(captions), DIM)]
 
 
 def reduced(array: Array) -> Array:
@@ -104,17 +104,17 @@ def halves(colours: Rgb) -> list[Text]:
     return lines
 
 
-def sparks(reading: Reading) -> Text:
+def sparks(reading: Reading) -> list[Text]:
     """Residual and light of the last minute."""
     found, flux = reading.state.wavefront, reading.state.flux
     kind = "true" if reading.state.true else "measured"
     residual = "?" if found is None else f"{figure(found.residual_nm)} nm {kind}"
     light = "?" if flux is None else f"{100 * flux:.0f} %"
     rows = ("residual", reading.residual_nm, residual), ("light", reading.light, light)
-    return Text("\n").join(
+    return [
         Text.assemble((f"{name:10}", DIM), (f"{sparkline(values, 34):>34}", style(ORANGE)), f" {last}")
         for name, values, last in rows
-    )
+    ]
 
 
 def sparkline(values: Sequence[float], width: int) -> str:
@@ -124,11 +124,11 @@ def sparkline(values: Sequence[float], width: int) -> str:
     return "".join(" " if np.isnan(one) else _SPARKS[min(int(one / largest * 8), 7)] for one in last)
 
 
-def modes(reading: Reading, width: int) -> Text:
+def modes(reading: Reading, width: int) -> list[Text]:
     """The command of each mode as a bar between its limits, in columns."""
     state, noll = reading.state.controller_state, reading.noll
     if state is None or not noll or len(noll) != len(reading.command_nm):
-        return Text("no calibration, so no modes yet", DIM)
+        return [Text("no calibration, so no modes yet", DIM)]
     columns = -(-len(noll) // _MODE_LINES)
     each = width // columns
     cells = [
@@ -141,7 +141,7 @@ def modes(reading: Reading, width: int) -> Text:
         for cell in cells[number::_MODE_LINES]:
             line.append_text(cell).append(" ")
         lines.append(line)
-    return Text("\n").join(lines)
+    return lines
 
 
 def _mode(noll: int, command_nm: float, limit_nm: float, width: int) -> Text:

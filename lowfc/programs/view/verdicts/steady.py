@@ -12,7 +12,6 @@ from lowfc.contract.messages import wire
 from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.spectra import pieces
 from lowfc.control.laws.stability import settling_frames
-from lowfc.control.laws.tuning import best_gains
 from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.view.snapshot import Snapshot
 
@@ -94,6 +93,8 @@ def attained(steady: Steady, rate_hz: float, camera: wire.CameraState | None) ->
     law, modes = steady.law, len(steady.law.gain) if steady.law is not None else 0
     if law is None or steady.mode != LoopMode.CLOSED or not rate_hz:
         return None
+    from lowfc.control.laws.tuning import best_gains  # scipy, which takes as long to import as all else of a view
+
     sequence, signals = steady.rows()
     try:
         timing = Timing.of(law.delay_frames, exposure_fraction(camera) or 0.0)
