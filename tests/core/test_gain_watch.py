@@ -11,20 +11,21 @@ from lowfc.arrays import Single
 from lowfc.contract.codecs.state_codec import controller_state, decode_state
 from lowfc.contract.configuration import FIXED_GAINS
 from lowfc.control.calibration.granted import noise_covariance_nm2
+from lowfc.control.laws.law import LET_GO
 from lowfc.control.loop.safety import LoopMode
 from tools.law_bench import Bench, calibrated, configured
 
 AUTO = {"control.tilt_gain": "auto", "control.gain": "auto"}
 
 
-def bench(magnitude: float, preset: str = "bench", **changed: Any) -> Bench:
+def bench(magnitude: float, preset: str = "bench", sensor: str = "sam", **changed: Any) -> Bench:
     star = {
         "camera.rate_hz": 250.0,
         "star.magnitude": magnitude,
         "disturbance.preset": preset,
         "control.start_mode": "closed",
     }
-    config = configured("sam", **AUTO | star | changed)
+    config = configured(sensor, **AUTO | star | changed)
     return Bench(config, calibrated(config))
 
 
@@ -86,6 +87,36 @@ def test_modes_that_are_left_alone_bring_less_noise_to_the_others(faint: Bench) 
     assert (made[~left] < 0.9 * own[~left]).any()
 
 
+def test_modes_that_are_left_alone_are_let_go() -> None:
+    """What an earlier gain put on the mirror does not stay there; at a gain of 0 that a person gave, it does."""
+    loop = bench(0.0)
+    loop.run(750)
+    loop.ask("gain", modes=(4,), values=(0.0,))
+    gain = gains(loop).copy()
+    gain[5:] = 0
+    loop.ask("gain", values=tuple(gain.tolist()), text="auto")
+    before_nm = loop.steps[-1].command_nm
+    loop.run(99)
+    after_nm = loop.steps[-1].command_nm
+    assert np.abs(before_nm[5:]).max() > 0.5
+    np.testing.assert_allclose(after_nm[5:], before_nm[5:] * LET_GO**99, atol=1e-3)
+    assert after_nm[2] == before_nm[2] != 0
+
+
+@pytest.mark.parametrize("magnitude", [2.0, 8.0])
+def test_a_sensor_beyond_its_range_is_not_believed(magnitude: float) -> None:
+    """The squares of the tilt that the wheel leaves look like focus, astigmatism and spherical to a Zernike sensor."""
+    loop = bench(magnitude, "reaction-wheel", "zwfs")
+    form = np.diag(factory.contrast_of(loop.config).form)
+    loop.run(5000)
+    truths = [truth.continuous for truth in loop.truths[-2500:]]
+    left, open_ = (
+        form @ np.mean(np.square(values), axis=0)
+        for values in ([one.residual_nm for one in truths], [one.disturbance_nm for one in truths])
+    )
+    assert left < open_
+
+
 def test_whoever_reads_the_state_goes_on_with_the_same_reconstructor(faint: Bench) -> None:
     drive = faint.state.drive
     assert drive is not None
@@ -95,6 +126,7 @@ def test_whoever_reads_the_state_goes_on_with_the_same_reconstructor(faint: Benc
     assert again.drive is not None
     np.testing.assert_array_equal(again.drive.estimator.rows, drive.estimator.rows)
     np.testing.assert_array_equal(again.drive.automatic, drive.automatic)
+    np.testing.assert_array_equal(again.drive.law.kept, drive.law.kept)
     assert controller_state(again, settings, 1) == message
 
 

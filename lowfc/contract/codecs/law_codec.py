@@ -59,7 +59,8 @@ def overruled(state: wire.ControllerState) -> list[str]:
 
 def gains_of(state: wire.ControllerState) -> Law:
     """The integrator of a controller's state."""
-    return Law(*(np.array(values, np.float32) for values in (state.gain, state.leak, state.limit_nm)))
+    gain, leak, limit_nm = (np.array(values, np.float32) for values in (state.gain, state.leak, state.limit_nm))
+    return Law(gain, leak, limit_nm)
 
 
 def wire_play(table: PlayTable, time_ns: int) -> wire.Play:

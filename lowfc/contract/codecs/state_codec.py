@@ -123,14 +123,13 @@ def decode_state(
             if x.shape != linear_law.at_rest(following.law).shape or following.law.noll != calibration.noll:
                 raise ValueError("the law of the controller's state does not fit")
         drive = drive._replace(
-            law=law,
             camera=camera_settings(message.camera_expected) if message.HasField("camera_expected") else drive.camera,
             following=following,
             command_channels=command_channels_of(message, drive.added(), drive.to_modes, plays),
             history_nm=tuple(history),
             actuators_nm=actuators,
             automatic=np.array(message.automatic or [False] * len(calibration.noll), bool),
-        )
+        ).under(law)
         if message.prior_nm2:
             prior_nm2 = np.array(message.prior_nm2, np.float32)
             drive = drive.weighted(Weighting(prior_nm2, message.weighting_flux_dn))

@@ -4,7 +4,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from lowfc.arrays import Single, single
+from lowfc.arrays import Mask, Single, single
+
+LET_GO = np.float32(0.99)
+"""Part of its command that a mode keeps from frame to frame when its gain was measured to be 0: its error says nothing
+of the command, which must not stay where an earlier gain has led it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -12,13 +16,15 @@ class Law:
     """Gain, leak and limit of each mode, each (modes,) float32; the limit is nm of wavefront rms.
 
     Attributes:
-        kept: (modes,) 1 - leak.
+        left: (modes,) whether a mode is left alone because that was measured to be best.
+        kept: (modes,) part of the command that stays: 1 - leak, or `LET_GO` of a mode that is left.
         rows: (3, modes) gain, kept and limit.
     """
 
     gain: Single
     leak: Single
     limit_nm: Single
+    left: Mask | bool = False
     kept: Single = field(init=False)
     rows: Single = field(init=False)
 
@@ -35,12 +41,12 @@ class Law:
         ):
             if not (np.isfinite(array).all() and (array >= low).all() and (array <= high).all()):
                 raise ValueError(f"every {name} must be between {low} and {high}, got {array.tolist()}")
-        object.__setattr__(self, "kept", 1 - self.leak)
+        object.__setattr__(self, "kept", np.where(self.left, np.minimum(1 - self.leak, LET_GO), 1 - self.leak))
         object.__setattr__(self, "rows", single([self.gain, self.kept, self.limit_nm]))
 
 
 def integrate(law: Law, command_nm: Single, error_nm: Single) -> tuple[Single, bool]:
-    """command[k+1] = (1 - leak) command[k] - gain error[k], cut to the limit of each mode; and whether any was cut.
+    """command[k+1] = kept command[k] - gain error[k], cut to the limit of each mode; and whether any was cut.
 
     All (modes,) float32, nm of wavefront rms.
     """

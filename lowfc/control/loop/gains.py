@@ -1,6 +1,7 @@
 """Gains, leaks and limits of the integrator, as they are asked for: by a person, or by what was measured."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +26,6 @@ def changed_law(settings: Settings, drive: ActiveLoop, request: Request) -> Chan
             "`lowfc ctl law integrator` goes back to the one that has"
         )
     law = _changed(drive.law, drive.calibration.noll, settings.delay_frames, request)
-    drive = drive._replace(law=law)
     if request.name == "gain":  # what a person gave is not automatic, and is measured as a mode that is corrected
         given = _chosen(drive, request)
         weighting = drive.weighting
@@ -33,6 +33,7 @@ def changed_law(settings: Settings, drive: ActiveLoop, request: Request) -> Chan
         if weighting is not None and (weighting.prior_nm2[given] > 0).any():
             prior_nm2 = np.where(given, np.float32(0), weighting.prior_nm2)
             drive = drive.weighted(weighting._replace(prior_nm2=prior_nm2))
+    drive = drive.under(law)
     text = f"{request.name} is now {_listed(getattr(law, _ATTRIBUTES[request.name]))}"
     return drive, text + remark(settings, drive, request)
 
@@ -41,7 +42,7 @@ def _automatic_gain(settings: Settings, drive: ActiveLoop, request: Request) -> 
     """Gains that follow what is measured: without values, from now on; with values, what they have become."""
     chosen, noll = _chosen(drive, request), drive.calibration.noll
     if not request.values:
-        drive = drive._replace(automatic=drive.automatic | chosen)
+        drive = drive._replace(automatic=drive.automatic | chosen).under(drive.law)
         names = ", ".join(f"Z{index}" for index, one in zip(noll, chosen, strict=True) if one)
         return drive, f"the gain of {names} is automatic"
     changed = _changed(drive.law, noll, settings.delay_frames, request)
@@ -53,7 +54,7 @@ def _automatic_gain(settings: Settings, drive: ActiveLoop, request: Request) -> 
     mine = chosen & drive.automatic
     gain = np.where(mine, changed.gain, drive.law.gain)
     weighting = Weighting(prior_nm2, request.flux_dn) if prior_nm2.any() else None
-    drive = drive._replace(law=replace(drive.law, gain=gain)).weighted(weighting)
+    drive = drive.under(replace(drive.law, gain=gain)).weighted(weighting)
     text = _listed(gain)
     return drive, f"gain is now {text}", PendingEvent("GAINS_CHANGED", {"gains": text})
 
@@ -103,7 +104,8 @@ def _changed(law: Law, noll: tuple[int, ...], delay_frames: float, request: Requ
         raise ValueError(f"leak must be between 0 and 1, got {max(request.values, key=abs):g}")
     elif lowest < 0:
         raise ValueError(f"limit must be at least 0 nm, got {lowest:g}")
-    return replace(law, **{attribute: values})
+    changed: dict[str, Any] = {attribute: values}
+    return replace(law, **changed)
 
 
 _ATTRIBUTES = {"gain": "gain", "leak": "leak", "limit": "limit_nm"}

@@ -217,6 +217,10 @@ class ActiveLoop(NamedTuple):
         """The modal command (modes,) that the last exposure saw."""
         return seen_nm(self.weights, self.history_nm)
 
+    def under(self, law: Law) -> "ActiveLoop":
+        """With these gains; a mode whose automatic gain is 0 is let go."""
+        return self._replace(law=replace(law, left=self.automatic & (law.gain == 0)))
+
     def weighted(self, weighting: Weighting | None) -> "ActiveLoop":
         """With R made for other modes, or another star."""
         calibration = self.calibration

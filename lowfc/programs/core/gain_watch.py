@@ -27,7 +27,7 @@ CAUTIOUS = 0.05
 LEAST_FRAMES = 50
 """Of a window, however slow the loop."""
 REQUESTER = "automatic gains"
-_JUDGED = (LoopMode.OPEN, LoopMode.CLOSED)
+TILT = (2, 3)
 
 
 class Remarks(NamedTuple):
@@ -46,9 +46,11 @@ class _Group:
     def __init__(self, mask: Mask, settings: Settings, drive: ActiveLoop, window_s: float) -> None:
         rate_hz = settings.rate_hz or 1.0
         frames = [max(round(seconds * rate_hz), LEAST_FRAMES) for seconds in (FIRST_S, window_s)]
+        tilt = np.isin(drive.calibration.noll, TILT)
         self.mask = mask
+        self.tilt = tilt if tilt.sum() == len(TILT) and not (tilt & mask).any() else None
         self.bank = GainBank(
-            drive.law.kept[mask],
+            1 - drive.law.leak[mask],
             drive.law.limit_nm[mask],
             drive.weights,
             settings.delay_frames,
@@ -124,7 +126,12 @@ class GainWatch:
         judged = [
             group
             for group in self._groups
-            if group.bank.followed(open_nm[group.mask], step.error_nm[group.mask], closed=closed)
+            if group.bank.followed(
+                open_nm[group.mask],
+                step.error_nm[group.mask],
+                None if group.tilt is None else step.error_nm[group.tilt],
+                closed=closed,
+            )
         ]
         if not judged:
             return Remarks(events=events) if events else NOTHING
@@ -148,11 +155,11 @@ class GainWatch:
 
     def _begin(self, drive: ActiveLoop) -> None:
         """Begin anew under another calibration, leak or limit."""
-        of = drive.calibration.id, drive.law.kept.tobytes(), drive.law.limit_nm.tobytes()
+        of = drive.calibration.id, drive.law.leak.tobytes(), drive.law.limit_nm.tobytes()
         if of == self._of:
             return
         self._of = of
-        tilt = np.isin(drive.calibration.noll, (2, 3))
+        tilt = np.isin(drive.calibration.noll, TILT)
         self._groups = [
             _Group(mask, self._settings, drive, window_s)
             for mask, window_s in ((tilt, TILT_S), (~tilt, OTHERS_S))

@@ -7,7 +7,7 @@ from lowfc.arrays import Array
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.granted import granted_rows, noise_covariance_nm2
 from lowfc.control.calibration.regularised import pixel_variance, reconstruct
-from lowfc.control.laws.automatic_gain import GainBank, Verdict, left_alone_nm2
+from lowfc.control.laws.automatic_gain import Feigned, GainBank, Verdict, left_alone_nm2
 from lowfc.control.laws.stability import delay_weights, highest_gain
 from lowfc.control.loop.camera import CameraSettings
 
@@ -110,6 +110,62 @@ def test_a_mode_that_begins_to_wander_need_not_wait_for_the_end_of_the_window() 
             early = made.early(early)
             assert count >= 2499 or not early.any()
     assert (early > 0.01).mean() > 0.9
+
+
+def _vibrating(frames: int, seed: int) -> tuple[Array, Array]:
+    """Tip and tilt of 20 nm rms, (frames, 2), and 30 modes of 1 nm noise of which one shows their squares."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(frames)[:, None]
+    tilt_nm = 28 * np.sin(time * np.array([0.7, 0.41]) + np.array([0.2, 1.1])) + rng.normal(0, 1, (frames, 2))
+    shown = rng.normal(0, 1, (frames, MODES))
+    shown[:, 4] += 0.01 * tilt_nm[:, 0] ** 2 - 0.003 * tilt_nm[:, 1] ** 2
+    return tilt_nm.astype(np.float32), shown.astype(np.float32)
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_a_mode_that_shows_the_squares_of_tilt_is_left_alone(closed: bool) -> None:
+    """A loop would put their mean, 2.7 nm, on the mirror for a mode that is not there at all."""
+    tilt_nm, shown = _vibrating(1000, 12)
+    gains = []
+    for seen in (tilt_nm, None):
+        made, gain = bank(), np.zeros(MODES, np.float32)
+        for index, one in enumerate(shown):
+            if made.followed(one, one, None if seen is None else seen[index], closed=closed) and made.complete:
+                gains.append(made.verdict(gain, ONES.astype(float)).gain[4])
+    assert gains[0] == 0
+    assert gains[1] > 0
+
+
+def test_a_gain_for_what_tilt_feigns_is_taken_back_before_the_window_ends() -> None:
+    tilt_nm, shown = _vibrating(4000, 17)
+    made = bank(windows=(100, 5000))
+    gain = verdicts(made, drift(100, 1.0, 1.0, 18), np.zeros(MODES, np.float32), 1.0)[0].gain
+    assert gain.all()
+    for seen, one in zip(tilt_nm, shown, strict=True):
+        if made.followed(one, one, seen, closed=True):
+            gain = made.early(gain)
+    assert gain[4] == 0
+
+
+def test_what_is_there_is_corrected_beside_what_tilt_feigns() -> None:
+    tilt_nm, shown = _vibrating(1000, 13)
+    shown += drift(1000, 0.3, 0.0, 14).astype(np.float32)
+    made = bank()
+    for one, seen in zip(shown, tilt_nm, strict=True):
+        made.followed(one, one, seen, closed=False)
+    assert (made.verdict(np.zeros(MODES, np.float32), ONES.astype(float)).gain > 0.01).mean() > 0.9
+
+
+def test_drifts_and_common_noise_of_tilt_and_other_modes_feign_nothing() -> None:
+    rng = np.random.default_rng(15)
+    noise = rng.normal(0, 1, (2000, MODES + 2))
+    noise[:, 2:] += 0.8 * noise[:, :1]
+    modes = drift(2000, 0.3, 0.0, 16)
+    tilt_nm = 40 + modes[:, :2] + noise[:, :2]
+    made = Feigned(MODES)
+    for one, other in zip(tilt_nm.astype(np.float32), (modes + noise[:, 2:]).astype(np.float32), strict=True):
+        made.followed(one, other)
+    assert np.count_nonzero(made.mean_nm()) <= 1
 
 
 def _calibration(measured: bool) -> tuple[Calibration, CameraSettings]:

@@ -99,14 +99,15 @@ def law(what: WhatIf, noll: tuple[int, ...], logged: Law) -> Law:
     """
     base = settings(what.config).law(noll) if what.config is not None else logged
     tilts = np.isin(noll, TILTS)
-    changed: dict[str, Single] = {}
+    changed = []
     for key in LAW_KEYS:
         values: Single = getattr(base, key).copy()
         values[:] = what.figures.get(key, values)
         values[tilts] = what.figures.get(f"tilt_{key}", values[tilts])
-        changed[key] = values
+        changed.append(values)
     try:
-        return Law(**changed)
+        gain, leak, limit_nm = changed
+        return Law(gain, leak, limit_nm)
     except ValueError as error:
         raise ConfigurationError(f"--set: {error}") from None
 
