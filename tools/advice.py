@@ -48,8 +48,8 @@ ADVICE: dict[str, Advice] = {
         "remove the cause, then `lowfc ctl clear`; the loop is open afterwards, and `lowfc ctl close` closes it.",
     ),
     "FRAMES_REFUSED": Advice(
-        "frames arrive and are not used; the command is held. The reason is one of the table below.",
-        "what the table below says for the reason.",
+        "frames arrive and are not used; the command is held. The reason is one of the table of reasons.",
+        "what the table of reasons says for the reason.",
     ),
     "FRAMES_ACCEPTED": Advice("frames are used again.", _NOTHING),
     "NO_FRAMES": Advice(
@@ -129,8 +129,8 @@ ADVICE: dict[str, Advice] = {
         "set `mirror.rows` and `mirror.columns`, or load the calibration of this mirror.",
     ),
     "LIMIT_HIT": Advice(
-        "a limit of the controller or the mirror cut a command. The reason is one of the table below.",
-        "what the table below says for the reason; a short one after closing is usual.",
+        "a limit of the controller or the mirror cut a command. The reason is one of the table of reasons.",
+        "what the table of reasons says for the reason; a short one after closing is usual.",
     ),
     "LIMIT_CLEARED": Advice("the limit acts no more.", _NOTHING),
     "COMMAND_EXPIRED": Advice(
@@ -201,7 +201,10 @@ REASONS: dict[str, Advice] = {
     "REPEATED": Advice("the frame was used before", "nothing, unless it is often"),
     "LATE": Advice("older than `control.max_frame_age_ms` on arrival", "`lowfc doctor`; a clock of its own host"),
     "SATURATED": Advice("more than `control.max_saturated_pixels` at full well", "shorter exposure, lower gain"),
-    "DARK": Advice("less light than `control.min_flux_fraction` of what is expected", "is the star on the mask?"),
+    "DARK": Advice(
+        "less light than `control.min_flux_fraction` of the calibration's",
+        "is the star on the mask? On a fainter star `lowfc calibrate reference`, or a lower fraction",
+    ),
     "NO_FRAME": Advice("no frame in time", "as for NO_FRAMES"),
     "STUCK": Advice("the same image again and again", "restart the camera"),
     "AHEAD": Advice("the camera's start is ahead of this host's clock", "as for START_AHEAD"),

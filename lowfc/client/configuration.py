@@ -18,14 +18,12 @@ def configuration_of(loop: "Client") -> "Configuration":
     Raises:
         ConfigurationError: it is one of another version.
     """
-    from lowfc.contract.configuration import Configuration
+    from lowfc.contract.configuration import Configuration, explain
 
     try:
         return Configuration.model_validate(tomllib.loads(loop.configuration()))
     except ValidationError as fault:
-        first = fault.errors()[0]
-        key = ".".join(map(str, first["loc"]))
         raise ConfigurationError(
-            f"the controller's configuration is one of another version of lowfc: {key}: {first['msg']}; use the "
+            f"the controller's configuration is one of another version of lowfc: {explain(fault.errors()[0])}; use the "
             "lowfc that the controller was started with"
         ) from None

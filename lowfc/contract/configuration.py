@@ -5,6 +5,7 @@ the nearest known one. `lowfc config show` prints all keys with their sentences.
 """
 
 import difflib
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -39,6 +40,7 @@ LATE_NS, HOLD_NS = 20_000_000, 50_000_000
 MOST_FAULTS = 20
 """Faults that are explained, of a file that may be something else altogether."""
 _LONGEST_KEY = 100  # characters of one that the nearest known key is looked for
+_ALTERNATIVE = re.compile(r"\.(?:constrained-\w+|literal\[[^]]*\])")  # pydantic's, behind a key of two types
 
 
 Gain = Annotated[float, Field(ge=0, le=4)]
@@ -349,10 +351,12 @@ def _nearest(wanted: str, known: Sequence[str]) -> str:
 
 def explain(detail: Any) -> str:
     """One of pydantic's errors as a line for a user."""
-    key = ".".join(str(part) for part in detail["loc"])
+    key = _ALTERNATIVE.sub("", ".".join(str(part) for part in detail["loc"]))
+    if detail["type"] == "missing":
+        return printable(f"{key[:_LONGEST_KEY]} is missing")
     if detail["type"] == "extra_forbidden":
         known = [*keys(), *Configuration.model_fields, *keys(InterlockSection, "interlocks.")]
         plain = ".".join(part for part in detail["loc"] if isinstance(part, str))
         return f"unknown key {brief(key)}; the nearest known one is {_nearest(plain[:_LONGEST_KEY], known)!r}"
-    message = detail["msg"].removeprefix("Value error, ")
+    message = detail["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
     return printable(f"{key[:_LONGEST_KEY]} = {brief(detail['input'])}: {message[:300]}" if key else message)

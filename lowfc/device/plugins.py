@@ -121,6 +121,11 @@ def _explained(fault: Any, model: type[DriverOptions]) -> str:
     """One of pydantic's errors as a line for a user."""
     if fault["type"] == "extra_forbidden":
         return f"there is no {brief(fault['loc'][0])}; there are {', '.join(model.model_fields) or 'none'}"
+    if fault["type"] == "missing":
+        key = str(fault["loc"][0])
+        return (
+            f"{key} is missing: --{key.replace('_', '-')} VALUE, or {key} in the driver's section of the configuration"
+        )
     return explain(fault)
 
 

@@ -126,6 +126,14 @@ def test_what_is_shown_chooses_nothing_that_was_not_chosen(tmp_path: Path) -> No
     assert load(write(tmp_path, uncommented)) == Configuration(), "each key can be uncommented as it stands"
 
 
+def test_a_fault_names_the_key_as_it_is_written() -> None:
+    assert complaint(None, {"control.gain": [1.0], "camera.rate_hz": "x"}).splitlines() == [
+        "camera.rate_hz = 'x': must be a valid number",
+        "control.gain = [1.0]: must be a valid number",
+        "control.gain = [1.0]: must be 'auto'",
+    ]
+
+
 def test_every_fault_gets_its_own_line(tmp_path: Path) -> None:
     said = complaint(write(tmp_path, "[camera]\nrate_hz = -1\ngain = 2\n[safety]\nslew_nm = 0"))
     lines = said.splitlines()

@@ -22,7 +22,7 @@ OTHER = "[camera]\nrate_hz = 300.0\nshutter = 'rolling'\n[control]\nleak = 7.0\n
 """Two keys that this version does not know, and a value that it refuses."""
 REMARKS = [
     "unknown key 'camera.shutter'; the nearest known one is 'camera.noise'; it is ignored",
-    "control.leak = 7.0: Input should be less than or equal to 1; the default is used",
+    "control.leak = 7.0: must be less than or equal to 1; the default is used",
     "unknown key 'weather'; the nearest known one is 'realtime'; it is ignored",
 ]
 
@@ -37,7 +37,7 @@ def test_what_this_version_knows_is_used() -> None:
 @pytest.mark.parametrize(
     ("toml", "changed", "remark"),
     [
-        ("camera = 5", {}, "camera = 5: Input should be a valid dictionary"),
+        ("camera = 5", {}, "camera = 5: must be a valid dictionary"),
         ("seed = -1", {}, "seed = -1: "),
         ("[mirror]\ndead = [1, 'x']\nrows = 33", {"mirror.rows": 33}, "mirror.dead.1 = 'x': "),
         ("[disturbance]\npreset = 'quake'\nscale = 2.0", {"disturbance.scale": 2.0}, "disturbance.preset = 'quake'"),

@@ -149,6 +149,14 @@ def test_a_configuration_is_checked_by_the_drivers_themselves() -> None:
     assert ["'falt'" in wrong[0], "did you mean 'sim'" in wrong[1], len(wrong)] == [True, True, 2]
 
 
+def test_an_option_that_is_missing_says_how_to_give_it() -> None:
+    class Sized(DriverOptions):
+        frame_rows: int
+
+    with pytest.raises(ConfigurationError, match=r"frame_rows is missing: --frame-rows VALUE, or frame_rows in"):
+        plugins.options(type("Camera", (), {"Options": Sized}), {})
+
+
 def test_a_driver_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
     needs = [Need("a cable", "cable 7", ""), Need("a camera", "", "switch it on")]
     monkeypatch.setattr(Ramp, "needs", lambda options: needs, raising=False)

@@ -32,6 +32,7 @@ ELSEWHERE = {
 }
 SHORTER = {
     "--duration 20": "--duration 2",
+    "--duration 5": "--duration 2",
     "--seconds 2": "--seconds 0.5",
     "--trials 20": "--trials 4",
     "--steps 200": "--steps 40",
@@ -107,7 +108,7 @@ REQUESTS = (
 FILES = (
     "lowfc config show > lowfc.toml",
     "lowfc config check lowfc.toml",
-    "lowfc sim-loop --config lowfc.toml --duration 2",
+    "lowfc sim-loop --config lowfc.toml --duration 5",
 )
 FEWER = "lowfc record --run bench --every 10 --topics lowfc/camera/frame --topics 'lowfc/mirror/*/state'"
 BY_HAND = ("sim-camera --run bench", "sim-dm --run bench", "lowfc controller --run bench", "lowfc record --run bench")

@@ -46,6 +46,14 @@ def test_log_to_pandas() -> None:
     assert rows[-1][1] == "163.0"
 
 
+def test_compare_nights() -> None:
+    log = str(ROOT / "tests/golden/0.1/night.mcap")
+    lines = run("compare_nights", f"{log} {log}")
+    assert lines[:3] == ["verdict", "    Not a good run", "    Not a good run"]
+    tilt = lines.index("Z2 tilt x, nm")
+    assert float(lines[tilt + 1]) == float(lines[tilt + 2]) > 0
+
+
 def test_the_package_offers_few_names_and_imports_them_when_they_are_named() -> None:
     script = (
         "import sys, lowfc; assert not [name for name in sys.modules if name.startswith('lowfc.')]\n"

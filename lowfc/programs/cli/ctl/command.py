@@ -232,8 +232,8 @@ for _name, _asked in BY_NAME.items():
             context_settings={"ignore_unknown_options": "values" in _fields},  # -5 is a value and no option
         )(_made)
 ctl_app.command()(bench)
-ctl_app.command()(dark)
-ctl_app.command()(reference)
+for measured in (dark, reference):
+    ctl_app.command(help=str(measured.__doc__).replace("lowfc calibrate", "lowfc ctl"))(measured)
 
 
 @ctl_app.callback()

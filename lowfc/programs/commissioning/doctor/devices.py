@@ -15,9 +15,14 @@ def device_checks(name: str, config: Configuration) -> Iterator[Check]:
         what = f"{kind} {name}"
         try:
             driver = plugins.load(kind, name)
+        except ConfigurationError as fault:
+            yield wrong(str(fault), "install it, or correct its name")._replace(name=what)
+            continue
+        try:
             options = plugins.options(driver, plugins.table(config, kind, name))
         except ConfigurationError as fault:
-            yield wrong(str(fault), f"install it, or mend drivers.{name}")._replace(name=what)
+            advice = f"set it in [drivers.{name}] of a configuration, and name that file: --config FILE"
+            yield wrong(str(fault), advice)._replace(name=what)
             continue
         yield ok(f"{driver.__module__}:{driver.__qualname__}")._replace(name=what)
         for need in getattr(driver, "needs", lambda _: ())(options):
