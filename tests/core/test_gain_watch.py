@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from lowfc.adapters.files import factory
-from lowfc.arrays import Single
+from lowfc.arrays import Array, Single
 from lowfc.contract.codecs.state_codec import controller_state, decode_state
 from lowfc.contract.configuration import FIXED_GAINS
 from lowfc.control.calibration.granted import noise_covariance_nm2
-from lowfc.control.laws.law import LET_GO
+from lowfc.control.laws.automatic_gain import TiltCrossTalk
+from lowfc.control.laws.law import RELAXING
 from lowfc.control.loop.safety import LoopMode
 from tools.law_bench import Bench, calibrated, configured
 
@@ -87,7 +88,7 @@ def test_modes_that_are_left_alone_bring_less_noise_to_the_others(faint: Bench) 
     assert (made[~left] < 0.9 * own[~left]).any()
 
 
-def test_modes_that_are_left_alone_are_let_go() -> None:
+def test_the_command_of_a_mode_that_is_left_alone_relaxes_to_zero() -> None:
     """What an earlier gain put on the mirror does not stay there; at a gain of 0 that a person gave, it does."""
     loop = bench(0.0)
     loop.run(750)
@@ -99,12 +100,12 @@ def test_modes_that_are_left_alone_are_let_go() -> None:
     loop.run(99)
     after_nm = loop.steps[-1].command_nm
     assert np.abs(before_nm[5:]).max() > 0.5
-    np.testing.assert_allclose(after_nm[5:], before_nm[5:] * LET_GO**99, atol=1e-3)
+    np.testing.assert_allclose(after_nm[5:], before_nm[5:] * RELAXING**99, atol=1e-3)
     assert after_nm[2] == before_nm[2] != 0
 
 
 @pytest.mark.parametrize("magnitude", [2.0, 8.0])
-def test_a_sensor_beyond_its_range_is_not_believed(magnitude: float) -> None:
+def test_the_cross_talk_of_a_sensor_beyond_its_range_is_not_corrected(magnitude: float) -> None:
     """The squares of the tilt that the wheel leaves look like focus, astigmatism and spherical to a Zernike sensor."""
     loop = bench(magnitude, "reaction-wheel", "zwfs")
     form = np.diag(factory.contrast_of(loop.config).form)
@@ -128,6 +129,34 @@ def test_whoever_reads_the_state_goes_on_with_the_same_reconstructor(faint: Benc
     np.testing.assert_array_equal(again.drive.automatic, drive.automatic)
     np.testing.assert_array_equal(again.drive.law.kept, drive.law.kept)
     assert controller_state(again, settings, 1) == message
+
+
+def test_whoever_reads_the_state_before_gains_are_measured_goes_on_with_the_same_law() -> None:
+    """A loop may be closed by hand before that: what the mirror had before must go on as it does in a replay."""
+    loop = bench(2.0)
+    drive, message = loop.state.drive, controller_state(loop.state, loop.settings, 1)
+    assert drive is not None
+    again = decode_state(message, drive.calibration)[1].drive
+    assert again is not None
+    np.testing.assert_array_equal(again.law.rows, drive.law.rows)
+
+
+def test_tilt_is_compared_with_other_modes_as_the_sensor_saw_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The square of an offset of tilt is in the image, though the loop's error is without it."""
+    seen: list[Single] = []
+    followed = TiltCrossTalk.followed
+
+    def noted(self: TiltCrossTalk, tilt_nm: Single, open_nm: Single) -> Array:
+        seen.append(tilt_nm)
+        return followed(self, tilt_nm, open_nm)
+
+    monkeypatch.setattr(TiltCrossTalk, "followed", noted)
+    loop = bench(2.0)
+    loop.ask("offset", modes=(2,), values=(40.0,))
+    loop.run(20)
+    error_nm = loop.steps[-1].error_nm
+    assert error_nm is not None
+    np.testing.assert_allclose(seen[-1], error_nm[:2] + np.float32([40, 0]), atol=1e-3)
 
 
 def test_what_the_wavefront_adds_to_the_contrast_is_measured_open_and_closed() -> None:

@@ -28,7 +28,7 @@ LEAST_CORRECTED = 0.1
 SURE = 4.0
 """Standard errors beyond which another mode is said to show the squares of tip and tilt."""
 MARGIN = 5.0
-"""Times these squares that must be there: beyond its range a sensor shows less of tilt than there is."""
+"""Times the cross-talk found that a gain must stand: beyond its range a sensor shows less of tilt than there is."""
 _REGRESSORS = 5
 """Tip, tilt, their squares and their product."""
 
@@ -38,7 +38,7 @@ class Verdict(NamedTuple):
 
     Attributes:
         gain: the gain that each mode should have from now on.
-        power_nm2: mean square of the open loop, with the noise of a frame and without what tip and tilt feign.
+        power_nm2: mean square of the open loop, with the noise of a frame and without the cross-talk of tip and tilt.
         noise_nm2: of that, noise: as computed, or half the mean square of the change between frames where that
             is more; None where it was not computed.
         change_nm2: mean square with the gain of now less that of the open loop: above 0, closing harms.
@@ -94,7 +94,7 @@ class GainBank:
     def restart(self) -> None:
         """Begin anew, as for another star."""
         self._loops = self._at_rest
-        self._feigned = Feigned(self._at_rest.kept.size)
+        self._cross_talk = TiltCrossTalk(self._at_rest.kept.size)
         self._before_nm = np.zeros_like(self._at_rest.kept)
         self.begin_again()
 
@@ -109,7 +109,7 @@ class GainBank:
         A bank of other modes takes tip and tilt (2,), too, as the sensor saw them.
         """
         if tilt_nm is not None:
-            self._feigned.followed(tilt_nm, open_nm)
+            self._tilt += self._cross_talk.followed(tilt_nm, open_nm)
         self._loops, errors_nm = self._loops.followed(open_nm)
         squares = np.square(errors_nm)
         self._power += squares[0]
@@ -130,6 +130,7 @@ class GainBank:
         self._powers.append(self._power / self._frames)
         self._changed.append(self._changes / self._frames)
         self._means.append(self._mean / self._frames)
+        self._tilts.append(self._tilt / self._frames)
         self._begin_block()
         return True
 
@@ -141,41 +142,42 @@ class GainBank:
     def early(self, gain: Single) -> Single:
         """Gains (modes,) before the window is complete.
 
-        Of modes at 0 or the least gain that have begun to wander; and 0 for those that turn out to be feigned.
+        Of modes at 0 or the least gain that have begun to wander; and 0 for those that turn out to be cross-talk.
         """
         if self.first or len(self._blocks) < EARLY:
             return gain
         now = self._row_of(gain)
-        blocks = self._shown()[-EARLY:, :-1]
+        cross_talk_nm = self._cross_talk.mean_nm(np.mean(self._tilts[-EARLY:], axis=0))
+        blocks = self._without(MARGIN * cross_talk_nm)[-EARLY:, :-1]
         own = blocks[:, now, np.arange(now.size)]
         beyond = blocks - own[:, None]
         sure = np.where((beyond < 0).all(axis=0), beyond.mean(axis=0), np.inf)
         grown = (now <= 1) & np.isfinite(sure).any(axis=0)
-        feigned = (self._feigned.mean_nm() != 0) & (own > 0).all(axis=0)
+        absent = (cross_talk_nm != 0) & (own > 0).all(axis=0)
         gain = np.where(grown, self.rows[np.argmin(sure, axis=0)], gain)
-        return np.where(feigned, 0, gain).astype(np.float32)
+        return np.where(absent, 0, gain).astype(np.float32)
 
     def held(self, frames: int) -> None:
         """Frames of which nothing was measured."""
         self._loops = self._loops.held(frames)
-        self._feigned.held()
+        self._cross_talk.held()
 
     def verdict(self, gain: Single, noise_nm2: Array | None) -> Verdict:
         """What the window has shown, at gains (modes,) and with the noise of one frame (modes,), None where unknown."""
-        means, feigned_nm = np.mean(self._means, axis=0, dtype=float), self._feigned.mean_nm()
-        blocks, power = self._shown(), np.mean(self._powers, axis=0, dtype=float)
-        power -= (2 * means - feigned_nm) * feigned_nm
+        means, power = (np.mean(values, axis=0, dtype=float) for values in (self._means, self._powers))
+        cross_talk_nm = self._cross_talk.mean_nm(np.mean(self._tilts, axis=0))
+        power -= (2 * means - cross_talk_nm) * cross_talk_nm
         now = self._row_of(gain)
         modes = np.arange(gain.size)
         frames = self._block * BLOCKS
-        mean, error = _mean(blocks)
-        chosen = self._chosen(blocks, now)
+        mean, error = _mean(self._without(cross_talk_nm))
+        chosen = self._chosen(self._without(MARGIN * cross_talk_nm), now)
         if noise_nm2 is not None:
             noise_nm2 = np.maximum(noise_nm2, np.mean(self._changed, axis=0))
         if self.first and noise_nm2 is not None:
             there = power - noise_nm2 * (1 + CONFIDENCE * np.sqrt(2 / frames))
             little = injected(self.rows[1]) * noise_nm2 < LEAST_CORRECTED * there
-            chosen = np.where((chosen == 0) & little & (feigned_nm == 0), 1, chosen)
+            chosen = np.where((chosen == 0) & little & (cross_talk_nm == 0), 1, chosen)
         found = Verdict(
             self.rows[chosen],
             power,
@@ -193,14 +195,14 @@ class GainBank:
             self._lengthen()
         return found
 
-    def _shown(self) -> Array:
-        """Mean squares (blocks, rows and the loop itself, modes) less the open loop's, nm^2.
+    def _without(self, cross_talk_nm: Array) -> Array:
+        """Mean squares (blocks, rows and the loop itself, modes) less the open loop's, nm^2, of what is there.
 
-        What tip and tilt feign is measured and not there: a loop of any gain but 0 puts it on the mirror, and then
-        measures nothing of it.
+        Cross-talk (modes,) is measured and not there: a loop of any gain but 0 puts it on the mirror, and then measures
+        nothing of it.
         """
         blocks = np.array(self._blocks, float)
-        blocks[:, 1:] += (2 * MARGIN * np.array(self._means, float) * self._feigned.mean_nm())[:, None]
+        blocks[:, 1:] += (2 * np.array(self._means, float) * cross_talk_nm)[:, None]
         return blocks
 
     def _chosen(self, blocks: Array, now: Whole) -> Whole:
@@ -238,17 +240,18 @@ class GainBank:
         self._powers: list[Array] = []
         self._changed: list[Array] = []
         self._means: list[Array] = []
+        self._tilts: list[Array] = []
         self._throughout = True
-        self._feigned.begin_window()
         self._begin_block()
 
     def _begin_block(self) -> None:
         self._frames = 0
         self._sums = np.zeros((self.rows.size + 1, self._at_rest.kept.size))
         self._power, self._changes, self._mean = np.zeros((3, self._at_rest.kept.size))
+        self._tilt = np.zeros(_REGRESSORS)
 
     def _kept(self) -> tuple[list[Array], ...]:
-        return self._blocks, self._powers, self._changed, self._means
+        return self._blocks, self._powers, self._changed, self._means, self._tilts
 
     def _lengthen(self) -> None:
         """Go on with blocks of twice the length; the longest window forgets its older half."""
@@ -261,12 +264,12 @@ class GainBank:
             values[:] = list(np.array(values).reshape(BLOCKS // 2, 2, *values[0].shape).mean(axis=1))
 
 
-class Feigned:
+class TiltCrossTalk:
     """What the squares of tip and tilt add to other modes, beyond the range in which the sensor is linear.
 
     Changes from frame to frame are compared, so that a drift of both is not taken for it; tip and tilt themselves are
     taken along, for the noise of a frame is common to all modes. How much a square adds is of the sensor, and is
-    known the better the longer it was looked at; the squares are those of a window.
+    known the better the longer it was looked at.
     """
 
     def __init__(self, modes: int) -> None:
@@ -275,32 +278,29 @@ class Feigned:
         self._powers = np.zeros(modes)
         self._changes = 0
         self._before: Array | None = None
-        self.begin_window()
 
-    def begin_window(self) -> None:
-        """Let the squares be those from now on."""
-        self._sum = np.zeros(_REGRESSORS)
-        self._frames = 0
+    def followed(self, tilt_nm: Single, open_nm: Single) -> Array:
+        """Take tip and tilt (2,), as the sensor saw them in one frame, and the open loop of the others (modes,), nm.
 
-    def followed(self, tilt_nm: Single, open_nm: Single) -> None:
-        """Take tip and tilt (2,), as the sensor saw them in one frame, and the open loop of the others (modes,), nm."""
+        Returns:
+            (regressors,) of the frame, as `mean_nm` takes their mean.
+        """
         x, y = tilt_nm.tolist()
         row = np.concatenate([(x, y, x * x, x * y, y * y), open_nm])
-        self._sum += row[:_REGRESSORS]
-        self._frames += 1
         if self._before is not None:
             change = row - self._before
             self._products += change[:_REGRESSORS, None] * change
             self._powers += np.square(change[_REGRESSORS:])
             self._changes += 1
         self._before = row
+        return np.asarray(row[:_REGRESSORS])
 
     def held(self) -> None:
         """Frames without a measurement: no change over them is taken."""
         self._before = None
 
-    def mean_nm(self) -> Array:
-        """Mean of it (modes,) over the window, nm; 0 where it is not beyond doubt."""
+    def mean_nm(self, tilt: Array) -> Array:
+        """Mean of it (modes,), nm, over frames of this mean (regressors,); 0 where it is not beyond doubt."""
         normal, right = self._products[:, :_REGRESSORS], self._products[:, _REGRESSORS:]
         if self._changes < 4 * _REGRESSORS or not np.all(np.diag(normal) > 0):
             return np.zeros(right.shape[1])
@@ -308,9 +308,9 @@ class Feigned:
         inverse = np.linalg.pinv(normal / np.outer(scale, scale), rcond=1e-9) / np.outer(scale, scale)
         slopes = inverse @ right
         unexplained = np.maximum(self._powers - np.sum(slopes * right, axis=0), 0) / (self._changes - _REGRESSORS)
-        mean = np.where(np.arange(_REGRESSORS) < 2, 0, self._sum / self._frames)
-        feigned, error = mean @ slopes, np.sqrt((mean @ inverse @ mean) * unexplained)
-        return np.where(np.abs(feigned) > SURE * error, feigned, 0)
+        squares = np.where(np.arange(_REGRESSORS) < 2, 0, tilt)
+        found, error = squares @ slopes, np.sqrt((squares @ inverse @ squares) * unexplained)
+        return np.where(np.abs(found) > SURE * error, found, 0)
 
 
 def _mean(blocks: Array) -> tuple[Array, Array]:

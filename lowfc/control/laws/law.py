@@ -6,9 +6,9 @@ import numpy as np
 
 from lowfc.arrays import Mask, Single, single
 
-LET_GO = np.float32(0.99)
-"""Part of its command that a mode keeps from frame to frame when its gain was measured to be 0: its error says nothing
-of the command, which must not stay where an earlier gain has led it."""
+RELAXING = np.float32(0.99)
+"""Part of its command that a mode keeps from frame to frame while its automatic gain is 0: nothing would correct what
+an earlier gain has put on the mirror."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,8 +16,8 @@ class Law:
     """Gain, leak and limit of each mode, each (modes,) float32; the limit is nm of wavefront rms.
 
     Attributes:
-        left: (modes,) whether a mode is left alone because that was measured to be best.
-        kept: (modes,) part of the command that stays: 1 - leak, or `LET_GO` of a mode that is left.
+        left: (modes,) whether a mode is left alone, its gain being automatic and 0.
+        kept: (modes,) part of the command that stays: 1 - leak, or `RELAXING` of a mode that is left.
         rows: (3, modes) gain, kept and limit.
     """
 
@@ -41,7 +41,7 @@ class Law:
         ):
             if not (np.isfinite(array).all() and (array >= low).all() and (array <= high).all()):
                 raise ValueError(f"every {name} must be between {low} and {high}, got {array.tolist()}")
-        object.__setattr__(self, "kept", np.where(self.left, np.minimum(1 - self.leak, LET_GO), 1 - self.leak))
+        object.__setattr__(self, "kept", np.where(self.left, np.minimum(1 - self.leak, RELAXING), 1 - self.leak))
         object.__setattr__(self, "rows", single([self.gain, self.kept, self.limit_nm]))
 
 

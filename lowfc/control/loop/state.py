@@ -196,10 +196,11 @@ class ActiveLoop(NamedTuple):
         modes = len(calibration.noll)
         weights = delay_weights(settings.delay_frames).astype(np.float32)
         inverse = np.linalg.pinv(calibration.modes_to_actuators.astype(np.float64)).astype(np.float32)
-        return cls(
+        law = settings.law(calibration.noll)
+        drive = cls(
             calibration,
             Estimator.of(calibration, settings.kernel),
-            settings.law(calibration.noll),
+            law,
             np.asfortranarray(calibration.modes_to_actuators),
             inverse,
             calibration.actuators_to_modes if calibration.actuators_to_modes.size else inverse,
@@ -212,13 +213,14 @@ class ActiveLoop(NamedTuple):
             (np.zeros(modes, np.float32),) * len(weights),
             np.zeros(calibration.grid, np.float32),
         )
+        return drive.under(law)
 
     def seen_nm(self) -> Single:
         """The modal command (modes,) that the last exposure saw."""
         return seen_nm(self.weights, self.history_nm)
 
     def under(self, law: Law) -> "ActiveLoop":
-        """With these gains; a mode whose automatic gain is 0 is let go."""
+        """With these gains; the command of a mode whose automatic gain is 0 relaxes to zero."""
         return self._replace(law=replace(law, left=self.automatic & (law.gain == 0)))
 
     def weighted(self, weighting: Weighting | None) -> "ActiveLoop":

@@ -109,6 +109,7 @@ class GainWatch:
         if (
             step.error_nm is None
             or step.pol_nm is None
+            or state.estimate is None
             or playing
             or state.mode not in (LoopMode.OPEN, LoopMode.CLOSED)
         ):
@@ -129,7 +130,7 @@ class GainWatch:
             if group.bank.followed(
                 open_nm[group.mask],
                 step.error_nm[group.mask],
-                None if group.tilt is None else step.error_nm[group.tilt],
+                None if group.tilt is None else state.estimate.error_nm[group.tilt],
                 closed=closed,
             )
         ]
