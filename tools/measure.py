@@ -89,6 +89,7 @@ MEASUREMENTS = {
     "fuzz": _of("python -m tests.support.fuzzing --inputs 1000000", reliability.render_fuzz),
     "latency": _latency("lowfc latency --duration 10 --repeats 5"),
     "watched": _latency("lowfc latency --duration 60 --record --view"),
+    "stalls": _latency("lowfc latency --duration 60 --kernel fused --trace"),
     "step": _bench("python -m benchmarks step", step),
     "peers": _bench("python -m benchmarks peers", contest),
     "curves": _bench("python -m benchmarks curves --seconds 1 --repeats 2", curves),

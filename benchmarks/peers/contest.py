@@ -67,6 +67,7 @@ DEFINITIONS = {
     "in the opposite order",
     "without a command": "measured frames that no command was made from, in all turns",
     "pinning": "source and mirror on the first processor, all else on the second",
+    "memory": "lowfc's processes lock theirs (`realtime.lock_memory`), the others do not",
     "threads": "BLAS and numba 1; garbage collection off everywhere; chain.c by cc -O3 -march=native -ffast-math",
 }
 

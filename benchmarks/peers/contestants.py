@@ -93,7 +93,7 @@ CONTESTANTS = (
         "stock",
         "WavefrontSensor, a component that makes a signal of the pixels, Loop.leaky_integrator and WavefrontCorrector, "
         "each a process; its command is modes, of which the corrector makes actuators",
-        "none",
+        "none here; a cap of all actuators where it is asked for (`command_cap`)",
         *("modal_mirror", "source", "signal", "loop"),
     ),
     _pyrtcao(

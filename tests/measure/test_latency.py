@@ -14,8 +14,9 @@ import pytest
 
 from lowfc.adapters.bus.run import runtime_base
 from lowfc.adapters.process.clock import HostClock
+from lowfc.adapters.process.host import Counters, Counts, busiest_thread
 from lowfc.contract.configuration import load
-from lowfc.contract.errors import DataFileError
+from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.messages import RawImage, image
 from lowfc.programs.measure.bench import record as bench_module
 from lowfc.programs.measure.bench.record import render
@@ -33,6 +34,7 @@ from lowfc.programs.measure.latency.figures import (
     percentiles,
     repeat_figures,
 )
+from lowfc.programs.measure.latency.stalls import Counted, Trace, signs_of, stalls_of
 from lowfc.programs.measure.latency.summary import compare, of_kernels, ratio, together
 from lowfc.programs.measure.latency.text import compared, sparkline, table
 from tests.support.loops import lowfc, until
@@ -182,6 +184,79 @@ def test_repeats_come_together_as_medians_with_their_range() -> None:
     assert ratio(repeat(300), "p99", "ratio_hot") == 4
 
 
+def trace(
+    wakings: int = 1000, late_us: Mapping[int, float] | None = None, steps: Mapping[str, tuple[int, int]] | None = None
+) -> Trace:
+    """A bare loop between frames 1 ms apart; late at some wakings, and counts that jump there by so much."""
+    due_ns = np.arange(wakings) * MS + MS // 2
+    woke_ns = due_ns + 20_000
+    for index, late in (late_us or {}).items():
+        woke_ns[index] = due_ns[index] + round(late * 1e3)
+    counts = {name: np.zeros(wakings, np.int64) for name in Trace._fields[2:]}
+    for name, (index, by) in (steps or {}).items():
+        counts[name][index:] += by
+    return Trace(due_ns, np.maximum.accumulate(woke_ns), **counts)
+
+
+def test_a_trace_has_the_kernels_counts_in_their_order() -> None:
+    assert Trace._fields == ("due_ns", "woke_ns", *Counts._fields)
+    own = os.getpid()
+    counters = Counters(own, busiest_thread(own, 0.01), {0})
+    before = counters.read()
+    np.ones(1 << 22).sum()  # 32 MB, on pages of its own
+    after = counters.read()
+    assert after.minor_faults > before.minor_faults > 0
+    assert all(later >= earlier for later, earlier in zip(after, before, strict=True))
+    with pytest.raises(FileNotFoundError):
+        Counters(own, 0, set())
+
+
+def test_signs_of_a_stall_are_the_hosts_or_the_loops() -> None:
+    nothing: Any = dict.fromkeys(Counted.model_fields, 0)
+    cases: list[tuple[dict[str, float], tuple[list[str], list[str]]]] = [
+        ({"bare_late_us": 250}, (["bare loop 250 us late"], [])),
+        ({"bare_late_us": 249, "waited_us": 249, "minor_faults": 249, "preempted": 9}, ([], [])),
+        ({"stolen_ms": 10}, (["10 ms stolen"], [])),
+        ({"throttled": 1}, (["quota used up"], [])),
+        ({"waited_us": 800, "stolen_ms": 10}, (["10 ms stolen"], ["waited 800 us for the processor"])),
+        ({"major_faults": 1, "minor_faults": 600}, ([], ["1 pages read", "600 pages mapped"])),
+    ]
+    for counted, expected in cases:
+        assert signs_of(Counted(**nothing | counted), 1000) == expected
+
+
+def test_each_stall_has_what_was_counted_in_it_alone() -> None:
+    command_us = np.full(1000, 100.0)
+    command_us[100] = 5000  # of the warm-up
+    command_us[600], command_us[601] = 3000, np.nan  # crowded out while the host stood still
+    command_us[[700, 800, 900, 950]] = 1500, 2000, 1200, 1100
+    late_us = np.zeros(1000)
+    late_us[900] = 800  # put so late, and the processor was another's before
+    beside_camera = trace(late_us={600: 2200})
+    steps = {"stolen_ns": (701, 10 * MS), "waited_ns": (801, 1_200_000), "major_faults": (899, 3)}
+    found = stalls_of(
+        frames(command_us=command_us, late_us=late_us), MS, {"camera": beside_camera, "controller": trace(steps=steps)}
+    )
+    assert [(stall.second, stall.held_up_by, stall.signs) for stall in found.stalls] == [
+        (0.6, "host", "camera: bare loop 2200 us late"),
+        (0.601, "host", "camera: bare loop 2200 us late"),
+        (0.7, "host", "controller: 10 ms stolen"),
+        (0.8, "loop", "controller: waited 1200 us for the processor"),
+        (0.9, "loop", "controller: 3 pages read"),
+        (0.95, "unknown", "none"),
+    ]
+    assert [stall.frame_to_command_us for stall in found.stalls] == [3000, None, 1500, 2000, 1200, 1100]
+    assert (found.frames, found.stalled, found.of_host, found.of_loop, found.unknown) == (500, 6, 3, 2, 1)
+    assert [(bare.beside, bare.wakings, bare.stalled) for bare in found.bare] == [
+        ("camera", 1000, 2),  # the next waking was late, too
+        ("controller", 1000, 0),
+    ]
+    both = together([repeat(100, stalls=found), repeat(100, stalls=found)])["stalls"]
+    assert (both["stalled"], len(both["stalls"]), both["bare"][0]["stalled"]) == (12, 12, 4)
+    quiet = stalls_of(frames(), MS, {"camera": trace(0)})
+    assert (quiet.stalled, quiet.bare[0].late_us) == (0, None)
+
+
 def test_kernels_in_turns_have_the_ratio_of_their_pairs() -> None:
     pairs = [("numpy", 100), ("fused", 80), ("fused", 60), ("numpy", 120), ("numpy", 100), ("fused", 70)]
     found = of_kernels([repeat(us, kernel=name) for name, us in pairs])
@@ -283,6 +358,25 @@ def test_every_frame_of_a_real_loop_is_in_the_account(measured: tuple[dict[str, 
     assert figures["host"]["kernel"]
     assert figures["host"]["clock_source"]
     assert any("garbage collector off" in measure for measure in figures["host"]["granted"])
+
+
+@pytest.mark.exclusive
+def test_stalls_of_a_real_loop_are_traced_beside_bare_loops() -> None:
+    words = ("--duration", str(SECONDS), "--rate", str(RATE_HZ), "--trace")
+    done = lowfc("latency", *words, "--json")
+    assert done.exit_code == 0, (done.output, done.exception)
+    figures = json.loads(done.stdout)
+    found = figures["stalls"]
+    assert found["frames"] == figures["frames"]
+    assert figures["frames_without_command"] <= found["stalled"] == len(found["stalls"])
+    assert found["stalled"] == found["of_host"] + found["of_loop"] + found["unknown"]
+    assert [loop["beside"] for loop in found["bare"]] == ["camera", "controller"]
+    for loop in found["bare"]:
+        assert 0.5 * found["frames"] < loop["wakings"] <= RATE_HZ * (SECONDS + WARM_UP_S)
+        assert 0 < loop["late_us"]["p50"] <= loop["late_us"]["max"]
+    assert "bare loop beside the" in table(figures)
+    fault = lowfc("latency", "--trace", "--camera", "simulated").exception
+    assert isinstance(fault, ConfigurationError)
 
 
 @pytest.mark.exclusive

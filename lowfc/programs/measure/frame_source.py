@@ -15,7 +15,7 @@ import typer
 
 from lowfc.adapters.bus.run import open_run
 from lowfc.adapters.files import factory
-from lowfc.adapters.files.whole_file import being_written
+from lowfc.adapters.files.whole_file import being_written, write_whole
 from lowfc.adapters.process.join import join
 from lowfc.adapters.process.realtime import let_send
 from lowfc.adapters.process.service import Service
@@ -33,6 +33,8 @@ FRAMES_FILE = "frames.npy"
 """In the run's directory: the frames, (frames, rows, columns) uint16."""
 SENT_FILE = "sent.npz"
 """In the run's directory: sequence, put_ns and due_ns of every frame sent."""
+BEGIN_FILE = "begin"
+"""In the run's directory: the moment for which the schedule has the first frame, ns."""
 
 _COUNT = 32
 _TILT_NM, _OTHER_NM = 3.0, 1.0
@@ -123,16 +125,17 @@ class Source:
         state = camera_state(CameraSettings.configured(self._config, *self._payloads.shape), service.clock.now_ns())
         self._settings.put(state.SerializeToString())
         service.state = "running"
-        self._on_schedule(math.ceil(seconds * self._config.camera.rate_hz))
+        begin_ns = service.clock.now_ns() + _LEAD_PERIODS * self._config.period_ns
+        write_whole(folder / BEGIN_FILE, str(begin_ns).encode())
+        self._on_schedule(begin_ns, math.ceil(seconds * self._config.camera.rate_hz))
         with being_written(folder / SENT_FILE) as part, part.open("wb") as file:
             put_ns, due_ns = np.array(self._put_ns), np.array(self._due_ns)
             np.savez(file, sequence=np.array(self._sequence), put_ns=put_ns, due_ns=due_ns)
         service.finish()
 
-    def _on_schedule(self, frames: int) -> None:
+    def _on_schedule(self, origin_ns: int, frames: int) -> None:
         """Every frame at its moment, whatever became of the last; what is late is put at once, and none left out."""
         clock, period_ns = self._service.clock, self._config.period_ns
-        origin_ns = clock.now_ns() + _LEAD_PERIODS * period_ns
         for index in range(frames):
             due_ns = origin_ns + index * period_ns
             payload = self._payloads.at(index, due_ns)

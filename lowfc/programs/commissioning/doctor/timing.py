@@ -246,7 +246,8 @@ def _boot_clock(facts: Facts) -> Check:
 
 @CHECKS.check(
     "wake-up",
-    advice="see scheduling class, processors, idle states, virtualisation and load",
+    advice="see scheduling class, processors, idle states, virtualisation and load; `lowfc latency --trace` says "
+    "which stalls of a loop are the host's",
     cost="frames wait so long before they are looked at, however fast the loop computes",
 )
 def _wake_up(facts: Facts) -> Check:

@@ -56,6 +56,9 @@ def latency(
     kernel: Annotated[
         Kernels | None, typer.Option(help="Arithmetic of the control step; default: the configuration's.")
     ] = None,
+    trace: Annotated[
+        bool, typer.Option("--trace", help="Mark stalls with what the host can tell, a bare loop beside.")
+    ] = False,
     config: ConfigFile = None,
     plot: Annotated[Path | None, typer.Option(help="Draw histograms and latency against time (PNG).")] = None,
     compare: Annotated[
@@ -94,7 +97,9 @@ def latency(
         kernels = KERNELS if kernel is Kernels.BOTH else (str(kernel),) if kernel is not None else ()
         if FUSED in kernels and not compiled.available():
             raise ConfigurationError(compiled.missing())
-        figures = _measure(Asked(settings, duration, repeats, simulated, record, view, kernels))
+        if trace and simulated:
+            raise ConfigurationError("stalls are traced with prepared frames: leave out --trace or --camera simulated")
+        figures = _measure(Asked(settings, duration, repeats, simulated, record, view, kernels, trace))
     if plot is not None:
         write_whole(plot, picture(figures))
     put(figures, table(figures), as_json=as_json)
@@ -140,6 +145,7 @@ def _measure(asked: "Asked") -> dict[str, Any]:
             "camera": str(Camera.SIMULATED if asked.simulated else Camera.PREPARED),
             "record": asked.record,
             "view": asked.view,
+            "trace": asked.trace,
             "realtime": asked.config.realtime.model_dump(),
         },
         "logs": [log for one in done for log in one["logs"]],

@@ -5,9 +5,11 @@ and the host's timer alone. Nothing else of ours runs beside either.
 """
 
 import contextlib
+import json
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,7 @@ from threadpoolctl import threadpool_limits
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.bus.run import Run, mirror_role, new_run_id, open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
+from lowfc.adapters.files.whole_file import write_whole
 from lowfc.adapters.logs.columns import Columns, TimingRows
 from lowfc.adapters.process.child import Child
 from lowfc.adapters.process.clock import HostClock
@@ -27,8 +30,9 @@ from lowfc.contract.messages import FRAME, HEALTH, MIRROR_STATE, TIMING, Role, w
 from lowfc.programs.launch.processes import program, start_all, stop_all
 from lowfc.programs.launch.sim_loop import ProcessDiedError, children_of, held_back, prepare
 from lowfc.programs.launch.watch import Watch
-from lowfc.programs.measure import echo
-from lowfc.programs.measure.frame_source import FRAMES_FILE, SENT_FILE, prepared_frames
+from lowfc.programs.measure import bare_loop, echo
+from lowfc.programs.measure.bare_loop import PROCESSES_FILE, TRACED, trace_file
+from lowfc.programs.measure.frame_source import BEGIN_FILE, FRAMES_FILE, SENT_FILE, prepared_frames
 from lowfc.programs.measure.latency.figures import (
     WARM_UP_S,
     controllers_account,
@@ -36,6 +40,7 @@ from lowfc.programs.measure.latency.figures import (
     percentiles,
     repeat_figures,
 )
+from lowfc.programs.measure.latency.stalls import Trace, stalls_of
 
 _TURN_S = 0.25
 _RING = 1 << 14
@@ -54,6 +59,7 @@ class Asked:
     record: bool = False
     view: bool = False
     kernels: tuple[str, ...] = ()
+    trace: bool = False
 
 
 def fill(config: Configuration, run: Run) -> None:
@@ -80,7 +86,7 @@ def run_repeats(asked: Asked, run: Run, progress: Callable[[str], None]) -> list
     Returns:
         For each repeat, and in it for each kernel: its name, kernel; `repeat_figures` and `controllers_account`;
         granted, refused, logs, messages_lost and commands_late; echo_us, step_us, hot_step_us and timer_us
-        (percentiles) and echo_lost.
+        (percentiles) and echo_lost; and stalls where they are traced.
 
     Raises:
         ProcessDiedError: a process ended by itself.
@@ -117,7 +123,9 @@ def one_loop(asked: Asked, run: Run) -> dict[str, Any]:
         for sample in frame_ring.drain() if frame_ring is not None else ():
             frames.add(sequence=sample.sequence, publish_ns=sample.publish_time_ns)
 
-    children = _children(asked, run)
+    children, traced = _children(asked, run), TRACED if asked.trace else ()
+    for file in (BEGIN_FILE, PROCESSES_FILE):
+        (run.path / file).unlink(missing_ok=True)  # of the last repeat
     with contextlib.ExitStack() as stack:
         bus = ZenohBus(run.links, Role.LAUNCHER, HostClock())
         stack.callback(bus.close)
@@ -126,7 +134,7 @@ def one_loop(asked: Asked, run: Run) -> dict[str, Any]:
         state_ring = bus.ring(MIRROR_STATE, _RING)
         frame_ring = bus.ring(FRAME, _RING) if asked.simulated else None
         stack.callback(stop_all, children)
-        _run(children, children[:1], drain)
+        _run(children, children[: 1 + len(traced)], drain, partial(_name_processes, run, children))
         time.sleep(_SETTLE_S)
         stop_all([*children[1:], children[0]])
         time.sleep(_LAST_WORDS_S)
@@ -139,6 +147,8 @@ def one_loop(asked: Asked, run: Run) -> dict[str, Any]:
         with np.load(run.path / SENT_FILE) as sent:
             joined = join(sent["sequence"], sent["put_ns"], sent["due_ns"], *received)
     figures = repeat_figures(joined)
+    if traced:
+        figures["stalls"] = stalls_of(joined, asked.config.period_ns, {role: _trace(run, role) for role in traced})
     if "frame_to_command" not in figures["latency_us"]:
         raise BusError("the controller reported the timing of no frame after the warm-up; let the test last longer")
     controller, recording = watch.of(Role.CONTROLLER), watch.of(Role.RECORDER).recording
@@ -170,7 +180,24 @@ def _children(asked: Asked, run: Run) -> list[Child]:
     else:
         words = ["-m", "lowfc.programs.measure.frame_source", *_shared(run), "--seconds", str(seconds), *waits]
         children[0] = program(str(Role.CAMERA), words, run.path / f"{Role.CAMERA}.stderr")
+    if asked.trace:
+        children[1:1] = [_bare_loop(run, role, seconds) for role in TRACED]
     return children
+
+
+def _bare_loop(run: Run, role: Role, seconds: float) -> Child:
+    words = ["-m", bare_loop.__name__, str(role), *_shared(run), "--seconds", str(seconds)]
+    return program(f"bare loop beside the {role}", words, run.path / f"bare-{role}.stderr")
+
+
+def _name_processes(run: Run, children: list[Child]) -> None:
+    """Leave the number of each process where the bare loops look for it."""
+    numbers = {child.name: child.process.pid for child in children if child.process is not None}
+    write_whole(run.path / PROCESSES_FILE, json.dumps(numbers).encode())
+
+
+def _trace(run: Run, role: Role) -> Trace:
+    return Trace(*np.load(run.path / trace_file(role)).T)
 
 
 def _alone(asked: Asked, run: Run) -> dict[str, Any]:
@@ -197,7 +224,12 @@ def _shared(run: Run) -> list[str]:
     return ["--run", run.run_id, "--config", str(run.path / "config.toml")]
 
 
-def _run(children: list[Child], awaited: list[Child], meanwhile: Callable[[], None]) -> None:
+def _run(
+    children: list[Child],
+    awaited: list[Child],
+    meanwhile: Callable[[], None],
+    started: Callable[[], None] = lambda: None,
+) -> None:
     """Start processes, and return when those awaited have ended by themselves.
 
     Raises:
@@ -206,6 +238,7 @@ def _run(children: list[Child], awaited: list[Child], meanwhile: Callable[[], No
     """
     with held_back() as interrupted:  # while a process forks, Python may swallow what signals would raise
         start_all(children)
+        started()
         while any(child.status is None for child in awaited) and not interrupted():
             for child in children:
                 if child.status is not None and (child.status != 0 or child not in awaited):

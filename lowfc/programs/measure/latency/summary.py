@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from lowfc.control.kernel.tables import KERNELS
+from lowfc.programs.measure.latency import stalls
 from lowfc.programs.measure.latency.figures import ALONE, COUNTS, RATIOS, RATIOS_AT, edges_us
 
 OVER = "over_echo_and_step"
@@ -21,7 +22,8 @@ def together(repeats: Repeats) -> dict[str, Any]:
         latency_us and spread_us by span: median, and lowest and highest, over the repeats of each percentile (max: the
         largest); echo_us{round_trip}, step_us, hot_step_us, timer_us, ratio (p50 and p99; see `RATIOS`) and ratio_hot,
         its step of those back to back, and the same with _spread; histogram{edges_us, counts by span}; over_time of
-        each repeat; `COUNTS`, and reasons; and repeats, the percentiles of each.
+        each repeat; `COUNTS`, and reasons; repeats, the percentiles of each; and stalls (`Stalls`) where they were
+        traced.
     """
     spans = [span for span in repeats[0]["latency_us"] if all(span in one["latency_us"] for one in repeats)]
     each = {span: [one["latency_us"][span] for one in repeats] for span in spans}
@@ -45,6 +47,8 @@ def together(repeats: Repeats) -> dict[str, Any]:
     found["histogram"] = _histogram(repeats, spans)
     found["over_time"] = [one["over_time"] for one in repeats]
     found["repeats"] = [{name: one.get(name) for name in ("latency_us", *ALONE)} for one in repeats]
+    if traced := [one["stalls"] for one in repeats if "stalls" in one]:
+        found["stalls"] = stalls.together(traced).figures()
     return found
 
 

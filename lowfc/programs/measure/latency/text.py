@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from lowfc.programs.measure.latency.figures import ALONE, COUNTS, LOOP_SPANS, PERCENTILES, RATIOS, SPANS
+from lowfc.programs.measure.latency.stalls import Stalls
 from lowfc.programs.measure.latency.summary import OVER
 
 _COMPARED = SPANS | {OVER: "over echo and step"}
@@ -114,6 +115,8 @@ def _remarks(figures: Mapping[str, Any]) -> list[str]:
     if figures["reasons"]:
         reasons = ", ".join(f"{name} {count}" for name, count in figures["reasons"].items())
         lines.append(f"frames that were refused or limited, the warm-up included: {reasons}")
+    if "stalls" in figures:
+        lines.append(Stalls.model_validate(figures["stalls"]).text())
     lines.append(_what(figures))
     host = figures["host"]
     lines.append(", ".join(f"{name} {host[name]}" for name in _HOST if host.get(name)))
@@ -129,7 +132,7 @@ def _what(figures: Mapping[str, Any]) -> str:
     settings, count = figures["settings"], len(figures["repeats"])
     if settings.get("log"):
         return f"{Path(settings['log']).name}, {figures['rate_hz']:.1f} Hz"
-    beside = "".join(f", {name} beside" for name in ("record", "view") if settings[name])
+    beside = "".join(f", {name} beside" for name in ("record", "view", "trace") if settings.get(name))
     times = f"medians over {count} times {settings['duration_s']:g} s" if count > 1 else f"{settings['duration_s']:g} s"
     reached = f"{settings['rate_hz']:g} Hz ({figures['rate_hz']:.1f} Hz reached)"
     return f"{reached}, {settings['camera']} frames{beside}, {times}"

@@ -1,0 +1,186 @@
+"""Stalls of a loop, and what the kernel counted in each: what is the host's is named as such.
+
+A frame stalls where its command takes longer than a period, or where it has none. A stall counts from the moment that
+its frame was due. It is the host's where a bare loop on the same processor was held up in it too, where the hypervisor
+gave the processor to others, or where the quota of the control group was used up.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from lowfc.arrays import Array, Long
+from lowfc.programs.cli.result import Result, figure
+from lowfc.programs.measure.latency.figures import WARM_UP_S, Frames, percentiles
+
+Holder = Literal["host", "loop", "unknown"]
+"""Who held a frame up: the loop where a process of it waited for a processor or for pages, and no bare loop did."""
+
+_PART = 0.25
+"""Of a period: shorter waits explain no stall."""
+_FAULT_US = 1.0
+"""What mapping a page takes, about."""
+_SPANS = {"frame_to_receive": "frame to receive", "wakeup": "waking", "compute": "computing", "publish": "publishing"}
+_SHOWN = 20
+
+
+class Trace(NamedTuple):
+    """What the bare loop beside one process noted; (wakings,), the counts as in `host.Counts`."""
+
+    due_ns: Long
+    woke_ns: Long
+    stolen_ns: Long
+    throttled: Long
+    waited_ns: Long
+    preempted: Long
+    minor_faults: Long
+    major_faults: Long
+
+
+class Counted(Result):
+    """What moved from the last waking of a bare loop before a stall to the first one after it, both included.
+
+    `bare_late_us` is how late it woke at most; the others are those of `host.Counts`, of the process beside it.
+    """
+
+    bare_late_us: float
+    stolen_ms: float
+    throttled: int
+    waited_us: float
+    preempted: int
+    minor_faults: int
+    major_faults: int
+
+
+class Stall(Result):
+    """One frame that stalled; `counted` by process."""
+
+    second: float = figure("at, s", form=".3f")
+    frame_to_command_us: float | None = figure("frame to command, us", form=".0f")
+    longest: str = figure("longest in")
+    held_up_by: Holder = figure("held up by")
+    signs: str = figure("signs")
+    counted: dict[str, Counted] = figure()
+
+
+class BareLoop(Result):
+    """A loop beside a process of ours that does nothing; `stalled` counts its wakings more than a period late."""
+
+    beside: str = figure("bare loop beside the")
+    wakings: int = figure("wakings")
+    stalled: int = figure("stalled")
+    late_us: dict[str, float] | None = figure()
+
+
+class Stalls(Result):
+    """The stalls of a run."""
+
+    frames: int = figure()
+    stalled: int = figure("stalled", "frames: no command, or more than a period from frame to command")
+    of_host: int = figure("  by the host", "frames: a bare loop was held up too, a processor stolen, a quota used up")
+    of_loop: int = figure("  by the loop", "frames: a process waited for a processor or for pages, no bare loop did")
+    unknown: int = figure("  not known", "frames: nothing was counted")
+    bare: list[BareLoop] = figure()
+    stalls: list[Stall] = figure()
+
+    def text(self) -> str:
+        """Counts, the bare loops, and the first stalls."""
+        more = len(self.stalls) - _SHOWN
+        shown = super(Stalls, self.model_copy(update={"stalls": self.stalls[:_SHOWN]})).text()
+        return shown + (f"\nand {more} more" if more > 0 else "")
+
+
+def signs_of(counted: Counted, period_us: float) -> tuple[list[str], list[str]]:
+    """Signs of the host's, and signs of the loop's own, in words; what is too short for a stall is none."""
+    long_us = _PART * period_us
+    hosts = {
+        f"bare loop {counted.bare_late_us:.0f} us late": counted.bare_late_us >= long_us,
+        f"{counted.stolen_ms:.0f} ms stolen": counted.stolen_ms > 0,
+        "quota used up": counted.throttled > 0,
+    }
+    own = {
+        f"waited {counted.waited_us:.0f} us for the processor": counted.waited_us >= long_us,
+        f"{counted.major_faults} pages read": counted.major_faults > 0,
+        f"{counted.minor_faults} pages mapped": counted.minor_faults * _FAULT_US >= long_us,
+    }
+    return [sign for sign, holds in hosts.items() if holds], [sign for sign, holds in own.items() if holds]
+
+
+def stalls_of(frames: Frames, period_ns: int, traces: Mapping[str, Trace]) -> Stalls:
+    """The stalls among these frames, the warm-up left out; traces by the process that each stands beside."""
+    command_us = frames.spans_us["frame_to_command"]
+    warm = frames.put_ns - frames.put_ns[:1] >= round(WARM_UP_S * 1e9)
+    slow = warm & (~frames.commanded | (command_us * 1e3 > period_ns))
+    end_ns = _ends_ns(frames, period_ns)
+    found = [_stall(frames, int(index), float(end_ns[index]), period_ns, traces) for index in np.flatnonzero(slow)]
+    held = [stall.held_up_by for stall in found]
+    return Stalls(
+        frames=int(warm.sum()),
+        stalled=len(found),
+        of_host=held.count("host"),
+        of_loop=held.count("loop"),
+        unknown=held.count("unknown"),
+        bare=[_bare(role, trace, period_ns) for role, trace in traces.items()],
+        stalls=found,
+    )
+
+
+def together(repeats: Sequence[Stalls]) -> Stalls:
+    """The stalls of several repeats; of the bare loops' lateness the percentiles of the worst repeat."""
+    names = "frames", "stalled", "of_host", "of_loop", "unknown"
+    bare = []
+    for loops in zip(*(one.bare for one in repeats), strict=True):
+        worst = max(loops, key=lambda loop: (loop.late_us or {}).get("max", 0.0))
+        sums = {name: sum(getattr(loop, name) for loop in loops) for name in ("wakings", "stalled")}
+        bare.append(worst.model_copy(update=sums))
+    counts = {name: sum(getattr(one, name) for one in repeats) for name in names}
+    return Stalls(**counts, bare=bare, stalls=[stall for one in repeats for stall in one.stalls])
+
+
+def _ends_ns(frames: Frames, period_ns: int) -> Array:
+    """When each frame's command was sent; of one without a command, when the next one was."""
+    sent_ns = frames.put_ns + frames.spans_us["frame_to_command"] * 1e3
+    known_ns = np.where(np.isfinite(sent_ns), sent_ns, np.inf)
+    next_ns = np.minimum.accumulate(known_ns[::-1])[::-1]
+    return np.where(np.isfinite(known_ns), known_ns, np.minimum(next_ns, frames.put_ns.max(initial=0) + period_ns))
+
+
+def _stall(frames: Frames, index: int, end_ns: float, period_ns: int, traces: Mapping[str, Trace]) -> Stall:
+    due_to_frame_us = frames.spans_us.get("due_to_frame", np.zeros_like(frames.spans_us["frame_to_command"]))
+    begin_ns = int(frames.put_ns[index] - due_to_frame_us[index] * 1e3)
+    spans_us = {name: float(frames.spans_us[span][index]) for span, name in _SPANS.items()}
+    command_us = float(frames.spans_us["frame_to_command"][index])
+    timed = bool(np.isfinite(command_us))
+    counted = {role: _counted(trace, begin_ns, end_ns) for role, trace in traces.items() if trace.woke_ns.size}
+    signs = {role: signs_of(one, period_ns / 1e3) for role, one in counted.items()}
+    hosts, own = (any(each[which] for each in signs.values()) for which in (0, 1))
+    words = [f"{role}: {', '.join([*first, *second])}" for role, (first, second) in signs.items() if first or second]
+    return Stall(
+        second=round(int(frames.put_ns[index] - frames.put_ns[0]) / 1e9, 4),
+        frame_to_command_us=command_us if timed else None,
+        longest=max(spans_us, key=lambda name: spans_us[name]) if timed else "no command",
+        held_up_by="host" if hosts else "loop" if own else "unknown",
+        signs="; ".join(words) or "none",
+        counted=counted,
+    )
+
+
+def _counted(trace: Trace, begin_ns: int, end_ns: float) -> Counted:
+    last = trace.woke_ns.size - 1
+    before = max(int(np.searchsorted(trace.woke_ns, begin_ns, side="right")) - 1, 0)
+    after = min(int(np.searchsorted(trace.woke_ns, end_ns)), last)
+    moved = {name: int(column[after] - column[before]) for name, column in trace._asdict().items()}
+    late_ns = (trace.woke_ns - trace.due_ns)[before : after + 1]
+    return Counted(
+        bare_late_us=float(late_ns.max(initial=0)) / 1e3,
+        stolen_ms=moved["stolen_ns"] / 1e6,
+        waited_us=moved["waited_ns"] / 1e3,
+        **{name: moved[name] for name in ("throttled", "preempted", "minor_faults", "major_faults")},
+    )
+
+
+def _bare(role: str, trace: Trace, period_ns: int) -> BareLoop:
+    late_ns = trace.woke_ns - trace.due_ns
+    late_us = percentiles(late_ns / 1e3)
+    return BareLoop(beside=role, wakings=late_ns.size, stalled=int(np.sum(late_ns > period_ns)), late_us=late_us)
