@@ -1,7 +1,8 @@
 """The fused step: the arithmetic of the usual frame in two plain functions, to be compiled.
 
 They are written for a compiler: loops over arrays that were made before, nothing allocated, nothing called but numpy's
-types. Rows are taken four at a time, so that each vector is read once for four of them. `lowfc.adapters` compiles them.
+types. Rows of R are taken ten at a time, and what is left five at a time, so that a frame is read once for all of them
+and several sums go on at once. `lowfc.adapters` compiles them.
 """
 
 import numpy as np
@@ -27,7 +28,7 @@ def measure(
         pixels: (pixels,) counts, DN.
         good: (pixels,) all bits set where a pixel is used, else 0.
         dark: (pixels,) DN.
-        tiles: (blocks x modes rounded up to four, block) R, block of pixels after block; zero where it was filled up.
+        tiles: (blocks x modes rounded up to five, block) R, block of pixels after block; zero where it was filled up.
         scratch: (block,) overwritten.
         reference_nm: (modes,) R I0.
         full_well: counts from which on a pixel is saturated.
@@ -40,7 +41,7 @@ def measure(
         usual: a good pixel is saturated, or there is little light.
     """
     modes, block, row = error_nm.size, scratch.size, 0
-    total, highest = np.uint64(0), np.uint16(0)
+    total, highest, zero = np.uint64(0), np.uint16(0), np.float32(0)
     for mode in range(modes):
         error_nm[mode] = 0
     for begin in range(0, pixels.size, block):
@@ -51,23 +52,42 @@ def measure(
             kept = count & used[i]
             total += np.uint64(kept)
             highest = max(highest, kept)
-        for mode in range(0, modes, 4):
-            first, second, third, fourth = tiles[row], tiles[row + 1], tiles[row + 2], tiles[row + 3]
-            row += 4
-            a, b, c, d = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
+        mode = 0
+        while mode + 5 < modes:
+            r0, r1, r2, r3, r4 = tiles[row], tiles[row + 1], tiles[row + 2], tiles[row + 3], tiles[row + 4]
+            r5, r6, r7, r8, r9 = tiles[row + 5], tiles[row + 6], tiles[row + 7], tiles[row + 8], tiles[row + 9]
+            s0, s1, s2, s3, s4 = zero, zero, zero, zero, zero
+            s5, s6, s7, s8, s9 = zero, zero, zero, zero, zero
             for i in range(counts.size):
                 value = scratch[i]
-                a += first[i] * value
-                b += second[i] * value
-                c += third[i] * value
-                d += fourth[i] * value
-            error_nm[mode] += a
-            if mode + 1 < modes:
-                error_nm[mode + 1] += b
-            if mode + 2 < modes:
-                error_nm[mode + 2] += c
-            if mode + 3 < modes:
-                error_nm[mode + 3] += d
+                s0 += r0[i] * value
+                s1 += r1[i] * value
+                s2 += r2[i] * value
+                s3 += r3[i] * value
+                s4 += r4[i] * value
+                s5 += r5[i] * value
+                s6 += r6[i] * value
+                s7 += r7[i] * value
+                s8 += r8[i] * value
+                s9 += r9[i] * value
+            for k, total_nm in enumerate((s0, s1, s2, s3, s4, s5, s6, s7, s8, s9)):
+                if mode + k < modes:
+                    error_nm[mode + k] += total_nm
+            mode, row = mode + 10, row + 10
+        if mode < modes:
+            r0, r1, r2, r3, r4 = tiles[row], tiles[row + 1], tiles[row + 2], tiles[row + 3], tiles[row + 4]
+            s0, s1, s2, s3, s4 = zero, zero, zero, zero, zero
+            for i in range(counts.size):
+                value = scratch[i]
+                s0 += r0[i] * value
+                s1 += r1[i] * value
+                s2 += r2[i] * value
+                s3 += r3[i] * value
+                s4 += r4[i] * value
+            for k, total_nm in enumerate((s0, s1, s2, s3, s4)):
+                if mode + k < modes:
+                    error_nm[mode + k] += total_nm
+            row += 5
     flux_dn = np.float32(np.float64(total) - dark_sum_dn)
     if highest >= full_well or not flux_dn > least_dn:
         return 0.0

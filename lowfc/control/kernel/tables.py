@@ -66,7 +66,7 @@ class Tables(NamedTuple):
             return None
         blocks = -(-pixels // BLOCK)
         block = -(-pixels // blocks)
-        filled = np.zeros((-(-modes // 4) * 4, blocks * block), np.float32)
+        filled = np.zeros((-(-modes // 5) * 5, blocks * block), np.float32)
         filled[:modes, :pixels] = calibration.reconstructor
         return cls(
             kernel.measure,
