@@ -71,14 +71,18 @@ def opened(kind: Kind, name: str, config: Configuration, words: Sequence[str] = 
         raise ConfigurationError(f"the {kind} {name!r} cannot be opened: {fault}") from fault
 
 
-def faults(config: Configuration) -> list[str]:
-    """What is wrong with the sections [drivers.NAME] of a configuration, a sentence each."""
+def faults(config: Configuration, folder: Path) -> list[str]:
+    """What is wrong with the sections [drivers.NAME] of a configuration in a folder, a sentence each."""
     found = []
     for name in config.drivers:
         kinds = [kind for kind in KINDS if name in installed(kind)]
-        if not kinds and importlib.util.find_spec(name.partition(".")[0]) is None:
+        in_file = any((here / f"{name}.py").is_file() for here in (folder, Path.cwd()))
+        if not kinds and not in_file and importlib.util.find_spec(name.partition(".")[0]) is None:
             known = {*installed("camera"), *installed("mirror")}
-            found.append(f"drivers.{name}: no installed driver has that name{nearest(name, known)}, nor a module")
+            found.append(
+                f"drivers.{name}: no installed driver has that name{nearest(name, known)}, nor a module, nor is there "
+                f"a file {name}.py; the options of folder/file.py:Class are in drivers.file"
+            )
         for kind in kinds:
             try:
                 options(load(kind, name), table(config, kind, name))

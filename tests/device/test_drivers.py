@@ -143,9 +143,11 @@ def test_a_driver_is_found_by_entry_point_or_by_module_and_class(
             plugins.load("camera", name)
 
 
-def test_a_configuration_is_checked_by_the_drivers_themselves() -> None:
-    assert plugins.faults(load(None, {"drivers.sim": {"camera": {"fault": ""}}, "drivers.json": {"any": 1}})) == []
-    wrong = plugins.faults(load(None, {"drivers.sim": {"camera": {"falt": ""}}, "drivers.sin.x": 1}))
+def test_a_configuration_is_checked_by_the_drivers_themselves(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").touch()
+    good = {"drivers.sim": {"camera": {"fault": ""}}, "drivers.json": {"any": 1}, "drivers.mine.level": 1}
+    assert plugins.faults(load(None, good), tmp_path) == []
+    wrong = plugins.faults(load(None, {"drivers.sim": {"camera": {"falt": ""}}, "drivers.sin.x": 1}), tmp_path)
     assert ["'falt'" in wrong[0], "did you mean 'sim'" in wrong[1], len(wrong)] == [True, True, 2]
 
 

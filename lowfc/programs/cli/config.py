@@ -79,7 +79,7 @@ def config_check(config: Annotated[Path, typer.Argument(help="Configuration file
 
     settings = configuration(config)
     check_files(settings)
-    if wrong := faults(settings):
+    if wrong := faults(settings, config.parent):
         raise ConfigurationError("\n".join(f"{config}: {one}" for one in wrong))
     typer.echo(f"{config}: fine")
 
