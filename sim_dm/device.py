@@ -38,10 +38,10 @@ def initial(device: Device) -> Status:
     return Status(flat, _at_rest(device, flat))
 
 
-def apply_command(device: Device, status: Status, told: Command, now_ns: int) -> tuple[Status, Reason | None]:
+def apply_command(device: Device, status: Status, command: Command, now_ns: int) -> tuple[Status, Reason | None]:
     """The mirror behind its guard: see `lowfc.device.guard.apply_command`."""
     return guarded_command(
-        device, status, told, now_ns, lambda driven_nm, ns: settled(device, driven_nm, status.surface_nm, ns)
+        device, status, command, now_ns, lambda driven_nm, ns: settled(device, driven_nm, status.surface_nm, ns)
     )
 
 

@@ -12,15 +12,15 @@ from lowfc.device.driver import Camera, CameraExtras, CameraSettings, Exposure, 
 from lowfc.device.watch import DriverWatch
 
 WAIT_S = 30.0
-"""How long the first frame waits for those who must not miss it."""
+"""How long the first frame waits for the processes that must not miss it."""
 SETTINGS_NS = round(1e9 / float(CAMERA_STATE.rate))
 PATIENCE_S = 1.0
 """How long an exposure may take to come, or three periods where they are longer."""
 REST_NS = 100_000_000
 AHEAD_NS = 5_000_000
-"""By which the end of an exposure may be ahead of its clock."""
+"""How far the end of an exposure may be ahead of its clock."""
 MOST_LOST, MOST_FASTER = 100, 4
-"""Frame numbers go on by at most so many, and so many times the periods since the last frame; else they began again."""
+"""Largest step of frame numbers: so many, and so many times the periods since the last frame. Beyond, a restart."""
 FRAME_ID = "lowfc_camera"
 
 _IDLE = CameraExtras()
@@ -46,7 +46,7 @@ class CameraLoop:
         self.watch = DriverWatch(service, PATIENCE_S)
         self._settings: CameraSettings | None = None
         self._due_ns = 0
-        self._tell_settings()
+        self._publish_settings()
         self._due_ns = 0
         service.fill = self._fill
         service.state = "ready"
@@ -74,7 +74,7 @@ class CameraLoop:
                     step()
                 elif service.clock.host_ns() < self.watch.retry_ns:
                     service.clock.sleep_until_ns(min(self.watch.retry_ns, service.clock.now_ns() + REST_NS))
-                self._tell_lost()
+                self._report_lost()
                 service.beat()
         service.finish()
 
@@ -85,13 +85,13 @@ class CameraLoop:
             return None
         watch.begin()
         try:
-            settings = self._tell_settings()
+            settings = self._publish_settings()
             exposure = self._driver.expose()
             watch.returned()
             if exposure is None:
                 return None
             if exposure.pixels.shape != (settings.rows, settings.columns):
-                settings = self._tell_settings()  # the region has changed since
+                settings = self._publish_settings()  # the region has changed since
             pixels = _checked(exposure.pixels, settings)
             end_ns = self._end_ns(exposure, settings)
             self._follow_numbers(exposure, settings)
@@ -130,7 +130,7 @@ class CameraLoop:
         return end_ns
 
     def _follow_numbers(self, exposure: Exposure, settings: CameraSettings) -> None:
-        """Count frames that the camera lost; where its numbers begin again, so do ours.
+        """Count frames that the camera lost; where its numbers restart, begin a new start of the publisher.
 
         Raises:
             ValueError: the number is that of the last frame.
@@ -155,16 +155,16 @@ class CameraLoop:
         """A new start of the publisher: frames, and the settings that the controller then waits for."""
         self._service.bus.restart()
         self._settings = None
-        self._tell_settings()
+        self._publish_settings()
 
-    def _tell_lost(self) -> None:
-        """Name lost frames, those of half a second in one event."""
+    def _report_lost(self) -> None:
+        """Report lost frames, those of half a second in one event."""
         now_ns = self._service.clock.host_ns()
         if self._lost and now_ns >= self._lost_due_ns:
             self._service.event("FRAMES_LOST", count=self._lost)
             self._lost, self._lost_due_ns = 0, now_ns + SETTINGS_NS
 
-    def _tell_settings(self) -> CameraSettings:
+    def _publish_settings(self) -> CameraSettings:
         """Publish the settings when they have changed, and twice a second."""
         settings = self._driver.settings()
         time_ns = self._service.clock.now_ns() if settings.time_ns is None else settings.time_ns

@@ -64,8 +64,8 @@ class CameraSettings:
         region_column: first column of the region read.
         clock: of `Exposure.end_ns`: CLOCK_MONOTONIC, CLOCK_REALTIME, or the run's (`service.clock`), by which only a
             simulated camera goes: its frame is published once that clock has reached the end of the exposure.
-        number_wrap: at which `Exposure.number` begins again at 0, such as 1 << 16.
-        time_ns: since when they are so, by the run's clock; now where it is None.
+        number_wrap: value at which `Exposure.number` begins again at 0, such as 1 << 16.
+        time_ns: time from which they hold, by the run's clock; now where it is None.
     """
 
     rows: int
@@ -144,7 +144,7 @@ class Camera(Protocol):
     """
 
     def settings(self) -> CameraSettings:
-        """What it is set to now. It is asked before every exposure, so it must not wait for the hardware."""
+        """Settings in force. It is called before every exposure, so it must not wait for the hardware."""
         ...
 
     def expose(self) -> Exposure | None:
@@ -152,12 +152,12 @@ class Camera(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go of the hardware; the last call."""
+        """Release the hardware; the last call."""
         ...
 
 
 class CameraExtras:
-    """Methods that a camera may have, each by itself; a class that derives from this one has them all, and idle."""
+    """Optional methods of a camera, each by itself; those of this class do nothing."""
 
     def join(self, service: Service) -> None:
         """The process has joined its run: `service` has its clock, publishers, bus and events."""
@@ -210,8 +210,8 @@ def geometry(config: Configuration) -> Geometry:
 class Mirror(Protocol):
     """A mirror: `MyMirror(options, config)` opens it.
 
-    It may have a class `Options`, derived from `DriverOptions`, and the methods of `MirrorExtras`. What it is given is
-    within the limits of its geometry and of [mirror], of which the tighter count.
+    It may have a class `Options`, derived from `DriverOptions`, and the methods of `MirrorExtras`. The actuators that
+    it receives are within the limits of its geometry and of [mirror], whichever are tighter.
     """
 
     @property
@@ -227,20 +227,20 @@ class Mirror(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go of the hardware; the last call. The shape stays as it is."""
+        """Release the hardware; the last call. The shape stays as it is."""
         ...
 
 
 class MirrorExtras:
-    """Methods that a mirror may have, each by itself."""
+    """Optional methods of a mirror, each by itself."""
 
     def join(self, service: Service) -> None:
         """The process has joined its run: `service` has its clock, publishers, bus and events."""
 
     def position(self) -> Single:
-        """(rows, columns) nm that it holds, for a mirror that can say: it is asked at the start, and after a fault.
+        """(rows, columns) nm that it holds, of a mirror that can read it; called at the start, and after a fault.
 
-        A mirror that cannot say is driven to flat at once.
+        Without this method the mirror is driven to flat at once.
         """
         raise NotImplementedError
 

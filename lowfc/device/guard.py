@@ -1,6 +1,6 @@
 """What protects a mirror: its own limits, its own dead-man, its own check of commands; functions of values.
 
-It trusts nobody, and it is the same for every mirror, simulated or real. The mirror itself is a function `Move`.
+It trusts no sender, and it is the same for every mirror, simulated or real. The mirror itself is a function `Move`.
 """
 
 from collections.abc import Callable, Mapping
@@ -18,9 +18,9 @@ from lowfc.control.loop.safety import Limit, Limited, Limits, Reason, Rejection,
 _NONE: Single = np.zeros(0, np.float32)
 
 LONGEST_VALID_NS = 2_000_000_000
-"""However long a command says that it is valid, the mirror does not hold it longer."""
+"""Longest validity of a command, whatever the command says."""
 AHEAD_NS = 1_000_000_000
-"""By which a frame's time may be ahead of the mirror's clock and still say when the surface was where it was."""
+"""How far a frame's time may be ahead of the mirror's clock and still be taken for the time of the surface."""
 
 
 Move = Callable[[Single, float], Single]
@@ -30,7 +30,7 @@ the last call, ns."""
 
 @dataclass(frozen=True)
 class Guard:
-    """What is kept of a mirror, whatever it is told.
+    """Limits of a mirror, and what it does when the last command has expired.
 
     Attributes:
         grid: rows and columns of actuators.
@@ -107,40 +107,40 @@ class Status(NamedTuple):
 
 
 def apply_command(
-    guard: Guard, status: Status, told: Command, now_ns: int, move: Move, beside_nm: Single | None = None
+    guard: Guard, status: Status, command: Command, now_ns: int, move: Move, beside_nm: Single | None = None
 ) -> tuple[Status, Reason | None]:
     """Follow a command that came at `now_ns`; a refused one changes nothing, and the reason is returned.
 
     What others have on the mirror, `beside_nm` (rows, columns), leaves less of the stroke.
     """
-    reason = _refusal(guard, status, told)
+    reason = _refusal(guard, status, command)
     if reason is not None:
         return status, reason
-    assert told.actuators_nm is not None  # noqa: S101  # _refusal
-    channels = {**status.channels, told.channel: told.actuators_nm}
-    wanted = told.actuators_nm
+    assert command.actuators_nm is not None  # noqa: S101  # _refusal
+    channels = {**status.channels, command.channel: command.actuators_nm}
+    wanted = command.actuators_nm
     if len(channels) > 1:
         with np.errstate(over="ignore", invalid="ignore"):  # a sum that is not finite is refused by `limit`
             wanted = sum(channels.values(), np.zeros(guard.grid, np.float32))
     limited = _limited(guard, status.driven_nm, wanted, beside_nm)
     # From frame to frame, not from the last tick: ticks go by the mirror's own clock, which is ahead of a frame's time.
-    elapsed_ns = told.time_ns - status.commanded_ns if status.commanded_ns else np.inf
+    elapsed_ns = command.time_ns - status.commanded_ns if status.commanded_ns else np.inf
     if elapsed_ns <= 0:  # the same frame again, while the camera is silent: only the mirror's own clock goes on
         elapsed_ns = now_ns - status.received_ns
     followed = Status(
         driven_nm=limited.actuators_nm,
         surface_nm=move(limited.actuators_nm, elapsed_ns),
         channels=channels,
-        command_nm=told.command_nm if not limited.reasons else _NONE,
+        command_nm=command.command_nm if not limited.reasons else _NONE,
         limits_hit=limited.reasons,
-        frame_sequence=told.frame_sequence,
-        time_ns=told.time_ns,
-        commanded_ns=told.time_ns,
+        frame_sequence=command.frame_sequence,
+        time_ns=command.time_ns,
+        commanded_ns=command.time_ns,
         received_ns=now_ns,
-        valid_for_ns=min(told.valid_for_ns, LONGEST_VALID_NS),
+        valid_for_ns=min(command.valid_for_ns, LONGEST_VALID_NS),
         following=True,
-        safe=status.safe | {told.channel} if told.safe else status.safe - {told.channel},
-        clear_id=told.clear_id or status.clear_id,
+        safe=status.safe | {command.channel} if command.safe else status.safe - {command.channel},
+        clear_id=command.clear_id or status.clear_id,
     )
     return followed, None
 
@@ -169,17 +169,17 @@ def tick(guard: Guard, status: Status, now_ns: int, move: Move) -> Status:
     return status._replace(surface_nm=move(status.driven_nm, elapsed_ns), time_ns=time_ns)
 
 
-def _refusal(guard: Guard, status: Status, told: Command) -> Reason | None:
-    if told.actuators_nm is None or told.actuators_nm.shape != guard.grid:
+def _refusal(guard: Guard, status: Status, command: Command) -> Reason | None:
+    if command.actuators_nm is None or command.actuators_nm.shape != guard.grid:
         return Limit.WRONG_GRID
-    if not (np.isfinite(told.actuators_nm).all() and np.isfinite(told.command_nm).all()):
+    if not (np.isfinite(command.actuators_nm).all() and np.isfinite(command.command_nm).all()):
         return Limit.NOT_FINITE
-    if told.ahead:
+    if command.ahead:
         return Rejection.AHEAD
-    cleared = told.clear_id and told.clear_id != status.clear_id
-    if told.frame_sequence < status.frame_sequence and not cleared:
+    cleared = command.clear_id and command.clear_id != status.clear_id
+    if command.frame_sequence < status.frame_sequence and not cleared:
         return Rejection.OUT_OF_ORDER
-    full = len(status.channels) >= MOST_CHANNELS and told.channel not in status.channels
-    if full or len(told.channel) > LONGEST_NAME:
+    full = len(status.channels) >= MOST_CHANNELS and command.channel not in status.channels
+    if full or len(command.channel) > LONGEST_NAME:
         return Limit.CHANNEL
     return None

@@ -43,7 +43,7 @@ PATIENCE_S = 0.5
 
 
 class _LostError(Exception):
-    """The driver failed or hung: nobody knows where the mirror is."""
+    """The driver failed or hung: the position of the mirror is unknown."""
 
 
 _IDLE = MirrorExtras()
@@ -51,7 +51,7 @@ _NONE: Single = np.zeros(0, np.float32)
 
 
 def guard_of(driver: Mirror, config: Configuration) -> Guard:
-    """What is kept of a mirror: of the limits of its driver and those of [mirror], the tighter.
+    """Limits of a mirror: those of its driver or those of [mirror], whichever are tighter.
 
     Raises:
         ConfigurationError: its grid is not that of [mirror].
@@ -87,7 +87,7 @@ class MirrorLoop:
         self._turn = threading.Lock()
         self._pause = Mailbox()  # nothing comes there: a signal can end its wait, wherever it strikes
         service.on_stop(self._pause.wake)
-        self._obeyed_ns = 0
+        self._applied_ns = 0
         self._states = service.publisher(MIRROR_STATE, name)
         self._surfaces = service.publisher(SURFACE, name)
         geometry, axis = true_mirror(config), pupil_axis(PICTURE_PIXELS)
@@ -122,7 +122,7 @@ class MirrorLoop:
         self._known = True
 
     def run(self) -> None:
-        """Do all but the commands, which are obeyed where they arrive: without one, the dead-man."""
+        """Run command timeout and return from a fault; commands are applied on the thread that receives them."""
         service = self._service
         with self.watch.over(self._close):
             while service.running:
@@ -130,7 +130,7 @@ class MirrorLoop:
                 free = self._turn.acquire(timeout=TICK_NS * 1e-9)
                 if free:
                     try:
-                        if not service.clock.lockstep and service.clock.host_ns() - self._obeyed_ns >= TICK_NS:
+                        if not service.clock.lockstep and service.clock.host_ns() - self._applied_ns >= TICK_NS:
                             self._wait()
                     finally:
                         self._turn.release()
@@ -150,18 +150,18 @@ class MirrorLoop:
     def _next_command(self, sample: Sample) -> None:
         clock = self._service.clock
         try:
-            told = command_of(sample.payload, self._start_check)
+            command = command_of(sample.payload, self._start_check)
         except (DecodeError, BadMessageError) as error:
             self._service.unreadable(sample.key, error)
             return
         if isinstance(clock, SimulatedClock):
-            clock.set_ns(told.time_ns)
+            clock.set_ns(command.time_ns)
         before, refused_before = self._status, self._refused
         refused: Reason | None = Rejection.NO_MIRROR
         if not self._returning:
             with contextlib.suppress(_LostError):
                 self._status, refused = apply_command(
-                    self._guard, before, told, clock.now_ns(), self._drive, self._beside()
+                    self._guard, before, command, clock.now_ns(), self._drive, self._beside()
                 )
         self._refused = refused
         self._publish(self._status.time_ns or clock.now_ns())
@@ -169,7 +169,7 @@ class MirrorLoop:
         if refused is not None and refused is not refused_before:
             self._service.event("COMMAND_REFUSED", reason=refused.name)
         if refused is None:
-            self._obeyed_ns = clock.host_ns()
+            self._applied_ns = clock.host_ns()
         if not before.following and before.frame_sequence and refused is None:
             self._service.event("COMMAND_BACK")
         for reason in self._status.limits_hit:
@@ -251,6 +251,7 @@ class MirrorLoop:
     def _publish(self, time_ns: int) -> None:
         """Publish the state, then, when it is due, a picture of the surface."""
         status, state = self._status, state_of(self._status, time_ns)
+        now_ns = self._service.clock.now_ns()  # a command's time may be anything
         if not self._known:
             state.ClearField("actuators")
             state.status = wire.MIRROR_STATUS_EXPIRED
@@ -258,8 +259,7 @@ class MirrorLoop:
         state.safe = bool(status.safe)
         state.refused = self._refused.value if self._refused is not None else 0  # type: ignore[assignment]  # numbered alike
         self._states.put(state.SerializeToString())
-        self._state_due_ns = self._service.clock.now_ns() + IDLE_STATE_NS
-        now_ns = self._service.clock.now_ns()  # not by a command's time: that may be anything
+        self._state_due_ns = now_ns + IDLE_STATE_NS
         if now_ns >= self._picture_due_ns and self._known:
             picture = np.asarray(self._y_factors @ status.surface_nm @ self._x_factors.T, np.float32)
             self._surfaces.put(image(picture, time_ns, "mirror").SerializeToString())

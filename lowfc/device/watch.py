@@ -1,4 +1,4 @@
-"""What becomes of a driver that fails or does not return: counted, named in an event, tried again after a while."""
+"""Faults of a driver: one that raises or does not return is counted, named in an event and tried again later."""
 
 import re
 import threading
@@ -10,9 +10,9 @@ from lowfc.contract.errors import LowfcError
 
 LOOK_S = 0.1
 PAUSES_NS = (0, 100_000_000, 200_000_000, 500_000_000, 1_000_000_000, 2_000_000_000, 4_000_000_000)
-"""How long a driver is left alone after so many failures in a row."""
+"""Pause after the first failure, the second in a row, and so on."""
 STEADY_NS = 1_000_000_000
-"""A driver that has not failed for so long works again."""
+"""A driver works again when it has not failed for this long."""
 
 
 class DriverWatch:
@@ -87,7 +87,7 @@ class DriverWatch:
             self._service.event("DRIVER_FAILED", why=why)
 
     def look(self) -> None:
-        """Whether a call is the same at every look for too long: by looks, since the host may have stood still."""
+        """Report a call that is under way for too many looks; looks are counted, for the host may have stood still."""
         if not self._under_way or self._calls != self._looked_at:
             self._looked_at, self._looks = self._calls, 0
             return

@@ -70,8 +70,8 @@ def test_images_of_every_type_are_read_and_written(path: Path, number: int) -> N
 
 
 def test_one_that_is_made_here_is_read_by_others(path: Path) -> None:
-    stream = Stream.create(path, (ROWS, COLUMNS), np.float32, {"gain": 2.5})
-    other = PlainStream(path, COLUMNS, ROWS, FLOAT32, keywords=1)
+    stream = Stream.create(path, (ROWS, COLUMNS), np.float32)
+    other = PlainStream(path, COLUMNS, ROWS, FLOAT32)
     assert (path.stat().st_mode & 0o777, other.get("<Q", 232)) == (0o666, path.stat().st_ino)
     assert [other.get("<I", 116), other.get("<I", 120), other.get("<Q", 128), other.get("B", 136)] == [9, 6, 54, 9]
     other.take(3)
@@ -79,7 +79,6 @@ def test_one_that_is_made_here_is_read_by_others(path: Path) -> None:
     assert other.wait(3, 1)
     assert np.array_equal(other.pixels[0], image(1, FLOAT32))
     assert other.get("<q", 184) - 1_700_000_000 == round(time.clock_gettime(time.CLOCK_TAI) - time.time())
-    assert stream.keywords() == {"gain": 2.5}
     with pytest.raises(StreamError, match="is there already"):
         Stream.create(path, (ROWS, COLUMNS), np.float32)
     assert [one.name for one in path.parent.iterdir()] == [path.name]

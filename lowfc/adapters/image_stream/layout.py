@@ -38,6 +38,8 @@ HEADER = np.dtype(
 )
 NEWEST, NEWEST_START = struct.Struct("@2q64x2Q8xB"), 184
 """What changes with each image, in one reading: `atime`, `cnt0`, `cnt1`, `write`; and where it begins."""
+TIMES = struct.Struct("<4q")
+"""There: `atime` and `writetime`, seconds and nanoseconds each."""
 KEYWORD = np.dtype(
     {
         "names": ["name", "type", "integer", "real", "text"],

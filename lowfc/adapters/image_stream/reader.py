@@ -36,7 +36,6 @@ class StreamReader:
     Attributes:
         stream: the one that is mapped, None while there is none.
         generation: of the stream, one for the first that was there.
-        torn: images that changed while they were copied, and were read again.
     """
 
     def __init__(self, path: Path) -> None:
@@ -46,7 +45,7 @@ class StreamReader:
             StreamError: it has another layout, or no free semaphore.
         """
         self.stream: Stream | None = None
-        self.generation = self.torn = 0
+        self.generation = 0
         self._path = path
         self._seen = self._semaphore = 0
         self._open()
@@ -115,5 +114,4 @@ class StreamReader:
             if stream.newest == newest:
                 self._seen = newest.number
                 return StreamImage(pixels, newest.number, newest.acquired_ns, self.generation)
-            self.torn += 1
         return None

@@ -59,9 +59,13 @@ class Semaphores:
             if _LIBC.sem_trywait(self._addresses[index]) and ctypes.get_errno() == errno.EAGAIN:
                 return
 
-    def post(self, index: int) -> bool:
-        """Post it, unless its reader is too far behind; returns whether it did."""
-        if self.value(index) >= MOST:
-            return False
-        _LIBC.sem_post(self._addresses[index])
-        return True
+    def post_all(self) -> list[int]:
+        """Post each, but for those whose reader is too far behind; which were posted."""
+        value, found = self._value, ctypes.byref(self._value)
+        posted = []
+        for index, address in enumerate(self._addresses):
+            _LIBC.sem_getvalue(address, found)
+            if value.value < MOST:
+                _LIBC.sem_post(address)
+                posted.append(index)
+        return posted

@@ -20,6 +20,7 @@ from lowfc.adapters.image_stream.layout import (
     NEWEST,
     NEWEST_START,
     NUMBERS,
+    TIMES,
     VERSION,
     Layout,
 )
@@ -125,34 +126,28 @@ class Stream:
             raise StreamError(f"stream {self.name!r} has semaphores of another C library ({path})")
 
     @classmethod
-    def create(
-        cls, path: Path, shape: tuple[int, int], dtype: npt.DTypeLike, keywords: dict[str, float] | None = None
-    ) -> "Stream":
+    def create(cls, path: Path, shape: tuple[int, int], dtype: npt.DTypeLike) -> "Stream":
         """Make a stream (rows, columns) where there is none; it appears complete, or not at all.
 
         Raises:
             StreamError: it is there already, or cannot be made.
         """
         rows, columns = shape
-        kind, keywords = np.dtype(dtype), keywords or {}
-        layout = Layout.made(kind, (1, rows, columns), len(keywords), SEMAPHORES, TRACES, 0)
+        kind = np.dtype(dtype)
+        layout = Layout.made(kind, (1, rows, columns), 0, SEMAPHORES, TRACES, 0)
         header = np.zeros(1, HEADER)
         fields: dict[str, Any] = {"version": VERSION.encode(), "name": path.name.removesuffix(".im.shm").encode()}
         fields |= {"axes": 2, "size": (columns, rows, 0), "elements": rows * columns, "type": NUMBERS[kind]}
         fields |= {"kind": MATRIX, "creator": os.getpid(), "shared": 1, "location": -1, "semaphores": SEMAPHORES}
-        fields |= {"traces": TRACES, "keywords": len(keywords), "data_bytes": rows * columns * kind.itemsize}
+        fields |= {"traces": TRACES, "data_bytes": rows * columns * kind.itemsize}
         fields |= {"created": _now(), "accessed": _now()}
-        words = np.zeros(len(keywords), KEYWORD)
-        words["name"], words["type"], words["real"] = list(keywords), b"D", list(keywords.values())
         try:
             with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}-") as file:
                 fields["inode"] = os.fstat(file.fileno()).st_ino
                 for name, value in fields.items():
                     header[name] = value
                 file.truncate(layout.file_bytes)
-                for part, content in (("header", header), ("keywords", words)):
-                    file.seek(layout.starts[part])
-                    file.write(content.tobytes())
+                file.write(header.tobytes())
                 for part in ("readers", "writers"):
                     file.seek(layout.starts[part])
                     file.write(np.full(SEMAPHORES, -1, "<i4").tobytes())
@@ -213,15 +208,15 @@ class Stream:
         np.copyto(self.data[0], image, casting="no")
         if self.layout.ring:
             self._put_in_ring()
-        self._header["writetime"] = now = _now()
-        self._header["atime"] = now if acquired_ns is None else divmod(acquired_ns + _tai_ahead_ns(), _NS)
+        now = _now()
+        acquired = now if acquired_ns is None else divmod(acquired_ns + _tai_ahead_ns(), _NS)
+        TIMES.pack_into(self._mapping, NEWEST_START, *acquired, *now)
         self._cnt0[0] += 1
         self._write[0] = 0
         pid = os.getpid()
-        for index in range(self.layout.semaphores):
-            if self.semaphores.post(index):
-                self.writers[index] = pid
-        self._log.post(0)
+        for index in self.semaphores.post_all():
+            self.writers[index] = pid
+        self._log.post_all()
 
     def _put_in_ring(self) -> None:
         """Copy the image into the circular buffer, as the C library does."""

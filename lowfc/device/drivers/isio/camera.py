@@ -83,7 +83,7 @@ class IsioCamera:
         stream = self._reader.stream
         if stream is not None and stream.current():
             rows, columns = stream.layout.shape[1:]
-            said = self._said(stream) if self._options.keywords else {}
+            said = self._from_keywords(stream) if self._options.keywords else {}
             self._settings = replace(self._settings, rows=rows, columns=columns, **said)
         return self._settings
 
@@ -108,8 +108,8 @@ class IsioCamera:
         """Give the semaphore back."""
         self._reader.close()
 
-    def _said(self, stream: Stream) -> dict[str, Any]:
-        """Settings that keywords of the stream say."""
+    def _from_keywords(self, stream: Stream) -> dict[str, Any]:
+        """Settings by keywords of the stream."""
         found, said = stream.keywords(), dict[str, Any]()
         for setting, word in self._options.keywords.items():
             if isinstance(value := found.get(word), str):

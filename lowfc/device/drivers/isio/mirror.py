@@ -21,7 +21,7 @@ from lowfc.contract.configuration import Configuration
 from lowfc.device import DriverOptions, Geometry, geometry
 
 SUM_WAIT_S = 0.001
-"""For which a command waits until the sum has followed it."""
+"""How long a command waits for the sum to follow it."""
 SUM_SILENT_S = 0.5
 """After so long without a new sum the mirror counts as not following."""
 SAME_NM = 0.05
