@@ -7,10 +7,7 @@ from math import expm1
 import numpy as np
 
 from lowfc.arrays import Single, Whole
-from lowfc.control.loop.safety import Reason
-from lowfc.device.guard import Command, Guard, Status
-from lowfc.device.guard import apply_command as guarded_command
-from lowfc.device.guard import tick as guarded_tick
+from lowfc.device.guard import Guard, Status
 
 
 @dataclass(frozen=True)
@@ -36,23 +33,6 @@ def initial(device: Device) -> Status:
     """Flat, and waiting for the first command."""
     flat = np.zeros(device.grid, np.float32)
     return Status(flat, _at_rest(device, flat))
-
-
-def apply_command(device: Device, status: Status, command: Command, now_ns: int) -> tuple[Status, Reason | None]:
-    """The mirror behind its guard: see `lowfc.device.guard.apply_command`."""
-    return guarded_command(
-        device, status, command, now_ns, lambda driven_nm, ns: settled(device, driven_nm, status.surface_nm, ns)
-    )
-
-
-def tick(device: Device, status: Status, now_ns: int) -> Status:
-    """The mirror behind its guard: see `lowfc.device.guard.tick`."""
-    return guarded_tick(device, status, now_ns, lambda driven_nm, ns: settled(device, driven_nm, status.surface_nm, ns))
-
-
-def settled(device: Device, driven_nm: Single, surface_nm: Single, elapsed_ns: float) -> Single:
-    """Round to the driver's steps; first-order response of the actuators from a surface of `elapsed_ns` ago."""
-    return responded(device, rounded(device, driven_nm), surface_nm, elapsed_ns)
 
 
 def rounded(device: Device, driven_nm: Single) -> Single:

@@ -44,9 +44,10 @@ from lowfc.programs.commissioning.conformance.frames import camera_checks
 from lowfc.programs.commissioning.conformance.line import Line, Received
 from lowfc.programs.commissioning.conformance.mirror import mirror_checks
 from lowfc.testing.clock import FakeClock
-from sim_dm.device import apply_command, initial, tick
+from sim_dm.device import initial
 from sim_dm.driver import device
 from tests.support.loops import lowfc, until
+from tests.support.safety_checks import apply_command, tick
 
 MS = 1_000_000
 LATENCY_NS = 100_000

@@ -12,9 +12,9 @@ from lowfc.arrays import Single
 from lowfc.contract.configuration import load
 from lowfc.control.loop.safety import Limit, Limits, Reason, Rejection, neighbour_difference_nm
 from lowfc.device.guard import LONGEST_VALID_NS, Command, Status
-from sim_dm.device import Device, apply_command, initial, tick
+from sim_dm.device import Device, initial
 from sim_dm.driver import device as device_of
-from tests.support.safety_checks import violations
+from tests.support.safety_checks import apply_command, tick, violations
 
 GRID = (4, 5)
 LIMITS = Limits(750.0, 150.0, 500.0)

@@ -1,4 +1,4 @@
-"""What must hold of `limit`, and cases chosen by hand: for the tests, and for the mutations of the source."""
+"""What must hold of `limit`, cases chosen by hand, and the simulated mirror behind its guard as functions of values."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -6,7 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from lowfc.arrays import Single
-from lowfc.control.loop.safety import Limited, Limits
+from lowfc.control.loop.safety import Limited, Limits, Reason
+from lowfc.device import guard
+from lowfc.device.guard import Command, Move, Status
+from sim_dm.device import Device, responded, rounded
 
 LIMITS = Limits(stroke_nm=700.0, slew_nm=100.0, neighbour_nm=400.0)
 
@@ -111,3 +114,20 @@ def check_kept(limit: Callable[[Limits, Single, Single], Limited], case: Case) -
     if case.expected_nm is not None:
         worst = np.abs(shape - case.expected_nm).max()
         assert worst < 0.01, f"{case.name}: {worst} nm from what was expected\n{shape}"
+
+
+def apply_command(device: Device, status: Status, command: Command, now_ns: int) -> tuple[Status, Reason | None]:
+    """See `lowfc.device.guard.apply_command`."""
+    return guard.apply_command(device, status, command, now_ns, _move(device, status))
+
+
+def tick(device: Device, status: Status, now_ns: int) -> Status:
+    """See `lowfc.device.guard.tick`."""
+    return guard.tick(device, status, now_ns, _move(device, status))
+
+
+def _move(device: Device, status: Status) -> Move:
+    def move(driven_nm: Single, elapsed_ns: float) -> Single:
+        return responded(device, rounded(device, driven_nm), status.surface_nm, elapsed_ns)
+
+    return move
