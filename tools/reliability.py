@@ -1,50 +1,64 @@
-"""Tables of docs/measured/reliability.md: faults injected into the loop, hours of it, damaged inputs."""
+"""Tables of docs/measured/reliability.md: faults injected into the loop, hours of it, damaged inputs.
 
+Example:
+    python -m tools.reliability --seed 1              # the chaos cases that the table lacks, with this seed
+    python -m tools.reliability --seed 1 kill-camera  # this one anew; then `python -m tools.measure` for the page
+"""
+
+import argparse
+import json
+from collections.abc import Sequence
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from lowfc.programs.reliability.chaos.command import counts
 from lowfc.programs.reliability.soak.figures import TOO_SHORT, latency_in_words, verdict
-from tools.shared import Figures, columns, json_of, markdown
+from tools.shared import ROOT, Figures, columns, host, json_of, markdown, of_host
 
 CHAOS = "lowfc chaos --all --seed N"
 SEEDS = (1, 2, 3, 4, 5)
+CASES_FILE = ROOT / "tools" / "measured" / "chaos.json"
+_STALL = ("before", "during", "after")
 
 
 def chaos() -> Figures:
     """Every case once with every seed."""
-    runs = []
-    for seed in SEEDS:
-        with TemporaryDirectory() as folder:
-            cases = json_of(CHAOS.replace("N", str(seed)), folder)["cases"]
-        runs.append({"seed": seed, **counts(cases), "cases": cases})
-    return {"runs": runs}
+    return {"runs": [{"seed": seed, **_run("--all", seed)} for seed in SEEDS]}
+
+
+def _run(cases: str, seed: int) -> Figures:
+    with TemporaryDirectory() as folder:
+        rows = json_of(f"lowfc chaos {cases} --seed {seed}", folder)["cases"]
+    return {**counts(rows), "cases": rows}
+
+
+def measure_again(figures: Figures, seed: int, names: Sequence[str]) -> None:
+    """Put cases of a seed among the measured ones: those named, or those that are lacking."""
+    from lowfc.programs.reliability.chaos.cases import CASES
+
+    run = next(one for one in figures["runs"] if one["seed"] == seed)
+    kept = {case["name"]: case for case in run["cases"] if case["name"] in CASES}
+    if wanted := list(names) or [name for name in CASES if name not in kept]:
+        about = host()
+        found = _run(" ".join(f"--case {name}" for name in wanted), seed)["cases"]
+        figures.setdefault("later", {}).update(dict.fromkeys((case["name"] for case in found), about))
+        kept |= {case["name"]: case for case in found}
+    run["cases"] = list(kept.values())
+    run |= counts(run["cases"])
 
 
 def render_chaos(figures: Figures) -> str:
-    """A line for each case, over all seeds, and one for each stall."""
+    """A line for each case, over all seeds; what is known of latencies beside stalls and consoles."""
     runs = figures["runs"]
-    rows, stalls, steps_nm, recovered_s = [], [], [], []
-    for cases in zip(*(run["cases"] for run in runs), strict=True):
-        name, sentence = cases[0]["name"], cases[0]["sentence"]
-        ended = counts(list(cases))
-        why = f", {ended['skipped']} skipped ({cases[0]['skipped']})" if ended["skipped"] else ""
-        found = [case["findings"].get("recovery", {}).get("found", "-") for case in cases]
-        recovered = "; ".join(text.removeprefix("residual ").split(" nm,")[0] for text in found)
-        rows.append((f"`{name}`", sentence, f"{ended['passed']} of {len(cases)}{why}", recovered))
-        for each in (case["figures"] for case in cases):
-            if "restart_step_nm" in each:
-                steps_nm.append(each["restart_step_nm"])
-            if name == "kill-controller" and "recovered_s" in each:
-                recovered_s.append(each["recovered_s"])
-            if "frame_to_command" in each:
-                spans = ", ".join(f"{span['p99_us']:.0f}" for span in each["frame_to_command"].values())
-                stalls.append((name.removeprefix("stall-"), spans, each.get("p99_during_over_calm", "-")))
+    by_name: dict[str, list[Figures]] = {}
+    for case in (case for run in runs for case in run["cases"]):
+        by_name.setdefault(case["name"], []).append(case)
     passed, failed, skipped = (sum(run[name] for run in runs) for name in ("passed", "failed", "skipped"))
     left_out = f", {skipped} skipped" if skipped else ""
     seeds = ", ".join(str(run["seed"]) for run in runs)
     parts = [
         f"{passed} of {passed + failed} passed{left_out}, seeds {seeds}.\n",
-        markdown(("case", "what befalls the loop", "passed", "residual, nm rms: before -> after"), rows),
+        markdown(("case", "what befalls the loop", "passed", "residual, nm rms: before -> after"), _rows(by_name)),
     ]
     failures = [
         f"- `{case['name']}`, seed {run['seed']}: {rule}: {one['found']}"
@@ -55,26 +69,68 @@ def render_chaos(figures: Figures) -> str:
     ]
     if failures:
         parts.append("\n".join(["What failed:", "", *failures, ""]))
-    if steps_nm:
+    if steps_nm := _figures(by_name, "restart_step_nm"):
         parts.append(
             f"Restarted controllers: {len(steps_nm)}; the first command of one moved an actuator by at most "
             f"{max(steps_nm):.1f} nm of surface.\n"
         )
-    if recovered_s:
+    if recovered_s := _figures({"": by_name.get("kill-controller", [])}, "recovered_s"):
         parts.append(
             "Killed in closed loop and started anew, a controller had the residual back at most "
             f"{max(recovered_s):.2f} s after the first frame that it used ({len(recovered_s)} times).\n"
         )
-    if stalls:
-        head = (
-            "stands still for 10 s",
-            "frame to command, p99 us: before, during, after",
-            "during over the mean of both",
-        )
-        parts.append(markdown(head, stalls))
+    parts += [*_stalls(by_name), *_consoles(by_name.get("console", []))]
     again = ", ".join(f"`{name}`" for name in figures.get("measured_again", ()))
     parts.append(f"Measured again after a change of what the case itself does: {again}." if again else "")
+    hosts: dict[str, list[str]] = {}
+    for name, about in figures.get("later", {}).items():
+        hosts.setdefault(of_host(about), []).append(f"`{name}`")
+    parts += [
+        f"Measured {about} by `python -m tools.reliability`: {', '.join(names)}." for about, names in hosts.items()
+    ]
     return "\n".join(parts)
+
+
+def _rows(by_name: dict[str, list[Figures]]) -> list[tuple[str, ...]]:
+    rows = []
+    for name, cases in by_name.items():
+        ended = counts(cases)
+        why = f", {ended['skipped']} skipped ({cases[0]['skipped']})" if ended["skipped"] else ""
+        found = [case["findings"].get("recovery", {}).get("found", "-") for case in cases]
+        recovered = "; ".join(text.removeprefix("residual ").split(" nm,")[0] for text in found)
+        rows.append((f"`{name}`", cases[0]["sentence"], f"{ended['passed']} of {len(cases)}{why}", recovered))
+    return rows
+
+
+def _figures(by_name: dict[str, list[Figures]], name: str) -> list[Any]:
+    return [case["figures"][name] for cases in by_name.values() for case in cases if name in case["figures"]]
+
+
+def _stalls(by_name: dict[str, list[Figures]]) -> list[str]:
+    rows = []
+    for name, cases in by_name.items():
+        for each in (case["figures"] for case in cases if name.startswith("stall-")):
+            spans = ", ".join(f"{each['frame_to_command'][span]['p99_us']:.0f}" for span in _STALL)
+            rows.append((name.removeprefix("stall-"), spans, each.get("p99_during_over_calm", "-")))
+    head = "stands still for 10 s", "frame to command, p99 us: before, during, after", "during over the mean of both"
+    return [markdown(head, rows)] if rows else []
+
+
+def _consoles(cases: Sequence[Figures]) -> list[str]:
+    """Latencies beside a console, in the spans of its case, and what the console took of a processor."""
+    each = [case["figures"] for case in cases if "console" in case["figures"]]
+    if not each:
+        return []
+    rows = []
+    for span in each[0]["frame_to_command"]:
+        found = [one["frame_to_command"][span] for one in each]
+        rows.append((span, *(", ".join(f"{one[key]:.0f}" for one in found) for key in ("p50_us", "p99_us"))))
+    starts_s, shares = ([one["console"][key] for one in each] for key in ("start_s", "share"))
+    cost = (
+        f"A console beside the loop at 1 kHz started in {min(starts_s):.1f} to {max(starts_s):.1f} s and took "
+        f"{100 * min(shares):.0f} to {100 * max(shares):.0f} % of a processor.\n"
+    )
+    return [markdown(("the console", "frame to command, p50 us, by seed", "p99 us, by seed"), rows), cost]
 
 
 SOAK_COLUMNS = {
@@ -115,3 +171,18 @@ def render_fuzz(figures: Figures) -> str:
         f"{inputs} inputs, {crashes} crashes, {hangs} hangs, in {figures['seconds'] / 60:.0f} minutes.\n\n"
         f"{markdown(head, rows)}\n"
     )
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", metavar="CASE", help="of `lowfc chaos`; default: those that are lacking")
+    parser.add_argument("--seed", type=int, choices=SEEDS, required=True)
+    asked = parser.parse_args()
+    figures = json.loads(CASES_FILE.read_text())
+    measure_again(figures, asked.seed, asked.names)
+    CASES_FILE.write_text(json.dumps(figures, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -65,8 +65,12 @@ def where(name: str, figures: Figures) -> str:
     about = figures["host"]
     *most, last = [f"`{command}`" for command in figures["commands"]] or [""]
     runs = f", which runs {', '.join(most)}{' and ' if most else ''}{last}" if last else ""
+    return f"Measured {of_host(about)} by `python -m tools.measure {name}`{runs}."
+
+
+def of_host(about: Figures) -> str:
+    """When and on which host, from what `host` found."""
     return (
-        f"Measured {about['date']} on {about['processors']} cores of {about['processor']} (a virtual machine, Linux "
-        f"{about['kernel']}, Python {about['python']}, load {about['load_before']} before) by "
-        f"`python -m tools.measure {name}`{runs}."
+        f"{about['date']} on {about['processors']} cores of {about['processor']} (a virtual machine, Linux "
+        f"{about['kernel']}, Python {about['python']}, load {about['load_before']} before)"
     )

@@ -9,12 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from textual.events import Key
 
 from lowfc.adapters.files import calibration_file, law_file
 from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.events import EVENTS
-from lowfc.contract.messages import EVENT
+from lowfc.contract.messages import EVENT, wire
 from lowfc.control.laws.linear_law import integrator_block, of_blocks
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from tests.console.live_run import RUN, LiveRun
@@ -82,12 +83,12 @@ PRESSED: dict[str, tuple[tuple[str, ...], dict[str, object]]] = {
     "close": ((), {"name": "close"}),
     "pause": ((), {"name": "pause"}),
     "step": (("7",), {"name": "step", "values": [7.0]}),
-    "gain": (("2,3", "0.25", ""), {"name": "gain", "modes": [2, 3], "values": [0.25]}),
-    "leak": (("", "0.01"), {"name": "leak", "modes": []}),
-    "limit": (("4", "40"), {"name": "limit", "modes": [4], "values": [40.0]}),
+    "gain": (("0.25", "2,3"), {"name": "gain", "modes": [2, 3], "values": [0.25]}),
+    "leak": (("0.01", ""), {"name": "leak", "modes": []}),
+    "limit": (("40", "4"), {"name": "limit", "modes": [4], "values": [40.0]}),
     "law": (("law.fits",), {"name": "law"}),
     "no law": ((), {"name": "law"}),
-    "offset": (("4", "5"), {"name": "offset", "modes": [4], "values": [5.0]}),
+    "offset": (("5", "4"), {"name": "offset", "modes": [4], "values": [5.0]}),
     "channel": (("dark-hole", "shape.npy"), {"name": "channel", "text": "dark-hole"}),
     "reset": ((), {"name": "reset"}),
     "stop": ((), {"name": "stop"}),
@@ -154,16 +155,16 @@ def test_every_button_by_its_key(run: LiveRun, tmp_path: Path, monkeypatch: pyte
 def test_what_is_refused_says_why_in_the_form_and_at_the_button(run: LiveRun) -> None:
     async def scenario(screen: Screen) -> None:
         await screen.pilot.press("g")
-        await screen.fill("2", "much", "")
+        await screen.fill("much", "2")
         await screen.until(lambda: "write numbers" in str(screen.app.screen.query_one("#refusal").render()))
-        await screen.fill("2", "9", "")
+        await screen.fill("9", "2")
         await screen.until(lambda: "becomes unstable" in str(screen.app.screen.query_one("#refusal").render()))
         assert not run.asked[-1].accepted
         assert "becomes unstable" in screen.text("answer")
         await screen.pilot.press("escape")
         assert screen.app.screen.query_one("#gain").has_class("refused")
         await screen.pilot.press("g")
-        await screen.fill("", "0.1", "")
+        await screen.fill("0.1", "")
         await screen.until(lambda: not screen.app.screen_stack[0].query_one("#gain").has_class("refused"))
 
     played(run, scenario)
@@ -195,24 +196,61 @@ def test_the_knobs_turn_all_gains_or_those_of_an_order(run: LiveRun) -> None:
 
     async def scenario(screen: Screen) -> None:
         await screen.pilot.press("g")
-        await screen.fill("2-4", "0.5 0.5 0.05", "")
-        await screen.until(lambda: "0.5 from 0.05" in screen.text("gains"))
+        await screen.fill("0.5 0.5 0.05", "2-4")
+        await screen.until(lambda: "0.05 to 0.5" in screen.text("gains"))
         await screen.pilot.press("right", "right")
         await screen.until(lambda: gain() == pytest.approx([0.6, 0.6, 0.06]))
-        await screen.until(lambda: "0.6 from 0.06" in screen.text("gains"))
+        await screen.until(lambda: "0.06 to 0.6" in screen.text("gains"))
         await screen.pilot.press("down", "left")
         await screen.until(lambda: gain() == pytest.approx([0.55, 0.55]))
         assert list(run.asked[-1].modes) == [2, 3]
         await screen.pilot.press("down", "left")
         await screen.until(lambda: gain() == pytest.approx([0.05]))
-        await screen.until(lambda: "0.55 from 0.05" in screen.text("gains"))
-        await screen.pilot.click("#gains", offset=(11 + 10, 0))
+        await screen.until(lambda: "0.05 to 0.55" in screen.text("gains"))
+        await screen.pilot.click("#gains", offset=(11 + 9, 0))
         await screen.until(lambda: gain() == pytest.approx([1.5, 1.5, 0.1364]))
         await screen.pilot.press("u")
         await screen.until(lambda: any(one.text == "auto" and one.accepted for one in run.asked))
         await screen.until(lambda: "auto" in screen.text("gains"))
 
     played(run, scenario)
+
+
+def test_what_is_typed_while_a_form_is_drawn_is_in_it(run: LiveRun) -> None:
+    async def scenario(screen: Screen) -> None:
+        before = len(run.asked)
+        for key in ("n", "o", "s", "escape", "g", "0", ".", "2", "tab", "2", "tab", "shift+tab", "enter"):
+            screen.app.post_message(Key(key, key if len(key) == 1 else None))
+        await screen.until(lambda: len(run.asked) > before)
+        (gain,) = run.asked[before:]
+        assert (gain.name, list(gain.values), list(gain.modes)) == ("gain", [pytest.approx(0.2)], [2])
+
+    played(run, scenario)
+
+
+def test_an_event_that_comes_again_and_again_has_one_line() -> None:
+    from lowfc.programs.console.history import History
+
+    history = History()
+    for number in range(40):
+        name, details = (("LIMIT_HIT", {"reason": "SLEW"}), ("LIMIT_CLEARED", {"reason": "SLEW"}))[number % 2]
+        history.add(EVENTS[name].log("controller", number * 10**7, **details))
+    history.add(wire.Request(name="open", accepted=True, reply="loop open"))
+    lines = history.last(5).plain.splitlines()
+    assert [line.split()[1:4] for line in lines[:2]] == [["20", "x", "controller:"]] * 2
+    assert "open (" in lines[2]
+    history.add(EVENTS["LIMIT_HIT"].log("controller", 60 * 10**9, reason="SLEW"))
+    assert len(history.last(5).plain.splitlines()) == 4, "later it is news again"
+
+
+def test_sentences_name_keys_in_place_of_commands_and_ranges_in_place_of_lists() -> None:
+    from lowfc.programs.console.phrases import phrased
+
+    assert phrased("`lowfc ctl clear` first, when it is safe") == "clear (key k) first, when it is safe"
+    assert phrased("`lowfc ctl record start` goes on") == "record start (key r) goes on"
+    assert phrased("`lowfc ctl permit` and `lowfc tune`") == "`lowfc ctl permit` and `lowfc tune`"
+    assert phrased("gain is now 0.5 0.5 0.05 0.01: below 2") == "gain is now 0.01 to 0.5 (4 modes): below 2"
+    assert phrased("1.9 1.9 1.9 1.9 1.9") == "1.9 (5 modes)"
 
 
 def test_tasks_are_commands_with_the_options_of_their_form(run: LiveRun, monkeypatch: pytest.MonkeyPatch) -> None:

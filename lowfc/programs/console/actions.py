@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 from lowfc.client import Answer, Client
 from lowfc.client.requests import BY_NAME
 from lowfc.contract.errors import ConfigurationError, RequestRefusedError
+from lowfc.control.loop.wording import AUTO
 from lowfc.programs.cli.modes import noll_of
 
 Values = Mapping[str, str]
@@ -16,7 +17,13 @@ Values = Mapping[str, str]
 
 
 class Field(NamedTuple):
-    """One line of a form: its name, what is expected, and what stands there at first."""
+    """One line of a form.
+
+    Attributes:
+        name: of the request's field, or of the option.
+        label: what is expected.
+        usual: what stands there at first.
+    """
 
     name: str
     label: str
@@ -81,11 +88,21 @@ _READERS: dict[str, tuple[str, Callable[[str], Any]]] = {
     "calibration": ("calibration", _calibration),
 }
 """The client's argument, and how it is read, of each field of a request."""
-_FILES = {
-    "actuators": "file (FITS or .npy), nm of surface; empty removes the channel",
-    "law": "file (FITS); empty for the integrator",
-    "calibration": "file (FITS)",
+_LABELS = {
+    "modes": "modes: Noll indices as in 2,3 or 4-8; empty for all",
+    "actuators": "shape: file (FITS or .npy), nm of surface; empty removes the channel",
+    "law": "law: file (FITS); empty for the integrator",
+    "calibration": "calibration: file (FITS)",
+    "step values": "frames: how many",
+    "gain values": "gain: one, or one for each mode; auto for automatic gains",
+    "leak values": "leak: one, or one for each mode",
+    "limit values": "limit: one, or one for each mode, nm rms of wavefront",
+    "offset values": "offset: one, or one for each mode, nm rms of wavefront; empty for zero",
+    "channel text": "name: up to 32 of a-z, 0-9 and -, a letter first",
+    "note text": "note",
 }
+"""What a form says of each field of a request, by the field alone or with the request's name."""
+_LAST = "modes"
 
 
 def numbers(text: str) -> list[float]:
@@ -105,12 +122,16 @@ def requested(key: str, name: str, confirm: str = "") -> Action:
     declared = BY_NAME[name]
 
     def ask(loop: Client, values: Values) -> Answer:
+        if values.get("values") == AUTO:
+            return loop.automatic_gain(_READERS["modes"][1](values["modes"]))
         read = {_READERS[field][0]: _READERS[field][1](text) for field, text in values.items()}
         if name == "channel":  # the client knows the mirror's rows and columns
             return loop.channel(read["text"], read["actuators_nm"])
         return loop.ask(name, **read)
 
-    fields = tuple(Field(field, _FILES.get(field, what)) for field, what in declared.fields)
+    names = sorted((field for field, _ in declared.fields), key=lambda field: field == _LAST)
+    labels = ((field, _LABELS.get(field) or _LABELS.get(f"{name} {field}")) for field in names)
+    fields = tuple(Field(field, label) for field, label in labels if label)
     return Action(key, name, declared.sentence, fields, ask, confirm=confirm)
 
 
@@ -135,8 +156,8 @@ def _file() -> str:
     return f"calibration-{datetime.now(UTC):%Y%m%dT%H%M%S}.fits"
 
 
-_OUT = Field("out", "file to be written (FITS)", _file)
-_LOAD = Field(LOAD, "use it at once (yes, no); the loop must be open", lambda: "yes")
+_OUT = Field("out", "out: file to be written (FITS)", _file)
+_LOAD = Field(LOAD, "load: use it at once (yes, no); the loop must be open", lambda: "yes")
 _TARGET = (Field("target", "target"), Field("observer", "observer"))
 
 SAFE = requested("s", "safe")
@@ -159,14 +180,14 @@ ACTIONS = (
         "d",
         "dark",
         "Take a dark and find bad pixels. Block the star first: by starting it you say that it is dark.",
-        (Field("frames", "frames that are averaged", lambda: "400"), _OUT, _LOAD),
+        (Field("frames", "frames: how many are averaged", lambda: "400"), _OUT, _LOAD),
         task=("calibrate", "dark", "--dark-taken"),
     ),
     Action(
         "e",
         "reference",
         "Take the present state of the wavefront as the zero point.",
-        (Field("frames", "frames that are averaged", lambda: "1000"), _OUT, _LOAD),
+        (Field("frames", "frames: how many are averaged", lambda: "1000"), _OUT, _LOAD),
         task=("calibrate", "reference"),
     ),
     Action(
@@ -174,8 +195,8 @@ ACTIONS = (
         "calibrate",
         "Measure a calibration with pokes of the mirror.",
         (
-            Field("method", "poke, hadamard, in-loop", lambda: "hadamard"),
-            Field("snr", "signal-to-noise ratio to reach", lambda: "70"),
+            Field("method", "method: poke, hadamard, in-loop", lambda: "hadamard"),
+            Field("snr", "snr: signal-to-noise ratio to reach", lambda: "70"),
             _OUT,
             _LOAD,
         ),

@@ -1,17 +1,17 @@
 """The console's screen: what the run is like, five times a second, and its buttons."""
 
 import threading
-from collections import deque
 from collections.abc import Callable
 from typing import ClassVar
 
 from rich.text import Text
 from textual import on
-from textual.app import App, ComposeResult
+from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.color import Color
 from textual.containers import Grid, Horizontal, Vertical
 from textual.message import Message
+from textual.screen import Screen
 from textual.widgets import Button, Static
 
 from lowfc.adapters.bus.bus import Bus
@@ -25,7 +25,10 @@ from lowfc.programs.console.actions import ACTIONS, EVERY, SAFE, Action, Values
 from lowfc.programs.console.feed import Feed, Reading
 from lowfc.programs.console.form import Form, Help
 from lowfc.programs.console.gains import Gains
+from lowfc.programs.console.history import History
+from lowfc.programs.console.keys import AT_ONCE, OrderedKeys
 from lowfc.programs.console.lines import Lines
+from lowfc.programs.console.phrases import phrased
 from lowfc.programs.console.task import Task
 from lowfc.programs.view.verdicts.tile import FILL, INK, Level
 
@@ -35,13 +38,12 @@ PICTURES_EVERY = 3
 MOVED = "moved"
 """What the application ends with where the run was begun anew, to be joined again."""
 _LEFT = 62
-_LINES = 200
 _MOVED_EVERY = 10
 _OTHERS = (
-    ("↑↓ ←→", "knobs", "Choose a gain knob and turn it, from 0 to 1.5 for the largest gain of its modes"),
+    ("↑↓ ←→", "knobs", "Choose a gain knob and turn it: largest gain of its modes, whose ratios stay"),
     ("u", "auto", "Let the gains of the chosen knob be automatic"),
     ("m", "mute", "Ring the terminal's bell at errors, or do not"),
-    ("? q", "help, quit", "This help, and leave the console: nothing else ends"),
+    ("? q", "help, quit", "This help, or leave the console (nothing else ends)"),
 )
 
 
@@ -53,7 +55,7 @@ class Answered(Message):
         self.action, self.sentence, self.good = action, sentence, good
 
 
-class Console(App[str]):
+class Console(OrderedKeys):
     """One run on one screen."""
 
     CSS = f"""
@@ -87,14 +89,14 @@ class Console(App[str]):
     Form Input {{ margin: 0 0 1 0; background: $panel; }}
     Form Horizontal, #refusal {{ height: auto; }}
     Help > Vertical {{ width: 100%; height: 100%; background: $surface; padding: 0 1; overflow-y: auto; }}
-    Help Static {{ height: auto; margin: 0 0 1 0; }}
+    Help Static {{ height: auto; }}
     """
     ENABLE_COMMAND_PALETTE = False
     AUTO_FOCUS = None
     BINDINGS: ClassVar[list[BindingType]] = [
         *(Binding(f"{one.key},{one.key.upper()}", f"press({one.name!r})") for one in ACTIONS),
         Binding("s,S", f"press({SAFE.name!r})"),
-        Binding("f12", f"press({SAFE.name!r})", priority=True),
+        Binding(AT_ONCE, f"press({SAFE.name!r})", priority=True),
         *(Binding(key, f"choose({by})") for key, by in (("up", -1), ("down", 1))),
         *(Binding(key, f"turn({by})") for key, by in (("left", -1), ("right", 1), ("minus", -1), ("plus", 1))),
         Binding("u,U", "automatic"),
@@ -116,7 +118,7 @@ class Console(App[str]):
         self._bus, self._run_id, self._run_clock, self._moved = bus, run_id, clock, moved
         self._terminal_gone = terminal_gone
         self._feed = Feed(bus, run_id, clock)
-        self._history: deque[Text] = deque(maxlen=_LINES)
+        self._history = History()
         self._shown: dict[str, Text] = {}
         self._tasks: list[Task] = []
         self._mute = False
@@ -148,6 +150,10 @@ class Console(App[str]):
     def on_mount(self) -> None:
         """Begin to read."""
         self.set_interval(FIGURES_S, self._read)
+
+    def awaits_focus(self, screen: Screen[object]) -> bool:
+        """A form does, which is being drawn."""
+        return isinstance(screen, Form) and screen.focused is None
 
     def action_press(self, name: str) -> None:
         """Do what a button does: at once, or with a form first."""
@@ -197,7 +203,7 @@ class Console(App[str]):
     @on(Gains.Turned)
     def _turned(self, event: Gains.Turned) -> None:
         modes, values = ",".join(map(str, event.modes)), " ".join(map(str, event.values))
-        self._do(EVERY["gain"], {"modes": modes, "values": values, "text": "" if values else AUTO})
+        self._do(EVERY["gain"], {"modes": modes, "values": values or AUTO})
 
     def _do(self, action: Action, values: Values) -> None:
         """Start a task, or ask in a thread of its own: nobody waits for an answer, least of all a later SAFE."""
@@ -213,9 +219,9 @@ class Console(App[str]):
                     since = f", from frame {answer.frame} on" if answer.frame else ""
                     sentence = f"{action.name}: {answer.reply}{since}"
             except (LowfcError, OSError, ValueError) as fault:
-                self.post_message(Answered(action, str(fault), good=False))
+                self.post_message(Answered(action, phrased(str(fault)), good=False))
             else:
-                self.post_message(Answered(action, sentence, good=True))
+                self.post_message(Answered(action, phrased(sentence), good=True))
 
         threading.Thread(target=ask, name=action.name, daemon=True).start()
 
@@ -272,9 +278,9 @@ class Console(App[str]):
                 self._drawn("pictures").show(panels.pictures(reading))
             self.screen_stack[0].query_one(Gains).update(reading)
         self._drawn("peers").show([panels.peers(reading, self._run_id)])
-        self._history.extend([*map(panels.request_line, reading.requests), *map(panels.event_line, reading.events)])
-        shown = list(self._history)[-max(1, self._main("#log").size.height) :]
-        self._put("log", Text("\n").join(shown))
+        for one in (*reading.requests, *reading.events):
+            self._history.add(one)
+        self._put("log", self._history.last(self._main("#log").size.height))
         if not self._mute and any(event.level >= Severity.ERROR for event in reading.events):
             self.bell()
 

@@ -17,6 +17,7 @@ from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import LowfcError
 from lowfc.contract.messages import EVENT, REQUEST, STEP, SURFACE, TRUTH, Log, Role, Topic, wire
+from lowfc.control.loop.wording import AUTO
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.view.snapshot import SHOWN, Accumulator, LastHealth
 from lowfc.programs.view.verdicts.run_state import RunState
@@ -130,7 +131,7 @@ class Feed:
             self._command_nm,
             dict(snapshot.health),
             snapshot.events,
-            [one for one in requests if one is not None and one.name not in _UNSEEN],
+            [one for one in requests if one is not None and not _by_itself(one)],
             [residual for residual, _ in self._trend],
             [light for _, light in self._trend],
             state.noll,
@@ -165,6 +166,11 @@ class Feed:
 def _import_scipy() -> None:
     for name in ("lowfc.control.laws.tuning", "scipy.signal"):
         import_module(name)
+
+
+def _by_itself(asked: wire.Request) -> bool:
+    """Whether it says nothing new: it changes nothing, or an event tells of the automatic gains that it sets."""
+    return asked.name in _UNSEEN or (asked.name == "gain" and asked.text == AUTO and bool(asked.values))
 
 
 def _request(sample: Sample) -> wire.Request | None:

@@ -1,5 +1,6 @@
 """What lies over the screen for a moment: the form of a button, and the help."""
 
+import re
 from collections.abc import Iterable
 from typing import ClassVar
 
@@ -15,10 +16,14 @@ from textual.widgets import Button, Input, Label, Static
 from lowfc.programs.console.actions import Action
 
 HELP = (
-    "The top line says whether all is well, those below it why, as in `lowfc view`. Press a key or click a button. "
-    "In a form: Tab next line, Enter do it, Escape leave. The answer is above the buttons; red: refused. "
+    "Top line: is all well; below it why. Bars: command of each mode, nm, between its limits. Press a key or click a "
+    "button. In a form: Tab next line, Enter do it, Escape leave. The answer is above the buttons; red: refused. "
     "When the console ends, the loop and what was started here go on."
 )
+
+
+_ENDS = re.compile(r"\. |; |, (?:and|whatever)|: it ")
+"""Where the help leaves a sentence."""
 
 
 class Form(ModalScreen[None]):
@@ -43,7 +48,7 @@ class Form(ModalScreen[None]):
         with Vertical():
             yield Static(self.what.confirm or f"{self.what.name}: {self.what.sentence}", markup=False)
             for field in self.what.fields:
-                yield Label(f"{field.name}: {field.label}", markup=False)
+                yield Label(field.label, markup=False)
                 yield Input(field.usual(), name=field.name, compact=True)
             yield Static("", id="refusal", markup=False)
             with Horizontal():
@@ -79,9 +84,7 @@ class Help(ModalScreen[None]):
     def compose(self) -> ComposeResult:
         """Lay it out."""
         lines = [
-            Text.assemble(
-                (f"{key:6}", "bold"), f"{name:11}", sentence.partition(". ")[0].partition("; ")[0].rstrip(".")
-            )
+            Text.assemble((f"{key:6}", "bold"), f"{name:11}", _ENDS.split(sentence, maxsplit=1)[0].rstrip("."))
             for key, name, sentence in self._rows
         ]
         with Vertical():

@@ -14,6 +14,7 @@ from lowfc.contract.events import Level as Severity
 from lowfc.contract.messages import Log, from_timestamp, wire
 from lowfc.contract.printable import printable
 from lowfc.programs.console.feed import Reading
+from lowfc.programs.console.phrases import numbers_in_short, phrased
 from lowfc.programs.view.draw.colours import GREY, ORANGE, RED, YELLOW, Colour, Rgb, diverging, sequential
 from lowfc.programs.view.verdicts.run_state import Liveness
 from lowfc.programs.view.verdicts.tile import FILL, INK, WORD, Level, duration, figure
@@ -45,7 +46,7 @@ def verdict(reading: Reading, run: str) -> tuple[Level, str]:
             f"NOT CONNECTED  no message of run {run} for {duration(reading.silent_s)}: figures are hidden. The run was "
             "killed, or this console is cut off; a loop that runs goes on by itself."
         )
-    return reading.verdict.level, f"{WORD[reading.verdict.level]}  {reading.verdict.headline}".strip()
+    return reading.verdict.level, f"{WORD[reading.verdict.level]}  {phrased(reading.verdict.headline)}".strip()
 
 
 def clock(host_ns: int) -> str:
@@ -59,7 +60,7 @@ def tiles(reading: Reading) -> list[Text]:
     for tile in reading.verdict.tiles:
         line = Text.assemble((f"{tile.title:10}", DIM), f"{WORD[tile.level]:5} ")
         line.append(f" {tile.value:^12} ", style(INK[tile.level], FILL[tile.level], bold=tile.level > Level.GOOD))
-        line.append(f" {tile.detail}", style())
+        line.append(f" {phrased(tile.detail)}", style())
         lines.append(line)
     return lines
 
@@ -179,25 +180,28 @@ def peers(reading: Reading, run: str) -> Text:
     return line
 
 
-def event_line(event: Log) -> Text:
-    """An event as it came."""
+def event_line(event: Log, times: int = 1) -> Text:
+    """An event, and how often it came."""
     ink = WRONG if event.level >= Severity.ERROR else WARNED if event.level >= Severity.WARNING else style()
     return Text.assemble(
         (f"{clock(from_timestamp(event.timestamp))} ", DIM),
+        (f"{times} x " if times > 1 else "", BOLD),
         (f"{printable(event.name)}: ", DIM),
-        (printable(event.message), ink),
+        (phrased(printable(event.message)), ink),
     )
 
 
 def request_line(asked: wire.Request) -> Text:
     """What was asked, by whom, the answer, and the frame from which it is in force."""
-    fields = [" ".join(f"{value:g}" for value in asked.values), printable(asked.text)]
+    fields = [numbers_in_short(list(asked.values)), printable(asked.text)]
     if asked.modes:
         fields.append(f"modes {','.join(map(str, asked.modes))}")
-    answer = f"{printable(asked.reply)}, from frame {count_of(asked.frame_sequence)} on"
+    reply = phrased(printable(asked.reply))
     return Text.assemble(
         (f"{clock(from_timestamp(asked.timestamp))} ", DIM),
         (" ".join(filter(None, [printable(asked.name), *fields])), BOLD),
         (f" ({printable(asked.requester) or 'who is not said'}): ", DIM),
-        (answer, style()) if asked.accepted else (f"refused: {printable(asked.reply)}", WRONG),
+        (f"{reply}, from frame {count_of(asked.frame_sequence)} on", style())
+        if asked.accepted
+        else (f"refused: {reply}", WRONG),
     )

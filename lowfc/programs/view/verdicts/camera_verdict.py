@@ -82,11 +82,12 @@ def _lost(state: RunState, lost: int, due: float) -> Tile:
 
 def _refused(state: RunState, refused: int, due: float) -> Tile:
     every = all_refused(state)
-    word, what = REFUSED[max(REFUSED, key=lambda reason: (state.now if every else state.recent)[reason])]
+    most = max(REFUSED, key=lambda reason: (state.now if every else state.recent)[reason])
+    word, what = REFUSED[most]
     if every:
         advice = f"Every frame is refused, {word}: {what}. The mirror holds."
         return Tile("FRAMES", "REFUSED", f"all: {word}", Level.BAD, advice)
-    advice = f"{counted(refused, 'frame')} refused {LATELY}, {word}: {what}."
+    advice = f"{counted(refused, 'frame')} refused {LATELY}, {word}: {what if state.now[most] else 'that is over'}."
     level = Level.WARNING if refused >= FEW * due else Level.NEUTRAL
     return Tile("FRAMES", f"{refused} REFUSED", f"{word}, {LATELY}", level, advice)
 

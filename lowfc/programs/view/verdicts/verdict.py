@@ -152,8 +152,8 @@ def _mirror(state: RunState) -> Tile:
         words, times = ", ".join(acting or own), counted(max(acting.values(), default=0), "time")
         often = max(state.now[reason] for reason in LIMITS) > LIMITED * max(1, state.now["steps"])
         advice = (
-            f"The mirror is at a limit ({words}), {times} {LATELY}: the disturbance is larger than it can correct. "
-            "Offload it, or raise the limit if that is safe."
+            f"The mirror is at a limit ({words}), {times} {LATELY}: too large a disturbance, or too high a gain. "
+            "Lower the gain, offload, or raise the limit."
         )
         detail = f"{words}: {times} in {RECENT_S:g} s; {value} {of}"
         return tile("AT LIMIT", detail, Level.BAD if often else Level.WARNING, advice)

@@ -4,6 +4,7 @@ from functools import partial
 from math import hypot, sqrt
 
 from lowfc.contract.messages import wire
+from lowfc.control.loop.command_channels import FLAT
 from lowfc.programs.view.verdicts.run_state import RunState
 from lowfc.programs.view.verdicts.steady import Attained
 from lowfc.programs.view.verdicts.tile import Level, Tile, figure
@@ -38,6 +39,9 @@ def wavefront(state: RunState, nm_per_mas: float | None, loop: Tile) -> Tile:
         return tile(f"last: {left} nm", f"of {flat}; {more}")
     if loop.level is not Level.GOOD:
         return tile(value, f"{'not corrected;' if loop.value in UNCORRECTED else 'of'} {flat}; {more}")
+    if state.true and _shaped(state.controller_state):
+        why = f"{value} of wavefront, the shapes of offset and channels in it; {flat}."
+        return tile(value, f"with offset and channels; {flat}; {more}", advice=why)
     raw, latest = found.open_nm / found.residual_nm if found.residual_nm else 1.0, state.latest
     if raw < 1 / WORSE and latest is not None and latest.residual_nm > WORSE * latest.open_nm:
         level = Level.BAD if raw < 1 / DIVERGING else Level.WARNING
@@ -74,6 +78,11 @@ def merit(better: float, attained: Attained | None) -> tuple[Level, str]:
         return Level.GOOD, ""
     best = attained.left_nm <= NEAR_BEST * attained.best_nm
     return Level.NEUTRAL, ": little is corrected" + (", and other gains correct no more" if best else "")
+
+
+def _shaped(state: wire.ControllerState | None) -> bool:
+    """Whether the loop holds another wavefront than the flattest one: the truth is not what is left then."""
+    return state is not None and (any(state.offset_nm) or any(one.name != FLAT for one in state.channels))
 
 
 def _without_noise(residual_nm: float, attained: Attained) -> str:

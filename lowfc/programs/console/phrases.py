@@ -1,0 +1,36 @@
+"""Sentences of the loop as the console says them: its own keys in place of commands, ranges in place of long lists."""
+
+import re
+
+from lowfc.programs.console.actions import ACTIONS, SAFE
+
+_KEYS = {one.name: one.key for one in (*ACTIONS, SAFE)} | {
+    "law integrator": "i",
+    "record start": "r",
+    "record stop": "v",
+}
+_COMMAND = re.compile(r"`lowfc ctl (\w+)(?: (\w+))?[^`]*`")
+_NUMBER = r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?"
+_LIST = re.compile(rf"(?<![\w.]){_NUMBER}(?: {_NUMBER}){{3,}}(?![\w.])")
+
+
+def phrased(sentence: str) -> str:
+    """A sentence that an operator of the console can act on, and that fits its lines."""
+    return _LIST.sub(_range, _COMMAND.sub(_key, sentence))
+
+
+def numbers_in_short(values: list[float]) -> str:
+    """A few numbers as they are, more of them by their range."""
+    if len(values) < 4:
+        return " ".join(f"{value:g}" for value in values)
+    lowest, highest = f"{min(values):.3g}", f"{max(values):.3g}"
+    return f"{lowest if lowest == highest else f'{lowest} to {highest}'} ({len(values)} modes)"
+
+
+def _range(found: re.Match[str]) -> str:
+    return numbers_in_short([float(one) for one in found[0].split()])
+
+
+def _key(found: re.Match[str]) -> str:
+    name = f"{found[1]} {found[2]}" if f"{found[1]} {found[2]}" in _KEYS else found[1]
+    return f"{name} (key {_KEYS[name]})" if name in _KEYS else found[0]
