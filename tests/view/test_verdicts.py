@@ -289,6 +289,24 @@ def test_what_the_gains_could_leave_is_computed_from_the_loop_itself(monkeypatch
     assert tile(judge(watcher.state()), "WAVEFRONT").detail.endswith("without noise")
 
 
+def test_a_shape_that_the_loop_holds_is_not_called_harm() -> None:
+    stage = begun(3)
+    stage.residual_nm = 60.0
+    channels = [wire.Channel(name="dark-hole")]
+    stage.send(CONTROLLER_STATE, wire.ControllerState(mode=stage.mode.value, channels=channels))
+    verdict = stage.run(4)
+    assert verdict.level is Level.NEUTRAL
+    assert "the shapes of offset and channels in it" in verdict.headline
+
+
+def test_refusals_that_are_over_are_said_to_be_over() -> None:
+    stage = begun(3)
+    stage.reasons = (Rejection.DARK,)
+    stage.run(2)
+    stage.reasons = ()
+    assert "too dark: that is over" in stage.run(2).headline
+
+
 # What is set.
 
 

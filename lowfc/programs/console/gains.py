@@ -19,7 +19,7 @@ HIGHEST = 1.5
 STEP, FINE_STEP = 0.05, 0.01
 FINE_BELOW = 0.1
 """Knobs below it are turned in fine steps."""
-_BAR = 9
+_BAR = 8
 _BEFORE = 11  # columns before the bar
 _PENDING_S = 1.0  # after which the controller's state has what was asked
 
@@ -102,7 +102,7 @@ class Gains(Lines):
             knob, places = self._knob(number), self._places(number)
             at = min(round(knob / HIGHEST * _BAR), _BAR)
             lowest = float(self._gain[places].min())
-            least = "" if lowest > 0.99 * knob else f"{lowest:.2g} to "
+            least = "" if lowest > 0.99 * knob else f"{lowest:.2g}-"
             chosen = number == self._chosen
             lines.append(
                 Text.assemble(

@@ -1,5 +1,6 @@
 """The parts of the screen as text: a reading in, lines out."""
 
+import re
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from functools import lru_cache
@@ -25,6 +26,8 @@ _PIXELS = 12
 _MODE_LINES = 7
 _SPARKS = "▁▂▃▄▅▆▇█"
 _NEAR_LIMIT = 0.95
+_GAINS = re.compile(r", gain .*?(?=, leak|;)")
+"""What the knobs show already."""
 
 
 @lru_cache(maxsize=4096)
@@ -107,10 +110,10 @@ def halves(colours: Rgb) -> list[Text]:
 
 def sparks(reading: Reading) -> list[Text]:
     """Residual and light of the last minute."""
-    found, flux = reading.state.wavefront, reading.state.flux
+    found, flux = reading.state.wavefront, reading.light[-1] if reading.light else float("nan")
     kind = "true" if reading.state.true else "measured"
     residual = "?" if found is None else f"{figure(found.residual_nm)} nm {kind}"
-    light = "?" if flux is None else f"{100 * flux:.0f} %"
+    light = "?" if np.isnan(flux) else f"{100 * flux:.0f} %"
     rows = ("residual", reading.residual_nm, residual), ("light", reading.light, light)
     return [
         Text.assemble((f"{name:10}", DIM), (f"{sparkline(values, 34):>34}", style(ORANGE)), f" {last}")
@@ -159,7 +162,8 @@ def _mode(noll: int, command_nm: float, limit_nm: float, width: int) -> Text:
 def facts(reading: Reading) -> Text:
     """What is set: law, offset and channels, who has reserved the loop, the last note."""
     known, state = reading.verdict.facts, reading.state.controller_state
-    rows = {"law": known["CONTROL LAW"], "shapes": known["OFFSET AND CHANNELS"], "note": known["LAST NOTE"]}
+    law = _GAINS.sub("", known["CONTROL LAW"])
+    rows = {"law": law, "shapes": known["OFFSET AND CHANNELS"], "note": known["LAST NOTE"]}
     if state is not None and state.lease.id and not state.lease.ended:
         rows["note"] = f"reserved for {printable(state.lease.holder)}"
     return Text("\n").join(Text.assemble((f"{name:7}", DIM), value) for name, value in rows.items())

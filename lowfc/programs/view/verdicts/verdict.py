@@ -47,7 +47,7 @@ def judge(state: RunState, nm_per_mas: float | None = None) -> Verdict:
     left = wavefront(state, nm_per_mas, loop)
     tiles = [loop, left, frames(state), star(state), _mirror(state), _latency(state), _recorder(state)]
     if state.contrast is not None:
-        tiles.insert(2, contrast(state.contrast))
+        tiles.insert(2, contrast(state.contrast, now=state.wavefront is not None))
     if state.behind_s > BEHIND_S:
         tiles.append(_view(state.behind_s))
     worst = worst_of(tiles)
