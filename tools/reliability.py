@@ -91,8 +91,8 @@ def render_chaos(figures: Figures) -> str:
     return "\n".join(parts)
 
 
-def _rows(by_name: dict[str, list[Figures]]) -> list[tuple[str, ...]]:
-    rows = []
+def _rows(by_name: dict[str, list[Figures]]) -> list[Sequence[object]]:
+    rows: list[Sequence[object]] = []
     for name, cases in by_name.items():
         ended = counts(cases)
         why = f", {ended['skipped']} skipped ({cases[0]['skipped']})" if ended["skipped"] else ""

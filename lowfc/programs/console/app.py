@@ -278,8 +278,10 @@ class Console(OrderedKeys):
                 self._drawn("pictures").show(panels.pictures(reading))
             self.screen_stack[0].query_one(Gains).update(reading)
         self._drawn("peers").show([panels.peers(reading, self._run_id)])
-        for one in (*reading.requests, *reading.events):
-            self._history.add(one)
+        for request in reading.requests:
+            self._history.add(request)
+        for event in reading.events:
+            self._history.add(event)
         self._put("log", self._history.last(self._main("#log").size.height))
         if not self._mute and any(event.level >= Severity.ERROR for event in reading.events):
             self.bell()
