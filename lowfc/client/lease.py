@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from lowfc.adapters.process.host import by_this_process
 from lowfc.contract.errors import BusError, CalibrationError, LowfcError, RequestRefusedError
+from lowfc.control.loop.lease import LEASE_OVER, OUTLOOK
 
 if TYPE_CHECKING:
     from lowfc.adapters.process.progress import Counted
@@ -93,9 +94,9 @@ class Lease:
                 try:
                     self._ask("renew", self.id, DURATION_S, self._holder())
                 except RequestRefusedError as fault:
-                    self._ended = str(fault).removeprefix("renew refused: ")
+                    self._ended = str(fault).removeprefix("renew refused: ").removeprefix(LEASE_OVER)
             if self._ended:
-                raise CalibrationError(f"ended by somebody else: {self._ended}")
+                raise CalibrationError(f"the reservation of the loop ended: {self._ended}")
 
     def release(self) -> None:
         """Give the loop back."""
@@ -116,4 +117,4 @@ class Lease:
     def _holder(self) -> str:
         if self._end_s is None:
             return self._purpose
-        return f"{self._purpose}, about {max(0.0, self._end_s - time.monotonic()):.0f} s to go"
+        return f"{self._purpose}{OUTLOOK}{max(0.0, self._end_s - time.monotonic()):.0f} s to go"

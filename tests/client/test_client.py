@@ -178,7 +178,7 @@ def test_a_reservation_that_ended_says_why(controller: FakeController) -> None:
     with loop.reserved("a test"):
         controller.reply = Reply(False, "the lease ended: operator asked to open", 77)
         for _ in range(2):
-            with pytest.raises(CalibrationError, match="the lease ended: operator asked to open"):
+            with pytest.raises(CalibrationError, match="reservation of the loop ended: operator asked to open"):
                 loop.check_lease()
 
 

@@ -265,5 +265,5 @@ def test_lines_that_move_leave_no_more_than_the_integrator_whatever_the_seed(pre
 @pytest.mark.slow
 @pytest.mark.parametrize("magnitude", [0.0, 2.0, 5.0])
 def test_a_good_law_is_never_overruled(magnitude: float) -> None:
-    """Ten minutes of it; `python -m tools.measure guard` has twenty seeds."""
+    """Ten minutes of it; `python -m tools.measure guard` measures as many for each of twenty seeds, for some hours."""
     assert undisturbed(case("reaction-wheel", magnitude), 21) == 0

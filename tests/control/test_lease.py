@@ -79,6 +79,21 @@ def test_these_are_granted_to_anybody_and_end_the_lease_and_what_it_plays(name: 
     assert outputs.reply.text == f"the lease ended: operator asked to {name}"
 
 
+def test_what_ends_a_lease_names_its_holder_without_how_long_it_was_going_to_take() -> None:
+    request = Request(0, "lease", values=(10.0,), text=f"{HOLDER}, about 33 s to go", lease_id=MINE)
+    state, _ = asked(loaded(USUAL), request)
+    _, outputs = asked(state, Request(S, "stop"))
+    assert [event.details["holder"] for event in outputs.events if event.name == "LEASE_ENDED"] == [HOLDER]
+    assert outputs.reply.text.endswith(f"; this ended the reservation for {HOLDER}")
+
+
+def test_a_closed_loop_is_not_said_to_be_closed_from_now_on() -> None:
+    state, outputs = asked(loaded(USUAL), Request(0, "close"))
+    assert outputs.reply.text == "the loop is closed already"
+    state, _ = asked(state, Request(1, "step", values=(5.0,)))
+    assert asked(state, Request(2, "close"))[1].reply.text == "loop closed"
+
+
 @pytest.mark.parametrize("name", ["close", "gain", "play", "load"])
 @pytest.mark.parametrize("ended", [True, False])
 def test_a_former_holder_is_refused_and_told_why(name: str, ended: bool) -> None:

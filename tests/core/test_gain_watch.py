@@ -9,7 +9,7 @@ import pytest
 from lowfc.adapters.files import factory
 from lowfc.arrays import Array, Single
 from lowfc.contract.codecs.state_codec import controller_state, decode_state
-from lowfc.contract.configuration import FIXED_GAINS
+from lowfc.contract.configuration import FIXED_GAINS, load
 from lowfc.control.calibration.granted import noise_covariance_nm2
 from lowfc.control.laws.automatic_gain import TiltCrossTalk
 from lowfc.control.laws.law import RELAXING
@@ -68,6 +68,18 @@ def test_a_faint_star_is_better_closed_than_open(faint: Bench) -> None:
     """Of a star of V = 6.5 at 250 Hz, gains of 0.5 and 0.05 leave 19 nm of 7."""
     left_nm, open_nm = rms_nm(faint, 750)
     assert left_nm < open_nm
+
+
+def test_the_first_minute_is_not_the_price_of_automatic_gains() -> None:
+    """`make sim-loop`: the default star and disturbance, for 20 s, beside gains of 0.5 and 0.05."""
+    left_nm = []
+    for keys in ({}, FIXED_GAINS):
+        config = load(None, {"control.start_mode": "closed"} | keys)
+        loop = Bench(config, calibrated(config))
+        loop.run(round(20 * config.camera.rate_hz))
+        assert loop.steps[round(3 * config.camera.rate_hz)].mode is LoopMode.CLOSED
+        left_nm.append(rms_nm(loop, len(loop.truths) // 2)[0])
+    assert left_nm[0] < 1.1 * left_nm[1]
 
 
 def test_modes_that_are_left_alone_bring_less_noise_to_the_others(faint: Bench) -> None:

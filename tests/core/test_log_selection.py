@@ -226,5 +226,6 @@ def test_the_answer_to_start_says_what_it_takes(tmp_path: Path) -> None:
         answers.append(wire.Request.FromString(sample.payload))
     bench.stop()
     assert [answer.accepted for answer in answers] == [True, True]
-    assert "an hour" not in answers[0].reply
+    assert answers[0].reply == f"recording stopped: {answers[0].text}"
+    assert answers[1].reply.startswith(f"recording into {answers[1].text}; about ")
     assert "about 3.6 GB an hour; " in answers[1].reply

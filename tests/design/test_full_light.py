@@ -37,6 +37,9 @@ EXPECTED = {
     "clowfs": (1.63, 0.062),
     "zwfs_tuned": (1.30, None),
     "clowfs_tuned": (1.22, None),
+    "bowtie": (None, None),
+    "lyot": (None, None),
+    "aplc": (None, None),
 }
 
 

@@ -198,14 +198,15 @@ def _newest(folder: Path) -> list[Path]:
     Raises:
         DataFileError: there is none.
     """
+    hint = f"that of another folder is FOLDER/{LAST}"
     try:
         files = {path: match for path in folder.iterdir() if (match := _NAMED.fullmatch(path.name))}
     except OSError as fault:
-        raise DataFileError(f"`{LAST}` is the newest log in {folder}, which cannot be read: {fault.strerror}") from None
-    if not files:
         raise DataFileError(
-            f"`{LAST}` is the newest log in {folder}, and there is none; a folder of yours is FOLDER/{LAST}"
-        )
+            f"`{LAST}` is the newest log in {folder}, which cannot be read: {fault.strerror}; {hint}"
+        ) from None
+    if not files:
+        raise DataFileError(f"`{LAST}` is the newest log in {folder}, and there is none; {hint}")
     # Of several files of one time the finished one as recorded, then one that was recovered, then an unfinished one.
     order = {
         path: (time, int(number or 1), not (suffix or part), suffix == "-recovered", bool(part))

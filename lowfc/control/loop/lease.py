@@ -20,6 +20,10 @@ ENDED_BY = frozenset({"safe", "open", "pause", "stop"})
 """Requests that are granted to anybody, and that end the lease of somebody else."""
 UNRELATED = frozenset({"status", "note", "lease", "renew", "release", "permit"})
 """Requests that do not change the loop, and those of leases themselves."""
+LEASE_OVER = "the lease ended: "
+"""What the refusal of a renewal begins with; then why."""
+OUTLOOK = ", about "
+"""What a holder's description ends with that says how long it is going to take."""
 
 
 class Lease(NamedTuple):
@@ -40,6 +44,11 @@ class Lease(NamedTuple):
     last_sequence: int = 0
     ended: str = ""
     holds: bool = False
+
+    @property
+    def without_outlook(self) -> str:
+        """The holder, without how long it was going to take."""
+        return self.holder.rpartition(OUTLOOK)[0] or self.holder
 
     def over(self, time_ns: int, frame_sequence: int) -> bool:
         """Whether it has not been renewed in time, by the clock or by the frames."""

@@ -3,7 +3,7 @@
 from math import ceil
 
 from lowfc.control.loop.inputs import PendingEvent, Request
-from lowfc.control.loop.lease import MAX_HOLDER, MAX_S, Lease
+from lowfc.control.loop.lease import LEASE_OVER, MAX_HOLDER, MAX_S, Lease
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import Settings, State
 
@@ -33,7 +33,7 @@ def renew(settings: Settings, state: State, request: Request) -> tuple[State, st
     if before is None or before.id != request.lease_id:
         raise ValueError("this lease is not in force: the controller restarted, or another lease was granted")
     if before.ended:
-        raise ValueError(f"the lease ended: {before.ended}")
+        raise ValueError(f"{LEASE_OVER}{before.ended}")
     made = _extended(settings, state, request)._replace(holds=before.holds)
     return _with(state, made), made.reserved(request.time_ns)
 
@@ -44,7 +44,7 @@ def release(settings: Settings, state: State, request: Request) -> tuple[State, 
     if held is None or held.ended or held.id != request.lease_id:
         return state, "nothing was reserved"
     after = _with(state, held._replace(ended="its holder released it"))
-    return after, "released", PendingEvent("LEASE_RELEASED", {"holder": held.holder})
+    return after, "released", PendingEvent("LEASE_RELEASED", {"holder": held.without_outlook})
 
 
 def lease_checked(state: State, time_ns: int, frame_sequence: int) -> tuple[State, list[PendingEvent]]:
@@ -63,7 +63,7 @@ def lease_ended(state: State, why: str) -> tuple[State, list[PendingEvent]]:
     if drive is not None and drive.command_channels is not None:
         drive = drive._replace(command_channels=drive.command_channels.stopped(state.frame_sequence))
     after = _with(state, held._replace(ended=why))._replace(drive=drive)
-    return after, [PendingEvent("LEASE_ENDED", {"holder": held.holder, "why": why})]
+    return after, [PendingEvent("LEASE_ENDED", {"holder": held.without_outlook, "why": why})]
 
 
 def permit(settings: Settings, state: State, request: Request) -> tuple[State, str, *tuple[PendingEvent, ...]]:

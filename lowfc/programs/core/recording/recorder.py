@@ -40,6 +40,7 @@ _FLUSH_NS = 250_000_000
 _SETTLE_S = (0.3, 1.5)
 _DRAIN_S = 1.0
 _SLOW_NS = 1_000_000_000
+_DONE = {"start": "recording into", "stop": "recording stopped:"}
 
 
 class Recorder:
@@ -173,7 +174,7 @@ class Recorder:
                 name=query.name,
                 text=path,
                 accepted=not refusal,
-                reply=refusal or "; ".join(filter(None, (f"{query.name}: {path}", outlook))),
+                reply=refusal or "; ".join(filter(None, (f"{_DONE[query.name]} {path}", outlook))),
             )
             query.reply(answer.SerializeToString())
 
