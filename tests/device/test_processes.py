@@ -1,16 +1,23 @@
-"""A driver whose process dies, and is started again as a service manager does."""
+"""Drivers that die, or hang for five seconds, in processes of their own: started again as a service manager does."""
 
 import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 
+import numpy as np
+import pytest
+
+from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.bus.run import open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.envelope import start_of
-from lowfc.contract.messages import FRAME, Role
+from lowfc.contract.messages import EVENT, FRAME, MIRROR_STATE, STEP, Log, Role, wire
 from tests.support.loops import LOWFC, going_on, until
 
-DRIVER = """
+DYING = """
 import os, time
 import numpy as np
 from lowfc.device import CameraSettings, Exposure
@@ -36,7 +43,7 @@ class Dying:
 
 
 def test_a_camera_whose_process_dies_is_a_new_start_once_it_is_started_again(tmp_path: Path) -> None:
-    (tmp_path / "dying.py").write_text(DRIVER)
+    (tmp_path / "dying.py").write_text(DYING)
     words = ("camera", "dying.py:Dying", "--run", "dying")
     starts: list[int] = []
     bus = ZenohBus(open_run("dying").links, Role.OPERATOR, HostClock())
@@ -49,3 +56,163 @@ def test_a_camera_whose_process_dies_is_a_new_start_once_it_is_started_again(tmp
     finally:
         bus.close()
     assert starts == sorted(starts)
+
+
+FAULTY = """
+import os, time
+import numpy as np
+from lowfc.device import geometry
+from sim_camera.driver import SimulatedCamera
+
+HANGS_S = 5.0
+
+def befall(name):
+    if os.path.exists(name):
+        fault = open(name).read()
+        os.remove(name)
+        if fault == "die":
+            os._exit(7)
+        time.sleep(HANGS_S)
+
+class Camera(SimulatedCamera):
+    def expose(self):
+        befall("camera")
+        return super().expose()
+
+class Mirror:
+    def __init__(self, options, config):
+        self.geometry = geometry(config)
+        self.calls = open("calls", "a", buffering=1)
+
+    def apply(self, actuators_nm):
+        self.calls.write(f"{np.abs(actuators_nm).max()}\\n")
+        befall("mirror")
+
+    def close(self):
+        pass
+"""
+BENCH = """
+[star]
+magnitude = -1.0
+[camera]
+rate_hz = 100
+[disturbance]
+preset = "quiet"
+static_nm = {2 = 8.0, 4 = 5.0}
+[control]
+start_mode = "closed"
+tilt_gain = 0.3
+gain = 0.3
+"""
+OF_BENCH = "--run bench --config bench.toml"
+CAMERA, MIRROR = (f"lowfc {kind} faulty.py:{kind.capitalize()} {OF_BENCH}" for kind in ("camera", "mirror"))
+CONTROLLER = f"lowfc controller {OF_BENCH}"
+
+
+class Bench:
+    """What a run says, and the faults that befall its drivers."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.events: list[tuple[str, str]] = []
+        self.steps: list[wire.ControlStep] = []
+        self.states: list[wire.MirrorState] = []
+        self.starts: set[int] = set()
+
+    @contextmanager
+    def listening(self) -> Iterator[None]:
+        def event(sample: Sample) -> None:
+            log = Log.FromString(sample.payload)
+            self.events.append((log.name, log.message.partition(" ")[0]))
+
+        with closing(ZenohBus(open_run("bench").links, Role.OPERATOR, HostClock())) as bus:
+            bus.subscribe(EVENT, event)
+            bus.subscribe(STEP, lambda sample: self.steps.append(wire.ControlStep.FromString(sample.payload)))
+            bus.subscribe(MIRROR_STATE, lambda sample: self.states.append(wire.MirrorState.FromString(sample.payload)))
+            bus.subscribe(FRAME, lambda sample: self.starts.add(start_of(sample.sequence)))
+            yield
+
+    def befall(self, name: str, fault: str) -> None:
+        """Let it hang or die, and forget what was said so far."""
+        self.events.clear()
+        (self.folder / name).write_text(fault)
+        until(lambda: not (self.folder / name).exists())
+
+    def named(self, process: str, event: str) -> int:
+        """How often a process told of it."""
+        return self.events.count((process, event))
+
+    def settled(self) -> None:
+        """Fifty good frames in a row from now on, by which the loop holds the wavefront."""
+        self.steps.clear()
+
+        def holds() -> bool:
+            newest = self.steps[-50:]
+            closed = all(step.mode == wire.LOOP_MODE_CLOSED and not step.reasons for step in newest)
+            return len(newest) == 50 and closed and all(max(map(abs, step.error_nm)) < 3 for step in newest)
+
+        until(holds, 60)
+
+    def calls_nm(self) -> list[float]:
+        """Largest actuator of each command that the mirror's driver has got."""
+        return [float(line) for line in (self.folder / "calls").read_text().splitlines()]
+
+
+@pytest.fixture
+def bench(tmp_path: Path, own_runtime: Path) -> Iterator[Bench]:
+    (tmp_path / "faulty.py").write_text(FAULTY)
+    (tmp_path / "bench.toml").write_text(BENCH)
+    made = Bench(tmp_path)
+    with made.listening(), going_on(tmp_path, CONTROLLER, CAMERA):
+        yield made
+
+
+@pytest.mark.exclusive
+def test_a_camera_that_hangs_for_five_seconds_is_named_and_its_loop_holds_and_goes_on(bench: Bench) -> None:
+    with going_on(bench.folder, MIRROR):
+        bench.settled()
+        bench.befall("camera", "hang")
+        until(lambda: bench.named("camera", "DRIVER_HANGS") and bench.named("controller", "NO_FRAMES"))
+        until(lambda: bench.named("controller", "FRAMES_BACK") and bench.named("camera", "DRIVER_BACK"))
+        assert bench.named("camera", "DRIVER_HANGS") == 1
+        bench.settled()
+    assert len(bench.starts) == 1, "its process has lived on"
+
+
+@pytest.mark.exclusive
+def test_a_mirror_that_hangs_for_five_seconds_gets_no_command_meanwhile_and_is_flat_before_the_next(
+    bench: Bench,
+) -> None:
+    with going_on(bench.folder, MIRROR):
+        bench.settled()
+        bench.befall("mirror", "hang")
+        begun_s = time.monotonic()
+        until(lambda: bench.named("mirror-dm", "DRIVER_HANGS") and bench.named("controller", "MIRROR_LOST"))
+        before = bench.calls_nm()
+        assert min(before[-20:]) > 1, "it holds a wavefront"
+        assert (bench.states[-1].actuators, bench.states[-1].status) == (b"", wire.MIRROR_STATUS_EXPIRED)
+        until(lambda: list(bench.steps[-1].reasons) == [wire.REASON_NO_MIRROR])
+        until(lambda: len(bench.calls_nm()) > len(before))
+        assert time.monotonic() - begun_s > 4, "nothing came while it hung"
+        until(lambda: bench.named("mirror-dm", "DRIVER_BACK") and bench.named("controller", "MIRROR_BACK"))
+        assert bench.calls_nm()[len(before)] == 0, "its idle state comes first"
+        assert bench.named("mirror-dm", "DRIVER_HANGS") == bench.named("controller", "MIRROR_LOST") == 1
+        bench.settled()
+
+
+@pytest.mark.exclusive
+def test_a_mirror_whose_process_dies_is_named_and_the_loop_holds_until_it_is_started_again(bench: Bench) -> None:
+    with subprocess.Popen([*LOWFC, *MIRROR.split()[1:]], cwd=bench.folder) as process:
+        bench.settled()
+        bench.befall("mirror", "die")
+        assert process.wait(10) == 7, "a failure, after which units of deploy start it again"
+    until(lambda: bench.named("controller", "MIRROR_LOST"))
+    held = bench.steps[-1].command_nm
+    until(lambda: list(bench.steps[-1].reasons) == [wire.REASON_NO_MIRROR])
+    before = bench.calls_nm()
+    with going_on(bench.folder, MIRROR):
+        until(lambda: bench.named("controller", "MIRROR_BACK"))
+        assert bench.calls_nm()[len(before)] == 0, "its idle state comes first"
+        bench.settled()
+        np.testing.assert_allclose(bench.steps[-1].command_nm, held, atol=5)
+    assert bench.named("controller", "MIRROR_LOST") == 1

@@ -273,6 +273,11 @@ def test_a_closed_loop_counts_every_buffer_that_fails(emulated: None, tmp_path: 
     refusals = (wire.REASON_LATE, wire.REASON_SATURATED, wire.REASON_DARK, wire.REASON_STUCK)
     refused = sum(one.count for one in status.counts if one.reason in refusals)
     failed = int((tmp_path / "failed").read_text())
+    print(
+        f"{health['camera'].mean_rate_hz:.0f} Hz: {sent.published} frames, {sent.missing} lost, {failed} buffers failed"
+        f"; the controller received {got.received}, missed {got.missing}, skipped {got.skipped}, used "
+        f"{status.frames_used} and refused {refused}"
+    )
     assert sent.missing == got.missing >= failed - 1  # the last may fail after the last frame
     assert failed > sent.published // 25
     assert sent.published - sent.missing == got.received + got.skipped
