@@ -4,6 +4,7 @@ from lowfc.adapters.process.service import Service
 from lowfc.arrays import Pixels, Single
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import ConfigurationError
+from lowfc.device.camera_clock import CameraClock
 from lowfc.device.driver import (
     Camera,
     CameraExtras,
@@ -22,6 +23,7 @@ from lowfc.device.volts import VoltMap, VoltOptions
 
 __all__ = [
     "Camera",
+    "CameraClock",
     "CameraExtras",
     "CameraSettings",
     "Configuration",

@@ -13,9 +13,11 @@ from pydantic import ValidationError
 from lowfc.contract.configuration import Configuration, explain
 from lowfc.contract.errors import ConfigurationError, brief, nearest
 from lowfc.device.driver import DriverOptions
+from lowfc.device.watch import opening
 
 Kind = Literal["camera", "mirror"]
 KINDS: tuple[Kind, ...] = ("camera", "mirror")
+METHODS: dict[Kind, tuple[str, ...]] = {"camera": ("settings", "expose", "close"), "mirror": ("apply", "close")}
 
 
 def installed(kind: Kind) -> dict[str, EntryPoint]:
@@ -31,6 +33,8 @@ def load(kind: Kind, name: str) -> Any:
     """
     module, colon, attribute = name.rpartition(":")
     if colon:
+        if module.endswith(".py") and not Path(module).is_file():
+            raise ConfigurationError(f"the driver {name!r} cannot be loaded: there is no file {module}")
         # `python -P` leaves out the folder in which the user stands
         sys.path.insert(0, str(Path(module).resolve().parent if module.endswith(".py") else Path.cwd()))
         point = EntryPoint(name, f"{section(name)}:{attribute}", f"lowfc.{kind}s")
@@ -42,9 +46,13 @@ def load(kind: Kind, name: str) -> Any:
             "write module:Class or file.py:Class"
         )
     try:
-        return point.load()
+        driver = point.load()
     except (ImportError, AttributeError) as fault:
         raise ConfigurationError(f"the driver {name!r} cannot be loaded: {fault}") from None
+    missing = [method for method in METHODS[kind] if isinstance(driver, type) and not hasattr(driver, method)]
+    if missing:
+        raise ConfigurationError(f"the driver {name!r} is no {kind}: it has no {' and no '.join(missing)}")
+    return driver
 
 
 def section(name: str) -> str:
@@ -65,10 +73,8 @@ def opened(kind: Kind, name: str, config: Configuration, words: Sequence[str] = 
     """
     driver = load(kind, name) if driver is None else driver
     given = options(driver, table(config, kind, name), words)
-    try:
+    with opening(f"the {kind} {name!r} cannot be opened"):
         return driver(given, config)
-    except OSError as fault:
-        raise ConfigurationError(f"the {kind} {name!r} cannot be opened: {fault}") from fault
 
 
 def faults(config: Configuration, folder: Path) -> list[str]:
@@ -92,8 +98,16 @@ def faults(config: Configuration, folder: Path) -> list[str]:
 
 
 def table(config: Configuration, kind: Kind, name: str) -> dict[str, Any]:
-    """Options of a driver in a configuration: [drivers.NAME], or its part for this kind."""
-    found = config.drivers.get(section(name), {})
+    """Options of a driver in a configuration: [drivers.NAME], or its part for this kind.
+
+    Raises:
+        ConfigurationError: they stand under the name of its class.
+    """
+    mine = section(name)
+    for other in {name, name.rpartition(":")[2]} - {mine}:
+        if other in config.drivers:
+            raise ConfigurationError(f"the options of {name} are in [drivers.{mine}], got [drivers.{other}]")
+    found = config.drivers.get(mine, {})
     if found and set(found) <= set(KINDS):
         return dict(found.get(kind, {}))
     return found

@@ -12,6 +12,7 @@ from lowfc.contract.messages import Role
 from lowfc.device.camera_loop import CameraLoop
 from lowfc.device.driver import Camera, Mirror
 from lowfc.device.mirror_loop import MirrorLoop
+from lowfc.device.watch import opening
 
 PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
 """Settings of a command that leaves words to the driver: its options."""
@@ -35,7 +36,8 @@ def run_camera(
         BusError: the run has a camera already, or one of `wait_for` did not come.
     """
     service = join(config, run, Role.CAMERA, config.realtime.camera_cpus)
-    loop = CameraLoop(driver, service, config, frames)
+    with opening("the camera does not say how it is set"):
+        loop = CameraLoop(driver, service, config, frames)
     service.catch_signals()
     with closing(service.bus):  # a callback on zenoh's threads must not outlive the interpreter
         loop.run(wait_for)
@@ -49,7 +51,8 @@ def run_mirror(driver: Mirror, config: Configuration, run: str) -> None:
         ConfigurationError: the driver's grid is not that of [mirror].
     """
     service = join(config, run, mirror_role(config.mirror.name), config.realtime.mirror_cpus)
-    loop = MirrorLoop(driver, service, config)
+    with opening("the mirror does not say what it is"):
+        loop = MirrorLoop(driver, service, config)
     service.catch_signals()
     with closing(service.bus):
         loop.run()

@@ -2,17 +2,45 @@
 
 import re
 import threading
+import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from lowfc.adapters.process.service import Service
-from lowfc.contract.errors import LowfcError
+from lowfc.contract.errors import ConfigurationError, LowfcError
 
 LOOK_S = 0.1
 PAUSES_NS = (0, 100_000_000, 200_000_000, 500_000_000, 1_000_000_000, 2_000_000_000, 4_000_000_000)
 """Pause after the first failure, the second in a row, and so on."""
 STEADY_NS = 1_000_000_000
 """A driver works again when it has not failed for this long."""
+AGAIN_NS = 10_000_000_000
+"""After this long, a fault that goes on is said again."""
+_HERE = Path(__file__).parent
+
+
+def described(fault: Exception) -> str:
+    """What a driver raised, and the line of the driver where."""
+    frames = [frame for frame in traceback.extract_tb(fault.__traceback__) if Path(frame.filename).parent != _HERE]
+    its_own = [frame for frame in frames if frame.filename == frames[0].filename]
+    where = f" ({Path(its_own[-1].filename).name}, line {its_own[-1].lineno})" if its_own else ""
+    return f"{type(fault).__name__}: {fault}"[:300] + where
+
+
+@contextmanager
+def opening(what: str) -> Iterator[None]:
+    """Say what a driver raised before it is watched.
+
+    Raises:
+        ConfigurationError: it raised something else than a `LowfcError`.
+    """
+    try:
+        yield
+    except LowfcError:
+        raise
+    except Exception as fault:
+        raise ConfigurationError(f"{what}: {described(fault)}") from fault
 
 
 class DriverWatch:
@@ -34,7 +62,7 @@ class DriverWatch:
         self._hanging = hanging
         self._calls = self._looked_at = self._looks = self._row = self._series = 0
         self._under_way = False
-        self._kind = ""
+        self._kind, self._said_ns = "", 0
         self._ended = threading.Event()
 
     @contextmanager
@@ -80,10 +108,10 @@ class DriverWatch:
         self.retry_ns = self._service.clock.host_ns() + PAUSES_NS[min(self._row, len(PAUSES_NS) - 1)]
         self._row += 1
         self._count()
-        why = f"{type(fault).__name__}: {fault}"[:300]
-        kind = re.sub(r"\d+", "", why)  # the same fault with other numbers is said once
-        if kind != self._kind:
-            self._kind = kind
+        why = described(fault)
+        kind = re.sub(r"\d+", "", why)  # the same fault with other numbers is no other fault
+        if kind != self._kind or self.failed_ns >= self._said_ns + AGAIN_NS:
+            self._kind, self._said_ns = kind, self.failed_ns
             self._service.event("DRIVER_FAILED", why=why)
 
     def look(self) -> None:

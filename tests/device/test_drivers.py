@@ -10,7 +10,18 @@ from lowfc.contract.configuration import load
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.messages import CAMERA_STATE, COMMAND, FRAME, MIRROR_STATE, wire
 from lowfc.control.loop.safety import Limit
-from lowfc.device import CameraSettings, Configuration, DriverOptions, Exposure, Need, Single, geometry, plugins
+from lowfc.device import (
+    CameraClock,
+    CameraSettings,
+    Configuration,
+    DriverOptions,
+    Exposure,
+    Need,
+    Single,
+    geometry,
+    plugins,
+    run_camera,
+)
 from lowfc.device.camera_loop import CameraLoop
 from lowfc.device.mirror_loop import MirrorLoop, guard_of
 from lowfc.programs.commissioning.doctor.devices import device_checks
@@ -130,12 +141,12 @@ def test_a_driver_is_found_by_entry_point_or_by_module_and_class(
 ) -> None:
     assert plugins.load("camera", "sim").__name__ == "SimulatedCamera"
     assert plugins.load("mirror", "sim").__name__ == "SimulatedMirror"
-    (tmp_path / "beside_me.py").write_text("class Mine: ...\n")
+    (tmp_path / "beside_me.py").write_text("class Mine:\n    settings = expose = close = None\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
     assert plugins.load("camera", "beside_me:Mine").__name__ == "Mine"
     (tmp_path / "folder").mkdir()
-    (tmp_path / "folder/in_a_folder.py").write_text("class Mine: ...\n")
+    (tmp_path / "folder/in_a_folder.py").write_text("class Mine:\n    settings = expose = close = None\n")
     assert plugins.load("camera", "folder/in_a_folder.py:Mine").__name__ == "Mine"
     assert plugins.section("folder/in_a_folder.py:Mine") == "in_a_folder"
     for name, why in [("sin", "did you mean 'sim'"), ("beside_me:Other", "cannot be loaded"), ("nowhere:X", "nowhere")]:
@@ -168,3 +179,60 @@ def test_a_driver_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
         *("camera sim ok", "camera sim: a cable ok", "camera sim: a camera wrong", "mirror sim wrong")
     ]
     assert [check.advice for check in checks[1:3]] == ["", "switch it on"]
+
+
+class Unset(Ramp):
+    """A camera whose first settings raise."""
+
+    def settings(self) -> CameraSettings:
+        raise RuntimeError("no link")
+
+
+class Unopened(Ramp):
+    """A camera that cannot be opened."""
+
+    def __init__(self, options: DriverOptions, config: Configuration) -> None:
+        raise ValueError("serial 7 is not there")
+
+
+class Half:
+    """No camera yet."""
+
+    def expose(self) -> None:
+        """Nothing."""
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("nowhere/half.py:Half", "there is no file nowhere/half.py"),
+        (f"{__name__}:Half", "is no camera: it has no settings and no close"),
+        (f"{__name__}:Unopened", r"cannot be opened: ValueError: serial 7 is not there \(test_drivers.py, line \d+\)"),
+    ],
+)
+def test_a_driver_that_cannot_be_opened_is_a_sentence(name: str, said: str) -> None:
+    with pytest.raises(ConfigurationError, match=said):
+        plugins.opened("camera", name, CONFIG)
+
+
+def test_the_first_settings_that_raise_are_a_sentence() -> None:
+    with pytest.raises(ConfigurationError, match=r"how it is set: RuntimeError: no link \(test_drivers.py, line \d+\)"):
+        run_camera(Unset(Unset.Options(), CONFIG), CONFIG, "unset")
+
+
+def test_options_under_the_name_of_the_class_are_not_passed_over() -> None:
+    config = load(None, {"drivers.Ramp.level": 3})
+    with pytest.raises(ConfigurationError, match=rf"are in \[drivers.{__name__}\], got \[drivers.Ramp\]"):
+        plugins.opened("camera", f"{__name__}:Ramp", config)
+
+
+def test_a_cameras_own_clock_is_followed_within_the_shortest_transfer() -> None:
+    """30 parts in a million slow, with transfers of 0.2 to 5 ms."""
+    clock, rng = CameraClock(), np.random.default_rng(1)
+    errors_ns = []
+    for end_ns in range(10**15, 10**15 + 60 * 10**9, 10**7):
+        stamp_ns = round((end_ns - 10**15) * (1 - 30e-6)) + 77
+        received_ns = end_ns + 200_000 + int(rng.exponential(500_000))
+        errors_ns.append(clock.monotonic_ns(stamp_ns, received_ns) - end_ns)
+    assert min(errors_ns[100:]) > -300_000
+    assert max(errors_ns[100:]) < 300_000

@@ -91,5 +91,5 @@ def test_the_example_of_a_vendors_mirror(monkeypatch: pytest.MonkeyPatch) -> Non
         mirror.apply(SURFACE)
     mirror.close()
     assert mirror.dm.closed
-    with pytest.raises(ConfigurationError, match="cannot be opened: error 5"):
+    with pytest.raises(ConfigurationError, match="cannot be opened: OSError: error 5"):
         opened("another")

@@ -42,7 +42,10 @@ def camera_checks(seen: Camera) -> Iterator[Check]:
 def _frames(seen: Camera) -> Check:
     count = len(seen.published)
     if not count:
-        advice = "is the camera in this run, with the session file of `lowfc config zenoh --role camera`, on this key?"
+        advice = (
+            seen.failing
+            or "is the camera in this run, with the session file of `lowfc config zenoh --role camera`, on this key?"
+        )
         return wrong(f"none in {seen.seconds:g} s; received: {seen.keys}", advice)
     if seen.unreadable:
         got = f"{seen.unreadable} of {count} payloads are no foxglove.RawImage"

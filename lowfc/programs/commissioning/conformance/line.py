@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import zenoh
+from google.protobuf.message import DecodeError
 from zenoh.handlers import Callback
 
 from lowfc.adapters.bus.run import Links
@@ -15,7 +16,7 @@ from lowfc.adapters.bus.zenoh_session import session_config
 from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.envelope import Envelope, sequence_of
 from lowfc.contract.errors import BusError
-from lowfc.contract.messages import Topic
+from lowfc.contract.messages import HEALTH, Topic, wire
 
 NS = 1_000_000_000
 EVERYTHING = "lowfc/**"
@@ -148,6 +149,15 @@ class Collected:
     def keys(self) -> str:
         """Keys under which something came, in words."""
         return ", ".join(sorted({message.key for message in self.messages})) or "nothing"
+
+    @property
+    def failing(self) -> str:
+        """What the device's process says of a driver that fails; empty where it does not, or says nothing."""
+        for message in reversed(self.on(HEALTH.at(self.process))):
+            with contextlib.suppress(DecodeError):
+                health = wire.Health.FromString(message.payload)
+                return health.last_warning if health.driver_failures else ""
+        return ""
 
     @cached_property
     def published(self) -> list[Received]:

@@ -28,7 +28,7 @@ def _settings(seen: Camera) -> Check:
         got = f"{unreadable} of {count} are no lowfc.v1.CameraState"
         return wrong(got, "encode the message with its declaration")
     if not count:
-        advice = "publish it: calibration, noise and the guard against a changed camera go by it"
+        advice = seen.failing or "publish it: calibration, noise and the guard against a changed camera go by it"
         return wrong(f"none in {seen.seconds:g} s", advice)
     if seen.seconds >= 2 and not 1 < count / seen.seconds < 20:
         return warning(f"{count / seen.seconds:.1f} a second", "publish them twice a second")
