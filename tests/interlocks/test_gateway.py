@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -86,6 +87,17 @@ def test_every_request_of_numbers_or_a_text_is_offered_under_a_name_of_its_own()
         plain = fields <= {"modes", "values", "text", "lease_id"} and one.example
         puts = bool(plain) and name not in ("status", "configuration")
         assert (name in offered and offered[name].put is not None) is puts, name
+    loop = Mock()
+    for name, value, asked in (
+        ("gain", [0.2], {"values": [0.2]}),
+        ("step", [7.0], {"values": [7.0]}),
+        ("permit", "the mask", {"text": "the mask"}),
+        ("close", True, {}),
+    ):
+        put = offered[name].put
+        assert put is not None
+        put(loop, value)
+        loop.ask.assert_called_with(name, **asked)
     assert offered["gain"].kind is Kind.NUMBERS
     assert all(one.read is not None or one.put is not None for one in offered.values())
 

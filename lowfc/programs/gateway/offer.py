@@ -100,7 +100,7 @@ def _request(one: Declaration) -> Variable | None:
     if one.key.startswith("lowfc/record/"):
         starts = name == "start"
         name, kind, put = f"record_{name}", Kind.TRUTH, lambda loop, value: loop.record(starts)
-    elif "text" in fields:
+    elif "text" in fields and "modes" not in fields:  # of `gain` the numbers
         kind, put = Kind.TEXT, lambda loop, value: loop.ask(one.name, text=str(value))
     elif "values" in fields:
         kind, put = Kind.NUMBERS, lambda loop, value: loop.ask(one.name, values=value)
