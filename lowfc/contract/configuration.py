@@ -174,6 +174,9 @@ class Realtime(Section):
     """Do each control step a second time for nothing, so that the next frame finds the caches warm; not above 2 kHz."""
     kernel: KernelName = "numpy"
     """Arithmetic of the controller's usual frame: numpy, or the fused step, compiled by numba (extra `fast`)."""
+    threads: int = Field(1, ge=1, le=8)
+    """Threads that share the pass of the fused step over large frames (R of 8 MB or more), each on a processor of
+    controller_cpus that nothing else needs."""
     camera_cpus: list[int] = Field(default_factory=list)
     """Processors of the camera; empty for all. Where the file says nothing, sim-loop gives the controller its own."""
     controller_cpus: list[int] = Field(default_factory=list)

@@ -7,13 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.sizes import Size, configuration, made_up
 from lowfc.adapters.process import compiled
 from lowfc.adapters.process.latch import Latch
 from lowfc.arrays import Pixels, Single
 from lowfc.contract.configuration import load
 from lowfc.control.calibration.calibration import Calibration, normalise_flux, reconstructor
 from lowfc.control.kernel import functions, stepping
-from lowfc.control.kernel.tables import FUSED
+from lowfc.control.kernel.tables import FUSED, Tables
 from lowfc.control.laws.linear_law import LinearLaw, integrator
 from lowfc.control.laws.pi_notch import pi_notch
 from lowfc.control.loop.advance import advance
@@ -211,11 +212,30 @@ def test_which_kernel_computes_is_an_event_and_without_numba_it_is_numpys(
     for there, name, event in ((True, FUSED, "KERNEL"), (False, "numpy", "KERNEL_MISSING")):
         monkeypatch.setattr(compiled, "available", lambda there=there: there)
         monkeypatch.setattr(compiled, "kernel", getattr(compiled.kernel, "__wrapped__", compiled.kernel))
-        monkeypatch.setattr(compiled, "_compiled", lambda: (functions.measure, functions.respond))
+        monkeypatch.setattr(compiled, "_compiled", lambda: [functions.measure, functions.respond, None])
         made = settings_under(latch, config, lambda *given, **details: events.append((given, details)))
         assert made.kernel.name == name
         assert events[-1][0] == (event,)
     assert "numba" in events[-1][1]["advice"]
+
+
+def test_threads_share_a_large_frame_and_give_the_same_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+    size = Size(side=100, modes=13, mirror_side=8)
+    calibration, frames = made_up(size, configuration(size, RATE_HZ))
+    reference, pixels = calibration.reconstructor @ calibration.reference, frames[0].ravel()
+    alone = Tables.of(compiled.kernel(FUSED), calibration, reference)
+    assert alone is not None
+    expected = alone.estimate(pixels, 0.0)
+    assert expected is not None
+    for threads in (2, 3):
+        shared = Tables.of(compiled.kernel(FUSED, threads), calibration, reference)
+        assert shared is not None
+        shared.sums_nm[:] = np.nan
+        for at_least in (shared.tiles.nbytes, shared.tiles.nbytes + 1):  # by all threads, and by one
+            monkeypatch.setattr(compiled, "SHARED_BYTES", at_least)
+            found = shared.estimate(pixels, 0.0)
+            assert found is not None
+            assert (found[0].tobytes(), found[1]) == (expected[0].tobytes(), expected[1])
 
 
 def test_random_frames_and_states(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,15 +1,23 @@
 """The fused step compiled by numba (extra `fast`), before the first frame."""
 
 import importlib.util
+import threading
+from collections.abc import Callable
 from functools import cache
+from itertools import pairwise
 from typing import Any
 
+import numpy as np
+
 from lowfc.adapters.process.extras import install_advice
+from lowfc.arrays import Pixels, Sequences, Single
 from lowfc.control.kernel import functions
 from lowfc.control.kernel.tables import FUSED, NUMPY, Kernel
 
 FASTMATH = frozenset({"reassoc", "contract"})
 """What of fast-math is allowed: NaN and infinity stay visible, and the same binary gives the same bytes."""
+SHARED_BYTES = 8 << 20
+"""Size of R from which on threads share a frame: waking them takes longer than they save of a smaller one."""
 
 
 def available() -> bool:
@@ -23,36 +31,102 @@ def missing() -> str:
 
 
 @cache
-def kernel(name: str) -> Kernel:
+def kernel(name: str, threads: int = 1) -> Kernel:
     """The kernel of that name, ready for use; without numba, numpy's.
 
-    The first use on a host compiles for some seconds; later ones load what was compiled, where that could be kept.
+    The first use on a host compiles for some seconds; later ones load what was compiled, where that could be kept. The
+    threads share the pass over a large frame, and give the same bytes.
     """
-    return Kernel(FUSED, *_compiled()) if name == FUSED and available() else NUMPY
+    if name != FUSED or not available():
+        return NUMPY
+    measure, respond, measure_blocks = _compiled()
+    return Kernel(FUSED, measure if threads == 1 else Pool(measure, measure_blocks, threads).measure, respond)
+
+
+class Pool:
+    """Threads that share the pass over large frames; they sleep in between, and start with this process's set-up."""
+
+    def __init__(self, measure: Callable[..., float], measure_blocks: Callable[..., None], threads: int) -> None:
+        """Start them; this one counts as the first."""
+        self._measure = measure
+        self._measure_blocks = measure_blocks
+        self._work: tuple[Any, ...] = ()
+        self._scratch = [np.empty(0, np.float32)] * (threads - 1)
+        self._shares: list[tuple[int, int]] = []
+        self._turns = [(threading.Lock(), threading.Lock()) for _ in range(threads - 1)]
+        for number, turn in enumerate(self._turns):
+            for lock in turn:
+                lock.acquire()
+            threading.Thread(target=self._help, args=(number, *turn), name="fused step", daemon=True).start()
+
+    def measure(
+        self,
+        pixels: Pixels,
+        good: Pixels,
+        dark: Single,
+        tiles: Single,
+        scratch: Single,
+        sums_nm: Single,
+        totals: Sequences,
+        *rest: Any,
+    ) -> float:
+        """As `lowfc.control.kernel.functions.measure`."""
+        scanned = pixels, good, dark, tiles, scratch, sums_nm, totals
+        if tiles.nbytes < SHARED_BYTES:
+            return self._measure(*scanned, *rest)
+        if self._scratch[0].size != scratch.size or self._shares[-1][1] != len(totals):
+            self._divide(scratch.size, len(totals))
+        self._work = scanned
+        for go, _ in self._turns:
+            go.release()
+        first, last = self._shares[-1]
+        self._measure_blocks(pixels, good, dark, tiles, scratch, first, last, sums_nm, totals)
+        for _, done in self._turns:
+            done.acquire()
+        return self._measure(*scanned, *rest[:-1], True)
+
+    def _divide(self, block: int, blocks: int) -> None:
+        """A share of the blocks for each thread, and arrays for those that help."""
+        edges = [blocks * number // (len(self._turns) + 1) for number in range(len(self._turns) + 2)]
+        self._shares = list(pairwise(edges))
+        self._scratch = [np.empty(block, np.float32) for _ in self._turns]
+
+    def _help(self, number: int, go: threading.Lock, done: threading.Lock) -> None:
+        while go.acquire():
+            pixels, good, dark, tiles, _, sums_nm, totals = self._work
+            first, last = self._shares[number]
+            self._measure_blocks(pixels, good, dark, tiles, self._scratch[number], first, last, sums_nm, totals)
+            done.release()
 
 
 def _compiled() -> list[Any]:
     import numba
     from numba import types
+    from numba.extending import register_jitable
 
     njit: Any = numba.njit
 
     def array(kind: Any, dimensions: int, *, readonly: bool = True) -> Any:
         return types.Array(kind, dimensions, "C", readonly=readonly)
 
-    real, flag, single = types.float64, types.boolean, types.float32
+    real, flag, single, whole = types.float64, types.boolean, types.float32, types.int64
     counts, line, plane = array(types.uint16, 1), array(single, 1), array(single, 2)
     result, surface = array(single, 1, readonly=False), array(single, 2, readonly=False)
-    law = (plane, line, plane, plane, flag)
+    law, totals = (plane, line, plane, plane, flag), array(types.uint64, 2, readonly=False)
+    frame = counts, counts, line, plane, result
     signatures = {
-        functions.measure: real(counts, counts, line, plane, result, line, types.int64, real, real, result),
+        functions.measure: real(*frame, surface, totals, line, whole, real, real, result, flag),
         functions.respond: flag(*(line,) * 5, *law, *(plane,) * 3, *(real,) * 3, result, surface),
+        functions.measure_blocks: types.void(*frame, whole, whole, surface, totals),
     }
     options: dict[str, Any] = {"fastmath": set(FASTMATH), "error_model": "numpy"}
+    for called in (functions.scan, functions.measure_blocks):
+        register_jitable(**options)(called)
     found = []
     for function, signature in signatures.items():
+        shared = {"nogil": function is functions.measure_blocks}
         try:
-            found.append(njit(signature, cache=True, **options)(function))
+            found.append(njit(signature, cache=True, **options, **shared)(function))
         except RuntimeError:  # no folder in which it may be kept
-            found.append(njit(signature, **options)(function))
+            found.append(njit(signature, **options, **shared)(function))
     return found

@@ -1,13 +1,111 @@
-"""The fused step: the arithmetic of the usual frame in two plain functions, to be compiled.
+"""The fused step: the arithmetic of the usual frame in plain functions, to be compiled.
 
 They are written for a compiler: loops over arrays that were made before, nothing allocated, nothing called but numpy's
-types. Rows of R are taken ten at a time, and what is left five at a time, so that a frame is read once for all of them
-and several sums go on at once. `lowfc.adapters` compiles them.
+types and each other. Rows of R are taken ten at a time, and what is left five at a time, so that a frame is read once
+for all of them and several sums go on at once. `lowfc.adapters` compiles them.
 """
 
 import numpy as np
 
-from lowfc.arrays import Pixels, Single
+from lowfc.arrays import Pixels, Sequences, Single
+
+
+def scan(
+    counts: Pixels,
+    used: Pixels,
+    dark: Single,
+    tiles: Single,
+    row: int,
+    scratch: Single,
+    sums_nm: Single,
+) -> tuple[np.uint64, np.uint16]:
+    """Products of one block of a frame with R, in one pass over its counts.
+
+    Args:
+        counts: (block,) DN.
+        used: (block,) all bits set where a pixel is used, else 0.
+        dark: (block,) DN.
+        tiles: as in `measure`; those of this block begin at `row`.
+        row: see there.
+        scratch: (block,) overwritten.
+        sums_nm: (modes rounded up to five,) the result, not normalised.
+
+    Returns:
+        Sum of the used counts, and the highest.
+    """
+    total, highest, zero = np.uint64(0), np.uint16(0), np.float32(0)
+    for i in range(counts.size):
+        count = counts[i]
+        scratch[i] = np.float32(count) - dark[i]
+        kept = count & used[i]
+        total += np.uint64(kept)
+        highest = max(highest, kept)
+    mode, rows = 0, sums_nm.size
+    while mode + 5 < rows:
+        r0, r1, r2, r3, r4 = tiles[row], tiles[row + 1], tiles[row + 2], tiles[row + 3], tiles[row + 4]
+        r5, r6, r7, r8, r9 = tiles[row + 5], tiles[row + 6], tiles[row + 7], tiles[row + 8], tiles[row + 9]
+        s0, s1, s2, s3, s4 = zero, zero, zero, zero, zero
+        s5, s6, s7, s8, s9 = zero, zero, zero, zero, zero
+        for i in range(counts.size):
+            value = scratch[i]
+            s0 += r0[i] * value
+            s1 += r1[i] * value
+            s2 += r2[i] * value
+            s3 += r3[i] * value
+            s4 += r4[i] * value
+            s5 += r5[i] * value
+            s6 += r6[i] * value
+            s7 += r7[i] * value
+            s8 += r8[i] * value
+            s9 += r9[i] * value
+        for k, sum_nm in enumerate((s0, s1, s2, s3, s4, s5, s6, s7, s8, s9)):
+            sums_nm[mode + k] = sum_nm
+        mode, row = mode + 10, row + 10
+    if mode < rows:
+        r0, r1, r2, r3, r4 = tiles[row], tiles[row + 1], tiles[row + 2], tiles[row + 3], tiles[row + 4]
+        s0, s1, s2, s3, s4 = zero, zero, zero, zero, zero
+        for i in range(counts.size):
+            value = scratch[i]
+            s0 += r0[i] * value
+            s1 += r1[i] * value
+            s2 += r2[i] * value
+            s3 += r3[i] * value
+            s4 += r4[i] * value
+        for k, sum_nm in enumerate((s0, s1, s2, s3, s4)):
+            sums_nm[mode + k] = sum_nm
+    return total, highest
+
+
+def measure_blocks(
+    pixels: Pixels,
+    good: Pixels,
+    dark: Single,
+    tiles: Single,
+    scratch: Single,
+    first: int,
+    last: int,
+    sums_nm: Single,
+    totals: Sequences,
+) -> None:
+    """`scan` of the blocks from `first` up to `last`, so that several threads share a frame.
+
+    Args:
+        pixels: and good, dark, tiles and scratch as in `measure`.
+        good: see there.
+        dark: see there.
+        tiles: see there.
+        scratch: see there; each thread has its own.
+        first: block.
+        last: block that is not scanned any more.
+        sums_nm: (blocks, modes rounded up to five) the result.
+        totals: (blocks, 2) sum of the used counts, and the highest.
+    """
+    block = scratch.size
+    for number in range(first, last):
+        begin, end, sums = number * block, (number + 1) * block, sums_nm[number]
+        counts, used, offset = pixels[begin:end], good[begin:end], dark[begin:end]
+        total, highest = scan(counts, used, offset, tiles, number * sums.size, scratch, sums)
+        totals[number, 0], totals[number, 1] = total, highest
 
 
 def measure(
@@ -16,11 +114,14 @@ def measure(
     dark: Single,
     tiles: Single,
     scratch: Single,
+    sums_nm: Single,
+    totals: Sequences,
     reference_nm: Single,
     full_well: int,
     dark_sum_dn: float,
     least_dn: float,
     error_nm: Single,
+    scanned: bool,
 ) -> float:
     """Modal errors of a frame in one pass over its counts.
 
@@ -30,64 +131,30 @@ def measure(
         dark: (pixels,) DN.
         tiles: (blocks x modes rounded up to five, block) R, block of pixels after block; zero where it was filled up.
         scratch: (block,) overwritten.
+        sums_nm: (blocks, modes rounded up to five) overwritten.
+        totals: (blocks, 2) overwritten.
         reference_nm: (modes,) R I0.
         full_well: counts from which on a pixel is saturated.
         dark_sum_dn: sum of the dark over the good pixels.
         least_dn: flux up to which the frame is not usual.
         error_nm: (modes,) the result, nm of wavefront rms.
+        scanned: `measure_blocks` has filled the sums and totals already.
 
     Returns:
         The flux, DN, rounded as float32: the exact sum of the good pixels less `dark_sum_dn`. 0 where the frame is not
         usual: a good pixel is saturated, or there is little light.
     """
-    modes, block, row = error_nm.size, scratch.size, 0
-    total, highest, zero = np.uint64(0), np.uint16(0), np.float32(0)
+    modes, blocks = error_nm.size, totals.shape[0]
+    if not scanned:
+        measure_blocks(pixels, good, dark, tiles, scratch, 0, blocks, sums_nm, totals)
+    total, highest = np.uint64(0), np.uint64(0)
     for mode in range(modes):
         error_nm[mode] = 0
-    for begin in range(0, pixels.size, block):
-        counts, used, offset = pixels[begin : begin + block], good[begin : begin + block], dark[begin : begin + block]
-        for i in range(counts.size):
-            count = counts[i]
-            scratch[i] = np.float32(count) - offset[i]
-            kept = count & used[i]
-            total += np.uint64(kept)
-            highest = max(highest, kept)
-        mode = 0
-        while mode + 5 < modes:
-            r0, r1, r2, r3, r4 = tiles[row], tiles[row + 1], tiles[row + 2], tiles[row + 3], tiles[row + 4]
-            r5, r6, r7, r8, r9 = tiles[row + 5], tiles[row + 6], tiles[row + 7], tiles[row + 8], tiles[row + 9]
-            s0, s1, s2, s3, s4 = zero, zero, zero, zero, zero
-            s5, s6, s7, s8, s9 = zero, zero, zero, zero, zero
-            for i in range(counts.size):
-                value = scratch[i]
-                s0 += r0[i] * value
-                s1 += r1[i] * value
-                s2 += r2[i] * value
-                s3 += r3[i] * value
-                s4 += r4[i] * value
-                s5 += r5[i] * value
-                s6 += r6[i] * value
-                s7 += r7[i] * value
-                s8 += r8[i] * value
-                s9 += r9[i] * value
-            for k, total_nm in enumerate((s0, s1, s2, s3, s4, s5, s6, s7, s8, s9)):
-                if mode + k < modes:
-                    error_nm[mode + k] += total_nm
-            mode, row = mode + 10, row + 10
-        if mode < modes:
-            r0, r1, r2, r3, r4 = tiles[row], tiles[row + 1], tiles[row + 2], tiles[row + 3], tiles[row + 4]
-            s0, s1, s2, s3, s4 = zero, zero, zero, zero, zero
-            for i in range(counts.size):
-                value = scratch[i]
-                s0 += r0[i] * value
-                s1 += r1[i] * value
-                s2 += r2[i] * value
-                s3 += r3[i] * value
-                s4 += r4[i] * value
-            for k, total_nm in enumerate((s0, s1, s2, s3, s4)):
-                if mode + k < modes:
-                    error_nm[mode + k] += total_nm
-            row += 5
+    for number in range(blocks):
+        total += totals[number, 0]
+        highest = max(highest, totals[number, 1])
+        for mode in range(modes):
+            error_nm[mode] += sums_nm[number, mode]
     flux_dn = np.float32(np.float64(total) - dark_sum_dn)
     if highest >= full_well or not flux_dn > least_dn:
         return 0.0

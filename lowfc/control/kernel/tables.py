@@ -5,7 +5,7 @@ from typing import Final, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from lowfc.arrays import Pixels, Single, single
+from lowfc.arrays import Pixels, Sequences, Single, single
 from lowfc.control.calibration.calibration import Calibration
 
 KernelName = Literal["numpy", "fused"]
@@ -48,6 +48,8 @@ class Tables(NamedTuple):
     dark: Single
     tiles: Single
     scratch: Single
+    sums_nm: Single
+    totals: Sequences
     reference_nm: Single
     full_well: int
     dark_sum_dn: float
@@ -75,6 +77,8 @@ class Tables(NamedTuple):
             single(calibration.dark),
             single(filled.reshape(-1, blocks, block).swapaxes(0, 1)).reshape(-1, block),
             np.empty(block, np.float32),
+            np.empty((blocks, len(filled)), np.float32),
+            np.empty((blocks, 2), np.uint64),
             reference_nm,
             int(np.ceil(min(calibration.saturation_dn, 0x1_0000))),
             float(calibration.dark.astype(np.float64) @ calibration.good),
@@ -90,6 +94,6 @@ class Tables(NamedTuple):
         """Modal errors (modes,) and flux of a usual frame (pixels,); None where it is not usual."""
         error_nm = np.empty_like(self.reference_nm)
         least_dn = min_flux_dn + self.margin_dn
-        measured = pixels, self.good, self.dark, self.tiles, self.scratch, self.reference_nm
-        flux_dn = self.measure(*measured, self.full_well, self.dark_sum_dn, least_dn, error_nm)
+        scanned = pixels, self.good, self.dark, self.tiles, self.scratch, self.sums_nm, self.totals
+        flux_dn = self.measure(*scanned, self.reference_nm, self.full_well, self.dark_sum_dn, least_dn, error_nm, False)
         return (error_nm, flux_dn) if flux_dn else None

@@ -76,7 +76,7 @@ def settings_under(latch: Latch, config: Configuration, event: Callable[..., Non
     where it is not numpy's, or ought not to be.
     """
     wanted = config.realtime.kernel
-    found = replace(factory.settings(config), kernel=compiled.kernel(wanted))
+    found = replace(factory.settings(config), kernel=compiled.kernel(wanted, config.realtime.threads))
     if found.kernel.name != wanted:
         event("KERNEL_MISSING", advice=compiled.missing())
     elif found.kernel is not NUMPY:

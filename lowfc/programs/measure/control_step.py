@@ -25,7 +25,8 @@ class ControlStep:
 
     def __init__(self, config: Configuration, calibration: Calibration, now_ns: int) -> None:
         """Load the calibration; the kernel is the configuration's."""
-        self._settings = replace(settings(config), kernel=compiled.kernel(config.realtime.kernel))
+        realtime = config.realtime
+        self._settings = replace(settings(config), kernel=compiled.kernel(realtime.kernel, realtime.threads))
         self._valid_ns = round(config.control.command_timeout_ms * 1e6)
         self.state, _ = advance(self._settings, State(), Load(now_ns, calibration, "the run's"))
 
