@@ -24,6 +24,7 @@ LOOPS = {
     "simulated camera": ["--camera", "simulated"],
     "prepared frames, recorder": ["--record"],
     "prepared frames": [],
+    "prepared frames, fused": ["--kernel", "fused"],
 }
 """Options of `lowfc latency` for each loop."""
 MAX_WITHOUT_COMMAND = 0.001

@@ -83,7 +83,7 @@ class Pool:
         self._measure_blocks(pixels, good, dark, tiles, scratch, first, last, sums_nm, totals)
         for _, done in self._turns:
             done.acquire()
-        return self._measure(*scanned, *rest[:-1], True)
+        return self._measure(pixels[:0], *scanned[1:], *rest)
 
     def _divide(self, block: int, blocks: int) -> None:
         """A share of the blocks for each thread, and arrays for those that help."""
@@ -115,7 +115,7 @@ def _compiled() -> list[Any]:
     law, totals = (plane, line, plane, plane, flag), array(types.uint64, 2, readonly=False)
     frame = counts, counts, line, plane, result
     signatures = {
-        functions.measure: real(*frame, surface, totals, line, whole, real, real, result, flag),
+        functions.measure: real(*frame, surface, totals, line, whole, real, real, result),
         functions.respond: flag(*(line,) * 5, *law, *(plane,) * 3, *(real,) * 3, result, surface),
         functions.measure_blocks: types.void(*frame, whole, whole, surface, totals),
     }

@@ -121,31 +121,29 @@ def measure(
     dark_sum_dn: float,
     least_dn: float,
     error_nm: Single,
-    scanned: bool,
 ) -> float:
     """Modal errors of a frame in one pass over its counts.
 
     Args:
-        pixels: (pixels,) counts, DN.
+        pixels: (pixels,) counts, DN; empty where `measure_blocks` has filled the sums and totals.
         good: (pixels,) all bits set where a pixel is used, else 0.
         dark: (pixels,) DN.
         tiles: (blocks x modes rounded up to five, block) R, block of pixels after block; zero where it was filled up.
         scratch: (block,) overwritten.
-        sums_nm: (blocks, modes rounded up to five) overwritten.
-        totals: (blocks, 2) overwritten.
+        sums_nm: (blocks, modes rounded up to five) overwritten, or filled.
+        totals: (blocks, 2) overwritten, or filled.
         reference_nm: (modes,) R I0.
         full_well: counts from which on a pixel is saturated.
         dark_sum_dn: sum of the dark over the good pixels.
         least_dn: flux up to which the frame is not usual.
         error_nm: (modes,) the result, nm of wavefront rms.
-        scanned: `measure_blocks` has filled the sums and totals already.
 
     Returns:
         The flux, DN, rounded as float32: the exact sum of the good pixels less `dark_sum_dn`. 0 where the frame is not
         usual: a good pixel is saturated, or there is little light.
     """
     modes, blocks = error_nm.size, totals.shape[0]
-    if not scanned:
+    if pixels.size:
         measure_blocks(pixels, good, dark, tiles, scratch, 0, blocks, sums_nm, totals)
     total, highest = np.uint64(0), np.uint64(0)
     for mode in range(modes):

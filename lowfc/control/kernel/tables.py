@@ -95,5 +95,5 @@ class Tables(NamedTuple):
         error_nm = np.empty_like(self.reference_nm)
         least_dn = min_flux_dn + self.margin_dn
         scanned = pixels, self.good, self.dark, self.tiles, self.scratch, self.sums_nm, self.totals
-        flux_dn = self.measure(*scanned, self.reference_nm, self.full_well, self.dark_sum_dn, least_dn, error_nm, False)
+        flux_dn = self.measure(*scanned, self.reference_nm, self.full_well, self.dark_sum_dn, least_dn, error_nm)
         return (error_nm, flux_dn) if flux_dn else None

@@ -85,8 +85,8 @@ def run_repeats(asked: Asked, run: Run, progress: Callable[[str], None]) -> list
 
     Returns:
         For each repeat, and in it for each kernel: its name, kernel; `repeat_figures` and `controllers_account`;
-        granted, refused, logs, messages_lost and commands_late; echo_us, step_us, hot_step_us and timer_us
-        (percentiles) and echo_lost; and stalls where they are traced.
+        granted, refused, memory_mb (by process), logs, messages_lost and commands_late; echo_us, step_us, hot_step_us
+        and timer_us (percentiles) and echo_lost; and stalls where they are traced.
 
     Raises:
         ProcessDiedError: a process ended by itself.
@@ -154,7 +154,9 @@ def one_loop(asked: Asked, run: Run) -> dict[str, Any]:
     controller, recording = watch.of(Role.CONTROLLER), watch.of(Role.RECORDER).recording
     if recording.failure:
         raise BusError(f"the recorder stopped: {recording.failure}")
+    loop = {role: watch.of(role) for role in (Role.CAMERA, Role.CONTROLLER, mirror_role(asked.config.mirror.name))}
     account = {
+        "memory_mb": {str(role): health.memory_bytes / 1e6 for role, health in loop.items()},
         "granted": list(controller.realtime_granted),
         "refused": list(controller.realtime_refused),
         "logs": list(recording.files),

@@ -22,8 +22,8 @@ def together(repeats: Repeats) -> dict[str, Any]:
         latency_us and spread_us by span: median, and lowest and highest, over the repeats of each percentile (max: the
         largest); echo_us{round_trip}, step_us, hot_step_us, timer_us, ratio (p50 and p99; see `RATIOS`) and ratio_hot,
         its step of those back to back, and the same with _spread; histogram{edges_us, counts by span}; over_time of
-        each repeat; `COUNTS`, and reasons; repeats, the percentiles of each; and stalls (`Stalls`) where they were
-        traced.
+        each repeat; `COUNTS`, and reasons; memory_mb, the most of each process, of a live loop; repeats, the
+        percentiles of each; and stalls (`Stalls`) where they were traced.
     """
     spans = [span for span in repeats[0]["latency_us"] if all(span in one["latency_us"] for one in repeats)]
     each = {span: [one["latency_us"][span] for one in repeats] for span in spans}
@@ -47,6 +47,8 @@ def together(repeats: Repeats) -> dict[str, Any]:
     found["histogram"] = _histogram(repeats, spans)
     found["over_time"] = [one["over_time"] for one in repeats]
     found["repeats"] = [{name: one.get(name) for name in ("latency_us", *ALONE)} for one in repeats]
+    if used := [one["memory_mb"] for one in repeats if "memory_mb" in one]:
+        found["memory_mb"] = {name: max(one[name] for one in used) for name in used[0]}
     if traced := [one["stalls"] for one in repeats if "stalls" in one]:
         found["stalls"] = stalls.together(traced).figures()
     return found

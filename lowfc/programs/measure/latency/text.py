@@ -117,6 +117,8 @@ def _remarks(figures: Mapping[str, Any]) -> list[str]:
         lines.append(f"frames that were refused or limited, the warm-up included: {reasons}")
     if "stalls" in figures:
         lines.append(Stalls.model_validate(figures["stalls"]).text())
+    if figures.get("memory_mb"):
+        lines.append("memory: " + ", ".join(f"{name} {mb:.0f} MB" for name, mb in figures["memory_mb"].items()))
     lines.append(_what(figures))
     host = figures["host"]
     lines.append(", ".join(f"{name} {host[name]}" for name in _HOST if host.get(name)))
