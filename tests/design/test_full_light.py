@@ -77,7 +77,7 @@ def test_an_interferometer_of_two_holes_reaches_the_quantum_limit():
     assert found.item() == pytest.approx(4 * 2 * 1.0)  # N = 2, variance of the phase over them 1
 
 
-@pytest.mark.parametrize("name", ["zwfs_tuned", "clowfs_tuned"])
+@pytest.mark.parametrize("name", EXPECTED)
 def test_estimates_of_small_wavefronts_reach_the_bound_and_none_beats_it(name, modes):
     sensor, count = sensor_named(name), 600
     I0, H = reference(sensor).ravel(), response(sensor, modes[:14])
