@@ -24,6 +24,8 @@ suppress_warnings = ["ref.python"]  # an attribute's name that several classes h
 html_theme = "pydata_sphinx_theme"
 html_title = f"lowfc {release}"
 html_copy_source = False
+html_static_path = ["style"]
+html_css_files = ["site.css"]
 html_theme_options = {"show_prev_next": False, "navigation_with_keys": False}
 
 _ARRAY = re.compile(r"~?numpy\.ndarray\[(?:tuple\[.*?\]|~?typing\.Any), ~?numpy\.dtype\[(.*?)\]\]")

@@ -209,6 +209,8 @@ def test_the_containers_run_the_same_as_the_units() -> None:
         assert f"./lowfc.toml:{CONFIGURED}:ro" in service["volumes"]
     assert len(services) == len(UNITS) - 1  # all but the router, which is for several hosts
     assert program(services["controller"]["healthcheck"]["test"][1:]) == "ctl"
+    for name in ("controller", "recorder"):  # the latch and the logs; the root is read only
+        assert any(volume.endswith(":/var/lib/lowfc") for volume in services[name]["volumes"])
     built = (DEPLOY / "Containerfile").read_text()
     last = built.rpartition("\nFROM ")[2]
     assert re.search(r"^USER [1-9]\d*:[1-9]\d*$", last, re.MULTILINE)
