@@ -208,6 +208,15 @@ def test_a_foolish_value_is_granted_and_said_so(name: str, value: float, said: s
     assert (":" in reply.text) == bool(said)
 
 
+def test_an_offset_that_would_not_be_followed_is_said_so() -> None:
+    state, _ = replied(loaded(USUAL), "gain", 0.0, modes=(3,))
+    for mode, said in ((3, "Z3 would not follow at a gain of 0"), (4, "")):
+        _, reply = replied(state, "offset", 5.0, modes=(mode,))
+        assert reply.accepted
+        assert said in reply.text
+        assert (":" in reply.text) == bool(said)
+
+
 def test_the_remark_begins_where_tune_ends() -> None:
     highest = highest_gain(USUAL.delay_frames)
     texts = [replied(loaded(USUAL), "gain", factor * highest)[1].text for factor in (0.999, 1.001)]

@@ -193,7 +193,10 @@ def _offset(settings: Settings, state: State, request: Request) -> Handled:
     values = per_mode(drive.calibration.noll, asked, added.offset_nm)
     check_offset(drive, np.abs(values))
     text = " ".join(f"{value:g}" for value in values.tolist())
-    return _with(state, drive, added._replace(offset_nm=values)), f"offset is now {text} nm"
+    fixed = (values != 0) & (drive.law.gain == 0) & ~drive.automatic & (drive.following is None)
+    names = ", ".join(f"Z{mode}" for mode, one in zip(drive.calibration.noll, fixed, strict=True) if one)
+    said = f": {names} would not follow at a gain of 0" if names else ""
+    return _with(state, drive, added._replace(offset_nm=values)), f"offset is now {text} nm{said}"
 
 
 def _channel(settings: Settings, state: State, request: Request) -> Handled:
