@@ -12,7 +12,7 @@ from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.messages import Role
 from tools.pictures import BRIGHT, PICTURES, SMALL_WELL, Night, night
 
-EASY = {"camera.rate_hz": 100.0, "realtime.priority": 0, "realtime.recorder_priority": 0}
+EASY = {"camera.rate_hz": 100.0}
 """Pictures need no quiet host at this rate."""
 LOOK_S = 6.0
 """How long the console looks, before what happens meanwhile and after the console says so."""
