@@ -19,6 +19,7 @@ _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 _CAP_IPC_LOCK = 1 << 14
 _MONITOR_NICE = 5  # of 19
 _LATENCY_DEVICE = "/dev/cpu_dma_latency"
+_COMPILER = "llvmlite"  # its work is done before the first frame, and it is larger than all the rest
 
 _Measure = tuple[str, Callable[[], object], str]
 """Name of a measure, what asks the host for it, and the cost of its refusal."""
@@ -185,7 +186,7 @@ def _lock_memory() -> None:
         raise _RefusedError(os.strerror(ctypes.get_errno()))
     for line in Path("/proc/self/maps").read_text().splitlines():
         pages, rights, *_, name = line.split(maxsplit=5)
-        if name.startswith("/") and rights.startswith("r"):
+        if name.startswith("/") and rights.startswith("r") and _COMPILER not in name:
             begin, end = (int(address, 16) for address in pages.split("-"))
             libc.mlock(ctypes.c_void_p(begin), ctypes.c_size_t(end - begin))
 
