@@ -34,6 +34,7 @@ from tools import (
     reliability,
     sensors,
     slow_modes,
+    targets,
     world,
 )
 from tools.declared import DECLARED
@@ -41,7 +42,6 @@ from tools.shared import ROOT, Figures, host, json_of, where
 
 MEASURED = ROOT / "tools" / "measured"
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
-SHORT = "loop in short"
 COST_CURVES = ROOT / "docs" / "pictures" / "cost_curves.png"
 
 
@@ -98,12 +98,19 @@ MEASUREMENTS = {
 }
 
 
+COMPOSED: dict[str, Callable[[], str]] = {
+    "loop in short": lambda: loop.short(measured("loop")),
+    "targets": lambda: targets.render(measured),
+}
+"""Tables of figures that other measurements made."""
+
+
 def table(name: str) -> str:
     """A table of the documentation by its name."""
     if name in DECLARED:
         return DECLARED[name]()
-    if name == SHORT:
-        return loop.short(measured("loop"))
+    if name in COMPOSED:
+        return COMPOSED[name]()
     one, figures = MEASUREMENTS[name], measured(name)
     text = one.render(figures)
     if one.signed:

@@ -1,0 +1,88 @@
+"""What was asked of the fused step and of the loop around it, beside what was measured."""
+
+from collections.abc import Callable, Iterator
+from statistics import median
+from typing import NamedTuple
+
+from benchmarks.peers.contestants import FUSED
+from lowfc.control.kernel.tables import KERNELS
+from tools.shared import Figures, markdown
+
+NUMPY = f"lowfc, {KERNELS[0]}"
+HEAD = ("what", "asked", "reached", "met", "the floor", "where the time goes")
+
+
+class Target(NamedTuple):
+    """One figure that was asked for.
+
+    Attributes:
+        what: it is of.
+        most: asked for at most; negative for at least.
+        values: measured, one for each turn.
+        form: of a value.
+        floor: that no program of this kind goes below, in words.
+        where: the time above the floor goes.
+    """
+
+    what: str
+    most: float
+    values: list[float]
+    form: str
+    floor: str
+    where: str
+
+    def row(self) -> list[str]:
+        """Its line of the table."""
+        reached, asked = median(self.values), self.form.format(abs(self.most))
+        spread = f" ({self.form.format(min(self.values))} to {self.form.format(max(self.values))})"
+        met = reached >= -self.most if self.most < 0 else reached <= self.most
+        return [
+            self.what,
+            f"{'at least' if self.most < 0 else 'at most'} {asked}",
+            self.form.format(reached) + (spread if len(self.values) > 1 else ""),
+            "yes" if met else "no",
+            self.floor,
+            self.where,
+        ]
+
+
+OBJECTS = "decoding and encoding by protobuf, the state as values made anew in Python, the calls of compiled code"
+
+
+def render(measured: Callable[[str], Figures]) -> str:
+    """The table; `measured` gives the figures of a measurement by its name."""
+    targets = [*_contest(measured("peers")), _stalls(measured("stalls"))]
+    return markdown(HEAD, [target.row() for target in targets])
+
+
+def _contest(figures: Figures) -> Iterator[Target]:
+    runs = figures["runs"]
+
+    def pairs(other: str, at: str) -> list[tuple[float, float]]:
+        both = zip(runs[FUSED], runs[other], strict=True)
+        return [(mine["frame_to_command"][at], its["frame_to_command"][at]) for mine, its in both if mine and its]
+
+    shared = "what both share: the way of the frame, waking, the command's way"
+    for at, most in (("p50", 0.72), ("p99", 0.75)):
+        ratios = [mine / its for mine, its in pairs(NUMPY, at)]
+        yield Target(f"frame to command, fused over numpy, {at}", most, ratios, "{:.2f}", shared, OBJECTS)
+    ways = "two Python processes that are woken by sockets, where the chain's wait on semaphores in shared memory"
+    for other, asked in (("C chain", {"p50": 40.0, "p99": 80.0}), ("pyrtcao, fused", {"p50": 0.0, "p99": 0.0})):
+        for at, most in asked.items():
+            differences = [mine - its for mine, its in pairs(other, at)]
+            what = f"frame to command, fused minus {other}, {at}, us"
+            where = ways if other == "C chain" else "the same; and the checks, limits and messages that pyrtcao has not"
+            yield Target(what, most, differences, "{:+.0f}", "0 for the same work in C", where)
+
+
+def _stalls(figures: Figures) -> Target:
+    found = figures["stalls"]
+    bare = ", ".join(f"{one['stalled']} beside the {one['beside']}" for one in found["bare"])
+    return Target(
+        f"frames without a command, of {found['frames']}",
+        0,
+        [float(figures["frames_without_command"])],
+        "{:.0f}",
+        f"{bare}: wakings of the bare loops later than a period",
+        f"{found['of_host']} of the {found['stalled']} stalls were the host's",
+    )
