@@ -18,7 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from benchmarks import curves, step, streams, throughput
+from benchmarks import curves, kernels, step, streams, throughput
 from benchmarks.peers import contest
 from benchmarks.runner import Benchmark, in_markdown
 from lowfc.programs.measure.latency import text as latency_text
@@ -89,6 +89,7 @@ MEASUREMENTS = {
     "fuzz": _of("python -m tests.support.fuzzing --inputs 1000000", reliability.render_fuzz),
     "latency": _latency("lowfc latency --duration 10 --repeats 5"),
     "watched": _latency("lowfc latency --duration 60 --record --view"),
+    "kernels": _bench("python -m benchmarks kernels", kernels),
     "stalls": _latency("lowfc latency --duration 60 --kernel fused --trace"),
     "step": _bench("python -m benchmarks step", step),
     "streams": _bench("python -m benchmarks streams", streams),

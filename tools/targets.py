@@ -51,8 +51,17 @@ OBJECTS = "decoding and encoding by protobuf, the state as values made anew in P
 
 def render(measured: Callable[[str], Figures]) -> str:
     """The table; `measured` gives the figures of a measurement by its name."""
-    targets = [*_contest(measured("peers")), _stalls(measured("stalls"))]
+    targets = [*_steps(measured("kernels")), *_contest(measured("peers")), *_stalls(measured("stalls"))]
     return markdown(HEAD, [target.row() for target in targets])
+
+
+def _steps(figures: Figures) -> Iterator[Target]:
+    for size, (other, most) in zip(figures["sizes"], (("product", 2.4), ("memory", 1.4), ("memory", 1.3)), strict=True):
+        side = round(size["pixels"] ** 0.5)
+        unit = "products R x" if other == "product" else "readings of its bytes"
+        where = OBJECTS if other == "product" else "two copies of the frame's bytes by protobuf; " + OBJECTS
+        ratios = size["ratios"][f"fused over {other}"]
+        yield Target(f"step, fused, {side} x {side}, in {unit}", most, ratios, "{:.2f}", "1", where)
 
 
 def _contest(figures: Figures) -> Iterator[Target]:
@@ -75,10 +84,10 @@ def _contest(figures: Figures) -> Iterator[Target]:
             yield Target(what, most, differences, "{:+.0f}", "0 for the same work in C", where)
 
 
-def _stalls(figures: Figures) -> Target:
+def _stalls(figures: Figures) -> Iterator[Target]:
     found = figures["stalls"]
     bare = ", ".join(f"{one['stalled']} beside the {one['beside']}" for one in found["bare"])
-    return Target(
+    yield Target(
         f"frames without a command, of {found['frames']}",
         0,
         [float(figures["frames_without_command"])],
@@ -86,3 +95,7 @@ def _stalls(figures: Figures) -> Target:
         f"{bare}: wakings of the bare loops later than a period",
         f"{found['of_host']} of the {found['stalled']} stalls were the host's",
     )
+    for name, mb in figures["memory_mb"].items():
+        process = "source of frames" if name == "camera" else name
+        where = "Python, numpy, zenoh, protobuf" + ("; numba and LLVM" if name == "controller" else "")
+        yield Target(f"memory of the {process}, locked, MB", 200, [mb], "{:.0f}", "", where)
