@@ -68,8 +68,12 @@ class TimedCamera(IsioCamera):
     def close(self) -> None:
         """Leave the times: the moment at which a frame was due is that at which it was written into the stream."""
         super().close()
-        times = {"put_ns": np.array(self._put_ns), "due_ns": np.array(self._written_ns)}
-        np.savez(self._folder / SENT_FILE, sequence=np.array(self._sequence), **times)
+        np.savez(
+            self._folder / SENT_FILE,
+            sequence=np.array(self._sequence),
+            put_ns=np.array(self._put_ns),
+            due_ns=np.array(self._written_ns),
+        )
 
 
 def main() -> None:
