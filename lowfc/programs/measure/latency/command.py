@@ -57,7 +57,7 @@ def latency(
         Kernels | None, typer.Option(help="Arithmetic of the control step; default: the configuration's.")
     ] = None,
     trace: Annotated[
-        bool, typer.Option("--trace", help="Mark stalls with what the host can tell, a bare loop beside.")
+        bool, typer.Option("--trace", help="Mark stalls with what held up the host, a bare loop beside.")
     ] = False,
     config: ConfigFile = None,
     plot: Annotated[Path | None, typer.Option(help="Draw histograms and latency against time (PNG).")] = None,
