@@ -108,6 +108,7 @@ TASKS = {
 }
 
 
+@pytest.mark.slow
 def test_every_button_by_its_key(run: LiveRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from lowfc.programs.console.actions import EVERY
 
@@ -190,6 +191,7 @@ def test_safe_is_one_key_even_in_a_form_and_one_large_button(run: LiveRun) -> No
     played(run, scenario)
 
 
+@pytest.mark.slow
 def test_the_knobs_turn_all_gains_or_those_of_an_order(run: LiveRun) -> None:
     def gain() -> list[float]:
         return list(run.asked[-1].values) if run.asked[-1].name == "gain" else []

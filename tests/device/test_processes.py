@@ -171,6 +171,7 @@ def bench(tmp_path: Path, own_runtime: Path) -> Iterator[Bench]:
         yield made
 
 
+@pytest.mark.slow
 @pytest.mark.exclusive
 def test_a_camera_that_hangs_for_five_seconds_is_named_and_its_loop_holds_and_goes_on(bench: Bench) -> None:
     with going_on(bench.folder, MIRROR):
@@ -183,6 +184,7 @@ def test_a_camera_that_hangs_for_five_seconds_is_named_and_its_loop_holds_and_go
     assert len(bench.starts) == 1, "its process has lived on"
 
 
+@pytest.mark.slow
 @pytest.mark.exclusive
 def test_a_mirror_that_hangs_for_five_seconds_gets_no_command_meanwhile_and_is_flat_before_the_next(
     bench: Bench,
