@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lowfc.arrays import Array, Complex, Single
+from lowfc.control.laws.law import TIP_TILT
 from sim_camera.wheel import Wheel, walk
 
 BLOCK = 8
@@ -104,7 +105,7 @@ def disturbance(
             raise ValueError(f"the static mode Z{index} is not one of Z{noll[0]} to Z{noll[-1]}")
         static[noll.index(index)] = amplitude
     rng = np.random.default_rng([seed, 1])
-    tilt = np.array([index in (2, 3) for index in noll])
+    tilt = np.array([index in TIP_TILT for index in noll])
     tilt_nm = scale * nm_per_mas * tilt
     step, screen = np.zeros(modes), 0.0
     lines: tuple[DampedLine, ...] = ()
@@ -172,7 +173,7 @@ def with_more(
     if jitter_nm:
         rng = np.random.default_rng([shaken.seed, 9])
         frequency_hz = rate_hz * (0.5 + (np.arange(_WAVES_PER_BAND) + rng.random(_WAVES_PER_BAND)) / _WAVES_PER_BAND)
-        tilt_nm = jitter_nm * np.isin(shaken.noll, (2, 3)) * np.sqrt(2 / _WAVES_PER_BAND)
+        tilt_nm = jitter_nm * np.isin(shaken.noll, TIP_TILT) * np.sqrt(2 / _WAVES_PER_BAND)
         waves.append((frequency_hz, tilt_nm * _phases(rng, (_WAVES_PER_BAND, len(shaken.noll)))))
     wander = _drift(np.random.default_rng([shaken.seed, 10]), np.full(2, shear), _DRIFT_HZ) if shear else None
     frequencies, amplitudes = zip(*waves, strict=True)

@@ -19,6 +19,7 @@ from lowfc.contract.envelope import Envelope
 from lowfc.contract.errors import BusError, ConfigurationError
 from lowfc.contract.messages import MIRROR_STATE, TRUTH, timestamp, wire
 from lowfc.control.durations import Durations
+from lowfc.control.laws.law import TIP_TILT
 from lowfc.control.laws.stability import delay_weights
 from lowfc.device import CameraSettings, DriverOptions, Exposure, Puts
 from lowfc.optics.detector.detector import saturation_dn
@@ -67,7 +68,7 @@ def disturbance_of(config: Configuration) -> Disturbance:
     if not section.wheel_hz:
         return shaken
     speeds_hz = (section.wheel_hz, section.wheel_hz + section.second_wheel_hz)[: 2 if section.second_wheel_hz else 1]
-    rms_nm = np.where(np.isin(config.noll, (2, 3)), section.wheel_mas * nm_per_mas, 0.0)
+    rms_nm = np.where(np.isin(config.noll, TIP_TILT), section.wheel_mas * nm_per_mas, 0.0)
     spinning = wheels(config.seed, speeds_hz, rms_nm, section.wheel_course, section.wheel_change)
     return replace(shaken, wheels=spinning)
 

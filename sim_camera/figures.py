@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lowfc.arrays import Single
+from lowfc.control.laws.law import TIP_TILT
 from lowfc.optics.chain.added_contrast import by_group, costliest
 from sim_camera.scene import Truth, Wavefront
 
@@ -52,7 +53,7 @@ class Figures:
         """
         self._noll, self._instants = noll, instants
         self._values = 1 + len(noll) + (8 if instants else 4)
-        self._tilts = slice(0, sum(index in (2, 3) for index in noll))  # they come first
+        self._tilts = slice(0, sum(index in TIP_TILT for index in noll))  # they come first
         self._nm_per_mas = nm_per_mas
         self._blocks: list[list[float]] = []
         self._sums = [0.0] * self._values

@@ -14,7 +14,7 @@ from lowfc.adapters.files.factory import frame_noise_nm2
 from lowfc.arrays import Array
 from lowfc.contract.configuration import Configuration
 from lowfc.control.laws.kalman import lqg
-from lowfc.control.laws.law import Law
+from lowfc.control.laws.law import TIP_TILT, Law
 from lowfc.control.laws.linear_law import LinearLaw, at_rest
 from lowfc.control.laws.stability import LOWEST_GAIN, highest_gain
 from lowfc.control.laws.tuning import best_gains
@@ -57,7 +57,7 @@ class Case:
         """A closed loop of this case; its law has followed the open loop before, for as long as narrow lines take."""
         shaken = disturbance_of(config)
         step_nm: Array = (
-            steps_mas * tilt_nm_per_mas(config.star.diameter_m) * np.isin(config.noll, (2, 3)).astype(float)
+            steps_mas * tilt_nm_per_mas(config.star.diameter_m) * np.isin(config.noll, TIP_TILT).astype(float)
         )
         bench = ModalBench(config, self.covariance_nm2, replace(shaken, step_nm=step_nm))
         bench.ask("gain", modes=config.noll, values=tuple(self.gains.tolist()))
@@ -87,7 +87,7 @@ def known_law(config: Configuration, covariance_nm2: Array, bench: ModalBench) -
     lines = tuple(Line(hz, width * hz, nm2) for hz, nm2 in zip(LINES_HZ, variances_nm2.tolist(), strict=True))
     models, gains = [], []
     for mode, noise_nm2 in zip(config.noll, np.diag(covariance_nm2).tolist(), strict=True):
-        tilt = mode in (2, 3)
+        tilt = mode in TIP_TILT
         models.append(Model(0.01 if tilt else 1e-4, 5.0 if tilt else np.inf, lines if tilt else (), noise_nm2, RATE_HZ))
         gains.append(highest_gain(config.camera.delay_frames) if tilt else LOWEST_GAIN)
     return lqg(models, config.noll, timing_of(config)), np.array(gains)

@@ -15,7 +15,7 @@ from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.envelope import start_of
 from lowfc.contract.messages import EVENT, FRAME, MIRROR_STATE, STEP, Log, Role, wire
-from tests.support.loops import LOWFC, going_on, until
+from tests.support.loops import LOWFC, STILL, going_on, until
 
 DYING = """
 import os, time
@@ -91,19 +91,7 @@ class Mirror:
     def close(self):
         pass
 """
-BENCH = """
-[star]
-magnitude = -1.0
-[camera]
-rate_hz = 100
-[disturbance]
-preset = "quiet"
-static_nm = {2 = 8.0, 4 = 5.0}
-[control]
-start_mode = "closed"
-tilt_gain = 0.3
-gain = 0.3
-"""
+BENCH = f"{STILL}tilt_gain = 0.3\n"
 OF_BENCH = "--run bench --config bench.toml"
 CAMERA, MIRROR = (f"lowfc {kind} faulty.py:{kind.capitalize()} {OF_BENCH}" for kind in ("camera", "mirror"))
 CONTROLLER = f"lowfc controller {OF_BENCH}"

@@ -17,6 +17,7 @@ from lowfc.adapters.bus.certificates import make_certificates
 from lowfc.adapters.files import calibration_file
 from lowfc.contract.configuration import load
 from tests.support import networks
+from tests.support.loops import STILL
 from tests.support.networks import ROUTER_ADDRESS, Host, Lab
 from tools.law_bench import calibrated
 
@@ -28,17 +29,7 @@ pytestmark = [
 
 RUN = "across"
 PORT = 7447
-TOML = f"""
-[star]
-magnitude = -1.0
-[camera]
-rate_hz = 100
-[disturbance]
-preset = "quiet"
-static_nm = {{2 = 8.0, 4 = 5.0}}
-[control]
-start_mode = "closed"
-gain = 0.3
+TOML = f"""{STILL}
 [realtime]
 priority = 0
 recorder_priority = 0

@@ -20,24 +20,14 @@ from lowfc.client import Client
 from lowfc.contract.configuration import load
 from lowfc.contract.errors import RequestRefusedError
 from lowfc.contract.messages import MIRROR_STATE, STEP, Role, wire
-from tests.support.loops import until
+from tests.support.loops import STILL, until
 from tools.law_bench import calibrated
 
 pytestmark = pytest.mark.exclusive
 
-TOML = """
-[star]
-magnitude = -1.0
-[camera]
-rate_hz = 100
-[disturbance]
-preset = "quiet"
-static_nm = {2 = 8.0, 4 = 5.0}
+TOML = f"""{STILL}
 [mirror]
 on_command_timeout = "hold"
-[control]
-start_mode = "closed"
-gain = 0.3
 """
 
 

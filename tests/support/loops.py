@@ -19,6 +19,19 @@ from typer.testing import CliRunner
 
 from lowfc.programs.cli.main import app
 
+STILL = """
+[star]
+magnitude = -1.0
+[camera]
+rate_hz = 100
+[disturbance]
+preset = "quiet"
+static_nm = {2 = 8.0, 4 = 5.0}
+[control]
+start_mode = "closed"
+gain = 0.3
+"""
+"""Configuration of a bright star and a wavefront that stands still, 8 nm of tilt and 5 nm of focus."""
 LOWFC = [sys.executable, "-m", "lowfc"]
 PROGRAMS = Path(sys.executable).parent
 

@@ -6,6 +6,8 @@ import numpy as np
 
 from lowfc.arrays import Mask, Single, single
 
+TIP_TILT = (2, 3)
+"""Noll indices of tip and tilt, which have gains and judgements of their own."""
 RELAXING = np.float32(0.99)
 """Part of its command that a mode keeps from frame to frame while its automatic gain is 0: nothing would correct what
 an earlier gain has put on the mirror."""

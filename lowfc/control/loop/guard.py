@@ -14,7 +14,7 @@ import numpy as np
 
 from lowfc.arrays import Array, Mask, Single
 from lowfc.control.laws import linear_law
-from lowfc.control.laws.law import Law, integrate
+from lowfc.control.laws.law import TIP_TILT, Law, integrate
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.loop.inputs import PendingEvent
 
@@ -38,7 +38,6 @@ AMPLIFIED = 2.5
 
 NAMES = ("tip and tilt", "the other modes")
 AGAIN = "again"
-_TILT = (2, 3)
 
 
 class Spans(NamedTuple):
@@ -136,7 +135,7 @@ class Guard(NamedTuple):
     @classmethod
     def of(cls, law: LinearLaw, groups: Sequence[Group] = ()) -> "Guard":
         """The guard of a law, with these groups or new ones."""
-        tilt = np.isin(law.noll, _TILT)
+        tilt = np.isin(law.noll, TIP_TILT)
         members = np.array([tilt, ~tilt], np.float32).T
         return cls(Spans.at(law.rate_hz), members, tuple(groups) or (Group(),) * len(NAMES), 0, np.zeros((3, 2)))
 

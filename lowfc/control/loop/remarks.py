@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from lowfc.arrays import Single
 from lowfc.control.laws.stability import LEAST_GAIN_MARGIN, LEAST_PHASE_MARGIN_DEG, LOWEST_GAIN, highest_gain
 from lowfc.control.loop.inputs import Request
 from lowfc.control.loop.state import ActiveLoop, Settings
@@ -35,6 +36,13 @@ def remark(settings: Settings, drive: ActiveLoop, request: Request) -> str:
             first = int(beyond[0])
             return f": above {reach_nm[first]:.3g} nm the stroke of {stroke_nm:g} nm limits mode {noll[first]} first"
     return ""
+
+
+def offset_remark(drive: ActiveLoop, offset_nm: Single) -> str:
+    """Remark on offsets (modes,) of modes that no gain lets follow; empty where there are none."""
+    fixed = (offset_nm != 0) & (drive.law.gain == 0) & ~drive.automatic & (drive.following is None)
+    names = ", ".join(f"Z{mode}" for mode, one in zip(drive.calibration.noll, fixed, strict=True) if one)
+    return f": {names} would not follow at a gain of 0" if names else ""
 
 
 def check_offset(drive: ActiveLoop, largest_nm: npt.NDArray[np.floating[Any]]) -> None:

@@ -17,7 +17,7 @@ from lowfc.control.loop.gains import changed_law, per_mode
 from lowfc.control.loop.inputs import Outputs, PendingEvent, Reply, Request
 from lowfc.control.loop.lease import ENDED_BY, Lease, asked_by, refusal
 from lowfc.control.loop.loading import holding, in_mode, loaded, misfit, mode_event, uncalibrated
-from lowfc.control.loop.remarks import check_offset
+from lowfc.control.loop.remarks import check_offset, offset_remark
 from lowfc.control.loop.reservation import lease, lease_checked, lease_ended, permit, release, renew
 from lowfc.control.loop.safety import Limits, LoopMode, Rejection, neighbour_difference_nm, request_mode
 from lowfc.control.loop.state import ActiveLoop, LawRunner, Settings, State
@@ -193,10 +193,8 @@ def _offset(settings: Settings, state: State, request: Request) -> Handled:
     values = per_mode(drive.calibration.noll, asked, added.offset_nm)
     check_offset(drive, np.abs(values))
     text = " ".join(f"{value:g}" for value in values.tolist())
-    fixed = (values != 0) & (drive.law.gain == 0) & ~drive.automatic & (drive.following is None)
-    names = ", ".join(f"Z{mode}" for mode, one in zip(drive.calibration.noll, fixed, strict=True) if one)
-    said = f": {names} would not follow at a gain of 0" if names else ""
-    return _with(state, drive, added._replace(offset_nm=values)), f"offset is now {text} nm{said}"
+    after = _with(state, drive, added._replace(offset_nm=values))
+    return after, f"offset is now {text} nm{offset_remark(drive, values)}"
 
 
 def _channel(settings: Settings, state: State, request: Request) -> Handled:

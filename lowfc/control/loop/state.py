@@ -12,7 +12,7 @@ from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.granted import granted_rows
 from lowfc.control.kernel.tables import NUMPY, Kernel
 from lowfc.control.laws import linear_law
-from lowfc.control.laws.law import Law
+from lowfc.control.laws.law import TIP_TILT, Law
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.stability import delay_weights
 from lowfc.control.loop.camera import CameraSettings
@@ -75,13 +75,13 @@ class Settings:
         """The law for these modes: the first figure of each pair for tip and tilt, the second for the rest."""
 
         def per_mode(pair: tuple[float, float]) -> Single:
-            return np.array([pair[0] if index in (2, 3) else pair[1] for index in noll], dtype=np.float32)
+            return np.array([pair[0] if index in TIP_TILT else pair[1] for index in noll], dtype=np.float32)
 
         return Law(per_mode(self.gain), per_mode(self.leak), per_mode(self.limit_nm))
 
     def automatic(self, noll: tuple[int, ...]) -> Mask:
         """The modes (modes,) whose gain is automatic to begin with."""
-        return np.array([self.auto_gain[index not in (2, 3)] for index in noll], dtype=bool)
+        return np.array([self.auto_gain[index not in TIP_TILT] for index in noll], dtype=bool)
 
 
 class LawRunner(NamedTuple):

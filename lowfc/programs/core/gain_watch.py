@@ -8,6 +8,7 @@ import numpy as np
 from lowfc.arrays import Array, Mask, Single
 from lowfc.control.calibration.granted import noise_covariance_nm2
 from lowfc.control.laws.automatic_gain import CONFIDENCE, GainBank, Verdict, injected, left_alone_nm2
+from lowfc.control.laws.law import TIP_TILT
 from lowfc.control.loop.inputs import COUNT_BITS, PendingEvent, Request, Step
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import ActiveLoop, Settings, State
@@ -27,7 +28,6 @@ CAUTIOUS = 0.05
 LEAST_FRAMES = 50
 """Of a window, however slow the loop."""
 REQUESTER = "automatic gains"
-TILT = (2, 3)
 
 
 class Remarks(NamedTuple):
@@ -43,12 +43,11 @@ NOTHING = Remarks()
 class _Group:
     """Modes that are judged together: tip and tilt, or the others."""
 
-    def __init__(self, mask: Mask, settings: Settings, drive: ActiveLoop, window_s: float) -> None:
+    def __init__(self, mask: Mask, tilt: Mask | None, settings: Settings, drive: ActiveLoop, window_s: float) -> None:
+        """Modes (modes,) of the group; and tip and tilt (modes,), where they are others and both there."""
         rate_hz = settings.rate_hz or 1.0
         frames = [max(round(seconds * rate_hz), LEAST_FRAMES) for seconds in (FIRST_S, window_s)]
-        tilt = np.isin(drive.calibration.noll, TILT)
-        self.mask = mask
-        self.tilt = tilt if tilt.sum() == len(TILT) and not (tilt & mask).any() else None
+        self.mask, self.tilt = mask, tilt
         self.bank = GainBank(
             1 - drive.law.leak[mask],
             drive.law.limit_nm[mask],
@@ -160,10 +159,11 @@ class GainWatch:
         if of == self._of:
             return
         self._of = of
-        tilt = np.isin(drive.calibration.noll, TILT)
+        tilt = np.isin(drive.calibration.noll, TIP_TILT)
+        both = tilt if tilt.sum() == len(TIP_TILT) else None
         self._groups = [
-            _Group(mask, self._settings, drive, window_s)
-            for mask, window_s in ((tilt, TILT_S), (~tilt, OTHERS_S))
+            _Group(mask, seen, self._settings, drive, window_s)
+            for mask, seen, window_s in ((tilt, None, TILT_S), (~tilt, both, OTHERS_S))
             if mask.any()
         ]
         self._light_was = 0.0

@@ -9,7 +9,7 @@ from lowfc.arrays import Single
 from lowfc.contract.configuration import Acceptance
 from lowfc.control.calibration.excitation import climb
 from lowfc.control.calibration.linearity import captured
-from lowfc.control.laws.law import Law
+from lowfc.control.laws.law import TIP_TILT, Law
 from lowfc.control.loop.safety import LoopMode
 from lowfc.optics.chain.zernike import mode_name
 from lowfc.programs.cli.result import figure
@@ -26,7 +26,6 @@ from lowfc.programs.commissioning.acceptance.played import (
 KIND: Kind = "capture-range"
 SIZES = (0.5, 1.0, 1.5)
 """Sizes that are played, as multiples of the one from which the loop must close."""
-_TILTS = (2, 3)
 
 
 class CaptureMode(ModeResult):
@@ -151,4 +150,4 @@ def draw(found: dict[str, Any], figure: Any) -> None:
 
 
 def _required_nm(required: Acceptance, noll: int) -> float:
-    return required.capture_tilt_nm if noll in _TILTS else required.capture_nm
+    return required.capture_tilt_nm if noll in TIP_TILT else required.capture_nm

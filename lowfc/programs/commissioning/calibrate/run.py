@@ -34,6 +34,7 @@ from lowfc.control.calibration.response_fit import (
     likeness,
     measured,
 )
+from lowfc.control.laws.law import TIP_TILT
 from lowfc.control.loop.wording import counted
 from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest, Pokes, checks
 from lowfc.programs.commissioning.calibrate.recording import Player, Report, check_size
@@ -154,7 +155,7 @@ class Calibrator:
     @property
     def _best(self) -> int:
         """Place of the mode that is measured best; tip and tilt, which are shaken most, only without others."""
-        tilt = np.array([index in (2, 3) for index in self.before.noll])
+        tilt = np.array([index in TIP_TILT for index in self.before.noll])
         return int(np.where(tilt & ~tilt.all(), np.inf, self.noise_nm).argmin())
 
     def delay(self) -> Delay:

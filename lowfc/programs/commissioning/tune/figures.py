@@ -7,6 +7,7 @@ import numpy as np
 from lowfc.arrays import Array
 from lowfc.control.laws import margins
 from lowfc.control.laws.continuous import Timing, spectrum_left
+from lowfc.control.laws.law import TIP_TILT
 from lowfc.control.laws.linear_law import LinearLaw, integrator
 from lowfc.control.laws.spectra import in_bins, spectrum
 from lowfc.control.laws.tuning import (
@@ -29,7 +30,6 @@ from lowfc.programs.commissioning.tune.data import Telemetry
 
 OPTICAL_GAIN_MAS = 10.0
 """Tilt of an open loop, rms per axis, above which the sensor shows less than there is."""
-TILTS = (2, 3)
 
 
 def tuned(run: Telemetry, controller: str) -> tuple[Tuned, Gains]:
@@ -220,7 +220,7 @@ def _lines(model: Model) -> list[dict[str, float]]:
 
 
 def _tilt_mas(run: Telemetry, rms_nm: Array | None) -> float | None:
-    tilts = np.isin(run.noll, TILTS)
+    tilts = np.isin(run.noll, TIP_TILT)
     if rms_nm is None or run.nm_per_mas is None or not tilts.any():
         return None
     return float(np.sqrt(np.mean(rms_nm[tilts] ** 2))) / run.nm_per_mas

@@ -16,7 +16,7 @@ from lowfc.contract.errors import CalibrationError, ConfigurationError
 from lowfc.contract.messages import MIRROR_STATE
 from lowfc.control.calibration.calibration import ESTIMATORS, Calibration, reconstructor
 from lowfc.control.laws.continuous import left_all_the_time_nm2
-from lowfc.control.laws.law import Law
+from lowfc.control.laws.law import TIP_TILT, Law
 from lowfc.control.laws.stability import limiting_gain
 from lowfc.control.laws.what_if import as_logged, counterfactual, rms
 from lowfc.control.loop.safety import Limit
@@ -25,7 +25,7 @@ from lowfc.optics.chain.zernike import mode_name
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.cli.contrast import added_contrast, sentence_of, with_variances
 from lowfc.programs.cli.result import table
-from lowfc.programs.logs.what_if.options import LAW_KEYS, TILTS, WhatIf, law
+from lowfc.programs.logs.what_if.options import LAW_KEYS, WhatIf, law
 from lowfc.programs.logs.what_if.run import LoggedRun
 
 LINEAR_WAVES = 5 * tilt_nm_per_mas(2.0) / 550
@@ -239,7 +239,7 @@ def _one(every: Law, row: int, suffix: str = "") -> dict[str, float]:
 
 def _tilt_mas(run: LoggedRun, columns: dict[str, Array]) -> dict[str, float]:
     """Tilt per axis on the sky; nothing where the telescope's diameter is unknown."""
-    tilts = np.isin(run.calibration.noll, TILTS)
+    tilts = np.isin(run.calibration.noll, TIP_TILT)
     if run.history.configuration is None or not tilts.any():
         return {}
     nm_per_mas = tilt_nm_per_mas(run.history.configuration.star.diameter_m)

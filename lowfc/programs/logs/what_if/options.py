@@ -15,10 +15,9 @@ from lowfc.arrays import Single
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import ConfigurationError, nearest
 from lowfc.control.calibration.calibration import ESTIMATORS
-from lowfc.control.laws.law import Law
+from lowfc.control.laws.law import TIP_TILT, Law
 from lowfc.control.laws.what_if import Controller
 
-TILTS = (2, 3)
 LAW_KEYS = ("gain", "leak", "limit_nm")
 KEYS = (*LAW_KEYS, *(f"tilt_{key}" for key in LAW_KEYS), "estimator")
 
@@ -98,7 +97,7 @@ def law(what: WhatIf, noll: tuple[int, ...], logged: Law) -> Law:
         ConfigurationError: a figure is out of range.
     """
     base = settings(what.config).law(noll) if what.config is not None else logged
-    tilts = np.isin(noll, TILTS)
+    tilts = np.isin(noll, TIP_TILT)
     changed = []
     for key in LAW_KEYS:
         values: Single = getattr(base, key).copy()

@@ -8,11 +8,11 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from lowfc.arrays import Long
+from lowfc.control.laws.law import TIP_TILT
 from lowfc.programs.view.draw.colours import BLUE, GREY, YELLOW
 from lowfc.programs.view.draw.pictures import Scale
 from lowfc.programs.view.draw.plots import at, words
 from lowfc.programs.view.panels.panel import Panel
-from lowfc.programs.view.panels.wavefront import TIP_TILT
 from lowfc.programs.view.snapshot import Snapshot
 
 TRAIL = "pointing/trail"

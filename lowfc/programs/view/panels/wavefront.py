@@ -6,6 +6,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from lowfc.arrays import Long, Whole
+from lowfc.control.laws.law import TIP_TILT
 from lowfc.optics.chain.zernike import mode_name, noll_to_nm
 from lowfc.programs.view.draw.colours import BLUE, GREEN, GREY, ORANGE, PINK, RED, YELLOW, distinct
 from lowfc.programs.view.draw.plots import Plot
@@ -21,7 +22,6 @@ MODES = (ERROR, POL, COMMAND, TRUTH)
 RMS = Plot("residual/rms", "Residual wavefront, nm rms", width=1.6)
 GROUPS = Plot("residual/groups", "Residual by group of modes, nm rms")
 TILT = Plot("pointing/tilt", "Residual tip and tilt, mas")
-TIP_TILT = (2, 3)
 
 _GROUPS = {1: "tip and tilt", 2: "focus, astigmatism", 3: "coma, trefoil", 4: "spherical to tetrafoil"}
 _GROUP_COLOURS = (YELLOW, BLUE, PINK, GREEN, RED)

@@ -23,6 +23,7 @@ from lowfc.contract.messages import (
     wire,
 )
 from lowfc.contract.printable import printable
+from lowfc.control.laws.law import TIP_TILT
 from lowfc.control.loop.estimator import saturated_pixels
 from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.launch.watch import topic_count
@@ -291,7 +292,7 @@ def _rate_hz(samples: list[_Sample]) -> float | None:
 def _squares(snapshot: Snapshot, waves: Waves) -> Array:
     """Count of rows, and the sums of squares of `Rms`; tip and tilt where the calibration is for so many modes."""
     noll = snapshot.calibration.noll if snapshot.calibration is not None else ()
-    tilts = [place for place, index in enumerate(noll) if index in (2, 3) and len(noll) == waves.left_nm.shape[1]]
+    tilts = [place for place, index in enumerate(noll) if index in TIP_TILT and len(noll) == waves.left_nm.shape[1]]
     tilt_nm2 = [
         np.square(one[:, tilts], dtype=float).sum() / max(1, len(tilts))
         for one in (waves.left_rms_nm, waves.open_rms_nm)
