@@ -8,7 +8,9 @@ from typing import Annotated
 import typer
 
 from lowfc.adapters.process.terminal import DEFAULT_RUN, ConfigFile, Json, RunId, configuration
-from lowfc.contract.errors import ConfigurationError
+from lowfc.contract.errors import BusError, ConfigurationError
+
+_PATIENCE_S = 30.0
 
 
 def controller(
@@ -17,6 +19,9 @@ def controller(
     calibration: Annotated[
         Path | None,
         typer.Option(help="Calibration file (FITS), or none; default: computed from the configuration."),
+    ] = None,
+    wait_for: Annotated[
+        list[str] | None, typer.Option(help="Process that must not miss how the loop begins; repeat.")
     ] = None,
 ) -> None:
     """Run the controller: frames from the bus, commands to it.
@@ -49,6 +54,10 @@ def controller(
         with Console(stderr=True).status("compiling the fused step"):
             compiled.kernel(FUSED)
     service = join(settings, run, Role.CONTROLLER, settings.realtime.controller_cpus)
+    if missing := service.wait_for(wait_for or (), _PATIENCE_S):
+        raise BusError(
+            f"no sign of {', '.join(missing)} after {_PATIENCE_S:g} s; the controller will not start without"
+        )
     source = calibration.name if calibration is not None else "the configuration"
     latch = Latch(
         latch_files(open_run(run, (settings.mirror.name,))), lambda why: service.event("LATCH_FAILED", why=why)

@@ -118,9 +118,10 @@ def children_of(config: Configuration, run: Run, duration_s: float | None, recor
     camera = ["-m", "sim_camera", *shared, *(word for name in awaited for word in ("--wait-for", str(name)))]
     if duration_s is not None:
         camera += ["--frames", str(max(1, math.ceil(duration_s * config.camera.rate_hz)))]
+    whole = ["--wait-for", str(Role.RECORDER)] if record and config.lockstep else []  # all logs of a seed begin alike
     commands = {
         str(Role.CAMERA): camera,
-        str(Role.CONTROLLER): ["-m", "lowfc", "controller", *shared, *calibration],
+        str(Role.CONTROLLER): ["-m", "lowfc", "controller", *shared, *calibration, *whole],
         mirror: ["-m", "sim_dm", *shared],
     }
     if record:
