@@ -5,25 +5,22 @@ import io
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
-from lowfc.adapters.files import factory
 from lowfc.client import Answer, mirror_watch
 from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
 from lowfc.contract.errors import BusError, CalibrationError, DataFileError
 from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import EVENT, wire
-from lowfc.control.calibration.calibration import Calibration, normalise_flux
+from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.response_fit import Initial, Sums, cross_talk
-from lowfc.optics.twin.twin import reference, response
-from lowfc.optics.twin.twin_mirror import wavefront_nm
 from lowfc.programs.commissioning.calibrate import recording
 from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest
-from lowfc.programs.commissioning.calibrate.result import Verdict, computed_noise_nm, judge, measured_calibration
+from lowfc.programs.commissioning.calibrate.result import measured_calibration
 from lowfc.programs.commissioning.calibrate.run import CalibrationData, Calibrator, go_on, keep, partial_of
 from tests.support.folded_loop import FoldedLoop
 
@@ -336,110 +333,3 @@ def test_a_mirror_that_died_ends_the_calibration(monkeypatch: pytest.MonkeyPatch
         calibrator.run()
     assert said[-1].startswith("a cycle is repeated: the mirror has reported no command as followed for 101 frames")
     assert go_on(partial_of(OUT), {"method": "hadamard"}).cycles == 1
-
-
-STILL = ("quiet", "thermal", "bench", "step", "kolmogorov")
-SHAKEN = "reaction-wheel"
-"""34 nm of tilt under pokes of some nm: a signal-to-noise ratio of 30 is out of reach."""
-SEEDS = 20
-BLOCK = 5
-
-
-class Outcome(NamedTuple):
-    """A calibration beside the truth."""
-
-    talk: np.ndarray
-    noise_ratio: np.ndarray
-    verdict: Verdict
-
-
-def response_there(loop: FoldedLoop, begun: int, *, closed: bool) -> np.ndarray:
-    """The analytic H (pixels, modes) of the commands, mean over where the wavefront was since; pokes do not count."""
-    before, config, scene = loop.calibration(), loop.config, loop.scene
-    optics = factory.twin(config, None, lambda _: None)
-    mirror = factory.mirror_on_twin(config, optics, lambda _: None)
-    still = scene._screen + wavefront_nm(mirror, np.mean(loop.surfaces_nm[begun:], axis=0).astype(np.float32))
-    moving = (
-        [0.0]
-        if closed
-        else [scene._sampler.at(i)[0] @ scene._basis for i in np.linspace(0, len(loop.surfaces_nm), 32).astype(int)]
-    )
-    shapes = np.array(
-        [wavefront_nm(mirror, each.reshape(before.grid)) for each in before.modes_to_actuators.T], dtype=np.float64
-    )
-    good, found = before.good.astype(np.float64), []
-    for opd_nm in (np.asarray(still + each, dtype=np.float64) for each in moving):
-        light = reference(optics, opd_nm).reshape(-1)
-        found.append(normalise_flux(light, response(optics, shapes, opd_nm), good)[1])
-    return np.mean(found, axis=0)
-
-
-def outcome(method: str, preset: str, seed: int, snr: float, folder: Path, cycles: int | None = None) -> Outcome:
-    config = load(None, {"disturbance.preset": preset, "seed": seed})
-    loop = FoldedLoop(config)
-    before = loop.calibration()
-    if method == "in-loop":
-        loop.close_loop()
-        loop.run(200)
-    begun = len(loop.surfaces_nm)
-    wanted = CalibrationRequest(method, folder / "night.fits", snr, cycles)
-    calibrator = Calibrator(loop, wanted, lambda _: None, lambda *_: None, before)
-    with calibrator.holding():
-        taken = calibrator.run()
-        made, _ = measured_calibration(config, before, taken.measured, wanted)
-        check = calibrator.check(made, taken)
-    computed = computed_noise_nm(config, made, before)
-    assert computed is not None
-    ratio = factory.frame_noise_nm(config, made) / computed
-    verdict = judge(snr, taken.measured.cycles, taken.measured.error, check, ratio, made.noll)
-    there = response_there(loop, begun, closed=method == "in-loop")
-    return Outcome(cross_talk(made.reconstructor, there), ratio, verdict)
-
-
-def assert_kept(found: Outcome, snr: float) -> None:
-    rms, largest = np.sqrt((found.talk**2).mean()), np.abs(found.talk).max()
-    assert (rms * snr, largest * snr) < (1.2, np.inf)
-    assert largest * snr < 4
-    assert found.noise_ratio.max() < 1.5
-
-
-@pytest.mark.parametrize(("method", "preset"), [("hadamard", "bench"), ("in-loop", "bench")])
-def test_a_few_cycles_keep_the_promise(method: str, preset: str, tmp_path: Path) -> None:
-    found = outcome(method, preset, 1, 20.0, tmp_path)
-    assert not found.verdict.faults
-    assert_kept(found, 20.0)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(1200)
-@pytest.mark.parametrize("first", range(1, SEEDS + 1, BLOCK))
-@pytest.mark.parametrize("preset", STILL)
-@pytest.mark.parametrize("method", ["hadamard", "poke", "in-loop"])
-def test_the_promise_is_kept(method: str, preset: str, first: int, tmp_path: Path) -> None:
-    for seed in range(first, first + BLOCK):
-        found = outcome(method, preset, seed, 30.0, tmp_path)
-        assert not found.verdict.faults
-        assert_kept(found, 30.0)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(1200)
-@pytest.mark.parametrize("snr", [70.0, 71.0])
-def test_the_promise_is_kept_at_the_default_and_with_halved_amplitudes(snr: float, tmp_path: Path) -> None:
-    found = outcome("hadamard", "bench", 1, snr, tmp_path)
-    assert not found.verdict.faults
-    assert_kept(found, snr)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2])
-def test_where_the_promise_is_out_of_reach_it_is_said(seed: int, tmp_path: Path) -> None:
-    found = outcome("hadamard", SHAKEN, seed, 30.0, tmp_path)
-    assert found.verdict.snr_reached < 30
-    assert "was to be reached: find what shakes this mode, or take about" in found.verdict.faults[0]
-
-
-@pytest.mark.slow
-def test_where_not_even_a_poke_is_seen_it_is_said(tmp_path: Path) -> None:
-    with pytest.raises(CalibrationError, match="too small for what shakes the wavefront"):
-        outcome("hadamard", SHAKEN, 3, 30.0, tmp_path)

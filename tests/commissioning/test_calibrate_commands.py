@@ -163,6 +163,15 @@ def test_without_a_terminal_a_line_every_10_s() -> None:
     assert len(said) == 4
 
 
+def test_what_comes_before_the_first_cycle_does_not_lengthen_the_time_to_go() -> None:
+    said, times = list[str](), iter([0.0, 7.0, 10.0, 13.0])
+    count = spoken(said.append, lambda: next(times))
+    count("looking for pokes", 400, 1000)
+    for done in (400, 500, 600):
+        count("hadamard cycle", done, 1000)
+    assert said == ["hadamard cycle: 50%, about 15 s to go"]
+
+
 def test_the_reference_is_the_present_state(loop: FoldedLoop) -> None:
     found = told("reference", "--frames", "200", "--out", "there.fits")
     shift = dict(zip(found["noll"], found["reference_shift_nm"], strict=True))

@@ -64,8 +64,9 @@ def spoken(say: Callable[[str], None], clock: Callable[[], float] = time.monoton
         nonlocal spoken_at
         now = clock()
         if not first:
-            first.append((now, done))
             spoken_at = now
+        if not first or done == first[0][1]:  # what comes before the first of it is no measure of its rate
+            first[:] = [(now, done)]
         begun, before = first[0]
         if now - spoken_at >= _EVERY_S and done > before:
             spoken_at = now

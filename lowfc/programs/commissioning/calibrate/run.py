@@ -69,10 +69,11 @@ class Calibrator:
         progress: Counted,
         computed: Calibration | None = None,
     ) -> None:
-        """Ask the controller what it has.
+        """Ask the controller what it has, and read the cycles to go on from.
 
         Raises:
             CalibrationError: the frames have another size than the calibration in use.
+            DataFileError: there is nothing to go on from.
 
         Args:
             loop: A connection to it.
@@ -94,7 +95,13 @@ class Calibrator:
         self.pokes = Pokes(self.config, self.before, self.noise_nm, request)
         self._progress = progress
         self._player = Player(loop, self.before, report, self._closed)
-        self.kept = 0
+        self._what: dict[str, Any] = {
+            "method": request.method,
+            "amplitude_nm": self.pokes.amplitude_nm,
+            "calibration": self.before.id,
+        }
+        self._begun = go_on(partial_of(request.out), self._what) if request.resume else None
+        self.kept = self._begun.cycles if self._begun else 0
 
     @contextlib.contextmanager
     def holding(self) -> Iterator[None]:
@@ -166,7 +173,7 @@ class Calibrator:
         """
         mode = self._best
         plan = self.pokes.delay(mode)
-        self._show("looking for pokes", self.pokes.cycles(), 0)
+        self._show("looking for pokes", max(self.pokes.cycles(), self.kept), self.kept)
         found = self._player.first_poke(mode, plan)
         self._compare_picture(found.picture, mode)
         self._report(
@@ -192,18 +199,12 @@ class Calibrator:
 
     def _cycles(self, delay: Delay) -> Measured:
         pokes, request = self.pokes, self._request
-        what: dict[str, Any] = {
-            "method": request.method,
-            "amplitude_nm": pokes.amplitude_nm,
-            "calibration": self.before.id,
-        }
         path = partial_of(request.out)
-        if request.resume:
-            sums = go_on(path, what)
-            self.kept = sums.cycles
-            self._report(f"going on after {counted(sums.cycles, 'cycle')}")
-        else:
+        if self._begun is None:
             sums = Sums.none(self._initial(delay))
+        else:
+            sums = self._begun
+            self._report(f"going on after {counted(sums.cycles, 'cycle')}")
         needed = max(pokes.cycles(), sums.cycles)
         self._report(
             f"{needed} cycles of {len(pokes.cycle(0))} frames and {checks(needed)} to check them; "
@@ -214,7 +215,7 @@ class Calibrator:
                 done = sums.cycles
                 self._show(f"{request.method} cycle {done + 1} of {needed}", needed, done)
                 sums = sums.plus(self._player.cycle(pokes.cycle(done), delay.delay_frames))
-                keep(path, sums, what)
+                keep(path, sums, self._what)
                 self.kept = sums.cycles
             found = measured(sums)
             more = pokes.more_cycles(needed, float(found.error.max()))
