@@ -3,7 +3,10 @@
 import ast
 from collections.abc import Callable, Iterable
 from functools import partial
+from importlib import import_module
 from importlib.resources import files
+from pkgutil import walk_packages
+from typing import Any, get_args
 
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
@@ -26,6 +29,8 @@ from lowfc.programs.console.actions import ACTIONS, SAFE
 from tools import continuous
 from tools.shared import ROOT, markdown
 
+API = ("client", "device", "optics", "design", "control")
+"""Packages of the Python API."""
 _MESSAGES = 4  # numbers of the fields of the descriptors, which the places of comments are made of
 _FIELDS = 2
 _TAKEOVER = (
@@ -78,6 +83,24 @@ def packages() -> str:
         text = ast.get_docstring(ast.parse(path.read_text())) or ""
         rows.append((f"`{'.'.join(path.relative_to(ROOT).parent.parts)}`", text.splitlines()[0]))
     return markdown(("package", "holds"), rows)
+
+
+def offered(package: str) -> str:
+    """The names that a package of the Python API offers, or its modules, each with its first sentence."""
+    top = import_module(package)
+    if hasattr(top, "__all__"):
+        found = [(name, _about(getattr(top, name))) for name in top.__all__]
+    else:
+        modules = [one.name for one in walk_packages(top.__path__, f"{package}.") if not one.ispkg]
+        found = [(name, import_module(name).__doc__) for name in modules]
+    rows = ((f"`{name}`", sentence((text or "").split("\n\n")[0])) for name, text in found)
+    return markdown(("name", ""), rows)
+
+
+def _about(value: Any) -> str | None:
+    """Docstring of a class or a function, or what an array's type is."""
+    types = get_args(value)
+    return f"numpy array of {get_args(types[1])[0].__name__}" if types else value.__doc__
 
 
 def limits(rows: Iterable[tuple[str, *tuple[float, ...]]]) -> str:
@@ -155,5 +178,6 @@ DECLARED: dict[str, Callable[[], str]] = {
     "mirror topics": partial(topics, Role.MIRROR, COMMAND, MIRROR_STATE, SURFACE),
     **{name: partial(fields, name) for name in ("CameraState", "MirrorCommand", "MirrorState")},
     "agreement": agreement,
+    **{f"names {one}": partial(offered, f"lowfc.{one}") for one in API},
 }
 """The tables by the names that the pages call them."""

@@ -26,7 +26,7 @@ from lowfc.contract.wire import lowfc_pb2
 from lowfc.programs.cli.main import app
 from lowfc.programs.cli.result import Result
 from tools.advice import ADVICE, REASONS
-from tools.declared import fields, sentence
+from tools.declared import API, fields, sentence
 from tools.shared import markdown
 
 _BUILT = re.compile(r"^<!-- built: (.+?) -->$", re.MULTILINE)
@@ -204,6 +204,6 @@ BUILT: dict[str, Callable[[], str]] = {
     "events that tell": partial(events, Level.INFO),
     "reasons": reasons,
     "former names": upgrade,
-    **{f"api {one}": partial(api, f"lowfc.{one}") for one in ("client", "device", "optics", "design", "control")},
+    **{f"api {one}": partial(api, f"lowfc.{one}") for one in API},
 }
 """The parts by the names that the pages call them."""
