@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from google.protobuf.message import DecodeError
+from pydantic import Field
 
 from lowfc.adapters.bus.bus import Publisher, Sample
 from lowfc.adapters.files import factory
@@ -105,6 +106,13 @@ def ignore(warning: str) -> None:
     """The launcher has told the user."""
 
 
+def _middle(name: str, size: int, of: int) -> tuple[int, int]:
+    """First and number of the rows or columns that are read."""
+    if size > of:
+        raise ConfigurationError(f"options of the simulated camera: {name} is {size}, the sensor has {of}")
+    return ((of - size) // 2, size) if size else (0, of)
+
+
 class _Exposed(NamedTuple):
     """A frame: its number, -1 before the first, its sequence, and the mirror at the exposure's start."""
 
@@ -119,18 +127,30 @@ class SimulatedCamera:
     """The optics, the star and the detector of a configuration, exposed frame after frame."""
 
     class Options(DriverOptions):
-        """Of tests."""
+        """Region that is read, and what tests need."""
 
+        rows: int = Field(0, ge=0)
+        """Rows of the region in the middle that is read; 0 for all."""
+        columns: int = Field(0, ge=0)
+        """Columns of the region in the middle that is read; 0 for all."""
         fault: str = ""
         """File (JSON) of a fault that befalls the frames; empty for none."""
 
     def __init__(self, options: Options, config: Configuration, optics: Scene | None = None) -> None:
-        """Build the optics, or take those that are given."""
+        """Build the optics, or take those that are given.
+
+        Raises:
+            ConfigurationError: the region is larger than the sensor.
+        """
         self._config = config
         self._scene = scene(config) if optics is None else optics
+        row, rows = _middle("rows", options.rows, self._scene.shape[0])
+        column, columns = _middle("columns", options.columns, self._scene.shape[1])
+        self._region = np.s_[row : row + rows, column : column + columns]
         self._contrast: Contrast | None = None
         self._fault = read_fault(Path(options.fault)) if options.fault else None
-        self._settings = replace(CameraSettings.configured(config, *self._scene.shape), clock="run")
+        configured = CameraSettings.configured(config, rows, columns)
+        self._settings = replace(configured, clock="run", region_row=row, region_column=column)
         self._weights = delay_weights(config.camera.delay_frames).astype(np.float32)
         flat = np.zeros((config.mirror.rows, config.mirror.columns), np.float32)
         self._shapes = deque([flat] * len(self._weights), maxlen=len(self._weights))
@@ -194,7 +214,7 @@ class SimulatedCamera:
         seen = self._latched
         if len(self._weights) > 1:
             seen = np.tensordot(self._weights, np.array(self._shapes), 1)
-        frame = self._scene.expose(self._index, seen)
+        frame = np.ascontiguousarray(self._scene.expose(self._index, seen)[self._region])
         end_ns = start_ns + self._config.exposure_ns
         self._exposing = _Exposed(self._index, start_ns, end_ns, 0, seen)
         self._index += 1

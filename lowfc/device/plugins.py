@@ -6,7 +6,7 @@ import tomllib
 from collections.abc import Sequence
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from pydantic import ValidationError
 
@@ -133,6 +133,18 @@ def options(driver: Any, found: dict[str, Any], words: Sequence[str] = ()) -> Dr
     if faults:
         raise ConfigurationError("\n".join(f"options of {driver.__name__}: {_explained(one, model)}" for one in faults))
     return made
+
+
+def options_help(driver: Any) -> list[tuple[str, str]]:
+    """Options of a driver's class on the command line, each with its sentence."""
+    found = []
+    for key, info in getattr(driver, "Options", DriverOptions).model_fields.items():
+        words = [str(word) for word in get_args(info.annotation) if isinstance(word, str)]
+        kind = "|".join(words) or getattr(info.annotation, "__name__", str(info.annotation)).removesuffix(" | None")
+        default = "required" if info.is_required() else f"default: {info.get_default(call_default_factory=True)}"
+        shown = "" if default.endswith((": ", "None")) else f"  [{default}]"
+        found.append((f"--{key.replace('_', '-')} <{kind}>", f"{info.description or ''}{shown}"))
+    return found
 
 
 def _explained(fault: Any, model: type[DriverOptions]) -> str:

@@ -1,9 +1,11 @@
 """A driver's process: how it joins a run, and its command line."""
 
+from collections.abc import Sequence
 from contextlib import closing
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 from lowfc.adapters.bus.run import mirror_role
 from lowfc.adapters.process.join import join
@@ -12,7 +14,30 @@ from lowfc.contract.messages import Role
 from lowfc.device.camera_loop import CameraLoop
 from lowfc.device.driver import Camera, Mirror
 from lowfc.device.mirror_loop import MirrorLoop
+from lowfc.device.plugins import Kind, load, options_help
 from lowfc.device.watch import opening
+
+
+def command_of(kind: Kind, name: str | None = None) -> type[TyperCommand]:
+    """A command whose help lists its driver's own options: of the driver of this name, or of the argument `driver`."""
+
+    class WithOptions(TyperCommand):
+        words: Sequence[str] = ()
+
+        def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+            self.words = tuple(args)
+            return super().parse_args(ctx, args)
+
+        def format_options(self, ctx: Any, formatter: Any) -> None:
+            super().format_options(ctx, formatter)
+            driver = name or self.make_parser(ctx).parse_args([*self.words])[0].get("driver")
+            rows = options_help(load(kind, driver)) if driver else []
+            if rows:
+                with formatter.section(f"Options of the driver {driver}"):
+                    formatter.write_dl(rows)
+
+    return WithOptions
+
 
 PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
 """Settings of a command that leaves words to the driver: its options."""

@@ -28,6 +28,7 @@ from lowfc.programs.commissioning.doctor.devices import device_checks
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.listener import Listener
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
+from tests.support.loops import lowfc
 
 GRID = (4, 5)
 CONFIG = load(None, {"mirror.rows": GRID[0], "mirror.columns": GRID[1]})
@@ -168,6 +169,34 @@ def test_an_option_that_is_missing_says_how_to_give_it() -> None:
 
     with pytest.raises(ConfigurationError, match=r"frame_rows is missing: --frame-rows VALUE, or frame_rows in"):
         plugins.options(type("Camera", (), {"Options": Sized}), {})
+
+
+OWN = '''
+from lowfc.device import DriverOptions
+
+class Own:
+    class Options(DriverOptions):
+        peak_dn: int = 8000
+        """Brightest pixel."""
+        serial: str
+        wait_s: float | None = None
+
+    settings = expose = apply = close = None
+'''
+
+
+@pytest.mark.parametrize("kind", ["camera", "mirror"])
+def test_the_help_of_a_driver_lists_its_own_options(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    (tmp_path / "own_driver.py").write_text(OWN)
+    words = [kind, "--run", "bench", f"{tmp_path}/own_driver.py:Own", "--help"]
+    *_, heading, peak, serial, wait = lowfc(*words).output.rstrip().splitlines()
+    assert heading == f"Options of the driver {words[3]}:"
+    assert " ".join(peak.split()) == "--peak-dn <int> Brightest pixel. [default: 8000]"
+    assert serial.split() == ["--serial", "<str>", "[required]"]
+    assert wait.split() == ["--wait-s", "<float>"]
+    assert "Options of the driver" not in lowfc(kind, "--help").output
+    assert "--rows <int>" in lowfc("camera", "sim", "-h").output
 
 
 def test_a_driver_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:

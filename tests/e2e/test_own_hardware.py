@@ -179,13 +179,36 @@ def closed(folder: Path) -> bool:
     return process.returncode == 0
 
 
+OWN_CAMERA = """
+from dataclasses import replace
+
+from camera import MyCamera
+
+
+class SmallCamera(MyCamera):
+    def settings(self):
+        return replace(super().settings(), rows=64, columns=64, bit_depth=14, saturation_dn=None)
+
+    def expose(self):
+        exposure = super().expose()
+        return exposure._replace(pixels=exposure.pixels[8:-8, 8:-8])
+"""
+
+
 @pytest.mark.slow
-def test_a_camera_of_another_size_comes_to_a_closed_loop(bench: Path) -> None:
-    """docs/howto/commissioning.md, as it stands: a camera of 64 x 64 pixels at 100 Hz with 14 bits."""
+@pytest.mark.parametrize("own", [False, True])
+def test_a_camera_of_another_size_comes_to_a_closed_loop(bench: Path, own: bool) -> None:
+    """docs/howto/commissioning.md, as it stands and with drivers of one's own: 64 x 64 pixels, 100 Hz, 14 bits."""
     assert len(COMMISSIONING) == 5
-    (bench / "examples/small_camera.py").write_text(block("python"))
     (bench / "bench.toml").write_text(block("toml"))
-    with going_on(bench, *PAGE_DEVICES, CONTROLLER):
+    devices = PAGE_DEVICES
+    if own:
+        (bench / "examples/small_camera.py").write_text(OWN_CAMERA)
+        sim = "lowfc mirror sim", "lowfc camera sim --rows 64 --columns 64"
+        drivers = "lowfc mirror examples/mirror.py:MyMirror", "lowfc camera examples/small_camera.py:SmallCamera"
+        devices = [line.replace(a, b) for line, a, b in zip(devices, sim, drivers, strict=True)]
+        assert not any(" sim " in line for line in devices)
+    with going_on(bench, *devices, CONTROLLER):
         with listening() as bus:
             heard(bus)
         process = started(bench, f"{COMMISSION} --json")
@@ -201,5 +224,5 @@ def test_a_camera_of_another_size_comes_to_a_closed_loop(bench: Path) -> None:
             state = client.status().state
             assert state.mode_cause == "asked to close for lowfc commission"
         assert calibration_file.load(bench / "calibration.fits").shape == (64, 64)
-    with going_on(bench, *PAGE_DEVICES, LATER):
+    with going_on(bench, *devices, LATER):
         until(lambda: closed(bench), 60)

@@ -8,6 +8,7 @@ import pytest
 
 from lowfc.adapters.process.service import Service
 from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.messages import EVENT, MIRROR_STATE, Log, wire
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
@@ -115,3 +116,20 @@ def test_the_camera_reports_the_habit_each_time() -> None:
     said = [event.split()[0] for event in events if event.startswith("COMMANDS_")]
     assert said == ["COMMANDS_LATE", "COMMANDS_IN_TIME", "COMMANDS_LATE"]
     assert camera._lateness.total == 4 * WINDOW
+
+
+def test_the_middle_of_the_sensor_is_read() -> None:
+    pixels = np.arange(80 * 80, dtype=np.uint16).reshape(80, 80)
+    optics = cast("Scene", SimpleNamespace(shape=(80, 80), instants=(), expose=lambda index, shape: pixels))
+    options = SimulatedCamera.Options(rows=64, columns=50)
+    camera, clock = SimulatedCamera(options, Configuration(), optics), FakeClock()
+    settings = camera.settings()
+    region = settings.region_row, settings.rows, settings.region_column, settings.columns
+    assert region == (8, 64, 15, 50)
+    camera.join(Service("camera", "night", clock, MemoryBus(MemoryHub(), "camera", clock)))
+    camera.start()
+    exposure = camera.expose()
+    assert exposure is not None
+    assert np.array_equal(exposure.pixels, pixels[8:72, 15:65])
+    with pytest.raises(ConfigurationError, match="rows is 81, the sensor has 80"):
+        SimulatedCamera(SimulatedCamera.Options(rows=81), Configuration(), optics)

@@ -7,7 +7,7 @@ import typer
 from lowfc.adapters.process.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, new_app
 from lowfc.device import run_camera, run_mirror
 from lowfc.device.plugins import opened
-from lowfc.device.run import PASSED_ON, Frames, WaitFor
+from lowfc.device.run import PASSED_ON, Frames, WaitFor, command_of
 
 _DRIVER = "Name of an installed driver, module:Class or file.py:Class."
 Driver = Annotated[str, typer.Argument(help=_DRIVER, show_default=False)]
@@ -16,7 +16,7 @@ camera_app = new_app("")
 mirror_app = new_app("")
 
 
-@camera_app.command(context_settings=PASSED_ON)
+@camera_app.command(cls=command_of("camera"), context_settings=PASSED_ON)
 def camera(
     context: typer.Context,
     driver: Driver,
@@ -28,6 +28,7 @@ def camera(
     """Run a camera: its driver's frames and settings go to the run.
 
     The driver's own options are in [drivers.DRIVER] of the configuration; `--name value` here takes precedence.
+    `lowfc camera DRIVER --help` lists them.
 
     Example: lowfc camera sim --run bench --config lowfc.toml
     """
@@ -36,11 +37,12 @@ def camera(
     run_camera(found, settings, run, frames, tuple(wait_for or ()))
 
 
-@mirror_app.command(context_settings=PASSED_ON)
+@mirror_app.command(cls=command_of("mirror"), context_settings=PASSED_ON)
 def mirror(context: typer.Context, driver: Driver, run: RunId = DEFAULT_RUN, config: ConfigFile = None) -> None:
     """Run a mirror: its driver follows the commands of the run, within the mirror's own limits.
 
     The driver's own options are in [drivers.DRIVER] of the configuration; `--name value` here takes precedence.
+    `lowfc mirror DRIVER --help` lists them.
 
     Example: lowfc mirror sim --run bench --config lowfc.toml
     """
