@@ -450,7 +450,7 @@ def test_a_forged_command_and_another_host_are_named(tmp_path: Path, monkeypatch
     done = lowfc("replay", forged)
     assert done.exit_code == 1
     for words in (
-        f"{STEPS} frames, 1 messages differ",
+        f"{STEPS} frames, 1 message differs",
         "first difference   MirrorCommand of frame 700 ",
         "actuators: [13] log",
         "numpy              1.0 in the log",

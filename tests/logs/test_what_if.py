@@ -227,7 +227,7 @@ def test_frames_that_are_not_in_the_log_are_counted(logs: dict[str, Path], monke
     monkeypatch.setattr(run, "measured_again", lambda *_: found)
     figures = compared(run, requested("estimator=pinv"))
     assert figures["frames_compared"] == FRAMES - 1000 - 20
-    assert "20 frames that were used are not in the log" in figures["warnings"][0]
+    assert "the log lacks 20 frames that were used" in figures["warnings"][0]
 
 
 def test_modes_of_another_size_shape_the_mirror_alike(logs: dict[str, Path], tmp_path: Path) -> None:

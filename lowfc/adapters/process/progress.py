@@ -57,18 +57,17 @@ def spoken(say: Callable[[str], None], clock: Callable[[], float] = time.monoton
         say: What prints a line.
         clock: Seconds.
     """
-    first: list[tuple[float, int]] = []  # clock and count
-    spoken_at = -inf
+    before = -1
+    begun = spoken_at = -inf
 
     def count(what: str, done: int, total: int) -> None:
-        nonlocal spoken_at
+        nonlocal before, begun, spoken_at
         now = clock()
-        if not first:
-            spoken_at = now
-        if not first or done == first[0][1]:  # what comes before the first of it is no measure of its rate
-            first[:] = [(now, done)]
-        begun, before = first[0]
-        if now - spoken_at >= _EVERY_S and done > before:
+        if before < 0:
+            before, spoken_at = done, now
+        if done == before:  # the time until then is no measure of the rate
+            begun = now
+        elif now - spoken_at >= _EVERY_S:
             spoken_at = now
             seconds = (now - begun) / (done - before) * (total - done)
             say(f"{what}: {done / total:.0%}, about {seconds:.0f} s to go")

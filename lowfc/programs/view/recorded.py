@@ -11,6 +11,7 @@ from lowfc.adapters.process.clock import SimulatedClock
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import topic_of
+from lowfc.control.loop.wording import counted
 from lowfc.programs.view.renderer import Renderer
 from lowfc.programs.view.snapshot import PICTURES_HZ, PICTURES_PER_COMPLETE, SHOWN, Accumulator, LogEnd
 
@@ -90,6 +91,6 @@ def draw_logs(
     ended = LogEnd(logs[-1].name.partition(".")[0], complete, run, host, no_end(logs, finished=complete))
     renderer.draw(accumulator.snapshot(last_ns, ended=ended))
     if accumulator.unreadable:
-        drawn.remarks.append(f"{accumulator.unreadable} messages could not be read")
+        drawn.remarks.append(f"{counted(accumulator.unreadable, 'message')} could not be read")
     drawn.log_s = (last_ns - first_ns) * 1e-9
     return drawn

@@ -15,6 +15,7 @@ from lowfc.control.laws.stability import delay_weights
 from lowfc.control.laws.transfer_function import Departure, Lines, departure, measured, seen_of_mirror
 from lowfc.control.loop.command_channels import MIRROR, OFFSET
 from lowfc.control.loop.safety import LoopMode
+from lowfc.control.loop.wording import counted
 from lowfc.optics.chain.zernike import mode_name
 from lowfc.programs.cli.result import Result, figure
 from lowfc.programs.commissioning.acceptance.live import Live
@@ -98,7 +99,7 @@ class RejectionResult(AcceptanceResult):
         if any(mode.too_noisy for mode in self.modes):
             lines.append("a longer --duration, a larger --rms-nm or fewer --modes make it more certain")
         if self.frames_missing:
-            lines.append(f"{self.frames_missing} frames are missing, or were refused, and are interpolated")
+            lines.append(f"interpolated: {counted(self.frames_missing, 'frame')}, missing or refused")
         return [*lines, *super().remarks()]
 
 

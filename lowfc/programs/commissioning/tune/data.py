@@ -23,6 +23,7 @@ from lowfc.control.laws.spectra import Pieces, pieces
 from lowfc.control.laws.vibration import FEWEST
 from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import LoopMode
+from lowfc.control.loop.wording import counted
 from lowfc.optics.chain.added_contrast import ModalContrast
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.logs.what_if.run import LoggedRun
@@ -149,7 +150,7 @@ def of_run(loop: Client, seconds: float, progress: Callable[[float], None] | Non
         None,
         config,
         calibration,
-        [f"{stream.lost} steps did not get here in time"] if stream.lost else [],
+        [f"{counted(stream.lost, 'step')} did not get here in time"] if stream.lost else [],
     )
 
 

@@ -63,10 +63,11 @@ def render(figures: dict[str, Any]) -> str:
     elif not figures["different"]:
         verdict = f"{frames} frames, steps identical, but no command is in the log"
     else:
-        verdict = f"{frames} frames, {figures['different']} messages differ"
+        verdict = f"{frames} frames, {counted(figures['different'], 'message differs', 'messages differ')}"
     lines = [
         f"{verdict}, largest difference {largest_nm:.3g} nm",
-        f"compared too       {figures['commands']} commands, {figures['states']} states, {figures['requests']} answers",
+        f"compared too       {counted(figures['commands'], 'command')}, {counted(figures['states'], 'state')}, "
+        f"{counted(figures['requests'], 'answer')}",
     ]
     for rule, count in figures["rules_changed"].items():
         lines.append(f"answered otherwise {count} since {figures['version']}: {rule}")

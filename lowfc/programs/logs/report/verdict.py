@@ -105,8 +105,8 @@ def _delay(figures: Figures) -> Figures:
         return _check("delay", UNKNOWN, "whether commands came in time is not in this log")
     if late < _MANY_LATE * steps:
         return _check("delay", GOOD, f"{counted(late, 'command')} late")
-    text = f"{late} commands came after the next exposure had begun, and acted a frame later than the law expects"
-    return _check("delay", LOOK, text)
+    acted = "after the next exposure had begun, and acted a frame later than the law expects"
+    return _check("delay", LOOK, f"{counted(late, 'command')} came {acted}")
 
 
 def _frames(figures: Figures) -> Figures:

@@ -114,7 +114,7 @@ def compared(run: LoggedRun, what: WhatIf) -> dict[str, Any]:
         "added_contrast": contrast,
         "warnings": [
             *_doubts_of_log(run),
-            *([f"{lost} frames that were used are not in the log: the what-if holds there"] if lost else []),
+            *([f"the log lacks {counted(lost, 'frame')} that were used: the what-if holds there"] if lost else []),
             *_doubts_of_range(run.calibration, columns),
             *([] if own else _doubts_of_law(run, after, command_nm[rows])),
         ],
@@ -264,13 +264,16 @@ def _doubts_of_log(run: LoggedRun) -> list[str]:
             "again with that for every frame"
         )
     counts = count_reasons(run.steps.reasons).items()
-    hit = [f"{reason.name.lower()} at {count} frames" for reason, count in counts if reason in _LIMITS]
+    hit = [f"{reason.name.lower()} at {counted(count, 'frame')}" for reason, count in counts if reason in _LIMITS]
     if hit:
         found.append(f"limits acted in the logged run, {', '.join(hit)}; in the what-if only modal limits do")
     cut = np.count_nonzero(run.history.mirror.limits)
     if cut:
         few = "" if log.selection.counts(MIRROR_STATE) else f" (of mirror states the log has: {log.selection.sentence})"
-        found.append(f"the mirror's own limits acted on {cut} commands{few}: pseudo-open-loop modes are wrong there")
+        found.append(
+            f"the mirror's own limits acted on {counted(int(cut), 'command')}{few}: pseudo-open-loop modes are wrong "
+            "there"
+        )
     changes = sum(one.accepted and one.name in LAW_KEYS for one in run.history.requests)
     if changes:
         found.append(f"gain or leak was changed {counted(changes, 'time')} in the logged run; the last ones are shown")
@@ -316,7 +319,7 @@ def _doubts_of_law(run: LoggedRun, law: Law, command_nm: Single) -> list[str]:
             f"the what-if is unstable with a delay of {counted(float(delay_frames), 'frame')}: {', '.join(unstable)}"
         )
     limited = [
-        f"{mode_name(index)} at {count} frames"
+        f"{mode_name(index)} at {counted(int(count), 'frame')}"
         for index, count in zip(noll, np.count_nonzero(np.abs(command_nm) >= law.limit_nm, axis=0), strict=True)
         if count
     ]
