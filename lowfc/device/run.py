@@ -1,6 +1,5 @@
 """A driver's process: how it joins a run, and its command line."""
 
-from collections.abc import Sequence
 from contextlib import closing
 from typing import Annotated, Any
 
@@ -22,18 +21,17 @@ def command_of(kind: Kind, name: str | None = None) -> type[TyperCommand]:
     """A command whose help lists its driver's own options: of the driver of this name, or of the argument `driver`."""
 
     class WithOptions(TyperCommand):
-        words: Sequence[str] = ()
+        driver = name
 
         def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-            self.words = tuple(args)
+            self.driver = name or self.make_parser(ctx).parse_args([*args])[0].get("driver")
             return super().parse_args(ctx, args)
 
         def format_options(self, ctx: Any, formatter: Any) -> None:
             super().format_options(ctx, formatter)
-            driver = name or self.make_parser(ctx).parse_args([*self.words])[0].get("driver")
-            rows = options_help(load(kind, driver)) if driver else []
+            rows = options_help(load(kind, self.driver)) if self.driver else []
             if rows:
-                with formatter.section(f"Options of the driver {driver}"):
+                with formatter.section(f"Options of the driver {self.driver}"):
                     formatter.write_dl(rows)
 
     return WithOptions
