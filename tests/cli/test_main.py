@@ -30,6 +30,13 @@ def test_every_command_has_help_with_an_example(name: str) -> None:
     assert "Example: lowfc " in done.stdout
 
 
+@pytest.mark.parametrize("name", ["ctl", "calibrate", "conformance", "acceptance", "design"])
+def test_no_sentence_is_cut_off_where_commands_are_listed(name: str) -> None:
+    _, commands = lowfc(name, "--help").stdout.split("\nCommands:\n")
+    assert "..." not in commands
+    assert commands.endswith(".\n")
+
+
 def test_help_is_in_the_fields_words() -> None:
     """Not those that say who told whom what; `latency` without a log runs a loop of its own."""
     pages, context = [], click.Context(typer.main.get_command(app))

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
+from typer.core import TyperGroup
 
 from lowfc.adapters.bus import DEFAULT_RUN as DEFAULT_RUN
 from lowfc.contract.errors import LowfcError
@@ -32,10 +33,19 @@ LogsOrMeasure = Annotated[list[Path] | None, _IfAny(help=f"{_LOGS} None: a loop 
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="Configuration file (TOML).", show_default=False)]
 
 
+class _Group(TyperGroup):
+    """Commands, each with its whole first sentence."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, one.get_short_help_str(limit=999)) for name, one in self.commands.items()])
+
+
 def new_app(help_text: str) -> typer.Typer:
     """A command line with plain errors."""
     return typer.Typer(
         help=help_text,
+        cls=_Group,
         add_completion=False,
         pretty_exceptions_enable=False,
         rich_markup_mode=None,

@@ -114,7 +114,7 @@ def compared(run: LoggedRun, what: WhatIf) -> dict[str, Any]:
         "added_contrast": contrast,
         "warnings": [
             *_doubts_of_log(run),
-            *([f"the log lacks {counted(lost, 'frame')} that were used: the what-if holds there"] if lost else []),
+            *([f"the log lacks {counted(int(lost), 'frame')} that were used: the what-if holds there"] if lost else []),
             *_doubts_of_range(run.calibration, columns),
             *([] if own else _doubts_of_law(run, after, command_nm[rows])),
         ],
