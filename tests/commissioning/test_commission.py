@@ -3,6 +3,7 @@
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from lowfc.device.driver import CameraSettings, camera_state
 from lowfc.programs.commissioning.calibrate.run import partial_of
 from lowfc.programs.commissioning.checks import Status
 from lowfc.programs.commissioning.commission.commissioning import Commission, Commissioning, first_of
+from lowfc.programs.commissioning.commission.first_calibration import linear_nm
 from lowfc.programs.commissioning.conformance.settings import AGREEMENTS, agreement_checks
 from tests.support.folded_loop import FoldedLoop, computed
 from tests.support.loops import lowfc
@@ -99,6 +101,21 @@ def test_frames_of_another_size_come_to_a_closed_loop(commissioned: tuple[Bench,
     assert made.saturation_dn == 2**14 - 1
     assert not first_of(bench.out).exists()
     assert not partial_of(bench.out).exists()
+
+
+@pytest.mark.parametrize(("scatter", "chosen_nm"), [(0.0, 1.5), (0.2, 3.0)])
+def test_a_shaken_mode_is_not_taken_for_a_sensor_that_is_not_linear(scatter: float, chosen_nm: float) -> None:
+    """Z3 answers a fifth less to the larger poke; its own cycles say whether that means something."""
+    first, gains = computed(CONFIG.to_toml()), np.ones((4, 14))
+    gains[:, 1] = 0.8 + scatter / 2, 0.8 - scatter / 2, 1 + scatter / 2, 1 - scatter / 2
+    answers = iter(gains)
+
+    def cycle(*played: object) -> SimpleNamespace:
+        return SimpleNamespace(response=first.response * next(answers))
+
+    player: Any = SimpleNamespace(before=first, cycle=cycle, report=lambda text: None)
+    delay: Any = SimpleNamespace(delay_frames=1.0)
+    assert linear_nm(player, CONFIG, delay, 3.0) == chosen_nm
 
 
 def test_the_wavefront_is_held_where_the_reference_was_taken(commissioned: tuple[Bench, dict[str, Any]]) -> None:

@@ -32,6 +32,8 @@ MARGIN = 0.9
 """Part of the promised error that is aimed at, so that the scatter of the cycles seldom asks for more."""
 MOST_TIMES = 4
 """Largest number of cycles over that for photons and read-out alone; beyond it the operator decides."""
+MOST_FEW = 24
+"""Cycles within which it is not beyond: of a bright star, four times the fewest are soon over."""
 CHECK_PART = 0.25
 """Cycles that check R, for each one that it is made from."""
 _LEAST_CHECKS = 3
@@ -106,7 +108,7 @@ class Pokes:
     def more_cycles(self, cycles: int, error: float) -> int:
         """How many are needed where so many have left this standard error; no more where that is out of reach."""
         needed = cycles_for(self._request.snr, cycles, error)
-        reachable = self._request.cycles is None and needed <= MOST_TIMES * self.cycles()
+        reachable = self._request.cycles is None and needed <= max(MOST_TIMES * self.cycles(), MOST_FEW)
         return needed if reachable and error * self._request.snr > 1 else cycles
 
     def frames(self, cycles: int, done: int = 0) -> int:

@@ -140,11 +140,13 @@ def linear_nm(player: Player, config: Configuration, delay: Delay, usual_nm: flo
             plan = _poke_cycle(modes, amplitude_nm, again)
             gains[level, again] = np.diag(R @ player.cycle(plan, delay.delay_frames).response)
     off = np.abs(gains[0].mean(axis=0) / gains[1].mean(axis=0) - 1)
-    error = float(np.sqrt(np.mean(np.diff(gains, axis=1) ** 2) / 2))  # of the mean of two, doubled: two amplitudes
-    worst = int(off.argmax())
-    chosen_nm = usual_nm / 2 if off[worst] > MAX_NOT_LINEAR + _SURE * error else usual_nm
+    # of the mean of two, doubled: two amplitudes; a mode's own where it is more than most, as of tip and tilt
+    squares = np.square(np.diff(gains, axis=1)).mean(axis=(0, 1)) / 2
+    error = np.sqrt(np.maximum(squares, squares.mean()))
+    worst = int((off - _SURE * error).argmax())
+    chosen_nm = usual_nm / 2 if off[worst] > MAX_NOT_LINEAR + _SURE * error[worst] else usual_nm
     player.report(
-        f"pokes of {top_nm:.3g} nm and of half of it answer alike within {off[worst]:.1%} (+- {error:.1%}; "
+        f"pokes of {top_nm:.3g} nm and of half of it answer alike within {off[worst]:.1%} (+- {error[worst]:.1%}; "
         f"Z{first.noll[worst]}): {chosen_nm:.3g} nm in each mode"
     )
     return chosen_nm
