@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lowfc.adapters.bus.run import open_run
 from lowfc.adapters.image_stream.stream import Stream, stream_path
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.join import prepare
@@ -31,21 +32,15 @@ _LAST_COMMAND_S = 0.1
 class TimedCamera(IsioCamera):
     """The driver `isio` as it is; beside it, the moment before each image was written, which is the image's `atime`."""
 
-    class Options(IsioCamera.Options):
-        """Where the times go."""
-
-        folder: str
-        """Folder of the run."""
-
-    def __init__(self, options: Options, config: Configuration) -> None:
+    def __init__(self, options: IsioCamera.Options, config: Configuration) -> None:
         """Open the stream."""
         super().__init__(options, config)
-        self._folder = Path(options.folder)
         self._sequence, self._put_ns, self._written_ns = array("Q"), array("q"), array("q")
 
     def join(self, service: Service) -> None:
-        """Keep the clock."""
+        """Keep the clock, and the run's folder, where the times go."""
         super().join(service)
+        self._folder = open_run(service.run_id, ()).path
         self._clock = service.clock
 
     def start(self) -> None:

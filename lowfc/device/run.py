@@ -1,14 +1,18 @@
 """A driver's process: how it joins a run, and its command line."""
 
-from contextlib import closing
+import threading
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand
 
 from lowfc.adapters.bus.run import mirror_role
-from lowfc.adapters.process.join import join
+from lowfc.adapters.process.join import join, join_beside
+from lowfc.adapters.process.service import Service
 from lowfc.contract.configuration import Configuration
+from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.messages import Role
 from lowfc.device.camera_loop import CameraLoop
 from lowfc.device.driver import Camera, Mirror
@@ -40,6 +44,8 @@ def command_of(kind: Kind, name: str | None = None) -> type[TyperCommand]:
 PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
 """Settings of a command that leaves words to the driver: its options."""
 Frames = Annotated[int | None, typer.Option(min=1, help="Stop after so many frames; default: until Ctrl-C or SIGTERM.")]
+LEAVE_S = 2.0
+"""How long a camera in the controller's process may take to end."""
 WaitFor = Annotated[list[str] | None, typer.Option(help="Process that the first frame waits for; repeat.")]
 
 
@@ -64,6 +70,51 @@ def run_camera(
     service.catch_signals()
     with closing(service.bus):  # a callback on zenoh's threads must not outlive the interpreter
         loop.run(wait_for)
+
+
+@contextmanager
+def camera_beside(driver: Camera, config: Configuration, service: Service) -> Iterator[None]:
+    """Read a camera in the controller's process: a frame is dealt with on the thread that read it, without a link.
+
+    To all others the camera is what it is in a process of its own: its role, its topics, its Health. When one of the
+    two ends, so does the other.
+
+    Args:
+        driver: of the camera.
+        config: of the run.
+        service: of the controller, which has subscribed to frames.
+
+    Raises:
+        BusError: the run has a camera already.
+        ConfigurationError: the run is in lockstep.
+        LowfcError: the driver said what a user has to put right; after the block.
+    """
+    if config.lockstep:
+        raise ConfigurationError("in lockstep the camera is a process of its own: leave out --camera, or lockstep")
+    camera = join_beside(config, service, Role.CAMERA)
+    faults: list[Exception] = []
+    with closing(camera.bus):
+        with opening("the camera does not say how it is set"):
+            loop = CameraLoop(driver, camera, config)
+
+        def read() -> None:
+            try:
+                loop.run()
+            except Exception as fault:
+                faults.append(fault)
+            finally:
+                service.stop("its camera has ended")
+
+        reading = threading.Thread(target=read, name="camera", daemon=True)
+        service.on_stop(lambda: camera.stop(service.why))
+        reading.start()
+        try:
+            yield
+        finally:
+            service.stop(service.why)
+            reading.join(LEAVE_S)
+    if faults:
+        raise faults[0]
 
 
 def run_mirror(driver: Mirror, config: Configuration, run: str) -> None:

@@ -87,6 +87,24 @@ def test_the_reader_gets_everything_by_the_short_way_and_others_by_the_bus(ends:
     assert recorded[-300:] == ends.got[-300:]
 
 
+def test_a_reader_of_the_same_process_gets_each_message_by_a_call(ends: Ends) -> None:
+    controller, recorder = ends.bus("controller"), ends.bus("recorder")
+    controller.subscribe(FRAME, ends.hear)
+    recorded: list[int] = []
+    recorder.subscribe(FRAME, lambda sample: recorded.append(count_of(sample.sequence)))
+    camera = ZenohBus(ends.run.links, "camera", ends.clock, beside=controller)
+    frames = camera.publisher(FRAME)
+    until(lambda: camera.peers() == 2)
+    ends.publish(frames, 100)
+    until(lambda: recorded[-1:] == [99])
+    camera.close()
+    assert ends.got == list(range(100)), "none twice, though the bus had them too"
+    assert set(ends.threads) == {threading.current_thread().name}
+    del ends.threads[:]
+    again = ends.bus("camera").publisher(FRAME)  # in a process of its own
+    ends.meet(again)
+
+
 def test_the_switch_loses_and_repeats_nothing(ends: Ends) -> None:
     camera = ends.bus("camera")
     frames = camera.publisher(FRAME)

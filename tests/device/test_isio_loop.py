@@ -52,7 +52,8 @@ MIRROR = "lowfc mirror isio --run bench --config bench.toml"
 CAMERA_DRIVER = "lowfc camera isio --run bench --config bench.toml"
 CONTROLLER = "lowfc controller --run bench --config bench.toml"
 BRIDGE = "lowfc bridge isio --run bench --beside dm00disp03"
-DOCUMENTED = (MIRROR, CAMERA_DRIVER, CONTROLLER, BRIDGE)
+LOOP, LOOP_OF_ONE = (CAMERA_DRIVER, CONTROLLER), (f"{CONTROLLER} --camera isio",)
+DOCUMENTED = (MIRROR, CAMERA_DRIVER, CONTROLLER, BRIDGE, *LOOP_OF_ONE)
 """Commands of docs/howto/cacao.md; all are run here."""
 
 
@@ -128,10 +129,11 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_a_loop_runs_by_streams_beside_others(folder: Path) -> None:
+@pytest.mark.parametrize("loop", [LOOP, LOOP_OF_ONE], ids=["two processes", "one process"])
+def test_a_loop_runs_by_streams_beside_others(folder: Path, loop: tuple[str, ...]) -> None:
     (folder / "bench.toml").write_text(bench_of(rate_hz=200, preset="quiet", tilt_nm=15))
-    with closing(Bench(folder)) as bench, going_on(folder, MIRROR, CAMERA_DRIVER), bench.listening():
-        with going_on(folder, CONTROLLER):
+    with closing(Bench(folder)) as bench, going_on(folder, MIRROR), bench.listening():
+        with going_on(folder, *loop):
             until(bench.held, 60)
             refused = run(folder, "mirror", "isio", "--run", "other", "--config", "bench.toml")
             assert refused.returncode == 2
@@ -142,9 +144,10 @@ def test_a_loop_runs_by_streams_beside_others(folder: Path) -> None:
         assert theirs.pixels.any()
 
 
-def test_each_fault_of_a_stream_is_named_and_recovered_from(folder: Path) -> None:
+@pytest.mark.parametrize("loop", [LOOP, LOOP_OF_ONE], ids=["two processes", "one process"])
+def test_each_fault_of_a_stream_is_named_and_recovered_from(folder: Path, loop: tuple[str, ...]) -> None:
     (folder / "bench.toml").write_text(bench_of(rate_hz=200, preset="quiet", tilt_nm=15))
-    with closing(Bench(folder)) as bench, going_on(folder, MIRROR, CAMERA_DRIVER, CONTROLLER), bench.listening():
+    with closing(Bench(folder)) as bench, going_on(folder, MIRROR, *loop), bench.listening():
         until(bench.held, 60)
         _a_reader_that_stands_still_goes_on_with_the_newest_image(bench)
         bench.tell("renew")

@@ -3,7 +3,7 @@
 import subprocess
 import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +13,11 @@ from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.bus.run import open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.process.clock import HostClock
+from lowfc.client import Client
 from lowfc.contract.envelope import start_of
 from lowfc.contract.messages import EVENT, FRAME, MIRROR_STATE, STEP, Log, Role, wire
-from tests.support.loops import LOWFC, STILL, going_on, until
+from lowfc.device.camera_loop import PATIENCE_S
+from tests.support.loops import LOWFC, STILL, going_on, run, until
 
 DYING = """
 import os, time
@@ -64,15 +66,13 @@ import numpy as np
 from lowfc.device import geometry
 from sim_camera.driver import SimulatedCamera
 
-HANGS_S = 5.0
-
 def befall(name):
     if os.path.exists(name):
         fault = open(name).read()
         os.remove(name)
         if fault == "die":
             os._exit(7)
-        time.sleep(HANGS_S)
+        time.sleep(5)
 
 class Camera(SimulatedCamera):
     def expose(self):
@@ -91,6 +91,7 @@ class Mirror:
     def close(self):
         pass
 """
+HANGS_S = 5.0
 BENCH = f"{STILL}tilt_gain = 0.3\n"
 OF_BENCH = "--run bench --config bench.toml"
 CAMERA, MIRROR = (f"lowfc {kind} faulty.py:{kind.capitalize()} {OF_BENCH}" for kind in ("camera", "mirror"))
@@ -192,6 +193,44 @@ def test_a_mirror_that_hangs_for_five_seconds_gets_no_command_meanwhile_and_is_f
         assert bench.calls_nm()[len(before)] == 0, "its idle state comes first"
         assert bench.named("mirror-dm", "DRIVER_HANGS") == bench.named("controller", "MIRROR_LOST") == 1
         bench.settled()
+
+
+@pytest.mark.exclusive
+def test_a_camera_in_the_controllers_process_closes_the_loop_and_hangs_alone(tmp_path: Path, own_runtime: Path) -> None:
+    (tmp_path / "faulty.py").write_text(FAULTY)
+    (tmp_path / "bench.toml").write_text(BENCH)
+    bench = Bench(tmp_path)
+    both = f"{CONTROLLER} --camera faulty.py:Camera"
+    with bench.listening(), going_on(tmp_path, MIRROR, both), ExitStack() as stack:
+        bench.settled()
+        client = stack.enter_context(Client("bench"))
+        processes = client.processes()
+        assert processes["camera"].pid == processes["controller"].pid
+        bench.befall("camera", "hang")
+        until(lambda: bench.named("camera", "DRIVER_HANGS") and bench.named("controller", "NO_FRAMES"))
+        client.safe()
+        assert client.status().state.mode == wire.LOOP_MODE_SAFE
+        ending_s = time.monotonic()
+    assert time.monotonic() - ending_s < HANGS_S - PATIENCE_S, "it did not wait for its camera"
+
+
+@pytest.mark.parametrize(
+    ("camera", "lockstep", "said"),
+    [
+        ("faulty.py:Camera", True, "in lockstep the camera is a process of its own"),
+        ("faulty.py:Absent", False, "faulty.py:Absent"),
+        ("isio", False, "stream is missing"),
+    ],
+)
+def test_a_camera_that_the_controller_cannot_read_is_a_sentence(
+    tmp_path: Path, own_runtime: Path, camera: str, lockstep: bool, said: str
+) -> None:
+    (tmp_path / "faulty.py").write_text(FAULTY)
+    (tmp_path / "bench.toml").write_text(f"lockstep = true\n{BENCH}" if lockstep else BENCH)
+    refused = run(tmp_path, *CONTROLLER.split()[1:], "--camera", camera)
+    assert refused.returncode == 2
+    assert said in refused.stderr
+    assert "Traceback" not in refused.stderr
 
 
 @pytest.mark.exclusive

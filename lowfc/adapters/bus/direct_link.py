@@ -73,6 +73,23 @@ class DirectWriter:
             self._socket = made
 
 
+class DirectCall:
+    """Sends to a reader of the same process: by a call, which returns once the message is dealt with."""
+
+    def __init__(self, reader: "DirectReader") -> None:
+        """Send to it."""
+        self._reader = reader
+
+    def send(self, envelope: bytes, payload: bytes) -> bool:
+        """Hand a message on; it always goes."""
+        self._reader.take(envelope, payload)
+        return True
+
+    def close(self) -> None:
+        """Leave the reader to the bus."""
+        self._reader.writer_gone()
+
+
 class DirectReader:
     """Hands on each message once, by the socket or by the bus, whichever was quicker.
 
@@ -123,6 +140,15 @@ class DirectReader:
         self._accepting = threading.Thread(target=self._accept, name="direct-link-accept", daemon=True)
         self._accepting.start()
 
+    def take(self, envelope: bytes, payload: bytes) -> None:
+        """Hand on a message of a writer, on the thread that calls; of the socket's, or of one in this process."""
+        now_ns = self._now_ns()
+        try:
+            self._by_socket(Sample(self._key, payload, *Envelope.unpack(envelope), now_ns))
+        except Exception as fault:
+            self._failed(fault)
+        self._leave()
+
     def close(self) -> None:
         """Hand on nothing more; for any thread but those that hand on."""
         with self._turn:
@@ -165,7 +191,7 @@ class DirectReader:
             self._leave_bus()
             self._leave_bus, self._both = None, False
 
-    def _return(self) -> None:
+    def writer_gone(self) -> None:
         """A writer has gone: its messages, or those of the next one, come by the bus."""
         with self._turn:
             self._both, self._first, self._newest = False, -1, -1
@@ -196,7 +222,7 @@ class DirectReader:
     def _serve(self, connection: socket.socket) -> None:
         with connection:
             self._receive(connection)
-        self._return()
+        self.writer_gone()
 
     def _receive(self, connection: socket.socket) -> None:
         buffer = memoryview(bytearray(2 * _BUFFER_BYTES))
@@ -207,14 +233,7 @@ class DirectReader:
                 return
             if not size:
                 return
-            now_ns = self._now_ns()
-            try:
-                envelope = bytes(buffer[: min(size, _ENVELOPE_BYTES)])
-                payload = bytes(buffer[_ENVELOPE_BYTES:size])
-                self._by_socket(Sample(self._key, payload, *Envelope.unpack(envelope), now_ns))
-            except Exception as fault:
-                self._failed(fault)
-            self._leave()
+            self.take(bytes(buffer[: min(size, _ENVELOPE_BYTES)]), bytes(buffer[_ENVELOPE_BYTES:size]))
 
 
 def _end(one: socket.socket) -> None:

@@ -18,7 +18,7 @@ from zenoh.handlers import Callback, Handler, RingChannel
 
 from lowfc.adapters.bus.access import CLOCK_KEY, ROUTER
 from lowfc.adapters.bus.bus import ALL, Faults, Query, Sample
-from lowfc.adapters.bus.direct_link import DirectReader, DirectWriter
+from lowfc.adapters.bus.direct_link import DirectCall, DirectReader, DirectWriter
 from lowfc.adapters.bus.routed import RouterWatch, open_by_router, require_certificate
 from lowfc.adapters.bus.run import Links, mirror_role
 from lowfc.adapters.bus.zenoh_fault import plain
@@ -52,7 +52,12 @@ class ZenohPublisher:
     """Publishes one topic; see `Publisher`."""
 
     def __init__(
-        self, bus: "ZenohBus", session: zenoh.Session, topic: Topic, key: str, direct_link: Path | None
+        self,
+        bus: "ZenohBus",
+        session: zenoh.Session,
+        topic: Topic,
+        key: str,
+        direct_link: DirectWriter | DirectCall | None,
     ) -> None:
         self.topic = topic
         self.key = key
@@ -65,7 +70,7 @@ class ZenohPublisher:
         self._sent = bus.sent
         self._replying = bus.replying
         self._publisher = declare_publisher(session, topic, key, lockstep=bus.clock.lockstep)
-        self._direct_link = None if direct_link is None else DirectWriter(direct_link)
+        self._direct_link = direct_link
         if self._keeps:
             session.declare_queryable(key, Callback(self._answer, indirect=False))
 
@@ -140,9 +145,12 @@ class ZenohBus:
         offset: of the router's clock, where the run is on several hosts. Envelopes go by that clock; what is sent and
             received here is by this host's.
         read: what a message of zenoh's says.
+        direct_readers: of the topics that this process gets directly, by key.
     """
 
-    def __init__(self, links: Links, role: str, clock: Clock, *, monitor: bool = False) -> None:
+    def __init__(
+        self, links: Links, role: str, clock: Clock, *, monitor: bool = False, beside: "ZenohBus | None" = None
+    ) -> None:
         """Join a run.
 
         Args:
@@ -152,6 +160,7 @@ class ZenohBus:
             monitor: this process takes no part in the loop: it looks at what it kept in a `Ring` now and then. It is
                 sent the topics of which only the newest matters no faster than it looks, receives into spare buffers,
                 and in one thread: half the cost. To be set in a process's first bus.
+            beside: bus of another role in this process, which has subscribed: what it gets directly, it gets by a call.
 
         Raises:
             BusError: the role's port is taken, or the role itself on another host; zenoh refuses the configuration, or
@@ -162,6 +171,8 @@ class ZenohBus:
         self._links = links
         self._closers: list[Callable[[], None]] = []
         self._publishers: list[ZenohPublisher] = []
+        self.direct_readers: dict[str, DirectReader] = {}
+        self._beside = beside
         self.clock = clock
         self.faults = Faults()
         self.offset: ClockOffset | None = None
@@ -207,9 +218,8 @@ class ZenohBus:
 
     def publisher(self, topic: Topic, name: str = "") -> ZenohPublisher:
         """See `Bus.publisher`."""
-        by_table = self.role.partition("-")[0] in topic.publisher
-        path = self._direct_link(topic, name) if by_table else None
-        publisher = ZenohPublisher(self, self._session, topic, topic.at(name), path)
+        key = topic.at(name)
+        publisher = ZenohPublisher(self, self._session, topic, key, self._direct_writer(topic, name, key))
         self._closers.append(publisher.close)
         self._publishers.append(publisher)
         return publisher
@@ -228,6 +238,7 @@ class ZenohBus:
             lambda fault: self.faults.add(f"{self.role}: handler of", key, fault),
             shared=topic.multiple_publishers,
         )
+        self.direct_readers[key] = reader
         self._closers.append(reader.close)
         return reader.close
 
@@ -326,6 +337,12 @@ class ZenohBus:
             close()
         with contextlib.suppress(zenoh.ZError):
             self._session.close()  # type: ignore[no-untyped-call]
+
+    def _direct_writer(self, topic: Topic, name: str, key: str) -> DirectWriter | DirectCall | None:
+        if self.role.partition("-")[0] not in topic.publisher or (path := self._direct_link(topic, name)) is None:
+            return None
+        reader = None if self._beside is None else self._beside.direct_readers.get(key)
+        return DirectWriter(path) if reader is None else DirectCall(reader)
 
     def _direct_link(self, topic: Topic, name: str) -> Path | None:
         reader = _reader(topic, name)

@@ -5,6 +5,7 @@ from lowfc.adapters.bus.zenoh_bus import ZenohBus, receive_in_one_thread
 from lowfc.adapters.process.clock import Clock, HostClock, SimulatedClock
 from lowfc.adapters.process.realtime import Granted, set_up
 from lowfc.adapters.process.service import Service
+from lowfc.adapters.process.supervision import Supervisor
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.messages import Role
 
@@ -37,3 +38,14 @@ def join(config: Configuration, run_id: str, role: str, cpus: list[int]) -> Serv
     run = open_run(run_id, (config.mirror.name,), network=config.network)
     clock = clock_of(config)
     return Service(role, run_id, clock, ZenohBus(run.links, role, clock), granted=granted, announces=True)
+
+
+def join_beside(config: Configuration, service: Service, role: str) -> Service:
+    """Join the run of a process once more, in another role: what is directly for the process, it gets by a call.
+
+    The service manager hears of the process alone.
+    """
+    assert isinstance(service.bus, ZenohBus)  # noqa: S101  # as `join` made it
+    links = open_run(service.run_id, (config.mirror.name,), network=config.network).links
+    bus = ZenohBus(links, role, service.clock, beside=service.bus)
+    return Service(role, service.run_id, service.clock, bus, announces=True, supervisor=Supervisor({}))

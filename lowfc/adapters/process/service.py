@@ -57,8 +57,9 @@ class Service:
         granted: Granted = NOTHING,
         fill: Callable[[wire.Health], None] | None = None,
         announces: bool = False,
+        supervisor: Supervisor | None = None,
     ) -> None:
-        """Join the run; `fill` adds the role's own fields to each Health."""
+        """Join the run; `fill` adds the role's own fields to each Health, the service manager is that of the host."""
         self.name = name
         self.clock = clock
         self.bus = bus
@@ -82,7 +83,7 @@ class Service:
         self._wakers: list[Callable[[], None]] = []
         self._event_lock = threading.Lock()
         self._last_warning: Log | None = None
-        self._supervisor = Supervisor()
+        self._supervisor = supervisor or Supervisor()
         self._started_ns = self._beaten_ns = clock.host_ns()
         self._worked = 0
         self._due_ns = 0

@@ -1,7 +1,7 @@
 """The commands of a loop's own processes: `lowfc controller` and `lowfc record`."""
 
 import json
-from contextlib import closing
+from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -20,11 +20,20 @@ def controller(
         Path | None,
         typer.Option(help="Calibration file (FITS), or none; default: computed from the configuration."),
     ] = None,
+    camera: Annotated[
+        str | None,
+        typer.Option(
+            metavar="DRIVER", help="Driver of a camera to read in this process; default: `lowfc camera` is one's own."
+        ),
+    ] = None,
     wait_for: Annotated[
         list[str] | None, typer.Option(help="Process that must not miss how the loop begins; repeat.")
     ] = None,
 ) -> None:
     """Run the controller: frames from the bus, commands to it.
+
+    With --camera, frames come from that driver without a process between, about as quickly as a camera allows; the
+    driver's options are in [drivers.DRIVER], and where it crashes the controller goes with it.
 
     Example: lowfc controller --run bench --calibration calibration.fits
     """
@@ -39,12 +48,15 @@ def controller(
     from lowfc.adapters.process.latch import Latch, latch_files
     from lowfc.contract.messages import Role
     from lowfc.control.kernel.tables import FUSED
+    from lowfc.device.plugins import opened
+    from lowfc.device.run import camera_beside
     from lowfc.programs.commissioning.analytic import analytic
     from lowfc.programs.core.controller import Controller
 
     signalled: list[int] = []  # before there is a loop to be made safe
     signal.signal(signal.SIGUSR1, lambda number, _: signalled.append(number))
     settings = configuration(config)
+    driver = None if camera is None else opened("camera", camera, settings)
     found = None
     if calibration is None:
         found = analytic(settings, Console(stderr=True))
@@ -68,7 +80,8 @@ def controller(
         process.safe_by_signal()
     service.fill = process.fill
     service.catch_signals()
-    with closing(service.bus):  # a callback on zenoh's threads must not outlive the interpreter
+    beside = nullcontext() if driver is None else camera_beside(driver, settings, service)
+    with closing(service.bus), beside:  # a callback on zenoh's threads must not outlive the interpreter
         process.run()
 
 
