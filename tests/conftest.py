@@ -26,9 +26,10 @@ def _private_cache(pytestconfig: pytest.Config) -> None:
 
 @pytest.fixture
 def own_runtime(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Give a test a runtime directory of its own, in which there is no run yet."""
+    """Give a test a runtime directory of its own, in which there is no run yet, and no latch of another test's run."""
     path = tmp_path_factory.mktemp("own")  # not `tmp_path`: a folder `lowfc` there would hide the package
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(path))
+    monkeypatch.setenv("XDG_STATE_HOME", str(path / "state"))
     return path
 
 
