@@ -32,7 +32,7 @@ MARGIN = 0.9
 """Part of the promised error that is aimed at, so that the scatter of the cycles seldom asks for more."""
 MOST_TIMES = 4
 """Largest number of cycles over that for photons and read-out alone; beyond it the operator decides."""
-MOST_FEW = 24
+MOST_FEW = 32
 """Cycles within which it is not beyond: of a bright star, four times the fewest are soon over."""
 CHECK_PART = 0.25
 """Cycles that check R, for each one that it is made from."""
