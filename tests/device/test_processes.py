@@ -63,6 +63,7 @@ def test_a_camera_whose_process_dies_is_a_new_start_once_it_is_started_again(tmp
 FAULTY = """
 import os, time
 import numpy as np
+from lowfc.contract.errors import LowfcError
 from lowfc.device import geometry
 from sim_camera.driver import SimulatedCamera
 
@@ -72,6 +73,8 @@ def befall(name):
         os.remove(name)
         if fault == "die":
             os._exit(7)
+        if fault == "refuse":
+            raise LowfcError("its lens cap is on")
         time.sleep(5)
 
 class Camera(SimulatedCamera):
@@ -218,6 +221,7 @@ def test_a_camera_in_the_controllers_process_closes_the_loop_and_hangs_alone(tmp
     ("camera", "lockstep", "said"),
     [
         ("faulty.py:Camera", True, "in lockstep the camera is a process of its own"),
+        ("faulty.py:Camera", False, "error: its lens cap is on"),
         ("faulty.py:Absent", False, "faulty.py:Absent"),
         ("isio", False, "stream is missing"),
     ],
@@ -226,6 +230,7 @@ def test_a_camera_that_the_controller_cannot_read_is_a_sentence(
     tmp_path: Path, own_runtime: Path, camera: str, lockstep: bool, said: str
 ) -> None:
     (tmp_path / "faulty.py").write_text(FAULTY)
+    (tmp_path / "camera").write_text("refuse")
     (tmp_path / "bench.toml").write_text(f"lockstep = true\n{BENCH}" if lockstep else BENCH)
     refused = run(tmp_path, *CONTROLLER.split()[1:], "--camera", camera)
     assert refused.returncode == 2
