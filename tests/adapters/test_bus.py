@@ -59,7 +59,7 @@ def join() -> Iterator[Join]:
         bus.close()
 
 
-@pytest.fixture(params=["memory", pytest.param("zenoh", marks=pytest.mark.exclusive)])
+@pytest.fixture(params=["memory", "zenoh"])
 def pair(request: pytest.FixtureRequest, run: Run, join: Join) -> tuple[Bus, Bus]:
     """Buses of a controller and an operator, linked."""
     if request.param == "memory":
@@ -150,7 +150,6 @@ def test_a_broken_handler_harms_nobody_else_and_is_shown_once(
     assert capfd.readouterr().err.count("RuntimeError: handler broke") == 2
 
 
-@pytest.mark.exclusive
 def test_sequences_count_from_zero_and_never_repeat(run: Run, join: Join) -> None:
     starts = []
     for _ in range(3):  # restarted within one second
@@ -173,7 +172,6 @@ def test_sequences_of_the_bus_in_memory_never_repeat_either() -> None:
         camera.publisher(FRAME).put(b"")
 
 
-@pytest.mark.exclusive
 @pytest.mark.parametrize("secret", ["lowfc:wrong\n", "intruder:wrong\n", None])
 def test_without_the_password_nobody_is_let_in(run: Run, join: Join, tmp_path: Path, secret: str | None) -> None:
     camera = join(run, "camera")
@@ -200,7 +198,6 @@ def test_without_the_password_nobody_is_let_in(run: Run, join: Join, tmp_path: P
     assert (overheard, forgeries.received) == ([], 0)
 
 
-@pytest.mark.exclusive
 @pytest.mark.parametrize("attachment", [None, b"xyz", b"\xff" * 16])
 def test_a_message_without_a_readable_envelope_is_counted_and_no_traceback(
     run: Run, join: Join, capfd: pytest.CaptureFixture[str], attachment: bytes | None
@@ -224,7 +221,6 @@ def test_a_message_without_a_readable_envelope_is_counted_and_no_traceback(
     assert "Traceback" not in capfd.readouterr().err
 
 
-@pytest.mark.exclusive
 def test_a_ring_that_is_closed_has_no_subscriber(run: Run, join: Join) -> None:
     operator, camera = join(run, "operator"), join(run, "camera")
     frames = camera.publisher(FRAME)
@@ -235,7 +231,6 @@ def test_a_ring_that_is_closed_has_no_subscriber(run: Run, join: Join) -> None:
     ring.close()
 
 
-@pytest.mark.exclusive
 def test_a_role_can_be_taken_once(run: Run, join: Join) -> None:
     join(run, "camera")
     with pytest.raises(BusError, match=rf"camera of run '{run.run_id}' .* 127.0.0.1:{run.links.ports['camera']}"):
@@ -358,7 +353,6 @@ def reader(run: Run, join: Join) -> Iterator[Reader]:
     made.process.communicate()
 
 
-@pytest.mark.exclusive
 def test_a_frozen_subscriber_costs_the_others_nothing(reader: Reader, run: Run, join: Join) -> None:
     box = Mailbox()
     join(run, "controller").subscribe(FRAME, box.put)
@@ -384,7 +378,6 @@ def test_a_frozen_subscriber_costs_the_others_nothing(reader: Reader, run: Run, 
     assert received_number == whole < reader.frames.published
 
 
-@pytest.mark.exclusive
 def test_a_session_that_ends_leaves_no_half_message_with_a_slow_reader(reader: Reader) -> None:
     reader.process.send_signal(signal.SIGSTOP)
     for _ in range(1000):  # more than the socket takes

@@ -19,8 +19,6 @@ from lowfc.contract.envelope import Envelope, count_of, sequence_of
 from lowfc.contract.messages import COMMAND, FRAME
 from tests.support.loops import until
 
-pytestmark = pytest.mark.exclusive
-
 PATIENCE_S = 30.0
 
 

@@ -228,7 +228,8 @@ def test_noise_without_images_is_that_of_the_images() -> None:
     assert left[1] == pytest.approx(left[0], rel=0.03)
 
 
-def test_lines_that_move_leave_no_more_than_the_integrator() -> None:
+def test_lines_that_move_leave_no_more_than_the_integrator(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tools.guard._SETTLE", 3_000)
     preset, factor = MOVED[0]
     got_mas, overruled_s = moved(case(preset, known=True), factor, 1)
     assert len(overruled_s) == 1

@@ -88,7 +88,6 @@ def bench(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Bench]:
         found.close()
 
 
-@pytest.mark.exclusive
 @pytest.mark.parametrize(
     "signals",
     [
@@ -116,7 +115,6 @@ def test_however_it_ends_the_log_has_all(bench: Bench, signals: tuple[signal.Sig
     assert killed or reader.metadata["recording"]["messages_lost"] == "0"
 
 
-@pytest.mark.exclusive
 @pytest.mark.parametrize("bench", [("--longest-s", 1, "--json")], indirect=True)
 def test_the_command_rotates_and_says_what_it_did(bench: Bench) -> None:
     def put_until_rotated() -> bool:
@@ -143,7 +141,6 @@ def test_the_command_rotates_and_says_what_it_did(bench: Bench) -> None:
     assert done["longest_unflushed_ms"] >= done["longest_wait_ms"] > 0
 
 
-@pytest.mark.exclusive
 def test_a_recording_is_ended_where_the_controller_has_died(own_runtime: Path, bench: Bench) -> None:
     stopped = lowfc("ctl", "record", "stop", "--json")
     reader = LogReader(Path(json.loads(stopped.stdout)["log"]))

@@ -44,14 +44,14 @@ def test_two_runs_with_one_seed_write_the_same_bytes_and_have_one_digest(tmp_pat
             "--rate",
             "1000",
             "--duration",
-            "0.5",
+            "0.3",
             "--seed",
             seed,
             "--disturbance",
             "bench",
             config=FIXED,
         )
-        assert figures["frames_published"] == figures["commands_applied"] == 500
+        assert figures["frames_published"] == figures["commands_applied"] == 300
         assert figures["messages_lost"] == 0
         logs.append(payloads(figures["log"]))
         told = run(folder, "info", "last", "--digest", "--json")
@@ -64,22 +64,21 @@ def test_two_runs_with_one_seed_write_the_same_bytes_and_have_one_digest(tmp_pat
     assert "lowfc/event" not in {key for key, line in infos[0]["topics"].items() if "digest" in line}
     config = load(None, {"camera.rate_hz": 1000.0})
     constant = sum(infos[0]["attachments"].values()) + infos[0]["topics"]["lowfc/calibration"]["bytes"]
-    growth = (infos[0]["bytes"] - constant) / 0.5  # bytes in a second of simulated time
+    growth = (infos[0]["bytes"] - constant) / 0.3  # bytes in a second of simulated time
     assert bytes_per_s(config, EVERYTHING) == pytest.approx(growth, rel=0.25)
     one, two, other = ({t: p for t, p in log.items() if topic_of(t[1:]).deterministic} for log in logs)
     assert one.keys() == two.keys()
-    assert len(one["/lowfc/camera/frame"]) == 500
+    assert len(one["/lowfc/camera/frame"]) == 300
     for topic, values in one.items():
         assert values == two[topic], topic
     assert one["/lowfc/camera/frame"] != other["/lowfc/camera/frame"]
 
 
-@pytest.mark.exclusive
 def test_automatic_gains_are_inputs_that_two_runs_and_a_replay_have_alike(tmp_path: Path) -> None:
     logs = []
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
-        figures = loop(tmp_path / name, "--lockstep", "--duration", "3", "--disturbance", "bench")
+        figures = loop(tmp_path / name, "--lockstep", "--duration", "2", "--disturbance", "bench")
         logs.append(payloads(figures["log"]))
     one, two = ({t: p for t, p in log.items() if topic_of(t[1:]).deterministic} for log in logs)
     assert one == two
@@ -90,7 +89,7 @@ def test_automatic_gains_are_inputs_that_two_runs_and_a_replay_have_alike(tmp_pa
     assert json.loads(replayed.stdout)["identical"] is True
 
 
-@pytest.mark.parametrize("frames", [6_000, pytest.param(20_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("frames", [4_000, pytest.param(20_000, marks=pytest.mark.slow)])
 def test_the_residual_is_the_predicted_one(tmp_path: Path, frames: int) -> None:
     """|S|^2 P_d + |T|^2 P_n for 5 mas rms of tilt per axis and half the limiting gain: within 10 %.
 
@@ -158,7 +157,7 @@ def test_the_documents_table_is_of_the_sensors_as_they_are() -> None:
 
 def test_a_configuration_that_was_shown_does_not_open_the_loop(tmp_path: Path) -> None:
     shown = run(tmp_path, "config", "show").stdout
-    short = ("sim-loop", "--lockstep", "--duration", "3", "--no-record")
+    short = ("sim-loop", "--lockstep", "--duration", "2", "--no-record")
     done = run(tmp_path, *short, config=shown)
     assert re.match(r"loop +closed", done.stdout), done.stderr
     assert "starts open" not in done.stderr

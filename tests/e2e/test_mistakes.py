@@ -12,10 +12,13 @@ from pathlib import Path
 import pytest
 
 from lowfc.adapters.bus.run import Run, open_run
+from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.files import calibration_file
 from lowfc.adapters.logs.writer import LogWriter
+from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import BusError, LowfcError
+from lowfc.contract.messages import Role
 from lowfc.programs.launch import sim_loop
 from tests.support.loops import LOWFC, lowfc, run
 from tools.law_bench import calibrated
@@ -175,7 +178,7 @@ def test_a_loop_that_is_starting_is_there_for_others(own_runtime: Path, monkeypa
     found: list[object] = []
 
     def meanwhile(config: Configuration, run: Run, console: object) -> None:
-        with socket.create_server(("127.0.0.1", open_run("other").links.ports["controller"])):
+        with contextlib.closing(ZenohBus(open_run("other").links, Role.CONTROLLER, HostClock())):
             done = lowfc("ctl", "open")
             listed = json.loads(lowfc("runs", "--json").stdout)["runs"]
             found.extend([str(done.exception), [(one["run"], one["mode"]) for one in listed]])

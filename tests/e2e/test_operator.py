@@ -165,7 +165,7 @@ def _the_rest(night: Night) -> None:
         night.ctl(command)
     night.said["refused"] = str(lowfc("ctl", "gain", "-0.1", "--modes", "2", "--run", night.name).exception)
     with Client(night.name) as loop:
-        list(loop.steps(500))  # so that the last log holds the controller's state, which comes once a second
+        list(loop.steps(250))  # so that the last log holds the controller's state, which comes once a second
 
 
 def test_every_request_is_made_by_a_command_of_the_document() -> None:

@@ -39,7 +39,9 @@ pytestmark = pytest.mark.exclusive
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path: Path = loop(tmp_path_factory.mktemp("night"), "--rate", "100", "--duration", "1", config=FIXED)["log"]
+    path: Path = loop(tmp_path_factory.mktemp("night"), "--lockstep", "--rate", "100", "--duration", "1", config=FIXED)[
+        "log"
+    ]
     return path
 
 

@@ -326,7 +326,16 @@ def runs() -> set[Path]:
 def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:
     folder = tmp_path_factory.mktemp("latency")
     (folder / "loop.toml").write_text(f'[recorder]\nfolder = "{folder}"\nmin_free_mb = 0\n')
-    words = ("--duration", str(SECONDS), "--rate", str(RATE_HZ), "--record", "--config", folder / "loop.toml")
+    words = (
+        "--duration",
+        str(SECONDS),
+        "--rate",
+        str(RATE_HZ),
+        "--trace",
+        "--record",
+        "--config",
+        folder / "loop.toml",
+    )
     before = runs()
     done = lowfc("latency", *words, "--plot", folder / "latency.png", "--json")
     assert done.exit_code == 0, (done.output, done.exception)
@@ -363,11 +372,8 @@ def test_every_frame_of_a_real_loop_is_in_the_account(measured: tuple[dict[str, 
 
 
 @pytest.mark.exclusive
-def test_stalls_of_a_real_loop_are_traced_beside_bare_loops() -> None:
-    words = ("--duration", str(SECONDS), "--rate", str(RATE_HZ), "--trace")
-    done = lowfc("latency", *words, "--json")
-    assert done.exit_code == 0, (done.output, done.exception)
-    figures = json.loads(done.stdout)
+def test_stalls_of_a_real_loop_are_traced_beside_bare_loops(measured: tuple[dict[str, Any], Path]) -> None:
+    figures, _ = measured
     found = figures["stalls"]
     assert found["frames"] == figures["frames"]
     assert figures["frames_without_command"] <= found["stalled"] == len(found["stalls"])

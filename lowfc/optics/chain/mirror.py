@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 
 from lowfc.arrays import Array, Mask
@@ -105,6 +104,8 @@ def modes_to_actuators(mirror: Mirror, nolls: Sequence[int], usable: Mask | None
     """
     u = pupil_axis(int(np.ceil(4.0 * mirror.pitches_per_pupil)))
     inside = (np.hypot(u[:, None], u) <= 0.5).astype(np.float64)
+    import scipy.linalg  # takes its time, and most processes load what was built
+
     y_factors = influence_factors(mirror, u, mirror.rows)
     x_factors = influence_factors(mirror, u, mirror.columns)
     # Sums over the circle of products of two influence functions: for each row of points, along x and then along y.

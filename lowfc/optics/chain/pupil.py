@@ -2,7 +2,6 @@
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import j0, j1
 
 from lowfc.arrays import Array
 from lowfc.optics.chain.grid import pupil_axis
@@ -60,6 +59,8 @@ def prolate(samples: int, mask_radius: float) -> Array:
 
 def _within(r: Array, rho: Array, radius: float) -> Array:
     """Integral of x J0(2 pi r x) J0(2 pi rho x) from 0 to the radius, for all pairs: through the mask and back."""
+    from scipy.special import j0, j1  # takes a quarter of a second, and most processes load what was built
+
     a, b = 2.0 * np.pi * r[:, None], 2.0 * np.pi * rho[None, :]
     gap = a**2 - b**2
     near = np.abs(gap) < 1e-6

@@ -9,7 +9,6 @@ one of them by chance, so that its mean is right.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import ndtr
 
 from lowfc.arrays import Pixels, Single
 
@@ -45,6 +44,8 @@ class PixelLaws:
 
 def pixel_laws(gain_e_per_dn: float, read_noise_e: float, bias_dn: float, saturation_dn: int) -> PixelLaws | None:
     """Laws for a detector without multiplication; None where rounding or saturation calls for more than a table."""
+    from scipy.special import ndtr  # takes a quarter of a second; of the processes only the camera needs it
+
     noise_dn = read_noise_e / gain_e_per_dn
     first = int(np.floor(bias_dn - _TAIL * noise_dn))
     last = int(np.ceil(bias_dn + _MOST_E / gain_e_per_dn + _TAIL * noise_dn))

@@ -10,7 +10,6 @@ operator ends at the focal plane, and what is left of the way is applied to the 
 from collections.abc import Callable, Iterator
 
 import numpy as np
-import scipy.linalg
 
 from lowfc.arrays import Array, Complex, Whole
 from lowfc.optics.chain.grid import OPEN_AREA, image_axis, pupil_axis
@@ -30,6 +29,8 @@ def prolates(samples: int, half_band: float, count: int) -> Array:
         half_band: Half of the band, in cycles per sample.
         count: How many, the best concentrated first.
     """
+    import scipy.linalg  # takes its time, and most processes load what was built
+
     index = np.arange(samples)
     diagonal = ((samples - 1) / 2.0 - index) ** 2 * np.cos(2.0 * np.pi * half_band)
     off_diagonal = index[1:] * (samples - index[1:]) / 2.0

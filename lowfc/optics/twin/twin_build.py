@@ -4,7 +4,6 @@ import itertools
 from collections.abc import Callable
 
 import numpy as np
-import scipy.linalg
 
 from lowfc.arrays import Array, Mask, Whole
 from lowfc.optics.chain.band import Band, monochromatic
@@ -91,6 +90,8 @@ def _intensity_sampling(sensor: Sensor, spec: TwinSpec, scale: float) -> tuple[W
 
     Intensities fill twice the field's band; the samples are picked by pivoted QR of that band's prolate functions.
     """
+    import scipy.linalg  # takes its time, and most processes load what was built
+
     functions = intensity_functions(sensor, scale, spec.guards)
     _, _, pivots = scipy.linalg.qr(functions.T, mode="economic", pivoting=True)
     points = np.sort(pivots[: functions.shape[1]]).astype(np.intp)
@@ -103,6 +104,8 @@ def _leading_modes(matrix: Array, rank: int) -> Array:
 
     They come from the smaller of the matrix's two squares, which costs precision only below 1e-8 of the largest value.
     """
+    import scipy.linalg
+
     size = min(matrix.shape)
     if not 0 < rank <= size:
         raise ValueError(f"the rank must lie between 1 and {size}, got {rank}")
