@@ -13,7 +13,7 @@ from tests.docs import test_tutorials as tutorials
 from tests.e2e.test_bench_day import COMMANDS as BENCH_DAY
 from tests.e2e.test_operator import COMMANDS as OPERATING
 from tests.e2e.test_own_hardware import COMMISSIONING, DOCUMENTED
-from tests.support.loops import command, going_on, interrupt, recorded_bytes, start, until
+from tests.support.loops import command, going_on, interrupt, recorded_bytes, start, told, until
 from tests.support.viewers import on_screen
 
 ROOT = Path(__file__).parents[2]
@@ -248,5 +248,6 @@ def test_the_logs(tmp_path: Path) -> None:
 
 
 def test_the_configuration(tmp_path: Path) -> None:
-    for line in FILES:
-        run(tmp_path, line)
+    for line in FILES[:-1]:
+        told(tmp_path, line)
+    run(tmp_path, f"{FILES[-1]} --lockstep")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.loops import command, going_on, interrupt, recorded_bytes, start, until
+from tests.support.loops import command, going_on, interrupt, recorded_bytes, start, told, until
 
 ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "tutorials"
@@ -35,6 +35,9 @@ _LIVE = re.compile(
 )
 
 
+_ALONE = re.compile(r"lowfc (?!sim-loop)")
+
+
 def followed_here(line: str) -> bool:
     """Whether a command ends by itself, and does not need a loop in real time."""
     return not _LIVE.search(line)
@@ -51,7 +54,8 @@ def followed(folder: Path, page: str, *, whole: bool = False) -> dict[str, str]:
         if not followed_here(line):
             continue
         short = re.sub(r"--\w+ \d+\b", lambda found: SHORTER.get(found[0], found[0]), line)
-        said[line] = command(folder, line if whole else short)
+        here = _ALONE.match(line) and not whole
+        said[line] = told(folder, short) if here else command(folder, line if whole else short)
     return said
 
 

@@ -17,7 +17,7 @@ from lowfc.contract.sections import SENSORS
 from lowfc.optics.chain.sensor import light_budget
 from lowfc.programs.core.recording.volume import bytes_per_s
 from sim_camera.prediction import tilt_residual_mas
-from tests.support.loops import FIXED, children, loop, payloads, recorded_bytes, run, start, until
+from tests.support.loops import FIXED, children, loop, payloads, recorded_bytes, run, start, told, until
 from tools.measure import measured
 
 GENTLE = """
@@ -54,8 +54,7 @@ def test_two_runs_with_one_seed_write_the_same_bytes_and_have_one_digest(tmp_pat
         assert figures["frames_published"] == figures["commands_applied"] == 300
         assert figures["messages_lost"] == 0
         logs.append(payloads(figures["log"]))
-        told = run(folder, "info", "last", "--digest", "--json")
-        infos.append(json.loads(told.stdout))
+        infos.append(json.loads(told(folder, "lowfc info last --digest --json")))
     digests = [info["digest"] for info in infos]
     assert digests[0] == digests[1] != digests[2]
     assert {key for key, line in infos[0]["topics"].items() if "digest" not in line} == {
@@ -85,8 +84,7 @@ def test_automatic_gains_are_inputs_that_two_runs_and_a_replay_have_alike(tmp_pa
     asked = [wire.Request.FromString(payload) for payload in one["/lowfc/control/request"]]
     assert [(request.name, request.accepted) for request in asked[:2]] == [("gain", True), ("close", True)]
     assert {request.requester for request in asked[:2]} == {"automatic gains"}
-    replayed = run(tmp_path / "one", "replay", "last", "--json")
-    assert json.loads(replayed.stdout)["identical"] is True
+    assert json.loads(told(tmp_path / "one", "lowfc replay last --json"))["identical"] is True
 
 
 @pytest.mark.parametrize("frames", [4_000, pytest.param(20_000, marks=pytest.mark.slow)])
@@ -156,7 +154,7 @@ def test_the_documents_table_is_of_the_sensors_as_they_are() -> None:
 
 
 def test_a_configuration_that_was_shown_does_not_open_the_loop(tmp_path: Path) -> None:
-    shown = run(tmp_path, "config", "show").stdout
+    shown = told(tmp_path, "lowfc config show")
     short = ("sim-loop", "--lockstep", "--duration", "2", "--no-record")
     done = run(tmp_path, *short, config=shown)
     assert re.match(r"loop +closed", done.stdout), done.stderr

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.support.loops import run
+from tests.support.loops import told
 from tests.support.report_log import Night
 from tests.support.viewers import Page, browser, needs_chromium, pixels
 
@@ -59,9 +59,7 @@ def figures(folder: Path) -> dict[str, Any]:
     night.request("close")
     night.frames(900, lost={300})
     log = night.write(folder / "night.mcap")
-    done = run(folder, "report", str(log), "--json", "--out", "report.html")
-    assert done.returncode == 0, done.stderr
-    found: dict[str, Any] = json.loads(done.stdout)
+    found: dict[str, Any] = json.loads(told(folder, f"lowfc report {log} --json --out report.html"))
     return found
 
 

@@ -54,6 +54,17 @@ def lowfc(*words: object) -> Result:
     return CliRunner().invoke(app, [*map(str, words)])
 
 
+def told(folder: Path, line: str) -> str:
+    """What a documented command that starts no loop prints, run in this process as if in this folder."""
+    words, _, output = line.partition(" > ")
+    with contextlib.chdir(folder):
+        done = lowfc(*shlex.split(words)[1:])
+    assert done.exit_code == 0, f"{line}: {done.output} {done.exception}"
+    if output:
+        (folder / output).write_text(done.stdout)
+    return done.stdout
+
+
 def loop(folder: Path, *arguments: str, config: str = "", timeout_s: float = 120) -> dict[str, Any]:
     """Figures of a `sim-loop` that must succeed; `log` becomes an absolute path."""
     done = run(folder, "sim-loop", "--json", *arguments, config=config, timeout_s=timeout_s)
