@@ -89,7 +89,7 @@ def test_what_ends_a_lease_names_its_holder_without_how_long_it_was_going_to_tak
 
 def test_a_closed_loop_is_not_said_to_be_closed_from_now_on() -> None:
     state, outputs = asked(loaded(USUAL), Request(0, "close"))
-    assert outputs.reply.text == "the loop is closed already"
+    assert outputs.reply.text == "the loop stays closed"
     state, _ = asked(state, Request(1, "step", values=(5.0,)))
     assert asked(state, Request(2, "close"))[1].reply.text == "loop closed"
 

@@ -104,7 +104,7 @@ def _mode(settings: Settings, state: State, request: Request) -> Handled:
     if request.name == "pause" and state.mode is LoopMode.OPEN and not paused:
         reply = "the loop is open already, and holds the command"
     if request.name == "close" and state.mode is LoopMode.CLOSED and not state.steps_left:
-        reply = "the loop is closed already"
+        reply = "the loop stays closed"
     waits = state.mode is LoopMode.OPEN and state.conditions.mode_cause == MEASURED_FIRST
     if (request.name == "open" and paused) or (after is LoopMode.OPEN and waits):  # it stays open from now on
         state = state._replace(conditions=state.conditions._replace(mode_cause=cause))
