@@ -161,8 +161,9 @@ def render(figures: Figures) -> str:
                 | {preset: "{open_nm:.2f} to {closed_nm:.2f}".format(**row) for preset, row in mine.items()}
             )
     harmful = [row for row in rows if harms(row)]
-    stars = ", ".join(f"{one:g}" for one in sorted({row["magnitude"] for row in modal}))
-    compared = [row["of_best"] for row in rows if "of_best" in row]
+    stars = _listed(modal)
+    bright = [row for row in rows if "of_best" in row]
+    compared = [row["of_best"] for row in bright]
     names = "; ".join(
         "{sensor}, {preset}, V = {magnitude}: {added:.2g}".format(**row, added=row["change"] / row["own"])
         for row in harmful
@@ -176,7 +177,12 @@ def render(figures: Figures) -> str:
         f"cases (V = {stars}; these and `quiet`; {len(rows) - len(modal)} of them "
         "with every image simulated) those in which "
         f"closing adds more contrast than three standard errors (of `quiet`: none) and {100 * OF_DARK_ZONE:g} % of the "
-        f"dark zone's own, and how much of that it adds: {names or 'none'}. On bright stars (V = -1, 0, 2) automatic "
-        f"gains leave {min(compared):.2f} to {max(compared):.2f} times what the best fixed gains leave, which were "
-        "looked for afterwards."
+        f"dark zone's own, and how much of that it adds: {names or 'none'}. On bright stars (V = {_listed(bright)}) "
+        f"automatic gains leave {min(compared):.2f} to {max(compared):.2f} times what the best fixed gains leave, "
+        "which were looked for afterwards."
     )
+
+
+def _listed(rows: list[Figures]) -> str:
+    """The magnitudes of rows."""
+    return ", ".join(f"{one:g}" for one in sorted({row["magnitude"] for row in rows}))

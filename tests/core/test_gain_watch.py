@@ -11,7 +11,7 @@ from lowfc.arrays import Array, Single
 from lowfc.contract.codecs.state_codec import controller_state, decode_state
 from lowfc.contract.configuration import FIXED_GAINS, load
 from lowfc.control.calibration.granted import noise_covariance_nm2
-from lowfc.control.laws.automatic_gain import TiltCrossTalk
+from lowfc.control.laws.automatic_gain import GainBank, TiltCrossTalk
 from lowfc.control.laws.law import RELAXING
 from lowfc.control.loop.safety import LoopMode
 from tools.law_bench import Bench, calibrated, configured
@@ -100,6 +100,24 @@ def test_modes_that_are_left_alone_bring_less_noise_to_the_others(faint: Bench) 
     assert (made[~left] < 0.9 * own[~left]).any()
 
 
+def test_the_bank_knows_what_r_for_fewer_modes_shows_of_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[Array | Single] = []
+    remade = GainBank.remade
+
+    def noted(self: GainBank, of_own: Array | Single) -> None:
+        seen.append(of_own)
+        remade(self, of_own)
+
+    monkeypatch.setattr(GainBank, "remade", noted)
+    loop = bench(6.5)
+    loop.run(1050)
+    drive = loop.state.drive
+    assert drive is not None
+    of_own = drive.estimator.rows[:-1] @ drive.calibration.response
+    np.testing.assert_array_equal(seen[-1], of_own[2:, 2:])
+    assert np.abs(of_own - np.eye(len(of_own))).max() > 0.1
+
+
 def test_the_command_of_a_mode_that_is_left_alone_relaxes_to_zero() -> None:
     """What an earlier gain put on the mirror does not stay there; at a gain of 0 that a person gave, it does."""
     loop = bench(0.0)
@@ -158,7 +176,7 @@ def test_tilt_is_compared_with_other_modes_as_the_sensor_saw_it(monkeypatch: pyt
     seen: list[Single] = []
     followed = TiltCrossTalk.followed
 
-    def noted(self: TiltCrossTalk, tilt_nm: Single, open_nm: Single) -> Array:
+    def noted(self: TiltCrossTalk, tilt_nm: Single, open_nm: Array | Single) -> Array:
         seen.append(tilt_nm)
         return followed(self, tilt_nm, open_nm)
 

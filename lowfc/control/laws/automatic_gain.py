@@ -16,8 +16,12 @@ CONFIDENCE = 2.0
 """Standard errors by which one gain must beat another; or it does so in `MOST_OF` of the blocks, for where the open
 loop wanders, one of them may outweigh all others."""
 MOST_OF = 9
+GRANTED = 3.0
+"""Standard errors of white noise by which a gain must beat the open loop in a first window, and for a mode at 0: one
+gain that noise was granted on a faint star may add as much contrast as the dark zone has."""
 EARLY = 5
-"""Blocks in a row that must speak for it, for a mode that is hardly corrected to get a gain before the window ends."""
+"""Blocks of a window after which a mode that is hardly corrected may get a gain before the window ends: one at 0 as
+above, one at the least gain where so many in a row speak for it."""
 LONGEST = 16
 """Times its first length, to which a window grows while it decides nothing."""
 FEW = 3
@@ -89,6 +93,7 @@ class GainBank:
         self._at_rest = VirtualIntegrators.at_rest(gain, kept, limit_nm, weights)
         self._windows = windows
         self._closed = self._throughout = False
+        self.remade(np.eye(kept.size))
         self.restart()
 
     def restart(self) -> None:
@@ -97,6 +102,13 @@ class GainBank:
         self._cross_talk = TiltCrossTalk(self._at_rest.kept.size)
         self._before_nm = np.zeros_like(self._at_rest.kept)
         self.begin_again()
+
+    def remade(self, of_own: Array | Single) -> None:
+        """Take modes of another R from now on: (modes, modes), what each shows of those of the calibration's own R.
+
+        The cross-talk of tilt is fitted in the latter, which stay: an R for fewer modes mixes it into those it is for.
+        """
+        self._of_own, self._to_own = of_own, np.linalg.inv(of_own)
 
     def begin_again(self) -> None:
         """Let the next window be a first one."""
@@ -109,7 +121,7 @@ class GainBank:
         A bank of other modes takes tip and tilt (2,), too, as the sensor saw them.
         """
         if tilt_nm is not None:
-            self._tilt += self._cross_talk.followed(tilt_nm, open_nm)
+            self._tilt += self._cross_talk.followed(tilt_nm, self._to_own @ open_nm)
         self._loops, errors_nm = self._loops.followed(open_nm)
         squares = np.square(errors_nm)
         self._power += squares[0]
@@ -117,6 +129,7 @@ class GainBank:
         self._before_nm = errors_nm[0]
         self._mean += errors_nm[0]
         squares -= squares[0].copy()
+        self._spread += np.square(squares)
         self._sums[:-1] += squares
         self._sums[-1] += np.square(error_nm) - np.square(open_nm)
         if closed is not self._closed and not self.first:
@@ -131,6 +144,7 @@ class GainBank:
         self._changed.append(self._changes / self._frames)
         self._means.append(self._mean / self._frames)
         self._tilts.append(self._tilt / self._frames)
+        self._spreads.append(self._spread / self._frames)
         self._begin_block()
         return True
 
@@ -147,13 +161,15 @@ class GainBank:
         if self.first or len(self._blocks) < EARLY:
             return gain
         now = self._row_of(gain)
-        cross_talk_nm = self._cross_talk.mean_nm(np.mean(self._tilts[-EARLY:], axis=0))
-        blocks = self._without(MARGIN * cross_talk_nm)[-EARLY:, :-1]
+        cross_talk_nm = self._of_own @ self._cross_talk.mean_nm(np.mean(self._tilts[-EARLY:], axis=0))
+        blocks = self._handicapped(cross_talk_nm)[:, :-1]
         own = blocks[:, now, np.arange(now.size)]
         beyond = blocks - own[:, None]
-        sure = np.where((beyond < 0).all(axis=0), beyond.mean(axis=0), np.inf)
-        grown = (now <= 1) & np.isfinite(sure).any(axis=0)
-        absent = (cross_talk_nm != 0) & (own > 0).all(axis=0)
+        mean = np.where(now == 0, beyond.mean(axis=0), beyond[-EARLY:].mean(axis=0))
+        shown = np.where(now == 0, self._no_noise(mean), (beyond[-EARLY:] < 0).all(axis=0))
+        sure = np.where(shown, mean, np.inf)
+        grown = (now <= 1) & shown.any(axis=0)
+        absent = (cross_talk_nm != 0) & (own[-EARLY:] > 0).all(axis=0)
         gain = np.where(grown, self.rows[np.argmin(sure, axis=0)], gain)
         return np.where(absent, 0, gain).astype(np.float32)
 
@@ -165,17 +181,18 @@ class GainBank:
     def verdict(self, gain: Single, noise_nm2: Array | None) -> Verdict:
         """What the window has shown, at gains (modes,) and with the noise of one frame (modes,), None where unknown."""
         means, power = (np.mean(values, axis=0, dtype=float) for values in (self._means, self._powers))
-        cross_talk_nm = self._cross_talk.mean_nm(np.mean(self._tilts, axis=0))
+        cross_talk_nm = self._of_own @ self._cross_talk.mean_nm(np.mean(self._tilts, axis=0))
         power -= (2 * means - cross_talk_nm) * cross_talk_nm
         now = self._row_of(gain)
         modes = np.arange(gain.size)
         frames = self._block * BLOCKS
         mean, error = _mean(self._without(cross_talk_nm))
-        chosen = self._chosen(self._without(MARGIN * cross_talk_nm), now)
+        chosen = self._chosen(self._handicapped(cross_talk_nm), now)
         if noise_nm2 is not None:
             noise_nm2 = np.maximum(noise_nm2, np.mean(self._changed, axis=0))
         if self.first and noise_nm2 is not None:
-            there = power - noise_nm2 * (1 + CONFIDENCE * np.sqrt(2 / frames))
+            scatter = _mean(np.subtract(self._powers, self._changed))[1]  # noise of a faint star has long tails
+            there = power - noise_nm2 - GRANTED * np.maximum(noise_nm2 * np.sqrt(2 / frames), scatter)
             little = injected(self.rows[1]) * noise_nm2 < LEAST_CORRECTED * there
             chosen = np.where((chosen == 0) & little & (cross_talk_nm == 0), 1, chosen)
         found = Verdict(
@@ -205,21 +222,35 @@ class GainBank:
         blocks[:, 1:] += (2 * np.array(self._means, float) * cross_talk_nm)[:, None]
         return blocks
 
+    def _handicapped(self, cross_talk_nm: Array) -> Array:
+        """The same with a margin, for what a gain must be worth; cross-talk that speaks for a gain is not counted."""
+        against = np.mean(self._means, axis=0) * cross_talk_nm > 0
+        return self._without(np.where(against, MARGIN * cross_talk_nm, 0))
+
     def _chosen(self, blocks: Array, now: Whole) -> Whole:
         """The row (modes,) for each mode whose row is `now`."""
         own, modes = blocks[:, :-1], np.arange(now.size)
         rows, helps = own + self._alike(own), own.mean(axis=0) < 0
         if self.first:
-            beyond_open, better = _better(rows)
-            better &= helps
+            beyond_open = rows.mean(axis=0)
+            better = helps & self._no_noise(beyond_open)
             return np.where(better.any(axis=0), np.argmin(np.where(better, beyond_open, np.inf), axis=0), 0)
         beyond_now, better = _better(rows - rows[:, now, modes][:, None])
-        better &= helps
+        better = helps & np.where(now == 0, self._no_noise(beyond_now), better)
         better[0] = _better(-own)[1][now, modes]
         best = np.argmin(np.where(better, beyond_now, np.inf), axis=0)
         best = np.where(better.any(axis=0), best, now)
         near = np.clip(best, np.maximum(now - 1, 0), now + 1)
         return np.where((now <= 1) | better[0], best, near)
+
+    def _no_noise(self, mean: Array) -> Mask:
+        """Whether a mean over the blocks, of gains (rows, modes) beyond none, is below what white noise would show.
+
+        No command knows the noise of a later frame, so the differences of frames are independent of each other.
+        """
+        return np.asarray(
+            mean < -GRANTED * np.sqrt(np.mean(self._spreads, axis=0) / (len(self._spreads) * self._block))
+        )
 
     def _alike(self, blocks: Array) -> Array:
         """What modes whose disturbance is to their noise as it is with most of them would show."""
@@ -241,17 +272,19 @@ class GainBank:
         self._changed: list[Array] = []
         self._means: list[Array] = []
         self._tilts: list[Array] = []
+        self._spreads: list[Array] = []
         self._throughout = True
         self._begin_block()
 
     def _begin_block(self) -> None:
         self._frames = 0
         self._sums = np.zeros((self.rows.size + 1, self._at_rest.kept.size))
+        self._spread = np.zeros((self.rows.size, self._at_rest.kept.size))
         self._power, self._changes, self._mean = np.zeros((3, self._at_rest.kept.size))
         self._tilt = np.zeros(_REGRESSORS)
 
     def _kept(self) -> tuple[list[Array], ...]:
-        return self._blocks, self._powers, self._changed, self._means, self._tilts
+        return self._blocks, self._powers, self._changed, self._means, self._tilts, self._spreads
 
     def _lengthen(self) -> None:
         """Go on with blocks of twice the length; the longest window forgets its older half."""
@@ -279,7 +312,7 @@ class TiltCrossTalk:
         self._changes = 0
         self._before: Array | None = None
 
-    def followed(self, tilt_nm: Single, open_nm: Single) -> Array:
+    def followed(self, tilt_nm: Single, open_nm: Array | Single) -> Array:
         """Take tip and tilt (2,), as the sensor saw them in one frame, and the open loop of the others (modes,), nm.
 
         Returns:

@@ -5,13 +5,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lowfc.arrays import Array, Mask, Single
+from lowfc.arrays import Array, Mask, Single, single
 from lowfc.control.calibration.granted import noise_covariance_nm2
 from lowfc.control.laws.automatic_gain import CONFIDENCE, GainBank, Verdict, injected, left_alone_nm2
 from lowfc.control.laws.law import TIP_TILT
 from lowfc.control.loop.inputs import COUNT_BITS, PendingEvent, Request, Step
 from lowfc.control.loop.safety import LoopMode
-from lowfc.control.loop.state import ActiveLoop, Settings, State
+from lowfc.control.loop.state import ActiveLoop, Settings, State, Weighting
 from lowfc.control.loop.wording import AUTO, MEASURED_FIRST
 
 FIRST_S = 2.0
@@ -79,6 +79,7 @@ class GainWatch:
         self._settings, self._on_harm, self._contrast = settings, on_harm, contrast
         self._groups: list[_Group] = []
         self._of: tuple[object, ...] = ()
+        self._weighting: Weighting | None = None
         self._newest = 0
         self._light = self._frames = 0.0
         self._light_was = 0.0
@@ -92,6 +93,11 @@ class GainWatch:
         if drive is None or not drive.calibration.noll:
             return NOTHING
         self._begin(drive)
+        if drive.weighting is not self._weighting:
+            self._weighting = drive.weighting
+            of_own = single(drive.estimator.rows[:-1] @ drive.calibration.response)
+            for group in self._groups:
+                group.bank.remade(of_own[np.ix_(group.mask, group.mask)])
         missing = step.frame_sequence - self._newest - 1
         if missing < 0:  # an old frame
             return NOTHING
@@ -158,7 +164,7 @@ class GainWatch:
         of = drive.calibration.id, drive.law.leak.tobytes(), drive.law.limit_nm.tobytes()
         if of == self._of:
             return
-        self._of = of
+        self._of, self._weighting = of, None
         tilt = np.isin(drive.calibration.noll, TIP_TILT)
         both = tilt if tilt.sum() == len(TIP_TILT) else None
         self._groups = [

@@ -38,11 +38,13 @@ def drift(frames: int, step_nm: float, noise_nm: float, seed: int) -> Array:
 
 
 def test_noise_alone_is_left_alone() -> None:
-    """Two standard errors let one mode in some tens through, and then with a low gain."""
-    found = verdicts(bank(), drift(1000, 0.0, 10.0, 1), np.zeros(MODES, np.float32), 100.0)
-    assert len(found) == 1
-    assert np.count_nonzero(found[0].gain) <= 3
-    assert found[0].gain.max() < 0.02
+    """Of 1200 modes in a first window, with long tails as of few photons; two standard errors let several through."""
+    rng, none = np.random.default_rng(1), np.zeros(MODES, np.float32)
+    granted = 0
+    for _ in range(40):
+        noise = rng.normal(0, 10, (300, MODES)) * (1 + 4 * (rng.random((300, 1)) < 0.02))
+        granted += np.count_nonzero(verdicts(bank(windows=(300, 1000)), noise, none, 100.0)[0].gain)
+    assert granted <= 1
 
 
 @pytest.mark.parametrize(("step_nm", "delay_frames"), [(0.1, 1.0), (1.0, 1.0), (1.0, 2.0), (20.0, 1.0)])
@@ -171,6 +173,38 @@ def test_a_gain_for_the_cross_talk_of_tilt_is_taken_back_before_the_window_ends(
         if made.followed(one, one, seen, closed=True):
             gain = made.early(gain)
     assert gain[4] == 0
+
+
+def test_cross_talk_of_tilt_does_not_speak_for_a_gain() -> None:
+    """What is there hides behind it, 2.72 nm behind 2.7 nm: no loop sees it."""
+    tilt_nm, shown = _vibrating(1000, 23)
+    shown[:, 4] -= 2.72
+    made = bank()
+    for one, seen in zip(shown, tilt_nm, strict=True):
+        made.followed(one, one, seen, closed=False)
+    assert made.verdict(np.zeros(MODES, np.float32), ONES.astype(float)).gain[4] == 0
+
+
+def test_cross_talk_of_tilt_that_another_r_mixes_into_a_mode_is_known_at_once() -> None:
+    """R for fewer modes takes twice of the mode that shows the squares from another one, which was free of them."""
+    tilt_nm, shown = _vibrating(5200, 22)
+    of_own = np.eye(MODES)
+    of_own[7, 4] = -2
+    mixed = (shown @ of_own.T).astype(np.float32)
+    gains = []
+    for told in (True, False):
+        made, gain = bank(windows=(200, 1000)), np.zeros(MODES, np.float32)
+        for one, seen in zip(shown[:5000], tilt_nm[:5000], strict=True):
+            if made.followed(one, one, seen, closed=True) and made.complete:
+                made.verdict(gain, ONES.astype(float))
+        made.begin_again()
+        if told:
+            made.remade(of_own)
+        for one, seen in zip(mixed[5000:], tilt_nm[5000:], strict=True):
+            made.followed(one, one, seen, closed=True)
+        gains.append(made.verdict(gain, ONES.astype(float)).gain[7])
+    assert gains[0] == 0
+    assert gains[1] > 0
 
 
 def test_what_is_there_is_corrected_beside_the_cross_talk_of_tilt() -> None:
