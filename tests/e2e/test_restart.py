@@ -93,29 +93,25 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.fixture
-def bench(folder: Path) -> Iterator[Bench]:
+ORDERS = list(itertools.permutations(["camera", "controller", "mirror"]))
+
+
+@pytest.fixture(scope="module", params=[ORDERS[0], *(pytest.param(one, marks=pytest.mark.slow) for one in ORDERS[1:])])
+def bench(folder: Path, request: pytest.FixtureRequest) -> Iterator[Bench]:
+    """Each is up before the next is started, so that every one of them is first and last once."""
     made = Bench(folder)
+    for name in request.param:
+        made.start(name)
+        until(lambda: all(_alive(made, process) for process in made.running))
     yield made
     made.stop()
 
 
-ORDERS = list(itertools.permutations(["camera", "controller", "mirror"]))
-
-
-@pytest.mark.parametrize("order", [ORDERS[0], *(pytest.param(one, marks=pytest.mark.slow) for one in ORDERS[1:])])
-def test_any_start_order(bench: Bench, order: tuple[str, ...]) -> None:
-    """Each is up before the next is started, so that every one of them is first and last once."""
-    for name in order:
-        bench.start(name)
-        heard = [*bench.running]
-        until(lambda: all(_alive(bench, process) for process in heard))  # noqa: B023
+def test_any_start_order(bench: Bench) -> None:
     bench.settled()
 
 
 def test_kill_and_restart_of_each(bench: Bench) -> None:
-    for name in ("mirror", "controller", "camera"):
-        bench.start(name)
     bench.settled()
     for name in ("camera", "controller", "mirror"):
         before = bench.shapes[-1]
@@ -138,8 +134,6 @@ def _alive(bench: Bench, name: str) -> bool:
 
 
 def test_a_mirror_that_dies_is_missed_and_taken_back(bench: Bench) -> None:
-    for name in ("mirror", "controller", "camera"):
-        bench.start(name)
     bench.settled()
     before = bench.shapes[-1]
     bench.kill("mirror")
