@@ -65,10 +65,10 @@ def run_camera(
         BusError: the run has a camera already, or one of `wait_for` did not come.
     """
     service = join(config, run, Role.CAMERA, config.realtime.camera_cpus)
-    with opening("the camera does not say how it is set"):
-        loop = CameraLoop(driver, service, config, frames)
-    service.catch_signals()
     with closing(service.bus):  # a callback on zenoh's threads must not outlive the interpreter
+        with opening("the camera does not say how it is set"):
+            loop = CameraLoop(driver, service, config, frames)
+        service.catch_signals()
         loop.run(wait_for)
 
 
@@ -125,8 +125,8 @@ def run_mirror(driver: Mirror, config: Configuration, run: str) -> None:
         ConfigurationError: the driver's grid is not that of [mirror].
     """
     service = join(config, run, mirror_role(config.mirror.name), config.realtime.mirror_cpus)
-    with opening("the mirror does not say what it is"):
-        loop = MirrorLoop(driver, service, config)
-    service.catch_signals()
     with closing(service.bus):
+        with opening("the mirror does not say what it is"):
+            loop = MirrorLoop(driver, service, config)
+        service.catch_signals()
         loop.run()

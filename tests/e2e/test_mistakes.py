@@ -99,7 +99,7 @@ def test_a_port_in_use(tmp_path: Path) -> None:
         held.remove()
 
 
-def test_nobody_is_there(tmp_path: Path) -> None:
+def test_nobody_is_there(tmp_path: Path, own_runtime: Path) -> None:
     _refused(tmp_path, "ctl", "status", expected="lowfc was searched")
     _refused(tmp_path, "ctl", "status", "--run", "none-such", expected="there is no run 'none-such': no loop of user")
     _refused(tmp_path, "ctl", "--run", "none-such", "record", "stop", expected="there is no run 'none-such'")
