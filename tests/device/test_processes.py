@@ -127,7 +127,8 @@ class Bench:
     def befall(self, name: str, fault: str) -> None:
         """Let it hang or die, and forget what was said so far."""
         self.events.clear()
-        (self.folder / name).write_text(fault)
+        (self.folder / "fault").write_text(fault)
+        (self.folder / "fault").rename(self.folder / name)  # whole, or the driver reads it empty
         until(lambda: not (self.folder / name).exists())
 
     def named(self, process: str, event: str) -> int:
