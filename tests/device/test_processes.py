@@ -60,7 +60,10 @@ def test_a_camera_whose_process_dies_is_a_new_start_once_it_is_started_again(tmp
     assert starts == sorted(starts)
 
 
-FAULTY = """
+HANGS_S = 5.0
+FAULTY = (
+    f"HANGS_S = {HANGS_S}"
+    + """
 import os, time
 import numpy as np
 from lowfc.contract.errors import LowfcError
@@ -75,7 +78,7 @@ def befall(name):
             os._exit(7)
         if fault == "refuse":
             raise LowfcError("its lens cap is on")
-        time.sleep(5)
+        time.sleep(HANGS_S)
 
 class Camera(SimulatedCamera):
     def expose(self):
@@ -94,7 +97,7 @@ class Mirror:
     def close(self):
         pass
 """
-HANGS_S = 5.0
+)
 BENCH = f"{STILL}tilt_gain = 0.3\n"
 OF_BENCH = "--run bench --config bench.toml"
 CAMERA, MIRROR = (f"lowfc {kind} faulty.py:{kind.capitalize()} {OF_BENCH}" for kind in ("camera", "mirror"))

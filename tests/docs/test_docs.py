@@ -31,8 +31,8 @@ ELSEWHERE = {
     ROUTE: "tests/design/test_layout_files.py",
 }
 SHORTER = {
-    "--duration 20": "--duration 0.5",
-    "--duration 5": "--duration 0.2",
+    "--duration 20": "--duration 2",
+    "--duration 5": "--duration 2",
     "--seconds 2": "--seconds 0.5",
     "--trials 20": "--trials 4",
     "--steps 200": "--steps 40",
@@ -140,9 +140,9 @@ LOGS = (
 )
 
 
+@pytest.mark.exclusive
 def test_the_loop(tmp_path: Path) -> None:
-    """In lockstep; in real time the loop of test_sim_loop runs."""
-    assert "frame to command" in run(tmp_path, f"{LOOP} --lockstep")
+    assert "frame to command" in run(tmp_path, LOOP)
     assert len(list((tmp_path / "logs").glob("*.mcap"))) == 1
 
 
@@ -250,4 +250,4 @@ def test_the_logs(tmp_path: Path) -> None:
 def test_the_configuration(tmp_path: Path) -> None:
     for line in FILES[:-1]:
         told(tmp_path, line)
-    run(tmp_path, f"{FILES[-1]} --lockstep")
+    run(tmp_path, FILES[-1])

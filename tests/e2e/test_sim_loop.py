@@ -14,7 +14,7 @@ import pytest
 
 from lowfc.contract.messages import RawImage, from_timestamp, topic_of, wire
 from lowfc.programs.cli.ctl.command import SIGNAL
-from tests.support.loops import FIXED, LOWFC, children, loop, lowfc, payloads, recorded_bytes, start, until
+from tests.support.loops import FIXED, LOWFC, children, interrupt, loop, lowfc, payloads, recorded_bytes, start, until
 from tests.support.other_readers import foxglove
 
 pytestmark = pytest.mark.exclusive
@@ -103,6 +103,19 @@ def test_an_independent_reader_agrees(live: dict[str, Any], topics: dict[str, li
     assert "lowfc" in found["metadata"]
 
 
+def test_a_process_that_dies_is_named(tmp_path: Path) -> None:
+    process = start(tmp_path, "sim-loop", "--rate", "200", "--duration", "60")
+    until(lambda: recorded_bytes(tmp_path) > 4e6)
+    os.kill(children(process.pid)["sim_dm"], signal.SIGKILL)
+    said, complaints = process.communicate(timeout=30)
+    assert process.returncode == 1
+    assert not said
+    assert "mirror-dm was killed by SIGKILL" in complaints
+    assert "Traceback" not in complaints
+    (log,) = (tmp_path / "logs").glob("*.mcap")  # it is finished all the same
+    assert complaints.endswith(f"recorded until then: logs/{log.name}\n")
+
+
 @pytest.mark.slow
 def test_two_loops_on_one_host_do_not_mix(tmp_path: Path) -> None:
     first, second = (tmp_path / name for name in ("first", "second"))
@@ -140,27 +153,23 @@ def test_a_disk_that_refuses_ends_the_recording_and_nothing_else(tmp_path: Path)
     assert sum(figures["lost"].values()) == figures["messages_lost"] > 100
 
 
-def test_a_signal_makes_the_loop_safe_and_a_process_that_dies_is_named(tmp_path: Path) -> None:
-    """The documented pattern finds the controller where nobody can ask any more; the log has it as a request."""
+def test_a_signal_makes_the_loop_safe_where_nobody_can_ask_any_more(tmp_path: Path) -> None:
+    """The documented pattern finds the controller, the log has the signal as a request; Ctrl-C ends with a summary."""
     pattern = re.search(r"pkill -USR1 -f '(.*)'", SIGNAL)
     process = start(tmp_path, "sim-loop", "--disturbance", "quiet")
     try:
         until(lambda: recorded_bytes(tmp_path) > 4e6)
-        found = children(process.pid)
-        command = Path(f"/proc/{found['controller']}/cmdline").read_text().replace("\0", " ")
+        controller = children(process.pid)["controller"]
+        command = Path(f"/proc/{controller}/cmdline").read_text().replace("\0", " ")
         assert re.search(pattern[1], command)
         assert not re.search(pattern[1], f"bash -c {command}")
-        os.kill(found["controller"], signal.SIGUSR1)
+        os.kill(controller, signal.SIGUSR1)
         until(lambda: "in safe mode" in lowfc("ctl", "status").stdout)
     finally:
-        os.kill(found["sim_dm"], signal.SIGKILL)
-        said, complaints = process.communicate(timeout=30)
-    assert process.returncode == 1
-    assert not said
-    assert "mirror-dm was killed by SIGKILL" in complaints
-    assert "Traceback" not in complaints
-    (log,) = (tmp_path / "logs").glob("*.mcap")  # it is finished all the same
-    assert complaints.endswith(f"recorded until then: logs/{log.name}\n")
+        said, complaints = interrupt(process)
+    assert process.returncode == 0, complaints
+    assert "frame to command" in said
+    (log,) = (tmp_path / "logs").glob("*.mcap")
     recorded = payloads(log)
     assert recorded["/lowfc/camera/frame"]
     asked = [wire.Request.FromString(payload) for payload in recorded["/lowfc/control/request"]]
