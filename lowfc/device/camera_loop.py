@@ -6,7 +6,6 @@ from lowfc.adapters.process.realtime import let_send
 from lowfc.adapters.process.service import Service
 from lowfc.arrays import Pixels
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.errors import BusError
 from lowfc.contract.messages import CAMERA_STATE, FRAME, image, wire
 from lowfc.device.driver import Camera, CameraExtras, CameraSettings, Exposure, camera_state
 from lowfc.device.watch import DriverWatch
@@ -59,9 +58,7 @@ class CameraLoop:
             LowfcError: the driver says what a user has to put right.
         """
         service = self._service
-        missing = service.wait_for(wait_for, WAIT_S)
-        if missing and service.running:
-            raise BusError(f"no sign of {', '.join(missing)} after {WAIT_S:g} s; the camera will not start without")
+        service.meet(wait_for, WAIT_S, "the camera will not start without")
         service.awaited = lambda: "" if service.work else "the camera's first frame"
         service.state = "running"
         getattr(self._driver, "start", _IDLE.start)()

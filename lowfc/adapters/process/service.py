@@ -21,6 +21,7 @@ from lowfc.adapters.process.clock import WALL_TOLERANCE_NS, Clock
 from lowfc.adapters.process.host import resident_bytes
 from lowfc.adapters.process.realtime import NOTHING, Granted
 from lowfc.adapters.process.supervision import Supervisor
+from lowfc.contract.errors import BusError
 from lowfc.contract.events import EVENTS, Level
 from lowfc.contract.messages import EVENT, HEALTH, Log, Role, Topic, timestamp, wire
 from lowfc.control.loop.wording import counted
@@ -59,7 +60,7 @@ class Service:
         announces: bool = False,
         supervisor: Supervisor | None = None,
     ) -> None:
-        """Join the run; `fill` adds the role's own fields to each Health, the service manager is that of the host."""
+        """Join the run; `fill` adds the role's own fields to each Health, `supervisor` is by default the host's."""
         self.name = name
         self.clock = clock
         self.bus = bus
@@ -257,6 +258,16 @@ class Service:
             self.beat()
             time.sleep(_MET_PERIOD_S)
         return ()
+
+    def meet(self, names: Iterable[str], timeout_s: float, otherwise: str) -> None:
+        """Wait for these processes as `wait_for` does.
+
+        Raises:
+            BusError: one did not answer in time, and the process was not told to stop; what happens `otherwise`.
+        """
+        missing = self.wait_for(names, timeout_s)
+        if missing and self.running:
+            raise BusError(f"no sign of {', '.join(missing)} after {timeout_s:g} s; {otherwise}")
 
     def health(self) -> wire.Health:
         """Health of the process, now."""

@@ -102,10 +102,10 @@ def modes_to_actuators(mirror: Mirror, nolls: Sequence[int], usable: Mask | None
     Raises:
         ValueError: too few actuators are left for so many modes.
     """
-    u = pupil_axis(int(np.ceil(4.0 * mirror.pitches_per_pupil)))
-    inside = (np.hypot(u[:, None], u) <= 0.5).astype(np.float64)
     import scipy.linalg  # takes its time, and most processes load what was built
 
+    u = pupil_axis(int(np.ceil(4.0 * mirror.pitches_per_pupil)))
+    inside = (np.hypot(u[:, None], u) <= 0.5).astype(np.float64)
     y_factors = influence_factors(mirror, u, mirror.rows)
     x_factors = influence_factors(mirror, u, mirror.columns)
     # Sums over the circle of products of two influence functions: for each row of points, along x and then along y.

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from lowfc.adapters.process.terminal import DEFAULT_RUN, ConfigFile, Json, RunId, configuration
-from lowfc.contract.errors import BusError, ConfigurationError
+from lowfc.contract.errors import ConfigurationError
 
 _PATIENCE_S = 30.0
 
@@ -66,10 +66,7 @@ def controller(
         with Console(stderr=True).status("compiling the fused step"):
             compiled.kernel(FUSED)
     service = join(settings, run, Role.CONTROLLER, settings.realtime.controller_cpus)
-    if missing := service.wait_for(wait_for or (), _PATIENCE_S):
-        raise BusError(
-            f"no sign of {', '.join(missing)} after {_PATIENCE_S:g} s; the controller will not start without"
-        )
+    service.meet(wait_for or (), _PATIENCE_S, "the controller will not start without")
     source = calibration.name if calibration is not None else "the configuration"
     latch = Latch(
         latch_files(open_run(run, (settings.mirror.name,))), lambda why: service.event("LATCH_FAILED", why=why)

@@ -22,7 +22,6 @@ from lowfc.adapters.process.service import Service
 from lowfc.adapters.process.terminal import DEFAULT_RUN, ConfigFile, RunId, configuration, new_app, run_app
 from lowfc.arrays import Pixels
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.errors import BusError
 from lowfc.contract.messages import CAMERA_STATE, FRAME, RawImage, Role, image, timestamp
 from lowfc.device.driver import CameraSettings, camera_state
 from lowfc.optics.chain.zernike import zernikes
@@ -119,9 +118,7 @@ class Source:
         """
         service = self._service
         service.state = "ready"
-        missing = service.wait_for(wait_for, _WAIT_S)
-        if missing and service.running:
-            raise BusError(f"no sign of {', '.join(missing)} after {_WAIT_S:g} s; no frame is sent without")
+        service.meet(wait_for, _WAIT_S, "no frame is sent without")
         state = camera_state(CameraSettings.configured(self._config, *self._payloads.shape), service.clock.now_ns())
         self._settings.put(state.SerializeToString())
         service.state = "running"
