@@ -1,6 +1,7 @@
 """What all tests share: runs that leave nothing behind, and no silent skips where none are allowed."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -32,6 +33,18 @@ def _private_cache(pytestconfig: pytest.Config) -> None:
     """Keep optical models apart from the user's, in a folder that all workers and later sessions share."""
     assert pytestconfig.cache is not None
     os.environ["XDG_CACHE_HOME"] = str(pytestconfig.cache.mkdir("home"))
+
+
+@pytest.fixture(autouse=True)
+def _same_process() -> Iterator[None]:
+    """A command run in this process leaves later tests no scheduling class, niceness or processors of its own."""
+    before = _scheduling()
+    yield
+    assert _scheduling() == before
+
+
+def _scheduling() -> tuple[int, int, set[int]]:
+    return os.sched_getscheduler(0), os.getpriority(os.PRIO_PROCESS, 0), os.sched_getaffinity(0)
 
 
 @pytest.fixture

@@ -221,12 +221,12 @@ def processors() -> tuple[int, int]:
 
 def may_run_first() -> bool:
     """Whether this host lets us have SCHED_FIFO."""
-    before = os.sched_getscheduler(0)
+    before = os.sched_getscheduler(0), os.sched_getparam(0)
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     except PermissionError:
         return False
-    os.sched_setscheduler(0, before, os.sched_param(0))
+    os.sched_setscheduler(0, *before)
     return True
 
 

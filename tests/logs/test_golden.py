@@ -19,7 +19,7 @@ from lowfc.contract.errors import ConfigurationError
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.inputs import Load, Request
 from lowfc.control.loop.state import State
-from tests.support.loops import lowfc
+from tests.support.loops import lowfc, run
 
 WIRE = Path(__file__).parents[2] / "lowfc" / "contract" / "wire"
 FOLDER = Path(__file__).parents[1] / "golden" / "0.1"
@@ -84,8 +84,8 @@ def test_a_killed_recorders_log_is_recovered_and_replays_as_before(tmp_path: Pat
 
 def test_it_is_looked_at(tmp_path: Path) -> None:
     out = tmp_path / "night.rrd"
-    done = lowfc("view", NIGHT, "--save", out)
-    assert done.exit_code == 0, (done.output, done.exception)
+    done = run(tmp_path, "view", str(NIGHT), "--save", str(out))
+    assert done.returncode == 0, done.stderr
     assert out.stat().st_size > 100_000
 
 
