@@ -56,6 +56,12 @@ def own_runtime(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Mo
     return path
 
 
+@pytest.fixture
+def without_drawings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports whose drawings nobody looks at have none: they take ten times as long as all the rest."""
+    monkeypatch.setattr("lowfc.programs.logs.report.drawings._DRAWINGS", {})
+
+
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
     if NO_SKIPS and report.skipped and not hasattr(report, "wasxfail"):
         report.outcome = "failed"

@@ -103,6 +103,7 @@ def log(tmp_path: Path, night: Night) -> Path:
     return night.write(tmp_path / "night.mcap", toml=OTHER)
 
 
+@pytest.mark.usefixtures("without_drawings")
 @pytest.mark.parametrize(
     "words",
     [

@@ -157,6 +157,7 @@ def _estimator(log: Path) -> str:
     return calibration.estimator
 
 
+@pytest.mark.usefixtures("without_drawings")
 def test_a_report_is_of_the_same_run(whole: Path, small: Path) -> None:
     found: list[dict[str, Any]] = []
     for log in (whole, small):

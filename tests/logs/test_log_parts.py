@@ -177,9 +177,9 @@ def test_recover_takes_the_files_one_by_one(folder: Path, samples: list[Sample])
 IN_TURN = [["info"], ["report"], ["export", "--to", "csv", "--force"], ["recover"]]
 
 
+@pytest.mark.usefixtures("without_drawings")
 @pytest.mark.parametrize("words", IN_TURN, ids=lambda words: words[0])
-def test_several_logs_are_taken_in_turn(folder: Path, words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("lowfc.programs.logs.report.drawings._DRAWINGS", {})  # they take their time
+def test_several_logs_are_taken_in_turn(folder: Path, words: list[str]) -> None:
     (night := Night()).frames(3)
     first, second = (str(night.write(Path(f"{name}.mcap"))) for name in "ab")
     several = lowfc(*words, first, second)

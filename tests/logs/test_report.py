@@ -240,6 +240,7 @@ def test_a_log_without_a_step_still_has_a_page(tmp_path: Path, empty: bool) -> N
     assert "No step of the control law is in this log" in page(made)
 
 
+@pytest.mark.usefixtures("without_drawings")
 def test_imperfections_of_the_simulated_world_are_named(tmp_path: Path) -> None:
     night, unkind = quiet(Night()), {"disturbance.wheel_hz": 40.0, "camera.hot_pixels": 0.01}
     made = report_of(read_run(night.write(tmp_path / "x.mcap", toml=load(None, unkind).to_toml())))

@@ -56,13 +56,17 @@ FAST_LIMITS = {
     "sam27d10_bal14": 1e-4,
     "sam27_crb20": 1e-4,
 }
+LARGE = ("aplc", "bowtie")
 ACCURATE_LIMITS = {"clowfs": 1e-6, "zwfs": 2e-6, "bar": 1e-6, "lyot": 2e-6, "aplc": 2e-6, "bowtie": 2e-6}
 
 
 @pytest.mark.parametrize(
     ("spec", "name", "limit"),
     [
-        *((FAST, name, limit) for name, limit in FAST_LIMITS.items()),
+        *(
+            pytest.param(FAST, *item, marks=[pytest.mark.slow] if item[0] in LARGE else [])
+            for item in FAST_LIMITS.items()
+        ),
         *(pytest.param(ACCURATE, *item, marks=pytest.mark.slow) for item in ACCURATE_LIMITS.items()),
     ],
 )
@@ -74,7 +78,10 @@ def test_the_twin_of_every_sensor(spec, name, limit, modes, coefficients_nm):
         assert len(twin.operators[0].to_modes) == 171  # as many as its area needs
 
 
-@pytest.mark.parametrize(("defocus_mm", "limit"), [(1.5, 2e-4), (3.0, 5e-5), (12.0, 5e-5)])
+@pytest.mark.parametrize(
+    ("defocus_mm", "limit"),
+    [(3.0, 5e-5), *(pytest.param(*far, marks=pytest.mark.slow) for far in ((1.5, 2e-4), (12.0, 5e-5)))],
+)
 def test_the_defocused_twin_is_right_at_any_distance(defocus_mm, limit, modes, coefficients_nm):
     sensor = sensor_from(SensorSection(kind="clowfs", defocus_mm=defocus_mm))
     assert worst_error(sensor, build(sensor, FAST), modes, coefficients_nm[:1]) < limit

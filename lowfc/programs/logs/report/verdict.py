@@ -137,7 +137,9 @@ def _events(figures: Figures) -> Figures:
     worst = grave or warned
     if not worst:
         return _check("events", GOOD, "no warning, no error")
-    names = _listed({name: sum(one["name"] == name for one in worst) for name in {one["name"] for one in worst}})
+    names = _listed(
+        {name: sum(one["name"] == name for one in worst) for name in sorted({one["name"] for one in worst})}
+    )
     what = "error" if grave else "warning"
     return _check("events", BAD if grave else LOOK, f"{counted(len(worst), what)}: {names}")
 
