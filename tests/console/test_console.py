@@ -23,7 +23,6 @@ from tests.support.loops import until
 from tests.support.stage import Stage
 from tests.support.toy import GRID, NOLL, calibration
 
-pytestmark = pytest.mark.exclusive
 LAW = of_blocks([integrator_block(0.2, 0.01, "pol", 1.0)] * 3, "pol", "leaky", NOLL, 1.0, 50.0)
 PATIENCE_S = 15.0
 
@@ -33,6 +32,17 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveRun]:
     one = LiveRun(tmp_path_factory.mktemp("run"))
     yield one
     one.stop()
+
+
+@pytest.fixture(autouse=True)
+def _nobody_waits_for_a_process_at_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Textual does after each key, for 2 s at most; with the loop in it, a process is never at rest."""
+
+    async def pause(*_: float) -> None:
+        await asyncio.sleep(0.02)
+
+    for module in ("app", "pilot"):
+        monkeypatch.setattr(f"textual.{module}.wait_for_idle", pause)
 
 
 @contextlib.asynccontextmanager
@@ -108,7 +118,6 @@ TASKS = {
 }
 
 
-@pytest.mark.slow
 def test_every_button_by_its_key(run: LiveRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from lowfc.programs.console.actions import EVERY
 
@@ -191,7 +200,6 @@ def test_safe_is_one_key_even_in_a_form_and_one_large_button(run: LiveRun) -> No
     played(run, scenario)
 
 
-@pytest.mark.slow
 def test_the_knobs_turn_all_gains_or_those_of_an_order(run: LiveRun) -> None:
     def gain() -> list[float]:
         return list(run.asked[-1].values) if run.asked[-1].name == "gain" else []
