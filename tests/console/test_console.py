@@ -222,6 +222,9 @@ def test_the_knobs_turn_all_gains_or_those_of_an_order(run: LiveRun) -> None:
         await screen.pilot.press("u")
         await screen.until(lambda: any(one.text == "auto" and one.accepted for one in run.asked))
         await screen.until(lambda: "auto" in screen.text("gains"))
+        await screen.pilot.press("g")  # automatic gains would ask for themselves in tests to come
+        await screen.fill("0.5 0.5 0.05", "2-4")
+        await screen.until(lambda: "auto" not in screen.text("gains"))
 
     played(run, scenario)
 
