@@ -10,14 +10,12 @@ import numpy as np
 import pytest
 
 from lowfc.adapters.files.sensors import sensor_named
-from lowfc.adapters.logs.selection import EVERYTHING
 from lowfc.contract.configuration import load
 from lowfc.contract.messages import topic_of, wire
 from lowfc.contract.sections import SENSORS
 from lowfc.optics.chain.sensor import light_budget
-from lowfc.programs.core.recording.volume import bytes_per_s
 from sim_camera.prediction import tilt_residual_mas
-from tests.support.loops import FIXED, children, loop, payloads, recorded_bytes, run, start, told, until
+from tests.support.loops import children, loop, payloads, recorded_bytes, run, start, told, until
 from tools.measure import measured
 
 GENTLE = """
@@ -33,25 +31,14 @@ gain = 0.05
 
 
 def test_two_runs_with_one_seed_write_the_same_bytes_and_have_one_digest(tmp_path: Path) -> None:
+    """Automatic gains are inputs that they and a replay have alike."""
     logs, infos = [], []
     for name in ("one", "two", "other"):
         folder = tmp_path / name
         folder.mkdir()
         seed = "8" if name == "other" else "7"
-        figures = loop(
-            folder,
-            "--lockstep",
-            "--rate",
-            "1000",
-            "--duration",
-            "0.3",
-            "--seed",
-            seed,
-            "--disturbance",
-            "bench",
-            config=FIXED,
-        )
-        assert figures["frames_published"] == figures["commands_applied"] == 300
+        figures = loop(folder, "--lockstep", "--duration", "2.4", "--seed", seed, "--disturbance", "bench")
+        assert figures["frames_published"] == figures["commands_applied"] == 600
         assert figures["messages_lost"] == 0
         logs.append(payloads(figures["log"]))
         infos.append(json.loads(told(folder, "lowfc info last --digest --json")))
@@ -61,33 +48,19 @@ def test_two_runs_with_one_seed_write_the_same_bytes_and_have_one_digest(tmp_pat
         key for key in infos[0]["topics"] if not topic_of(key).deterministic
     }
     assert "lowfc/event" not in {key for key, line in infos[0]["topics"].items() if "digest" in line}
-    config = load(None, {"camera.rate_hz": 1000.0})
-    constant = sum(infos[0]["attachments"].values()) + infos[0]["topics"]["lowfc/calibration"]["bytes"]
-    growth = (infos[0]["bytes"] - constant) / 0.3  # bytes in a second of simulated time
-    assert bytes_per_s(config, EVERYTHING) == pytest.approx(growth, rel=0.25)
     one, two, other = ({t: p for t, p in log.items() if topic_of(t[1:]).deterministic} for log in logs)
     assert one.keys() == two.keys()
-    assert len(one["/lowfc/camera/frame"]) == 300
+    assert len(one["/lowfc/camera/frame"]) == 600
     for topic, values in one.items():
         assert values == two[topic], topic
     assert one["/lowfc/camera/frame"] != other["/lowfc/camera/frame"]
-
-
-def test_automatic_gains_are_inputs_that_two_runs_and_a_replay_have_alike(tmp_path: Path) -> None:
-    logs = []
-    for name in ("one", "two"):
-        (tmp_path / name).mkdir()
-        figures = loop(tmp_path / name, "--lockstep", "--duration", "2", "--disturbance", "bench")
-        logs.append(payloads(figures["log"]))
-    one, two = ({t: p for t, p in log.items() if topic_of(t[1:]).deterministic} for log in logs)
-    assert one == two
     asked = [wire.Request.FromString(payload) for payload in one["/lowfc/control/request"]]
     assert [(request.name, request.accepted) for request in asked[:2]] == [("gain", True), ("close", True)]
     assert {request.requester for request in asked[:2]} == {"automatic gains"}
     assert json.loads(told(tmp_path / "one", "lowfc replay last --json"))["identical"] is True
 
 
-@pytest.mark.parametrize("frames", [4_000, pytest.param(20_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("frames", [2_000, pytest.param(20_000, marks=pytest.mark.slow)])
 def test_the_residual_is_the_predicted_one(tmp_path: Path, frames: int) -> None:
     """|S|^2 P_d + |T|^2 P_n for 5 mas rms of tilt per axis and half the limiting gain: within 10 %.
 
@@ -155,7 +128,9 @@ def test_the_documents_table_is_of_the_sensors_as_they_are() -> None:
 
 def test_a_configuration_that_was_shown_does_not_open_the_loop(tmp_path: Path) -> None:
     shown = told(tmp_path, "lowfc config show")
-    short = ("sim-loop", "--lockstep", "--duration", "2", "--no-record")
+    for gain in ("tilt_gain", "gain"):  # not measured first
+        shown = shown.replace(f'\n#{gain} = "auto"', f"\n{gain} = 0.3")
+    short = ("sim-loop", "--lockstep", "--duration", "0.2", "--no-record")
     done = run(tmp_path, *short, config=shown)
     assert re.match(r"loop +closed", done.stdout), done.stderr
     assert "starts open" not in done.stderr

@@ -12,9 +12,24 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lowfc.adapters.logs.selection import EVERYTHING
+from lowfc.contract.configuration import load
 from lowfc.contract.messages import RawImage, from_timestamp, topic_of, wire
 from lowfc.programs.cli.ctl.command import SIGNAL
-from tests.support.loops import FIXED, LOWFC, children, interrupt, loop, lowfc, payloads, recorded_bytes, start, until
+from lowfc.programs.core.recording.volume import bytes_per_s
+from tests.support.loops import (
+    FIXED,
+    LOWFC,
+    children,
+    interrupt,
+    loop,
+    lowfc,
+    payloads,
+    recorded_bytes,
+    start,
+    told,
+    until,
+)
 from tests.support.other_readers import foxglove
 
 pytestmark = pytest.mark.exclusive
@@ -66,6 +81,13 @@ def test_the_log_holds_every_topic_and_says_what_it_lost(live: dict[str, Any], t
     assert len(topics["/lowfc/calibration"]) == 1
     missing = FRAMES - len(topics["/lowfc/camera/frame"]) + FRAMES - len(topics["/lowfc/sim/truth"])
     assert live["messages_lost"] >= missing
+
+
+def test_the_log_is_as_large_as_said_before(live: dict[str, Any]) -> None:
+    info = json.loads(told(live["log"].parent, f"lowfc info {live['log']} --json"))
+    constant = sum(info["attachments"].values()) + info["topics"]["lowfc/calibration"]["bytes"]
+    growth = (info["bytes"] - constant) * 500 / FRAMES
+    assert bytes_per_s(load(None, {"camera.rate_hz": 500.0}), EVERYTHING) == pytest.approx(growth, rel=0.25)
 
 
 def test_frame_step_command_and_state_join(topics: dict[str, list[bytes]]) -> None:
