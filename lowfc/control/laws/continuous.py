@@ -73,9 +73,13 @@ def hold_floor(omega: Array, held: float = 1.0) -> Array:
 
 def left_power(law: LinearLaw, omega: Array, timing: Timing) -> Array:
     """Mean over time (frequencies, modes) of what the loop leaves of a wave of power 1; rad per frame."""
+    return _left(sensitivity(law, omega, timing.delay), omega, timing)
+
+
+def _left(S: Complex, omega: Array, timing: Timing) -> Array:
     if not timing.held:  # at an instant, of a command what an exposure sees of it
-        return np.asarray(np.abs(sensitivity(law, omega, timing.delay)) ** 2)
-    command = commanded(law, omega, timing.delay) * mean_over(omega, timing.exposure)[:, None]
+        return np.asarray(np.abs(S) ** 2)
+    command = _commanded(S, omega, timing.delay) * mean_over(omega, timing.exposure)[:, None]
     return np.asarray(hold_floor(omega, timing.held)[:, None] + np.abs(_ahead(omega, timing)[:, None] + command) ** 2)
 
 
@@ -94,14 +98,18 @@ def spectrum_left(law: LinearLaw, omega: Array, measured: Array, noise_nm2: Arra
         noise_nm2: (modes,) variance of one frame's white noise.
         timing: of the loop.
     """
-    of_wave = left_power(law, omega, timing) / np.abs(mean_over(omega, timing.exposure))[:, None] ** 2
-    of_noise = np.abs(commanded(law, omega, timing.delay)) ** 2
+    S = sensitivity(law, omega, timing.delay)
+    of_wave = _left(S, omega, timing) / np.abs(mean_over(omega, timing.exposure))[:, None] ** 2
+    of_noise = np.abs(_commanded(S, omega, timing.delay)) ** 2
     return np.asarray((measured - noise_nm2) * of_wave + noise_nm2 * of_noise)
 
 
 def commanded(law: LinearLaw, omega: Array, delay: float) -> Complex:
     """Command (frequencies, modes) made of a frame that measures e^(i w t_k), over that wave; rad per frame."""
-    S = sensitivity(law, omega, delay)
+    return _commanded(sensitivity(law, omega, delay), omega, delay)
+
+
+def _commanded(S: Complex, omega: Array, delay: float) -> Complex:
     seen = np.polynomial.polynomial.polyval(np.exp(-1j * omega), delay_weights(delay)) * np.exp(-1j * omega)
     return np.asarray((S - 1) / seen[:, None])
 

@@ -192,17 +192,18 @@ class _Part:
         """What the law commands of an error, (frequencies, modes, modes)."""
         identity = np.eye(len(self.F))
         inside = identity - (self.F + self.H @ self.K) / z[:, None, None]
-        answer = self.K @ np.linalg.solve(inside, np.broadcast_to(self.G.astype(complex), (z.size, *self.G.shape)))
+        answer = self.K @ _solved(inside, np.broadcast_to(self.G.astype(complex), (z.size, *self.G.shape)))
         if not self.own_weights.size:
             return np.asarray(answer)
         believed = np.polynomial.polynomial.polyval(1 / z, self.own_weights) / z
-        return np.asarray(np.linalg.solve(np.eye(len(self.modes)) + answer * believed[:, None, None], answer))
+        return _solved(np.eye(len(self.modes)) + answer * believed[:, None, None], answer)
 
     def sensitivity(self, omega: Array, weights: Array) -> Complex:
         """S (frequencies, modes, modes) at rad per frame."""
         z = np.exp(1j * omega)
         seen = np.polynomial.polynomial.polyval(1 / z, weights) / z
-        return np.asarray(np.linalg.inv(np.eye(len(self.modes)) - seen[:, None, None] * self.answer(z)))
+        inverse = np.eye(len(self.modes)) - seen[:, None, None] * self.answer(z)
+        return 1 / inverse if len(self.modes) == 1 else np.asarray(np.linalg.inv(inverse))
 
     def closed(self, weights: Array) -> Array:
         """The matrix of the closed loop: x[k-1], c[k-1], c[k-2], ... one frame on."""
@@ -243,6 +244,11 @@ def _first_linked(linked: Mask) -> Whole:
         if (further == linked).all():
             return np.asarray(np.argmax(linked, axis=1))
         linked = further
+
+
+def _solved(of: Complex, right: Complex) -> Complex:
+    """`numpy.linalg.solve` of many; of one unknown it takes several times as long as a division."""
+    return np.asarray(right / of if of.shape[-1] == 1 else np.linalg.solve(of, right))
 
 
 def _poles(matrix: Array) -> Complex:
