@@ -191,7 +191,7 @@ def test_safe_is_one_key_even_in_a_form_and_one_large_button(run: LiveRun) -> No
         before = len(run.asked)
         await screen.pilot.press("s", "f12")
         await screen.until(lambda: [one.name for one in run.asked[before:]] == ["safe"])
-        assert screen.app.screen.query_one("Input").value == "s"
+        await screen.until(lambda: screen.app.screen.query_one("Input").value == "s")
         await screen.pilot.press("escape", "k", "enter")
         await screen.until(lambda: run.asked[-1].name == "clear")
         await screen.pilot.click("#close")
