@@ -55,7 +55,7 @@ def test_flipped_flooded_and_silent_interlocks(tmp_path: Path) -> None:
     assert process.returncode == 0, complaints
     figures = json.loads(out)
     assert figures["frames_missing"] == figures["messages_lost"] == 0
-    assert figures["frames_skipped"] <= 100, "a host that stands still for 0.2 s; a flood would cost hundreds"
+    assert figures["frames_skipped"] <= 3, "the host stands still now and then, a flood would cost hundreds"
     log = tmp_path / figures["log"]
     replayed = json.loads(run(tmp_path, "replay", "--json", str(log)).stdout)
     assert replayed["identical"]
