@@ -202,8 +202,8 @@ class _Part:
         """S (frequencies, modes, modes) at rad per frame."""
         z = np.exp(1j * omega)
         seen = np.polynomial.polynomial.polyval(1 / z, weights) / z
-        inverse = np.eye(len(self.modes)) - seen[:, None, None] * self.answer(z)
-        return 1 / inverse if len(self.modes) == 1 else np.asarray(np.linalg.inv(inverse))
+        identity = np.eye(len(self.modes), dtype=complex)
+        return _solved(identity - seen[:, None, None] * self.answer(z), identity)
 
     def closed(self, weights: Array) -> Array:
         """The matrix of the closed loop: x[k-1], c[k-1], c[k-2], ... one frame on."""
