@@ -117,6 +117,7 @@ class Scene:
 def _quickly(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bridges, "_CHECK_S", 0.05)
     monkeypatch.setattr(bridges, "_TURN_S", 0.02)
+    monkeypatch.setattr(render_threads, "PICTURES_HZ", 100.0)
     monkeypatch.setattr(bridges, "resident_bytes", lambda: 0)  # that of all tests in this process is no view's
 
 
@@ -173,7 +174,7 @@ def test_a_view_that_comes_late_shows_the_events_from_before_once(scenes: Scenes
 def test_without_a_recorder_a_line_says_that_earlier_events_are_missing(
     scenes: Scenes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bridges, "_RECORDER_S", 0.1)
+    monkeypatch.setattr(bridges, "_RECORDER_S", 0.0)
     scene = scenes()
     until(lambda: scene.screens[0].tape.logged["log/view"])
 
@@ -183,12 +184,12 @@ def dies(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def takes_nothing(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bridges, "STUCK_S", 0.3)
+    monkeypatch.setattr(bridges, "STUCK_S", 0.1)
 
 
 def grows(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     scene.screens[0].held_bytes = 100_000_000 + bridges.VIEWER_SPARE_BYTES - 1
-    time.sleep(0.2)
+    time.sleep(0.1)
     assert len(scene.screens) == 1
     scene.screens[0].held_bytes += 2
 
@@ -232,7 +233,7 @@ def test_a_window_that_was_closed_ends_the_view(scenes: Scenes) -> None:
 def test_a_window_that_takes_nothing_is_waited_for_in_bounded_memory(
     scenes: Scenes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bridges, "STUCK_S", 0.3)
+    monkeypatch.setattr(bridges, "STUCK_S", 0.1)
     scene = scenes(Show.NATIVE, stuck=1)
     until(lambda: scene.screens[0].holds_up.is_set())
     for _ in range(100):
@@ -241,7 +242,7 @@ def test_a_window_that_takes_nothing_is_waited_for_in_bounded_memory(
     assert (waiting[STEP], waiting[FRAME]) == (bridges.WAITING[STEP], 1)
     assert all(count <= bridges.WAITING[topic] for topic, count in waiting.items())
     until(lambda: any("VIEW_STUCK" in event for event in scene.events))
-    time.sleep(0.4)
+    time.sleep(0.2)
     assert sum("VIEW_STUCK" in event for event in scene.events) == 1
     assert len(scene.screens) == 1
     scene.screens[0].stopped.set()
@@ -265,7 +266,7 @@ def test_a_view_into_a_file_is_not_begun_anew(scenes: Scenes, monkeypatch: pytes
     assert "the view into a file ended: drawing failed" in failed(scene)
 
 
-@pytest.mark.parametrize(("pause_s", "every_one"), [(0.3, True), (0.0, False)])
+@pytest.mark.parametrize(("pause_s", "every_one"), [(0.1, True), (0.0, False)])
 def test_rows_are_taken_by_time_however_slow_the_drawing_is(
     monkeypatch: pytest.MonkeyPatch, pause_s: float, every_one: bool
 ) -> None:

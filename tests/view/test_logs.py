@@ -119,12 +119,12 @@ def test_every_view_of_the_layout_has_something_and_the_plots_show_all_of_a_log(
     made = night(120)
     made.health("controller")
     made.put(SURFACE, image(np.eye(8, dtype=np.float32), made.now_ns, "dm"))
-    made.frames(2880)
+    made.frames(1380)
     done, tape = drawn(made.write(tmp_path / "night.mcap"))
     assert done.remarks == []
     assert done.snapshots > 5
     times_ns, _ = tape.column(wavefront.ERROR.path)
-    assert len(times_ns) == 3000
+    assert len(times_ns) == 1500
     assert np.all(np.diff(times_ns) > 0)
     origins = {str(view.origin) for view in views(layout().root_container)}
     assert not [origin for origin in origins if not any(path.startswith(origin) for path in tape.paths)]

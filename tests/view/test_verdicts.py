@@ -41,8 +41,8 @@ def begun(seconds: float = 0.0, **values: object) -> Stage:
 
 
 def staged(change: Callable[[Stage], object], after_s: float = 4.0) -> Verdict:
-    """A healthy run for three seconds, and then something is changed."""
-    stage = begun(3)
+    """A healthy run for a second, and then something is changed."""
+    stage = begun(1)
     change(stage)
     return stage.run(after_s)
 
@@ -277,11 +277,11 @@ def test_a_loop_that_corrects_little_is_grey_and_so_is_its_headline() -> None:
 def test_what_the_gains_could_leave_is_computed_from_the_loop_itself(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lowfc.programs.view.verdicts.watcher.ATTAINED_NS", 1_000_000_000)
     night = Night(truth=False)
-    night.frames(6000)
+    night.frames(3000)
     accumulator, watcher = Accumulator(), Watcher()
     for number, one in enumerate(night.samples, 1):
         accumulator.add(topic_of(one.key), one.key, one.payload, one.publish_time_ns, one.sequence)
-        if number % 5000 == 0 or number == len(night.samples):
+        if number % 2500 == 0 or number == len(night.samples):
             watcher.feed(accumulator.snapshot(one.publish_time_ns))
     found = watcher.state().attained
     assert 0 < found.best_nm <= 1.05 * found.left_nm

@@ -121,6 +121,7 @@ class Console(OrderedKeys):
         self._history = History()
         self._shown: dict[str, Text] = {}
         self._tasks: list[Task] = []
+        self._asking: dict[str, threading.Thread] = {}
         self._mute = False
         self._readings = 0
 
@@ -206,13 +207,17 @@ class Console(OrderedKeys):
         self._do(EVERY["gain"], {"modes": modes, "values": values or AUTO})
 
     def _do(self, action: Action, values: Values) -> None:
-        """Start a task, or ask in a thread of its own: nobody waits for an answer, least of all a later SAFE."""
+        """Start a task, or ask in a thread of its own: only the same button waits for an answer, and SAFE does not."""
         self._answer(f"{action.name}: asked", good=True)
+        before = self._asking.get(action.name) if action is not SAFE else None
 
         def ask() -> None:
+            if before is not None:
+                before.join()  # two turns of a knob are asked in their order
+            tasks: list[Task] = []
             try:
                 if action.ask is None:
-                    self._tasks.append(Task(action.name, action.command(values, self._run_id)))
+                    tasks.append(Task(action.name, action.command(values, self._run_id)))
                     sentence = f"{action.name}: started"
                 else:
                     answer = action.ask(Client(self._run_id, bus=self._bus), values)
@@ -222,8 +227,10 @@ class Console(OrderedKeys):
                 self.post_message(Answered(action, phrased(str(fault)), good=False))
             else:
                 self.post_message(Answered(action, phrased(sentence), good=True))
+                self.call_later(self._tasks.extend, tasks)  # it has started before it has ended
 
-        threading.Thread(target=ask, name=action.name, daemon=True).start()
+        self._asking[action.name] = threading.Thread(target=ask, name=action.name, daemon=True)
+        self._asking[action.name].start()
 
     @on(Answered)
     def _answered(self, event: Answered) -> None:
