@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import pytest
 
+from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.bus.names import LARGEST_HEALTH_BYTES, LONGEST_NAME, MOST_NAMES, Names
 from lowfc.adapters.bus.start_check import StartCheck
 from lowfc.adapters.process.clock import SIMULATED_START_NS
@@ -177,7 +178,7 @@ def test_a_launcher_and_a_view_are_not_filled_either(hub: MemoryHub) -> None:
     launcher = MemoryBus(hub, "launcher", FakeClock())
     launcher.subscribe(HEALTH, watch.hear)
     for number in range(FORGED):
-        view.add(HEALTH, HEALTH.at(f"forged-{number}"), health(number), 1, 1)
+        view.add(Sample(HEALTH.at(f"forged-{number}"), health(number), 1, 1, 1))
         launcher.publisher(HEALTH, f"forged-{number}").put(health(number))
     assert len(watch.health) == len(view.snapshot(1).health) == MOST_NAMES
     assert view.unreadable == launcher.faults.unreadable[HEALTH.at("*")][0] == FORGED - MOST_NAMES

@@ -386,7 +386,7 @@ def test_the_words_are_those_of_the_tiles() -> None:
     stage.flux = 0.01
     found = stage.run(2.0)
     none = np.zeros(0, np.float32)
-    reading = Reading(stage.host_ns, 0.1, stage.watcher.state(), found, None, None, none, {}, [], [], [], [], NOLL)
+    reading = Reading(0.1, stage.watcher.state(), found, None, none, [], [], [])
     assert panels.verdict(reading, RUN) == (found.level, f"CHECK  {found.headline}")
     for line, tile in zip(panels.tiles(reading), found.tiles, strict=True):
         assert all(word in line.plain for word in (tile.title, tile.value, tile.detail))

@@ -25,7 +25,6 @@ from lowfc.contract.messages import (
     Topic,
     image,
     timestamp,
-    topic_of,
     wire,
 )
 from lowfc.control.loop.safety import LoopMode, Rejection
@@ -46,7 +45,7 @@ def tile(verdict: Verdict, title: str) -> Tile:
 def accumulated(samples: Iterable[Sample]) -> Accumulator:
     accumulator = Accumulator()
     for one in samples:
-        accumulator.add(topic_of(one.key), one.key, one.payload, one.publish_time_ns, one.sequence)
+        accumulator.add(one)
     return accumulator
 
 
@@ -82,7 +81,7 @@ class Stage:
 
     def send(self, topic: Topic, message: Message | bytes, name: str = "dm") -> None:
         payload = message if isinstance(message, bytes) else message.SerializeToString()
-        self.accumulator.add(topic, topic.at(name), payload, self.host_ns)
+        self.accumulator.add(Sample(topic.at(name), payload, 0, self.host_ns, self.host_ns))
 
     def begin(self) -> None:
         self.send(CALIBRATION, encode_calibration(identified(calibration()), self.data_ns))

@@ -11,6 +11,7 @@ from random import Random
 import numpy as np
 from google.protobuf.message import Message
 
+from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.files import calibration_file, law_file, layouts
 from lowfc.adapters.files.sensors import load_pupil
 from lowfc.adapters.logs.history import read_history
@@ -283,7 +284,7 @@ def _shown(data: bytes) -> None:
     """A message under the name of each topic that is looked at."""
     accumulator = Accumulator()
     for topic in SHOWN:
-        accumulator.add(topic, topic.at("dm"), data, 1)
+        accumulator.add(Sample(topic.at("dm"), data, 0, 1, 1))
     accumulator.snapshot(2)
 
 

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.files.sensors import load_pupil
 from lowfc.adapters.logs.columns import STAGES, Steps, Truths
 from lowfc.contract.codecs.codec import actuators
@@ -135,7 +136,7 @@ def test_the_mode_is_a_band_and_events_have_their_level() -> None:
 def test_the_band_of_the_mode_begins_before_the_view() -> None:
     tape, accumulator = Tape(), Accumulator()
     state = wire.ControllerState(mode=LoopMode.CLOSED.value, mode_timestamp=timestamp(5))
-    accumulator.add(CONTROLLER_STATE, CONTROLLER_STATE.key, state.SerializeToString(), 9, 1)
+    accumulator.add(Sample(CONTROLLER_STATE.key, state.SerializeToString(), 1, 9, 9))
     loop.Loop().draw(tape, accumulator.snapshot(10))
     ((at_ns, (change,)),) = tape.logged[loop.MODE]
     assert (at_ns, values_of(change.state)) == (5, ["CLOSED"])

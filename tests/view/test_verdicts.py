@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from lowfc.contract.events import EVENTS
-from lowfc.contract.messages import CONTROLLER_STATE, EVENT, FRAME, topic_of, wire
+from lowfc.contract.messages import CONTROLLER_STATE, EVENT, FRAME, wire
 from lowfc.control.loop.safety import Limit, LoopMode, Rejection
 from lowfc.programs.view.panels.tiles import FILL, GROUND, HEIGHT, TILES, WIDTH, Tiles, picture, places, png
 from lowfc.programs.view.snapshot import Accumulator
@@ -280,7 +280,7 @@ def test_what_the_gains_could_leave_is_computed_from_the_loop_itself(monkeypatch
     night.frames(3000)
     accumulator, watcher = Accumulator(), Watcher()
     for number, one in enumerate(night.samples, 1):
-        accumulator.add(topic_of(one.key), one.key, one.payload, one.publish_time_ns, one.sequence)
+        accumulator.add(one)
         if number % 2500 == 0 or number == len(night.samples):
             watcher.feed(accumulator.snapshot(one.publish_time_ns))
     found = watcher.state().attained
@@ -326,14 +326,14 @@ def test_the_facts_are_run_host_law_offset_channels_and_note() -> None:
         stage.send(EVENT, EVENTS["NOTE"].log("controller", (START + at_s) * 10**9, text=text))
     found = stage.run(1).facts
     assert found["RUN"] == "night-7 on bench"
-    assert found["CONTROL LAW"] == "integrator, gain 0.5 (2 modes), 0.25 (1 mode); delay 1 frame"
-    assert found["OFFSET AND CHANNELS"].endswith("5 nm; channel dark-hole 2 nm")
+    assert found["CONTROL LAW"] == "integrator, gain 0.5 0.5 0.25; delay 1 frame"
+    assert found["OFFSET AND CHANNELS"].endswith("5 nm; dark-hole 2 nm rms of surface, zero point not shifted")
     assert found["LAST NOTE"].endswith("later")
     state.law.name, state.law_frames, state.offset_nm[:] = "lqg", 10**6, [0.0] * 3
     stage.send(CONTROLLER_STATE, state)
     found = stage.run(1).facts
     assert found["CONTROL LAW"] == "lqg; delay 1 frame"
-    assert found["OFFSET AND CHANNELS"] == "no offset; channel dark-hole 2 nm"
+    assert found["OFFSET AND CHANNELS"] == "no offset; dark-hole 2 nm rms of surface, zero point not shifted"
     assert set(facts(RunState()).values()) == {"not known", "none known"}
 
 

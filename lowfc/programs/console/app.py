@@ -274,7 +274,7 @@ class Console(OrderedKeys):
         level, sentence = panels.verdict(reading, self._run_id)
         self._colour(level)
         self._put("verdict", Text(sentence))
-        self._put("clock", Text(f"{panels.clock(reading.host_ns)}\nUTC"))
+        self._put("clock", Text(f"{panels.clock(reading.state.snapshot.host_ns)}\nUTC"))
         self.screen_stack[0].query_one("#figures").set_class(not reading.connected, "cut")
         if reading.connected:
             self._drawn("tiles").show(panels.tiles(reading))
@@ -287,10 +287,11 @@ class Console(OrderedKeys):
         self._drawn("peers").show([panels.peers(reading, self._run_id)])
         for request in reading.requests:
             self._history.add(request)
-        for event in reading.events:
+        events = reading.state.snapshot.events
+        for event in events:
             self._history.add(event)
         self._put("log", self._history.last(self._main("#log").size.height))
-        if not self._mute and any(event.level >= Severity.ERROR for event in reading.events):
+        if not self._mute and any(event.level >= Severity.ERROR for event in events):
             self.bell()
 
     def _watch_tasks(self) -> None:

@@ -13,13 +13,12 @@ from lowfc.adapters.bus.bus import Bus, Sample, states
 from lowfc.adapters.process.clock import Clock
 from lowfc.arrays import Pixels, Single
 from lowfc.client import Client, configuration_of
-from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import LowfcError
-from lowfc.contract.messages import EVENT, REQUEST, STEP, SURFACE, TRUTH, Log, Role, Topic, wire
+from lowfc.contract.messages import EVENT, REQUEST, STEP, SURFACE, TRUTH, Role, wire
 from lowfc.control.loop.wording import AUTO
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
-from lowfc.programs.view.snapshot import SHOWN, Accumulator, LastHealth
+from lowfc.programs.view.snapshot import SHOWN, Accumulator
 from lowfc.programs.view.verdicts.run_state import RunState
 from lowfc.programs.view.verdicts.tile import Verdict
 from lowfc.programs.view.verdicts.verdict import judge
@@ -43,26 +42,20 @@ class Reading(NamedTuple):
 
     Attributes:
         silent_s: since the newest message was sent; None before the first.
-        frame, mirror_nm: the newest ones; None before the first.
+        frame: the newest one; None before the first.
         command_nm: (modes,) of the last step.
-        events, requests: new ones.
+        requests: new ones.
         residual_nm, light: a value for each second, NaN where there is none.
-        noll: modes of the calibration; empty before it is known.
     """
 
-    host_ns: int
     silent_s: float | None
     state: RunState
     verdict: Verdict
     frame: Pixels | None
-    mirror_nm: Single | None
     command_nm: Single
-    health: dict[str, LastHealth]
-    events: list[Log]
     requests: list[wire.Request]
     residual_nm: list[float]
     light: list[float]
-    noll: tuple[int, ...]
 
     @property
     def connected(self) -> bool:
@@ -78,13 +71,12 @@ class Feed:
         self._bus, self._run_id, self._clock = bus, run_id, clock
         waiting = {topic: _WAITING.get(topic, 1 if topic.latest_only else 100) for topic in _TOPICS}
         self._rings = {topic: bus.ring(topic, waiting[topic]) for topic in _TOPICS}
-        self._earlier: deque[tuple[Topic, Sample]] = deque()
+        self._earlier: deque[Sample] = deque()
         self._accumulator = Accumulator(clock.now_ns() if clock.lockstep else None)
         self._watcher = Watcher()
         self._config: Configuration | None = None
         self._known: set[tuple[str, int]] = set()
         self._frame: Pixels | None = None
-        self._mirror_nm: Single | None = None
         self._command_nm = np.zeros(0, np.float32)
         self._trend: deque[tuple[float, float]] = deque(maxlen=TREND)
         self._point_ns = 0
@@ -102,9 +94,9 @@ class Feed:
         arrived = [self._earlier.popleft() for _ in range(len(self._earlier))]
         for topic, ring in self._rings.items():
             if topic is not REQUEST:
-                arrived += [(topic, sample) for sample in ring.drain()]
-        for topic, sample in arrived:
-            self._accumulator.add(topic, sample.key, sample.payload, sample.publish_time_ns, sample.sequence)
+                arrived += ring.drain()
+        for sample in arrived:
+            self._accumulator.add(sample)
         snapshot = self._accumulator.snapshot(host_ns, behind_s=behind_s)
         there = {(name, one.health.pid) for name, one in snapshot.health.items()}
         lacking = Role.CONTROLLER in snapshot.health and (snapshot.calibration is None or self._config is None)
@@ -114,27 +106,20 @@ class Feed:
         self._watcher.feed(snapshot)
         state = self._watcher.state()
         self._frame = self._frame if snapshot.frame is None else snapshot.frame
-        if snapshot.mirror is not None:
-            self._mirror_nm = actuators(snapshot.mirror)
         if snapshot.steps.mode.size:
             self._command_nm = snapshot.steps.command_nm[-1]
         self._extend_trend(state, host_ns)
         newest_ns = max(snapshot.sent_ns.values(), default=0)
         per_mas = None if self._config is None else tilt_nm_per_mas(self._config.star.diameter_m)
         return Reading(
-            host_ns,
             (host_ns - newest_ns) * 1e-9 if newest_ns else None,
             state,
             judge(state, per_mas),
             self._frame,
-            self._mirror_nm,
             self._command_nm,
-            dict(snapshot.health),
-            snapshot.events,
             [one for one in requests if one is not None and not _by_itself(one)],
             [residual for residual, _ in self._trend],
             [light for _, light in self._trend],
-            state.noll,
         )
 
     def close(self) -> None:
@@ -154,7 +139,7 @@ class Feed:
         self._asked_s = time.monotonic()
 
         def ask() -> None:
-            self._earlier.extend(states(self._bus, SHOWN))
+            self._earlier.extend(sample for _, sample in states(self._bus, SHOWN))
             try:
                 self._config = configuration_of(Client(self._run_id, bus=self._bus))
             except LowfcError:  # there is no controller yet: it is asked again when one is

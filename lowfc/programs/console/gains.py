@@ -44,11 +44,11 @@ class Gains(Lines):
 
     def update(self, reading: Reading) -> None:
         """Take in the gains of the run."""
-        state = reading.state.controller_state
-        if state is None or len(state.gain) != len(reading.noll):
+        state, noll = reading.state.snapshot.controller, reading.state.snapshot.noll
+        if state is None or len(state.gain) != len(noll):
             self._noll = ()
         else:
-            self._noll, self._gain = reading.noll, np.array(state.gain, np.float32)
+            self._noll, self._gain = noll, np.array(state.gain, np.float32)
             self._automatic = np.array(state.automatic or [False] * len(state.gain), bool)
         self._draw()
 

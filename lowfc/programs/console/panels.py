@@ -10,15 +10,16 @@ from rich.style import Style
 from rich.text import Text
 
 from lowfc.arrays import Array
+from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.envelope import count_of
 from lowfc.contract.events import Level as Severity
 from lowfc.contract.messages import Log, from_timestamp, wire
 from lowfc.contract.printable import printable
 from lowfc.programs.console.feed import Reading
-from lowfc.programs.console.phrases import numbers_in_short, phrased
+from lowfc.programs.console.phrases import phrased
 from lowfc.programs.view.draw.colours import GREY, ORANGE, RED, YELLOW, Colour, Rgb, diverging, sequential
 from lowfc.programs.view.verdicts.run_state import Liveness
-from lowfc.programs.view.verdicts.tile import FILL, INK, WORD, Level, duration, figure
+from lowfc.programs.view.verdicts.tile import FILL, INK, WORD, Level, duration, figure, numbers
 from lowfc.programs.view.verdicts.watcher import SILENT_S
 
 _PIXELS = 12
@@ -72,7 +73,8 @@ def pictures(reading: Reading) -> list[Text]:
     """The newest frame and the mirror, small."""
     lines = [Text() for _ in range(_PIXELS // 2)]
     captions = []
-    for array, signed in ((reading.frame, False), (reading.mirror_nm, True)):
+    mirror = reading.state.mirror_state
+    for array, signed in ((reading.frame, False), (actuators(mirror) if mirror is not None else None, True)):
         if array is None:
             drawn, caption = np.zeros((_PIXELS, _PIXELS, 3), np.uint8), "none yet"
         else:
@@ -130,7 +132,7 @@ def sparkline(values: Sequence[float], width: int) -> str:
 
 def modes(reading: Reading, width: int) -> list[Text]:
     """The command of each mode as a bar between its limits, in columns."""
-    state, noll = reading.state.controller_state, reading.noll
+    state, noll = reading.state.snapshot.controller, reading.state.snapshot.noll
     if state is None or not noll or len(noll) != len(reading.command_nm):
         return [Text("no calibration, so no modes yet", DIM)]
     columns = -(-len(noll) // _MODE_LINES)
@@ -161,7 +163,7 @@ def _mode(noll: int, command_nm: float, limit_nm: float, width: int) -> Text:
 
 def facts(reading: Reading) -> Text:
     """What is set: law, offset and channels, who has reserved the loop, the last note."""
-    known, state = reading.verdict.facts, reading.state.controller_state
+    known, state = reading.verdict.facts, reading.state.snapshot.controller
     law = _GAINS.sub("", known["CONTROL LAW"])
     rows = {"law": law, "shapes": known["OFFSET AND CHANNELS"], "note": known["LAST NOTE"]}
     if state is not None and state.lease.id and not state.lease.ended:
@@ -172,8 +174,9 @@ def facts(reading: Reading) -> Text:
 def peers(reading: Reading, run: str) -> Text:
     """Who is alive, and at what rate; in red who is silent."""
     line = Text(f"run {run} ", DIM)
-    for name, last in sorted(reading.health.items()):
-        silent_s, stopped = (reading.host_ns - last.time_ns) * 1e-9, last.health.state in ("stopping", "stopped")
+    snapshot = reading.state.snapshot
+    for name, last in sorted(snapshot.health.items()):
+        silent_s, stopped = (snapshot.host_ns - last.time_ns) * 1e-9, last.health.state in ("stopping", "stopped")
         if silent_s > SILENT_S and not stopped:
             line.append(f" {name} silent {duration(silent_s)} ", WRONG)
         else:
@@ -197,7 +200,7 @@ def event_line(event: Log, times: int = 1) -> Text:
 
 def request_line(asked: wire.Request) -> Text:
     """What was asked, by whom, the answer, and the frame from which it is in force."""
-    fields = [numbers_in_short(list(asked.values)), printable(asked.text)]
+    fields = [numbers(list(asked.values)), printable(asked.text)]
     if asked.modes:
         fields.append(f"modes {','.join(map(str, asked.modes))}")
     reply = phrased(printable(asked.reply))

@@ -3,6 +3,7 @@
 import re
 
 from lowfc.programs.console.actions import ACTIONS, SAFE
+from lowfc.programs.view.verdicts.tile import numbers
 
 _KEYS = {one.name: one.key for one in (*ACTIONS, SAFE)} | {
     "law integrator": "i",
@@ -16,19 +17,7 @@ _LIST = re.compile(rf"(?<![\w.]){_NUMBER}(?: {_NUMBER}){{3,}}(?![\w.])")
 
 def phrased(sentence: str) -> str:
     """A sentence that an operator of the console can act on, and that fits its lines."""
-    return _LIST.sub(_range, _COMMAND.sub(_key, sentence))
-
-
-def numbers_in_short(values: list[float]) -> str:
-    """A few numbers as they are, more of them by their range."""
-    if len(values) < 4:
-        return " ".join(f"{value:g}" for value in values)
-    lowest, highest = f"{min(values):.3g}", f"{max(values):.3g}"
-    return f"{lowest if lowest == highest else f'{lowest} to {highest}'} ({len(values)} modes)"
-
-
-def _range(found: re.Match[str]) -> str:
-    return numbers_in_short([float(one) for one in found[0].split()])
+    return _LIST.sub(lambda found: numbers([float(one) for one in found[0].split()]), _COMMAND.sub(_key, sentence))
 
 
 def _key(found: re.Match[str]) -> str:

@@ -50,15 +50,15 @@ class Watch:
         for topic, ring in self._rings.items():
             samples = ring.drain()
             for sample in samples:
-                add(topic, sample.key, sample.payload, sample.publish_time_ns, sample.sequence)
+                add(sample)
             if topic is STEP and samples:
                 self._step = wire.ControlStep.FromString(samples[-1].payload)
         snapshot = self._accumulator.snapshot(now_ns)
         there = {(name, one.health.pid) for name, one in snapshot.health.items()}
         if not there <= self._known:
             self._known = there
-            for topic, sample in states(self._bus, SHOWN, _PATIENCE_S):
-                add(topic, sample.key, sample.payload, sample.publish_time_ns, sample.sequence)
+            for _, sample in states(self._bus, SHOWN, _PATIENCE_S):
+                add(sample)
         self._watcher.feed(snapshot)
         controller = snapshot.health.get(Role.CONTROLLER)
         connected = controller is not None and now_ns - controller.time_ns < SILENT_NS

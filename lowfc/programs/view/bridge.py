@@ -138,9 +138,9 @@ class Bridge:
         self._past_known |= events_due
 
         def add() -> None:
-            render.add_earlier(states(self._bus, SHOWN))
+            render.add_earlier(sample for _, sample in states(self._bus, SHOWN))
             if events_due:
-                render.add_earlier((EVENT, event) for event in earlier_events(recorder, self._clock.now_ns()))
+                render.add_earlier(earlier_events(recorder, self._clock.now_ns()))
 
         threading.Thread(target=add, name="earlier", daemon=True).start()
 

@@ -10,7 +10,6 @@ from lowfc.adapters.logs.recovery import no_end
 from lowfc.adapters.process.clock import SimulatedClock
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
-from lowfc.contract.messages import topic_of
 from lowfc.control.loop.wording import counted
 from lowfc.programs.view.renderer import Renderer
 from lowfc.programs.view.snapshot import PICTURES_HZ, PICTURES_PER_COMPLETE, SHOWN, Accumulator, LogEnd
@@ -70,8 +69,8 @@ def draw_logs(
                     raise DataFileError(
                         f"{log} is of run {run!r}, and the log before it of {before!r}: look at one at a time"
                     )
-            last_ns, topic = message.log_time_ns, topic_of(message.key)
-            accumulator.add(topic, message.key, message.payload, message.publish_time_ns, message.sequence)
+            last_ns = message.log_time_ns
+            accumulator.add(message)
             if last_ns >= due_ns:
                 snapshot = accumulator.snapshot(last_ns, complete=drawn.snapshots % PICTURES_PER_COMPLETE == 0)
                 renderer.draw(snapshot)

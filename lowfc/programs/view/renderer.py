@@ -114,11 +114,11 @@ class RenderThread(threading.Thread):
         self._config = config
         self._clock = clock
         self._rings = rings
-        self._earlier: deque[tuple[Topic, Sample]] = deque()
+        self._earlier: deque[Sample] = deque()
         self._make_stream = make_stream
         self._abandoned = False
 
-    def add_earlier(self, samples: Iterable[tuple[Topic, Sample]]) -> None:
+    def add_earlier(self, samples: Iterable[Sample]) -> None:
         """Draw messages, too, that were sent before the view received anything."""
         self._earlier.extend(samples)
 
@@ -146,9 +146,9 @@ class RenderThread(threading.Thread):
             arrived = [self._earlier.popleft() for _ in range(len(self._earlier))]
             for topic, ring in self._rings.items():
                 if complete or topic.latest_only:  # many messages in a row cost less each
-                    arrived += [(topic, sample) for sample in ring.drain()]
-            for topic, sample in arrived:
-                accumulator.add(topic, sample.key, sample.payload, sample.publish_time_ns, sample.sequence)
+                    arrived += ring.drain()
+            for sample in arrived:
+                accumulator.add(sample)
             renderer.draw(accumulator.snapshot(self._clock.host_ns(), complete=complete, behind_s=behind_s))
             self.snapshots += 1
             self.drawn_s = time.monotonic()

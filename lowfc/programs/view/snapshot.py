@@ -7,8 +7,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from google.protobuf.message import DecodeError
 
+from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.bus.names import Names
 from lowfc.adapters.logs.columns import StepRows, Steps, TimingRows, TruthRows, Truths
+from lowfc.adapters.logs.reader import Logged
 from lowfc.arrays import Long, Mask, Pixels, Sequences, Single
 from lowfc.contract.codecs.calibration_codec import decode_calibration
 from lowfc.contract.codecs.codec import decode_frame
@@ -31,6 +33,7 @@ from lowfc.contract.messages import (
     RawImage,
     Topic,
     from_timestamp,
+    topic_of,
     wire,
 )
 from lowfc.control.calibration.calibration import Calibration
@@ -44,7 +47,7 @@ PICTURES_PER_COMPLETE = 8
 """Snapshots for each that is complete: curves grow four times a second, for many rows cost hardly more than one."""
 
 _KNOWN_EVENTS = 5000
-_UNREADABLE = (BadMessageError, DecodeError, OverflowError, ValueError)
+_UNREADABLE = (BadMessageError, DecodeError, KeyError, OverflowError, ValueError)
 
 
 class Waves(NamedTuple):
@@ -130,6 +133,16 @@ class Snapshot:
     ended: LogEnd | None = None
 
     @property
+    def period_ns(self) -> int:
+        """Of the frames; 0 where the camera does not report it."""
+        return self.camera.period_ns if self.camera is not None else 0
+
+    @property
+    def noll(self) -> tuple[int, ...]:
+        """Modes of the calibration; empty before there is one."""
+        return self.calibration.noll if self.calibration is not None else ()
+
+    @property
     def stroke_nm(self) -> float:
         """Limit of an actuator's deviation from flat; 0 where the controller has not reported it."""
         return self.controller.settings.stroke_nm if self.controller is not None else 0.0
@@ -171,21 +184,23 @@ class Accumulator:
         self._sequences: dict[str, int] = {}
         self._data_ns = self._data_host_ns = 0
 
-    def add(self, topic: Topic, key: str, payload: bytes, publish_time_ns: int, sequence: int = 0) -> None:
+    def add(self, message: Sample | Logged) -> None:
         """Add one message of one of `SHOWN`; a state that is older than the last one is left out."""
+        key, sequence = message.key, message.sequence
         try:
+            topic = topic_of(key)
             self._names.admit(topic, key)
             if topic.queryable:
                 if sequence < self._sequences.get(key, 0):
                     return
                 self._sequences[key] = sequence
-            if topic is EVENT and not self._is_new(sequence, payload):
+            if topic is EVENT and not self._is_new(sequence, message.payload):
                 return
-            self._sent_ns[topic] = max(publish_time_ns, self._sent_ns.get(topic, 0))
+            self._sent_ns[topic] = max(message.publish_time_ns, self._sent_ns.get(topic, 0))
             if topic.latest_only:
-                self._newest[topic] = payload
+                self._newest[topic] = message.payload
             else:
-                self._read(topic, key, payload, publish_time_ns)
+                self._read(topic, key, message.payload, message.publish_time_ns)
         except _UNREADABLE:
             self.unreadable += 1
 

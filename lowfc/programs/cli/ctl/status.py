@@ -126,16 +126,6 @@ def text(known: dict[str, Any]) -> str:
     """The same figures for a person: whether all is well in the first line."""
     since = "" if known["mode_s"] is None else f" for {known['mode_s']:.0f} s ({known['mode_cause']})"
     opens = f", opens after {counted(known['steps_left'], 'frame')}" if known["steps_left"] else ""
-    law = known["law"]["name"]
-    if known["law"]["weight"] < 1:
-        law += f", driving with a weight of {known['law']['weight']:.2f}; the integrator has the rest"
-    if known["law"]["overruled"]:
-        law += f", in whose place the integrator drives {' and '.join(known['law']['overruled'])}"
-    channels = [
-        f"{one['name']} {one['rms_nm']:.3g} nm rms of surface"
-        f"{'' if one['reached'] else ', on its way'}{'' if one['shifts_zero_point'] else ', zero point not shifted'}"
-        for one in known["channels"]
-    ]
     playing = known["playing"]
     rows = {
         "loop": _mode(known, since) + opens,
@@ -145,13 +135,13 @@ def text(known: dict[str, Any]) -> str:
         "command": f"{known['command_rms_nm']:.3f} nm rms" + (", on its way to zero" if known["homing"] else ""),
         "offset": f"{known['offset_rms_nm']:.3f} nm rms",
         **_contrast(known),
-        "law": law,
+        "law": law_in_words(known),
         "gain": _values(known["gain"])
         + _automatic(known["gain_automatic"])
         + ("" if known["law"]["name"] == "integrator" else ", of the integrator alone"),
         "leak": _values(known["leak"]),
         "limit": _values(known["limit_nm"], " nm"),
-        "channels": "; ".join(channels) or "none",
+        "channels": channels_in_words(known),
         "playing": f"{playing['target']}, {playing['frames_left']} of {counted(playing['frames'], 'frame')} left"
         if playing
         else "nothing",
@@ -172,6 +162,24 @@ def _contrast(known: dict[str, Any]) -> dict[str, str]:
         return {}
     of = ", as measured by the sensor" if known["added_contrast_estimated"] else ""
     return {"contrast": sentence(with_this_mirror(known["added_contrast"]), most_of(known)) + of}
+
+
+def law_in_words(known: dict[str, Any]) -> str:
+    """The law in force, and what of the mirror the integrator drives in its place."""
+    law, weight = known["law"], known["law"]["weight"]
+    fading = "" if weight == 1 else f", driving with a weight of {weight:.2f}; the integrator has the rest"
+    instead = f", in whose place the integrator drives {' and '.join(law['overruled'])}" if law["overruled"] else ""
+    return f"{law['name']}{fading}{instead}"
+
+
+def channels_in_words(known: dict[str, Any]) -> str:
+    """The shapes that are added to the mirror."""
+    channels = [
+        f"{one['name']} {one['rms_nm']:.3g} nm rms of surface"
+        f"{'' if one['reached'] else ', on its way'}{'' if one['shifts_zero_point'] else ', zero point not shifted'}"
+        for one in known["channels"]
+    ]
+    return "; ".join(channels) or "no channel"
 
 
 def interlocks(known: dict[str, Any]) -> str:

@@ -49,19 +49,19 @@ def frames(state: RunState) -> Tile:
         return tile("NO FRAMES", f"for {since}: {who}", Level.BAD, advice)
     refused = sum(state.recent[reason] for reason in REFUSED)
     lost = state.recent["skipped"] + state.recent["missing"]
-    nominal = RECENT_S * 1e9 / state.period_ns if state.period_ns else 0.0
-    due = max(state.recent["steps"] + lost, nominal, 1)
-    return worst_of((_rate(state, refused), _lost(state, lost, due), _refused(state, refused, due)))
+    period_ns = state.snapshot.period_ns
+    nominal_hz = 1e9 / period_ns if period_ns else 0.0
+    due = max(state.recent["steps"] + lost, RECENT_S * nominal_hz, 1)
+    return worst_of((_rate(state, refused, nominal_hz), _lost(state, lost, due), _refused(state, refused, due)))
 
 
-def _rate(state: RunState, refused: int) -> Tile:
+def _rate(state: RunState, refused: int, nominal_hz: float) -> Tile:
     tile, rate_hz = partial(Tile, "FRAMES"), state.rate_hz
     if rate_hz is None:
         if state.now["steps"]:
             return tile("STARTING", "too few for a rate")
         return tile("UNUSED", "frames arrive, no controller uses them")
     value = f"{rate_hz:.0f} Hz" if rate_hz >= 10 else f"{rate_hz:.2g} Hz"
-    nominal_hz = 1e9 / state.period_ns if state.period_ns else 0.0
     if rate_hz < SLOW * nominal_hz:
         advice = f"The camera runs at {rate_hz:.3g} Hz, not at {nominal_hz:.3g} Hz: the host does not keep up."
         return tile(value, f"slow: {nominal_hz:.3g} Hz wanted", Level.WARNING, advice)

@@ -1,79 +1,56 @@
 """What is set, in words: run and host, control law and gains, offset and channels, the last note."""
 
-from collections import Counter
-from collections.abc import Sequence
 from datetime import UTC, datetime
 
 import numpy as np
 
-from lowfc.contract.codecs.law_codec import overruled
-from lowfc.contract.messages import from_timestamp, wire
+from lowfc.contract.messages import Role, from_timestamp, wire
 from lowfc.contract.printable import printable
-from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
 from lowfc.control.loop.wording import counted
 from lowfc.optics.chain.zernike import mode_name
+from lowfc.programs.cli.ctl.status import channels_in_words, figures, law_in_words
+from lowfc.programs.view.snapshot import Snapshot
 from lowfc.programs.view.verdicts.run_state import RunState
-from lowfc.programs.view.verdicts.tile import short
+from lowfc.programs.view.verdicts.tile import numbers, short
 
 _MOST = 3
-"""Different values, modes or channels that are named one by one."""
+"""Modes of an offset that are named one by one."""
 
 
 def facts(state: RunState) -> dict[str, str]:
     """The facts of a run by title, as far as they are known."""
-    controller, note = state.controller_state, "none known"
+    snapshot, note = state.snapshot, "none known"
     if state.note is not None:
         clock = datetime.fromtimestamp(from_timestamp(state.note.timestamp) * 1e-9, UTC)
         note = f"{clock:%H:%M} {short(printable(state.note.message.partition(' ')[2]))}"
     law = shapes = "not known"
-    if controller is not None:
-        law, shapes = _law(controller), f"{_offset(controller, state.noll)}; {_channels(controller)}"
-    run = (f"{state.run} on {state.host}" if state.host else state.run) or "not known"
-    return {"RUN": run, "CONTROL LAW": law, "OFFSET AND CHANNELS": shapes, "LAST NOTE": note}
+    if snapshot.controller is not None:
+        known = figures(snapshot.controller)
+        law = short(printable(law_in_words(known)))
+        if not snapshot.controller.HasField("law"):
+            leak = f", leak {numbers(known['leak'])}" if any(known["leak"]) else ""
+            law += f", gain {numbers(known['gain'])}{leak}" if known["gain"] else ", no calibration"
+        law += f"; delay {counted(snapshot.controller.delay_frames, 'frame')}"
+        shapes = f"{_offset(known['offset_nm'], snapshot.noll)}; {short(printable(channels_in_words(known)))}"
+        if known["playing"]:
+            shapes += f"; probe sequence on the {printable(known['playing']['target'])}"
+    return {"RUN": _run(snapshot), "CONTROL LAW": law, "OFFSET AND CHANNELS": shapes, "LAST NOTE": note}
 
 
-def _law(state: wire.ControllerState) -> str:
-    if state.HasField("law"):
-        weight = min(max(state.law_frames - SETTLING_FRAMES, 0) / FADING_FRAMES, 1.0)
-        fading = "" if weight == 1 else f", taking over from the integrator ({100 * weight:.0f} %)"
-        modes = overruled(state)
-        instead = f", the integrator in its place for {' and '.join(modes)}" if modes else ""
-        law = f"{short(printable(state.law.name))}{fading}{instead}"
-    elif state.gain:
-        leak = f", leak {_values(state.leak)}" if any(state.leak) else ""
-        law = f"integrator, gain {_values(state.gain)}{leak}"
+def _run(snapshot: Snapshot) -> str:
+    if snapshot.ended is not None:
+        name, host = snapshot.ended.run, snapshot.ended.host
     else:
-        law = "integrator, no calibration"
-    return f"{law}; delay {counted(state.delay_frames, 'frame')}"
+        reported = {name: one.health for name, one in snapshot.health.items() if name != Role.VIEWER}
+        health = reported.get(Role.CONTROLLER) or next(iter(reported.values()), wire.Health())
+        name, host = printable(health.run_id), printable(health.host)
+    return (f"{name} on {host}" if host else name) or "not known"
 
 
-def _values(values: Sequence[float]) -> str:
-    """Each value with the number of its modes, where there are few; the range where there are many."""
-    counts = Counter(values)
-    if len(counts) == 1:
-        return f"{values[0]:.3g}"
-    if len(counts) > _MOST:
-        return f"{min(values):.3g} to {max(values):.3g}"
-    return ", ".join(f"{value:.3g} ({counted(count, 'mode')})" for value, count in counts.items())
-
-
-def _offset(state: wire.ControllerState, noll: tuple[int, ...]) -> str:
-    values = np.array(state.offset_nm)
-    set_ = np.flatnonzero(values)
-    if not set_.size:
+def _offset(values_nm: list[float], noll: tuple[int, ...]) -> str:
+    places = np.flatnonzero(values_nm)
+    if not places.size:
         return "no offset"
-    if len(noll) != len(values) or len(set_) > _MOST:
-        return f"offset {np.linalg.norm(values):.3g} nm rms, {counted(len(set_), 'mode')}"
-    return f"offset {', '.join(f'{mode_name(noll[place])} {values[place]:.3g}' for place in set_)} nm"
-
-
-def _channels(state: wire.ControllerState) -> str:
-    named = []
-    for one in state.channels[:_MOST]:
-        shape = np.frombuffer(one.actuators, "<f4").astype(np.float64)
-        rms_nm = float(np.sqrt(np.mean(shape**2))) if shape.size else 0.0
-        named.append(f"{printable(one.name)} {rms_nm:.3g} nm{'' if one.actuators == one.reached else ' (on its way)'}")
-    if len(state.channels) > _MOST:
-        named.append(f"{len(state.channels) - _MOST} more")
-    text = f"{'channel' if len(state.channels) == 1 else 'channels'} {', '.join(named)}" if named else "no channels"
-    return f"{text}; probe sequence on the {printable(state.play.target)}" if state.HasField("play") else text
+    if len(noll) != len(values_nm) or len(places) > _MOST:
+        return f"offset {np.linalg.norm(values_nm):.3g} nm rms, {counted(len(places), 'mode')}"
+    return f"offset {', '.join(f'{mode_name(noll[place])} {values_nm[place]:.3g}' for place in places)} nm"

@@ -6,7 +6,6 @@ from datetime import UTC, datetime
 import numpy as np
 
 from lowfc.adapters.logs.columns import Steps
-from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.messages import Role
 from lowfc.control.durations import Durations
 from lowfc.control.loop.safety import LoopMode
@@ -17,7 +16,7 @@ from lowfc.programs.view.verdicts.course import Course
 from lowfc.programs.view.verdicts.facts import facts
 from lowfc.programs.view.verdicts.run_state import RunState
 from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict, duration, figure, worst_of
-from lowfc.programs.view.verdicts.verdict import LIMITS, stroke
+from lowfc.programs.view.verdicts.verdict import LIMITS, stroke, stroke_used_nm
 from lowfc.programs.view.verdicts.wavefront_verdict import GOOD_FACTOR
 
 _LONGEST_STEP_NS = 1_000_000_000
@@ -48,9 +47,7 @@ class Night:
             self._closed += (closed.sum(), *np.sum(waves.rms_nm[closed].astype(float) ** 2, axis=0))
         for duration_ns in snapshot.timings["frame_to_command"].tolist():
             self._latency.add(duration_ns)
-        surface_nm = actuators(snapshot.mirror) if snapshot.mirror is not None else None
-        if surface_nm is not None:
-            self._stroke_nm = max(self._stroke_nm, float(np.abs(surface_nm).max(initial=0.0)))
+        self._stroke_nm = max(self._stroke_nm, stroke_used_nm(snapshot.mirror))
         if (recorder := snapshot.health.get(Role.RECORDER)) is not None:
             self._lost = max(self._lost, recorder.health.recording.lost)
 
@@ -124,7 +121,7 @@ class Night:
         return Tile("STAR", value, detail, Level.GOOD)
 
     def _mirror(self, state: RunState) -> Tile:
-        value, of = stroke(self._stroke_nm, state.stroke_limit_nm)
+        value, of = stroke(self._stroke_nm, state.snapshot.stroke_nm)
         acted = {words: state.totals[reason] for reason, words in LIMITS.items() if state.totals[reason]}
         if not acted:
             return Tile("MIRROR", value, f"{of} at most, no limit acted", Level.GOOD)
@@ -162,5 +159,5 @@ def _frames(state: RunState) -> Tile:
     if unused >= FEW * max(steps, 1):
         advice = f"{counted(lost, 'frame')} lost, {refused.total()} refused: see the events."
         return Tile("FRAMES", f"{unused} UNUSED", detail, Level.WARNING, advice)
-    rate = f"{1e9 / state.period_ns:.0f} Hz" if state.period_ns else f"{steps}"
+    rate = f"{1e9 / state.snapshot.period_ns:.0f} Hz" if state.snapshot.period_ns else f"{steps}"
     return Tile("FRAMES", rate, detail, Level.GOOD if steps else Level.NEUTRAL)

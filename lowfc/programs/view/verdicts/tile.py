@@ -75,6 +75,14 @@ def figure(value: float) -> str:
     return f"{value:.0f}" if value >= 100 else f"{value:.1f}" if value >= 1 else f"{value:.2f}"
 
 
+def numbers(values: Sequence[float]) -> str:
+    """A few numbers as they are, more of them by their range."""
+    if len(values) < 4:
+        return " ".join(f"{value:g}" for value in values)
+    lowest, highest = f"{min(values):.3g}", f"{max(values):.3g}"
+    return f"{lowest if lowest == highest else f'{lowest} to {highest}'} ({len(values)} modes)"
+
+
 def duration(seconds: float) -> str:
     """A span of time in words, up to a night."""
     if seconds < 120:

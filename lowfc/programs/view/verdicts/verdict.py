@@ -7,7 +7,10 @@ from datetime import UTC, datetime
 from functools import partial
 from pathlib import PurePath
 
-from lowfc.contract.messages import from_timestamp, wire
+import numpy as np
+
+from lowfc.contract.codecs.codec import actuators
+from lowfc.contract.messages import Role, from_timestamp, wire
 from lowfc.contract.printable import printable
 from lowfc.control.loop.safety import Limit, LoopMode, Reason
 from lowfc.control.loop.wording import counted
@@ -46,10 +49,12 @@ def judge(state: RunState, nm_per_mas: float | None = None) -> Verdict:
     loop = _loop(state)
     left = wavefront(state, nm_per_mas, loop)
     tiles = [loop, left, frames(state), star(state), _mirror(state), _latency(state), _recorder(state)]
-    if state.contrast is not None:
-        tiles.insert(2, contrast(state.contrast, now=state.wavefront is not None))
-    if state.behind_s > BEHIND_S:
-        tiles.append(_view(state.behind_s))
+    reported = (state.snapshot.health.get(role) for role in (Role.CAMERA, Role.CONTROLLER))
+    known = (one.health.recent_wavefront for one in reported if one is not None)
+    if figures := next((one for one in known if one.costliest_modes), None):
+        tiles.insert(2, contrast(figures, now=state.wavefront is not None))
+    if state.snapshot.behind_s > BEHIND_S:
+        tiles.append(_view(state.snapshot.behind_s))
     worst = worst_of(tiles)
     headline, level = worst.advice, worst.level
     if worst.level < Level.WARNING:
@@ -63,7 +68,7 @@ def judge(state: RunState, nm_per_mas: float | None = None) -> Verdict:
 def _loop(state: RunState) -> Tile:
     tile, mode = partial(Tile, "LOOP"), state.mode
     controller, camera, mirror = state.controller, state.camera, state.mirror
-    others = {camera.life, mirror.life}
+    others, reported = {camera.life, mirror.life}, state.snapshot.controller
     if controller.life is Liveness.SILENT and others <= {Liveness.SILENT, Liveness.NEVER}:
         since = duration(controller.silent_s)
         advice = f"No message from any process for {since}: the run was killed, or this view is cut off from it. "
@@ -84,10 +89,7 @@ def _loop(state: RunState) -> Tile:
         return _open(state)
     if Liveness.STARTING in (controller.life, camera.life) or camera.life is Liveness.NEVER:
         return tile("WAITING", "closed, no frame yet", advice="Waiting for the first frame.")
-    fault = state.controller_state.mirror_fault if state.controller_state is not None else ""
-    if fault:
-        return tile("HOLDING", f"closed, but the mirror {fault}: command held", Level.WARNING)
-    if held := _held(state.controller_state):
+    if held := _held(reported):
         return tile("HOLDING", f"closed, but {held}: command held", Level.WARNING)
     if mirror.life is Liveness.SILENT:  # in logs of version 0.1 it is not missed
         return tile("CLOSED", "but the mirror is silent", Level.WARNING)
@@ -104,13 +106,15 @@ def _loop(state: RunState) -> Tile:
     if state.now[Limit.LAW_OVERRULED]:
         advice = "The law leaves more than the integrator, which has taken over. Tune again: `lowfc tune --live`."
         return tile("CLOSED", "the integrator in place of the law", Level.WARNING, advice)
-    return tile("CLOSED", f"correcting{_since(state.controller_state)}", Level.GOOD, "Loop closed, nothing is wrong.")
+    return tile("CLOSED", f"correcting{_since(reported)}", Level.GOOD, "Loop closed, nothing is wrong.")
 
 
 def _held(state: wire.ControllerState | None) -> str:
-    """What holds a closed loop: an interlock, or a permit; empty where nothing does."""
+    """What holds a closed loop: the mirror, a permit or an interlock; empty where nothing does."""
     if state is None:
         return ""
+    if state.mirror_fault:
+        return f"the mirror {state.mirror_fault}"
     if state.lease.holds and not state.lease.ended:
         return f"reserved for {short(printable(state.lease.holder))}"
     return next((short(printable(one.why)) for one in state.interlocks_acting if one.action == "hold"), "")
@@ -145,7 +149,8 @@ def _mirror(state: RunState) -> Tile:
         level = Level.NEUTRAL if state.controller.life is Liveness.STOPPED else Level.BAD
         advice = "The mirror receives no commands: the last one has expired, it holds or relaxes by itself. "
         return tile("EXPIRED", "no commands: holds or relaxes by itself", level, f"{advice}Look at the controller.")
-    value, of = stroke(state.stroke_nm, state.stroke_limit_nm)
+    used_nm, limit_nm = stroke_used_nm(reported), state.snapshot.stroke_nm
+    value, of = stroke(used_nm, limit_nm)
     acting = {words: state.recent[reason] for reason, words in LIMITS.items() if state.recent[reason]}
     own = [words for reason, words in LIMITS.items() if reason.value in reported.limits_hit]
     if acting or own:
@@ -157,10 +162,16 @@ def _mirror(state: RunState) -> Tile:
         )
         detail = f"{words}: {times} in {RECENT_S:g} s; {value} {of}"
         return tile("AT LIMIT", detail, Level.BAD if often else Level.WARNING, advice)
-    if state.stroke_limit_nm and state.stroke_nm > NEAR_STROKE * state.stroke_limit_nm:
+    if limit_nm and used_nm > NEAR_STROKE * limit_nm:
         advice = f"The mirror has used {value} of its stroke: little is left. Offload the slow part of it."
         return tile(value, f"{of}: nearly all", Level.WARNING, advice)
     return tile(value, f"{of}, no limit acts", Level.GOOD)
+
+
+def stroke_used_nm(mirror: wire.MirrorState | None) -> float:
+    """Largest deviation of an actuator from flat; 0 where it is not known."""
+    surface_nm = actuators(mirror) if mirror is not None else None
+    return float(np.abs(surface_nm).max(initial=0.0)) if surface_nm is not None else 0.0
 
 
 def stroke(used_nm: float, limit_nm: float) -> tuple[str, str]:
@@ -188,16 +199,17 @@ def _latency(state: RunState) -> Tile:
         )
         what = f"{'command' if late == 1 else 'commands'} in {RECENT_S:g} s; {value}, {detail}"
         return tile(f"{late} LATE", what, Level.WARNING, advice)
-    if state.period_ns and state.latency_us[1] * 1e3 > state.period_ns:
+    if 0 < state.snapshot.period_ns < state.latency_us[1] * 1e3:
         advice = f"1 command in 100 takes over {long} us, longer than a frame. Free the host or lower the rate."
         return tile(value, f"slow: {detail}", Level.WARNING, advice)
     return tile(value, detail, Level.GOOD)
 
 
 def _recorder(state: RunState) -> Tile:
-    tile, recorder, done = partial(Tile, "RECORDER"), state.recorder, state.recording
-    if done is None:
+    tile, recorder, last = partial(Tile, "RECORDER"), state.recorder, state.snapshot.health.get(Role.RECORDER)
+    if last is None:
         return tile("NONE", "there is no recorder: nothing is recorded")
+    done = last.health.recording
     log = short(PurePath(done.file).stem)
     if done.failure:
         advice = f"Recording failed, the loop goes on: {short(done.failure)}. Make room and start `lowfc record` again."

@@ -9,7 +9,6 @@ import numpy as np
 from lowfc.adapters.bus.run import mirror_role
 from lowfc.adapters.logs.columns import count_reasons, frame_rate_hz
 from lowfc.arrays import Array, Long, Sequences
-from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.envelope import start_of
 from lowfc.contract.messages import (
     CONTROLLER_STATE,
@@ -27,7 +26,7 @@ from lowfc.control.laws.law import TIP_TILT
 from lowfc.control.loop.estimator import saturated_pixels
 from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.launch.watch import topic_count
-from lowfc.programs.view.snapshot import Accumulator, LastHealth, Snapshot, Waves
+from lowfc.programs.view.snapshot import Accumulator, Snapshot, Waves
 from lowfc.programs.view.verdicts.run_state import NOW_S, RECENT_S, Counts, Liveness, Process, Rms, RunState
 from lowfc.programs.view.verdicts.steady import Attained, Steady, attained
 
@@ -39,8 +38,6 @@ FRAMES_SILENT_S = 1.0
 """Without a frame for so long, and for `PERIODS` of its own, a camera is not merely slow."""
 PERIODS = 10
 """Frames of a slow camera that "now" holds."""
-OTHER_CLOCK_NS = 3_600_000_000_000
-"""Clocks of one host do not differ by an hour: frame times that do are simulated, or another clock's."""
 ATTAINED_NS = 30_000_000_000
 """Between two computations of the best gains, which take 0.3 s for 14 modes."""
 _SAMPLES = 1000
@@ -96,7 +93,7 @@ class Watcher:
         self._mirror = snapshot.mirror or self._mirror
         self._samples.append(self._sample(snapshot))
         self._totals.update(self._samples[-1].counts)
-        while self._samples[0].host_ns < snapshot.host_ns - RECENT_S * 1e9 - PERIODS * self._period_ns:
+        while self._samples[0].host_ns < snapshot.host_ns - RECENT_S * 1e9 - PERIODS * self._snapshot.period_ns:
             self._samples.popleft()
         if snapshot.steps.mode.size:
             self._last_worked = self._last(NOW_S)
@@ -111,16 +108,11 @@ class Watcher:
             wavefront, true = _rms(self._last_worked)
         worked = self._last_worked if stopped else now
         durations_us = np.concatenate([np.zeros(0), *(one.durations_ns / 1e3 for one in worked)])
-        surface_nm = actuators(self._mirror) if self._mirror is not None else None
-        camera, recorder = (snapshot.health.get(role) for role in (Role.CAMERA, Role.RECORDER))
-        run, host = self._run_and_host()
         return RunState(
+            snapshot=snapshot,
             mode=self._mode,
             why=self._why,
             running_s=(snapshot.host_ns - self._begun_ns) * 1e-9 if self._begun_ns else 0.0,
-            behind_s=snapshot.behind_s,
-            simulated=abs(snapshot.time_ns - snapshot.host_ns) > OTHER_CLOCK_NS,
-            period_ns=self._period_ns,
             rate_hz=_rate_hz(now),
             controller=controller,
             camera=self._process((Role.CAMERA,), FRAME),  # one of the user's own may send nothing else
@@ -136,33 +128,14 @@ class Watcher:
             wavefront=wavefront,
             latest=_rms(self._last(LATEST_S))[0],
             true=true,
-            contrast=_contrast(camera, snapshot.health.get(Role.CONTROLLER)),
             attained=self._attained,
             latency_us=tuple(np.percentile(durations_us, [50, 99]).tolist()) if durations_us.size else None,
-            stroke_nm=float(np.abs(surface_nm).max(initial=0.0)) if surface_nm is not None else 0.0,
-            stroke_limit_nm=snapshot.stroke_nm,
             mirror_state=self._mirror,
-            controller_state=snapshot.controller,
-            recording=recorder.health.recording if recorder is not None else None,
-            noll=snapshot.calibration.noll if snapshot.calibration is not None else (),
-            run=run,
-            host=host,
             note=self._note,
         )
 
-    @property
-    def _period_ns(self) -> int:
-        return self._snapshot.camera.period_ns if self._snapshot.camera is not None else 0
-
-    def _run_and_host(self) -> tuple[str, str]:
-        if self._snapshot.ended is not None:
-            return self._snapshot.ended.run, self._snapshot.ended.host
-        reported = {name: one.health for name, one in self._snapshot.health.items() if name != Role.VIEWER}
-        health = reported.get(Role.CONTROLLER) or next(iter(reported.values()), wire.Health())
-        return printable(health.run_id), printable(health.host)
-
     def _last(self, span_s: float) -> list[_Sample]:
-        begin_ns = self._snapshot.host_ns - max(span_s * 1e9, PERIODS * self._period_ns)
+        begin_ns = self._snapshot.host_ns - max(span_s * 1e9, PERIODS * self._snapshot.period_ns)
         return [one for one in self._samples if one.host_ns > begin_ns]
 
     def _worst_mirror(self) -> Process:
@@ -186,7 +159,7 @@ class Watcher:
         state = last.health.state if last is not None and last.time_ns >= sent_ns else "running"
         if state in ("stopping", "stopped"):
             return Process(Liveness.STOPPED, silent_s)
-        if silent_s > max(SILENT_S, PERIODS * self._period_ns * 1e-9):
+        if silent_s > max(SILENT_S, PERIODS * self._snapshot.period_ns * 1e-9):
             return Process(Liveness.SILENT, silent_s)
         return Process(Liveness.STARTING if state in ("starting", "ready") else Liveness.RUNNING, silent_s)
 
@@ -195,7 +168,7 @@ class Watcher:
             return None
         sent_ns = self._snapshot.sent_ns  # a step stands for its frame, which a log need not have
         silent_s = self._since_s(max(sent_ns.get(topic, self._begun_ns), sent_ns.get(STEP, 0)))
-        return silent_s if silent_s > max(FRAMES_SILENT_S, PERIODS * self._period_ns * 1e-9) else None
+        return silent_s if silent_s > max(FRAMES_SILENT_S, PERIODS * self._snapshot.period_ns * 1e-9) else None
 
     def _since_s(self, time_ns: int) -> float:
         """Silence, without the delay of this view."""
@@ -263,12 +236,6 @@ class Watcher:
         return grown
 
 
-def _contrast(*processes: LastHealth | None) -> wire.WavefrontFigures | None:
-    """Of the first of these processes that knows what the wavefront adds to the contrast."""
-    known = (one.health.recent_wavefront for one in processes if one is not None)
-    return next((one for one in known if one.costliest_modes), None)
-
-
 def _rms(samples: list[_Sample]) -> tuple[Rms | None, bool]:
     """Of the truth, or without one of the measurement, and whether it is the truth; None without either."""
     for column in (0, 1):
@@ -291,8 +258,8 @@ def _rate_hz(samples: list[_Sample]) -> float | None:
 
 def _squares(snapshot: Snapshot, waves: Waves) -> Array:
     """Count of rows, and the sums of squares of `Rms`; tip and tilt where the calibration is for so many modes."""
-    noll = snapshot.calibration.noll if snapshot.calibration is not None else ()
-    tilts = [place for place, index in enumerate(noll) if index in TIP_TILT and len(noll) == waves.left_nm.shape[1]]
+    noll = snapshot.noll if len(snapshot.noll) == waves.left_nm.shape[1] else ()
+    tilts = [place for place, index in enumerate(noll) if index in TIP_TILT]
     tilt_nm2 = [
         np.square(one[:, tilts], dtype=float).sum() / max(1, len(tilts))
         for one in (waves.left_rms_nm, waves.open_rms_nm)

@@ -39,7 +39,7 @@ def wavefront(state: RunState, nm_per_mas: float | None, loop: Tile) -> Tile:
         return tile(f"last: {left} nm", f"of {flat}; {more}")
     if loop.level is not Level.GOOD:
         return tile(value, f"{'not corrected;' if loop.value in UNCORRECTED else 'of'} {flat}; {more}")
-    if state.true and _shaped(state.controller_state):
+    if state.true and _shaped(state.snapshot.controller):
         why = f"{value} of wavefront, the shapes of offset and channels in it; {flat}."
         return tile(value, f"with offset and channels; {flat}; {more}", advice=why)
     raw, latest = found.open_nm / found.residual_nm if found.residual_nm else 1.0, state.latest
