@@ -69,6 +69,7 @@ def record(
             granted=granted,
             selection=selection,
             expected_bytes_per_s=expected_bytes_per_s,
+            silent_peers=int(Role.LAUNCHER in run.links.ports),
         )
         recorder.catch_signals()
         recorder.service.announces = True

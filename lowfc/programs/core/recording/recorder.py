@@ -59,8 +59,13 @@ class Recorder:
         granted: Granted = NOTHING,
         selection: Selection = EVERYTHING,
         expected_bytes_per_s: float = 0.0,
+        silent_peers: int = 0,
     ) -> None:
-        """Subscribe to everything; `run` begins to record, each log with `metadata` and `attachments` first."""
+        """Subscribe to everything; `run` begins to record, each log with `metadata` and `attachments` first.
+
+        Of the processes on the bus, `silent_peers` never publish Health.
+        """
+        self._silent_peers = silent_peers
         self._bus = bus
         self._clock = clock
         self._backlog = Backlog(QUEUE_MESSAGES, QUEUE_BYTES)
@@ -128,7 +133,8 @@ class Recorder:
             self.service.beat()
             time.sleep(_TURN_S)
             age_s = time.monotonic() - begun_s
-            if age_s >= longest_s or (age_s >= shortest_s and len(self.service.last_health) >= self._bus.peers()):
+            heard = len(self.service.last_health) + self._silent_peers
+            if age_s >= longest_s or (age_s >= shortest_s and heard >= self._bus.peers()):
                 return
 
     def _begin(self, *, anew: bool = True) -> None:
