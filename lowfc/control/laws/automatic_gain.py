@@ -31,6 +31,9 @@ LEAST_CORRECTED = 0.1
 
 SURE = 4.0
 """Standard errors beyond which another mode is said to show the squares of tip and tilt."""
+SUSPECTED = 2.0
+"""The same for what a gain must be worth: what a faint star does not show beyond doubt may add ten times what the gain
+removes."""
 MARGIN = 5.0
 """Times the cross-talk found that a gain must stand: beyond its range a sensor shows less of tilt than there is."""
 _REGRESSORS = 5
@@ -161,8 +164,8 @@ class GainBank:
         if self.first or len(self._blocks) < EARLY:
             return gain
         now = self._row_of(gain)
-        cross_talk_nm = self._of_own @ self._cross_talk.mean_nm(np.mean(self._tilts[-EARLY:], axis=0))
-        blocks = self._handicapped(cross_talk_nm)[:, :-1]
+        cross_talk_nm, suspected_nm = self._cross_talk_nm(self._tilts[-EARLY:])
+        blocks = self._handicapped(suspected_nm)[:, :-1]
         own = blocks[:, now, np.arange(now.size)]
         beyond = blocks - own[:, None]
         mean = np.where(now == 0, beyond.mean(axis=0), beyond[-EARLY:].mean(axis=0))
@@ -181,20 +184,20 @@ class GainBank:
     def verdict(self, gain: Single, noise_nm2: Array | None) -> Verdict:
         """What the window has shown, at gains (modes,) and with the noise of one frame (modes,), None where unknown."""
         means, power = (np.mean(values, axis=0, dtype=float) for values in (self._means, self._powers))
-        cross_talk_nm = self._of_own @ self._cross_talk.mean_nm(np.mean(self._tilts, axis=0))
+        cross_talk_nm, suspected_nm = self._cross_talk_nm(self._tilts)
         power -= (2 * means - cross_talk_nm) * cross_talk_nm
         now = self._row_of(gain)
         modes = np.arange(gain.size)
         frames = self._block * BLOCKS
         mean, error = _mean(self._without(cross_talk_nm))
-        chosen = self._chosen(self._handicapped(cross_talk_nm), now)
+        chosen = self._chosen(self._handicapped(suspected_nm), now)
         if noise_nm2 is not None:
             noise_nm2 = np.maximum(noise_nm2, np.mean(self._changed, axis=0))
         if self.first and noise_nm2 is not None:
             scatter = _mean(np.subtract(self._powers, self._changed))[1]  # noise of a faint star has long tails
             there = power - noise_nm2 - GRANTED * np.maximum(noise_nm2 * np.sqrt(2 / frames), scatter)
             little = injected(self.rows[1]) * noise_nm2 < LEAST_CORRECTED * there
-            chosen = np.where((chosen == 0) & little & (cross_talk_nm == 0), 1, chosen)
+            chosen = np.where((chosen == 0) & little & (suspected_nm == 0), 1, chosen)
         found = Verdict(
             self.rows[chosen],
             power,
@@ -211,6 +214,11 @@ class GainBank:
         else:
             self._lengthen()
         return found
+
+    def _cross_talk_nm(self, tilts: list[Array]) -> list[Array]:
+        """Cross-talk (modes,) of tip and tilt over these blocks: what is beyond doubt, and what may be."""
+        tilt = np.mean(tilts, axis=0)
+        return [self._of_own @ self._cross_talk.mean_nm(tilt, errors) for errors in (SURE, SUSPECTED)]
 
     def _without(self, cross_talk_nm: Array) -> Array:
         """Mean squares (blocks, rows and the loop itself, modes) less the open loop's, nm^2, of what is there.
@@ -332,8 +340,8 @@ class TiltCrossTalk:
         """Frames without a measurement: no change over them is taken."""
         self._before = None
 
-    def mean_nm(self, tilt: Array) -> Array:
-        """Mean of it (modes,), nm, over frames of this mean (regressors,); 0 where it is not beyond doubt."""
+    def mean_nm(self, tilt: Array, errors: float) -> Array:
+        """Mean of it (modes,), nm, over frames of this mean (regressors,); 0 where it is not beyond so many errors."""
         normal, right = self._products[:, :_REGRESSORS], self._products[:, _REGRESSORS:]
         if self._changes < 4 * _REGRESSORS or not np.all(np.diag(normal) > 0):
             return np.zeros(right.shape[1])
@@ -343,7 +351,7 @@ class TiltCrossTalk:
         unexplained = np.maximum(self._powers - np.sum(slopes * right, axis=0), 0) / (self._changes - _REGRESSORS)
         squares = np.where(np.arange(_REGRESSORS) < 2, 0, tilt)
         found, error = squares @ slopes, np.sqrt((squares @ inverse @ squares) * unexplained)
-        return np.where(np.abs(found) > SURE * error, found, 0)
+        return np.where(np.abs(found) > errors * error, found, 0)
 
 
 def _mean(blocks: Array) -> tuple[Array, Array]:

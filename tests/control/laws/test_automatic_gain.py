@@ -7,7 +7,7 @@ from lowfc.arrays import Array, single
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.granted import granted_rows, noise_covariance_nm2
 from lowfc.control.calibration.regularised import pixel_variance, reconstruct
-from lowfc.control.laws.automatic_gain import GainBank, TiltCrossTalk, Verdict, left_alone_nm2
+from lowfc.control.laws.automatic_gain import SURE, GainBank, TiltCrossTalk, Verdict, left_alone_nm2
 from lowfc.control.laws.stability import delay_weights, highest_gain
 from lowfc.control.loop.camera import CameraSettings
 
@@ -224,7 +224,7 @@ def test_drifts_and_common_noise_of_tilt_and_other_modes_are_no_cross_talk() -> 
     tilt_nm = 40 + modes[:, :2] + noise[:, :2]
     made = TiltCrossTalk(MODES)
     rows = [made.followed(single(one), single(other)) for one, other in zip(tilt_nm, modes + noise[:, 2:], strict=True)]
-    assert np.count_nonzero(made.mean_nm(np.mean(rows, axis=0))) <= 1
+    assert np.count_nonzero(made.mean_nm(np.mean(rows, axis=0), SURE)) <= 1
 
 
 def _calibration(measured: bool) -> tuple[Calibration, CameraSettings]:
