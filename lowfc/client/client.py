@@ -1,6 +1,7 @@
 """What an operator asks of a running loop, from Python."""
 
 import contextlib
+import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -12,24 +13,25 @@ import numpy as np
 import numpy.typing as npt
 from google.protobuf.message import DecodeError, Message
 
-from lowfc.adapters.bus.bus import ALL, UNREADABLE, Bus, Sample
+from lowfc.adapters.bus.bus import ALL, UNREADABLE, Bus, Publisher, Sample
 from lowfc.adapters.bus.names import Names
 from lowfc.adapters.bus.run import DEFAULT_RUN, open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.host import by_this_process, program_name
 from lowfc.client.answer import Answer
-from lowfc.client.bench import BenchPublisher
 from lowfc.client.lease import Lease, held, new_identity
 from lowfc.client.mirror_watch import MirrorWatch
 from lowfc.client.requests import BY_NAME
 from lowfc.client.runs import starting, the_run
 from lowfc.client.stream import SILENT_S, WAITING, Frame, Stream, frame_of, step_of
+from lowfc.contract.codecs.bench_codec import encode_bench_value
 from lowfc.contract.codecs.calibration_codec import camera_settings, decode_calibration, encode_calibration
 from lowfc.contract.codecs.codec import most_bytes
 from lowfc.contract.codecs.law_codec import wire_law
-from lowfc.contract.errors import BusError, RequestRefusedError
+from lowfc.contract.errors import BadMessageError, BusError, ConfigurationError, RequestRefusedError
 from lowfc.contract.messages import (
+    BENCH,
     CALIBRATION,
     CAMERA_STATE,
     FRAME,
@@ -43,6 +45,7 @@ from lowfc.contract.messages import (
     wire,
 )
 from lowfc.contract.published import Published
+from lowfc.contract.sections import BENCH_NAME
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.loop.camera import CameraSettings
@@ -85,9 +88,7 @@ class Client:
     def __init__(self, run: str | None = None, *, bus: Bus | None = None) -> None:
         """Join a run.
 
-        Args:
-            run: its name; the only one on this host when None.
-            bus: of a process that has joined it already; `disconnect` leaves that alone.
+        None is the only run on this host. `disconnect` leaves the bus of a process that has joined already alone.
 
         Raises:
             BusError: there is no such run, none at all, or more than one to choose from.
@@ -103,7 +104,7 @@ class Client:
         self._bus = bus
         self._grid: tuple[int, int] | None = None
         self._lease: Lease | None = None
-        self._bench = BenchPublisher(bus)
+        self._bench: dict[str, Publisher] = {}
 
     def __enter__(self) -> "Client":
         return self
@@ -213,11 +214,7 @@ class Client:
             lease.release()
 
     def check_lease(self) -> None:
-        """Make sure that the loop is still reserved, where it was.
-
-        Raises:
-            CalibrationError: it is not, and why.
-        """
+        """Make sure that the loop is still reserved, where it was; CalibrationError with the reason where it is not."""
         if self._lease is not None:
             self._lease.check()
 
@@ -231,8 +228,20 @@ class Client:
         return held(lambda own: self.permit(purpose, hold_s, own), lambda own: self.ask("release", lease_id=own))
 
     def bench(self, name: str, value: Value) -> None:
-        """Publish a value of something else on the bench, for interlocks: again and again, or it becomes too old."""
-        self._bench.put(name, value)
+        """Publish a value of something else on the bench, for interlocks: again and again, or it becomes too old.
+
+        Raises:
+            ConfigurationError: the name or the value is none.
+        """
+        if not re.fullmatch(BENCH_NAME, name):
+            raise ConfigurationError(f"a bench value's name has up to 64 of A-Z, a-z, 0-9, _ and -, got {name[:80]!r}")
+        try:
+            message = encode_bench_value(float(value) if type(value) is int else value, HostClock().now_ns())
+        except BadMessageError as fault:
+            raise ConfigurationError(f"bench value {name}: {fault}") from None
+        if name not in self._bench:
+            self._bench[name] = self._bus.publisher(BENCH, name)
+        self._bench[name].put(message)
 
     def note(self, text: str) -> Answer:
         """Leave a note in the log."""
@@ -248,11 +257,7 @@ class Client:
         return self.ask("configuration").reply
 
     def calibration(self) -> Calibration:
-        """The calibration in use.
-
-        Raises:
-            BusError: nobody has one, or what was answered is none.
-        """
+        """The calibration in use; BusError where nobody has one, or what was answered is none."""
         message = self._get_message(CALIBRATION, wire.Calibration, Role.CONTROLLER)
         try:
             return decode_calibration(message)
@@ -267,11 +272,7 @@ class Client:
         return replace(camera_settings(state.camera), start_s=0)
 
     def camera_state(self) -> wire.CameraState:
-        """Settings of the camera, as it publishes them.
-
-        Raises:
-            BusError: no camera answers.
-        """
+        """Settings of the camera, as it publishes them; BusError where no camera answers."""
         return self._get_message(CAMERA_STATE, wire.CameraState, Role.CAMERA)
 
     def processes(self) -> dict[str, wire.Health]:
@@ -291,11 +292,7 @@ class Client:
         return published.laws
 
     def frames(self, count: int | None = None, patience_s: float = SILENT_S) -> Stream[Frame]:
-        """Sensor images from now on, `count` of them or without end.
-
-        Raises:
-            BusError: none came.
-        """
+        """Sensor images from now on, `count` of them or without end; BusError where none comes."""
         return Stream(self._bus.ring(FRAME, WAITING), frame_of, "frame", count, patience_s)
 
     def steps(self, count: int | None = None, patience_s: float = SILENT_S) -> Stream[Step]:

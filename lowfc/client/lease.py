@@ -41,19 +41,10 @@ def held(permit: Callable[[int], object], release: Callable[[int], object]) -> I
 
 
 class Lease:
-    """A reservation of the loop, from its construction to `release`.
-
-    Attributes:
-        id: carried by the holder's requests.
-    """
+    """A reservation of the loop, from its construction to `release`; the holder's requests carry its `id`."""
 
     def __init__(self, ask: Ask, purpose: str, duration_s: float | None = None) -> None:
-        """Reserve the loop.
-
-        Args:
-            ask: Of the controller.
-            purpose: For people, such as "lowfc calibrate".
-            duration_s: How long it is going to take, where that is known.
+        """Reserve the loop for a purpose such as "lowfc calibrate", and a time where that is known.
 
         Raises:
             RequestRefusedError: somebody else has reserved it.
@@ -84,11 +75,7 @@ class Lease:
         return count
 
     def check(self) -> None:
-        """Renew it now.
-
-        Raises:
-            CalibrationError: it has ended, and why.
-        """
+        """Renew it now; CalibrationError where it has ended, with the reason."""
         with self._turn:
             if not self._ended:
                 try:

@@ -24,11 +24,7 @@ class MirrorWatch:
     """
 
     def __init__(self, bus: Bus) -> None:
-        """Begin with what the bus gets; `read` takes in what has come.
-
-        Raises:
-            BusError: no mirror reported.
-        """
+        """Begin with what the bus gets; BusError where no mirror reports."""
         self.interruption = ""
         self.applied: deque[tuple[int, int]] = deque(maxlen=WAITING)
         self._events: Ring = bus.ring(EVENT, WAITING)

@@ -45,17 +45,9 @@ class Stream(Generic[T]):
     def __init__(
         self, ring: Ring, decode: Callable[[Sample], T | None], what: str, count: int | None, patience_s: float
     ) -> None:
-        """Begin with what the ring gets; it is read now and then, and keeps the newest.
+        """Begin with what the ring gets, for `count` messages or for ever; BusError where none comes.
 
-        Args:
-            ring: that gets the messages.
-            decode: a message; None where it is none.
-            what: they are, for people.
-            count: messages after which it ends; None for never.
-            patience_s: silence after which it is given up.
-
-        Raises:
-            BusError: none came.
+        `decode` returns None for what is no message, `what` they are for people.
         """
         self._ring = ring
         self._decode = decode
@@ -76,11 +68,7 @@ class Stream(Generic[T]):
         return self
 
     def __next__(self) -> T:
-        """The next message.
-
-        Raises:
-            BusError: none came for too long.
-        """
+        """The next message; BusError where none comes for too long."""
         while self._left:
             self._fill()
             sample = self._waiting.popleft()

@@ -73,9 +73,7 @@ class Show(StrEnum):
 class RerunViewer:
     """One viewer, running from construction until stop() or the end of its `with` block.
 
-    Attributes:
-        url: where a RecordingStream connects to.
-        web_address: what to open in a browser; None for a viewer that is not for browsers.
+    A RecordingStream connects to its `url`, a browser to its `web_address`, which is None for another `show`.
     """
 
     def __init__(
@@ -87,14 +85,9 @@ class RerunViewer:
         port: int | None = None,
         web_port: int | None = None,
     ) -> None:
-        """Start it and wait until it answers.
+        """Start it and wait until it answers; a port that is None is a free one.
 
-        Args:
-            show: window, picture or page.
-            memory_limit: what it may keep of the stream, such as "512MB".
-            size_px: width and height of a headless viewer.
-            port: TCP port to listen on for the stream; None for a free one.
-            web_port: TCP port of the page; None for a free one.
+        `memory_limit` bounds what it keeps of the stream, `size_px` (width, height) is for a headless one.
 
         Raises:
             ViewerError: the binary, a screen or a driver is missing, or it does not come up.
@@ -174,13 +167,7 @@ class RerunViewer:
         self._stderr.close()
 
     def screenshot(self, path: Path | None = None, patience_s: float = 20.0) -> bytes:
-        """Picture of the whole viewer once it has loaded and stands still.
-
-        A live stream does not stand still; then it is the picture at the end of the patience.
-
-        Args:
-            path: PNG to write as well.
-            patience_s: how long to wait for it to load, and then for it to stand still.
+        """PNG of the whole viewer once it has loaded and stands still, or when the patience with either ends.
 
         Raises:
             ViewerError: it does not answer, or nothing is loaded.

@@ -18,16 +18,9 @@ class ViewerPage:
     """Serves what another server on this host serves, with the policy added, until stop()."""
 
     def __init__(self, host: str, port: int, source_port: int, stream_port: int) -> None:
-        """Listen at `host` and `port`, and serve.
+        """Listen at `host` and `port`, and serve what is at `source_port`; OSError where the port is taken.
 
-        Args:
-            host: address to listen on, and where the others are.
-            port: TCP port of the page.
-            source_port: TCP port of the viewer's own server of the page.
-            stream_port: TCP port of the stream, the only one that the page may ask besides its own.
-
-        Raises:
-            OSError: the port is taken.
+        The page may ask nobody but this server and the stream.
         """
         own = "'self' 'unsafe-inline' 'wasm-unsafe-eval' data: blob:"
         policy = f"default-src {own}; connect-src {own} http://{host}:{stream_port}"

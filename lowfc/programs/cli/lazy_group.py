@@ -12,12 +12,9 @@ from lowfc.adapters.process.terminal import new_app
 
 
 class Row(NamedTuple):
-    """One command.
+    """One command: its name, its "module:attribute" below `lowfc.programs` (empty for a group), and what it does.
 
-    Attributes:
-        name: as it is typed.
-        where: "module:attribute" below `lowfc.programs`, a function or a typer application; empty for a group.
-        sentence: what it does; it fits beside the name in 80 columns.
+    Name and sentence fit in 80 columns. The attribute is a function or a typer application.
     """
 
     name: str
@@ -57,12 +54,9 @@ class Commands(Mapping[str, Any]):
 
 
 def lazy_app(help_text: str, panels: Mapping[str, Sequence[Row]], parts: Sequence[Row] = ()) -> typer.Typer:
-    """A command line of rows by the heading under which its help lists them; it needs a callback.
+    """A command line of rows by the heading under which its help lists them, and of the rows "group command" of groups.
 
-    Args:
-        help_text: Of the command line itself.
-        panels: Rows by heading.
-        parts: Rows of groups, "group command".
+    It needs a callback.
     """
     rows = [row for panel in panels.values() for row in panel]
     wide = max(len(row.name) for row in rows)

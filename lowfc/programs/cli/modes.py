@@ -17,25 +17,15 @@ HIGHEST = 1000
 
 
 def noll_of(words: Sequence[str] | None) -> tuple[int, ...]:
-    """Noll indices of words such as "2,3" and "4-11", each once; empty, which is all, where there are no words.
-
-    Raises:
-        ConfigurationError: something else is in them, or nothing.
-    """
+    """Noll indices of words such as "2,3" and "4-11", each once; empty, which is all, where there are no words."""
     if not words:
         return ()
     found: list[int] = []
     said = ",".join(words).replace(" ", "")
-    for part in filter(None, said.split(",")):
+    for part in [part for part in said.split(",") if part] or [said]:
         first, dash, last = part.partition("-")
         last = last if dash else first
         if not (first.isdecimal() and last.isdecimal() and int(first) <= int(last) <= HIGHEST):
-            raise _none(part)
+            raise ConfigurationError(f"--modes takes Noll indices, as in 2,3 or 4-11; got {part!r}")
         found += range(int(first), int(last) + 1)
-    if not found:
-        raise _none(said)
     return tuple(dict.fromkeys(found))
-
-
-def _none(word: str) -> ConfigurationError:
-    return ConfigurationError(f"--modes takes Noll indices, as in 2,3 or 4-11; got {word!r}")

@@ -20,12 +20,8 @@ _LABEL_WIDTH = 18
 def figure(label: str = "", unit: str = "", form: str = "", *, column: bool = False, **field: Any) -> Any:
     """A field of a result.
 
-    Args:
-        label: In the text and at the head of a table's column; a figure without one stands in the JSON alone.
-        unit: Behind the value, or the label of a column.
-        form: As of `format`, such as ".3g", or with something around it, such as "Z{}".
-        column: It is a list, and a column of the result's own table.
-        field: As of pydantic's `Field`.
+    Without a label it stands in the JSON alone. `form` is as of `format`, or with something around it, such as "Z{}". A
+    `column` is a list, and stands in the result's own table.
     """
     return Field(description=label or None, json_schema_extra={"unit": unit, "form": form, "column": column}, **field)
 

@@ -17,13 +17,7 @@ Values = Mapping[str, str]
 
 
 class Field(NamedTuple):
-    """One line of a form.
-
-    Attributes:
-        name: of the request's field, or of the option.
-        label: what is expected.
-        usual: what stands there at first.
-    """
+    """One line of a form: a request's field or an option, what is expected, and what stands there at first."""
 
     name: str
     label: str
@@ -31,16 +25,10 @@ class Field(NamedTuple):
 
 
 class Action(NamedTuple):
-    """One button.
+    """One button, and the key that presses it.
 
-    Attributes:
-        key: that presses it.
-        name: on the button.
-        sentence: what it does.
-        fields: that are filled in first; with `confirm` alone there is a question.
-        ask: requests it of the loop; None for a task.
-        task: words of a `lowfc` command that is started as a process of its own; the fields are its options.
-        confirm: question before it.
+    Its fields are filled in first, or its question `confirm` is answered. Then it asks the loop, or starts the words
+    of `task` as a `lowfc` command, a process of its own, with the fields as options.
     """
 
     key: str
@@ -106,11 +94,7 @@ _LAST = "modes"
 
 
 def numbers(text: str) -> list[float]:
-    """Numbers with spaces or commas between.
-
-    Raises:
-        ConfigurationError: something else is there.
-    """
+    """Numbers with spaces or commas between; ConfigurationError where something else is there."""
     try:
         return [float(word) for word in text.replace(",", " ").split()]
     except ValueError:
@@ -135,10 +119,6 @@ def requested(key: str, name: str, confirm: str = "") -> Action:
     return Action(key, name, declared.sentence, fields, ask, confirm=confirm)
 
 
-def _integrator(loop: Client, values: Values) -> Answer:
-    return loop.law()
-
-
 def _record(loop: Client, values: Values) -> Answer:
     with suppress(RequestRefusedError):  # nothing is being recorded
         loop.record(False)
@@ -148,15 +128,7 @@ def _record(loop: Client, values: Values) -> Answer:
     return answer
 
 
-def _stop_recording(loop: Client, values: Values) -> Answer:
-    return loop.record(False)
-
-
-def _file() -> str:
-    return f"calibration-{datetime.now(UTC):%Y%m%dT%H%M%S}.fits"
-
-
-_OUT = Field("out", "out: file to be written (FITS)", _file)
+_OUT = Field("out", "out: file to be written (FITS)", lambda: f"calibration-{datetime.now(UTC):%Y%m%dT%H%M%S}.fits")
 _LOAD = Field(LOAD, "load: use it at once (yes, no); the loop must be open", lambda: "yes")
 _TARGET = (Field("target", "target"), Field("observer", "observer"))
 
@@ -170,7 +142,7 @@ ACTIONS = (
     requested("l", "leak"),
     requested("x", "limit"),
     requested("w", "law"),
-    Action("i", "no law", "Go back from a linear law to the integrator.", ask=_integrator),
+    Action("i", "no law", "Go back from a linear law to the integrator.", ask=lambda loop, _: loop.law()),
     requested("f", "offset"),
     requested("h", "channel"),
     requested("z", "reset"),
@@ -204,7 +176,7 @@ ACTIONS = (
     ),
     requested("a", "load"),
     Action("r", "record", "Begin a new log, with a note of target and observer.", _TARGET, _record),
-    Action("v", "end log", BY_NAME["record/stop"].sentence, ask=_stop_recording),
+    Action("v", "end log", BY_NAME["record/stop"].sentence, ask=lambda loop, _: loop.record(False)),
     requested("n", "note"),
 )
 """In their order on the screen."""

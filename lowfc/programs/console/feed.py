@@ -4,6 +4,7 @@ import threading
 import time
 from collections import deque
 from importlib import import_module
+from math import nan
 from typing import NamedTuple
 
 import numpy as np
@@ -30,7 +31,8 @@ TREND = 60
 """Seconds that the sparklines show, one value each."""
 _WAITING = {EVENT: 200, REQUEST: 200, STEP: 4000, TRUTH: 50}  # of the truth so many a reading are enough for an rms
 _TOPICS = (*(topic for topic in SHOWN if topic is not SURFACE), REQUEST)
-_SCIPY_S = 4.0  # after which it is imported: the first figures do without, and a verdict of later would stop the screen
+_LATER, _LATER_S = ("lowfc.control.laws.tuning", "scipy.signal"), 4.0
+"""Imported after so many seconds: the first figures do without, and a later verdict would stop the screen."""
 _AGAIN_S = 5.0  # after which a busy controller is asked again for what it has not answered
 _POINT_NS = 1_000_000_000
 _UNSEEN = frozenset(("status", "configuration", "renew"))
@@ -42,8 +44,7 @@ class Reading(NamedTuple):
 
     Attributes:
         silent_s: since the newest message was sent; None before the first.
-        frame: the newest one; None before the first.
-        command_nm: (modes,) of the last step.
+        frame, command_nm: the newest, and (modes,) of the last step.
         requests: new ones.
         residual_nm, light: a value for each second, NaN where there is none.
     """
@@ -82,7 +83,7 @@ class Feed:
         self._point_ns = 0
         self._read_s = self._asked_s = time.monotonic()
         self._catch_up()
-        later = threading.Timer(_SCIPY_S, _import_scipy)
+        later = threading.Timer(_LATER_S, lambda: [import_module(name) for name in _LATER])
         later.daemon = True
         later.start()
 
@@ -122,17 +123,12 @@ class Feed:
             [light for _, light in self._trend],
         )
 
-    def close(self) -> None:
-        """Get no more."""
-        for ring in self._rings.values():
-            ring.close()
-
     def _extend_trend(self, state: RunState, host_ns: int) -> None:
         if host_ns - self._point_ns >= _POINT_NS:
             self._point_ns = host_ns
-            found = state.wavefront
-            light = float("nan") if state.flux is None or state.frame_silent_s is not None else state.flux
-            self._trend.append((float("nan") if found is None else found.residual_nm, light))
+            residual_nm = None if state.wavefront is None else state.wavefront.residual_nm
+            light = state.flux if state.frame_silent_s is None else None
+            self._trend.append((nan if residual_nm is None else residual_nm, nan if light is None else light))
 
     def _catch_up(self) -> None:
         """Ask for what was sent before, in a thread: a process that is frozen answers late."""
@@ -146,11 +142,6 @@ class Feed:
                 return
 
         threading.Thread(target=ask, name="earlier", daemon=True).start()
-
-
-def _import_scipy() -> None:
-    for name in ("lowfc.control.laws.tuning", "scipy.signal"):
-        import_module(name)
 
 
 def _by_itself(asked: wire.Request) -> bool:

@@ -12,12 +12,7 @@ _TAIL_BYTES = 4000
 
 
 class Task:
-    """One such process.
-
-    Attributes:
-        name: of the button.
-        output: file with everything that it writes.
-    """
+    """One such process, named as its button; `output` is the file with everything that it writes."""
 
     def __init__(self, name: str, words: Sequence[str]) -> None:
         """Start `lowfc` with these words, in a session of its own: neither Ctrl-C nor a lost terminal reaches it."""

@@ -53,14 +53,7 @@ class ViewError(LowfcError):
 
 
 class Bridge:
-    """One live view of a run.
-
-    Attributes:
-        service: this process as the others of the run see it.
-        viewer: once it runs; None where a file is written.
-        renewals: how often the view began anew.
-        most_bytes: most memory of this process.
-    """
+    """One live view of a run; `renewals` counts how often it began anew, `most_bytes` is its most memory."""
 
     def __init__(self, config: Configuration, run_id: str, clock: Clock, bus: Bus, target: Target) -> None:
         """Subscribe to everything that is shown; drawing starts with `run`."""
@@ -81,8 +74,7 @@ class Bridge:
         """Show the run until it is stopped, until a window is closed, or for a time; `ready` once the viewer is there.
 
         Raises:
-            ViewerError: no viewer can be started.
-            ViewError: it fails again and again, or memory stays beyond its bound.
+            ViewerError, ViewError: no viewer starts, it fails again and again, or memory stays beyond its bound.
         """
         try:
             self._begin()
@@ -106,7 +98,7 @@ class Bridge:
             self._end_render()
 
     def close(self) -> None:
-        """Close the viewer; a stream that it held up is free then."""
+        """Close the viewer, which frees a stream that it held up."""
         if self.viewer is not None:
             self.viewer.stop()
 
@@ -134,7 +126,8 @@ class Bridge:
     def _add_earlier(self, render: RenderThread) -> None:
         """Add what was sent before this view received anything; in a thread, for a peer that is frozen answers late."""
         recorder = self.service.last_health.get(Role.RECORDER)
-        events_due = not self._past_known and (recorder is not None or self._recorder_absent(time.monotonic()))
+        absent = time.monotonic() - self._began_s > _RECORDER_S
+        events_due = not self._past_known and (recorder is not None or absent)
         self._past_known |= events_due
 
         def add() -> None:
@@ -144,13 +137,10 @@ class Bridge:
 
         threading.Thread(target=add, name="earlier", daemon=True).start()
 
-    def _recorder_absent(self, now_s: float) -> bool:
-        return now_s - self._began_s > _RECORDER_S
-
     def _check(self, now_s: float) -> None:
         render, viewer = self._render, self.viewer
         assert render is not None  # noqa: S101  # `_begin` made it
-        if self.service.newcomers() or (not self._past_known and self._recorder_absent(now_s)):
+        if self.service.newcomers() or (not self._past_known and now_s - self._began_s > _RECORDER_S):
             self._add_earlier(render)
         own_bytes, stuck_s = resident_bytes(), now_s - max(render.drawn_s, self._awake_s)
         viewer_bytes = viewer.resident_bytes() if viewer is not None else 0

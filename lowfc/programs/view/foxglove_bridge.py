@@ -38,13 +38,9 @@ _PATIENCE_S = 0.2
 
 
 class FoxgloveBridge:
-    """Passes on the messages of a bus to the apps that connect.
+    """Passes on the messages of a bus to the apps that connect to `port` on loopback.
 
-    Attributes:
-        service: this process as the others of the run see it.
-        port: where apps connect, on loopback.
-        subscriptions: client and topic of each that there is now.
-        kept: the states in force, by key.
+    `subscriptions` are client and topic of each that there is now, `kept` the states in force, by key.
     """
 
     def __init__(self, bus: Bus, clock: Clock, run_id: str, port: int = DEFAULT_PORT) -> None:
@@ -111,7 +107,7 @@ class FoxgloveBridge:
             self._channels[kept.key].log(kept.payload, log_time=kept.publish_time_ns)
 
     def on_unsubscribe(self, client: "Client", channel: "ChannelView") -> None:
-        """A client has unsubscribed; called by the server."""
+        """Forget a subscription; called by the server."""
         self.subscriptions.discard((client.id, channel.topic))
 
     def _publish(self, topic: Topic, sample: Sample) -> None:
@@ -139,12 +135,7 @@ class FoxgloveBridge:
 
 
 def serve_foxglove(run: Run, clock: Clock, port: int = DEFAULT_PORT) -> None:
-    """Serve a run to Foxglove and Lichtblick until SIGTERM or SIGINT; the process of `lowfc view --foxglove`.
-
-    Raises:
-        BusError: the port is taken.
-        ConfigurationError: foxglove-sdk is not installed.
-    """
+    """Serve a run to Foxglove and Lichtblick until SIGTERM or SIGINT; see `FoxgloveBridge`."""
     bus = ZenohBus(run.links, Role.VIEWER, clock, monitor=True)
     try:
         bridge = FoxgloveBridge(bus, clock, run.run_id, port)

@@ -1,6 +1,7 @@
 """The one layout of live and recorded views: a tab for the operator, one for the optics, one for engineering."""
 
 from collections.abc import Iterable
+from functools import partial
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -21,6 +22,8 @@ from lowfc.programs.view.panels import (
 )
 
 APPLICATION = "lowfc"
+_CONTRAST = partial(science.CONTRAST.view, axis_y=science.CONTRAST_AXIS)
+_MODE = partial(rrb.StateTimelineView, origin=loop.MODE, name="Loop mode")
 LIVE_WINDOW_S = 20.0
 """Of a live plot."""
 
@@ -50,11 +53,8 @@ def layout(
 ) -> rrb.Blueprint:
     """The blueprint, opened at a tab.
 
-    Args:
-        active: the tab.
-        window_s: plots show so many last seconds; None for a log.
-        span_ns: plots show what is between these times, of a log; where it is None, too, the viewer chooses.
-        still: for one picture of a whole log: the operator's tab has nothing of the last instant alone.
+    Plots show so many last seconds or, of a log, what is between two times; else the viewer chooses. In one `still`
+    picture of a whole log the operator's tab has nothing of the last instant alone.
     """
     tabs = {
         Tab.OPERATOR: _night() if still else _operator(),
@@ -82,15 +82,15 @@ def _operator() -> rrb.Container:
         *map(_picture, (sensor.FRAME, sensor.DIFFERENCE, mirror.COMMAND, pointing.TRAIL, science.IMAGE)),
         column_shares=[1, 1, 1, 1, 2],
     )
-    courses = rrb.Horizontal(_picture(trend.TREND), wavefront.RMS.view(), wavefront.TILT.view(), _contrast())
-    below = rrb.Horizontal(_mode(), latency.WHOLE.view(), _events(), column_shares=[2, 3, 4])
+    courses = rrb.Horizontal(_picture(trend.TREND), wavefront.RMS.view(), wavefront.TILT.view(), _CONTRAST())
+    below = rrb.Horizontal(_MODE(), latency.WHOLE.view(), _events(), column_shares=[2, 3, 4])
     return rrb.Vertical(_picture(tiles.TILES), pictures, courses, below, row_shares=[10, 9, 9, 7], name=Tab.OPERATOR)
 
 
 def _night() -> rrb.Container:
-    courses = rrb.Horizontal(_picture(trend.TREND), wavefront.TILT.view(), _contrast())
+    courses = rrb.Horizontal(_picture(trend.TREND), wavefront.TILT.view(), _CONTRAST())
     rates = rrb.Horizontal(loop.FLUX.view(), mirror.STROKE.view(), latency.WHOLE.view(), latency.COUNTS.view())
-    below = rrb.Horizontal(_mode(), _events(worst=True), column_shares=[3, 5])
+    below = rrb.Horizontal(_MODE(), _events(worst=True), column_shares=[3, 5])
     return rrb.Vertical(_picture(tiles.TILES), courses, rates, below, row_shares=[11, 10, 8, 9], name=Tab.OPERATOR)
 
 
@@ -125,14 +125,6 @@ def _engineering() -> rrb.Container:
 def _picture(path: str) -> rrb.View:
     title, shown = _PICTURES[path]
     return rrb.Spatial2DView(origin=path, name=title, visual_bounds=shown)
-
-
-def _contrast() -> rrb.View:
-    return science.CONTRAST.view(axis_y=science.CONTRAST_AXIS)
-
-
-def _mode() -> rrb.View:
-    return rrb.StateTimelineView(origin=loop.MODE, name="Loop mode")
 
 
 def _events(*, worst: bool = False) -> rrb.View:

@@ -20,13 +20,9 @@ _STRIDE = 500  # messages between two reports of the progress
 
 @dataclass(slots=True)
 class Drawn:
-    """What was drawn of some logs.
+    """What was drawn of some logs: snapshots, seconds, and `remarks` on what is damaged, truncated or unreadable.
 
-    Attributes:
-        snapshots: drawn.
-        log_s: from the first message to the last.
-        span_ns: times of the first and of the last snapshot with a frame, on the timeline; None without one.
-        remarks: what a person should know: what is damaged, truncated, unreadable.
+    `span_ns` has the times of the first and the last snapshot with a frame, on the timeline; None without one.
     """
 
     snapshots: int = 0

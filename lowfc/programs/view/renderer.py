@@ -91,12 +91,9 @@ class Renderer:
 
 
 class RenderThread(threading.Thread):
-    """Draws what arrived, thirty times a second, until it is abandoned.
+    """Draws what arrived, thirty times a second, until it is abandoned or ends with a `fault`.
 
-    Attributes:
-        drawn_s: when it last had drawn everything, by time.monotonic().
-        snapshots: drawn so far.
-        fault: what ended it, other than being abandoned.
+    `drawn_s` is when it last had drawn everything, by time.monotonic().
     """
 
     def __init__(

@@ -51,12 +51,10 @@ _UNREADABLE = (BadMessageError, DecodeError, KeyError, OverflowError, ValueError
 
 
 class Waves(NamedTuple):
-    """The wavefront of some frames, nm, each with the mirror as it was and with a flat one.
+    """The wavefront of some frames, nm, each with the mirror as it was (`left`) and with a flat one (`open`).
 
-    Attributes:
-        left_nm, open_nm: of the modes, (frames, modes), at an instant of each frame.
-        left_rms_nm, open_rms_nm: of the modes, (frames, modes), rms over each frame where it is known.
-        rms_nm: of all modes or over the open pupil, both, (frames, 2).
+    Of the modes (frames, modes): at an instant of each frame, and rms over each frame where it is known. `rms_nm`
+    (frames, 2) is of all modes or over the open pupil, left and open.
     """
 
     sequence: Sequences
@@ -77,14 +75,7 @@ class LastHealth(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class LogEnd:
-    """The end of the logs that are shown.
-
-    Attributes:
-        name: of the last one.
-        complete: it was finished, and all of it is there.
-        run, host: of the run; empty where the log does not say.
-        no_end: sentence about a log that was not finished.
-    """
+    """The end of the logs that are shown; `no_end` is a sentence about one that is not `complete`."""
 
     name: str
     complete: bool
@@ -99,15 +90,11 @@ class Snapshot:
 
     Attributes:
         time_ns: on the timeline: that of the newest data, and what has passed since. In lockstep it is simulated time.
-        host_ns: host clock, the one of `sent_ns` and of `LastHealth`.
-        steps, truths: new rows; `timings` the new durations of the controller's stages.
-        frame: newest frame, DN; None without a new one. `frame_ns` is its time.
-        mirror: newest state of the mirror; None without a new one.
-        surface: newest surface over the pupil, nm; None without a new one.
-        events: new ones.
-        calibration, camera, controller: the last of each; None before the first.
-        health: of every process, by name.
-        sent_ns: when the last message of each topic was sent.
+        host_ns: host clock, the one of `sent_ns` (of the last message of each topic) and of `LastHealth`.
+        steps, truths, timings, events: new ones; timings are the durations of the controller's stages.
+        frame, mirror, surface: newest frame (DN, at `frame_ns`), state and surface over the pupil (nm); None without
+            a new one.
+        calibration, camera, controller, health: the last of each; None before the first.
         complete: everything is in it; otherwise only what is newest, and rows and events wait for a later snapshot.
         behind_s: how late this snapshot is.
         ended: the end of the logs, at their last snapshot.
@@ -207,14 +194,7 @@ class Accumulator:
     def snapshot(
         self, host_ns: int, *, complete: bool = True, behind_s: float = 0.0, ended: LogEnd | None = None
     ) -> Snapshot:
-        """Return what is new at this time of the host's clock; the next snapshot begins here.
-
-        Args:
-            host_ns: now.
-            complete: with rows and events; otherwise they wait for a later snapshot, in which more come at once.
-            behind_s: how late it is.
-            ended: the end of the logs, where this is their last snapshot.
-        """
+        """Return what is new at this time of the host's clock; the next snapshot begins here. See `Snapshot`."""
         frame: Frame | None = self._newest_of(FRAME, _frame)
         if frame is not None:
             self._date(frame.time_ns, self._sent_ns[FRAME])

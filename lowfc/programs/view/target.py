@@ -17,8 +17,7 @@ from lowfc.programs.view.layout import APPLICATION, layout
 class Target:
     """At most one of window, page, file and picture; by default a window, or a page where there is no screen.
 
-    Attributes:
-        part: where the file is written until it is whole.
+    `part` is where the file is written until it is whole.
     """
 
     native: bool = False
@@ -65,11 +64,7 @@ class Target:
         return self.save or self.picture
 
     def viewer(self) -> RerunViewer | None:
-        """Start the viewer; None where a file is written.
-
-        Raises:
-            ViewerError: it cannot be started.
-        """
+        """Start the viewer; None where a file is written. ViewerError where it cannot be started."""
         if self.show is None:
             return None
         memory = f"{self.memory_mb:.0f}MB"

@@ -35,14 +35,9 @@ def words(places: npt.ArrayLike, texts: Sequence[str], colours: Sequence[Colour]
 
 @dataclass(frozen=True, slots=True)
 class Plot:
-    """Curves against time, as a panel declares them.
+    """Curves against time, as a panel declares them: name and colour of each, the last one on top.
 
-    Attributes:
-        path: of the entity.
-        title: of the view, with the unit.
-        curves: name and colour of each, the last one on top; empty where they depend on the run.
-        width: of the lines, points.
-        legend: its place; None leaves it to the viewer.
+    There are none where they depend on the run. The legend's place is the viewer's choice where it is None.
     """
 
     path: str

@@ -86,14 +86,8 @@ class Spectra(Panel):
 def power_curves(found: Spectrum, modes: Mask, law: LawInForce | None, rate_hz: float) -> tuple[Array, list[Array]]:
     """Frequency, Hz, and the power of some modes, nm^2/Hz: open, measured and, under an integrator, in theory.
 
-    An error is measured with noise, and so is the pseudo-open-loop: both are in the theory. No curves of a wavefront
-    that stands still.
-
-    Args:
-        found: spectra of the errors and, after them, of the pseudo-open-loop.
-        modes: which of the modes.
-        law: of the closed loop; None where it is open.
-        rate_hz: of the frames.
+    `found` are spectra of the errors and, after them, of the pseudo-open-loop, all with noise; `law` is None for an
+    open loop. There are no curves of a wavefront that stands still.
     """
     error, as_open = found.power_nm2_hz[:, : modes.size], found.power_nm2_hz[:, modes.size :]
     columns = [as_open[:, modes].sum(axis=1), error[:, modes].sum(axis=1)]

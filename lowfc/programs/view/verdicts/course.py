@@ -15,12 +15,9 @@ _COLUMNS = 8
 
 
 class Course:
-    """Means of each span, one second long at first.
+    """Means of each span of `span_ns`, one second long at first, from `begin_ns` on (None before the first row).
 
-    Attributes:
-        begin_ns: beginning of the first span; None before the first step or truth.
-        span_ns: length of each.
-        true: whether the wavefront is the true one of a simulation, else the measured one.
+    The wavefront is the `true` one of a simulation, else the measured one.
     """
 
     def __init__(self) -> None:

@@ -20,10 +20,7 @@ FRAMES = 6144
 
 
 class LawInForce(NamedTuple):
-    """Gain and leak of each mode of the integrator, the delay in frames, and the linear law in its place, if any.
-
-    A law that is overruled is another one than before.
-    """
+    """The integrator, and the linear law in its place, if any; one that is overruled is another than before."""
 
     gain: tuple[float, ...]
     leak: tuple[float, ...]
@@ -34,9 +31,7 @@ class LawInForce(NamedTuple):
 class Steady:
     """Measured error and pseudo-open-loop of the last frames since loop mode or law changed, and the law has settled.
 
-    Attributes:
-        mode: of the loop, as in a step; 0 before the first step.
-        law: in force; None where the controller does not report it, or reports one for other modes.
+    `mode` is 0 before the first step; `law` None where the controller reports none, or one for other modes.
     """
 
     def __init__(self) -> None:
@@ -75,12 +70,9 @@ class Steady:
 
 
 class Attained(NamedTuple):
-    """Rms over the circle of all modes of the last frames under one law, as the sensor sees it, nm, without its noise.
+    """What a law leaves, and what integrators with the best gains would leave: rms of all modes without noise, nm.
 
-    Attributes:
-        left_nm: what the loop leaves.
-        best_nm: what integrators with the best gains would leave.
-        noise_nm: the sensor's noise in one frame.
+    `noise_nm` is the sensor's noise in one frame.
     """
 
     left_nm: float

@@ -38,15 +38,7 @@ WORD: dict[Level, str] = {Level.NEUTRAL: "", Level.GOOD: "ok", Level.WARNING: "C
 
 @dataclass(frozen=True, slots=True)
 class Tile:
-    """One tile of the annunciator.
-
-    Attributes:
-        title: what it is about.
-        value: the one word or figure.
-        detail: what it means.
-        level: of the tile.
-        advice: for the headline: what is the matter, and what to do.
-    """
+    """One tile of the annunciator: one word or figure, what it means, and for the headline what to do."""
 
     title: str
     value: str
@@ -99,12 +91,7 @@ def short(text: str) -> str:
 def absent(title: str, name: str, process: Process, running_s: float, harm: str) -> Tile | None:
     """Tile of a process that is silent, was stopped, or has not sent anything yet; None for one that runs.
 
-    Args:
-        title: of the tile.
-        name: of the process, for people.
-        process: how it is.
-        running_s: time since the first message of any process.
-        harm: what its silence means.
+    `running_s` is the time since the first message of any process, `harm` what its silence means.
     """
     since = duration(process.silent_s)
     if process.life is Liveness.SILENT:

@@ -40,12 +40,7 @@ LIMITS: dict[Reason, str] = {
 
 
 def judge(state: RunState, nm_per_mas: float | None = None) -> Verdict:
-    """Judge the last seconds.
-
-    Args:
-        state: of the run.
-        nm_per_mas: wavefront rms of a tilt of 1 mas (`lowfc.optics.detector.photometry`); without it tilt is left out.
-    """
+    """Judge the last seconds; without the wavefront rms of a tilt of 1 mas, tilt is left out."""
     loop = _loop(state)
     left = wavefront(state, nm_per_mas, loop)
     tiles = [loop, left, frames(state), star(state), _mirror(state), _latency(state), _recorder(state)]
