@@ -13,7 +13,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import typer
 
 from lowfc.adapters.bus.bus import Query, Sample
 from lowfc.adapters.bus.other_loops import none_here, other_loops
@@ -51,7 +50,6 @@ from lowfc.control.loop.inputs import Reply, Request, Step
 from lowfc.control.loop.interlocks import Value
 from lowfc.control.loop.requests import REQUESTS
 from lowfc.control.loop.safety import Limit, LoopMode
-from lowfc.programs.cli.ctl.command import ctl_app
 from lowfc.programs.cli.ctl.status import figures, text
 from lowfc.programs.cli.modes import noll_of
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub, MemoryRing
@@ -530,45 +528,21 @@ def test_the_declared_requests_are_those_that_there_are() -> None:
     assert all(not by_key[REQUEST_KEY.format(name=name)].fields for name in SIMPLE)
 
 
-def test_every_command_has_help_with_an_example() -> None:
-    group = typer.main.get_command(ctl_app)
-    commands = dict(group.commands) | {  # type: ignore[attr-defined]
-        f"record {name}": each
-        for name, each in group.commands["record"].commands.items()  # type: ignore[attr-defined]
-    }
-    names = {asked.example.split()[0] for asked in DECLARED if asked.example}
-    assert names | {"bench", "dark", "reference"} == {name.split()[0] for name in commands}
-    for name, command in commands.items():
-        assert f"Example: lowfc ctl {name.split()[0]}" in command.help, name
+def test_modes_are_read_as_people_write_them() -> None:
+    assert noll_of(None) == ()
+    assert noll_of(["2", "3"]) == noll_of(["2,3"]) == (2, 3)
+    assert noll_of(["4-7, 11"]) == (4, 5, 6, 7, 11)
+    assert noll_of(["3,2-4"]) == (3, 2, 4)
+    for word in ("x", "2-", "-2", "2.5", "11-4", "2,11-4", "", ",", "2-9999999999"):
+        with pytest.raises(ConfigurationError, match="as in 2,3 or 4-11"):
+            noll_of([word])
 
 
-@pytest.mark.parametrize(
-    ("words", "noll"),
-    [
-        (None, ()),
-        (["2,3"], (2, 3)),
-        (["2", "3"], (2, 3)),
-        (["4-7, 11"], (4, 5, 6, 7, 11)),
-        (["3,2-4"], (3, 2, 4)),
-        (["2,4-6, 5"], (2, 4, 5, 6)),
-    ],
-)
-def test_modes_are_read_as_people_write_them(words: list[str] | None, noll: tuple[int, ...]) -> None:
-    assert noll_of(words) == noll
-
-
-@pytest.mark.parametrize("word", ["x", "2-", "-2", "2.5", "11-4", "2,11-4", "", ",", "2-9999999999"])
-def test_modes_that_are_none_are_refused(word: str) -> None:
-    with pytest.raises(ConfigurationError, match="as in 2,3 or 4-11") as caught:
-        noll_of([word])
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("words", [["gain", "0,3"], ["limit", "60", "0,3"], ["offset", "-5", "0,3"]])
-def test_a_number_that_is_none_is_shown(words: list[str]) -> None:
-    done = lowfc("ctl", *words)
-    assert done.exit_code == 2
-    assert "'0,3' is not a number: write 0.3" in done.output
+def test_a_number_that_is_none_is_shown() -> None:
+    for words in (["gain", "0,3"], ["limit", "60", "0,3"], ["offset", "-5", "0,3"]):
+        done = lowfc("ctl", *words)
+        assert done.exit_code == 2
+        assert "'0,3' is not a number: write 0.3" in done.output
     assert "'1.5' is not a whole number" in lowfc("ctl", "step", "1.5").output
 
 
