@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from lowfc.arrays import Array, Single
+from lowfc.arrays import Array, Single, single
 from lowfc.control.identity import identity
 from lowfc.control.laws.stability import delay_weights
 
@@ -150,12 +150,7 @@ def of_blocks(
         here = slice(end - len(block.gain), end)
         F[here, here], A[here, here] = block.follow, block.coast
         G[here, mode], H[here, mode], K[mode, here] = block.gain, block.kept, block.output
-
-    def single(array: Array) -> Single:
-        return array.astype(np.float32)
-
-    matrices = (single(F), single(G), single(H), single(A), single(K))
-    return LinearLaw(signal, *matrices, name, noll, delay_frames, rate_hz)
+    return LinearLaw(signal, single(F), single(G), single(H), single(A), single(K), name, noll, delay_frames, rate_hz)
 
 
 def integrator_block(gain: float, leak: float, signal: Signal, delay_frames: float) -> Block:

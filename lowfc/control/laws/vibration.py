@@ -72,22 +72,15 @@ class Model:
 
     def states(self) -> tuple[Array, Array, Array]:
         """F, Q, C of x[k] = F x[k-1] + q, disturbance[k] = C x[k], with Q the covariance of q."""
-        blocks, noise, seen = [np.ones((1, 1))], [self.drift_nm2], [1.0]
+        step, seen = [1.0], [1.0]
         if np.isfinite(self.cutoff_hz):  # x0 the walk, x1 what the low-pass makes of it
-            kept = _kept(self.cutoff_hz / self.rate_hz)
-            blocks = [np.array([[1.0, 0.0], [1 - kept, kept]])]
-            covariance = self.drift_nm2 * np.outer([1, 1 - kept], [1, 1 - kept])
-            seen = [0.0, 1.0]
-        else:
-            covariance = np.array([noise])
-        parts = [covariance]
+            step, seen = [1.0, 1 - _kept(self.cutoff_hz / self.rate_hz)], [0.0, 1.0]
+        parts = [self.drift_nm2 * np.outer(step, step)]
         for line in self.lines:
-            omega, left, variance = _per_frame(line, self.rate_hz)
-            cos, sin = np.cos(omega), np.sin(omega)
-            blocks.append(left * np.array([[cos, -sin], [sin, cos]]))
+            _, left, variance = _per_frame(line, self.rate_hz)
             parts.append(variance * (1 - left**2) * np.eye(2))
             seen += [1.0, 0.0]
-        return block_diag(*blocks), block_diag(*parts), np.array(seen)
+        return self.mean_over(1.0, 0.0), block_diag(*parts), np.array(seen)
 
     def mean_over(self, start: float, length: float) -> Array:
         """Mean (states, states) of A^u over u in [start, start + length] frames: what the states will be meanwhile."""

@@ -148,10 +148,8 @@ def _arrive(state: State, frame: Frame, events: list[PendingEvent]) -> tuple[Sta
     elif state.frame_sequence:
         events.append(PendingEvent("CAMERA_RESTARTED", {}))
         state = _awaiting_camera(state, frame)
-        if drive is not None and drive.command_channels is not None and drive.command_channels.play is not None:
-            drive = drive._replace(
-                command_channels=drive.command_channels.stopped(0)
-            )  # its frames were the former camera's
+        if drive is not None and drive.play is not None:
+            drive = drive.stopped(0)  # its frames were the former camera's
             events.append(PendingEvent("PLAY_ENDED", {"why": "the camera restarted"}))
     else:  # after a clear, this may be another start of the camera
         state = _awaiting_camera(state, frame)

@@ -140,10 +140,7 @@ def bench_reported(settings: Settings, state: State, report: BenchReport) -> tup
             mode = LoopMode.SAFE
         elif one.action in opening and mode is LoopMode.CLOSED:
             mode = LoopMode.OPEN
-        if mode is not state.mode:
-            events.append(mode_event(state.mode, mode, cause))
-            events += [PendingEvent("SAFED", {"why": cause})] if mode is LoopMode.SAFE else []
-            state = in_mode(state, mode, report.time_ns, cause)
+        state = _changed(state, mode, report.time_ns, cause, events)
     return state, Outputs(events=events, changed=True)
 
 
@@ -157,9 +154,8 @@ def mirror_reported(settings: Settings, state: State, shape: MirrorShape) -> tup
         drive = ActiveLoop.at_rest(settings, Calibration.none(shape.actuators_nm.shape))
         events.append(PendingEvent("NOT_CALIBRATED", {"why": uncalibrated(state)}))
         safe = safe or (LATCHED if settings.start_mode is LoopMode.SAFE else "")
-    if safe and state.mode is not LoopMode.SAFE:
-        events += [mode_event(state.mode, LoopMode.SAFE, safe), PendingEvent("SAFED", {"why": safe})]
-        state = in_mode(state, LoopMode.SAFE, shape.time_ns, safe)
+    if safe:
+        state = _changed(state, LoopMode.SAFE, shape.time_ns, safe, events)
     if shape.actuators_nm.shape != drive.calibration.grid or not np.isfinite(shape.actuators_nm).all():
         why = f"the mirror has a grid of {shape.actuators_nm.shape}, the calibration {drive.calibration.grid}"
         events.append(PendingEvent("MIRROR_REFUSED", {"why": why}))
@@ -214,11 +210,10 @@ def _gone_back(settings: Settings, drive: ActiveLoop, shape_nm: Single) -> Activ
 
 def end_probe(drive: ActiveLoop, sequence: int, why: str, events: list[PendingEvent]) -> ActiveLoop:
     """The drive with nothing more to play after this frame."""
-    added = drive.command_channels
-    if added is None or added.play is None or added.play.over(sequence):
+    if drive.play is None or drive.play.over(sequence):
         return drive
     events.append(PendingEvent("PLAY_ENDED", {"why": why}))
-    return drive._replace(command_channels=added.stopped(sequence))
+    return drive.stopped(sequence)
 
 
 def camera_reported(settings: Settings, state: State, camera: CameraSettings) -> tuple[State, Outputs]:
@@ -227,7 +222,8 @@ def camera_reported(settings: Settings, state: State, camera: CameraSettings) ->
     if after is state:
         return state, Outputs()
     wrong = misfit(after)
-    events, mode, cause = [], after.mode, "the camera's frames fit the calibration"
+    events: list[PendingEvent] = []
+    mode, cause = after.mode, "the camera's frames fit the calibration"
     if wrong and wrong != misfit(state):
         events.append(PendingEvent("CAMERA_CHANGED", {"what": wrong}))
         cause = f"the camera does not fit the calibration: {wrong}"
@@ -235,9 +231,7 @@ def camera_reported(settings: Settings, state: State, camera: CameraSettings) ->
         mode = LoopMode.IDLE
     elif (mode is LoopMode.CLOSED and wrong) or (mode is LoopMode.IDLE and not uncalibrated(after)):
         mode = LoopMode.OPEN
-    if mode is not after.mode:
-        events.append(mode_event(after.mode, mode, cause))
-        after = in_mode(after, mode, camera.time_ns, cause)
+    after = _changed(after, mode, camera.time_ns, cause, events)
     return after, Outputs(events=events, changed=True)
 
 
@@ -287,12 +281,10 @@ def in_mode(state: State, mode: LoopMode, time_ns: int, cause: str) -> State:
     """Nothing of the last mode goes on in the next one."""
     drive = state.drive
     if drive is not None and mode is not state.mode:
-        if drive.command_channels is not None:
-            only_flat = mode is LoopMode.SAFE
-            added = drive.command_channels.stopped(state.frame_sequence)
-            drive = drive._replace(
-                command_channels=added.lowered(drive.to_modes, only_flat=True) if only_flat else added
-            )
+        drive = drive.stopped(state.frame_sequence)
+        if drive.command_channels is not None and mode is LoopMode.SAFE:
+            lowered = drive.command_channels.lowered(drive.to_modes, only_flat=True)
+            drive = drive._replace(command_channels=lowered)
         if drive.following is not None and mode is LoopMode.CLOSED:
             drive = drive._replace(following=drive.following.taking_over())
     same = mode is state.mode
@@ -300,6 +292,15 @@ def in_mode(state: State, mode: LoopMode, time_ns: int, cause: str) -> State:
     return state._replace(
         mode=mode, drive=drive, steps_left=0, returning_to_zero=state.returning_to_zero and same, conditions=conditions
     )
+
+
+def _changed(state: State, mode: LoopMode, time_ns: int, cause: str, events: list[PendingEvent]) -> State:
+    """The state in a loop mode, and the events where that is another one."""
+    if mode is state.mode:
+        return state
+    events.append(mode_event(state.mode, mode, cause))
+    events += [PendingEvent("SAFED", {"why": cause})] if mode is LoopMode.SAFE else []
+    return in_mode(state, mode, time_ns, cause)
 
 
 def mode_event(before: LoopMode, after: LoopMode, why: str) -> PendingEvent:

@@ -163,12 +163,7 @@ def _step(settings: Settings, state: State, request: Request) -> Handled:
     if not (1 <= frames <= MOST_STEPS and frames == int(frames)):
         given = " ".join(map("{:g}".format, request.values)) or "none"
         raise ValueError(f"step takes one whole number of frames, 1 or more; got {given}")
-    state = in_mode(
-        state,
-        _granted(state, "close"),
-        request.time_ns,
-        asked_by(state.conditions.lease, request),
-    )
+    state = in_mode(state, _granted(state, "close"), request.time_ns, asked_by(state.conditions.lease, request))
     return state._replace(steps_left=int(frames)), f"loop closed for {counted(int(frames), 'frame')}"
 
 
@@ -252,12 +247,11 @@ def _play(settings: Settings, state: State, request: Request) -> Handled:
 
 def _stop(settings: Settings, state: State, request: Request) -> Handled:
     drive = state.drive
-    play = drive.command_channels.play if drive is not None and drive.command_channels is not None else None
-    left = 0 if play is None else play.left(state.frame_sequence + 1)
-    if drive is None or drive.command_channels is None or play is None or not left:
+    if drive is None or drive.play is None or drive.play.over(state.frame_sequence + 1):
         return state, "nothing is being played"
-    text = f"stopped on the {play.target}: {left} of {play.frames} frames were left"
-    return _with(state, drive, drive.command_channels.stopped(state.frame_sequence)), text
+    left = drive.play.left(state.frame_sequence + 1)
+    text = f"stopped on the {drive.play.target}: {left} of {drive.play.frames} frames were left"
+    return state._replace(drive=drive.stopped(state.frame_sequence)), text
 
 
 def _law(settings: Settings, state: State, request: Request) -> Handled:

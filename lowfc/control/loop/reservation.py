@@ -57,11 +57,10 @@ def lease_checked(state: State, time_ns: int, frame_sequence: int) -> tuple[Stat
 
 def lease_ended(state: State, why: str) -> tuple[State, list[PendingEvent]]:
     """The state without the lease in force and without its probe sequence, and the event."""
-    held, drive = state.conditions.lease, state.drive
+    held = state.conditions.lease
     if held is None or held.ended:
         return state, []
-    if drive is not None and drive.command_channels is not None:
-        drive = drive._replace(command_channels=drive.command_channels.stopped(state.frame_sequence))
+    drive = None if state.drive is None else state.drive.stopped(state.frame_sequence)
     after = _with(state, held._replace(ended=why))._replace(drive=drive)
     return after, [PendingEvent("LEASE_ENDED", {"holder": held.without_outlook, "why": why})]
 
@@ -75,7 +74,7 @@ def permit(settings: Settings, state: State, request: Request) -> tuple[State, s
     before, drive, closed = state.conditions.lease, state.drive, state.mode is LoopMode.CLOSED
     if before is not None and not before.ended and before.id != request.lease_id:
         raise ValueError(before.reserved(request.time_ns))
-    play = drive.command_channels.play if drive is not None and drive.command_channels is not None else None
+    play = None if drive is None else drive.play
     if play is not None and not play.over(state.frame_sequence + 1):
         raise ValueError("a probe sequence is being played, and would measure what moves")
     if not request.values:

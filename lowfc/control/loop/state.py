@@ -16,7 +16,7 @@ from lowfc.control.laws.law import TIP_TILT, Law
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.stability import delay_weights
 from lowfc.control.loop.camera import CameraSettings
-from lowfc.control.loop.command_channels import CommandChannels, seen_nm
+from lowfc.control.loop.command_channels import CommandChannels, Play, seen_nm
 from lowfc.control.loop.estimator import Estimate, Estimator
 from lowfc.control.loop.guard import Guard
 from lowfc.control.loop.interlocks import Acting, Interlock
@@ -236,6 +236,17 @@ class ActiveLoop(NamedTuple):
         if self.command_channels is not None:
             return self.command_channels
         return CommandChannels.none(self.calibration.grid, len(self.calibration.noll), len(self.history_nm))
+
+    @property
+    def play(self) -> Play | None:
+        """What is being played."""
+        return None if self.command_channels is None else self.command_channels.play
+
+    def stopped(self, sequence: int) -> "ActiveLoop":
+        """With nothing more to play after this frame."""
+        if self.play is None or self.command_channels is None:
+            return self
+        return self._replace(command_channels=self.command_channels.stopped(sequence))
 
     def pushed(self, command_nm: Single, actuators_nm: Single) -> "ActiveLoop":
         """One frame later, under this command."""

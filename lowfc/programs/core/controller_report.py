@@ -138,7 +138,7 @@ class Arrays:
         drive = state.drive
         if drive is None:
             return
-        play = drive.command_channels.play if drive.command_channels is not None else None
+        play = drive.play
         in_use = Request(
             refused.time_ns,
             refused.name,
