@@ -4,7 +4,6 @@ import contextlib
 import io
 import re
 from collections.abc import Callable, Mapping
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
