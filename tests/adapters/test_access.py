@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from lowfc.adapters.bus import routed
 from lowfc.adapters.bus.access import CLOCK_KEY, ROUTER, access_control, grant, roles
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.bus.run import free_ports, open_run
@@ -212,8 +213,9 @@ def test_there_is_one_of_each_role(hosts: Hosts) -> None:
     hosts.join("operator")  # of those who only connect there may be several
 
 
-def test_a_foreign_certificate_is_told_so(hosts: Hosts) -> None:
+def test_a_foreign_certificate_is_told_so(hosts: Hosts, monkeypatch: pytest.MonkeyPatch) -> None:
     hosts.join(ROUTER)
+    monkeypatch.setattr(routed, "CONNECT_MS", 100)
     certificates.make_certificates(hosts.folder / "foreign", ("camera",), [])
     others = hosts.folder / "foreign"
     with pytest.raises(BusError, match=r"do not take each other .CERTIFICATE_VERIFY_FAILED"):
@@ -263,12 +265,13 @@ def test_a_router_is_not_waited_for_where_that_does_not_help(hosts: Hosts, monke
     def refuse(config: object) -> None:
         raise zenoh.ZError("this and that")
 
+    hosts.join(ROUTER)
+    monkeypatch.setattr(routed, "_ALERT_S", 0.01)
+    monkeypatch.setattr("lowfc.adapters.bus.routed.zenoh.open", refuse)
     with monkeypatch.context() as patch:
         patch.setattr("lowfc.adapters.bus.routed.socket.create_connection", unknown)
         with pytest.raises(BusError, match=r"nowhere\.invalid.*cannot be reached .*resolve it"):
             hosts.join("camera", network=hosts.network(host="nowhere.invalid"))
-    hosts.join(ROUTER)
-    monkeypatch.setattr("lowfc.adapters.bus.routed.zenoh.open", refuse)
     with pytest.raises(BusError, match="takes camera's certificate, and zenoh opens no session: this and that"):
         hosts.join("camera")
 
@@ -280,6 +283,7 @@ def test_a_role_does_not_pass_for_the_router(hosts: Hosts, monkeypatch: pytest.M
     for name, source in (("ca.pem", "ca.pem"), ("router.pem", "camera.pem"), ("router.key", "camera.key")):
         (folder / name).write_bytes((hosts.folder / "certs" / source).read_bytes())
     hosts.join(ROUTER, network=hosts.network("false"))
+    monkeypatch.setattr(routed, "CONNECT_MS", 100)
     with pytest.raises(BusError, match="do not take each other"):
         hosts.join("recorder")
 

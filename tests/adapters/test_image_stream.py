@@ -279,13 +279,13 @@ def test_the_folder_is_the_first_that_there_is(tmp_path: Path, monkeypatch: pyte
             stream_path(name)
 
 
-def test_ten_thousand_wrong_headers_do_no_harm(path: Path) -> None:
+def test_wrong_headers_do_no_harm(path: Path) -> None:
     rng = np.random.default_rng(7)
     writer = made(path, planes=2, axes=3, kind=0x20001, keywords={"tint": 1e-3})
     good = bytes(writer.map)
     rest = slice(writer.semaphores + 10 * 32 + 32 + 4 * 40, None)  # behind all that a reader and a writer may change
     opened = 0
-    for _ in range(10_000):
+    for _ in range(1500):
         writer.map[:] = good
         for _ in range(rng.integers(1, 4)):
             at = int(rng.integers(0, 384)) if rng.random() < 0.6 else int(rng.choice((112, 116, 128, 136, 258, 292)))
@@ -307,4 +307,4 @@ def test_ten_thousand_wrong_headers_do_no_harm(path: Path) -> None:
         assert isinstance(stream.newest.acquired_ns, int)
         assert bytes(writer.map[:184]) == header
         assert bytes(writer.map[rest]) == good[rest]
-    assert 500 < opened < 9500
+    assert 75 < opened < 1425

@@ -227,9 +227,7 @@ if {stuck}:
 """
 
 
-@pytest.mark.parametrize(
-    ("number", "stuck", "status"), [("SIGTERM", False, 0), ("SIGINT", False, 0), ("SIGINT", True, 128 + signal.SIGINT)]
-)
+@pytest.mark.parametrize(("number", "stuck", "status"), [("SIGTERM", False, 0), ("SIGINT", True, 128 + signal.SIGINT)])
 def test_a_signal_ends_the_loop_and_a_second_interrupt_the_process(number: str, stuck: bool, status: int) -> None:
     words = [sys.executable, "-c", LOOP.format(stuck=stuck)]
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:

@@ -88,6 +88,7 @@ def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return night.write(tmp_path / "night.mcap")
 
 
+@pytest.mark.usefixtures("without_drawings")
 @pytest.mark.parametrize("command", ["info", "report", "replay"])
 def test_readers_of_a_log_print_them_so(log: Path, command: str) -> None:
     done = lowfc(command, log)
@@ -97,7 +98,6 @@ def test_readers_of_a_log_print_them_so(log: Path, command: str) -> None:
         page = log.with_suffix(".html").read_text()
         check(page.replace("\u2028", ""), keep=LINES)
         assert page.count("clouds\\x1b[2J") >= 6, "events, requests, what ran"
-        assert page.count("<svg") > 3, "drawings are left as they are"
 
 
 def test_a_view_shows_them(log: Path) -> None:

@@ -68,9 +68,9 @@ def test_values_that_do_not_go_together_stay_as_the_run_had_them() -> None:
 
 
 def test_of_very_many_remarks_the_first_are_made() -> None:
-    _, remarks = recorded("".join(f"k{number} = 1\n" for number in range(50_000)).encode())
+    _, remarks = recorded("".join(f"k{number} = 1\n" for number in range(2000)).encode())
     assert len(remarks) == MOST_FAULTS + 1
-    assert remarks[-1] == f"and {50_000 - MOST_FAULTS} more"
+    assert remarks[-1] == f"and {2000 - MOST_FAULTS} more"
 
 
 @pytest.mark.parametrize("toml", ["[camera", "a = " + "[" * 100_000, "#" * (1 << 20) + "#"])
@@ -90,7 +90,7 @@ def test_what_is_no_configuration_is_a_remark_too(tmp_path: Path, toml: str) -> 
 def night() -> Night:
     """A loop that was open, then closed, with an acceptance test of its noise."""
     made = Night()
-    for loop, frames in (("open", 1000), ("closed", 3000)):
+    for loop, frames in (("open", 1000), ("closed", 1500)):
         made.request({"open": "open", "closed": "close"}[loop])
         made.frames(200)
         made.request("note", text=ANNOUNCEMENT + json.dumps({"test": "noise-floor", "loop": loop, "frames": 900}))

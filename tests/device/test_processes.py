@@ -34,7 +34,7 @@ class Dying:
     def expose(self):
         time.sleep(0.01)
         self.number += 1
-        if self.number == 200 and not self.lives:
+        if self.number == 30 and not self.lives:
             open("died", "w").close()
             os._exit(7)
         return Exposure(np.full((8, 8), self.number, np.uint16), None, self.number)
@@ -48,15 +48,12 @@ def test_a_camera_whose_process_dies_is_a_new_start_once_it_is_started_again(tmp
     (tmp_path / "dying.py").write_text(DYING)
     words = ("camera", "dying.py:Dying", "--run", "dying")
     starts: list[int] = []
-    bus = ZenohBus(open_run("dying").links, Role.OPERATOR, HostClock())
-    bus.subscribe(FRAME, lambda sample: starts.append(start_of(sample.sequence)))
-    try:
+    with closing(ZenohBus(open_run("dying").links, Role.RECORDER, HostClock())) as bus:  # the camera connects to it
+        bus.subscribe(FRAME, lambda sample: starts.append(start_of(sample.sequence)))
         died = subprocess.run([*LOWFC, *words], cwd=tmp_path, timeout=60, check=False)
         assert died.returncode == 7, "a failure, after which units of deploy start it again"
         with going_on(tmp_path, f"lowfc {' '.join(words)}"):
             until(lambda: len(set(starts)) == 2)
-    finally:
-        bus.close()
     assert starts == sorted(starts)
 
 
@@ -222,21 +219,16 @@ def test_a_camera_in_the_controllers_process_closes_the_loop_and_hangs_alone(tmp
 
 
 @pytest.mark.parametrize(
-    ("camera", "lockstep", "said"),
-    [
-        ("faulty.py:Camera", True, "in lockstep the camera is a process of its own"),
-        ("faulty.py:Camera", False, "error: its lens cap is on"),
-        ("faulty.py:Absent", False, "faulty.py:Absent"),
-        ("isio", False, "stream is missing"),
-    ],
+    ("lockstep", "said"),
+    [("lockstep = true\n", "in lockstep the camera is a process of its own"), ("", "error: its lens cap is on")],
 )
 def test_a_camera_that_the_controller_cannot_read_is_a_sentence(
-    tmp_path: Path, own_runtime: Path, camera: str, lockstep: bool, said: str
+    tmp_path: Path, own_runtime: Path, lockstep: str, said: str
 ) -> None:
     (tmp_path / "faulty.py").write_text(FAULTY)
     (tmp_path / "camera").write_text("refuse")
-    (tmp_path / "bench.toml").write_text(f"lockstep = true\n{BENCH}" if lockstep else BENCH)
-    refused = run(tmp_path, *CONTROLLER.split()[1:], "--camera", camera)
+    (tmp_path / "bench.toml").write_text(f"{lockstep}{BENCH}")
+    refused = run(tmp_path, *CONTROLLER.split()[1:], "--camera", "faulty.py:Camera")
     assert refused.returncode == 2
     assert said in refused.stderr
     assert "Traceback" not in refused.stderr
