@@ -136,7 +136,7 @@ def test_the_law_drives_again_once_it_would_be_far_better() -> None:
     quiet = np.zeros(((SPANS.better + 3) * SPANS.block, len(NOLL)))
     steps, _, state = live(WHAT, quiet, NOISE_NM[: len(quiet)], state, frames + 1)
     assert [group.takeovers for group in state.drive.following.guard.groups] == [1, 0]
-    assert state.drive.following.alone
+    assert state.drive.following.alone()
     by_the_integrator = [step.reasons for step in steps].count((Limit.LAW_OVERRULED,))
     assert SPANS.better * SPANS.block <= by_the_integrator < len(steps)
 

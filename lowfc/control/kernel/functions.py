@@ -21,14 +21,8 @@ def scan(
 ) -> tuple[np.uint64, np.uint16]:
     """Products of one block of a frame with R, in one pass over its counts.
 
-    Args:
-        counts: (block,) DN.
-        used: (block,) all bits set where a pixel is used, else 0.
-        dark: (block,) DN.
-        tiles: as in `measure`; those of this block begin at `row`.
-        row: see there.
-        scratch: (block,) overwritten.
-        sums_nm: (modes rounded up to five,) the result, not normalised.
+    Counts, used, dark and scratch are of the block (block,), as in `measure`; its tiles begin at `row`. The result,
+    not normalised, is in `sums_nm` (modes rounded up to five,).
 
     Returns:
         Sum of the used counts, and the highest.
@@ -87,18 +81,10 @@ def measure_blocks(
     sums_nm: Single,
     totals: Sequences,
 ) -> None:
-    """`scan` of the blocks from `first` up to `last`, so that several threads share a frame.
+    """`scan` of the blocks from `first` up to, but not, `last`, so that several threads share a frame.
 
-    Args:
-        pixels: and good, dark, tiles and scratch as in `measure`.
-        good: see there.
-        dark: see there.
-        tiles: see there.
-        scratch: see there; each thread has its own.
-        first: block.
-        last: block that is not scanned any more.
-        sums_nm: (blocks, modes rounded up to five) the result.
-        totals: (blocks, 2) sum of the used counts, and the highest.
+    The results are in `sums_nm` (blocks, modes rounded up to five) and `totals` (blocks, 2): sum of the used counts,
+    and the highest. Each thread has its own scratch; all else is as in `measure`.
     """
     block = scratch.size
     for number in range(first, last):

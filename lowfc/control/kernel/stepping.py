@@ -53,7 +53,7 @@ def respond(
         target_nm = None if drive.command_channels is None else drive.command_channels.target_nm(sequence)
         to_undo_nm = pol_nm if target_nm is None else pol_nm - target_nm
         drive = _follow(state, drive, followed, error_nm, to_undo_nm, events)
-        if drive.following is not None and not drive.following.alone:  # its guard has changed its mind
+        if drive.following is not None and not drive.following.alone():  # its guard has changed its mind
             return Response(error_nm, pol_nm, *next_command(settings, state, drive, error_nm, sequence))
     return Response(error_nm, pol_nm, drive.pushed(command_nm, actuators_nm), (), False)
 
@@ -71,7 +71,7 @@ def _fused(
         return None
     x, law, of_error = tables.no_states, (tables.no_law, tables.no_law), True
     if following is not None:
-        if not following.about_to_be_alone:
+        if not following.alone(1):
             return None
         x, law = following.x, (following.law.joined, following.law.output)
         of_error = following.law.signal == "error"
@@ -183,7 +183,7 @@ def next_command(
 def _law_output(drive: ActiveLoop, error_nm: Single) -> tuple[Single, bool]:
     """The law's modal command (modes,) in its limits, and whether one was cut."""
     following, held_nm = drive.following, drive.history_nm[0]
-    alone = following is not None and following.alone
+    alone = following is not None and following.alone()
     if following is None or not alone:
         integrated_nm, cut = integrate(drive.law, held_nm, error_nm)
         if following is None or following.frames <= SETTLING_FRAMES:

@@ -68,7 +68,7 @@ class Interlock(NamedTuple):
         return (value == self.value) is (self.test == "equal")
 
     def _compared(self) -> str:
-        return "" if self.test == "equal" else f", {_BOUNDS.get(self.test, 'not')} {shown(self.value)}"
+        return "" if self.test == "equal" else f", {self.test if self.test in _BOUNDS else 'not'} {shown(self.value)}"
 
 
 class Acting(NamedTuple):
@@ -128,5 +128,5 @@ def _by_value(why: str, report: BenchReport) -> bool:
 
 
 _AGAINST_CLOSING = (Action.REFUSE_CLOSE, Action.HOLD, Action.OPEN, Action.SAFE)
-_BOUNDS = {"above": "above", "below": "below"}
+_BOUNDS = ("above", "below")
 _KINDS = {bool: "truth", float: "number", str: "text"}

@@ -13,11 +13,10 @@ from lowfc.control.laws.margins import check_law
 from lowfc.control.laws.stability import highest_gain
 from lowfc.control.loop import interlocks
 from lowfc.control.loop.command_channels import EXTERNAL, FLAT, MIRROR, CommandChannels, Play, play_table
-from lowfc.control.loop.gains import changed_law, per_mode
+from lowfc.control.loop.gains import changed_law, check_offset, offset_remark, per_mode
 from lowfc.control.loop.inputs import Outputs, PendingEvent, Reply, Request
 from lowfc.control.loop.lease import ENDED_BY, Lease, asked_by, refusal
 from lowfc.control.loop.loading import holding, in_mode, loaded, misfit, mode_event, uncalibrated
-from lowfc.control.loop.remarks import check_offset, offset_remark
 from lowfc.control.loop.reservation import lease, lease_checked, lease_ended, permit, release, renew
 from lowfc.control.loop.safety import Limits, LoopMode, Rejection, neighbour_difference_nm, request_mode
 from lowfc.control.loop.state import ActiveLoop, LawRunner, Settings, State

@@ -126,17 +126,9 @@ class LawRunner(NamedTuple):
         weight = np.float32(min(max(self.frames - SETTLING_FRAMES, 0) / FADING_FRAMES, 1))
         return weight if self.guard is None or not self.guard.overruled else weight * self.guard.weight
 
-    @property
-    def alone(self) -> bool:
-        """Whether all of the command is the law's."""
-        return self._alone(self.frames)
-
-    @property
-    def about_to_be_alone(self) -> bool:
-        """Whether all of the command will be the law's once it has followed another frame."""
-        return self._alone(self.frames + 1)
-
-    def _alone(self, frames: int) -> bool:
+    def alone(self, more: int = 0) -> bool:
+        """Whether all of the command is the law's, now or once it has followed some more frames."""
+        frames = self.frames + more
         return frames >= SETTLING_FRAMES + FADING_FRAMES and (self.guard is None or not self.guard.overruled)
 
     def taking_over(self) -> "LawRunner":
