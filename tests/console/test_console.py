@@ -304,7 +304,9 @@ def test_tasks_are_processes_of_their_own() -> None:
     from lowfc.programs.console.task import Task
 
     wanted = (["--version"], 0, "t: done; 0."), (["no-such"], 2, "t failed: ")
-    for task, status, sentence in [(Task("t", words), *more) for words, *more in wanted]:
+    for words, status, sentence in wanted:
+        task = Task("t", words)
+        assert task.sentence.startswith("t: running for ")
         assert os.getsid(task._process.pid) == task._process.pid, "neither Ctrl-C nor a lost terminal reaches it"
         until(lambda task=task: task.status is not None)
         assert task.status == status

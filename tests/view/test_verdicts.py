@@ -126,7 +126,7 @@ STATES: dict[str, tuple[Callable[[Stage], object], str, str]] = {
 
 @pytest.fixture(scope="module")
 def verdicts() -> dict[str, Verdict]:
-    return {name: staged(change) for name, (change, *_) in STATES.items()}
+    return {name: staged(change, 4 if "dead" in name else 2) for name, (change, *_) in STATES.items()}
 
 
 @pytest.mark.parametrize("name", STATES)
