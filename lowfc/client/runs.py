@@ -34,6 +34,11 @@ def the_run(name: str | None) -> str:
     )
 
 
+def the_known_run(name: str | None) -> str:
+    """The run of that name, whether a process of it is there or not; else as `the_run`."""
+    return name if name is not None and (runtime_base() / name).is_dir() else the_run(name)
+
+
 def nobody_yet(name: str) -> str:
     """Sentence while a process waits for a run of which no other is on this host; empty where one is."""
     runs = living()

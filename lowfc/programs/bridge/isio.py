@@ -19,12 +19,12 @@ from lowfc.adapters.process.clock import Clock, HostClock
 from lowfc.adapters.process.realtime import give_way
 from lowfc.arrays import Single
 from lowfc.client import Client
+from lowfc.client.runs import the_known_run
 from lowfc.client.stream import step_of
 from lowfc.contract.errors import ConfigurationError, LowfcError
 from lowfc.contract.messages import CONTROLLER_STATE, STEP, Role, wire
 from lowfc.contract.printable import printable
 from lowfc.control.loop.command_channels import EXTERNAL
-from lowfc.programs.cli.ctl.which_run import the_known_run
 
 WAITING = 2000
 """Steps that wait while the bridge stands still: two seconds at 1 kHz."""

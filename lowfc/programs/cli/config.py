@@ -13,9 +13,9 @@ from lowfc.adapters.bus.run import DEFAULT_RUN, open_run
 from lowfc.adapters.bus.zenoh_session import session_config
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.terminal import AnyRun, ConfigFile, configuration
+from lowfc.client.runs import the_known_run
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BusError, ConfigurationError
-from lowfc.programs.cli.ctl.which_run import the_known_run
 
 _HEADER = (
     "# A key with a # before it has its default. Remove the # to choose a value; a command may choose another default",

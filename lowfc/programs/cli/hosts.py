@@ -144,8 +144,8 @@ def hosts(
     from lowfc.adapters.bus.zenoh_bus import ZenohBus
     from lowfc.adapters.process.clock import HostClock
     from lowfc.client import Client, running
+    from lowfc.client.runs import the_known_run
     from lowfc.contract.messages import Role
-    from lowfc.programs.cli.ctl.which_run import the_known_run
 
     settings = configuration(config)
     if not settings.network.router or (run is None and running()):

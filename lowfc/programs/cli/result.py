@@ -4,15 +4,13 @@ A field is declared once, with `figure`: its label, its unit and how it is forma
 figure, then a table for each list of parts; figures of one length that are declared as columns stand in one table.
 """
 
-import json
-import sys
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 from pydantic.fields import FieldInfo
 
-from lowfc.contract.printable import LINES, printable
+from lowfc.programs.cli import output
 
 _LABEL_WIDTH = 18
 
@@ -100,7 +98,7 @@ def formatted(info: FieldInfo, value: Any, *, with_unit: bool = False) -> str:
 
 def put(result: Result, *, as_json: bool) -> None:
     """Print a result: one JSON object, or its text with control characters escaped."""
-    sys.stdout.write((json.dumps(result.figures()) if as_json else printable(result.text(), keep=LINES)) + "\n")
+    output.put(result.figures(), result.text(), as_json=as_json)
 
 
 def _heading(info: FieldInfo) -> str:

@@ -37,7 +37,7 @@ def view(
     Example: lowfc view --web
     """
     from lowfc.adapters.process.realtime import give_way
-    from lowfc.programs.cli.ctl.which_run import the_known_run
+    from lowfc.client.runs import the_known_run
 
     give_way()
     if foxglove:

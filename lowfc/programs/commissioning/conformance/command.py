@@ -99,9 +99,8 @@ def _run_with(role: str, name: str | None) -> "Run":
         BusError: there is no such run, or none or several to choose from.
     """
     from lowfc.adapters.bus.run import open_run
-    from lowfc.client.runs import living
+    from lowfc.client.runs import living, the_known_run
     from lowfc.contract.errors import BusError
-    from lowfc.programs.cli.ctl.which_run import the_known_run
 
     if name is None:
         found = [run for run, roles in living().items() if role in roles]
