@@ -110,11 +110,7 @@ def play(live: Live, how: Staircase, required: Acceptance) -> list[Played]:
 
 
 def judge(every: Sequence[Played], required: Acceptance) -> LinearityResult:
-    """Gains and cross-talk of what was played.
-
-    Raises:
-        AcceptanceError: the loop was disturbed meanwhile.
-    """
+    """Gains and cross-talk of what was played; AcceptanceError where the loop was disturbed meanwhile."""
     modes = []
     for played in every:
         played.check(LoopMode.OPEN)

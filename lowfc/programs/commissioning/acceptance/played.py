@@ -138,11 +138,7 @@ class Played:
         return int(np.count_nonzero(~np.isfinite(self.error_nm).all(axis=1)))
 
     def check(self, mode: LoopMode) -> None:
-        """Refuse what was disturbed.
-
-        Raises:
-            AcceptanceError: it was, and how.
-        """
+        """Refuse what was disturbed; AcceptanceError where it was, and how."""
         other = self.mode[(self.mode != 0) & (self.mode != mode)]
         if other.size:
             raise AcceptanceError(
@@ -170,11 +166,7 @@ class Played:
 
 
 def chosen(wanted: Sequence[int], noll: Sequence[int]) -> tuple[int, ...]:
-    """The Noll indices asked for, all where none are.
-
-    Raises:
-        AcceptanceError: one is not the loop's.
-    """
+    """The Noll indices asked for, all where none are; AcceptanceError where one is not the loop's."""
     unknown = sorted(set(wanted) - set(noll))
     if unknown:
         raise AcceptanceError(f"Noll modes {unknown} are not controlled; there are {noll[0]} to {noll[-1]}")
@@ -182,11 +174,7 @@ def chosen(wanted: Sequence[int], noll: Sequence[int]) -> tuple[int, ...]:
 
 
 def logged(history: History, kind: Kind) -> list[Played]:
-    """The probe sequences of a test in a log.
-
-    Raises:
-        DataFileError: nothing was, or the loop was changed meanwhile.
-    """
+    """The probe sequences of a test in a log; DataFileError where nothing was, or the loop was changed meanwhile."""
     path, calibration = history.log.path, history.calibration
     announced = _announced(history.requests, kind)
     if calibration is None or not announced:

@@ -132,11 +132,7 @@ def play(live: Live, how: Excitation, required: Acceptance) -> list[Played]:
 
 
 def transfer_function(played: Played) -> Lines:
-    """The lines of what was played, as measured.
-
-    Raises:
-        AcceptanceError: the loop was disturbed meanwhile.
-    """
+    """The lines of what was played, as measured; AcceptanceError where the loop was disturbed meanwhile."""
     played.check(LoopMode.CLOSED)
     period = played.table[-played.what["period_frames"] :].astype(float)
     added = -period if played.target == OFFSET else seen_of_mirror(period, delay_weights(played.loop.delay_frames))
@@ -144,11 +140,7 @@ def transfer_function(played: Played) -> Lines:
 
 
 def judge(every: Sequence[Played], required: Acceptance) -> RejectionResult:
-    """The last of what was played, against theory.
-
-    Raises:
-        AcceptanceError: the loop was disturbed meanwhile.
-    """
+    """The last of what was played, against theory; AcceptanceError where the loop was disturbed meanwhile."""
     played = every[-1]
     found, rate_hz = transfer_function(played), played.loop.rate_hz
     tolerance_db = required.rejection_db

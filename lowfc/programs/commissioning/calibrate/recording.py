@@ -146,11 +146,7 @@ def play(loop: Client, basis_nm: npt.NDArray[np.floating], table: npt.NDArray[np
 
 
 def watch(loop: Client, count: int) -> Pixels:
-    """The next `count` frames (count, rows, columns), DN.
-
-    Raises:
-        BusError: they stopped.
-    """
+    """The next `count` frames (count, rows, columns), DN; BusError where they stopped."""
     stream = loop.frames(count)
     received = [np.asarray(image.pixels) for image in stream]
     if len(received) < count:

@@ -260,11 +260,7 @@ def partial_of(out: Path) -> Path:
 
 
 def keep(path: Path, sums: Sums, what: dict[str, Any]) -> None:
-    """Write the cycles done, and what they are of.
-
-    Raises:
-        DataFileError: it cannot be written.
-    """
+    """Write the cycles done, and what they are of; DataFileError where it cannot be written."""
     stream = io.BytesIO()
     arrays = sums._asdict() | {"initial": sums.initial.matrix, "estimator": sums.initial.estimator}
     np.savez(stream, what=np.array(json.dumps(what, sort_keys=True)), **arrays)
@@ -272,11 +268,7 @@ def keep(path: Path, sums: Sums, what: dict[str, Any]) -> None:
 
 
 def go_on(path: Path, what: dict[str, Any]) -> Sums:
-    """The cycles done.
-
-    Raises:
-        DataFileError: there are none, the file is damaged, or they are of another calibration.
-    """
+    """The cycles done; DataFileError where there are none, the file is damaged, or they are of another calibration."""
     before, sums = begun(path)
     for key, value in what.items():
         if before.get(key) != value:

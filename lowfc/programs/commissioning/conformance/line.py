@@ -54,11 +54,7 @@ class Line:
     """
 
     def __init__(self, links: Links, role: str) -> None:
-        """Join a run as `role`.
-
-        Raises:
-            BusError: the role's port is taken.
-        """
+        """Join a run as `role`; BusError where the role's port is taken."""
         self._clock = HostClock()
         self.offset_ns = self._clock.offset_ns
         self._start_s = links.claim_start(role, self._clock.start_s)

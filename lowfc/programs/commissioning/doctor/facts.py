@@ -28,11 +28,7 @@ class Facts:
 
     @property
     def tried(self) -> Trial:
-        """What was granted and measured.
-
-        Raises:
-            OSError: it could not be tried.
-        """
+        """What was granted and measured; OSError where it could not be tried."""
         if isinstance(self.trial, OSError):
             raise self.trial
         return self.trial

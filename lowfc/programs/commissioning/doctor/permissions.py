@@ -54,11 +54,7 @@ def apply(root: Path, user: str) -> list[str]:
 
 
 def undo(root: Path) -> list[str]:
-    """Take the files, the group and the device's rights back; what was done.
-
-    Raises:
-        ConfigurationError: not root.
-    """
+    """Take files, group and the device's rights back, and say what was done; ConfigurationError where not root."""
     _require_root("--undo")
     done = []
     for name, text in FILES.items():

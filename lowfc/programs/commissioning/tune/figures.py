@@ -33,11 +33,7 @@ OPTICAL_GAIN_MAS = 10.0
 
 
 def tuned(run: Telemetry, controller: str) -> tuple[Tuned, Gains]:
-    """The best law of a kind for a run.
-
-    Raises:
-        ValueError: there are too few frames, or no law of this kind is stable.
-    """
+    """The best law of a kind for a run; ValueError where there are too few frames, or no law of this kind is stable."""
     leak = run.law.leak.astype(np.float64)
     gains = best_gains(run.pol, run.rate_hz, run.timing, leak)
     models = identified(run.pol, run.rate_hz)
