@@ -168,8 +168,7 @@ def test_r_is_found_within_its_standard_error(patterns: np.ndarray) -> None:
     assert np.abs(made.matrix @ (found.reference - I0)).max() < 0.5
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_the_noise_of_h_neither_makes_modes_small_nor_gets_into_r(seed: int) -> None:
+def test_the_noise_of_h_neither_makes_modes_small_nor_gets_into_r() -> None:
     """H is measured so shortly that its pixels' noise is as strong as the modes."""
     found = calibrated(poke_patterns(MODES, 0.3), 10)
     variance = I0 / FLUX_E
@@ -180,9 +179,7 @@ def test_the_noise_of_h_neither_makes_modes_small_nor_gets_into_r(seed: int) -> 
     assert abs(np.diag(cross_talk(made.matrix, H)).mean()) < 3 * found.error.max() / np.sqrt(MODES)
     assert (np.sqrt(made.matrix**2 @ variance) / least).max() < 1 + 3 * found.error.max()
     # one whose weights are wrong, with other modes mixed in, does as well but for its own noise
-    mixed = np.random.default_rng(seed).standard_normal((MODES, MODES)) @ reconstructor(
-        I0, H, GOOD, FLUX_E, 0.0, "pinv"
-    )
+    mixed = np.random.default_rng(0).standard_normal((MODES, MODES)) @ reconstructor(I0, H, GOOD, FLUX_E, 0.0, "pinv")
     other = reconstruct(I0, found.response, mixed, GOOD, FLUX_E, 0.0)
     assert np.abs(cross_talk(other.matrix, H)).max() < 6 * found.error.max()
 
@@ -262,7 +259,7 @@ def test_the_delay_is_found(delay: float) -> None:
     assert backwards.picture @ H[:, 1] < 0
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_pokes_that_are_not_there_are_not_seen(seed: int) -> None:
     poke = dither(1, 8.0, 600, 1, seed).table[:, 0]
     fractions, _ = fractions_of(exposed(np.zeros((600, MODES)), seed))

@@ -36,7 +36,7 @@ def test_laws_are_near_the_best_that_keeps_the_margins(width: float, magnitude: 
     assert found["optimum_mas"] <= 1.001 * found["best_within_margins_mas"]
 
 
-@pytest.mark.parametrize("noise_nm", [0.05, 0.3, 2.0])
+@pytest.mark.parametrize("noise_nm", [0.05, 2.0])
 @pytest.mark.parametrize("width", lines.WIDTHS)
 @pytest.mark.parametrize("delay", lines.DELAYS)
 def test_however_little_noise_there_is_a_filter_keeps_the_margins(noise_nm: float, width: float, delay: float) -> None:

@@ -141,9 +141,10 @@ def through(what: Settings, requests: Iterable[Request], frames: int) -> tuple[A
     return error_nm, command_nm, state
 
 
-@pytest.mark.parametrize("delay_frames", [1.0, 1.5, 2.0])
-@pytest.mark.parametrize("target", ["offset", "mirror"])
-def test_the_measured_rejection_is_the_theorys(delay_frames: float, target: str) -> None:
+@pytest.mark.parametrize(
+    ("target", "delay_frames"), [("offset", 1.0), ("offset", 1.5), ("mirror", 1.5), ("mirror", 2.0)]
+)
+def test_the_measured_rejection_is_the_theorys(target: str, delay_frames: float) -> None:
     what = settings(delay_frames=delay_frames, gain=GAIN)
     places = lines(PERIOD, len(NOLL), 12, FEWEST_CYCLES / PERIOD, 0.3)
     period = multisine(PERIOD, places, 3.0, 1)

@@ -103,7 +103,7 @@ def test_the_reaction_wheel_without_images() -> None:
 
 def test_a_mode_that_no_model_helps_keeps_its_integrator() -> None:
     """Of white noise nothing can be foreseen: what is left is decided by this very run, and small either way."""
-    noise = np.random.default_rng(5).standard_normal((8192, 2))
+    noise = np.random.default_rng(5).standard_normal((4096, 2))
     pol = Pieces((noise,), 0)
     gains = best_gains(pol, RATE_HZ, Timing.sampled(1.0), NONE)
     best = tune_lqg(pol, identified(pol, RATE_HZ), gains, NOLL, NONE, Timing.sampled(1.0))
