@@ -34,3 +34,7 @@ class Listener:
     def events(self) -> list[str]:
         """Names of the events, in their order."""
         return [message.message.split()[0] for message in self.messages(EVENT)]
+
+    def said(self, start: str) -> list[str]:
+        """Events that begin so, in full."""
+        return [log.message for log in self.messages(EVENT) if log.message.startswith(start)]

@@ -114,7 +114,7 @@ class MemoryBus:
         self.queryables.append((key_expression, handler))
 
     def get(self, key: str, payload: bytes = b"", timeout_s: float = 1.0) -> list[Sample]:
-        """See `Bus.get`; returns once every handler asked has replied, or after `timeout_s`."""
+        """See `Bus.get`; returns once every handler has replied or failed, or after `timeout_s`."""
         answers: list[Sample] = []
         replied = threading.Semaphore(0)
         asked = 0
@@ -128,8 +128,7 @@ class MemoryBus:
                 replied.release()
 
             for handler in [one for expression, one in bus.queryables if _covers(expression, key)]:
-                asked += 1
-                bus.call("queryable of", key, handler, Query(key, payload, reply))
+                asked += bus.call("queryable of", key, handler, Query(key, payload, reply))
         deadline_s = time.monotonic() + timeout_s
         while asked and replied.acquire(timeout=max(0.0, deadline_s - time.monotonic())):
             asked -= 1
@@ -159,12 +158,14 @@ class MemoryBus:
             if key == wanted or (wanted == topic.at(ALL) and topic.matches(key)):
                 self.call("handler of", wanted, handler, _sample(key, payload, envelope, self.clock))
 
-    def call(self, what: str, key: str, handler: Callable[[T], None], argument: T) -> None:
-        """Call a handler; its fault is its own process's, never the publisher's."""
+    def call(self, what: str, key: str, handler: Callable[[T], None], argument: T) -> bool:
+        """Call a handler, and say whether it raised nothing; its fault is its own process's, never the publisher's."""
         try:
             handler(argument)
         except Exception as fault:
             self.faults.add(f"{self.role}: {what}", key, fault)
+            return False
+        return True
 
 
 def _sample(key: str, payload: bytes, envelope: Envelope, clock: Clock) -> Sample:

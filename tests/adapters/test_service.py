@@ -9,25 +9,12 @@ import pytest
 from lowfc import __version__
 from lowfc.adapters.process.realtime import Granted
 from lowfc.adapters.process.service import HEALTH_PERIOD_NS, WAITING_NS, Service
-from lowfc.contract.messages import COMMAND, EVENT, FRAME, HEALTH, Log, from_timestamp, wire
+from lowfc.contract.messages import COMMAND, EVENT, FRAME, HEALTH, from_timestamp, wire
 from lowfc.testing.clock import FakeClock
+from lowfc.testing.listener import Listener
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 
 PATIENCE_S = 30.0
-
-
-class Ear:
-    """What a run publishes about itself."""
-
-    def __init__(self, hub: MemoryHub, clock: FakeClock) -> None:
-        self.health: list[wire.Health] = []
-        self.events: list[Log] = []
-        bus = MemoryBus(hub, "operator", clock)
-        bus.subscribe(HEALTH, lambda sample: self.health.append(wire.Health.FromString(sample.payload)))
-        bus.subscribe(EVENT, lambda sample: self.events.append(Log.FromString(sample.payload)))
-
-    def said(self, word: str) -> list[str]:
-        return [log.message for log in self.events if log.message.startswith(word)]
 
 
 @pytest.fixture
@@ -45,7 +32,7 @@ def service(hub: MemoryHub, clock: FakeClock, name: str, **more: object) -> Serv
 
 
 def test_health_is_sent_when_due_and_tells_everything(hub: MemoryHub, clock: FakeClock) -> None:
-    ear = Ear(hub, clock)
+    ear = Listener(hub, clock, HEALTH)
 
     def fill(health: wire.Health) -> None:
         health.commands_late = 3
@@ -54,13 +41,13 @@ def test_health_is_sent_when_due_and_tells_everything(hub: MemoryHub, clock: Fak
     frames = camera.publisher(FRAME)
     camera.beat()
     camera.beat()
-    assert len(ear.health) == 1
+    assert len(ear.messages(HEALTH)) == 1
     for _ in range(5):
         frames.put(b"")
         camera.work += 1
     clock.advance(HEALTH_PERIOD_NS)
     camera.beat()
-    first, second = ear.health
+    first, second = ear.messages(HEALTH)
     assert (first.state, first.rate_hz, second.rate_hz) == ("starting", 0.0, 10.0)
     assert (second.process, second.run_id, second.pid, second.version) == ("camera", "night", os.getpid(), __version__)
     assert (second.commands_late, second.uptime_ns, second.realtime_granted) == (
@@ -81,7 +68,7 @@ def test_health_is_sent_when_due_and_tells_everything(hub: MemoryHub, clock: Fak
 def test_a_clock_that_is_off_is_reported_at_the_start(
     hub: MemoryHub, clock: FakeClock, monkeypatch: pytest.MonkeyPatch, ahead_ms: int, said: bool
 ) -> None:
-    ear = Ear(hub, clock)
+    ear = Listener(hub, clock, HEALTH)
     monkeypatch.setattr(clock, "ahead_ns", lambda: ahead_ms * 1_000_000)
     service(hub, clock, "camera")
     found = ear.said(f"CLOCK_OFF this boot's clock is {ahead_ms:+d} ms from the wall clock")
@@ -103,16 +90,16 @@ def test_what_a_mailbox_got_is_in_health(hub: MemoryHub, clock: FakeClock) -> No
 def test_events_are_published_and_warnings_shown(
     hub: MemoryHub, clock: FakeClock, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    ear = Ear(hub, clock)
+    ear = Listener(hub, clock, HEALTH)
     controller = service(hub, clock, "controller", granted=Granted((), (("SCHED_FIFO", "a longer tail"),)))
     controller.event("FRAMES_BACK", silent_ms=12.4)
-    assert [(log.name, log.message.split()[0], log.level) for log in ear.events] == [
+    assert [(log.name, log.message.split()[0], log.level) for log in ear.messages(EVENT)] == [
         ("controller", "STARTED", 2),
         ("controller", "REALTIME_REFUSED", 3),
         ("controller", "FRAMES_BACK", 2),
     ]
-    assert ear.events[-1].message == "FRAMES_BACK frames are back after 12 ms"
-    assert from_timestamp(ear.events[-1].timestamp) == clock.now_ns()
+    assert ear.messages(EVENT)[-1].message == "FRAMES_BACK frames are back after 12 ms"
+    assert from_timestamp(ear.messages(EVENT)[-1].timestamp) == clock.now_ns()
     shown = capsys.readouterr().err
     assert shown == "controller: REALTIME_REFUSED the host refused SCHED_FIFO: a longer tail\n"
 
@@ -134,24 +121,24 @@ def test_processes_meet_when_each_has_heard_the_other(hub: MemoryHub, clock: Fak
 def test_a_newcomer_is_answered_before_the_next_health_is_due(hub: MemoryHub, clock: FakeClock) -> None:
     camera = service(hub, clock, "camera")
     camera.beat()
-    ear = Ear(hub, clock)
+    ear = Listener(hub, clock, HEALTH)
     camera.beat()
-    assert ear.health == []
+    assert ear.messages(HEALTH) == []
     service(hub, clock, "controller").beat()
     camera.beat()
-    assert list(ear.health[-1].peers_alive) == ["controller"]
+    assert list(ear.messages(HEALTH)[-1].peers_alive) == ["controller"]
     again = service(hub, clock, "controller")
     camera.beat()
-    assert len(ear.health) == 2  # one of each process
+    assert len(ear.messages(HEALTH)) == 2  # one of each process
     again.beat()  # the same name and the same process: no news
     camera.beat()
-    assert [health.process for health in ear.health] == ["controller", "camera", "controller"]
+    assert [health.process for health in ear.messages(HEALTH)] == ["controller", "camera", "controller"]
 
 
 def test_a_flood_of_bad_messages_is_one_event_and_the_last_health_has_all_counts(
     hub: MemoryHub, clock: FakeClock
 ) -> None:
-    ear = Ear(hub, clock)
+    ear = Listener(hub, clock, HEALTH)
     mirror = service(hub, clock, "mirror-dm")
     for number in range(500):
         mirror.unreadable("lowfc/mirror/dm/command", f"reason {number}")
@@ -165,18 +152,18 @@ def test_a_flood_of_bad_messages_is_one_event_and_the_last_health_has_all_counts
         "BAD_MESSAGE 1 on lowfc/mirror/dm/command could not be read, the last because: too short",
     ]
     assert not mirror.running
-    assert ear.events[-1].message == "STOPPED mirror-dm stopped: enough"
-    assert ear.health[-1].state == "stopped"
-    assert {count.topic: count.published for count in ear.health[-1].topics} == {
-        "lowfc/event": len(ear.events),
-        "lowfc/health/mirror-dm": len(ear.health),
+    assert ear.messages(EVENT)[-1].message == "STOPPED mirror-dm stopped: enough"
+    assert ear.messages(HEALTH)[-1].state == "stopped"
+    assert {count.topic: count.published for count in ear.messages(HEALTH)[-1].topics} == {
+        "lowfc/event": len(ear.messages(EVENT)),
+        "lowfc/health/mirror-dm": len(ear.messages(HEALTH)),
     }
 
 
 def test_a_message_that_cannot_be_read_is_an_event_and_neither_a_traceback_nor_the_end(
     hub: MemoryHub, clock: FakeClock, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    ear = Ear(hub, clock)
+    ear = Listener(hub, clock, HEALTH)
     mirror = service(hub, clock, "mirror-dm")
     read: list[int] = []
     mirror.handover(
@@ -209,6 +196,7 @@ def test_a_stop_wakes_the_loop(hub: MemoryHub, clock: FakeClock) -> None:
 
 LOOP = """
 from lowfc.testing.clock import FakeClock
+from lowfc.testing.listener import Listener
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from lowfc.adapters.process.service import Service
 from lowfc.contract.messages import FRAME

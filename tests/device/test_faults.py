@@ -10,7 +10,7 @@ import pytest
 from lowfc.contract.configuration import load
 from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.errors import ConfigurationError
-from lowfc.contract.messages import CAMERA_STATE, COMMAND, EVENT, FRAME, HEALTH, MIRROR_STATE, wire
+from lowfc.contract.messages import CAMERA_STATE, COMMAND, FRAME, HEALTH, MIRROR_STATE, wire
 from lowfc.control.loop.safety import Rejection
 from lowfc.device import CameraSettings, Exposure, Single, geometry
 from lowfc.device.camera_loop import CameraLoop
@@ -60,11 +60,6 @@ def exposed(*exposures: Callable[[], Any], frames: int, settings: CameraSettings
     return heard
 
 
-def why(heard: Listener, name: str) -> list[str]:
-    """Events of a name, in full."""
-    return [log.message for log in heard.messages(EVENT) if log.message.startswith(name)]
-
-
 @pytest.mark.parametrize(
     ("bad", "said"),
     [
@@ -81,8 +76,8 @@ def test_a_camera_that_fails_is_named_once_counted_and_tried_again(bad: Callable
     steady = [good()] * 251  # more than a second
     heard = exposed(good(), bad, bad, bad, *steady, frames=252)
     assert heard.events() == ["STARTED", "DRIVER_FAILED", "DRIVER_BACK", "STOPPED"]
-    assert said in why(heard, "DRIVER_FAILED")[0]
-    assert "after 3 failures" in why(heard, "DRIVER_BACK")[0]
+    assert said in heard.said("DRIVER_FAILED")[0]
+    assert "after 3 failures" in heard.said("DRIVER_BACK")[0]
     assert heard.messages(HEALTH)[-1].driver_failures == 3
 
 
@@ -147,7 +142,7 @@ def test_numbers_that_wrap_go_on_and_gaps_are_frames_that_the_camera_lost() -> N
     assert len({start_of(sample.sequence) for sample in heard.samples[FRAME]}) == 1
     last = next(one for one in heard.messages(HEALTH)[-1].topics if one.topic == FRAME.key)
     assert (last.published, last.missing) == (9, 4)
-    assert why(heard, "FRAMES_LOST") == ["FRAMES_LOST 2 frames lost by the camera"], "at most twice a second"
+    assert heard.said("FRAMES_LOST") == ["FRAMES_LOST 2 frames lost by the camera"], "at most twice a second"
 
 
 def test_frames_lost_without_numbers_are_counted_too() -> None:
@@ -250,7 +245,7 @@ def test_a_mirror_whose_driver_fails_goes_to_flat_before_it_follows_again(bad: A
     assert not bench.service.health().command_refused
     assert bench.command(50.0).refused == 0
     assert mirror.heights_nm[-1] == 50.0
-    failed = why(bench.heard, "DRIVER_FAILED")
+    failed = bench.heard.said("DRIVER_FAILED")
     assert len(failed) == 1
     assert said in failed[0]
     assert bench.service.health().driver_failures == 2

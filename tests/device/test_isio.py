@@ -145,6 +145,7 @@ def test_silence_and_a_stream_made_anew_are_named_once(folder: Path, monkeypatch
 def test_the_channel_is_made_or_adopted_with_its_shape(folder: Path) -> None:
     driver, _ = mirror()
     assert not driver.position().any()
+    assert not driver.beside().any()
     assert driver.apply(shape_nm(1)) is None
     assert np.allclose(channel(folder).pixels[0] * 1000, shape_nm(1), atol=1e-4)
     driver, _ = mirror(nm_per_unit=2000.0)
@@ -221,10 +222,6 @@ def test_the_sum_of_all_channels_says_what_was_reached(folder: Path, monkeypatch
     time.sleep(0.02)
     with pytest.raises(RuntimeError, match="'dm00disp' has not followed 'dm00disp03'"):
         driver.apply(shape_nm(1))
-
-
-def test_without_others_there_is_nothing_beside() -> None:
-    assert not mirror()[0].beside().any()
 
 
 def test_the_stroke_holds_for_the_sum_with_others() -> None:
