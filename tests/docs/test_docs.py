@@ -32,7 +32,7 @@ ELSEWHERE = {
 }
 SHORTER = {
     "--duration 20": "--duration 2",
-    "--duration 5": "--duration 2",
+    "--duration 5": "--duration 0.5",
     "--seconds 2": "--seconds 0.5",
     "--trials 20": "--trials 4",
     "--steps 200": "--steps 40",

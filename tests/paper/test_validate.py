@@ -25,6 +25,7 @@ from lowfc.programs.paper.report import (
     to_text,
     write_document,
 )
+from lowfc.programs.paper.tables import conditioning
 from lowfc.programs.paper.tables.reconstruction import ESTIMATORS, WITH_NUISANCES
 from lowfc.programs.paper.tables.tables import TABLES
 from tests.support.loops import lowfc
@@ -54,7 +55,10 @@ def committed():
 def few():
     """A few trials of one sensor, and what needs no trials at all."""
     names = ("table1", "table2", "table3", "table4", "conditioning", "photometry")
-    return {table["table"]: table for table in run(names, Context(FEW, jobs=2, sensors=(SAM,)))}
+    with pytest.MonkeyPatch.context() as fewer:
+        fewer.setattr(conditioning, "BARS", ((0.1, 45.0),))
+        fewer.setattr(conditioning, "HOLES", (0.09, 0.05))
+        return {table["table"]: table for table in run(names, Context(FEW, jobs=2, sensors=(SAM,)))}
 
 
 def agree(measured, reference):
@@ -104,10 +108,10 @@ def test_a_table_of_one_sensor_is_as_committed(few, committed, name):
     assert (SAM in own) == (name not in ("table1", "photometry"))
 
 
-def test_the_conditioning_is_as_section_4_says(few):
+def test_the_committed_conditioning_is_as_section_4_says(committed):
     condition = {
         row["name"]: row["measured"]
-        for row in few["conditioning"]["rows"]
+        for row in committed["conditioning"]["rows"]
         if row["quantity"] == "condition number" and row["modes"] == 14
     }
     assert condition["open"] > 1e12
