@@ -17,14 +17,8 @@ _LEAST_LEFT = 1e-3
 def with_dark(calibration: Calibration, dark_dn: Array, good: Array, read_noise_e: float, gain_e: float) -> Calibration:
     """The calibration with another dark (pixels,), DN, and only the pixels (pixels,) that are 1 in `good`.
 
-    I0 and H pass through the flux normalisation of the pixels that are left, and R is made anew from them.
-
-    Args:
-        calibration: The one so far; pixels that were bad stay bad.
-        dark_dn: Mean of frames without light.
-        good: 1 where a pixel is used, else 0.
-        read_noise_e: Of a pixel.
-        gain_e: Electrons per DN.
+    Pixels that were bad stay bad. I0 and H pass through the flux normalisation of the pixels that are left, and R is
+    made anew from them, for this read noise of a pixel and electrons per DN.
 
     Raises:
         ValueError: too little is left to tell the modes apart.

@@ -70,12 +70,7 @@ def dark_of(frames: npt.NDArray[np.number]) -> Dark:
 
 
 def check_dark(dark_dn: Array, reference: Array, flux_dn: float) -> None:
-    """Refuse a dark that the star is in.
-
-    Args:
-        dark_dn: (pixels,) mean of the dark frames.
-        reference: (pixels,) image in flux fractions.
-        flux_dn: Light of the star in one frame.
+    """Refuse a dark (pixels,) with a part of the star's light, whose image (pixels,) is in flux fractions.
 
     Raises:
         ValueError: the star is in it.

@@ -57,14 +57,9 @@ class Gains:
 
 
 def gains(error_nm: Array, mode: int, levels_nm: Array, starts: Whole, frames: int) -> Gains:
-    """Gain and cross-talk of a mode that went through the levels of `levels`.
+    """Gain and cross-talk of a mode that went through the levels (levels,) of `levels`, from open-loop errors.
 
-    Args:
-        error_nm: (frames, modes) measured with the loop open.
-        mode: Place of the mode.
-        levels_nm: (levels,) in their order.
-        starts: (levels,) first frame that saw each level.
-        frames: That saw each.
+    Errors are (frames, modes); `starts` (levels,) are the first of the `frames` frames that saw each level.
     """
     means = np.stack([error_nm[start : start + frames].mean(axis=0) for start in starts])
     per_cycle = (means * np.sign(levels_nm)[:, None]).reshape(-1, len(_SIGNS), error_nm.shape[1]).mean(axis=1)
@@ -80,15 +75,8 @@ def captured(error_nm: Array, command_nm: Array, mode: int, level_nm: float, bef
     """Whether a closed loop took a shape of one mode away that came at once.
 
     The command of that mode must have moved against the shape, and no error be left in any: a loop that settled
-    elsewhere measures none either. Commands of other modes follow what drifts meanwhile.
-
-    Args:
-        error_nm: (frames, modes).
-        command_nm: (frames, modes).
-        mode: Place of the mode.
-        level_nm: Of the shape.
-        before: Frames before it came.
-        after: Frames in which the loop must have settled again.
+    elsewhere measures none either. Commands of other modes follow what drifts meanwhile. Errors and commands are
+    (frames, modes); `before` are frames before the shape came, `after` those in which the loop must have settled again.
     """
     moved_nm = command_nm[after, mode].mean() - command_nm[before, mode].mean()
     left = error_nm[after].mean(axis=0)

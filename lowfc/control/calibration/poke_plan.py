@@ -75,12 +75,8 @@ def cycle(patterns: Array, hold: int, settle: int, rest: int, *, backwards: bool
 def dither(columns: int, amplitude: float, frames: int, hold: int, seed: int) -> Plan:
     """Pseudo-random pushes and pulls of all modes at once, to be played with the loop closed.
 
-    Args:
-        columns: Modes.
-        amplitude: Of each, nm rms of wavefront.
-        frames: Length of the piece.
-        hold: Frames between changes of sign; 1 is quickest, and least answered by the loop.
-        seed: Of the signs; another one for each piece.
+    Columns are modes, the amplitude is in nm rms of wavefront, and signs change every `hold` frames: 1 is quickest, and
+    least answered by the loop. Each piece has a seed of its own.
     """
     rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence([seed, 7])))
     states = rng.integers(0, 2, (-(-frames // hold), columns)) * 2.0 - 1.0
@@ -89,13 +85,7 @@ def dither(columns: int, amplitude: float, frames: int, hold: int, seed: int) ->
 
 
 def frames_for(snr: float, noise_nm: float, amplitude_nm: float) -> int:
-    """Frames of a mode's pokes after which R knows it to 1 / snr of itself.
-
-    Args:
-        snr: Wanted signal-to-noise ratio.
-        noise_nm: With which R measures the noisiest mode in one frame.
-        amplitude_nm: Of the poke.
-    """
+    """Frames of pokes of this amplitude after which R knows a mode of this noise in one frame to 1 / snr."""
     return int(np.ceil((snr * noise_nm / amplitude_nm) ** 2))
 
 

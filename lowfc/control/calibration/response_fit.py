@@ -233,11 +233,7 @@ def row_error(answers: Array) -> Array:
 def initial_of(candidates: list[Initial], picture: Array, mode: int, variance: Array) -> Initial:
     """The reconstructor that sees a poke best; an earlier one unless a later is better by more than `_BETTER`.
 
-    Args:
-        candidates: One or more.
-        picture: (pixels,) answer to a poke of one mode, in flux fractions.
-        mode: Place of the mode.
-        variance: (pixels,) of a frame's noise.
+    The picture (pixels,) is the answer to a poke of the mode, in flux fractions; the variance (pixels,) a frame's.
     """
 
     def noise(initial: Initial) -> float:
@@ -245,8 +241,8 @@ def initial_of(candidates: list[Initial], picture: Array, mode: int, variance: A
         seen = abs(float(row @ picture))
         return float(np.sqrt(row**2 @ variance)) / seen if seen > 0 else np.inf
 
-    best = candidates[0]
-    for each in candidates[1:]:
+    best, *later = candidates
+    for each in later:
         if noise(each) < _BETTER * noise(best):
             best = each
     return best

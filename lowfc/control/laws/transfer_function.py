@@ -102,12 +102,7 @@ def measured(error_nm: Array, added_nm: Array) -> Lines:
 
 
 def seen_of_mirror(played_nm: Array, weights: Array) -> Array:
-    """What exposures see (frames, modes) of modes played on the mirror in one period after another.
-
-    Args:
-        played_nm: (frames, modes) with each frame's command.
-        weights: Of the delay, `lowfc.control.laws.stability.delay_weights`.
-    """
+    """What exposures see (frames, modes) of modes (frames, modes) played on the mirror in one period after another."""
     seen = np.zeros_like(played_nm)
     for lag, weight in enumerate(weights):
         seen += weight * np.roll(played_nm, 1 + lag, axis=0)

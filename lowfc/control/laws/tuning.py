@@ -227,11 +227,7 @@ def predicted_nm(law: LinearLaw, models: Sequence[Model], timing: Timing) -> Arr
 def predicted_nm2(law: LinearLaw, models: Sequence[Model], noise_nm2: Array, timing: Timing) -> Array:
     """Covariance (modes, modes) over all time of the true residual, of modes that have nothing in common but noise.
 
-    Args:
-        law: of the loop.
-        models: of each mode.
-        noise_nm2: (modes, modes) covariance of one frame's noise; the models say how large it is.
-        timing: of the loop.
+    Of the covariance (modes, modes) of one frame's noise, the models say how large it is.
     """
     omega = np.linspace(0, np.pi, 2049)[1:]
     passed = commanded(law, omega, timing.delay)

@@ -155,13 +155,7 @@ def delay_from_times(
 
 
 def frames_since(begins: Mask, running: Mask, missing: Whole) -> Whole:
-    """Frames (steps,) since the loop began to run, or began anew; -1 where it does not run.
-
-    Args:
-        begins: (steps,) where it begins anew although it ran before.
-        running: (steps,) whether it runs.
-        missing: (steps,) of `missing_before`.
-    """
+    """Frames (steps,) since the loop began to run, or began anew (steps,) although it ran; -1 where it does not run."""
     place = np.arange(len(running)) + np.cumsum(missing)
     started = running & (begins | ~np.concatenate([[False], running[:-1]]))
     return np.where(running, place - np.maximum.accumulate(np.where(started, place, 0)), -1)
