@@ -90,10 +90,10 @@ def test_what_is_no_configuration_is_a_remark_too(tmp_path: Path, toml: str) -> 
 def night() -> Night:
     """A loop that was open, then closed, with an acceptance test of its noise."""
     made = Night()
-    for loop, frames in (("open", 1000), ("closed", 1500)):
+    for loop, frames in (("open", 500), ("closed", 1200)):
         made.request({"open": "open", "closed": "close"}[loop])
         made.frames(200)
-        made.request("note", text=ANNOUNCEMENT + json.dumps({"test": "noise-floor", "loop": loop, "frames": 900}))
+        made.request("note", text=ANNOUNCEMENT + json.dumps({"test": "noise-floor", "loop": loop, "frames": 400}))
         made.frames(frames)
     return made
 

@@ -25,6 +25,7 @@ from lowfc.device import (
 )
 from lowfc.device.camera_loop import CameraLoop
 from lowfc.device.mirror_loop import MirrorLoop, guard_of
+from lowfc.device.run import camera_beside
 from lowfc.programs.commissioning.doctor.devices import device_checks
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.listener import Listener
@@ -252,6 +253,13 @@ def test_the_first_settings_that_raise_are_a_sentence() -> None:
         pytest.raises(ConfigurationError, match=r"how it is set: RuntimeError: no link \(test_drivers.py, line \d+\)"),
     ):
         own.submit(run_camera, camera, CONFIG, "unset").result()
+
+
+def test_in_lockstep_the_camera_is_a_process_of_its_own() -> None:
+    controller = Listener(MemoryHub(), FakeClock()).service("controller")
+    beside = camera_beside(Ramp(Ramp.Options(), CONFIG), load(None, {"lockstep": True}), controller)
+    with pytest.raises(ConfigurationError, match="leave out --camera, or lockstep"), beside:
+        pass
 
 
 def test_options_under_the_name_of_the_class_are_not_passed_over() -> None:

@@ -46,14 +46,13 @@ from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from sim_dm.device import Device, initial
 from sim_dm.driver import SimulatedMirror
-from tests.support.happenings import INTERLOCKS
+from tests.support.happenings import CALIBRATION, INTERLOCKS
 from tests.support.mutated_logs import damaged, mutated, rewritten, small_log
 from tests.support.report_log import Night
 from tests.support.safety_checks import apply_command, tick, violations
 from tests.support.toy import GRID, NOLL, calibration, frame, loaded, settings
 
 USUAL = settings(interlocks=INTERLOCKS)
-CALIBRATION = identified(calibration())
 
 
 @dataclass(frozen=True)

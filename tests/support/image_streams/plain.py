@@ -1,6 +1,6 @@
 """ImageStreamIO streams by their published layout alone: a reader and a writer that share nothing with the product.
 
-Byte offsets are written out, packed and unpacked with `struct`. Run as a program it plays a writer that dies.
+Byte offsets are written out, packed and unpacked with `struct`.
 """
 
 import ctypes
@@ -146,7 +146,3 @@ class PlainStream:
         """Wait for an image."""
         end = struct.pack("@ll", *divmod(time.time_ns() + int(timeout_s * 1e9), 10**9))
         return LIBC.sem_timedwait(self.semaphore(index), ctypes.c_char_p(end)) == 0
-
-    def close(self) -> None:
-        """Let the file go; the mapping goes with the object."""
-        os.close(self.file)
