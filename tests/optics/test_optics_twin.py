@@ -38,7 +38,7 @@ def worst_error(sensor, twin, modes, coefficients_nm, band=None):
 
 
 @pytest.mark.parametrize(
-    ("name", "wavefronts", "limit"), [("fast", 20, 1e-4), ("accurate", 20, 2e-6), ("broadband", 5, 1e-4)]
+    ("name", "wavefronts", "limit"), [("fast", 8, 1e-4), ("accurate", 5, 2e-6), ("broadband", 3, 1e-4)]
 )
 def test_the_twin_of_the_default_sensor(name, wavefronts, limit, request, sensor, modes, coefficients_nm):
     twin, band = request.getfixturevalue(name), gauss_legendre(550.0) if name == "broadband" else None
