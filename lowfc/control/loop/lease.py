@@ -65,7 +65,8 @@ def refusal(lease: Lease | None, name: str, lease_id: int, time_ns: int) -> str:
     """Why a request is refused; empty where it is granted.
 
     Refused are requests of others while a lease is in force, and those of a former holder: whoever ended its lease has
-    the last word on the loop. The lease is the last one, in force or ended; `lease_id` is the request's, 0 for none; the time is the controller's.
+    the last word on the loop. The lease is the last one, in force or ended; `lease_id` is the request's, 0 for
+    none; the time is the controller's.
     """
     if name in ENDED_BY or name in UNRELATED:
         return ""
