@@ -30,11 +30,7 @@ class Envelope(NamedTuple):
 
     @classmethod
     def decode(cls, data: bytes) -> "Envelope":
-        """Envelope of 16 bytes, whatever its numbers.
-
-        Raises:
-            BadMessageError: `data` has another length.
-        """
+        """Envelope of 16 bytes, whatever its numbers; BadMessageError where `data` has another length."""
         if len(data) != _LAYOUT.size:
             raise BadMessageError(
                 f"an envelope is {_LAYOUT.size} bytes (sequence and publish_time_ns, little-endian uint64), "
@@ -46,8 +42,7 @@ class Envelope(NamedTuple):
     def unpack(cls, data: bytes) -> "Envelope":
         """Envelope of 16 bytes as the bus takes it.
 
-        Raises:
-            BadMessageError: as for `decode`, or the sequence is not below 2^64 - 2^33, or the time above 2^62 ns.
+        BadMessageError as for `decode`, and where the sequence is not below 2^64 - 2^33, or the time above 2^62 ns.
         """
         sequence, publish_time_ns = found = cls.decode(data)
         if sequence >= SEQUENCES or publish_time_ns > LATEST_NS:

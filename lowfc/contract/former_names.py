@@ -56,8 +56,7 @@ LAW_EXTENSIONS = {
 def renamed_keys(data: dict[str, Any]) -> list[str]:
     """Rename the former keys of a configuration's tables, in place; return one remark for each.
 
-    Raises:
-        ValueError: a key is there under both names.
+    ValueError where a key is there under both names.
     """
     remarks = []
     for former, name in KEYS.items():

@@ -282,11 +282,7 @@ _LONGEST_KEY = 200
 
 @lru_cache(maxsize=256)
 def topic_of(key: str) -> Topic:
-    """Return the line of the table for a key on the bus.
-
-    Raises:
-        KeyError: there is no such topic.
-    """
+    """The line of the table for a key on the bus; KeyError where there is no such topic."""
     if len(key) > _LONGEST_KEY:
         raise KeyError(key)
     for topic in TOPICS:
@@ -313,11 +309,7 @@ SEQUENCES = (1 << 64) - (1 << 33)
 
 
 def checked_time_ns(stamp: Timestamp) -> int:
-    """Nanoseconds since the epoch of a received message's time.
-
-    Raises:
-        BadMessageError: it cannot be.
-    """
+    """A received message's time, nanoseconds since the epoch; BadMessageError where it cannot be."""
     time_ns = from_timestamp(stamp)
     if not 0 <= time_ns <= LATEST_NS:
         raise BadMessageError(f"its time is {time_ns} ns since the epoch, not 0 to 2^62")
@@ -325,22 +317,14 @@ def checked_time_ns(stamp: Timestamp) -> int:
 
 
 def checked_sequence(sequence: int) -> int:
-    """A received frame sequence.
-
-    Raises:
-        BadMessageError: it cannot be.
-    """
+    """A received frame sequence; BadMessageError where it cannot be."""
     if not 0 <= sequence < SEQUENCES:
         raise BadMessageError(f"its frame sequence is {sequence}, not below {SEQUENCES}")
     return sequence
 
 
 def floats(data: bytes, *shape: int) -> Single:
-    """Little-endian float32 of a message, in that shape.
-
-    Raises:
-        ValueError: there are more or fewer.
-    """
+    """Little-endian float32 of a message, in that shape; ValueError where there are more or fewer."""
     return np.frombuffer(data, dtype="<f4").reshape(shape)
 
 

@@ -10,12 +10,7 @@ LINES = "\n\t"
 
 
 def printable(text: str, keep: str = "") -> str:
-    """Text in which control characters are shown as escapes, as in a Python string.
-
-    Args:
-        text: any.
-        keep: control characters that stay, such as `LINES`.
-    """
+    """Text in which control characters, but for those to `keep`, are shown as escapes, as in a Python string."""
     if text.isprintable():
         return text
     return "".join(

@@ -11,11 +11,7 @@ _MOST_DOTS = 100  # in a line: the time to parse a dotted key grows with the squ
 
 
 def parsed(content: bytes) -> dict[str, Any]:
-    """The tables of a TOML file.
-
-    Raises:
-        ValueError: it is none, or too large, or would take long to parse; the text is short.
-    """
+    """The tables of a TOML file; ValueError, in short, where it is none, too large, or would take long to parse."""
     if len(content) > LARGEST_BYTES:
         raise ValueError(f"larger than {LARGEST_BYTES} bytes")
     text = content.decode()

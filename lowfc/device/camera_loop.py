@@ -110,11 +110,7 @@ class CameraLoop:
         self._service.work += 1
 
     def _end_ns(self, exposure: Exposure, settings: CameraSettings) -> int:
-        """End of an exposure by the run's clock.
-
-        Raises:
-            ValueError: it is in the future.
-        """
+        """End of an exposure by the run's clock; ValueError where it is in the future."""
         clock = self._service.clock
         if exposure.end_ns is None:
             return clock.now_ns()
@@ -129,8 +125,7 @@ class CameraLoop:
     def _follow_numbers(self, exposure: Exposure, settings: CameraSettings) -> None:
         """Count frames that the camera lost; where its numbers restart, begin a new start of the publisher.
 
-        Raises:
-            ValueError: the number is that of the last frame.
+        ValueError where the number is that of the last frame.
         """
         lost, now_ns = exposure.lost, self._service.clock.host_ns()
         if exposure.number is not None and self._number is not None:
@@ -180,11 +175,7 @@ class CameraLoop:
 
 
 def _checked(pixels: Pixels, settings: CameraSettings) -> Pixels:
-    """Pixels as they may be published.
-
-    Raises:
-        ValueError: they are of another type or shape.
-    """
+    """Pixels as they may be published; ValueError where they are of another type or shape."""
     if pixels.dtype != np.uint16 or pixels.shape != (settings.rows, settings.columns):
         raise ValueError(
             f"pixels are {pixels.dtype} of shape {pixels.shape}, expected uint16 of shape "

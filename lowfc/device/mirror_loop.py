@@ -53,8 +53,7 @@ _NONE: Single = np.zeros(0, np.float32)
 def guard_of(driver: Mirror, config: Configuration) -> Guard:
     """Limits of a mirror: those of its driver or those of [mirror], whichever are tighter.
 
-    Raises:
-        ConfigurationError: its grid is not that of [mirror].
+    ConfigurationError where its grid is not that of [mirror].
     """
     own, configured = driver.geometry, geometry(config)
     if (own.rows, own.columns) != (configured.rows, configured.columns):
@@ -195,8 +194,7 @@ class MirrorLoop:
     def _call(self, method: Callable[..., Single | None], *arguments: object) -> Single | None:
         """Where the mirror is, as a method of its driver returns.
 
-        Raises:
-            _LostError: it failed or hung: the mirror may be anywhere, and goes to its idle state before all else.
+        _LostError where it failed or hung: the mirror may be anywhere, and goes to its idle state before all else.
         """
         self.watch.begin()
         try:
@@ -291,12 +289,7 @@ def state_of(status: Status, time_ns: int) -> wire.MirrorState:
 
 
 def command_of(payload: bytes, start_check: StartCheck | None = None) -> Command:
-    """Command of a message.
-
-    Raises:
-        BadMessageError: its sequence or its time cannot be.
-        DecodeError: it is no MirrorCommand.
-    """
+    """Command of a message; DecodeError where it is none, BadMessageError where sequence or time cannot be."""
     message = wire.MirrorCommand.FromString(payload)
     return Command(
         message.channel,

@@ -26,11 +26,7 @@ def installed(kind: Kind) -> dict[str, EntryPoint]:
 
 
 def load(kind: Kind, name: str) -> Any:
-    """Class of a driver.
-
-    Raises:
-        ConfigurationError: there is none of that name, or it cannot be imported.
-    """
+    """Class of a driver; ConfigurationError where there is none of that name, or it cannot be imported."""
     module, colon, attribute = name.rpartition(":")
     if colon:
         if module.endswith(".py") and not Path(module).is_file():
@@ -62,14 +58,9 @@ def section(name: str) -> str:
 
 
 def opened(kind: Kind, name: str, config: Configuration, words: Sequence[str] = (), driver: Any = None) -> Any:
-    """A driver with its options: of the configuration, and `words` of a command line over them.
+    """A driver with its options: of the configuration, and `words` ("--key", "value" or "--key=value") over them.
 
-    Args:
-        kind: of the driver.
-        name: of the driver.
-        config: of the run.
-        words: "--key", "value" or "--key=value".
-        driver: its class, where that is known.
+    `driver` is its class, where that is known.
     """
     driver = load(kind, name) if driver is None else driver
     given = options(driver, table(config, kind, name), words)
@@ -100,8 +91,7 @@ def faults(config: Configuration, folder: Path) -> list[str]:
 def table(config: Configuration, kind: Kind, name: str) -> dict[str, Any]:
     """Options of a driver in a configuration: [drivers.NAME], or its part for this kind.
 
-    Raises:
-        ConfigurationError: they stand under the name of its class.
+    ConfigurationError where they stand under the name of its class.
     """
     mine = section(name)
     for other in {name, name.rpartition(":")[2]} - {mine}:
@@ -116,8 +106,7 @@ def table(config: Configuration, kind: Kind, name: str) -> dict[str, Any]:
 def options(driver: Any, found: dict[str, Any], words: Sequence[str] = ()) -> DriverOptions:
     """Options of a driver's class: those of a table, and words of a command line, `--key value`, over it.
 
-    Raises:
-        ConfigurationError: one is unknown or wrong.
+    ConfigurationError where one is unknown or wrong.
     """
     model: type[DriverOptions] = getattr(driver, "Options", DriverOptions)
     given, faults = _given(words), []

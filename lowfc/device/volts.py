@@ -39,8 +39,7 @@ class VoltMap:
     def __init__(self, options: VoltOptions, config: Configuration, channels: int | None = None) -> None:
         """Read the maps; `channels` is how many the electronics have, where that is known.
 
-        Raises:
-            ConfigurationError: a map cannot be read or does not fit the mirror, or leaves no room for a surface.
+        ConfigurationError where a map cannot be read, does not fit the mirror, or leaves no room for a surface.
         """
         grid = (config.mirror.rows, config.mirror.columns)
 

@@ -30,11 +30,7 @@ def described(fault: Exception) -> str:
 
 @contextmanager
 def opening(what: str) -> Iterator[None]:
-    """Say what a driver raised before it is watched.
-
-    Raises:
-        ConfigurationError: it raised something else than a `LowfcError`.
-    """
+    """Turn what a driver raises before it is watched, but for a `LowfcError`, into a ConfigurationError."""
     try:
         yield
     except LowfcError:
@@ -97,11 +93,7 @@ class DriverWatch:
             self._series, self._kind = 0, ""
 
     def failed(self, fault: Exception) -> None:
-        """A call raised, or returned nonsense.
-
-        Raises:
-            LowfcError: the fault itself, where it is one: a user has to put it right.
-        """
+        """A call raised, or returned nonsense; raises a `LowfcError` again, for a user has to put that right."""
         self._under_way = self.hangs = False
         if isinstance(fault, LowfcError):
             raise fault

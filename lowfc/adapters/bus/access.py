@@ -43,11 +43,7 @@ class Grant:
 
 
 def roles(mirrors: Iterable[str]) -> tuple[str, ...]:
-    """Every role that has a certificate, without the router.
-
-    Args:
-        mirrors: roles of the mirrors, such as "mirror-dm".
-    """
+    """Every role that has a certificate, without the router, with those of `mirrors`, such as "mirror-dm"."""
     alone = [role for role in Role if role is not Role.MIRROR and role not in _LOCAL]
     return tuple(sorted([*map(str, alone), *mirrors]))
 

@@ -34,11 +34,7 @@ class Backlog:
                 self._bytes += size
 
     def take(self) -> tuple[Topic, Sample]:
-        """Oldest message.
-
-        Raises:
-            IndexError: nothing waits.
-        """
+        """Oldest message; IndexError where nothing waits."""
         with self._lock:
             topic, sample = self._waiting.popleft()
             self._bytes -= len(sample.payload)

@@ -20,8 +20,7 @@ class Names:
     def admit(self, topic: Topic, key: str) -> str:
         """Name of the mirror or process in a key of this topic; empty for a topic without one.
 
-        Raises:
-            BadMessageError: the name is too long, or new and there is no room for it.
+        BadMessageError where it is too long, or new and there is no room for it.
         """
         name = name_in(topic, key)
         known = self._known.setdefault(topic.key, set())
@@ -38,9 +37,7 @@ class Names:
     def health(self, key: str, payload: bytes) -> tuple[str, wire.Health]:
         """Name and Health of a process.
 
-        Raises:
-            BadMessageError: as for `admit`, or the message is too large.
-            DecodeError: it is no Health.
+        BadMessageError as for `admit`, or where the message is too large; DecodeError where it is no Health.
         """
         if len(payload) > LARGEST_HEALTH_BYTES:
             raise BadMessageError(f"a Health has up to {LARGEST_HEALTH_BYTES} bytes, got {len(payload)}")

@@ -27,16 +27,9 @@ class OwnCertificate(NamedTuple):
 
 
 def read_certificate(authority: Path, certificate: Path, key: Path, *, server: bool = False) -> OwnCertificate:
-    """Read a certificate and check it as a peer does.
+    """Read a certificate and check it as a peer does: signed by `authority`, of this `key`, a router's where `server`.
 
-    Args:
-        authority: file of the certificate that signed it.
-        certificate: its file.
-        key: file of its private key.
-        server: it is the router's; the others' are checked as those of clients.
-
-    Raises:
-        DataFileError: a file cannot be read, or the three do not fit, or it is not valid now.
+    DataFileError where a file cannot be read, or the three do not fit, or it is not valid now.
     """
     try:
         listening, connecting = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)

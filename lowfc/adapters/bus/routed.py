@@ -37,10 +37,7 @@ _NOT_THERE = {
 def client_session(network: Network, role: str, sending: dict[str, Any]) -> dict[str, Any]:
     """Part of a role's session configuration across hosts that replaces its links on one.
 
-    Args:
-        network: where the router is, and the certificates.
-        role: of the process.
-        sending: zenoh's `transport/link/tx`, as on one host.
+    `sending` is zenoh's `transport/link/tx`, as on one host.
     """
     ca, certificate, key = certificate_files(network, role)
     return {
@@ -69,10 +66,7 @@ def client_session(network: Network, role: str, sending: dict[str, Any]) -> dict
 def router_session(network: Network, mirrors: Iterable[str], sending: dict[str, Any]) -> dict[str, Any]:
     """Part of the router's session configuration: TLS only, and the access control of the table of topics.
 
-    Args:
-        network: where it is, and its certificates.
-        mirrors: roles of the mirrors, such as "mirror-dm".
-        sending: zenoh's `transport/link/tx`, as on one host.
+    `mirrors` are roles such as "mirror-dm"; `sending` is zenoh's `transport/link/tx`, as on one host.
     """
     ca, certificate, key = certificate_files(network, ROUTER)
     return {
@@ -183,10 +177,9 @@ def certificate_files(network: Network, role: str) -> tuple[Path, Path, Path]:
 
 
 def require_certificate(network: Network, role: str) -> None:
-    """Refuse a certificate before a session is opened that would not be let in, or let in and sent nothing.
+    """Refuse, by a DataFileError, a certificate that would not be let in, or let in and sent nothing.
 
-    Raises:
-        DataFileError: a file is missing or cannot be read, or the certificate is not valid, or another role's.
+    Its files are missing or cannot be read, or it is not valid, or another role's.
     """
     files = certificate_files(network, role)
     for file in files:

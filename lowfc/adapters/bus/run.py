@@ -56,11 +56,7 @@ class Links:
 
     @property
     def secret(self) -> str:
-        """The run's password.
-
-        Raises:
-            DataFileError: the file is missing or damaged.
-        """
+        """The run's password; DataFileError where its file is missing or damaged."""
         try:
             user, _, secret = self.secret_file.read_text().strip().partition(":")
         except OSError as fault:
@@ -211,8 +207,7 @@ def runtime_path() -> Path:
 def runtime_base() -> Path:
     """The user's runtime directory for lowfc, made if there is none.
 
-    Raises:
-        DataFileError: it belongs to somebody else, is open to others, or is not a directory.
+    DataFileError where it belongs to somebody else, is open to others, or is not a directory.
     """
     base = runtime_path()
     try:
@@ -227,11 +222,7 @@ def runtime_base() -> Path:
 
 
 def own_directory(path: Path) -> Path:
-    """Check that `path` is a directory, not a link, of this user and closed to all others.
-
-    Raises:
-        DataFileError: it is not.
-    """
+    """Check that `path` is a directory of this user, closed to all others and no link; DataFileError where not."""
     found = path.lstat()
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid() or found.st_mode & 0o077:
         raise DataFileError(

@@ -17,14 +17,9 @@ _PRIORITIES = ("real_time", "interactive_high", "interactive_low", "data_high", 
 
 
 def session_config(links: Links, role: str, *, monitor: bool = False) -> dict[str, Any]:
-    """Return zenoh's configuration for a role of a run; a role without a port of its own only connects.
+    """Zenoh's configuration for a role of a run; a role without a port of its own only connects.
 
-    A run on several hosts goes by its router: see `routed`.
-
-    Args:
-        links: of the run.
-        role: of the process.
-        monitor: it takes no part in the loop, see `ZenohBus`.
+    A run on several hosts goes by its router: see `routed`. For `monitor` see `ZenohBus`.
     """
     batch_bytes = _SMALL_BATCH_BYTES if monitor else _BATCH_BYTES
     sending = {

@@ -90,8 +90,7 @@ def whole(stream: Stream) -> Single | None:
 def channel_of(name: str, grid: tuple[int, int]) -> Stream:
     """A channel to be written: the one that there is, or a new one, at zero.
 
-    Raises:
-        StreamError: it is not of this grid, or another process writes it.
+    StreamError where it is not of this grid, or another process writes it.
     """
     path = stream_path(name)
     try:

@@ -41,8 +41,7 @@ class StreamReader:
     def __init__(self, path: Path) -> None:
         """Read the stream at `path`, now or once it is there; what it holds already is nobody's new image.
 
-        Raises:
-            StreamError: it has another layout, or no free semaphore.
+        StreamError where it has another layout, or no free semaphore.
         """
         self.stream: Stream | None = None
         self.generation = 0
@@ -51,11 +50,7 @@ class StreamReader:
         self._open()
 
     def next(self, timeout_s: float) -> StreamImage | None:
-        """The newest image that was not yet returned; None where none came in time.
-
-        Raises:
-            StreamError: the stream that is there now has another layout, or no free semaphore.
-        """
+        """The newest image that was not yet returned; None where none came in time, StreamError as at the start."""
         end_s = time.monotonic() + timeout_s
         there = self._open()
         while True:

@@ -88,9 +88,7 @@ class Stream:
     def __init__(self, path: Path) -> None:
         """Map an existing stream.
 
-        Raises:
-            StreamAbsentError: there is none yet.
-            StreamError: it has another layout, or may not be opened.
+        StreamAbsentError where there is none yet; StreamError where it has another layout, or may not be opened.
         """
         self.path, self._file = path, os.fspath(path)
         self.name = path.name.removesuffix(".im.shm")
@@ -129,8 +127,7 @@ class Stream:
     def create(cls, path: Path, shape: tuple[int, int], dtype: npt.DTypeLike) -> "Stream":
         """Make a stream (rows, columns) where there is none; it appears complete, or not at all.
 
-        Raises:
-            StreamError: it is there already, or cannot be made.
+        StreamError where it is there already, or cannot be made.
         """
         rows, columns = shape
         kind = np.dtype(dtype)
@@ -229,11 +226,7 @@ class Stream:
         self._header["ring_index"] = index
 
     def take_semaphore(self) -> int:
-        """Reserve a semaphore for this process.
-
-        Raises:
-            StreamError: each is another living process's.
-        """
+        """Reserve a semaphore for this process; StreamError where each is another living process's."""
         pid = os.getpid()
         holders = self.readers.tolist()
         free = (index for index, one in enumerate(holders) if one == pid or not alive(one))

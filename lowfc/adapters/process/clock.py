@@ -108,8 +108,7 @@ def boot_file(base: Path | None = None) -> Path:
 def boot_offset_ns(base: Path) -> int:
     """Offset of CLOCK_MONOTONIC from the epoch, ns; the first to ask since the host was booted fixes it.
 
-    Raises:
-        DataFileError: the file in `base` that keeps it is damaged.
+    DataFileError where the file in `base` that keeps it is damaged.
     """
     path = boot_file(base)
     text = write_once(path, str(time.time_ns() - time.monotonic_ns()))

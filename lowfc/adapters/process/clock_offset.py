@@ -46,13 +46,7 @@ class ClockOffset:
         return 0 if best is None else best.offset_ns
 
     def exchanged(self, asked_ns: int, theirs_ns: int, answered_ns: int) -> None:
-        """Add one exchange.
-
-        Args:
-            asked_ns: this host's clock, just before the question.
-            theirs_ns: the other's clock, when it answered.
-            answered_ns: this host's clock, when the answer was there.
-        """
+        """Add one exchange: this host's clock at question and answer, and the other's when it answered."""
         self._recent.append(Exchange(theirs_ns - (asked_ns + answered_ns) // 2, answered_ns - asked_ns))
         self.best = min(self._recent, key=lambda exchange: exchange.round_trip_ns)
 

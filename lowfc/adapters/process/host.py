@@ -142,11 +142,7 @@ class Counters:
     """The `Counts` of one thread of a process; the files stay open, so that a reading takes some 20 us."""
 
     def __init__(self, process: int, thread: int, cpus: Collection[int]) -> None:
-        """Open the files of a thread that runs on these processors, on all when empty.
-
-        Raises:
-            OSError: there is no such thread.
-        """
+        """Open the files of a thread that runs on these processors, on all when empty; OSError where there is none."""
         folder = f"/proc/{process}/task/{thread}"
         self._cpu = f"cpu{next(iter(cpus))} " if len(cpus) == 1 else "cpu "
         names = "/proc/stat", f"{folder}/schedstat", f"{folder}/status", f"/proc/{process}/stat"
@@ -156,11 +152,7 @@ class Counters:
         self._tick_ns = 1_000_000_000 // os.sysconf("SC_CLK_TCK")
 
     def read(self) -> Counts:
-        """The counts now.
-
-        Raises:
-            OSError: the process has ended.
-        """
+        """The counts now; OSError where the process has ended."""
         stat = _content(self._stat)
         stolen = stat[stat.index(self._cpu) :].split(maxsplit=9)[8]
         waited_ns = _content(self._waits).split()[1]
@@ -172,11 +164,7 @@ class Counters:
 
 
 def busiest_thread(process: int, seconds: float) -> int:
-    """The thread of a process that runs most in the next seconds.
-
-    Raises:
-        OSError: there is no such process.
-    """
+    """The thread of a process that runs most in the next seconds; OSError where there is no such process."""
     before = _run_ns(process)
     time.sleep(seconds)
     return max((ran_ns - before.get(thread, 0), thread) for thread, ran_ns in _run_ns(process).items())[1]

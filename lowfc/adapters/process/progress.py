@@ -28,12 +28,7 @@ def passing_bar(console: Console, *columns: ProgressColumn) -> Progress:
 
 @contextlib.contextmanager
 def counting_bar(console: Console, *columns: ProgressColumn) -> Iterator[Counted]:
-    """One bar for several things in turn; it appears with the first step.
-
-    Args:
-        console: where it is drawn.
-        columns: beside its description.
-    """
+    """One bar for several things in turn, with `columns` beside its description; it appears with the first step."""
     with passing_bar(console, TextColumn("{task.description}"), BarColumn(), *columns) as bar:
         tasks: list[TaskID] = []
 
@@ -51,12 +46,7 @@ def reading_bar(console: Console) -> contextlib.AbstractContextManager[Counted]:
 
 
 def spoken(say: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> Counted:
-    """Progress without a terminal: a line every 10 s, with the time to go at the rate so far.
-
-    Args:
-        say: What prints a line.
-        clock: Seconds.
-    """
+    """Progress without a terminal: a line every 10 s, with the time to go at the rate so far; `clock` is in seconds."""
     before = -1
     begun = spoken_at = -inf
 

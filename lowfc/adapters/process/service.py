@@ -206,11 +206,7 @@ class Service:
             self._send_health(now_ns)
 
     def finish(self) -> None:
-        """Send the last Health, with all counts: nothing may be published after it.
-
-        Raises:
-            Exception: what ended the process, where a handler failed.
-        """
+        """Send the last Health, with all counts, after which nothing may be published; raise what a handler raised."""
         if self._fault is not None:
             raise self._fault
         self._tell_unreadable()
@@ -262,8 +258,7 @@ class Service:
     def meet(self, names: Iterable[str], timeout_s: float, otherwise: str) -> None:
         """Wait for these processes as `wait_for` does.
 
-        Raises:
-            BusError: one did not answer in time, and the process was not told to stop; what happens `otherwise`.
+        BusError where one did not answer in time, with what happens `otherwise`, unless the process was told to stop.
         """
         missing = self.wait_for(names, timeout_s)
         if missing and self.running:

@@ -36,13 +36,7 @@ class Trial(NamedTuple):
 def try_out(asked: Realtime, cpus: set[int], seconds: float) -> Trial:
     """Ask for what a process of the loop asks for, and sleep 1000 times a second in each scheduling class.
 
-    Args:
-        asked: of the host.
-        cpus: processors to sleep on; empty for all.
-        seconds: how long, in each class.
-
-    Raises:
-        OSError: the process that tries cannot be started, or fails.
+    It sleeps on these processors, all when empty. OSError where the process that tries cannot be started, or fails.
     """
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         try:

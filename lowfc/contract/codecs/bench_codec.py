@@ -12,11 +12,7 @@ LARGEST_BYTES = 4 * MAX_TEXT + 200
 
 
 def encode_bench_value(value: Value, time_ns: int) -> bytes:
-    """BenchValue of a value measured at that time.
-
-    Raises:
-        BadMessageError: it is no finite number, no truth and no text of at most 200 characters.
-    """
+    """BenchValue of a value measured at that time; BadMessageError where the value is none."""
     message = wire_value(value)
     _checked(message)
     message.timestamp.CopyFrom(timestamp(time_ns))
@@ -24,11 +20,7 @@ def encode_bench_value(value: Value, time_ns: int) -> bytes:
 
 
 def decode_bench_value(payload: bytes) -> Value:
-    """Value of a received BenchValue.
-
-    Raises:
-        BadMessageError: it cannot be read, or is none.
-    """
+    """Value of a received BenchValue; BadMessageError where it cannot be read, or is none."""
     if len(payload) > LARGEST_BYTES:
         raise BadMessageError(f"a bench value has at most {LARGEST_BYTES} bytes, got {len(payload)}")
     try:
@@ -47,11 +39,7 @@ def wire_value(value: Value) -> wire.BenchValue:
 
 
 def value_of(message: wire.BenchValue) -> Value:
-    """Value of a message.
-
-    Raises:
-        ValueError: it holds none, a number that is not finite, or a long text.
-    """
+    """Value of a message; ValueError where it holds none, a number that is not finite, or a long text."""
     match message.WhichOneof("value"):
         case "number" if isfinite(message.number):
             return message.number
@@ -77,11 +65,7 @@ def wire_report(report: BenchReport) -> wire.BenchReport:
 
 
 def report_of(message: wire.BenchReport) -> BenchReport:
-    """Report of a message.
-
-    Raises:
-        ValueError: its value is none.
-    """
+    """Report of a message; ValueError where its value is none."""
     value = value_of(message.value) if message.HasField("value") else None
     return BenchReport(from_timestamp(message.timestamp), message.name, value, message.age_ns)
 
@@ -99,11 +83,7 @@ def wire_interlock(one: Interlock) -> wire.Interlock:
 
 
 def interlock_of(message: wire.Interlock) -> Interlock:
-    """Interlock of a message.
-
-    Raises:
-        ValueError: it has no value, or an action that this version does not know.
-    """
+    """Interlock of a message; ValueError where it has no value, or its action is unknown."""
     value, action = value_of(message.value), Action(message.action)
     return Interlock(message.name, message.test, value, action, message.max_age_ns, message.acts_when_old)
 

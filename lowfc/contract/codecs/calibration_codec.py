@@ -39,11 +39,7 @@ def identified(calibration: Calibration) -> Calibration:
 
 
 def decode_calibration(message: wire.Calibration) -> Calibration:
-    """Calibration of a message.
-
-    Raises:
-        ValueError: it is not whole, or not the one that its identity says.
-    """
+    """Calibration of a message; ValueError where it is not whole, or not the one that its identity says."""
     shape, grid = (message.rows, message.columns), (message.mirror_rows, message.mirror_columns)
     shapes = array_shapes(len(message.noll), shape, grid)
     if not message.actuators_to_modes:

@@ -50,8 +50,7 @@ _PIXEL = np.dtype("<u2")  # read from its name, it would cost every frame 0.2 us
 def decode_frame(payload: bytes, sequence: int, age_ns: int, *, ahead: bool = False) -> Frame:
     """Frame of a RawImage; its pixels are None where the message holds no whole mono16 image.
 
-    Raises:
-        BadMessageError: its time or its sequence cannot be.
+    BadMessageError where its time or its sequence cannot be.
     """
     checked_sequence(sequence)
     try:
@@ -109,11 +108,7 @@ def actuators(message: wire.MirrorCommand | wire.MirrorState) -> Single | None:
 
 
 def decode_mirror(payload: bytes) -> MirrorShape | None:
-    """Shape of a MirrorState; None where it is none.
-
-    Raises:
-        BadMessageError: its time cannot be.
-    """
+    """Shape of a MirrorState; None where it is none, BadMessageError where its time cannot be."""
     try:
         state = wire.MirrorState.FromString(payload)
     except DecodeError:
@@ -125,8 +120,7 @@ def decode_mirror(payload: bytes) -> MirrorShape | None:
 def decode_camera(payload: bytes, start_s: int) -> CameraSettings:
     """What of a CameraState must fit the calibration; it was published by a camera that started at `start_s`.
 
-    Raises:
-        BadMessageError: the message cannot be read, is of no camera, or a number in it cannot be.
+    BadMessageError where it cannot be read, is of no camera, or a number in it cannot be.
     """
     try:
         state = wire.CameraState.FromString(payload)
@@ -163,11 +157,7 @@ def encode_input(taken: Report, number: int) -> bytes:
 
 
 def decode_input(message: wire.ControlInput, calibrations: Mapping[str, Calibration]) -> Input:
-    """What the controller took in.
-
-    Raises:
-        ValueError: it is an input that this version does not know, or its calibration is not among these (by id).
-    """
+    """What the controller took in; ValueError where it is unknown, or its calibration not among these (by id)."""
     match message.WhichOneof("input"):
         case "mirror":
             shape = _mirror_shape(message.mirror)
@@ -237,11 +227,7 @@ def requester_alone(payload: bytes) -> bytes:
 
 
 def decode_request(payload: bytes, name: str, time_ns: int) -> Request:
-    """Request under a key's name.
-
-    Raises:
-        ValueError: the payload is too large or cannot be read, or what it holds is not whole.
-    """
+    """Request under a key's name; ValueError where it is too large, cannot be read, or holds what is not whole."""
     if len(payload) > most_bytes(name):
         raise ValueError(f"a request of this name holds at most {most_bytes(name)} bytes, got {len(payload)}")
     try:
@@ -261,8 +247,7 @@ def request(
 ) -> Request:
     """Request of a message; of a logged one, calibration, law and table are identities, and are among those.
 
-    Raises:
-        ValueError: what it holds is not whole.
+    ValueError where what it holds is not whole.
     """
     table, basis = floats(message.table, -1, message.columns or 1), floats(message.actuators, -1)
     if message.play_id:

@@ -11,14 +11,9 @@ UNBOUNDED = (1 << 63) - 1
 
 
 def opened(path: Path, largest_bytes: int) -> BinaryIO:
-    """A regular file, open for reading.
+    """A regular file of at most `largest_bytes`, or a symbolic link to one, open for reading.
 
-    Args:
-        path: of the file, or of a symbolic link to it.
-        largest_bytes: largest size that is accepted.
-
-    Raises:
-        OSError: it cannot be opened, is not a regular file, or is larger; `strerror` is a sentence for a user.
+    OSError where it is something else, or cannot be opened; `strerror` is a sentence for a user.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # a pipe without a writer would wait
     try:
@@ -34,11 +29,7 @@ def opened(path: Path, largest_bytes: int) -> BinaryIO:
 
 
 def read_whole(path: Path, largest_bytes: int) -> bytes:
-    """Content of a regular file of at most `largest_bytes`.
-
-    Raises:
-        OSError: as for `opened`.
-    """
+    """Content of a regular file of at most `largest_bytes`; OSError as for `opened`."""
     with opened(path, largest_bytes) as stream:
         content = stream.read(largest_bytes + 1)
     if len(content) > largest_bytes:  # its size was not known: a file of /proc, or one that grows

@@ -34,8 +34,7 @@ def wire_law(law: LinearLaw, time_ns: int = 0) -> wire.LinearLaw:
 def law_of(message: wire.LinearLaw, known: Mapping[str, LinearLaw] = MappingProxyType({})) -> LinearLaw:
     """The law of a message; of one without matrices, that of its identity among the `known` ones.
 
-    Raises:
-        ValueError: it is not whole, or not known.
+    ValueError where it is not whole, or not known.
     """
     if message.id and not message.transition:
         if message.id not in known:
@@ -77,11 +76,7 @@ def wire_play(table: PlayTable, time_ns: int) -> wire.Play:
 
 
 def table_of(message: wire.Play) -> PlayTable:
-    """The table of a message.
-
-    Raises:
-        ValueError: it is not whole.
-    """
+    """The table of a message; ValueError where it is not whole."""
     return play_table(message.target, floats(message.table, -1, message.columns or 1), floats(message.basis, -1))
 
 

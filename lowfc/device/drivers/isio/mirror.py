@@ -110,8 +110,7 @@ class IsioMirror:
     def _followed(self, total: Stream, before: int) -> bool:
         """Whether the sum was made anew after the channel, within what a command may wait.
 
-        Raises:
-            RuntimeError: it has not been for long, so that the mirror does not follow.
+        RuntimeError where it has not been for long, so that the mirror does not follow.
         """
         written_s = time.monotonic()
         while (now_s := time.monotonic()) - written_s < SUM_WAIT_S and total.count == before:
