@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lowfc.adapters.files import calibration_file
+from lowfc.adapters.files import calibration_file, factory
 from lowfc.contract.configuration import Configuration, Control
 from lowfc.contract.errors import BusError, CalibrationError, DataFileError, RequestRefusedError
 from lowfc.contract.messages import wire
@@ -59,9 +59,9 @@ class Bench:
             if text.startswith(begin):
                 happens()
 
-    def commission(self, *, model: Configuration | None = None, **asked: Any) -> dict[str, Any]:
+    def steps(self, *, model: Configuration | None = None, **asked: Any) -> Commissioning:
         usual = {"dark": None, "no_dark": True, "frames": 100, "snr": 30.0, "cycles": 4, "resume": False}
-        made = Commissioning(
+        return Commissioning(
             self.loop,
             self.config,
             computed((model or self.config).to_toml()),
@@ -70,8 +70,10 @@ class Bench:
             lambda what, done, total: None,
             self.asked.append,
         )
+
+    def commission(self, **asked: Any) -> dict[str, Any]:
         with self.loop.reserved("a test"):
-            figures, _ = made.run()
+            figures, _ = self.steps(**asked).run()
         return figures
 
     @property
@@ -126,6 +128,15 @@ def test_the_wavefront_is_held_where_the_reference_was_taken(commissioned: tuple
     bench.loop.run(200)
     true = bench.loop.residual_nm(-200)
     assert float(np.sqrt(true.var(axis=0).sum())) < figures["measured_error_nm"]  # in which there is noise, too
+
+
+def test_a_loop_that_shall_stay_open_is_predicted_only(commissioned: tuple[Bench, dict[str, Any]]) -> None:
+    bench, _ = commissioned
+    bench.loop.open_loop()
+    text = bench.steps(close=False)._close(factory.settings(bench.config).law(bench.config.noll), 1.0)
+    assert "predicted from" in text
+    assert "`lowfc ctl close` closes it" in text
+    assert bench.loop.status().state.mode == wire.LOOP_MODE_OPEN
 
 
 @pytest.mark.slow
