@@ -6,7 +6,7 @@ import re
 import shlex
 from collections.abc import Callable
 from dataclasses import asdict, fields
-from math import isfinite
+from math import isfinite, nan
 from typing import Annotated, Any, get_type_hints
 
 import typer
@@ -35,8 +35,8 @@ def span(option: str, text: str) -> tuple[float, float]:
     try:
         found = float(low), float(high or low)
     except ValueError:
-        raise ValueError(f"{option} must be a number or LOW:HIGH, got {text!r}") from None
-    if not (isfinite(found[0]) and isfinite(found[1])):
+        found = nan, nan
+    if not all(map(isfinite, found)):
         raise ValueError(f"{option} must be a number or LOW:HIGH, got {text!r}")
     return found
 
