@@ -80,7 +80,7 @@ class Layout(NamedTuple):
 
     @classmethod
     def of(cls, header: np.void, file_bytes: int) -> "Layout":
-        """The layout that a header declares, for a file of that size; ValueError, with what was found, where it is another."""
+        """The layout that a header declares, for a file of that size; ValueError where it is another, and which."""
         version = header["version"].partition(b"\0")[0].decode("ascii", "backslashreplace")
         if version != VERSION:
             raise ValueError(f"has layout version {version!r}, expected {VERSION!r}")
