@@ -30,13 +30,9 @@ the last call, ns."""
 
 @dataclass(frozen=True)
 class Guard:
-    """Limits of a mirror, and what it does when the last command has expired.
+    """Limits of a mirror, after its driver has rounded to `step_nm`, and what it does once the last command expires.
 
-    Attributes:
-        grid: rows and columns of actuators.
-        limits: of the actuators, after the driver has rounded.
-        step_nm: least step of the driver.
-        flatten: whether it relaxes to flat once the last command has expired, or holds its shape.
+    `flatten`: it relaxes to flat then, and holds its shape otherwise.
     """
 
     grid: tuple[int, int]

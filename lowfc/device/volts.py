@@ -30,11 +30,7 @@ class VoltOptions(DriverOptions):
 
 
 class VoltMap:
-    """The values of a mirror's channels.
-
-    Attributes:
-        channels: how many there are, with those that no actuator has.
-    """
+    """The values of a mirror's channels; `channels` counts those that no actuator has, too."""
 
     def __init__(self, options: VoltOptions, config: Configuration, channels: int | None = None) -> None:
         """Read the maps; `channels` is how many the electronics have, where that is known.

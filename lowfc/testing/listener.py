@@ -10,11 +10,7 @@ from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 
 
 class Listener:
-    """Keeps every message of some topics and of the events.
-
-    Attributes:
-        samples: with their envelopes, by topic.
-    """
+    """Keeps every message of some topics and of the events: `samples` has them with their envelopes, by topic."""
 
     def __init__(self, hub: MemoryHub, clock: Clock, *topics: Topic) -> None:
         self.samples: dict[Topic, list[Sample]] = {topic: [] for topic in (*topics, EVENT)}

@@ -20,11 +20,7 @@ T = TypeVar("T")
 
 @dataclass(slots=True)
 class MemoryHub:
-    """What the buses of one test have in common.
-
-    Attributes:
-        lose: whether to lose this message on its way to that role; a test may set it.
-    """
+    """What the buses of one test have in common; `lose` says whether to lose a message on its way to a role."""
 
     buses: "list[MemoryBus]" = field(default_factory=list)
     starts: dict[str, int] = field(default_factory=dict)

@@ -21,16 +21,10 @@ _LOCAL = frozenset({Role.LAUNCHER, Role.REPLAY})  # they are never part of a run
 
 @dataclass(frozen=True, slots=True)
 class Grant:
-    """Rights of a process. Subscriptions and queries have "*" in place of a name.
+    """Rights of a process: the common name of its certificate, and keys.
 
-    Attributes:
-        role: common name of its certificate.
-        publishes: keys that it may put, its own names only.
-        subscribed: the same keys as others subscribe to them.
-        receives: keys that it may subscribe to.
-        answers: keys at which it may answer queries, its own names only.
-        queried: the same keys as others query them.
-        queries: keys that it may query.
+    It publishes and answers under its own names only. The same keys, as others subscribe to them (`subscribed`) and
+    query them (`queried`), have "*" in place of a name, as have those that it receives and queries.
     """
 
     role: str

@@ -42,14 +42,7 @@ class Sample(NamedTuple):
 
 @dataclass(slots=True)
 class Query:
-    """A query that waits for its answer; `reply` may be called later and from any thread, once.
-
-    Attributes:
-        key: that was queried.
-        name: last part of the key, such as "gain" of "lowfc/request/gain".
-        payload: protobuf bytes; may be empty.
-        reply: sends the answer.
-    """
+    """A query of a key that waits for its answer: `reply` sends it, later and from any thread, once."""
 
     key: str
     payload: bytes
@@ -99,12 +92,7 @@ class Ring(Protocol):
 
 
 class Bus(Protocol):
-    """A connection of one process to all others of its run.
-
-    Attributes:
-        faults: of handlers, and messages that could not be read.
-        offset: of the router's clock, where the run is on several hosts.
-    """
+    """A connection of one process to all others of its run; `offset` is of the router's clock, across hosts."""
 
     faults: "Faults"
     offset: ClockOffset | None

@@ -15,12 +15,7 @@ _ROUNDS = 4  # of both ends; three are enough
 
 
 class OwnCertificate(NamedTuple):
-    """What a certificate says, its authority having been checked.
-
-    Attributes:
-        name: its common name, the role that it is for.
-        ends: when it, or the authority's own, ceases to be valid.
-    """
+    """A certificate's common name, which is its role, and when it, or the authority's own, ceases to be valid."""
 
     name: str
     ends: datetime.datetime

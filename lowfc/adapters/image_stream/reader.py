@@ -15,13 +15,9 @@ _ATTEMPTS = 3
 
 
 class StreamImage(NamedTuple):
-    """An image as it was read.
+    """A copy of an image (rows, columns) as it was read; its number in its stream, and its stream's, from one on.
 
-    Attributes:
-        pixels: (rows, columns), a copy.
-        number: of the image, from one on in each stream.
-        acquired_ns: when its writer says that it was acquired, nanoseconds since the epoch.
-        generation: of the stream, one for the first that this reader found.
+    Its writer says that it was acquired at `acquired_ns`, nanoseconds since the epoch.
     """
 
     pixels: npt.NDArray[np.generic]
@@ -33,9 +29,7 @@ class StreamImage(NamedTuple):
 class StreamReader:
     """Waits for images by a semaphore of its own, and follows a stream that is made anew.
 
-    Attributes:
-        stream: the one that is mapped, None while there is none.
-        generation: of the stream, one for the first that was there.
+    `stream` is the one that is mapped, None while there is none; `generation` counts them, from one.
     """
 
     def __init__(self, path: Path) -> None:

@@ -52,13 +52,9 @@ def stream_path(name: str) -> Path:
 
 
 class Newest(NamedTuple):
-    """What the header says of the newest image.
+    """What the header says of the newest image: its `atime`, and how many images were written.
 
-    Attributes:
-        seconds: and `nanoseconds` of its `atime`, when it was acquired.
-        number: of the image, which is how many were written.
-        plane: number of the plane that it is in.
-        writing: whether an image is being written, or its writer died in the middle.
+    It is in this plane; `writing` is set while an image is written, and stays so where its writer died in the middle.
     """
 
     seconds: int

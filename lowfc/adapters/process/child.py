@@ -25,14 +25,10 @@ if os.getppid() == parent:  # it lives still
 
 @dataclass(slots=True)
 class Child:
-    """One process, its standard error going to a file.
+    """One process, its standard error going to a file; its name is as in its Health, or in messages about it.
 
-    Attributes:
-        name: as in its Health, or in messages about it.
-        command: the program and its arguments.
-        stderr_path: file with its standard error.
-        environment: of the process; None for ours.
-        death_signal: that it gets when its parent dies; only SIGKILL ends a process that is stopped.
+    Without an `environment` it has ours. It gets `death_signal` when its parent dies; only SIGKILL ends a process that
+    is stopped.
     """
 
     name: str

@@ -17,23 +17,14 @@ PERIOD_S = 0.5
 
 
 class Exchange(NamedTuple):
-    """One query and its answer.
-
-    Attributes:
-        offset_ns: to be added to this host's clock to have the other's.
-        round_trip_ns: between query and receipt; the offset is wrong by at most half of it.
-    """
+    """One query and its answer: what to add to this host's clock to have the other's, wrong by half the round trip."""
 
     offset_ns: int
     round_trip_ns: int
 
 
 class ClockOffset:
-    """The other clock's offset, by the best of recent exchanges.
-
-    Attributes:
-        best: None before the first.
-    """
+    """The other clock's offset, by the best of recent exchanges, None before the first."""
 
     def __init__(self) -> None:
         self.best: Exchange | None = None

@@ -29,12 +29,7 @@ _held: list[int] = []
 
 @dataclass(frozen=True, slots=True)
 class Granted:
-    """What the host allowed.
-
-    Attributes:
-        granted: measures in force.
-        refused: measures that are not, each with what that costs.
-    """
+    """Measures that are in force, and those that the host refused, each with what that costs."""
 
     granted: tuple[str, ...]
     refused: tuple[tuple[str, str], ...]

@@ -16,8 +16,7 @@ from lowfc.control.loop.safety import LoopMode
 class Supervisor:
     """The service manager, where there is one.
 
-    Attributes:
-        period_ns: between signs of life, half of the manager's timeout; None where it wants none.
+    It wants a sign of life within twice `period_ns`; None where it wants none.
     """
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
