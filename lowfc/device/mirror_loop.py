@@ -247,7 +247,6 @@ class MirrorLoop:
             self._publish(now_ns)
 
     def _publish(self, time_ns: int) -> None:
-        """Publish the state, then, when it is due, a picture of the surface."""
         status, state = self._status, state_of(self._status, time_ns)
         now_ns = self._service.clock.now_ns()  # a command's time may be anything
         if not self._known:

@@ -137,7 +137,6 @@ def options_help(driver: Any) -> list[tuple[str, str]]:
 
 
 def _explained(fault: Any, model: type[DriverOptions]) -> str:
-    """One of pydantic's errors as a line for a user."""
     if fault["type"] == "extra_forbidden":
         return f"there is no {brief(fault['loc'][0])}; there are {', '.join(model.model_fields) or 'none'}"
     if fault["type"] == "missing":

@@ -166,8 +166,6 @@ def test_a_configuration_is_checked_by_the_drivers_themselves(tmp_path: Path) ->
 
 
 class Sized(Ramp):
-    """A camera with an option that must be given."""
-
     class Options(DriverOptions):
         frame_rows: int
 
@@ -212,15 +210,11 @@ def test_a_driver_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Unset(Ramp):
-    """A camera whose first settings raise."""
-
     def settings(self) -> CameraSettings:
         raise RuntimeError("no link")
 
 
 class Unopened(Ramp):
-    """A camera that cannot be opened."""
-
     def __init__(self, options: DriverOptions, config: Configuration) -> None:
         raise ValueError("serial 7 is not there")
 

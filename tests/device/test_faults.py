@@ -188,8 +188,6 @@ class Mirror:
 
 
 class Bench:
-    """A mirror's loop and who commands it."""
-
     def __init__(self, mirror: Mirror) -> None:
         hub, self.clock = MemoryHub(), FakeClock()
         self.heard = Listener(hub, self.clock, MIRROR_STATE)

@@ -84,7 +84,6 @@ class Bench:
         self.process.stdin.flush()
 
     def stopped(self) -> dict[str, float]:
-        """Figures of the bench, which ends."""
         figures: dict[str, float] = json.loads(self.process.communicate("stop\n", timeout=60)[0])
         return figures
 
@@ -97,7 +96,6 @@ class Bench:
 
     @contextmanager
     def listening(self) -> Iterator[None]:
-        """Note events and modal errors of the run."""
         bus = ZenohBus(open_run("bench").links, Role.OPERATOR, HostClock())
 
         def step(sample: Sample) -> None:
@@ -111,7 +109,6 @@ class Bench:
             bus.close()
 
     def said(self, *words: str) -> bool:
-        """Whether there was an event with all these words."""
         return any(all(word in event for word in words) for event in list(self.events))
 
     def held(self) -> bool:

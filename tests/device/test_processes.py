@@ -132,7 +132,6 @@ class Bench:
         until(lambda: not (self.folder / name).exists())
 
     def named(self, process: str, event: str) -> int:
-        """How often a process told of it."""
         return self.events.count((process, event))
 
     def settled(self) -> None:

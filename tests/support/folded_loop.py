@@ -97,7 +97,6 @@ class FoldedLoop(Client):
         self.first = FIRST
 
     def start_mirror(self) -> None:
-        """The mirror's process, anew and flat."""
         self._bench.start_mirror()
         self.mirror_bus = MemoryBus(self.hub, "mirror-dm", HostClock())
         self._states: Publisher = self.mirror_bus.publisher(MIRROR_STATE, "dm")
@@ -123,12 +122,10 @@ class FoldedLoop(Client):
         return np.array([truth.sampled.residual_nm for truth in truths], np.float64)
 
     def run(self, frames: int) -> None:
-        """Some frames that nobody looks at."""
         for _ in range(frames):
             self.expose()
 
     def ask(self, name: str, modes: Any = (), values: Any = (), **fields: Any) -> Answer:
-        """A request, carried out before the next frame."""
         fields = {"lease_id": self.lease_id} | {key: value for key, value in fields.items() if value is not None}
         if "actuators_nm" in fields:
             fields["actuators_nm"] = fields["actuators_nm"].reshape(-1)

@@ -117,7 +117,6 @@ def mutated(data: bytes, number: int) -> tuple[str, bytes]:
 
 
 def mutations(data: bytes, numbers: range) -> Iterator[tuple[int, str, bytes]]:
-    """Number, kind and bytes of each."""
     for number in numbers:
         yield number, *mutated(data, number)
 

@@ -57,7 +57,6 @@ class Host:
         subprocess.run(self.inside("ip", *words), check=True, capture_output=True)
 
     def run(self, *words: str, timeout_s: float = 60) -> "subprocess.CompletedProcess[str]":
-        """A Python program here, to its end."""
         return subprocess.run(
             self.inside(sys.executable, "-P", *words),
             capture_output=True,
@@ -69,7 +68,6 @@ class Host:
         )
 
     def start(self, name: str, *words: str) -> Child:
-        """A Python program here that goes on."""
         child = Child(
             name,
             self.inside(sys.executable, "-P", *words),

@@ -17,8 +17,6 @@ PATIENCE_S = 20.0
 
 
 class Bench:
-    """A run in memory: a camera, a controller, and a recorder in a thread."""
-
     def __init__(self, folder: Path) -> None:
         self.hub = MemoryHub()
         self.clock = HostClock()

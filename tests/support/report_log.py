@@ -82,7 +82,6 @@ class Night:
         self._take(advance(self.settings, self._state, Load(self.now_ns, self.calibration, "test")))
 
     def start_camera(self) -> None:
-        """A camera that counts from nothing."""
         self._camera_start += 60
         self._count = 0
 

@@ -117,12 +117,10 @@ def check_kept(limit: Callable[[Limits, Single, Single], Limited], case: Case) -
 
 
 def apply_command(device: Device, status: Status, command: Command, now_ns: int) -> tuple[Status, Reason | None]:
-    """See `lowfc.device.guard.apply_command`."""
     return guard.apply_command(device, status, command, now_ns, _move(device, status))
 
 
 def tick(device: Device, status: Status, now_ns: int) -> Status:
-    """See `lowfc.device.guard.tick`."""
     return guard.tick(device, status, now_ns, _move(device, status))
 
 

@@ -257,7 +257,6 @@ def _arrays() -> tuple[dict[str, LinearLaw], dict[str, PlayTable]]:
 
 
 def _busy(state: State) -> wire.ControllerState:
-    """A state with everything in it."""
     state, _ = advance(USUAL, state, BenchReport(0, "mask", None))
     for asked in _asked():
         if asked.name in ("channel", "offset", "law", "play"):
@@ -316,8 +315,6 @@ def _requests() -> list[Target]:
 
 
 def _by(read: Callable[[Path], object], path: Path) -> Callable[[bytes], object]:
-    """Reads input from a file at this path."""
-
     def run(data: bytes) -> object:
         path.write_bytes(data)
         return read(path)

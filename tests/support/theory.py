@@ -30,7 +30,6 @@ def law_of(
 
 
 def linear(law: Law, noll: tuple[int, ...] = (2, 3, 4), delay_frames: float = 1.0, rate_hz: float = 1e3) -> LinearLaw:
-    """The same as a linear law."""
     return integrator(law.gain, law.leak, noll, delay_frames, rate_hz)
 
 

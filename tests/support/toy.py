@@ -103,7 +103,6 @@ def loaded(what: Settings) -> State:
 
 
 def frame(count: int, modes_nm: npt.ArrayLike = (0, 0, 0), **changes: object) -> Frame:
-    """Frame number `count` of a wavefront."""
     usual: dict[str, object] = {
         "sequence": frame_sequence(count),
         "time_ns": START * 10**9 + count * PERIOD_NS,

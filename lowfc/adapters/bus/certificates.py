@@ -73,7 +73,6 @@ def make_certificates(
 
 
 def _authority(folder: Path) -> tuple[EllipticCurvePrivateKey, x509.Certificate]:
-    """The authority's key and certificate, made where there are none."""
     certificate_file, key_file = folder / CA, folder / CA_KEY
     missing = [file.name for file in (certificate_file, key_file) if not file.exists()]
     if len(missing) == 2:

@@ -212,7 +212,6 @@ class Stream:
         self._log.post_all()
 
     def _put_in_ring(self) -> None:
-        """Copy the image into the circular buffer, as the C library does."""
         after = int(self._header["ring_index"][0]) + 1
         index = after if after < self.layout.ring else 0
         image = self.data.reshape(-1).view(np.uint8)

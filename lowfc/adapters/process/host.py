@@ -171,7 +171,6 @@ def busiest_thread(process: int, seconds: float) -> int:
 
 
 def _run_ns(process: int) -> dict[int, int]:
-    """How long each thread of a process has run."""
     found = {}
     for folder in Path(f"/proc/{process}/task").iterdir():
         with contextlib.suppress(OSError):  # it has ended

@@ -131,6 +131,5 @@ def _remove(file: Path) -> None:
 
 
 def _probe(file: Path) -> None:
-    """Raise where `file` could not be written."""
     with tempfile.TemporaryFile(dir=file.parent):
         pass

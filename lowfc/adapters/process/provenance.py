@@ -77,7 +77,6 @@ def _blas() -> str:
 
 
 def _commit() -> str:
-    """Commit of the checkout that runs, where it is one and git is there."""
     checkout = Path(__file__).parents[3]
     git = shutil.which("git")
     if git is None or not (checkout / ".git").exists():

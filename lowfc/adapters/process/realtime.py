@@ -132,7 +132,6 @@ def give_way() -> None:
 
 
 def _ask(in_force: list[str], measures: Iterable[_Measure]) -> Granted:
-    """Ask the host for measures, beside those in force."""
     refused = []
     for name, measure, cost in measures:
         try:
@@ -187,7 +186,6 @@ def _lock_memory() -> None:
 
 
 def _capabilities() -> int:
-    """Effective capabilities of this process, as the kernel's bit mask."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith("CapEff:"):
             return int(line.split()[1], 16)

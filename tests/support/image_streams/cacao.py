@@ -33,7 +33,6 @@ REGION = 2
 
 
 def file_of(folder: Path, name: str) -> Path:
-    """File of a stream."""
     return folder / f"{name}.im.shm"
 
 
@@ -52,7 +51,6 @@ class Comb:
         threading.Thread(target=self.run, daemon=True).start()
 
     def look(self) -> None:
-        """Open channels that came; hold a semaphore of each."""
         for index in range(12):
             path = file_of(self.folder, f"{TOTAL}{index:02d}")
             if path.name not in self.channels and path.exists():
@@ -80,7 +78,6 @@ class Comb:
 
 
 def main() -> None:
-    """Run the bench until it is told to stop."""
     config, folder = load(Path(sys.argv[1])), Path(sys.argv[2])
     sys.setswitchinterval(1e-4)
     set_up(

@@ -23,7 +23,6 @@ class PlainStream:
     """A stream, mapped: `offset` of each part from sizes that are given, never from the header."""
 
     def __init__(self, path: Path, columns: int, rows: int, number: int, planes: int = 1, keywords: int = 0) -> None:
-        """Map a file that is there."""
         self.type, self.shape = np.dtype(NUMPY_TYPES[number]), (planes, rows, columns)
         self.file = os.open(path, os.O_RDWR)
         self.map = mmap.mmap(self.file, os.fstat(self.file).st_size)
@@ -84,31 +83,25 @@ class PlainStream:
         return stream
 
     def pack(self, form: str, offset: int, *values: object) -> None:
-        """Put values at a byte."""
         struct.pack_into(form, self.map, offset, *values)
 
     def get(self, form: str, offset: int) -> int:
-        """The value at a byte."""
         return struct.unpack_from(form, self.map, offset)[0]
 
     def semaphore(self, index: int) -> ctypes.c_void_p:
-        """Where one is."""
         return ctypes.c_void_p(self.address + self.semaphores + SEMAPHORE * index)
 
     def value(self, index: int) -> int:
-        """Of a semaphore."""
         value = ctypes.c_int()
         LIBC.sem_getvalue(self.semaphore(index), ctypes.byref(value))
         return value.value
 
     @property
     def count(self) -> int:
-        """Images written."""
         return self.get("<Q", 264)
 
     @property
     def pixels(self) -> npt.NDArray[np.generic]:
-        """Image as it is now."""
         elements = int(np.prod(self.shape))
         flat = np.frombuffer(self.map[self.data : self.data + elements * self.type.itemsize], self.type)
         return flat.reshape(self.shape)
@@ -134,15 +127,12 @@ class PlainStream:
                 self.pack("<i", self.writers + 4 * index, os.getpid())
 
     def write(self, image: npt.NDArray[np.generic], acquired_ns: int | None = None, plane: int = 0) -> None:
-        """Write an image."""
         self.begin(image, plane)
         self.end(acquired_ns)
 
     def take(self, index: int, pid: int | None = None) -> None:
-        """Hold a semaphore as a reader."""
         self.pack("<i", self.readers + 4 * index, os.getpid() if pid is None else pid)
 
     def wait(self, index: int, timeout_s: float) -> bool:
-        """Wait for an image."""
         end = struct.pack("@ll", *divmod(time.time_ns() + int(timeout_s * 1e9), 10**9))
         return LIBC.sem_timedwait(self.semaphore(index), ctypes.c_char_p(end)) == 0

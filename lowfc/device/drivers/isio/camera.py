@@ -109,7 +109,6 @@ class IsioCamera:
         self._reader.close()
 
     def _from_keywords(self, stream: Stream) -> dict[str, Any]:
-        """Settings by keywords of the stream."""
         found, said = stream.keywords(), dict[str, Any]()
         for setting, word in self._options.keywords.items():
             if isinstance(value := found.get(word), str):
