@@ -8,15 +8,12 @@ from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.bus.names import LARGEST_HEALTH_BYTES, LONGEST_NAME, MOST_NAMES, Names
 from lowfc.adapters.bus.start_check import StartCheck
 from lowfc.adapters.process.clock import SIMULATED_START_NS
-from lowfc.adapters.process.service import Service
 from lowfc.contract.envelope import Envelope, count_of, sequence_of, start_of
 from lowfc.contract.errors import BadMessageError, BusError
 from lowfc.contract.messages import (
-    EVENT,
     FRAME,
     HEALTH,
     MIRROR_STATE,
-    Log,
     Role,
     topic_of,
     wire,
@@ -24,6 +21,7 @@ from lowfc.contract.messages import (
 from lowfc.programs.launch.watch import Watch
 from lowfc.programs.view.snapshot import Accumulator
 from lowfc.testing.clock import FakeClock
+from lowfc.testing.listener import Listener
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 
 
@@ -149,22 +147,19 @@ def forge(hub: MemoryHub) -> Callable[[], None]:
 
 
 def test_forged_names_fill_no_process_and_are_one_event(hub: MemoryHub, forge: Callable[[], None]) -> None:
-    events: list[str] = []
-    MemoryBus(hub, "launcher", FakeClock()).subscribe(
-        EVENT, lambda sample: events.append(Log.FromString(sample.payload).message)
-    )
-    camera = Service("camera", "night", FakeClock(), MemoryBus(hub, "camera", FakeClock()))
+    heard = Listener(hub, FakeClock())
+    camera = heard.service("camera")
     forge()
-    Service("controller", "night", FakeClock(), MemoryBus(hub, "controller", FakeClock())).beat()
+    heard.service("controller").beat()
     camera.beat()
     assert len(camera.last_health) == MOST_NAMES + 1
     assert "controller" in camera.last_health
-    (event,) = (event for event in events if "BAD_MESSAGE" in event)
+    (event,) = heard.said("BAD_MESSAGE")
     assert event.startswith(f"BAD_MESSAGE {FORGED - MOST_NAMES} on lowfc/health/* could not be read")
 
 
 def test_a_process_that_returns_under_many_numbers_is_remembered_once(hub: MemoryHub) -> None:
-    camera = Service("camera", "night", FakeClock(), MemoryBus(hub, "camera", FakeClock()))
+    camera = Listener(hub, FakeClock()).service("camera")
     stranger = MemoryBus(hub, "operator", FakeClock()).publisher(HEALTH, "stranger")
     for number in range(FORGED):
         stranger.put(health(number))

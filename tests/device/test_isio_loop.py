@@ -96,17 +96,13 @@ class Bench:
 
     @contextmanager
     def listening(self) -> Iterator[None]:
-        bus = ZenohBus(open_run("bench").links, Role.OPERATOR, HostClock())
-
         def step(sample: Sample) -> None:
             self.errors_nm.append(list(wire.ControlStep.FromString(sample.payload).error_nm))
 
-        bus.subscribe(EVENT, lambda sample: self.events.append(Log.FromString(sample.payload).message))
-        bus.subscribe(STEP, step)
-        try:
+        with closing(ZenohBus(open_run("bench").links, Role.OPERATOR, HostClock())) as bus:
+            bus.subscribe(EVENT, lambda sample: self.events.append(Log.FromString(sample.payload).message))
+            bus.subscribe(STEP, step)
             yield
-        finally:
-            bus.close()
 
     def said(self, *words: str) -> bool:
         return any(all(word in event for word in words) for event in list(self.events))
@@ -118,10 +114,7 @@ class Bench:
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    runtime = tmp_path / "run"
-    runtime.mkdir(mode=0o700)
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
+def folder(tmp_path: Path, own_runtime: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("MILK_SHM_DIR", str(tmp_path))
     return tmp_path
 
