@@ -217,8 +217,8 @@ class GainBank:
 
     def _cross_talk_nm(self, tilts: list[Array]) -> list[Array]:
         """Cross-talk (modes,) of tip and tilt over these blocks: what is beyond doubt, and what may be."""
-        tilt = np.mean(tilts, axis=0)
-        return [self._of_own @ self._cross_talk.mean_nm(tilt, errors) for errors in (SURE, SUSPECTED)]
+        found, error = self._cross_talk.mean_nm(np.mean(tilts, axis=0))
+        return [self._of_own @ np.where(np.abs(found) > errors * error, found, 0) for errors in (SURE, SUSPECTED)]
 
     def _without(self, cross_talk_nm: Array) -> Array:
         """Mean squares (blocks, rows and the loop itself, modes) less the open loop's, nm^2, of what is there.
@@ -340,18 +340,17 @@ class TiltCrossTalk:
         """Frames without a measurement: no change over them is taken."""
         self._before = None
 
-    def mean_nm(self, tilt: Array, errors: float) -> Array:
-        """Mean of it (modes,), nm, over frames of this mean (regressors,); 0 where it is not beyond so many errors."""
+    def mean_nm(self, tilt: Array) -> tuple[Array, Array]:
+        """Mean of it and its standard error (modes,), nm, over frames of this mean (regressors,); 0 where unknown."""
         normal, right = self._products[:, :_REGRESSORS], self._products[:, _REGRESSORS:]
         if self._changes < 4 * _REGRESSORS or not np.all(np.diag(normal) > 0):
-            return np.zeros(right.shape[1])
+            return np.zeros(right.shape[1]), np.zeros(right.shape[1])
         scale = np.sqrt(np.diag(normal))
         inverse = np.linalg.pinv(normal / np.outer(scale, scale), rcond=1e-9) / np.outer(scale, scale)
         slopes = inverse @ right
         unexplained = np.maximum(self._powers - np.sum(slopes * right, axis=0), 0) / (self._changes - _REGRESSORS)
         squares = np.where(np.arange(_REGRESSORS) < 2, 0, tilt)
-        found, error = squares @ slopes, np.sqrt((squares @ inverse @ squares) * unexplained)
-        return np.where(np.abs(found) > errors * error, found, 0)
+        return squares @ slopes, np.sqrt((squares @ inverse @ squares) * unexplained)
 
 
 def _mean(blocks: Array) -> tuple[Array, Array]:

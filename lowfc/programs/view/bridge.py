@@ -126,8 +126,7 @@ class Bridge:
     def _add_earlier(self, render: RenderThread) -> None:
         """Add what was sent before this view received anything; in a thread, for a peer that is frozen answers late."""
         recorder = self.service.last_health.get(Role.RECORDER)
-        absent = time.monotonic() - self._began_s > _RECORDER_S
-        events_due = not self._past_known and (recorder is not None or absent)
+        events_due = not self._past_known and (recorder is not None or self._recorder_absent(time.monotonic()))
         self._past_known |= events_due
 
         def add() -> None:
@@ -137,10 +136,13 @@ class Bridge:
 
         threading.Thread(target=add, name="earlier", daemon=True).start()
 
+    def _recorder_absent(self, now_s: float) -> bool:
+        return now_s - self._began_s > _RECORDER_S
+
     def _check(self, now_s: float) -> None:
         render, viewer = self._render, self.viewer
         assert render is not None  # noqa: S101  # `_begin` made it
-        if self.service.newcomers() or (not self._past_known and now_s - self._began_s > _RECORDER_S):
+        if self.service.newcomers() or (not self._past_known and self._recorder_absent(now_s)):
             self._add_earlier(render)
         own_bytes, stuck_s = resident_bytes(), now_s - max(render.drawn_s, self._awake_s)
         viewer_bytes = viewer.resident_bytes() if viewer is not None else 0
