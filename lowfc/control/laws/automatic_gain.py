@@ -218,7 +218,8 @@ class GainBank:
     def _cross_talk_nm(self, tilts: list[Array]) -> list[Array]:
         """Cross-talk (modes,) of tip and tilt over these blocks: what is beyond doubt, and what may be."""
         found, error = self._cross_talk.mean_nm(np.mean(tilts, axis=0))
-        return [self._of_own @ np.where(np.abs(found) > errors * error, found, 0) for errors in (SURE, SUSPECTED)]
+        taken: list[Array] = [np.where(np.abs(found) > errors * error, found, 0) for errors in (SURE, SUSPECTED)]
+        return [self._of_own @ one for one in taken]
 
     def _without(self, cross_talk_nm: Array) -> Array:
         """Mean squares (blocks, rows and the loop itself, modes) less the open loop's, nm^2, of what is there.

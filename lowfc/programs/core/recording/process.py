@@ -1,6 +1,7 @@
 """The recorder's process: joins a run, and records it until it is stopped."""
 
 from collections.abc import Callable
+from collections.abc import Set as AbstractSet
 from pathlib import Path
 
 from lowfc.adapters.bus.run import Run
@@ -69,7 +70,7 @@ def record(
             granted=granted,
             selection=selection,
             expected_bytes_per_s=expected_bytes_per_s,
-            silent_peers=int(Role.LAUNCHER in run.links.ports),
+            awaited=_launched(run),
         )
         recorder.catch_signals()
         recorder.service.announces = True
@@ -77,6 +78,12 @@ def record(
         return recorder.run()
     finally:
         bus.close()
+
+
+def _launched(run: Run) -> AbstractSet[str]:
+    """The processes that a launcher starts beside the recorder; it sends no Health itself."""
+    ports = run.links.ports.keys()
+    return ports - {Role.LAUNCHER, Role.RECORDER} if Role.LAUNCHER in ports else frozenset()
 
 
 def _attached(path: Path, media_type: str) -> Attachment:

@@ -8,6 +8,7 @@ import signal
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -59,13 +60,13 @@ class Recorder:
         granted: Granted = NOTHING,
         selection: Selection = EVERYTHING,
         expected_bytes_per_s: float = 0.0,
-        silent_peers: int = 0,
+        awaited: AbstractSet[str] = frozenset(),
     ) -> None:
         """Subscribe to everything; `run` begins to record, each log with `metadata` and `attachments` first.
 
-        Of the processes on the bus, `silent_peers` never publish Health.
+        It begins once each of the `awaited` processes, or of those on the bus, has sent Health, or after a while.
         """
-        self._silent_peers = silent_peers
+        self._awaited = awaited
         self._bus = bus
         self._clock = clock
         self._backlog = Backlog(QUEUE_MESSAGES, QUEUE_BYTES)
@@ -126,15 +127,16 @@ class Recorder:
         self.service.stop(signal.Signals(number).name)
 
     def _settle(self) -> None:
-        """Wait for a Health of each process that is there already, so that it can be queried."""
+        """Wait for a Health of each process that is there already or is awaited, so that it can be queried."""
         begun_s = time.monotonic()
         shortest_s, longest_s = _SETTLE_S
         while self.service.running:
             self.service.beat()
             time.sleep(_TURN_S)
             age_s = time.monotonic() - begun_s
-            heard = len(self.service.last_health) + self._silent_peers
-            if age_s >= longest_s or (age_s >= shortest_s and heard >= self._bus.peers()):
+            heard = self.service.last_health.keys()
+            all_there = self._awaited <= heard if self._awaited else len(heard) >= self._bus.peers()
+            if age_s >= longest_s or (age_s >= shortest_s and all_there):
                 return
 
     def _begin(self, *, anew: bool = True) -> None:
