@@ -141,6 +141,7 @@ LOGS = (
 
 
 @pytest.mark.exclusive
+@pytest.mark.slow
 def test_the_loop(tmp_path: Path) -> None:
     assert "frame to command" in run(tmp_path, LOOP)
     assert len(list((tmp_path / "logs").glob("*.mcap"))) == 1
@@ -169,7 +170,8 @@ def test_the_requests(tmp_path: Path, own_runtime: Path) -> None:
 
 
 @pytest.mark.exclusive
-@pytest.mark.parametrize("recorder", [BY_HAND[3], pytest.param(FEWER, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("recorder", [BY_HAND[3], FEWER])
 def test_the_processes_by_hand(tmp_path: Path, recorder: str) -> None:
     with going_on(tmp_path, *BY_HAND[:3], recorder) as complaints:
         status = [sys.executable, "-m", "lowfc", "ctl", "status", "--run", "bench"]
@@ -247,6 +249,7 @@ def test_the_logs(tmp_path: Path) -> None:
     assert {path.suffix for path in (tmp_path / "logs").iterdir()} == {".mcap", ".html", ".fits"}
 
 
+@pytest.mark.slow
 def test_the_configuration(tmp_path: Path) -> None:
     for line in FILES[:-1]:
         told(tmp_path, line)

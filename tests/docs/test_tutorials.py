@@ -1,4 +1,4 @@
-"""Tutorials: every command of each page, in its order; here in short forms, whole as slow tests.
+"""Tutorials: every command of each page, in its order; the first page in a short form too, the others as slow tests.
 
 Commands of a loop in real time, and of views, are run by the tests that `test_docs` names.
 """
@@ -14,12 +14,6 @@ from tests.support.loops import command, going_on, interrupt, recorded_bytes, st
 
 ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "tutorials"
-SHORTER = {
-    "--duration 20": "--duration 0.5",
-    "--duration 10": "--duration 4.5",
-    "--duration 4": "--duration 0.2",
-    "--steps 40": "--steps 2",
-}
 LIVE = (
     "lowfc sim-loop --run night --open --star-magnitude 0",
     "lowfc calibrate --run night --method hadamard --snr 20 --out night.fits",
@@ -34,8 +28,6 @@ _LIVE = re.compile(
     r"--run |--web|--compare|^lowfc sim-loop --rate|--config lowfc|spc|--steps 200"
 )
 _ALONE = re.compile(r"lowfc (?!sim-loop)")
-_ONE_MORE = re.compile(r"lowfc sim-loop (--sensor clowfs )?--lockstep --duration 4")
-"""The loop of a mask that was made, with other sensors."""
 
 
 def followed_here(line: str) -> bool:
@@ -43,20 +35,18 @@ def followed_here(line: str) -> bool:
     return not _LIVE.search(line)
 
 
-def followed(folder: Path, page: str, *, whole: bool = False) -> dict[str, str]:
-    """What each command of a page prints, run in its order in this folder."""
+def followed(folder: Path, page: str, *, shorter: bool = False) -> dict[str, str]:
+    """What each command of a page prints, run in its order in this folder; only loops as processes of their own."""
     text = (PAGES / f"{page}.md").read_text()
     for name, content in re.findall(r"Save this as `(\S+)`.*?```\w+\n(.*?)```", text, re.DOTALL):
         (folder / name).write_text(content)
-    said = {}
+    printed = {}
     for found in re.findall(r"^    (\S.*)$", text, re.MULTILINE):
         line = found.split("  #")[0].strip()
-        if not followed_here(line) or (_ONE_MORE.match(line) and not whole):
-            continue
-        short = re.sub(r"--\w+ \d+\b", lambda found: SHORTER.get(found[0], found[0]), line)
-        here = _ALONE.match(line) and not whole
-        said[line] = told(folder, short) if here else command(folder, line if whole else short)
-    return said
+        if followed_here(line):
+            short = line.replace("--duration 20", "--duration 0.5") if shorter else line
+            printed[line] = (told if _ALONE.match(line) else command)(folder, short)
+    return printed
 
 
 def tilt_mas(summary: str) -> float:
@@ -64,9 +54,9 @@ def tilt_mas(summary: str) -> float:
     return float(re.findall(r"tilt per axis +(\S+) mas", summary)[0])
 
 
-@pytest.mark.parametrize("whole", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_first_loop(tmp_path: Path, whole: bool) -> None:
-    first, info, report, replay, what_if, digest = followed(tmp_path, "first_loop", whole=whole).values()
+@pytest.mark.parametrize("shorter", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_first_loop(tmp_path: Path, shorter: bool) -> None:
+    first, info, report, replay, what_if, digest = followed(tmp_path, "first_loop", shorter=shorter).values()
     assert "frame to command" in first
     assert "lowfc/camera/frame" in info
     assert ".html" in report
@@ -75,21 +65,19 @@ def test_first_loop(tmp_path: Path, whole: bool) -> None:
     assert "digest " in digest
 
 
-@pytest.mark.parametrize("whole", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_tuned_law(tmp_path: Path, whole: bool) -> None:
-    computed, integrator, tuned, law = followed(tmp_path, "tuned_law", whole=whole).values()
+@pytest.mark.slow
+def test_tuned_law(tmp_path: Path) -> None:
+    computed, integrator, tuned, law = followed(tmp_path, "tuned_law").values()
     assert "computed.fits" in computed
     assert "written: lqg.fits" in tuned
-    assert tilt_mas(law) < 0.7 * tilt_mas(integrator)
-    if whole:  # the page's figures
-        assert (tilt_mas(integrator), tilt_mas(law)) == pytest.approx((3.1, 1.2), rel=0.15)
+    assert (tilt_mas(integrator), tilt_mas(law)) == pytest.approx((3.1, 1.2), rel=0.15), "the page's figures"
 
 
-@pytest.mark.parametrize("whole", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_design_mask(tmp_path: Path, whole: bool) -> None:
-    design, *flown = followed(tmp_path, "design_mask", whole=whole).values()
+@pytest.mark.slow
+def test_design_mask(tmp_path: Path) -> None:
+    design, *flown = followed(tmp_path, "design_mask").values()
     assert "written to mask.json" in design
-    assert len(flown) == (3 if whole else 1)
+    assert len(flown) == 3
     assert all("frame to command" in one for one in flown)
 
 

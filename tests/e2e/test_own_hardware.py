@@ -26,7 +26,7 @@ pytestmark = pytest.mark.exclusive
 ROOT = Path(__file__).parents[2]
 BENCH = """
 [camera]
-rate_hz = 100
+rate_hz = 250
 
 [disturbance]
 preset = "quiet"

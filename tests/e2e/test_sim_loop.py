@@ -21,7 +21,6 @@ from tests.support.loops import (
     FIXED,
     LOWFC,
     children,
-    interrupt,
     loop,
     lowfc,
     payloads,
@@ -125,9 +124,17 @@ def test_an_independent_reader_agrees(live: dict[str, Any], topics: dict[str, li
     assert "lowfc" in found["metadata"]
 
 
-def test_a_process_that_dies_is_named(tmp_path: Path) -> None:
+def test_a_signal_makes_the_loop_safe_and_a_process_that_dies_is_named(tmp_path: Path) -> None:
+    """The documented pattern finds the controller, and the log has the signal as a request."""
+    pattern = re.search(r"pkill -USR1 -f '(.*)'", SIGNAL)
     process = start(tmp_path, "sim-loop", "--rate", "200", "--duration", "60")
     until(lambda: recorded_bytes(tmp_path) > 4e6)
+    controller = children(process.pid)["controller"]
+    command = Path(f"/proc/{controller}/cmdline").read_text().replace("\0", " ")
+    assert re.search(pattern[1], command)
+    assert not re.search(pattern[1], f"bash -c {command}")
+    os.kill(controller, signal.SIGUSR1)
+    until(lambda: "in safe mode" in lowfc("ctl", "status").stdout)
     os.kill(children(process.pid)["sim_dm"], signal.SIGKILL)
     said, complaints = process.communicate(timeout=30)
     assert process.returncode == 1
@@ -136,6 +143,10 @@ def test_a_process_that_dies_is_named(tmp_path: Path) -> None:
     assert "Traceback" not in complaints
     (log,) = (tmp_path / "logs").glob("*.mcap")  # it is finished all the same
     assert complaints.endswith(f"recorded until then: logs/{log.name}\n")
+    recorded = payloads(log)
+    assert recorded["/lowfc/camera/frame"]
+    asked = [wire.Request.FromString(payload) for payload in recorded["/lowfc/control/request"]]
+    assert [(one.name, one.text, one.accepted) for one in asked if one.name == "safe"] == [("safe", "SIGUSR1", True)]
 
 
 @pytest.mark.slow
@@ -173,26 +184,3 @@ def test_a_disk_that_refuses_ends_the_recording_and_nothing_else(tmp_path: Path)
     assert figures["frames_published"] == 200
     assert figures["frames_processed"] + figures["frames_skipped"] == 200
     assert sum(figures["lost"].values()) == figures["messages_lost"] > 100
-
-
-def test_a_signal_makes_the_loop_safe_where_nobody_can_ask_any_more(tmp_path: Path) -> None:
-    """The documented pattern finds the controller, the log has the signal as a request; Ctrl-C ends with a summary."""
-    pattern = re.search(r"pkill -USR1 -f '(.*)'", SIGNAL)
-    process = start(tmp_path, "sim-loop", "--disturbance", "quiet")
-    try:
-        until(lambda: recorded_bytes(tmp_path) > 4e6)
-        controller = children(process.pid)["controller"]
-        command = Path(f"/proc/{controller}/cmdline").read_text().replace("\0", " ")
-        assert re.search(pattern[1], command)
-        assert not re.search(pattern[1], f"bash -c {command}")
-        os.kill(controller, signal.SIGUSR1)
-        until(lambda: "in safe mode" in lowfc("ctl", "status").stdout)
-    finally:
-        said, complaints = interrupt(process)
-    assert process.returncode == 0, complaints
-    assert "frame to command" in said
-    (log,) = (tmp_path / "logs").glob("*.mcap")
-    recorded = payloads(log)
-    assert recorded["/lowfc/camera/frame"]
-    asked = [wire.Request.FromString(payload) for payload in recorded["/lowfc/control/request"]]
-    assert [(one.name, one.text, one.accepted) for one in asked if one.name == "safe"] == [("safe", "SIGUSR1", True)]

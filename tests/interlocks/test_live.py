@@ -12,12 +12,12 @@ from lowfc.adapters.logs.reader import LogReader
 from lowfc.client import Client, running
 from lowfc.contract.errors import BusError, RequestRefusedError
 from lowfc.contract.messages import BENCH, CONTROL_INPUT, FRAME, STEP, wire
-from tests.support.loops import FIXED, interrupt, run, start, until
+from tests.support.loops import FIXED, interrupt, start, told, until
 
-FLIPS = 100
+FLIPS = 60
 MAX_AGE_S = 1
 FLOOD_HZ = 2000
-FLOOD_S = 2
+FLOOD_S = 1
 S = 1_000_000_000
 CONFIG = f"""
 [camera]
@@ -57,7 +57,7 @@ def test_flipped_flooded_and_silent_interlocks(tmp_path: Path) -> None:
     assert figures["frames_missing"] == figures["messages_lost"] == 0
     assert figures["frames_skipped"] <= 3, "the host stands still now and then, a flood would cost hundreds"
     log = tmp_path / figures["log"]
-    replayed = json.loads(run(tmp_path, "replay", "--json", str(log)).stdout)
+    replayed = json.loads(told(tmp_path, f"lowfc replay --json {log}"))
     assert replayed["identical"]
     assert replayed["unchecked"] == 0
     _steps_follow_what_was_taken(log)
