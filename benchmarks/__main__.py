@@ -14,9 +14,7 @@ BENCHMARKS = {
     "step": "benchmarks.step",
     "curves": "benchmarks.curves",
     "kernels": "benchmarks.kernels",
-    "streams": "benchmarks.streams",
     "throughput": "benchmarks.throughput",
-    "view": "benchmarks.view",
     "peers": "benchmarks.peers.contest",
 }
 

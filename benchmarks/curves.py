@@ -46,19 +46,11 @@ _LOOP = ("frame_to_command_us", "echo_us")
 
 
 def step_figures(size: Size, seconds: float) -> Result:
-    """The control step of that size, and beside it what it cannot do without.
+    """The control step of that size, and beside it what it cannot do without, each done over and over for so long.
 
-    Args:
-        size: of the calibration and the frames.
-        seconds: for which each of the three is done over and over.
-
-    Returns:
-        step_us, stream_us (as many bytes as `Size.bytes` read once, by the dot product of one half with the other: of
-        NumPy's sum, max, copy and products the fastest reader) and products_us (R with a frame, the modes' shapes with
-        a command); each p50, p99 and cpu.
-
-    Raises:
-        RuntimeError: the step did not go its usual way.
+    stream_us is of as many bytes as `Size.bytes`, read once by the dot product of one half with the other (of NumPy's
+    sum, max, copy and products the fastest reader), products_us of R with a frame and the modes' shapes with a command.
+    RuntimeError: the step did not go its usual way.
     """
     config = configuration(size, RATE_HZ)
     calibration, frames = made_up(size, config)
@@ -93,16 +85,9 @@ def timed(work: Callable[[], object], seconds: float) -> dict[str, float]:
 
 
 def loop_figures(size: Size, rate_hz: float, seconds: float) -> Result:
-    """The loop of that size, and a bare echo of its messages.
+    """The loop of that size and half a round trip of a bare echo of its messages; or failure, what was wrong.
 
-    Args:
-        size: of the calibration and the frames.
-        rate_hz: of the frames.
-        seconds: for how long.
-
-    Returns:
-        frame_to_command_us (p50 and p99; cpu: the controller's, for each frame), echo_us (p50 and p99 of half a round
-        trip), frames and frames_without_command; or failure, what was wrong.
+    cpu is the controller's, for each frame.
     """
     try:
         with watched(os.getpid()) as moments:
@@ -131,13 +116,7 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, tell: Tell) -> Result:
-    """Measure every point of every curve, the repeats around all of them.
-
-    Returns:
-        curves, of each its points: pixels, modes, actuators, bytes, and of `step_figures` and `loop_figures` the
-        medians over the repeats, `spread` with the lowest and highest p50; default, seconds, repeats, rate_hz (None
-        without the loop) and failed.
-    """
+    """Measure every point of every curve, the repeats around all of them; rate_hz is None without the loop."""
     curves = {name: [Size(**{field: n}) for n in getattr(options, name)] for name, (_, field, _) in AXES.items()}
     sizes = list(dict.fromkeys(size for curve in curves.values() for size in curve))
     if not sizes:
@@ -160,7 +139,7 @@ def measure(options: argparse.Namespace, tell: Tell) -> Result:
 
 
 def point(size: Size, repeats: Sequence[Result]) -> Result:
-    """One point of a curve from its repeats."""
+    """One point of a curve: medians over the repeats of what they measured, and the lowest and highest p50."""
     made: Result = {name: getattr(size, name) for name in ("pixels", "modes", "actuators", "bytes")} | asdict(size)
     for name in (*_STEP, *_LOOP):
         if each := [repeat[name] for repeat in repeats if name in repeat]:

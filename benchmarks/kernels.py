@@ -30,17 +30,11 @@ PRODUCT, STREAM = "product", "memory"
 def options(parser: argparse.ArgumentParser) -> None:
     """The sizes, for how long, and how often."""
     add_times(parser, seconds=0.3, repeats=9)
-    parser.add_argument(
-        "--pixels", type=int, nargs="+", default=SIDES, metavar="N", help="across the frame %(default)s"
-    )
+    parser.add_argument("--pixels", type=int, nargs="+", default=SIDES, metavar="N", help="across %(default)s")
 
 
 def measure(options: argparse.Namespace, tell: Tell) -> Result:
-    """Measure in turns.
-
-    Returns:
-        sizes: of each pixels, modes, actuators, turns (p50 in us of numpy, fused, product and memory) and ratios.
-    """
+    """Measure in turns: of each size the p50 in us of numpy, fused, product and memory, turn by turn, and ratios."""
     set_up(None, None, lock_memory=False, disable_cpu_idle=False)
     found = []
     for side in options.pixels:

@@ -78,15 +78,9 @@ def _moment(pid: int) -> Moment:
 
 
 def shares(moments: Sequence[Moment], seconds: float) -> dict[str, Result]:
-    """What each role used while the loop went on: over the last four fifths of it, before its processes ended.
+    """What each role used over the last four fifths of so many seconds of frames, before its processes ended.
 
-    Args:
-        moments: in the order of time.
-        seconds: for how long frames came.
-
-    Returns:
-        By role: share (of one processor, all threads), processors (on which it may run) and mb (of memory); nothing
-        where fewer than two moments fall into that time.
+    share is of one processor, all threads; nothing is known where fewer than two moments fall into that time.
     """
     complete = [moment for moment in moments if moment.roles.keys() >= LOOP][:-1]
     inside = [moment for moment in complete if moment.at_s >= complete[-1].at_s - _PART * seconds]
@@ -111,11 +105,7 @@ def role_of(words: Sequence[str]) -> str | None:
 
 
 def run_lowfc(words: Sequence[str], seconds: float) -> dict[str, Any]:
-    """Run `lowfc` with these words and `--json` for so long, in a folder of its own.
-
-    Returns:
-        What it prints, and usage (`shares` of its processes); or failure, the last line that it wrote.
-    """
+    """What `lowfc` with these words prints by `--json`, and usage (`shares`); or failure, the last that it wrote."""
     command = [sys.executable, "-P", "-m", "lowfc", *words, "--duration", f"{seconds:g}", "--json"]
     patience_s = _START_S + _SLOWEST * seconds
     with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile("w+") as stderr:

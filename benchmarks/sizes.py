@@ -33,13 +33,7 @@ _LEAK = 0.01  # nothing answers to the mirror: without it, noise would add up
 
 @dataclass(frozen=True, slots=True)
 class Size:
-    """One point of a curve.
-
-    Attributes:
-        side: pixels across the frame.
-        modes: how many.
-        mirror_side: actuators across the mirror.
-    """
+    """One point of a curve: pixels across the frame, modes, actuators across the mirror."""
 
     side: int = 80
     modes: int = 20
@@ -121,11 +115,7 @@ def laid_out(size: Size, config: Configuration) -> Iterator[Run]:
 
 
 def run_loop(size: Size, config: Configuration, seconds: float) -> dict[str, Any]:
-    """Run the loop of that size once, and then a bare echo of its messages; one repeat's figures of `run_repeats`.
-
-    Raises:
-        LowfcError: a process of the loop ended by itself, or reported nothing.
-    """
+    """Run the loop of that size once, and then a bare echo of its messages; one repeat's figures of `run_repeats`."""
     with laid_out(size, config) as run:
         (found,) = run_repeats(Asked(config, seconds, 1), run, lambda _: None)
     return found

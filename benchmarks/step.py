@@ -53,12 +53,7 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, tell: Tell) -> Result:
-    """Time the stages.
-
-    Returns:
-        hot_us and paced_us (percentiles by stage), over_product (the whole step over the product, p50, of both), memory
-        (see `allocated`), rate_hz and granted.
-    """
+    """Time the stages: percentiles by stage, and the whole step over the product; back to back and paced."""
     size = Size()
     config = configuration(size, RATE_HZ)
     calibration, frames = made_up(size, config)
@@ -79,12 +74,7 @@ def measure(options: argparse.Namespace, tell: Tell) -> Result:
 
 
 def allocated(step: ControlStep, payloads: Payloads) -> dict[str, float]:
-    """What a step takes of memory after the first few.
-
-    Returns:
-        peak_bytes of a step over what is there before it, kept_bytes a step on average, and frame_bytes: of one frame
-        in float32, for comparison.
-    """
+    """What a step takes after the first few, bytes: its peak, what it keeps on average, and a float32 frame's."""
     for number in range(_WARM_UP):
         step(payloads.at(number, number))
     tracemalloc.start()

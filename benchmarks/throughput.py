@@ -44,11 +44,7 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, tell: Tell) -> Result:
-    """Look for the highest rate of each loop.
-
-    Returns:
-        loops (of each what `find` returns), seconds and rates_hz.
-    """
+    """Look for the highest rate of each loop: loops (of each what `find` returns), seconds and rates_hz."""
     if not (0 < options.lowest <= options.highest and options.step > 1):
         raise ConfigurationError("--lowest must be above 0 and at most --highest, and --step above 1")
     rates = grid(options.lowest, options.highest, options.step)
@@ -60,17 +56,9 @@ def measure(options: argparse.Namespace, tell: Tell) -> Result:
 
 
 def run_once(words: Sequence[str], rate_hz: float, seconds: float) -> Result:
-    """Run a loop once.
+    """Run a loop once with these options of `lowfc latency`; failure, where it failed, is the last that it wrote.
 
-    Args:
-        words: options of `lowfc latency`; see `LOOPS`.
-        rate_hz: asked for.
-        seconds: of frames.
-
-    Returns:
-        asked_hz, rate_hz, frames, without_command, messages_lost (None without a recorder), frame_to_command_us (p50,
-        p99), commands_late (part of them all, of a simulated camera), usage (see `shares`); or failure, the last that
-        the command wrote.
+    messages_lost is None without a recorder, commands_late the part of all commands, of a simulated camera alone.
     """
     found = run_lowfc(["latency", *words, "--rate", f"{rate_hz:g}"], seconds)
     if "failure" in found:
@@ -121,11 +109,10 @@ def search(sustains: Callable[[int], bool], count: int) -> int:
 
 
 def find(words: Sequence[str], rates: Sequence[float], seconds: float, tell: Tell) -> Result:
-    """Look for the highest rate of one loop.
+    """Look for the highest rate of one loop; None where not even the lowest is sustained.
 
-    Returns:
-        command, highest_hz (None where not even the lowest is sustained), run (a sustained one there), above (a run
-        that was not, one step faster; None where the grid ends), compared (a run at `COMPARED_HZ`) and all runs.
+    run is a sustained one there, above one that was not, one step faster (None where the grid ends), compared one at
+    `COMPARED_HZ`.
     """
     command = shlex.join(["lowfc", "latency", *words])
     runs: list[Result] = []

@@ -89,12 +89,7 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, tell: Tell) -> Result:
-    """Hold the contest.
-
-    Returns:
-        runs, of each contestant the figures of every turn (see `figures`), None where it failed; missing, why who could
-        not take part; rules, priority, granted, refused, pinned_to, versions and failed.
-    """
+    """Hold the contest: of each contestant the figures of every turn, None where it failed, and why who is missing."""
     chosen = [one for one in CONTESTANTS if any(word in one.name for word in options.only or [""])]
     if not chosen:
         raise ConfigurationError(f"--only: none of {'; '.join(one.name for one in CONTESTANTS)}")
@@ -126,12 +121,7 @@ def measure(options: argparse.Namespace, tell: Tell) -> Result:
 
 
 def one_run(contestant: Contestant, rules: argparse.Namespace, priority: int) -> dict[str, Any]:
-    """Run one contestant once; figures as `figures` makes them.
-
-    Raises:
-        ContestError: it did not start, did not come to its end, or made no command at all.
-        LowfcError: the same of lowfc's loop.
-    """
+    """Run one contestant once; ContestError or LowfcError where it does not start or end, or makes no command."""
     if contestant.kernel:
         return _lowfc(contestant.kernel, rules, priority)
     frames = rules.warm_up + round(rules.seconds * rules.rate_hz)
@@ -155,12 +145,9 @@ def one_run(contestant: Contestant, rules: argparse.Namespace, priority: int) ->
 
 
 def figures(folder: Path, warm_up: int) -> dict[str, Any]:
-    """What the times of a run say, its first `warm_up` frames left out.
+    """What the times of a run say, its first `warm_up` frames left out; percentiles in us, None where none came.
 
-    Returns:
-        frames; without_command of them; sent_late, of them, more than a period after they were due; frame_to_command
-        and frame_to_mirror (until the actuators were there), each percentiles in us, None where none came; off, by what
-        part of the largest the last actuators differ from those of numpy, None where a command is missing.
+    off is by what part of the largest the last actuators differ from those of numpy, None where a command is missing.
     """
     due, published, commanded, received = (np.fromfile(folder / name, np.int64)[1:] for name in MARKS)
     off = _off(folder, commanded.size) if commanded.all() and received[-1] else None

@@ -29,17 +29,9 @@ class ContestError(Exception):
 
 @dataclass(frozen=True)
 class Contestant:
-    """One way to close the loop.
+    """One way to close the loop: what can be kept of a run, what protects the mirror, and may it be on other machines.
 
-    Attributes:
-        name: in the tables.
-        what: it is, in a sentence.
-        log: what of a run can be kept.
-        safety: what stands between a bad frame or a dead process and the mirror.
-        elsewhere: whether its processes may be on other machines.
-        roles: its processes in the order in which they start; the source's end is the end of a run.
-        program: that plays the roles: a module of this package, or the C chain.
-        kernel: lowfc's, which has no roles here.
+    Its roles are in the order in which they start; the source's end is the end of a run. lowfc has a kernel and none.
     """
 
     name: str
@@ -107,11 +99,7 @@ CONTESTANTS = (
 
 
 def program(contestant: Contestant, options: argparse.Namespace, folder: Path) -> list[str]:
-    """The program of a contestant's processes; the C chain is compiled into the folder.
-
-    Raises:
-        ContestError: it does not compile.
-    """
+    """The program of a contestant's processes; the C chain is compiled into the folder."""
     if contestant.program != CHAIN:
         python = options.pyrtcao if contestant.program == PYRTCAO else sys.executable
         return [python, "-m", f"{__package__}.{contestant.program}"]

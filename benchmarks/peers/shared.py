@@ -101,11 +101,8 @@ def go(folder: Path) -> None:
 class Problem:
     """Frames, and the matrices that make actuators of them, each a file of a run's folder.
 
-    Attributes:
-        frames: (frames, 80, 80) uint16, DN, sent in turn.
-        I0: (6400,) float32, DN, dark included.
-        R: (20, 6400) float32, nm per DN.
-        to_actuators: (1156, 20) float32, nm of surface per nm of wavefront.
+    frames (frames, 80, 80) uint16 and I0 (6400,), dark included: DN; R (20, 6400): nm per DN; to_actuators (1156, 20):
+    nm of surface per nm of wavefront.
     """
 
     def __init__(self, folder: Path) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import curves, kernels, load, runner, step, streams, throughput, view
+from benchmarks import curves, kernels, load, runner, step, throughput
 from benchmarks.peers import contest, contestants
 from benchmarks.peers.contestants import CONTESTANTS, FUSED
 from benchmarks.peers.shared import ACTUATORS, MARKS, NumpyStep, Problem
@@ -255,41 +255,6 @@ def test_processes_are_known_by_what_python_was_told_to_run() -> None:
     assert load.role_of(["python", "-m"]) is load.role_of([]) is None
 
 
-# A view
-
-
-def test_what_a_view_costs_is_a_ratio_pair_by_pair(monkeypatch: pytest.MonkeyPatch) -> None:
-    order: list[bool] = []
-
-    def run_lowfc(words: Sequence[str], seconds: float) -> dict[str, Any]:
-        web = "--web" in words
-        order.append(web)
-        us = {"p50": 100.0 * len(order) * (1 + web), "p99": 300.0}
-        usage = {"view": {"share": 0.25, "mb": 200.0}} if web else {}
-        lost = {"frames_published": 9, "frames_skipped": web, "frames_missing": 0, "messages_lost": 0}
-        return {"latency_us": dict.fromkeys(("frame_to_command", "frame_to_mirror"), us), "usage": usage, **lost}
-
-    monkeypatch.setattr(view, "run_lowfc", run_lowfc)
-    found = view.measure(Namespace(repeats=2, rate=1000.0, seconds=1.0), lambda _: None)
-    assert order == [False, True, True, False]
-    (lines,) = view.tables(found)
-    first, second, *_ = lines[1:]
-    assert first == ["frame to command p50", "250 (100 to 400)", "500 (400 to 600)", "2.750 (1.500 to 4.000)"]
-    assert second[3] == "1.000 (1.000 to 1.000)"
-    assert ["frames skipped", "0", "2", ""] in lines
-    assert "25.0 (25.0 to 25.0) % of one processor and 200 (200 to 200) MB" in view.about(found)
-
-
-@pytest.mark.exclusive
-@pytest.mark.slow
-def test_the_view_that_is_measured_is_a_real_one() -> None:
-    found = view.measure(Namespace(repeats=1, rate=200.0, seconds=3.0), lambda _: None)
-    ((without, with_),) = ([pair["without"], pair["with"]] for pair in found["pairs"])
-    assert "view" not in without["usage"]
-    assert with_["usage"]["view"]["mb"] > 50
-    assert with_["frames_published"] == without["frames_published"] == 600
-
-
 # The contest
 
 
@@ -410,38 +375,3 @@ def test_kernels_are_measured_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:
     (lines,) = kernels.tables(found)
     assert len(lines) == 6
     assert "product" in kernels.about(found)
-
-
-# Streams
-
-
-def test_streams_and_the_direct_link_are_compared_turn_by_turn(monkeypatch: pytest.MonkeyPatch) -> None:
-    order: list[str] = []
-
-    def one_run(rate_hz: float, seconds: float, name: str) -> dict[str, Any]:
-        order.append(name)
-        span = one(100.0 * len(order), 1000.0)["frame_to_command"]
-        spans = dict.fromkeys(("frame_to_command", "frame_to_mirror", "stream_to_camera"), span)
-        return spans | {"frames": 500, "without_command": int(name != streams.DIRECT)}
-
-    monkeypatch.setattr(streams, "one_run", one_run)
-    found = streams.measure(Namespace(repeats=2, rate_hz=1000.0, seconds=1.0), lambda _: None)
-    assert order[:3] == order[:2:-1] == [streams.DIRECT, streams.BETWEEN, streams.READ]
-    (lines,) = streams.tables(json.loads(json.dumps(found)))
-    found_p50 = [line["frame to mirror, us: p50"] for line in by_heading(lines)]
-    assert found_p50[:3] == ["350 (100 to 600)", "350 (200 to 500)", "350 (300 to 400)"]
-    assert found_p50[3:] == ["1.42 (0.83 to 2.00)", "1.83 (0.67 to 3.00)"]
-    _, between, _, ratio, _ = by_heading(lines)
-    assert (between["without a command"], ratio["frame to command, us: p99"]) == ("2 of 1000", "1.00 (1.00 to 1.00)")
-    assert "350 (200 to 500) us (p50)" in streams.about(found)
-    assert "350 (300 to 400) where the controller" in streams.about(found)
-
-
-@pytest.mark.exclusive
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [streams.BETWEEN, streams.READ])
-def test_a_loop_by_streams_is_really_run(name: str) -> None:
-    found = streams.one_run(200.0, 1.0, name)
-    assert found["frames"] == pytest.approx(200, abs=10)
-    assert found["without_command"] < found["frames"]
-    assert 0 < found["stream_to_camera"]["p50"] < found["frame_to_command"]["p50"] < found["frame_to_mirror"]["p50"]

@@ -44,11 +44,7 @@ class BenchValues:
 
 
 class _Slot:
-    """The newest value under one name.
-
-    Attributes:
-        due_ns: time from which on it is too old for the next of its interlocks.
-    """
+    """The newest value under one name; from `due_ns` on it is too old for the next of its interlocks."""
 
     def __init__(self, service: Service, name: str, ages_ns: list[int]) -> None:
         self.name = name

@@ -64,18 +64,11 @@ class _Group:
 class GainWatch:
     """Follows the steps of one controller; no part of what a step depends on.
 
-    Attributes:
-        closing_harm: what closing at the present gains would add, as a sentence; empty where nothing, or once closed.
+    `closing_harm` is what closing at the present gains would add, as a sentence; empty where nothing, or once closed.
     """
 
     def __init__(self, settings: Settings, on_harm: str, contrast: Array | None = None) -> None:
-        """Watch a loop of these settings.
-
-        Args:
-            settings: The controller's.
-            on_harm: As `control.on_harm`.
-            contrast: (modes, modes) form of what the modes add to the dark zone, per nm^2, where it is known.
-        """
+        """Watch a loop; `contrast` (modes, modes) is what the modes add to the dark zone, per nm^2, where known."""
         self._settings, self._on_harm, self._contrast = settings, on_harm, contrast
         self._groups: list[_Group] = []
         self._of: tuple[object, ...] = ()

@@ -28,11 +28,7 @@ LIKENESS = 0.5
 
 
 def check_files(config: Configuration) -> None:
-    """Open every file that a configuration names.
-
-    Raises:
-        ConfigurationError: one line for each that is missing, damaged or does not fit.
-    """
+    """Open every file that a configuration names; ConfigurationError has a line for each that cannot be used."""
     checks: tuple[Callable[[Configuration], object], ...] = (
         lambda config: factory.sensor(config, lambda _: None),
         active_actuators,
@@ -50,11 +46,7 @@ def check_files(config: Configuration) -> None:
 
 
 def law(config: Configuration) -> LinearLaw | None:
-    """The law of `control.law`, which suits the loop; None for the integrator.
-
-    Raises:
-        ConfigurationError: the file cannot be used, or the law is of another delay or rate, or not stable here.
-    """
+    """The law of `control.law`, which suits the loop; None for the integrator."""
     file = config.control.law
     if not file:
         return None
@@ -90,11 +82,7 @@ class StartUp:
     """What a configuration puts on the mirror, and the law that it chooses."""
 
     def __init__(self, config: Configuration) -> None:
-        """Read the files.
-
-        Raises:
-            ConfigurationError: one cannot be used.
-        """
+        """Read the files."""
         self._file, self._flat_nm = config.mirror.flat, _flat_within_limits(config)
         self._law_file, self._law = config.control.law, law(config)
 
@@ -122,9 +110,6 @@ class StartUp:
         """Raise where a request was refused without which the loop would not be as configured.
 
         A shape that was adopted and cannot be taken apart stays one: what comes after is then not asked.
-
-        Raises:
-            ConfigurationError: the flat map or the law was refused.
         """
         if request.text == ADOPTED:
             return

@@ -21,11 +21,7 @@ Ask = Callable[[Put, Any], object]
 
 
 def protocol() -> Any:
-    """The package p4p, with what is used of it.
-
-    Raises:
-        ConfigurationError: it is not installed.
-    """
+    """The package p4p, with what is used of it; ConfigurationError where it is not installed."""
     try:
         import p4p
         import p4p.client.thread
@@ -40,19 +36,10 @@ def protocol() -> Any:
 
 
 class EpicsGateway:
-    """The server of the variables, and monitors of the PVs that become bench values.
-
-    Attributes:
-        bench: value of each bench variable that is connected and valid, by the name of the bench value.
-    """
+    """The server of the variables, and monitors of the PVs that become bench values, the valid ones in `bench`."""
 
     def __init__(self, config: Gateway, variables: Sequence[Variable], ask: Ask, changed: Callable[[], None]) -> None:
-        """Serve; `changed` is called after a change of `bench`, on another thread.
-
-        Raises:
-            ConfigurationError: p4p is not installed.
-            BusError: it cannot listen.
-        """
+        """Serve; `changed` is called after a change of `bench`, on another thread. BusError: it cannot listen."""
         p4p = protocol()
         self._variables, self.bench, self._changed = variables, dict[str, Value](), changed
         self._last: dict[str, Any] = {}

@@ -30,14 +30,9 @@ Put = Callable[[Client, Any], Answer]
 
 
 class Variable(NamedTuple):
-    """A variable.
+    """A variable; its name, in lower case, follows the gateway's prefix.
 
-    Attributes:
-        name: lower case, after the gateway's prefix.
-        unit: of its value; empty where it has none.
-        sentence: what it is, or what a put does.
-        read: its value of what was seen; None of a request that has nothing to show.
-        put: asks the controller for the value that was put; RequestRefusedError has the refusal. None: read only.
+    A request that has nothing to show has no `read`; what is read only has no `put`.
     """
 
     name: str

@@ -18,13 +18,7 @@ _PATIENCE_S = 0.2
 
 
 class Seen(NamedTuple):
-    """The run, now.
-
-    Attributes:
-        connected: the controller has been received lately; what is shown is not old.
-        frame: the newest one; None without a new one.
-        step: of the newest frame; None before the first.
-    """
+    """The run now: connected where the controller has been received lately; a frame only where it is new."""
 
     connected: bool
     state: wire.ControllerState

@@ -44,19 +44,9 @@ class ProcessDiedError(LowfcError):
 def sim_loop(
     config: Configuration, duration_s: float | None, record: bool, show: Show | None = None, name: str | None = None
 ) -> dict[str, Any]:
-    """Run the simulated loop for a time; return the summary that `--json` prints.
+    """Run the simulated loop for a time, or until Ctrl-C; return the summary that `--json` prints.
 
-    Args:
-        config: of the run.
-        duration_s: for so long; None until Ctrl-C.
-        record: write a log.
-        show: look at it, in a window or a browser; the loop goes on where the view ends.
-        name: of the run; a new one when None.
-
-    Raises:
-        BusError: a run of that name is there already.
-        ViewerError: there is no screen for the window.
-        ProcessDiedError: a process ended by itself; the text names it, the end of its output and the log.
+    The loop goes on where the view ends. ProcessDiedError: a process ended by itself; the text has its last words.
     """
     console = Console(stderr=True)
     require_screen(show)
@@ -87,11 +77,7 @@ def sim_loop(
 
 
 def _new_run(config: Configuration, name: str | None) -> Run:
-    """A run for this launcher alone; what a launcher that was killed has left of it is used again.
-
-    Raises:
-        BusError: a process of that run is there, or it was made by processes that were started by hand.
-    """
+    """A run for this launcher alone; what a launcher that was killed has left of it is used again."""
     run = open_run(name or new_run_id(), (config.mirror.name,), listeners=(Role.LAUNCHER,))
     if living := run.links.live():
         raise BusError(f"run {run.run_id!r} is running already ({', '.join(sorted(living))}): choose another name")

@@ -39,12 +39,7 @@ class ControlStep:
 
 
 class Alone(NamedTuple):
-    """Durations of what was timed alone, ns, one for each frame.
-
-    Attributes:
-        timer_ns: from the moment a sleep ought to end to the moment it did; empty without a schedule.
-        step_ns: of the control step.
-    """
+    """Durations of the control step alone, a frame each, and of how late sleeps ended; none without a schedule."""
 
     timer_ns: Long
     step_ns: Long

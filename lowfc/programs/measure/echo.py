@@ -85,14 +85,7 @@ def answer(run: RunId = DEFAULT_RUN, config: ConfigFile = None, seconds: Seconds
 
 
 def _ask(config: Configuration, run: Run, payloads: Payloads, seconds: float) -> Long:
-    """Send frames for a time, after the warm-up's, then an empty one.
-
-    Returns:
-        Round trips after the warm-up, -1 for an answer lost.
-
-    Raises:
-        BusError: nobody came to answer.
-    """
+    """Send frames for a time, after the warm-up's, then an empty one; round trips, -1 for an answer lost."""
     clock = HostClock()
     put_ns: list[int] = []
     round_trip_ns: list[int] = []

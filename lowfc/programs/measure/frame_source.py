@@ -111,11 +111,7 @@ class Source:
         self._sequence, self._put_ns, self._due_ns = array("Q"), array("q"), array("q")
 
     def run(self, seconds: float, wait_for: tuple[str, ...], folder: Path) -> None:
-        """Wait for those named, send, and write what was sent into `folder`.
-
-        Raises:
-            BusError: somebody did not come.
-        """
+        """Wait for those named, send, and write what was sent into `folder`."""
         service = self._service
         service.state = "ready"
         service.meet(wait_for, _WAIT_S, "no frame is sent without")

@@ -8,11 +8,7 @@ from lowfc.contract.messages import HEALTH, TOPICS, wire
 
 
 class Peers:
-    """Processes by their last Health, and the newest of each calibration and state, received or queried.
-
-    Attributes:
-        kept: calibrations and states by key, with which a log begins.
-    """
+    """Processes by their last Health, and `kept`: the newest of each calibration and state, with which a log begins."""
 
     def __init__(self, bus: Bus) -> None:
         self.kept: dict[str, Sample] = {}
@@ -57,10 +53,9 @@ class Peers:
         self._newcomers = True
 
     def query_meanwhile(self, *, more: bool) -> list[Sample]:
-        """Query where a process is new, unless no `more` is wanted: in a thread, for a frozen process answers late.
+        """Query where a process is new, unless no `more` is wanted; what is new among answers since the last call.
 
-        Returns:
-            What is new among the answers since the last call.
+        That is done in a thread, for a frozen process answers late.
         """
         if more and self._newcomers and self._answers is None:
             self._answers = self._thread.submit(self._get)

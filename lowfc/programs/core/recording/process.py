@@ -42,10 +42,6 @@ def record(
 
     The files `configuration` (TOML) and `calibration` (FITS) go into each log; `begins` is called once there is room,
     and `alarm` with the service whose events it watches.
-
-    Raises:
-        BusError: another recorder has this run.
-        DataFileError: a file cannot be read, or no log can be written in `folder`.
     """
     if short := shortage(folder, limits.min_free_bytes):
         raise DataFileError(short)

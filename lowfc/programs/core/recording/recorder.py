@@ -101,11 +101,7 @@ class Recorder:
                 signal.signal(number, self._signalled)
 
     def run(self) -> Summary:
-        """Record until stopped.
-
-        Raises:
-            DataFileError: the first log cannot be opened.
-        """
+        """Record until stopped; DataFileError where the first log cannot be opened."""
         self._settle()
         for sample in self._peers.query():
             self._write(sample)

@@ -7,16 +7,10 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """What a recorder has done.
+    """What a recorder has done; a log that could not be finished ends in `.part`.
 
-    Attributes:
-        files: logs, in order; one that could not be finished ends in `.part`.
-        messages: recorded, in all of them.
-        lost: messages published and not recorded, by topic; only topics that lost some.
-        failure: why recording stopped early; empty when it did not.
-        longest_wait_ns: between a message's arrival, once there was a log, and its being written.
-        longest_unflushed_ns: between a message's arrival, once there was a log, and its surviving a kill -9.
-        longest_write_ns: of one write to the disk.
+    The longest times are from a message's arrival, once there was a log, to its being written (wait) and to its
+    surviving a kill -9 (unflushed), and of one write to the disk.
     """
 
     files: tuple[Path, ...]

@@ -70,10 +70,9 @@ _BURST = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Frames:
-    """What became of each frame that was sent, in the order in which they were put; (frames,).
+    """What became of each frame, in the order in which they were put, just before `put_ns`; all are (frames,).
 
     Attributes:
-        put_ns: just before the camera's put.
         commanded: whether a command made from it was timed, or followed by the mirror.
         spans_us: of `SPANS`, NaN where it is not known; those from the moment due only where there was a schedule.
     """
@@ -90,14 +89,10 @@ def join(
     timing: tuple[Sequences, Mapping[str, Long]],
     mirror: tuple[Sequences, Long],
 ) -> Frames:
-    """Frames that were sent, and what is known of each.
+    """Frames that were sent, and what is known of each; `due_ns` is None where there was no schedule.
 
-    Args:
-        sequence: of each frame sent.
-        put_ns: just before the camera's put.
-        due_ns: when it ought to have been put; None where there was no schedule.
-        timing: sequences, and the controller's stages, ns, as in ControlTiming.
-        mirror: frame sequence and time of each state; the first of a frame counts.
+    `timing` has sequences and the controller's stages as in ControlTiming, `mirror` the frame sequence and time of each
+    state, of which the first of a frame counts.
     """
     row, mirror_row = rows_of(sequence, timing[0]), rows_of(sequence, mirror[0])
     stages_us = {stage: np.append(column / 1e3, np.nan)[row] for stage, column in timing[1].items()}
@@ -145,11 +140,8 @@ def histogram(values_us: Array) -> Long:
 def repeat_figures(frames: Frames) -> dict[str, Any]:
     """Figures of one repeat, the warm-up left out.
 
-    Returns:
-        latency_us (percentiles by span), histogram (counts by span), over_time (seconds, p50_us and max_us of frame to
-        command), rate_hz as sent, and numbers of frames: frames, warm_up_frames, frames_without_command, of these
-        frames_crowded_out (the next one was put within half the mean period), frames_untimed (there is a command, but
-        no word of how long it took), frames_without_mirror_state and frames_sent_late (by more than a period).
+    Of the frames without a command, crowded out are those whose next one was put within half the mean period; untimed
+    are frames that have a command, but no word of how long it took.
     """
     warm = frames.put_ns - frames.put_ns[:1] >= round(WARM_UP_S * 1e9)
     put_ns, commanded = frames.put_ns[warm], frames.commanded[warm]

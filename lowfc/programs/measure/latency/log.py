@@ -17,12 +17,7 @@ _LOOP = frozenset({Role.CAMERA, Role.CONTROLLER, Role.MIRROR})
 def log_figures(files: LogFiles, progress: Callable[[int, int], None]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Figures of one log as of one repeat, and what its metadata say of the host.
 
-    Returns:
-        `repeat_figures` and `controllers_account`; and `provenance`, with what the host granted the controller and,
-        where the loop was on several hosts, `clock_error_us`: what a span from one to another is wrong by at most.
-
-    Raises:
-        DataFileError: this is no log, it is damaged, or it has no frame whose timing is known.
+    Where the loop was on several hosts, `clock_error_us` is what a span from one to another is wrong by at most.
     """
     log = WholeLog(files)
     log.progress = progress

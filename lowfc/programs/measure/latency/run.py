@@ -81,17 +81,7 @@ def prepared(config: Configuration, fill: Callable[[Configuration, Run], None] =
 
 
 def run_repeats(asked: Asked, run: Run, progress: Callable[[str], None]) -> list[dict[str, Any]]:
-    """Measure; figures of each repeat.
-
-    Returns:
-        For each repeat, and in it for each kernel: its name, kernel; `repeat_figures` and `controllers_account`;
-        granted, refused, memory_mb (by process), logs, messages_lost and commands_late; echo_us, step_us, hot_step_us
-        and timer_us (percentiles) and echo_lost; and stalls where they are traced.
-
-    Raises:
-        ProcessDiedError: a process ended by itself.
-        BusError: the controller did not report its timing.
-    """
+    """Figures of each repeat, and in it of each kernel: of `one_loop`, and percentiles of echo, step and timer."""
     repeats, kernels = [], asked.kernels or (asked.config.realtime.kernel,)
     for number in range(asked.repeats):
         for kernel in kernels[:: -1 if number % 2 else 1]:
@@ -105,11 +95,10 @@ def run_repeats(asked: Asked, run: Run, progress: Callable[[str], None]) -> list
     return repeats
 
 
-def one_loop(asked: Asked, run: Run, children: list[Child] | None = None) -> dict[str, Any]:
+def one_loop(asked: Asked, run: Run) -> dict[str, Any]:
     """One repeat of the loop alone: figures of its frames, and what its processes reported at their end.
 
-    Python is woken ten times a second, and by Health; frames and mirror states wait in rings. `children` are the
-    loop's processes where they are others; the first ends by itself, and they leave the times of frames as the source.
+    Python is woken ten times a second, and by Health; frames and mirror states wait in rings.
     """
     watch, timings = Watch({}, []), TimingRows()
     states, frames = (Columns(sequence="Q", publish_ns="q") for _ in range(2))
@@ -124,7 +113,7 @@ def one_loop(asked: Asked, run: Run, children: list[Child] | None = None) -> dic
         for sample in frame_ring.drain() if frame_ring is not None else ():
             frames.add(sequence=sample.sequence, publish_ns=sample.publish_time_ns)
 
-    children, traced = _children(asked, run) if children is None else children, TRACED if asked.trace else ()
+    children, traced = _children(asked, run), TRACED if asked.trace else ()
     for file in (BEGIN_FILE, PROCESSES_FILE):
         (run.path / file).unlink(missing_ok=True)  # of the last repeat
     with contextlib.ExitStack() as stack:
@@ -233,12 +222,7 @@ def _run(
     meanwhile: Callable[[], None],
     started: Callable[[], None] = lambda: None,
 ) -> None:
-    """Start processes, and return when those awaited have ended by themselves.
-
-    Raises:
-        ProcessDiedError: a process ended that should not have, or with an error.
-        KeyboardInterrupt: at Ctrl-C, or when told to end.
-    """
+    """Start processes, and return when those awaited have ended by themselves."""
     with held_back() as interrupted:  # while a process forks, Python may swallow what signals would raise
         start_all(children)
         started()

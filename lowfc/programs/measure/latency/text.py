@@ -64,11 +64,7 @@ def sparkline(counts: Sequence[int]) -> str:
 
 
 def picture(figures: Mapping[str, Any]) -> bytes:
-    """PNG: a histogram of each span, and frame to command against time.
-
-    Raises:
-        ConfigurationError: matplotlib is not installed.
-    """
+    """PNG: a histogram of each span, and frame to command against time."""
     from lowfc.adapters.files.drawing import figure_class, png
 
     figure = figure_class()(figsize=(9, 8), layout="constrained")

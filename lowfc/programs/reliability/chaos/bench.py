@@ -56,21 +56,10 @@ class Ended:
 
 @dataclass(slots=True)
 class Left:
-    """What is left of a case.
+    """What is left of a case: its folder has the logs and what the processes wrote on standard error.
 
-    Attributes:
-        folder: with the logs and what the processes wrote on standard error.
-        config: of the run.
-        marks: when it was quiet and when the fault was, by the host's clock, ns.
-        ended: every process.
-        alive: processes of the case that live on after its end.
-        killed_ns: when each recorder was killed.
-        mode: of the loop, at the end.
-        lost: what the last recorder reports as lost, by key.
-        failure: why it stopped recording, if it did.
-        residuals_nm: true residuals of the last second, rms, as they were received.
-        figures: what the case measured.
-        notes: what went wrong while it ran.
+    marks and killed_ns (of each recorder) are by the host's clock; lost, by key, and failure are what the last recorder
+    reports; residuals_nm are true ones of the last second, rms; notes tell what went wrong while it ran.
     """
 
     folder: Path
@@ -88,14 +77,7 @@ class Left:
 
 
 class ChaosBench:
-    """A simulated loop to which things are done.
-
-    Attributes:
-        run: of its processes.
-        mirror: role of the mirror's process.
-        children: the process that has each role now.
-        health: the last Health of each process that was started last under its role.
-    """
+    """A simulated loop to which things are done; children and health are of the process that has each role now."""
 
     def __init__(self, config: Configuration, folder: Path, rng: random.Random, fault: dict[str, Any] | None) -> None:
         """Prepare a run in a folder of its own; `fault` befalls the camera's frames."""
@@ -153,11 +135,7 @@ class ChaosBench:
         self.wait(lambda: self._good >= frames, f"{frames} good frames with the loop closed")
 
     def wait(self, condition: Callable[[], bool], what: str, timeout_s: float = WAIT_S) -> None:
-        """Wait for something.
-
-        Raises:
-            CaseFailedError: it did not come.
-        """
+        """Wait for something; CaseFailedError where it does not come."""
         deadline_s = time.monotonic() + timeout_s
         while not condition():
             if time.monotonic() >= deadline_s:
@@ -205,11 +183,7 @@ class ChaosBench:
         self._start(Child(name, command or self.children[name].command, stderr), ready=ready)
 
     def ends(self, name: str, status: int) -> str:
-        """Wait until a process ends by itself, as the case means it to; return the last that it wrote.
-
-        Raises:
-            CaseFailedError: it did not end, or with another exit status.
-        """
+        """Wait until a process ends by itself with this exit status, as the case means it to; the last it wrote."""
         child, begun_s = self.children[name], time.monotonic()
         self.wait(lambda: child.status is not None, f"the end of {name}")
         self._note_end(child, time.monotonic() - begun_s, meant=True)

@@ -26,17 +26,13 @@ class End(Enum):
 
 @dataclass(frozen=True)
 class Case:
-    """One case.
+    """One case: `act` does what its sentence says once the loop is quiet; then the loop is left to come to its end.
 
     Attributes:
-        name: on the command line.
-        sentence: what befalls the loop.
-        act: does it, once the loop is quiet; then the loop is left to come to its end.
         fault: kind of the frames' fault, of the camera from the start.
         config: keys that differ from a chaos run's own.
         expected: events that must be in the log, by how they begin.
         allowed: names of events of the level ERROR that may be there.
-        end: what it must come to.
         bad: which frames, by their number, may not be used.
         statuses: exit statuses that a process may end with, beside 0.
         noisy: tracebacks of what could not be read are to be expected.

@@ -57,19 +57,10 @@ def _console(bench: ChaosBench) -> None:
 
 
 class TerminalConsole(contextlib.AbstractContextManager["TerminalConsole"]):
-    """`lowfc console` as a process with a terminal of its own, once it shows the loop.
-
-    Attributes:
-        process: that it is.
-        start_s: from its start until it showed the loop.
-    """
+    """`lowfc console` as a process with a terminal of its own, once it shows the loop, `start_s` after its start."""
 
     def __init__(self, run: str, folder: Path | None = None) -> None:
-        """Start it in a folder, and wait.
-
-        Raises:
-            CaseFailedError: it shows nothing.
-        """
+        """Start it in a folder, and wait; CaseFailedError where it shows nothing."""
         self._terminal, its_own = pty.openpty()
         termios.tcsetwinsize(self._terminal, _SIZE)
         self._screen = b""

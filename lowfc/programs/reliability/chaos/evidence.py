@@ -46,9 +46,7 @@ class Evidence:
             of another recorder, which answers for what came while it was there.
         sent: what each publisher reported at its end that it had sent, by the same.
         lost: what the recorders report as lost, by key.
-        unreadable: what is wrong with a log.
         last_ns: when the last message of each log was recorded, and whether that log was finished.
-        messages: how many there are.
     """
 
     entries: dict[Topic, list[Entry]] = field(default_factory=lambda: {topic: [] for topic in DECODED})

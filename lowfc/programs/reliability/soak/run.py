@@ -47,11 +47,7 @@ class LogChecker:
         return sum(one.missing for one in self._came.values())
 
     def look(self) -> None:
-        """Check and remove what has been finished.
-
-        Raises:
-            DataFileError: a log is damaged.
-        """
+        """Check and remove what has been finished."""
         for path in sorted(self._folder.glob("*.mcap"), key=lambda one: (one.stat().st_mtime_ns, one.name)):
             for message in LogReader(path):
                 self.messages += 1
@@ -121,12 +117,7 @@ class _Soak:
 
 
 def soak_loop(config: Configuration, seconds: float, progress: Callable[[float], None]) -> dict[str, Any]:
-    """Run the loop for so long; the figures that `lowfc soak --json` prints.
-
-    Raises:
-        ProcessDiedError: a process ended by itself.
-        DataFileError: a log is damaged.
-    """
+    """Run the loop for so long; the figures that `lowfc soak --json` prints."""
     with tempfile.TemporaryDirectory(prefix="lowfc-soak-") as name:
         logged = config.model_copy(update={"recorder": config.recorder.model_copy(update={"folder": name})})
         bench = ChaosBench(logged, Path(name), random.Random(), None)  # noqa: S311  # nothing secret
