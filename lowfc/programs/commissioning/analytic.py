@@ -25,10 +25,6 @@ def analytic(config: Configuration, console: Console, at: Wavefront | None = Non
         config: The instrument's.
         console: For people: a progress bar, warnings.
         at: The wavefront that is the zero point; flat when None.
-
-    Raises:
-        CalibrationError: this sensor cannot tell the modes apart.
-        DataFileError: a layout is missing or damaged.
     """
 
     def warn(text: str) -> None:

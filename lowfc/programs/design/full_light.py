@@ -49,12 +49,7 @@ class Swept(Result):
 
 
 def design(sizes: Sizes, goal: Goal, out: Path, plot: Path | None) -> Swept:
-    """Look at sizes of a sensor, find the best between them, and write its keys as a configuration.
-
-    Raises:
-        ConfigurationError: The sizes are not those of a sensor, or there is no matplotlib for the plot.
-        DataFileError: A file cannot be written.
-    """
+    """Look at sizes of a sensor, find the best between them, and write its keys as a configuration."""
     if plot is not None:
         figure_class()
     require_folder(out, plot)

@@ -26,11 +26,7 @@ def command_line(command: str, request: Any) -> str:
 
 
 def span(option: str, text: str) -> tuple[float, float]:
-    """Ends of LOW:HIGH, or one value for both.
-
-    Raises:
-        ValueError: It is neither, or not finite.
-    """
+    """Ends of LOW:HIGH, or one value for both; ValueError where it is neither, or not finite."""
     low, _, high = text.partition(":")
     try:
         found = float(low), float(high or low)

@@ -41,11 +41,7 @@ STATE_PERIOD_S = 10.0
 
 
 def begin(search: Search) -> list[Chain]:
-    """The chains of a new search, at random layouts.
-
-    Raises:
-        ConfigurationError: The holes cannot be placed.
-    """
+    """The chains of a new search, at random layouts; ConfigurationError where the holes cannot be placed."""
     try:
         return [start(search.bounds, search.seed, i, search.steps) for i in range(search.chains)]
     except ValueError as error:
@@ -70,12 +66,6 @@ def design_sam(
     """Search, write the best layout or the front, and say what they would show; Ctrl-C writes the best so far.
 
     The chains are brought forward in place, and kept in the file `state` until the end.
-
-    Raises:
-        DataFileError: A file cannot be written.
-        ConfigurationError: A package for the plot is missing, or a worker has another shaped pupil.
-        LowfcError: The workers are lost; the state file stays if any chain had finished a block.
-        KeyboardInterrupt: Ctrl-C, before any chain had finished a block.
     """
     console = Console(stderr=True) if console is None else console
     _one_thread()
@@ -162,11 +152,7 @@ def run_chains(search: Search, chains: list[Chain], executor: Executor, on_block
 
 
 def advance_block(search: Search, chain: Chain, pupil: str) -> Chain:
-    """One block of one chain, on whatever machine this runs.
-
-    Raises:
-        ConfigurationError: This machine has another shaped pupil.
-    """
+    """One block of one chain, on whatever machine this runs."""
     if pupil != pupil_digest():
         raise ConfigurationError("a worker has another shaped pupil: install the same lowfc on all machines")
     _one_thread()

@@ -30,11 +30,7 @@ class Here(Executor):
 
 @contextmanager
 def open_executor(jobs: int, scheduler: str | None) -> Iterator[Executor]:
-    """Where the chains run.
-
-    Raises:
-        ConfigurationError: The scheduler does not answer, or the package for it is missing.
-    """
+    """Where the chains run."""
     if scheduler is not None:
         with _dask(scheduler) as executor:
             yield executor

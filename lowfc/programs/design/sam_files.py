@@ -43,11 +43,6 @@ def check_files(out: Path, resume: Path | None, *others: Path | None) -> Path:
 
     Returns:
         The state file.
-
-    Raises:
-        ConfigurationError: The layout file is not called .json, two files are the same one, or an interrupted search
-            would be overwritten.
-        DataFileError: A directory is missing.
     """
     if out.suffix != ".json":
         raise ConfigurationError(f"--out must end in .json, as only that is read as a layout file; got {out}")
@@ -68,11 +63,7 @@ def write_state(path: Path, search: Search, pupil: str, chains: Sequence[Chain])
 
 
 def read_state(path: Path, pupil: str) -> tuple[Search, list[Chain]]:
-    """The search and its chains that `write_state` wrote.
-
-    Raises:
-        DataFileError: The file is missing, damaged, or of a search with another shaped pupil.
-    """
+    """The search and its chains that `write_state` wrote."""
     try:
         state = json.loads(input_file.read_whole(path, _LARGEST_BYTES))
         search = Search(**state["search"])
@@ -88,11 +79,7 @@ def read_state(path: Path, pupil: str) -> tuple[Search, list[Chain]]:
 
 
 def write_layouts(path: Path, points: Sequence[Point], search: Search, command: str) -> None:
-    """Write layouts as the loop reads them, each with how it was found.
-
-    Raises:
-        DataFileError: The file cannot be written, or the loop would refuse it.
-    """
+    """Write layouts as the loop reads them, each with how it was found."""
     entries = {point.layout.name: _entry(point, search, command) for point in points}
     content = json.dumps({"units": UNITS, "layouts": entries}, indent=1) + "\n"
     for name, entry in json.loads(content)["layouts"].items():

@@ -68,11 +68,6 @@ def design_spc(wanted: Request, out: Path, plot: Path | None, console: Console) 
         out: An npz file with `quarter`, which `load_pupil` reads, and `made_by`, the request as JSON.
         plot: Picture to be drawn, or None.
         console: Where progress goes.
-
-    Raises:
-        ConfigurationError: No mask does that, and which nearest request is feasible; or the rounds did not suffice,
-            or there is no matplotlib.
-        DataFileError: A file cannot be written.
     """
     if plot is not None:
         figure_class()
@@ -140,11 +135,7 @@ def _infeasible(wanted: Request, inner: float | None, contrast: float | None) ->
 
 
 def _interruptibly(work: Callable[[], Value]) -> Value:
-    """Do work in a thread, for Ctrl-C waits for the end of a program where the main thread solves it.
-
-    Raises:
-        ConfigurationError: The solver gave up.
-    """
+    """Do work in a thread, for Ctrl-C waits for the end of a program where the main thread solves it."""
     future: Future[Value] = Future()
 
     def run() -> None:

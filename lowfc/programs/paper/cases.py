@@ -119,11 +119,7 @@ class Prepared:
         in_band: bool = False,
         nuisance: Array | None = None,
     ) -> Fit:
-        """A linear estimator of the first modes, at the central wavelength or over the band.
-
-        Raises:
-            ConfigurationError: This sensor cannot tell the modes apart.
-        """
+        """A linear estimator of the first modes, at the central wavelength or over the band."""
         I0, H = (self.band_I0, self.band_H) if in_band else (self.I0, self.H)
         try:
             return fit(NOLLS_20[:modes], I0, H[:, :modes], scale_e, read_noise_e, kind, nuisance)
@@ -160,9 +156,6 @@ def prepared(name: str) -> Prepared:
 
     Args:
         name: as of `lowfc.adapters.files.sensors.sensor_named`; clowfs:MM with its defocus; or bowtie:LAYOUT.
-
-    Raises:
-        ConfigurationError: There is no such sensor.
     """
     kind, _, detail = name.partition(":")
     if kind == "clowfs" and detail:

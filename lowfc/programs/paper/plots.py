@@ -46,12 +46,7 @@ Panel = Callable[["Figure", "Axes"], None]
 
 
 def draw(path: Path, panels: Sequence[Panel], caption: str, columns: int = 3, wide: bool = False) -> None:
-    """Draw panels in rows with a caption beneath, as a PNG file.
-
-    Raises:
-        ConfigurationError: matplotlib is not installed.
-        DataFileError: The file cannot be written.
-    """
+    """Draw panels in rows with a caption beneath, as a PNG file."""
     figure_type = figure_class()
     columns = min(columns, len(panels))
     rows = ceil(len(panels) / columns)

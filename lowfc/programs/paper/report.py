@@ -93,13 +93,7 @@ paper's, *predicted* decides.
 
 
 def run(names: Sequence[str], context: Context, plots: Path | None = None) -> list[Table]:
-    """The tables of these names, in the paper's units, and their drawings.
-
-    Raises:
-        DataFileError: The folder cannot be written.
-        ConfigurationError: A sensor or a layout is not known, a sensor cannot tell the modes of a table apart, or
-            matplotlib is missing.
-    """
+    """The tables of these names, in the paper's units, and their drawings."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     tables = []
     for name in context.sensors or ():
@@ -173,11 +167,7 @@ def to_page(table: Table) -> str:
 
 
 def write_page(folder: Path, table: Table) -> None:
-    """Write the JSON file, with the rows that stand in the text, and the page that is made from it.
-
-    Raises:
-        DataFileError: The folder cannot be written.
-    """
+    """Write the JSON file, with the rows that stand in the text, and the page that is made from it."""
     shown = _shown(table)
     write_whole(folder / f"{table['table']}.json", _one_row_to_a_line([shown]).encode())
     write_whole(folder / f"{table['table']}.md", to_page(shown).encode())
@@ -192,11 +182,7 @@ def _shown(table: Table) -> Table:
 
 
 def write_document(folder: Path, tables: Sequence[Table]) -> None:
-    """Write the JSON file and the document that is made from it.
-
-    Raises:
-        DataFileError: The folder cannot be written.
-    """
+    """Write the JSON file and the document that is made from it; DataFileError where the folder cannot be written."""
     write_whole(folder / RESULTS, _one_row_to_a_line(tables).encode())
     write_whole(folder / DOCUMENT, to_markdown(tables).encode())
 

@@ -49,9 +49,6 @@ def play(live: Live, modes: Sequence[int], required: Acceptance) -> list[Played]
 
     A shape comes as quickly as the mirror's slew allows, in a frame or two, and goes again. To the loop that is what it
     finds when it is closed on it. After one that it did not take away it begins anew from zero.
-
-    Raises:
-        AcceptanceError: the loop was changed meanwhile, or does not close any more on what it was closed on before.
     """
     plan = [trials for noll in chosen(modes, live.loop.noll) if (trials := _trials(live, noll, required))]
     live.expect(sum(len(table) for trials in plan for _, table, _ in trials))
@@ -93,11 +90,7 @@ def _trials(live: Live, noll: int, required: Acceptance) -> list[tuple[dict[str,
 
 
 def closed(trial: Played) -> bool:
-    """Whether the loop removed the shape of a trial.
-
-    Raises:
-        AcceptanceError: somebody opened the loop meanwhile, or frames are missing.
-    """
+    """Whether the loop removed the shape of a trial."""
     if trial.limits_hit:
         return False
     trial.check(LoopMode.CLOSED)
@@ -108,11 +101,7 @@ def closed(trial: Played) -> bool:
 
 
 def judge(trials: Sequence[Played], required: Acceptance) -> CaptureResult:
-    """The capture range of each mode that was tried.
-
-    Raises:
-        AcceptanceError: as `closed`; or there was no trial, for no mode has a gain.
-    """
+    """The capture range of each mode that was tried."""
     if not trials:
         raise AcceptanceError("no mode of the loop has a gain: there is nothing to capture")
     modes = []

@@ -82,11 +82,7 @@ class LinearityResult(AcceptanceResult):
 
 
 def play(live: Live, how: Staircase, required: Acceptance) -> list[Played]:
-    """Play a staircase of each mode to the mirror, with the loop open.
-
-    Raises:
-        AcceptanceError: a mode is not one of the loop's, or the levels are too short.
-    """
+    """Play a staircase of each mode to the mirror, with the loop open."""
     skipped = int(np.ceil(live.loop.delay_frames)) + _SPARE_FRAMES
     if how.hold_frames <= skipped:
         raise AcceptanceError(

@@ -96,9 +96,6 @@ class Live:
         """Play a table and keep what the loop does meanwhile; without shapes in `basis` it goes to the offset.
 
         A table without columns is a stretch in which nothing is played.
-
-        Raises:
-            AcceptanceError: the loop was changed meanwhile.
         """
         modes = len(self.calibration.noll)
         basis = np.zeros((modes, 0), np.float32) if basis is None else basis

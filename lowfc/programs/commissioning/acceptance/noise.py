@@ -59,11 +59,7 @@ def play(live: Live, duration_s: float) -> list[Played]:
 def judge(
     every: Sequence[Played], required: Acceptance, configuration: Configuration, calibration: Calibration
 ) -> NoiseResult:
-    """The noise of an open and of a closed stretch.
-
-    Raises:
-        AcceptanceError: the loop was disturbed meanwhile, or a stretch is missing.
-    """
+    """The noise of an open and of a closed stretch."""
     stretches = {played.what["loop"]: played for played in every}
     if set(stretches) != set(_LOOPS):
         raise AcceptanceError(f"there must be an open and a closed stretch, there is {', '.join(stretches) or 'none'}")

@@ -108,9 +108,6 @@ def play(live: Live, how: Excitation, required: Acceptance) -> list[Played]:
 
     It goes to the offset of the loop; to the mirror where the law is one of pseudo-open-loop modes, for how such a law
     goes to an offset is not how it rejects a disturbance.
-
-    Raises:
-        AcceptanceError: the duration is too short for the lines, or a mode is not one of the loop's.
     """
     noll, rate_hz = live.loop.noll, live.loop.rate_hz
     wanted = chosen(how.modes, noll)

@@ -45,12 +45,7 @@ class AlignResult(Result):
 
 
 def aligned(out: Path, run: str | None, frames: int, *, load: bool) -> AlignResult:
-    """Fit the geometry, resample the computed calibration, write it.
-
-    Raises:
-        CalibrationError: the image is not like the computed one, or pokes are not seen.
-        DataFileError: the file cannot be written.
-    """
+    """Fit the geometry, resample the computed calibration, write it."""
     require_folder(out)
     console = Console(stderr=True)
     with Client(run) as loop, loop.reserved("lowfc calibrate align"):
@@ -84,11 +79,7 @@ def aligned(out: Path, run: str | None, frames: int, *, load: bool) -> AlignResu
 def on_sensor(
     config: Configuration, computed: Calibration, geometry: Geometry, flux: float, before: Calibration
 ) -> Calibration:
-    """A computed calibration on the pixels of a real sensor, with the dark and the mask of the one before.
-
-    Raises:
-        CalibrationError: too little of the image falls on the sensor.
-    """
+    """A computed calibration on the pixels of a real sensor, with the dark and the mask of the one before."""
     own, pixels = (*computed.shape, -1), before.good.size
     I0 = onto(computed.reference.astype(np.float64).reshape(computed.shape), geometry, before.shape).reshape(-1)
     H = onto(computed.response.astype(np.float64).reshape(own), geometry, before.shape).reshape(pixels, -1)

@@ -74,11 +74,7 @@ class Pokes:
     def __init__(
         self, config: Configuration, calibration: Calibration, noise_nm: Array, request: CalibrationRequest
     ) -> None:
-        """Choose the amplitude; `noise_nm` is that of one frame (modes,).
-
-        Raises:
-            CalibrationError: the amplitude asked for is too large.
-        """
+        """Choose the amplitude; `noise_nm` is that of one frame (modes,)."""
         self._request = request
         self._noise_nm = noise_nm
         self._modes = len(calibration.noll)

@@ -106,12 +106,6 @@ def play(loop: Client, basis_nm: npt.NDArray[np.floating], table: npt.NDArray[np
         loop: A connection to the controller.
         basis_nm: (shapes, actuators) nm of surface.
         table: (frames, shapes).
-
-    Raises:
-        CalibrationError: the loop ended the play, or too little of it came through.
-        PlayInterruptedError: the mirror or the camera restarted, or the mirror did not follow commands throughout.
-        BusError: frames or steps stopped, or no mirror is there.
-        RequestRefusedError: the controller would not play it.
     """
     loop.check_lease()
     with _streams(loop) as (frames, steps):
@@ -155,11 +149,7 @@ def watch(loop: Client, count: int) -> Pixels:
 
 
 def check_size(shape: tuple[int, ...], before: Calibration) -> None:
-    """Compare the size of the frames with that of the calibration in use.
-
-    Raises:
-        CalibrationError: they differ, so that every frame is refused.
-    """
+    """Compare the size of the frames with that of the calibration in use."""
     if shape != before.shape:
         raise CalibrationError(
             f"the frames have {shape[0]} x {shape[1]} pixels and are refused as WRONG_SIZE: the calibration in use, "
@@ -267,11 +257,7 @@ class Player:
     closed: bool = False
 
     def first_poke(self, mode: int, plan: Plan) -> Delay:
-        """Poke the mode at one place in a pseudo-random sequence: the delay, and the image of the poke.
-
-        Raises:
-            CalibrationError: no poke is seen, or there was no run without a lost frame.
-        """
+        """Poke the mode at one place in a pseudo-random sequence: the delay, and the image of the poke."""
 
         def attempt() -> Recording:
             played = self._play(plan, slice(mode, mode + 1))
@@ -295,11 +281,7 @@ class Player:
             raise CalibrationError(str(error)) from None
 
     def cycle(self, plan: Plan, delay_frames: float) -> Cycle:
-        """Play a cycle of pokes of all modes; `delay_frames` pass from a poke to its image.
-
-        Raises:
-            CalibrationError: several in a row were of no use.
-        """
+        """Play a cycle of pokes of all modes; `delay_frames` pass from a poke to its image."""
 
         def attempt() -> Cycle:
             recording = self._play(plan)

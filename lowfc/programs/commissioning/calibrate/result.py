@@ -107,12 +107,7 @@ def rejected_of(out: Path) -> Path:
 def finished(
     calibrator: Calibrator, request: CalibrationRequest, data: CalibrationData, computed: Calibration
 ) -> tuple[Calibration, CalibrationResult]:
-    """Make R, check it on other frames, write the file: under another name where it is not recommended.
-
-    Raises:
-        CalibrationError: H is not above its noise, or frames are lost.
-        DataFileError: the file cannot be written.
-    """
+    """Make R, check it on other frames, write the file: under another name where it is not recommended."""
     config = calibrator.config
     made, quality = measured_calibration(config, calibrator.before, data.measured, request)
     check = calibrator.check(made, data)
@@ -140,11 +135,7 @@ def reconstructed(
     flux_dn: float,
     **how: Any,
 ) -> Reconstruction:
-    """R of H on the camera of a configuration; the arguments are those of `reconstruct`, the light is in DN.
-
-    Raises:
-        CalibrationError: H does not tell the modes apart.
-    """
+    """R of H on the camera of a configuration; the arguments are those of `reconstruct`, the light is in DN."""
     camera = factory.detector(config)
     flux_e, read_noise_e = flux_dn * camera.gain_e_per_dn / camera.em_gain, factory.equivalent_read_noise_e(camera)
     try:
@@ -156,11 +147,7 @@ def reconstructed(
 def measured_calibration(
     config: Configuration, before: Calibration, found: Measured, request: CalibrationRequest
 ) -> tuple[Calibration, Reconstruction]:
-    """The calibration that cycles of pokes give, with the dark, the mask and the commands of the one before.
-
-    Raises:
-        CalibrationError: H is not above its noise.
-    """
+    """The calibration that cycles of pokes give, with the dark, the mask and the commands of the one before."""
     I0 = found.reference if found.reference is not None else before.reference.astype(np.float64)
     made = reconstructed(
         config,
@@ -288,11 +275,7 @@ def judge(
 
 
 def comparison(one: Calibration, other: Calibration) -> Comparison:
-    """How two calibrations differ; what is of each mode is in the order of `noll`.
-
-    Raises:
-        CalibrationError: they are of different sensors or modes.
-    """
+    """How two calibrations differ; what is of each mode is in the order of `noll`."""
     if not comparable(one, other):
         raise CalibrationError(
             f"they cannot be compared: {one.shape[0]} x {one.shape[1]} pixels and modes {_span(one)} against "

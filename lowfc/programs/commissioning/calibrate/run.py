@@ -71,10 +71,6 @@ class Calibrator:
     ) -> None:
         """Ask the controller what it has, and read the cycles to go on from.
 
-        Raises:
-            CalibrationError: the frames have another size than the calibration in use.
-            DataFileError: there is nothing to go on from.
-
         Args:
             loop: A connection to it.
             request: What is asked for.
@@ -105,11 +101,7 @@ class Calibrator:
 
     @contextlib.contextmanager
     def holding(self) -> Iterator[None]:
-        """The loop as the method needs it; afterwards it is as it was.
-
-        Raises:
-            CalibrationError: the loop is open where it must be closed, or in safe mode.
-        """
+        """The loop as the method needs it; afterwards it is as it was."""
         state = self._loop.status().state
         mode = state.mode if state is not None else wire.LOOP_MODE_OPEN
         if mode not in (wire.LOOP_MODE_OPEN, wire.LOOP_MODE_CLOSED):
@@ -135,20 +127,12 @@ class Calibrator:
         self._loop.close_loop()
 
     def run(self, delay: Delay | None = None) -> CalibrationData:
-        """Check that pokes are seen, measure the delay unless it is known, then the response.
-
-        Raises:
-            CalibrationError: pokes are not seen, frames are lost, or a limit acts.
-        """
+        """Check that pokes are seen, measure the delay unless it is known, then the response."""
         delay = self.delay() if delay is None else delay
         return CalibrationData(self._cycles(delay), delay)
 
     def check(self, made: Calibration, data: CalibrationData) -> Check:
-        """The cross-talk of a new calibration at the present zero point, from cycles of its own.
-
-        Raises:
-            CalibrationError: frames were lost, or a limit acts.
-        """
+        """The cross-talk of a new calibration at the present zero point, from cycles of its own."""
         R = made.reconstructor.astype(np.float64)
         cycles = data.measured.cycles
         count = checks(cycles)
@@ -166,11 +150,7 @@ class Calibrator:
         return int(np.where(tilt & ~tilt.all(), np.inf, self.noise_nm).argmin())
 
     def delay(self) -> Delay:
-        """The delay from poke to image, measured with the mode of least noise.
-
-        Raises:
-            CalibrationError: no poke is seen, or frames are lost.
-        """
+        """The delay from poke to image, measured with the mode of least noise."""
         mode = self._best
         plan = self.pokes.delay(mode)
         self._show("looking for pokes", max(self.pokes.cycles(), self.kept), self.kept)
@@ -280,11 +260,7 @@ def go_on(path: Path, what: dict[str, Any]) -> Sums:
 
 
 def begun(path: Path) -> tuple[dict[str, Any], Sums]:
-    """Method, amplitude and calibration of the cycles that were kept, and these cycles.
-
-    Raises:
-        DataFileError: there are none, or the file is damaged.
-    """
+    """Method, amplitude and calibration of the cycles that were kept, and these cycles."""
     if not path.is_file():
         raise DataFileError(f"there is nothing to go on from: no {path}; leave --resume out")
     try:

@@ -64,13 +64,7 @@ class ReferenceResult(Result):
 
 
 def poked(request: CalibrationRequest, run: str | None, *, load: bool) -> CalibrationResult:
-    """Calibrate a running loop and write the file, once nothing else can go wrong.
-
-    Raises:
-        CalibrationError: pokes are not seen, frames are lost, or H is not above its noise.
-        BusError: there is no such loop.
-        DataFileError: a file cannot be written, or there is nothing to go on from.
-    """
+    """Calibrate a running loop and write the file, once nothing else can go wrong."""
     require_folder(request.out)
     console = Console(stderr=True)
     report = reporter(console)
@@ -113,13 +107,7 @@ def shown_progress(console: Console, report: Callable[[str], None]) -> Iterator[
 def computed(
     file: Path | None, request: CalibrationRequest, at: str | None, run: str | None, *, load: bool
 ) -> CalibrationResult:
-    """Compute a calibration from a configuration, flat or at a wavefront, and write the file.
-
-    Raises:
-        CalibrationError: this sensor cannot tell the modes apart.
-        ConfigurationError: there is no such wavefront.
-        DataFileError: the file cannot be written.
-    """
+    """Compute a calibration from a configuration, flat or at a wavefront, and write the file."""
     require_folder(request.out)
     config = configuration(file)
     name, wavefront = ("", None) if at is None else zero_point(config, at)
@@ -149,9 +137,6 @@ def zero_point(config: Configuration, text: str) -> tuple[str, Wavefront]:
 
     Returns:
         Its name in a calibration, and the wavefront.
-
-    Raises:
-        ConfigurationError: it is neither, or the shape does not fit the mirror.
     """
     if "=" not in text:
         shape = shape_of(config, "--at", text)
@@ -181,12 +166,7 @@ def _modes(text: str) -> dict[int, float]:
 
 
 def darkened(out: Path, run: str | None, frames: int, file: Path | None, *, load: bool) -> DarkResult:
-    """The calibration in use with a dark and a mask, from the loop's frames or a cube of them.
-
-    Raises:
-        CalibrationError: the frames are not dark.
-        DataFileError: the cube cannot be read, or the file not be written.
-    """
+    """The calibration in use with a dark and a mask, from the loop's frames or a cube of them."""
     require_folder(out)
     with Client(run) as loop, _in_use(loop) as (before, noise):
         cube = watch(loop, frames) if file is None else images(file)
@@ -204,12 +184,7 @@ def darkened(out: Path, run: str | None, frames: int, file: Path | None, *, load
 
 
 def referenced(out: Path, run: str | None, frames: int, *, load: bool) -> ReferenceResult:
-    """The calibration in use with the present image as its reference.
-
-    Raises:
-        CalibrationError: there is no light.
-        DataFileError: the file cannot be written.
-    """
+    """The calibration in use with the present image as its reference."""
     require_folder(out)
     with Client(run) as loop, _in_use(loop) as (before, noise):
         taken = watch(loop, frames)
@@ -225,11 +200,7 @@ def referenced(out: Path, run: str | None, frames: int, *, load: bool) -> Refere
 
 @contextlib.contextmanager
 def _in_use(loop: Client) -> Iterator[tuple[Calibration, tuple[float, float]]]:
-    """The calibration in use, and of the camera the read noise of a pixel, e-, and electrons per DN.
-
-    Raises:
-        CalibrationError: what is made of it is none.
-    """
+    """The calibration in use, and of the camera the read noise of a pixel, e-, and electrons per DN."""
     camera = factory.detector(configuration_of(loop))
     noise = factory.equivalent_read_noise_e(camera), camera.gain_e_per_dn / camera.em_gain
     try:
@@ -248,11 +219,7 @@ def written(made: Calibration, out: Path, loop: Client | None) -> Calibration:
 
 
 def images(file: Path) -> Array:
-    """Frames (frames, rows, columns) of a file's image or cube.
-
-    Raises:
-        DataFileError: there are none, or the file is damaged.
-    """
+    """Frames (frames, rows, columns) of a file's image or cube."""
     data = read_array(file, "frames are an array (rows, columns) or (frames, rows, columns)", (2, 3))
     return np.asarray(data, dtype=np.float64).reshape(-1, *data.shape[-2:])
 

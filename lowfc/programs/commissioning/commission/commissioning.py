@@ -89,11 +89,7 @@ class Commissioning:
         self._judged = False
 
     def run(self) -> tuple[dict[str, Any], str]:
-        """All steps; the figures, and the text for people.
-
-        Raises:
-            CalibrationError: a step failed; the sentence says what to do.
-        """
+        """All steps; the figures, and the text for people."""
         options, kept = self._options, first_of(self._options.out)
         if options.resume and not kept.is_file():
             if options.out.is_file():

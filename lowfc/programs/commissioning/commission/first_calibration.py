@@ -32,11 +32,7 @@ _SURE = 3.0
 
 
 def first_delay(player: Player, config: Configuration) -> Delay:
-    """The delay, and the image of a poke of the first mode: pokes that grow until they are seen.
-
-    Raises:
-        CalibrationError: no poke is seen, or frames are lost.
-    """
+    """The delay, and the image of a poke of the first mode: pokes that grow until they are seen."""
     before, report = player.before, player.report
     amplitude_nm, most_nm = FIRST_NM, float(largest_nm(config, before)[0])
     while True:
@@ -98,11 +94,7 @@ def aligned(
 
 
 def poked(player: Player, config: Configuration, poke: Delay) -> Calibration:
-    """A calibration of each mode's own pokes, without an optical model.
-
-    Raises:
-        CalibrationError: frames are lost, or the sensor cannot tell the modes apart.
-    """
+    """A calibration of each mode's own pokes, without an optical model."""
     before, modes = player.before, len(player.before.noll)
     amplitude_nm = min(FIRST_NM, float(largest_nm(config, before).min()))
     response = np.zeros_like(before.response, dtype=np.float64)
@@ -126,9 +118,6 @@ def linear_nm(player: Player, config: Configuration, delay: Delay, usual_nm: flo
     """Amplitude at which all modes may be poked at once, nm rms of each.
 
     It is the usual one, halved where single pokes and those of half their amplitude show a sensor that is not linear.
-
-    Raises:
-        CalibrationError: frames are lost.
     """
     first = player.before
     R, modes = first.reconstructor.astype(np.float64), len(first.noll)

@@ -45,11 +45,7 @@ class Sensor(NamedTuple):
 def camera_fits(
     config: Configuration, state: wire.CameraState, images: Sequence[Frame], report: Report
 ) -> CameraSettings:
-    """The camera's settings, once its frames and the configuration agree with them.
-
-    Raises:
-        CalibrationError: they do not agree, or the frames are saturated.
-    """
+    """The camera's settings, once its frames and the configuration agree with them."""
     checks = list(agreement_checks(config, state))
     faults = [
         f"{check.name}: the camera has {check.got}, expected {check.expected}; {check.advice}"
@@ -94,11 +90,7 @@ def without_dark(camera: CameraSettings) -> Sensor:
 
 
 def darkened(camera: CameraSettings, frames: npt.NDArray[np.number], report: Report) -> Sensor:
-    """A sensor with a dark (frames, rows, columns) and what it shows of bad pixels.
-
-    Raises:
-        CalibrationError: the frames are of another size, too few, or much brighter in some pixels than in others.
-    """
+    """A sensor with a dark (frames, rows, columns) and what it shows of bad pixels."""
     if frames.shape[1:] != camera.shape:
         raise CalibrationError(f"the dark frames have {frames.shape[1:]} pixels, the camera {camera.shape}")
     try:
@@ -113,9 +105,6 @@ def referenced(sensor: Sensor, frames: npt.NDArray[np.number], computed: Calibra
     """A calibration with the reference image of these frames (frames, rows, columns), and no response yet.
 
     Its modes and the mirror's commands are those of a computed calibration.
-
-    Raises:
-        CalibrationError: there is no light on the sensor, or it is in the dark frames, too.
     """
     image = frames.reshape(len(frames), -1).astype(np.float64).mean(axis=0) - sensor.dark_dn
     flux_dn = float(image @ sensor.good)

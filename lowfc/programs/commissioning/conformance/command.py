@@ -93,11 +93,7 @@ def mirror(
 
 
 def _run_with(role: str, name: str | None) -> "Run":
-    """The run of that name, or the only one in which such a role listens.
-
-    Raises:
-        BusError: there is no such run, or none or several to choose from.
-    """
+    """The run of that name, or the only one in which such a role listens."""
     from lowfc.adapters.bus.run import open_run
     from lowfc.client.runs import living, the_known_run
     from lowfc.contract.errors import BusError

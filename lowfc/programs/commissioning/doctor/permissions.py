@@ -27,11 +27,7 @@ def shown(root: Path) -> str:
 
 
 def apply(root: Path, user: str) -> list[str]:
-    """Write the files, make the group with this user in it, and let it open the device; what was done.
-
-    Raises:
-        ConfigurationError: not root, or a file is there that is another.
-    """
+    """Write the files, make the group with this user in it, and let it open the device; what was done."""
     _require_root("--apply")
     for name, text in FILES.items():
         file = root / name

@@ -81,12 +81,7 @@ def tune(
 
 
 def integrate(loop: "Client", gains: list[float], noll: tuple[int, ...]) -> "Answer":
-    """Let the integrator drive the mirror with these gains; on refusal the previous law stays in force.
-
-    Raises:
-        RequestRefusedError: the gains were refused.
-        BusError: the controller did not answer.
-    """
+    """Let the integrator drive the mirror with these gains; on refusal the previous law stays in force."""
     from lowfc.contract.codecs.law_codec import driving
 
     before = driving(loop.status().state, loop.laws())

@@ -70,9 +70,6 @@ def of_log(log: LogReader) -> Telemetry:
     """The frames of a log that were used while the loop was closed; all of them, where it hardly was.
 
     What was played, by an acceptance test for one, is nothing that a law shall learn: those frames are left out.
-
-    Raises:
-        DataFileError: the log cannot be read, or has too few frames in a row.
     """
     history = read_history(log)
     run = LoggedRun(history)
@@ -106,12 +103,7 @@ def of_log(log: LogReader) -> Telemetry:
 
 
 def of_run(loop: Client, seconds: float, progress: Callable[[float], None] | None = None) -> Telemetry:
-    """The steps that a running loop makes in the next seconds.
-
-    Raises:
-        BusError: the loop does not answer, or makes no steps.
-        DataFileError: there are too few frames in a row.
-    """
+    """The steps that a running loop makes in the next seconds."""
     state = loop.status().state
     calibration = loop.calibration()
     config = configuration_of(loop)

@@ -141,11 +141,7 @@ def render(found: dict[str, Any]) -> str:
 
 
 def picture(run: Telemetry, best: Tuned) -> bytes:
-    """PNG: spectra of the two largest modes: as it was, as modelled, and what the tuned law would leave.
-
-    Raises:
-        ConfigurationError: matplotlib is not installed.
-    """
+    """PNG: spectra of the two largest modes: as it was, as modelled, and what the tuned law would leave."""
     from lowfc.adapters.files.drawing import figure_class, png
 
     figure = figure_class()(figsize=(10, 8), layout="constrained")

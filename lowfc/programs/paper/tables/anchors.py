@@ -275,11 +275,7 @@ def _sim_loop(name: str, preset: str, folder: Path, config: str, duration_s: flo
 
 
 def _lowfc(folder: Path, *words: str) -> dict[str, Any]:
-    """What a command prints with --json.
-
-    Raises:
-        LowfcError: It failed.
-    """
+    """What a command prints with --json; LowfcError where it failed."""
     command = [sys.executable, "-m", "lowfc", *words, "--json"]
     done = subprocess.run(  # noqa: S603  # our own program
         command, cwd=folder, capture_output=True, text=True, check=False

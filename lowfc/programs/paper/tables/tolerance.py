@@ -79,11 +79,7 @@ class Contrasts:
 
 @lru_cache(maxsize=8)
 def contrasts(pupil: str, focal_radius: float) -> Contrasts:
-    """Of a coronagraph; the fourth order from full images.
-
-    Raises:
-        ConfigurationError: A mode adds nothing to the dark zone, so that any of it is tolerated.
-    """
+    """Of a coronagraph; the fourth order from full images."""
     section = SensorSection(pupil=pupil, focal_radius=focal_radius)
     modal = ModalContrast(coronagraph_from(section), NOLLS_14, prepared("sam").sensor.wavelength_nm)
     own, form = modal.by_image(np.zeros(len(NOLLS_14))), np.diag(modal.form)
