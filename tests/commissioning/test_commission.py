@@ -34,6 +34,10 @@ instants = 1
 bit_depth = 14
 [control]
 gain = 0.2
+[mirror]
+rows = 12
+columns = 12
+pitches_per_pupil = 10
 """
 CONFIG = Configuration.model_validate(tomllib.loads(TOML))
 SHAKEN = CONFIG.model_copy(update={"sensor": SensorSection(modes=3)})
@@ -92,7 +96,7 @@ def _few_frames() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def commissioned(tmp_path_factory: pytest.TempPathFactory) -> tuple[Bench, dict[str, Any]]:
     bench = Bench(tmp_path_factory.mktemp("bench"), SHAKEN)
-    return bench, bench.commission(cycles=8)
+    return bench, bench.commission(cycles=6)
 
 
 def test_frames_of_another_size_come_to_a_closed_loop(commissioned: tuple[Bench, dict[str, Any]]) -> None:
