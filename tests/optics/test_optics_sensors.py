@@ -323,9 +323,9 @@ def test_behind_an_aperture_mask_shear_flux_and_background_do_not_look_like_a_wa
 
 
 @pytest.fixture
-def calibrated(tmp_path, monkeypatch):
+def calibrated(cache_dir, monkeypatch):
     """Makes calibrations and their noise from keys of the configuration, with a small mirror and a cache of its own."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache_dir))
 
     def make(**changed):
         keys = {"mirror.rows": 12, "mirror.columns": 12, "mirror.pitches_per_pupil": 11.0}

@@ -15,7 +15,7 @@ from lowfc.adapters.files.twin_cache import (
 from lowfc.optics.chain.band import gauss_legendre, monochromatic
 from lowfc.optics.chain.mirror import Mirror
 from lowfc.optics.chain.relay import ApertureMask
-from lowfc.optics.twin.twin import FAST, Evaluator, TwinSpec
+from lowfc.optics.twin.twin import Evaluator, TwinSpec
 
 SMALL = TwinSpec(nodes=16, order=4, rank=40, guards=4)  # the real optics, coarser, for tests of the file
 HASH_OF_ONES = "a4449a9f81f26403e8a1f5dda2c0cbe7385184dc0b31b34b2b78eb5a92ba3eec"
@@ -45,10 +45,12 @@ def test_a_second_call_reads_the_file(sensor, stored, tmp_path):
     assert again.operator_hash == operator_hash(sensor, SMALL, monochromatic(550.0))
 
 
-def test_broadband_twins_survive_the_file(sensor, broadband, cache_dir):
-    again = load_or_build(sensor, FAST, gauss_legendre(550.0), cache_dir=cache_dir, progress=forbidden)
-    same(broadband, again)
-    assert [each.weight for each in again.operators] == list(gauss_legendre(550.0).weights)
+def test_broadband_twins_survive_the_file(sensor, tmp_path):
+    band = gauss_legendre(550.0, count=2)
+    built = load_or_build(sensor, SMALL, band, cache_dir=tmp_path)
+    again = load_or_build(sensor, SMALL, band, cache_dir=tmp_path, progress=forbidden)
+    same(built, again)
+    assert [each.weight for each in again.operators] == list(band.weights)
 
 
 def test_the_hash_depends_on_everything(sensor):
@@ -99,29 +101,32 @@ def test_the_tests_have_a_cache_of_their_own():
     assert default_cache_dir().is_relative_to(Path(__file__).parents[2] / ".pytest_cache")
 
 
-@pytest.mark.parametrize("damage", ["truncated", "empty", "one bit", "another twin"])
-def test_a_damaged_file_is_noticed_and_built_again(damage, sensor, stored, tmp_path):
+def test_a_damaged_file_is_noticed_and_built_again(sensor, stored, tmp_path):
     twin, path = stored
-    content = bytearray(path.read_bytes())
-    if damage == "truncated":
-        path.write_bytes(content[: len(content) // 2])
-    elif damage == "empty":
-        path.write_bytes(b"")
-    elif damage == "one bit":
-        content[len(content) // 3] ^= 1
-        path.write_bytes(content)
-    else:
-        load_or_build(sensor, replace(SMALL, rank=41), cache_dir=tmp_path / "other")
-        path.write_bytes(next((tmp_path / "other").iterdir()).read_bytes())
-    said, steps = [], []
-    again = load_or_build(
-        sensor, SMALL, cache_dir=tmp_path, notice=said.append, progress=lambda done, total: steps.append(done)
-    )
-    assert len(said) == 1
-    assert str(path) in said[0]
-    assert steps[-1] == 32
-    same(twin, again)
-    same(twin, load_or_build(sensor, SMALL, cache_dir=tmp_path, progress=forbidden, notice=forbidden))
+    content = path.read_bytes()
+    middle = len(content) // 3
+    load_or_build(sensor, replace(SMALL, rank=41), cache_dir=tmp_path / "other")
+    (other,) = (tmp_path / "other").iterdir()
+    for damaged in (
+        content[: len(content) // 2],
+        b"",
+        content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :],
+        other.read_bytes(),
+    ):
+        path.write_bytes(damaged)
+        said, steps = [], []
+        again = load_or_build(
+            sensor,
+            SMALL,
+            cache_dir=tmp_path,
+            notice=said.append,
+            progress=lambda *step, steps=steps: steps.append(step),
+        )
+        assert len(said) == 1
+        assert str(path) in said[0]
+        assert steps[-1] == (32, 32)
+        same(twin, again)
+        same(twin, load_or_build(sensor, SMALL, cache_dir=tmp_path, progress=forbidden, notice=forbidden))
 
 
 def test_a_directory_that_cannot_be_written_is_not_fatal(sensor, stored, tmp_path):

@@ -156,12 +156,6 @@ def test_the_papers_inconsistencies_are_numbers(few):
             assert row["measured"] > 0.985
 
 
-def test_no_figure_depends_on_the_number_of_threads(few):
-    names = ("table3", "table4")
-    again = run(names, Context(FEW, jobs=1, sensors=(SAM,)))
-    assert again == [few[name] for name in names]
-
-
 def test_another_seed_is_another_draw(few):
     (again,) = run(["table4"], Context(FEW, seed=2, jobs=2, sensors=(SAM,)))
     assert again["rows"] != few["table4"]["rows"]
