@@ -95,7 +95,6 @@ class Mirror:
         pass
 """
 )
-BENCH = f"{STILL}tilt_gain = 0.3\n"
 OF_BENCH = "--run bench --config bench.toml"
 CAMERA, MIRROR = (f"lowfc {kind} faulty.py:{kind.capitalize()} {OF_BENCH}" for kind in ("camera", "mirror"))
 CONTROLLER = f"lowfc controller {OF_BENCH}"
@@ -157,7 +156,7 @@ class Bench:
 @pytest.fixture
 def bench(tmp_path: Path, own_runtime: Path) -> Iterator[Bench]:
     (tmp_path / "faulty.py").write_text(FAULTY)
-    (tmp_path / "bench.toml").write_text(BENCH)
+    (tmp_path / "bench.toml").write_text(STILL)
     made = Bench(tmp_path)
     with made.listening(), going_on(tmp_path, CONTROLLER, CAMERA):
         yield made
@@ -201,7 +200,7 @@ def test_a_mirror_that_hangs_for_five_seconds_gets_no_command_meanwhile_and_is_f
 @pytest.mark.exclusive
 def test_a_camera_in_the_controllers_process_closes_the_loop_and_hangs_alone(tmp_path: Path, own_runtime: Path) -> None:
     (tmp_path / "faulty.py").write_text(FAULTY)
-    (tmp_path / "bench.toml").write_text(BENCH)
+    (tmp_path / "bench.toml").write_text(STILL)
     bench = Bench(tmp_path)
     both = f"{CONTROLLER} --camera faulty.py:Camera"
     with bench.listening(), going_on(tmp_path, MIRROR, both), ExitStack() as stack:
@@ -220,7 +219,7 @@ def test_a_camera_in_the_controllers_process_closes_the_loop_and_hangs_alone(tmp
 def test_a_camera_that_the_controller_cannot_read_is_a_sentence(tmp_path: Path, own_runtime: Path) -> None:
     (tmp_path / "faulty.py").write_text(FAULTY)
     (tmp_path / "camera").write_text("refuse")
-    (tmp_path / "bench.toml").write_text(BENCH)
+    (tmp_path / "bench.toml").write_text(STILL)
     refused = run(tmp_path, *CONTROLLER.split()[1:], "--camera", "faulty.py:Camera")
     assert refused.returncode == 2
     assert "error: its lens cap is on" in refused.stderr

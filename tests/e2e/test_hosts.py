@@ -247,7 +247,7 @@ def test_without_the_desks_link_the_loop_goes_on(bench: Bench) -> None:
         bench.wait(lambda: len(bench.seen()) > start + 40, "four seconds")
         assert [bench.events(name) for name in events] == before
         during = bench.seen()[start:]
-        assert sum(one["steps"] for one in during) > 0.8 * 4 * 100
+        assert sum(one["steps"] for one in during) > 0.8 * 4 * 200
         assert sum("FOLLOWING" in one["status"] for one in during) > 0.9 * len(during)
     lost = bench.events("recorder MESSAGES_LOST")
     bench.wait(lambda: bench.events("recorder MESSAGES_LOST") > lost or lost, "the recorder's account of what it lost")

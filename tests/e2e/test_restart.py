@@ -130,7 +130,7 @@ def test_kill_and_restart_of_each(bench: Bench) -> None:
 
 def _alive(bench: Bench, name: str) -> bool:
     process = {"mirror": "mirror-dm"}.get(name, name)
-    return bool(bench.bus.get(f"lowfc/health/{process}", timeout_s=0.5))
+    return bool(bench.bus.get(f"lowfc/health/{process}", timeout_s=0.1))
 
 
 def test_a_mirror_that_dies_is_missed_and_taken_back(bench: Bench) -> None:

@@ -23,12 +23,13 @@ STILL = """
 [star]
 magnitude = -1.0
 [camera]
-rate_hz = 100
+rate_hz = 200
 [disturbance]
 preset = "quiet"
 static_nm = {2 = 8.0, 4 = 5.0}
 [control]
 start_mode = "closed"
+tilt_gain = 0.3
 gain = 0.3
 """
 """Configuration of a bright star and a wavefront that stands still, 8 nm of tilt and 5 nm of focus."""
