@@ -77,7 +77,7 @@ BENCH = {"disturbance__preset": "bench", "disturbance__scale": 0.7}
     [
         # Two runs of 1250 frames differ by 2.8 % rms by their noise alone; it is 10 % at most of 28 modes.
         (1500, (HARD, SOFT), 1, 0.0, {}),
-        (1500, (SOFT, LEAKY), 2, 0.0, {}),
+        pytest.param(1500, (SOFT, LEAKY), 2, 0.0, {}, marks=pytest.mark.slow),
         *(
             pytest.param(4000, pair, delay, 0.0, overrides, marks=pytest.mark.slow)
             for pair in ((HARD, SOFT), (SOFT, LEAKY))

@@ -18,6 +18,7 @@ from tools import laws, lines
 from tools.law_bench import RATE_HZ, Bench, calibrated, configured, tuned
 
 
+@pytest.mark.slow
 def test_an_identified_law_is_near_the_best() -> None:
     """At a noise at which the margins cost nothing."""
     config = configured()
