@@ -50,8 +50,8 @@ from lowfc.control.loop.inputs import Reply, Request, Step
 from lowfc.control.loop.interlocks import Value
 from lowfc.control.loop.requests import REQUESTS
 from lowfc.control.loop.safety import Limit, LoopMode
-from lowfc.programs.cli.ctl.status import figures, text
 from lowfc.programs.cli.modes import noll_of
+from lowfc.programs.cli.status import figures, text
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub, MemoryRing
 from tests.support.loops import lowfc, until
 from tests.support.recording import Bench, bodies_of, put

@@ -15,7 +15,7 @@ from lowfc.control.loop.guard import AGAIN, BETTER_S, MOST_TAKEOVERS, WORSE_BLOC
 from lowfc.control.loop.inputs import Request
 from lowfc.control.loop.safety import Limit
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES, Settings, State
-from lowfc.programs.cli.ctl import status
+from lowfc.programs.cli import status
 from tests.support.toy import NOLL, calibration, feed, frame, live, loaded, names, settings
 from tools.guard import MOVED, SEEDS, Case, identified_law, known_law, moved, undisturbed
 from tools.law_bench import Bench, calibrated, configured

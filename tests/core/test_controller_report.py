@@ -16,7 +16,7 @@ from lowfc.control.loop.advance import advance
 from lowfc.control.loop.camera import CameraSettings
 from lowfc.control.loop.inputs import Request, Step
 from lowfc.control.loop.safety import LoopMode
-from lowfc.programs.cli.ctl import status
+from lowfc.programs.cli import status
 from lowfc.programs.core.controller_report import LastSecond, NotClosed, Offload
 from lowfc.programs.launch.status import screen, status_line, summary_text
 from lowfc.programs.launch.watch import Watch, summary

@@ -25,7 +25,7 @@ from lowfc.contract.messages import COMMAND, EVENT, REQUEST, Log, wire
 from lowfc.control.laws.linear_law import integrator_block, of_blocks
 from lowfc.control.loop.requests import REQUESTS
 from lowfc.control.loop.safety import Limits
-from lowfc.programs.cli.ctl.command import ctl_app
+from lowfc.programs.cli.ctl import ctl_app
 from tests.support.loops import FIXED, children, interrupt, lowfc, payloads, run, start, until
 from tests.support.safety_checks import violations
 

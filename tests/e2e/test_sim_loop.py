@@ -15,7 +15,7 @@ import pytest
 from lowfc.adapters.logs.selection import EVERYTHING
 from lowfc.contract.configuration import load
 from lowfc.contract.messages import RawImage, from_timestamp, topic_of, wire
-from lowfc.programs.cli.ctl.command import SIGNAL
+from lowfc.programs.cli.ctl import SIGNAL
 from lowfc.programs.core.recording.volume import bytes_per_s
 from tests.support.loops import (
     FIXED,

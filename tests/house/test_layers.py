@@ -188,7 +188,7 @@ def test_every_folder_of_modules_is_a_package_of_at_most_sixteen() -> None:
         ("lowfc.control.laws.law", "from lowfc.optics.twin.twin import Twin", False),
         ("lowfc.contract.codecs.codec", "def later():\n    from lowfc.adapters.process.clock import HostClock", False),
         ("lowfc.adapters.bus.bus", "import sim_dm.device", False),
-        ("lowfc.client.client", "from lowfc.programs.cli.ctl import status", False),
+        ("lowfc.client.client", "from lowfc.programs.cli import status", False),
         ("sim_dm.driver", "from sim_camera import bench", False),
         ("lowfc.adapters.bus.bus", "from . import clock", False),
         ("lowfc.contract.codecs.codec", "from lowfc.control.laws.law import Law\nimport lowfc.optics.zernike", True),

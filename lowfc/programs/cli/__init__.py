@@ -1,1 +1,1 @@
-"""The command line."""
+"""The command line, and `lowfc ctl`: what operators ask of a running loop."""

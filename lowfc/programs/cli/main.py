@@ -12,7 +12,7 @@ from lowfc.programs.cli.lazy_group import Row, lazy_app
 COMMANDS = {
     "Run": (
         Row("sim-loop", "launch.command:sim_loop", "Run the simulated loop: camera, mirror, controller, recorder."),
-        Row("ctl", "cli.ctl.command:ctl_app", "Operate a running loop: status, open, close, gain, offset."),
+        Row("ctl", "cli.ctl:ctl_app", "Operate a running loop: status, open, close, gain, offset."),
         Row("console", "console.command:console", "Operate a running loop from one screen, with buttons."),
         Row("controller", "cli.processes:controller", "Run the controller: frames in, mirror commands out."),
         Row("camera", "cli.devices:camera_app", "Run a camera: the frames of its driver to a run."),

@@ -24,7 +24,7 @@ def _row(name: str, roles: set[str]) -> dict[str, Any]:
     """What the processes of a run report of themselves; one that only listens so far is starting."""
     from lowfc.client import Client
     from lowfc.contract.messages import Role
-    from lowfc.programs.cli.ctl.status import NOBODY, recording_state
+    from lowfc.programs.cli.status import NOBODY, recording_state
     from lowfc.programs.launch.watch import mode_name
 
     with Client(name) as loop:

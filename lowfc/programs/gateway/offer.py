@@ -12,7 +12,7 @@ import numpy as np
 from lowfc.client import Answer, Client
 from lowfc.client.requests import DECLARED, Declaration
 from lowfc.contract.messages import Role, wire
-from lowfc.programs.cli.ctl.status import figures, interlocks
+from lowfc.programs.cli.status import figures, interlocks
 from lowfc.programs.gateway.watch import Seen
 
 

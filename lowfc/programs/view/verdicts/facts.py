@@ -8,7 +8,7 @@ from lowfc.contract.messages import Role, from_timestamp, wire
 from lowfc.contract.printable import printable
 from lowfc.control.loop.wording import counted
 from lowfc.optics.chain.zernike import mode_name
-from lowfc.programs.cli.ctl.status import channels_in_words, figures, law_in_words
+from lowfc.programs.cli.status import channels_in_words, figures, law_in_words
 from lowfc.programs.view.snapshot import Snapshot
 from lowfc.programs.view.verdicts.run_state import RunState
 from lowfc.programs.view.verdicts.tile import numbers, short

@@ -110,7 +110,7 @@ def _close(run: AnyRun = None, as_json: Json = False) -> None:
 
 
 def _status(run: AnyRun = None, as_json: Json = False) -> None:
-    from lowfc.programs.cli.ctl.status import figures, text
+    from lowfc.programs.cli.status import figures, text
 
     with _joined(run) as loop:
         state, processes = loop.status().state, loop.processes()
@@ -161,7 +161,7 @@ def bench(name: BenchName, value: BenchValue, run: AnyRun = None, as_json: Json 
 
     Example: lowfc ctl bench mask-moving true
     """
-    from lowfc.programs.cli.ctl.status import figures, interlocks
+    from lowfc.programs.cli.status import figures, interlocks
 
     truths: dict[str, bool | float | str] = {"true": True, "false": False}
     try:

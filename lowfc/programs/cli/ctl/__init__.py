@@ -1,1 +1,0 @@
-"""`lowfc ctl`: what operators ask of a running loop."""
