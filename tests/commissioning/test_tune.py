@@ -24,7 +24,7 @@ from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.commissioning.tune.command import integrate
 from lowfc.programs.commissioning.tune.data import of_log, of_run
-from lowfc.programs.commissioning.tune.figures import figures, render, tuned
+from lowfc.programs.commissioning.tune.figures import result_of, tuned
 from tests.support.folded_loop import FoldedLoop
 from tests.support.loops import lowfc
 from tests.support.report_log import Night
@@ -69,9 +69,6 @@ def test_each_law_is_tuned_from_a_closed_loop(log: Path, controller: str, tmp_pa
     law = law_file.load(out)
     assert law.name == controller
     check_stable(law, found["delay_frames"])
-    text = render(found)
-    assert "7.00 (8." in text
-    assert "tilt per axis, mas rms: open" in text
 
 
 def test_what_was_played_is_neither_tuned_for_nor_taken_for_the_delay(tmp_path: Path) -> None:
@@ -102,8 +99,8 @@ def test_an_open_loop_with_much_tilt_is_flagged(tmp_path: Path) -> None:
     assert ("optical gain" in " ".join(found["warnings"])) == (small > 10)
     run = of_log(LogReader(path))
     larger = replace(run, nm_per_mas=run.nm_per_mas / 10)  # type: ignore[operator]
-    warned = figures(larger, *tuned(larger, "integrator"), "integrator")["warnings"]
-    assert "above 10: the sensor shows less than there is (optical gain)" in " ".join(warned)
+    warned = result_of(larger, *tuned(larger, "integrator"), "integrator").text()
+    assert "above 10: the sensor shows less than there is (optical gain)" in warned
 
 
 class Listening:
@@ -150,13 +147,16 @@ def test_a_running_loop_is_listened_to() -> None:
     assert run.warnings == ("4 steps did not get here in time",)
     assert run.pol.frames == pytest.approx(5500, abs=5)
 
-    found = figures(run, *tuned(run, "lqg"), "lqg")
+    result = result_of(run, *tuned(run, "lqg"), "lqg")
+    found, text = result.figures(), result.text()
+    assert f"{found['modes'][0]['lines'][0]['frequency_hz']:.2f} Hz (" in text
+    assert "tilt per axis, mas rms: open" in text
     assert found["modes"][0]["lines"][0]["frequency_hz"] == pytest.approx(20, abs=0.05)
     assert found["achieved_from"] == "error less noise"
     added = found["added_contrast"]
     assert 0 < added["predicted"] < added["open"]
     assert set(added["by_group"]["predicted"]) == {"tilt", "focus"}
-    assert f"closed {added['closed']:+.1e}, predicted {added['predicted']:+.1e}; focus costs most (" in render(found)
+    assert f"closed {added['closed']:+.1e}, predicted {added['predicted']:+.1e}; focus costs most (" in text
 
 
 class Applying(Watched):

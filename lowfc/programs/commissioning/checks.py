@@ -46,6 +46,10 @@ class Check(NamedTuple):
     expected: str = ""
 
 
+Severity = Callable[[str, str], Check]
+"""What makes a check of what was found and what to do about it."""
+
+
 def ok(got: str) -> Check:
     """As it should be."""
     return Check(Status.OK, got)
@@ -64,6 +68,14 @@ def warning(got: str, advice: str = "", cost: str = "") -> Check:
 def wrong(got: str, advice: str) -> Check:
     """Something that breaks the contract."""
     return Check(Status.WRONG, got, advice)
+
+
+def judged(
+    name: str, expected: str, good: bool, got: str, advice: str, but: str = "", severity: Severity = wrong
+) -> Check:
+    """A check by its name: `got` where it is good, else `but`, or the same again, with what to do."""
+    check = ok(got) if good else severity(but or got, advice)
+    return check._replace(name=name, expected=expected)
 
 
 class Table(Generic[S]):

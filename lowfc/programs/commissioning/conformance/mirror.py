@@ -7,7 +7,7 @@ import numpy as np
 
 from lowfc.arrays import Mask, Single
 from lowfc.contract.messages import from_timestamp, wire
-from lowfc.programs.commissioning.checks import Check, Status, ok, warning, wrong
+from lowfc.programs.commissioning.checks import Check, Status, judged, ok, warning, wrong
 from lowfc.programs.commissioning.conformance.dialogue import ANSWER_S, MODAL_NM, Dialogue, Show
 from lowfc.programs.commissioning.conformance.line import NS
 from lowfc.programs.commissioning.conformance.publisher import PROCESS, PUBLISHER
@@ -125,21 +125,15 @@ def _next_command(mirror: Dialogue, base_nm: Single, seconds: float) -> Iterator
     settled = [state for _, state in mirror.states if state.frame_sequence == last.frame_sequence]
     expected = f"the commanded surface within a step of the driver, {mirror.expected.step_nm:.3g} nm"
     yield _applied(mirror, base_nm, commanded_nm, settled[-1])._replace(name="applied", expected=expected)
-    check = ok(wire.MirrorStatus.Name(last.status).removeprefix("MIRROR_STATUS_"))
-    if last.status != _FOLLOWING:
-        check = wrong(check.got, "report FOLLOWING while a command is in force")
-    yield check._replace(name="status", expected="FOLLOWING")
-    check = ok("the same")
-    if others := len(answers) - same_time:
-        age_ms = (from_timestamp(last.timestamp) - line.now_ns()) / 1e6
-        got = f"{others} of {len(answers)} another, the last {age_ms:.3g} ms from now"
-        check = warning(got, "copy the command's timestamp: logs are joined by it")
-    yield check._replace(name="time", expected="the time of the command that was followed")
-    check = ok(f"{len(last.command_nm)} values")
-    if tuple(last.command_nm) != MODAL_NM:
-        advice = "copy it; leave it out where your limits changed the command: a restarted controller goes on from it"
-        check = warning(check.got, advice)
-    yield check._replace(name="modal command", expected="command_nm of the command that was followed")
+    got, advice = wire.MirrorStatus.Name(last.status).removeprefix("MIRROR_STATUS_"), "while a command is in force"
+    yield judged("status", "FOLLOWING", last.status == _FOLLOWING, got, f"report FOLLOWING {advice}")
+    others, expected = len(answers) - same_time, "the time of the command that was followed"
+    age_ms, advice = (from_timestamp(last.timestamp) - line.now_ns()) / 1e6, "copy the command's timestamp: logs are "
+    got = f"{others} of {len(answers)} another, the last {age_ms:.3g} ms from now"
+    yield judged("time", expected, not others, "the same", f"{advice}joined by it", got, warning)
+    got, expected = f"{len(last.command_nm)} values", "command_nm of the command that was followed"
+    advice = "copy it; leave it out where your limits changed the command: a restarted controller goes on from it"
+    yield judged("modal command", expected, tuple(last.command_nm) == MODAL_NM, got, advice, severity=warning)
 
 
 def _answers(mirror: Dialogue, took_ns: list[int], unanswered: int) -> Check:
@@ -224,31 +218,27 @@ def _refusals(mirror: Dialogue, base_nm: Single) -> Iterator[Check]:
         state, _, _ = mirror.ask(base_nm)
         before_nm = mirror.surface_nm(state)
         if state is None or before_nm is None:
-            check = wrong("a good command before it is not answered", "go on after a command that is refused")
-            yield check._replace(name=name, expected=expected)
+            got = "a good command before it is not answered"
+            yield judged(name, expected, False, got, "go on after a command that is refused")
             return
         earlier = max(0, state.frame_sequence - 1) if name == "old command refused" else None
         sequence, _ = mirror.put(wanted_nm, sequence=earlier, cut=cut)
-        after, check = mirror.listen(_REFUSAL_S), ok("nothing changed")
+        after = mirror.listen(_REFUSAL_S)
         bad = [one for one in after if mirror.moved(before_nm, one) or one.frame_sequence == sequence]
-        if bad:
-            got = "the state is no finite grid" if mirror.surface_nm(bad[-1]) is None else "it was followed"
-            advice = "check it before anything moves: shape, byte count, isfinite, frame_sequence not below the last"
-            check = wrong(got, advice)
-        yield check._replace(name=name, expected=expected)
+        got = "it was followed" if bad and mirror.surface_nm(bad[-1]) is not None else "the state is no finite grid"
+        advice = "check it before anything moves: shape, byte count, isfinite, frame_sequence not below the last"
+        yield judged(name, expected, not bad, "nothing changed", advice, got)
     state, _, _ = mirror.ask(base_nm)
     if state is None:
-        check = wrong("no answer any more", "catch what cannot be read, and go on")
-        yield check._replace(name="after bad commands", expected="good commands are followed after bad ones")
+        expected, advice = "good commands are followed after bad ones", "catch what cannot be read, and go on"
+        yield judged("after bad commands", expected, False, "no answer any more", advice)
         return
     mirror.listen(_SETTLE_S)
     sequence, _ = mirror.put(base_nm, sequence=max(0, state.frame_sequence - 1), clear_id=mirror.line.now_ns())
-    check = ok("it was followed")
-    if not any(one.frame_sequence == sequence for one in mirror.listen(_REFUSAL_S)):
-        advice = "on a new clear_id forget the newest frame_sequence: else an operator's clear cannot bring it back"
-        check = warning("it was not", advice)
+    followed = any(one.frame_sequence == sequence for one in mirror.listen(_REFUSAL_S))
     expected = "a command with a new clear_id is followed, though its frame_sequence is below the last"
-    yield check._replace(name="clear", expected=expected)
+    advice = "on a new clear_id forget the newest frame_sequence: else an operator's clear cannot bring it back"
+    yield judged("clear", expected, followed, "it was followed", advice, "it was not", warning)
 
 
 def _timeout(mirror: Dialogue, base_nm: Single, raised_by_nm: float) -> Iterator[Check]:
@@ -261,42 +251,37 @@ def _timeout(mirror: Dialogue, base_nm: Single, raised_by_nm: float) -> Iterator
         mirror.put(nan_nm, valid_ns=_LONG_NS)
         mirror.listen(_REFUSED_EVERY_NS / NS)
     expired_ns = _expired_ns(mirror, sent_ns)
+    expected = f"EXPIRED after valid_for_ns, {EXPIRES_NS / 1e6:.0f} ms here; refused commands in between renew nothing"
     if expired_ns is None:
         advice = "watch valid_for_ns by the mirror's own clock, from the command's arrival; then hold or relax, and "
-        check = wrong(f"not within {(EXPIRES_NS + SLACK_NS) / 1e6:.0f} ms", f"{advice}report EXPIRED")
+        late = f"not within {(EXPIRES_NS + SLACK_NS) / 1e6:.0f} ms"
+        yield judged("dead-man", expected, False, late, f"{advice}report EXPIRED")
     else:
-        check = ok(f"after {(expired_ns - sent_ns) / 1e6:.0f} ms")
-        if expired_ns - sent_ns < 0.8 * EXPIRES_NS:
-            check = wrong(check.got, "hold the command for as long as it is valid")
-    expected = f"EXPIRED after valid_for_ns, {EXPIRES_NS / 1e6:.0f} ms here; refused commands in between renew nothing"
-    yield check._replace(name="dead-man", expected=expected)
+        held, advice = expired_ns - sent_ns >= 0.8 * EXPIRES_NS, "hold the command for as long as it is valid"
+        yield judged("dead-man", expected, held, f"after {(expired_ns - sent_ns) / 1e6:.0f} ms", advice)
     expired = [state for _, state in mirror.since(sent_ns) if state.status == _EXPIRED]
-    check = ok("no modal command is named")
-    if any(mirror.moved(raised_nm, state) and state.command_nm for state in expired):
-        advice = "clear command_nm when you relax: a controller that starts takes the difference for a shape to keep"
-        check = wrong("a modal command is named while the mirror relaxes", advice)
-    yield check._replace(name="relaxing", expected="command_nm is empty in the state of a mirror that relaxes")
+    silent = not any(mirror.moved(raised_nm, state) and state.command_nm for state in expired)
+    expected, got = "command_nm is empty in the state of a mirror that relaxes", "no modal command is named"
+    advice = "clear command_nm when you relax: a controller that starts takes the difference for a shape to keep"
+    yield judged("relaxing", expected, silent, got, advice, "a modal command is named while the mirror relaxes")
     mirror.go(base_nm)
     state, _, _ = mirror.ask(base_nm, _LONG_NS)
-    sent_ns, check = mirror.line.now_ns(), ok("followed")
-    if state is None or state.status == _EXPIRED:
-        check = wrong("not followed", "let a new command take over")
-    yield check._replace(name="after the dead-man", expected="a good command is followed again")
+    sent_ns, again = mirror.line.now_ns(), state is not None and state.status != _EXPIRED
+    expected, advice = "a good command is followed again", "let a new command take over"
+    yield judged("after the dead-man", expected, again, "followed", advice, "not followed")
     mirror.listen((LONGEST_NS + SLACK_NS) / NS)
-    check = ok("EXPIRED")
-    if _expired_ns(mirror, sent_ns) is None:
-        advice = "bound valid_for_ns yourself: a sender's mistake must not hold the mirror for ever"
-        check = warning(f"not within {(LONGEST_NS + SLACK_NS) / 1e9:g} s", advice)
     expected = f"EXPIRED after {LONGEST_NS / 1e9:g} s, however long a command says that it is valid"
-    yield check._replace(name="longest command", expected=expected)
+    late, bounded = f"not within {(LONGEST_NS + SLACK_NS) / 1e9:g} s", _expired_ns(mirror, sent_ns) is not None
+    advice = "bound valid_for_ns yourself: a sender's mistake must not hold the mirror for ever"
+    yield judged("longest command", expected, bounded, "EXPIRED", advice, late, warning)
     arrivals = [message.receive_time_ns for message, _ in mirror.since(sent_ns)]
     longest_s = max((later - earlier for earlier, later in pairwise(arrivals)), default=LONGEST_NS) / 1e9
-    check = ok(f"{longest_s:.2g} s at most without one")
-    if longest_s > 1.0:
-        check = wrong(f"{longest_s:.2g} s without one", "publish the state when it is idle, too")
-    elif longest_s > 0.25:
-        check = warning(f"{longest_s:.2g} s without one", "publish the state ten times a second")
-    yield check._replace(name="silence", expected="states all the time, ten a second, while no command comes")
+    expected, got = (
+        "states all the time, ten a second, while no command comes",
+        f"{longest_s:.2g} s at most without one",
+    )
+    advice, severity = "publish the state ten times a second, also when idle", wrong if longest_s > 1.0 else warning
+    yield judged("silence", expected, longest_s <= 0.25, got, advice, severity=severity)
 
 
 def _expired_ns(mirror: Dialogue, since_ns: int) -> int | None:

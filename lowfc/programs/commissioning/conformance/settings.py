@@ -10,7 +10,7 @@ from google.protobuf.message import DecodeError
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.messages import CAMERA_STATE, from_timestamp, wire
 from lowfc.device import CameraSettings
-from lowfc.programs.commissioning.checks import Check, Table, ok, warning, wrong
+from lowfc.programs.commissioning.checks import Check, Table, judged, ok, warning, wrong
 from lowfc.programs.commissioning.conformance.camera import Camera
 
 _FIELDS = tuple(field.name for field in wire.CameraState.DESCRIPTOR.fields if field.name != "timestamp")
@@ -170,13 +170,17 @@ def agreement_checks(config: Configuration, state: wire.CameraState) -> Iterator
             found = max(found, 1.0)  # 0 from a camera that has none
         shown = _NS_PER_MS if one.unit == "ms" else 1.0
         got, expected = (f"{value / shown:.6g} {one.unit}".rstrip() for value in (found, configured))
-        check = ok(got)
-        if abs(found - configured) > one.apart * abs(configured):
-            advice = f"set {one.key}, or the camera; it is used for: {one.use}"
-            check, expected = (wrong if one.needed else warning)(got, advice), f"{expected}, as configured"
-        yield check._replace(name=f"{one.field} and {one.key}", expected=expected)
+        alike, advice = abs(found - configured) <= one.apart * abs(configured), f"it is used for: {one.use}"
+        expected, severity = f"{expected}, as configured", wrong if one.needed else warning
+        advice = f"set {one.key}, or the camera; {advice}"
+        yield judged(f"{one.field} and {one.key}", expected, alike, got, advice, severity=severity)
     frame_timeout_ms, period_ms = config.frame_timeout_ns * 1e-6, state.period_ns * 1e-6
-    check = ok(f"{frame_timeout_ms:g} ms, the period is {period_ms:g} ms")
-    if frame_timeout_ms < PERIODS_OF_TIMEOUT * period_ms:
-        check = wrong(check.got, "leave the key out: it then follows camera.rate_hz")
-    yield check._replace(name="control.frame_timeout_ms", expected=f"at least {PERIODS_OF_TIMEOUT:g} frame periods")
+    long, expected = (
+        frame_timeout_ms >= PERIODS_OF_TIMEOUT * period_ms,
+        f"at least {PERIODS_OF_TIMEOUT:g} frame periods",
+    )
+    got, advice = (
+        f"{frame_timeout_ms:g} ms, the period is {period_ms:g} ms",
+        "leave the key out: it follows camera.rate_hz",
+    )
+    yield judged("control.frame_timeout_ms", expected, long, got, advice)

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import ConfigurationError
 from lowfc.device import plugins
-from lowfc.programs.commissioning.checks import Check, ok, wrong
+from lowfc.programs.commissioning.checks import Check, judged, ok, wrong
 
 
 def device_checks(name: str, config: Configuration) -> Iterator[Check]:
@@ -26,5 +26,5 @@ def device_checks(name: str, config: Configuration) -> Iterator[Check]:
             continue
         yield ok(f"{driver.__module__}:{driver.__qualname__}")._replace(name=what)
         for need in getattr(driver, "needs", lambda _: ())(options):
-            check = ok(need.found) if need.found else wrong("it is not there", need.advice)
-            yield check._replace(name=f"{what}: {need.what}")
+            name, found = f"{what}: {need.what}", need.found
+            yield judged(name, "", bool(found), found or "it is not there", need.advice)

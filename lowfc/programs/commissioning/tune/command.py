@@ -8,7 +8,7 @@ import typer
 
 from lowfc.adapters.process.terminal import AnyRun, Json, LogsIfAny
 from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError, RequestRefusedError
-from lowfc.programs.cli.output import put
+from lowfc.programs.cli.result import put
 
 if TYPE_CHECKING:
     from lowfc.client import Answer, Client
@@ -39,7 +39,7 @@ def tune(
     from lowfc.adapters.process.progress import passing_bar, reading_bar
     from lowfc.client import Client
     from lowfc.programs.commissioning.tune.data import of_log, of_run
-    from lowfc.programs.commissioning.tune.figures import figures, picture, render, tuned
+    from lowfc.programs.commissioning.tune.figures import picture, result_of, tuned
     from lowfc.programs.logs.guard import refuse_log
 
     if bool(logs) == (live is not None):
@@ -64,9 +64,8 @@ def tune(
             best, gains = tuned(telemetry, controller)
         except ValueError as error:
             raise DataFileError(f"{telemetry.source}: {error}") from None
-        found = figures(telemetry, best, gains, controller)
-    found["files"], found["applied"] = [str(file) for file in (out, plot) if file is not None], None
-    lines = [render(found), *(f"written: {file}" for file in found["files"])]
+        found = result_of(telemetry, best, gains, controller)
+    found.files, found.applied = [str(file) for file in (out, plot) if file is not None], None
     if out is not None:
         save(best.law, out)
     if plot is not None:
@@ -75,9 +74,8 @@ def tune(
         with Client(run) as loop:
             integrator = controller == "integrator"
             answer = integrate(loop, gains.gain.tolist(), telemetry.noll) if integrator else loop.law(best.law)
-        found["applied"] = answer.sentence
-        lines.append(answer.sentence)
-    put(found, "\n".join(lines), as_json=as_json)
+        found.applied = answer.sentence
+    put(found, as_json=as_json)
 
 
 def integrate(loop: "Client", gains: list[float], noll: tuple[int, ...]) -> "Answer":

@@ -1,5 +1,6 @@
-"""The figures of `lowfc tune`: what the loop leaves now and what a tuned law would, in numbers, words and pictures."""
+"""The result of `lowfc tune`: what the loop leaves now and what a tuned law would."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ from lowfc.control.laws.vibration import Model
 from lowfc.control.loop.wording import counted
 from lowfc.optics.chain.zernike import mode_name
 from lowfc.programs.cli.contrast import added_contrast, sentence_of, with_variances
+from lowfc.programs.cli.result import Result, figure
 from lowfc.programs.commissioning.tune.data import Telemetry
 
 OPTICAL_GAIN_MAS = 10.0
@@ -51,8 +53,74 @@ def law_now(run: Telemetry) -> LinearLaw:
     return run.driving or integrator(run.law.gain, run.law.leak, run.noll, run.timing.delay, run.rate_hz)
 
 
-def figures(run: Telemetry, best: Tuned, gains: Gains, controller: str) -> dict[str, Any]:
-    """What `--json` prints."""
+class TunedMode(Result):
+    """A mode: residual now and under the tuned law, nm rms of wavefront, with the margins of the latter."""
+
+    noll: int = figure("mode", form="Z{}")
+    name: str = figure("name")
+    gain_now: float | None = figure("gain now", form=".3g")
+    gain_best: float = figure("best", form=".2f")
+    achieved_nm: float | None = figure("achieved", "nm", ".3f")
+    predicted_now_nm: float | None = figure("in theory", "nm", ".3f")
+    kind: str = figure("tuned to")
+    predicted_nm: float = figure("predicted", "nm", ".3f")
+    integrator_predicted_nm: float = figure()
+    noise_nm: float = figure()
+    gain_margin: float | None = figure("gain margin", form=".2f")
+    phase_margin_deg: float = figure("phase margin", "deg", ".0f")
+    max_rejection: float = figure("max |S|", form=".2f")
+    lines: list[dict[str, float]] = figure()
+
+    def remarks(self) -> Sequence[str]:
+        """The lines that were found, behind its row."""
+        shown = [f"{line['frequency_hz']:.2f} Hz ({line['rms_nm']:.2g} nm)" for line in self.lines]
+        return [", ".join(shown)] if shown else []
+
+
+class TuneResult(Result):
+    """The best law of a kind for a run, and what it would leave."""
+
+    source: str = figure()
+    controller: str = figure()
+    law_now: str = figure()
+    rate_hz: float = figure()
+    delay_frames: float = figure()
+    closed: bool = figure()
+    frames: int = figure()
+    achieved_from: str | None = figure()
+    tilt_mas: dict[str, float | None] = figure()
+    added_contrast: dict[str, Any] | None = figure()
+    gain_margin: float | None = figure()
+    phase_margin_deg: float = figure()
+    max_rejection: float = figure()
+    modes: list[TunedMode] = figure()
+    warnings: list[str] = figure()
+    files: list[str] = figure(default=[])
+    applied: str | None = figure(default=None)
+
+    def head(self) -> Sequence[str]:
+        """What the law was tuned from."""
+        return [
+            f"{self.source}: {counted(self.frames, 'frame')} at {self.rate_hz:.4g} Hz, loop "
+            f"{'closed' if self.closed else 'open'}, delay {self.delay_frames:.2f} frames, law {self.law_now}"
+        ]
+
+    def remarks(self) -> Sequence[str]:
+        """Tilt and contrast, warnings, and what came of it."""
+        tilt = {name: rms for name, rms in self.tilt_mas.items() if rms is not None}
+        names = {"predicted": f"predicted ({self.controller})", "integrator_predicted": "best integrator"}
+        cases = ", ".join(f"{names.get(name, name)} {rms:.2f}" for name, rms in tilt.items())
+        return [
+            *([f"tilt per axis, mas rms: {cases}"] if tilt else []),
+            *([] if self.added_contrast is None else [sentence_of(self.added_contrast)]),
+            *(f"warning: {warning}" for warning in self.warnings),
+            *(f"written: {file}" for file in self.files),
+            *([] if self.applied is None else [self.applied]),
+        ]
+
+
+def result_of(run: Telemetry, best: Tuned, gains: Gains, controller: str) -> TuneResult:
+    """What a tuned law would leave of a run, beside what was left."""
     now = law_now(run)
     leak = run.law.leak.astype(np.float64)
     integrator_nm = tune_integrator(best.models, gains, run.noll, leak, run.timing).predicted_nm
@@ -61,95 +129,64 @@ def figures(run: Telemetry, best: Tuned, gains: Gains, controller: str) -> dict[
     if achieved_nm is not None and now_nm is not None:  # nobody has looked between two frames
         sampled_nm = predicted_nm(now, best.models, Timing.sampled(run.timing.delay))
         achieved_nm = np.sqrt(np.maximum(achieved_nm**2 + now_nm**2 - sampled_nm**2, 0.0))
-    modes: list[dict[str, Any]] = []
-    for place, index in enumerate(run.noll):
-        model = best.models[place]
-        modes.append(
-            {
-                "noll": index,
-                "name": mode_name(index),
-                "kind": best.kinds[place],
-                "gain_now": None if run.driving else round(float(run.law.gain[place]), 6),
-                "gain_best": round(float(gains.gain[place]), 4),
-                "achieved_nm": None if achieved_nm is None else float(achieved_nm[place]),
-                "predicted_now_nm": None if now_nm is None else float(now_nm[place]),
-                "predicted_nm": float(best.predicted_nm[place]),
-                "integrator_predicted_nm": float(integrator_nm[place]),
-                "noise_nm": float(np.sqrt(model.noise_nm2)),
-                "gain_margin": _finite(float(best.margins.gain_margin[place])),
-                "phase_margin_deg": float(best.margins.phase_margin_deg[place]),
-                "max_rejection": float(best.margins.peak[place]),
-                "lines": _lines(model),
-            }
+    columns = {
+        "achieved_nm": achieved_nm,
+        "predicted_now_nm": now_nm,
+        "predicted_nm": best.predicted_nm,
+        "integrator_predicted_nm": integrator_nm,
+        "gain_now": None if run.driving else run.law.gain.astype(float).round(6),
+        "gain_best": gains.gain.round(4),
+        "phase_margin_deg": best.margins.phase_margin_deg,
+        "max_rejection": best.margins.peak,
+    }
+    modes = [
+        TunedMode(
+            noll=noll,
+            name=mode_name(noll),
+            kind=best.kinds[k],
+            noise_nm=np.sqrt(best.models[k].noise_nm2),
+            gain_margin=_finite(float(best.margins.gain_margin[k])),
+            lines=_lines(best.models[k]),
+            **{name: None if each is None else each[k] for name, each in columns.items()},
         )
-    open_nm = np.sqrt(np.mean(run.pol.joined() ** 2, axis=0))
-    tilt: dict[str, Any] = {
-        "open": _tilt_mas(run, open_nm),
-        "achieved": _tilt_mas(run, achieved_nm),
-        "predicted": _tilt_mas(run, best.predicted_nm),
-        "integrator_predicted": _tilt_mas(run, integrator_nm),
-    }
-    return {
-        "source": run.source,
-        "controller": controller,
-        "law_now": now.name,
-        "rate_hz": run.rate_hz,
-        "delay_frames": run.timing.delay,
-        "closed": run.closed,
-        "frames": run.pol.frames,
-        "achieved_from": None if achieved_nm is None else ("truth" if run.true_nm2 is not None else "error less noise"),
-        "tilt_mas": tilt,
-        "added_contrast": _added_contrast(run, best, now, achieved_nm),
-        "gain_margin": _finite(float(best.margins.gain_margin.min())),
-        "phase_margin_deg": float(best.margins.phase_margin_deg.min()),
-        "max_rejection": float(best.margins.peak.max()),
-        "modes": modes,
-        "warnings": [*run.warnings, *_doubts(run, tilt["open"], now_nm is not None)],
-    }
-
-
-def render(found: dict[str, Any]) -> str:
-    """The figures as a table."""
-    state = "closed" if found["closed"] else "open"
-    lines = [
-        f"{found['source']}: {counted(found['frames'], 'frame')} at {found['rate_hz']:.4g} Hz, loop {state}, delay "
-        f"{found['delay_frames']:.2f} frames, law {found['law_now']}",
-        "",
-        f"{'residual, nm rms':<26}{'gain now':>9}{'best':>7}{'achieved':>10}{'in theory':>10}  {'tuned to':<11}"
-        f"{'predicted':>9}{'gain m.':>9}{'phase m.':>9}{'max |S|':>8}  lines, Hz (nm rms)",
+        for k, noll in enumerate(run.noll)
     ]
-    for mode in found["modes"]:
-        found_lines = ", ".join(f"{line['frequency_hz']:.2f} ({line['rms_nm']:.2g})" for line in mode["lines"])
-        lines.append(
-            f"{mode['noll']:>3} {mode['name']:<22}{_or_dash(mode['gain_now'], '>9.3g')}{mode['gain_best']:>7.2f}"
-            f"{_or_dash(mode['achieved_nm'], '>10.3f')}{_or_dash(mode['predicted_now_nm'], '>10.3f')}  "
-            f"{mode['kind']:<11}{mode['predicted_nm']:>9.3f}{_factor(mode['gain_margin'])}"
-            f"{mode['phase_margin_deg']:>9.0f}{mode['max_rejection']:>8.2f}  {found_lines}".rstrip()
-        )
-    tilt = found["tilt_mas"]
-    if tilt["predicted"] is not None:
-        achieved = "" if tilt["achieved"] is None else f", achieved {tilt['achieved']:.2f}"
-        lines += [
-            "",
-            f"tilt per axis, mas rms: open {tilt['open']:.2f}{achieved}, predicted {tilt['predicted']:.2f} "
-            f"({found['controller']}), {tilt['integrator_predicted']:.2f} (best integrator)",
-        ]
-    if found["added_contrast"] is not None:
-        lines.append(sentence_of(found["added_contrast"]))
-    lines += [f"warning: {warning}" for warning in found["warnings"]]
-    return "\n".join(lines)
+    rms_nm = {
+        "open": np.sqrt(np.mean(run.pol.joined() ** 2, axis=0)),
+        "achieved": achieved_nm,
+        "predicted": best.predicted_nm,
+        "integrator_predicted": integrator_nm,
+    }
+    tilt_mas = {name: _tilt_mas(run, each) for name, each in rms_nm.items()}
+    return TuneResult(
+        source=run.source,
+        controller=controller,
+        law_now=now.name,
+        rate_hz=run.rate_hz,
+        delay_frames=run.timing.delay,
+        closed=run.closed,
+        frames=run.pol.frames,
+        achieved_from=None if achieved_nm is None else "error less noise" if run.true_nm2 is None else "truth",
+        tilt_mas=tilt_mas,
+        added_contrast=_added_contrast(run, best, now, achieved_nm),
+        gain_margin=_finite(float(best.margins.gain_margin.min())),
+        phase_margin_deg=best.margins.phase_margin_deg.min(),
+        max_rejection=best.margins.peak.max(),
+        modes=modes,
+        warnings=[*run.warnings, *_doubts(run, tilt_mas["open"], now_nm is not None)],
+    )
 
 
 def picture(run: Telemetry, best: Tuned) -> bytes:
     """PNG: spectra of the two largest modes: as it was, as modelled, and what the tuned law would leave."""
     from lowfc.adapters.files.drawing import figure_class, png
 
-    figure = figure_class()(figsize=(10, 8), layout="constrained")
+    drawing = figure_class()(figsize=(10, 8), layout="constrained")
     found = spectrum(run.pol, run.rate_hz)
     if found is None:  # a run that can be tuned from has one
         return b""
     largest = np.argsort(-found.variance_nm2())[:2]
-    for axes, place in zip(figure.subplots(2, 1, sharex=True), largest.tolist(), strict=False):
+    for axes, place in zip(drawing.subplots(2, 1, sharex=True), largest.tolist(), strict=False):
         model = best.models[place]
         omega = 2 * np.pi * found.frequency_hz[1:] / run.rate_hz
         one_sided = 2 / run.rate_hz
@@ -167,7 +204,7 @@ def picture(run: Telemetry, best: Tuned) -> bytes:
         axes.set(ylabel=f"Z{run.noll[place]} {mode_name(run.noll[place])}, nm$^2$/Hz")
         axes.legend()
     axes.set(xlabel="Hz")
-    return png(figure)
+    return png(drawing)
 
 
 def _added_contrast(run: Telemetry, best: Tuned, now: LinearLaw, closed_nm: Array | None) -> dict[str, Any] | None:
@@ -231,13 +268,5 @@ def _doubts(run: Telemetry, open_mas: float | None, stable: bool) -> list[str]:
     return found
 
 
-def _or_dash(value: float | None, form: str) -> str:
-    return f"{'-':>{int(form[1:].split('.')[0])}}" if value is None else f"{value:{form}}"
-
-
 def _finite(value: float) -> float | None:
     return value if np.isfinite(value) else None
-
-
-def _factor(value: float | None) -> str:
-    return f"{'>100':>9}" if value is None or value > 100 else f"{value:>9.2f}"
