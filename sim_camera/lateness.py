@@ -9,11 +9,9 @@ _OFF = 0.125
 
 
 class Lateness:
-    """Counts late commands.
+    """Counts late commands since the start.
 
-    Attributes:
-        total: late ones since the start.
-        habitual: more than a quarter of a window was late, and since then never less than an eighth.
+    They are habitual once more than a quarter of a window is late, until less than an eighth is.
     """
 
     def __init__(self) -> None:
