@@ -53,12 +53,8 @@ class CalibrationData(NamedTuple):
 class Calibrator:
     """One calibration of a running loop; the mirror is afterwards where it was.
 
-    Attributes:
-        config: the loop's.
-        before: the calibration in use.
-        noise_nm: (modes,) of one frame, with that calibration.
-        pokes: what is played.
-        kept: cycles that another calibration can go on from.
+    `before` is the calibration in use, with a noise (modes,) in one frame; another calibration can go on from the
+    cycles `kept`.
     """
 
     def __init__(
@@ -71,12 +67,7 @@ class Calibrator:
     ) -> None:
         """Ask the controller what it has, and read the cycles to go on from.
 
-        Args:
-            loop: A connection to it.
-            request: What is asked for.
-            report: For people.
-            progress: For people: frames so far, and of how many.
-            computed: What the optical model says, of which R is made where its pixels are the loop's.
+        R is made of what the optical model computes, where its pixels are the loop's.
         """
         self._loop = loop
         self._request = request

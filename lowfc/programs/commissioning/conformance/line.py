@@ -23,14 +23,7 @@ EVERYTHING = "lowfc/**"
 
 
 class Received(NamedTuple):
-    """One message as it arrived, whatever is wrong with it.
-
-    Attributes:
-        key: where it was published.
-        payload: its bytes.
-        attachment: what should be its envelope; None without one.
-        receive_time_ns: when it was received, by the host's clock.
-    """
+    """One message as it arrived, whatever is wrong with it; the attachment should be its envelope."""
 
     key: str
     payload: bytes
@@ -47,11 +40,7 @@ class Received(NamedTuple):
 
 
 class Line:
-    """A session of a run that receives everything; `ZenohBus` would refuse what has no envelope.
-
-    Attributes:
-        offset_ns: what CLOCK_MONOTONIC is short of the epoch, on this host.
-    """
+    """A session of a run that receives everything; `ZenohBus` would refuse what has no envelope."""
 
     def __init__(self, links: Links, role: str) -> None:
         """Join a run as `role`; BusError where the role's port is taken."""
@@ -111,15 +100,7 @@ class Line:
 
 
 class Collected:
-    """Messages of a device, in the order of arrival.
-
-    Attributes:
-        line: to the device.
-        key: of its main topic.
-        process: name under which it publishes its Health.
-        messages: all of them.
-        seconds: for how long; set at the end.
-    """
+    """Messages of a device, in the order of arrival, and for how many seconds; `key` is that of its main topic."""
 
     def __init__(self, line: Line, key: str, process: str) -> None:
         """Begin to look at a device."""
