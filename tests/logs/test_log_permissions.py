@@ -3,7 +3,6 @@
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -13,8 +12,7 @@ from lowfc.adapters.logs.series import Limits, LogSeries
 from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.configuration import load
 from lowfc.contract.errors import ConfigurationError
-from lowfc.programs.core.recording.summary import Summary
-from tests.support.loops import lowfc
+from lowfc.programs.core.recording.process import limits_of
 from tests.support.mutated_logs import small_log
 
 
@@ -59,18 +57,8 @@ def test_what_is_written_has_what_the_umask_leaves_and_at_most_its_source_s_mode
     assert mode_of(tmp_path / "night.html") == 0o640 & ~umask
 
 
-def test_the_recorder_is_given_the_key(own_runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    given: dict[str, Any] = {}
-
-    def record(*words: object, **options: object) -> Summary:
-        given.update(options)
-        return Summary((), 0, {}, "", 0, 0, 0)
-
-    monkeypatch.setattr("lowfc.programs.core.recording.process.record", record)
-    (own_runtime / "lowfc.toml").write_text('[recorder]\nfile_mode = "0604"\n')
-    done = lowfc("record", "--config", own_runtime / "lowfc.toml")
-    assert done.exit_code == 0, done.output
-    assert given["limits"].file_mode == 0o604
+def test_the_recorder_is_given_the_key() -> None:
+    assert limits_of(load(None, {"recorder.file_mode": "0604"})).file_mode == 0o604
 
 
 @pytest.mark.parametrize("mode", ["0666 ", "640", "0o640", "0440", "0641", "0x20", "", 416])

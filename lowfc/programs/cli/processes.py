@@ -107,15 +107,9 @@ def record(
     Example: lowfc record --run bench --folder logs --longest-s 600 --min-free-mb 2000
     """
     from lowfc.adapters.bus.run import open_run
-    from lowfc.adapters.files.whole_file import write_whole
-    from lowfc.adapters.logs.series import Limits
-    from lowfc.adapters.process.join import clock_of
     from lowfc.client.runs import nobody_yet
-    from lowfc.contract.events import Level
-    from lowfc.programs.core.recording.alarm import Alarm
     from lowfc.programs.core.recording.process import record as run_recorder
     from lowfc.programs.core.recording.summary import figures, report
-    from lowfc.programs.core.recording.volume import bytes_per_s, outlook, selected
 
     overrides = {
         "recorder.folder": folder,
@@ -129,31 +123,10 @@ def record(
         hint = f"; `lowfc ctl record {words[0]}` asks a recorder that runs" if words[0] in ("start", "stop") else ""
         raise ConfigurationError(f"lowfc record takes options only, got {' '.join(words)!r}{hint}")
     settings = configuration(config, overrides)
-    log, recorded = settings.recorder, selected(settings)
     joined = open_run(run, (settings.mirror.name,), network=settings.network)
-    complete = joined.path / "config.toml"  # a file may name only what was chosen; the log names every value
-    write_whole(complete, settings.to_toml().encode())
     if not joined.links.network.router and (nobody := nobody_yet(run)):
         typer.echo(f"recorder: {nobody}", err=True)
-    done = run_recorder(
-        joined,
-        Path(log.folder),
-        configuration=complete,
-        calibration=calibration,
-        seed=settings.seed,
-        limits=Limits(round(log.largest_mb * 1e6), log.longest_s, round(log.min_free_mb * 1e6), int(log.file_mode, 8)),
-        clock=clock_of(settings),
-        priority=(settings.realtime.priority and settings.realtime.recorder_priority) or None,
-        cpus=set(settings.realtime.recorder_cpus) or None,
-        selection=recorded,
-        expected_bytes_per_s=bytes_per_s(settings, recorded),
-        begins=lambda: typer.echo(outlook(settings), err=True),
-        alarm=lambda service: (
-            Alarm(service, log.on_event, Level[log.on_event_level.upper()], log.on_event_every_s)
-            if log.on_event
-            else None
-        ),
-    )
+    done = run_recorder(joined, settings, calibration)
     typer.echo(json.dumps(figures(done)) if as_json else report(done), err=not as_json)
     if done.failure:
         raise typer.Exit(1)

@@ -1,79 +1,76 @@
 """The recorder's process: joins a run, and records it until it is stopped."""
 
-from collections.abc import Callable
+import sys
 from collections.abc import Set as AbstractSet
 from pathlib import Path
 
 from lowfc.adapters.bus.run import Run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
-from lowfc.adapters.logs.selection import EVERYTHING, Selection
-from lowfc.adapters.logs.series import STANDARD, Limits, shortage
+from lowfc.adapters.files.whole_file import write_whole
+from lowfc.adapters.logs.series import Limits, shortage
 from lowfc.adapters.logs.writer import Attachment
-from lowfc.adapters.process.clock import Clock, HostClock
+from lowfc.adapters.process.join import clock_of
 from lowfc.adapters.process.provenance import provenance
 from lowfc.adapters.process.realtime import step_back
-from lowfc.adapters.process.service import Service
 from lowfc.contract.codecs import input_file
+from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
+from lowfc.contract.events import Level
 from lowfc.contract.messages import Role
+from lowfc.programs.core.recording.alarm import Alarm
 from lowfc.programs.core.recording.recorder import Recorder
 from lowfc.programs.core.recording.summary import Summary
+from lowfc.programs.core.recording.volume import bytes_per_s, outlook, selected
 
 _LARGEST_ATTACHMENT_BYTES = 1 << 28
 
 
-def record(
-    run: Run,
-    folder: Path,
-    *,
-    configuration: Path | None = None,
-    calibration: Path | None = None,
-    seed: int | None = None,
-    limits: Limits = STANDARD,
-    clock: Clock | None = None,
-    priority: int | None = None,
-    cpus: set[int] | None = None,
-    selection: Selection = EVERYTHING,
-    expected_bytes_per_s: float = 0.0,
-    begins: Callable[[], None] = lambda: None,
-    alarm: Callable[[Service], object] = lambda service: None,
-) -> Summary:
-    """Record a run into `folder` until SIGTERM or SIGINT; the process of `lowfc record`.
+def record(run: Run, config: Configuration, calibration: Path | None) -> Summary:
+    """Record a run until SIGTERM or SIGINT; its configuration and the calibration (FITS) go into each log.
 
-    The files `configuration` (TOML) and `calibration` (FITS) go into each log; `begins` is called once there is room,
-    and `alarm` with the service whose events it watches.
+    Raises:
+        BusError: another recorder has this run.
+        DataFileError: a file cannot be read, or no log can be written in the folder.
     """
-    if short := shortage(folder, limits.min_free_bytes):
+    log, realtime, limits, selection = config.recorder, config.realtime, limits_of(config), selected(config)
+    if short := shortage(Path(log.folder), limits.min_free_bytes):
         raise DataFileError(short)
-    begins()
-    attachments = [
-        _attached(path, media_type)
-        for path, media_type in ((configuration, "application/toml"), (calibration, "application/fits"))
-        if path is not None
-    ]
-    granted = step_back(priority, cpus)
-    clock = HostClock() if clock is None else clock
+    sys.stderr.write(f"{outlook(config)}\n")
+    complete = run.path / "config.toml"  # a file may name only what was chosen; the log names every value
+    write_whole(complete, config.to_toml().encode())
+    attachments = [_attached(complete, "application/toml")]
+    attachments += [] if calibration is None else [_attached(calibration, "application/fits")]
+    granted = step_back((realtime.priority and realtime.recorder_priority) or None, set(realtime.recorder_cpus) or None)
+    clock = clock_of(config)
+    origin = {**provenance(run.run_id, config.seed), "clock_ahead_ms": f"{clock.ahead_ns() / 1e6:.3f}"}
     bus = ZenohBus(run.links, Role.RECORDER, clock)
     try:
         recorder = Recorder(
             bus,
             clock,
             run.run_id,
-            folder,
-            metadata={"lowfc": {**provenance(run.run_id, seed), "clock_ahead_ms": f"{clock.ahead_ns() / 1e6:.3f}"}},
+            Path(log.folder),
+            metadata={"lowfc": origin},
             attachments=attachments,
             limits=limits,
             granted=granted,
             selection=selection,
-            expected_bytes_per_s=expected_bytes_per_s,
+            expected_bytes_per_s=bytes_per_s(config, selection),
             awaited=_launched(run),
         )
         recorder.catch_signals()
         recorder.service.announces = True
-        alarm(recorder.service)
+        if log.on_event:
+            Alarm(recorder.service, log.on_event, Level[log.on_event_level.upper()], log.on_event_every_s)
         return recorder.run()
     finally:
         bus.close()
+
+
+def limits_of(config: Configuration) -> Limits:
+    """When the next log is begun, and who may read it."""
+    log = config.recorder
+    return Limits(round(log.largest_mb * 1e6), log.longest_s, round(log.min_free_mb * 1e6), int(log.file_mode, 8))
 
 
 def _launched(run: Run) -> AbstractSet[str]:
