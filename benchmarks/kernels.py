@@ -74,7 +74,6 @@ def about(found: Result) -> str:
 
 
 def _works(size: Size) -> dict[str, Callable[[], object]]:
-    """What is timed of a size, by name."""
     calibration, frames = made_up(size, configuration(size, RATE_HZ))
     made = Payloads(frames)
     payloads = cycle([made.at(index, HostClock().host_ns()) for index in range(FRAMES)])

@@ -134,7 +134,6 @@ def _timed(
 
 @contextmanager
 def _clocked(durations: dict[str, list[int]]) -> Iterator[None]:
-    """Each stage's function timed where the step calls it."""
     originals = [(owner, name, getattr(owner, name)) for owner, name in STAGES.values()]
     for stage, (owner, name, original) in zip(STAGES, originals, strict=True):
         setattr(owner, name, _clock(original, durations[stage]))

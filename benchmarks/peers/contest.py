@@ -221,7 +221,6 @@ def may_run_first() -> bool:
 def _processes(
     contestant: Contestant, rules: argparse.Namespace, folder: Path, words: list[str], priority: int
 ) -> Iterator[dict[str, Child]]:
-    """Start all processes, one after the other is ready; end all."""
     start = program(contestant, rules, folder)
     environment = os.environ | _ONE_THREAD | {"PYTHONPATH": str(ROOT), "MILK_SHM_DIR": str(folder)}
 
@@ -284,7 +283,6 @@ def _spans(turns: Sequence[Result], span: str, names: Iterable[str]) -> list[str
 
 
 def _pairs(runs: Result, other: str) -> list[tuple[Result, Result]]:
-    """Frame to command of the fused step and of another, turn by turn."""
     turns = zip(runs.get(FUSED, ()), runs[other], strict=False)
     return [(mine["frame_to_command"], its["frame_to_command"]) for mine, its in turns if mine and its]
 

@@ -18,7 +18,6 @@ class BenchValues:
     """One slot for each name: a flood of values costs the loop one look at each per frame."""
 
     def __init__(self, service: Service, interlocks: Iterable[Interlock], take: Callable[[BenchReport], None]) -> None:
-        """Subscribe to the names that interlocks look at, and to no others; `take` receives what is new."""
         self._service = service
         self._take = take
         ages_ns: dict[str, set[int]] = {}

@@ -18,7 +18,6 @@ class CacheWarmup:
     """
 
     def __init__(self, period_ns: int) -> None:
-        """Nothing is known yet of frames that come every `period_ns`."""
         self._period_ns = period_ns
         self._due_ns = 0
         self._waits = False

@@ -21,7 +21,6 @@ class CameraSigns:
     """The newest settings of the camera; each is given to `take`."""
 
     def __init__(self, service: Service, take: Callable[[CameraSettings], None]) -> None:
-        """Subscribe."""
         self._service, self._give = service, take
         self._mailbox = service.mailbox(CAMERA_STATE)
         self._due_ns = 0

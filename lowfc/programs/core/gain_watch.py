@@ -153,7 +153,6 @@ class GainWatch:
         return float(each @ before), each * left
 
     def _begin(self, drive: ActiveLoop) -> None:
-        """Begin anew under another calibration, leak or limit."""
         of = drive.calibration.id, drive.law.leak.tobytes(), drive.law.limit_nm.tobytes()
         if of == self._of:
             return
@@ -290,7 +289,6 @@ class GainWatch:
         return [PendingEvent("LOOP_HARMS", details)]
 
     def _reaction(self, event: PendingEvent, step: Step, state: State) -> list[Request]:
-        """What `control.on_harm` wants."""
         if event.name != "LOOP_HARMS" or self._on_harm == "warn":
             return []
         law = state.drive is not None and state.drive.following is not None

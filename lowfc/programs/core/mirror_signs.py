@@ -91,7 +91,6 @@ class MirrorSigns:
 
 
 def _wrong(health: wire.Health) -> str:
-    """Why the mirror does not follow, by its own account."""
     if health.command_refused:
         return f"refuses commands: {wire.Reason.Name(health.command_refused).removeprefix('REASON_')}"
     return "gets no commands" if health.command_expired else ""

@@ -82,7 +82,6 @@ class StartUp:
     """What a configuration puts on the mirror, and the law that it chooses."""
 
     def __init__(self, config: Configuration) -> None:
-        """Read the files."""
         self._file, self._flat_nm = config.mirror.flat, _flat_within_limits(config)
         self._law_file, self._law = config.control.law, law(config)
 

@@ -87,7 +87,6 @@ READINGS = (
 
 
 def _request(one: Declaration) -> Variable | None:
-    """The variable of a request; None of one with arrays, or that only answers."""
     fields, name = {field for field, _ in one.fields}, one.name
     if not one.example or not fields <= {"modes", "values", "text", "lease_id"} or name in ("status", "configuration"):
         return None

@@ -85,7 +85,6 @@ def _added(recent: dict[str, Any]) -> str:
 
 
 def _wavefront(camera: wire.Health) -> str:
-    """The true wavefront over the last seconds."""
     if not camera.HasField("recent_wavefront"):
         return "no frame yet"
     recent = wavefront(camera.recent_wavefront)

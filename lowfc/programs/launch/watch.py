@@ -88,7 +88,6 @@ def summary(watch: Watch, record: bool, rate_hz: float) -> dict[str, Any]:
 
 
 def _closed_fraction(not_closed_s: float, frames: int, rate_hz: float) -> float:
-    """Part of the time since the first frame used for which the loop was closed."""
     return round(max(0.0, 1 - not_closed_s * rate_hz / frames), 4) if frames else 0.0
 
 

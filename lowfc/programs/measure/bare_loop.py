@@ -36,7 +36,7 @@ _HIGHEST = 99
 _WAIT_S = 60.0
 _LOOK_S = 0.01
 
-app = new_app("A loop that does nothing.\n\nExample: python -m lowfc.programs.measure.bare_loop controller --run bench")
+app = new_app("A loop that does nothing.")
 
 
 def trace_file(role: str) -> str:
@@ -51,10 +51,7 @@ def bare_loop(
     config: ConfigFile = None,
     seconds: Annotated[float, typer.Option(help="Of frames.")] = 10.0,
 ) -> None:
-    """Wake once between two frames, as long as there are frames, and note what the kernel counts.
-
-    Example: python -m lowfc.programs.measure.bare_loop controller --run bench --seconds 5
-    """
+    """Wake once between two frames, as long as there are frames, and note what the kernel counts."""
     settings = configuration(config)
     cpus = settings.realtime.controller_cpus if role is Role.CONTROLLER else settings.realtime.camera_cpus
     priority = settings.realtime.priority

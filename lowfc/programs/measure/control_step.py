@@ -24,14 +24,13 @@ class ControlStep:
     """The controller's arithmetic: a frame's bytes in, a command's bytes out."""
 
     def __init__(self, config: Configuration, calibration: Calibration, now_ns: int) -> None:
-        """Load the calibration; the kernel is the configuration's."""
         realtime = config.realtime
         self._settings = replace(settings(config), kernel=compiled.kernel(realtime.kernel, realtime.threads))
         self._valid_ns = round(config.control.command_timeout_ms * 1e6)
         self.state, _ = advance(self._settings, State(), Load(now_ns, calibration, "the run's"))
 
     def __call__(self, payload: bytes) -> bytes:
-        """Decode, check, advance, limit, encode; each frame is newer than the last."""
+        """A frame, newer than the last."""
         frame = codec.decode_frame(payload, self.state.frame_sequence + 1, 0)
         self.state, outputs = advance(self._settings, self.state, frame)
         assert outputs.command is not None  # noqa: S101  # every frame yields one

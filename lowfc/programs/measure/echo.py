@@ -45,15 +45,12 @@ _LOST = -1
 
 Seconds = Annotated[float, typer.Option(help="For how long.")]
 
-app = new_app("A bare zenoh echo.\n\nExample: python -m lowfc.programs.measure.echo ask --run bench --seconds 5")
+app = new_app("A bare zenoh echo.")
 
 
 @app.command()
 def ask(run: RunId = DEFAULT_RUN, config: ConfigFile = None, seconds: Seconds = 10.0) -> None:
-    """Send frames at the camera's place, and time each until its answer is there.
-
-    Example: python -m lowfc.programs.measure.echo ask --run bench --seconds 5
-    """
+    """Send frames at the camera's place, and time each until its answer is there."""
     settings = configuration(config)
     joined = _joined(settings, run, Role.CAMERA, settings.realtime.camera_cpus)
     payloads = Payloads(np.load(joined.path / FRAMES_FILE))
@@ -64,10 +61,7 @@ def ask(run: RunId = DEFAULT_RUN, config: ConfigFile = None, seconds: Seconds = 
 
 @app.command()
 def answer(run: RunId = DEFAULT_RUN, config: ConfigFile = None, seconds: Seconds = 10.0) -> None:
-    """Answer frames at the controller's place until an empty one; then time what it does alone.
-
-    Example: python -m lowfc.programs.measure.echo answer --run bench --seconds 5
-    """
+    """Answer frames at the controller's place until an empty one; then time what it does alone."""
     from lowfc.adapters.files import calibration_file
     from lowfc.programs.measure.control_step import ControlStep, time_alone
 

@@ -41,9 +41,7 @@ _FASTEST = 3
 _WAIT_S = 60.0  # a view may have to load
 _LEAD_PERIODS = 10
 
-app = new_app(
-    "A camera that sends frames made beforehand.\n\nExample: python -m lowfc.programs.measure.frame_source --seconds 5"
-)
+app = new_app("A camera that sends frames made beforehand.")
 
 
 def prepared_frames(config: Configuration) -> Pixels:
@@ -64,7 +62,6 @@ class Payloads:
     """Frames as messages: encoded once, only the time put before each."""
 
     def __init__(self, pixels: Pixels) -> None:
-        """Encode frames (frames, rows, columns)."""
         self.shape: tuple[int, int] = (pixels.shape[1], pixels.shape[2])
         self._bodies = []
         for frame in pixels:
@@ -85,10 +82,7 @@ def frame_source(
     seconds: Annotated[float, typer.Option(help="For how long.")] = 10.0,
     wait_for: Annotated[list[str] | None, typer.Option(help="Process that the first frame waits for; repeat.")] = None,
 ) -> None:
-    """Send the frames in the run's directory as its camera, and write there when each was due and put.
-
-    Example: python -m lowfc.programs.measure.frame_source --run bench --seconds 5 --wait-for controller
-    """
+    """Send the frames in the run's directory as its camera, and write there when each was due and put."""
     settings = configuration(config)
     folder = open_run(run, (settings.mirror.name,)).path
     payloads = Payloads(np.load(folder / FRAMES_FILE))
@@ -102,7 +96,6 @@ class Source:
     """Sends frame after frame for a time, or until it is stopped."""
 
     def __init__(self, config: Configuration, service: Service, payloads: Payloads) -> None:
-        """Declare everything on the bus."""
         self._config = config
         self._service = service
         self._payloads = payloads
@@ -135,17 +128,13 @@ class Source:
             clock.sleep_until_ns(due_ns)
             if not self._service.running:
                 break
+            envelope = self._frames.put(payload)
+            let_send()
             self._due_ns.append(due_ns)
-            self._put(payload)
-
-    def _put(self, payload: bytes) -> int:
-        envelope = self._frames.put(payload)
-        let_send()
-        self._sequence.append(envelope.sequence)
-        self._put_ns.append(envelope.publish_time_ns)
-        self._service.work += 1
-        self._service.beat()
-        return envelope.sequence
+            self._sequence.append(envelope.sequence)
+            self._put_ns.append(envelope.publish_time_ns)
+            self._service.work += 1
+            self._service.beat()
 
 
 if __name__ == "__main__":

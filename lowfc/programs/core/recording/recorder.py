@@ -233,7 +233,6 @@ class Recorder:
         self.service.beat()
 
     def _take(self, topic: Topic, sample: Sample) -> None:
-        """Record one message, unless a query brought it before."""
         try:
             self._account.names.admit(topic, sample.key)
         except BadMessageError as fault:
@@ -325,7 +324,6 @@ class Recorder:
             time.sleep(_TURN_S)
 
     def _peers_recorded(self) -> bool:
-        """Whether a message of another process was recorded."""
         own = {EVENT.key, HEALTH.at(self.service.name)}
         return bool(self.service.last_health or self._peers.kept or set(self._account.recorded()) - own)
 

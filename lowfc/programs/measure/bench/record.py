@@ -9,9 +9,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import psutil
 import typer
@@ -20,9 +19,6 @@ from lowfc.adapters.process.terminal import Json
 from lowfc.contract.errors import BusError, DataFileError
 from lowfc.programs.cli.output import put
 
-if TYPE_CHECKING:
-    from lowfc.adapters.bus.run import Run
-
 RATES_HZ = (1000.0, 2000.0, 5000.0)
 
 _READY_S = 30.0
@@ -30,6 +26,8 @@ _LOOK_S = 0.5
 _WARM_UP_S = 0.5
 _COPY_S = 0.5
 _COPY_BYTES = 256 * 1024
+_TAKEN = ("messages_recorded", "messages_lost", "longest_wait_ms", "longest_unflushed_ms", "longest_write_ms")
+"""What the recorder prints at its end."""
 
 
 def bench_record(
@@ -84,11 +82,7 @@ def measure(rates_hz: tuple[float, ...], seconds: float, folder: Path | None = N
         "rates": rates,
         "payload_bytes_per_frame": frame_bytes,
         "copy_us_per_frame": copy_us,
-        "host": {
-            "machine": platform.machine(),
-            "processors": os.cpu_count(),
-            "python": platform.python_version(),
-        },
+        "host": {"machine": platform.machine(), "processors": os.cpu_count(), "python": platform.python_version()},
     }
 
 
@@ -115,63 +109,45 @@ def _one_rate(rate_hz: float, seconds: float, folder: Path) -> dict[str, Any]:
     from lowfc.programs.measure.traffic import Traffic
 
     run = open_run(new_run_id())
-    try:
-        with _recorder(run, folder) as process, contextlib.closing(Traffic(run, rate_hz)) as traffic:
-            deadline_s = time.monotonic() + _READY_S
-            while not traffic.wait_for("recorder", _LOOK_S):
-                if process.poll() is not None or time.monotonic() > deadline_s:
-                    process.kill()
-                    raise BusError(f"the recorder did not get ready: {process.communicate()[1].strip()[-500:]}")
-            traffic.run(_WARM_UP_S)
-            begun_s, frames = time.monotonic(), traffic.frames
-            own_s, before = time.process_time(), psutil.Process(process.pid).cpu_times()
-            traffic.run(seconds)
-            elapsed_s = time.monotonic() - begun_s
-            own_s, after = time.process_time() - own_s, psutil.Process(process.pid).cpu_times()
-            others_s = after.user + after.system - before.user - before.system
-            traffic.finish()
-            process.send_signal(signal.SIGTERM)
-            out, error = process.communicate()
-            if process.returncode:
-                raise BusError(f"the recorder failed: {error.strip()[-500:]}")
-            done = json.loads(out)
-        (log,) = map(Path, done["logs"])
-        size = log.stat().st_size
-        log.unlink()
-    finally:
-        run.remove()
-    stalls = ("longest_wait_ms", "longest_unflushed_ms", "longest_write_ms")
+    words = [sys.executable, "-P", "-m", "lowfc", "record", "--run", run.run_id, "--folder", str(folder), "--json"]
+    pipes: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with contextlib.ExitStack() as stack:
+        stack.callback(run.remove)
+        process = stack.enter_context(
+            subprocess.Popen(words, **pipes, text=True, start_new_session=True)  # noqa: S603  # our own program
+        )
+        stack.callback(process.kill)  # unless it has ended
+        traffic = stack.enter_context(contextlib.closing(Traffic(run, rate_hz)))
+        deadline_s = time.monotonic() + _READY_S
+        while not traffic.wait_for("recorder", _LOOK_S):
+            if process.poll() is not None or time.monotonic() > deadline_s:
+                process.kill()
+                raise BusError(f"the recorder did not get ready: {process.communicate()[1].strip()[-500:]}")
+        traffic.run(_WARM_UP_S)
+        begun_s, frames = time.monotonic(), traffic.frames
+        own_s, before = time.process_time(), psutil.Process(process.pid).cpu_times()
+        traffic.run(seconds)
+        elapsed_s = time.monotonic() - begun_s
+        own_s, after = time.process_time() - own_s, psutil.Process(process.pid).cpu_times()
+        traffic.finish()
+        process.send_signal(signal.SIGTERM)
+        out, error = process.communicate()
+        if process.returncode:
+            raise BusError(f"the recorder failed: {error.strip()[-500:]}")
+    done = json.loads(out)
+    (log,) = map(Path, done["logs"])
+    size = log.stat().st_size
+    log.unlink()
     return {
         "rate_hz": rate_hz,
         "offered_hz": (traffic.frames - frames) / elapsed_s,
         "seconds": elapsed_s,
-        "cpu_share": others_s / elapsed_s,
+        "cpu_share": (after.user + after.system - before.user - before.system) / elapsed_s,
         "publisher_cpu_share": own_s / elapsed_s,
         "messages_published": traffic.messages,
-        "messages_recorded": done["messages_recorded"],
-        "messages_lost": done["messages_lost"],
         "log_bytes": size,
-        **{stall: done[stall] for stall in stalls},
+        **{name: done[name] for name in _TAKEN},
     }
-
-
-@contextlib.contextmanager
-def _recorder(run: "Run", folder: Path) -> Iterator["subprocess.Popen[str]"]:
-    words = ["record", "--run", run.run_id, "--folder", str(folder), "--json"]
-    process = subprocess.Popen(  # noqa: S603  # our own program
-        [sys.executable, "-P", "-m", "lowfc", *words],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-    try:
-        yield process
-    finally:
-        if process.poll() is None:
-            process.kill()
-            process.communicate()
 
 
 def _copying(folder: Path) -> tuple[float, float]:

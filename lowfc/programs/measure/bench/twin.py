@@ -109,7 +109,6 @@ def render(result: dict[str, Any]) -> str:
 
 
 def _median_us(frame: Callable[[Any], object], wavefronts: NDArray[Any], seconds: float) -> float:
-    """Median time of one frame over the wavefronts in turn, after a few to warm up."""
     for wavefront in wavefronts[:3]:
         frame(wavefront)
     times: list[int] = []

@@ -131,12 +131,8 @@ def _measure(asked: "Asked") -> dict[str, Any]:
     return of_kernels(done) | {
         "settings": {
             "rate_hz": asked.config.camera.rate_hz,
-            "duration_s": asked.duration_s,
-            "repeats": asked.repeats,
+            **{name: getattr(asked, name) for name in ("duration_s", "repeats", "record", "view", "trace")},
             "camera": str(Camera.SIMULATED if asked.simulated else Camera.PREPARED),
-            "record": asked.record,
-            "view": asked.view,
-            "trace": asked.trace,
             "realtime": asked.config.realtime.model_dump(),
         },
         "logs": [log for one in done for log in one["logs"]],

@@ -183,7 +183,6 @@ def _bare_loop(run: Run, role: Role, seconds: float) -> Child:
 
 
 def _name_processes(run: Run, children: list[Child]) -> None:
-    """Leave the number of each process where the bare loops look for it."""
     numbers = {child.name: child.process.pid for child in children if child.process is not None}
     write_whole(run.path / PROCESSES_FILE, json.dumps(numbers).encode())
 
@@ -222,7 +221,6 @@ def _run(
     meanwhile: Callable[[], None],
     started: Callable[[], None] = lambda: None,
 ) -> None:
-    """Start processes, and return when those awaited have ended by themselves."""
     with held_back() as interrupted:  # while a process forks, Python may swallow what signals would raise
         start_all(children)
         started()

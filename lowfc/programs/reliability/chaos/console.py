@@ -109,7 +109,6 @@ class TerminalConsole(contextlib.AbstractContextManager["TerminalConsole"]):
         self.close()
 
     def _look(self) -> None:
-        """Read what it draws, as a terminal does."""
         with contextlib.suppress(OSError):  # it has ended
             while drawn := os.read(self._terminal, 1 << 16):
                 self._screen = (self._screen + drawn)[-(1 << 16) :]

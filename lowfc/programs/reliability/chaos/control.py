@@ -163,7 +163,6 @@ def _interlock(bench: ChaosBench) -> None:
 
 
 def _acting(client: Client) -> list[str]:
-    """Why interlocks act."""
     state = client.status().state
     return [] if state is None else [one.why for one in state.interlocks_acting]
 
@@ -200,7 +199,6 @@ unkept_case(
 
 
 def _other_clock(bench: ChaosBench, seconds: int) -> None:
-    """Let a camera with another clock take the camera's place for a while."""
     usual = bench.children[Role.CAMERA].command
     for command in (["unshare", "--time", "--monotonic", str(seconds), *usual], usual):
         bench.kill(Role.CAMERA)

@@ -94,7 +94,6 @@ def _on_slow_disk(bench: ChaosBench, seconds: float, after: int, times: int) -> 
 
 
 def _instead(bench: ChaosBench, command: list[str], *, ready: bool = True) -> None:
-    """Stop the recorder, and start one with another command line."""
     bench.signal(Role.RECORDER, signal.SIGTERM)
     bench.ends(Role.RECORDER, 0)
     bench.restart(Role.RECORDER, command, ready=ready)

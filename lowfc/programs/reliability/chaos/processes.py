@@ -101,7 +101,6 @@ class CommandTimes:
     """Frame-to-command latencies over some spans of a case, among its figures."""
 
     def __init__(self, bench: ChaosBench) -> None:
-        """Begin to receive them."""
         assert bench.bus is not None  # noqa: S101  # it has begun
         self.found: dict[str, dict[str, float]] = {}
         self._latencies_ns: list[int] = []

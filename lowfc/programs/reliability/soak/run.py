@@ -36,7 +36,6 @@ class LogChecker:
     """Reads each log once it is finished, and removes it: a night's would not fit on a disk."""
 
     def __init__(self, folder: Path) -> None:
-        """Check the logs of a folder."""
         self._folder = folder
         self._came: dict[tuple[str, int], Gaps] = {}
         self.logs = self.messages = 0
