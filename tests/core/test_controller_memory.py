@@ -66,7 +66,7 @@ def configured(**overrides: object) -> Configuration:
     return load(None, FIXED_GAINS | bright | {key.replace("__", "."): value for key, value in overrides.items()})
 
 
-CONFIG = configured()
+CONFIG, CLOSED = configured(), configured(control__start_mode="closed")
 
 
 class Rig:
@@ -159,6 +159,19 @@ class Rig:
         assert not any(bus.faults.counts for bus in self.hub.buses)
 
 
+def alone(calibration: Calibration, latch: Latch, config: Configuration) -> tuple[MemoryHub, Service, Controller]:
+    """A controller without camera and mirror."""
+    hub, clock = MemoryHub(), SimulatedClock(START_NS) if config.lockstep else HostClock()
+    service = Service("controller", "test", clock, MemoryBus(hub, "controller", clock))
+    return hub, service, Controller(config, service, calibration, "a test", latch)
+
+
+def mode_of(controller: Controller) -> LoopMode:
+    health = wire.Health()
+    controller.fill(health)
+    return LoopMode(health.mode)
+
+
 @pytest.fixture(scope="module")
 def calibration() -> Calibration:
     return calibrated(CONFIG)
@@ -196,7 +209,7 @@ def test_closing_the_loop_corrects_every_mode(rig: Rig) -> None:
     before = rig.expose(3)[0].residual_rms_nm
     assert rig.ask("gain", 0.25).accepted
     assert rig.ask("close").accepted
-    assert rig.expose(260)[-1].residual_rms_nm < 0.2 * before, "the true wavefront gets flat too"
+    assert rig.expose(120)[-1].residual_rms_nm < 0.2 * before, "the true wavefront gets flat too"
     last = rig.steps(20)
     assert all(step.mode == wire.LOOP_MODE_CLOSED for step in last)
     command = np.array([step.command_nm for step in last], float)
@@ -277,14 +290,12 @@ def test_a_camera_with_a_wrong_clock_is_late_and_does_not_stop_the_controller(
     assert max(rig.said[TIMING.key][0].transport_ns) == 2**32 - 1
 
 
-def test_a_latch_that_cannot_be_written_starts_open(rig: Rig, tmp_path: Path) -> None:
+def test_a_latch_that_cannot_be_written_starts_open(calibration: Calibration, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    service = Service("controller", "test", rig.clock(), MemoryBus(MemoryHub(), "controller", rig.clock()))
-    health, said = wire.Health(), []
-    latch = Latch([tmp_path / "file" / "safe"], said.append)
-    Controller(configured(control__start_mode="closed"), service, rig.calibration, "a test", latch).fill(health)
+    said: list[str] = []
+    _, service, controller = alone(calibration, Latch([tmp_path / "file" / "safe"], said.append), CLOSED)
     assert service.awaited() == "a camera"
-    assert (LoopMode(health.mode), len(said)) == (LoopMode.OPEN, 1)
+    assert (mode_of(controller), len(said)) == (LoopMode.OPEN, 1)
 
 
 def test_a_signal_makes_the_loop_safe(rig: Rig) -> None:
@@ -342,17 +353,15 @@ def test_states_carry_the_identity_of_a_law_and_of_a_play(rig: Rig) -> None:
     assert published.plays[state.play.id].rows.shape == (50_000, 14)
 
 
-def test_safed_outlives_the_controller(rig: Rig, tmp_path: Path) -> None:
+def test_safed_outlives_the_controller(calibration: Calibration, tmp_path: Path) -> None:
     """The latch is a file of the run: only an operator's clear removes it."""
     file = tmp_path / "safe"
-    closed = configured(control__start_mode="closed")
 
     def mode() -> LoopMode:
-        service = Service("controller", "test", rig.clock(), MemoryBus(MemoryHub(), "controller", rig.clock()))
-        health, latch = wire.Health(), Latch([file])
-        Controller(closed, service, rig.calibration, "a test", latch).fill(health)
+        latch = Latch([file])
+        found = mode_of(alone(calibration, latch, CLOSED)[2])
         latch.close()  # or it writes the file again
-        return LoopMode(health.mode)
+        return found
 
     assert mode() is LoopMode.CLOSED
     file.touch()
@@ -361,15 +370,8 @@ def test_safed_outlives_the_controller(rig: Rig, tmp_path: Path) -> None:
     assert mode() is LoopMode.CLOSED
 
 
-def alone(calibration: Calibration, latch: Path) -> tuple[MemoryHub, Controller]:
-    """A controller in real time without camera and mirror."""
-    hub = MemoryHub()
-    service = Service("controller", "test", HostClock(), MemoryBus(hub, "controller", HostClock()))
-    return hub, Controller(configured(lockstep=False), service, calibration, "a test", Latch([latch]))
-
-
 def test_another_mirror_than_the_calibrations_is_refused(calibration: Calibration, tmp_path: Path) -> None:
-    hub, controller = alone(calibration, tmp_path / "safe")
+    hub, _, controller = alone(calibration, Latch([tmp_path / "safe"]), configured(lockstep=False))
     small = wire.MirrorState(rows=20, columns=20, actuators=np.zeros(400, np.float32).tobytes())
     MemoryBus(hub, "mirror-dm", HostClock()).publisher(MIRROR_STATE, "dm").put(small.SerializeToString())
     with pytest.raises(CalibrationError, match="20, 20"):
@@ -408,7 +410,7 @@ def test_a_frame_that_cannot_be_dealt_with_ends_the_controller(
 ) -> None:
     """On the bus's thread it would be counted, and the loop would stand still."""
     monkeypatch.setattr("lowfc.programs.core.controller.MIRROR_PATIENCE_S", 0.01)
-    hub, controller = alone(calibration, tmp_path / "safe")
+    hub, _, controller = alone(calibration, Latch([tmp_path / "safe"]), configured(lockstep=False))
 
     def broken(*_: object) -> None:
         raise ArithmeticError("one and one is three")

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 
 from lowfc.contract.configuration import Configuration, load
+from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.stability import limiting_gain
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from tests.support.folded_loop import fold
+from tools.law_bench import calibrated
 
 QUIET = {
     "camera.rate_hz": 1000,
@@ -24,9 +26,16 @@ def configured(**overrides: object) -> Configuration:
     return load(None, QUIET | {key.replace("__", "."): value for key, value in overrides.items()})
 
 
+@pytest.fixture(scope="module")
+def calibration() -> Calibration:
+    return calibrated(configured())
+
+
 @pytest.mark.parametrize("delay", [1, 2, 3])
 @pytest.mark.parametrize(("factor", "stable"), [(0.99, True), (1.01, False)])
-def test_the_limiting_gain_is_right_within_a_percent(delay: int, factor: float, stable: bool) -> None:
+def test_the_limiting_gain_is_right_within_a_percent(
+    delay: int, factor: float, stable: bool, calibration: Calibration
+) -> None:
     """2 sin(pi / (2 (2d - 1))), with noiseless diffraction and a tilt of less than 1 mas."""
     gain = factor * 2 * np.sin(np.pi / (2 * (2 * delay - 1)))
     assert limiting_gain(delay) == pytest.approx(gain / factor, rel=1e-9)
@@ -34,7 +43,7 @@ def test_the_limiting_gain_is_right_within_a_percent(delay: int, factor: float, 
     config = configured(
         camera__delay_frames=delay, control__tilt_gain=gain, control__gain=0.0, disturbance__static_nm={"2": start_nm}
     )
-    run = fold(config, 240)
+    run = fold(config, 240, calibration)
     tilt = np.abs(run.residual_nm[:, 0])
     early, late = tilt[40:80].max(), tilt[-40:].max()
     assert tilt[:80].max() < tilt_nm_per_mas(2.0)

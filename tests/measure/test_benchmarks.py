@@ -16,6 +16,7 @@ from benchmarks.peers import contest, contestants
 from benchmarks.peers.contestants import CONTESTANTS, FUSED
 from benchmarks.peers.shared import ACTUATORS, MARKS, NumpyStep, Problem
 from benchmarks.sizes import Size, configuration, made_up
+from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.sections import Camera
 from lowfc.control.kernel import stepping
 from lowfc.programs.measure.control_step import ControlStep
@@ -23,11 +24,6 @@ from lowfc.programs.measure.frame_source import Payloads
 
 ROOT = Path(__file__).parents[2]
 SMALL = Size(side=32, modes=5, mirror_side=10)
-
-
-def run(*words: str | Path) -> "subprocess.CompletedProcess[str]":
-    command = [sys.executable, "-m", "benchmarks", *map(str, words)]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
 
 
 def by_heading(lines: runner.Lines) -> list[dict[str, str]]:
@@ -133,19 +129,22 @@ def test_a_point_is_the_median_of_its_repeats_and_says_what_the_limit_is() -> No
 
 
 def test_the_curves_of_a_few_sizes_from_the_command_line() -> None:
-    sizes = ("--pixels", "32", "--modes", "20", "--actuators", "--no-loop")
-    done = run("curves", *sizes, "--seconds", "0.02", "--repeats", "2", "--json")
+    words = "--pixels 32 --modes 20 --actuators --no-loop --seconds 0.02 --repeats 2 --json"
+    command = [sys.executable, "-m", "benchmarks", "curves", *words.split()]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
-    assert [one["pixels"] for one in found["curves"]["pixels"]] == [1024]
-    assert [one["pixels"] for one in found["curves"]["modes"]] == [6400]
-    assert found["curves"]["actuators"] == []
+    assert {name: [one["pixels"] for one in points] for name, points in found["curves"].items()} == {
+        "pixels": [1024],
+        "modes": [6400],
+        "actuators": [],
+    }
     for name in ("step_us", "stream_us", "products_us"):
         figures = found["curves"]["pixels"][0][name]
         assert 0 < figures["p50"] <= figures["p99"]
         assert figures["cpu"] > 0
-    nothing = run("curves", "--pixels", "--modes", "--actuators")
-    assert (nothing.returncode, nothing.stderr.split(":")[0]) == (2, "error")
+    with pytest.raises(ConfigurationError, match="nothing to measure"):
+        curves.measure(Namespace(pixels=[], modes=[], actuators=[]), lambda _: None)
 
 
 # The highest rate
@@ -323,10 +322,8 @@ def test_the_tables_have_ranges_and_differences_within_a_turn_and_who_is_not_the
 
 
 def test_who_cannot_take_part_is_said_and_how_it_can(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    done = run("peers", "--only", "pyrtcao", "--pyrtcao", "/no/such/python", "--repeats", "1", "--json")
-    assert done.returncode == 0, done.stderr
-    assert all("/no/such/python" in why for why in json.loads(done.stdout)["missing"].values())
-    chain = CONTESTANTS[0]
+    chain, *_, pyrtcao, _, _ = CONTESTANTS
+    assert "pyrtcao is not installed in /no" in contestants.missing(pyrtcao, rules("--pyrtcao", "/no"))
     monkeypatch.setattr(contestants.shutil, "which", lambda _: "cc")
     assert f"{tmp_path} has no ImageStreamIO.c: git clone" in contestants.missing(chain, rules("--isio", tmp_path))
     monkeypatch.setattr(contestants.shutil, "which", lambda _: None)

@@ -210,13 +210,13 @@ class FoldedLoop(Client):
         return each()
 
 
-def fold(config: Configuration, frames: int) -> SimpleNamespace:
+def fold(config: Configuration, frames: int, calibration: Calibration | None = None) -> SimpleNamespace:
     """The loop of a configuration, of which every frame must be used.
 
     Of the steps, error_nm, pol_nm and command_nm (frames, modes); of the truth, disturbance_nm and residual_nm
     (frames, modes), disturbance_rms_nm and residual_rms_nm (frames,) over the open pupil; nm of wavefront.
     """
-    bench = Bench(config, calibrated(config))
+    bench = Bench(config, calibration or calibrated(config))
     bench.run(frames)
     assert not bench.refused
     found = {name: [getattr(step, name) for step in bench.steps] for name in ("error_nm", "pol_nm", "command_nm")}
