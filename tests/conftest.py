@@ -9,7 +9,7 @@ import pytest
 NO_SKIPS = os.environ.get("LOWFC_NO_SKIPS") == "1"
 LONGEST = (
     *("test_tutorials", "test_lockstep", "test_calibrate", "test_what_if", "test_gain_watch", "test_commission"),
-    *("test_calibrate_commands", "test_optics_twin", "test_dark_hole", "test_validate", "test_guard", "test_site"),
+    *("test_calibrate_commands", "test_optics_twin", "test_validate", "test_guard", "test_site"),
 )
 """Files that are begun first, so that no worker is left alone with one of them at the end."""
 

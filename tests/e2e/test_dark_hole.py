@@ -11,6 +11,8 @@ from lowfc.contract.messages import CALIBRATION, COMMAND, OFFLOAD, STEP, wire
 from lowfc.programs.paper.dark_hole import PLAIN, SHIFTED, STEPS, Night, dark_hole
 from tests.support.loops import payloads, run
 
+pytestmark = pytest.mark.slow
+
 GRID = (34, 34)
 DEAD = (352, 561, 595, 757)
 EACH_NM = 2.0
