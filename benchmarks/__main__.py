@@ -14,6 +14,7 @@ BENCHMARKS = {
     "step": "benchmarks.step",
     "curves": "benchmarks.curves",
     "kernels": "benchmarks.kernels",
+    "streams": "benchmarks.streams",
     "throughput": "benchmarks.throughput",
     "peers": "benchmarks.peers.contest",
 }

@@ -18,7 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from benchmarks import curves, kernels, step, throughput
+from benchmarks import curves, kernels, step, streams, throughput
 from benchmarks.peers import contest
 from benchmarks.runner import Benchmark, in_markdown
 from lowfc.programs.measure.latency import text as latency_text
@@ -92,6 +92,7 @@ MEASUREMENTS = {
     "kernels": _bench("python -m benchmarks kernels", kernels),
     "stalls": _latency("lowfc latency --duration 60 --kernel fused --trace"),
     "step": _bench("python -m benchmarks step", step),
+    "streams": _bench("python -m benchmarks streams", streams),
     "peers": _bench("python -m benchmarks peers", contest),
     "curves": _bench("python -m benchmarks curves --seconds 1 --repeats 2", curves),
     "throughput": _bench("python -m benchmarks throughput --seconds 6", throughput),

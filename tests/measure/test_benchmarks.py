@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import curves, kernels, load, runner, step, throughput
+from benchmarks import curves, kernels, load, runner, step, streams, throughput
 from benchmarks.peers import contest, contestants
 from benchmarks.peers.contestants import CONTESTANTS, FUSED
 from benchmarks.peers.shared import ACTUATORS, MARKS, NumpyStep, Problem
@@ -372,3 +372,38 @@ def test_kernels_are_measured_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:
     (lines,) = kernels.tables(found)
     assert len(lines) == 6
     assert "product" in kernels.about(found)
+
+
+# Streams
+
+
+def test_streams_and_the_direct_link_are_compared_turn_by_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    order: list[str] = []
+
+    def one_run(rate_hz: float, seconds: float, name: str) -> dict[str, Any]:
+        order.append(name)
+        span = one(100.0 * len(order), 1000.0)["frame_to_command"]
+        spans = dict.fromkeys(("frame_to_command", "frame_to_mirror", "stream_to_camera"), span)
+        return spans | {"frames": 500, "without_command": int(name != streams.DIRECT)}
+
+    monkeypatch.setattr(streams, "one_run", one_run)
+    found = streams.measure(Namespace(repeats=2, rate_hz=1000.0, seconds=1.0), lambda _: None)
+    assert order[:3] == order[:2:-1] == [streams.DIRECT, streams.BETWEEN, streams.READ]
+    (lines,) = streams.tables(json.loads(json.dumps(found)))
+    found_p50 = [line["frame to mirror, us: p50"] for line in by_heading(lines)]
+    assert found_p50[:3] == ["350 (100 to 600)", "350 (200 to 500)", "350 (300 to 400)"]
+    assert found_p50[3:] == ["1.42 (0.83 to 2.00)", "1.83 (0.67 to 3.00)"]
+    _, between, _, ratio, _ = by_heading(lines)
+    assert (between["without a command"], ratio["frame to command, us: p99"]) == ("2 of 1000", "1.00 (1.00 to 1.00)")
+    assert "350 (200 to 500) us (p50)" in streams.about(found)
+    assert "350 (300 to 400) where the controller" in streams.about(found)
+
+
+@pytest.mark.exclusive
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [streams.BETWEEN, streams.READ])
+def test_a_loop_by_streams_is_really_run(name: str) -> None:
+    found = streams.one_run(200.0, 1.0, name)
+    assert found["frames"] == pytest.approx(200, abs=10)
+    assert found["without_command"] < found["frames"]
+    assert 0 < found["stream_to_camera"]["p50"] < found["frame_to_command"]["p50"] < found["frame_to_mirror"]["p50"]

@@ -95,10 +95,15 @@ def run_repeats(asked: Asked, run: Run, progress: Callable[[str], None]) -> list
     return repeats
 
 
-def one_loop(asked: Asked, run: Run) -> dict[str, Any]:
+def one_loop(asked: Asked, run: Run, children: list[Child] | None = None) -> dict[str, Any]:
     """One repeat of the loop alone: figures of its frames, and what its processes reported at their end.
 
-    Python is woken ten times a second, and by Health; frames and mirror states wait in rings.
+    Python is woken ten times a second, and by Health; frames and mirror states wait in rings. `children` are the
+    loop's processes where they are others; the first ends by itself, and they leave the times of frames as the source.
+
+    Raises:
+        ProcessDiedError: a process ended that should not have, or with an error.
+        BusError: the controller did not report its timing.
     """
     watch, timings = Watch({}, []), TimingRows()
     states, frames = (Columns(sequence="Q", publish_ns="q") for _ in range(2))
@@ -113,7 +118,7 @@ def one_loop(asked: Asked, run: Run) -> dict[str, Any]:
         for sample in frame_ring.drain() if frame_ring is not None else ():
             frames.add(sequence=sample.sequence, publish_ns=sample.publish_time_ns)
 
-    children, traced = _children(asked, run), TRACED if asked.trace else ()
+    children, traced = _children(asked, run) if children is None else children, TRACED if asked.trace else ()
     for file in (BEGIN_FILE, PROCESSES_FILE):
         (run.path / file).unlink(missing_ok=True)  # of the last repeat
     with contextlib.ExitStack() as stack:

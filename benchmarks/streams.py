@@ -1,0 +1,138 @@
+"""Frame to command over ImageStreamIO beside the direct link: the same controller, frames and processors, in turns.
+
+Over ImageStreamIO a program writes each frame into a stream, `lowfc camera isio` reads it, or the controller does so
+itself (`lowfc controller --camera isio`), and `lowfc mirror isio` writes the command into a channel. By the direct link
+the source of frames and the mirror are those of `lowfc latency`.
+
+Example:
+    python -m benchmarks streams --seconds 5 --repeats 9
+"""
+
+import argparse
+import os
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks import stream_ends
+from benchmarks.runner import Lines, Result, Tell, add_times, ranged
+from benchmarks.sizes import Size, configuration, laid_out
+from lowfc.adapters.bus.run import Run, mirror_role
+from lowfc.adapters.image_stream.stream import Stream, stream_path
+from lowfc.adapters.process.child import Child
+from lowfc.contract.messages import Role
+from lowfc.programs.launch.processes import program
+from lowfc.programs.launch.sim_loop import children_of
+from lowfc.programs.measure.latency.figures import WARM_UP_S
+from lowfc.programs.measure.latency.run import Asked, one_loop
+
+ROOT = Path(__file__).parents[1]
+SIZE = Size()
+DIRECT, BETWEEN, READ = "direct link", "ImageStreamIO, a process between", "ImageStreamIO, read by the controller"
+SPANS = {"frame_to_command": "frame to command", "frame_to_mirror": "frame to mirror"}
+AT = {"p50": "p50", "p99": "p99", "p99_9": "p99.9"}
+FRAMES, CHANNEL = "lowfs", "dm00disp03"
+
+_MEMORY = Path("/dev/shm")  # noqa: S108  # a folder of one's own is made in it
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    """How long, how often, how fast."""
+    add_times(parser, seconds=3.0, repeats=9)
+    parser.add_argument("--rate", dest="rate_hz", type=float, default=1000.0, help="frames per second (%(default)g)")
+
+
+def measure(options: argparse.Namespace, tell: Tell) -> Result:
+    """Run them in turns, every other time in the opposite order.
+
+    Returns:
+        turns, of each the figures of all as `one_run` makes them; seconds and rate_hz.
+    """
+    turns: list[dict[str, Result]] = []
+    for number in range(options.repeats):
+        turns.append({})
+        for name in (DIRECT, BETWEEN, READ)[:: -1 if number % 2 else 1]:
+            tell(f"turn {number + 1} of {options.repeats}: {name}")
+            turns[-1][name] = one_run(options.rate_hz, options.seconds, name)
+    return {"turns": turns, "seconds": options.seconds, "rate_hz": options.rate_hz}
+
+
+def one_run(rate_hz: float, seconds: float, name: str) -> Result:
+    """Run one of the loops once.
+
+    Returns:
+        frame_to_command and frame_to_mirror (percentiles in us), frames, and without_command of them; by streams also
+        stream_to_camera, from just before a frame is written until just before the camera's put.
+    """
+    driver = stream_ends.__name__
+    config = configuration(SIZE, rate_hz).model_copy(update={"drivers": {driver: {"stream": FRAMES}}})
+    by_streams = name != DIRECT
+    asked = Asked(config, seconds, 1)
+    with laid_out(SIZE, config) as run, tempfile.TemporaryDirectory(prefix="lowfc-streams-", dir=_MEMORY) as folder:
+        found = one_loop(asked, run, _loop(asked, run, Path(folder), name) if by_streams else None)
+    start = "due" if by_streams else "frame"
+    spans_us = {f"frame_to_{end}": found["latency_us"][f"{start}_to_{end}"] for end in ("command", "mirror")}
+    if by_streams:
+        spans_us["stream_to_camera"] = found["latency_us"]["due_to_frame"]
+    return spans_us | {"frames": found["frames"], "without_command": found["frames_without_command"]}
+
+
+def _loop(asked: Asked, run: Run, folder: Path, name: str) -> list[Child]:
+    """Processes of a loop whose streams are in a folder; the first is the program that writes the frames."""
+    config, seconds = asked.config, WARM_UP_S + asked.duration_s
+    Stream.create(folder / stream_path(FRAMES).name, (SIZE.side, SIZE.side), np.uint16)
+    role = mirror_role(config.mirror.name)
+    shared = ["--run", run.run_id, "--config", str(run.path / "config.toml")]
+    writer, mirror_there = stream_ends.__name__, ["--wait-for", role]
+    driver = f"{writer}:{stream_ends.TimedCamera.__name__}"
+    commands = {
+        "source": ["-m", writer, str(run.path), FRAMES, str(round(seconds * config.camera.rate_hz))],
+        role: ["-m", "lowfc", "mirror", "isio", *shared, "--stream", CHANNEL],
+    }
+    if name == BETWEEN:
+        waits = ["--wait-for", str(Role.CONTROLLER), *mirror_there]
+        commands[str(Role.CAMERA)] = ["-m", "lowfc", "camera", driver, *shared, *waits]
+    children = [program(role, words, run.path / f"{role}.stderr") for role, words in commands.items()]
+    (controller,) = (one for one in children_of(config, run, seconds, record=False) if one.name == Role.CONTROLLER)
+    if name == READ:
+        controller.command += ["--camera", driver, *mirror_there]
+    children.append(controller)
+    for child in children:
+        child.environment = os.environ | {"MILK_SHM_DIR": str(folder), "PYTHONPATH": str(ROOT)}
+    return children
+
+
+def tables(result: Result) -> list[Lines]:
+    """Latencies of all, and their ratios turn by turn."""
+    turns = result["turns"]
+    lines = [["", *(f"{words}, us: {at}" for words in SPANS.values() for at in AT.values()), "without a command"]]
+    for name in (DIRECT, BETWEEN, READ):
+        each = [turn[name] for turn in turns]
+        cells = [ranged([one[span][at] for one in each]) for span in SPANS for at in AT]
+        without, frames = (sum(one[key] for one in each) for key in ("without_command", "frames"))
+        lines.append([name, *cells, f"{without} of {frames}"])
+    for name in (BETWEEN, READ):
+        ratios = [ranged(ratios_of(turns, name, span, at), "{:.2f}".format) for span in SPANS for at in AT]
+        lines.append([f"{name}: over {DIRECT}, turn by turn", *ratios, ""])
+    return [lines]
+
+
+def ratios_of(turns: Sequence[Result], name: str, span: str, at: str) -> list[float]:
+    """Of that one over the direct link, of each turn."""
+    return [turn[name][span][at] / turn[DIRECT][span][at] for turn in turns]
+
+
+def about(result: Result) -> str:
+    """What the figures are."""
+    turns = result["turns"]
+    before, read = (ranged([turn[name]["stream_to_camera"]["p50"] for turn in turns]) for name in (BETWEEN, READ))
+    return (
+        f"Medians (lowest to highest) over {len(turns)} turns of {result['seconds']:g} s each at {result['rate_hz']:g} "
+        f"Hz; {SIZE.side} x {SIZE.side} pixels, {SIZE.modes} modes, {SIZE.actuators} actuators. Over ImageStreamIO a "
+        "frame begins just before its writer sets the write flag, by the direct link just before the put; a command "
+        "ends just after the controller's send, and at the mirror just before its state. Of the frame to command over "
+        f"ImageStreamIO {before} us (p50) are from there until just before the camera's put; {read} where the "
+        "controller reads it."
+    )
