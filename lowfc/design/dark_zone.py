@@ -12,7 +12,13 @@ FINE_STEP = 0.1
 
 @dataclass(frozen=True)
 class DarkZone:
-    """Part of a ring: from where it begins to where it ends, within half an angle of the x axis."""
+    """Part of a ring.
+
+    Attributes:
+        inner: Where it begins.
+        outer: Where it ends.
+        half_angle_deg: It lies within this angle of the x axis.
+    """
 
     inner: float
     outer: float

@@ -17,9 +17,14 @@ _SETTLED = 8.0  # time constants of the slowest mode that do not count
 
 @dataclass(frozen=True, eq=False)
 class DriftTrial:
-    """A sensor's twin, the modes that are fitted, a star of so many electrons in an exposure, and a loop.
+    """A sensor, a star and a loop.
 
-    Electrons are of the open circle's light, read noise is of a pixel, the exposure a part of the period.
+    Attributes:
+        twin: of the sensor.
+        noll: of the modes that are fitted.
+        light_e: electrons of the open circle's light in an exposure.
+        read_noise_e: of a pixel.
+        exposure: of the period.
     """
 
     twin: Twin
@@ -29,9 +34,13 @@ class DriftTrial:
     exposure: float
 
     def left_nm2(self, step_nm2: Array, gain: Array, frames: int, rng: np.random.Generator) -> Array:
-        """Mean square (modes,) over all time of what integrators leave, of so many frames that count.
+        """Mean square (modes,) over all time of what integrators leave.
 
-        Each mode steps in a frame with a variance (modes,), nm^2; a gain (modes,) of 0 leaves it where it is.
+        Args:
+            step_nm2: (modes,) variance of each mode's step in a frame, nm^2.
+            gain: (modes,) of the integrators; 0 for a mode that stays.
+            frames: That count.
+            rng: Source of all randomness.
         """
         basis = zernikes(self.noll, *node_radii(self.twin))
         I0, H = reference(self.twin).ravel(), response(self.twin, basis)

@@ -45,13 +45,20 @@ def fit(
     kind: str,
     nuisance: Array | None = None,
 ) -> Fit:
-    """The least-squares solution of eq. (11) for one exposure, of the image I0 (pixels,) and its derivative H.
+    """The least-squares solution of eq. (11) for one exposure.
 
-    H (pixels, modes) is per nm of each mode, both in fractions of the open circle's light, of which the exposure has
-    `scale_e` electrons. "pinv" weighs all pixels alike, "weighted" by the inverse variance of the flat image. Nuisances
-    (pixels, extra) are changes of the image that are no wavefront, in fractions per unit of each: I0 for the flux,
-    `lowfc.optics.chain.sensor.shear_response` for the pupil's shear. They are fitted along and dropped. ValueError for
-    an unknown kind, or modes that this sensor cannot tell apart.
+    Args:
+        nolls: Noll index of each mode.
+        I0: (pixels,) flat wavefront's image, fractions of the open circle's light.
+        H: (pixels, modes) its derivative per nm of each mode.
+        scale_e: Electrons of the open circle's light in the exposure: fractions times this are electrons.
+        read_noise_e: Of each pixel.
+        kind: "pinv" weighs all pixels alike, "weighted" by the inverse variance of the flat image.
+        nuisance: (pixels, extra) changes of the image that are no wavefront, in fractions per unit of each: I0 for the
+            flux, `lowfc.optics.chain.sensor.shear_response` for the pupil's shear. They are fitted along and dropped.
+
+    Raises:
+        ValueError: Unknown kind, or modes that this sensor cannot tell apart.
     """
     R = reconstructor(I0, H, np.ones_like(I0), scale_e, read_noise_e, kind, nuisance)
     return Fit(tuple(nolls), I0 * scale_e, H * scale_e, R / scale_e, kind, scale_e)
@@ -65,8 +72,13 @@ def estimate(fit: Fit, image_e: Array) -> Array:
 def iterated(fit: Fit, image_e: Array, model: Model, iterations: int) -> list[Array]:
     """Estimates (modes,) in nm after none, one, ... `iterations` with the full model: a <- a + R (I - I_model(a)).
 
-    The image (pixels,) is in electrons. The gain stays, the model, the image for modes in nm, is not linear; two
-    iterations are enough for the wavefronts of Sect. 3.1.
+    The gain stays, the model is not linear; two iterations are enough for the wavefronts of Sect. 3.1.
+
+    Args:
+        fit: The linear estimator.
+        image_e: (pixels,) electrons.
+        model: The sensor's image for modes in nm.
+        iterations: How many.
     """
     found = [estimate(fit, image_e)]
     for _ in range(iterations):

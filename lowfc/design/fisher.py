@@ -11,25 +11,38 @@ from lowfc.optics.chain.grid import OPEN_AREA
 
 
 def variance_e(reference_e: Array, read_noise_e: float) -> Array:
-    """Variance (pixels,) of the noise of the flat wavefront's image (pixels,) in electrons, photon and read noise.
+    """Variance (pixels,) of the noise of the flat wavefront's image, photon and read noise (Sects. 3 and 3.3).
 
-    Sects. 3 and 3.3. Rounding to whole electrons is left out: its 1/12 e-^2 changes no scatter of Table 4 by more than
-    1 %.
+    Rounding to whole electrons is left out: its 1/12 e-^2 changes no scatter of Table 4 by more than 1 %.
+
+    Args:
+        reference_e: I0 (pixels,) in electrons.
+        read_noise_e: Of each pixel.
     """
     return np.asarray(np.maximum(reference_e, 0.0) + read_noise_e**2)
 
 
 def covariance(R: Array, variance: Array) -> Array:
-    """Covariance (modes, modes) of the estimate R (I - I0), in nm^2, R (modes, pixels) in nm per electron."""
+    """Covariance (modes, modes) of the estimate R (I - I0), in nm^2.
+
+    Args:
+        R: (modes, pixels) nm per electron.
+        variance: (pixels,) of the image, in electrons squared.
+    """
     return np.asarray((R * variance) @ R.T)
 
 
 def cramer_rao(H: Array, variance: Array) -> Array:
     """Inverse Fisher information (modes, modes), nm^2: no unbiased linear estimate has a smaller covariance.
 
-    The information is that of the image's mean, H (pixels, modes) in electrons per nm; the little that the photon
-    noise's own variance adds is not counted. A pixel without any variance (pixels,), electrons squared, carries no
-    information. ValueError where the modes cannot be told apart.
+    The information is that of the image's mean; the little that the photon noise's own variance adds is not counted.
+
+    Args:
+        H: (pixels, modes) electrons per nm.
+        variance: (pixels,) of the image, in electrons squared; a pixel without any carries no information.
+
+    Raises:
+        ValueError: The modes cannot be told apart.
     """
     weights = np.divide(1.0, variance, out=np.zeros_like(variance), where=variance > 0)
     weighted = np.sqrt(weights)[:, None] * H
@@ -42,8 +55,13 @@ def cramer_rao(H: Array, variance: Array) -> Array:
 def quantum_information(pupil: Array, modes: Array, wavelength_nm: float, light_e: float = 1.0) -> Array:
     """Quantum Fisher information (modes, modes), per nm^2: no measurement of the light tells more of its wavefront.
 
-    It is 4 N Cov: N photons behind the pupil's mask (n, n), amplitude transmission, and the covariance of the phases of
-    modes (modes, n, n), of unit rms over the circle, over them. `light_e` are electrons of the open circle's light.
+    It is 4 N Cov: N photons behind the pupil's mask, and the covariance of the modes' phases over them.
+
+    Args:
+        pupil: (n, n) amplitude transmission.
+        modes: (modes, n, n) of unit rms over the circle.
+        wavelength_nm: The wavelength.
+        light_e: Electrons of the open circle's light.
     """
     energy = pupil**2
     weights = (energy / energy.sum()).ravel()

@@ -72,6 +72,10 @@ class FullLight:
     """A sensor without a relay mask that is judged: a `lowfc.design.merit.Candidate`.
 
     Its paper's rows are those of CLOWFS, the only sensor of this kind that the paper has figures of.
+
+    Attributes:
+        sensor: The optics.
+        focus: What falls on its focal-plane mask.
     """
 
     sensor: Sensor
@@ -128,7 +132,11 @@ class FullLight:
 def sweep(merit_of: Callable[[float], float], low: float, high: float, count: int) -> tuple[Array, float]:
     """Values (count,) evenly over a range, and the one between their neighbours of the least merit where it is least.
 
-    There are at least 3; one where the ends of the range are the same.
+    Args:
+        merit_of: Of a value.
+        low: End of the range.
+        high: Other end; the same for one value.
+        count: How many, at least 3.
     """
     if low == high:
         return np.array([low]), low

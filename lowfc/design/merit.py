@@ -92,8 +92,15 @@ class Candidate(Protocol):
 def covariance_nm2(seen: Signal, electrons_e: float, read_noise_e: float, modes: int, estimator: str) -> Array:
     """Covariance (modes, modes) of the first modes when these alone are fitted to one frame, photon and read noise.
 
-    Electrons are those that enter the open circle during the exposure, read noise is of a pixel. The estimator is
-    "pinv", or "weighted", which attains the Cramer-Rao bound; ValueError for another.
+    Args:
+        seen: What the sensor sees.
+        electrons_e: Light that enters the open circle during the exposure.
+        read_noise_e: Of each pixel.
+        modes: How many are fitted.
+        estimator: "pinv", or "weighted", which attains the Cramer-Rao bound.
+
+    Raises:
+        ValueError: The estimator is not known.
     """
     H = seen.H[:, :modes] * electrons_e
     variance_e2 = (np.maximum(seen.I0, 0.0) * electrons_e + read_noise_e**2)[:, None]

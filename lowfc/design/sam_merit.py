@@ -49,9 +49,11 @@ SAMPLES_PER = 2
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Fields (fields, relay, relay) in the relay pupil at one wavelength, and the kernel (samples, relay) from there.
+    """What is propagated at one wavelength.
 
-    The kernel to the sensor is that of one axis, and conserves energy.
+    Attributes:
+        relay: (fields, relay, relay) fields in the relay pupil.
+        kernel: (samples, relay) from the relay pupil to the sensor, along one axis; conserves energy.
     """
 
     relay: Single
@@ -92,10 +94,15 @@ def build_optics(
 ) -> Optics:
     """Propagate the flat wavefront and the modes to the relay pupil, eqs. (4), (5) and (12).
 
-    With the default sampling every figure of a mask is within 2 % of that of the paper's sampling (Table 1). The pupil
-    (n, n) is an amplitude transmission, the focal-plane masks are of `FOCAL_MASKS`. `band_modes`, tilts first, can be
-    fitted in Table 4: a search needs the two tilts. The band is the paper's five wavelengths when None; there are at
-    least 2 samples per lambda0 / D at the sensor.
+    With the default sampling every figure of a mask is within 2 % of that of the paper's sampling (Table 1).
+
+    Args:
+        pupil: (n, n) amplitude transmission of the shaped pupil.
+        focal_masks: Of `FOCAL_MASKS`.
+        band_modes: Modes, tilts first, that can be fitted in Table 4; a search needs the two tilts.
+        band: Of Table 4; the paper's five wavelengths when None.
+        relay_samples: Across the relay pupil.
+        samples_per: At the sensor, per lambda0 / D; at least 2.
     """
     band = uniform(WAVELENGTH_NM) if band is None else band
     u = 2.0 * pupil_axis(len(pupil))
@@ -145,9 +152,12 @@ def hole_fields(optics: Optics, hole: Hole) -> Single:
 
 
 def signal(optics: Optics, fields: Single, focal_mask: str) -> Signal:
-    """What the sensor sees at the central wavelength, for Table 3, through one of `optics.focal_masks`.
+    """What the sensor sees at the central wavelength, for Table 3.
 
-    The fields are the sum of `hole_fields` over the mask, shapes as there; amplitude.
+    Args:
+        optics: Everything before the mask.
+        fields: The sum of `hole_fields` over the mask, shapes as there; amplitude.
+        focal_mask: One of `optics.focal_masks`.
     """
     count = 1 + len(NOLLS_20)
     first = count * optics.focal_masks.index(focal_mask)
@@ -172,7 +182,12 @@ def band_signal(optics: Optics, fields: Single) -> Signal:
 
 @dataclass(frozen=True, eq=False)
 class Mask:
-    """A sparse aperture mask that is judged, by the sum of `hole_fields` over its holes: a `Candidate`."""
+    """A sparse aperture mask that is judged: a `Candidate`.
+
+    Attributes:
+        optics: Everything before it.
+        fields: The sum of `hole_fields` over its holes.
+    """
 
     optics: Optics
     fields: Single

@@ -60,7 +60,17 @@ class Bounds:
 
 @dataclass(frozen=True)
 class Chain:
-    """One search between two blocks: which of the seed's it is, how many of its steps it has made, and its best."""
+    """One search between two blocks.
+
+    Attributes:
+        seed: Of the whole search.
+        index: Of this chain.
+        steps: How many it makes in all.
+        step: How many it has made.
+        orbits: Where it stands.
+        best: The best it has seen.
+        best_merit: Merit of that.
+    """
 
     seed: int
     index: int

@@ -136,8 +136,11 @@ class Figures:
 def exchange(request: Request) -> Iterator[Round]:
     """Solve program after program, first with few cells; the last one keeps the promise unless the rounds ran out.
 
-    Each program begins at the multipliers of the one before, and the points are those that few cells have found. Where
-    nothing but a closed mask is dark the last round's contrast is infinite. NotSolvedError where the solver gave up.
+    Each program begins at the multipliers of the one before, and the points are those that few cells have found.
+    Where nothing but a closed mask is dark the last round's contrast is infinite.
+
+    Raises:
+        NotSolvedError: The solver gave up.
     """
     points = first_points(request.zone, request.step)
     points, signs = np.concatenate([points, points]), np.repeat([1.0, -1.0], len(points))
@@ -167,7 +170,12 @@ def exchange(request: Request) -> Iterator[Round]:
 
 
 def relative_field(quarter: Array, axis: Array) -> Array:
-    """Field E / E(0) of a mask (cells, cells) at all pairs of coordinates (n,) in lambda / D, [row = y, column = x]."""
+    """Field E / E(0) of a mask at all pairs of coordinates, [row = y, column = x].
+
+    Args:
+        quarter: (cells, cells) of the mask.
+        axis: (n,) coordinates in lambda / D.
+    """
     waves = _waves(axis, len(quarter))
     return np.asarray(waves @ quarter @ waves.T / quarter.sum())
 
@@ -211,8 +219,11 @@ def stored(quarter: Array, request: Request) -> NDArray[np.floating]:
 def nearest_feasible(request: Request) -> tuple[float | None, float | None]:
     """For an infeasible request, what would do: the next inner angle in steps of 0.1, and contrast in steps of 26 %.
 
-    Found with the fewest cells that resolve the zone, each with all else kept: an angle at most twice as large, a
-    contrast at most 1e5 times as large; None where even the largest is infeasible.
+    Found with the fewest cells that resolve the zone.
+
+    Returns:
+        Inner angle (at most twice as large), and contrast (at most 1e5 times as large) with all else kept; None where
+        even the largest is infeasible.
     """
     coarse = replace(request, cells=_levels(request)[0])
     inners = [round(v, 6) for v in request.inner + 0.1 * np.arange(1, round(10 * request.inner) + 1)]

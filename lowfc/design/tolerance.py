@@ -39,7 +39,13 @@ _LINE_RATIOS = np.geomspace(1e-6, 1e10, 49)  # variance of a line over that of a
 
 @dataclass(frozen=True)
 class Drift:
-    """A drift that is held: D, variance of its step in a frame, the gain, and v, variance of what is left, nm^2."""
+    """A drift that is held.
+
+    Attributes:
+        step_nm2: D, variance of its step in a frame.
+        gain: of the integrator.
+        left_nm2: v, variance of what is left, at all times.
+    """
 
     step_nm2: float
     gain: float
@@ -60,10 +66,13 @@ def best_gain(step_nm2: float, noise_nm2: float, exposure: float) -> float:
 
 
 def tolerated_drift(left_nm2: float, noise_nm2: float, exposure: float, kind: Kind = "integrator") -> Drift:
-    """The fastest drift of which no more than a variance is left, with a noise in each frame, nm^2.
+    """The fastest drift of which no more than a variance is left.
 
-    An integrator keeps the gain at which its margins hold, where the best one is higher. The exposure is a part of the
-    period.
+    Args:
+        left_nm2: That variance.
+        noise_nm2: Of a frame.
+        exposure: Of the period.
+        kind: An integrator keeps the gain at which its margins hold, where the best one is higher.
     """
     square = (exposure - 1.0) ** 2 / 4.0 - exposure / 3.0 + 0.5
     linear = (exposure - 2.0) * left_nm2 - noise_nm2
@@ -78,7 +87,11 @@ def tolerated_drift(left_nm2: float, noise_nm2: float, exposure: float, kind: Ki
 def tolerated_lines(kind: Kind, line: Line, rate_hz: float, exposure: float) -> Callable[[Array], Array]:
     """What variance a line may have, over a frame's noise, by the variance that may be left of it, over the same.
 
-    The law is an integrator of the best gain, or the filter that knows frequency and width of the line.
+    Args:
+        kind: Integrator of the best gain, or the filter that knows the line.
+        line: Its frequency and width.
+        rate_hz: Of the frames.
+        exposure: Of the period.
     """
     timing = Timing.of(DELAY, exposure)
 

@@ -61,7 +61,12 @@ def residual_rms(gram: Array, residuals: Array) -> Array:
 
 
 def residual_pv(basis: Array, residuals: Array) -> Array:
-    """Peak to valley (n,) over the open pupil of residual coefficients (n, modes), in their unit."""
+    """Peak to valley (n,) over the open pupil of residual coefficients (n, modes), in their unit.
+
+    Args:
+        basis: Modes (modes, samples) at the open samples.
+        residuals: Truth minus estimate.
+    """
     blocks = (residuals[i : i + _BLOCK] @ basis for i in range(0, len(residuals), _BLOCK))
     return np.concatenate([np.ptp(block, axis=1) for block in blocks])
 
@@ -69,7 +74,9 @@ def residual_pv(basis: Array, residuals: Array) -> Array:
 def expected_r_squared(variances: Array, bounds: Array) -> Array:
     """What `r_squared` tends to (modes,), without unit, with many estimates, if errors do not depend on the truth.
 
-    The errors have variances (modes,); the coefficients are uniform between minus and plus the bounds (modes,).
+    Args:
+        variances: (modes,) of the errors.
+        bounds: (modes,) of the coefficients, uniform between minus and plus these.
     """
     return np.asarray(1.0 - variances / (bounds**2 / 3.0 + variances))
 

@@ -24,7 +24,12 @@ _DRAWS = 24
 
 
 class ModalContrast:
-    """What wavefronts, known by their modes, add to the contrast of a dark zone: by a form (modes, modes) or images."""
+    """What wavefronts, known by their modes, add to the contrast of a dark zone: by their form, and by full images.
+
+    Attributes:
+        noll: of the modes.
+        form: (modes, modes), see `contrast_form`.
+    """
 
     def __init__(self, coronagraph: Coronagraph, noll: tuple[int, ...], wavelength_nm: float) -> None:
         """Prepare form and images."""
@@ -78,8 +83,12 @@ def contrast_form(
 ) -> Array:
     """Q (modes, modes) of the contrast a' Q a that a wavefront a (modes,) adds on average in a wedge, per nm^2.
 
-    a is nm rms over the circle, of modes by Noll index; the pupil (n, n) is an amplitude transmission. Without mask and
-    stop of a Lyot coronagraph it is a shaped pupil alone.
+    Args:
+        pupil: (n, n) amplitude transmission.
+        noll: Noll index of each mode; a is nm rms over the circle.
+        wavelength_nm: The wavelength.
+        wedge: Part of the focal plane.
+        lyot: Mask and stop of a Lyot coronagraph; None for a shaped pupil alone.
     """
     side = 2 * int(np.ceil(wedge.outer * _SAMPLES_PER))
     inside = wedge_samples(wedge, side, side, _SAMPLES_PER)

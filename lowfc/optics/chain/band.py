@@ -7,7 +7,12 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Band:
-    """Quadrature over a passband: an image is the sum of weight times image at each wavelength; weights of sum 1."""
+    """Quadrature over a passband: an image is the sum of weight times image at each wavelength.
+
+    Attributes:
+        wavelengths_nm: The wavelengths.
+        weights: One for each, positive, of sum 1.
+    """
 
     wavelengths_nm: tuple[float, ...]
     weights: tuple[float, ...]

@@ -17,7 +17,10 @@ from lowfc.optics.chain.grid import image_axis
 class Wedge:
     """Part of the focal plane on both sides of the star; the default is the dark zone of the shipped pupil.
 
-    Radii are in lambda / D; half the opening is the angle between its edges and the x axis.
+    Attributes:
+        inner: Radius, in lambda / D.
+        outer: Radius, in lambda / D.
+        half_opening_deg: Angle between its edges and the x axis.
     """
 
     inner: float = 4.0
@@ -38,8 +41,10 @@ DARK_ZONE = Wedge()
 class LyotStop:
     """What of a Lyot coronagraph follows its pupil: the light that the opaque mask takes out, and the stop.
 
-    The mask takes out a part (k, k), 0 to 1, of the focal plane, of so many samples per lambda / D; it goes to the
-    sensor. The stop (n, n) is the transmission in the pupil behind it.
+    Attributes:
+        opaque: (k, k) part of the focal plane that the mask takes out, 0 to 1; it goes to the sensor.
+        stop: (n, n) transmission in the pupil behind it.
+        samples_per: Samples of the opaque part per lambda / D.
     """
 
     opaque: Array
@@ -62,9 +67,12 @@ class LyotStop:
 
 @dataclass(frozen=True, eq=False)
 class Coronagraph:
-    """What makes the science image: a pupil (n, n), amplitude transmission, and where contrast is looked at.
+    """What makes the science image.
 
-    `lyot` has mask and stop of a Lyot coronagraph; None for a shaped pupil alone.
+    Attributes:
+        pupil: (n, n) amplitude transmission in front.
+        dark_zone: Where contrast is looked at.
+        lyot: Mask and stop of a Lyot coronagraph; None for a shaped pupil alone.
     """
 
     pupil: Array
@@ -83,8 +91,17 @@ def contrast(
 ) -> Array:
     """Contrast (rows, columns) in the middle of the science focal plane, on `image_axis` in either direction.
 
-    Pupil (n, n) and wavefront (n, n), nm, are sampled alike, else ValueError. There are as many rows as columns where
-    they are None; two samples per lambda / D are enough for means, for the intensity's band is 1 D to either side.
+    Args:
+        pupil: (n, n) amplitude transmission.
+        opd_nm: Wavefront (n, n).
+        wavelength_nm: The wavelength.
+        columns: Samples along x.
+        rows: Samples along y; as many as columns when None.
+        samples_per: Samples per lambda / D; two are enough for means, for the intensity's band is 1 D to either side.
+        lyot: Mask and stop of a Lyot coronagraph; None for a shaped pupil alone.
+
+    Raises:
+        ValueError: The wavefront is not sampled like the pupil.
     """
     if opd_nm.shape != pupil.shape:
         raise ValueError(f"a wavefront must be sampled like the pupil, {pupil.shape}, got {opd_nm.shape}")
@@ -123,7 +140,13 @@ def contrast_curve(
 ) -> Array:
     """Contrast (rings,) averaged in azimuth within a wedge's opening, Fig. 1(c); other arguments as for `contrast`.
 
-    The edges (rings + 1,) are radii between the rings, in lambda / D, each at least a sample from the next.
+    Args:
+        pupil: The shaped pupil.
+        opd_nm: Wavefront.
+        wavelength_nm: The wavelength.
+        edges: (rings + 1,) radii between the rings, in lambda / D, each at least a sample's distance from the next.
+        wedge: Its opening alone counts.
+        samples_per: Samples per lambda / D.
     """
     whole = Wedge(0.0, float(edges[-1]), wedge.half_opening_deg)
     columns, rows = _extent(whole, samples_per)

@@ -11,7 +11,10 @@ _FINE = 16  # by which a sample is divided to find how much of it the phase spot
 def disk(samples_per: int = 8, radius: float = 4.0, inner_radius: float = 0.0) -> Array:
     """Reflecting disk of a radius in lambda0 / D (Sect. 2.1), on the smallest square grid that holds it.
 
-    With an inner radius it is the annulus of Sect. 2.4.
+    Args:
+        samples_per: Samples per lambda0 / D.
+        radius: In lambda0 / D.
+        inner_radius: Of the hole in its middle; the annulus of Sect. 2.4 where it is not zero.
     """
     r, _ = _polar(samples_per, radius)
     return np.asarray((r <= radius) & (r >= inner_radius), dtype=np.float64)
@@ -20,8 +23,13 @@ def disk(samples_per: int = 8, radius: float = 4.0, inner_radius: float = 0.0) -
 def phase_spot(samples_per: int = 8, radius: float = 4.0, spot_diameter: float = 1.06) -> Complex:
     """The disk with a spot in its middle that delays by a quarter of a wave: the Zernike sensor's two masks as one.
 
-    Samples that the spot's edge cuts have the mean of both sides, for the spot is only eight samples wide. The delay is
-    taken to be the same at all wavelengths, the spot's size to be physical. Sizes are in lambda0 / D.
+    Samples that the spot's edge cuts have the mean of both sides, for the spot is only eight samples wide. The delay
+    is taken to be the same at all wavelengths, the spot's size to be physical.
+
+    Args:
+        samples_per: Samples per lambda0 / D.
+        radius: Of the disk, in lambda0 / D.
+        spot_diameter: In lambda0 / D.
     """
     mask = disk(samples_per, radius)
     size = len(mask)

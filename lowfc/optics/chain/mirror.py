@@ -51,9 +51,14 @@ def actuator_axis(mirror: Mirror, actuators: int) -> Array:
 def influence_factors(mirror: Mirror, coordinates: Array, actuators: int, lowpass_cycles: float | None = None) -> Array:
     """One axis of the influence functions, (points, actuators); surface = y_factors actuators x_factors'.
 
-    Coordinates (points,) are in pupil diameters. They must be closer than half a pitch, or the print-through of the
-    actuators folds to low frequencies unless what is finer than `lowpass_cycles` per diameter is removed; on the nodes
-    of a twin `twin_mirror` is several times closer to the truth than a low-pass.
+    Points must be closer than half a pitch, or the print-through of the actuators folds to low frequencies unless it
+    is removed; on the nodes of a twin `twin_mirror` is several times closer to the truth than a low-pass.
+
+    Args:
+        mirror: The mirror.
+        coordinates: (points,) in pupil diameters.
+        actuators: The mirror's rows for y, columns for x.
+        lowpass_cycles: Remove what is finer than this many cycles per pupil diameter; nothing when None.
     """
     distance = coordinates[:, None] - actuator_axis(mirror, actuators)
     width = 1.0 / (mirror.pitches_per_pupil * np.sqrt(-np.log(mirror.coupling)))
@@ -80,11 +85,22 @@ def active_actuators(mirror: Mirror) -> Mask:
 
 
 def modes_to_actuators(mirror: Mirror, nolls: Sequence[int], usable: Mask | None = None) -> Array:
-    """Commands (rows times columns, modes) that make Zernike wavefronts: nm of surface per nm rms of wavefront.
+    """Commands that make Zernike wavefronts: nm of surface at the actuators per nm rms of wavefront.
 
-    A regularised least-squares fit over the circle. It contains the 1/2 of reflection: the wavefront is twice the
-    surface. Actuators that are not `usable` (rows, columns) stay at exactly zero, and their neighbours make up for them
-    as far as they can; ValueError where too few are left for so many modes.
+    A regularised least-squares fit over the circle. It contains the 1/2 of reflection: the wavefront is twice
+    the surface.
+
+    Args:
+        mirror: The mirror.
+        nolls: Noll indices.
+        usable: (rows, columns) actuators that may be commanded; all when None. The others stay at zero, and their
+            neighbours make up for them as far as they can.
+
+    Returns:
+        (rows times columns, modes); inactive actuators are exactly zero.
+
+    Raises:
+        ValueError: too few actuators are left for so many modes.
     """
     import scipy.linalg  # takes its time, and most processes load what was built
 

@@ -16,7 +16,10 @@ def circle(samples: int) -> Array:
 def with_bar(samples: int, width: float, angle_deg: float) -> Array:
     """Circle (samples, samples) with a bar from the centre to the edge, which makes it asymmetric (Sect. 4, [46]).
 
-    The bar has a width in pupil diameters and an angle from the x axis towards y.
+    Args:
+        samples: Points across the diameter.
+        width: Of the bar, in pupil diameters.
+        angle_deg: Of the bar, from the x axis towards y.
     """
     u, angle = pupil_axis(samples), np.deg2rad(angle_deg)
     along = u * np.cos(angle) + u[:, None] * np.sin(angle)
@@ -27,8 +30,14 @@ def with_bar(samples: int, width: float, angle_deg: float) -> Array:
 def prolate(samples: int, mask_radius: float) -> Array:
     """Apodised pupil (samples, samples) of an apodised-pupil Lyot coronagraph, 1 at its centre.
 
-    The circular prolate function: of all pupils it puts the most of its light within the focal-plane mask, whose radius
-    is in lambda0 / D; ValueError where that is not above 0.
+    The circular prolate function: of all pupils it puts the most of its light within the focal-plane mask.
+
+    Args:
+        samples: Points across the diameter.
+        mask_radius: Of the focal-plane mask, in lambda0 / D.
+
+    Raises:
+        ValueError: The mask has no size.
     """
     if not mask_radius > 0:
         raise ValueError(f"the focal-plane mask must have a radius, got {mask_radius} lambda0 / D")
@@ -63,8 +72,13 @@ def _within(r: Array, rho: Array, radius: float) -> Array:
 def from_quarter(quarter: ArrayLike, samples: int) -> Array:
     """Pupil (samples, samples) from its quadrant x >= 0, y >= 0, mirrored in both axes.
 
-    The quadrant (cells, cells) is an amplitude transmission, [0, 0] next to the pupil's centre. ValueError where it is
-    not real and square, is outside 0..1, lets nothing through, or twice its cells do not divide the samples.
+    Args:
+        quarter: (cells, cells) amplitude transmission from 0 to 1, [0, 0] next to the pupil's centre.
+        samples: Points across the diameter, a multiple of twice the number of cells.
+
+    Raises:
+        ValueError: The quadrant is not real and square, is outside 0..1, lets nothing through, or does not divide
+            `samples`.
     """
     given = np.asarray(quarter)
     if given.dtype.kind not in "buif":

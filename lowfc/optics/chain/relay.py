@@ -11,7 +11,11 @@ from lowfc.optics.chain.grid import image_axis
 
 @dataclass(frozen=True, eq=False)
 class ApertureMask:
-    """A mask (n, n) in the relay pupil and a focus behind it: sparse (Sect. 2.2), with a bar, or open (Sect. 4)."""
+    """A mask in the relay pupil and a focus behind it: sparse (Sect. 2.2), with a radial bar, or open (Sect. 4).
+
+    Attributes:
+        transmission: (n, n), sampled like the pupil.
+    """
 
     transmission: Array
 
@@ -58,7 +62,10 @@ def least_distance(reach: float, samples_per: int) -> float:
     """Shortest distance of a `Defocus` whose chirp the samples resolve, in (lambda0/D)^2.
 
     The sum over the focal plane repeats itself where chirp and field together turn by a wave from sample to sample.
-    `reach` is from the edge of the detector to the far edge of the focal-plane mask, in lambda0 / D.
+
+    Args:
+        reach: From the edge of the detector to the far edge of the focal-plane mask, in lambda0 / D.
+        samples_per: Samples per lambda0 / D.
     """
     spare = 2.0  # half a cycle for the pupil's light, the rest for the short end of a wide band
     return reach / (samples_per - spare)
@@ -75,8 +82,14 @@ def direct_kernel(
     """Kernel (samples, focal_samples) of one axis from the focal-plane mask to the detector; conserves energy.
 
     Eq. (13)'s Fresnel integral, exp(i pi (x' - x)^2 scale / distance), sampled exactly as long as the chirp is
-    resolved; or the transform to the relay pupil. There are `samples_per` in lambda0 / D of the focal plane; scale is
-    lambda0 / lambda.
+    resolved; or the transform to the relay pupil.
+
+    Args:
+        relay: The optics between them.
+        samples: Across the detector.
+        focal_samples: Across the focal-plane mask.
+        samples_per: Samples per lambda0 / D in the focal plane.
+        scale: lambda0 / lambda.
     """
     if isinstance(relay, PupilImage):
         # The pupil's samples are spaced by the width over their number, not by 1 / samples as `kernel` has them.
@@ -88,9 +101,13 @@ def direct_kernel(
 
 
 def half_band(relay: Relay, width: float, mask_radius: float, scale: float) -> float:
-    """Half of the band of the field on the detector, in cycles per unit of its axis; scale is lambda0 / lambda.
+    """Half of the band of the field on the detector, in cycles per unit of its axis.
 
-    `width` is that of the detector, in its unit, the mask's radius is in lambda0 / D.
+    Args:
+        relay: The optics before the detector.
+        width: Of the detector, in its unit.
+        mask_radius: Of the focal-plane mask, in lambda0 / D.
+        scale: lambda0 / lambda.
     """
     match relay:
         case ApertureMask():

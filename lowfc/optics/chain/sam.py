@@ -11,7 +11,13 @@ from lowfc.optics.chain.grid import pupil_axis
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the holes of a sparse aperture mask are: each (x, y, diameter) from the centre, in pupil diameters."""
+    """Where the holes of a sparse aperture mask are.
+
+    Attributes:
+        name: What users call it.
+        purpose: One line on what it was designed for.
+        holes: Each (x, y, diameter): the centre from the pupil's centre, all in pupil diameters.
+    """
 
     name: str
     purpose: str
@@ -72,7 +78,10 @@ def is_even_symmetric(layout: Layout) -> bool:
 def transmission(layout: Layout, samples: int, points: int = 1) -> Array:
     """The mask (samples, samples), eqs. (1) and (2): how much of each sample the holes leave open.
 
-    So many points across a sample are looked at in either direction; 1 is its centre alone.
+    Args:
+        layout: Where the holes are.
+        samples: Across the pupil.
+        points: Across a sample, in either direction, that are looked at; 1 is its centre alone.
     """
     u = pupil_axis(samples * points)
     mask = np.zeros((samples * points, samples * points), np.bool_)

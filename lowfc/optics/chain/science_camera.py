@@ -21,7 +21,12 @@ class ScienceCamera:
 
     The field is summed over the open samples of the pupil alone. Where the pupil's samples come in equal squares of two
     by two, as those of the shipped one do, a square has the wavefront of its middle; its kernel stays exact. Those of a
-    Lyot coronagraph are averaged in squares of four by four. Where the samples of the image are says `grid.image_axis`.
+    Lyot coronagraph are averaged in squares of four by four.
+
+    Attributes:
+        samples: across the square image.
+        samples_per: of them in each lambda / D; where they are says `grid.image_axis`.
+        wavelength_nm: of the light.
     """
 
     def __init__(
@@ -33,10 +38,18 @@ class ScienceCamera:
         samples_per: int = 4,
         lyot: LyotStop | None = None,
     ) -> None:
-        """Prepare the kernels, for a pupil (n, n), amplitude transmission, and modes by Noll index.
+        """Prepare the kernels.
 
-        Half the image's width is in lambda / D; `lyot` has mask and stop of a Lyot coronagraph, None for a shaped pupil
-        alone. ValueError where the pupil is not square or lets no light through, or there are no modes.
+        Args:
+            pupil: (n, n) amplitude transmission.
+            noll: Noll index of each mode.
+            wavelength_nm: The wavelength.
+            half_width: Of the image, in lambda / D.
+            samples_per: Samples per lambda / D.
+            lyot: Mask and stop of a Lyot coronagraph; None for a shaped pupil alone.
+
+        Raises:
+            ValueError: The pupil is not square or lets no light through, or there are no modes.
         """
         if pupil.ndim != 2 or pupil.shape[0] != pupil.shape[1] or not pupil.any():
             raise ValueError(f"a pupil must be square and let light through, got shape {pupil.shape}")
@@ -64,7 +77,11 @@ class ScienceCamera:
         self._field = np.zeros(cells.shape, np.complex64)
 
     def image(self, modes_nm: npt.NDArray[np.floating]) -> Single:
-        """Contrast (samples, samples) with a wavefront (modes,) in nm rms of each mode; ValueError for other modes."""
+        """Contrast (samples, samples) with a wavefront (modes,) in nm rms of each mode.
+
+        Raises:
+            ValueError: The wavefront has another number of modes.
+        """
         modes = len(self._phase_per_nm)
         if modes_nm.shape != (modes,):
             raise ValueError(f"a wavefront must have {modes} modes, got shape {modes_nm.shape}")
@@ -76,7 +93,11 @@ class ScienceCamera:
         return np.asarray(field.real**2 + field.imag**2)
 
     def mean_contrast(self, image: Single, wedge: Wedge) -> float:
-        """Mean of an image (rows, columns) in a wedge, as `coronagraph.mean_contrast`; ValueError beyond the image."""
+        """Mean of an image's samples (rows, columns) in a wedge, those of `coronagraph.mean_contrast`.
+
+        Raises:
+            ValueError: The wedge reaches beyond the image.
+        """
         if 2 * wedge.outer * self.samples_per > self.samples:
             raise ValueError(
                 f"the image ends {self.samples / (2 * self.samples_per):g} lambda/D from the star, got {wedge}"

@@ -13,8 +13,15 @@ def kolmogorov(rng: np.random.Generator, samples: int, width: int = 4) -> Array:
 
     It is cut out of a periodic one, which holds no wave longer than itself. What it lacks is tilt: over a circle that
     has 0.90 rad^2 of the 1.03 rad^2 of an endless screen (Noll 1976), but about 0.3 rad^2 here at a width of 4 and 0.04
-    at a width of 1. The orders above tilt are nearly whole at a width of 4. The width is that of the periodic screen,
-    in pupil diameters; ValueError below 1.
+    at a width of 1. The orders above tilt are nearly whole at a width of 4.
+
+    Args:
+        rng: Source of all randomness.
+        samples: Points across the pupil.
+        width: Of the periodic screen, in pupil diameters.
+
+    Raises:
+        ValueError: The periodic screen would be narrower than the pupil.
     """
     if width < 1:
         raise ValueError(f"the periodic screen must be at least as wide as the pupil, got {width} pupil diameters")

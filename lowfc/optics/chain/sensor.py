@@ -102,7 +102,11 @@ def propagate(
 ) -> Complex:
     """Field at the sensor's samples, eqs. (4) to (6) or (13), of a field (n, n) that has passed the pupil's mask.
 
-    Another focal-plane mask may stand instead of the sensor's own; amplitudes are in any unit.
+    Args:
+        sensor: The optics.
+        pupil_field: The field.
+        wavelength_nm: Its wavelength.
+        focal_mask: Instead of the sensor's own.
     """
     mask = sensor.focal_mask if focal_mask is None else focal_mask
     scale = sensor.wavelength_nm / wavelength_nm
@@ -123,7 +127,13 @@ def from_focus(sensor: Sensor, focal: Complex, wavelength_nm: float) -> Complex:
 def field(sensor: Sensor, opd_nm: NDArray[np.floating], wavelength_nm: float | None = None) -> Complex:
     """Field at the sensor's samples for a wavefront (n, n) in nm, with exp(i phi) and not its expansion.
 
-    The central wavelength when None; ValueError where the wavefront is not sampled like the pupil.
+    Args:
+        sensor: The optics.
+        opd_nm: Optical path difference.
+        wavelength_nm: The central wavelength when None.
+
+    Raises:
+        ValueError: The wavefront is not sampled like the pupil.
     """
     if opd_nm.shape != sensor.pupil.shape:
         raise ValueError(f"a wavefront must be sampled like the pupil, {sensor.pupil.shape}, got {opd_nm.shape}")
@@ -132,9 +142,12 @@ def field(sensor: Sensor, opd_nm: NDArray[np.floating], wavelength_nm: float | N
 
 
 def image(sensor: Sensor, opd_nm: NDArray[np.floating], band: Band | None = None) -> Array:
-    """Image (pixels, pixels) of a wavefront (n, n) in nm, fraction per pixel of the light entering the open circle.
+    """Image (pixels, pixels), fraction per pixel of the light entering the open circular pupil.
 
-    The central wavelength alone where the band is None.
+    Args:
+        sensor: The optics.
+        opd_nm: Wavefront (n, n).
+        band: The central wavelength alone when None.
     """
     band = monochromatic(sensor.wavelength_nm) if band is None else band
     total = np.zeros((sensor.pixels, sensor.pixels))
@@ -152,8 +165,12 @@ def reference(sensor: Sensor, band: Band | None = None) -> Array:
 def response(sensor: Sensor, basis: NDArray[np.floating], band: Band | None = None) -> Array:
     """H = dI/da (pixels squared, modes), in the units of `image` per nm of each mode.
 
-    H = 2 (2 pi / lambda) Re{E0 conj(i E_k)}: eq. (12) with the 2 of eq. (9), so that I - I0 = H a. The basis are modes
-    (modes, n, n), of unit rms where a is to be nm rms; the central wavelength alone where the band is None.
+    H = 2 (2 pi / lambda) Re{E0 conj(i E_k)}: eq. (12) with the 2 of eq. (9), so that I - I0 = H a.
+
+    Args:
+        sensor: The optics.
+        basis: Modes (modes, n, n), unit rms where a is to be nm rms.
+        band: The central wavelength alone when None.
     """
     band = monochromatic(sensor.wavelength_nm) if band is None else band
     H = np.zeros((sensor.pixels**2, len(basis)))
@@ -170,8 +187,11 @@ def shear_response(sensor: Sensor, band: Band | None = None) -> Array:
     """dI/ds (pixels squared, 2), in the units of `image` per pupil diameter of shear of the beam along x and y.
 
     A shift of the beam in the pupil is a ramp of phase on the focal plane, where -2 pi i x of the field is its slope.
-    It is a nuisance: the beam wanders on the relay mask, which looks like a wavefront and is none. The central
-    wavelength alone where the band is None.
+    It is a nuisance: the beam wanders on the relay mask, which looks like a wavefront and is none.
+
+    Args:
+        sensor: The optics.
+        band: The central wavelength alone when None.
     """
     band = monochromatic(sensor.wavelength_nm) if band is None else band
     x = image_axis(sensor.focal_mask.shape[0], sensor.samples_per)

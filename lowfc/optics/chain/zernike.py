@@ -52,7 +52,11 @@ def mode_group(noll: int) -> str:
 
 
 def noll_to_nm(noll: int) -> tuple[int, int]:
-    """Radial degree n and azimuthal order m of a Noll index, m < 0 is the sine; ValueError below 1."""
+    """Radial degree n and azimuthal order m of a Noll index; m < 0 is the sine.
+
+    Raises:
+        ValueError: The index is below 1.
+    """
     if noll < 1:
         raise ValueError(f"Noll indices start at 1 (piston), got {noll}")
     n = int((sqrt(8 * noll - 7) - 1) / 2)

@@ -59,16 +59,22 @@ def saturation_dn(detector: Detector) -> int:
 
 
 def expose(detector: Detector, electrons: NDArray[np.floating], rng: np.random.Generator) -> Pixels:
-    """One frame (rows, columns) in DN of mean photo-electrons (rows, columns); below zero they count as none.
+    """One frame (rows, columns) in DN.
 
-    Electrons are drawn from the Poisson law. Multiplication draws from the gamma law of a long register, whose excess
-    noise doubles the variance of the photons. Unless the detector is `exact`, pixels below `FAINT_E` electrons are
-    drawn from the law of their digital number. It is exact at multiples of 1/64 electron; between these the mean is
-    exact and the variance too large by at most 6e-5 electrons squared, which the chi-square test of a million draws
-    does not see.
+    Electrons are drawn from the Poisson law. Multiplication draws from the gamma law of a long register, whose
+    excess noise doubles the variance of the photons.
 
-    The source of all randomness has words of 64 random bits, as all of numpy's but MT19937 have. ValueError where an
-    expected number of electrons is not finite.
+    Unless the detector is `exact`, pixels below `FAINT_E` electrons are drawn from the law of their digital number. It
+    is exact at multiples of 1/64 electron; between these the mean is exact and the variance too large by at most
+    6e-5 electrons squared, which the chi-square test of a million draws does not see.
+
+    Args:
+        detector: The camera.
+        electrons: (rows, columns) mean photo-electrons in the exposure; rounding below zero counts as none.
+        rng: Source of all randomness, with words of 64 random bits, as all of numpy's but MT19937 have.
+
+    Raises:
+        ValueError: An expected number of electrons is not a finite number.
     """
     mean = np.asarray(electrons, np.float32).ravel()
     if detector.clock_induced_charge_e:

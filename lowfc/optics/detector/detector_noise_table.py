@@ -67,9 +67,12 @@ def pixel_laws(gain_e_per_dn: float, read_noise_e: float, bias_dn: float, satura
 
 
 def draw(laws: PixelLaws, mean_e: Single, rng: np.random.Generator) -> Pixels:
-    """Digital numbers (pixels,) of pixels that expect so many electrons (pixels,), of one above FAINT_E as if of that.
+    """Digital numbers (pixels,) of pixels that expect so many electrons each; of one above FAINT_E, as if of FAINT_E.
 
-    Below zero counts as none; the source of randomness is as of `expose`.
+    Args:
+        laws: Of the detector.
+        mean_e: (pixels,); below zero counts as none.
+        rng: Source of all randomness, with words of 64 random bits, as all of numpy's but MT19937 have.
     """
     words = rng.bit_generator.random_raw((mean_e.size + 1) // 2).view(np.uint32)[: mean_e.size]
     level = mean_e * np.float32((1 << _CHANCE_BITS) / STEP_E)

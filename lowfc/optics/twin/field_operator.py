@@ -22,9 +22,12 @@ _WIDEST = 0.49  # cycles per sample: the samples hold no more than half
 
 
 def prolates(samples: int, half_band: float, count: int) -> Array:
-    """Discrete prolate sequences (samples, count), even and odd in turn, orthonormal, the best concentrated first.
+    """Discrete prolate sequences (samples, count), even and odd in turn, orthonormal.
 
-    Half of their band is in cycles per sample.
+    Args:
+        samples: Of the axis.
+        half_band: Half of the band, in cycles per sample.
+        count: How many, the best concentrated first.
     """
     import scipy.linalg  # takes its time, and most processes load what was built
 
@@ -41,9 +44,12 @@ def prolates(samples: int, half_band: float, count: int) -> Array:
 
 
 def sensor_functions(sensor: Sensor, scale: float, guards: int) -> Array:
-    """Prolate functions (sensor samples, functions) that hold the field at a wavelength; scale is lambda0 / lambda.
+    """Prolate functions (sensor samples, functions) that hold the field at a wavelength.
 
-    There are `guards` more than the field's band and the sensor's width call for.
+    Args:
+        sensor: The optics.
+        scale: lambda0 / lambda.
+        guards: Functions beyond the number that the field's band and the sensor's width call for.
     """
     band = _half_band(sensor, scale)
     return prolates(sensor.samples, band, min(int(np.ceil(2.0 * band * sensor.samples)) + guards, sensor.samples))
@@ -71,13 +77,19 @@ def field_operator(
     wanted: Whole,
     advance: Callable[[], None] = lambda: None,
 ) -> Array:
-    """Real matrix (rows, wanted) from amplitudes of separable functions in the pupil; scale is lambda0 / lambda.
+    """Real matrix (rows, wanted) from amplitudes of separable functions in the pupil.
 
-    Its rows are coefficients of the functions (sensor samples, functions) on the sensor where there is an aperture
-    mask, and samples of the focal plane within its mask, in cosines and sines, where there is none; `on_sensor` takes
-    either to the sensor. The factors are (n, p) along y and (n, q) along x at the pupil's samples, without unit;
-    `wanted` are indices in the flattened (p, q). `advance` is called after each of the k / 2 steps, k the samples
-    across the focal-plane mask.
+    Its rows are coefficients of the functions on the sensor where there is an aperture mask, and samples of the focal
+    plane within its mask, in cosines and sines, where there is none; `on_sensor` takes either to the sensor.
+
+    Args:
+        sensor: The optics.
+        scale: lambda0 / lambda.
+        functions: (sensor samples, functions) from `sensor_functions`.
+        y_factors: (n, p) the functions' factors along y at the pupil's samples.
+        x_factors: (n, q) along x.
+        wanted: Indices of the wanted products in the flattened (p, q).
+        advance: Called after each of the k / 2 steps, k the samples across the focal-plane mask.
     """
     samples = sensor.pupil.shape[0]
     unit = scale * sensor.pitch / (samples**2 * np.sqrt(OPEN_AREA))

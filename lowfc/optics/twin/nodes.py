@@ -9,7 +9,12 @@ from lowfc.optics.chain.grid import pupil_axis
 def node_axis(nodes: int, order: int) -> Array:
     """Coordinates of the nodes along one axis, in pupil diameters: `nodes` across the pupil and order/2 guards outside.
 
-    The order, the points of the interpolation, is even, so that every stencil is centred; else ValueError.
+    Args:
+        nodes: Across the diameter; the spacing is 1 / nodes.
+        order: Points of the interpolation, even, so that every stencil is centred.
+
+    Raises:
+        ValueError: The order is odd or below 2.
     """
     if order < 2 or order % 2:
         raise ValueError(f"the interpolation order must be even and at least 2, got {order}")

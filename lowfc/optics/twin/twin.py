@@ -100,7 +100,12 @@ def wavefront_rms_nm(twin: Twin, opd_nm: NDArray[np.floating]) -> float:
 
 
 def reference(twin: Twin, opd_nm: Array | None = None) -> Array:
-    """I0 (pixels, pixels) in float64 at a wavefront (used,) in nm: fraction per pixel of the open circle's light."""
+    """I0 (pixels, pixels) in float64: fraction per pixel of the light entering the open circle.
+
+    Args:
+        twin: The twin.
+        opd_nm: The wavefront (used,) that is the zero point; flat when None.
+    """
     images = [each.weight * np.abs(_field(each, _phasor(twin, each, opd_nm))) ** 2 for each in twin.operators]
     return np.asarray(twin.to_pixels @ np.sum(images, axis=0) @ twin.to_pixels.T)
 
@@ -108,9 +113,15 @@ def reference(twin: Twin, opd_nm: Array | None = None) -> Array:
 def response(twin: Twin, basis: NDArray[np.floating], opd_nm: Array | None = None) -> Array:
     """H = dI/da (pixels squared, modes) in float64, per nm: 2 (2 pi / lambda) Re{E0 conj(i E_k)}, eq. (12) times 2.
 
-    At a wavefront phi (used,) that is not flat, both E0 and E_k are fields of exp(i phi) times what they are of at a
-    flat one. Modes (modes, used) are of unit rms where a is to be nm rms; ValueError where they are not at the used
-    nodes.
+    At a wavefront phi that is not flat, both E0 and E_k are fields of exp(i phi) times what they are of at a flat one.
+
+    Args:
+        twin: The twin.
+        basis: Modes (modes, used) at the used nodes, of unit rms where a is to be nm rms.
+        opd_nm: The wavefront (used,) that is the zero point; flat when None.
+
+    Raises:
+        ValueError: The modes are not at the used nodes.
     """
     if basis.ndim != 2 or basis.shape[1] != twin.used.size:
         raise ValueError(f"modes must be (modes, {twin.used.size}) values at the used nodes, got {basis.shape}")
@@ -163,7 +174,10 @@ class Evaluator:
     def image(self, opd_nm: Single) -> Single:
         """Image (pixels, pixels) of a wavefront (used,) in nm, fraction per pixel of the open circle's light.
 
-        The array is overwritten by the next call. ValueError where there is not one value per used node.
+        The array is overwritten by the next call.
+
+        Raises:
+            ValueError: The wavefront does not have one value per used node.
         """
         if opd_nm.shape != (self._used,):
             raise ValueError(f"a wavefront must have one value for each of {self._used} nodes, got {opd_nm.shape}")

@@ -23,9 +23,17 @@ def build(
     operator_hash: str = "",
     progress: Callable[[int, int], None] | None = None,
 ) -> Twin:
-    """Compress a sensor; ValueError where its focal-plane mask is not symmetric, or the specification cannot be met.
+    """Compress a sensor.
 
-    The central wavelength alone where the band is None; `progress` receives the steps done and the steps in all.
+    Args:
+        sensor: The optics; the focal-plane mask must be symmetric about both axes.
+        spec: How far.
+        band: The central wavelength alone when None.
+        operator_hash: Digest of the three above, see `twin_store`.
+        progress: Called with the steps done and the steps in all.
+
+    Raises:
+        ValueError: The mask is not symmetric, or the specification cannot be met.
     """
     mask = sensor.focal_mask
     if mask.shape[0] % 2 or not (np.array_equal(mask, mask[::-1]) and np.array_equal(mask, mask[:, ::-1])):

@@ -42,7 +42,13 @@ class TwinMirror:
 
 
 def twin_mirror(sensor: Sensor, twin: Twin, mirror: Mirror) -> TwinMirror:
-    """Fit a mirror to the twin of a sensor; the correction is exact at the wavelength in the middle of the band."""
+    """Fit a mirror to a twin; the correction is exact at the wavelength in the middle of the band.
+
+    Args:
+        sensor: The optics that the twin was built from.
+        twin: The twin.
+        mirror: The mirror.
+    """
     operator = twin.operators[len(twin.operators) // 2]
     scale = sensor.wavelength_nm / operator.wavelength_nm
     u = pupil_axis(sensor.pupil.shape[0])
@@ -68,7 +74,12 @@ def twin_mirror(sensor: Sensor, twin: Twin, mirror: Mirror) -> TwinMirror:
 
 
 def wavefront_nm(mirror: TwinMirror, actuators_nm: NDArray[np.floating]) -> Single:
-    """Wavefront (used,) at the twin's nodes: twice the surface, of actuators (rows, columns), nm of surface."""
+    """Wavefront (used,) at the twin's nodes: twice the surface.
+
+    Args:
+        mirror: From `twin_mirror`.
+        actuators_nm: (rows, columns) nm of surface.
+    """
     twice = np.multiply(actuators_nm, np.float32(2.0), dtype=np.float32)
     wavefront = (mirror.y_factors @ twice @ mirror.x_factors.T).take(mirror.used)
     wavefront += mirror.expand @ (mirror.reduce @ twice.ravel())

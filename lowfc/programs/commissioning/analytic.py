@@ -19,9 +19,12 @@ Wavefront = Callable[[Twin, TwinMirror], Array]
 
 
 def analytic(config: Configuration, console: Console, at: Wavefront | None = None) -> Calibration:
-    """I0, H and R from the paper's equations, at a flat wavefront or at another one.
+    """I0, H and R from the paper's equations; the optical model goes into the cache, from where the camera takes it.
 
-    The optical model goes into the cache, from where the camera takes it.
+    Args:
+        config: The instrument's.
+        console: For people: a progress bar, warnings.
+        at: The wavefront that is the zero point; flat when None.
     """
 
     def warn(text: str) -> None:

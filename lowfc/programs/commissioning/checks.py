@@ -27,9 +27,15 @@ _STYLES = {Status.OK: "green", Status.NOTE: "cyan", Status.WARNING: "bold yellow
 
 
 class Check(NamedTuple):
-    """One line of a report: what was found of what is expected, what to do about it, and what it costs otherwise.
+    """One line of a report.
 
-    Wrong breaks the contract; a warning costs something or could not be tried; a note is worth knowing.
+    Attributes:
+        status: wrong breaks the contract; a warning costs something or could not be tried; a note is worth knowing.
+        got: what was found.
+        advice: what to do about it; empty where there is nothing to do.
+        cost: what it costs otherwise.
+        name: what was looked at.
+        expected: what the contract says.
     """
 
     status: Status
@@ -83,7 +89,11 @@ class Table(Generic[S]):
     ) -> Callable[[Callable[[S], Check | None]], Callable[[S], object]]:
         """Enter a function that looks; it returns None where there is nothing to look at.
 
-        Advice and cost are those of a warning that does not say them itself.
+        Args:
+            name: of the check.
+            expected: what the contract says.
+            advice: what to do, for a warning that does not say it itself.
+            cost: what it costs otherwise.
         """
 
         def enter(look: Callable[[S], Check | None]) -> Callable[[S], object]:
@@ -108,7 +118,14 @@ class Table(Generic[S]):
 def put(
     checks: list[Check], worst_first: tuple[Status, ...], fields: Mapping[str, str], about: dict[str, Any] | None
 ) -> None:
-    """Print a report, as a table or with `about`, the rest of it, as a JSON object whose keys are those of `fields`."""
+    """Print a report.
+
+    Args:
+        checks: in their order.
+        worst_first: statuses that are counted.
+        fields: attribute of a check by its key in JSON.
+        about: the rest of the JSON object; None for a table.
+    """
     ended = Counter(check.status for check in checks)
     if about is not None:
         rows = [{key: getattr(check, attribute) for key, attribute in fields.items()} for check in checks]

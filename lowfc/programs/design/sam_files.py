@@ -34,7 +34,16 @@ class Point:
 
 
 def check_files(out: Path, resume: Path | None, *others: Path | None) -> Path:
-    """Say before the search what would go wrong with its files after it; return the state file."""
+    """Say before the search what would go wrong after it.
+
+    Args:
+        out: Layout file.
+        resume: State file to go on from.
+        others: More files to be written.
+
+    Returns:
+        The state file.
+    """
     if out.suffix != ".json":
         raise ConfigurationError(f"--out must end in .json, as only that is read as a layout file; got {out}")
     state = resume if resume is not None else out.with_name(f"{out.name}.state.json")

@@ -61,7 +61,14 @@ class ShapedPupil(Result):
 
 
 def design_spc(wanted: Request, out: Path, plot: Path | None, console: Console) -> ShapedPupil:
-    """Design a mask and write an npz file: `quarter`, which `load_pupil` reads, and `made_by`, the request as JSON."""
+    """Design a mask and write it.
+
+    Args:
+        wanted: The mask.
+        out: An npz file with `quarter`, which `load_pupil` reads, and `made_by`, the request as JSON.
+        plot: Picture to be drawn, or None.
+        console: Where progress goes.
+    """
     if plot is not None:
         figure_class()
     require_folder(out, plot)

@@ -152,7 +152,11 @@ def sparse_apertures() -> tuple[str, ...]:
 
 @lru_cache(maxsize=64)
 def prepared(name: str) -> Prepared:
-    """A sensor by its name, made ready once in a process: as of `sensor_named`, clowfs:MM, or bowtie:LAYOUT."""
+    """A sensor by its name, made ready once in a process.
+
+    Args:
+        name: as of `lowfc.adapters.files.sensors.sensor_named`; clowfs:MM with its defocus; or bowtie:LAYOUT.
+    """
     kind, _, detail = name.partition(":")
     if kind == "clowfs" and detail:
         try:
@@ -226,10 +230,14 @@ def assuming(rows: Sequence[Row], assumption: str) -> list[Row]:
 
 @dataclass(frozen=True)
 class Context:
-    """Trials, the seed of all random numbers, and threads, on which no figure depends.
+    """What a table is given to work with.
 
-    `sensors` stand instead of a table's own, where it has a choice; `progress` receives what is being done, how much of
-    it is, and how much there is.
+    Attributes:
+        trials: Wavefronts, noise realisations.
+        seed: Of all random numbers.
+        jobs: Threads; no figure depends on them.
+        sensors: Instead of a table's own sensors, where it has a choice.
+        progress: Called with what is being done, how much of it is, and how much there is.
     """
 
     trials: int = 100

@@ -37,8 +37,10 @@ PATIENCE_S = 60.0
 class Channel:
     """What became of a channel; arrays (1 + changes of it, modes), nm rms of wavefront, the first before all changes.
 
-    The loop's own command is that beyond what cancels the disturbance, mean of the last frames of each step; `left_nm`
-    (2,) is the rms of the true residual about its mean, before the steps and after them.
+    Attributes:
+        seen_nm: what the sensor sees of the channel.
+        own_nm: the loop's own command beyond what cancels the disturbance, mean of the last frames of each step.
+        left_nm: (2,) rms of the true residual about its mean, before the steps and after them.
     """
 
     seen_nm: Array
@@ -73,7 +75,12 @@ def dark_hole(
 ) -> Night:
     """Take the steps on one channel, take them back, and take them on the other; all in one run of the processes.
 
-    `base_nm` (rows, columns) is on the channel without a zero-point shift all the time.
+    Args:
+        folder: where the log goes.
+        each_nm: rms of each step.
+        toml: configuration.
+        base_nm: (rows, columns) nm that are on the channel without a zero-point shift all the time.
+        seed: of the simulation; the configuration's when None.
     """
     (folder / "night.toml").write_text(f"{GAINS}{toml}")
     words = [sys.executable, "-m", *COMMAND.split(), "--run", RUN, "--config", "night.toml", "--json"]

@@ -103,11 +103,17 @@ class Loop:
 
 @dataclass(frozen=True, slots=True)
 class Played:
-    """One play of a table (frames, columns) of shapes (columns, actuators), nm of surface, frame by frame.
+    """One play, or a stretch of nothing, frame by frame.
 
-    `what` are the parameters that it was announced with. A stretch of nothing has no target and no columns. Errors and
-    pseudo-open-loop modes (frames, modes) are NaN where a frame is missing or was refused, commands where it is
-    missing; there the loop mode is 0. Reasons have a bit `1 << reason` for each.
+    Attributes:
+        what: the parameters that it was announced with.
+        target: of the play; empty for none.
+        table: (frames, columns) of the play; (frames, 0) for none.
+        basis: (columns, actuators) of the play, nm of surface.
+        error_nm: (frames, modes), NaN where a frame is missing or was refused; so is pol_nm.
+        command_nm: (frames, modes) after each frame; NaN where it is missing.
+        mode: (frames,) loop mode, 0 where a frame is missing.
+        reasons: (frames,) bit `1 << reason` for each.
     """
 
     what: dict[str, Any]

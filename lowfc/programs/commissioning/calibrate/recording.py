@@ -50,9 +50,12 @@ class PokesNotSeenError(CalibrationError):
 class Recording(NamedTuple):
     """Frames of a play, counted from the first whose command had a row.
 
-    Frames that were lost are not among the sequences (frames,) and pixels (frames, pixels), DN. `steps` (steps,) are
-    the sequences of the controller's steps, which may be more: whether each made a command, and the loop's own modal
-    command.
+    Attributes:
+        sequence: (frames,) rising; frames that were lost are not there.
+        pixels: (frames, pixels) uint16, DN.
+        steps: (steps,) sequences of the controller's steps, which may be more.
+        commanded: (steps,) whether the frame was used and a command made of it.
+        command_nm: (steps, modes) the loop's own modal command.
     """
 
     sequence: Long
@@ -97,7 +100,13 @@ def _weights(delay_frames: float) -> Array:
 
 
 def play(loop: Client, basis_nm: npt.NDArray[np.floating], table: npt.NDArray[np.floating]) -> Recording:
-    """Play a table (frames, shapes) of shapes (shapes, actuators) and record until its last row has been seen."""
+    """Play a table on the mirror and record until its last row has been seen.
+
+    Args:
+        loop: A connection to the controller.
+        basis_nm: (shapes, actuators) nm of surface.
+        table: (frames, shapes).
+    """
     loop.check_lease()
     with _streams(loop) as (frames, steps):
         mirror = loop.mirror_watch()
@@ -235,7 +244,11 @@ def _recording(images: list[Frame], made: list[Step], first: int) -> Recording:
 class Player:
     """Sequences of pokes on the mirror of a loop, played again where frames were lost or a device restarted.
 
-    `before` has dark, good pixels, reference and the mirror's commands; a closed loop works against the pokes.
+    Attributes:
+        loop: to play on.
+        before: has dark, good pixels, reference and the mirror's commands.
+        report: for people: why a sequence is played again.
+        closed: the loop works against the pokes.
     """
 
     loop: Client

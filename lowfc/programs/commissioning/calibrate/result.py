@@ -227,10 +227,15 @@ def configured_delay(config: Configuration) -> float:
 def judge(
     asked_snr: float, cycles: int, error: Array, check: Check, noise_ratio: Array | None, noll: tuple[int, ...]
 ) -> Verdict:
-    """Judge a reconstructor of so many cycles by the signal-to-noise ratio that it must have, and by its cross-talk.
+    """Judge a reconstructor.
 
-    `error` (modes,) is the standard error of the elements of each row of R H, `noise_ratio` (modes,) the noise in a
-    frame over that of the computed reconstructor; None where there is none to compare.
+    Args:
+        asked_snr: signal-to-noise ratio that it must have.
+        cycles: that it was made from.
+        error: (modes,) standard error of the elements of each row of R H.
+        check: its cross-talk on other frames.
+        noise_ratio: (modes,) its noise in a frame over that of the computed one; None where there is none to compare.
+        noll: Noll index of each mode.
     """
     reached = 1 / max(float(error.max()), 1e-300)
     rms, largest = MOST_RMS / asked_snr, MOST_LARGEST / asked_snr

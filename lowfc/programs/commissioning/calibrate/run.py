@@ -53,8 +53,12 @@ class CalibrationData(NamedTuple):
 class Calibrator:
     """One calibration of a running loop; the mirror is afterwards where it was.
 
-    `before` is the calibration in use, with a noise (modes,) in one frame; another calibration can go on from the
-    cycles `kept`.
+    Attributes:
+        config: the loop's.
+        before: the calibration in use.
+        noise_nm: (modes,) of one frame, with that calibration.
+        pokes: what is played.
+        kept: cycles that another calibration can go on from.
     """
 
     def __init__(
@@ -67,7 +71,12 @@ class Calibrator:
     ) -> None:
         """Ask the controller what it has, and read the cycles to go on from.
 
-        R is made of what the optical model computes, where its pixels are the loop's.
+        Args:
+            loop: A connection to it.
+            request: What is asked for.
+            report: For people.
+            progress: For people: frames so far, and of how many.
+            computed: What the optical model says, of which R is made where its pixels are the loop's.
         """
         self._loop = loop
         self._request = request

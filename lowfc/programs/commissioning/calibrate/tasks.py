@@ -133,7 +133,11 @@ def computed(
 
 
 def zero_point(config: Configuration, text: str) -> tuple[str, Wavefront]:
-    """Name and wavefront of --at: modes as in 4=15,7=-10, Noll index = nm rms, or a file with a shape of the mirror."""
+    """The wavefront of --at: modes as in 4=15,7=-10, Noll index = nm rms, or a file as `lowfc ctl channel` takes it.
+
+    Returns:
+        Its name in a calibration, and the wavefront.
+    """
     if "=" not in text:
         shape = shape_of(config, "--at", text)
         return ("a shape", lambda _, mirror: wavefront_nm(mirror, shape).astype(np.float64))

@@ -27,7 +27,14 @@ _NS = 1e9
 
 
 class Sensor(NamedTuple):
-    """A camera without light: its dark (pixels,), measured or not, and 1 for each pixel (pixels,) that is used."""
+    """A camera without light.
+
+    Attributes:
+        camera: its settings.
+        dark_dn: (pixels,) mean.
+        good: (pixels,) 1 where a pixel is used, else 0.
+        measured: Whether the dark was measured.
+    """
 
     camera: CameraSettings
     dark_dn: Array

@@ -41,9 +41,14 @@ class Picture(NamedTuple):
 
 
 class Camera(Collected):
-    """Messages of a camera: its frames without their pixels, the pixels (rows, columns) of some, its settings.
+    """Messages of a camera.
 
-    Settings that could not be read are None; `answers` are those to a query for them.
+    Attributes:
+        frames: every frame, without its pixels.
+        unreadable: payloads that are no RawImage.
+        pixels: (rows, columns) of some of them, as little-endian.
+        states: the camera's settings as they came; None for one that could not be read.
+        answers: to a query for the settings.
     """
 
     def __init__(self, line: Line) -> None:

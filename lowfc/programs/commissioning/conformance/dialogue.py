@@ -30,7 +30,16 @@ _MOST_MOVES = 400
 
 
 class Expected:
-    """What a configuration says of its mirror: its grid, limits, driver's step, and which actuators move."""
+    """What a configuration says of its mirror; dead and stuck actuators do not move.
+
+    Attributes:
+        name: in its topics.
+        grid: rows and columns of actuators.
+        limits: that it keeps, nm of surface.
+        step_nm: least step of its driver.
+        moving: (rows, columns) which actuators move.
+        period_ns: between two commands of the loop.
+    """
 
     def __init__(self, config: Configuration) -> None:
         """Read the mirror's section."""
@@ -60,7 +69,12 @@ class Expected:
 
 
 class Dialogue(Collected):
-    """Sends commands to a mirror and collects its states, each with the message that it came in."""
+    """Sends commands to a mirror and collects its states.
+
+    Attributes:
+        states: every state that could be read, with the message that it came in.
+        unreadable: states that could not be read.
+    """
 
     def __init__(self, line: Line, expected: Expected) -> None:
         super().__init__(line, MIRROR_STATE.at(expected.name), mirror_role(expected.name))
@@ -123,7 +137,15 @@ class Dialogue(Collected):
         cut: int = 0,
         clear_id: int = 0,
     ) -> tuple[int, int]:
-        """Send a command (rows, columns), nm of surface, without its last `cut` bytes; its sequence and its time."""
+        """Send a command; return its sequence and its time.
+
+        Args:
+            wanted_nm: (rows, columns) nm of surface.
+            valid_ns: how long it may be held.
+            sequence: of its frame; the next one if None.
+            cut: bytes that are missing at the end.
+            clear_id: identity of an operator's clear; 0 for none.
+        """
         if sequence is None:
             sequence, self._next = self._next, self._next + 1
         data, time_ns = wanted_nm.astype("<f4").tobytes(), self.line.now_ns()
@@ -142,7 +164,11 @@ class Dialogue(Collected):
         return sequence, time_ns
 
     def ask(self, wanted_nm: Single, valid_ns: int = VALID_NS) -> tuple[wire.MirrorState | None, int, int]:
-        """Send a command and wait for its answer, None in vain; that, the command's time, and how long it took, ns."""
+        """Send a command and wait for the state that answers it, None in vain.
+
+        Returns:
+            The state, the command's time, and how long it took, ns.
+        """
         self._commanded_nm, before = wanted_nm, len(self.states)
         sequence, sent_ns = self.put(wanted_nm, valid_ns=valid_ns)
         end_ns = self.line.now_ns() + round(ANSWER_S * NS)

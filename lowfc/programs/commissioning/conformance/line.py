@@ -23,7 +23,14 @@ EVERYTHING = "lowfc/**"
 
 
 class Received(NamedTuple):
-    """One message as it arrived, whatever is wrong with it; the attachment should be its envelope."""
+    """One message as it arrived, whatever is wrong with it.
+
+    Attributes:
+        key: where it was published.
+        payload: its bytes.
+        attachment: what should be its envelope; None without one.
+        receive_time_ns: when it was received, by the host's clock.
+    """
 
     key: str
     payload: bytes
@@ -40,7 +47,11 @@ class Received(NamedTuple):
 
 
 class Line:
-    """A session of a run that receives everything; `ZenohBus` would refuse what has no envelope."""
+    """A session of a run that receives everything; `ZenohBus` would refuse what has no envelope.
+
+    Attributes:
+        offset_ns: what CLOCK_MONOTONIC is short of the epoch, on this host.
+    """
 
     def __init__(self, links: Links, role: str) -> None:
         """Join a run as `role`; BusError where the role's port is taken."""
@@ -100,7 +111,15 @@ class Line:
 
 
 class Collected:
-    """Messages of a device, in the order of arrival, and for how many seconds; `key` is that of its main topic."""
+    """Messages of a device, in the order of arrival.
+
+    Attributes:
+        line: to the device.
+        key: of its main topic.
+        process: name under which it publishes its Health.
+        messages: all of them.
+        seconds: for how long; set at the end.
+    """
 
     def __init__(self, line: Line, key: str, process: str) -> None:
         """Begin to look at a device."""

@@ -126,10 +126,15 @@ def _on_request(seen: Camera) -> Check | None:
 
 
 class Agreement(NamedTuple):
-    """One value that is both a field of lowfc.v1.CameraState and, from a key, of the configuration.
+    """One value that is in both.
 
-    They may differ by a part of the configured value. Where they do, the loop is wrong if the value is `needed`;
-    otherwise only what is computed from it is.
+    Attributes:
+        field: of lowfc.v1.CameraState.
+        key: of the configuration, from which the same field is made.
+        unit: in which both are printed.
+        apart: part of the configured value by which they may differ.
+        needed: whether the loop is wrong where they differ; otherwise only what is computed is.
+        use: what is computed from it.
     """
 
     field: str

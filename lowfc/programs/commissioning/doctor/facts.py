@@ -12,9 +12,13 @@ from lowfc.programs.core.recording.volume import payload_bytes
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """What the checks look at: the host, the loop's configuration, what was granted and measured, or why not.
+    """What the checks look at.
 
-    `busy` are other processes while that was measured, as `Host.busy`.
+    Attributes:
+        host: the kernel's account of it.
+        config: of the loop that is to run.
+        trial: what was granted and measured; why not, where it could not be tried.
+        busy: other processes while that was measured, as `Host.busy`.
     """
 
     host: Host

@@ -83,7 +83,13 @@ def inputs(sensor: Prepared, modes: int, literal: bool) -> Iterator[Input]:
 
 @dataclass(frozen=True, eq=False)
 class Ensemble:
-    """Random wavefronts (trials, modes), their estimates by one sensor in every way, and the rms at the bound, nm."""
+    """Random wavefronts and their estimates by one sensor.
+
+    Attributes:
+        truth_nm: (trials, modes).
+        estimates_nm: Of each estimator, (trials, modes).
+        bound_nm: Root mean square over the open pupil at the Cramer-Rao bound.
+    """
 
     truth_nm: Array
     estimates_nm: dict[str, Array]
