@@ -13,10 +13,13 @@ IMAGES = 200
 
 @dataclass(frozen=True, slots=True)
 class AddedContrast:
-    """Added contrast, means over so many instants of a run's second half.
+    """Means over instants of a run's second half.
 
-    Of full images: `flat` by the disturbance, as with a flat mirror, and `left` by what the loop left; `quadratic_left`
-    is the latter by the quadratic form. The dark zone's own contrast is that without any wavefront.
+    Attributes:
+        instants: of which the full images were made.
+        flat: added by the disturbance, as with a flat mirror, and `left` by what the loop left; of full images.
+        quadratic_left: by the quadratic form, at the same instants.
+        dark_zone: the coronagraph's own contrast, without any wavefront.
     """
 
     instants: int
@@ -27,7 +30,11 @@ class AddedContrast:
 
 
 class Contrast:
-    """Keeps modes of some instants, evenly spread over a run of unknown length."""
+    """Keeps modes of some instants, evenly spread over a run of unknown length.
+
+    Attributes:
+        noll: of the modes.
+    """
 
     def __init__(self, modal: ModalContrast) -> None:
         """Begin without an instant."""

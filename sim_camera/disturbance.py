@@ -46,11 +46,19 @@ class DampedLine:
 
 @dataclass(frozen=True, eq=False)
 class Disturbance:
-    """A disturbance of the modes, and a static Kolmogorov screen of some nm rms.
+    """A disturbance of the modes and a static screen.
 
-    Each sine wave has a frequency (waves,) and a complex amplitude (waves, modes), nm of wavefront rms; `step_nm`
-    (modes,) is half of the height of a square wave, `static_nm` (modes,) is constant. The seed is of the damped lines'
-    course. Shear of the beam on the sensor's masks is of sine waves, too: Hz (waves,) and pupil diameters (waves, 2).
+    Attributes:
+        noll: Noll index of each mode.
+        frequency_hz: (waves,) of each sine wave.
+        amplitude_nm: (waves, modes) complex: amplitude and phase, nm of wavefront rms.
+        step_nm: (modes,) half of the height of a square wave.
+        static_nm: (modes,) constant.
+        screen_nm: rms of a static Kolmogorov screen, 0 for none.
+        lines: damped ones.
+        seed: of the lines' course.
+        wheels: whose speeds may change.
+        shear: of the beam on the sensor's masks, sine waves: Hz (waves,) and pupil diameters (waves, 2).
     """
 
     noll: tuple[int, ...]
@@ -75,10 +83,20 @@ def disturbance(
     static_nm: dict[int, float] | None = None,
     line_width: float = LINE_WIDTH,
 ) -> Disturbance:
-    """The disturbance of a preset for these modes; ValueError where one of them is not known.
+    """The disturbance of a preset for these modes.
 
-    The seed is of all phases, the scale multiplies the amplitude. A constant wavefront is added, nm rms by Noll index.
-    The reaction wheel's lines have a width between half-power points, as a fraction of their frequency.
+    Args:
+        preset: its name.
+        noll: Noll index of each mode.
+        seed: of all phases.
+        nm_per_mas: wavefront rms of a milliarcsecond of tilt.
+        wavelength_nm: of the light.
+        scale: multiplies the amplitude.
+        static_nm: constant wavefront, nm rms by Noll index.
+        line_width: of the reaction wheel's lines, between half-power points, as a fraction of their frequency.
+
+    Raises:
+        ValueError: unknown preset, or a static mode that is not among the modes.
     """
     modes = len(noll)
     static = np.zeros(modes)
@@ -133,11 +151,18 @@ def with_more(
     jitter_nm: float,
     shear: float,
 ) -> Disturbance:
-    """The disturbance with more sources, each from a seed of its own; ValueError where a mode is not known.
+    """The disturbance with more sources, each from a seed of its own.
 
-    Drift is a random walk of so many nm per root second by Noll index, or of another spectrum than a walk's slope of 2.
-    Jitter has an rms of tip and of tilt, white from half the frame rate to one and a half. Shear is the rms of the
-    beam's slow wander on the sensor's masks along each axis, pupil diameters.
+    Args:
+        shaken: without them.
+        rate_hz: frame rate.
+        drift_nm: nm per root second by Noll index, of a random walk.
+        drift_slope: of its spectrum, where it is another than a walk's 2.
+        jitter_nm: rms of tip and of tilt, white from half the frame rate to one and a half.
+        shear: rms of the beam's slow wander on the sensor's masks along each axis, pupil diameters.
+
+    Raises:
+        ValueError: a mode of the drift is not among the modes.
     """
     if unknown := set(drift_nm) - set(shaken.noll):
         raise ValueError(f"the drifting mode Z{min(unknown)} is not one of Z{shaken.noll[0]} to Z{shaken.noll[-1]}")
@@ -205,7 +230,11 @@ def variances_nm2(shaken: Disturbance, per_line: int = 401) -> tuple[Array, Arra
 
 
 class _Lines:
-    """The course of damped lines at the starts of exposures, as complex vectors; drawn in the order of the frames."""
+    """The course of damped lines at the starts of exposures, as complex vectors; drawn in the order of the frames.
+
+    Attributes:
+        modes: (moved,) those that the lines move.
+    """
 
     def __init__(self, shaken: Disturbance, rate_hz: float) -> None:
         self._seed = shaken.seed

@@ -137,7 +137,11 @@ class SimulatedCamera:
         """File (JSON) of a fault that befalls the frames; empty for none."""
 
     def __init__(self, options: Options, config: Configuration, optics: Scene | None = None) -> None:
-        """Build the optics, or take those that are given; ConfigurationError where the region is too large."""
+        """Build the optics, or take those that are given.
+
+        Raises:
+            ConfigurationError: the region is larger than the sensor.
+        """
         self._config = config
         self._scene = scene(config) if optics is None else optics
         row, rows = _middle("rows", options.rows, self._scene.shape[0])
@@ -224,7 +228,11 @@ class SimulatedCamera:
         self._exposed = self._exposing._replace(sequence=envelope.sequence)
 
     def step(self) -> None:
-        """Until the mirror has applied the command made from the last frame; BusError where it does not."""
+        """Until the mirror has applied the command made from the last frame.
+
+        Raises:
+            BusError: it did not for so long.
+        """
         while self._newest_state < self._last_frame and self._service.running:
             self._arrived.clear()
             if not self._states and not self._arrived.wait(PATIENCE_S):

@@ -78,7 +78,15 @@ class Fault:
         return (frame,)
 
     def pixels(self, index: int, frame: Frame, before: Frame, dark: int, highest: int) -> Frame:
-        """What the detector gives instead of a frame (rows, columns), of values from `dark` to `highest`, DN."""
+        """What the detector gives instead of a frame (rows, columns).
+
+        Args:
+            index: of the frame.
+            frame: as it would be.
+            before: what the detector gave last.
+            dark: value without light, DN.
+            highest: value of a pixel at full well, DN.
+        """
         rng = self.random(index)
         match self.befalling(index):
             case Kind.SATURATED:

@@ -18,7 +18,11 @@ EARLIER_S = 3600
 
 
 def read_fault(file: Path) -> Fault:
-    """Fault of a JSON file: an object with kind, first, frames and seed; ConfigurationError where it is none."""
+    """Fault of a JSON file: an object with kind, first, frames and seed.
+
+    Raises:
+        ConfigurationError: it is none.
+    """
     try:
         found = json.loads(file.read_text())
         return Fault(**(found | {"kind": Kind(found["kind"])}))

@@ -43,9 +43,13 @@ class Figures:
     """Sums over frames, block by block: what each mode adds to the contrast, and squares of the wavefront."""
 
     def __init__(self, noll: tuple[int, ...], nm_per_mas: float, recent: int = 1, instants: int = 0) -> None:
-        """Begin without a frame; `recent` frames are those of the recent figures.
+        """Begin without a frame.
 
-        Continuous truths are means over so many instants of each period; 0 where there are none.
+        Args:
+            noll: modes of the truths to come.
+            nm_per_mas: wavefront rms of a milliarcsecond of tilt.
+            recent: frames of the recent figures.
+            instants: of each period over which continuous truths are means; 0 where there are none.
         """
         self._noll, self._instants = noll, instants
         self._values = 1 + len(noll) + (8 if instants else 4)

@@ -9,9 +9,11 @@ _OFF = 0.125
 
 
 class Lateness:
-    """Counts late commands since the start.
+    """Counts late commands.
 
-    They are habitual once more than a quarter of a window is late, until less than an eighth is.
+    Attributes:
+        total: late ones since the start.
+        habitual: more than a quarter of a window was late, and since then never less than an eighth.
     """
 
     def __init__(self) -> None:

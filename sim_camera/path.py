@@ -11,10 +11,12 @@ class MirrorPath:
     """Shapes of the mirror in the order in which they came into force; times are in frame periods."""
 
     def __init__(self, flat_nm: Single, delay: float = 0.0, settling: float = 0.0) -> None:
-        """Begin with a shape (rows, columns), nm of surface, in force since ever.
+        """Begin with a shape (rows, columns), nm of surface.
 
-        Each shape comes into force a `delay` after it was applied, and is reached with the time constant `settling` of
-        a first-order response; at once where that is 0.
+        Args:
+            flat_nm: the first shape, in force since ever.
+            delay: by which each shape comes into force later than it was applied.
+            settling: time constant of the mirror's first-order response; 0 where a shape is reached at once.
         """
         self._moves: deque[tuple[float, Single]] = deque([(-np.inf, flat_nm)])
         self._delay = delay

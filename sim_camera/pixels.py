@@ -10,9 +10,12 @@ from lowfc.optics.detector.detector import Detector, saturation_dn
 
 @dataclass(frozen=True, eq=False)
 class PixelErrors:
-    """Errors of the pixels (rows, columns): response to light, 1 on average, and electrons of the hot ones.
+    """Errors of the pixels (rows, columns).
 
-    `response_dn` (65536,) is the digital number in place of each that a linear detector gives.
+    Attributes:
+        gain: response to light, 1 on average.
+        hot_e: electrons of the hot ones' dark current in an exposure.
+        response_dn: (65536,) digital number in place of each that a linear detector gives.
     """
 
     gain: Single
@@ -29,10 +32,16 @@ def pixel_errors(
     hot_pixels: float,
     hot_pixel_e: float,
 ) -> PixelErrors | None:
-    """Errors drawn from the seed, for pixels (rows, columns) of a detector; None where there are none.
+    """Errors drawn from the seed; None where there are none.
 
-    Nonuniformity is the rms of the gains, nonlinearity by how much the gain of a faint pixel exceeds that of one at
-    full well. A fraction of the pixels is hot, with so many mean electrons of dark current in an exposure.
+    Args:
+        detector: without errors.
+        shape: rows and columns.
+        seed: of gains and hot pixels.
+        nonuniformity: rms of the gains.
+        nonlinearity: by which the gain of a faint pixel exceeds that of one at full well.
+        hot_pixels: fraction of the pixels.
+        hot_pixel_e: mean electrons of a hot one's dark current in an exposure.
     """
     if not (hot_pixels or nonlinearity or nonuniformity):
         return None

@@ -36,10 +36,13 @@ class Wavefront:
 class Truth:
     """What no sensor knows.
 
-    The wavefront at the instant at which the exposure starts, and root mean squares over the period, None where they
-    are not computed; `sensed_nm` (modes,) is the residual's mean over the exposure, which the sensor sees,
-    `instants_nm` (2, instants, modes) disturbance and residual at each instant. The wheels' speeds are as the exposure
-    starts, the beam's shear along x and y in its middle, in pupil diameters; empty where there is none.
+    Attributes:
+        sampled: the wavefront at the instant at which the exposure starts.
+        continuous: root mean squares over the period, modes included; None where they are not computed.
+        sensed_nm: (modes,) of the residual's mean over the exposure, which is what the sensor sees.
+        instants_nm: (2, instants, modes) disturbance and residual at each instant.
+        wheel_speed_hz: of each wheel as the exposure starts.
+        shear: of the beam along x and y in the middle of the exposure, pupil diameters; empty where it has none.
     """
 
     sampled: Wavefront
@@ -74,9 +77,20 @@ class Scene:
     ) -> None:
         """Prepare everything that does not change from frame to frame.
 
-        An exposure has so many electrons through the open circle, and is so long, in periods. The truth is computed at
-        `instants` of each period; 1 is the start of the exposure alone, of which the image is then one, too.
-        `shear_slopes` (pixels, 2) is the change of the image per pupil diameter, where the disturbance has shear.
+        Args:
+            optics: the twin.
+            mirror: on its nodes.
+            detector: of the sensor.
+            electrons: of one exposure, through the open circle.
+            shaken: the disturbance.
+            rate_hz: frame rate.
+            seed: of noise and screen.
+            noise: photon and read noise.
+            exposure: its length, in periods.
+            instants: of each period at which the truth is computed; 1 for the start of the exposure alone, of which
+                the image is then one, too.
+            pixels: their errors; None for none.
+            shear_slopes: (pixels, 2) change of the image per pupil diameter of shear; where the disturbance has shear.
         """
         self._optics = optics
         self._mirror = mirror
@@ -132,8 +146,11 @@ class Scene:
     def truth(self, index: int, actuators_nm: Single, path: tuple[list[Single], Single] | None = None) -> Truth:
         """The truth of a frame and of its period.
 
-        `path` has the shapes (rows, columns) of the mirror in the period, and how much of each it has at each of the
-        instants (instants, shapes); where it is None, the mirror stays as at the start, `actuators_nm` (rows, columns).
+        Args:
+            index: of the frame.
+            actuators_nm: (rows, columns) at the start of its exposure.
+            path: shapes (rows, columns) that the mirror has in the period, and how much of each it has at each of the
+                instants (instants, shapes); as at the start all the time when None.
         """
         modes = self._sampler.at(index)
         shapes_nm, weights = [actuators_nm], np.ones((len(self.instants), 1), np.float32)

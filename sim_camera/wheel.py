@@ -32,11 +32,14 @@ def walk(rng: np.random.Generator, per_root_s: Array, slope: float = 2.0) -> tup
 
 @dataclass(frozen=True, eq=False)
 class Wheel:
-    """A wheel that shakes the modes, and its speed at time 0.
+    """A wheel that shakes the modes.
 
-    On a ramp the speed changes by Hz per second, in a walk by Hz per root second, running down by friction in
-    proportion to itself. The complex amplitude (harmonics, modes) is that at high speed, nm of wavefront rms; `wander`
-    are waves (waves,) and (waves, 1) of a walk's speed in Hz.
+    Attributes:
+        start_hz: its speed at time 0, turns per second.
+        course: ramp, walk or run-down (by friction in proportion to the speed).
+        change: of the speed: Hz per second, of a walk Hz per root second; 0 for a steady one.
+        amplitude_nm: (harmonics, modes) complex: amplitude and phase at high speed, nm of wavefront rms.
+        wander: (waves,) and (waves, 1) of a walk's speed in Hz.
     """
 
     start_hz: float

@@ -18,9 +18,14 @@ class Actuators:
     """
 
     def __init__(self, grid: tuple[int, int], gain_error: float, hysteresis: float, creep: float, seed: int) -> None:
-        """Draw the gains, with an rms error; `hysteresis` is the share of the command that passes through the plays.
+        """Draw the gains.
 
-        `creep` is the share of a move that follows in each decade of time.
+        Args:
+            grid: rows and columns.
+            gain_error: rms, a fraction.
+            hysteresis: share of the command that passes through the plays.
+            creep: share of a move that follows in each decade of time.
+            seed: of the gains.
         """
         self._gain = 1 + gain_error * np.random.default_rng([seed, 5]).standard_normal(grid)
         self._hysteresis, self._creep = hysteresis, creep

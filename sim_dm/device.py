@@ -12,9 +12,11 @@ from lowfc.device.guard import Guard, Status
 
 @dataclass(frozen=True)
 class Device(Guard):
-    """What the mirror is, beside what protects it: the time constant of its actuators, and those that do not move.
+    """What the mirror is, beside what protects it.
 
-    `fixed_nm` (rows, columns) is the height of dead and stuck actuators, NaN for those that move.
+    Attributes:
+        settling_ns: time constant of the actuators.
+        fixed_nm: (rows, columns) height of dead and stuck actuators, NaN for those that move.
     """
 
     settling_ns: float

@@ -13,7 +13,13 @@ from lowfc.contract.errors import DataFileError
 
 
 def read_array(path: Path, what: str, dimensions: tuple[int, ...]) -> npt.NDArray[np.generic]:
-    """The array of a file, of one of these numbers of `dimensions`; `what` it should be, for people."""
+    """The array of a file.
+
+    Args:
+        path: of the file.
+        what: it should be, for people.
+        dimensions: which number of them it may have.
+    """
     try:
         array = _npy(path) if path.suffix == ".npy" else _fits(path)
     except FileNotFoundError:

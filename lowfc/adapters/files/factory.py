@@ -165,8 +165,14 @@ def analytic_calibration(
 
     The modes are fitted to the influence functions, then mixed a little so that a modal command is what the sensor
     measures of it: through the shaped pupil some of the mirror's print-through looks like low orders, by 2 to 6 %.
-    Actuators that are not active stay out of the modes, and the sensor sees nothing of them. I0 and H are those at the
-    wavefront `opd_nm` (used,) at the twin's used nodes; at a flat one where it is None.
+
+    Actuators that are not active stay out of the modes, and the sensor sees nothing of them.
+
+    Args:
+        config: The instrument's.
+        optics: Its twin.
+        on_nodes: Its mirror.
+        opd_nm: Wavefront at the twin's used nodes at which I0 and H are wanted; flat when None.
     """
     if opd_nm is not None and "shear" in config.control.nuisance:
         raise CalibrationError(

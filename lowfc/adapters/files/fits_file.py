@@ -63,9 +63,14 @@ def opened(path: Path) -> Iterator[fits.HDUList]:
 
 
 def load(path: Path, kinds: tuple[str, ...], what: str, parse: Callable[[fits.HDUList], T], advice: str = "") -> T:
-    """What `parse`, which raises some of `DAMAGED`, makes of a file of our own, of one of these kinds.
+    """What `parse` makes of a file of our own.
 
-    The present kind is the first. Of `what` it is and of the `advice` how such a file is made DataFileError speaks.
+    Args:
+        path: of the file.
+        kinds: one of which it must be, the present one first.
+        what: it is, for people.
+        parse: raises some of `DAMAGED` where something is wrong.
+        advice: how such a file is made.
     """
     try:
         with opened(path) as units:

@@ -22,10 +22,12 @@ def layout_names() -> list[str]:
 
 
 def load_layout(name: str) -> sams.Layout:
-    """A layout by name, checked: a shipped one, `file.json` with one layout, or `file.json:name` with several.
+    """A layout by name, checked.
 
-    A file has the shape of the shipped one: {"layouts": {name: {"purpose", "hole_diameter", "holes": [[x, y], ...]}}}
-    in pupil diameters; a hole [x, y, diameter] has its own size. A single layout may stand alone, without "layouts".
+    Args:
+        name: A shipped layout, `file.json` with one layout, or `file.json:name` with several. A file has the shape of
+            the shipped one: {"layouts": {name: {"purpose", "hole_diameter", "holes": [[x, y], ...]}}} in pupil
+            diameters; a hole [x, y, diameter] has its own size. A single layout may stand alone, without "layouts".
     """
     in_file = re.fullmatch(r"(.*\.json)(?::(.*))?", name)
     file: Traversable = Path(in_file[1]) if in_file else SHIPPED
@@ -44,7 +46,13 @@ def load_layout(name: str) -> sams.Layout:
 
 
 def parse_layout(file: Traversable, name: str, entry: Any) -> sams.Layout:
-    """A layout from what a JSON file holds under its name, as in `load_layout`, checked; `file` is named in errors."""
+    """A layout from what a JSON file holds under its name, checked.
+
+    Args:
+        file: Named in errors.
+        name: Of the layout.
+        entry: "hole_diameter", "holes" and perhaps "purpose", as in `load_layout`.
+    """
     try:
         holes = tuple(_hole(hole, entry) for hole in entry["holes"])
         layout = sams.Layout(name, str(entry.get("purpose", "")), holes)

@@ -33,7 +33,9 @@ _log = logging.getLogger(__name__)
 def load_pupil(samples: int = SAMPLES, file: Traversable = _DATA / "spc_quarter128.npz") -> Array:
     """The shaped pupil (samples, samples): 1e-9 between 4 and 20 lambda/D within 42.5 degrees of the x axis.
 
-    `samples` is a multiple of 256; the array `quarter` of the npz file is the quadrant x >= 0, y >= 0.
+    Args:
+        samples: Across the diameter, a multiple of 256.
+        file: An npz file whose array `quarter` is the quadrant x >= 0, y >= 0.
     """
     try:
         opened = input_file.opened(file, _LARGEST_BYTES) if isinstance(file, Path) else file.open("rb")
@@ -56,7 +58,13 @@ def load_pupil(samples: int = SAMPLES, file: Traversable = _DATA / "spc_quarter1
 def sensor_from(
     section: SensorSection | None = None, wavelength_nm: float = 550.0, warn: Callable[[str], None] = _log.warning
 ) -> Sensor:
-    """The optics that [sensor] describes at a central wavelength; `warn` receives each of `layout_warnings`."""
+    """The optics that [sensor] describes, at the sampling of Table 1.
+
+    Args:
+        section: All defaults when None.
+        wavelength_nm: The central wavelength.
+        warn: Called with each of `layout_warnings`.
+    """
     section = SensorSection() if section is None else section
     pupil = _pupil(section)
     try:

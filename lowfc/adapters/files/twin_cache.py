@@ -72,11 +72,15 @@ def load_or_build(
     cache_dir: Path | None = None,
     notice: Callable[[str], None] = _log.warning,
 ) -> Twin:
-    """The twin from the cache, or built and put there; without a band it is that of the central wavelength.
+    """The twin from the cache, or built and put there.
 
-    `progress` receives the steps done and the steps in all, only while building; `notice` a sentence about a damaged
-    file or a directory that cannot be written: neither is fatal. The directory is `default_cache_dir()` where none is
-    given.
+    Args:
+        sensor: The optics.
+        spec: How far they are compressed.
+        band: The central wavelength alone when None.
+        progress: Called with the steps done and the steps in all, only while building.
+        cache_dir: `default_cache_dir()` when None.
+        notice: Called with a sentence about a damaged file or a directory that cannot be written; neither is fatal.
     """
     band = monochromatic(sensor.wavelength_nm) if band is None else band
     key = operator_hash(sensor, spec, band)
