@@ -82,7 +82,11 @@ class Chain:
 
 
 def start(bounds: Bounds, seed: int, index: int, steps: int) -> Chain:
-    """A chain at a random layout; ValueError where so many holes cannot be placed."""
+    """A chain at a random layout.
+
+    Raises:
+        ValueError: So many holes cannot be placed.
+    """
     rng = np.random.default_rng([seed, index])
     for _ in range(_PACKINGS):
         orbits = _packed(rng, bounds)

@@ -19,6 +19,9 @@ def read_array(path: Path, what: str, dimensions: tuple[int, ...]) -> npt.NDArra
         path: of the file.
         what: it should be, for people.
         dimensions: which number of them it may have.
+
+    Raises:
+        DataFileError: the file is missing, damaged or holds something else.
     """
     try:
         array = _npy(path) if path.suffix == ".npy" else _fits(path)

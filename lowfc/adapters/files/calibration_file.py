@@ -64,12 +64,20 @@ def to_bytes(calibration: Calibration) -> bytes:
 
 
 def save(calibration: Calibration, path: Path) -> None:
-    """Write a FITS file; DataFileError where the file cannot be written."""
+    """Write a FITS file.
+
+    Raises:
+        DataFileError: the file cannot be written.
+    """
     write_whole(path, to_bytes(calibration))
 
 
 def load(path: Path) -> Calibration:
-    """Read a FITS file and check that it is whole."""
+    """Read a FITS file and check that it is whole.
+
+    Raises:
+        DataFileError: the file is missing, damaged or holds something else.
+    """
     calibration = fits_file.load(path, (KIND,), "calibration file", _read)
     fits_file.require_identity(path, calibration.identity(), calibration.id)
     return calibration

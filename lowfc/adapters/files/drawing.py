@@ -8,7 +8,11 @@ from lowfc.contract.errors import ConfigurationError
 
 
 def figure_class() -> Any:
-    """Matplotlib's Figure, which draws without a screen; ConfigurationError where matplotlib is not installed."""
+    """Matplotlib's Figure, which draws without a screen.
+
+    Raises:
+        ConfigurationError: matplotlib is not installed.
+    """
     try:
         from matplotlib.figure import Figure
     except ImportError as error:

@@ -53,7 +53,11 @@ def band(config: Configuration) -> Band:
 
 
 def twin(config: Configuration, progress: Progress | None, warn: Callable[[str], None]) -> Twin:
-    """The real-time twin of the sensor, from the cache or built."""
+    """The real-time twin of the sensor, from the cache or built.
+
+    Raises:
+        ConfigurationError: the optics do not have as many modes as they ask for.
+    """
     spec = replace(_TWINS[config.sensor.nodes], rank=config.sensor.rank)
     try:
         return load_or_build(sensor(config, warn), spec, band(config), progress, notice=warn)
@@ -173,6 +177,11 @@ def analytic_calibration(
         optics: Its twin.
         on_nodes: Its mirror.
         opd_nm: Wavefront at the twin's used nodes at which I0 and H are wanted; flat when None.
+
+    Raises:
+        CalibrationError: this sensor cannot tell the modes apart, the star saturates it, or shear is to be fitted
+            along at a wavefront that is not flat.
+        ConfigurationError: the map of active actuators cannot be used.
     """
     if opd_nm is not None and "shear" in config.control.nuisance:
         raise CalibrationError(

@@ -71,6 +71,9 @@ def load(path: Path, kinds: tuple[str, ...], what: str, parse: Callable[[fits.HD
         what: it is, for people.
         parse: raises some of `DAMAGED` where something is wrong.
         advice: how such a file is made.
+
+    Raises:
+        DataFileError: the file is missing, damaged or holds something else.
     """
     try:
         with opened(path) as units:
@@ -85,7 +88,12 @@ def load(path: Path, kinds: tuple[str, ...], what: str, parse: Callable[[fits.HD
 
 
 def single(units: fits.HDUList, name: str) -> Single:
-    """An extension's array; KeyError where there is no such extension, ValueError where it holds no array."""
+    """An extension's array.
+
+    Raises:
+        KeyError: there is no such extension.
+        ValueError: it holds no array.
+    """
     data = getattr(units[name], "data", None)  # damaged, it may be an extension of no known kind
     if data is None:
         raise ValueError(f"the extension {name} holds no array")
@@ -93,7 +101,11 @@ def single(units: fits.HDUList, name: str) -> Single:
 
 
 def first_image(units: fits.HDUList) -> npt.NDArray[np.generic]:
-    """The first image or cube that there is; ValueError where there is none."""
+    """The first image or cube that there is.
+
+    Raises:
+        ValueError: there is none.
+    """
     found = next((unit.data for unit in units if unit.is_image and unit.data is not None), None)
     if found is None:
         raise ValueError("there is no image in it")
@@ -101,7 +113,11 @@ def first_image(units: fits.HDUList) -> npt.NDArray[np.generic]:
 
 
 def require_identity(path: Path, found: str, stated: str) -> None:
-    """Refuse a file whose content is not what it says; DataFileError where it is not."""
+    """Refuse a file whose content is not what it says.
+
+    Raises:
+        DataFileError: it is not.
+    """
     if found != stated:
         raise DataFileError(f"{path}: damaged: its content has identity {found[:12]}, it says {stated[:12]}")
 

@@ -40,12 +40,20 @@ def to_bytes(law: LinearLaw) -> bytes:
 
 
 def save(law: LinearLaw, path: Path) -> None:
-    """Write a FITS file; DataFileError where the file cannot be written."""
+    """Write a FITS file.
+
+    Raises:
+        DataFileError: the file cannot be written.
+    """
     write_whole(path, to_bytes(law))
 
 
 def load(path: Path) -> LinearLaw:
-    """Read a FITS file and check that it is whole."""
+    """Read a FITS file and check that it is whole.
+
+    Raises:
+        DataFileError: the file is missing, damaged or holds something else.
+    """
     law, stated = fits_file.load(
         path, (KIND, FORMER_KIND), "law file", _read, ": make one with `lowfc tune LOG --out FILE`"
     )

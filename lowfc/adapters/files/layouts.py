@@ -28,6 +28,10 @@ def load_layout(name: str) -> sams.Layout:
         name: A shipped layout, `file.json` with one layout, or `file.json:name` with several. A file has the shape of
             the shipped one: {"layouts": {name: {"purpose", "hole_diameter", "holes": [[x, y], ...]}}} in pupil
             diameters; a hole [x, y, diameter] has its own size. A single layout may stand alone, without "layouts".
+
+    Raises:
+        ConfigurationError: No layout has that name.
+        DataFileError: The file is missing, damaged, or its holes overlap or leave the pupil.
     """
     in_file = re.fullmatch(r"(.*\.json)(?::(.*))?", name)
     file: Traversable = Path(in_file[1]) if in_file else SHIPPED
@@ -52,6 +56,9 @@ def parse_layout(file: Traversable, name: str, entry: Any) -> sams.Layout:
         file: Named in errors.
         name: Of the layout.
         entry: "hole_diameter", "holes" and perhaps "purpose", as in `load_layout`.
+
+    Raises:
+        DataFileError: It is malformed, or its holes overlap or leave the pupil.
     """
     try:
         holes = tuple(_hole(hole, entry) for hole in entry["holes"])

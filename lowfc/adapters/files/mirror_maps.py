@@ -10,7 +10,11 @@ from lowfc.contract.errors import ConfigurationError, DataFileError
 
 
 def read_shape(path: Path) -> Single:
-    """Shape of a mirror (rows, columns), nm of surface: the first image of a FITS file, or the array of a .npy file."""
+    """Shape of a mirror (rows, columns), nm of surface: the first image of a FITS file, or the array of a .npy file.
+
+    Raises:
+        DataFileError: the file is missing, damaged or holds something else.
+    """
     from lowfc.adapters.files.array_file import read_array  # astropy takes its time
 
     shape = read_array(path, "a mirror's shape is an array (rows, columns)", (2,))
@@ -18,7 +22,11 @@ def read_shape(path: Path) -> Single:
 
 
 def active_actuators(config: Configuration) -> Mask | None:
-    """Actuators (rows, columns) that may be commanded, of `mirror.active`; None where all may."""
+    """Actuators (rows, columns) that may be commanded, of `mirror.active`; None where all may.
+
+    Raises:
+        ConfigurationError: the file is missing, damaged or does not fit the mirror.
+    """
     if not config.mirror.active:
         return None
     found = shape_of(config, "mirror.active", config.mirror.active)
@@ -30,7 +38,11 @@ def active_actuators(config: Configuration) -> Mask | None:
 
 
 def flat_nm(config: Configuration) -> Single | None:
-    """The flat map (rows, columns) of `mirror.flat`, nm of surface, zero at inactive actuators; None without one."""
+    """The flat map (rows, columns) of `mirror.flat`, nm of surface, zero at inactive actuators; None without one.
+
+    Raises:
+        ConfigurationError: the file is missing, damaged or does not fit the mirror.
+    """
     if not config.mirror.flat:
         return None
     found = shape_of(config, "mirror.flat", config.mirror.flat)
@@ -39,7 +51,11 @@ def flat_nm(config: Configuration) -> Single | None:
 
 
 def shape_of(config: Configuration, key: str, file: str) -> Single:
-    """A shape (rows, columns) of the configured mirror, nm of surface, from the file that `key` names."""
+    """A shape (rows, columns) of the configured mirror, nm of surface, from the file that `key` names.
+
+    Raises:
+        ConfigurationError: the file is missing, damaged or does not fit the mirror.
+    """
     try:
         found = read_shape(Path(file).expanduser())
     except DataFileError as fault:

@@ -36,6 +36,10 @@ def load_pupil(samples: int = SAMPLES, file: Traversable = _DATA / "spc_quarter1
     Args:
         samples: Across the diameter, a multiple of 256.
         file: An npz file whose array `quarter` is the quadrant x >= 0, y >= 0.
+
+    Raises:
+        DataFileError: The file is missing, damaged or holds no such quadrant.
+        ConfigurationError: The quadrant does not divide `samples`.
     """
     try:
         opened = input_file.opened(file, _LARGEST_BYTES) if isinstance(file, Path) else file.open("rb")
@@ -64,6 +68,10 @@ def sensor_from(
         section: All defaults when None.
         wavelength_nm: The central wavelength.
         warn: Called with each of `layout_warnings`.
+
+    Raises:
+        ConfigurationError: A name is not known, or values do not go together.
+        DataFileError: A file is missing or damaged, or a layout is impossible.
     """
     section = SensorSection() if section is None else section
     pupil = _pupil(section)
@@ -94,7 +102,12 @@ def sensor_named(name: str) -> Sensor:
 
 
 def coronagraph_from(section: SensorSection) -> Coronagraph:
-    """What makes the science image: of a shaped pupil, or behind a Lyot stop."""
+    """What makes the science image: of a shaped pupil, or behind a Lyot stop.
+
+    Raises:
+        ConfigurationError: There is no such pupil.
+        DataFileError: Its file is missing or damaged.
+    """
     pupil = _pupil(section)
     if section.pupil not in _WITH_LYOT_STOP:
         return Coronagraph(pupil)

@@ -15,6 +15,9 @@ def being_written(path: Path, source: Path | None = None, mode: int = 0o666) -> 
     """A file to write that gets the name `path` when all went well, and is gone when not.
 
     Its permissions are those of `mode` that the umask leaves, and no more than those of `source`, its origin.
+
+    Raises:
+        DataFileError: it cannot be written.
     """
     try:
         most = source.stat().st_mode & mode if source is not None and source.exists() else mode
@@ -33,13 +36,21 @@ def being_written(path: Path, source: Path | None = None, mode: int = 0o666) -> 
 
 
 def write_whole(path: Path, content: bytes, source: Path | None = None, mode: int = 0o666) -> None:
-    """Write beside, then rename: neither a reader nor a second writer ever sees half a file; see `being_written`."""
+    """Write beside, then rename: neither a reader nor a second writer ever sees half a file; see `being_written`.
+
+    Raises:
+        DataFileError: The file cannot be written.
+    """
     with being_written(path, source, mode) as part:
         part.write_bytes(content)
 
 
 def require_folder(*files: Path | None) -> None:
-    """Say before the work that a file could not be written after it; None is no file."""
+    """Say before the work that a file could not be written after it; None is no file.
+
+    Raises:
+        DataFileError: A file's folder is not there.
+    """
     for file in files:
         if file is not None and not file.parent.is_dir():
             raise DataFileError(f"{file} cannot be written: there is no directory {file.parent}")
