@@ -81,9 +81,6 @@ def read_chunk(body: bytes, at: int, *, may_lack_crc: bool = False) -> Chunk:
         body: of the record, behind its opcode and length.
         at: position of the record in the file.
         may_lack_crc: accept one without a checksum.
-
-    Raises:
-        UnsoundError: it is not as it was written.
     """
     try:
         _, _, size, crc, named = _FIXED.unpack_from(body)

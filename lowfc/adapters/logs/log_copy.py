@@ -96,11 +96,7 @@ class LogCopy:
 
 @contextlib.contextmanager
 def new_log(path: Path, source: Path) -> Iterator[IO[bytes]]:
-    """A file with the permissions of `source`: it has its name when it is whole, and is gone when something fails.
-
-    Raises:
-        DataFileError: there is such a file, or the disk refuses.
-    """
+    """A file with the permissions of `source`: it has its name when it is whole, and is gone when something fails."""
     never = f"{path} exists already; a log is never overwritten; name another one with --out"
     if path.exists():
         raise DataFileError(never)

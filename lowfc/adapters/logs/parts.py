@@ -65,11 +65,7 @@ class WholeLog(LogReader):
         self._options = options
 
     def __iter__(self) -> Generator[Logged, None, None]:
-        """Messages in the order they were recorded; a reader reads once.
-
-        Raises:
-            DataFileError: a file is no log, or a part of it is damaged.
-        """
+        """Messages in the order they were recorded; a reader reads once."""
         if len(self.paths) == 1:
             self.parts.append(self)
             yield from super().__iter__()
@@ -116,10 +112,6 @@ def one_by_one(names: Sequence[Path], out: Path | None = None, *, as_json: bool 
         names: as given.
         out: the one file that is written, if so.
         as_json: one JSON object is printed.
-
-    Raises:
-        ConfigurationError: there are several logs, and one place for what is made of them; or a part is named twice.
-        DataFileError: there is no log in the folder.
     """
     logs: dict[tuple[str, ...], dict[int, Path]] = {}
     for path in _files(names):
@@ -134,12 +126,7 @@ def one_by_one(names: Sequence[Path], out: Path | None = None, *, as_json: bool 
 
 
 def the_one(names: Sequence[Path]) -> Parts:
-    """The one log that a command line names; see `one_by_one`.
-
-    Raises:
-        ConfigurationError: they are several.
-        DataFileError: there is no log in the folder.
-    """
+    """The one log that a command line names; see `one_by_one`."""
     found = one_by_one(names)
     if len(found) > 1:
         raise ConfigurationError(f"this reads one log: name one, not {_listed(found)}; the newest one is `{LAST}`")
@@ -159,11 +146,7 @@ def titled(paths: Parts) -> str:
 
 
 def metadata_at_start(path: Path) -> dict[str, dict[str, str]]:
-    """Metadata that stand before the messages of a log, by name.
-
-    Raises:
-        DataFileError: it cannot be read.
-    """
+    """Metadata that stand before the messages of a log, by name."""
     found: dict[str, dict[str, str]] = {}
     with LogFile(path) as file:
         for part in file.parts():
@@ -193,11 +176,7 @@ def _files(names: Sequence[Path]) -> Iterator[Path]:
 
 
 def _newest(folder: Path) -> list[Path]:
-    """Files of the newest log of a folder, by their names, which begin with the time; in order.
-
-    Raises:
-        DataFileError: there is none.
-    """
+    """Files of the newest log of a folder, by their names, which begin with the time; in order."""
     hint = f"that of another folder is FOLDER/{LAST}"
     try:
         files = {path: match for path in folder.iterdir() if (match := _NAMED.fullmatch(path.name))}

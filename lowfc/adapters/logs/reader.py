@@ -123,11 +123,7 @@ class LogReader:
         return Selection.of(self.metadata)
 
     def __iter__(self) -> Iterator[Logged]:
-        """Messages in the order they were recorded; a reader reads once.
-
-        Raises:
-            DataFileError: this is no log, or a part of it is damaged.
-        """
+        """Messages in the order they were recorded; a reader reads once."""
         with LogFile(self.path) as file:
             self.size, self.finished, self._file = file.size, file.finished, file
             if (declarations := file.declarations()) is not None:
@@ -181,11 +177,7 @@ class LogReader:
         return messages
 
     def _messages(self, content: bytes) -> list[Logged]:
-        """Messages in a chunk that are wanted; what it declares is remembered.
-
-        Raises:
-            UnsoundError: its records do not hold together, or contradict those before.
-        """
+        """Messages in a chunk that are wanted; what it declares is remembered."""
         found: list[Logged] = []
         wanted, at, end = self._wanted, 0, len(content)
         read_head, read_message, logged = HEAD.unpack_from, _MESSAGE_HEAD.unpack_from, Logged._make

@@ -72,9 +72,6 @@ def recover(source: Path, out: Path, progress: Callable[[int, int], None] | None
         source: a log, finished or not.
         out: a file that is not there yet.
         progress: called with the bytes done and their total.
-
-    Raises:
-        DataFileError: `source` is no log or is being recorded, `out` is there already, or the disk refuses.
     """
     if source.exists() and being_recorded(source):
         raise DataFileError(f"{source} is being recorded, and nothing is lost: `lowfc ctl record stop` finishes it")

@@ -102,9 +102,6 @@ def selection(every: int = 1, patterns: Iterable[str] = ()) -> Selection:
     Args:
         every: record each Nth frame and mirror state.
         patterns: keys or shell patterns of the optional topics to record; all of them where there are none.
-
-    Raises:
-        ConfigurationError: a pattern fits no topic.
     """
     wanted: set[Topic] = set()
     for pattern in (given.removeprefix("/") for given in patterns):

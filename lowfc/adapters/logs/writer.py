@@ -96,11 +96,7 @@ class LogWriter:
         attachments: Sequence[Attachment] = (),
         file_mode: int = FILE_MODE,
     ) -> None:
-        """Open `path` + ".part", with these permissions, and write what describes the log, made at `time_ns`.
-
-        Raises:
-            DataFileError: there is a log of that name, or the disk refuses.
-        """
+        """Open `path` + ".part", with these permissions, and write what describes the log, made at `time_ns`."""
         self.path = path
         self.part = path.with_name(path.name + UNFINISHED)
         self.messages = self.messages_written = self.bytes_written = 0
@@ -142,12 +138,7 @@ class LogWriter:
         return self._raw.longest_write_ns
 
     def write(self, sample: Sample) -> None:
-        """Add one message, its payload verbatim.
-
-        Raises:
-            DataFileError: the disk refuses; the log keeps what was flushed and takes no more.
-            KeyError: there is no such topic.
-        """
+        """Add one message, its payload verbatim."""
         try:
             self._writer.add_message(
                 channel_id=self._channel(sample),
@@ -161,22 +152,14 @@ class LogWriter:
         self.messages += 1
 
     def flush(self) -> None:
-        """Hand everything to the operating system: what was flushed survives a kill -9 of this process.
-
-        Raises:
-            DataFileError: as for `write`, or the file is no longer there.
-        """
+        """Hand everything to the operating system: what was flushed survives a kill -9 of this process."""
         try:
             self._flush()
         except OSError as fault:
             raise self._refused(fault) from fault
 
     def finish(self, metadata: Mapping[str, Mapping[str, str]]) -> Path:
-        """Close the log, with what became known at its end, and give it its name once the disk has it.
-
-        Raises:
-            DataFileError: as for `write`.
-        """
+        """Close the log, with what became known at its end, and give it its name once the disk has it."""
         try:
             self._flush()
             self._describe(metadata)

@@ -8,11 +8,7 @@ from lowfc.contract.errors import DataFileError
 
 
 def refuse_log(out: Path, source: Path) -> None:
-    """Refuse to write over the log that is read, or over another one, whatever its name.
-
-    Raises:
-        DataFileError: `out` is a log, or cannot be read to see whether it is.
-    """
+    """Refuse to write over the log that is read, or over another one, whatever its name."""
     if not out.is_file():
         return
     try:

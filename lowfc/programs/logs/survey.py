@@ -177,11 +177,7 @@ class _Account:
 def survey(
     log: LogFiles, progress: Callable[[int, int], None] | None = None, *, digest: bool = False
 ) -> dict[str, Any]:
-    """Figures of a log, whole or not, from all of its messages; with its `Digest`, and that of each topic, if asked.
-
-    Raises:
-        DataFileError: it is no log.
-    """
+    """Figures of a log, whole or not, from all of its messages; with its `Digest`, and that of each topic, if asked."""
     reader, account, found = WholeLog(log, skip_damaged=True), _Account(), Digest()
     reader.progress = progress
     for number, message in enumerate(reader):

@@ -56,11 +56,7 @@ _NM = 1e-9
 
 
 def write_aot(files: list[Path], history: History, *, with_frames: bool) -> None:
-    """Write a run as AOT, and have `aotpy` read it and check it.
-
-    Raises:
-        DataFileError: the log has no step, no calibration, no frame, or frames of several sizes.
-    """
+    """Write a run as AOT, and have `aotpy` read it and check it."""
     step_columns(history)  # there are some
     path = files[0]
     if history.calibration is None:

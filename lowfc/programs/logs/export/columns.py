@@ -43,9 +43,6 @@ def step_columns(history: History) -> list[Column]:
     """Every quantity of a run's steps, one row per step in the order they were recorded.
 
     What is joined by the frame's sequence (truth, durations, mirror) is NaN where the log does not have it.
-
-    Raises:
-        DataFileError: the log has no step.
     """
     steps = history.steps
     if not steps.sequence.size:

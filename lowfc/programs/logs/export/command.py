@@ -92,12 +92,7 @@ def export_log(
     force: bool = False,
     console: "Console",
 ) -> dict[str, Any]:
-    """Export a log; return the figures that `--json` prints.
-
-    Raises:
-        ConfigurationError: this format has no place for frames, or needs a library that is not there.
-        DataFileError: the log cannot be read or has no steps, or the file is there already or cannot be written.
-    """
+    """Export a log; return the figures that `--json` prints."""
     from lowfc.adapters.files.whole_file import being_written
     from lowfc.adapters.logs.history import read_history
     from lowfc.adapters.logs.parts import WholeLog

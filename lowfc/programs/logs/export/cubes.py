@@ -76,9 +76,6 @@ def _copy_frames(
 
     Returns:
         Sequence and time in ns of each frame, in the order they were recorded.
-
-    Raises:
-        DataFileError: there is no frame, or they have several sizes.
     """
     path, count = history.log.path, history.frame_sequence.size
     sequence, time_ns = np.zeros(count, np.uint64), np.zeros(count, np.int64)

@@ -25,9 +25,6 @@ def write_csv(files: list[Path], history: History) -> None:
     """A table of the steps as comma-separated values: a column for each mode, nothing where there is no value.
 
     A number is the shortest that becomes the log's when it is read in the log's precision.
-
-    Raises:
-        DataFileError: the log has no step.
     """
     columns = step_columns(history)
     noll = _noll(history)
@@ -46,9 +43,6 @@ def write_npz(files: list[Path], history: History) -> None:
         files: the .npz, and a .npy for the frames (frames, rows, columns) in DN if they are wanted: `numpy.load` maps
             it with `mmap_mode="r"`. Its order is that of `frame_sequence` in the .npz.
         history: of the run.
-
-    Raises:
-        DataFileError: the log has no step, no frame, or frames of several sizes.
     """
     arrays = {column.name: column.values for column in step_columns(history)}
     arrays["frame_sequence"] = history.frame_sequence
@@ -70,11 +64,7 @@ def write_npz(files: list[Path], history: History) -> None:
 
 
 def write_fits(files: list[Path], history: History, *, with_frames: bool) -> None:
-    """The steps as binary table STEPS, each array of the calibration as an image, the frames as cube FRAMES.
-
-    Raises:
-        DataFileError: the log has no step, no frame, or frames of several sizes.
-    """
+    """The steps as binary table STEPS, each array of the calibration as an image, the frames as cube FRAMES."""
     units = [_primary(history), _table("STEPS", step_columns(history))]
     for column in calibration_columns(history.calibration) if history.calibration is not None else ():
         image = fits.ImageHDU(column.values, name=column.name)

@@ -60,11 +60,6 @@ def publish(
 
     Returns:
         Figures for `render` and `--json`.
-
-    Raises:
-        ConfigurationError: an option makes no sense.
-        BusError: a live process of the run publishes what should be played.
-        DataFileError: a log cannot be read, or has nothing to play.
     """
     if not 0 < speed < float("inf"):
         raise ConfigurationError(f"--speed is a factor above 0, 1 as recorded; got {speed:g}")

@@ -32,10 +32,6 @@ class Selection:
             patterns: names or shell patterns of keys; everything when empty.
             live: roles of the run that processes play, or shall play.
             allow_commands: whether a live mirror may be moved.
-
-        Raises:
-            ConfigurationError: a pattern fits no topic, or asks for commands without leave.
-            BusError: a live process publishes what was asked for.
         """
         self.live = frozenset(live)
         self._patterns = [pattern.removeprefix("/") for pattern in patterns]

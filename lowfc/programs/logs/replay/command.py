@@ -22,11 +22,7 @@ _HOST = ("lowfc", "git", "python", "numpy", "numba", "scipy", "blas", "processor
 
 
 def verify(logs: list[Path], tolerance_nm: float, jobs: int, console: Console, kernel: str = "") -> dict[str, Any]:
-    """Replay logs that follow each other; return the figures that `--json` prints.
-
-    Raises:
-        DataFileError: a log cannot be read, or cannot be replayed.
-    """
+    """Replay logs that follow each other; return the figures that `--json` prints."""
     from lowfc.programs.logs.replay.workers import replay_files
 
     total = sum(path.stat().st_size for path in logs if path.exists())

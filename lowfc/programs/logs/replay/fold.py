@@ -36,11 +36,7 @@ class Replay:
         return (self._ended_ns - self._begun_ns) * 1e-9
 
     def take(self, message: Logged) -> None:
-        """Take the next message.
-
-        Raises:
-            DataFileError: the log is from before the inputs of the controller were numbered.
-        """
+        """Take the next message."""
         context, topic = self.context, topic_of(message.key)
         self._last_ns = now_ns = message.log_time_ns
         if now_ns < context.share.from_ns - PATIENCE_NS and topic not in published.TOPICS:
@@ -81,11 +77,7 @@ class Replay:
 
 
 def replay(messages: Iterable[Logged], tolerance_nm: float = 0.0, share: Share = WHOLE, kernel: str = "") -> Account:
-    """Replay a log's messages from beginning to end, or a share of them.
-
-    Raises:
-        DataFileError: see `Replay.take`.
-    """
+    """Replay a log's messages from beginning to end, or a share of them."""
     run = Replay(tolerance_nm, share, kernel)
     for message in messages:
         run.take(message)

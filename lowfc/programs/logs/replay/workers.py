@@ -65,10 +65,6 @@ def replay_files(
         jobs: processes, at most; 0 for as many as there are processors.
         progress: called with the bytes replayed so far.
         kernel: that computes; empty for the log's own.
-
-    Raises:
-        ConfigurationError: a log is named twice.
-        DataFileError: a log cannot be read, or cannot be replayed.
     """
     ends_ns = [one for path in paths for one in _chunk_ends_ns(path)]
     if len({path.resolve() for path in paths}) < len(paths):

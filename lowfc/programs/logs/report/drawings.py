@@ -30,11 +30,7 @@ _SECONDS = "seconds since the first step"
 
 
 def drawings(report: Report, progress: Callable[[str], None] = lambda name: None) -> dict[str, str]:
-    """SVG of every drawing that the log has something for, by name.
-
-    Raises:
-        ConfigurationError: matplotlib is not installed.
-    """
+    """SVG of every drawing that the log has something for, by name."""
     found = {}
     for name, (height_in, draw) in _DRAWINGS.items():
         progress(name)

@@ -19,11 +19,7 @@ NOT_HERE = "not in this log"
 
 
 def page(report: Report, progress: Callable[[str], None] = lambda name: None) -> str:
-    """HTML that needs no other file and no network.
-
-    Raises:
-        ConfigurationError: jinja2 or matplotlib is not installed.
-    """
+    """HTML that needs no other file and no network."""
     environment = _environment()
     template = environment.from_string((files("lowfc") / "data" / "report.html").read_text(encoding="utf-8"))
     configuration = report.figures["run"]["configuration"]
@@ -38,11 +34,7 @@ def page(report: Report, progress: Callable[[str], None] = lambda name: None) ->
 
 
 def require_page() -> None:
-    """Find before the work that a page cannot be made after it.
-
-    Raises:
-        ConfigurationError: jinja2 or matplotlib is not installed.
-    """
+    """Find before the work that a page cannot be made after it."""
     _environment()
     figure_class()
 

@@ -71,11 +71,7 @@ class Run:
 
 
 def read_run(files: LogFiles, progress: Callable[[int, int], None] | None = None) -> Run:
-    """Read a log, whole or not, to its end; damaged parts are left out and listed by the history's reader.
-
-    Raises:
-        DataFileError: this is no log, or it has a calibration that cannot be read.
-    """
+    """Read a log, whole or not, to its end; damaged parts are left out and listed by the history's reader."""
     log = WholeLog(files, skip_damaged=True)
     log.progress = progress
     history = read_history(log)

@@ -54,9 +54,6 @@ def svg(name: str, height_in: float, draw: Callable[["Figure", Report], bool], r
     """Draw a figure of the page's width; None where `draw` has nothing to draw.
 
     No prologue, no metadata, no identifier that another drawing of the page has; colours are the page's.
-
-    Raises:
-        ConfigurationError: matplotlib is not installed.
     """
     figure_type = figure_class()
     from matplotlib import rc_context

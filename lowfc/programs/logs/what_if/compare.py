@@ -55,11 +55,6 @@ def what_if(log: LogReader, what: WhatIf) -> dict[str, Any]:
     Args:
         log: a reader that has not been read.
         what: what shall be different; for another reconstructor the frames are read in a second pass.
-
-    Raises:
-        DataFileError: the log cannot be read, or has too little in it.
-        ConfigurationError: a figure is out of range, or an estimator needs more than the log has.
-        CalibrationError: the other calibration does not fit the log, or the reconstructor cannot be made.
     """
     return compared(LoggedRun(read_history(log)), what)
 

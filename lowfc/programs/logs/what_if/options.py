@@ -57,10 +57,6 @@ def requested(
         calibration: FITS file.
         controller: FILE.py:NAME of a function `step(state, error_nm) -> (state, command_nm)`; the state is None at
             first, both arrays are (modes,) nm of wavefront rms.
-
-    Raises:
-        ConfigurationError: an unknown key, a value that is none, a text that asks for nothing, or a file that cannot be
-            used.
     """
     values: dict[str, str] = {}
     for part in filter(None, (part.strip() for part in (text or "").split(","))):
@@ -91,11 +87,7 @@ def requested(
 
 
 def law(what: WhatIf, noll: tuple[int, ...], logged: Law) -> Law:
-    """The law of the what-if: the logged one, or the configuration's, and single figures over it.
-
-    Raises:
-        ConfigurationError: a figure is out of range.
-    """
+    """The law of the what-if: the logged one, or the configuration's, and single figures over it."""
     base = settings(what.config).law(noll) if what.config is not None else logged
     tilts = np.isin(noll, TIP_TILT)
     changed = []
@@ -112,12 +104,7 @@ def law(what: WhatIf, noll: tuple[int, ...], logged: Law) -> Law:
 
 
 def user_controller(where: str) -> Controller:
-    """The function at FILE.py:NAME; what it prints goes to standard error, as standard output is for the figures.
-
-    Raises:
-        ConfigurationError: there is no such file or function, the file cannot be run, or, when it is called, the
-            function fails or returns something else than a state and a command.
-    """
+    """The function at FILE.py:NAME; what it prints goes to standard error, as standard output is for the figures."""
     file, _, name = where.rpartition(":")
     if not file.endswith(".py") or not Path(file).is_file():
         raise ConfigurationError(f"--controller must be FILE.py:NAME of a file that exists, got {where!r}")

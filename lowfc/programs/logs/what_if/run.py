@@ -53,11 +53,7 @@ class LoggedRun:
     """
 
     def __init__(self, history: History) -> None:
-        """Take the run out of a history.
-
-        Raises:
-            DataFileError: no frame was used, or gains and delay are not known.
-        """
+        """Take the run out of a history."""
         self.history = history
         rows = exposed(history.steps.sequence)
         used = rows & np.isfinite(history.steps.error_nm).all(axis=1)
@@ -106,11 +102,7 @@ class LoggedRun:
         return Timing.measured(delay, exposure, float(np.median(waited_ns)) * 1e-9 * history.rate_hz)
 
     def rows_to_compare(self, laws: list[Law], usable: Mask) -> tuple[Mask, int, str]:
-        """Which of the usable steps to compare runs at, the frames in which these laws settle, and in words.
-
-        Raises:
-            DataFileError: none are left.
-        """
+        """Which of the usable steps to compare runs at, the frames in which these laws settle, and in words."""
         steps, missing = self.steps, self.missing
         closed, over = steps.mode == LoopMode.CLOSED, "closed loop"
         if not (closed & usable).any():
@@ -127,11 +119,7 @@ class LoggedRun:
         return rows, settling, over
 
     def measured_again(self, calibration: Calibration) -> Single:
-        """Errors (steps, modes) that another calibration measures in the frames that were used: a second pass.
-
-        Raises:
-            DataFileError: the log was made to hold only some of the frames.
-        """
+        """Errors (steps, modes) that another calibration measures in the frames that were used: a second pass."""
         steps, log = self.steps, self.history.log
         if not log.selection.has_every_frame:
             raise DataFileError(
