@@ -5,7 +5,7 @@ import pytest
 from tests.support.fuzzing import MOST_GROWTH_BYTES, fuzz, shares
 from tests.support.targets import Target, targets
 
-FEW, MANY = 15_000, 1_000_000
+FEW, MANY = 8_000, 1_000_000
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.files import calibration_file
 from lowfc.adapters.logs.parts import LAST, WholeLog, in_order, one_by_one, the_one
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.recovery import recover
@@ -115,18 +116,16 @@ def test_the_files_of_a_log_are_read_as_one(folder: Path, samples: list[Sample])
     assert not log.complete
 
 
-COMMANDS = {
-    "info": ["info"],
-    "digest": ["info", "--digest"],
-    "report": ["report"],
-    "replay": ["replay", "--jobs", "1"],
-    "what-if": ["what-if", "--set", "gain=0.3"],
-    "estimator": ["what-if", "--calibration", "other.fits"],
-    "tune": ["tune", "--controller", "lqg"],
-    "export": ["export", "--to", "npz", "--frames", "--force"],
-    "decimate": ["export", "--decimate", "7"],
-    "latency": ["latency"],
-}
+COMMANDS = [
+    ["info", "--digest"],
+    ["report"],
+    ["replay", "--jobs", "1"],
+    ["what-if", "--calibration", "other.fits"],
+    ["tune", "--controller", "lqg"],
+    ["export", "--to", "npz", "--frames", "--force"],
+    ["export", "--decimate", "7"],
+    ["latency"],
+]
 OF_FILES = {
     *("log", "logs", "file", "files", "bytes", "bytes_before", "metadata", "attachments", "speed", "runs", "source"),
     *("remarks", "settings", "warnings"),
@@ -140,17 +139,23 @@ def without_files(figures: Any) -> Any:
     return figures
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_reads_ten_files_as_it_reads_one(folder: Path, samples: list[Sample], command: str) -> None:
-    from lowfc.adapters.files import calibration_file
+@pytest.fixture(scope="module")
+def ten_and_one(tmp_path_factory: pytest.TempPathFactory, samples: list[Sample]) -> Path:
+    folder = tmp_path_factory.mktemp("recorded")
+    calibration_file.save(Night().calibration, folder / "other.fits")
+    recorded(folder / "logs", samples[:9], 1)  # there is an older one
+    recorded(folder / "logs", samples, 10)
+    recorded(folder / "one", samples, 1)
+    return folder
 
-    calibration_file.save(Night().calibration, Path("other.fits"))
-    recorded(folder, samples[:9], 1)  # there is an older one
-    recorded(folder, samples, 10)
-    recorded(Path("one"), samples, 1)
+
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def test_every_command_reads_ten_files_as_it_reads_one(
+    ten_and_one: Path, monkeypatch: pytest.MonkeyPatch, words: list[str]
+) -> None:
+    monkeypatch.chdir(ten_and_one)
     figures = []
     for log in (LAST, f"one/{LAST}"):
-        words = COMMANDS[command]
         done = lowfc(words[0], log, *words[1:], "--json")
         assert done.exit_code == 0, (done.output, done.exception)
         figures.append(without_files(json.loads(done.stdout)))

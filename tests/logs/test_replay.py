@@ -55,7 +55,8 @@ from tests.support.toy import NOLL, frame, settings
 
 START_S = 1_767_225_600
 STATE_EVERY = 12
-STEPS = 1500
+STEPS = 1000
+EXAMPLES = 40
 
 
 class Night:
@@ -163,7 +164,7 @@ def frames(count: int, first: int = 0) -> list[Input]:
     return [frame(first + index, rng.normal(0, 4, len(NOLL))) for index in range(count)]
 
 
-@effort(deadline=None)
+@effort(deadline=None, max_examples=EXAMPLES)
 @given(*[inputs()] * 2, *map(st.sampled_from, (["hold", "flat"], [1.0, 2.5], ["numpy", "fused"])))
 def test_whatever_happens_is_replayed_to_the_bit(
     before: list[Input], after: list[Input], silence: str, delay_frames: float, kernel: str
@@ -199,7 +200,7 @@ def test_a_law_that_is_overruled_is_replayed_to_the_bit_also_from_the_middle_of_
         assert account.frames >= 860 - first - 2 * STATE_EVERY
 
 
-@effort(deadline=None)
+@effort(deadline=None, max_examples=EXAMPLES)
 @given(inputs(), st.randoms(use_true_random=False), st.integers(1, 6))
 def test_lost_messages_are_never_a_difference_and_every_step_is_accounted_for(
     taken: list[Input], random: st.DataObject, losses: int
@@ -213,7 +214,7 @@ def test_lost_messages_are_never_a_difference_and_every_step_is_accounted_for(
     assert account.frames + account.unchecked == sum(message.key == STEP.key for message in kept)
 
 
-@effort(deadline=None)
+@effort(deadline=None, max_examples=EXAMPLES)
 @given(inputs(), st.randoms(use_true_random=False))
 def test_the_order_between_publishers_does_not_matter(taken: list[Input], random: st.DataObject) -> None:
     made = night([*taken, *frames(20, 5000)])
@@ -228,7 +229,7 @@ def test_the_order_between_publishers_does_not_matter(taken: list[Input], random
     assert account.frames == made.steps()
 
 
-@effort(deadline=None)
+@effort(deadline=None, max_examples=EXAMPLES)
 @given(
     inputs(),
     inputs(),
