@@ -1,7 +1,7 @@
 """Messages of the loop as columns, a row for each: what reports, exports, what-ifs, tuning and views read of them."""
 
 from array import array
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from types import MappingProxyType
 from typing import Any, Generic, TypeVar
@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lowfc.arrays import Long, Sequences, Single
+from lowfc.contract.codecs.codec import encode_step
 from lowfc.contract.messages import from_timestamp, wire
 from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import REASONS, Reason
@@ -200,25 +201,12 @@ class TruthRows(_Rows[Truths]):
         }
 
 
-def of_steps(steps: Sequence[Step], modes: int) -> Steps:
+def of_steps(steps: Iterable[Step], modes: int) -> Steps:
     """Steps of a running loop, as a log's."""
-    nothing = np.full(modes, np.nan, np.float32)
-
-    def of_modes(name: str) -> Single:
-        values = [getattr(step, name) for step in steps]
-        return np.array([nothing if one is None else one for one in values], np.float32).reshape(-1, modes)
-
-    return Steps(
-        np.array([step.frame_sequence for step in steps], np.uint64),
-        np.array([step.time_ns for step in steps], np.int64),
-        np.array([step.mode for step in steps], np.uint8),
-        np.array([bits_of(step.reasons) for step in steps], np.int64),
-        of_modes("error_nm"),
-        of_modes("pol_nm"),
-        of_modes("command_nm"),
-        np.array([step.flux_dn for step in steps], np.float32),
-        np.array([step.saturated_pixels for step in steps], np.int64),
-    )
+    rows = StepRows(modes)
+    for step in steps:
+        rows.add(wire.ControlStep.FromString(encode_step(step, 0)))
+    return rows.taken()
 
 
 def count_reasons(bits: Long) -> dict[Reason, int]:

@@ -18,11 +18,7 @@ from lowfc.contract.errors import DataFileError
 
 
 class LogCopy:
-    """A new log, into which files are copied, one after the other.
-
-    Attributes:
-        messages: written so far.
-    """
+    """A new log, into which files are copied, one after the other; `messages` of them so far."""
 
     def __init__(self, file: IO[bytes]) -> None:
         self.messages = 0
@@ -54,13 +50,7 @@ class LogCopy:
         wanted: Callable[[Logged], bool] = lambda message: True,
         described: Callable[[Metadata | Attachment], bool] = lambda record: True,
     ) -> None:
-        """Copy a file's messages, and where it stands what describes it.
-
-        Args:
-            reader: of the file; it has not been read.
-            wanted: whether to copy a message.
-            described: whether to copy metadata or an attachment.
-        """
+        """Copy messages that are `wanted` of a file that has not been read, and where it stands what describes it."""
         done = 0
         for message in reader:
             self.describe(list(filter(described, reader.described[done:])))

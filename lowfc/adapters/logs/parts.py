@@ -106,12 +106,7 @@ def one_by_one(names: Sequence[Path], out: Path | None = None, *, as_json: bool 
     """Logs that a command line names, each with all of its files that are named.
 
     `last` is the newest log in the default folder, with every file of its recording, and FOLDER/last that of another
-    folder; a file of that name goes before.
-
-    Args:
-        names: as given.
-        out: the one file that is written, if so.
-        as_json: one JSON object is printed.
+    folder; a file of that name goes before. Only one log may be named where one file `out` or one JSON object is made.
     """
     logs: dict[tuple[str, ...], dict[int, Path]] = {}
     for path in _files(names):

@@ -67,11 +67,7 @@ def recover(source: Path, out: Path, progress: Callable[[int, int], None] | None
     """Write what is whole of `source` to `out`; nothing where all of it is whole.
 
     Messages, channels, schemas, attachments and metadata stay as they are; a metadata record "recovery" is added.
-
-    Args:
-        source: a log, finished or not.
-        out: a file that is not there yet.
-        progress: called with the bytes done and their total.
+    `progress` is called with the bytes done and their total.
     """
     if source.exists() and being_recorded(source):
         raise DataFileError(f"{source} is being recorded, and nothing is lost: `lowfc ctl record stop` finishes it")

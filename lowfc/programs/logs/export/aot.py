@@ -173,14 +173,11 @@ class _System:
             loop.commands = aotpy.Image(_COMMANDS, np.zeros((1, 1), np.float32), "m", time=clock)
         if state is not None and len(state.gain) == len(calibration.noll):
             gain, leak = np.array(state.gain, np.float32), np.array(state.leak, np.float32)
-            loop.delay = state.delay_frames + self._idle_fraction() / 2
+            exposure = self._history.exposure_fraction
+            loop.delay = state.delay_frames + (0.0 if exposure is None else (1 - exposure) / 2)
             loop.time_filter_num = aotpy.Image("TIME FILTER NUM", gain[:, None])
             loop.time_filter_den = aotpy.Image("TIME FILTER DEN", np.stack([leak - 1, np.ones_like(leak)], axis=1))
         return loop
-
-    def _idle_fraction(self) -> float:
-        camera = self._history.camera
-        return 1 - camera.exposure_ns / camera.period_ns if camera is not None and camera.period_ns else 0.0
 
     def _metadata(self) -> list[aotpy.Metadatum]:
         history, calibration = self._history, self._calibration

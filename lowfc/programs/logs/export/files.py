@@ -39,10 +39,8 @@ def write_csv(files: list[Path], history: History) -> None:
 def write_npz(files: list[Path], history: History) -> None:
     """Arrays of the steps and of the calibration under names with units, none pickled.
 
-    Args:
-        files: the .npz, and a .npy for the frames (frames, rows, columns) in DN if they are wanted: `numpy.load` maps
-            it with `mmap_mode="r"`. Its order is that of `frame_sequence` in the .npz.
-        history: of the run.
+    Frames (frames, rows, columns) in DN go to a second file, if there is one, a .npy in the order of `frame_sequence`,
+    which `numpy.load` maps with `mmap_mode="r"`.
     """
     arrays = {column.name: column.values for column in step_columns(history)}
     arrays["frame_sequence"] = history.frame_sequence

@@ -57,14 +57,9 @@ class Outcome:
 def replay_files(
     paths: Sequence[Path], tolerance_nm: float, jobs: int, progress: Progress, kernel: str = ""
 ) -> Outcome:
-    """Replay logs that follow each other.
+    """Replay logs that follow each other, in as many processes as `jobs`, 0 for one on every processor, at most.
 
-    Args:
-        paths: of the logs, in their order.
-        tolerance_nm: differences up to this are none.
-        jobs: processes, at most; 0 for as many as there are processors.
-        progress: called with the bytes replayed so far.
-        kernel: that computes; empty for the log's own.
+    `progress` is called with the bytes replayed so far.
     """
     ends_ns = [one for path in paths for one in _chunk_ends_ns(path)]
     if len({path.resolve() for path in paths}) < len(paths):

@@ -51,10 +51,7 @@ def what_if(log: LogReader, what: WhatIf) -> dict[str, Any]:
     actuators' do not. All figures are over the same frames: those at which the logged loop was closed and both had
     settled (all frames, where it never was closed), without those that have saturated pixels. Where the log has the
     truth, the true residual is given too: the measured one is noise for the most part where the star is faint.
-
-    Args:
-        log: a reader that has not been read.
-        what: what shall be different; for another reconstructor the frames are read in a second pass.
+    For another reconstructor the frames are read in a second pass.
     """
     return compared(LoggedRun(read_history(log)), what)
 
@@ -120,13 +117,8 @@ def _true(run: LoggedRun, rows: Mask, moved_nm: Single) -> tuple[dict[str, Array
     """Rms (modes,) of the true residual, in the frames and all the time, as it was and with the mirror moved by that.
 
     The second is what the residual at all times adds to the contrast of the dark zone, where that is known.
-
-    Args:
-        run: of which the truth is known.
-        rows: (steps,) which are compared.
-        moved_nm: (steps, modes).
     """
-    assert run.true_nm is not None  # noqa: S101  # see above
+    assert run.true_nm is not None  # noqa: S101  # the caller knows
     disturbance_nm, residual_nm = (values.astype(np.float64) for values in run.true_nm)
     found, covariances = dict[str, Array](), dict[str, Array | None]()
     known = rows & np.isfinite(residual_nm).all(axis=1)

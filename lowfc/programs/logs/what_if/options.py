@@ -51,12 +51,8 @@ def requested(
 ) -> WhatIf:
     """What the options of the command line ask for.
 
-    Args:
-        text: such as "gain=0.6,leak=0.01".
-        config: configuration file.
-        calibration: FITS file.
-        controller: FILE.py:NAME of a function `step(state, error_nm) -> (state, command_nm)`; the state is None at
-            first, both arrays are (modes,) nm of wavefront rms.
+    A controller is FILE.py:NAME of a function `step(state, error_nm) -> (state, command_nm)`; the state is None at
+    first, both arrays are (modes,) nm of wavefront rms.
     """
     values: dict[str, str] = {}
     for part in filter(None, (part.strip() for part in (text or "").split(","))):
