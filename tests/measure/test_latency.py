@@ -24,6 +24,7 @@ from lowfc.programs.measure.bench.record import render
 from lowfc.programs.measure.control_step import ControlStep, time_alone
 from lowfc.programs.measure.frame_source import Payloads, prepared_frames
 from lowfc.programs.measure.latency.figures import (
+    LOOP_SPANS,
     SPANS,
     STAGES,
     WARM_UP_S,
@@ -40,7 +41,6 @@ from lowfc.programs.measure.latency.text import compared, sparkline, table
 from tests.support.loops import lowfc, until
 from tools.law_bench import calibrated
 
-LOOP_SPANS = ("frame_to_receive", "receive_to_command", "frame_to_command", "command_to_mirror", "frame_to_mirror")
 START = 1_700_000_000 << 32
 MS = 1_000_000
 RATE_HZ, SECONDS = 200, 0.5
@@ -124,6 +124,8 @@ def test_figures_leave_the_warm_up_out_and_count_what_is_not_there() -> None:
     assert found["rate_hz"] == pytest.approx(1000)
     assert found["latency_us"]["frame_to_command"] == {"p50": 100, "p90": 100, "p99": 100, "p99_9": 400, "max": 400}
     assert sum(found["histogram"]["frame_to_command"]) == 499
+    assert max(found["over_time"]["max_us"]) == 400
+    assert found["over_time"]["seconds"][0] == 0
 
 
 def test_frames_of_a_burst_are_told_from_those_lost_alone() -> None:
@@ -335,7 +337,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], 
         folder / "loop.toml",
     )
     before = runs()
-    done = lowfc("latency", *words, "--json")
+    done = lowfc("latency", *words, "--plot", folder / "latency.png", "--json")
     assert done.exit_code == 0, (done.output, done.exception)
     assert runs() == before
     (folder / "a.json").write_text(done.stdout)
@@ -344,10 +346,11 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], 
 
 @pytest.mark.exclusive
 def test_every_frame_of_a_real_loop_is_in_the_account(measured: tuple[dict[str, Any], Path]) -> None:
-    figures, _ = measured
+    figures, folder = measured
     text = table(figures)
     for words in ("frame to command", "due to command", "half a bare echo", "timer wake-up", "without a command"):
         assert words in text
+    assert (folder / "latency.png").read_bytes().startswith(b"\x89PNG")
     sent = round(RATE_HZ * (SECONDS + WARM_UP_S))
     assert figures["frames"] + figures["warm_up_frames"] == sent
     assert figures["frames_untimed"] == figures["frames_missing"] == 0

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from lowfc.adapters.files.whole_file import require_folder, write_whole
 from lowfc.adapters.process.terminal import ConfigFile, Json, LogsOrMeasure, configuration
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.programs.cli.output import put
@@ -59,6 +60,7 @@ def latency(
         bool, typer.Option("--trace", help="Mark stalls with what held up the host, a bare loop beside.")
     ] = False,
     config: ConfigFile = None,
+    plot: Annotated[Path | None, typer.Option(help="Draw histograms and latency against time (PNG).")] = None,
     compare: Annotated[
         tuple[Path, Path] | None, typer.Option(help="Compare two results of --json.", metavar="A.json B.json")
     ] = None,
@@ -72,12 +74,17 @@ def latency(
 
     Example: lowfc latency --duration 10 --repeats 5 --json > latency.json
     """
-    from lowfc.programs.measure.latency.text import compared, table
+    from lowfc.programs.measure.latency.text import compared, picture, table
 
     if compare is not None:
         found = _compare(compare)
         put(found, compared(found), as_json=as_json)
         return
+    require_folder(plot)
+    if plot is not None:
+        from lowfc.adapters.files.drawing import figure_class
+
+        figure_class()  # before the work, where it is not there
     if logs:
         figures = _of_log(logs)
     else:
@@ -93,6 +100,8 @@ def latency(
         if trace and simulated:
             raise ConfigurationError("stalls are traced with prepared frames: leave out --trace or --camera simulated")
         figures = _measure(Asked(settings, duration, repeats, simulated, record, view, kernels, trace))
+    if plot is not None:
+        write_whole(plot, picture(figures))
     put(figures, table(figures), as_json=as_json)
 
 

@@ -18,6 +18,7 @@ WARM_UP_S = 0.5
 """Frames put so soon after the first one are left out."""
 STAGES = TIMED[1:-1]
 """What receive to command is made of, as in ControlTiming."""
+LOOP_SPANS = ("frame_to_receive", "receive_to_command", "frame_to_command", "command_to_mirror", "frame_to_mirror")
 PERCENTILES = {"p50": 500, "p90": 900, "p99": 990, "p99_9": 999, "max": 1000}
 """Each in thousandths, so that its place among the values is exact."""
 
@@ -63,6 +64,7 @@ COUNTS = {
 
 _BINS_PER_OCTAVE = 8
 _LOWEST_US, _OCTAVES = 1.0, 20
+_MOMENTS = 200
 _BURST = 0.5
 
 
@@ -152,6 +154,7 @@ def repeat_figures(frames: Frames) -> dict[str, Any]:
     return {
         "latency_us": {span: figures for span, figures in found.items() if figures is not None},
         "histogram": {span: histogram(values).tolist() for span, values in spans.items()},
+        "over_time": _over_time(put_ns, spans["frame_to_command"]),
         "rate_hz": round(1e9 / period_ns, 3) if period_ns else 0.0,
         "frames": count,
         "warm_up_frames": frames.put_ns.size - count,
@@ -171,4 +174,15 @@ def controllers_account(health: wire.Health) -> dict[str, Any]:
         "frames_skipped": frames.skipped,
         "frames_missing": frames.missing,
         "reasons": {reason.name: count for reason, count in reasons.items() if reason is not Rejection.NO_FRAME},
+    }
+
+
+def _over_time(put_ns: Long, command_us: Array) -> dict[str, list[float]]:
+    """Median and largest in each of up to `_MOMENTS` equal parts, by the time of the first frame of each."""
+    known = np.flatnonzero(np.isfinite(command_us))
+    parts = np.array_split(known, min(_MOMENTS, known.size)) if known.size else []
+    return {
+        "seconds": [round(float(put_ns[part[0]] - put_ns[0]) / 1e9, 6) for part in parts],
+        "p50_us": [round(float(np.median(command_us[part])), 3) for part in parts],
+        "max_us": [round(float(command_us[part].max()), 3) for part in parts],
     }

@@ -40,6 +40,7 @@ def together(repeats: Repeats) -> dict[str, Any]:
     found["reasons"] = {name: sum(one["reasons"].get(name, 0) for one in repeats) for name in names}
     found["rate_hz"] = float(np.median([one["rate_hz"] for one in repeats]))
     found["histogram"] = _histogram(repeats, spans)
+    found["over_time"] = [one["over_time"] for one in repeats]
     found["repeats"] = [{name: one.get(name) for name in ("latency_us", *ALONE)} for one in repeats]
     if used := [one["memory_mb"] for one in repeats if "memory_mb" in one]:
         found["memory_mb"] = {name: max(one[name] for one in used) for name in used[0]}

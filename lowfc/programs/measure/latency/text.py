@@ -1,11 +1,11 @@
-"""The figures of `lowfc latency` as text."""
+"""The figures of `lowfc latency` as text and as a picture."""
 
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lowfc.programs.measure.latency.figures import ALONE, COUNTS, PERCENTILES, RATIOS, SPANS
+from lowfc.programs.measure.latency.figures import ALONE, COUNTS, LOOP_SPANS, PERCENTILES, RATIOS, SPANS
 from lowfc.programs.measure.latency.stalls import Stalls
 from lowfc.programs.measure.latency.summary import OVER
 
@@ -61,6 +61,30 @@ def sparkline(counts: Sequence[int]) -> str:
     sums = [sum(counts[start : start + per]) for start in range(0, len(counts), per)]
     highest = math.log1p(max(sums, default=0)) or 1.0
     return "".join(_BLOCKS[math.ceil(math.log1p(one) / highest * (len(_BLOCKS) - 1))] for one in sums).rstrip()
+
+
+def picture(figures: Mapping[str, Any]) -> bytes:
+    """PNG: a histogram of each span, and frame to command against time."""
+    from lowfc.adapters.files.drawing import figure_class, png
+
+    figure = figure_class()(figsize=(9, 8), layout="constrained")
+    counted, timed = figure.subplots(2, 1)
+    edges = figures["histogram"]["edges_us"]
+    for span in LOOP_SPANS:
+        if span in figures["latency_us"]:
+            counted.stairs(figures["histogram"]["counts"][span], edges, label=SPANS[span])
+    counted.set(xscale="log", yscale="log", xlabel="us", ylabel="frames", title=_what(figures))
+    counted.legend()
+    begun_s = 0.0
+    for number, repeat in enumerate(figures["over_time"]):
+        seconds = [begun_s + second for second in repeat["seconds"]]
+        labels = ("largest", "median") if number == 0 else (None, None)
+        timed.plot(seconds, repeat["max_us"], ".", color="tab:red", markersize=3, label=labels[0])
+        timed.plot(seconds, repeat["p50_us"], color="tab:blue", label=labels[1])
+        begun_s = seconds[-1] if seconds else begun_s
+    timed.set(yscale="log", xlabel="s, one repeat after the other", ylabel="frame to command, us")
+    timed.legend()
+    return png(figure)
 
 
 def _row(name: str, values: Mapping[str, float]) -> str:
