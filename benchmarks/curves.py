@@ -1,10 +1,10 @@
-"""What a frame costs, against the numbers of pixels, modes and actuators: the control step alone, and the loop.
+"""Time for each frame against the numbers of pixels, modes and actuators: the control step alone, and the loop.
 
-Of each size a calibration is made up, random numbers in arrays of its shape, and noisy frames to go with it. The step
-is timed from a frame's bytes to a command's, one after the other, in this process. The loop is the real one: a source
-of prepared frames, zenoh, controller and mirror, each a process; no optical model is needed, so every size can be had.
-Beside them stand what the step cannot do without: reading every byte of its matrices and vectors once, which is the
-limit that memory sets, and its two matrix-vector products.
+The calibration of each size is random numbers in arrays of its shape, with noisy frames to match. The step is timed
+back to back in this process, from the bytes of a frame to the bytes of a command. The loop is the real one: frame
+source, controller and mirror are processes connected by zenoh. The frames are prepared, so that any size is possible
+without an optical model. For comparison, two lower bounds are timed: one read of every byte of the step's matrices and
+vectors (the memory limit), and its two matrix-vector products.
 
 Example:
     python -m benchmarks curves
@@ -34,11 +34,11 @@ from lowfc.programs.measure.frame_source import Payloads
 from lowfc.programs.measure.latency.figures import WARM_UP_S
 
 AXES = {
-    "pixels": ((32, 48, 64, 80, 128, 192, 256, 384, 512), "side", "across the frame"),
-    "modes": ((5, 10, 20, 50, 100, 200, 500), "modes", "how many"),
-    "actuators": ((10, 16, 23, 34, 48, 64), "mirror_side", "across the mirror"),
+    "pixels": ((32, 48, 64, 80, 128, 192, 256, 384, 512), "side", "pixels across the frame"),
+    "modes": ((5, 10, 20, 50, 100, 200, 500), "modes", "number of modes"),
+    "actuators": ((10, 16, 23, 34, 48, 64), "mirror_side", "actuators across the mirror"),
 }
-"""Sizes of each curve, the field of `Size` that they are, and what that is."""
+"""Sizes of each curve, their field of `Size`, and its description."""
 RATE_HZ = 250.0
 
 _STEP = ("step_us", "stream_us", "products_us")
@@ -46,11 +46,13 @@ _LOOP = ("frame_to_command_us", "echo_us")
 
 
 def step_figures(size: Size, seconds: float) -> Result:
-    """The control step of that size, and beside it what it cannot do without, each done over and over for so long.
+    """Times of the control step of that size and of its two lower bounds, each repeated for `seconds`.
 
-    stream_us is of as many bytes as `Size.bytes`, read once by the dot product of one half with the other (of NumPy's
-    sum, max, copy and products the fastest reader), products_us of R with a frame and the modes' shapes with a command.
-    RuntimeError: the step did not go its usual way.
+    stream_us: one read of `Size.bytes` bytes by the dot product of one half with the other, the fastest reader among
+    NumPy's sum, max, copy and products. products_us: R times a frame, and the modes' shapes times a command.
+
+    Raises:
+        RuntimeError: frames were refused or limits acted.
     """
     config = configuration(size, RATE_HZ)
     calibration, frames = made_up(size, config)
@@ -69,7 +71,7 @@ def step_figures(size: Size, seconds: float) -> Result:
 
 
 def timed(work: Callable[[], object], seconds: float) -> dict[str, float]:
-    """p50 and p99 of doing it over and over for so long, and the processor time (cpu) that one takes, us."""
+    """p50, p99 and processor time (cpu) of one call of `work`, us, repeated for `seconds`."""
     work()
     durations_ns = []
     end_ns = time.perf_counter_ns() + round(seconds * 1e9)
@@ -85,9 +87,9 @@ def timed(work: Callable[[], object], seconds: float) -> dict[str, float]:
 
 
 def loop_figures(size: Size, rate_hz: float, seconds: float) -> Result:
-    """The loop of that size and half a round trip of a bare echo of its messages; or failure, what was wrong.
+    """Latency of the loop of that size, and half a round trip of a bare echo of its messages; or `failure`, why not.
 
-    cpu is the controller's, for each frame.
+    cpu is the processor time of the controller for each frame.
     """
     try:
         with watched(os.getpid()) as moments:
@@ -107,16 +109,16 @@ def loop_figures(size: Size, rate_hz: float, seconds: float) -> Result:
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    """The sizes, and whether the loop is measured too."""
+    """Add the sizes, and whether the loop is measured too."""
     add_times(parser, seconds=2.0, repeats=3)
     parser.add_argument("--rate", type=float, default=RATE_HZ, help="frames per second of the loop (%(default)g)")
-    parser.add_argument("--loop", action=argparse.BooleanOptionalAction, default=True, help="the loop too")
+    parser.add_argument("--loop", action=argparse.BooleanOptionalAction, default=True, help="measure the loop too")
     for name, (sizes, _, what) in AXES.items():
         parser.add_argument(f"--{name}", type=int, nargs="*", default=sizes, metavar="N", help=f"{what} (%(default)s)")
 
 
 def measure(options: argparse.Namespace, tell: Tell) -> Result:
-    """Measure every point of every curve, the repeats around all of them; rate_hz is None without the loop."""
+    """Measure every point of every curve once in each repeat; rate_hz is None without the loop."""
     curves = {name: [Size(**{field: n}) for n in getattr(options, name)] for name, (_, field, _) in AXES.items()}
     sizes = list(dict.fromkeys(size for curve in curves.values() for size in curve))
     if not sizes:
@@ -139,7 +141,7 @@ def measure(options: argparse.Namespace, tell: Tell) -> Result:
 
 
 def point(size: Size, repeats: Sequence[Result]) -> Result:
-    """One point of a curve: medians over the repeats of what they measured, and the lowest and highest p50."""
+    """One point of a curve: medians over the repeats, and the lowest and highest p50."""
     made: Result = {name: getattr(size, name) for name in ("pixels", "modes", "actuators", "bytes")} | asdict(size)
     for name in (*_STEP, *_LOOP):
         if each := [repeat[name] for repeat in repeats if name in repeat]:
@@ -159,9 +161,9 @@ HEADINGS = (
     "cpu",
     "products alone",
     "bytes, MB",
-    "read at, GB/s",
-    "memory's limit, us",
-    "step of the limit",
+    "read rate, GB/s",
+    "memory limit, us",
+    "step over limit",
     "loop p50, us",
     "p99",
     "controller's cpu",
@@ -208,7 +210,7 @@ def _cells(one: Result) -> list[str]:
 
 
 def about(result: Result) -> str:
-    """What the figures are."""
+    """Definitions of the figures."""
     default = Size(**result["default"])
     loops = (
         f"The loop runs at {result['rate_hz']:g} Hz, real-time set-up included; from just before a frame's put to just "
@@ -219,14 +221,14 @@ def about(result: Result) -> str:
     failed = "".join(f" Failed, {fault}." for fault in result["failed"])
     return (
         f"us; medians over {result['repeats']} repeats of {result['seconds']:g} s each, in brackets the lowest and "
-        f"highest p50. What is not on the axis is {default.pixels} pixels, {default.modes} modes, {default.actuators} "
-        "actuators. The step: one thread, one after the other, normal scheduling, matrices as warm as the caches keep "
+        f"highest p50. Sizes not on the axis: {default.pixels} pixels, {default.modes} modes, {default.actuators} "
+        "actuators. The step: one thread, back to back, normal scheduling, matrices as warm as the caches keep "
         "them. The limit: as many bytes as a step must touch, read once, by a float32 dot product of one half with the "
         f"other. {loops}{failed}"
     )
 
 
-# Okabe and Ito's colours, told apart by every eye; and each line has a mark and a dash of its own.
+# Okabe and Ito's colours, safe for colour blindness; each line also has its own mark and dash.
 _DRAWN = (
     ("frame_to_command_us", "p50", "loop: frame to command", "#D55E00", "o", "-"),
     ("frame_to_command_us", "cpu", "loop: controller's processor time", "#E69F00", "^", "--"),
@@ -234,12 +236,12 @@ _DRAWN = (
     ("step_us", "p50", "control step", "#0072B2", "s", "-"),
     ("step_us", "cpu", "step's processor time", "#56B4E9", "D", "--"),
     ("products_us", "p50", "two matrix-vector products", "#009E73", "x", "-."),
-    ("stream_us", "p50", "memory's limit: its bytes read once", "#000000", "", ":"),
+    ("stream_us", "p50", "memory limit: its bytes read once", "#000000", "", ":"),
 )
 
 
 def picture(result: Result) -> bytes:
-    """PNG: a panel for each curve, all on one scale of time.
+    """PNG: a panel for each curve, all with the same time scale.
 
     Raises:
         ConfigurationError: matplotlib is not installed.

@@ -1,7 +1,7 @@
-"""The control step by each kernel, back to back, over one matrix-vector product of its size and over memory's limit.
+"""The control step with each kernel, relative to one matrix-vector product of its size and to the memory limit.
 
-In every turn the step by numpy, the fused step, the product R x, and reading every byte that a step must touch once
-follow each other; ratios are those of a turn.
+Each turn times, one after the other: the numpy step, the fused step, the product R x, and one read of every byte that a
+step must touch. Ratios are taken within a turn.
 
 Example:
     python -m benchmarks kernels --pixels 80 256 --repeats 9
@@ -28,13 +28,15 @@ PRODUCT, STREAM = "product", "memory"
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    """The sizes, for how long, and how often."""
+    """Add the sizes, the duration and the repeats."""
     add_times(parser, seconds=0.3, repeats=9)
-    parser.add_argument("--pixels", type=int, nargs="+", default=SIDES, metavar="N", help="across %(default)s")
+    parser.add_argument(
+        "--pixels", type=int, nargs="+", default=SIDES, metavar="N", help="pixels across the frame (%(default)s)"
+    )
 
 
 def measure(options: argparse.Namespace, tell: Tell) -> Result:
-    """Measure in turns: of each size the p50 in us of numpy, fused, product and memory, turn by turn, and ratios."""
+    """Measure each size in turns: p50 of numpy, fused, product and memory in us, and their ratios."""
     set_up(None, None, lock_memory=False, disable_cpu_idle=False)
     found = []
     for side in options.pixels:
@@ -54,7 +56,7 @@ def measure(options: argparse.Namespace, tell: Tell) -> Result:
 
 
 def tables(found: Result) -> list[Lines]:
-    """One line a size and ratio."""
+    """A row for each size and ratio."""
     head = ["pixels, modes, actuators", "ratio", "median (range)"]
     lines = [
         [f"{one['pixels']}, {one['modes']}, {one['actuators']}", name, ranged(ratios, "{:.2f}".format)]

@@ -1,4 +1,4 @@
-"""What the benchmarks share: their command line, ranges over repeats, and the tables as text."""
+"""Command line, ranges over repeats and tables as text, shared by the benchmarks."""
 
 import argparse
 import json
@@ -17,7 +17,7 @@ Result = dict[str, Any]
 Lines = Sequence[Sequence[str]]
 """A table, its headings first."""
 Tell = Callable[[str], None]
-"""Shows what is measured now."""
+"""Displays what is being measured."""
 
 
 class Benchmark(Protocol):
@@ -27,17 +27,17 @@ class Benchmark(Protocol):
         """Add its own options."""
 
     def measure(self, options: argparse.Namespace, tell: Tell) -> Result:
-        """Measure; what `--json` prints. A `failed` in it that is not empty makes the exit status 1."""
+        """Measure, and return the object that `--json` prints; a `failed` that is not empty makes the exit status 1."""
 
     def tables(self, result: Result) -> Sequence[Lines]:
-        """Lay the figures out."""
+        """Tables of the result."""
 
     def about(self, result: Result) -> str:
-        """What the tables do not say."""
+        """Explanation of the tables: conditions and definitions."""
 
 
 def run(name: str, benchmark: Benchmark, words: Sequence[str]) -> int:
-    """Run one from its command line; returns the exit status."""
+    """Run a benchmark from its command line; returns the exit status."""
     parser = argparse.ArgumentParser(
         f"python -m benchmarks {name}",
         description=benchmark.__doc__,
@@ -57,15 +57,15 @@ def run(name: str, benchmark: Benchmark, words: Sequence[str]) -> int:
 
 
 def in_markdown(benchmark: Benchmark, result: Result) -> str:
-    """The whole result for a document."""
+    """The result in markdown."""
     return "\n".join([*(markdown(head, rows) for head, *rows in benchmark.tables(result)), benchmark.about(result)])
 
 
 def add_times(parser: argparse.ArgumentParser, seconds: float, repeats: int | None = None) -> None:
-    """Add the options for how long and, where there are repeats, how often."""
-    parser.add_argument("--seconds", type=float, default=seconds, help="of each measurement (%(default)g)")
+    """Add `--seconds` and, if `repeats` is given, `--repeats`."""
+    parser.add_argument("--seconds", type=float, default=seconds, help="duration of each measurement (%(default)g)")
     if repeats is not None:
-        parser.add_argument("--repeats", type=int, default=repeats, help="of everything (%(default)s)")
+        parser.add_argument("--repeats", type=int, default=repeats, help="repeats of every measurement (%(default)s)")
 
 
 def us(value: float) -> str:

@@ -1,7 +1,7 @@
-"""Where the control step's time goes: each stage, beside one matrix-vector product of the same size in the same run.
+"""Time of each stage of the control step, and of one matrix-vector product of the same size in the same run.
 
-The step is the loop's own, from a frame's bytes to a command's, of a made-up calibration of the usual size. It is timed
-back to back and as in the loop, after a rest as long as a frame's period; so is the product R x alone. After that it is
+The step is the loop's own, from the bytes of a frame to the bytes of a command, with a random calibration of the usual
+size. The step and the product R x are timed back to back, and paced at the frame rate as in the loop. Then the step is
 timed stage by stage, which takes a little longer.
 
 Example:
@@ -48,7 +48,7 @@ _TRACED = 1000
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    """For how long."""
+    """Add the duration."""
     add_times(parser, seconds=5.0)
 
 
@@ -74,7 +74,7 @@ def measure(options: argparse.Namespace, tell: Tell) -> Result:
 
 
 def allocated(step: ControlStep, payloads: Payloads) -> dict[str, float]:
-    """What a step takes after the first few, bytes: its peak, what it keeps on average, and a float32 frame's."""
+    """Memory of a step after warm-up, bytes: its peak, what it keeps on average, and the size of a float32 frame."""
     for number in range(_WARM_UP):
         step(payloads.at(number, number))
     tracemalloc.start()
@@ -97,7 +97,7 @@ def allocated(step: ControlStep, payloads: Payloads) -> dict[str, float]:
 
 
 def tables(found: Result) -> list[Lines]:
-    """One line a stage."""
+    """A row for each stage."""
     columns = [(name, at) for name in ("hot_us", "paced_us") for at in ("p50", "p99")]
     head = ["us", "back to back p50", "p99", f"at {found['rate_hz']:g} Hz p50", "p99"]
     stages = (*STAGES, REST, STEP, PRODUCT)
@@ -105,14 +105,14 @@ def tables(found: Result) -> list[Lines]:
 
 
 def about(found: Result) -> str:
-    """How the step compares with one product, and what it takes of memory."""
+    """The step relative to one product, and its memory."""
     over, memory, size = found["over_product"], found["memory"], Size()
     return (
         f"The step takes {over['hot_us']:.1f} times as long as one product back to back, "
         f"{over['paced_us']:.1f} times at {found['rate_hz']:g} Hz. {size.pixels} pixels, {size.modes} modes, "
         f"{size.actuators} actuators. A step's allocations reach {memory['peak_bytes'] / 1e3:.1f} kB at most "
         f"(a frame in float32 is {memory['frame_bytes'] / 1e3:.1f} kB), and {memory['kept_bytes']:.1f} bytes of each "
-        "stay."
+        "are kept."
     )
 
 

@@ -1,7 +1,6 @@
-"""Parts of the site that the code makes while it is built: a line `<!-- built: NAME -->` of a page stands for one.
+"""Reference tables that are generated while the site is built, in place of lines `<!-- built: NAME -->` of its pages.
 
-They are reference tables, longer than a page in the sources should be. Shorter tables stand in the pages themselves
-(`tools.measure`).
+They are too long for the sources of a page. `tools.measure` writes shorter tables into the pages themselves.
 """
 
 import re
@@ -34,7 +33,7 @@ _WIDTH = 100
 
 
 def with_built(page: str) -> str:
-    """A page with its built parts."""
+    """A page with its tables generated."""
     return _BUILT.sub(lambda found: BUILT[found[1]](), page)
 
 
@@ -47,7 +46,7 @@ def commands() -> str:
 
 
 def _contexts(context: typer.Context) -> Iterator[typer.Context]:
-    """A command, then those below it."""
+    """A command, then its subcommands, recursively."""
     yield context
     for name in getattr(context.command, "commands", ()):
         command = context.command.get_command(context, name)  # type: ignore[attr-defined]  # a group
@@ -61,9 +60,9 @@ def configuration() -> str:
         for name, info in Configuration.model_fields.items()
         if isinstance(info.annotation, type) and issubclass(info.annotation, BaseModel)
     }
-    found = [_keys("The top of the file", "", {name: 0 for name in Configuration.model_fields if name not in sections})]
+    found = [_keys("Top level", "", {name: 0 for name in Configuration.model_fields if name not in sections})]
     found += [_keys(f"[{name}]", f"{sentence(one.__doc__)}.", keys(one, f"{name}.")) for name, one in sections.items()]
-    about = f"{sentence(InterlockSection.__doc__)}. A table each."
+    about = f"{sentence(InterlockSection.__doc__)}. One table for each interlock."
     found.append(_keys("[[interlocks]]", about, keys(InterlockSection, "interlocks.")))
     return "\n".join(found)
 
@@ -81,7 +80,7 @@ def _keys(heading: str, about: str, names: Any) -> str:
 
 
 def _bound(text: str) -> str:
-    """In a reader's form, of a bound as in "Ge(ge=1)"."""
+    """A bound such as "Ge(ge=1)" in words."""
     kind, _, value = text.rstrip(")").partition("=")
     sign = {"Ge(ge": "at least", "Gt(gt": "above", "Le(le": "at most", "Lt(lt": "below"}.get(kind)
     return f"{sign} {value}" if sign else ""
@@ -114,7 +113,7 @@ def json_objects() -> str:
     rows = []
     for one in sorted(_subclasses(Result), key=lambda each: f"{each.__module__}.{each.__name__}"):
         command = " ".join(one.__module__.removeprefix("lowfc.programs.").split(".")[-2:])
-        rows.append(f"### {one.__name__}\n\n{sentence(one.__doc__)}. Made by `{command}`.\n\n{_figures(one)}")
+        rows.append(f"### {one.__name__}\n\n{sentence(one.__doc__)}. Printed by `{command}`.\n\n{_figures(one)}")
     return "\n".join(rows)
 
 
@@ -145,7 +144,7 @@ def _subclasses(kind: type[Result]) -> set[type[Result]]:
 
 
 def events(*levels: Level) -> str:
-    """Every event of these levels: what one sees, why, what to do."""
+    """Every event of these levels: its text, its cause, what to do."""
     return "\n".join(_event(one) for one in EVENTS.values() if one.level in levels)
 
 
@@ -159,13 +158,13 @@ def _event(event: Event) -> str:
 
 
 def reasons() -> str:
-    """Every reason of a refusal or a limit."""
+    """Every reason of a refused frame or command, and every limit."""
     names = [one.name.removeprefix("REASON_") for one in lowfc_pb2.Reason.DESCRIPTOR.values[1:]]
     return markdown(("reason", "why", "what to do"), ((f"`{name}`", *REASONS[name]) for name in names))
 
 
 def upgrade() -> str:
-    """The former names."""
+    """The names of release 0.1 and their successors."""
     tables = {
         "configuration key": KEYS,
         "field of a message": FIELDS,
@@ -177,7 +176,7 @@ def upgrade() -> str:
 
 
 def api(package: str) -> str:
-    """A package of the Python API: what it offers itself, or each of its modules."""
+    """A package of the Python API: its exported names or, without `__all__`, each of its modules."""
     top = import_module(package)
     own = [top] if hasattr(top, "__all__") else [*_modules(top)]
     return "\n".join(_module(module) for module in own)
@@ -206,4 +205,4 @@ BUILT: dict[str, Callable[[], str]] = {
     "former names": upgrade,
     **{f"api {one}": partial(api, f"lowfc.{one}") for one in API},
 }
-"""The parts by the names that the pages call them."""
+"""The generated tables, by the names used in the pages."""

@@ -1,4 +1,4 @@
-"""What was asked of the fused step and of the loop around it, beside what was measured."""
+"""Targets of the fused step and of the loop around it, and what was measured."""
 
 from collections.abc import Callable, Iterator
 from statistics import median
@@ -9,19 +9,19 @@ from lowfc.control.kernel.tables import KERNELS
 from tools.shared import Figures, markdown
 
 NUMPY = f"lowfc, {KERNELS[0]}"
-HEAD = ("what", "asked", "reached", "met", "the floor", "where the time goes")
+HEAD = ("what", "target", "reached", "met", "lower bound", "where the time goes")
 
 
 class Target(NamedTuple):
-    """One figure that was asked for.
+    """A target for one figure.
 
     Attributes:
-        what: it is of.
-        most: asked for at most; negative for at least.
+        what: the figure.
+        most: largest value that meets the target.
         values: measured, one for each turn.
-        form: of a value.
-        floor: that no program of this kind goes below, in words.
-        where: the time above the floor goes.
+        form: format of a value.
+        floor: lower bound for any program of this kind, in words.
+        where: what takes the time above that bound.
     """
 
     what: str
@@ -32,21 +32,20 @@ class Target(NamedTuple):
     where: str
 
     def row(self) -> list[str]:
-        """Its line of the table."""
-        reached, asked = median(self.values), self.form.format(abs(self.most))
+        """The row of the table."""
+        reached = median(self.values)
         spread = f" ({self.form.format(min(self.values))} to {self.form.format(max(self.values))})"
-        met = reached >= -self.most if self.most < 0 else reached <= self.most
         return [
             self.what,
-            f"{'at least' if self.most < 0 else 'at most'} {asked}",
+            f"at most {self.form.format(self.most)}",
             self.form.format(reached) + (spread if len(self.values) > 1 else ""),
-            "yes" if met else "no",
+            "yes" if reached <= self.most else "no",
             self.floor,
             self.where,
         ]
 
 
-OBJECTS = "decoding and encoding by protobuf, the state as values made anew in Python, the calls of compiled code"
+OBJECTS = "decoding and encoding by protobuf, new Python objects for the state, calls of compiled code"
 
 
 def render(measured: Callable[[str], Figures]) -> str:
@@ -58,7 +57,7 @@ def render(measured: Callable[[str], Figures]) -> str:
 def _steps(figures: Figures) -> Iterator[Target]:
     for size, (other, most) in zip(figures["sizes"], (("product", 2.4), ("memory", 1.4), ("memory", 1.3)), strict=True):
         side = round(size["pixels"] ** 0.5)
-        unit = "products R x" if other == "product" else "readings of its bytes"
+        unit = "products R x" if other == "product" else "reads of its bytes"
         where = OBJECTS if other == "product" else "two copies of the frame's bytes by protobuf; " + OBJECTS
         ratios = size["ratios"][f"fused over {other}"]
         yield Target(f"step, fused, {side} x {side}, in {unit}", most, ratios, "{:.2f}", "1", where)
@@ -71,16 +70,16 @@ def _contest(figures: Figures) -> Iterator[Target]:
         both = zip(runs[FUSED], runs[other], strict=True)
         return [(mine["frame_to_command"][at], its["frame_to_command"][at]) for mine, its in both if mine and its]
 
-    shared = "what both share: the way of the frame, waking, the command's way"
+    shared = "the parts common to both: transport of the frame, wake-up, transport of the command"
     for at, most in (("p50", 0.72), ("p99", 0.75)):
         ratios = [mine / its for mine, its in pairs(NUMPY, at)]
         yield Target(f"frame to command, fused over numpy, {at}", most, ratios, "{:.2f}", shared, OBJECTS)
-    ways = "two Python processes that are woken by sockets, where the chain's wait on semaphores in shared memory"
+    ways = "sockets wake two Python processes; the chain's processes wait on semaphores in shared memory"
     for other, asked in (("C chain", {"p50": 40.0, "p99": 80.0}), ("pyrtcao, fused", {"p50": 0.0, "p99": 0.0})):
         for at, most in asked.items():
             differences = [mine - its for mine, its in pairs(other, at)]
             what = f"frame to command, fused minus {other}, {at}, us"
-            where = ways if other == "C chain" else "the same; and the checks, limits and messages that pyrtcao has not"
+            where = ways if other == "C chain" else "the same; also checks, limits and messages that pyrtcao lacks"
             yield Target(what, most, differences, "{:+.0f}", "0 for the same work in C", where)
 
 
@@ -92,8 +91,8 @@ def _stalls(figures: Figures) -> Iterator[Target]:
         0,
         [float(figures["frames_without_command"])],
         "{:.0f}",
-        f"{bare}: wakings of the bare loops later than a period",
-        f"{found['of_host']} of the {found['stalled']} stalls were the host's",
+        f"{bare}: wake-ups of the bare loops more than a period late",
+        f"the host caused {found['of_host']} of the {found['stalled']} stalls",
     )
     for name, mb in figures["memory_mb"].items():
         process = "source of frames" if name == "camera" else name

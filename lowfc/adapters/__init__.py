@@ -1,1 +1,1 @@
-"""Everything that touches the outside: bus, clock, files, scheduling."""
+"""Access to the host: bus, clock, files, scheduling."""

@@ -1,4 +1,4 @@
-"""A running loop in Python: what an operator asks of it, and the frames and steps that it makes.
+"""Python client of a running loop: the operator's requests, and the loop's frames and steps.
 
 with Client() as loop:
     loop.gain(0.4, modes=[2, 3])

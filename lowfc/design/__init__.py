@@ -1,1 +1,1 @@
-"""How good a sensor can be, how good an estimator is, and the search for better masks: pure functions of arrays."""
+"""Bounds on a sensor's noise, the accuracy of estimators, and the search for better masks: pure functions of arrays."""

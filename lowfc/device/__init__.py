@@ -1,4 +1,4 @@
-"""Drivers of cameras and mirrors: what one is, and the two loops that run it."""
+"""Drivers of cameras and mirrors: their interfaces, and the two loops that run them."""
 
 from lowfc.adapters.process.service import Service
 from lowfc.arrays import Pixels, Single

@@ -1,4 +1,4 @@
-"""From nm of surface to what a mirror's electronics take: a value for each channel, clipped, in the vendor's order."""
+"""Conversion from nm of surface to the drive value of each channel, clipped, in the vendor's order."""
 
 import numpy as np
 
@@ -12,30 +12,31 @@ from lowfc.device.driver import DriverOptions
 class VoltOptions(DriverOptions):
     """Options of a mirror that is driven by a value for each channel: volts, or a fraction of their range.
 
-    Files are FITS or .npy, (rows, columns). A value makes `mirror.nm_per_unit` x gain nm of surface for each unit.
+    Files are FITS or .npy, (rows, columns). One unit of value moves the surface by `mirror.nm_per_unit` x gain nm.
     """
 
     zero: float = 0.5
     """Value at which an actuator is flat."""
     zero_map: str = ""
-    """File of that value for each actuator; empty for `zero` for all."""
+    """File of the flat value of each actuator; empty: `zero` for all."""
     gain_map: str = ""
-    """File of each actuator's gain, relative to mirror.nm_per_unit; empty for 1 for all."""
+    """File of each actuator's gain, relative to mirror.nm_per_unit; empty: 1 for all."""
     lowest: float = 0.0
-    """Least value that is ever sent."""
+    """Lowest value that is ever sent."""
     highest: float = 1.0
-    """Largest value that is ever sent."""
+    """Highest value that is ever sent."""
     order: str = ""
-    """File of each actuator's channel, from 0, and -1 for an actuator without one; empty for row after row."""
+    """File of each actuator's channel, from 0, or -1 for an actuator without channel; empty: row by row."""
 
 
 class VoltMap:
-    """The values of a mirror's channels; `channels` counts those that no actuator has, too."""
+    """Converts a surface to channel values and back; `channels` includes channels without an actuator."""
 
     def __init__(self, options: VoltOptions, config: Configuration, channels: int | None = None) -> None:
-        """Read the maps; `channels` is how many the electronics have, where that is known.
+        """Read the maps; `channels` is the number of channels of the electronics, if known.
 
-        ConfigurationError where a map cannot be read, does not fit the mirror, or leaves no room for a surface.
+        Raises:
+            ConfigurationError: a map cannot be read, does not fit the mirror, or its flat values are out of range.
         """
         grid = (config.mirror.rows, config.mirror.columns)
 

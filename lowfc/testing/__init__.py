@@ -1,1 +1,1 @@
-"""For tests, ours and those of a driver: the bus in memory, the clock that stands still."""
+"""For tests of lowfc and of drivers: an in-memory bus, a clock that the test advances."""

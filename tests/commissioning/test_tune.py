@@ -156,7 +156,7 @@ def test_a_running_loop_is_listened_to() -> None:
     added = found["added_contrast"]
     assert 0 < added["predicted"] < added["open"]
     assert set(added["by_group"]["predicted"]) == {"tilt", "focus"}
-    assert f"closed {added['closed']:+.1e}, predicted {added['predicted']:+.1e}; focus costs most (" in text
+    assert f"closed {added['closed']:+.1e}, predicted {added['predicted']:+.1e}; focus contributes most (" in text
 
 
 class Applying(Watched):

@@ -1,6 +1,7 @@
 """The limits of the mirror hold for any wanted shape, exactly, in float64; each mutation of their source is caught."""
 
 import importlib.util
+import pkgutil
 import re
 import sys
 from pathlib import Path
@@ -230,10 +231,16 @@ def test_an_unknown_request_is_an_error_of_the_program() -> None:
 
 def test_the_document_on_safety_names_tests_that_exist() -> None:
     root = Path(__file__).parents[2]
-    named = set(re.findall(r"`(test_\w+)`", (root / "docs" / "explanation" / "safety.md").read_text(encoding="utf-8")))
+    text = (root / "docs" / "explanation" / "safety.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"`(test_\w+)`", text))
     every = "\n".join(path.read_text(encoding="utf-8") for path in (root / "tests").rglob("test_*.py"))
     assert len(named) > 30
     assert {name for name in named if f"def {name}(" not in every} == set()
+    rows = [line.split("|") for line in text.splitlines() if line.startswith("| ")]
+    places = {place for row in rows for place in re.findall(r"`([\w.]+)`", row[3])}
+    assert len(places) > 30
+    for place in places:
+        pkgutil.resolve_name(f"lowfc.{place}")
 
 
 SOURCE = Path(safety.__file__).read_text(encoding="utf-8")

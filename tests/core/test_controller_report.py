@@ -83,7 +83,7 @@ def test_the_summary_and_the_status_say_it() -> None:
     assert "over the open pupil, second half of the run" in summary_text(figures)
     late = {"not_closed_ns": 3 * SECOND, "not_closed_cause": "the camera does not fit"}
     assert first(mode=wire.LOOP_MODE_CLOSED) == "closed"
-    before = "closed; before that not closed for 3.0 s: the camera does not fit"
+    before = "closed; in total not closed for 3.0 s: the camera does not fit"
     assert first(mode=wire.LOOP_MODE_CLOSED, **late) == before
     assert first(mode=wire.LOOP_MODE_OPEN, **late) == "open for 3.0 s: the camera does not fit"
     assert first(mode=wire.LOOP_MODE_SAFE, **late) == "in safe mode, not closed for 3.0 s: the camera does not fit"
@@ -139,7 +139,7 @@ def test_contrast_is_of_a_flat_mirror_and_of_this_one_whether_the_loop_is_closed
     camera = wire.Health(recent_wavefront=recent, wavefront=recent)
     message = controller_state(loaded(USUAL), USUAL, (START + 12) * SECOND)
     watch = Watch({"camera": camera}, [])
-    expected = "added to the dark zone's contrast: flat mirror +7.0e-10, left -4.0e-11"
+    expected = "added to the dark zone's contrast: flat mirror +7.0e-10, residual -4.0e-11"
     assert expected in status.text(status.figures(message, {"camera": camera}))
     assert expected in summary_text(summary(watch, record=False, rate_hz=250.0))
     assert "  contrast -4.0e-11 of +7.0e-10  " in status_line(watch, 5.0)
@@ -174,7 +174,7 @@ def test_the_status_line_is_of_the_last_seconds_and_says_nothing_before_the_firs
     assert "closed for 1.6 s     250 Hz" in status_line(early, 5.0), "the residual is of the open loop, too"
     with Console(width=120, file=io.StringIO(), record=True) as console:
         console.print(screen(watch, Configuration(), None, 10.0))
-    assert "2.20 nm rms left of 30.00 nm" in console.export_text()
+    assert "residual 2.20 of 30.00 nm rms" in console.export_text()
     for health, seconds in ((watch.health["camera"], 10), (watch.health["controller"], 17)):
         health.timestamp.FromSeconds(seconds)
     assert status_line(watch, 17.0) == "   17 s  closed  the camera has been silent for 7 s"

@@ -1,4 +1,4 @@
-"""Drivers that die, or hang for five seconds, in processes of their own: started again as a service manager does."""
+"""Drivers that die or hang for five seconds, each in its own process, restarted as a service manager does."""
 
 import subprocess
 import time
@@ -51,7 +51,7 @@ def test_a_camera_whose_process_dies_is_a_new_start_once_it_is_started_again(tmp
     with closing(ZenohBus(open_run("dying").links, Role.RECORDER, HostClock())) as bus:  # the camera connects to it
         bus.subscribe(FRAME, lambda sample: starts.append(start_of(sample.sequence)))
         died = subprocess.run([*LOWFC, *words], cwd=tmp_path, timeout=60, check=False)
-        assert died.returncode == 7, "a failure, after which units of deploy start it again"
+        assert died.returncode == 7, "a failure: the units in deploy restart it"
         with going_on(tmp_path, f"lowfc {' '.join(words)}"):
             until(lambda: len(set(starts)) == 2)
     assert starts == sorted(starts)
@@ -67,7 +67,7 @@ from lowfc.contract.errors import LowfcError
 from lowfc.device import geometry
 from sim_camera.driver import SimulatedCamera
 
-def befall(name):
+def inject(name):
     if os.path.exists(name):
         fault = open(name).read()
         os.remove(name)
@@ -79,7 +79,7 @@ def befall(name):
 
 class Camera(SimulatedCamera):
     def expose(self):
-        befall("camera")
+        inject("camera")
         return super().expose()
 
 class Mirror:
@@ -89,7 +89,7 @@ class Mirror:
 
     def apply(self, actuators_nm):
         self.calls.write(f"{np.abs(actuators_nm).max()}\\n")
-        befall("mirror")
+        inject("mirror")
 
     def close(self):
         pass
@@ -101,7 +101,7 @@ CONTROLLER = f"lowfc controller {OF_BENCH}"
 
 
 class Bench:
-    """What a run says, and the faults that befall its drivers."""
+    """The messages of a run, and faults injected into its drivers."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -123,18 +123,18 @@ class Bench:
             bus.subscribe(FRAME, lambda sample: self.starts.add(start_of(sample.sequence)))
             yield
 
-    def befall(self, name: str, fault: str) -> None:
-        """Let it hang or die, and forget what was said so far."""
+    def inject(self, name: str, fault: str) -> None:
+        """Let a driver hang or die, and clear the events."""
         self.events.clear()
         (self.folder / "fault").write_text(fault)
-        (self.folder / "fault").rename(self.folder / name)  # whole, or the driver reads it empty
+        (self.folder / "fault").rename(self.folder / name)  # renamed when complete: the driver must not read it empty
         until(lambda: not (self.folder / name).exists())
 
     def named(self, process: str, event: str) -> int:
         return self.events.count((process, event))
 
     def settled(self) -> None:
-        """Fifty good frames in a row from now on, by which the loop holds the wavefront."""
+        """Wait for fifty frames in a row without a rejection and with small errors in closed loop."""
         self.steps.clear()
 
         def holds() -> bool:
@@ -145,11 +145,11 @@ class Bench:
         until(holds, 60)
 
     def commanded(self, command_nm: list[float]) -> bool:
-        """Whether the last command is this one, but for noise."""
+        """Whether the last command is this one, up to noise."""
         return bool(np.allclose(self.steps[-1].command_nm, command_nm, rtol=0, atol=3))
 
     def calls_nm(self) -> list[float]:
-        """Largest actuator of each command that the mirror's driver has got."""
+        """Largest actuator of each command that the mirror's driver has received."""
         return [float(line) for line in (self.folder / "calls").read_text().splitlines()]
 
 
@@ -167,12 +167,12 @@ def bench(tmp_path: Path, own_runtime: Path) -> Iterator[Bench]:
 def test_a_camera_that_hangs_for_five_seconds_is_named_and_its_loop_holds_and_goes_on(bench: Bench) -> None:
     with going_on(bench.folder, MIRROR):
         bench.settled()
-        bench.befall("camera", "hang")
+        bench.inject("camera", "hang")
         until(lambda: bench.named("camera", "DRIVER_HANGS") and bench.named("controller", "NO_FRAMES"))
         until(lambda: bench.named("controller", "FRAMES_BACK") and bench.named("camera", "DRIVER_BACK"))
         assert bench.named("camera", "DRIVER_HANGS") == 1
         bench.settled()
-    assert len(bench.starts) == 1, "its process has lived on"
+    assert len(bench.starts) == 1, "its process has not died"
 
 
 @pytest.mark.slow
@@ -182,15 +182,15 @@ def test_a_mirror_that_hangs_for_five_seconds_gets_no_command_meanwhile_and_is_f
 ) -> None:
     with going_on(bench.folder, MIRROR):
         bench.settled()
-        bench.befall("mirror", "hang")
+        bench.inject("mirror", "hang")
         begun_s = time.monotonic()
         until(lambda: bench.named("mirror-dm", "DRIVER_HANGS") and bench.named("controller", "MIRROR_LOST"))
         before = bench.calls_nm()
-        assert min(before[-20:]) > 1, "it holds a wavefront"
+        assert min(before[-20:]) > 1, "the mirror has a shape to return from"
         assert (bench.states[-1].actuators, bench.states[-1].status) == (b"", wire.MIRROR_STATUS_EXPIRED)
         until(lambda: list(bench.steps[-1].reasons) == [wire.REASON_NO_MIRROR])
         until(lambda: len(bench.calls_nm()) > len(before))
-        assert time.monotonic() - begun_s > 4, "nothing came while it hung"
+        assert time.monotonic() - begun_s > 4, "no command arrived while it hung"
         until(lambda: bench.named("mirror-dm", "DRIVER_BACK") and bench.named("controller", "MIRROR_BACK"))
         assert bench.calls_nm()[len(before)] == 0, "its idle state comes first"
         assert bench.named("mirror-dm", "DRIVER_HANGS") == bench.named("controller", "MIRROR_LOST") == 1
@@ -208,7 +208,7 @@ def test_a_camera_in_the_controllers_process_closes_the_loop_and_hangs_alone(tmp
         client = stack.enter_context(Client("bench"))
         processes = client.processes()
         assert processes["camera"].pid == processes["controller"].pid
-        bench.befall("camera", "hang")
+        bench.inject("camera", "hang")
         until(lambda: bench.named("camera", "DRIVER_HANGS") and bench.named("controller", "NO_FRAMES"))
         client.safe()
         assert client.status().state.mode == wire.LOOP_MODE_SAFE
@@ -216,7 +216,7 @@ def test_a_camera_in_the_controllers_process_closes_the_loop_and_hangs_alone(tmp
     assert time.monotonic() - ending_s < HANGS_S - PATIENCE_S, "it did not wait for its camera"
 
 
-def test_a_camera_that_the_controller_cannot_read_is_a_sentence(tmp_path: Path, own_runtime: Path) -> None:
+def test_a_camera_that_the_controller_cannot_read_is_an_error_message(tmp_path: Path, own_runtime: Path) -> None:
     (tmp_path / "faulty.py").write_text(FAULTY)
     (tmp_path / "camera").write_text("refuse")
     (tmp_path / "bench.toml").write_text(STILL)
@@ -232,8 +232,8 @@ def test_a_mirror_whose_process_dies_is_named_and_the_loop_holds_until_it_is_sta
         try:
             bench.settled()
             before_nm = list(bench.steps[-1].command_nm)
-            bench.befall("mirror", "die")
-            assert process.wait(10) == 7, "a failure, after which units of deploy start it again"
+            bench.inject("mirror", "die")
+            assert process.wait(10) == 7, "a failure: the units in deploy restart it"
         finally:
             process.kill()
     until(lambda: bench.named("controller", "MIRROR_LOST"))

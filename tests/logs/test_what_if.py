@@ -158,7 +158,7 @@ def test_contrast_is_told_of_every_coronagraph() -> None:
     assert (contrast["was"], contrast["what if"], contrast["other"]) == (0, pytest.approx(expected), None)
     assert contrast["by_group"]["what if"]["spherical"] == pytest.approx(expected)
     assert sentence_of(contrast) == (
-        f"added to the dark zone's contrast: was +0.0e+00, what if +{expected:.1e}; spherical costs most (100 %)"
+        f"added to the dark zone's contrast: was +0.0e+00, what if +{expected:.1e}; spherical contributes most (100 %)"
     )
     assert found(sensor__modes=10) is None
     behind_lyot = found(sensor__pupil="circle")

@@ -120,8 +120,8 @@ def test_a_point_is_the_median_of_its_repeats_and_says_what_the_limit_is() -> No
     assert first["pixels"] == "1024 (32 x 32)"
     assert modes[1][0] == "20"
     assert first["step p50, us"] == "25.0 (20.0 to 30.0)"
-    assert first["step of the limit"] == "2.5"
-    assert first["read at, GB/s"] == f"{Size(side=32).bytes / 10.0 / 1e3:.0f}"
+    assert first["step over limit"] == "2.5"
+    assert first["read rate, GB/s"] == f"{Size(side=32).bytes / 10.0 / 1e3:.0f}"
     assert first["frames without a command"] == "2 of 300"
     assert second["loop p50, us"] == "failed"
     assert curves.picture(result).startswith(b"\x89PNG")

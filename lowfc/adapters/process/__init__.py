@@ -1,1 +1,1 @@
-"""What a process needs of its host: clocks, scheduling, service managers, terminals."""
+"""What a process uses of its host: clocks, scheduling, service managers, terminals."""

@@ -1,1 +1,1 @@
-"""Calibrations and what is measured to make them."""
+"""Calibrations, and the measurements that they are made from."""

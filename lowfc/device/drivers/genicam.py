@@ -1,4 +1,4 @@
-"""What the drivers of GenICam cameras have in common: their options, and settings made of them."""
+"""Options and camera settings that the drivers of GenICam cameras share."""
 
 from dataclasses import replace
 from typing import Literal
@@ -9,12 +9,12 @@ from lowfc.contract.configuration import Configuration
 from lowfc.device import CameraSettings, DriverOptions
 
 FRAME_ID_WRAP = 65535
-"""GigE Vision counts frames from 1 to 65535 and goes on with 1; 64-bit numbers are as good modulo 65535."""
+"""GigE Vision counts frames from 1 to 65535, then from 1 again; 64-bit numbers are reduced modulo 65535."""
 WAIT_MS = 500
 
 
 class GenicamOptions(DriverOptions):
-    """Region and format of the frames; exposure and rate are those of [camera] where they are left out."""
+    """Region and format of the frames; exposure and rate default to those of [camera]."""
 
     camera: str = ""
     """Serial number (basler), or identifier or address (aravis); empty for the first camera found."""
@@ -33,12 +33,12 @@ class GenicamOptions(DriverOptions):
     rate_hz: float | None = Field(default=None, gt=0)
     """Frames per second: of the camera, or of its trigger."""
     gain: float | None = None
-    """Gain, in the camera's unit, mostly dB; left as it is where it is left out."""
+    """Gain, in the camera's unit, mostly dB; if not given, the camera keeps its gain."""
     trigger: str = ""
     """Line that triggers each frame, as the camera calls it (`Line1`); empty for a camera that runs freely."""
 
     def settings(self, config: Configuration) -> CameraSettings:
-        """Settings as asked for; the converter's bits are the format's."""
+        """Settings requested by the options; the bit depth is that of the pixel format."""
         usual = CameraSettings.configured(config, self.rows, self.columns)
         bits = int(self.pixel_format.removeprefix("Mono"))
         full_dn = 2**bits - 1

@@ -1,1 +1,1 @@
-"""The command line, and `lowfc ctl`: what operators ask of a running loop."""
+"""The command line, and `lowfc ctl`: operate a running loop."""

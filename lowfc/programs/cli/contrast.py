@@ -41,14 +41,14 @@ def most_of(figures: Mapping[str, Any]) -> tuple[str, float] | None:
 
 
 def with_this_mirror(added: Mapping[str, float]) -> dict[str, float | None]:
-    """What a flat mirror would add, and what the present one does, whether the loop is closed or not."""
-    return {"flat mirror": added["open"], "left": added["closed"]}
+    """Contrast added with a flat mirror, and by the residual with the mirror as it is, in any loop mode."""
+    return {"flat mirror": added["open"], "residual": added["closed"]}
 
 
 def sentence(added: Mapping[str, float | None], most: tuple[str, float] | None, beyond: Sequence[str] = ()) -> str:
-    """What is added in each case, and which modes cost most in the last one."""
+    """The added contrast of each case, and the modes that contribute most to the last one."""
     cases = ", ".join(f"{name} {one:+.1e}" for name, one in added.items() if one is not None)
-    which = "" if most is None else f"; {most[0]} costs most ({100 * most[1]:.0f} %)"
+    which = "" if most is None else f"; {most[0]} contributes most ({100 * most[1]:.0f} %)"
     but = f"; beyond quadratic, full images differ by more than 10 %: {', '.join(beyond)}" if beyond else ""
     return f"added to the dark zone's contrast: {cases}{which}{but}"
 

@@ -123,14 +123,14 @@ def figures(
 
 
 def text(known: dict[str, Any]) -> str:
-    """The same figures for a person: whether all is well in the first line."""
+    """The figures as text; the first line summarises them."""
     since = "" if known["mode_s"] is None else f" for {known['mode_s']:.0f} s ({known['mode_cause']})"
     opens = f", opens after {counted(known['steps_left'], 'frame')}" if known["steps_left"] else ""
     playing = known["playing"]
     rows = {
         "loop": _mode(known, since) + opens,
         **{name: _of_mirror(one) for name, one in known["mirrors"].items()},
-        "frame": f"{known['frame']} of the camera, {known['frames_used']} used by this controller"
+        "frame": f"number {known['frame']}; {known['frames_used']} used since the controller started"
         + (f"; the last was refused as {_spoken(known['refused'])}" if known["refused"] else ""),
         "command": f"{known['command_rms_nm']:.3f} nm rms" + (", on its way to zero" if known["homing"] else ""),
         "offset": f"{known['offset_rms_nm']:.3f} nm rms",
@@ -145,7 +145,7 @@ def text(known: dict[str, Any]) -> str:
         "playing": f"{playing['target']}, {playing['frames_left']} of {counted(playing['frames'], 'frame')} left"
         if playing
         else "nothing",
-        "reserved": f"for {known['reserved_for']}" if known["reserved_for"] else "for nobody",
+        "reserved": f"for {known['reserved_for']}" if known["reserved_for"] else "no",
         "interlocks": interlocks(known),
         "mirror limits": f"stroke {known['stroke_nm']:g} nm, slew {known['slew_nm']:g} nm a frame, "
         f"neighbours {known['neighbour_nm']:g} nm; {_acting(known['limits_hit'])}",

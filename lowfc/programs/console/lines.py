@@ -1,4 +1,4 @@
-"""Figures on the screen, of which only the lines that change are drawn anew."""
+"""A text widget that redraws only the lines that changed."""
 
 from collections.abc import Sequence
 from itertools import zip_longest
@@ -10,7 +10,7 @@ from textual.widget import Widget
 
 
 class Lines(Widget):
-    """A text for each line of the screen, cut off at the right; textual's `Static` draws all lines anew."""
+    """One text for each line of the screen, cut off at the right; textual's `Static` redraws all lines."""
 
     ALLOW_SELECT = False
 
@@ -19,18 +19,18 @@ class Lines(Widget):
         self._lines: Sequence[Text] = ()
 
     def show(self, lines: Sequence[Text]) -> None:
-        """Show these lines from now on."""
+        """Replace the lines."""
         before, self._lines = self._lines, lines
         changed = [y for y, (old, new) in enumerate(zip_longest(before, lines)) if old != new]
         if changed:
             self.refresh(*(Region(0, y, self.size.width, 1) for y in changed))
 
     def render(self) -> Text:
-        """All of them."""
+        """All lines."""
         return Text("\n").join(self._lines)
 
     def render_line(self, y: int) -> Strip:
-        """Draw one of them."""
+        """The strip of one line."""
         width = self.size.width
         if y >= len(self._lines):
             return Strip.blank(width, self.rich_style)

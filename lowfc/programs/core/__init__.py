@@ -1,1 +1,1 @@
-"""The controller's and the recorder's processes."""
+"""The processes of controller and recorder."""

@@ -1,1 +1,1 @@
-"""`lowfc gateway`: a loop offered to a control system, whose variables become bench values."""
+"""`lowfc gateway`: serve a loop to a control system, and read its variables as bench values."""

@@ -15,8 +15,8 @@ def sim_loop(
     config: ConfigFile = None,
     duration: Annotated[float | None, typer.Option(min=0.01, max=1e7, help="Seconds; default: until Ctrl-C.")] = None,
     rate: Annotated[float | None, typer.Option(help="Frames per second.")] = None,
-    disturbance: Annotated[Preset | None, typer.Option(help="What shakes the wavefront.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of every random number.")] = None,
+    disturbance: Annotated[Preset | None, typer.Option(help="Preset of the disturbance.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of all random numbers.")] = None,
     sensor: Annotated[
         str | None,
         typer.Option(help="sam, bowtie, clowfs, zwfs, bar, lyot, aplc; or a layout, FILE.json or FILE.json:NAME."),
@@ -27,12 +27,12 @@ def sim_loop(
     ] = False,
     no_record: Annotated[bool, typer.Option("--no-record", help="Write no log.")] = False,
     open_loop: Annotated[bool, typer.Option("--open", help="Start with the loop open.")] = False,
-    view_: Annotated[bool, typer.Option("--view", help="Look at it in a window.")] = False,
-    web: Annotated[bool, typer.Option("--web", help="Look at it in a browser.")] = False,
+    view_: Annotated[bool, typer.Option("--view", help="Show the view in a window.")] = False,
+    web: Annotated[bool, typer.Option("--web", help="Show the view in a browser.")] = False,
     name: Annotated[str | None, typer.Option("--run", help="Name of the run; default: a new one.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Start the simulated loop: camera, mirror, controller and recorder; show its status, end with a summary.
+    """Run the simulated loop (camera, mirror, controller, recorder), show its status and end with a summary.
 
     Example: lowfc sim-loop --rate 1000 --duration 20 --disturbance reaction-wheel --star-magnitude 2
     """
@@ -58,9 +58,9 @@ def sim_loop(
         chosen = "--open" if open_loop else f"control.start_mode of {config}"
         typer.echo(f"the loop starts open ({chosen}): `lowfc ctl close` closes it", err=True)
     if view_ and web:
-        raise ConfigurationError("a view is in one place: choose --view or --web")
+        raise ConfigurationError("--view and --web exclude each other: choose one")
     if has_screen() and not (view_ or web):
-        typer.echo("to look at it: lowfc view", err=True)
+        typer.echo("to view the run: lowfc view", err=True)
     show = Show.NATIVE if view_ else Show.WEB if web else None
     figures = run(settings, duration, not no_record, show, name)
     put(figures, summary_text(figures), as_json=as_json)

@@ -1,4 +1,4 @@
-"""What a person sees of a running loop: a screen, a line, a summary."""
+"""Status of a running loop for a terminal: a screen, a line, a summary."""
 
 from typing import Any
 
@@ -17,9 +17,9 @@ from lowfc.programs.cli.contrast import most_of, sentence, with_this_mirror
 from lowfc.programs.launch.watch import Watch, mode_name, topic_count, wavefront
 
 SILENT_S = 2.0
-"""A process sends Health twice a second: after so long its last figures are no longer shown."""
+"""A process sends Health twice a second; after this silence its last figures are no longer shown."""
 _FIGURES_S = 2.5
-"""Time that the last figures of the wavefront are of, and of which they may be late."""
+"""Span of the recent wavefront figures, plus the delay of their report."""
 _EVENTS_SHOWN = 4
 _STYLES = {Level.WARNING: "yellow", Level.ERROR: "red", Level.FATAL: "bold red"}
 
@@ -49,7 +49,7 @@ def screen(watch: Watch, config: Configuration, duration_s: float | None, elapse
 
 
 def status_line(watch: Watch, elapsed_s: float) -> str:
-    """The same in one line, where there is no terminal."""
+    """The status in one line, for output that is not a terminal."""
     camera, controller = watch.of(Role.CAMERA), watch.of(Role.CONTROLLER)
     if not camera.HasField("recent_wavefront"):
         return f"{elapsed_s:5.0f} s  no frame yet"
@@ -65,7 +65,7 @@ def status_line(watch: Watch, elapsed_s: float) -> str:
 
 
 def _only_just(controller: wire.Health, rate_hz: float) -> str:
-    """For how long a loop has been closed that was not for all of the time its residual is of; else empty."""
+    """How long the loop has been closed, if shorter than the span of its residual; else empty."""
     frames = topic_count(controller, FRAME.key).received
     closed_s = frames / rate_hz - controller.not_closed_ns * 1e-9 if rate_hz else 0.0
     just = controller.mode == wire.LOOP_MODE_CLOSED and 0 < closed_s < _FIGURES_S
@@ -73,7 +73,7 @@ def _only_just(controller: wire.Health, rate_hz: float) -> str:
 
 
 def _silent(watch: Watch) -> str:
-    """That the camera no longer reports, so that its last figures are old; empty where it does or never did."""
+    """A notice that the camera has stopped reporting, so that its figures are old; empty if it reports or never did."""
     silent_s = watch.silent_s(Role.CAMERA)
     known = bool(watch.of(Role.CAMERA).process)
     return f"the camera has been silent for {silent_s:.0f} s" if known and silent_s > SILENT_S else ""
@@ -89,7 +89,7 @@ def _wavefront(camera: wire.Health) -> str:
         return "no frame yet"
     recent = wavefront(camera.recent_wavefront)
     return (
-        f"{recent['residual_rms_nm']:.2f} nm rms left of {recent['disturbance_rms_nm']:.2f} nm; "
+        f"residual {recent['residual_rms_nm']:.2f} of {recent['disturbance_rms_nm']:.2f} nm rms; "
         f"tilt {recent['tilt_residual_mas']:.2f} mas of {recent['tilt_disturbance_mas']:.2f} mas per axis"
     )
 
@@ -109,7 +109,7 @@ def latency(durations: wire.Latency) -> str:
 
 
 def recording(recorder: wire.Health) -> str:
-    """What the recorder has."""
+    """Messages, bytes and losses of the recorder."""
     if not recorder.process:
         return "not recording"
     done = recorder.recording
@@ -122,7 +122,7 @@ def _loop(figures: dict[str, Any]) -> str:
         case None:
             return "no controller reported"
         case "closed":
-            return f"closed; before that not closed for {seconds}: {cause}" if figures["not_closed_s"] else "closed"
+            return f"closed; in total not closed for {seconds}: {cause}" if figures["not_closed_s"] else "closed"
         case "safe":
             return f"{mode_word('safe')}, not closed for {seconds}: {cause}"
         case mode:
@@ -130,24 +130,24 @@ def _loop(figures: dict[str, Any]) -> str:
 
 
 def _when(figures: dict[str, Any], name: str, of: str = "") -> str:
-    """Of what moments a figure of the true wavefront is."""
+    """At which times a figure of the true wavefront is sampled."""
     if figures["instants_per_frame"] == 1:
-        return "sampled as exposures start"
-    return f"continuous ({of}{figures[f'sampled_{name}']:.2f} as exposures start)"
+        return "sampled at the start of each exposure"
+    return f"continuous ({of}{figures[f'sampled_{name}']:.2f} at exposure start)"
 
 
 def _contrast(figures: dict[str, Any]) -> list[str]:
-    """What the wavefront adds to the contrast of the dark zone; nothing where that is not known."""
+    """The line on the contrast that the wavefront adds to the dark zone; empty where it is unknown."""
     added = figures["added_contrast"]
     if added is None:
         return []
-    own = "" if figures["dark_zone_contrast"] is None else f"own {figures['dark_zone_contrast']:.1e}; "
-    beyond = ("left",) if figures["beyond_quadratic"] else ()
+    own = "" if figures["dark_zone_contrast"] is None else f"coronagraph alone {figures['dark_zone_contrast']:.1e}; "
+    beyond = ("residual",) if figures["beyond_quadratic"] else ()
     return [f"contrast           {own}{sentence(with_this_mirror(added), most_of(figures), beyond)}"]
 
 
 def summary_text(figures: dict[str, Any]) -> str:
-    """The summary of a run for a person."""
+    """The summary of a run as text."""
     command, mirror = (figures["latency_us"][name] for name in ("frame_to_command", "frame_to_mirror"))
 
     def percentiles(values: dict[str, float]) -> str:
@@ -160,11 +160,11 @@ def summary_text(figures: dict[str, Any]) -> str:
         f"{figures['frames_skipped']} skipped, {figures['frames_missing']} missing",
         f"commands           {figures['commands_applied']} applied, {figures['commands_late']} after the next exposure "
         "had begun",
-        f"wavefront          {figures['residual_rms_nm']:.2f} nm rms left of {figures['disturbance_rms_nm']:.2f} nm "
+        f"wavefront          residual {figures['residual_rms_nm']:.2f} of {figures['disturbance_rms_nm']:.2f} nm rms "
         "over the open pupil, second half of the run, "
-        + _when(figures, "residual_rms_nm", f"{figures['instants_per_frame']} instants a frame; "),
-        f"tilt per axis      {figures['tilt_residual_mas']:.2f} mas rms left of "
-        f"{figures['tilt_disturbance_mas']:.2f} mas, second half, " + _when(figures, "tilt_residual_mas"),
+        + _when(figures, "residual_rms_nm", f"{figures['instants_per_frame']} instants per frame; "),
+        f"tilt per axis      residual {figures['tilt_residual_mas']:.2f} of "
+        f"{figures['tilt_disturbance_mas']:.2f} mas rms, second half, " + _when(figures, "tilt_residual_mas"),
         *_contrast(figures),
         f"frame to command   {percentiles(command)}",
         f"frame to mirror    {percentiles(mirror)}",

@@ -1,4 +1,4 @@
-"""The one layout of live and recorded views: a tab for the operator, one for the optics, one for engineering."""
+"""Layout of the view, live or of a log: tabs for the operator, the optics and engineering."""
 
 from collections.abc import Iterable
 from functools import partial
@@ -25,14 +25,14 @@ APPLICATION = "lowfc"
 _CONTRAST = partial(science.CONTRAST.view, axis_y=science.CONTRAST_AXIS)
 _MODE = partial(rrb.StateTimelineView, origin=loop.MODE, name="Loop mode")
 LIVE_WINDOW_S = 20.0
-"""Of a live plot."""
+"""Time span of a live plot."""
 
 _PICTURES: dict[str, tuple[str, rrb.VisualBounds2D | None]] = {
     tiles.TILES: ("Status", None),
     sensor.FRAME: ("Sensor frame, DN", None),
     sensor.DIFFERENCE: ("I - I0, DN", None),
     sensor.REFERENCE: ("Reference I0, DN", None),
-    sensor.RAW: ("Frame as it came, DN", None),
+    sensor.RAW: ("Raw frame, DN", None),
     mirror.COMMAND: ("Mirror, nm (ring: at limit)", None),
     mirror.SURFACE: ("Mirror over the pupil, nm", None),
     pointing.TRAIL: ("Residual pointing, mas", pointing.BOUNDS),
@@ -51,13 +51,13 @@ def layout(
     span_ns: tuple[int, int] | None = None,
     still: bool = False,
 ) -> rrb.Blueprint:
-    """The blueprint, opened at a tab.
+    """The blueprint, with the tab `active` in front.
 
-    Plots show so many last seconds or, of a log, what is between two times; else the viewer chooses. In one `still`
-    picture of a whole log the operator's tab has nothing of the last instant alone.
+    Plots show the last `window_s` seconds or, for a log, the interval `span_ns`; with neither, the viewer chooses. In a
+    `still` picture of a whole log, the operator's tab omits what shows only the last instant.
     """
     tabs = {
-        Tab.OPERATOR: _night() if still else _operator(),
+        Tab.OPERATOR: _whole_log() if still else _operator(),
         Tab.OPTICS: _optics(),
         Tab.ENGINEERING: _engineering(),
     }
@@ -68,7 +68,7 @@ def layout(
         _timed(tabs.values(), absolute(nanos=span_ns[0]), absolute(nanos=span_ns[1]))
     return rrb.Blueprint(
         rrb.Tabs(*tabs.values(), active_tab=list(tabs).index(active)),
-        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),  # of a log, its end
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),  # at the end of a log
         rrb.TopPanel(state="collapsed"),
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),
@@ -87,7 +87,7 @@ def _operator() -> rrb.Container:
     return rrb.Vertical(_picture(tiles.TILES), pictures, courses, below, row_shares=[10, 9, 9, 7], name=Tab.OPERATOR)
 
 
-def _night() -> rrb.Container:
+def _whole_log() -> rrb.Container:
     courses = rrb.Horizontal(_picture(trend.TREND), wavefront.TILT.view(), _CONTRAST())
     rates = rrb.Horizontal(loop.FLUX.view(), mirror.STROKE.view(), latency.WHOLE.view(), latency.COUNTS.view())
     below = rrb.Horizontal(_MODE(), _events(worst=True), column_shares=[3, 5])
@@ -105,7 +105,7 @@ def _optics() -> rrb.Container:
 def _engineering() -> rrb.Container:
     histogram = rrb.BarChartView(
         origin=latency.HISTOGRAM,
-        name="Frame to command, us; last bar: or longer",
+        name="Frame to command, us; last bar: overflow",
         plot_legend=rrb.PlotLegend(visible=False),
     )
     spectra_ = (_picture(path) for path in (spectra.TILTS, spectra.OTHERS))
@@ -138,7 +138,7 @@ def _events(*, worst: bool = False) -> rrb.View:
 
 
 def _timed(parts: Iterable[rrb.Container | rrb.View], start: rrb.TimeRangeBoundary, end: rrb.TimeRangeBoundary) -> None:
-    """Let the plots among the parts show what is between these times."""
+    """Set the time range of all plots among the parts."""
     for part in parts:
         if isinstance(part, rrb.Container):
             _timed(part.contents, start, end)

@@ -1,1 +1,1 @@
-"""Camera and mirror by ImageStreamIO streams, as milk and CACAO have them."""
+"""Camera and mirror by ImageStreamIO streams, as milk and CACAO use them."""

@@ -1,1 +1,1 @@
-"""`lowfc acceptance`: what a loop must show before it is used, each test by itself."""
+"""`lowfc acceptance`: the tests that a loop must pass before it is used."""

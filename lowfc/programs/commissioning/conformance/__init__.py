@@ -1,1 +1,1 @@
-"""`lowfc conformance`: what a camera or a mirror of somebody else still has to put right."""
+"""`lowfc conformance`: check a camera or mirror driver against the message contract."""

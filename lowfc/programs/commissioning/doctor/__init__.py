@@ -1,1 +1,1 @@
-"""`lowfc doctor`: is this host fit for a real-time loop?"""
+"""`lowfc doctor`: check whether this host is fit for a real-time loop."""

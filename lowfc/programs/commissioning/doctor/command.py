@@ -1,4 +1,4 @@
-"""The command `lowfc doctor`: is this host fit for a real-time loop?"""
+"""The command `lowfc doctor`: check whether this host is fit for a real-time loop."""
 
 import os
 import sys
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from lowfc.programs.commissioning.doctor.facts import Facts
 
 TRIAL_S = 1.0
-"""How long wake-ups are measured in each scheduling class."""
+"""Duration of the wake-up measurement in each scheduling class."""
 
 STATUSES = (Status.WARNING, Status.NOTE, Status.OK)
 FIELDS = {"name": "name", "status": "status", "detail": "got", "advice": "advice", "cost": "cost"}
@@ -22,19 +22,19 @@ FIELDS = {"name": "name", "status": "status", "detail": "got", "advice": "advice
 
 def doctor(
     config: ConfigFile = None,
-    strict: Annotated[bool, typer.Option("--strict", help="Exit status 1 where there is a warning.")] = False,
-    device: Annotated[
-        str | None, typer.Option(help="Driver, by its name: look at what it needs, and at nothing else.")
-    ] = None,
-    setup: Annotated[bool, typer.Option("--setup", help="Show what grants a user real-time rights.")] = False,
-    apply: Annotated[bool, typer.Option("--apply", help="As root: set that up.")] = False,
-    undo: Annotated[bool, typer.Option("--undo", help="As root: take it back.")] = False,
+    strict: Annotated[bool, typer.Option("--strict", help="Exit status 1 if there is a warning.")] = False,
+    device: Annotated[str | None, typer.Option(help="Check only the requirements of the driver of this name.")] = None,
+    setup: Annotated[
+        bool, typer.Option("--setup", help="Show the settings that grant a user real-time rights.")
+    ] = False,
+    apply: Annotated[bool, typer.Option("--apply", help="As root: apply these settings.")] = False,
+    undo: Annotated[bool, typer.Option("--undo", help="As root: remove these settings.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Say whether this host is fit for a real-time loop, what to do where it is not, and what it costs otherwise.
+    """Check whether this host is fit for a real-time loop; show what to do where it is not, and what it costs.
 
-    Nothing is changed but by --apply and --undo, and nothing else needs root: what the loop asks of the host is tried
-    in a process of its own.
+    Only --apply and --undo change anything or need root. What the loop requires of the host is tried in a separate
+    process.
 
     Example: lowfc doctor --config lowfc.toml --strict
     """
@@ -57,9 +57,7 @@ def doctor(
         if any(check.status is Status.WRONG for check in checks):
             raise typer.Exit(1)
         return
-    sys.stderr.write(
-        f"sleeping 1000 times a second for {TRIAL_S:g} s in each scheduling class, to see how late this host wakes\n"
-    )
+    sys.stderr.write(f"measuring wake-up delays: 1000 sleeps a second for {TRIAL_S:g} s in each scheduling class\n")
     facts = gather(Host(), settings, TRIAL_S)
     checks = examine(facts)
     put(checks, STATUSES, FIELDS, measured(facts) if as_json else None)

@@ -1,1 +1,1 @@
-"""`lowfc recorder`: everything that is sent, into a log."""
+"""`lowfc record`: the recorder, which writes every message of a run into a log."""

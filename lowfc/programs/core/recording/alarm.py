@@ -1,8 +1,8 @@
-"""The command of `recorder.on_event`: what the user wants done when something happens.
+"""The command of `recorder.on_event`, run when an event of its level or above occurs.
 
-The recorder runs it: it is there once for each run, receives every event, and is not in the loop. A console may be
-closed, or open twice. A thread of its own in the normal scheduling class starts the command, which inherits that class;
-what happens meanwhile waits for its end, and then it is the worst of it that the command is run for.
+The recorder runs it, because there is one in each run, it receives every event, and it is not in the loop. A console
+may be closed, or open twice. A thread in the normal scheduling class starts the command, which inherits that class.
+Events during the command wait for its end; then the command is run once, for the worst of them.
 """
 
 import contextlib
@@ -21,7 +21,7 @@ from lowfc.contract.messages import EVENT, Log, from_timestamp
 from lowfc.contract.printable import printable
 
 PATIENCE_S = 60.0
-"""After which a command is killed."""
+"""Time after which a command is killed."""
 _MOST_WAITING = 1000
 _LEVELS: dict[int, str] = {level.value: level.name.lower() for level in Level}
 _OWN = EVENTS["ON_EVENT_FAILED"].name
@@ -31,7 +31,7 @@ class Alarm:
     """Runs a shell command on events of a level, one at a time and not too often."""
 
     def __init__(self, service: Service, command: str, level: Level, every_s: float) -> None:
-        """Begin with the next event; that the command failed is one, too."""
+        """Start with the next event; a failure of the command is published as an event that does not run it again."""
         self._command, self._level, self._every_s, self._service = command, level, every_s, service
         self._waiting: deque[Log] = deque(maxlen=_MOST_WAITING)
         self._arrived = threading.Event()
@@ -48,9 +48,9 @@ class Alarm:
         give_way()  # this thread alone, and what it starts
         while self._arrived.wait():
             self._arrived.clear()
-            taken = [self._waiting.popleft() for _ in range(len(self._waiting))]
-            if taken:
-                self._run(max(taken, key=lambda event: event.level), len(taken) - 1)
+            events = [self._waiting.popleft() for _ in range(len(self._waiting))]
+            if events:
+                self._run(max(events, key=lambda event: event.level), len(events) - 1)
                 time.sleep(self._every_s)
 
     def _run(self, event: Log, others: int) -> None:

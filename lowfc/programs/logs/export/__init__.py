@@ -1,1 +1,1 @@
-"""`lowfc export`: a log for the tools of the field."""
+"""`lowfc export`: write a log as files for other tools."""

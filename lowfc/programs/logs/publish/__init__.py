@@ -1,1 +1,1 @@
-"""A log back on the bus, in its own time."""
+"""`lowfc publish`: republish a log on the bus, at its own pace."""

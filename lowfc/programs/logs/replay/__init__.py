@@ -1,1 +1,1 @@
-"""`lowfc replay`: a log folded through the live loop again, and everything compared."""
+"""`lowfc replay`: repeat a log through the controller's function and compare every result."""

@@ -1,1 +1,1 @@
-"""`lowfc chaos`: faults done to the real processes, and what must come of each."""
+"""`lowfc chaos`: inject faults into the real processes and check the loop's response."""

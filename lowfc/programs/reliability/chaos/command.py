@@ -1,4 +1,4 @@
-"""The command `lowfc chaos`: faults done to the real processes, and what came of it."""
+"""The command `lowfc chaos`: inject faults into the real processes and check the loop's response."""
 
 import os
 import random
@@ -25,20 +25,20 @@ FAILED_LOGS = Path("chaos-logs")
 
 
 def chaos(
-    case: Annotated[list[str] | None, typer.Option(help="Name of a case; repeat.")] = None,
+    case: Annotated[list[str] | None, typer.Option(help="Name of a case; may be repeated.")] = None,
     all_: Annotated[bool, typer.Option("--all", help="All cases.")] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of everything that is random.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 1,
     keep: Annotated[
         Path | None,
-        typer.Option(help=f"Keep the logs of all cases here; default: of those that failed, {FAILED_LOGS}."),
+        typer.Option(help=f"Keep the logs of all cases here; default: only of failed cases, in {FAILED_LOGS}."),
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Inject faults into a simulated loop, case by case, and check its log; exit status 1 where a case failed.
+    """Inject faults into a simulated loop, case by case, and check its log; exit status 1 if a case failed.
 
-    Without a case, they are listed. Frames, processes, the bus, the mirror, the disk and the operator are spoilt in
-    turn; the mirror must stay within its limits, the loop come back, and everything be named and counted in the log.
-    A case that this host cannot run is skipped, and its reason is shown.
+    Without a case, the cases are listed. Each case injects a fault into frames, processes, bus, mirror, disk or
+    operator requests. The mirror must stay within its limits, the loop must recover, and the log must name and count
+    every fault. A case that this host cannot run is skipped, with the reason.
 
     Example: lowfc chaos --case frames-dark --case kill-controller --seed 3
     """

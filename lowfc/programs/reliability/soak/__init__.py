@@ -1,1 +1,1 @@
-"""`lowfc soak`: does anything grow, drift or get lost in hours?"""
+"""`lowfc soak`: run the simulated loop for hours; check for growth, drift and loss."""

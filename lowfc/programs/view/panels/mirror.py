@@ -14,11 +14,11 @@ from lowfc.programs.view.snapshot import Snapshot
 COMMAND, SURFACE = "mirror/command", "mirror/surface"
 STROKE = Plot("mirror/stroke", "Mirror: stroke used, %", {"largest stroke used, % of the limit": YELLOW}, legend=None)
 _NEAR = 0.995
-"""Share of the stroke from which on an actuator counts as at its limit: the driver's step and margins lie above."""
+"""Fraction of the stroke at which an actuator counts as limited, below 1 for the margin and the driver's rounding."""
 
 
 class Mirror(Panel):
-    """The newest state, as a picture."""
+    """Pictures of the newest mirror state."""
 
     pictures = True
     plots = (STROKE,)
@@ -28,7 +28,7 @@ class Mirror(Panel):
         self._limited = False
 
     def draw(self, stream: rr.RecordingStream, snapshot: Snapshot) -> None:
-        """Show where the mirror is."""
+        """Show the surface at the actuators and over the pupil."""
         surface_nm = actuators(snapshot.mirror) if snapshot.mirror is not None else None
         if surface_nm is not None:
             self._command.show_values(stream, snapshot.time_ns, surface_nm)

@@ -1,1 +1,1 @@
-"""Judgement on a run: good, degraded, wrong."""
+"""The state of a run: good, degraded or bad, by thresholds."""

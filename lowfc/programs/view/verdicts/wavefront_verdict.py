@@ -57,7 +57,7 @@ def contrast(known: wire.WavefrontFigures, *, now: bool) -> Tile:
     """What the wavefront adds to the contrast of the dark zone; a figure without a threshold, for nobody set one."""
     if not now:
         return Tile("CONTRAST", "?", "not measured now")
-    share = f"{known.costliest_modes} costs most ({100 * known.costliest_share:.0f} %)"
+    share = f"{known.costliest_modes} contributes most ({100 * known.costliest_share:.0f} %)"
     flat = f"added to the dark zone; {known.added_contrast_flat:.1e} with a flat mirror"
     return Tile("CONTRAST", f"{known.added_contrast:+.1e}", f"{flat}; {share}")
 
