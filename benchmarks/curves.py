@@ -12,7 +12,6 @@ Example:
 """
 
 import argparse
-import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
@@ -92,7 +91,7 @@ def loop_figures(size: Size, rate_hz: float, seconds: float) -> Result:
     cpu is the processor time of the controller for each frame.
     """
     try:
-        with watched(os.getpid()) as moments:
+        with watched() as moments:
             found = run_loop(size, configuration(size, rate_hz), seconds)
     except LowfcError as fault:
         return {"failure": str(fault)}

@@ -47,14 +47,14 @@ class Moment(NamedTuple):
 
 
 @contextlib.contextmanager
-def watched(pid: int) -> Iterator[list[Moment]]:
-    """Look at the processes below one, five times a second, within a `with` block; see `shares`."""
+def watched() -> Iterator[list[Moment]]:
+    """Look at the processes below this one, five times a second, within a `with` block; see `shares`."""
     moments: list[Moment] = []
     ended = threading.Event()
 
     def look() -> None:
         while not ended.wait(_EVERY_S):
-            moments.append(_moment(pid))
+            moments.append(_moment())
 
     thread = threading.Thread(target=look, daemon=True)
     thread.start()
@@ -65,15 +65,14 @@ def watched(pid: int) -> Iterator[list[Moment]]:
         thread.join()
 
 
-def _moment(pid: int) -> Moment:
+def _moment() -> Moment:
     moment = Moment(time.monotonic(), {})
-    with contextlib.suppress(psutil.Error):
-        for process in psutil.Process(pid).children(recursive=True):
-            with contextlib.suppress(psutil.Error):  # it has just ended
-                role = role_of(process.cmdline())
-                if role is not None:
-                    times, cpus = process.cpu_times(), ",".join(map(str, process.cpu_affinity()))
-                    moment.roles[role] = Used(times.user + times.system, cpus, process.memory_info().rss)
+    for process in psutil.Process().children(recursive=True):
+        with contextlib.suppress(psutil.Error):  # it has just ended
+            role = role_of(process.cmdline())
+            if role is not None:
+                times, cpus = process.cpu_times(), ",".join(map(str, process.cpu_affinity()))
+                moment.roles[role] = Used(times.user + times.system, cpus, process.memory_info().rss)
     return moment
 
 
@@ -108,23 +107,15 @@ def run_lowfc(words: Sequence[str], seconds: float) -> dict[str, Any]:
     """What `lowfc` with these words prints by `--json`, and usage (`shares`); or failure, the last that it wrote."""
     command = [sys.executable, "-P", "-m", "lowfc", *words, "--duration", f"{seconds:g}", "--json"]
     patience_s = _START_S + _SLOWEST * seconds
-    with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile("w+") as stderr:
-        environment = os.environ | {"XDG_RUNTIME_DIR": folder}
-        process = subprocess.Popen(  # noqa: S603  # our own
-            command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=stderr, text=True
-        )
+    with tempfile.TemporaryDirectory() as folder, watched() as moments:
+        where: dict[str, Any] = {"cwd": folder, "env": os.environ | {"XDG_RUNTIME_DIR": folder}}
         try:
-            with watched(process.pid) as moments:
-                out, _ = process.communicate(timeout=patience_s)
+            done = subprocess.run(  # noqa: S603  # our own
+                command, **where, capture_output=True, text=True, timeout=patience_s, check=False
+            )
         except subprocess.TimeoutExpired:
             return {"failure": f"not done after {patience_s:g} s"}
-        finally:
-            if process.poll() is None:
-                process.terminate()
-                process.wait()
-        stderr.seek(0)
-        last = stderr.read().strip().splitlines()[-1:]
-    if process.returncode:
-        return {"failure": "; ".join(last) or f"exit status {process.returncode}"}
-    found: dict[str, Any] = json.loads(out)
+    if done.returncode:
+        return {"failure": "; ".join(done.stderr.strip().splitlines()[-1:]) or f"exit status {done.returncode}"}
+    found: dict[str, Any] = json.loads(done.stdout)
     return found | {"usage": shares(moments, seconds)}

@@ -50,7 +50,6 @@ def rms_nm(loop: Bench, frames: int) -> tuple[float, float]:
 
 
 def gains(loop: Bench) -> Single:
-    assert loop.state.drive is not None
     return loop.state.drive.law.gain
 
 
@@ -105,8 +104,6 @@ def test_the_first_minute_is_not_the_price_of_automatic_gains(duration_s: float)
 
 def test_modes_that_are_left_alone_bring_less_noise_to_the_others(faint: Bench) -> None:
     drive = faint.state.drive
-    assert drive is not None
-    assert drive.weighting is not None
     left = drive.weighting.prior_nm2 > 0
     assert 0 < left.sum() < left.size
     np.testing.assert_array_equal(left, drive.law.gain == 0)
@@ -123,7 +120,6 @@ def test_modes_that_are_left_alone_bring_less_noise_to_the_others(faint: Bench) 
 
 def test_the_bank_knows_what_r_for_fewer_modes_shows_of_the_others(faint: Bench, of_own: list[Array | Single]) -> None:
     drive = faint.state.drive
-    assert drive is not None
     shown = drive.estimator.rows[:-1] @ drive.calibration.response
     np.testing.assert_array_equal(of_own[-1], shown[2:, 2:])
     assert np.abs(shown - np.eye(len(shown))).max() > 0.1
@@ -171,11 +167,9 @@ def test_on_a_faint_star_its_cross_talk_is_seldom_corrected() -> None:
 
 def test_whoever_reads_the_state_goes_on_with_the_same_reconstructor(faint: Bench) -> None:
     drive = faint.state.drive
-    assert drive is not None
     message = controller_state(faint.state, faint.settings, 1)
     settings, again = decode_state(message, drive.calibration)
     assert settings == faint.settings
-    assert again.drive is not None
     np.testing.assert_array_equal(again.drive.estimator.rows, drive.estimator.rows)
     np.testing.assert_array_equal(again.drive.automatic, drive.automatic)
     np.testing.assert_array_equal(again.drive.law.kept, drive.law.kept)
@@ -186,9 +180,7 @@ def test_whoever_reads_the_state_before_gains_are_measured_goes_on_with_the_same
     """A loop may be closed by hand before that: what the mirror had before must go on as it does in a replay."""
     loop = bench(2.0)
     drive, message = loop.state.drive, controller_state(loop.state, loop.settings, 1)
-    assert drive is not None
     again = decode_state(message, drive.calibration)[1].drive
-    assert again is not None
     np.testing.assert_array_equal(again.law.rows, drive.law.rows)
 
 
@@ -206,7 +198,6 @@ def test_tilt_is_compared_with_other_modes_as_the_sensor_saw_it(monkeypatch: pyt
     loop.ask("offset", modes=(2,), values=(40.0,))
     loop.run(20)
     error_nm = loop.steps[-1].error_nm
-    assert error_nm is not None
     np.testing.assert_allclose(seen[-1], error_nm[:2] + np.float32([40, 0]), atol=1e-3)
 
 
@@ -221,14 +212,12 @@ def test_what_the_wavefront_adds_to_the_contrast_is_measured_open_and_closed() -
     assert loop.added_contrast() is None
     loop.run(1000)
     found = loop.added_contrast()
-    assert found is not None
     flat, each = found
     assert flat == pytest.approx(true("disturbance_nm", 667), rel=0.3)
     assert 0.5 < each.sum() / true("residual_nm", 500) < 2  # a frame's noise is some ten times what is left
     loop.ask("open")
     loop.run(1)
     opened = loop.added_contrast()
-    assert opened is not None
     assert opened[1].sum() == pytest.approx(flat)
 
 
@@ -241,7 +230,6 @@ def test_gains_of_a_person_are_not_touched_and_harm_is_said_before_and_after() -
     assert named(loop, "CLOSING_HARMS")[0]["harm"].startswith("closing adds")
     assert named(loop, "LOOP_HARMS")[0]["action"] == "nothing is done"
     drive = loop.state.drive
-    assert drive is not None
     assert set(drive.law.gain.tolist()) == {np.float32(0.5), np.float32(0.05)}
     assert not named(loop, "GAINS_CHANGED")
     left_nm, open_nm = rms_nm(loop, 600)
@@ -271,11 +259,9 @@ def test_a_mode_can_be_given_a_gain_and_be_made_automatic_again() -> None:
     loop.ask("gain", values=(0.3,), modes=(4,))
     loop.run(300)
     drive = loop.state.drive
-    assert drive is not None
     assert drive.law.gain[2] == np.float32(0.3)
     assert not drive.automatic[2]
     loop.ask("gain", text="auto", modes=(4,))
-    assert loop.state.drive is not None
     assert loop.state.drive.automatic.all()
 
 

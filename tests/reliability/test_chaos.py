@@ -19,7 +19,7 @@ from lowfc.contract.errors import ConfigurationError, LowfcError
 from lowfc.contract.events import EVENTS, Level
 from lowfc.contract.messages import COMMAND, EVENT, FRAME, MIRROR_STATE, STEP, TRUTH, Log, wire
 from lowfc.programs.reliability.chaos.bench import PATIENCE_S, Ended, Left
-from lowfc.programs.reliability.chaos.case import Case, End, lacking
+from lowfc.programs.reliability.chaos.case import Case, lacking
 from lowfc.programs.reliability.chaos.cases import CASES
 from lowfc.programs.reliability.chaos.command import chaos, configured
 from lowfc.programs.reliability.chaos.evidence import FORGED_S, Entry, Evidence
@@ -172,7 +172,7 @@ def test_an_expected_event_must_be_there(left: Left, evidence: Evidence) -> None
 
 
 def test_safed_means_latched_and_flat(left: Left, evidence: Evidence) -> None:
-    case = replace(CASE, end=End.SAFE)
+    case = replace(CASE, safe=True)
     assert "closed" in broken(case, left, evidence)["recovery"]
     left.mode = wire.LOOP_MODE_SAFE
     assert "mirror at" in broken(case, left, evidence)["recovery"]

@@ -159,7 +159,13 @@ def _supervise(
         if child.name == Role.RECORDER and watch.of(Role.RECORDER).recording.failure:
             continue  # the loop ran to its end without it; the summary says why
         if child.status not in (0, -signal.SIGTERM, INTERRUPTED):  # told to end before it was ready is no failure
-            raise ProcessDiedError(f"{child.how_it_ended()}\n{child.stderr_tail()}")
+            raise died(child)
+
+
+def died(child: Child) -> ProcessDiedError:
+    """The error that says how a process ended."""
+    words = child.stderr_tail()
+    return ProcessDiedError(child.how_it_ended() + (f"; the end of its output:\n{words}" if words else ""))
 
 
 def check(children: list[Child]) -> None:
@@ -167,7 +173,7 @@ def check(children: list[Child]) -> None:
     for child in children:
         done = child.name == Role.VIEWER or (child.name == Role.CAMERA and child.status == 0)
         if child.status is not None and not done:
-            raise ProcessDiedError(f"{child.how_it_ended()}; the end of its output:\n{child.stderr_tail()}")
+            raise died(child)
 
 
 def _say_view_ended(view: Child, console: Console) -> None:

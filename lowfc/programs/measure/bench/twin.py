@@ -22,7 +22,7 @@ from lowfc.optics.chain.zernike import NOLLS_20, zernikes
 from lowfc.optics.twin.twin import ACCURATE, FAST, Evaluator, node_radii
 from lowfc.programs.cli.output import put
 
-WAVEFRONTS = 20
+SENSOR, WAVEFRONTS = "sam", 20
 
 
 def twin(as_json: Json = False) -> None:
@@ -34,18 +34,13 @@ def twin(as_json: Json = False) -> None:
     put(figures, render(figures), as_json=as_json)
 
 
-def bench_twin(
-    sensor: str = "sam",
-    seconds: float = 1.0,
-    progress: Callable[[str], None] = lambda name: None,
-    cache_dir: Path | None = None,
-) -> dict[str, Any]:
+def bench_twin(seconds: float = 1.0, cache_dir: Path | None = None) -> dict[str, Any]:
     """Measure the three twins; the figures of the live loop's default are also at the top level.
 
     Times are medians of one frame, from the phase to the binned image, the two models in turn. `relative_l2` is the
     worst of 20 random wavefronts: radial degrees 1 to 5 within the literal bounds of Sect. 3.1.
     """
-    optics = sensor_named(sensor)
+    optics = sensor_named(SENSOR)
     nm = optics.wavelength_nm
     cases = (
         ("monochromatic, rank 60", FAST, monochromatic(nm)),
@@ -57,7 +52,6 @@ def bench_twin(
     results = []
     with threadpool_limits(1):
         for name, spec, band in cases:
-            progress(name)
             begin = time.perf_counter()
             twin = load_or_build(optics, spec, band, cache_dir=cache_dir)
             load_s = time.perf_counter() - begin
@@ -84,7 +78,7 @@ def bench_twin(
             )
     top = {key: results[0][key] for key in ("twin_us", "full_us", "ratio", "relative_l2", "rank")}
     host = {"machine": platform.machine(), "python": platform.python_version(), "numpy": np.__version__}
-    return {**top, "sensor": sensor, "wavefronts": WAVEFRONTS, "cases": results, "host": host}
+    return {**top, "sensor": SENSOR, "wavefronts": WAVEFRONTS, "cases": results, "host": host}
 
 
 def random_coefficients_waves(rng: np.random.Generator, count: int) -> Array:

@@ -28,7 +28,7 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import FRAME, HEALTH, MIRROR_STATE, TIMING, Role, wire
 from lowfc.programs.launch.processes import program, start_all, stop_all
-from lowfc.programs.launch.sim_loop import ProcessDiedError, children_of, held_back, prepare
+from lowfc.programs.launch.sim_loop import children_of, died, held_back, prepare
 from lowfc.programs.launch.watch import Watch
 from lowfc.programs.measure import bare_loop, echo
 from lowfc.programs.measure.bare_loop import PROCESSES_FILE, TRACED, trace_file
@@ -232,7 +232,7 @@ def _run(
         while any(child.status is None for child in awaited) and not interrupted():
             for child in children:
                 if child.status is not None and (child.status != 0 or child not in awaited):
-                    raise _died(child)
+                    raise died(child)
             meanwhile()
             time.sleep(_TURN_S)
     if interrupted():
@@ -243,9 +243,4 @@ def _run(
 def _check_ends(children: list[Child]) -> None:
     for child in children:
         if child.status not in (0, INTERRUPTED):
-            raise _died(child)
-
-
-def _died(child: Child) -> ProcessDiedError:
-    words = child.stderr_tail()
-    return ProcessDiedError(child.how_it_ended() + (f"; the end of its output:\n{words}" if words else ""))
+            raise died(child)

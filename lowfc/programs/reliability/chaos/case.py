@@ -5,7 +5,6 @@ import subprocess
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +16,6 @@ LOST = ("MESSAGES_LOST", "MIRROR_LOST")
 WHILE_FRAMES = 250
 
 
-class End(Enum):
-    """What a case must come to."""
-
-    RECOVERS = "the loop is closed, and the residual as before"
-    SAFE = "latched, and the mirror flat"
-
-
 @dataclass(frozen=True)
 class Case:
     """One case: `act` does what its sentence says once the loop is quiet; then the loop is left to come to its end.
@@ -33,6 +25,7 @@ class Case:
         config: keys that differ from a chaos run's own.
         expected: events that must be in the log, by how they begin.
         allowed: names of events of the level ERROR that may be there.
+        safe: it must come to a latched loop and a flat mirror, not to a closed one with the residual as before.
         bad: which frames, by their number, may not be used.
         statuses: exit statuses that a process may end with, beside 0.
         noisy: tracebacks of what could not be read are to be expected.
@@ -46,7 +39,7 @@ class Case:
     config: Mapping[str, Any] = field(default_factory=dict)
     expected: tuple[str, ...] = ()
     allowed: tuple[str, ...] = ()
-    end: End = End.RECOVERS
+    safe: bool = False
     bad: Callable[[int], bool] | None = None
     statuses: Mapping[str, int] = field(default_factory=dict)
     noisy: bool = False
@@ -55,10 +48,10 @@ class Case:
     def play(self, bench: ChaosBench) -> None:
         """Do it, and wait until what must come of it has come."""
         self.act(bench)
-        if self.end is End.RECOVERS:
-            bench.settled()
-        else:
+        if self.safe:
             bench.frames(WHILE_FRAMES)
+        else:
+            bench.settled()
 
 
 REGISTERED: dict[str, Case] = {}

@@ -22,7 +22,7 @@ from lowfc.control.laws.stability import limiting_gain
 from lowfc.control.loop.guard import FEWEST, WORSE_BLOCKS
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
 from lowfc.programs.reliability.chaos.bench import CaseFailedError, ChaosBench
-from lowfc.programs.reliability.chaos.case import LOST, WHILE_FRAMES, End, case, no_mounts, no_other_clock, read_only
+from lowfc.programs.reliability.chaos.case import LOST, WHILE_FRAMES, case, no_mounts, no_other_clock, read_only
 from lowfc.programs.reliability.chaos.processes import killed
 
 JUST_BELOW = 0.9
@@ -129,7 +129,7 @@ def _damaged_calibration(bench: ChaosBench) -> None:
     "safed-restart",
     "safe mode, then the controller is killed and started anew",
     expected=("SAFED",),
-    end=End.SAFE,
+    safe=True,
 )
 def _restart_in_safe_mode(bench: ChaosBench) -> None:
     bench.client().safe()
@@ -186,7 +186,7 @@ def _safe_while(unkept: Callable[[Path], contextlib.AbstractContextManager[None]
     bench.restart(Role.CONTROLLER)
 
 
-unkept_case = partial(case, expected=("SAFED", "LATCH_FAILED"), end=End.SAFE)
+unkept_case = partial(case, expected=("SAFED", "LATCH_FAILED"), safe=True)
 unkept_case(
     "safe-without-directory",
     "safe while the run's directory is gone; then the controller is killed and started anew",

@@ -13,7 +13,7 @@ from lowfc.contract.events import Level
 from lowfc.contract.messages import COMMAND, EVENT, FRAME, MIRROR_STATE, STEP, Role, wire
 from lowfc.control.loop.safety import Limits
 from lowfc.programs.reliability.chaos.bench import PATIENCE_S, Left
-from lowfc.programs.reliability.chaos.case import Case, End
+from lowfc.programs.reliability.chaos.case import Case
 from lowfc.programs.reliability.chaos.evidence import Entry, Evidence
 
 WITHIN = 2.0
@@ -169,7 +169,7 @@ def _recovery(case: Case, left: Left, evidence: Evidence) -> Finding:
     where = wire.LoopMode.Name(left.mode).removeprefix("LOOP_MODE_").lower()
     if left.notes:
         return Finding("recovery", False, "; ".join(left.notes))
-    if case.end is End.RECOVERS:
+    if not case.safe:
         held = left.mode == wire.LOOP_MODE_CLOSED and after <= WITHIN * before + FLOOR_NM
         return Finding("recovery", held, f"residual {before:.2f} -> {after:.2f} nm, {where}")
     states = evidence.entries[MIRROR_STATE]

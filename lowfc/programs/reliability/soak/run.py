@@ -25,11 +25,11 @@ from lowfc.programs.reliability.soak.figures import Usage, of_latency, of_proces
 
 LOOK_S = 1.0
 _PATIENCE_S = 10.0
-_NONE_OF = (
-    ("messages_lost", "messages lost"),
-    ("gaps", "messages missing in the logs"),
-    ("frames_missing", "frames never arrived"),
-)
+_NONE_OF = {
+    "messages_lost": "messages lost",
+    "gaps": "messages missing in the logs",
+    "frames_missing": "frames never arrived",
+}
 
 
 class LogChecker:
@@ -107,7 +107,7 @@ class _Soak:
             "latency": of_latency(self.latency),
         }
         why = [f"the {name}'s {what} grow" for name, one in processes.items() for what in one["grows"]]
-        why += [f"{found[key]} {word}" for key, word in _NONE_OF if found[key]]
+        why += [f"{found[key]} {word}" for key, word in _NONE_OF.items() if found[key]]
         why += [f"{name} was not finished" for name in unfinished]
         if recording.messages != self.checker.messages:
             why.append(f"the recorder reports {recording.messages} messages, in the logs are {self.checker.messages}")
