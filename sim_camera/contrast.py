@@ -1,32 +1,13 @@
 """What the simulated wavefront adds to the contrast of the dark zone: by the full science image, and by its form."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from lowfc.arrays import Single
+from lowfc.contract.messages import wire
 from lowfc.optics.chain.added_contrast import ModalContrast
 
 IMAGES = 200
 """Full images of each that a figure is the mean of, where there were so many frames."""
-
-
-@dataclass(frozen=True, slots=True)
-class AddedContrast:
-    """Means over instants of a run's second half.
-
-    Attributes:
-        instants: of which the full images were made.
-        flat: added by the disturbance, as with a flat mirror, and `left` by what the loop left; of full images.
-        quadratic_left: by the quadratic form, at the same instants.
-        dark_zone: the coronagraph's own contrast, without any wavefront.
-    """
-
-    instants: int
-    flat: float
-    left: float
-    quadratic_left: float
-    dark_zone: float
 
 
 class Contrast:
@@ -57,7 +38,7 @@ class Contrast:
             np.einsum("nj,nj->j", modes_nm @ self._form, modes_nm) / np.float32(len(modes_nm)), np.float32
         )
 
-    def measure(self) -> AddedContrast | None:
+    def measure(self) -> wire.WavefrontFigures | None:
         """Full images at up to `IMAGES` instants of the second half; None before the first frame."""
         half = self._kept[len(self._kept) // 2 :]
         chosen = [half[int(place)] for place in np.linspace(0, len(half) - 1, min(IMAGES, len(half)))]
@@ -67,4 +48,10 @@ class Contrast:
         dark_zone = by_image(np.zeros_like(chosen[0][0]))
         flat, left = (np.mean([by_image(pair[which]) for pair in chosen]) - dark_zone for which in (0, 1))
         quadratic = self.quadratic(np.array([residual for _, residual in chosen])).sum()
-        return AddedContrast(len(chosen), float(flat), float(left), float(quadratic), dark_zone)
+        return wire.WavefrontFigures(
+            added_contrast_flat=float(flat),
+            added_contrast=float(left),
+            science_images=len(chosen),
+            quadratic_added_contrast=float(quadratic),
+            dark_zone_contrast=dark_zone,
+        )

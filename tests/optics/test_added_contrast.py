@@ -82,7 +82,7 @@ def test_a_run_is_measured_by_images_of_its_second_half(pupil: Array) -> None:
         contrast.add(2 * modes_nm, (10 if frame < 2000 else 1) * modes_nm)
     found = contrast.measure()
     assert found is not None
-    assert found.instants == IMAGES
+    assert found.science_images == IMAGES
     expected = by_image(pupil, modes_nm.astype(float))
-    assert (found.left, found.quadratic_left) == pytest.approx((expected, expected), rel=0.02)
-    assert found.flat == pytest.approx(4 * expected, rel=0.02)
+    assert (found.added_contrast, found.quadratic_added_contrast) == pytest.approx((expected, expected), rel=0.02)
+    assert found.added_contrast_flat == pytest.approx(4 * expected, rel=0.02)

@@ -91,21 +91,6 @@ def test_a_mirror_may_lie_beside_the_pupil():
     np.testing.assert_allclose(moved, 0.5 / 31)
 
 
-def test_low_pass_removes_the_print_through_and_nothing_else():
-    tilt = modes_to_actuators(MIRROR, [2])[:, 0].reshape(34, 34)
-    u = pupil_axis(512)
-    plain = influence_factors(MIRROR, u, 34)
-    smooth = influence_factors(MIRROR, u, 34, lowpass_cycles=12)
-
-    def cycles(factors, frequency):
-        surface = surface_nm(factors, tilt, factors)
-        row = (surface - surface[:, ::-1])[256] * np.hanning(512)
-        return abs(np.exp(-2j * np.pi * frequency * u) @ row) / 512
-
-    assert cycles(plain, 31) > 20 * cycles(smooth, 31)
-    assert cycles(smooth, 2) == pytest.approx(cycles(plain, 2), rel=0.01)
-
-
 @pytest.mark.parametrize("bad", [{"rows": 0}, {"pitches_per_pupil": 0.0}, {"coupling": 0.0}, {"coupling": 1.0}])
 def test_impossible_mirrors_are_refused(bad):
     with pytest.raises(ValueError, match="got"):

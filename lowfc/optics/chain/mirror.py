@@ -48,26 +48,20 @@ def actuator_axis(mirror: Mirror, actuators: int) -> Array:
     return np.asarray((np.arange(actuators) - (actuators - 1) / 2.0 + mirror.shift_pitches) / mirror.pitches_per_pupil)
 
 
-def influence_factors(mirror: Mirror, coordinates: Array, actuators: int, lowpass_cycles: float | None = None) -> Array:
+def influence_factors(mirror: Mirror, coordinates: Array, actuators: int) -> Array:
     """One axis of the influence functions, (points, actuators); surface = y_factors actuators x_factors'.
 
-    Points must be closer than half a pitch, or the print-through of the actuators folds to low frequencies unless it
-    is removed; on the nodes of a twin `twin_mirror` is several times closer to the truth than a low-pass.
+    Points must be closer than half a pitch, or the print-through of the actuators folds to low frequencies; on the
+    nodes of a twin `twin_mirror` makes up for it.
 
     Args:
         mirror: The mirror.
         coordinates: (points,) in pupil diameters.
         actuators: The mirror's rows for y, columns for x.
-        lowpass_cycles: Remove what is finer than this many cycles per pupil diameter; nothing when None.
     """
     distance = coordinates[:, None] - actuator_axis(mirror, actuators)
     width = 1.0 / (mirror.pitches_per_pupil * np.sqrt(-np.log(mirror.coupling)))
-    if lowpass_cycles is None:
-        return np.asarray(np.exp(-((distance / width) ** 2)))
-    points, weights = np.polynomial.legendre.leggauss(64)
-    cycles = 0.5 * lowpass_cycles * (points + 1.0)
-    spectrum = lowpass_cycles * weights * np.sqrt(np.pi) * width * np.exp(-((np.pi * width * cycles) ** 2))
-    return np.asarray(np.cos(2.0 * np.pi * distance[..., None] * cycles) @ spectrum)
+    return np.asarray(np.exp(-((distance / width) ** 2)))
 
 
 def surface_nm(
