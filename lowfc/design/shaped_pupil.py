@@ -8,6 +8,7 @@ Between the points of a grid the light is tens of times brighter. Exchange: the 
 grid become points of the next program, until none is above what was promised.
 """
 
+from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -117,20 +118,20 @@ class Figures:
     """Figures of a mask: all are fractions; contrasts every `FINE_STEP` of the dark zone.
 
     Attributes:
-        open_area: Sum of the transmission, of the open circle.
-        energy: Of the open circle's light, what passes.
-        focal_mask: Of that, what falls within `FOCAL_MASK_RADIUS`.
+        open_area_fraction: Sum of the transmission, of the open circle.
+        energy_fraction: Of the open circle's light, what passes.
+        focal_mask_fraction: Of that, what falls within `FOCAL_MASK_RADIUS`.
         max_contrast: The largest, also on the zone's edges.
         mean_contrast: The mean.
-        grey: Of the circle's cells, those neither open nor closed to a thousandth.
+        grey_cells_fraction: Of the circle's cells, those neither open nor closed to a thousandth.
     """
 
-    open_area: float
-    energy: float
-    focal_mask: float
+    open_area_fraction: float
+    energy_fraction: float
+    focal_mask_fraction: float
     max_contrast: float
     mean_contrast: float
-    grey: float
+    grey_cells_fraction: float
 
 
 def exchange(request: Request) -> Iterator[Round]:
@@ -198,12 +199,12 @@ def figures(quarter: Array, request: Request) -> Figures:
     image = np.abs(to_image(pupil.astype(np.complex128), len(mask), samples_per, 1.0)) ** 2
     cells = quarter[_circle_quarter(len(quarter))]
     return Figures(
-        open_area=_open_area(quarter),
-        energy=float((pupil**2).mean() / OPEN_AREA),
-        focal_mask=float((image * mask).sum() / samples_per**2 / (pupil**2).mean()),
+        open_area_fraction=_open_area(quarter),
+        energy_fraction=float((pupil**2).mean() / OPEN_AREA),
+        focal_mask_fraction=float((image * mask).sum() / samples_per**2 / (pupil**2).mean()),
         max_contrast=largest_contrast(quarter, request),
         mean_contrast=float(contrast.mean()),
-        grey=float(((cells > 1e-3) & (cells < 1 - 1e-3)).mean()),
+        grey_cells_fraction=float(((cells > 1e-3) & (cells < 1 - 1e-3)).mean()),
     )
 
 
@@ -241,14 +242,8 @@ def is_feasible(request: Request) -> bool:
 
 def _first(candidates: Sequence[float], feasible: Callable[[float], bool]) -> float | None:
     """The first feasible one of candidates that grow easier, by bisection."""
-    low, high = 0, len(candidates)
-    while low < high:
-        middle = (low + high) // 2
-        if feasible(candidates[middle]):
-            high = middle
-        else:
-            low = middle + 1
-    return candidates[low] if low < len(candidates) else None
+    place = bisect_left(candidates, True, key=feasible)
+    return candidates[place] if place < len(candidates) else None
 
 
 def _levels(request: Request) -> list[int]:

@@ -60,11 +60,11 @@ def test_the_field_is_the_sensors():
 
 def test_figures_of_the_open_circle():
     found = figures(circle(512)[256:, 256:], Request())
-    assert found.open_area == pytest.approx(1.0, abs=1e-3)
-    assert found.energy == found.open_area
+    assert found.open_area_fraction == pytest.approx(1.0, abs=1e-3)
+    assert found.energy_fraction == found.open_area_fraction
     encircled = 1.0 - j0(4 * np.pi) ** 2 - j1(4 * np.pi) ** 2
-    assert found.focal_mask == pytest.approx(encircled, abs=2e-3)  # the disk's rim is a staircase
-    assert found.grey == 0.0
+    assert found.focal_mask_fraction == pytest.approx(encircled, abs=2e-3)  # the disk's rim is a staircase
+    assert found.grey_cells_fraction == 0.0
 
 
 def test_the_first_program_has_the_optimum_that_another_formulation_and_solver_find():
@@ -221,7 +221,7 @@ def test_the_shipped_mask_keeps_what_its_record_promises():
     assert request == Request()
     found = figures(quarter, request)
     assert found.max_contrast <= request.contrast == 1e-9
-    assert found.open_area > 0.26
+    assert found.open_area_fraction > 0.26
 
 
 @pytest.mark.slow
