@@ -55,6 +55,7 @@ PURE_IMPORTS = (
         "numpy",
         "scipy",
         "abc",
+        "bisect",
         "collections",
         "dataclasses",
         "enum",

@@ -3,21 +3,20 @@
 import hashlib
 import shlex
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
-from contextlib import contextmanager
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import TimeElapsedColumn, TimeRemainingColumn
 from threadpoolctl import threadpool_limits
 
 from lowfc.adapters.files.drawing import figure_class
 from lowfc.adapters.files.sensors import load_pupil
-from lowfc.adapters.process.progress import passing_bar
+from lowfc.adapters.process.progress import counting_bar
 from lowfc.contract.errors import ConfigurationError, LowfcError
 from lowfc.design.goal import figures
 from lowfc.design.paper import TABLE4_MODES
@@ -74,12 +73,14 @@ def design_sam(
     pupil = pupil_digest()
     write_state(state, search, pupil, chains)  # and so must a folder that cannot be written
     interrupted = False
-    with _progress(search, chains, console) as show:
+    with counting_bar(console, TimeElapsedColumn(), TimeRemainingColumn()) as count:
         saved_s = time.monotonic()
+        count(search.goal.merit, sum(chain.step for chain in chains), search.chains * search.steps)
 
         def on_block() -> None:
             nonlocal saved_s
-            show()
+            best, done = min(chain.best_merit for chain in chains), sum(chain.step for chain in chains)
+            count(f"{search.goal.merit} {best:.4g}", done, search.chains * search.steps)
             if time.monotonic() - saved_s > STATE_PERIOD_S:
                 write_state(state, search, pupil, chains)
                 saved_s = time.monotonic()
@@ -252,18 +253,3 @@ def _described(found: Sequence[Hole]) -> str:
     low, high = min(hole[2] for hole in found), max(hole[2] for hole in found)
     size = f"{low:.1%}" if low == high else f"{low:.1%} to {high:.1%}"
     return f"{len(found)} holes of {size.replace('.0%', '%')}"
-
-
-@contextmanager
-def _progress(search: Search, chains: list[Chain], console: Console) -> Iterator[Callable[[], None]]:
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with passing_bar(console, *columns) as bar:
-        task = bar.add_task(search.goal.merit, total=search.chains * search.steps)
-
-        def show() -> None:
-            best = min(chain.best_merit for chain in chains)
-            done = sum(chain.step for chain in chains)
-            bar.update(task, completed=done, description=f"{search.goal.merit} {best:.4g}")
-
-        show()
-        yield show

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+from rich.progress import MofNCompleteColumn, TimeElapsedColumn
 from threadpoolctl import threadpool_limits
 
 from lowfc.adapters.files.drawing import figure_class
 from lowfc.adapters.files.whole_file import write_whole
-from lowfc.adapters.process.progress import passing_bar
+from lowfc.adapters.process.progress import counting_bar
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.programs.cli.result import table as text_table
 from lowfc.programs.paper.cases import Case, Context, plain, prepared
@@ -94,7 +94,6 @@ paper's, *predicted* decides.
 
 def run(names: Sequence[str], context: Context, plots: Path | None = None) -> list[Table]:
     """The tables of these names, in the paper's units, and their drawings."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     tables = []
     for name in context.sensors or ():
         prepared(name)  # a mistake is reported before the work, not after it
@@ -104,11 +103,10 @@ def run(names: Sequence[str], context: Context, plots: Path | None = None) -> li
             plots.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise DataFileError(f"the folder {plots} cannot be made: {error}") from error
-    with passing_bar(Console(stderr=True), *columns) as shown, threadpool_limits(1):
-        all_of_them, this = shown.add_task("tables", total=len(names)), shown.add_task("")
+    with counting_bar(Console(stderr=True), MofNCompleteColumn(), TimeElapsedColumn()) as count, threadpool_limits(1):
 
         def progress(what: str, done: int, total: int) -> None:
-            shown.update(this, description=what, completed=done, total=total)
+            count(f"{len(tables) + 1} of {len(names)}: {what}", done, total)
 
         context = replace(context, progress=progress)
         for name in names:
@@ -123,7 +121,6 @@ def run(names: Sequence[str], context: Context, plots: Path | None = None) -> li
             except ConfigurationError as error:
                 raise ConfigurationError(f"{name}: {error}") from error
             tables.append(table | {"rows": rows})
-            shown.advance(all_of_them)
     return tables
 
 

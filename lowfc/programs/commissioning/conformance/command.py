@@ -1,8 +1,7 @@
 """The command `lowfc conformance`: options only."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -43,6 +42,9 @@ def camera(
 
     Example: lowfc conformance camera --run bench --config bench.toml
     """
+    from rich.console import Console
+
+    from lowfc.adapters.process.progress import passing_bar
     from lowfc.contract.messages import Role
     from lowfc.programs.commissioning.conformance.camera import watch
     from lowfc.programs.commissioning.conformance.frames import camera_checks
@@ -50,8 +52,9 @@ def camera(
 
     settings = None if config is None else configuration(config)
     found = _run_with(Role.CAMERA, run)
-    with _line(found, Role.OPERATOR) as line, _bar(f"looking at the camera for {duration:g} s", duration) as show:
-        seen = watch(line, duration, lambda done_s: show(completed=done_s))
+    with _line(found, Role.OPERATOR) as line, passing_bar(Console(stderr=True)) as bar:
+        task = bar.add_task(f"looking at the camera for {duration:g} s", total=duration)
+        seen = watch(line, duration, lambda done_s: bar.update(task, completed=done_s))
     checks = list(camera_checks(seen))
     if settings is not None and seen.settings is not None:
         checks += agreement_checks(settings, seen.settings)
@@ -74,7 +77,10 @@ def mirror(
 
     Example: lowfc conformance mirror --run bench --config lowfc.toml
     """
+    from rich.console import Console
+
     from lowfc.adapters.bus.run import mirror_role
+    from lowfc.adapters.process.progress import passing_bar
     from lowfc.contract.errors import BusError, ConfigurationError
     from lowfc.contract.messages import Role
     from lowfc.programs.commissioning.conformance.dialogue import Dialogue, Expected
@@ -86,9 +92,9 @@ def mirror(
     found = _run_with(mirror_role(settings.mirror.name), run)
     if Role.CONTROLLER in found.links.live():
         raise BusError(f"run {found.run_id!r} has a controller, and only one process may command the mirror: stop it")
-    with _line(found, Role.CONTROLLER) as line, _bar("the mirror", None) as show:
-        dialogue = Dialogue(line, Expected(settings))
-        checks = mirror_checks(dialogue, duration, lambda what: show(description=f"the mirror: {what}"), gentle=gentle)
+    with _line(found, Role.CONTROLLER) as line, passing_bar(Console(stderr=True)) as bar:
+        task, dialogue = bar.add_task("the mirror", total=None), Dialogue(line, Expected(settings))
+        checks = mirror_checks(dialogue, duration, lambda what: bar.update(task, description=what), gentle=gentle)
     _end(f"mirror-{settings.mirror.name}", found.run_id, checks, as_json)
 
 
@@ -131,20 +137,6 @@ def _line(run: "Run", role: str) -> "Iterator[Line]":
         yield line
     finally:
         line.close()
-
-
-@contextmanager
-def _bar(text: str, total: float | None) -> Iterator[Callable[..., None]]:
-    """A progress bar that is gone when it is done; what it yields changes it."""
-    from rich.console import Console
-    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
-
-    from lowfc.adapters.process.progress import passing_bar
-
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with passing_bar(Console(stderr=True), *columns) as bar:
-        task = bar.add_task(text, total=total)
-        yield partial(bar.update, task)
 
 
 def _end(device: str, run_id: str, checks: list[Check], as_json: bool) -> None:
