@@ -94,7 +94,7 @@ paper's, *predicted* decides.
 
 def run(names: Sequence[str], context: Context, plots: Path | None = None) -> list[Table]:
     """The tables of these names, in the paper's units, and their drawings."""
-    tables = []
+    tables: list[Table] = []
     for name in context.sensors or ():
         prepared(name)  # a mistake is reported before the work, not after it
     if plots is not None:
