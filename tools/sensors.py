@@ -34,13 +34,13 @@ SHEAR = 1e-3
 
 
 def configured(name: str, **changed: Any) -> Configuration:
-    """The configuration behind `--sensor name` at the loop's rate."""
+    """The configuration of `--sensor name` at the loop's rate."""
     keys = {f"sensor.{key}": value for key, value in sensor_keys(name).items()}
     return load(None, keys | {"camera.rate_hz": RATE_HZ} | changed)
 
 
 def measure() -> Figures:
-    """Figures of every sensor."""
+    """Measure every sensor, alone and in the loop."""
     with threadpool_limits(1):
         found = {name: alone(name) for name in track(NAMES, "sensors alone")}
     for name in track(NAMES, "sensors in the loop"):
@@ -84,8 +84,8 @@ def alone(name: str) -> Figures:
         limit = np.linalg.inv(quantum_information(optics.pupil, modes, optics.wavelength_nm))
         figures["quantum_share"] = float(np.median(np.diag(limit) / np.diag(bound)))
         slopes = normalise_flux(light, shear_response(optics), np.ones(light.size))[1]
-        taken_nm = SHEAR * np.linalg.norm(plain.reconstructor @ slopes, axis=0)
-        figures["shear_taken_for_nm"] = float(np.sqrt(np.mean(taken_nm**2)))
+        mistaken_nm = SHEAR * np.linalg.norm(plain.reconstructor @ slopes, axis=0)
+        figures["shear_taken_for_nm"] = float(np.sqrt(np.mean(mistaken_nm**2)))
     return figures
 
 
@@ -96,7 +96,7 @@ def tilt_noise_mas(config: Configuration, calibration: Calibration) -> float:
 
 
 def in_the_loop(name: str, preset: str) -> dict[str, float]:
-    """What the real processes leave of a disturbance."""
+    """Disturbance and residual of the simulated loop, run by the real processes."""
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "FILE").write_text(GAINS)
         run = json_of(f"{COMMAND.replace('NAME', name)} --disturbance {preset}", folder)
@@ -105,7 +105,7 @@ def in_the_loop(name: str, preset: str) -> dict[str, float]:
 
 
 def render(figures: Figures) -> str:
-    """A line for each sensor."""
+    """A row for each sensor."""
     head = [
         *("`--sensor`", "light, %", "peak, %", "cond14", "quantum, %", "tilt noise, mas"),
         *("in the band", "with shear", "shear, nm", "twin, us"),
@@ -126,15 +126,17 @@ def render(figures: Figures) -> str:
         rows.append(cells)
     star = configured("sam")
     return (
-        f"{markdown(head, rows)}\nLight is what falls on the detector, of all that enters the open circle; peak is the "
-        "brightest pixel's share of it; cond14 is the condition number of H for Z2 to Z15. Quantum is the share "
-        "that is used of what the light behind the pupil could tell: the median of the modes, without read noise. "
+        f"{markdown(head, rows)}\nLight is the fraction of the light entering the open circle that falls on the "
+        "detector; peak is the brightest pixel's share of that; cond14 is the condition number of H for Z2 "
+        "to Z15. Quantum is the ratio "
+        "of the quantum limit to the Cramer-Rao bound in variance: the median of the modes, without read noise. "
         "The noise is that of tip and tilt, rms of both axes, in one frame of "
         f"{star.exposure_ns / 1e6:g} ms of a star of V = {star.star.magnitude:g}, all {len(star.noll)} modes fitted, "
         "all photons at the central wavelength; then with "
-        "the same photons over the band of 20 %, in four wavelengths; then with the shear of the beam fitted along; "
-        f"then the wavefront, nm rms over the circle, for which a shear of {100 * SHEAR:g} % of the diameter is taken "
-        "otherwise. The twin's time is one frame's, on one thread. The loop's columns are open -> closed: the true "
-        f"wavefront over the open pupil and the true tilt, in the second half of {DURATION_S} simulated seconds at "
+        "the same photons over the band of 20 %, in four wavelengths; then with the shear of the beam as an additional "
+        f'fitted parameter. "Shear, nm" is the wavefront error, nm rms over the circle, from a shear of '
+        f"{100 * SHEAR:g} % of the diameter that is not fitted. The twin's time is for one frame on one thread. "
+        "The loop's columns are open -> closed: the true wavefront over the open pupil and the true tilt, "
+        f"in the second half of {DURATION_S} simulated seconds at "
         f"{RATE_HZ} Hz with gains of 0.5 for tilt and 0.05 for the rest, in FILE."
     )

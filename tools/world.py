@@ -18,7 +18,7 @@ from tools.shared import Figures, markdown
 SENSORS, MAGNITUDES = ("sam27d10_bal14", "zwfs"), (2, 5)
 PRESET, RATE_HZ, SECONDS = "bench", 500.0, 4.0
 _UNTIL_GAINS_S = 2.5
-_FRAMES = 2000  # of which a dark and a reference image are means
+_FRAMES = 2000  # averaged for a dark and a reference image
 WHEEL = {"disturbance.wheel_hz": 12.0}
 CASES: dict[str, dict[str, Any]] = {
     "none": {},
@@ -43,17 +43,17 @@ CASES: dict[str, dict[str, Any]] = {
     "response not uniform": {"camera.nonuniformity": 0.01},
 }
 CALIBRATED = ("hot pixels", "response not linear", "response not uniform")
-"""Those that are measured again with a dark and a reference image of that detector."""
+"""Cases that are repeated with a dark and a reference image measured on that detector."""
 
 
 def measure(sensors: tuple[str, ...] = SENSORS, seconds: float = SECONDS) -> Figures:
-    """A row for each case, with the figures of each sensor and star."""
+    """Measure every case with each sensor and star."""
     rows = []
     with threadpool_limits(1):
         for name, keys in track(CASES.items(), "cases"):
             for again in (False, True) if name in CALIBRATED else (False,):
                 pairs = [(sensor, magnitude) for sensor in sensors for magnitude in MAGNITUDES]
-                found = [_left(*pair, keys, seconds, again) | {"of": pair} for pair in pairs]
+                found = [_residual(*pair, keys, seconds, again) | {"of": pair} for pair in pairs]
                 rows.append({"name": name, "keys": keys, "calibrated": again, "figures": found})
     return {"rows": rows, "seconds": seconds}
 
@@ -69,7 +69,7 @@ def _configured(sensor: str, magnitude: float, keys: dict[str, Any]) -> Configur
 
 @lru_cache
 def _gains(sensor: str, magnitude: float) -> tuple[float, ...]:
-    """Those that are found automatically, of each mode, in the world without imperfections."""
+    """The automatic gains (modes,) in the world without imperfections."""
     automatic = {"control.tilt_gain": "auto", "control.gain": "auto"}
     config = _configured(sensor, magnitude, automatic)
     bench = Bench(config, calibrated(config))
@@ -78,8 +78,8 @@ def _gains(sensor: str, magnitude: float) -> tuple[float, ...]:
     return tuple(bench.state.drive.law.gain.tolist())
 
 
-def _left(sensor: str, magnitude: float, keys: dict[str, Any], seconds: float, again: bool) -> Figures:
-    """Wavefront over the open pupil and added contrast of the second half, at every moment."""
+def _residual(sensor: str, magnitude: float, keys: dict[str, Any], seconds: float, again: bool) -> Figures:
+    """Residual wavefront over the open pupil and added contrast, continuous, over the second half of the run."""
     config = _configured(sensor, magnitude, keys)
     calibration = calibrated(config)
     bench = Bench(config, _measured(config, calibration) if again else calibration)
@@ -99,7 +99,7 @@ def _left(sensor: str, magnitude: float, keys: dict[str, Any], seconds: float, a
 
 
 def _measured(config: Configuration, calibration: Calibration) -> Calibration:
-    """With dark and reference image as means of this detector's frames."""
+    """The calibration with dark and reference image averaged from frames of this detector."""
     still = config.disturbance.model_copy(update={"preset": "quiet"})
     flat = np.zeros(calibration.grid, np.float32)
     means = []
@@ -113,9 +113,9 @@ def _measured(config: Configuration, calibration: Calibration) -> Calibration:
 
 
 def render(figures: Figures) -> str:
-    """A line for each case."""
+    """A row for each case."""
     rows = figures["rows"]
-    head = ["what the world has", "keys"]
+    head = ["imperfection", "keys"]
     for sensor, magnitude in (one["of"] for one in rows[0]["figures"]):
         head += [f"`{sensor}`, V = {magnitude}: nm rms", "added contrast"]
     lines = []
@@ -125,12 +125,13 @@ def render(figures: Figures) -> str:
         cells = [(f"{one['residual_nm']:.2f}", f"{one['contrast']:.1e}") for one in row["figures"]]
         lines.append([name, keys, *(cell for pair in cells for cell in pair)])
     return (
-        f"{markdown(head, lines)}\nTrue wavefront over the open pupil at every moment, and what the modes add to the "
-        "mean contrast of the dark zone by their quadratic form, over the second half of "
-        f"{figures['seconds']:g} s at {RATE_HZ:g} Hz, disturbance `{PRESET}`, one seed, with the gains that the loop "
-        "finds by itself without any of these; sensor images through the live loop's own `advance` and the simulated "
-        "mirror. The calibration is the analytic one, which knows of dark current and of nothing else, or one with "
-        "the dark and the reference image of that detector."
+        f"{markdown(head, lines)}\nResidual of the true wavefront over the open pupil, continuous, and the mean "
+        "contrast that the modes add to the dark zone (quadratic form), over the second half of "
+        f"{figures['seconds']:g} s at {RATE_HZ:g} Hz, disturbance `{PRESET}`, one seed, with the automatic gains "
+        "of the loop without imperfections. Sensor images pass through the live loop's own `advance` and the simulated "
+        "mirror. The calibration is the analytic one, which includes dark current and no other "
+        "imperfection, or one with "
+        "the measured dark and reference image of that detector."
     )
 
 

@@ -1,6 +1,6 @@
-"""Other ways to close the same loop beside lowfc: same frames, sizes and processors, on this host, in turns.
+"""Comparison of lowfc with other implementations of the same loop: same frames, sizes and processors, in turns.
 
-All run under SCHED_FIFO with idle processors kept awake, where the host grants it to this user; else nobody does.
+All run under SCHED_FIFO with processors kept from idling if the host grants it to this user; otherwise none does.
 
 Example:
     git clone https://github.com/milk-org/ImageStreamIO DIR
@@ -63,9 +63,9 @@ DEFINITIONS = {
     "clock": "CLOCK_MONOTONIC, one host",
     "pacing": "the source sleeps until absolute times; a late frame is sent at once, its t0 is when it was sent, and "
     "none is left out",
-    "cells": "us, median (lowest to highest) over the turns; in every turn each contestant runs once, every other turn "
-    "in the opposite order",
-    "without a command": "measured frames that no command was made from, in all turns",
+    "cells": "us, median (lowest to highest) over the turns; in every turn each contestant runs once, and every other "
+    "turn in the opposite order",
+    "without a command": "measured frames that led to no command, in all turns",
     "pinning": "source and mirror on the first processor, all else on the second",
     "memory": "lowfc's processes lock theirs (`realtime.lock_memory`), the others do not",
     "threads": "BLAS and numba 1; garbage collection off everywhere; chain.c by cc -O3 -march=native -ffast-math",
@@ -73,9 +73,9 @@ DEFINITIONS = {
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    """How long, how often, how fast, and who."""
+    """Add duration, repeats, rate and contestants."""
     add_times(parser, seconds=3.0, repeats=9)
-    parser.add_argument("--warm-up", type=int, default=500, help="frames before (%(default)s)")
+    parser.add_argument("--warm-up", type=int, default=500, help="warm-up frames (%(default)s)")
     parser.add_argument("--rate", dest="rate_hz", type=float, default=1000.0, help="frames per second (%(default)g)")
     parser.add_argument("--only", action="append", metavar="WORD", help="contestants with this in their name; repeat")
     isio = os.environ.get("ISIO_DIR")
@@ -89,14 +89,14 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, tell: Tell) -> Result:
-    """Hold the contest: of each contestant the figures of every turn, None where it failed, and why who is missing."""
+    """Run all contestants in turns: the figures of each turn, None where it failed, and why a contestant is missing."""
     chosen = [one for one in CONTESTANTS if any(word in one.name for word in options.only or [""])]
     if not chosen:
         raise ConfigurationError(f"--only: none of {'; '.join(one.name for one in CONTESTANTS)}")
     absent = {one.name: why for one in chosen if (why := missing(one, options))}
     present = [one for one in chosen if one.name not in absent]
     awake = set_up(None, None, lock_memory=False, disable_cpu_idle=True)  # for all, as long as this process lives
-    priority = PRIORITY if may_run_first() else 0
+    priority = PRIORITY if fifo_granted() else 0
     runs: dict[str, list[Any]] = {one.name: [] for one in chosen}
     failed = []
     for turn in range(options.repeats):
@@ -121,7 +121,7 @@ def measure(options: argparse.Namespace, tell: Tell) -> Result:
 
 
 def one_run(contestant: Contestant, rules: argparse.Namespace, priority: int) -> dict[str, Any]:
-    """Run one contestant once; ContestError or LowfcError where it does not start or end, or makes no command."""
+    """Run a contestant once; ContestError or LowfcError if it does not start, does not end or sends no command."""
     if contestant.kernel:
         return _lowfc(contestant.kernel, rules, priority)
     frames = rules.warm_up + round(rules.seconds * rules.rate_hz)
@@ -145,9 +145,10 @@ def one_run(contestant: Contestant, rules: argparse.Namespace, priority: int) ->
 
 
 def figures(folder: Path, warm_up: int) -> dict[str, Any]:
-    """What the times of a run say, its first `warm_up` frames left out; percentiles in us, None where none came.
+    """Figures of a run without its first `warm_up` frames; percentiles in us, None without any command.
 
-    off is by what part of the largest the last actuators differ from those of numpy, None where a command is missing.
+    off: largest difference of the last actuators from those of numpy, relative to the largest actuator; None where a
+    command is missing.
     """
     due, published, commanded, received = (np.fromfile(folder / name, np.int64)[1:] for name in MARKS)
     off = _off(folder, commanded.size) if commanded.all() and received[-1] else None
@@ -173,7 +174,7 @@ def _off(folder: Path, frames: int) -> float:
 
 
 def _lowfc(kernel: str, rules: argparse.Namespace, priority: int) -> dict[str, Any]:
-    """The real loop, of the contest's size; it warms up for half a second by itself."""
+    """Run lowfc's own loop with the size of the comparison; it warms up for half a second by itself."""
     config = configuration(SIZE, rules.rate_hz, priority=priority, disable_cpu_idle=True, kernel=kernel)
     with laid_out(SIZE, config) as run:
         found = one_loop(Asked(config, rules.seconds, 1), run)
@@ -187,7 +188,7 @@ def _lowfc(kernel: str, rules: argparse.Namespace, priority: int) -> dict[str, A
 
 
 def lay_out(folder: Path, frames: int) -> None:
-    """Write what the processes of a run share."""
+    """Write the files that the processes of a run share."""
     calibration, images = made_up(SIZE, configuration(SIZE, 1.0))
     images.tofile(folder / "frames")
     (calibration.dark + calibration.flux_dn * calibration.reference).tofile(folder / "I0")
@@ -201,13 +202,13 @@ def lay_out(folder: Path, frames: int) -> None:
 
 
 def processors() -> tuple[int, int]:
-    """The first two that this process may run on; the same one twice where there is but one."""
+    """The first two processors that this process may run on; the same one twice if there is only one."""
     allowed = sorted(os.sched_getaffinity(0))
     return allowed[0], allowed[1 % len(allowed)]
 
 
-def may_run_first() -> bool:
-    """Whether this host lets us have SCHED_FIFO."""
+def fifo_granted() -> bool:
+    """Whether this host grants SCHED_FIFO."""
     before = os.sched_getscheduler(0), os.sched_getparam(0)
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
@@ -252,7 +253,7 @@ HEADINGS = ["contestant", *PERCENTILES.values(), "without a command", "to the mi
 
 
 def tables(result: Result) -> list[Lines]:
-    """Latencies; differences within a turn; and what each contestant does and does not do."""
+    """Tables of the latencies, of the differences within a turn, and of what else each contestant does."""
     runs = result["runs"]
     does = [
         [one.name, str(len(one.roles) or 3), one.log, one.safety, one.elsewhere]
@@ -295,7 +296,7 @@ def _difference(runs: Result, other: str) -> list[str]:
 
 
 def about(result: Result) -> str:
-    """What the tables' figures are."""
+    """Definitions and conditions of the tables."""
     rules, runs = result["rules"], result["runs"]
     what = {one.name: one.what for one in CONTESTANTS if one.name in runs}
     lines = [f"{name}: {what}." for name, what in (DEFINITIONS | what).items()]
@@ -308,8 +309,8 @@ def about(result: Result) -> str:
     lines.append(f"{late} of all {sent} frames were sent more than a period late.")
     if off := [turn["off"] for turn in done if turn["off"] is not None]:
         lines.append(
-            f"The last actuators of the {len(off)} runs with a command for every frame are those of numpy within "
-            f"{max(off):.1g} of the largest; lowfc's step divides by the flux and is not compared."
+            f"In the {len(off)} runs with a command for every frame, the last actuators agree with those of numpy to "
+            f"{max(off):.1g} of the largest actuator; lowfc's step divides by the flux and is not compared."
         )
     lines += [f"{name}: {why}." for name, why in result["missing"].items()]
     lines += [f"Failed, {fault}." for fault in result["failed"]]

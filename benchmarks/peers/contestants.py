@@ -1,4 +1,4 @@
-"""Who takes part, what each does and does not do, and what it needs on this host."""
+"""The contestants: what each does, and what it requires on this host."""
 
 import argparse
 import contextlib
@@ -24,7 +24,7 @@ _LIMIT_ONLY = "limit of each mode"
 
 
 class ContestError(Exception):
-    """A contestant did not start, or did not come to its end."""
+    """A contestant did not start, or did not end."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,8 @@ def _pyrtcao(name: str, what: str, safety: str, *roles: str) -> Contestant:
 def _lowfc(kernel: str) -> Contestant:
     return Contestant(
         f"lowfc, {kernel}",
-        "its controller and mirror as they run, frames made beforehand: the loop of `lowfc latency`, of this size",
-        log="every frame, command, mirror state and step is published for a recorder; replay to the bit",
+        "its real controller and mirror with prepared frames: the loop of `lowfc latency`, with this size",
+        log="every frame, command, mirror state and step is published for a recorder; bit-exact replay",
         safety="late, dark, saturated, identical and missing frames refused or bridged; limits of mode, stroke, slew "
         "and neighbours, in the mirror too; command timeout",
         elsewhere="yes, mutual TLS",
