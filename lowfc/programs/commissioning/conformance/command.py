@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from lowfc.programs.commissioning.conformance.line import Line
 
 CONNECT_S = 3.0
-"""How long a device is waited for."""
+"""Time to wait for a device."""
 
 STATUSES = (Status.WRONG, Status.WARNING, Status.OK)
 FIELDS = {name: name for name in ("name", "status", "expected", "got", "advice")}
@@ -35,9 +35,9 @@ def camera(
     duration: Annotated[float, typer.Option(min=0.2, max=3600, help="Seconds of messages to check.")] = 5.0,
     as_json: Json = False,
 ) -> None:
-    """Check the messages of a camera driver against the contract; exit status 1 where something is wrong.
+    """Check the messages of a camera driver against the contract; exit status 1 if a check fails.
 
-    The loop may be running meanwhile: nothing is published. With --config, the camera's settings are compared with the
+    The check publishes nothing, so the loop may be running. With --config, the camera's settings are compared with the
     loop's configuration, too.
 
     Example: lowfc conformance camera --run bench --config bench.toml
@@ -53,7 +53,7 @@ def camera(
     settings = None if config is None else configuration(config)
     found = _run_with(Role.CAMERA, run)
     with _line(found, Role.OPERATOR) as line, passing_bar(Console(stderr=True)) as bar:
-        task = bar.add_task(f"looking at the camera for {duration:g} s", total=duration)
+        task = bar.add_task(f"observing the camera for {duration:g} s", total=duration)
         seen = watch(line, duration, lambda done_s: bar.update(task, completed=done_s))
     checks = list(camera_checks(seen))
     if settings is not None and seen.settings is not None:
@@ -69,7 +69,7 @@ def mirror(
     gentle: Annotated[bool, typer.Option("--gentle", help="Do not try its limits.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Command a mirror and check its answers against the contract; exit status 1 where something is wrong.
+    """Command a mirror and check its answers against the contract; exit status 1 if a check fails.
 
     It takes the controller's place, so none may be running. The commands are a twentieth of what the configuration
     allows in one move; only where all of them were answered rightly, and without --gentle, stroke, slew and neighbour
