@@ -21,7 +21,7 @@ from lowfc.programs.commissioning.calibrate import pokes
 from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest
 from lowfc.programs.commissioning.calibrate.result import Verdict, computed_noise_nm, judge, measured_calibration
 from lowfc.programs.commissioning.calibrate.run import Calibrator
-from tests.support.folded_loop import FoldedLoop
+from tests.support.folded_loop import SMALL_MIRROR, FoldedLoop
 from tests.support.loops import interrupt, run, start, until
 
 STILL = ("quiet", "thermal", "bench", "step", "kolmogorov")
@@ -61,7 +61,8 @@ def response_there(loop: FoldedLoop, begun: int, *, closed: bool) -> np.ndarray:
 
 
 def outcome(method: str, preset: str, seed: int, snr: float, folder: Path, modes: int = 14) -> Outcome:
-    config = load(None, {"disturbance.preset": preset, "seed": seed, "sensor.modes": modes})
+    mirror = SMALL_MIRROR if modes < 14 else {}
+    config = load(None, mirror | {"disturbance.preset": preset, "seed": seed, "sensor.modes": modes})
     loop = FoldedLoop(config)
     before = loop.calibration()
     if method == "in-loop":
