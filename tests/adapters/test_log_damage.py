@@ -15,7 +15,8 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC as MAGIC
 from mcap.writer import CompressionType, Writer
 
-from lowfc.adapters.logs.reader import Logged, LogReader
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.records import LogFile
 from lowfc.adapters.logs.recovery import recover
 from lowfc.contract.errors import DataFileError
@@ -38,7 +39,7 @@ SENT: list[Message] = identity(small_samples())
 
 def read_of(reader: LogReader) -> tuple[list[Message], str]:
     """What a reader delivers, and how it complains."""
-    read: list[Logged] = []
+    read: list[Sample] = []
     try:
         read.extend(reader)
     except DataFileError as error:

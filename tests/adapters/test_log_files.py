@@ -48,7 +48,7 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     reader = LogReader(small_log(tmp_path / "logs" / "a.mcap"))
     read = list(reader)
     assert identity(read) == identity(SENT)
-    assert {m.schema for m in read} >= {"foxglove.RawImage", "lowfc.v1.ControlStep"}
+    assert {reader.schema_of(m) for m in read} >= {"foxglove.RawImage", "lowfc.v1.ControlStep"}
     assert reader.complete
     assert reader.metadata == {**METADATA, "recording": {"messages": str(len(SENT))}}
     assert reader.attachments == {one.name: one.data for one in ATTACHMENTS}
@@ -167,7 +167,7 @@ def test_damage_is_found_and_can_be_left_out(tmp_path: Path) -> None:
     assert (damage.position, damage.length) == (begin, end - begin)
     assert damage.after_ns is not None
     assert damage.before_ns is not None
-    times = [m.log_time_ns for m in read]
+    times = [m.receive_time_ns for m in read]
     assert (damage.after_ns, damage.before_ns) in pairwise(times)
     assert damage.before_ns - damage.after_ns == max(b - a for a, b in pairwise(times))
 
@@ -282,7 +282,7 @@ def test_records_that_contradict_what_vouches_for_them_are_damage(
     with pytest.raises(DataFileError, match=said):
         list(LogReader(path))
     reader = LogReader(path, skip_damaged=True)
-    assert [(one.schema, one.sequence) for one in reader] == [
+    assert [(reader.schema_of(one), one.sequence) for one in reader] == [
         ("lowfc.v1.ControlStep", sequence_of(7, count)) for count in delivered
     ]
     assert len(reader.damage) + reader.unreadable == 1

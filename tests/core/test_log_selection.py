@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.logs.history import read_history
 from lowfc.adapters.logs.parts import WholeLog
-from lowfc.adapters.logs.reader import Logged, LogReader
+from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.selection import EVERYTHING, Selection, selection
 from lowfc.adapters.logs.thinning import thin
 from lowfc.contract.configuration import load
@@ -57,7 +58,7 @@ def small(whole: Path) -> Path:
     return out
 
 
-def of(messages: list[Logged], topic: Topic) -> list[Logged]:
+def of(messages: list[Sample], topic: Topic) -> list[Sample]:
     return [message for message in messages if topic.matches(message.key)]
 
 

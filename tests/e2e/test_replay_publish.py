@@ -14,7 +14,7 @@ import pytest
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.bus.run import Run, new_run_id, open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
-from lowfc.adapters.logs.reader import Logged, LogReader
+from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.terminal import INTERRUPTED
 from lowfc.contract.errors import BusError, ConfigurationError, DataFileError
@@ -46,7 +46,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def logged(log: Path) -> dict[str, list[Logged]]:
+def logged(log: Path) -> dict[str, list[Sample]]:
     found = defaultdict(list)
     for message in LogReader(log):
         found[message.key].append(message)
@@ -91,7 +91,7 @@ def figures_of(process: "subprocess.Popen[str]", status: int = 0) -> dict[str, A
     return figures
 
 
-def test_a_tool_sees_the_night_again(log: Path, logged: dict[str, list[Logged]], run: Run, tool: Tool) -> None:
+def test_a_tool_sees_the_night_again(log: Path, logged: dict[str, list[Sample]], run: Run, tool: Tool) -> None:
     begun_ns = tool.bus.clock.host_ns()
     playing = start(log, run, "--speed", "2")
     until(lambda: tool.heard[FRAME.key] or playing.poll() is not None)
@@ -108,7 +108,7 @@ def test_a_tool_sees_the_night_again(log: Path, logged: dict[str, list[Logged]],
         times = [sample.publish_time_ns for sample in heard]
         assert times == sorted(times)
         assert times[0] > begun_ns, "the time of publication is that of today"
-        span_ns = sent[-1].log_time_ns - sent[0].log_time_ns
+        span_ns = sent[-1].receive_time_ns - sent[0].receive_time_ns
         assert times[-1] - times[0] > 0.9 * span_ns / 2, "played in its own time, twice as fast"
     frames = {sample.sequence for sample in tool.heard[FRAME.key]}
     joined = {wire.ControlStep.FromString(sample.payload).frame_sequence for sample in tool.heard[STEP.key]}
@@ -144,7 +144,7 @@ def test_a_truncated_log_faster_with_commands(log: Path, run: Run, tool: Tool, t
     assert figures["took_s"] < figures["span_s"] * 0.9 or figures["messages_behind"]
 
 
-def test_a_controller_under_test(log: Path, logged: dict[str, list[Logged]], run: Run, tool: Tool, tmp_path: Path):
+def test_a_controller_under_test(log: Path, logged: dict[str, list[Sample]], run: Run, tool: Tool, tmp_path: Path):
     next(iter(reader := LogReader(log)))
     for name, content in reader.attachments.items():
         (tmp_path / name).write_bytes(content)

@@ -11,7 +11,8 @@ from hypothesis import settings as effort
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
-from lowfc.adapters.logs.reader import Logged, LogReader
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.process import compiled
 from lowfc.adapters.process.provenance import provenance
 from lowfc.contract.codecs import codec
@@ -63,7 +64,7 @@ class Night:
     """A log as the controller's process and its neighbours make it, from a list of inputs."""
 
     def __init__(self, what: Settings) -> None:
-        self.messages: list[Logged] = []
+        self.messages: list[Sample] = []
         self.what = what
         self.start_s = START_S
         self.now_ns = START_S * 10**9
@@ -118,14 +119,14 @@ class Night:
         if taken.pixels is not None:
             message = image(taken.pixels, taken.time_ns, "sensor")
         payload = message.SerializeToString()
-        self.messages.append(Logged(FRAME.key, "", payload, taken.sequence, self.now_ns, self.now_ns))
+        self.messages.append(Sample(FRAME.key, payload, taken.sequence, self.now_ns, self.now_ns))
 
     def _put(self, topic: Topic, payload: bytes, name: str = "") -> None:
         key = topic.at(name)
         count = self._counts.get((key, self.start_s), 0)
         self._counts[key, self.start_s] = count + 1
         sequence = sequence_of(self.start_s, count)
-        self.messages.append(Logged(key, "", payload, sequence, self.now_ns, self.now_ns))
+        self.messages.append(Sample(key, payload, sequence, self.now_ns, self.now_ns))
 
 
 def night(taken: list[Input], **changes: object) -> Night:
@@ -194,7 +195,7 @@ def test_a_law_that_is_overruled_is_replayed_to_the_bit_also_from_the_middle_of_
     assert account.identical
     for first in (300, 640, 800):
         cut = [message for message in made.messages if message.key in (CALIBRATION.key, LAW.key)]
-        cut += [message for message in made.messages if message.log_time_ns >= told[first].log_time_ns]
+        cut += [message for message in made.messages if message.receive_time_ns >= told[first].receive_time_ns]
         account = replay(cut)
         assert account.identical
         assert account.frames >= 860 - first - 2 * STATE_EVERY
@@ -220,10 +221,10 @@ def test_the_order_between_publishers_does_not_matter(taken: list[Input], random
     made = night([*taken, *frames(20, 5000)])
     late_ns = {True: random.randrange(PATIENCE_NS // 2), False: random.randrange(PATIENCE_NS // 2)}  # type: ignore[attr-defined]
     late = [
-        message._replace(log_time_ns=message.log_time_ns + late_ns[message.key == FRAME.key])
+        message._replace(receive_time_ns=message.receive_time_ns + late_ns[message.key == FRAME.key])
         for message in made.messages
     ]
-    shuffled = sorted(late, key=lambda message: message.log_time_ns)
+    shuffled = sorted(late, key=lambda message: message.receive_time_ns)
     account = replay(shuffled)
     assert account.identical
     assert account.frames == made.steps()
@@ -251,16 +252,17 @@ def test_shares_are_together_what_the_whole_is(
     made.restart()
     for one in of_another_camera([*after, *frames(60, 9000)]):
         made.take(one)
-    begun_ns = made.messages[0].log_time_ns
+    begun_ns = made.messages[0].receive_time_ns
     messages = [
-        message._replace(log_time_ns=begun_ns + slower * (message.log_time_ns - begun_ns)) for message in made.messages
+        message._replace(receive_time_ns=begun_ns + slower * (message.receive_time_ns - begun_ns))
+        for message in made.messages
     ]
     for place, count in holes:
         first = int(place * (len(messages) - 1))
         states = [index for index, message in enumerate(messages) if message.key == CONTROLLER_STATE.key]
         gone = [index for index in (states if only_states else range(len(messages))) if index >= first][:count]
         messages = [message for index, message in enumerate(messages) if index not in gone]
-    span_ns = messages[-1].log_time_ns - messages[0].log_time_ns if messages else 0
+    span_ns = messages[-1].receive_time_ns - messages[0].receive_time_ns if messages else 0
     edges = sorted({begun_ns + 1 + int(cut * span_ns) for cut in cuts})
     whole = replay(messages)
     parts = [replay(messages, share=Share(begin, end)) for begin, end in pairwise([0, *edges, 1 << 63])]
@@ -296,7 +298,7 @@ def test_a_recording_that_begins_in_the_middle_of_a_run_lacks_no_input() -> None
     head = [message for message in made if message.key == CALIBRATION.key]
     later = made[len(made) // 2 :]
     state = [message for message in made[: len(made) // 2] if message.key == CONTROLLER_STATE.key][-2]
-    account = replay([*head, state._replace(log_time_ns=later[0].log_time_ns), *later])
+    account = replay([*head, state._replace(receive_time_ns=later[0].receive_time_ns), *later])
     assert account.identical
     assert list(account.unchecked_because) == ["recorded before the first complete state of the controller"]
     assert account.inputs_missing == 0
@@ -379,7 +381,7 @@ def test_a_log_from_before_inputs_were_numbered_is_refused() -> None:
     made = night(frames(3))
     with pytest.raises(DataFileError, match="the steps in this log are not numbered"):
         tampered(made, STEP, 0, "body.input_number = 0")
-    made.messages.append(Logged(REQUEST.key, "", wire.Request(name="gain").SerializeToString(), 0, 0, 0))
+    made.messages.append(Sample(REQUEST.key, wire.Request(name="gain").SerializeToString(), 0, 0, 0))
     assert replay(made.messages).identical
 
 

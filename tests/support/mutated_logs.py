@@ -12,7 +12,6 @@ from google.protobuf.message import Message
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from lowfc.adapters.bus.bus import Sample
-from lowfc.adapters.logs.reader import Logged
 from lowfc.adapters.logs.writer import Attachment, LogWriter
 from lowfc.contract.envelope import sequence_of
 from lowfc.contract.messages import EVENT, FRAME, HEALTH, STEP, SURFACE, image, timestamp, wire
@@ -61,12 +60,9 @@ def small_log(path: Path, *, finished: bool = True) -> Path:
     return log.part
 
 
-def identity(messages: list[Logged] | list[Sample]) -> list[tuple[str, bytes, int, int, int]]:
+def identity(messages: list[Sample]) -> list[tuple[str, bytes, int, int, int]]:
     """What a message is, as it was sent or as it was read."""
-    return [
-        (m.key, m.payload, m.sequence, m.publish_time_ns, m.log_time_ns if isinstance(m, Logged) else m.receive_time_ns)
-        for m in messages
-    ]
+    return [(m.key, m.payload, m.sequence, m.publish_time_ns, m.receive_time_ns) for m in messages]
 
 
 def boundaries(data: bytes) -> list[int]:

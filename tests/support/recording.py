@@ -3,8 +3,8 @@
 import threading
 from pathlib import Path
 
-from lowfc.adapters.bus.bus import Publisher
-from lowfc.adapters.logs.reader import Logged, LogReader
+from lowfc.adapters.bus.bus import Publisher, Sample
+from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.service import Service
 from lowfc.contract.messages import EVENT, Log, Topic
@@ -58,9 +58,9 @@ def put(publisher: Publisher, count: int) -> list[bytes]:
     return bodies
 
 
-def logged(summary: Summary) -> list[Logged]:
+def logged(summary: Summary) -> list[Sample]:
     return [message for path in summary.files for message in LogReader(path)]
 
 
-def bodies_of(messages: list[Logged], topic: Topic) -> list[bytes]:
+def bodies_of(messages: list[Sample], topic: Topic) -> list[bytes]:
     return [message.payload for message in messages if message.key == topic.key]

@@ -12,7 +12,7 @@ from typing import Any, cast
 import numpy as np
 from google.protobuf.message import DecodeError
 
-from lowfc.adapters.bus.bus import name_in
+from lowfc.adapters.bus.bus import Sample, name_in
 from lowfc.adapters.logs.columns import (
     Columns,
     StepRows,
@@ -27,7 +27,7 @@ from lowfc.adapters.logs.columns import (
     rows_of,
 )
 from lowfc.adapters.logs.parts import WholeLog
-from lowfc.adapters.logs.reader import Logged, LogReader
+from lowfc.adapters.logs.reader import LogReader
 from lowfc.arrays import Long, Sequences, Single
 from lowfc.contract.codecs.calibration_codec import decode_calibration
 from lowfc.contract.codecs.codec import actuators
@@ -204,14 +204,14 @@ class _Rows:
         self._mirror = Columns(sequence="Q", publish_time_ns="q", stroke_nm="f", limits="q")
         self._steps, self._truths = StepRows(0), TruthRows(0)
 
-    def take(self, message: Logged) -> None:
+    def take(self, message: Sample) -> None:
         """Take one message of the log."""
         history = self._history
-        if max(message.log_time_ns, message.publish_time_ns) > _LAST_NS:
+        if max(message.receive_time_ns, message.publish_time_ns) > _LAST_NS:
             history.left_out += 1
             return
         first_ns, _ = history.span_ns
-        history.span_ns = (first_ns or message.log_time_ns, message.log_time_ns)
+        history.span_ns = (first_ns or message.receive_time_ns, message.receive_time_ns)
         history.counts[message.key] += 1
         try:
             self._decode(message)
@@ -220,7 +220,7 @@ class _Rows:
         except OverflowError:
             history.left_out += 1  # protobuf allows it, and nobody of the loop sends it
 
-    def _decode(self, message: Logged) -> None:
+    def _decode(self, message: Sample) -> None:
         topic, history = topic_of(message.key), self._history
         if topic is FRAME:
             self._frames.add(sequence=message.sequence, publish_ns=message.publish_time_ns)
@@ -250,7 +250,7 @@ class _Rows:
         elif isinstance(body, wire.Health):
             history.health[name_in(HEALTH, message.key)] = body
         elif isinstance(body, Log):
-            history.events.append((message.log_time_ns, body))
+            history.events.append((message.receive_time_ns, body))
 
     def _mirror_state(self, state: wire.MirrorState, publish_time_ns: int) -> None:
         surface = actuators(state)

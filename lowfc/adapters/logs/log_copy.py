@@ -10,8 +10,9 @@ from mcap.records import Attachment, Metadata
 from mcap.writer import CompressionType, Writer
 
 from lowfc import __version__
+from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.files.whole_file import being_written
-from lowfc.adapters.logs.reader import Logged, LogReader
+from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.writer import CHUNK_BYTES
 from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.errors import DataFileError
@@ -47,7 +48,7 @@ class LogCopy:
         self,
         reader: LogReader,
         *,
-        wanted: Callable[[Logged], bool] = lambda message: True,
+        wanted: Callable[[Sample], bool] = lambda message: True,
         described: Callable[[Metadata | Attachment], bool] = lambda record: True,
     ) -> None:
         """Copy messages that are `wanted` of a file that has not been read, and where it stands what describes it."""
@@ -63,7 +64,7 @@ class LogCopy:
         """Write the index."""
         self._writer.finish()  # type: ignore[no-untyped-call]
 
-    def _add(self, reader: LogReader, message: Logged) -> None:
+    def _add(self, reader: LogReader, message: Sample) -> None:
         name = message.key, start_of(message.sequence)
         if name not in self._channels:
             channel = reader.channels[name]
@@ -76,7 +77,7 @@ class LogCopy:
             )
         self._writer.add_message(
             channel_id=self._channels[name],
-            log_time=message.log_time_ns,
+            log_time=message.receive_time_ns,
             publish_time=message.publish_time_ns,
             sequence=count_of(message.sequence),
             data=message.payload,

@@ -8,8 +8,9 @@ from typing import Any
 
 from mcap.records import Attachment, Metadata
 
+from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.logs.chunk import Chunk
-from lowfc.adapters.logs.reader import Logged, LogReader
+from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.records import LogFile
 from lowfc.adapters.logs.writer import PART
 from lowfc.contract.configuration import Recorder
@@ -38,7 +39,7 @@ class Repeated:
         """The messages of another file follow."""
         self._before = dict(self._newest)
 
-    def __call__(self, message: Logged) -> bool:
+    def __call__(self, message: Sample) -> bool:
         """Whether this message was in the files before."""
         with contextlib.suppress(KeyError):
             if topic_of(message.key).queryable:
@@ -64,7 +65,7 @@ class WholeLog(LogReader):
         self.parts: list[LogReader] = []
         self._options = options
 
-    def __iter__(self) -> Generator[Logged, None, None]:
+    def __iter__(self) -> Generator[Sample, None, None]:
         """Messages in the order they were recorded; a reader reads once."""
         if len(self.paths) == 1:
             self.parts.append(self)

@@ -4,41 +4,21 @@ import re
 import struct
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata, Schema
 
+from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.logs.chunk import Chunk, UnsoundError
 from lowfc.adapters.logs.records import HEAD, Damage, LogFile, parsed
 from lowfc.adapters.logs.selection import Selection
 from lowfc.adapters.logs.writer import START_KEY
-from lowfc.contract.envelope import COUNT_BITS, sequence_of
+from lowfc.contract.envelope import COUNT_BITS, sequence_of, start_of
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import Topic
 
 _BEGINNING = 64  # bytes of a chunk, with the first message's times: a night has too many chunks for 32 bits of CRC
 _MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, count, log time, publish time
-
-
-class Logged(NamedTuple):
-    """One message of a log.
-
-    Attributes:
-        key: where it was published; the log's topic without the leading slash.
-        schema: full name of its protobuf message.
-        payload: as it was on the bus.
-        sequence: see `Envelope`.
-        publish_time_ns: when it was sent.
-        log_time_ns: when the recorder received it.
-    """
-
-    key: str
-    schema: str
-    payload: bytes
-    sequence: int
-    publish_time_ns: int
-    log_time_ns: int
 
 
 class LogReader:
@@ -101,7 +81,7 @@ class LogReader:
         self._always = always
         self._sparse = sparse
         self._declared: dict[int, Channel] = {}
-        self._wanted: dict[int, tuple[str, str, int] | None] = {}
+        self._wanted: dict[int, tuple[str, int] | None] = {}
         self._chunks: set[int] = set()
         self._last_ns: int | None = None
         self._spanned = 0
@@ -122,7 +102,7 @@ class LogReader:
         """What the log was made to hold."""
         return Selection.of(self.metadata)
 
-    def __iter__(self) -> Iterator[Logged]:
+    def __iter__(self) -> Iterator[Sample]:
         """Messages in the order they were recorded; a reader reads once."""
         with LogFile(self.path) as file:
             self.size, self.finished, self._file = file.size, file.finished, file
@@ -156,7 +136,7 @@ class LogReader:
             return any(topic.matches(key) for topic in self._always for key in keys)
         return not self._sparse or any(self._wanted[number] for number in channels)
 
-    def _chunk(self, chunk: Chunk) -> list[Logged]:
+    def _chunk(self, chunk: Chunk) -> list[Sample]:
         """Messages of a chunk, unless it is not in its place."""
         identity = hash((chunk.crc, chunk.content[:_BEGINNING]))
         try:
@@ -171,28 +151,28 @@ class LogReader:
             raise self._error(chunk.position, "what declares its messages is not there")
         if messages:
             for damage in self.damage[self._spanned :]:
-                damage.before_ns = messages[0].log_time_ns
+                damage.before_ns = messages[0].receive_time_ns
             self._spanned = len(self.damage)
-            self._last_ns = messages[-1].log_time_ns
+            self._last_ns = messages[-1].receive_time_ns
         return messages
 
-    def _messages(self, content: bytes) -> list[Logged]:
+    def _messages(self, content: bytes) -> list[Sample]:
         """Messages in a chunk that are wanted; what it declares is remembered."""
-        found: list[Logged] = []
+        found: list[Sample] = []
         wanted, at, end = self._wanted, 0, len(content)
-        read_head, read_message, logged = HEAD.unpack_from, _MESSAGE_HEAD.unpack_from, Logged._make
+        read_head, read_message, logged = HEAD.unpack_from, _MESSAGE_HEAD.unpack_from, Sample._make
         message_opcode, head_bytes, message_bytes = int(Opcode.MESSAGE), HEAD.size, HEAD.size + _MESSAGE_HEAD.size
         try:
             while at < end:
                 opcode, length = read_head(content, at)
                 begin, at = at, at + head_bytes + length
                 if opcode == message_opcode:
-                    number, count, log_time_ns, publish_time_ns = read_message(content, begin + head_bytes)
+                    number, count, receive_time_ns, publish_time_ns = read_message(content, begin + head_bytes)
                     channel = wanted.get(number)
                     if channel is not None:
-                        key, schema, start = channel
+                        key, start = channel
                         payload = content[begin + message_bytes : at]
-                        found.append(logged((key, schema, payload, start | count, publish_time_ns, log_time_ns)))
+                        found.append(logged((key, payload, start | count, publish_time_ns, receive_time_ns)))
                     elif number not in wanted:
                         self.unreadable += 1
                 elif opcode == Opcode.SCHEMA:
@@ -221,8 +201,11 @@ class LogReader:
         key = channel.topic.removeprefix("/")
         self.channels[key, start_s] = channel
         asked = self._topics is None or any(topic.matches(key) for topic in self._topics)
-        schema = self.schemas[channel.schema_id].name
-        self._wanted[channel.id] = (key, schema, sequence_of(start_s, 0)) if asked else None
+        self._wanted[channel.id] = (key, sequence_of(start_s, 0)) if asked else None
+
+    def schema_of(self, message: Sample) -> str:
+        """Full name of a delivered message's protobuf message."""
+        return self.schemas[self.channels[message.key, start_of(message.sequence)].schema_id].name
 
     def _leave_out(self, damage: Damage) -> None:
         if not self._skip_damaged:

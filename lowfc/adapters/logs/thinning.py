@@ -6,9 +6,9 @@ from pathlib import Path
 
 from mcap.records import Attachment, Metadata
 
+from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.logs.log_copy import LogCopy, new_log
 from lowfc.adapters.logs.parts import Parts, WholeLog, metadata_at_start
-from lowfc.adapters.logs.reader import Logged
 from lowfc.adapters.logs.recovery import RECOVERY, account, faults, in_words, no_end
 from lowfc.adapters.logs.selection import SELECTION, Selection
 from lowfc.adapters.logs.writer import PART, stem_of
@@ -58,7 +58,7 @@ def thin(log: Parts, out: Path, asked: Selection, progress: Callable[[int, int],
     reader.progress = progress
     described: set[str] = {PART, SELECTION}  # the copy has its own
 
-    def wanted(message: Logged) -> bool:
+    def wanted(message: Sample) -> bool:
         nonlocal messages
         messages += 1
         return made.keeps(topic_of(message.key), message.sequence, message.payload)

@@ -16,7 +16,6 @@ from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.logs.history import attached_configuration
 from lowfc.adapters.logs.loss_account import LossAccount
 from lowfc.adapters.logs.parts import LogFiles, WholeLog
-from lowfc.adapters.logs.reader import Logged
 from lowfc.adapters.logs.recovery import RECOVERY
 from lowfc.adapters.logs.selection import EVERYTHING, Selection
 from lowfc.adapters.logs.writer import being_recorded
@@ -54,7 +53,7 @@ class Digest:
         self._states: dict[str, dict[int, tuple[int, bytes]]] = {}
         self._first_frame_ns: int | None = None
 
-    def enter(self, topic: Topic, message: Logged) -> None:
+    def enter(self, topic: Topic, message: Sample) -> None:
         """Take the next message of a log."""
         if not topic.deterministic:
             return
@@ -124,10 +123,10 @@ class _Account:
         self._begin_ns: int | None = None
         self._end_ns = 0
 
-    def enter(self, topic: Topic | None, message: Logged) -> None:
+    def enter(self, topic: Topic | None, message: Sample, schema: str) -> None:
         """Take account of one message."""
-        now_ns = message.log_time_ns
-        line = self._lines.setdefault(message.key, _Line(message.schema, now_ns, now_ns))
+        now_ns = message.receive_time_ns
+        line = self._lines.setdefault(message.key, _Line(schema, now_ns, now_ns))
         line.messages += 1
         line.size += len(message.payload)
         line.first_ns, line.last_ns = min(line.first_ns, now_ns), max(line.last_ns, now_ns)
@@ -136,19 +135,18 @@ class _Account:
         self._end_ns = max(self._end_ns, now_ns)
         if not topic.queryable and (self._begin_ns is None or now_ns < self._begin_ns):
             self._begin_ns = now_ns  # what was asked for at the log's beginning may be hours old
-        sample = Sample(message.key, message.payload, message.sequence, message.publish_time_ns, now_ns)
-        self._ledger.enter(topic, sample, recorded=True)
+        self._ledger.enter(topic, message, recorded=True)
         author = ""
         with contextlib.suppress(BadMessageError, DecodeError):  # it is in the log as it came
             if topic is HEALTH:
-                self._ledger.believe(sample, wire.Health.FromString(sample.payload))
+                self._ledger.believe(message, wire.Health.FromString(message.payload))
             elif topic is CONTROLLER_STATE:
-                number = wire.ControllerState.FromString(sample.payload).mode
+                number = wire.ControllerState.FromString(message.payload).mode
                 mode = _MODES.get(number, f"mode {number}")
                 if self._modes[-1:] != [mode]:
                     self._modes.append(mode)
             elif topic is EVENT:
-                event = Log.FromString(sample.payload)
+                event = Log.FromString(message.payload)
                 author = event.name  # of several publishers
                 if event.level >= Level.WARNING:
                     self._events[event.message.partition(" ")[0]] += 1
@@ -184,7 +182,7 @@ def survey(
         if not number:
             account = _Account(reader.selection)
         topic = _topic(message.key)
-        account.enter(topic, message)
+        account.enter(topic, message, reader.schema_of(message))
         if digest and topic is not None:
             found.enter(topic, message)
     configuration, remarks = attached_configuration(reader)

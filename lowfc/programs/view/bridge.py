@@ -208,7 +208,7 @@ def earlier_events(recorder: wire.Health | None, now_ns: int) -> list[Sample]:
             log = LogReader(
                 path if path.exists() or not part.exists() else part, topics=(EVENT,), skip_damaged=True, sparse=True
             )
-            found[:0] = [Sample(one.key, *one[2:]) for one in log]
+            found[:0] = log
         except DataFileError as fault:
             missing.append(_line(f"earlier events are missing here: {fault}", now_ns))
         if len(found) >= MOST_EARLIER:

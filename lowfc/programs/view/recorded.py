@@ -57,7 +57,7 @@ def draw_logs(
                 own = found or Configuration()
                 renderer = make_renderer(own)
                 accumulator = Accumulator(SimulatedClock().now_ns() if own.lockstep else None)
-                first_ns = message.log_time_ns
+                first_ns = message.receive_time_ns
             if number == 0:
                 recorded = reader.metadata.get("lowfc", {})
                 before, run, host = run, recorded.get("run", "") or run, host or recorded.get("host", "")
@@ -65,7 +65,7 @@ def draw_logs(
                     raise DataFileError(
                         f"{log} is of run {run!r}, and the log before it of {before!r}: look at one at a time"
                     )
-            last_ns = message.log_time_ns
+            last_ns = message.receive_time_ns
             accumulator.add(message)
             if last_ns >= due_ns:
                 snapshot = accumulator.snapshot(last_ns, complete=drawn.snapshots % PICTURES_PER_COMPLETE == 0)

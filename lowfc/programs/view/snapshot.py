@@ -10,7 +10,6 @@ from google.protobuf.message import DecodeError
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.bus.names import Names
 from lowfc.adapters.logs.columns import StepRows, Steps, TimingRows, TruthRows, Truths
-from lowfc.adapters.logs.reader import Logged
 from lowfc.arrays import Long, Mask, Pixels, Sequences, Single
 from lowfc.contract.codecs.calibration_codec import decode_calibration
 from lowfc.contract.codecs.codec import decode_frame
@@ -171,7 +170,7 @@ class Accumulator:
         self._sequences: dict[str, int] = {}
         self._data_ns = self._data_host_ns = 0
 
-    def add(self, message: Sample | Logged) -> None:
+    def add(self, message: Sample) -> None:
         """Add one message of one of `SHOWN`; a state that is older than the last one is left out."""
         key, sequence = message.key, message.sequence
         try:

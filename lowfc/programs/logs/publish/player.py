@@ -13,11 +13,11 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, TextColumn
 
-from lowfc.adapters.bus.bus import Publisher, name_in
+from lowfc.adapters.bus.bus import Publisher, Sample, name_in
 from lowfc.adapters.bus.run import Run, open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.logs.parts import WholeLog, titled
-from lowfc.adapters.logs.reader import Logged, LogReader
+from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.recovery import faults, no_end
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.progress import passing_bar
@@ -103,7 +103,7 @@ class Player:
                 if self._sent_ns >= show_ns:
                     show_ns = self._sent_ns + _SHOW_NS
                     self._service.beat()
-                    bar.update(task, completed=log.position, total=log.size, description=_utc(message.log_time_ns))
+                    bar.update(task, completed=log.position, total=log.size, description=_utc(message.receive_time_ns))
         if self._service.running and not self._at_once and not self._errors.count:
             raise DataFileError(f"{titled(log.paths)}: there is no message of the topics to play")
         p50_ns, p99_ns = self._errors.percentiles_ns(0.5, 0.99)
@@ -122,7 +122,7 @@ class Player:
             "interrupted": not self._service.running,
         }
 
-    def _play(self, message: Logged) -> None:
+    def _play(self, message: Sample) -> None:
         if message.key not in self._publishers:
             self._publishers[message.key] = self._publisher(message.key)
         publisher = self._publishers[message.key]
@@ -133,13 +133,13 @@ class Player:
             # A log begins with the calibration and states that were valid then, as old as they may be.
             self._at_once.add(message.key)
             publisher.put(message.payload, None, message.sequence)
-        elif not kept and message.log_time_ns < self._last_log_ns - _ORDER_NS:
+        elif not kept and message.receive_time_ns < self._last_log_ns - _ORDER_NS:
             raise DataFileError("a log begins before the log given before it ends; give them in the order of recording")
         else:
             self._send(publisher, message)
 
-    def _send(self, publisher: Publisher, message: Logged) -> None:
-        self._last_log_ns = max(self._last_log_ns, message.log_time_ns)
+    def _send(self, publisher: Publisher, message: Sample) -> None:
+        self._last_log_ns = max(self._last_log_ns, message.receive_time_ns)
         if not self._begun_ns:
             self._first_log_ns = self._last_log_ns
             self._begun_ns = self._sent_ns = self._clock.host_ns()

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from google.protobuf.message import Message
 
-from lowfc.adapters.logs.reader import Logged
+from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.process import compiled
 from lowfc.contract.codecs import codec
 from lowfc.contract.codecs.state_codec import controller_state, decode_state
@@ -34,7 +34,7 @@ _BEFORE = "recorded before the first complete state of the controller"
 class _Entry:
     """What the log has of one input of the controller, `taken`, and of the command that it gave rise to."""
 
-    log_time_ns: int
+    receive_time_ns: int
     taken: wire.ControlStep | wire.Request | wire.ControlInput | None = None
     taken_bytes: bytes = b""
     command: wire.MirrorCommand | None = None
@@ -107,13 +107,13 @@ class ControllerReplay:
         self._why = _BEFORE if begun_ns >= context.share.from_ns else ""
         self._counts = bool(self._why)
 
-    def take(self, message: Logged, kind: type[Message]) -> None:
+    def take(self, message: Sample, kind: type[Message]) -> None:
         """Take one of the controller's messages; the fold goes on as far as it can."""
         if self.done:
             return
         body = kind.FromString(message.payload)
         if isinstance(body, wire.ControllerState):
-            self._take_state(body, message.log_time_ns)
+            self._take_state(body, message.receive_time_ns)
         else:
             number: int = body.input_number  # type: ignore[attr-defined]  # all others of the controller have it
             if not number:  # a request that could not be read, a command of somebody else
@@ -129,14 +129,14 @@ class ControllerReplay:
                 return
             entry = self._entries.get(number)
             if entry is None:
-                entry = self._entries[number] = _Entry(message.log_time_ns)
+                entry = self._entries[number] = _Entry(message.receive_time_ns)
             if isinstance(body, wire.MirrorCommand):  # what it was made from comes after it
                 entry.command, entry.command_bytes = body, message.payload
                 return
             entry.taken, entry.taken_bytes = body, message.payload  # type: ignore[assignment]  # one of the three
             if isinstance(body, wire.ControlStep):
                 self._context.frames.note_step(body)
-        self.go_on(message.log_time_ns)
+        self.go_on(message.receive_time_ns)
 
     def _come_late(self, number: int, body: Message) -> None:
         """A message of an input that is behind: from before the state that was begun with, or there a second time."""
@@ -162,12 +162,12 @@ class ControllerReplay:
             entry = self._entries.get(number)
             if entry is None:
                 waiting = next(iter(self._entries.values()), None)
-                if waiting is None or not (ended or now_ns - waiting.log_time_ns > PATIENCE_NS):
+                if waiting is None or not (ended or now_ns - waiting.receive_time_ns > PATIENCE_NS):
                     return
                 earlier = self._first is not None and number < self._first  # than the recording
                 self._lose(_BEFORE if earlier else "after an input that the log does not have")
                 continue
-            late = ended or now_ns - entry.log_time_ns > PATIENCE_NS
+            late = ended or now_ns - entry.receive_time_ns > PATIENCE_NS
             if not late and entry.command is None and entry.commands and self._state.drive is not None:
                 return
             rule = changed_rule(entry.taken) if self._context.former is not None else ""
@@ -185,10 +185,10 @@ class ControllerReplay:
             else:
                 return
 
-    def _take_state(self, message: wire.ControllerState, log_time_ns: int) -> None:
-        if log_time_ns < self._context.share.from_ns:
+    def _take_state(self, message: wire.ControllerState, receive_time_ns: int) -> None:
+        if receive_time_ns < self._context.share.from_ns:
             return
-        if log_time_ns >= self._context.share.until_ns:
+        if receive_time_ns >= self._context.share.until_ns:
             self._last = message.input_number if self._last is None else min(self._last, message.input_number)
         past = next((state for state in self._past if state.input_number == message.input_number), None)
         if past is not None:
@@ -242,7 +242,7 @@ class ControllerReplay:
 
     def _forget(self, now_ns: int, *, ended: bool) -> None:
         """While there is no state to go on from, forget what the next one will not need, and states of no use."""
-        old = [number for number, entry in self._entries.items() if now_ns - entry.log_time_ns > 2 * PATIENCE_NS]
+        old = [number for number, entry in self._entries.items() if now_ns - entry.receive_time_ns > 2 * PATIENCE_NS]
         self._leave_out(max(self._entries if ended else old, default=0))
         while len(self._states) > _STATES_KEPT:
             del self._states[min(self._states)]

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 
 from google.protobuf.message import DecodeError
 
-from lowfc.adapters.logs.reader import Logged
+from lowfc.adapters.bus.bus import Sample
 from lowfc.contract import published
 from lowfc.contract.envelope import start_of
 from lowfc.contract.messages import COMMAND, CONTROL_INPUT, CONTROLLER_STATE, FRAME, REQUEST, STEP, topic_of
@@ -35,10 +35,10 @@ class Replay:
         """From the first frame of the share to its last, by their log times."""
         return (self._ended_ns - self._begun_ns) * 1e-9
 
-    def take(self, message: Logged) -> None:
+    def take(self, message: Sample) -> None:
         """Take the next message."""
         context, topic = self.context, topic_of(message.key)
-        self._last_ns = now_ns = message.log_time_ns
+        self._last_ns = now_ns = message.receive_time_ns
         if now_ns < context.share.from_ns - PATIENCE_NS and topic not in published.TOPICS:
             return
         inside = context.share.from_ns <= now_ns < context.share.until_ns
@@ -69,14 +69,14 @@ class Replay:
             controller.go_on(self._last_ns, ended=True)
         return self.context.account
 
-    def _controller(self, message: Logged) -> ControllerReplay:
+    def _controller(self, message: Sample) -> ControllerReplay:
         start_s = start_of(message.sequence)
         if start_s not in self._controllers:
-            self._controllers[start_s] = ControllerReplay(self.context, message.log_time_ns)
+            self._controllers[start_s] = ControllerReplay(self.context, message.receive_time_ns)
         return self._controllers[start_s]
 
 
-def replay(messages: Iterable[Logged], tolerance_nm: float = 0.0, share: Share = WHOLE, kernel: str = "") -> Account:
+def replay(messages: Iterable[Sample], tolerance_nm: float = 0.0, share: Share = WHOLE, kernel: str = "") -> Account:
     """Replay a log's messages from beginning to end, or a share of them."""
     run = Replay(tolerance_nm, share, kernel)
     for message in messages:

@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from google.protobuf.message import DecodeError
 
-from lowfc.adapters.logs.reader import Logged, LogReader
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.sequence_gaps import Gaps
 from lowfc.arrays import Array, Long, Single
 from lowfc.contract.codecs.codec import actuators
@@ -77,7 +78,7 @@ def read(folder: Path) -> Evidence:
         reader, last_ns = LogReader(path), 0
         try:
             for message in reader:
-                last_ns = message.log_time_ns
+                last_ns = message.receive_time_ns
                 _enter(found, message, number if reader.finished else None)
         except DataFileError as fault:
             found.unreadable.append(str(fault))
@@ -89,7 +90,7 @@ def read(folder: Path) -> Evidence:
     return found
 
 
-def _enter(found: Evidence, message: Logged, number: int | None) -> None:
+def _enter(found: Evidence, message: Sample, number: int | None) -> None:
     found.messages += 1
     start_s, count = start_of(message.sequence), count_of(message.sequence)
     if start_s <= FORGED_S:
@@ -106,6 +107,6 @@ def _enter(found: Evidence, message: Logged, number: int | None) -> None:
         return
     shape = actuators(decoded) if topic in (COMMAND, MIRROR_STATE) else _NONE
     if shape is not None:
-        found.entries[topic].append(Entry(message.sequence, message.log_time_ns, decoded, shape))
+        found.entries[topic].append(Entry(message.sequence, message.receive_time_ns, decoded, shape))
     if topic is HEALTH and decoded.state == "stopped" and number is not None:
         found.sent |= {(number, one.topic, start_s): one.published for one in decoded.topics if one.published}
