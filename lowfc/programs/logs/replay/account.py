@@ -1,15 +1,25 @@
-"""The account of a replay: what was checked, what differed, what could not be checked."""
+"""The result of a replay: what was checked, what differed, what could not be checked."""
 
 from collections import Counter
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Sequence
 from typing import Any
 
+from pydantic import Field, computed_field
+
+from lowfc.adapters.logs.recovery import faults
+from lowfc.contract.envelope import count_of
+from lowfc.control.loop.wording import counted
+from lowfc.programs.cli.result import Result
 from lowfc.programs.logs.replay.difference import Difference
 
+_SUMS = (
+    *("frames", "commands", "states", "requests", "steps", "unchecked_because", "rules_changed", "log_s"),
+    *("inputs_missing", "commands_missing", "different"),
+)
 
-@dataclass(slots=True)
-class Account:
-    """What a replay has found; the names are those of `--json`.
+
+class Account(Result):
+    """What a replay has found, and what the logs were like.
 
     Attributes:
         frames: steps that were checked; `commands`, `states` and `requests` likewise.
@@ -21,13 +31,19 @@ class Account:
             number in nm.
         other_kernel: arithmetic of the replay where the log's was another; empty where it was the same.
         rules_changed: inputs of another version's log that this version answers otherwise on purpose, by the rule.
+        version: that recorded the first log; `host_differs` is what of versions and processor is not as it was then.
+        log_s: from the first frame to the last; `speed` is that in parts of the time that the replay took.
+        complete: every log has its end; `no_end` is why not, `damaged` what was left out of them, a sentence each.
+        runs: names of the runs that are in the logs.
+        stopped: why a recording ended early, a sentence each.
+        recorded_on: versions and host, as the first log has them.
     """
 
     frames: int = 0
     commands: int = 0
     states: int = 0
     requests: int = 0
-    unchecked_because: Counter[str] = field(default_factory=Counter)
+    unchecked_because: Counter[str] = Field(default_factory=Counter)
     inputs_missing: int = 0
     commands_missing: int = 0
     steps: int = 0
@@ -35,34 +51,45 @@ class Account:
     first_difference: Difference | None = None
     largest_difference_nm: float = 0.0
     other_kernel: str = ""
-    rules_changed: Counter[str] = field(default_factory=Counter)
+    rules_changed: Counter[str] = Field(default_factory=Counter)
+    version: str = ""
+    tolerance_nm: float = 0.0
+    log_s: float = 0.0
+    speed: float = 0.0
+    complete: bool = True
+    no_end: str = ""
+    damaged: list[str] = Field([])
+    runs: list[str] = Field([])
+    stopped: list[str] = Field([])
+    host_differs: dict[str, tuple[str, str]] = Field({})
+    recorded_on: dict[str, str] = Field({}, exclude=True)
 
+    @computed_field  # type: ignore[prop-decorator]
     @property
     def unchecked(self) -> int:
         """Steps of the log that could not be checked."""
         return self.unchecked_because.total()
 
+    @computed_field  # type: ignore[prop-decorator]
     @property
     def identical(self) -> bool:
         """Whether steps and commands were checked by the log's own arithmetic, and nothing differed."""
         same = not self.different and not self.other_kernel
         return self.frames > 0 and same and (self.commands > 0 or not self.commands_missing)
 
-    def add(self, other: "Account") -> None:
-        """Add what was found in the next share."""
-        for one in fields(self):
-            mine, more = getattr(self, one.name), getattr(other, one.name)
-            if one.name == "largest_difference_nm":
-                setattr(self, one.name, max(mine, more))
-            else:
-                either = one.name in ("first_difference", "other_kernel")
-                setattr(self, one.name, mine or more if either else mine + more)
+    def add(self, later: "Account") -> None:
+        """Add what was found in the next share, whose worker has read the logs further."""
+        for name in _SUMS:
+            setattr(self, name, getattr(self, name) + getattr(later, name))
+        self.first_difference = self.first_difference or later.first_difference
+        self.other_kernel = self.other_kernel or later.other_kernel
+        self.largest_difference_nm = max(self.largest_difference_nm, later.largest_difference_nm)
+        self.damaged = sorted({*self.damaged, *later.damaged})
+        self.complete, self.runs, self.stopped = later.complete, later.runs, later.stopped
 
     def figures(self) -> dict[str, Any]:
-        """For a program."""
-        found = {one.name: getattr(self, one.name) for one in fields(self)}
-        found["first_difference"] = self.first_difference and asdict(self.first_difference)
-        return found | {"unchecked": self.unchecked, "identical": self.identical}
+        """All of them."""
+        return self.model_dump()
 
     def leave_out(self, why: str, steps: int) -> None:
         """Count steps that cannot be checked."""
@@ -77,3 +104,44 @@ class Account:
         if not found.within(tolerance_nm):
             self.different += 1
             self.first_difference = self.first_difference or found
+
+    def head(self) -> Sequence[str]:
+        """The verdict, and what was checked."""
+        frames = f"{self.frames} frames"
+        if not self.frames:
+            verdict = "nothing could be replayed"
+        elif self.other_kernel:
+            verdict = f"{frames}, computed by {self.other_kernel}: not the same kernel as the log's"
+        elif self.identical:
+            verdict = f"{frames}, commands identical" + (
+                f" within {self.tolerance_nm:g} nm" if self.tolerance_nm else ""
+            )
+        elif not self.different:
+            verdict = f"{frames}, steps identical, but no command is in the log"
+        else:
+            verdict = f"{frames}, {counted(self.different, 'message differs', 'messages differ')}"
+        return (
+            f"{verdict}, largest difference {self.largest_difference_nm:.3g} nm",
+            f"compared too       {counted(self.commands, 'command')}, {counted(self.states, 'state')}, "
+            f"{counted(self.requests, 'answer')}",
+        )
+
+    def remarks(self) -> Sequence[str]:
+        """What could not be checked, what differs, and how fast it was."""
+        missing = ((self.inputs_missing, "input"), (self.commands_missing, "command"))
+        lines = [f"answered otherwise {n} since {self.version}: {rule}" for rule, n in self.rules_changed.items()]
+        lines += [f"unchecked          {counted(n, 'step')} {why}" for why, n in self.unchecked_because.items()]
+        lines += [f"missing            the log lacks {counted(n, what)} of the controller" for n, what in missing if n]
+        lines += faults(self.damaged, self.no_end)
+        lines += [f"recording stopped  {why}" for why in self.stopped]
+        if len(self.runs) > 1:
+            lines.append(f"of several runs    {', '.join(self.runs)}")
+        if first := self.first_difference:
+            lines.append(
+                f"first difference   {first.message} of frame {count_of(first.frame_sequence)} "
+                f"(sequence {first.frame_sequence}), input {first.taken} of the controller"
+            )
+            lines += [f"                   {line}" for line in first.fields]
+        for key, (there, here) in self.host_differs.items():
+            lines.append(f"{key:18} {there or 'none'} in the log, {here or 'none'} here")
+        return [*lines, f"speed              {self.log_s:.1f} s of log, {self.speed:.1f} times as fast as it was"]

@@ -6,7 +6,6 @@ import multiprocessing
 import os
 import signal
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -32,31 +31,9 @@ _NEWS_EVERY = 5000
 Progress = Callable[[int], None]
 
 
-@dataclass(slots=True)
-class Outcome:
-    """What a replay has found, and what the logs were like.
-
-    Attributes:
-        complete: every log has its end.
-        damage: what was left out of the logs, a sentence each.
-        recorded_on: versions and host, as the first log has them.
-        runs: names of the runs that are in the logs.
-        stopped: why a recording ended early, a sentence each.
-        log_s: from the first frame to the last.
-    """
-
-    account: Account
-    complete: bool = True
-    damage: list[str] = field(default_factory=list)
-    recorded_on: dict[str, str] = field(default_factory=dict)
-    log_s: float = 0.0
-    runs: list[str] = field(default_factory=list)
-    stopped: list[str] = field(default_factory=list)
-
-
 def replay_files(
     paths: Sequence[Path], tolerance_nm: float, jobs: int, progress: Progress, kernel: str = ""
-) -> Outcome:
+) -> Account:
     """Replay logs that follow each other, in as many processes as `jobs`, 0 for one on every processor, at most.
 
     `progress` is called with the bytes replayed so far.
@@ -68,26 +45,22 @@ def replay_files(
     jobs = jobs or len(os.sched_getaffinity(0))
     count = min(_SHARES_PER_JOB * jobs, size // _WORTH_BYTES) if ends_ns and jobs > 1 else 1
     if count < 2:
-        outcomes = [_replay_share(paths, tolerance_nm, kernel, WHOLE, progress)]
+        accounts = [_replay_share(paths, tolerance_nm, kernel, WHOLE, progress)]
     else:
         edges = [0, *(ends_ns[len(ends_ns) * share // count] for share in range(1, count)), WHOLE.until_ns]
         shares = [Share(from_ns, until_ns) for from_ns, until_ns in pairwise(edges)]
-        outcomes = []
+        accounts = []
         # Ctrl-C is for the parent, which ends its workers.
         context = multiprocessing.get_context("spawn")
         with context.Pool(min(jobs, count), signal.signal, (signal.SIGINT, signal.SIG_IGN)) as pool:
-            for outcome in pool.imap(partial(_replay_share, paths, tolerance_nm, kernel), shares):
-                outcomes.append(outcome)
-                progress(size * len(outcomes) // count)
-    whole = outcomes[0]
-    for outcome in outcomes[1:]:
-        whole.account.add(outcome.account)
-        whole.log_s += outcome.log_s
-        whole.damage = sorted({*whole.damage, *outcome.damage})
-    last = outcomes[-1]  # its worker has read the logs to their end
-    whole.complete, whole.runs, whole.stopped = last.complete, sorted(set(last.runs)), last.stopped
-    unaccounted = whole.account.steps - whole.account.frames - sum(whole.account.unchecked_because.values())
-    whole.account.leave_out("without a state of the controller before them", max(0, unaccounted))
+            for account in pool.imap(partial(_replay_share, paths, tolerance_nm, kernel), shares):
+                accounts.append(account)
+                progress(size * len(accounts) // count)
+    whole = accounts[0]
+    for account in accounts[1:]:
+        whole.add(account)
+    unaccounted = whole.steps - whole.frames - whole.unchecked
+    whole.leave_out("without a state of the controller before them", max(0, unaccounted))
     return whole
 
 
@@ -99,7 +72,7 @@ def _chunk_ends_ns(path: Path) -> list[int]:
 
 def _replay_share(
     paths: Sequence[Path], tolerance_nm: float, kernel: str, share: Share, progress: Progress = lambda done: None
-) -> Outcome:
+) -> Account:
     """Replay a share, on one thread as the live loop: more threads sum in another order."""
     run = Replay(tolerance_nm, share, kernel)
     log = WholeLog(
@@ -123,19 +96,16 @@ def _replay_share(
                     progress(log.position)
                 if run.done:
                     break
-            run.finish()
+            account = run.finish()
     finally:
         gc.enable()
     about = [(part.path.name, part.metadata) for part in log.parts]
-    return Outcome(
-        run.context.account,
-        log.complete,
-        [f"byte {one.position}: {one.why}" for one in log.damage],
-        about[0][1].get("lowfc", {}),
-        run.duration_s,
-        [metadata.get("lowfc", {}).get("run", "?") for _, metadata in about],
-        [f"{name}: {why}" for name, metadata in about if (why := metadata.get("recording", {}).get("stopped"))],
-    )
+    account.complete, account.log_s, account.recorded_on = log.complete, run.duration_s, about[0][1].get("lowfc", {})
+    account.damaged = [f"byte {one.position}: {one.why}" for one in log.damage]
+    account.runs = sorted({metadata.get("lowfc", {}).get("run", "?") for _, metadata in about})
+    stopped = [(name, metadata.get("recording", {}).get("stopped")) for name, metadata in about]
+    account.stopped = [f"{name}: {why}" for name, why in stopped if why]
+    return account
 
 
 def _refuse_thinned(reader: LogReader) -> None:
