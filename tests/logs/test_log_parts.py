@@ -22,7 +22,7 @@ from lowfc.contract.messages import CALIBRATION, CONTROLLER_STATE, FRAME, topic_
 from tests.support.loops import lowfc
 from tests.support.report_log import METADATA, Night
 
-FRAMES = 2600
+FRAMES = 2200
 TOML = [Attachment("config.toml", "application/toml", Configuration().to_toml().encode())]
 
 
@@ -48,7 +48,7 @@ def recorded(folder: Path, samples: Sequence[Sample], files: int, *, finish: boo
 def samples() -> list[Sample]:
     night = Night()
     night.request("close")
-    night.frames(FRAMES, lost=[700, 701])
+    night.frames(FRAMES, lost=[100, 101])
     return night.samples
 
 

@@ -17,7 +17,7 @@ from lowfc.contract.messages import CALIBRATION, CONTROLLER_STATE, EVENT, FRAME,
 from lowfc.control.laws.error_budget import sensor_noise
 from lowfc.control.loop.state import State
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
-from lowfc.programs.logs.report import closed_loop
+from lowfc.programs.logs.report import closed_loop, drawings
 from lowfc.programs.logs.report.figures import report_of
 from lowfc.programs.logs.report.page import NOT_HERE, page
 from lowfc.programs.logs.report.source import read_run
@@ -372,6 +372,7 @@ def test_text_of_a_log_is_no_markup(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     about = {name: f"{name} {MARKUP}" for name in (f"9 {MARKUP}", "host", "kernel", "processor", "git", "lowfc")}
     recording = {"messages_lost": MARKUP, f"lost {MARKUP}": MARKUP}
     monkeypatch.setattr(report_log, "METADATA", {"lowfc": about, "recording": recording})
+    monkeypatch.setattr(drawings, "_DRAWINGS", {"timeline": drawings._DRAWINGS["timeline"]})
     text = page(report_of(read_run(night.write(tmp_path / "x.mcap", finish=False))))
     assert "<script" not in text
     for digit in "123456789":
