@@ -2,16 +2,20 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.logs.writer import LogWriter
+from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.envelope import sequence_of
-from lowfc.contract.messages import STEP, TRUTH
+from lowfc.contract.messages import STEP, TIMING, TRUTH, wire
+from lowfc.programs.reliability.chaos.processes import CommandTimes
 from lowfc.programs.reliability.soak.figures import Usage, of_latency, of_process, render, slope, too_short
 from lowfc.programs.reliability.soak.run import LogChecker
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 
 SECONDS = 1800
 START_S = 1_800_000_000
@@ -74,6 +78,15 @@ def test_what_is_too_short_is_not_judged_and_has_not_passed() -> None:
     text = render(figures | {"latency": latency, "why": ["the camera's memory grow"]})
     assert "p50 502 us, +8.0 +- 0.0 us per hour" in text
     assert text.endswith("FAILED: the camera's memory grow")
+
+
+def test_latencies_are_those_that_the_controller_reports() -> None:
+    bus = MemoryBus(MemoryHub(), "launcher", HostClock())
+    times = CommandTimes(SimpleNamespace(bus=bus, left=SimpleNamespace(figures={})))
+    bus.publisher(TRUTH).put(wire.Truth(residual_rms_nm=9).SerializeToString())
+    bus.publisher(TIMING).put(wire.ControlTiming(frame_to_command_ns=[100_000, 300_000]).SerializeToString())
+    assert times.taken() == {"frames": 2, "p50_us": 200.0, "p99_us": 298.0}
+    assert times.taken() == {}
 
 
 def log(folder: Path, name: str, counts: dict[str, list[int]]) -> None:

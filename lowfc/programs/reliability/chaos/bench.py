@@ -25,7 +25,7 @@ from lowfc.adapters.process.clock import HostClock
 from lowfc.client import Client
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import LowfcError
-from lowfc.contract.messages import HEALTH, STEP, TRUTH, Role, Topic, topic_of, wire
+from lowfc.contract.messages import HEALTH, STEP, TRUTH, Role, topic_of, wire
 from lowfc.programs.launch.processes import program, start_all
 from lowfc.programs.launch.sim_loop import children_of, prepare
 
@@ -103,15 +103,13 @@ class ChaosBench:
         self._noted: set[int] = set()
         self.bus: ZenohBus | None = None
 
-    def begin(self, topic: Topic | None = None, receive: Callable[[Sample], None] | None = None) -> None:
-        """Start the processes, and wait for the loop to run quietly; messages of `topic` go to `receive`."""
+    def begin(self) -> None:
+        """Start the processes, and wait for the loop to run quietly."""
         self._started += self.children.values()
         start_all(self._started)
         self.bus = ZenohBus(self.run.links, Role.LAUNCHER, HostClock())
         for topic in (HEALTH, STEP, TRUTH):
             self.bus.subscribe(topic, self._receive)
-        if topic is not None and receive is not None:
-            self.bus.subscribe(topic, receive)
         self.wait(lambda: self._steps > 0, "the first frame", START_S)
         self.settled(_QUIET_FRAMES)
         self.mark("quiet")

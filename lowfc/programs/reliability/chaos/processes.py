@@ -98,7 +98,7 @@ def _stalled_viewer(bench: ChaosBench) -> None:
 
 
 class CommandTimes:
-    """Frame-to-command latencies over some spans of a case, among its figures."""
+    """Frame-to-command latencies of a bench that has begun; those noted are among the figures of its case."""
 
     def __init__(self, bench: ChaosBench) -> None:
         assert bench.bus is not None  # noqa: S101  # it has begun
@@ -107,14 +107,21 @@ class CommandTimes:
         bench.bus.subscribe(TIMING, self._receive)
         bench.left.figures["frame_to_command"] = self.found
 
+    def taken(self) -> dict[str, float]:
+        """How many frames have been timed since the last call, and their p50 and p99; empty where none has."""
+        latencies_ns, self._latencies_ns = self._latencies_ns, []
+        if not latencies_ns:
+            return {}
+        p50, p99 = (np.percentile(latencies_ns, (50, 99)) / 1e3).round(1).tolist()
+        return {"frames": len(latencies_ns), "p50_us": p50, "p99_us": p99}
+
     def note(self, name: str, seconds: float) -> None:
         """Listen for so long."""
         time.sleep(_AFTER_S)  # what is on its way belongs to the time before
-        self._latencies_ns.clear()
+        self.taken()
         time.sleep(seconds)
-        if self._latencies_ns:
-            p50, p99 = (np.percentile(self._latencies_ns, (50, 99)) / 1e3).round(1).tolist()
-            self.found[name] = {"frames": len(self._latencies_ns), "p50_us": p50, "p99_us": p99}
+        if found := self.taken():
+            self.found[name] = found
 
     def _receive(self, sample: Sample) -> None:
         self._latencies_ns.extend(wire.ControlTiming.FromString(sample.payload).frame_to_command_ns)

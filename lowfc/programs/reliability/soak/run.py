@@ -8,19 +8,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import psutil
-from google.protobuf.message import DecodeError
 
-from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.sequence_gaps import Gaps
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.envelope import count_of, start_of
-from lowfc.contract.messages import EVENT, FRAME, TIMING, Role, wire
+from lowfc.contract.messages import EVENT, FRAME, Role, wire
 from lowfc.programs.launch.sim_loop import check
 from lowfc.programs.launch.watch import topic_count
 from lowfc.programs.reliability.chaos.bench import ChaosBench
+from lowfc.programs.reliability.chaos.processes import CommandTimes
 from lowfc.programs.reliability.soak.figures import Usage, of_latency, of_process, too_short
 
 LOOK_S = 1.0
@@ -63,11 +61,7 @@ class _Soak:
         self.checker = LogChecker(bench.folder)
         self.usage: dict[str, list[Usage]] = {}
         self.latency: list[tuple[float, float, float]] = []
-        self._latencies_ns: list[int] = []
-
-    def receive_timing(self, sample: Sample) -> None:
-        with contextlib.suppress(DecodeError):
-            self._latencies_ns += wire.ControlTiming.FromString(sample.payload).frame_to_command_ns
+        self._times = CommandTimes(bench)
 
     def look(self, now_s: float) -> None:
         """Sample processes and latency, and check finished logs."""
@@ -79,10 +73,8 @@ class _Soak:
                 process = psutil.Process(child.process.pid)
                 used = Usage(now_s, process.memory_info().rss, process.num_fds(), process.num_threads())
                 self.usage.setdefault(child.name, []).append(used)
-        latencies_ns, self._latencies_ns = self._latencies_ns, []
-        if latencies_ns:
-            p50, p99 = (np.percentile(latencies_ns, (50, 99)) / 1e3).tolist()
-            self.latency.append((now_s, p50, p99))
+        if timed := self._times.taken():
+            self.latency.append((now_s, timed["p50_us"], timed["p99_us"]))
         self.checker.look()
 
     def figures(self, seconds: float, stopped_s: float, unfinished: list[str]) -> dict[str, Any]:
@@ -120,9 +112,9 @@ def soak_loop(config: Configuration, seconds: float, progress: Callable[[float],
     with tempfile.TemporaryDirectory(prefix="lowfc-soak-") as name:
         logged = config.model_copy(update={"recorder": config.recorder.model_copy(update={"folder": name})})
         bench = ChaosBench(logged, Path(name), random.Random(), None)  # noqa: S311  # nothing secret
-        soak = _Soak(bench)
         try:
-            bench.begin(TIMING, soak.receive_timing)
+            bench.begin()
+            soak = _Soak(bench)
             begun_s = time.monotonic()
             while (elapsed_s := time.monotonic() - begun_s) < seconds:
                 soak.look(elapsed_s)
