@@ -82,33 +82,22 @@ def test_what_was_heard_is_put_beside_what_was_sent() -> None:
     stages = {stage: np.array([0, 1, 3]) + value for stage, value in columns.items()}
     states = sequence[[0, 0, 3]], np.array([1200, 9999, 4200])  # the first one was said twice, the second one lost
     put_ns = np.array([1000, 2000, 3000, 4000])
-    found = join(sequence, put_ns, put_ns - 5, (timed, stages), states)
+    found = join(sequence, put_ns, put_ns - [5, 5, 5, 705], (timed, stages), states)
     assert found.commanded.tolist() == [True, True, False, True]
     expected_ns = {
         "frame_to_receive": [10, 11, np.nan, 13],
+        "receive_to_command": [90, 90, np.nan, 90],
         "frame_to_command": [100, 101, np.nan, 103],
         "compute": [30, 31, np.nan, 33],
+        "command_to_mirror": [100, np.nan, np.nan, 97],
         "frame_to_mirror": [200, np.nan, np.nan, 200],
-        "due_to_frame": [5, 5, 5, 5],
+        "due_to_frame": [5, 5, 5, 705],
+        "due_to_command": [105, 106, np.nan, 808],
+        "due_to_mirror": [205, np.nan, np.nan, 905],
     }
+    assert list(found.spans_us) == list(SPANS)
     for span, values_ns in expected_ns.items():
         np.testing.assert_allclose(found.spans_us[span] * 1e3, values_ns)
-
-
-def test_spans_of_a_late_source_count_from_the_moment_due() -> None:
-    spans = frames(3, late_us=[0, 0, 700]).spans_us
-    assert list(spans) == list(SPANS)
-    expected_us = {
-        "frame_to_command": [100, 100, 100],
-        "receive_to_command": [60, 60, 60],
-        "command_to_mirror": [50, 50, 50],
-        "frame_to_mirror": [150, 150, 150],
-        "due_to_frame": [0, 0, 700],
-        "due_to_command": [100, 100, 800],
-        "due_to_mirror": [150, 150, 850],
-    }
-    for span, values_us in expected_us.items():
-        np.testing.assert_allclose(spans[span], values_us)
     assert "due_to_command" not in frames(3, scheduled=False).spans_us
 
 
