@@ -11,7 +11,6 @@ Example:
 import argparse
 import os
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -114,14 +113,10 @@ def tables(result: Result) -> list[Lines]:
         without, frames = (sum(one[key] for one in each) for key in ("without_command", "frames"))
         lines.append([name, *cells, f"{without} of {frames}"])
     for name in (BETWEEN, READ):
-        ratios = [ranged(ratios_of(turns, name, span, at), "{:.2f}".format) for span in SPANS for at in AT]
+        each = [[turn[name][span][at] / turn[DIRECT][span][at] for turn in turns] for span in SPANS for at in AT]
+        ratios = [ranged(one, "{:.2f}".format) for one in each]
         lines.append([f"{name}: over {DIRECT}, turn by turn", *ratios, ""])
     return [lines]
-
-
-def ratios_of(turns: Sequence[Result], name: str, span: str, at: str) -> list[float]:
-    """Of that one over the direct link, of each turn."""
-    return [turn[name][span][at] / turn[DIRECT][span][at] for turn in turns]
 
 
 def about(result: Result) -> str:

@@ -17,7 +17,7 @@ from lowfc.adapters.files import factory
 from lowfc.adapters.process.clock import HostClock, SimulatedClock
 from lowfc.adapters.process.latch import Latch
 from lowfc.adapters.process.service import Service
-from lowfc.arrays import Array, Pixels
+from lowfc.arrays import Pixels
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.codecs.law_codec import wire_law
 from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
@@ -199,10 +199,6 @@ def rig(calibration: Calibration, scene: Scene) -> Iterator[Rig]:
         yield one
 
 
-def errors_of(steps: list[wire.ControlStep]) -> Array:
-    return np.array([step.error_nm for step in steps], float)
-
-
 def test_closing_the_loop_corrects_every_mode(rig: Rig) -> None:
     injected = 12.0 * np.array([1, -1] * 7)
     rig.inject(injected)
@@ -213,7 +209,7 @@ def test_closing_the_loop_corrects_every_mode(rig: Rig) -> None:
     last = rig.steps(20)
     assert all(step.mode == wire.LOOP_MODE_CLOSED for step in last)
     command = np.array([step.command_nm for step in last], float)
-    error = errors_of(last)
+    error = np.array([step.error_nm for step in last], float)
     # Noise through an integrator of gain 0.25 is correlated over some 7 frames.
     allowed = 4 * error.std(axis=0) / np.sqrt(20) * 2 + 0.03 * 12
     assert (np.abs(command.mean(axis=0) + injected) < allowed).all()

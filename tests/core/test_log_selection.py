@@ -149,13 +149,9 @@ def test_a_what_if_is_the_same(whole: Path, small: Path, tmp_path: Path) -> None
     for figures in found:
         del figures["log"]
     assert found[0] == found[1]
+    other = {"pinv": "weighted", "weighted": "pinv"}[read_history(WholeLog(small)).calibration.estimator]
     with pytest.raises(DataFileError, match=r"no other reconstructor can be tried.*other gains, leaks and limits can"):
-        what_if(LogReader(small), WhatIf(estimator="weighted" if _estimator(small) == "pinv" else "pinv"))
-
-
-def _estimator(log: Path) -> str:
-    calibration = read_history(WholeLog(log)).calibration
-    return calibration.estimator
+        what_if(LogReader(small), WhatIf(estimator=other))
 
 
 @pytest.mark.usefixtures("without_drawings")

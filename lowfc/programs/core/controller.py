@@ -142,7 +142,9 @@ class Controller:
             with self._turn:
                 self._between_frames(camera)
             if self._safe_signalled:
-                self._make_safe()
+                self._safe_signalled = False
+                now_ns = self._service.clock.now_ns()
+                self._enter(Request(now_ns, "safe", text="SIGUSR1", requester="a signal"))
             for _ in range(len(self._queries)):
                 self._answer(self._queries.popleft())
             while self._measured:
@@ -301,10 +303,6 @@ class Controller:
         """Make the loop safe as soon as the main thread gets there; to be called from a signal."""
         self._safe_signalled = True
         self._camera.wake()
-
-    def _make_safe(self) -> None:
-        self._safe_signalled = False
-        self._enter(Request(self._service.clock.now_ns(), "safe", text="SIGUSR1", requester="a signal"))
 
     def _keep_safe(self) -> None:
         """Let the latch follow the loop mode: after the answer, and by a thread of its own."""

@@ -41,7 +41,7 @@ class Watch:
 def summary(watch: Watch, record: bool, rate_hz: float) -> dict[str, Any]:
     """Figures of a run at this frame rate, from the last Health of each process."""
     camera, controller = watch.of(Role.CAMERA), watch.of(Role.CONTROLLER)
-    frames = topic_count(controller, FRAME.key)
+    frames, not_closed_s = topic_count(controller, FRAME.key), controller.not_closed_ns * 1e-9
     figures: dict[str, Any] = {
         "rate_hz": round(camera.mean_rate_hz, 2),
         "frames_published": topic_count(camera, FRAME.key).published,
@@ -51,8 +51,8 @@ def summary(watch: Watch, record: bool, rate_hz: float) -> dict[str, Any]:
         "commands_applied": camera.frame_to_mirror.count,
         "commands_late": camera.commands_late,
         "mode": mode_name(controller.mode),
-        "closed_fraction": _closed_fraction(controller.not_closed_ns * 1e-9, frames.received, rate_hz),
-        "not_closed_s": round(controller.not_closed_ns * 1e-9, 3),
+        "closed_fraction": round(max(0.0, 1 - not_closed_s * rate_hz / frames.received), 4) if frames.received else 0.0,
+        "not_closed_s": round(not_closed_s, 3),
         "not_closed_cause": controller.not_closed_cause,
         "messages_recorded": None,
         "messages_lost": None,
@@ -85,10 +85,6 @@ def summary(watch: Watch, record: bool, rate_hz: float) -> dict[str, Any]:
             "logs": list(recording.files),
         }
     return figures
-
-
-def _closed_fraction(not_closed_s: float, frames: int, rate_hz: float) -> float:
-    return round(max(0.0, 1 - not_closed_s * rate_hz / frames), 4) if frames else 0.0
 
 
 def wavefront(known: wire.WavefrontFigures) -> dict[str, Any]:

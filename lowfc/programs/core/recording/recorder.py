@@ -323,10 +323,6 @@ class Recorder:
                 return
             time.sleep(_TURN_S)
 
-    def _peers_recorded(self) -> bool:
-        own = {EVENT.key, HEALTH.at(self.service.name)}
-        return bool(self.service.last_health or self._peers.kept or set(self._account.recorded()) - own)
-
     def _close(self) -> Summary:
         while self._ending is not None:
             self._turn()
@@ -336,7 +332,9 @@ class Recorder:
         self._flush()
         try:
             self._series.end(self._figures())
-            if not (self._failure or self._peers_recorded()):
+            own = {EVENT.key, HEALTH.at(self.service.name)}
+            peers_recorded = self.service.last_health or self._peers.kept or set(self._account.recorded()) - own
+            if not (self._failure or peers_recorded):
                 self._series.remove()
         except DataFileError as fault:
             self._fail(fault)

@@ -143,7 +143,8 @@ def one_loop(asked: Asked, run: Run, children: list[Child] | None = None) -> dic
             joined = join(sent["sequence"], sent["put_ns"], sent["due_ns"], *received)
     figures = repeat_figures(joined)
     if traced:
-        figures["stalls"] = stalls_of(joined, asked.config.period_ns, {role: _trace(run, role) for role in traced})
+        traces: dict[str, Trace] = {role: Trace(*np.load(run.path / trace_file(role)).T) for role in traced}
+        figures["stalls"] = stalls_of(joined, asked.config.period_ns, traces)
     if "frame_to_command" not in figures["latency_us"]:
         raise BusError("the controller reported the timing of no frame after the warm-up; let the test last longer")
     controller, recording = watch.of(Role.CONTROLLER), watch.of(Role.RECORDER).recording
@@ -177,23 +178,15 @@ def _children(asked: Asked, run: Run) -> list[Child]:
     else:
         words = ["-m", "lowfc.programs.measure.frame_source", *_shared(run), "--seconds", str(seconds), *waits]
         children[0] = program(str(Role.CAMERA), words, run.path / f"{Role.CAMERA}.stderr")
-    if asked.trace:
-        children[1:1] = [_bare_loop(run, role, seconds) for role in TRACED]
+    for role in reversed(TRACED) if asked.trace else ():
+        words = ["-m", bare_loop.__name__, str(role), *_shared(run), "--seconds", str(seconds)]
+        children.insert(1, program(f"bare loop beside the {role}", words, run.path / f"bare-{role}.stderr"))
     return children
-
-
-def _bare_loop(run: Run, role: Role, seconds: float) -> Child:
-    words = ["-m", bare_loop.__name__, str(role), *_shared(run), "--seconds", str(seconds)]
-    return program(f"bare loop beside the {role}", words, run.path / f"bare-{role}.stderr")
 
 
 def _name_processes(run: Run, children: list[Child]) -> None:
     numbers = {child.name: child.process.pid for child in children if child.process is not None}
     write_whole(run.path / PROCESSES_FILE, json.dumps(numbers).encode())
-
-
-def _trace(run: Run, role: Role) -> Trace:
-    return Trace(*np.load(run.path / trace_file(role)).T)
 
 
 def _alone(asked: Asked, run: Run) -> dict[str, Any]:
