@@ -161,7 +161,7 @@ def test_what_cannot_be_recorded_is_refused_before_anything_is_made(
 ) -> None:
     monkeypatch.setattr("lowfc.programs.core.recording.process.step_back", lambda *_: NOTHING)
     done = lowfc("record", "--run", new_run_id(), *(str(option).format(tmp_path) for option in options))
-    assert complaint in str(done.exception)
+    assert (done.exception.exit_status, complaint in str(done.exception)) == (2, True)
     assert list(tmp_path.iterdir()) == []
 
 
