@@ -1,3 +1,4 @@
+import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -21,11 +22,18 @@ SMALL = TwinSpec(nodes=16, order=4, rank=40, guards=4)  # the real optics, coars
 HASH_OF_ONES = "a4449a9f81f26403e8a1f5dda2c0cbe7385184dc0b31b34b2b78eb5a92ba3eec"
 
 
-@pytest.fixture
-def stored(sensor, tmp_path):
-    twin = load_or_build(sensor, SMALL, cache_dir=tmp_path)
-    (path,) = tmp_path.iterdir()
+@pytest.fixture(scope="module")
+def built(sensor, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("built")
+    twin = load_or_build(sensor, SMALL, cache_dir=folder)
+    (path,) = folder.iterdir()
     return twin, path
+
+
+@pytest.fixture
+def stored(built, tmp_path):
+    twin, path = built
+    return twin, Path(shutil.copy(path, tmp_path))
 
 
 def same(first, second):
