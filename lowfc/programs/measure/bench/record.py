@@ -61,8 +61,15 @@ def bench_record(
 def measure(rates_hz: tuple[float, ...], seconds: float, folder: Path | None = None) -> dict[str, Any]:
     """Record at each rate for a time, into `folder`, which is left as it was.
 
-    rate_hz is as asked, offered_hz as sent; shares are of one processor, a ratio is the recorder's over that of copying
-    the payloads. BusError: the recorder did not get ready, or failed.
+    Returns:
+        host, payload_bytes_per_frame, copy_us_per_frame (processor time of copying the payloads) and rates, one for
+        each: rate_hz as asked and offered_hz as sent; seconds; cpu_share (of one processor) and publisher_cpu_share;
+        ratio (cpu_share over that of copying); messages_published, messages_recorded and messages_lost by the
+        recorder's account; log_bytes; and three stalls: longest_wait_ms (a message's arrival to its being written),
+        longest_unflushed_ms (arrival to its surviving a kill -9) and longest_write_ms (one write to the disk).
+
+    Raises:
+        BusError: the recorder did not get ready, or failed.
     """
     from rich.console import Console
 

@@ -16,9 +16,14 @@ Repeats = Sequence[Mapping[str, Any]]
 
 
 def together(repeats: Repeats) -> dict[str, Any]:
-    """Figures of all repeats: of each percentile the median (of max the largest), and as spread lowest and highest.
+    """Figures of all repeats.
 
-    memory_mb is the most of each process of a live loop; stalls are there where they were traced.
+    Returns:
+        latency_us and spread_us by span: median, and lowest and highest, over the repeats of each percentile (max: the
+        largest); echo_us{round_trip}, step_us, hot_step_us, timer_us, ratio (p50 and p99; see `RATIOS`) and ratio_hot,
+        its step of those back to back, and the same with _spread; histogram{edges_us, counts by span}; over_time of
+        each repeat; `COUNTS`, and reasons; memory_mb, the most of each process, of a live loop; repeats, the
+        percentiles of each; and stalls (`Stalls`) where they were traced.
     """
     spans = [span for span in repeats[0]["latency_us"] if all(span in one["latency_us"] for one in repeats)]
     each = {span: [one["latency_us"][span] for one in repeats] for span in spans}
@@ -52,7 +57,9 @@ def together(repeats: Repeats) -> dict[str, Any]:
 def of_kernels(repeats: Repeats) -> dict[str, Any]:
     """`together` of the repeats, where they are of one kernel; else of the fused step's, beside numpy's.
 
-    With both, kernel_ratio is frame to command of the fused step over numpy's, of repeats that followed each other.
+    Returns:
+        kernel: numpy, fused or both; with both, kernel_ratio (p50 and p99), frame to command of the fused step over
+        numpy's, the median of those that followed each other, kernel_ratio_spread, and numpy_us, numpy's own.
     """
     of = {name: [one for one in repeats if one["kernel"] == name] for name in KERNELS}
     if not all(of.values()):
@@ -81,10 +88,13 @@ def ratio(repeat: Mapping[str, Any], at: str, name: str = "ratio") -> float:
 
 
 def compare(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
-    """Two results side by side: rows of each span and percentile that both have, and of ratios; and counts.
+    """Two results side by side.
 
-    A ratio is b over a, a difference b minus a; spread is the larger of both ranges over the repeats, None for a single
-    one.
+    Returns:
+        rows, one for each span and percentile that both have, and for each ratio to what the host can do: name, at,
+        a, b, ratio (b over a), better ("a", "b" or "same"), difference (b minus a), spread (the larger of both ranges
+        over the repeats; None for a single one) and beyond_spread; unit is us, or empty for a ratio. And counts: of
+        each of `COUNTS` that both have, a and b.
     """
     both = (before, after)
     pairs = [
