@@ -1,6 +1,7 @@
 """Damaged and rewritten logs: no crash, no message that was not sent, and nothing is missing without a word."""
 
 import dataclasses
+import io
 import struct
 from itertools import pairwise
 from pathlib import Path
@@ -9,13 +10,13 @@ from typing import Any
 import pytest
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.reader import make_reader
 from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC as MAGIC
 from mcap.writer import CompressionType, Writer
 
 from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.logs.log_copy import LogCopy
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.records import LogFile
 from lowfc.adapters.logs.recovery import recover
@@ -121,28 +122,14 @@ def test_a_file_made_to_mislead_is_read_only_a_few_times(
     assert total < 12 * path.stat().st_size
 
 
-def rewritten(source: Path, out: Path, library: str | None = None, **options: Any) -> Path:
-    """The same log as Python's MCAP library writes it."""
-    with source.open("rb") as given, out.open("wb") as stream:
-        reader = make_reader(given)
-        writer = Writer(stream, chunk_size=8192, **options)
-        writer.start() if library is None else writer.start(library=library)
-        for one in reader.iter_metadata():
-            writer.add_metadata(one.name, one.metadata)
-        for one in reader.iter_attachments():
-            writer.add_attachment(one.create_time, one.log_time, one.name, one.media_type, one.data)
-        schemas: dict[int, int] = {}
-        channels: dict[int, int] = {}
-        for schema, channel, message in reader.iter_messages(log_time_order=False):
-            if schema.id not in schemas:
-                schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
-            if channel.id not in channels:
-                channels[channel.id] = writer.register_channel(
-                    channel.topic, channel.message_encoding, schemas[schema.id], channel.metadata
-                )
-            number = channels[channel.id]
-            writer.add_message(number, message.log_time, message.data, message.publish_time, message.sequence)
-        writer.finish()
+def rewritten(source: Path, out: Path, options: dict[str, Any]) -> Path:
+    """The same log, written by Python's MCAP library with other options."""
+    with out.open("wb") as stream:
+        copy = LogCopy(io.BytesIO())
+        copy._writer = Writer(stream, chunk_size=8192, **{k: v for k, v in options.items() if k != "library"})
+        copy._writer.start(library=options.get("library", "another tool"))
+        copy.take(LogReader(source))
+        copy.finish()
     return out
 
 
@@ -170,7 +157,7 @@ NO_CHUNKS = {"use_chunking": False}
     ids=str,
 )
 def test_a_rewritten_log_is_read_as_the_original(tmp_path: Path, source: Path, options: dict[str, Any]) -> None:
-    path = rewritten(source, tmp_path / "rewritten.mcap", **options)
+    path = rewritten(source, tmp_path / "rewritten.mcap", options)
     reader = LogReader(path)
     assert sorted(identity(list(reader))) == sorted(SENT)
     assert (reader.damage, reader.unreadable, reader.finished, reader.complete) == ([], 0, True, True)
@@ -186,7 +173,7 @@ def test_a_rewritten_log_is_read_as_the_original(tmp_path: Path, source: Path, o
 def test_of_a_damaged_one_only_the_damaged_chunk_is_lost(
     tmp_path: Path, source: Path, compression: CompressionType, at: int, finished: bool
 ) -> None:
-    path = rewritten(source, tmp_path / "rewritten.mcap", compression=compression)
+    path = rewritten(source, tmp_path / "rewritten.mcap", {"compression": compression})
     data = bytearray(path.read_bytes())
     chunks = [(a, b) for a, b in pairwise(boundaries(data)) if data[a] == Opcode.CHUNK]
     assert len(chunks) > 10
@@ -206,7 +193,7 @@ def test_of_a_damaged_one_only_the_damaged_chunk_is_lost(
 def test_messages_without_chunks_are_under_the_checksum_of_the_whole_and_read_up_to_the_end(
     tmp_path: Path, source: Path
 ) -> None:
-    path = rewritten(source, tmp_path / "rewritten.mcap", use_chunking=False, enable_data_crcs=True)
+    path = rewritten(source, tmp_path / "rewritten.mcap", NO_CHUNKS | {"enable_data_crcs": True})
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
@@ -226,7 +213,7 @@ def test_an_unknown_compression_is_named_and_not_called_damage(
     tmp_path: Path, source: Path, skip_damaged: bool
 ) -> None:
     path, builder = tmp_path / "rewritten.mcap", RecordBuilder()
-    with rewritten(source, path).open("rb") as stream:
+    with rewritten(source, path, {}).open("rb") as stream:
         for record in StreamReader(stream, emit_chunks=True).records:
             changed = dataclasses.replace(record, compression="brotli") if isinstance(record, Chunk) else record
             changed.write(builder)

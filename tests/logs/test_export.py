@@ -297,3 +297,12 @@ def test_frames_are_not_held_in_memory(tmp_path: Path, to: Format) -> None:
     assert figures["frames"] == frames
     size = frames * shape[0] * shape[1] * 2
     assert sum(Path(file).stat().st_size for file in figures["files"]) > size > 2 * peak
+
+
+def test_a_loop_mode_of_a_newer_version_is_exported_by_its_number(tmp_path: Path) -> None:
+    night = a_night()
+    step = STEP.message.FromString(of(night, STEP)[-1])
+    step.mode = 9  # type: ignore[attr-defined]
+    night.put(STEP, step)
+    export_log(night.write(tmp_path / "night.mcap"), Format.CSV, tmp_path / "out.csv", console=QUIET)
+    assert "mode 9" in (tmp_path / "out.csv").read_text().splitlines()[-1]

@@ -13,7 +13,7 @@ from lowfc.arrays import Long, Sequences, Single
 from lowfc.contract.codecs.codec import encode_step
 from lowfc.contract.messages import from_timestamp, wire
 from lowfc.control.loop.inputs import Step
-from lowfc.control.loop.safety import REASONS, Reason
+from lowfc.control.loop.safety import REASONS, LoopMode, Reason
 
 STAGES = ("transport", "wakeup", "compute", "publish", "frame_to_command")
 """Durations of the controller, as in ControlTiming."""
@@ -213,6 +213,11 @@ def count_reasons(bits: Long) -> dict[Reason, int]:
     """How often each reason was given, of those that were."""
     counts = {reason: int(np.count_nonzero(bits & (1 << reason))) for reason in REASONS} if bits.any() else {}
     return {reason: count for reason, count in counts.items() if count}
+
+
+def mode_name(number: int) -> str:
+    """Name of a loop mode, also of one that this version does not know."""
+    return LoopMode(number).name.lower() if number in list(LoopMode) else f"mode {number}"
 
 
 class TimingRows:

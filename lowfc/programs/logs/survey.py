@@ -13,6 +13,7 @@ from typing import Any
 from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.logs.columns import mode_name
 from lowfc.adapters.logs.history import attached_configuration
 from lowfc.adapters.logs.loss_account import LossAccount
 from lowfc.adapters.logs.parts import LogFiles, WholeLog
@@ -34,9 +35,6 @@ from lowfc.contract.messages import (
     topic_of,
     wire,
 )
-from lowfc.control.loop.safety import LoopMode
-
-_MODES = {int(mode): mode.name.lower() for mode in LoopMode}
 
 
 class Digest:
@@ -141,8 +139,7 @@ class _Account:
             if topic is HEALTH:
                 self._ledger.believe(message, wire.Health.FromString(message.payload))
             elif topic is CONTROLLER_STATE:
-                number = wire.ControllerState.FromString(message.payload).mode
-                mode = _MODES.get(number, f"mode {number}")
+                mode = mode_name(wire.ControllerState.FromString(message.payload).mode)
                 if self._modes[-1:] != [mode]:
                     self._modes.append(mode)
             elif topic is EVENT:

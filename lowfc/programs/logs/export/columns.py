@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.adapters.logs.columns import STAGES, joined, rows_of
+from lowfc.adapters.logs.columns import STAGES, joined, mode_name, rows_of
 from lowfc.adapters.logs.history import History
 from lowfc.contract.envelope import count_of
 from lowfc.contract.errors import DataFileError
 from lowfc.control.calibration.calibration import Calibration
-from lowfc.control.loop.safety import REASONS, LoopMode
+from lowfc.control.loop.safety import REASONS
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ def step_columns(history: History) -> list[Column]:
         Column("count", np.array([count_of(int(one)) for one in steps.sequence]), "", "of the frame"),
         Column("time_ns", steps.time_ns, "ns", "end of the frame's exposure, since 1970-01-01 UTC"),
         Column("time_utc", steps.time_ns.astype("datetime64[ns]"), "", "the same as a date"),
-        Column("mode", _named(steps.mode, lambda mode: LoopMode(mode).name.lower()), "", "of the loop"),
+        Column("mode", _named(steps.mode, mode_name), "", "of the loop"),
         Column("reasons", _named(steps.reasons, reasons), "", "why the frame was refused, or which limits acted"),
         Column("flux_dn", steps.flux_dn, "adu", "sum of the good pixels, dark subtracted"),
         Column("saturated_pixels", steps.saturated_pixels, "pix", "good pixels at full well"),

@@ -4,12 +4,12 @@ from collections import Counter
 
 import numpy as np
 
-from lowfc.adapters.logs.columns import count_reasons
+from lowfc.adapters.logs.columns import count_reasons, mode_name
 from lowfc.adapters.logs.history import History
 from lowfc.arrays import Long, Single
 from lowfc.contract.events import Level
 from lowfc.contract.messages import wire
-from lowfc.control.loop.safety import Limit, LoopMode
+from lowfc.control.loop.safety import Limit
 from lowfc.programs.logs.report.source import Figures, Run
 
 _FIRST_LIMIT = Limit.MODAL_LIMIT
@@ -34,11 +34,6 @@ def mode_steps(history: History) -> dict[str, int]:
     """Steps in each loop mode."""
     counted = Counter(history.steps.mode.tolist())
     return {mode_name(number): count for number, count in sorted(counted.items())}
-
-
-def mode_name(number: int) -> str:
-    """Name of a loop mode."""
-    return LoopMode(number).name.lower() if number in list(LoopMode) else f"mode {number}"
 
 
 def events(run: Run) -> list[Figures]:
