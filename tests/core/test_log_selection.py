@@ -32,6 +32,7 @@ from lowfc.programs.core.recording.volume import bytes_per_s, outlook, selected
 from lowfc.programs.logs.survey import survey
 from lowfc.programs.logs.what_if.compare import what_if
 from lowfc.programs.logs.what_if.options import WhatIf, requested
+from lowfc.programs.logs.what_if.run import LoggedRun
 from tests.support.loops import lowfc
 from tests.support.recording import Bench, bodies_of, logged, put
 from tests.support.report_log import Night
@@ -145,13 +146,13 @@ def test_replay_needs_frames_and_nothing_else_that_may_be_left_out(whole: Path) 
 
 def test_a_what_if_is_the_same(whole: Path, small: Path, tmp_path: Path) -> None:
     asked = requested("gain=0.3", None, None, None)
-    found = [what_if(LogReader(log), asked) for log in (whole, small)]
+    found = [what_if(LoggedRun(read_history(LogReader(log))), asked) for log in (whole, small)]
     for figures in found:
         del figures["log"]
     assert found[0] == found[1]
     other = {"pinv": "weighted", "weighted": "pinv"}[read_history(WholeLog(small)).calibration.estimator]
     with pytest.raises(DataFileError, match=r"no other reconstructor can be tried.*other gains, leaks and limits can"):
-        what_if(LogReader(small), WhatIf(estimator=other))
+        what_if(LoggedRun(read_history(LogReader(small))), WhatIf(estimator=other))
 
 
 @pytest.mark.usefixtures("without_drawings")

@@ -25,12 +25,13 @@ from lowfc.control.loop.safety import Limit, LoopMode
 from lowfc.optics.chain.added_contrast import contrast_form
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.cli.contrast import added_contrast, sentence_of
-from lowfc.programs.logs.what_if.compare import LINEAR_WAVES, compared, render, what_if
+from lowfc.programs.logs.what_if.compare import LINEAR_WAVES, render, what_if
 from lowfc.programs.logs.what_if.options import WhatIf, requested, user_controller
 from lowfc.programs.logs.what_if.run import LoggedRun
 from tests.support import toy
-from tests.support.folded_loop import fold
+from tests.support.folded_loop import SMALL_MIRROR, fold
 from tests.support.report_log import Night
+from tools.law_bench import calibrated
 
 RATE_HZ = 250
 Gains = tuple[float, float, float]
@@ -53,7 +54,7 @@ def configured(gains: Gains, delay: float, **overrides: object) -> Configuration
         "control.tilt_leak": leak,
         "control.leak": leak,
     }
-    return load(None, keys | {key.replace("__", "."): value for key, value in overrides.items()})
+    return load(None, SMALL_MIRROR | keys | {key.replace("__", "."): value for key, value in overrides.items()})
 
 
 def settled_rms(values: np.ndarray) -> np.ndarray:
@@ -95,7 +96,8 @@ def test_in_the_linear_range_it_agrees_with_a_run_with_those_gains(
 ) -> None:
     """Both ways between two laws: each mode within 10 % of the simulated run, and the law itself to the rounding."""
     configs = [configured(gains, delay, **overrides) for gains in pair]
-    runs = [fold(config, frames) for config in configs]
+    calibration = calibrated(configs[0])  # which knows no gains
+    runs = [fold(config, frames, calibration) for config in configs]
     for run, config in zip(runs, configs, strict=True):
         tilt_mas = settled_rms(run.disturbance_nm)[:2] / tilt_nm_per_mas(config.star.diameter_m)
         assert tilt_mas.max() < 5
@@ -113,19 +115,20 @@ OTHER = "gain=0.3,tilt_gain=0.2,leak=0.01"
 
 
 @pytest.fixture(scope="module")
-def logs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, LoggedRun]:
     """A closed loop, and one with other gains and a wrong idea of the delay."""
     folder, made = tmp_path_factory.mktemp("logs"), {}
     other = {"gain": (0.2, 0.3), "leak": (0.01, 0.01), "delay_frames": 2.0}
+    toml = load(None, {"sensor.modes": 10}).to_toml()  # of 10 modes no contrast is computed, which takes its time
     for name, changes in (("usual", {}), ("other", other)):
         night = Night(**changes)
         night.frames(FRAMES)
-        made[name] = night.write(folder / f"{name}.mcap")
+        made[name] = LoggedRun(read_history(LogReader(night.write(folder / f"{name}.mcap", toml=toml))))
     return made
 
 
-def figures_of(log: Path, what: WhatIf | None = None) -> dict[str, Any]:
-    found = what_if(LogReader(log), what or WhatIf())
+def figures_of(run: LoggedRun, what: WhatIf | None = None) -> dict[str, Any]:
+    found = what_if(run, what or WhatIf())
     assert found == json.loads(json.dumps(found))
     return found
 
@@ -134,8 +137,8 @@ def column(figures: dict[str, Any], name: str) -> np.ndarray:
     return np.array([mode[f"{name}_nm"] for mode in figures["modes"]])
 
 
-def test_the_gains_that_were_used_give_the_logged_run(logs: dict[str, Path]) -> None:
-    figures = figures_of(logs["usual"])
+def test_the_gains_that_were_used_give_the_logged_run(runs: dict[str, LoggedRun]) -> None:
+    figures = figures_of(runs["usual"])
     np.testing.assert_allclose(column(figures, "what_if"), column(figures, "was"), atol=1e-5)
     for kind in ("true", "continuous"):
         np.testing.assert_allclose(column(figures, f"{kind}_what_if"), column(figures, f"{kind}_was"), atol=1e-5)
@@ -167,9 +170,9 @@ def test_contrast_is_told_of_every_coronagraph() -> None:
     assert behind_lyot["what if"] > 0
 
 
-def test_a_log_says_what_other_gains_give(logs: dict[str, Path]) -> None:
+def test_a_log_says_what_other_gains_give(runs: dict[str, LoggedRun]) -> None:
     """Measured residual with measured residual, mode by mode, of two runs."""
-    guess, run = figures_of(logs["usual"], requested(OTHER)), figures_of(logs["other"])
+    guess, run = figures_of(runs["usual"], requested(OTHER)), figures_of(runs["other"])
     np.testing.assert_allclose(column(guess, "what_if"), column(run, "was"), rtol=0.1)
     np.testing.assert_allclose(column(guess, "open"), column(run, "open"), rtol=0.1)
     assert np.abs(column(guess, "was") / column(run, "was") - 1).max() > 0.1
@@ -182,55 +185,57 @@ def test_a_log_says_what_other_gains_give(logs: dict[str, Path]) -> None:
     assert laws == {"name": "focus", "gain_was": 0.2, "gain": 0.3, "leak_was": 0.0, "leak": 0.01}
 
 
-def test_a_wrong_idea_of_the_delay_is_found_and_put_right(logs: dict[str, Path]) -> None:
-    figures = figures_of(logs["other"])
+def test_a_wrong_idea_of_the_delay_is_found_and_put_right(runs: dict[str, LoggedRun]) -> None:
+    figures = figures_of(runs["other"])
     assert (figures["delay_controller_frames"], figures["delay_frames"]) == (2, 1)
     assert "reckoned with a delay of 2 frames" in figures["warnings"][0]
     np.testing.assert_allclose(column(figures, "what_if"), column(figures, "was"), atol=1e-5)
 
 
-def test_a_configuration_says_the_same_as_the_words(logs: dict[str, Path], tmp_path: Path) -> None:
+def test_a_configuration_says_the_same_as_the_words(runs: dict[str, LoggedRun], tmp_path: Path) -> None:
     path = tmp_path / "other.toml"
     path.write_text("[control]\ntilt_gain=0.2\ngain=0.9\nleak=0.01\ntilt_leak=0.01\n")
-    by_file = figures_of(logs["usual"], requested("gain=0.3,tilt_gain=0.2,limit_nm=150,tilt_limit_nm=150", path))
-    assert by_file == figures_of(logs["usual"], requested(OTHER + ",limit_nm=150"))
+    by_file = figures_of(runs["usual"], requested("gain=0.3,tilt_gain=0.2,limit_nm=150,tilt_limit_nm=150", path))
+    assert by_file == figures_of(runs["usual"], requested(OTHER + ",limit_nm=150"))
     table = render(by_file).splitlines()
     assert sum(" -> " in line for line in table) == len(by_file["modes"])
     assert any("0.4 -> 0.2" in line and "tilt x" in line for line in table)
     assert any(f"{by_file['tilt_what_if_mas']:.2f}" in line and "mas" in line for line in table)
 
 
-def test_another_reconstructor_measures_the_same_frames(logs: dict[str, Path], tmp_path: Path) -> None:
+def test_another_reconstructor_measures_the_same_frames(runs: dict[str, LoggedRun], tmp_path: Path) -> None:
     """pinv by name and as a file are the same; and back from there to the logged one."""
-    by_name = figures_of(logs["usual"], requested("estimator=pinv"))
+    by_name = figures_of(runs["usual"], requested("estimator=pinv"))
     assert by_name["estimator"] == "pinv"
     assert by_name["what_if_nm"] != pytest.approx(by_name["was_nm"], rel=1e-3)
-    np.testing.assert_allclose(column(by_name, "open")[:2], column(figures_of(logs["usual"]), "open")[:2], rtol=0.1)
+    np.testing.assert_allclose(column(by_name, "open")[:2], column(figures_of(runs["usual"]), "open")[:2], rtol=0.1)
 
     calibration = toy.calibration()
     I0, H, good = (array.astype(float) for array in (calibration.reference, calibration.response, calibration.good))
     R = reconstructor(I0, H, good, 1.0, 0.0, "pinv").astype(np.float32)
     path = tmp_path / "pinv.fits"
     calibration_file.save(identified(replace(calibration, reconstructor=R, estimator="pinv")), path)
-    by_file = figures_of(logs["usual"], requested(calibration=path))
+    by_file = figures_of(runs["usual"], requested(calibration=path))
     np.testing.assert_allclose(column(by_file, "what_if"), column(by_name, "what_if"), rtol=1e-4)
-    back = figures_of(logs["usual"], requested("estimator=weighted", calibration=path))
+    back = figures_of(runs["usual"], requested("estimator=weighted", calibration=path))
     np.testing.assert_allclose(column(back, "what_if"), column(back, "was"), rtol=1e-2)
 
 
-def test_frames_that_are_not_in_the_log_are_counted(logs: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_that_are_not_in_the_log_are_counted(
+    runs: dict[str, LoggedRun], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Another reconstructor cannot measure them, and the what-if holds, as it would without those frames."""
-    run = LoggedRun(read_history(LogReader(logs["usual"])))
+    run = runs["usual"]
     found = run.measured_again(run.calibration)
     np.testing.assert_allclose(found, run.steps.error_nm, atol=1e-4)
     found[1107::20] = np.nan
     monkeypatch.setattr(run, "measured_again", lambda *_: found)
-    figures = compared(run, requested("estimator=pinv"))
+    figures = what_if(run, requested("estimator=pinv"))
     assert figures["frames_compared"] == FRAMES - SETTLING - 5
     assert "the log lacks 5 frames that were used" in figures["warnings"][0]
 
 
-def test_modes_of_another_size_shape_the_mirror_alike(logs: dict[str, Path], tmp_path: Path) -> None:
+def test_modes_of_another_size_shape_the_mirror_alike(runs: dict[str, LoggedRun], tmp_path: Path) -> None:
     """A calibration in which every mode is twice as large measures half of everything."""
     calibration = toy.calibration()
     twice = replace(
@@ -240,18 +245,18 @@ def test_modes_of_another_size_shape_the_mirror_alike(logs: dict[str, Path], tmp
         modes_to_actuators=calibration.modes_to_actuators * 2,
     )
     calibration_file.save(identified(twice), tmp_path / "twice.fits")
-    figures = figures_of(logs["usual"], requested(calibration=tmp_path / "twice.fits"))
+    figures = figures_of(runs["usual"], requested(calibration=tmp_path / "twice.fits"))
     np.testing.assert_allclose(column(figures, "what_if"), column(figures, "was") / 2, rtol=1e-4)
 
 
-def test_calibrations_that_do_not_fit_are_refused(logs: dict[str, Path], tmp_path: Path) -> None:
+def test_calibrations_that_do_not_fit_are_refused(runs: dict[str, LoggedRun], tmp_path: Path) -> None:
     path = tmp_path / "other.fits"
     calibration_file.save(identified(replace(toy.calibration(), noll=(2, 3, 11))), path)
     with pytest.raises(CalibrationError, match=r"its noll is \(2, 3, 11\), in the log it is \(2, 3, 4\)"):
-        figures_of(logs["usual"], requested(calibration=path))
+        figures_of(runs["usual"], requested(calibration=path))
     (tmp_path / "shear.toml").write_text('[control]\nnuisance = ["shear"]\n')
     with pytest.raises(ConfigurationError, match=r"weighted\+shear: .* --calibration"):
-        figures_of(logs["usual"], requested(config=tmp_path / "shear.toml"))
+        figures_of(runs["usual"], requested(config=tmp_path / "shear.toml"))
 
 
 INTEGRATOR = """
@@ -276,11 +281,11 @@ def step(state: State | None, error_nm: np.ndarray) -> tuple[State, np.ndarray]:
 
 
 def test_a_controller_of_ones_own_is_folded_like_the_integrator(
-    logs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    runs: dict[str, LoggedRun], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "mine.py").write_text(INTEGRATOR)
     where = f"{tmp_path / 'mine.py'}:step"
-    own, ours = figures_of(logs["usual"], requested(controller=where)), figures_of(logs["usual"], requested(OTHER))
+    own, ours = figures_of(runs["usual"], requested(controller=where)), figures_of(runs["usual"], requested(OTHER))
     np.testing.assert_allclose(column(own, "what_if"), column(ours, "what_if"), rtol=1e-4)
     assert own["controller"] == where
     assert "gain" not in own["modes"][0]
@@ -377,7 +382,7 @@ def test_doubts_are_said() -> None:
     known.mirror.limits = np.array([0, 1, 1])
     known.log.finished = False
     known.log.damage.append(Damage(77, 5, "the checksum of a chunk is wrong"))
-    doubts = "\n".join(compared(LoggedRun(known), WhatIf())["warnings"])
+    doubts = "\n".join(what_if(LoggedRun(known), WhatIf())["warnings"])
     for words in (
         "stroke at 4 frames, slew at 4 frames",
         "the mirror's own limits acted on 2 commands",
@@ -393,7 +398,7 @@ def test_doubts_are_said() -> None:
 def test_an_open_loop_far_out_is_warned_of() -> None:
     far = np.full((40, 3), [20.0, -30.0, 12.0], np.float32)
     run = LoggedRun(history(error_nm=far, pol_nm=far.copy(), mode=np.full(40, LoopMode.OPEN, np.uint8)))
-    figures = compared(run, requested("tilt_gain=2.5"))
+    figures = what_if(run, requested("tilt_gain=2.5"))
     assert figures["compared"] == "the loop was never closed"
     assert column(figures, "was").tolist() == column(figures, "open").tolist() == [20, 30, 12]
     _, linear, unstable, limits = figures["warnings"]
@@ -449,6 +454,6 @@ def test_the_words_of_the_command_line() -> None:
 )
 def test_words_that_make_no_sense_are_refused(text: str, message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):
-        compared(LoggedRun(history()), requested(text))
+        what_if(LoggedRun(history()), requested(text))
     with pytest.raises(ConfigurationError, match="gain are the integrator's"):
         requested("gain=0.3", controller="mine.py:step")

@@ -29,15 +29,17 @@ def what_if(
     """
     from rich.console import Console
 
+    from lowfc.adapters.logs.history import read_history
     from lowfc.adapters.logs.parts import WholeLog, the_one, titled
     from lowfc.adapters.process.progress import reading_bar
     from lowfc.programs.logs.what_if.compare import render
-    from lowfc.programs.logs.what_if.compare import what_if as run
+    from lowfc.programs.logs.what_if.compare import what_if as compared
     from lowfc.programs.logs.what_if.options import requested
+    from lowfc.programs.logs.what_if.run import LoggedRun
 
     what = requested(changes, config, calibration, controller)
     reader = WholeLog(log := the_one(logs), skip_damaged=True)
     with reading_bar(Console(stderr=True)) as count:
         reader.progress = partial(count, f"reading {titled(log)}")
-        figures = run(reader, what)
+        figures = compared(LoggedRun(read_history(reader)), what)
     put(figures, render(figures), as_json=as_json)

@@ -7,8 +7,6 @@ import numpy as np
 
 from lowfc.adapters.files.factory import contrast_of, detector, equivalent_read_noise_e
 from lowfc.adapters.logs.columns import count_reasons
-from lowfc.adapters.logs.history import read_history
-from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.recovery import no_end
 from lowfc.arrays import Array, Mask, Single
 from lowfc.contract.codecs.calibration_codec import identified
@@ -43,7 +41,7 @@ _TITLES = {
 }
 
 
-def what_if(log: LogReader, what: WhatIf) -> dict[str, Any]:
+def what_if(run: LoggedRun, what: WhatIf) -> dict[str, Any]:
     """Figures of the logged run, and of the run that it would have been.
 
     The other loop is closed throughout, from a flat mirror, and meets the pseudo-open-loop modes of every frame that
@@ -53,11 +51,6 @@ def what_if(log: LogReader, what: WhatIf) -> dict[str, Any]:
     truth, the true residual is given too: the measured one is noise for the most part where the star is faint.
     For another reconstructor the frames are read in a second pass.
     """
-    return compared(LoggedRun(read_history(log)), what)
-
-
-def compared(run: LoggedRun, what: WhatIf) -> dict[str, Any]:
-    """As `what_if`, for a run that has been read."""
     own, noll = what.step, run.calibration.noll
     after = law(what, noll, run.law)
     calibration = _calibration(what, run)
