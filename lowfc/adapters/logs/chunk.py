@@ -75,7 +75,16 @@ _COMPRESSIONS: dict[bytes, tuple[Callable[[memoryview, int], bytes], int]] = {
 
 
 def read_chunk(body: bytes, at: int, *, may_lack_crc: bool = False) -> Chunk:
-    """The chunk whose record begins at `at` in the file and has this body, which is all behind opcode and length."""
+    """The chunk whose record begins at `at` in the file and has this body.
+
+    Args:
+        body: of the record, behind its opcode and length.
+        at: position of the record in the file.
+        may_lack_crc: accept one without a checksum.
+
+    Raises:
+        UnsoundError: it is not as it was written.
+    """
     try:
         _, _, size, crc, named = _FIXED.unpack_from(body)
         (compressed,) = _COMPRESSED.unpack_from(body, _FIXED.size + named)

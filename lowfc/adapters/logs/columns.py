@@ -104,7 +104,11 @@ class Columns:
         return self._rows
 
     def add(self, **values: int | float | Iterable[int | float]) -> bool:
-        """Add to every column; to none, and return False, where they make no whole rows; OverflowError if too large."""
+        """Add to every column; to none, and return False, where the values do not make whole rows.
+
+        Raises:
+            OverflowError: a value is beyond what its column can hold.
+        """
         columns = self._columns
         try:
             for name, value in values.items():
@@ -150,7 +154,11 @@ class _Rows(Generic[T]):
         return len(self._columns)
 
     def add(self, message: Any) -> bool:
-        """Add a message; False where it has another number of modes."""
+        """Add a message; False where it has another number of modes.
+
+        Raises:
+            OverflowError: a value that nobody of the loop sends.
+        """
         special = self._special(message)
         row = {name: getattr(message, name) for name in self._alike if name not in special} | special
         return self._columns.add(sequence=message.frame_sequence, time_ns=from_timestamp(message.timestamp), **row)
@@ -240,7 +248,11 @@ class TimingRows:
 
 
 def bits_of(reasons: Iterable[int]) -> int:
-    """Bit `1 << reason` for each; OverflowError where there is no such bit."""
+    """Bit `1 << reason` for each.
+
+    Raises:
+        OverflowError: there is no such bit.
+    """
     bits = 0
     for reason in reasons:
         if not 0 <= reason < _BITS:

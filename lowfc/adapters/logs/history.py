@@ -168,7 +168,11 @@ class History:
 
 
 def read_history(log: LogReader) -> History:
-    """Read a log, with a reader that has not been read, to its end."""
+    """Read a log, with a reader that has not been read, to its end.
+
+    Raises:
+        DataFileError: as `LogReader`, or the log has a calibration that cannot be read.
+    """
     rows = _Rows(history := History(log))
     for message in log:
         rows.take(message)

@@ -19,7 +19,11 @@ from lowfc.contract.errors import DataFileError
 
 
 class LogCopy:
-    """A new log, into which files are copied, one after the other; `messages` of them so far."""
+    """A new log, into which files are copied, one after the other.
+
+    Attributes:
+        messages: written so far.
+    """
 
     def __init__(self, file: IO[bytes]) -> None:
         self.messages = 0
@@ -51,7 +55,13 @@ class LogCopy:
         wanted: Callable[[Sample], bool] = lambda message: True,
         described: Callable[[Metadata | Attachment], bool] = lambda record: True,
     ) -> None:
-        """Copy messages that are `wanted` of a file that has not been read, and where it stands what describes it."""
+        """Copy a file's messages, and where it stands what describes it.
+
+        Args:
+            reader: of the file; it has not been read.
+            wanted: whether to copy a message.
+            described: whether to copy metadata or an attachment.
+        """
         done = 0
         for message in reader:
             self.describe(list(filter(described, reader.described[done:])))
@@ -87,7 +97,11 @@ class LogCopy:
 
 @contextlib.contextmanager
 def new_log(path: Path, source: Path) -> Iterator[IO[bytes]]:
-    """A file with the permissions of `source`: it has its name when it is whole, and is gone when something fails."""
+    """A file with the permissions of `source`: it has its name when it is whole, and is gone when something fails.
+
+    Raises:
+        DataFileError: there is such a file, or the disk refuses.
+    """
     never = f"{path} exists already; a log is never overwritten; name another one with --out"
     if path.exists():
         raise DataFileError(never)

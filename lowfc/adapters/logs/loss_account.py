@@ -97,7 +97,11 @@ class LossAccount:
         tally.enter(count, recorded=recorded or unwanted, unwanted=unwanted)
 
     def believe(self, sample: Sample, health: wire.Health) -> None:
-        """Take over a publisher's own counts; what it sent before its first message arrived does not count as lost."""
+        """Take over a publisher's own counts; what it sent before its first message arrived does not count as lost.
+
+        Raises:
+            BadMessageError: it names what there is no room for; what comes after that is left out.
+        """
         for count in health.topics:
             topic = _published(health.process, count.topic)
             if topic is not None and self._selection.counts(topic):

@@ -66,7 +66,11 @@ class WholeLog(LogReader):
         self._options = options
 
     def __iter__(self) -> Generator[Sample, None, None]:
-        """Messages in the order they were recorded; a reader reads once."""
+        """Messages in the order they were recorded; a reader reads once.
+
+        Raises:
+            DataFileError: a file is no log, or a part of it is damaged.
+        """
         if len(self.paths) == 1:
             self.parts.append(self)
             yield from super().__iter__()
@@ -107,7 +111,16 @@ def one_by_one(names: Sequence[Path], out: Path | None = None, *, as_json: bool 
     """Logs that a command line names, each with all of its files that are named.
 
     `last` is the newest log in the default folder, with every file of its recording, and FOLDER/last that of another
-    folder; a file of that name goes before. Only one log may be named where one file `out` or one JSON object is made.
+    folder; a file of that name goes before.
+
+    Args:
+        names: as given.
+        out: the one file that is written, if so.
+        as_json: one JSON object is printed.
+
+    Raises:
+        ConfigurationError: there are several logs, and one place for what is made of them; or a part is named twice.
+        DataFileError: there is no log in the folder.
     """
     logs: dict[tuple[str, ...], dict[int, Path]] = {}
     for path in _files(names):
@@ -122,7 +135,12 @@ def one_by_one(names: Sequence[Path], out: Path | None = None, *, as_json: bool 
 
 
 def the_one(names: Sequence[Path]) -> Parts:
-    """The one log that a command line names; see `one_by_one`."""
+    """The one log that a command line names; see `one_by_one`.
+
+    Raises:
+        ConfigurationError: they are several.
+        DataFileError: there is no log in the folder.
+    """
     found = one_by_one(names)
     if len(found) > 1:
         raise ConfigurationError(f"this reads one log: name one, not {_listed(found)}; the newest one is `{LAST}`")
@@ -142,7 +160,11 @@ def titled(paths: Parts) -> str:
 
 
 def metadata_at_start(path: Path) -> dict[str, dict[str, str]]:
-    """Metadata that stand before the messages of a log, by name."""
+    """Metadata that stand before the messages of a log, by name.
+
+    Raises:
+        DataFileError: it cannot be read.
+    """
     found: dict[str, dict[str, str]] = {}
     with LogFile(path) as file:
         for part in file.parts():
@@ -172,7 +194,11 @@ def _files(names: Sequence[Path]) -> Iterator[Path]:
 
 
 def _newest(folder: Path) -> list[Path]:
-    """Files of the newest log of a folder, by their names, which begin with the time; in order."""
+    """Files of the newest log of a folder, by their names, which begin with the time; in order.
+
+    Raises:
+        DataFileError: there is none.
+    """
     hint = f"that of another folder is FOLDER/{LAST}"
     try:
         files = {path: match for path in folder.iterdir() if (match := _NAMED.fullmatch(path.name))}

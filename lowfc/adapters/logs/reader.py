@@ -103,7 +103,11 @@ class LogReader:
         return Selection.of(self.metadata)
 
     def __iter__(self) -> Iterator[Sample]:
-        """Messages in the order they were recorded; a reader reads once."""
+        """Messages in the order they were recorded; a reader reads once.
+
+        Raises:
+            DataFileError: this is no log, or a part of it is damaged.
+        """
         with LogFile(self.path) as file:
             self.size, self.finished, self._file = file.size, file.finished, file
             if (declarations := file.declarations()) is not None:
@@ -157,7 +161,11 @@ class LogReader:
         return messages
 
     def _messages(self, content: bytes) -> list[Sample]:
-        """Messages in a chunk that are wanted; what it declares is remembered."""
+        """Messages in a chunk that are wanted; what it declares is remembered.
+
+        Raises:
+            UnsoundError: its records do not hold together, or contradict those before.
+        """
         found: list[Sample] = []
         wanted, at, end = self._wanted, 0, len(content)
         read_head, read_message, logged = HEAD.unpack_from, _MESSAGE_HEAD.unpack_from, Sample._make

@@ -75,7 +75,11 @@ class LogFile:
     """
 
     def __init__(self, path: Path) -> None:
-        """Open the log at `path`."""
+        """Open the log at `path`.
+
+        Raises:
+            DataFileError: it cannot be read.
+        """
         self.path = path
         self.complete = False
         self.unread = ""
@@ -119,6 +123,9 @@ class LogFile:
 
         Chunks of which `needed` is false are passed over unread; it is asked with the log time at which one ends and
         the channels (ids) of its messages.
+
+        Raises:
+            DataFileError: the disk refuses.
         """
         magic = self._read(0, len(MAGIC))
         at, crc, intact = len(MAGIC), zlib.crc32(magic), MAGIC.startswith(magic)
@@ -225,7 +232,11 @@ class LogFile:
         return True
 
     def _part(self, opcode: int, body: bytes, at: int) -> Chunk | Metadata | Attachment | None:
-        """A record of the data section, checked (UnsoundError); None for one that only helps to find others."""
+        """A record of the data section, checked; None for one that only helps to find others.
+
+        Raises:
+            UnsoundError: it is damaged, or has no place in a log.
+        """
         match opcode:
             case Opcode.CHUNK:
                 try:
@@ -300,7 +311,11 @@ _Record = TypeVar("_Record", Attachment, ChunkIndex, Header, Metadata, Schema, S
 
 
 def parsed(kind: type[_Record], body: bytes) -> _Record:
-    """A record of this kind; UnsoundError where it is not one."""
+    """A record of this kind.
+
+    Raises:
+        UnsoundError: it is not one.
+    """
     stream = ReadDataStream(io.BytesIO(body))
     try:
         record: _Record = kind.read(stream)

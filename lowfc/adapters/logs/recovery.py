@@ -67,7 +67,14 @@ def recover(source: Path, out: Path, progress: Callable[[int, int], None] | None
     """Write what is whole of `source` to `out`; nothing where all of it is whole.
 
     Messages, channels, schemas, attachments and metadata stay as they are; a metadata record "recovery" is added.
-    `progress` is called with the bytes done and their total.
+
+    Args:
+        source: a log, finished or not.
+        out: a file that is not there yet.
+        progress: called with the bytes done and their total.
+
+    Raises:
+        DataFileError: `source` is no log or is being recorded, `out` is there already, or the disk refuses.
     """
     if source.exists() and being_recorded(source):
         raise DataFileError(f"{source} is being recorded, and nothing is lost: `lowfc ctl record stop` finishes it")

@@ -97,7 +97,15 @@ EVERYTHING = Selection()
 
 
 def selection(every: int = 1, patterns: Iterable[str] = ()) -> Selection:
-    """Each Nth frame and mirror state, and the optional topics that a key or shell pattern fits; all without any."""
+    """Selection of what is asked for.
+
+    Args:
+        every: record each Nth frame and mirror state.
+        patterns: keys or shell patterns of the optional topics to record; all of them where there are none.
+
+    Raises:
+        ConfigurationError: a pattern fits no topic.
+    """
     wanted: set[Topic] = set()
     for pattern in (given.removeprefix("/") for given in patterns):
         fitting = {topic for topic in TOPICS if topic.matches(pattern) or fnmatchcase(topic.key, pattern)}

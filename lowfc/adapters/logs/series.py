@@ -37,8 +37,7 @@ _TELLING_S = 10.0  # after the start of a recording; then its growth is that of 
 class LogSeries:
     """Writes logs into a folder.
 
-    A full log is finished by a thread of its own, for the disk may need seconds to have all of it. Where
-    the disk refuses it is a DataFileError: then `give_up`.
+    A full log is finished by a thread of its own, for the disk may need seconds to have all of it.
 
     Attributes:
         files: of the logs so far, under the names that they have now.
@@ -95,7 +94,11 @@ class LogSeries:
         )
 
     def begin(self, first: Iterable[Sample], *, anew: bool = True) -> None:
-        """Begin a log with the messages that those in it depend on; unless `anew`, as the next part of the last one."""
+        """Begin a log, with the messages that those in it depend on; unless `anew`, as the next part of the last one.
+
+        Raises:
+            DataFileError: it cannot be made.
+        """
         now_ns = self._clock.host_ns()
         path = log_path(self._folder, now_ns)
         if anew:
@@ -109,25 +112,41 @@ class LogSeries:
             self._log.write(sample)
 
     def write(self, sample: Sample) -> bool:
-        """Write a message; False where there is no log."""
+        """Write a message; False where there is no log.
+
+        Raises:
+            DataFileError: the disk refuses; see `give_up`.
+        """
         if self._log is None:
             return False
         self._log.write(sample)
         return True
 
     def flush(self) -> None:
-        """Flush the log, and raise what went wrong with the one before."""
+        """Flush the log, and raise what went wrong with the one before.
+
+        Raises:
+            DataFileError: the disk refuses; see `give_up`.
+        """
         if self._log is not None:
             self._log.flush()
         if self._finishing is not None and self._finishing[1].done():
             self._finished()
 
     def shortage(self) -> str:
-        """Sentence for a person where the disk is too full to go on; empty where it is not."""
+        """Sentence for a person where the disk is too full to go on; empty where it is not.
+
+        Raises:
+            DataFileError: the folder is not there.
+        """
         return shortage(self._folder, self._limits.min_free_bytes)
 
     def end(self, figures: Mapping[str, str], *, wait: bool = True) -> None:
-        """Finish the log with its "recording" figures, if there is one; without `wait` while the next is written."""
+        """Finish the log with its "recording" figures, if there is one; without `wait` while the next is written.
+
+        Raises:
+            DataFileError: the disk refuses; see `give_up`.
+        """
         self._finished()
         if self._log is not None:
             self._log.flush()
@@ -137,7 +156,11 @@ class LogSeries:
             self._finished()
 
     def remove(self) -> None:
-        """Remove the finished logs, in which there is nothing."""
+        """Remove the finished logs, in which there is nothing.
+
+        Raises:
+            DataFileError: the disk refuses.
+        """
         while self.files:
             try:
                 self.files[-1].unlink(missing_ok=True)
@@ -184,7 +207,11 @@ def _finish(log: LogWriter, figures: Mapping[str, str]) -> int:
 
 
 def shortage(folder: Path, min_free_bytes: int) -> str:
-    """Sentence for a person where a folder's disk has too little room; empty where it has enough."""
+    """Sentence for a person where a folder's disk has too little room; empty where it has enough.
+
+    Raises:
+        DataFileError: the folder cannot be looked at.
+    """
     try:
         free_bytes = shutil.disk_usage(existing(folder)).free
     except OSError as fault:

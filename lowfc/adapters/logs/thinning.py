@@ -52,7 +52,11 @@ def thinned_path(source: Path, asked: Selection) -> Path:
 
 
 def thin(log: Parts, out: Path, asked: Selection, progress: Callable[[int, int], None] | None = None) -> Thinned:
-    """Write a smaller log of all files of a log; its metadata names what was left out."""
+    """Write a smaller log of all files of a log; its metadata names what was left out.
+
+    Raises:
+        DataFileError: a file is no log, `out` is there already, or the disk refuses.
+    """
     made = Selection.of(metadata_at_start(log[0])).within(asked)
     reader, messages = WholeLog(log, skip_damaged=True), 0
     reader.progress = progress

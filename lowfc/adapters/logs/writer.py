@@ -96,7 +96,11 @@ class LogWriter:
         attachments: Sequence[Attachment] = (),
         file_mode: int = FILE_MODE,
     ) -> None:
-        """Open `path` + ".part", with these permissions, and write what describes the log, made at `time_ns`."""
+        """Open `path` + ".part", with these permissions, and write what describes the log, made at `time_ns`.
+
+        Raises:
+            DataFileError: there is a log of that name, or the disk refuses.
+        """
         self.path = path
         self.part = path.with_name(path.name + UNFINISHED)
         self.messages = self.messages_written = self.bytes_written = 0
@@ -138,7 +142,12 @@ class LogWriter:
         return self._raw.longest_write_ns
 
     def write(self, sample: Sample) -> None:
-        """Add one message, its payload verbatim."""
+        """Add one message, its payload verbatim.
+
+        Raises:
+            DataFileError: the disk refuses; the log keeps what was flushed and takes no more.
+            KeyError: there is no such topic.
+        """
         try:
             self._writer.add_message(
                 channel_id=self._channel(sample),
@@ -152,14 +161,22 @@ class LogWriter:
         self.messages += 1
 
     def flush(self) -> None:
-        """Hand everything to the operating system: what was flushed survives a kill -9 of this process."""
+        """Hand everything to the operating system: what was flushed survives a kill -9 of this process.
+
+        Raises:
+            DataFileError: as for `write`, or the file is no longer there.
+        """
         try:
             self._flush()
         except OSError as fault:
             raise self._refused(fault) from fault
 
     def finish(self, metadata: Mapping[str, Mapping[str, str]]) -> Path:
-        """Close the log, with what became known at its end, and give it its name once the disk has it."""
+        """Close the log, with what became known at its end, and give it its name once the disk has it.
+
+        Raises:
+            DataFileError: as for `write`.
+        """
         try:
             self._flush()
             self._describe(metadata)

@@ -49,8 +49,17 @@ def publish(
 ) -> dict[str, Any]:
     """Play logs into a run until their end, or until SIGTERM or SIGINT.
 
-    A run of that name is made where there is none. As from a live camera, whoever does not keep up loses messages. The
-    topics of roles that are waited for are left to them. Returns figures for `render` and `--json`.
+    Args:
+        logs: files in the order of their recording, finished or not.
+        run_id: the run to play into; made where there is none of that name.
+        speed: 2 is twice as fast, a large one as fast as it goes. As from a live camera, whoever does not keep up loses
+            messages.
+        topics: names or shell patterns of keys; all topics but commands when empty.
+        allow_commands: play commands too, and frames where a live mirror may follow them.
+        wait_for: roles that must be live and linked before the first message; their topics are left to them.
+
+    Returns:
+        Figures for `render` and `--json`.
     """
     if not 0 < speed < float("inf"):
         raise ConfigurationError(f"--speed is a factor above 0, 1 as recorded; got {speed:g}")

@@ -25,7 +25,14 @@ class Selection:
     def __init__(
         self, links: Links, patterns: Sequence[str], live: Collection[str], *, allow_commands: bool = False
     ) -> None:
-        """Choose among the topics of a run by shell patterns, all for none; processes play, or shall play, `live`."""
+        """Choose among the topics of a run.
+
+        Args:
+            links: of the run.
+            patterns: names or shell patterns of keys; everything when empty.
+            live: roles of the run that processes play, or shall play.
+            allow_commands: whether a live mirror may be moved.
+        """
         self.live = frozenset(live)
         self._patterns = [pattern.removeprefix("/") for pattern in patterns]
         self._allow_commands = allow_commands
