@@ -20,7 +20,7 @@ from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.host import by_this_process, program_name
 from lowfc.client.answer import Answer
-from lowfc.client.lease import Lease, held, new_identity
+from lowfc.client.lease import Lease, new_identity
 from lowfc.client.mirror_watch import MirrorWatch
 from lowfc.client.requests import BY_NAME
 from lowfc.client.runs import starting, the_run
@@ -29,7 +29,7 @@ from lowfc.contract.codecs.bench_codec import encode_bench_value
 from lowfc.contract.codecs.calibration_codec import camera_settings, decode_calibration, encode_calibration
 from lowfc.contract.codecs.codec import most_bytes
 from lowfc.contract.codecs.law_codec import wire_law
-from lowfc.contract.errors import BadMessageError, BusError, ConfigurationError, RequestRefusedError
+from lowfc.contract.errors import BadMessageError, BusError, ConfigurationError, LowfcError, RequestRefusedError
 from lowfc.contract.messages import (
     BENCH,
     CALIBRATION,
@@ -223,9 +223,16 @@ class Client:
         values = () if hold_s is None else hold_s
         return self.ask("permit", values=values, text=by_this_process(purpose), lease_id=lease_id or new_identity())
 
-    def held(self, purpose: str, hold_s: float) -> contextlib.AbstractContextManager[None]:
+    @contextlib.contextmanager
+    def held(self, purpose: str, hold_s: float) -> Iterator[None]:
         """Hold the loop while something on the bench is moved, for at most `hold_s`; a closed loop then goes on."""
-        return held(lambda own: self.permit(purpose, hold_s, own), lambda own: self.ask("release", lease_id=own))
+        identity = new_identity()
+        self.permit(purpose, hold_s, identity)
+        try:
+            yield
+        finally:
+            with contextlib.suppress(LowfcError):  # it ends by itself
+                self.ask("release", lease_id=identity)
 
     def bench(self, name: str, value: Value) -> None:
         """Publish a value of something else on the bench, for interlocks: again and again, or it becomes too old.

@@ -4,7 +4,7 @@ import contextlib
 import secrets
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from lowfc.adapters.process.host import by_this_process
@@ -26,18 +26,6 @@ Ask = Callable[[str, int, float, str], object]
 def new_identity() -> int:
     """Identity of a reservation: a random number above 0."""
     return secrets.randbits(63) | 1
-
-
-@contextlib.contextmanager
-def held(permit: Callable[[int], object], release: Callable[[int], object]) -> Iterator[None]:
-    """Ask for a permit, and release it at the end of the block."""
-    identity = new_identity()
-    permit(identity)
-    try:
-        yield
-    finally:
-        with contextlib.suppress(LowfcError):  # it ends by itself
-            release(identity)
 
 
 class Lease:
