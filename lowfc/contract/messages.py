@@ -60,7 +60,6 @@ class Topic:
         publisher: whose it is to put; by a router, nobody else's messages get through.
         sentence: what it is.
         subscribers: who gets it.
-        simulated_only: there is no such topic on a bench with real devices.
         deterministic: in lockstep two runs with the same seed write the same payload bytes.
         queryable: a late joiner may ask the publisher for the last one.
         latest_only: who looks at a run wants the newest only, and gets no more than eyes can follow.
@@ -75,7 +74,6 @@ class Topic:
     publisher: frozenset[Role]
     sentence: str
     subscribers: frozenset[Role] = _MONITORS
-    simulated_only: bool = False
     deterministic: bool = True
     queryable: bool = False
     latest_only: bool = False
@@ -183,7 +181,6 @@ TRUTH = Topic(
     Rate.LOOP,
     _CAMERA,
     "What the simulation knows and no sensor does.",
-    simulated_only=True,
     optional=True,
 )
 OFFLOAD = Topic(
