@@ -99,6 +99,7 @@ class Pool:
             done.release()
 
 
+@cache
 def _compiled() -> list[Any]:
     import numba
     from numba import types

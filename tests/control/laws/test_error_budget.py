@@ -169,7 +169,7 @@ def test_the_terms_add_up_to_the_residual_of_a_loop_that_ran() -> None:
     keys = {"control.start_mode": "closed", "camera.rate_hz": RATE_HZ, "disturbance.scale": 2.0}
     config = load(None, keys | FIXED_GAINS)
     calibration = calibrated(config)
-    ran = fold(config, 1600)
+    ran = fold(config, 1600, calibration)
     signals = {name: getattr(ran, name)[100:] for name in ("error_nm", "pol_nm", "disturbance_nm", "residual_nm")}
     settings = factory.settings(config)
     law = settings.law(calibration.noll)
