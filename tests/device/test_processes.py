@@ -231,6 +231,7 @@ def test_a_mirror_whose_process_dies_is_named_and_the_loop_holds_until_it_is_sta
     with subprocess.Popen([*LOWFC, *MIRROR.split()[1:]], cwd=bench.folder) as process:
         try:
             bench.settled()
+            time.sleep(1.2)  # two Healths of the mirror: the controller goes back to the command of the last but one
             before_nm = list(bench.steps[-1].command_nm)
             bench.inject("mirror", "die")
             assert process.wait(10) == 7, "a failure: the units in deploy restart it"
