@@ -57,7 +57,6 @@ from tests.support.loops import lowfc, until
 from tests.support.recording import Bench, bodies_of, put
 from tests.support.toy import NOLL, calibration
 
-DOCUMENT = Path(__file__).parents[2] / "docs" / "howto" / "operating.md"
 KNOWN = identified(calibration())
 LAW = of_blocks([integrator_block(0.2, 0.01, "pol", 1.5)] * 3, "pol", "leaky", NOLL, 1.5, 1000.0)
 LEASE = {"text": "a test", "lease_id": 7}

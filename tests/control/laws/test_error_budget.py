@@ -12,7 +12,7 @@ from lowfc.control.laws.continuous import Timing, left_power
 from lowfc.control.laws.error_budget import Term, lag, lag_under_noise, measurement_error, sensor_noise, white_noise
 from lowfc.control.laws.linear_law import LinearLaw, integrator
 from lowfc.control.laws.spectra import Pieces, spectrum
-from tests.support.folded_loop import fold
+from tests.support.folded_loop import SMALL_MIRROR, fold
 from tests.support.theory import rejection
 from tools.law_bench import calibrated
 
@@ -167,7 +167,7 @@ def test_too_few_frames_for_a_fit_give_none() -> None:
 def test_the_terms_add_up_to_the_residual_of_a_loop_that_ran() -> None:
     """Within 6 % of the rms in all, 12 % of tip and tilt: there are 1.5 s, so that noise alone scatters by 3 to 5 %."""
     keys = {"control.start_mode": "closed", "camera.rate_hz": RATE_HZ, "disturbance.scale": 2.0}
-    config = load(None, keys | FIXED_GAINS)
+    config = load(None, keys | FIXED_GAINS | SMALL_MIRROR)
     calibration = calibrated(config)
     ran = fold(config, 1600, calibration)
     signals = {name: getattr(ran, name)[100:] for name in ("error_nm", "pol_nm", "disturbance_nm", "residual_nm")}

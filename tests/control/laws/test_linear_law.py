@@ -19,13 +19,11 @@ from lowfc.control.laws.margins import (
 )
 from lowfc.control.laws.pi_notch import Notch, pi_notch
 from lowfc.control.laws.stability import delay_weights, limiting_gain
-from lowfc.control.loop.safety import Limits
 from tests.support import theory
 from tests.support.theory import LAWS, integrators, law_of, linear, run
 from tests.support.toy import live, settings
 
 RATE_HZ = 1000.0
-WIDE = {"limits": Limits(7000.0, 7000.0, 7000.0), "limit_nm": (5000.0, 5000.0)}
 
 
 def test_the_integrator_is_what_the_design_says() -> None:
