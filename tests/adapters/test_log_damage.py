@@ -168,7 +168,7 @@ def test_a_rewritten_log_is_read_as_the_original(tmp_path: Path, source: Path, o
 
 
 @pytest.mark.parametrize("compression", CompressionType)
-@pytest.mark.parametrize("at", [1, 4, 8, 60])  # of a chunk: its length twice, and its content
+@pytest.mark.parametrize("at", [8, 60])  # of a chunk: its length, and its content
 @pytest.mark.parametrize("finished", [True, False])
 def test_of_a_damaged_one_only_the_damaged_chunk_is_lost(
     tmp_path: Path, source: Path, compression: CompressionType, at: int, finished: bool

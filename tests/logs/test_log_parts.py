@@ -171,14 +171,6 @@ def test_acceptance_takes_several_files(folder: Path, samples: list[Sample]) -> 
         assert "no `lowfc acceptance rejection` was carried out" in str(done.exception)
 
 
-def test_recover_takes_the_files_one_by_one(folder: Path, samples: list[Sample]) -> None:
-    files = recorded(folder, samples[:3000], 3, finish=False)
-    done = lowfc("recover", LAST)
-    assert done.exit_code == 0, done.exception
-    assert done.stdout.count("there is nothing to recover") == 2
-    assert in_order([Path(LAST)])[:2] == files[:2]
-
-
 IN_TURN = [["info"], ["report"], ["export", "--to", "csv", "--force"], ["recover"]]
 
 
