@@ -26,5 +26,5 @@ def device_checks(name: str, config: Configuration) -> Iterator[Check]:
             continue
         yield ok(f"{driver.__module__}:{driver.__qualname__}")._replace(name=what)
         for need in getattr(driver, "needs", lambda _: ())(options):
-            name, found = f"{what}: {need.what}", need.found
-            yield judged(name, "", bool(found), found or "it is not there", need.advice)
+            found = need.found
+            yield judged(f"{what}: {need.what}", "", bool(found), found or "it is not there", need.advice)
