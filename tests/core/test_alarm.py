@@ -53,14 +53,14 @@ def test_the_command_is_run_again_for_the_worst_event_that_occurred_while_it_ran
     assert not run.failures()
 
 
-def test_the_command_has_the_normal_scheduling_class_and_waits_for_its_interval(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    run = Alarmed("chrt -p $$ >> notes; nice >> notes", every_s=60.0)
+def test_the_command_has_the_normal_scheduling_class_and_waits_for_its_interval(tmp_path: Path) -> None:
+    notes = tmp_path / "notes"  # absolute: the second run may come when other tests are running
+    run = Alarmed(f"chrt -p $$ >> {notes}; nice >> {notes}", every_s=60.0)
     run.camera.event("CAMERA_RESTARTED")
-    until(lambda: Path("notes").exists() and len(Path("notes").read_text().splitlines()) == 3)
+    until(lambda: notes.exists() and len(notes.read_text().splitlines()) == 3)
     run.camera.event("CAMERA_RESTARTED")
     time.sleep(0.2)  # a second run would append to the file
-    policy, *_, niceness = lines = Path("notes").read_text().splitlines()
+    policy, *_, niceness = lines = notes.read_text().splitlines()
     assert len(lines) == 3
     assert "SCHED_OTHER" in policy
     assert niceness == str(os.nice(0) + 5), "the niceness of the alarm's thread, not of the recorder"
