@@ -58,10 +58,11 @@ def test_another_linear_algebra_differs_by_rounding_alone() -> None:
         assert 0 < figures["largest_difference_nm"] < 1e-4
 
 
-@pytest.mark.usefixtures("without_drawings")
 @pytest.mark.parametrize("log", [NIGHT, KILLED])
 @pytest.mark.parametrize("command", ["info", "report"])
-def test_readers_of_logs(command: str, log: Path, tmp_path: Path) -> None:
+def test_readers_of_logs(command: str, log: Path, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    if log == KILLED:
+        request.getfixturevalue("without_drawings")
     out = ["--out", tmp_path / "page.html"] if command == "report" else []
     assert asked(command, log, *out)
 
