@@ -16,6 +16,7 @@ from lowfc.control.loop.inputs import Request
 from lowfc.control.loop.safety import Limit
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES, Settings, State
 from lowfc.programs.cli import status
+from tests.support.folded_loop import SMALL_MIRROR
 from tests.support.toy import NOLL, calibration, feed, frame, live, loaded, names, settings
 from tools.guard import MOVED, SEEDS, Case, identified_law, known_law, moved, undisturbed
 from tools.law_bench import Bench, calibrated, configured
@@ -218,14 +219,14 @@ def brief(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_noise_without_images_is_that_of_the_images() -> None:
     """Modes of an open loop that nothing disturbs, and tilt that a law leaves of the wheel."""
-    config = configured(**{"disturbance.preset": "quiet"})
+    config = configured(**{"disturbance.preset": "quiet"}, **SMALL_MIRROR)
     found = calibrated(config)
     bench = Bench(config, found)
     bench.run(600)
     expected = frame_noise_nm2(config, found)
     got = np.cov(np.array([step.error_nm for step in bench.steps]).T)
     assert np.linalg.norm(got - expected) < 0.2 * np.linalg.norm(expected)
-    wheel = configured()
+    wheel = configured(**SMALL_MIRROR)
     left: list[float] = []
     for one in (Bench(wheel, found), ModalBench(wheel, expected)):
         one.ask("close")
