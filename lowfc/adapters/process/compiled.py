@@ -99,7 +99,6 @@ class Pool:
             done.release()
 
 
-@cache
 def _compiled() -> list[Any]:
     import numba
     from numba import types
