@@ -8,8 +8,8 @@ import pytest
 
 NO_SKIPS = os.environ.get("LOWFC_NO_SKIPS") == "1"
 LONGEST = (
-    *("test_tutorials", "test_lockstep", "test_calibrate", "test_what_if", "test_gain_watch", "test_commission"),
-    *("test_calibrate_commands", "test_optics_twin", "test_validate", "test_guard", "test_site"),
+    *("test_lockstep", "test_gain_watch", "test_calibrate", "test_optics_twin", "test_tutorials", "test_validate"),
+    *("test_commission", "test_calibrate_commands", "test_validate_figures", "test_what_if", "test_guard", "test_site"),
 )
 """Files that are begun first, so that no worker is left alone with one of them at the end."""
 
