@@ -24,7 +24,7 @@ _LIMITS = "`lowfc doctor --setup` (memlock unlimited in /etc/security/limits.d),
 
 @CHECKS.check("locked memory")
 def _locked_memory(facts: Facts) -> Check:
-    """Locking a process's memory, asked for as the loop asks for it."""
+    """Locking a process's memory, requested as by the loop."""
     if not facts.config.realtime.lock_memory:
         return note("the configuration does not ask for it: realtime.lock_memory = false")
     if refused := facts.tried.refused.get("lock_memory"):
@@ -55,7 +55,7 @@ def _swap(facts: Facts) -> Check:
     cost="a page fault may clear or gather 2 MB in the middle of a frame",
 )
 def _huge_pages(facts: Facts) -> Check:
-    """When the kernel takes huge pages by itself: `transparent_hugepage/enabled`."""
+    """When the kernel uses huge pages by itself: `transparent_hugepage/enabled`."""
     text = facts.host.text("sys/kernel/mm/transparent_hugepage/enabled")
     when = text[text.index("[") + 1 : text.index("]")]
     return ok(when) if when != "always" else warning(when)
@@ -67,7 +67,7 @@ def _huge_pages(facts: Facts) -> Check:
     cost="threads of a small product wait for each other on the loop's processors",
 )
 def _blas(facts: Facts) -> Check:
-    """Linear algebra of numpy, and whether it can be held to one thread, as the loop does."""
+    """Linear algebra of numpy, and whether it can be limited to one thread, as in the loop."""
     names = ", ".join(f"{name}, {threads} threads" for name, threads in sorted(_blas_threads().items()))
     with threadpool_limits(limits=1):
         held = _blas_threads()
@@ -78,7 +78,7 @@ def _blas(facts: Facts) -> Check:
 
 @CHECKS.check("control step")
 def _control_step(facts: Facts) -> Check:
-    """Arithmetic of the usual frame, `realtime.kernel`: numpy, or the fused step, which needs the extra `fast`."""
+    """Implementation of the control step, `realtime.kernel`: numpy, or the fused step, which needs the extra `fast`."""
     there = compiled.available()
     if facts.config.realtime.kernel == FUSED:
         return ok("the fused step") if there else warning("numpy, not the fused step", compiled.missing())
@@ -88,7 +88,7 @@ def _control_step(facts: Facts) -> Check:
 
 @CHECKS.check("socket buffers")
 def _socket_buffers(facts: Facts) -> Check:
-    """Bytes that sockets hold for a slow reader: `net.core.{r,w}mem_{default,max}` and `net.ipv4.tcp_{r,w}mem`."""
+    """Bytes that sockets buffer for a slow reader: `net.core.{r,w}mem_{default,max}` and `net.ipv4.tcp_{r,w}mem`."""
     net, read = "proc/sys/net", facts.host.text
     default_bytes, largest_bytes = (
         min(int(read(f"{net}/core/{way}mem_{which}")) for way in "rw") for which in ("default", "max")
@@ -111,7 +111,7 @@ def _socket_buffers(facts: Facts) -> Check:
 
 @CHECKS.check("disk")
 def _disk(facts: Facts) -> Check:
-    """Room for logs in `recorder.folder`, and how long it lasts at `camera.rate_hz`, as the recorder reckons."""
+    """Free space for logs in `recorder.folder`, and how long it lasts at `camera.rate_hz` by the recorder's estimate."""
     section, rate_hz = facts.config.recorder, facts.config.camera.rate_hz
     folder = Path(section.folder)
     free_bytes, writable = facts.host.disk(folder)
@@ -136,7 +136,7 @@ def _disk(facts: Facts) -> Check:
     "open files", advice="ulimit -n 1024, or LimitNOFILE=1024 of the service", cost="a process may fail to join the bus"
 )
 def _open_files(facts: Facts) -> Check:
-    """How many files and sockets a process may have open."""
+    """Limit of open files and sockets of a process."""
     limit = facts.host.open_files()
     detail = "no limit" if limit is None else f"{limit}"
     return ok(detail) if limit is None or limit >= _OPEN_FILES else warning(detail)
@@ -148,7 +148,7 @@ def _open_files(facts: Facts) -> Check:
     cost="a link that is up stays up; a process or a router that starts after the end is not let in",
 )
 def _certificates(facts: Facts) -> Check:
-    """Certificates in this host's folder, `network.certificates`, where the loop goes by a router."""
+    """Certificates in this host's folder, `network.certificates`, if the loop uses a router."""
     network = facts.config.network
     if not network.router:
         return ok("none needed: the configuration names no router")

@@ -30,7 +30,7 @@ _BUSY_SHOWN = 3
 
 @CHECKS.check("scheduling class")
 def _scheduling_class(facts: Facts) -> Check:
-    """SCHED_FIFO at `realtime.priority`, asked for as the loop asks for it."""
+    """SCHED_FIFO at `realtime.priority`, requested as by the loop."""
     priority = facts.config.realtime.priority
     if not priority:
         return note("the configuration asks for the normal class: realtime.priority = 0")
@@ -60,7 +60,7 @@ def _realtime_share(facts: Facts) -> Check:
 
 @CHECKS.check("processors")
 def _processors(facts: Facts) -> Check:
-    """Processors that the loop's processes may use, and those that the configuration names."""
+    """Processors available to the loop's processes, and those in the configuration."""
     usable, online = facts.host.usable_cpus(), facts.host.cpus("online")
     detail = f"{len(usable)} usable ({ranges(usable)}) of {len(online)}"
     named = facts.named_cpus
@@ -132,7 +132,7 @@ def _frequency(facts: Facts) -> Check:
 
 @CHECKS.check("idle states")
 def _idle_states(facts: Facts) -> Check:
-    """How deeply an idle processor sleeps: the driver and the longest waking of the states in use."""
+    """Depth of processor sleep: the driver and the longest exit latency of the states in use."""
     host, folder = facts.host, f"{CPUS}/cpu{min(facts.host.usable_cpus())}/cpuidle"
     driver, states = host.text(f"{CPUS}/cpuidle/current_driver"), sorted((host.root / folder).glob("state*"))
     read = [[host.text(f"{folder}/{state.name}/{key}") for key in ("latency", "name", "disable")] for state in states]
@@ -186,7 +186,7 @@ def _kernel(facts: Facts) -> Check:
     cost="the hypervisor stops a processor without saying so, whatever the scheduling class",
 )
 def _virtualisation(facts: Facts) -> Check:
-    """Hypervisor, and the processor time that it gave to others since boot."""
+    """Hypervisor, and the processor time stolen by it since boot."""
     read = facts.host.text_or_nothing
     flags = re.search(r"^flags\s*:(.*)$", facts.host.text("proc/cpuinfo"), re.MULTILINE)
     kind, stolen = read("sys/hypervisor/type"), facts.host.stolen_share()
@@ -206,7 +206,7 @@ def _virtualisation(facts: Facts) -> Check:
     cost="every process reads the time several times a frame",
 )
 def _clock_source(facts: Facts) -> Check:
-    """What the kernel reads the time from, and what a reading takes."""
+    """Time source of the kernel, and the duration of a reading."""
     source = facts.host.clock_source()
     reading_ns = min(timeit.repeat(time.monotonic_ns, number=_READINGS, repeat=10)) * 1e9 / _READINGS
     detail = f"{source}, {reading_ns:.0f} ns for a reading"
@@ -220,7 +220,7 @@ def _clock_source(facts: Facts) -> Check:
     "boot, and those of two hosts cannot be compared",
 )
 def _synchronisation(facts: Facts) -> Check:
-    """Whether a daemon keeps CLOCK_REALTIME, and how well, by the kernel's account."""
+    """Whether a daemon synchronises CLOCK_REALTIME, and the error that the kernel reports."""
     kept = facts.host.synchronisation()
     if kept.synchronised:
         return ok(f"kept; {kept.offset_s * 1e6:.0f} us to correct, error at most {kept.error_s * 1e3:.1f} ms")
@@ -229,7 +229,7 @@ def _synchronisation(facts: Facts) -> Check:
 
 @CHECKS.check("boot's clock")
 def _boot_clock(facts: Facts) -> Check:
-    """The clock of all runs since the boot, which the first one set by CLOCK_REALTIME, against CLOCK_REALTIME now."""
+    """The clock of all runs since boot, set from CLOCK_REALTIME by the first one, against CLOCK_REALTIME now."""
     file = boot_file()
     if not file.exists():
         return ok("not set yet: the first process of a run does it")
@@ -251,7 +251,7 @@ def _boot_clock(facts: Facts) -> Check:
     cost="frames wait so long before they are looked at, however fast the loop computes",
 )
 def _wake_up(facts: Facts) -> Check:
-    """How late a process wakes that sleeps until a time, 1000 times in one second, in both scheduling classes."""
+    """Lateness of a timer wake-up, 1000 times in one second, in both scheduling classes."""
     figures = wake_up_us(facts.tried)
     detail = "; ".join(
         f"{name}: p50 {one['p50']:.0f} us, p99 {one['p99']:.0f} us, max {one['max']:.0f} us"
