@@ -111,7 +111,7 @@ def _socket_buffers(facts: Facts) -> Check:
 
 @CHECKS.check("disk")
 def _disk(facts: Facts) -> Check:
-    """Free space for logs in `recorder.folder`, and how long it lasts at `camera.rate_hz` by the recorder's estimate."""
+    """Free space in `recorder.folder`, and how long it lasts at `camera.rate_hz` by the recorder's estimate."""
     section, rate_hz = facts.config.recorder, facts.config.camera.rate_hz
     folder = Path(section.folder)
     free_bytes, writable = facts.host.disk(folder)
