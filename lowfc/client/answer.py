@@ -1,4 +1,4 @@
-"""What a client gets for a request."""
+"""The controller's answer to a request."""
 
 from typing import NamedTuple
 
@@ -7,14 +7,14 @@ from lowfc.contract.messages import wire
 
 
 class Answer(NamedTuple):
-    """What was answered to a request that was carried out; one that was refused raises RequestRefusedError.
+    """Answer to a request that was carried out; a refused request raises RequestRefusedError.
 
     Attributes:
         accepted: always true.
-        reply: the sentence.
-        frame_sequence: of the first frame for which the request is in force.
-        text: path of the log, of `record`.
-        state: the controller's, of `status`.
+        reply: one sentence: what was done.
+        frame_sequence: sequence of the first frame for which the request is in force.
+        text: path of the log (`record` only).
+        state: the controller's state (`status` only).
         run: name of the run that answered.
     """
 
@@ -27,11 +27,11 @@ class Answer(NamedTuple):
 
     @property
     def frame(self) -> int:
-        """Number of that frame among those of its camera."""
+        """Number of that frame since its camera started."""
         return count_of(self.frame_sequence)
 
     @property
     def sentence(self) -> str:
-        """The answer as people read it."""
+        """The answer as a readable sentence."""
         run = f" (run {self.run})" if self.run else ""
         return f"{self.reply}, from frame {self.frame} on{run}"

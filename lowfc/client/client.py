@@ -1,4 +1,4 @@
-"""What an operator asks of a running loop, from Python."""
+"""An operator's requests to a running loop, from Python."""
 
 import contextlib
 import re
@@ -61,13 +61,13 @@ M = TypeVar("M", bound=Message)
 CONNECT_S = 1.0
 ANSWER_S = 2.0
 SLOW_ANSWER_S = 30.0
-"""To load a calibration, to take a long play, to finish a log."""
+"""Answer timeout for loading a calibration, a long play, or finishing a log."""
 LARGE_BYTES = 100_000
-"""Of a request; a larger one takes its time."""
+"""Size of a request above which it has the longer timeout."""
 
 
 def _plain(name: str) -> Callable[["Client"], Answer]:
-    """The method of a request without fields, as declared."""
+    """Make the method of a request that has no fields, with the declared docstring."""
 
     def ask(client: "Client") -> Answer:
         return client.ask(name)
@@ -77,18 +77,18 @@ def _plain(name: str) -> Callable[["Client"], Answer]:
 
 
 class Client:
-    """A connection to a loop, for one thread (another renews a reservation); it stays until `disconnect`.
+    """A connection to a loop, for use by one thread (another renews a reservation), until `disconnect`.
 
-    Of the run, only the process that answers need be there.
+    Only the process that answers a request has to be running.
 
     Every request is carried out between two frames or refused, and answered with the first frame for which it is in
-    force. What is refused raises RequestRefusedError, what is not answered BusError.
+    force. A refused request raises RequestRefusedError, an unanswered one BusError.
     """
 
     def __init__(self, run: str | None = None, *, bus: Bus | None = None) -> None:
         """Join a run.
 
-        None is the only run on this host. `disconnect` leaves the bus of a process that has joined already alone.
+        None selects the only run on this host. `disconnect` does not close a `bus` that was passed in.
 
         Raises:
             BusError: there is no such run, none at all, or more than one to choose from.
@@ -113,7 +113,7 @@ class Client:
         self.disconnect()
 
     def disconnect(self) -> None:
-        """Leave the run; the loop goes on as it is."""
+        """Leave the run; the loop continues unchanged."""
         if self._own is not None:
             self._own.close()
 
@@ -131,11 +131,11 @@ class Client:
         return self.ask("gain", modes, values)
 
     def automatic_gain(self, modes: Modes = ()) -> Answer:
-        """Let the controller choose integrator gains by what it measures (of Noll indices; of all when empty)."""
+        """Let the controller choose integrator gains from its measurements (Noll indices; all when empty)."""
         return self.ask("gain", modes, text=AUTO)
 
     def leak(self, values: npt.ArrayLike, modes: Modes = ()) -> Answer:
-        """Set integrator leaks, as `gain`: one for all modes or one for each, (modes,)."""
+        """Set integrator leaks: one for all modes or one for each, (modes,), as in `gain`."""
         return self.ask("leak", modes, values)
 
     def limit(self, values: npt.ArrayLike, modes: Modes = ()) -> Answer:
@@ -143,7 +143,7 @@ class Client:
         return self.ask("limit", modes, values)
 
     def step(self, frames: int) -> Answer:
-        """Close the loop for some frames; then it opens by itself."""
+        """Close the loop for a number of frames; it then opens automatically."""
         return self.ask("step", values=frames)
 
     def offset(self, values: npt.ArrayLike = (), modes: Modes = ()) -> Answer:
@@ -151,9 +151,9 @@ class Client:
         return self.ask("offset", modes, values)
 
     def channel(self, name: str, actuators_nm: npt.ArrayLike | None = None) -> Answer:
-        """Add a shape to the mirror: (rows, columns) nm of surface, in place of the one of that name; None removes it.
+        """Add a shape to the mirror, (rows, columns) nm of surface, as channel `name`; None removes the channel.
 
-        The sensor's zero point is shifted along, so that the loop does not undo it; not by the channel "flat".
+        The sensor's zero point shifts with it, so that the loop does not undo it, except for the channel "flat".
         """
         shape = np.zeros(0, np.float32) if actuators_nm is None else np.asarray(actuators_nm, np.float32)
         if shape.size and shape.shape != self._mirror_grid():
@@ -164,11 +164,11 @@ class Client:
         return self.ask("channel", text=name, actuators_nm=shape)
 
     def play(self, basis_nm: npt.ArrayLike, table: npt.ArrayLike) -> Answer:
-        """Add shapes to the mirror frame by frame, unknown to the control law; it ends by itself.
+        """Add shapes to the mirror frame by frame, unknown to the control law, until the table ends.
 
         Args:
             basis_nm: (shapes, actuators) or (shapes, rows, columns), nm of surface.
-            table: (frames, shapes), a row of factors for each frame from the answered one on.
+            table: (frames, shapes), a row of factors for each frame, starting with the frame of the answer.
         """
         basis, factors = np.asarray(basis_nm, np.float32), np.asarray(table, np.float32)
         basis = basis.reshape(len(basis), -1) if basis.ndim == 3 else basis
@@ -180,7 +180,7 @@ class Client:
         return self.ask("play", text=MIRROR, actuators_nm=basis, table=factors)
 
     def play_offset(self, table_nm: npt.ArrayLike) -> Answer:
-        """Add to the loop's target frame by frame: (frames, modes), nm rms of wavefront; it ends by itself."""
+        """Add a table to the loop's target frame by frame, (frames, modes), nm rms of wavefront, until it ends."""
         table = np.asarray(table_nm, np.float32)
         if table.ndim != 2:
             raise RequestRefusedError(f"play refused: it takes a table (frames, modes), got an array of {table.shape}")
@@ -196,9 +196,9 @@ class Client:
 
     @contextlib.contextmanager
     def reserved(self, purpose: str, duration_s: float | None = None) -> Iterator[Lease]:
-        """Reserve the loop: until the end of the block, requests of others that would change it are refused.
+        """Reserve the loop: until the end of the block, other clients' requests that would change it are refused.
 
-        `safe`, `open`, `pause` and `stop` are always granted, and end the reservation: see `check_lease`.
+        `safe`, `open`, `pause` and `stop` are always granted and end the reservation: see `check_lease`.
         See `Lease`.
         """
         lease = Lease(
@@ -214,31 +214,31 @@ class Client:
             lease.release()
 
     def check_lease(self) -> None:
-        """Make sure that the loop is still reserved, where it was; CalibrationError with the reason where it is not."""
+        """Check that a reservation of the loop is still in force; CalibrationError with the reason if it ended."""
         if self._lease is not None:
             self._lease.check()
 
     def permit(self, purpose: str, hold_s: float | None = None, lease_id: int = 0) -> Answer:
-        """Ask whether something on the bench may be moved; with `hold_s`, the loop is held for so long: see `held`."""
+        """Ask permission to move something on the bench; with `hold_s`, the loop holds for that long: see `held`."""
         values = () if hold_s is None else hold_s
         return self.ask("permit", values=values, text=by_this_process(purpose), lease_id=lease_id or new_identity())
 
     @contextlib.contextmanager
     def held(self, purpose: str, hold_s: float) -> Iterator[None]:
-        """Hold the loop while something on the bench is moved, for at most `hold_s`; a closed loop then goes on."""
+        """Hold the loop for at most `hold_s` while something on the bench moves; a closed loop then resumes."""
         identity = new_identity()
         self.permit(purpose, hold_s, identity)
         try:
             yield
         finally:
-            with contextlib.suppress(LowfcError):  # it ends by itself
+            with contextlib.suppress(LowfcError):  # it expires anyway
                 self.ask("release", lease_id=identity)
 
     def bench(self, name: str, value: Value) -> None:
-        """Publish a value of something else on the bench, for interlocks: again and again, or it becomes too old.
+        """Publish a value of another device on the bench, for interlocks: repeat it before it becomes too old.
 
         Raises:
-            ConfigurationError: the name or the value is none.
+            ConfigurationError: the name or the value is invalid.
         """
         if not re.fullmatch(BENCH_NAME, name):
             raise ConfigurationError(f"a bench value's name has up to 64 of A-Z, a-z, 0-9, _ and -, got {name[:80]!r}")
@@ -251,11 +251,11 @@ class Client:
         self._bench[name].put(message)
 
     def note(self, text: str) -> Answer:
-        """Leave a note in the log."""
+        """Write a note to the log."""
         return self.ask("note", text=text)
 
     def record(self, on: bool) -> Answer:
-        """Start the next log, or finish this one, and return its path as the answer's text."""
+        """Start the next log, or finish the current one; the answer's text is its path."""
         key = RECORD_KEY.format(name="start" if on else "stop")
         return self._answer("record", self._get(key, b"", SLOW_ANSWER_S, Role.RECORDER))
 
@@ -264,26 +264,26 @@ class Client:
         return self.ask("configuration").reply
 
     def calibration(self) -> Calibration:
-        """The calibration in use; BusError where nobody has one, or what was answered is none."""
+        """The calibration in use; BusError if there is none, or the answer is not a calibration."""
         message = self._get_message(CALIBRATION, wire.Calibration, Role.CONTROLLER)
         try:
             return decode_calibration(message)
         except ValueError as fault:
-            raise BusError(f"{CALIBRATION.key} was answered with what is no calibration: {fault}") from None
+            raise BusError(f"the answer to {CALIBRATION.key} is not a calibration: {fault}") from None
 
     def camera(self) -> CameraSettings | None:
-        """Settings of the camera as the controller last received them, to be kept with what is measured with it."""
+        """Camera settings as the controller last received them, to store with a measurement."""
         state = self.status().state
         if state is None or not state.HasField("camera"):
             return None
         return replace(camera_settings(state.camera), start_s=0)
 
     def camera_state(self) -> wire.CameraState:
-        """Settings of the camera, as it publishes them; BusError where no camera answers."""
+        """Camera settings as the camera publishes them; BusError if no camera answers."""
         return self._get_message(CAMERA_STATE, wire.CameraState, Role.CAMERA)
 
     def processes(self) -> dict[str, wire.Health]:
-        """What each process of the run reports of itself, by its name."""
+        """Health report of each process of the run, by name."""
         found, names = {}, Names()
         for sample in self._bus.get(HEALTH.at(ALL), timeout_s=ANSWER_S):
             with contextlib.suppress(*UNREADABLE):
@@ -292,22 +292,22 @@ class Client:
         return found
 
     def laws(self) -> dict[str, LinearLaw]:
-        """The law in place of the integrator, by its identity; empty where there has been none."""
+        """The law loaded in place of the integrator, by its identity; empty if there has been none."""
         published = Published()
         for sample in self._bus.get(LAW.key, timeout_s=ANSWER_S):
             published.take(LAW, sample.payload)
         return published.laws
 
     def frames(self, count: int | None = None, patience_s: float = SILENT_S) -> Stream[Frame]:
-        """Sensor images from now on, `count` of them or without end; BusError where none comes."""
+        """Stream sensor images from now on, `count` of them or without end; BusError if none arrives."""
         return Stream(self._bus.ring(FRAME, WAITING), frame_of, "frame", count, patience_s)
 
     def steps(self, count: int | None = None, patience_s: float = SILENT_S) -> Stream[Step]:
-        """Steps of the control law from now on, `count` of them or without end; see `frames`."""
+        """Stream steps of the control law from now on, `count` of them or without end; see `frames`."""
         return Stream(self._bus.ring(STEP, WAITING), step_of, "step", count, patience_s)
 
     def mirror_watch(self) -> MirrorWatch:
-        """What the mirror reports from now on, read without waiting; see `MirrorWatch`."""
+        """Watch the mirror's reports from now on, without blocking; see `MirrorWatch`."""
         return MirrorWatch(self._bus)
 
     def ask(
@@ -323,10 +323,10 @@ class Client:
         calibration: Calibration | None = None,
         lease_id: int | None = None,
     ) -> Answer:
-        """Ask the controller anything; the fields are those of `lowfc.v1.Request`: values (modes,), actuators nm.
+        """Send any request to the controller, with the fields of `lowfc.v1.Request`: values (modes,), actuators nm.
 
         Raises:
-            BusError: no controller is there, or it is too slow.
+            BusError: no controller is running, or it is too slow.
             RequestRefusedError: the controller refused, with its reason.
         """
         try:
@@ -349,13 +349,13 @@ class Client:
         payload = message.SerializeToString()
         if len(payload) > most_bytes(name):
             raise RequestRefusedError(
-                f"{name} refused: it may have {most_bytes(name):,} bytes and has {len(payload):,}: ask in parts"
+                f"{name} refused: at most {most_bytes(name):,} bytes, got {len(payload):,}: send it in parts"
             )
         patience_s = SLOW_ANSWER_S if len(payload) > LARGE_BYTES else ANSWER_S
         return self._answer(name, self._get(REQUEST_KEY.format(name=name), payload, patience_s))
 
     def _get(self, key: str, payload: bytes, answer_s: float, who: Role = Role.CONTROLLER) -> Sample:
-        """Ask one process; a link that is just being made answers at once that nobody is there."""
+        """Query one process; retry while a new link reports at once that nobody is there."""
         deadline_s = time.monotonic() + CONNECT_S
         while True:
             begun_s = time.monotonic()
@@ -365,26 +365,26 @@ class Client:
             if now_s - begun_s >= answer_s * 0.9:
                 raise BusError(
                     f"the {who} of run {self.run_id!r} did not answer within {answer_s:g} s: it hangs or is too slow; "
-                    "whether it did what was asked, the log and `lowfc ctl status` say"
+                    "the log and `lowfc ctl status` show whether the request was carried out"
                 )
             if now_s >= deadline_s:
                 if starting(self.run_id, who):
-                    raise BusError(f"run {self.run_id!r} is starting, and its {who} is not there yet: ask again")
+                    raise BusError(f"run {self.run_id!r} is starting, and its {who} is not there yet: try again")
                 raise BusError(f"no {who} is there in run {self.run_id!r}: start one, as with `{_COMMANDS[who]}`")
             time.sleep(0.05)
 
     def _get_message(self, topic: Topic, kind: type[M], who: Role) -> M:
-        """The state that a process published last."""
+        """The state that a process last published."""
         try:
             return kind.FromString(self._get(topic.key, b"", ANSWER_S, who).payload)
         except DecodeError as fault:
-            raise BusError(f"{topic.key} was answered with what is no {kind.DESCRIPTOR.full_name}: {fault}") from None
+            raise BusError(f"the answer to {topic.key} is not a {kind.DESCRIPTOR.full_name}: {fault}") from None
 
     def _answer(self, name: str, sample: Sample) -> Answer:
         try:
             message = wire.Request.FromString(sample.payload)
         except DecodeError as fault:
-            raise BusError(f"{name} was answered with what is no lowfc.v1.Request: {fault}") from None
+            raise BusError(f"the answer to {name} is not a lowfc.v1.Request: {fault}") from None
         if not message.accepted:
             raise RequestRefusedError(f"{name} refused: {message.reply} (run {self.run_id})")
         state = message.state if message.HasField("state") else None

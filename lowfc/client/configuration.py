@@ -13,10 +13,10 @@ if TYPE_CHECKING:
 
 
 def configuration_of(loop: "Client") -> "Configuration":
-    """The configuration that a loop's controller was started with.
+    """Return the configuration that a loop's controller was started with.
 
     Raises:
-        ConfigurationError: it is one of another version.
+        ConfigurationError: it belongs to another version of lowfc.
     """
     from lowfc.contract.configuration import Configuration, explain
 
@@ -24,6 +24,6 @@ def configuration_of(loop: "Client") -> "Configuration":
         return Configuration.model_validate(tomllib.loads(loop.configuration()))
     except ValidationError as fault:
         raise ConfigurationError(
-            f"the controller's configuration is one of another version of lowfc: {explain(fault.errors()[0])}; use the "
-            "lowfc that the controller was started with"
+            f"the controller's configuration belongs to another version of lowfc: {explain(fault.errors()[0])}; use "
+            "the lowfc that the controller was started with"
         ) from None

@@ -1,4 +1,4 @@
-"""The loop reserved for one client, renewed by a thread of its own for as long as it is needed."""
+"""A reservation of the loop for one client; a thread renews it until it is released."""
 
 import contextlib
 import secrets
@@ -15,16 +15,16 @@ if TYPE_CHECKING:
     from lowfc.adapters.process.progress import Counted
 
 DURATION_S = 10.0
-"""For which it is in force unless it is renewed: so long are others refused after its holder's death."""
+"""Time in force without renewal: after the holder's death, other clients are refused for this long."""
 RENEWAL_S = 0.5
-"""Between renewals; in lockstep a loop may be twenty times as fast as its clock says."""
+"""Time between renewals; in lockstep a loop may run twenty times faster than real time."""
 
 Ask = Callable[[str, int, float, str], object]
-"""Ask for `lease`, `renew` or `release`: the request, the lease's identity, seconds, its holder."""
+"""Sends `lease`, `renew` or `release`: the request, the lease's identity, seconds, its holder."""
 
 
 def new_identity() -> int:
-    """Identity of a reservation: a random number above 0."""
+    """Make the identity of a reservation: a random number above 0."""
     return secrets.randbits(63) | 1
 
 
@@ -32,11 +32,11 @@ class Lease:
     """A reservation of the loop, from its construction to `release`; the holder's requests carry its `id`."""
 
     def __init__(self, ask: Ask, purpose: str, duration_s: float | None = None) -> None:
-        """Reserve the loop for a purpose such as "lowfc calibrate", and a time where that is known.
+        """Reserve the loop for a purpose such as "lowfc calibrate", with its duration if known.
 
         Raises:
-            RequestRefusedError: somebody else has reserved it.
-            BusError: no controller is there.
+            RequestRefusedError: another client has reserved it.
+            BusError: no controller is running.
         """
         self.id = new_identity()
         self._ask = ask
@@ -50,11 +50,11 @@ class Lease:
         self._thread.start()
 
     def expect(self, duration_s: float) -> None:
-        """Set how long it is going to take from now on."""
+        """Set the expected remaining duration."""
         self._end_s = time.monotonic() + duration_s
 
     def expecting(self, progress: "Counted", rate_hz: float) -> "Counted":
-        """Progress in frames, from which others learn how long it is going to take."""
+        """Wrap a progress callback in frames, so that other clients can read the remaining time."""
 
         def count(what: str, done: int, total: int) -> None:
             self.expect((total - done) / rate_hz)
@@ -63,7 +63,7 @@ class Lease:
         return count
 
     def check(self) -> None:
-        """Renew it now; CalibrationError where it has ended, with the reason."""
+        """Renew it now; CalibrationError with the reason if it has ended."""
         with self._turn:
             if not self._ended:
                 try:
@@ -74,7 +74,7 @@ class Lease:
                 raise CalibrationError(f"the reservation of the loop ended: {self._ended}")
 
     def release(self) -> None:
-        """Give the loop back."""
+        """End the reservation."""
         self._done.set()
         self._thread.join()
         with contextlib.suppress(LowfcError):
@@ -85,7 +85,7 @@ class Lease:
             try:
                 self.check()
             except BusError:
-                continue  # the controller may come back; the next request says what is wrong
+                continue  # the controller may come back; the next request reports the fault
             except CalibrationError:
                 return
 

@@ -1,4 +1,4 @@
-"""The mirrors of a running loop, for a program whose frames are worth nothing unless the mirror follows commands."""
+"""The mirrors of a running loop, for a program whose frames are valid only while the mirror follows commands."""
 
 import time
 from collections import deque
@@ -15,16 +15,16 @@ _POLL_S = 0.002
 
 
 class MirrorWatch:
-    """What the mirrors of a run reported since it was made; it is there once a first mirror has reported.
+    """Reports of the mirrors of a run since construction, which returns once a first mirror has reported.
 
     Attributes:
         frame_sequence: of the newest command that every known mirror follows.
-        applied: the last ones of them, each with the time at which the mirror reported it, ns of the host's clock.
-        interruption: what kept a mirror from following commands meanwhile, a sentence's subject and verb; else empty.
+        applied: the last of these commands, each with the time of the mirror's report, ns of the host's clock.
+        interruption: subject and verb of what kept a mirror from following commands meanwhile; empty if nothing did.
     """
 
     def __init__(self, bus: Bus) -> None:
-        """Begin with what the bus gets; BusError where no mirror reports."""
+        """Subscribe to the mirrors' states and events; BusError if no mirror reports."""
         self.interruption = ""
         self.applied: deque[tuple[int, int]] = deque(maxlen=WAITING)
         self._events: Ring = bus.ring(EVENT, WAITING)
@@ -44,7 +44,7 @@ class MirrorWatch:
         return min(sequence for _, sequence in self._mirrors.values())
 
     def read(self) -> None:
-        """Take in what has come since the last call; waits for nothing."""
+        """Process the messages received since the last call, without blocking."""
         for sample in self._states.drain():
             name, start_s = name_in(MIRROR_STATE, sample.key), start_of(sample.sequence)
             try:

@@ -1,7 +1,7 @@
-"""Every request, once: its key, the fields of `lowfc.v1.Request` that it takes, what it does, its `lowfc ctl`.
+"""The table of requests: key, fields of `lowfc.v1.Request`, description and `lowfc ctl` command of each.
 
-The client's methods, the commands of `lowfc ctl` and the table in docs/reference/requests.md are made of it; a test
-holds it against what the controller and the recorder know.
+The client's methods, the commands of `lowfc ctl` and the table in docs/reference/requests.md are generated from it; a
+test compares it with the requests that the controller and the recorder accept.
 """
 
 from typing import NamedTuple
@@ -13,10 +13,10 @@ class Declaration(NamedTuple):
     """Declaration of one kind of request.
 
     Attributes:
-        key: of the query.
-        fields: of the message, with what they hold.
+        key: key of the query.
+        fields: fields of the message, with their content.
         sentence: what it does.
-        example: of a command line; none where there is only the message.
+        example: an example command line; empty if the request has no command.
     """
 
     key: str
@@ -44,7 +44,7 @@ DECLARED: tuple[Declaration, ...] = (
     _declared("close", "Let the control law drive the mirror.", "close"),
     _declared("pause", "Hold the command; `close` goes on from it.", "pause"),
     _declared(
-        "step", "Close the loop for some frames; then it opens by itself.", "step 100", ("values", "number of frames")
+        "step", "Close the loop for some frames, then open it again.", "step 100", ("values", "number of frames")
     ),
     _declared("safe", "Relax the mirror to flat and latch it there, whatever else is requested.", "safe"),
     _declared("clear", "Leave the latched safe state; the loop is open afterwards.", "clear"),
@@ -74,8 +74,8 @@ DECLARED: tuple[Declaration, ...] = (
     ),
     _declared(
         "channel",
-        "Add a shape to the mirror in place of the one of that name, and take the sensor's zero point along, so that "
-        "the loop does not undo it; `flat` is added without.",
+        "Set a shape that is added to the mirror, and shift the sensor's zero point with it, so that the loop does not "
+        "undo it; `flat` shifts nothing.",
         "channel dark-hole shape.fits",
         ("text", "name: up to 32 of a-z, 0-9 and -, a letter first"),
         ("actuators", "float32, nm of surface, rows x columns; empty removes the channel"),
@@ -90,7 +90,7 @@ DECLARED: tuple[Declaration, ...] = (
         ("columns", "of the table"),
         ("actuators", "of `mirror`: one shape for each column, float32, nm of surface"),
     ),
-    _declared("stop", "End what is being played.", "stop"),
+    _declared("stop", "End the play.", "stop"),
     _declared(
         "law",
         "Let a linear law drive the mirror: it observes for a while, then takes over in a cross-fade; refused where it "
@@ -99,11 +99,11 @@ DECLARED: tuple[Declaration, ...] = (
         ("law", "none for the integrator"),
     ),
     _declared("load", "Use another calibration in an open loop.", "load calibration.fits", ("calibration", "all")),
-    _declared("note", "Leave a note in the log.", 'note "new star"', ("text", "the note")),
+    _declared("note", "Write a note to the log.", 'note "new star"', ("text", "the note")),
     _declared(
         "lease",
-        "Reserve the loop: until that ends, requests of others that would change it are refused; `safe`, `open`, "
-        "`pause` and `stop` are granted to anybody, and end it.",
+        "Reserve the loop: until that ends, other clients' requests that would change it are refused; `safe`, `open`, "
+        "`pause` and `stop` are granted to everyone, and end it.",
         "",
         ("lease_id", "a random number, which all requests of the holder carry"),
         ("values", "seconds for which it holds without being renewed, at most 60"),
@@ -111,7 +111,7 @@ DECLARED: tuple[Declaration, ...] = (
     ),
     _declared(
         "renew",
-        "Let a reservation that is in force hold longer; refused where it has ended, with the cause.",
+        "Extend a reservation that is in force; refused with the cause if it has ended.",
         "",
         ("lease_id", "as in `lease`"),
         ("values", "seconds"),
@@ -120,11 +120,11 @@ DECLARED: tuple[Declaration, ...] = (
     _declared("release", "End a reservation.", "", ("lease_id", "as in `lease`")),
     _declared(
         "permit",
-        "Ask whether something on the bench may be moved; with a time, a closed loop holds its command and the loop is "
-        "reserved for so long, or until it is released.",
+        "Ask permission to move something on the bench; with a time, a closed loop holds its command and the loop is "
+        "reserved for that long, or until it is released.",
         'permit "moving the mask" --hold 5',
         ("text", "what is moved, for people"),
-        ("values", "seconds for which the loop is held, at most 60; none to ask alone"),
+        ("values", "seconds for which the loop is held, at most 60; none only asks"),
         ("lease_id", "of a hold: as in `lease`"),
     ),
     _declared("configuration", "Answer with the configuration that the controller was started with.", "configuration"),

@@ -1,4 +1,4 @@
-"""Which runs there are on this host."""
+"""Find the runs on this host."""
 
 from lowfc.adapters.bus.other_loops import none_here
 from lowfc.adapters.bus.run import open_run, runtime_base
@@ -7,12 +7,12 @@ from lowfc.contract.messages import Role
 
 
 def running() -> list[str]:
-    """Names of the runs on this host whose controller listens; a run that was killed leaves its directory behind."""
+    """Names of the runs on this host whose controller is listening; the directory of a killed run does not count."""
     return [name for name, roles in living().items() if Role.CONTROLLER in roles]
 
 
 def the_run(name: str | None) -> str:
-    """The run of that name or of the one name that begins so, or the only one there is, whoever of it is there.
+    """The run with that name or unique beginning of a name, or the only run, whichever of its processes are running.
 
     Raises:
         BusError: there is no such run, none at all, or more than one to choose from.
@@ -35,27 +35,27 @@ def the_run(name: str | None) -> str:
 
 
 def the_known_run(name: str | None) -> str:
-    """The run of that name, whether a process of it is there or not; else as `the_run`."""
+    """The run of that name, even if none of its processes is running; otherwise as `the_run`."""
     return name if name is not None and (runtime_base() / name).is_dir() else the_run(name)
 
 
 def nobody_yet(name: str) -> str:
-    """Sentence while a process waits for a run of which no other is on this host; empty where one is."""
+    """Message while a process waits alone for its run on this host; empty once another process is running."""
     runs = living()
     if name in runs:
         return ""
     there = f"running: {_listed(runs)}{nearest(name, runs)}" if runs else "no other loop of yours is running"
-    return f"waiting for run {name!r}, of which no process is on this host yet; {there}"
+    return f"waiting for run {name!r}, which has no other process on this host yet; {there}"
 
 
 def starting(name: str, role: Role) -> bool:
-    """Whether `lowfc sim-loop` has begun this run, and its process of this role does not listen yet."""
+    """Whether `lowfc sim-loop` has started this run but its process of this role is not listening yet."""
     roles = living().get(name, set())
     return Role.LAUNCHER in roles and role not in roles
 
 
 def living(wanted: str | None = None) -> dict[str, set[str]]:
-    """Runs of which somebody listens, and who; a damaged one is left out, unless it is the one that is wanted.
+    """Runs with a listening process, and their roles; a damaged run is omitted unless it is the wanted one.
 
     Raises:
         BusError, DataFileError: the wanted one is damaged.
@@ -74,7 +74,7 @@ def living(wanted: str | None = None) -> dict[str, set[str]]:
 
 
 def _listed(runs: dict[str, set[str]]) -> str:
-    """Names of runs, those without a controller marked: they may still be starting."""
+    """List names of runs; those without a controller are marked, as they may still be starting."""
     return ", ".join(
         name if Role.CONTROLLER in roles else f"{name} (no controller yet)" for name, roles in runs.items()
     )

@@ -1,4 +1,4 @@
-"""Frames and steps of a running loop, for who looks at them one after the other; what did not get here is counted."""
+"""Frames and steps of a running loop, one after the other; lost ones are counted."""
 
 import time
 from collections import deque
@@ -21,7 +21,7 @@ from lowfc.control.loop.safety import LoopMode, reason_of
 T = TypeVar("T")
 
 WAITING = 1024
-"""Messages of a stream that wait for their reader: a second of a 1 kHz loop."""
+"""Messages of a stream that its buffer holds: one second of a 1 kHz loop."""
 SILENT_S = 5.0
 _POLL_S = 0.002
 
@@ -35,19 +35,19 @@ class Frame(NamedTuple):
 
     @property
     def number(self) -> int:
-        """Number of the frame within its camera's start, as `lowfc ctl` and the views show it."""
+        """Number of the frame since its camera started, as in `lowfc ctl` and the views."""
         return count_of(self.sequence)
 
 
 class Stream(Generic[T]):
-    """Messages of one topic as they come, from the moment it is made; it is there once the first one has come."""
+    """Messages of one topic as they arrive; construction returns once the first one has arrived."""
 
     def __init__(
         self, ring: Ring, decode: Callable[[Sample], T | None], what: str, count: int | None, patience_s: float
     ) -> None:
-        """Begin with what the ring gets, for `count` messages or for ever; BusError where none comes.
+        """Subscribe, for `count` messages or without end; BusError if none arrives.
 
-        `decode` returns None for what is no message, `what` they are for people.
+        `decode` returns None for an invalid message; `what` names the messages in errors.
         """
         self._ring = ring
         self._decode = decode
@@ -61,14 +61,14 @@ class Stream(Generic[T]):
 
     @property
     def lost(self) -> int:
-        """Messages that were sent and did not get here, because their reader was too slow, or that were damaged."""
+        """Messages that were lost because the reader was too slow, or that were damaged."""
         return self._damaged + sum(gaps.missing for gaps in self._gaps.values())
 
     def __iter__(self) -> "Stream[T]":
         return self
 
     def __next__(self) -> T:
-        """The next message; BusError where none comes for too long."""
+        """The next message; BusError if none arrives in time."""
         while self._left:
             self._fill()
             sample = self._waiting.popleft()
@@ -83,7 +83,7 @@ class Stream(Generic[T]):
         raise StopIteration
 
     def close(self) -> None:
-        """Get no more."""
+        """Stop receiving."""
         self._left = 0
         self._ring.close()
         self._waiting.clear()
@@ -100,13 +100,13 @@ class Stream(Generic[T]):
 
 
 def frame_of(sample: Sample) -> Frame | None:
-    """Frame of a message; None where it holds no whole image."""
+    """Frame of a message; None if it holds no complete image."""
     frame = codec.decode_frame(sample.payload, sample.sequence, 0)
     return None if frame.pixels is None else Frame(frame.sequence, frame.time_ns, frame.pixels)
 
 
 def step_of(sample: Sample) -> Step | None:
-    """Step of a message; None where it is none."""
+    """Step of a message; None if it is not valid."""
     try:
         message = wire.ControlStep.FromString(sample.payload)
         return Step(

@@ -1,14 +1,14 @@
-"""A camera's own clock: its times by the host's."""
+"""Conversion of a camera's own clock to the host's."""
 
 WINDOW_NS = 10_000_000_000
-"""In which the offset is looked for: a quartz of 20 parts in a million goes 0.2 ms astray meanwhile."""
+"""Window of the offset estimate: a quartz off by 20 parts in a million drifts 0.2 ms in it."""
 
 
 class CameraClock:
-    """Times of a camera whose clock has an epoch and a rate of its own, by CLOCK_MONOTONIC.
+    """Converts times of a camera whose clock has its own epoch and rate to CLOCK_MONOTONIC.
 
-    No frame arrives before it was stamped, and some arrive almost at once. So the least difference between reception
-    and stamp of the last 10 s is the offset, but for the shortest transfer, by which times are late.
+    No frame arrives before its time stamp, and some arrive almost at once. The offset is therefore the smallest
+    difference between reception and stamp in the last 10 s; times are late by the shortest transfer.
 
     Example:
         self.clock = CameraClock()                                    # in __init__
@@ -16,12 +16,12 @@ class CameraClock:
     """
 
     def __init__(self) -> None:
-        """Without any frame yet."""
+        """Start without any frame."""
         self._least_ns: list[int] = []
         self._begun_ns = 0
 
     def monotonic_ns(self, stamp_ns: int, received_ns: int) -> int:
-        """Time of a stamp (ns of the camera's clock, of the end of the exposure) of a frame received at that time."""
+        """Convert the stamp of a received frame (end of the exposure, ns of the camera's clock)."""
         offset_ns = received_ns - stamp_ns
         if not self._least_ns or received_ns - self._begun_ns > WINDOW_NS // 2:
             self._least_ns = [*self._least_ns[-1:], offset_ns]

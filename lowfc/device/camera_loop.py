@@ -1,4 +1,4 @@
-"""A camera's process: frames and settings of its driver to the bus."""
+"""A camera's process: publishes the frames and settings of its driver."""
 
 import numpy as np
 
@@ -11,25 +11,25 @@ from lowfc.device.driver import Camera, CameraExtras, CameraSettings, Exposure, 
 from lowfc.device.watch import DriverWatch
 
 WAIT_S = 30.0
-"""How long the first frame waits for the processes that must not miss it."""
+"""Time the first frame waits for the processes that need it."""
 SETTINGS_NS = round(1e9 / float(CAMERA_STATE.rate))
 PATIENCE_S = 1.0
-"""How long an exposure may take to come, or three periods where they are longer."""
+"""Timeout of an exposure, or three periods if that is longer."""
 REST_NS = 100_000_000
 AHEAD_NS = 5_000_000
-"""How far the end of an exposure may be ahead of its clock."""
+"""Largest time by which the end of an exposure may be ahead of its clock."""
 MOST_LOST, MOST_FASTER = 100, 4
-"""Largest step of frame numbers: so many, and so many times the periods since the last frame. Beyond, a restart."""
+"""Largest step of frame numbers: this many, plus this factor times the periods since the last frame; else a restart."""
 FRAME_ID = "lowfc_camera"
 
 _IDLE = CameraExtras()
 
 
 class CameraLoop:
-    """Publishes a driver's frames until it is stopped, or a number of them."""
+    """Publishes a driver's frames until it is stopped, or for a number of frames."""
 
     def __init__(self, driver: Camera, service: Service, config: Configuration, frames: int | None = None) -> None:
-        """Declare everything on the bus; publish the first settings."""
+        """Declare the publishers on the bus and publish the first settings."""
         self._driver = driver
         self._service = service
         self._limit = frames
@@ -51,11 +51,11 @@ class CameraLoop:
         service.state = "ready"
 
     def run(self, wait_for: tuple[str, ...] = ()) -> None:
-        """Expose and publish; the first frame waits for those named.
+        """Expose and publish; the first frame waits for the named processes.
 
         Raises:
-            BusError: somebody did not come, or in lockstep did not answer.
-            LowfcError: the driver says what a user has to put right.
+            BusError: a process did not appear, or did not answer in lockstep.
+            LowfcError: the driver reports a fault that a user has to correct.
         """
         service = self._service
         service.meet(wait_for, WAIT_S, "the camera will not start without")
@@ -76,7 +76,7 @@ class CameraLoop:
         service.finish()
 
     def _next_frame(self) -> tuple[Pixels, int] | None:
-        """Pixels of the next exposure and the run's time of its end; None where there is none."""
+        """Pixels of the next exposure and the run's time of its end; None if there is no frame."""
         clock, watch = self._service.clock, self.watch
         if clock.host_ns() < watch.retry_ns:
             return None
@@ -110,7 +110,7 @@ class CameraLoop:
         self._service.work += 1
 
     def _end_ns(self, exposure: Exposure, settings: CameraSettings) -> int:
-        """End of an exposure by the run's clock; ValueError where it is in the future."""
+        """End of an exposure by the run's clock; ValueError if it is in the future."""
         clock = self._service.clock
         if exposure.end_ns is None:
             return clock.now_ns()
@@ -123,9 +123,9 @@ class CameraLoop:
         return end_ns
 
     def _follow_numbers(self, exposure: Exposure, settings: CameraSettings) -> None:
-        """Count frames that the camera lost; where its numbers restart, begin a new start of the publisher.
+        """Count frames that the camera lost; restart the publisher if the camera's numbers restart.
 
-        ValueError where the number is that of the last frame.
+        ValueError if the number is that of the last frame.
         """
         lost, now_ns = exposure.lost, self._service.clock.host_ns()
         if exposure.number is not None and self._number is not None:
@@ -144,13 +144,13 @@ class CameraLoop:
             self._lost += lost
 
     def _restart(self) -> None:
-        """A new start of the publisher: frames, and the settings that the controller then waits for."""
+        """Restart the publishers of frames and of the settings, which the controller then waits for."""
         self._service.bus.restart()
         self._settings = None
         self._publish_settings()
 
     def _report_lost(self) -> None:
-        """Report lost frames, those of half a second in one event."""
+        """Report lost frames, one event per half second."""
         now_ns = self._service.clock.host_ns()
         if self._lost and now_ns >= self._lost_due_ns:
             self._service.event("FRAMES_LOST", count=self._lost)
@@ -175,7 +175,7 @@ class CameraLoop:
 
 
 def _checked(pixels: Pixels, settings: CameraSettings) -> Pixels:
-    """Pixels as they may be published; ValueError where they are of another type or shape."""
+    """Check pixels before publication; ValueError if their type or shape is wrong."""
     if pixels.dtype != np.uint16 or pixels.shape != (settings.rows, settings.columns):
         raise ValueError(
             f"pixels are {pixels.dtype} of shape {pixels.shape}, expected uint16 of shape "

@@ -1,9 +1,9 @@
-"""What a driver of a camera or of a mirror is: a class with a handful of methods, run by `run_camera` or `run_mirror`.
+"""Interfaces of camera and mirror drivers: a class with a few methods, run by `run_camera` or `run_mirror`.
 
-The loops do all the rest: real-time set-up, bus, envelope, frame numbers, clocks, settings, health, and for a mirror
+The loops do everything else: real-time set-up, bus, envelope, frame numbers, clocks, settings, health, and for a mirror
 limits, refusal of bad commands, command timeout, idle state and channels. A driver does not catch, retry or log: it
-raises, and the loop counts it, names it in an event and tries again. A `LowfcError`, such as `ConfigurationError`, is
-what a user has to put right: the process ends with its sentence.
+raises, and the loop counts the fault, reports it in an event and tries again. A `LowfcError`, such as
+`ConfigurationError`, is a fault that a user has to correct: the process ends with its message.
 """
 
 from dataclasses import dataclass, field, fields
@@ -23,19 +23,19 @@ from lowfc.optics.detector.detector import saturation_dn
 class DriverOptions(Section):
     """Options of a driver: derive from it and call it `Options` in the driver's class.
 
-    A docstring below a field is its help. Unknown keys are refused, no value is converted, values do not change. They
-    come from `[drivers.NAME]` of the configuration, and from the command line: `--frame-rate 100` is `frame_rate`.
+    A docstring below a field is its help. Unknown keys are refused, values are not converted and cannot change. They
+    come from `[drivers.NAME]` of the configuration and from the command line: `--frame-rate 100` sets `frame_rate`.
     """
 
 
 class Need(NamedTuple):
-    """What a driver needs of its host, for `lowfc doctor --device`.
+    """A requirement of a driver on its host, for `lowfc doctor --device`.
 
-    A driver's class may have a class method `needs(options)` that returns some.
+    A driver's class may have a class method `needs(options)` that returns its requirements.
 
     Attributes:
-        what: a package, a file, a device.
-        found: what was found of it; empty where it is not there.
+        what: a package, file or device.
+        found: what was found; empty if it is missing.
         advice: how to get it.
     """
 
@@ -46,26 +46,26 @@ class Need(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class CameraSettings:
-    """What a camera is set to.
+    """Settings of a camera.
 
     Attributes:
-        rows: of a frame, that is, of the region read.
-        columns: of a frame.
+        rows: rows of a frame, that is, of the region read.
+        columns: columns of a frame.
         exposure_ns: exposure time of one frame.
         period_ns: time between the starts of two exposures.
         gain_e_per_dn: electrons per digital number.
         bias_dn: level without light.
         read_noise_e: read noise of one pixel.
         bit_depth: bits of the converter.
-        saturation_dn: highest value of a pixel, bias included: full well or converter, whichever is lower; the
-            converter's where it is None.
-        em_gain: electron-multiplying gain; 1 where there is none.
+        saturation_dn: highest value of a pixel, bias included: full well or converter, whichever is lower; None for
+            the converter's.
+        em_gain: electron-multiplying gain; 1 if there is none.
         region_row: first row of the region read.
         region_column: first column of the region read.
-        clock: of `Exposure.end_ns`: CLOCK_MONOTONIC, CLOCK_REALTIME, or the run's (`service.clock`), by which only a
-            simulated camera goes: its frame is published once that clock has reached the end of the exposure.
-        number_wrap: value at which `Exposure.number` begins again at 0, such as 1 << 16.
-        time_ns: time from which they hold, by the run's clock; now where it is None.
+        clock: clock of `Exposure.end_ns`: CLOCK_MONOTONIC, CLOCK_REALTIME, or the run's (`service.clock`), only for
+            simulated cameras: a frame is published once that clock has reached the end of the exposure.
+        number_wrap: value at which `Exposure.number` wraps to 0, such as 1 << 16.
+        time_ns: time from which the settings hold, by the run's clock; None for now.
     """
 
     rows: int
@@ -86,7 +86,7 @@ class CameraSettings:
 
     @classmethod
     def configured(cls, config: Configuration, rows: int, columns: int) -> "CameraSettings":
-        """What [camera] says of a camera with frames of this size; a driver replaces what its hardware says."""
+        """Settings from [camera] for frames of this size; a driver replaces those that its hardware reports."""
         camera = config.camera
         return cls(
             rows,
@@ -118,9 +118,9 @@ class Exposure(NamedTuple):
 
     Attributes:
         pixels: (rows, columns) uint16 in DN as the converter gives them, the low bit at bit 0.
-        end_ns: end of the exposure, ns of the clock that the settings name; the moment of reception where it is None.
-        number: of the frame as the hardware counts; the loop unwraps it and counts those missing. None without one.
-        lost: frames that were lost just before this one, where the hardware has no numbers to tell.
+        end_ns: end of the exposure, ns of the clock that the settings name; None for the moment of reception.
+        number: the hardware's frame number; the loop unwraps it and counts missing frames. None if there is none.
+        lost: frames lost just before this one, if the hardware has no frame numbers.
     """
 
     pixels: Pixels
@@ -130,7 +130,7 @@ class Exposure(NamedTuple):
 
 
 class Puts(Protocol):
-    """Puts messages of a topic."""
+    """Publishes messages of a topic."""
 
     def put(self, payload: bytes) -> Envelope:
         """Send a message; return its envelope."""
@@ -148,7 +148,7 @@ class Camera(Protocol):
         ...
 
     def expose(self) -> Exposure | None:
-        """Wait for the next frame and return it; None where there was none for about half a second."""
+        """Wait for the next frame and return it; None if none arrived for about half a second."""
         ...
 
     def close(self) -> None:
@@ -157,13 +157,13 @@ class Camera(Protocol):
 
 
 class CameraExtras:
-    """Optional methods of a camera, each by itself; those of this class do nothing."""
+    """Optional methods of a camera, independent of each other; the defaults do nothing."""
 
     def join(self, service: Service) -> None:
         """The process has joined its run: `service` has its clock, publishers, bus and events."""
 
     def start(self) -> None:
-        """All processes that the first frame waits for are there: the first exposure follows."""
+        """All processes that the first frame waits for are running; the first exposure follows."""
 
     def sent(self, envelope: Envelope) -> None:
         """The last frame has been published, with this envelope."""
@@ -172,24 +172,24 @@ class CameraExtras:
         """In lockstep, after each frame: wait until the mirror has applied its command."""
 
     def through(self, publisher: Publisher) -> Puts:
-        """What puts the frames in place of their publisher, as for tests of faults."""
+        """Replace the publisher of frames, for example in fault tests."""
         return publisher
 
     def fill(self, health: wire.Health) -> None:
-        """Add to a Health, twice a second."""
+        """Add fields to the Health message, twice a second."""
 
 
 @dataclass(frozen=True, slots=True)
 class Geometry:
-    """A mirror's actuators and what they can do, nm of surface.
+    """A mirror's actuator grid and limits, nm of surface.
 
     Attributes:
-        rows: of actuators.
-        columns: of actuators.
+        rows: rows of actuators.
+        columns: columns of actuators.
         stroke_nm: largest deviation from flat, either way.
         slew_nm: largest change from one command to the next.
         neighbour_nm: largest difference between neighbours.
-        step_nm: least step of the driver: what it rounds to.
+        step_nm: smallest step of the driver, to which it rounds.
     """
 
     rows: int
@@ -201,7 +201,7 @@ class Geometry:
 
 
 def geometry(config: Configuration) -> Geometry:
-    """The mirror that the section [mirror] of a configuration describes."""
+    """Geometry from the section [mirror] of a configuration."""
     section, limits = config.mirror, mirror_limits(config)
     step_nm = section.stroke_nm / 2**section.driver_bits
     return Geometry(section.rows, section.columns, limits.stroke_nm, limits.slew_nm, limits.neighbour_nm, step_nm)
@@ -211,7 +211,7 @@ class Mirror(Protocol):
     """A mirror: `MyMirror(options, config)` opens it.
 
     It may have a class `Options`, derived from `DriverOptions`, and the methods of `MirrorExtras`. The actuators that
-    it receives are within the limits of its geometry and of [mirror], whichever are tighter.
+    it receives keep the tighter of its geometry's limits and those of [mirror].
     """
 
     @property
@@ -220,40 +220,40 @@ class Mirror(Protocol):
         ...
 
     def apply(self, actuators_nm: Single) -> Single | None:
-        """Move to (rows, columns) nm of surface from flat; return where the actuators are, None for there.
+        """Move to (rows, columns) nm of surface from flat; return the actuators' positions, None if as commanded.
 
-        Do not keep or change the array. It is called for every command on the thread that received it: be quick.
+        Do not keep or change the array. Called for every command on the receiving thread: be quick.
         """
         ...
 
     def close(self) -> None:
-        """Release the hardware; the last call. The shape stays as it is."""
+        """Release the hardware; the last call. The mirror keeps its shape."""
         ...
 
 
 class MirrorExtras:
-    """Optional methods of a mirror, each by itself."""
+    """Optional methods of a mirror, independent of each other."""
 
     def join(self, service: Service) -> None:
         """The process has joined its run: `service` has its clock, publishers, bus and events."""
 
     def position(self) -> Single:
-        """(rows, columns) nm that it holds, of a mirror that can read it; called at the start, and after a fault.
+        """Read back the shape (rows, columns), nm; called at the start and after a fault.
 
         Without this method the mirror is driven to flat at once.
         """
         raise NotImplementedError
 
     def beside(self) -> Single | None:
-        """(rows, columns) nm that others have on the mirror beside the commands; the stroke holds for the sum."""
+        """Shape (rows, columns), nm, that other programs add to the commands; the stroke limit holds for the sum."""
         return None
 
     def settle(self, actuators_nm: Single, elapsed_ns: float) -> Single:
         """Simulated mirrors: `apply` (rows, columns) with the run's time since the last call.
 
-        Without a command, too.
+        Also called without a new command.
         """
         raise NotImplementedError
 
     def fill(self, health: wire.Health) -> None:
-        """Add to a Health, twice a second."""
+        """Add fields to the Health message, twice a second."""

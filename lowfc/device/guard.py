@@ -1,6 +1,6 @@
-"""What protects a mirror: its own limits, its own dead-man, its own check of commands; functions of values.
+"""The mirror's own protection: limits, command timeout and check of commands, as pure functions.
 
-It trusts no sender, and it is the same for every mirror, simulated or real. The mirror itself is a function `Move`.
+It trusts no sender and is the same for every mirror, simulated or real. The mirror itself is a function `Move`.
 """
 
 from collections.abc import Callable, Mapping
@@ -18,21 +18,21 @@ from lowfc.control.loop.safety import Limit, Limited, Limits, Reason, Rejection,
 _NONE: Single = np.zeros(0, np.float32)
 
 LONGEST_VALID_NS = 2_000_000_000
-"""Longest validity of a command, whatever the command says."""
+"""Longest validity of a command, whatever it requests."""
 AHEAD_NS = 1_000_000_000
-"""How far a frame's time may be ahead of the mirror's clock and still be taken for the time of the surface."""
+"""Largest time by which a frame may be ahead of the mirror's clock and still set the time of the surface."""
 
 
 Move = Callable[[Single, float], Single]
-"""Drives the actuators (rows, columns), nm of surface; returns where they are. The second is the time of the run since
-the last call, ns."""
+"""Drives the actuators (rows, columns), nm of surface, and returns their positions; the second argument is the run's
+time since the last call, ns."""
 
 
 @dataclass(frozen=True)
 class Guard:
-    """Limits of a mirror, after its driver has rounded to `step_nm`, and what it does once the last command expires.
+    """Limits of a mirror, after its driver has rounded to `step_nm`, and its action on the command timeout.
 
-    `flatten`: it relaxes to flat then, and holds its shape otherwise.
+    `flatten`: relax to flat on the timeout; otherwise hold the shape.
     """
 
     grid: tuple[int, int]
@@ -42,17 +42,17 @@ class Guard:
 
     @cached_property
     def tighter(self) -> Limits:
-        """Limits before the driver rounds, one step tighter, so that rounding cannot cross those that count."""
+        """Limits before the driver rounds, one step tighter, so that rounding cannot cross the real ones."""
         limits, step = self.limits, self.step_nm
         return Limits(limits.stroke_nm - step, limits.slew_nm - step, limits.neighbour_nm - step)
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A command as it came.
+    """A command as received.
 
     Attributes:
-        actuators_nm: (rows, columns) float32, nm of surface, or None where the bytes made no grid.
+        actuators_nm: (rows, columns) float32, nm of surface, or None if the bytes made no grid.
         safe: it was sent in safe mode.
         clear_id: identity of the operator's last clear; a new one makes the mirror forget the newest sequence.
         ahead: its sequence starts further ahead of the mirror's clock than allowed (a clock's verdict).
@@ -70,21 +70,21 @@ class Command:
 
 
 class Status(NamedTuple):
-    """Where the mirror is.
+    """State of the mirror.
 
     Attributes:
-        driven_nm: (rows, columns) what the driver is given, before it rounds: always within the limits.
-        surface_nm: (rows, columns) where the actuators are.
+        driven_nm: (rows, columns) sent to the driver, before it rounds: always within the limits.
+        surface_nm: (rows, columns) positions of the actuators.
         channels: last actuators of each channel; the mirror follows their sum.
-        command_nm: the modal command behind it; empty where the mirror's own limits changed it.
+        command_nm: its modal command; empty if the mirror's own limits changed it.
         limits_hit: the mirror's own limits that acted on the last command.
-        frame_sequence: of the frame behind the last command; its time is `time_ns`.
-        commanded_ns: `time_ns` at the last command; between commands `time_ns` goes on by the mirror's clock.
-        received_ns: when the last command came, by the mirror's clock.
-        valid_for_ns: how long it may be held.
+        frame_sequence: sequence of the frame of the last command; its time is `time_ns`.
+        commanded_ns: `time_ns` at the last command; between commands `time_ns` advances by the mirror's clock.
+        received_ns: time of reception of the last command, by the mirror's clock.
+        valid_for_ns: time for which it may be held.
         following: whether there is a command in force.
         safe: channels whose last command was sent in safe mode.
-        clear_id: of the newest clear that a command carried.
+        clear_id: identity of the newest clear carried by a command.
     """
 
     driven_nm: Single
@@ -105,9 +105,9 @@ class Status(NamedTuple):
 def apply_command(
     guard: Guard, status: Status, command: Command, now_ns: int, move: Move, beside_nm: Single | None = None
 ) -> tuple[Status, Reason | None]:
-    """Follow a command that came at `now_ns`; a refused one changes nothing, and the reason is returned.
+    """Apply a command received at `now_ns`; a refused one changes nothing, and the reason is returned.
 
-    What others have on the mirror, `beside_nm` (rows, columns), leaves less of the stroke.
+    A shape of other programs on the mirror, `beside_nm` (rows, columns), uses part of the stroke.
     """
     reason = _refusal(guard, status, command)
     if reason is not None:
@@ -119,9 +119,9 @@ def apply_command(
         with np.errstate(over="ignore", invalid="ignore"):  # a sum that is not finite is refused by `limit`
             wanted = sum(channels.values(), np.zeros(guard.grid, np.float32))
     limited = _limited(guard, status.driven_nm, wanted, beside_nm)
-    # From frame to frame, not from the last tick: ticks go by the mirror's own clock, which is ahead of a frame's time.
+    # From frame to frame, not from the last tick: ticks use the mirror's own clock, which is ahead of a frame's time.
     elapsed_ns = command.time_ns - status.commanded_ns if status.commanded_ns else np.inf
-    if elapsed_ns <= 0:  # the same frame again, while the camera is silent: only the mirror's own clock goes on
+    if elapsed_ns <= 0:  # the same frame again, while no frame arrives: only the mirror's own clock advances
         elapsed_ns = now_ns - status.received_ns
     followed = Status(
         driven_nm=limited.actuators_nm,
@@ -142,7 +142,7 @@ def apply_command(
 
 
 def _limited(guard: Guard, previous_nm: Single, wanted_nm: Single, beside_nm: Single | None) -> Limited:
-    """The command in its limits; in a sum with others each actuator goes no further than the stroke, or not at all."""
+    """Limit the command; its sum with other programs' shape keeps the stroke, or goes no further beyond it."""
     if beside_nm is None or not beside_nm.any() or not np.isfinite(wanted_nm).all():
         return limit(guard.tighter, previous_nm, wanted_nm)
     stroke_nm = np.float32(guard.tighter.kept_stroke_nm)
@@ -153,7 +153,7 @@ def _limited(guard: Guard, previous_nm: Single, wanted_nm: Single, beside_nm: Si
 
 
 def tick(guard: Guard, status: Status, now_ns: int, move: Move) -> Status:
-    """Without a command: settle, and act on one that has expired."""
+    """Advance without a new command: settle, and act on the command timeout."""
     if status.following and expired(now_ns - status.received_ns, status.valid_for_ns):
         status = status._replace(following=False, channels={})
     if not status.following and guard.flatten and status.driven_nm.any():

@@ -1,4 +1,4 @@
-"""A mirror's process: commands from the bus to its driver, state and picture to the bus."""
+"""A mirror's process: passes commands to its driver and publishes its state and its surface."""
 
 import contextlib
 import threading
@@ -36,10 +36,10 @@ from lowfc.optics.chain.mirror import influence_factors
 
 TICK_NS = 10_000_000
 IDLE_STATE_NS = 100_000_000
-"""Without commands the state is published this often, so that a restarted controller learns it."""
+"""Period of the state without commands, from which a restarted controller starts."""
 PICTURE_PIXELS = 64
 PATIENCE_S = 0.5
-"""How long a driver may take to move."""
+"""Timeout of a move by the driver."""
 
 
 class _LostError(Exception):
@@ -51,9 +51,9 @@ _NONE: Single = np.zeros(0, np.float32)
 
 
 def guard_of(driver: Mirror, config: Configuration) -> Guard:
-    """Limits of a mirror: those of its driver or those of [mirror], whichever are tighter.
+    """Limits of a mirror: the tighter of its driver's and those of [mirror].
 
-    ConfigurationError where its grid is not that of [mirror].
+    ConfigurationError if its grid is not that of [mirror].
     """
     own, configured = driver.geometry, geometry(config)
     if (own.rows, own.columns) != (configured.rows, configured.columns):
@@ -70,10 +70,10 @@ def guard_of(driver: Mirror, config: Configuration) -> Guard:
 
 
 class MirrorLoop:
-    """Follows commands until it is stopped."""
+    """Applies commands until it is stopped."""
 
     def __init__(self, driver: Mirror, service: Service, config: Configuration) -> None:
-        """Declare everything on the bus, and see where the mirror is."""
+        """Declare publishers and subscribers on the bus, and find the mirror's position."""
         name = config.mirror.name
         self._driver = driver
         self._service = service
@@ -84,7 +84,7 @@ class MirrorLoop:
         self._fill_extra = getattr(driver, "fill", _IDLE.fill)
         self.watch = DriverWatch(service, PATIENCE_S, self._hang)
         self._turn = threading.Lock()
-        self._pause = Mailbox()  # nothing comes there: a signal can end its wait, wherever it strikes
+        self._pause = Mailbox()  # never receives: waiting on it can be ended by a signal at any point
         service.on_stop(self._pause.wake)
         self._applied_ns = 0
         self._states = service.publisher(MIRROR_STATE, name)
@@ -112,7 +112,7 @@ class MirrorLoop:
         service.state = "ready"
 
     def _start(self, flat_nm: Single) -> None:
-        """Begin from where the mirror is, as its driver says, or drive it to flat."""
+        """Start from the mirror's position if its driver can read it; otherwise drive it to flat."""
         held_nm = self._held()
         if held_nm is None:
             self._status = Status(flat_nm, self._drive(flat_nm, np.inf))
@@ -121,7 +121,7 @@ class MirrorLoop:
         self._known = True
 
     def run(self) -> None:
-        """Run command timeout and return from a fault; commands are applied on the thread that receives them."""
+        """Run the command timeout and the recovery from faults; the receiving thread applies commands."""
         service = self._service
         with self.watch.over(self._close):
             while service.running:
@@ -141,7 +141,7 @@ class MirrorLoop:
         self._driver.close()
 
     def _arrived(self, sample: Sample) -> None:
-        """On the thread that receives: a command. Those that waited while this process stood still are skipped."""
+        """Handle a command on the receiving thread; commands superseded while this process stood still are skipped."""
         with self._turn:
             if self._service.running:
                 self._next_command(sample)
@@ -176,7 +176,7 @@ class MirrorLoop:
                 self._service.event("LIMIT_HIT", reason=reason.name)
 
     def _drive(self, actuators_nm: Single, elapsed_ns: float) -> Single:
-        """Have the driver move; without a new command a real mirror is left alone."""
+        """Call the driver to move; without a new command a real mirror is not called."""
         if self._settle is not None:
             reached_nm = self._call(self._settle, actuators_nm, elapsed_ns)
         elif actuators_nm is self._driven_nm:
@@ -187,14 +187,14 @@ class MirrorLoop:
         return actuators_nm if reached_nm is None else reached_nm
 
     def _held(self) -> Single | None:
-        """What the mirror holds, as its driver says; None where it cannot say."""
+        """Read the mirror's shape from its driver; None if it cannot be read."""
         position = getattr(self._driver, "position", None)
         return None if position is None else self._call(position)
 
     def _call(self, method: Callable[..., Single | None], *arguments: object) -> Single | None:
-        """Where the mirror is, as a method of its driver returns.
+        """Call a method of the driver and return the mirror's positions.
 
-        _LostError where it failed or hung: the mirror may be anywhere, and goes to its idle state before all else.
+        _LostError if it failed or hung: the position is then unknown, and the mirror first goes to its idle state.
         """
         self.watch.begin()
         try:
@@ -213,12 +213,12 @@ class MirrorLoop:
         raise _LostError
 
     def _hang(self) -> None:
-        """On the watch's thread: the state no longer says where the mirror is."""
+        """Mark the position in the state as unknown; called on the watch's thread."""
         self._known, self._refused = False, Rejection.NO_MIRROR
         self._publish(self._service.clock.now_ns())
 
     def _return(self) -> None:
-        """After a fault, a step to the idle state: flat, or the shape that it holds, or was driven to last."""
+        """After a fault, step towards the idle state: flat, or the shape that it holds or was last driven to."""
         if self._service.clock.host_ns() < self.watch.retry_ns:
             return
         if self._driven_nm is None and (held_nm := self._held()) is not None:
@@ -248,7 +248,7 @@ class MirrorLoop:
 
     def _publish(self, time_ns: int) -> None:
         status, state = self._status, state_of(self._status, time_ns)
-        now_ns = self._service.clock.now_ns()  # a command's time may be anything
+        now_ns = self._service.clock.now_ns()  # a command's time cannot be trusted
         if not self._known:
             state.ClearField("actuators")
             state.status = wire.MIRROR_STATUS_EXPIRED
@@ -263,7 +263,7 @@ class MirrorLoop:
             self._picture_due_ns = now_ns + int(1e9 / float(SURFACE.rate))
 
     def _fill(self, health: wire.Health) -> None:
-        """Add to each Health what an operator's `status` says of the mirror."""
+        """Add the mirror's part of an operator's `status` to each Health."""
         status = self._status
         health.command_refused = self._refused.value if self._refused is not None else 0  # type: ignore[assignment]
         health.command_expired = bool(status.received_ns) and not status.following
@@ -273,7 +273,7 @@ class MirrorLoop:
 
 
 def state_of(status: Status, time_ns: int) -> wire.MirrorState:
-    """What a mirror publishes of itself, but for channels, safe mode and the last refusal."""
+    """Message of a mirror's state, without channels, safe mode and the last refusal."""
     following = wire.MIRROR_STATUS_FOLLOWING if status.following else wire.MIRROR_STATUS_EXPIRED
     return wire.MirrorState(
         timestamp=timestamp(time_ns),
@@ -288,7 +288,7 @@ def state_of(status: Status, time_ns: int) -> wire.MirrorState:
 
 
 def command_of(payload: bytes, start_check: StartCheck | None = None) -> Command:
-    """Command of a message; DecodeError where it is none, BadMessageError where sequence or time cannot be."""
+    """Decode a command; DecodeError if it is not one, BadMessageError if its sequence or time is impossible."""
     message = wire.MirrorCommand.FromString(payload)
     return Command(
         message.channel,

@@ -1,4 +1,4 @@
-"""Drivers by their names: entry points of installed packages, or "module:Class", or "folder/file.py:Class"."""
+"""Find drivers by name: entry points of installed packages, "module:Class", or "folder/file.py:Class"."""
 
 import importlib.util
 import sys
@@ -21,17 +21,17 @@ METHODS: dict[Kind, tuple[str, ...]] = {"camera": ("settings", "expose", "close"
 
 
 def installed(kind: Kind) -> dict[str, EntryPoint]:
-    """Entry points of the drivers that are installed, by name."""
+    """Entry points of the installed drivers, by name."""
     return {point.name: point for point in entry_points(group=f"lowfc.{kind}s")}
 
 
 def load(kind: Kind, name: str) -> Any:
-    """Class of a driver; ConfigurationError where there is none of that name, or it cannot be imported."""
+    """Import the class of a driver; ConfigurationError if there is none of that name or the import fails."""
     module, colon, attribute = name.rpartition(":")
     if colon:
         if module.endswith(".py") and not Path(module).is_file():
             raise ConfigurationError(f"the driver {name!r} cannot be loaded: there is no file {module}")
-        # `python -P` leaves out the folder in which the user stands
+        # `python -P` leaves out the current folder
         sys.path.insert(0, str(Path(module).resolve().parent if module.endswith(".py") else Path.cwd()))
         point = EntryPoint(name, f"{section(name)}:{attribute}", f"lowfc.{kind}s")
     elif name in (known := installed(kind)):
@@ -52,15 +52,15 @@ def load(kind: Kind, name: str) -> Any:
 
 
 def section(name: str) -> str:
-    """NAME of a driver's section [drivers.NAME]: its own, or its module's."""
+    """NAME of a driver's section [drivers.NAME]: its own or its module's name."""
     module = name.partition(":")[0]
     return Path(module).stem if module.endswith(".py") else module
 
 
 def opened(kind: Kind, name: str, config: Configuration, words: Sequence[str] = (), driver: Any = None) -> Any:
-    """A driver with its options: of the configuration, and `words` ("--key", "value" or "--key=value") over them.
+    """Open a driver with the options of the configuration, overridden by `words` ("--key", "value" or "--key=value").
 
-    `driver` is its class, where that is known.
+    `driver` is its class, if known.
     """
     driver = load(kind, name) if driver is None else driver
     given = options(driver, table(config, kind, name), words)
@@ -69,7 +69,7 @@ def opened(kind: Kind, name: str, config: Configuration, words: Sequence[str] = 
 
 
 def faults(config: Configuration, folder: Path) -> list[str]:
-    """What is wrong with the sections [drivers.NAME] of a configuration in a folder, a sentence each."""
+    """List the faults of the sections [drivers.NAME] of a configuration in a folder, one sentence each."""
     found = []
     for name in config.drivers:
         kinds = [kind for kind in KINDS if name in installed(kind)]
@@ -77,8 +77,8 @@ def faults(config: Configuration, folder: Path) -> list[str]:
         if not kinds and not in_file and importlib.util.find_spec(name.partition(".")[0]) is None:
             known = {*installed("camera"), *installed("mirror")}
             found.append(
-                f"drivers.{name}: no installed driver has that name{nearest(name, known)}, nor a module, nor is there "
-                f"a file {name}.py; the options of folder/file.py:Class are in drivers.file"
+                f"drivers.{name}: no installed driver or module has that name{nearest(name, known)}, and there is no "
+                f"file {name}.py; the options of folder/file.py:Class are in drivers.file"
             )
         for kind in kinds:
             try:
@@ -91,7 +91,7 @@ def faults(config: Configuration, folder: Path) -> list[str]:
 def table(config: Configuration, kind: Kind, name: str) -> dict[str, Any]:
     """Options of a driver in a configuration: [drivers.NAME], or its part for this kind.
 
-    ConfigurationError where they stand under the name of its class.
+    ConfigurationError if they are under the name of its class.
     """
     mine = section(name)
     for other in {name, name.rpartition(":")[2]} - {mine}:
@@ -104,15 +104,15 @@ def table(config: Configuration, kind: Kind, name: str) -> dict[str, Any]:
 
 
 def options(driver: Any, found: dict[str, Any], words: Sequence[str] = ()) -> DriverOptions:
-    """Options of a driver's class: those of a table, and words of a command line, `--key value`, over it.
+    """Options of a driver's class from a table, overridden by the words of a command line, `--key value`.
 
-    ConfigurationError where one is unknown or wrong.
+    ConfigurationError if one is unknown or wrong.
     """
     model: type[DriverOptions] = getattr(driver, "Options", DriverOptions)
     given, faults = _given(words), []
     try:
         made = model.model_validate(found)
-    except ValidationError as error:  # what is missing there may be among the words
+    except ValidationError as error:  # options missing here may be among the words
         faults = [one for one in error.errors() if not (given and one["type"] == "missing")]
     if given and not faults:
         try:
@@ -125,7 +125,7 @@ def options(driver: Any, found: dict[str, Any], words: Sequence[str] = ()) -> Dr
 
 
 def options_help(driver: Any) -> list[tuple[str, str]]:
-    """Options of a driver's class on the command line, each with its sentence."""
+    """Command-line options of a driver's class, each with its help."""
     found = []
     for key, info in getattr(driver, "Options", DriverOptions).model_fields.items():
         words = [str(word) for word in get_args(info.annotation) if isinstance(word, str)]
@@ -148,7 +148,7 @@ def _explained(fault: Any, model: type[DriverOptions]) -> str:
 
 
 def _given(words: Sequence[str]) -> dict[str, Any]:
-    """Values of a command line by the names of fields; lists in the way of TOML."""
+    """Values of a command line by field name; lists are written as in TOML."""
     found: dict[str, Any] = {}
     rest = list(words)
     while rest:

@@ -1,4 +1,4 @@
-"""A driver's process: how it joins a run, and its command line."""
+"""A driver's process: joining a run, and its command line."""
 
 import threading
 from collections.abc import Iterator
@@ -22,7 +22,7 @@ from lowfc.device.watch import opening
 
 
 def command_of(kind: Kind, name: str | None = None) -> type[TyperCommand]:
-    """A command whose help lists its driver's own options: of the driver of this name, or of the argument `driver`."""
+    """Make a command whose help lists the options of the driver with this name or of its argument `driver`."""
 
     class WithOptions(TyperCommand):
         driver = name
@@ -42,27 +42,27 @@ def command_of(kind: Kind, name: str | None = None) -> type[TyperCommand]:
 
 
 PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
-"""Settings of a command that leaves words to the driver: its options."""
-Frames = Annotated[int | None, typer.Option(min=1, help="Stop after so many frames; default: until Ctrl-C or SIGTERM.")]
+"""Settings of a command that passes unknown words to the driver as its options."""
+Frames = Annotated[int | None, typer.Option(min=1, help="Stop after so many frames; default: at Ctrl-C or SIGTERM.")]
 LEAVE_S = 2.0
-"""How long a camera in the controller's process may take to end."""
+"""Time a camera in the controller's process has to end."""
 WaitFor = Annotated[list[str] | None, typer.Option(help="Process that the first frame waits for; repeat.")]
 
 
 def run_camera(
     driver: Camera, config: Configuration, run: str, frames: int | None = None, wait_for: tuple[str, ...] = ()
 ) -> None:
-    """Join a run and publish the driver's frames until SIGTERM or Ctrl-C, or a number of them.
+    """Join a run and publish the driver's frames until SIGTERM or Ctrl-C, or for a number of frames.
 
     Args:
-        driver: of the camera.
-        config: of the run.
-        run: its name.
-        frames: after which it stops.
+        driver: driver of the camera.
+        config: configuration of the run.
+        run: name of the run.
+        frames: number of frames after which it stops.
         wait_for: processes that the first frame waits for.
 
     Raises:
-        BusError: the run has a camera already, or one of `wait_for` did not come.
+        BusError: the run has a camera already, or one of `wait_for` did not appear.
     """
     service = join(config, run, Role.CAMERA, config.realtime.camera_cpus)
     with closing(service.bus):  # a callback on zenoh's threads must not outlive the interpreter
@@ -74,20 +74,20 @@ def run_camera(
 
 @contextmanager
 def camera_beside(driver: Camera, config: Configuration, service: Service) -> Iterator[None]:
-    """Read a camera in the controller's process: a frame is dealt with on the thread that read it, without a link.
+    """Read a camera in the controller's process: the thread that reads a frame also handles it, without a link.
 
-    To all others the camera is what it is in a process of its own: its role, its topics, its Health. When one of the
-    two ends, so does the other.
+    Other processes see the same role, topics and Health as from a camera in its own process. When the camera or the
+    controller ends, so does the other.
 
     Args:
-        driver: of the camera.
-        config: of the run.
-        service: of the controller, which has subscribed to frames.
+        driver: driver of the camera.
+        config: configuration of the run.
+        service: the controller's service, which has subscribed to frames.
 
     Raises:
         BusError: the run has a camera already.
         ConfigurationError: the run is in lockstep.
-        LowfcError: the driver said what a user has to put right; after the block.
+        LowfcError: the driver reported a fault that a user has to correct; raised after the block.
     """
     if config.lockstep:
         raise ConfigurationError("in lockstep the camera is a process of its own: leave out --camera, or lockstep")
@@ -118,7 +118,7 @@ def camera_beside(driver: Camera, config: Configuration, service: Service) -> It
 
 
 def run_mirror(driver: Mirror, config: Configuration, run: str) -> None:
-    """Join a run and have the driver follow its commands until SIGTERM or Ctrl-C; arguments as of `run_camera`.
+    """Join a run and apply its commands with the driver until SIGTERM or Ctrl-C; arguments as in `run_camera`.
 
     Raises:
         BusError: the run has this mirror already.

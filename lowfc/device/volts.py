@@ -10,7 +10,7 @@ from lowfc.device.driver import DriverOptions
 
 
 class VoltOptions(DriverOptions):
-    """Options of a mirror that is driven by a value for each channel: volts, or a fraction of their range.
+    """Options of a mirror driven by one value for each channel: volts, or a fraction of their range.
 
     Files are FITS or .npy, (rows, columns). One unit of value moves the surface by `mirror.nm_per_unit` x gain nm.
     """
@@ -22,9 +22,9 @@ class VoltOptions(DriverOptions):
     gain_map: str = ""
     """File of each actuator's gain, relative to mirror.nm_per_unit; empty: 1 for all."""
     lowest: float = 0.0
-    """Lowest value that is ever sent."""
+    """Lowest value sent."""
     highest: float = 1.0
-    """Highest value that is ever sent."""
+    """Highest value sent."""
     order: str = ""
     """File of each actuator's channel, from 0, or -1 for an actuator without channel; empty: row by row."""
 

@@ -16,12 +16,12 @@ PAUSES_NS = (0, 100_000_000, 200_000_000, 500_000_000, 1_000_000_000, 2_000_000_
 STEADY_NS = 1_000_000_000
 """A driver works again when it has not failed for this long."""
 AGAIN_NS = 10_000_000_000
-"""After this long, a fault that goes on is said again."""
+"""Period at which a persistent fault is reported again."""
 _HERE = Path(__file__).parent
 
 
 def described(fault: Exception) -> str:
-    """What a driver raised, and the line of the driver where."""
+    """Describe an exception of a driver, with the line of the driver that raised it."""
     frames = [frame for frame in traceback.extract_tb(fault.__traceback__) if Path(frame.filename).parent != _HERE]
     its_own = [frame for frame in frames if frame.filename == frames[0].filename]
     where = f" ({Path(its_own[-1].filename).name}, line {its_own[-1].lineno})" if its_own else ""
@@ -30,7 +30,7 @@ def described(fault: Exception) -> str:
 
 @contextmanager
 def opening(what: str) -> Iterator[None]:
-    """Turn what a driver raises before it is watched, but for a `LowfcError`, into a ConfigurationError."""
+    """Turn any exception of a driver that is not watched yet, except `LowfcError`, into a ConfigurationError."""
     try:
         yield
     except LowfcError:
@@ -43,14 +43,14 @@ class DriverWatch:
     """Watches the calls of one driver.
 
     Attributes:
-        failures: since the start; a call that does not return is one.
-        hangs: the call under way has not returned for too long.
-        failed_ns: host's time of the last one.
-        retry_ns: host's time before which the driver is left alone.
+        failures: failures since the start, calls that did not return included.
+        hangs: the current call has exceeded its timeout.
+        failed_ns: host's time of the last failure.
+        retry_ns: host's time before which the driver is not called.
     """
 
     def __init__(self, service: Service, patience_s: float, hanging: Callable[[], None] = lambda: None) -> None:
-        """Give a call so many seconds, then call `hanging`, on another thread."""
+        """Set the timeout of a call, after which `hanging` is called on another thread."""
         self.failures = self.failed_ns = self.retry_ns = 0
         self.hangs = False
         self.patience_s = patience_s
@@ -63,7 +63,7 @@ class DriverWatch:
 
     @contextmanager
     def over(self, close: Callable[[], None]) -> Iterator[None]:
-        """Look from now on, on a thread of its own; close the driver at the end, however that comes."""
+        """Watch on a separate thread; close the driver at the end of the block in any case."""
         threading.Thread(target=self._look_on, name="driver's watch", daemon=True).start()
         try:
             yield
@@ -80,20 +80,20 @@ class DriverWatch:
         self._under_way = True
 
     def returned(self) -> bool:
-        """The call has returned; whether it did so in time."""
+        """Note that the call has returned; return whether it did so in time."""
         self._under_way = False
         in_time, self.hangs = not self.hangs, False
         return in_time
 
     def worked(self) -> None:
-        """What a call returned was good."""
+        """Note that a call returned a valid result."""
         self._row = 0
         if self._series and self._service.clock.host_ns() - self.failed_ns >= STEADY_NS:
             self._service.event("DRIVER_BACK", count=self._series)
             self._series, self._kind = 0, ""
 
     def failed(self, fault: Exception) -> None:
-        """A call raised, or returned nonsense; raises a `LowfcError` again, for a user has to put that right."""
+        """Note that a call raised or returned nonsense; a `LowfcError`, for a user to correct, is raised again."""
         self._under_way = self.hangs = False
         if isinstance(fault, LowfcError):
             raise fault
@@ -101,13 +101,13 @@ class DriverWatch:
         self._row += 1
         self._count()
         why = described(fault)
-        kind = re.sub(r"\d+", "", why)  # the same fault with other numbers is no other fault
+        kind = re.sub(r"\d+", "", why)  # the same fault with other numbers counts as the same
         if kind != self._kind or self.failed_ns >= self._said_ns + AGAIN_NS:
             self._kind, self._said_ns = kind, self.failed_ns
             self._service.event("DRIVER_FAILED", why=why)
 
     def look(self) -> None:
-        """Report a call that is under way for too many looks; looks are counted, for the host may have stood still."""
+        """Report a call that lasts too many checks; checks are counted because the host may have stood still."""
         if not self._under_way or self._calls != self._looked_at:
             self._looked_at, self._looks = self._calls, 0
             return

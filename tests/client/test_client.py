@@ -221,7 +221,7 @@ def test_a_refusal_is_an_error_with_the_controllers_sentence(controller: FakeCon
         (lambda loop: loop.play(np.stack([SHAPE]), [[1, 2]]), r"got arrays of shape \(1, 20\) and \(1, 2\)"),
         (lambda loop: loop.play(SHAPE, [1, 2, 3, 4]), r"\(4, 5\) and \(4,\)"),
         (lambda loop: loop.play_offset([1, 2, 3]), r"takes a table \(frames, modes\)"),
-        (lambda loop: loop.play_offset(np.zeros((3_000_000, 3))), "may have 16,000,000 bytes and has 36,000,0"),
+        (lambda loop: loop.play_offset(np.zeros((3_000_000, 3))), "at most 16,000,000 bytes, got 36,000,0"),
     ],
 )
 def test_what_cannot_be_asked_is_refused_here(
@@ -469,9 +469,9 @@ def test_an_answer_that_is_none_is_an_error_with_a_sentence(payload: bytes) -> N
     controller.queryable(REQUEST_KEY.format(name="*"), lambda query: query.reply(b"\xff"))
     controller.publisher(CALIBRATION).put(payload)
     loop = Client(bus=MemoryBus(hub, "operator", HostClock()))
-    with pytest.raises(BusError, match=r"safe was answered with what is no lowfc\.v1\.Request"):
+    with pytest.raises(BusError, match=r"the answer to safe is not a lowfc\.v1\.Request"):
         loop.safe()
-    with pytest.raises(BusError, match="lowfc/calibration was answered with what is no "):
+    with pytest.raises(BusError, match="the answer to lowfc/calibration is not a "):
         loop.calibration()
 
 
