@@ -118,7 +118,7 @@ def test_every_file_that_cannot_be_used_is_a_line(tmp_path: Path) -> None:
     check_files(load(None, {"control.law": str(law)}))
     assert "Z2 to Z15" in complaint({"control.law": str(law), "sensor.modes": 9})
     assert "made for 250 Hz, the frames come at 500 Hz" in complaint({"control.law": str(law), "camera.rate_hz": 500})
-    assert "reckons with a delay of 1 frames, the loop with 3" in complaint(
+    assert "is made for a delay of 1 frames, the loop has 3" in complaint(
         {"control.law": str(law), "control.delay_frames": 3}
     )
     law_file.save(law_of(config, gain=0.95, signal="error"), law)

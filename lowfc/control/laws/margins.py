@@ -77,8 +77,8 @@ def check_law(law: LinearLaw, delay_frames: float, rate_hz: float) -> None:
     """
     if law.signal == "pol" and abs(law.delay_frames - delay_frames) > 1e-3:
         raise ValueError(
-            f"the law reckons with a delay of {law.delay_frames:g} frames, the loop with {delay_frames:g}: "
-            "set control.delay_frames, or make the law for that"
+            f"the law is made for a delay of {law.delay_frames:g} frames, the loop has {delay_frames:g}: "
+            "set control.delay_frames, or make a law for that delay"
         )
     if rate_hz and abs(law.rate_hz - rate_hz) > SAME_RATE * rate_hz:
         raise ValueError(
@@ -101,7 +101,7 @@ def check_stable(law: LinearLaw, delay_frames: float) -> None:
     for part in _parts(law):
         if len(part.F) > MOST_COUPLED:
             raise ValueError(
-                f"{len(part.F)} states of the law {law.name!r} have to do with each other; {MOST_COUPLED} are the most "
+                f"{len(part.F)} states of the law {law.name!r} are coupled; {MOST_COUPLED} are the most "
                 "whose poles can be found between two frames"
             )
         matrices = (

@@ -1,8 +1,8 @@
-"""The controller: one pure function, `advance(settings, state, input)`, of which every run is a fold.
+"""The controller as one pure function, `advance(settings, state, input)`; a run is a fold of it over the inputs.
 
 The live loop, replay and the tests call it with frames, requests, mirror shapes, camera settings, calibrations and
-ticks, in the order in which they were taken. Nothing here reads a clock: each input brings its time, and every verdict
-that needs one (how late a frame is, how long it has been silent) comes with the input.
+ticks, in order of input number. Nothing here reads a clock: each input carries its time and every value that depends
+on a clock (the age of a frame, the time without frames).
 """
 
 from collections.abc import Callable, Mapping
@@ -45,14 +45,14 @@ from lowfc.control.loop.safety import Limit, LoopMode, Reason, Rejection
 from lowfc.control.loop.state import ActiveLoop, Settings, State
 
 UNMEASURED = frozenset({Rejection.NO_CALIBRATION, Rejection.WRONG_SIZE})
-"""Without a calibration of its size, a frame is an exposure all the same: probe sequences go on where no law acts."""
+"""Probe sequences continue with frames that do not match a calibration: each is still an exposure."""
 STEPPED = "its last step is done"
 
 
 def advance(settings: Settings, state: State, taken: Input) -> tuple[State, Outputs]:
-    """Take one input; return the state after it and what shall be sent.
+    """Process one input; return the next state and the messages to send.
 
-    An input that changes nothing and gives rise to nothing leaves the very same state, and is not counted in it.
+    An input that changes nothing and produces no output returns the same state object and is not counted.
     """
     if isinstance(taken, Frame):
         return _frame(settings, state, taken)
@@ -99,7 +99,7 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
     steps_left, stepped = max(state.steps_left - 1, 0), state.steps_left == 1
     if stepped:
         events += [PendingEvent("LOOP_STEPPED", {}), mode_event(mode, LoopMode.OPEN, STEPPED)]
-    state = State(  # made anew: `_replace` takes four times as long
+    state = State(  # constructed: `_replace` takes four times as long
         mode,
         drive,
         frame.sequence,
@@ -130,12 +130,12 @@ def _command(state: State, drive: ActiveLoop, command_nm: Single) -> Command:
 
 
 def _commands(state: State) -> bool:
-    """Whether commands go out: a mirror that has not said where it is would jump, unless in safe mode."""
+    """Whether commands are sent: a mirror that has not reported its shape would jump, unless in safe mode."""
     return state.commanded or not state.conditions.mirror_fault or state.mode is LoopMode.SAFE
 
 
 def _arrive(state: State, frame: Frame, events: list[PendingEvent]) -> tuple[State, ActiveLoop | None]:
-    """The state, and the drive after the frames that never came before this one."""
+    """The state, and the active loop advanced by the frames missing before this one."""
     if state.frame_timeout and state.frame_time_ns:
         events.append(PendingEvent("FRAMES_BACK", {"silent_ms": (frame.time_ns - state.frame_time_ns) / 1e6}))
     drive = state.drive
@@ -149,7 +149,7 @@ def _arrive(state: State, frame: Frame, events: list[PendingEvent]) -> tuple[Sta
         events.append(PendingEvent("CAMERA_RESTARTED", {}))
         state = _awaiting_camera(state, frame)
         if drive is not None and drive.play is not None:
-            drive = drive.stopped(0)  # its frames were the former camera's
+            drive = drive.stopped(0)  # its frames were counted by the previous start of the camera
             events.append(PendingEvent("PLAY_ENDED", {"why": "the camera restarted"}))
     else:  # after a clear, this may be another start of the camera
         state = _awaiting_camera(state, frame)
@@ -157,7 +157,7 @@ def _arrive(state: State, frame: Frame, events: list[PendingEvent]) -> tuple[Sta
 
 
 def _awaiting_camera(state: State, frame: Frame) -> State:
-    """The state, in which settings are awaited unless those that are known may be of the camera's present start."""
+    """The state, awaiting camera settings unless the known ones may belong to the camera's current start."""
     camera = state.conditions.camera
     if camera is None or camera.start_s in (0, frame.sequence >> COUNT_BITS):
         return state
@@ -171,7 +171,7 @@ def _newest(state: State, drive: ActiveLoop | None, frame: Frame) -> State:
 def _measure(
     settings: Settings, state: State, drive: ActiveLoop, frame: Frame
 ) -> tuple[Estimate, int, bool] | Rejection:
-    """Modal errors of a frame, its saturated pixels, and whether they are the fused step's; or why it is of no use."""
+    """Modal errors of a frame, its saturated pixels, and whether the fused step made them; or why it is refused."""
     calibration = drive.calibration
     if not calibration.noll:
         return Rejection.NO_CALIBRATION
@@ -199,20 +199,20 @@ def _measure(
 
 
 def _overruled(state: State, drive: ActiveLoop) -> bool:
-    """Whether the integrator has a part of the command in place of a law that was worse."""
+    """Whether the integrator has taken over part of the command from a law that did worse."""
     guard = drive.following.guard if drive.following is not None else None
     return guard is not None and state.mode is LoopMode.CLOSED and guard.overruled
 
 
 def _acted(limits: tuple[Reason, ...]) -> str:
-    """Why a probe sequence ends once a limit acts: it is no longer what was asked for."""
+    """Why a probe sequence ends once a limit acts: the mirror no longer shows the requested shape."""
     return f"a limit acted: {', '.join(reason.name for reason in limits)}"
 
 
 def _refuse(
     settings: Settings, state: State, frame: Frame, reason: Rejection, events: list[PendingEvent]
 ) -> tuple[State, Outputs]:
-    """Hold the command: a frame that cannot be used still yields a step and a command."""
+    """Hold the command: a refused frame still yields a step and a command."""
     if reason is not state.refused:
         events.append(PendingEvent("FRAMES_REFUSED", {"reason": reason.name}))
     drive, homing, hit = state.drive, state.returning_to_zero, state.limits_hit
@@ -227,7 +227,7 @@ def _refuse(
                 drive = end_probe(drive, frame.sequence, _acted(hit), events)
             _limit_events(state.limits_hit, hit, events)
             reasons = (reason, *hit)
-        elif reason not in (Rejection.REPEATED, Rejection.OUT_OF_ORDER, Rejection.AHEAD):  # those are no new exposure
+        elif reason not in (Rejection.REPEATED, Rejection.OUT_OF_ORDER, Rejection.AHEAD):  # these are not new exposures
             drive = drive.missed(1)
         held = drive.history_nm[0]
     state = state._replace(
@@ -243,12 +243,12 @@ def _refuse(
     step = Step(frame.sequence, frame.time_ns, state.mode, held, reasons)
     if drive is None or not state.commanded:
         return state, Outputs(step=step, events=events)
-    # Under the newest frame's sequence even where an older frame came: the mirror refuses older commands.
+    # With the newest frame's sequence even if this frame is older: the mirror refuses older commands.
     return state, Outputs(step=step, command=_command(state, drive, held), events=events)
 
 
 def _tick(settings: Settings, state: State, tick: Tick) -> tuple[State, Outputs]:
-    """Without frames: repeat the held command, so that only a dead controller lets it expire."""
+    """Without frames: repeat the held command, so that it expires only if the controller dies."""
     state, events = lease_checked(state, tick.time_ns, 0)
     freed = bool(events)
     drive = state.drive

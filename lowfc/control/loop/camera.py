@@ -1,27 +1,27 @@
-"""Camera settings, and which changes of them make a calibration wrong."""
+"""Camera settings, and the changes that make a calibration invalid."""
 
 from dataclasses import dataclass, field
 
 LEAST_DN = 1.0
-"""Change of bias or saturation that is always tolerated."""
+"""Change of bias or saturation that is always tolerated, DN."""
 GAIN_TOLERANCE = 0.01
 """Relative change of a gain that is tolerated: gains are settings, not measurements."""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraSettings:
-    """What of the camera must fit the calibration; two are equal whenever they were received.
+    """Camera settings that must match the calibration; the time of reception does not count in a comparison.
 
     Attributes:
         time_ns: when they were published.
         shape: rows and columns of the frame.
         bias_dn: level without light and without dark current.
         saturation_dn: highest value a pixel can have.
-        gain_e_per_dn: conversion gain; 0 where it is not known, as below.
+        gain_e_per_dn: conversion gain; 0 if unknown, as below.
         em_gain: electron-multiplying gain.
         read_noise_e: read noise of one pixel.
         region: first row and first column that are read.
-        start_s: start of the camera, unix seconds; 0 where it is not known.
+        start_s: start of the camera, unix seconds; 0 if unknown.
     """
 
     time_ns: int = field(compare=False)
@@ -36,12 +36,12 @@ class CameraSettings:
 
     @property
     def noise_dn(self) -> float:
-        """Read noise of a pixel in a frame; 0 where it is not known."""
+        """Read noise of a pixel in a frame, DN; 0 if unknown."""
         return self.read_noise_e / self.gain_e_per_dn if self.gain_e_per_dn > 0 else 0.0
 
 
 def changes(now: CameraSettings, then: CameraSettings) -> list[str]:
-    """What differs by more than noise explains, a phrase each; `then` are the settings of the calibration."""
+    """List differences larger than noise explains, one phrase each; `then` are the settings of the calibration."""
     tolerance_dn = max(LEAST_DN, then.noise_dn)
     exact = (
         ("rows", now.shape[0], then.shape[0]),

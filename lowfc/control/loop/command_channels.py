@@ -1,8 +1,8 @@
-"""What is added to the loop's command: channels that stay, an offset of its target, a table played frame by frame.
+"""Additions to the loop's command: static channels, an offset of its target, a table played frame by frame.
 
-A channel is a shape of the mirror that somebody else wants, a dark hole's for one. The sensor sees it, and its zero
-point is shifted along (Sect. 1 and 4), with the delay of a command, so that the loop does not undo it. What is played
-is for calibration and for tests: nothing is shifted along.
+A channel is a mirror shape set by another user, such as a dark hole. The sensor sees it, so its zero point shifts
+with it (Sect. 1 and 4), after the delay of a command, and the loop does not undo it. A play is for calibration and
+tests and shifts nothing.
 """
 
 from typing import NamedTuple
@@ -13,22 +13,22 @@ from lowfc.arrays import Array, Single
 from lowfc.control.identity import identity
 
 FLAT = "flat"
-"""The channel of the mirror's flat map: the reference image is taken with it, so that it shifts nothing."""
+"""Channel of the mirror's flat map: the reference image includes it, so it shifts nothing."""
 ADOPTED = "adopted"
-"""The channel of what a mirror already had, beyond the modes, when the controller started."""
+"""Channel of the mirror's shape at the controller's start, beyond the modes."""
 EXTERNAL = "external"
-"""The channel of what other programs have on the mirror: it is there already, so that nothing of it is commanded."""
+"""Channel of shapes that other programs put on the mirror: already applied, so it is not commanded."""
 MOST_CHANNELS = 16
 MOST_PLAYED = 1 << 24
-"""Numbers in the table of a play, and in its basis."""
+"""Largest count of numbers in the table of a play, and in its basis."""
 MIRROR, OFFSET = "mirror", "offset"
 LONGEST_NAME = 32
 
 
 class Channel(NamedTuple):
-    """A shape added to the command: (rows, columns), nm of surface; what is wanted, and how far the mirror is.
+    """A shape added to the command, (rows, columns), nm of surface: the wanted shape and the part reached so far.
 
-    The two are one array where it is there: `of` sees to that.
+    `of` makes both the same array once the mirror has reached the shape.
     """
 
     name: str
@@ -37,12 +37,12 @@ class Channel(NamedTuple):
 
     @classmethod
     def of(cls, name: str, wanted_nm: Single, reached_nm: Single) -> "Channel":
-        """A channel on its way, or there."""
+        """A channel that is moving to its shape or has reached it."""
         return cls(name, wanted_nm, wanted_nm if np.array_equal(wanted_nm, reached_nm) else reached_nm)
 
     @property
     def shifts(self) -> bool:
-        """Whether the sensor's zero point is shifted along."""
+        """Whether the sensor's zero point shifts with it."""
         return self.name != FLAT
 
     @property
@@ -52,18 +52,18 @@ class Channel(NamedTuple):
 
     @property
     def moving(self) -> bool:
-        """Whether the mirror is still on its way."""
+        """Whether the mirror is still moving to it."""
         return self.reached_nm is not self.wanted_nm
 
 
 class PlayTable(NamedTuple):
-    """A table (frames, columns) that can be played, a row for each frame.
+    """A table (frames, columns) to play, one row for each frame.
 
     Attributes:
-        target: `MIRROR`, where a row holds the factors of the shapes in `basis` (columns, actuators), nm of surface; or
-            `OFFSET`, where it is added to the loop's target, nm of wavefront of each mode.
+        target: `MIRROR`: a row holds the factors of the shapes in `basis` (columns, actuators), nm of surface; or
+            `OFFSET`: a row is added to the loop's target, nm of wavefront of each mode.
         largest: (columns,) largest absolute number of each column.
-        reach_nm: on the mirror, what no actuator can exceed.
+        reach_nm: on the mirror, an upper bound for every actuator.
         id: identity of target, rows and basis.
     """
 
@@ -88,29 +88,29 @@ class Play(NamedTuple):
         return self.table.target
 
     def row(self, sequence: int) -> Single | None:
-        """The row for a frame; None before the first and after the last."""
+        """Row for a frame; None before the first and after the last."""
         place = sequence - self.first_sequence
         return self.table.rows[place] if 0 <= place < self.frames else None
 
     def left(self, sequence: int) -> int:
-        """Rows left for this frame and those to come."""
+        """Rows left for this and later frames."""
         return min(max(self.first_sequence + self.frames - sequence, 0), self.frames)
 
     def over(self, sequence: int) -> bool:
-        """Whether nothing of it is left for this frame and those to come."""
+        """Whether no row is left for this and later frames."""
         return not self.left(sequence)
 
 
 class CommandChannels(NamedTuple):
-    """All that is added.
+    """All additions to the command.
 
     Attributes:
-        channels: by the order of their names.
-        sum_nm: (rows, columns) sum of the channels as far as the mirror is.
-        shift_nm: (modes,) what the sensor sees of those that shift it.
-        shifts_nm: `shift_nm` under the last frames, newest first, as many as there are weights of the delay.
+        channels: sorted by name.
+        sum_nm: (rows, columns) sum of the channels as far as reached.
+        shift_nm: (modes,) shift of the sensor's zero point by the channels.
+        shifts_nm: `shift_nm` under the last frames, newest first, one for each weight of the delay.
         offset_nm: (modes,) the loop's target.
-        play: what is being played.
+        play: the current play.
     """
 
     channels: tuple[Channel, ...]
@@ -122,13 +122,13 @@ class CommandChannels(NamedTuple):
 
     @classmethod
     def none(cls, grid: tuple[int, int], modes: int, frames: int) -> "CommandChannels":
-        """Nothing added; `frames` are those that a command takes to be seen."""
+        """No additions; `frames` is the number of frames until a command is seen."""
         rest = np.zeros(modes, np.float32)
         return cls((), np.zeros(grid, np.float32), rest, (rest,) * frames, rest)
 
     @property
     def moving(self) -> bool:
-        """Whether the command changes with the next frame even where the loop is open."""
+        """Whether the command changes with the next frame even in an open loop."""
         return self.play is not None or any(channel.moving for channel in self.channels)
 
     def seen_nm(self, weights: tuple[tuple[int, np.float32], ...]) -> Single:
@@ -148,7 +148,7 @@ class CommandChannels(NamedTuple):
         return (row @ self.play.table.basis).reshape(self.sum_nm.shape)
 
     def moved(self, sequence: int, step_nm: float, to_modes: Single) -> "CommandChannels":
-        """For the next command: each channel nearer to what is wanted of it, all together by at most `step_nm`."""
+        """For the next command: move every channel towards its shape, all together by at most `step_nm`."""
         play = None if self.play is not None and self.play.over(sequence) else self.play
         moving = sum(channel.moving for channel in self.channels)
         if not moving:
@@ -157,7 +157,7 @@ class CommandChannels(NamedTuple):
         return self._replace(play=play).at(tuple(_nearer(channel, step) for channel in self.channels), to_modes)
 
     def at(self, channels: tuple[Channel, ...], to_modes: Single) -> "CommandChannels":
-        """With these channels; those that are wanted flat and are flat are gone."""
+        """With these channels, without those that have become flat as wanted."""
         kept = tuple(one for one in channels if one.wanted_nm.any() or one.reached_nm.any())
         sums = [
             sum((one.reached_nm for one in kept if one.commanded and one.shifts is shifts), np.zeros_like(self.sum_nm))
@@ -167,10 +167,10 @@ class CommandChannels(NamedTuple):
         return self._replace(channels=kept, sum_nm=sums[0] + sums[1], shift_nm=to_modes @ seen_nm.reshape(-1))
 
     def with_channel(self, name: str, wanted_nm: Single, to_modes: Single) -> "CommandChannels":
-        """With a new shape for a channel, which the mirror goes to from where that channel is; `EXTERNAL` is there.
+        """With a new shape for a channel, approached from its current one; `EXTERNAL` is reached at once.
 
         Raises:
-            ValueError: the name is none, or there are too many.
+            ValueError: the name is invalid, or there are too many channels.
         """
         plain = name.isascii() and name == name.lower() and name.replace("-", "").isalnum()
         if not (plain and name[0].isalpha() and len(name) <= LONGEST_NAME):
@@ -190,12 +190,12 @@ class CommandChannels(NamedTuple):
         return next((one for one in self.channels if one.name == name), None)
 
     def having(self, channel: Channel, to_modes: Single) -> "CommandChannels":
-        """With this channel in the place of the one of its name, or beside the others."""
+        """With this channel added, or replacing the one of its name."""
         channels = {one.name: one for one in (*self.channels, channel)}
         return self.at(tuple(channels[name] for name in sorted(channels)), to_modes)
 
     def stopped(self, sequence: int) -> "CommandChannels":
-        """With nothing more to play after this frame; what was played for it goes with the next command."""
+        """With the play ended after this frame; its shape is removed with the next command."""
         if self.play is None:
             return self
         left = min(max(sequence + 1 - self.play.first_sequence, 0), self.play.frames)
@@ -207,11 +207,11 @@ class CommandChannels(NamedTuple):
         return self._replace(shifts_nm=(*newest, *self.shifts_nm)[: len(self.shifts_nm)])
 
     def settled(self) -> "CommandChannels":
-        """As if the channels had always been where they are."""
+        """As if the channels had always had their current shapes."""
         return self.passed(len(self.shifts_nm))
 
     def lowered(self, to_modes: Single, *, only_flat: bool = False) -> "CommandChannels":
-        """The loop's command goes to zero: none of its channels has reached anything, and nothing is played."""
+        """For a loop command that goes to zero: its channels start from flat, and no play runs."""
         flat = np.zeros_like(self.sum_nm)
         kept = (
             Channel.of(one.name, one.wanted_nm, flat if one.commanded else one.wanted_nm)
@@ -222,7 +222,7 @@ class CommandChannels(NamedTuple):
 
 
 def seen_nm(weights: tuple[tuple[int, np.float32], ...], newest_first: tuple[Single, ...]) -> Single:
-    """What the last exposure saw of commands or shifts (modes,), nm of wavefront rms."""
+    """Commands or shifts (modes,) as the last exposure saw them, nm of wavefront rms."""
     (lag, weight), *others = weights
     seen: Single = newest_first[lag] if weight == 1 else weight * newest_first[lag]
     for lag, weight in others:
@@ -231,10 +231,10 @@ def seen_nm(weights: tuple[tuple[int, np.float32], ...], newest_first: tuple[Sin
 
 
 def play_table(target: str, rows: Single, basis: Single) -> PlayTable:
-    """A table to be played, checked for all that needs no loop; shapes as in `PlayTable`, nm.
+    """Make a table to play, after all checks that do not need the loop; shapes as in `PlayTable`, nm.
 
     Raises:
-        ValueError: its parts do not fit together, it is too long, or a number in it is not finite.
+        ValueError: its parts do not match, it is too long, or a number in it is not finite.
     """
     if target not in (MIRROR, OFFSET):
         raise ValueError(f"a play's target is {MIRROR} or {OFFSET}, got {target!r}")

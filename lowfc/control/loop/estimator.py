@@ -16,22 +16,22 @@ class Estimate(NamedTuple):
     flux_dn: float
 
     def same(self, other: "Estimate | None") -> bool:
-        """Whether the other is of the same image: photons are never twice the same, a stuck camera's are."""
+        """Whether both come from identical images, as from a stuck camera; photon noise makes real ones differ."""
         return other is not None and self.flux_dn == other.flux_dn and np.array_equal(self.error_nm, other.error_nm)
 
 
 class Estimator(NamedTuple):
-    """R times the `difference` of a frame, in the order in which it is quickest: R (I - dark) and the flux at once.
+    """R times the `difference` of a frame, in the fastest order: R (I - dark) and the flux in one product.
 
-    Rounding adds some 1e-5 nm to a mode of the paper's sensor.
+    Rounding adds about 1e-5 nm to a mode of the paper's sensor.
 
     Attributes:
         rows: (modes + 1, pixels) R, and below it the good pixels.
         reference_nm: (modes,) R I0.
         dark: (pixels,) DN.
-        scratch: (pixels,) overwritten by every frame, so that nothing the size of a frame is allocated; it carries
-            nothing from one call to the next.
-        kernel: by which the usual frame is measured, and its `tables`; None for the reference alone.
+        scratch: (pixels,) overwritten by every frame, so that no array of a frame's size is allocated; it carries no
+            data from one call to the next.
+        kernel: fused step for usual frames, with its `tables`; None for the reference implementation alone.
     """
 
     rows: Single
@@ -51,13 +51,13 @@ class Estimator(NamedTuple):
         return cls(rows, reference_nm, calibration.dark, scratch, kernel, tables)
 
     def usual(self, pixels: Pixels, min_flux_dn: float) -> Estimate | None:
-        """Modal error of a usual frame (pixels,) by the fused step; None where the reference has to look at it."""
+        """Modal error of a usual frame (pixels,) by the fused step; None if the reference step is needed."""
         found = None if self.tables is None else self.tables.estimate(pixels, min_flux_dn)
         return None if found is None else Estimate(*found)
 
     def estimate(self, pixels: Pixels, min_flux_dn: float) -> Estimate | None:
-        """Modal error of a frame (pixels,); None where its flux is at most `min_flux_dn`."""
-        np.copyto(self.scratch, pixels)  # by itself, for it is quicker than a subtraction of two types
+        """Modal error of a frame (pixels,); None if its flux is at most `min_flux_dn`."""
+        np.copyto(self.scratch, pixels)  # separately: faster than a subtraction of two types
         np.subtract(self.scratch, self.dark, out=self.scratch)
         sums = self.rows.dot(self.scratch)  # half a microsecond less than `@`
         flux_dn = float(sums[-1])
@@ -70,7 +70,7 @@ def difference(calibration: Calibration, pixels: Pixels, min_flux_dn: float, out
     """Put (I - dark) / flux - I0 of a frame (pixels,) into `out` (pixels,), float32.
 
     Returns:
-        The flux: the sum of the good pixels, dark subtracted, DN. None where it is at most `min_flux_dn`; `out` then
+        The flux: the sum of the good pixels, dark subtracted, DN. None if it is at most `min_flux_dn`; `out` then
         holds I - dark.
     """
     np.subtract(pixels, calibration.dark, out=out)
@@ -83,9 +83,9 @@ def difference(calibration: Calibration, pixels: Pixels, min_flux_dn: float, out
 
 
 def filled(calibration: Calibration, pixels: Pixels) -> Pixels:
-    """A frame (pixels,) DN whose pixels at full well are what the reference has there, for the light of all the others.
+    """Replace the saturated pixels of a frame (pixels,) DN by the reference, scaled to the flux of the other pixels.
 
-    A pixel that was hit says nothing of the wavefront, but would weigh as much as its charge.
+    A pixel with a cosmic ray hit carries no wavefront information, but would enter with all its charge.
     """
     full = pixels >= calibration.saturation_dn
     others = calibration.good * ~full
@@ -96,7 +96,7 @@ def filled(calibration: Calibration, pixels: Pixels) -> Pixels:
 
 
 def saturated_pixels(calibration: Calibration, pixels: Pixels) -> int:
-    """How many good pixels of a frame (pixels,) DN are at full well."""
+    """Number of good pixels of a frame (pixels,) DN at full well."""
     if pixels.item(pixels.argmax()) < calibration.saturation_dn:
         return 0
     return int(np.count_nonzero((pixels >= calibration.saturation_dn) & (calibration.good > 0)))

@@ -1,4 +1,4 @@
-"""Gains, leaks and limits of the integrator, and offsets, as they are asked for: by a person, or as measured."""
+"""Requests for gains, leaks and limits of the integrator, and for offsets, by a person or by measurement."""
 
 from dataclasses import replace
 from typing import Any
@@ -23,16 +23,16 @@ Changed = tuple[ActiveLoop, str, *tuple[PendingEvent, ...]]
 
 
 def changed_law(settings: Settings, drive: ActiveLoop, request: Request) -> Changed:
-    """The loop after a request for gain, leak or limit, and the reply; ValueError says why it is refused."""
+    """The loop after a request for gain, leak or limit, and the reply; ValueError with the reason if refused."""
     if request.name == "gain" and request.text == AUTO:
         return _automatic_gain(settings, drive, request)
     if drive.following is not None and request.name != "limit":
         raise ValueError(
             f"the law {drive.following.law.name!r} drives the mirror, and has no {request.name}: "
-            "`lowfc ctl law integrator` goes back to the one that has"
+            "`lowfc ctl law integrator` returns to the integrator"
         )
     law = _changed(drive.law, drive.calibration.noll, settings.delay_frames, request)
-    if request.name == "gain":  # what a person gave is not automatic, and is measured as a mode that is corrected
+    if request.name == "gain":  # a gain set by a person is not automatic, and its mode is measured as a corrected one
         given = _chosen(drive, request)
         weighting = drive.weighting
         drive = drive._replace(automatic=drive.automatic & ~given)
@@ -45,7 +45,7 @@ def changed_law(settings: Settings, drive: ActiveLoop, request: Request) -> Chan
 
 
 def _automatic_gain(settings: Settings, drive: ActiveLoop, request: Request) -> Changed:
-    """Gains that follow what is measured: without values, from now on; with values, what they have become."""
+    """Automatic gains: switched on by a request without values, changed by one with measured values."""
     chosen, noll = _chosen(drive, request), drive.calibration.noll
     if not request.values:
         drive = drive._replace(automatic=drive.automatic | chosen).under(drive.law)
@@ -70,13 +70,13 @@ def _listed(values: Single) -> str:
 
 
 def _chosen(drive: ActiveLoop, request: Request) -> Mask:
-    """The modes (modes,) that a request is for."""
+    """The modes (modes,) of a request."""
     noll = drive.calibration.noll
     return np.isin(noll, request.modes or noll)
 
 
 def per_mode(noll: tuple[int, ...], request: Request, before: Single) -> Single:
-    """The values of all modes (modes,), in their unit, with those of the request in their places.
+    """Values of all modes (modes,), in their unit, updated with those of the request.
 
     Raises:
         ValueError: what is wrong with the request.
@@ -95,7 +95,7 @@ def per_mode(noll: tuple[int, ...], request: Request, before: Single) -> Single:
 
 
 def _changed(law: Law, noll: tuple[int, ...], delay_frames: float, request: Request) -> Law:
-    """The law with new gains, leaks or limits; ValueError says what is wrong with the request."""
+    """The law with new gains, leaks or limits; ValueError if the request is wrong."""
     attribute = _ATTRIBUTES[request.name]
     values = per_mode(noll, request, getattr(law, attribute))
     lowest, highest = min(request.values), max(request.values)
@@ -115,7 +115,7 @@ def _changed(law: Law, noll: tuple[int, ...], delay_frames: float, request: Requ
 
 
 def remark(settings: Settings, drive: ActiveLoop, request: Request) -> str:
-    """Remark on the values of a request for gains or limits; empty where there is nothing to say."""
+    """Remark on the values of a request for gains or limits; usually empty."""
     lowest, highest = min(request.values), max(request.values)
     if request.name == "gain":
         recommended = highest_gain(settings.delay_frames)
@@ -142,7 +142,7 @@ def remark(settings: Settings, drive: ActiveLoop, request: Request) -> str:
 
 
 def offset_remark(drive: ActiveLoop, offset_nm: Single) -> str:
-    """Remark on offsets (modes,) of modes that no gain lets follow; empty where there are none."""
+    """Remark on offsets (modes,) of modes that cannot follow at a gain of 0; empty if there are none."""
     fixed = (offset_nm != 0) & (drive.law.gain == 0) & ~drive.automatic & (drive.following is None)
     names = ", ".join(f"Z{mode}" for mode, one in zip(drive.calibration.noll, fixed, strict=True) if one)
     return f": {names} would not follow at a gain of 0" if names else ""
@@ -152,7 +152,7 @@ def check_offset(drive: ActiveLoop, largest_nm: npt.NDArray[np.floating[Any]]) -
     """Refuse offsets (modes,), nm rms of wavefront, beyond the limits of their modes.
 
     Raises:
-        ValueError: one is; the text names its mode.
+        ValueError: an offset is too large; the text names its mode.
     """
     for mode, limit_nm, asked_nm in zip(drive.calibration.noll, drive.law.limit_nm, largest_nm, strict=True):
         if asked_nm > limit_nm:

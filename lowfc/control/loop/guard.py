@@ -1,10 +1,10 @@
-"""The guard of a linear law: an integrator beside it, of the same frames, which takes over where the law does worse.
+"""The guard of a linear law: an integrator on the same frames, which takes over if the law does worse.
 
-Tip and tilt are judged by themselves, and so are the other modes: the weight of one would hide the other. While the law
-drives a group, the integrator is virtual there; while the integrator drives it, the law is.
+Tip and tilt are judged apart from the other modes, as the larger group would hide the smaller. While the law drives a
+group, the integrator is virtual there, and vice versa.
 
-Squared errors are compared in blocks of frames, some of which in a row decide: a step of the disturbance, for which a
-law may take longer than the integrator, spoils one or two blocks, and moved lines spoil all.
+Squared errors are compared in blocks of frames, and several blocks in a row decide: a step of the disturbance, from
+which a law may recover more slowly than the integrator, spoils one or two blocks; vibration lines that moved spoil all.
 """
 
 from collections.abc import Sequence
@@ -19,29 +19,29 @@ from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.loop.inputs import PendingEvent
 
 BLOCK_S, FEWEST = 0.1, 100
-"""Duration of a block, and its frames at least."""
+"""Duration of a block, and its least number of frames."""
 WORSE_BLOCKS = 4
-"""In a row after which the integrator takes over."""
+"""Blocks in a row after which the integrator takes over."""
 FADED_S = 0.1
-"""In which one takes over from the other."""
+"""Duration of the cross-fade."""
 BETTER_S = 10.0
-"""For how long the law must be better in every block before it drives again; twice as long each time."""
+"""Time for which the law must be better in every block before it drives again; doubled each time."""
 MOST_TAKEOVERS = 4
-"""From this one on, only an operator lets the law drive again."""
+"""Takeover after which only an operator can let the law drive again."""
 WORSE, BETTER = 1.2, 0.25
-"""Mean squared error of the law over the integrator's, above which it is worse, and below which it is better."""
+"""Ratio of the law's mean squared error to the integrator's above which it is worse, and below which it is better."""
 USUAL_S = 10.0
-"""Time constant of what is usual of the pseudo-open-loop modes."""
+"""Time constant of the usual mean square of the pseudo-open-loop modes."""
 AMPLIFIED = 2.5
-"""Mean squared error over the usual mean square of the pseudo-open-loop modes, above which the loop amplifies; below
-`BETTER` of the present mean square the disturbance has grown, and the loop corrects it."""
+"""Ratio of mean squared error to the usual mean square of the pseudo-open-loop modes above which the loop amplifies;
+below `BETTER` of the present mean square the disturbance has grown, and the loop corrects it."""
 
 NAMES = ("tip and tilt", "the other modes")
 AGAIN = "again"
 
 
 class Spans(NamedTuple):
-    """Durations at a frame rate: of a block and of the cross-fade in frames, of the others in blocks."""
+    """Durations at a frame rate: block and cross-fade in frames, the others in blocks."""
 
     block: int
     faded: int
@@ -57,14 +57,14 @@ class Spans(NamedTuple):
 
 
 class Group(NamedTuple):
-    """What the guard knows of a group of modes.
+    """The guard's state for a group of modes.
 
     Attributes:
         overruled: the integrator drives it.
-        faded: frames of the cross-fade that the integrator has had, up to all of them.
-        takeovers: by the integrator.
-        blocks: in a row that speak for a change.
-        usual_nm2: sum of the mean squares of its pseudo-open-loop modes over a longer time.
+        faded: frames of the cross-fade to the integrator so far.
+        takeovers: number of takeovers by the integrator.
+        blocks: blocks in a row in favour of a change.
+        usual_nm2: long-term sum of the mean squares of its pseudo-open-loop modes.
     """
 
     overruled: bool = False
@@ -75,16 +75,16 @@ class Group(NamedTuple):
 
     @property
     def final(self) -> bool:
-        """Whether only an operator lets the law drive it again."""
+        """Whether only an operator can let the law drive it again."""
         return self.takeovers >= MOST_TAKEOVERS
 
     def judged(self, means_nm2: Sequence[float], spans: Spans, *, void: bool) -> tuple["Group", str]:
-        """After a block, and why the law is overruled, or `AGAIN`; mostly empty.
+        """The group after a block, and why the law is overruled, or `AGAIN`; usually empty.
 
         Args:
-            means_nm2: over the block, of the squares of errors, virtual errors and pseudo-open-loop modes.
+            means_nm2: means over the block of the squares of errors, virtual errors and pseudo-open-loop modes.
             spans: durations.
-            void: there is nothing to compare with. A loop that amplifies shows all the same; a wrong delay, for one,
+            void: the comparison is not valid. An amplifying loop is detected nevertheless; a wrong delay, for example,
                 spoils pseudo-open-loop modes, and with them the comparison.
         """
         error_nm2, virtual_nm2, pol_nm2 = means_nm2
@@ -109,17 +109,17 @@ class Group(NamedTuple):
 
 
 class Guard(NamedTuple):
-    """What the guard knows, from one frame to the next.
+    """The guard's state, from one frame to the next.
 
     Attributes:
         spans: at the law's frame rate.
-        members: (modes, groups) 1 where a mode is one of the group.
-        groups: as in `members`.
-        frames: of the present block.
-        sums_nm2: (3, groups) squares of them: errors, virtual errors, pseudo-open-loop modes.
-        void: the virtual loop has not been there all the time.
-        virtual_nm: commands (modes,) of whichever does not drive a mode, newest first; empty before it begins from
-            where the loop is.
+        members: (modes, groups) 1 where a mode belongs to the group.
+        groups: in the order of `members`.
+        frames: frames of the current block.
+        sums_nm2: (3, groups) sums of squares: errors, virtual errors, pseudo-open-loop modes.
+        void: the virtual loop has not run for the whole block.
+        virtual_nm: commands (modes,) of the controller that does not drive a mode, newest first; empty until it
+            starts from the loop's command.
         x: (states,) of the law as if it drove all modes; None while it does.
     """
 
@@ -141,12 +141,12 @@ class Guard(NamedTuple):
 
     @property
     def overruled(self) -> bool:
-        """Whether the integrator has, or is given, a part of the command."""
+        """Whether the integrator has part of the command or is taking it over."""
         return any(group.faded or group.overruled for group in self.groups)
 
     @property
     def weight(self) -> Single:
-        """The law's part (modes,) of the command."""
+        """The law's share (modes,) of the command."""
         left = np.array([1 - group.faded / self.spans.faded for group in self.groups], np.float32)
         return self.members @ left
 
@@ -155,15 +155,15 @@ class Guard(NamedTuple):
         return Guard(self.spans, self.members, tuple(groups), 0, np.zeros_like(self.sums_nm2))
 
     def anew(self) -> "Guard":
-        """Of a law that takes over from the integrator once more; what is usual is known."""
+        """For a law that takes over from the integrator again; the usual mean squares are kept."""
         return self.with_groups([Group(usual_nm2=group.usual_nm2) for group in self.groups])
 
     def at_rest(self) -> "Guard":
-        """While there is nothing to judge."""
+        """Reset the block while there is nothing to judge."""
         return self.with_groups([group._replace(blocks=0) for group in self.groups])
 
     def observed(self, pol_nm: Single, frames: int) -> "Guard":
-        """At rest, in one more of so many frames in which the law did not drive."""
+        """At rest, one frame later, as one of `frames` in which the law did not drive."""
         part = 1 / min(frames, self.spans.usual * self.spans.block)
         squares = np.square(pol_nm).dot(self.members).tolist()
         return self.with_groups(
@@ -174,7 +174,7 @@ class Guard(NamedTuple):
         )
 
     def held(self, frames: int, law: LinearLaw) -> "Guard":
-        """Some frames later, of which nothing was measured: commands are held, as those of the loop."""
+        """Some frames later, without measurements: commands are held, as in the loop."""
         if not self.virtual_nm:
             return self
         x = self.x
@@ -196,17 +196,17 @@ class Guard(NamedTuple):
         *,
         limited: bool,
     ) -> tuple["Guard", list[PendingEvent]]:
-        """One frame later, in a closed loop, and what there is to say of it.
+        """One frame later, in a closed loop, and the resulting events.
 
         Args:
-            law: that is guarded.
+            law: the guarded law.
             x: (states,) its state after this frame, in the real loop.
-            integrator: its rival.
+            integrator: the integrator that it is compared with.
             weights: which commands an exposure sees.
             history_nm: the loop's commands (modes,) before this frame's, newest first.
             error_nm: (modes,) of this frame.
             pol_nm: (modes,) pseudo-open-loop; both without the loop's target.
-            limited: a limit of the mirror has acted on the last command, which no virtual one is held to.
+            limited: a limit of the mirror acted on the last command; virtual commands do not keep it.
         """
         spans, groups = self.spans, self.groups
         overruled = self.overruled
@@ -238,13 +238,13 @@ class Guard(NamedTuple):
         means_nm2 = (sums_nm2 / frames).T.tolist()
         judged = [group.judged(means, spans, void=void) for group, means in zip(groups, means_nm2, strict=True)]
         after, events = self.with_groups([group for group, _ in judged]), _events(law.name, judged)
-        if events:  # whoever drives now is compared once it drives alone
+        if events:  # the new driver is compared once it drives alone
             return after.at_rest(), events
         return after._replace(virtual_nm=virtual_nm, x=virtual_x), []
 
 
 def _faded(group: Group, spans: Spans) -> Group:
-    """One frame nearer to whoever drives it."""
+    """One frame further in the cross-fade to the controller that drives it."""
     faded = min(group.faded + 1, spans.faded) if group.overruled else max(group.faded - 1, 0)
     return group._replace(faded=faded, blocks=0)
 

@@ -1,4 +1,4 @@
-"""What the controller takes in and gives out: values, with the time each was taken."""
+"""Inputs and outputs of the controller, with their times."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,14 +15,14 @@ from lowfc.control.loop.interlocks import BenchReport
 from lowfc.control.loop.safety import LoopMode, Reason
 
 COUNT_BITS = 32
-"""A frame's sequence is its publisher's start in seconds, shifted by this, and its count."""
+"""A frame's sequence is its publisher's start in seconds, shifted by this many bits, plus its count."""
 
 
 class Frame(NamedTuple):
     """A sensor image that arrived.
 
     Attributes:
-        pixels: (rows, columns) uint16, DN, or None where the message made no image.
+        pixels: (rows, columns) uint16, DN, or None if the message held no valid image.
         ahead: its sequence starts further ahead of the host's clock than allowed (a clock's verdict, as its age is).
     """
 
@@ -35,22 +35,22 @@ class Frame(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What an operator asks.
+    """An operator's request.
 
     Attributes:
         modes: Noll indices that the values are for; empty for all.
         values: one for all modes, or one for each.
         text: name of a channel, target of a play, a note.
         actuators_nm: one or more shapes of the mirror, one after the other, nm of surface.
-        table: of a play, (frames, columns).
-        law: that shall drive the mirror; None for the integrator.
-        calibration: that shall be used.
-        played: what a play's table and shapes make, once they were checked.
-        refusal: why it is refused whatever the state of the loop.
-        prepared: it has been checked for what needs no state; see `lowfc.control.loop.requests.prepared`.
-        lease_id: of the lease under which it is asked for, or that is asked for; 0 for none.
-        requester: user and program that ask, for people.
-        prior_nm2: of automatic gains, as `lowfc.control.loop.state.Weighting`; with the light `flux_dn`.
+        table: table of a play, (frames, columns).
+        law: the law to drive the mirror; None for the integrator.
+        calibration: the calibration to use.
+        played: the play made of `table` and shapes, once checked.
+        refusal: reason to refuse it in any state of the loop.
+        prepared: the checks that need no state are done; see `lowfc.control.loop.requests.prepared`.
+        lease_id: identity of the lease that it is sent under, or that it requests; 0 for none.
+        requester: user and program that sent it, for people.
+        prior_nm2: of automatic gains, as in `lowfc.control.loop.state.Weighting`; with the light `flux_dn`.
     """
 
     time_ns: int
@@ -73,7 +73,7 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class MirrorShape:
-    """Where the mirror is: actuators (rows, columns) nm of surface, and the modal command behind them.
+    """The mirror's shape: actuators (rows, columns) nm of surface, and their modal command.
 
     Attributes:
         safe: its last command was sent in safe mode.
@@ -90,8 +90,8 @@ class MirrorReport:
     """Whether the mirror follows commands (a clock's verdict).
 
     Attributes:
-        fault: what is wrong, to be read after "the mirror"; empty where it follows.
-        shape: where it last was; None where that is not known.
+        fault: the fault, a phrase that continues "the mirror ..."; empty if there is none.
+        shape: its last known shape; None if unknown.
     """
 
     time_ns: int
@@ -101,7 +101,7 @@ class MirrorReport:
 
 @dataclass(frozen=True, slots=True)
 class Load:
-    """A calibration to use from now on, and where it came from."""
+    """A calibration to use from now on, and its origin."""
 
     time_ns: int
     calibration: Calibration
@@ -110,19 +110,19 @@ class Load:
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """No frame came; `silent_ns` is how long it has been (a clock's verdict)."""
+    """No frame arrived; `silent_ns` is the time since the last (a clock's verdict)."""
 
     time_ns: int
     silent_ns: int
 
 
 Report = MirrorShape | MirrorReport | CameraSettings | BenchReport | Load | Tick
-"""What is neither a frame nor a request."""
+"""Inputs other than frames and requests."""
 Input = Frame | Request | Report
 
 
 class Step(NamedTuple):
-    """One step of the control law, for every frame that arrived; arrays (modes,) float32, nm of wavefront rms."""
+    """One step of the control law, made for every frame; arrays (modes,) float32, nm of wavefront rms."""
 
     frame_sequence: int
     time_ns: int
@@ -136,12 +136,12 @@ class Step(NamedTuple):
 
     @property
     def frame(self) -> int:
-        """Number of its frame within its camera's start, as `lowfc ctl` and the views show it."""
+        """Number of its frame since its camera started, as in `lowfc ctl` and the views."""
         return self.frame_sequence & 0xFFFF_FFFF
 
 
 class Command(NamedTuple):
-    """Where the mirror shall be: (rows, columns) float32, nm of surface.
+    """A command to the mirror: (rows, columns) float32, nm of surface.
 
     Attributes:
         safe: the loop is in safe mode.
@@ -164,7 +164,7 @@ class PendingEvent(NamedTuple):
 
 
 class Reply(NamedTuple):
-    """The answer to a request, and the first frame for which it is in force."""
+    """The answer to a request, with the first frame for which it is in force."""
 
     accepted: bool
     text: str
@@ -172,7 +172,7 @@ class Reply(NamedTuple):
 
 
 class Outputs(NamedTuple):
-    """What one input gave rise to; `changed` says that more of the state changed than the next frame will show."""
+    """Outputs of one input; `changed`: the state changed by more than the next frame will show."""
 
     step: Step | None = None
     command: Command | None = None

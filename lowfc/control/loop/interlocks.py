@@ -1,7 +1,7 @@
-"""Interlocks: conditions on values that others on the bench publish, and what follows while they hold.
+"""Interlocks: conditions on values published by other devices on the bench, and their actions.
 
 An interlock only ever makes the loop safer: it holds, opens, relaxes to safe mode, refuses to close, or warns. It never
-closes the loop, and what it opened stays open.
+closes the loop, and a loop that it opened stays open.
 """
 
 from dataclasses import dataclass
@@ -10,11 +10,11 @@ from typing import NamedTuple
 
 Value = bool | float | str
 MAX_TEXT = 200
-"""Characters of a value that is a text."""
+"""Most characters of a text value."""
 
 
 class Action(StrEnum):
-    """What follows while an interlock acts, the mildest first."""
+    """Action of an interlock, the mildest first."""
 
     WARN = "warn"
     REFUSE_CLOSE = "refuse_close"
@@ -36,12 +36,12 @@ class Interlock(NamedTuple):
     """A condition on a bench value.
 
     Attributes:
-        name: of the bench value.
+        name: name of the bench value.
         test: equal, different, above or below.
-        value: what it is compared with.
-        action: what follows while the condition holds.
+        value: value to compare with.
+        action: action while the condition holds.
         max_age_ns: age above which the bench value is too old.
-        acts_when_old: what a value counts as that is too old, of another kind, or was never received.
+        acts_when_old: whether it acts if the value is too old, of another type, or was never received.
     """
 
     name: str
@@ -52,7 +52,7 @@ class Interlock(NamedTuple):
     acts_when_old: bool = True
 
     def acts(self, value: Value | None, age_ns: int) -> str:
-        """Why it acts on a value of this age, None where there is none; empty where it does not act."""
+        """Why it acts on a value of this age (None if never received); empty if it does not act."""
         age_s = self.max_age_ns * 1e-9
         if value is None:
             return f"no value of {self.name} has been received" if self.acts_when_old else ""
@@ -75,9 +75,9 @@ class Acting(NamedTuple):
     """An interlock that acts.
 
     Attributes:
-        number: its place among the interlocks of the settings.
-        action: what follows.
-        why: what it acts on, as it began: a number goes on to change.
+        number: its index in the interlocks of the settings.
+        action: its action.
+        why: its cause when it began to act; the value may change afterwards.
     """
 
     number: int
@@ -87,7 +87,7 @@ class Acting(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class BenchReport:
-    """The newest value under a name; None where none was received. Its age is a clock's verdict."""
+    """The newest value of a name, None if none was received; its age is a clock's verdict."""
 
     time_ns: int
     name: str
@@ -96,7 +96,7 @@ class BenchReport:
 
 
 def judged(interlocks: tuple[Interlock, ...], acting: tuple[Acting, ...], report: BenchReport) -> tuple[Acting, ...]:
-    """The interlocks that act after a report; the very same ones where that changes nothing."""
+    """The interlocks that act after a report; the same object if nothing changed."""
     before = {one.number: one for one in acting}
     after = dict(before)
     for number, interlock in enumerate(interlocks):
@@ -110,20 +110,20 @@ def judged(interlocks: tuple[Interlock, ...], acting: tuple[Acting, ...], report
 
 
 def refusal(acting: tuple[Acting, ...], asked: str) -> str:
-    """Why the interlocks that act refuse to `close` the loop or to `clear` safe mode; empty where they do not."""
+    """Why acting interlocks refuse to `close` the loop or `clear` safe mode; empty if they do not."""
     refusing = (Action.SAFE,) if asked == "clear" else _AGAINST_CLOSING if asked == "close" else ()
     return "; ".join(f"an interlock acts: {one.why}" for one in acting if one.action in refusing)
 
 
 def shown(value: Value) -> str:
-    """A value for people."""
+    """Format a value for people."""
     if isinstance(value, bool):
         return "true" if value else "false"
     return f"{value:g}" if isinstance(value, float) else repr(value)
 
 
 def _by_value(why: str, report: BenchReport) -> bool:
-    """Whether an interlock acts by a value, and not for want of one."""
+    """Whether an interlock acts because of a value, not because one is missing."""
     return why.startswith(f"{report.name} is ")
 
 

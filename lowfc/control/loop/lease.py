@@ -1,9 +1,9 @@
-"""A lease: the loop is reserved for one client, and requests of others that would change the loop are refused.
+"""A lease: the loop is reserved for one client, and other clients' requests that would change it are refused.
 
-It keeps apart programs that mean well: its identity is in the controller's state, where everybody can read it.
+It separates cooperating programs and is no access control: its identity is in the controller's state, open to all.
 
-It ends when its holder releases it or does not renew it in time, and by `safe`, `open`, `pause` or `stop` of anybody
-else.
+It ends when its holder releases it or does not renew it in time, and on `safe`, `open`, `pause` or `stop` from any
+other client.
 """
 
 from math import ceil
@@ -14,16 +14,16 @@ from lowfc.control.loop.wording import AUTO
 
 MAX_S = 60.0
 MAX_HOLDER = 200
-"""Characters of the holder's description."""
+"""Most characters of the holder's description."""
 
 ENDED_BY = frozenset({"safe", "open", "pause", "stop"})
-"""Requests that are granted to anybody, and that end the lease of somebody else."""
+"""Requests granted to every client, which end another client's lease."""
 UNRELATED = frozenset({"status", "note", "lease", "renew", "release", "permit"})
-"""Requests that do not change the loop, and those of leases themselves."""
+"""Requests that do not change the loop, and the requests for leases themselves."""
 LEASE_OVER = "the lease ended: "
-"""What the refusal of a renewal begins with; then why."""
+"""Beginning of the refusal of a renewal, before the cause."""
 OUTLOOK = ", about "
-"""What a holder's description ends with that says how long it is going to take."""
+"""Separator in a holder's description before its remaining time."""
 
 
 class Lease(NamedTuple):
@@ -33,9 +33,9 @@ class Lease(NamedTuple):
         id: carried by the holder's requests; above 0.
         holder: the holder and its purpose, for people.
         until_ns: end by the controller's clock, unless it is renewed.
-        last_sequence: of the last frame for which it is in force; 0 where the frame rate is not known.
+        last_sequence: last frame for which it is in force; 0 if the frame rate is unknown.
         ended: cause of its end; empty while it is in force.
-        holds: it is a permit: a closed loop holds its command while it is in force.
+        holds: whether it is a permit: a closed loop holds its command while it is in force.
     """
 
     id: int
@@ -47,26 +47,26 @@ class Lease(NamedTuple):
 
     @property
     def without_outlook(self) -> str:
-        """The holder, without how long it was going to take."""
+        """The holder, without its remaining time."""
         return self.holder.rpartition(OUTLOOK)[0] or self.holder
 
     def over(self, time_ns: int, frame_sequence: int) -> bool:
-        """Whether it has not been renewed in time, by the clock or by the frames."""
+        """Whether it was not renewed in time, by the clock or by frames."""
         same_camera = frame_sequence >> COUNT_BITS == self.last_sequence >> COUNT_BITS
         return time_ns > self.until_ns or (same_camera and 0 < self.last_sequence < frame_sequence)
 
     def reserved(self, time_ns: int) -> str:
-        """The sentence for people."""
+        """Message that the loop is reserved."""
         left_s = ceil(max(0, self.until_ns - time_ns) * 1e-9)
         return f"the loop is reserved for {self.holder} (while that runs, and for at most {left_s} s after it)"
 
 
 def refusal(lease: Lease | None, name: str, lease_id: int, time_ns: int) -> str:
-    """Why a request is refused; empty where it is granted.
+    """Why a request is refused; empty if it is granted.
 
-    Refused are requests of others while a lease is in force, and those of a former holder: whoever ended its lease has
-    the last word on the loop. The lease is the last one, in force or ended; `lease_id` is the request's, 0 for
-    none; the time is the controller's.
+    Other clients' requests are refused while a lease is in force, and those of a former holder after it: the client
+    that ended a lease decides. `lease` is the last one, in force or ended; `lease_id` is the request's, 0 for none;
+    the time is the controller's.
     """
     if name in ENDED_BY or name in UNRELATED:
         return ""
@@ -77,12 +77,12 @@ def refusal(lease: Lease | None, name: str, lease_id: int, time_ns: int) -> str:
     if not lease_id:
         return ""
     if lease is None or lease.id != lease_id:
-        return "the reservation that it is asked under is not in force: did the controller restart?"
-    return f"the reservation that it is asked under ended: {lease.ended}"
+        return "the request's reservation is not in force: did the controller restart?"
+    return f"the request's reservation ended: {lease.ended}"
 
 
 def asked_by(held: Lease | None, request: Request) -> str:
-    """What a change of the loop is put down to: a request, and what it was for where its sender holds the loop."""
+    """Cause of a change of the loop: the request, and the purpose of its sender's reservation if it has one."""
     if request.text.startswith(f"{AUTO}: "):
         return request.text
     if held is not None and request.lease_id and request.lease_id == held.id:

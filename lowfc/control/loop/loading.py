@@ -1,4 +1,4 @@
-"""A calibration, a mirror, a camera or a mode taken into use: the mirror stays where it is, whatever changes."""
+"""Changes of calibration, mirror, camera or loop mode; the mirror keeps its shape in each."""
 
 from dataclasses import replace
 
@@ -15,9 +15,9 @@ from lowfc.control.loop.state import ActiveLoop, Conditions, Settings, State
 from lowfc.control.loop.wording import MEASURED_FIRST
 
 ADOPTED_NM = 1.0
-"""Of an actuator beyond the modal command, above which a mirror's shape is adopted as a channel."""
+"""Deviation of an actuator from the modal command above which a mirror's shape is adopted as a channel, nm."""
 REFUSED_IN_A_ROW = 3
-"""Frames refused in a row from which on the loop counts as holding; fewer may be a hiccup."""
+"""Frames refused in a row from which on the loop counts as holding; fewer are ignored."""
 LATCHED = "it was in safe mode before the controller started"
 WITNESSED = "the mirror's last command was sent in safe mode"
 
@@ -25,11 +25,10 @@ WITNESSED = "the mirror's last command was sent in safe mode"
 def loaded(
     settings: Settings, state: State, calibration: Calibration, source: str, time_ns: int
 ) -> tuple[State, list[PendingEvent]]:
-    """The state under another calibration, and what there is to say of it.
+    """The state with another calibration, and the events.
 
-    Where the mirror has the same grid, its shape stays: the channels as they are, the rest as a command of the new
-    modes, and what these cannot make as a channel of its own. Offset, play and a law of other modes are of no meaning
-    any more.
+    If the mirror has the same grid, it keeps its shape: the channels stay, the rest becomes a command of the new modes,
+    and what these cannot make becomes a channel of its own. Offset, play and a law of other modes are dropped.
     """
     drive, before = ActiveLoop.at_rest(settings, calibration), state.drive
     details: dict[str, object] = {
@@ -78,7 +77,7 @@ def loaded(
 
 
 def misfit(state: State) -> str:
-    """Why the camera, as its settings were last received, does not fit the calibration; empty where it does."""
+    """Why the camera's last received settings do not fit the calibration; empty if they do."""
     camera, drive = state.conditions.camera, state.drive
     if camera is None or drive is None or not drive.calibration.noll:
         return ""
@@ -86,7 +85,7 @@ def misfit(state: State) -> str:
 
 
 def uncalibrated(state: State) -> str:
-    """Why no mode can be measured: no calibration, or the model's, of frames of another size; empty where they can."""
+    """Why no mode can be measured: no calibration, or a computed one for another frame size; empty if they can."""
     drive, camera = state.drive, state.conditions.camera
     hint = ": `lowfc commission` measures one"
     if drive is None or not drive.calibration.noll:
@@ -99,7 +98,7 @@ def uncalibrated(state: State) -> str:
 
 
 def holding(state: State) -> str:
-    """Why a closed loop would hold its command for now; empty where it would correct."""
+    """Why a closed loop would hold its command at present; empty if it would correct."""
     if state.conditions.mirror_fault:
         return f"the mirror {state.conditions.mirror_fault}"
     if state.frame_timeout:
@@ -112,7 +111,7 @@ def holding(state: State) -> str:
 
 
 def held(state: State) -> str:
-    """What holds the command of a closed loop, an interlock or a permit; empty where nothing does."""
+    """Interlock or permit that holds the command of a closed loop; empty if there is none."""
     acting, lease = state.conditions.acting, state.conditions.lease
     if lease is not None and lease.holds and not lease.ended:
         return f"it is held for {lease.holder}"
@@ -120,9 +119,9 @@ def held(state: State) -> str:
 
 
 def bench_reported(settings: Settings, state: State, report: BenchReport) -> tuple[State, Outputs]:
-    """Judge the interlocks on a bench value; one that begins to act makes the loop safer, and none closes it again.
+    """Evaluate the interlocks on a bench value; one that begins to act makes the loop safer, and none closes it.
 
-    A loop that started closed is opened by what would have refused to close it.
+    A loop that started closed is opened by any interlock that would have refused to close it.
     """
     before = state.conditions.acting
     after = judged(settings.interlocks, before, report)
@@ -145,7 +144,7 @@ def bench_reported(settings: Settings, state: State, report: BenchReport) -> tup
 
 
 def mirror_reported(settings: Settings, state: State, shape: MirrorShape) -> tuple[State, Outputs]:
-    """Start from where the mirror is, so that it does not jump; later shapes change nothing."""
+    """Start from the mirror's shape, so that it does not jump; later shapes change nothing."""
     if state.commanded:
         return state, Outputs()
     events: list[PendingEvent] = []
@@ -166,7 +165,7 @@ def mirror_reported(settings: Settings, state: State, shape: MirrorShape) -> tup
     drive = drive._replace(actuators_nm=shape.actuators_nm, history_nm=(command_nm,) * len(drive.history_nm))
     if command_nm.any():
         events.append(PendingEvent("MIRROR_ADOPTED", {"rms_nm": float(np.sqrt(command_nm @ command_nm))}))
-    if state.mode is not LoopMode.SAFE:  # then it is on its way to flat, and shall stay there
+    if state.mode is not LoopMode.SAFE:  # in safe mode it relaxes to flat and stays there
         added = drive.command_channels  # of a mirror that reported late
         drive, rest = adopted(drive, shape.actuators_nm if added is None else shape.actuators_nm - added.sum_nm)
         events += rest
@@ -174,9 +173,9 @@ def mirror_reported(settings: Settings, state: State, shape: MirrorShape) -> tup
 
 
 def mirror_judged(settings: Settings, state: State, report: MirrorReport) -> tuple[State, Outputs]:
-    """Hold while the mirror does not follow; a closed loop goes back to where the mirror last was, against wind-up.
+    """Hold while the mirror does not follow; a closed loop steps back to the mirror's last shape, against wind-up.
 
-    Far back, it takes several reports: each step keeps the slew limit.
+    A long way back takes several reports: each step keeps the slew limit.
     """
     fault, drive = report.fault, state.drive
     news = fault != state.conditions.mirror_fault
@@ -197,7 +196,7 @@ def mirror_judged(settings: Settings, state: State, report: MirrorReport) -> tup
 
 
 def _gone_back(settings: Settings, drive: ActiveLoop, shape_nm: Single) -> ActiveLoop:
-    """The drive with a command nearer to a shape (rows, columns) of the mirror."""
+    """Move the command towards a shape (rows, columns) of the mirror."""
     if shape_nm.shape != drive.calibration.grid:
         return drive
     kept_nm = limit(settings.limits, drive.actuators_nm, shape_nm).actuators_nm
@@ -209,7 +208,7 @@ def _gone_back(settings: Settings, drive: ActiveLoop, shape_nm: Single) -> Activ
 
 
 def end_probe(drive: ActiveLoop, sequence: int, why: str, events: list[PendingEvent]) -> ActiveLoop:
-    """The drive with nothing more to play after this frame."""
+    """End the play after this frame."""
     if drive.play is None or drive.play.over(sequence):
         return drive
     events.append(PendingEvent("PLAY_ENDED", {"why": why}))
@@ -217,7 +216,7 @@ def end_probe(drive: ActiveLoop, sequence: int, why: str, events: list[PendingEv
 
 
 def camera_reported(settings: Settings, state: State, camera: CameraSettings) -> tuple[State, Outputs]:
-    """Keep the camera's settings; open the loop where it is no longer the camera that was calibrated."""
+    """Store the camera's settings; open the loop if they no longer fit the calibration."""
     after = _with_camera(state, camera)
     if after is state:
         return state, Outputs()
@@ -236,7 +235,7 @@ def camera_reported(settings: Settings, state: State, camera: CameraSettings) ->
 
 
 def _with_camera(state: State, camera: CameraSettings) -> State:
-    """The state with settings of the camera just received; the very same one where they are nothing new."""
+    """The state with newly received camera settings; the same object if they are unchanged."""
     drive, known = state.drive, state.conditions
     if (
         drive is not None
@@ -251,7 +250,7 @@ def _with_camera(state: State, camera: CameraSettings) -> State:
 
 
 def _expected(drive: ActiveLoop, camera: CameraSettings) -> CameraSettings:
-    """Settings of the calibration; where it has none yet, those of the camera as far as the calibration allows."""
+    """Settings of the calibration; if it has none yet, the camera's as far as the calibration allows."""
     if drive.camera is not None:
         return drive.camera
     calibration = drive.calibration
@@ -263,7 +262,7 @@ def _since(state: State, time_ns: int, cause: str) -> Conditions:
 
 
 def adopted(drive: ActiveLoop, shape_nm: Single) -> tuple[ActiveLoop, list[PendingEvent]]:
-    """What a shape (rows, columns) has beyond the modal command, kept as a channel; the driver's rounding is not."""
+    """Keep a shape's deviation (rows, columns) from the modal command as a channel, except the driver's rounding."""
     rest_nm = shape_nm.copy()
     rest_nm -= (drive.to_actuators @ drive.history_nm[0]).reshape(rest_nm.shape)
     if not np.abs(rest_nm).max() > ADOPTED_NM:
@@ -278,7 +277,7 @@ def adopted(drive: ActiveLoop, shape_nm: Single) -> tuple[ActiveLoop, list[Pendi
 
 
 def in_mode(state: State, mode: LoopMode, time_ns: int, cause: str) -> State:
-    """Nothing of the last mode goes on in the next one."""
+    """Change the loop mode; the play, steps and return to zero of the previous mode end."""
     drive = state.drive
     if drive is not None and mode is not state.mode:
         drive = drive.stopped(state.frame_sequence)
@@ -295,7 +294,7 @@ def in_mode(state: State, mode: LoopMode, time_ns: int, cause: str) -> State:
 
 
 def _changed(state: State, mode: LoopMode, time_ns: int, cause: str, events: list[PendingEvent]) -> State:
-    """The state in a loop mode, and the events where that is another one."""
+    """Change the loop mode, and add its events if it differs."""
     if mode is state.mode:
         return state
     events.append(mode_event(state.mode, mode, cause))

@@ -1,6 +1,6 @@
-"""Operators' requests: what each does to the state, and the sentence it is answered with.
+"""Operators' requests: the effect of each on the state, and its reply.
 
-Each is applied whole, between two frames, or refused with a sentence and nothing changed.
+A request is applied completely, between two frames, or refused with a reason and no change.
 """
 
 from collections.abc import Callable
@@ -24,11 +24,11 @@ from lowfc.control.loop.wording import MEASURED_FIRST, MOST_TEXT, PAUSED, counte
 
 MOST_STEPS = 1 << 32
 MOST_REPLY = 1000
-"""Characters of a reply."""
+"""Most characters of a reply."""
 
 
 def answer(settings: Settings, state: State, request: Request) -> tuple[State, Outputs]:
-    """The state after a request, and its reply; a refused request changes nothing, and is counted all the same."""
+    """The state after a request, and its reply; a refused request changes nothing but is counted."""
     request = prepared(settings, request)
     now, ended = lease_checked(state, request.time_ns, 0)
     held = now.conditions.lease
@@ -51,7 +51,7 @@ def answer(settings: Settings, state: State, request: Request) -> tuple[State, O
 
 
 def _handler(request: Request, held: Lease | None) -> "Handler":
-    """What carries a request out; ValueError says why it is refused whatever the state of the loop."""
+    """Handler of a request; ValueError with the reason if it is refused in any state of the loop."""
     if request.name not in _HANDLERS:
         raise ValueError(f"unknown request {request.name[:40]!r}; there are {', '.join(REQUESTS)}")
     refused = refusal(held, request.name, request.lease_id, request.time_ns) or request.refusal
@@ -61,9 +61,9 @@ def _handler(request: Request, held: Lease | None) -> "Handler":
 
 
 def prepared(settings: Settings, request: Request) -> Request:
-    """The request, checked for what needs no state and may take long: for a thread that no frame waits for.
+    """Do the slow checks of a request that need no state, on a thread that no frame waits for.
 
-    What is wrong with it is its `refusal`. A request that was prepared is returned as it is.
+    A fault becomes its `refusal`. A prepared request is returned unchanged.
     """
     if request.prepared:
         return request
@@ -71,7 +71,7 @@ def prepared(settings: Settings, request: Request) -> Request:
         if request.law is not None:
             check_law(request.law, settings.delay_frames, settings.rate_hz)
         if request.name == "gain":
-            highest_gain(settings.delay_frames)  # which the reply needs, and no frame shall wait for
+            highest_gain(settings.delay_frames)  # cached for the reply, so that no frame waits for it
         if request.name == "play":
             request = replace(request, played=play_table(request.text, request.table, request.actuators_nm.reshape(-1)))
     except ValueError as error:
@@ -92,10 +92,10 @@ def _status(settings: Settings, state: State, request: Request) -> Handled:
 
 
 def _mode(settings: Settings, state: State, request: Request) -> Handled:
-    """open, close, safe, clear; to pause is to open: the command is held until the loop is closed again."""
+    """open, close, safe, clear, pause; a paused loop is open and holds its command until it is closed again."""
     asked = "open" if request.name == "pause" else request.name
     after = _granted(state, asked)
-    if request.name == "clear":  # the camera's and the mirror's numbers may begin anew, too
+    if request.name == "clear":  # the camera's and the mirror's numbers may restart, too
         conditions = state.conditions._replace(clear_id=request.time_ns)
         state = state._replace(frame_sequence=0, conditions=conditions)
     reply, paused = _REPLIES[request.name], state.conditions.mode_cause == PAUSED
@@ -105,7 +105,7 @@ def _mode(settings: Settings, state: State, request: Request) -> Handled:
     if request.name == "close" and state.mode is LoopMode.CLOSED and not state.steps_left:
         reply = "the loop stays closed"
     waits = state.mode is LoopMode.OPEN and state.conditions.mode_cause == MEASURED_FIRST
-    if (request.name == "open" and paused) or (after is LoopMode.OPEN and waits):  # it stays open from now on
+    if (request.name == "open" and paused) or (after is LoopMode.OPEN and waits):  # it stays open
         state = state._replace(conditions=state.conditions._replace(mode_cause=cause))
     if after is LoopMode.CLOSED and state.drive is not None and state.drive.calibration.provisional:
         reply += (
@@ -118,7 +118,7 @@ def _mode(settings: Settings, state: State, request: Request) -> Handled:
 
 
 def _granted(state: State, asked: str) -> LoopMode:
-    """The mode that a request leads to; ValueError says why it is refused."""
+    """The mode after a request; ValueError with the reason if it is refused."""
     missing = uncalibrated(state)
     after, why = request_mode(state.mode, asked, calibrated=not missing)
     if why := why or interlocks.refusal(state.conditions.acting, asked):
@@ -144,7 +144,7 @@ def _check_closable(state: State) -> None:
     if why and state.refused in (Rejection.OUT_OF_ORDER, Rejection.REPEATED):
         why += " (`lowfc ctl safe` and then `lowfc ctl clear` reset the newest sequence)"
     if why:
-        raise ValueError(f"{why}: correct this first, the loop would only hold its command")
+        raise ValueError(f"{why}: correct this first, the closed loop would only hold its command")
 
 
 def _check_camera(state: State) -> None:
@@ -169,7 +169,7 @@ def _step(settings: Settings, state: State, request: Request) -> Handled:
 def _reset(settings: Settings, state: State, request: Request) -> Handled:
     drive = _drive(state)
     if state.mode is LoopMode.SAFE:
-        raise ValueError("the loop is in safe mode: the mirror is on its way to flat, or there")
+        raise ValueError("the loop is in safe mode: the mirror relaxes to flat anyway")
     if drive.following is not None:
         drive = drive._replace(following=drive.following.again())
     return state._replace(drive=drive, returning_to_zero=True), "the modal command goes to zero"
@@ -217,9 +217,9 @@ def _play(settings: Settings, state: State, request: Request) -> Handled:
     if state.mode is LoopMode.SAFE:
         raise ValueError("the loop is in safe mode: `lowfc ctl clear` first, when it is safe")
     if not state.frame_sequence:
-        raise ValueError("no frame has come yet, from which to count those of a play")
+        raise ValueError("a play starts at a frame, and no frame has arrived yet")
     if state.conditions.mirror_fault:
-        raise ValueError(f"the mirror {state.conditions.mirror_fault}: it would follow no play")
+        raise ValueError(f"the mirror {state.conditions.mirror_fault}: it would not follow a play")
     added = drive.added()
     if added.play is not None and not added.play.over(state.frame_sequence + 1):
         raise ValueError("something is being played already: `lowfc ctl stop` ends it")
@@ -260,25 +260,25 @@ def _law(settings: Settings, state: State, request: Request) -> Handled:
     _check_camera(state)
     law = request.law
     if law.noll != drive.calibration.noll:
-        raise ValueError(f"the law is of the modes {list(law.noll)}, the loop of {list(drive.calibration.noll)}")
+        raise ValueError(f"the law is for modes {list(law.noll)}, the loop has {list(drive.calibration.noll)}")
     drive = drive._replace(following=LawRunner.at_rest(law, guarded=settings.guard))
     return state._replace(drive=drive), f"the law {law.name!r} takes over from the integrator"
 
 
 def _load(settings: Settings, state: State, request: Request) -> Handled:
     if request.calibration is None:
-        raise ValueError("there is no calibration in the request")
+        raise ValueError("the request has no calibration")
     if state.mode is LoopMode.CLOSED:
-        raise ValueError("the loop is closed: open it before another calibration is loaded")
+        raise ValueError("the loop is closed: open it before loading another calibration")
     before = state.drive
     if before is not None and before.calibration.grid != request.calibration.grid:
         raise ValueError(
             f"the calibration is for a mirror of {request.calibration.grid} actuators, this one has "
             f"{before.calibration.grid}"
         )
-    settings = replace(settings, start_mode=LoopMode.OPEN)  # an idle loop is not closed by what may be a first try
+    settings = replace(settings, start_mode=LoopMode.OPEN)  # an idle loop stays open
     after, events = loaded(settings, state, request.calibration, "operator", request.time_ns)
-    others = (event for event in events if event.name != "MODE_CHANGED")  # which every request has
+    others = (event for event in events if event.name != "MODE_CHANGED")  # every request adds its own
     return after, f"calibration {request.calibration.id[:12]}", *others
 
 
@@ -306,10 +306,10 @@ def _with(state: State, drive: ActiveLoop, command_channels: CommandChannels) ->
 
 
 def _check_shape(limits: Limits | None, wanted_nm: Single) -> None:
-    """A channel that the mirror could not take by itself is refused here, where the refusal has a reader."""
+    """Refuse a channel that exceeds the mirror's limits by itself, while an operator can still read why."""
     if not np.isfinite(wanted_nm).all():
         raise ValueError("every actuator of a channel must be finite")
-    if limits is None:  # it is on the mirror already
+    if limits is None:  # already on the mirror
         return
     largest, apart = float(np.abs(wanted_nm).max()), neighbour_difference_nm(wanted_nm)
     if largest > limits.kept_stroke_nm:
@@ -344,5 +344,5 @@ _HANDLERS: dict[str, Handler] = {
 }
 
 CONFIGURATION = "configuration"
-"""The one request that the process answers, which knows its configuration."""
+"""The one request answered by the process, which has the configuration."""
 REQUESTS = (*_HANDLERS, CONFIGURATION)

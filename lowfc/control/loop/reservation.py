@@ -1,4 +1,4 @@
-"""What leases do to the state: requested, renewed, released, ended."""
+"""Effect of leases on the state: request, renewal, release, end."""
 
 from math import ceil
 
@@ -9,10 +9,10 @@ from lowfc.control.loop.state import Settings, State
 
 
 def lease(settings: Settings, state: State, request: Request) -> tuple[State, str, PendingEvent]:
-    """Reserve the loop for the client that asks.
+    """Reserve the loop for the requesting client.
 
     Raises:
-        ValueError: somebody else holds it, the loop is in safe mode, or the request is not whole.
+        ValueError: another client holds it, the loop is in safe mode, or the request is incomplete.
     """
     before = state.conditions.lease
     if state.mode is LoopMode.SAFE:
@@ -27,7 +27,7 @@ def renew(settings: Settings, state: State, request: Request) -> tuple[State, st
     """Extend a lease that is in force.
 
     Raises:
-        ValueError: it is not, and why it ended.
+        ValueError: it is not in force, with the cause of its end.
     """
     before = state.conditions.lease
     if before is None or before.id != request.lease_id:
@@ -39,7 +39,7 @@ def renew(settings: Settings, state: State, request: Request) -> tuple[State, st
 
 
 def release(settings: Settings, state: State, request: Request) -> tuple[State, str] | tuple[State, str, PendingEvent]:
-    """End a lease at its holder's request; another's stays."""
+    """End a lease at its holder's request; another client's stays."""
     held = state.conditions.lease
     if held is None or held.ended or held.id != request.lease_id:
         return state, "nothing was reserved"
@@ -48,7 +48,7 @@ def release(settings: Settings, state: State, request: Request) -> tuple[State, 
 
 
 def lease_checked(state: State, time_ns: int, frame_sequence: int) -> tuple[State, list[PendingEvent]]:
-    """The state without a lease that was not renewed by this time or frame, and the event of its end."""
+    """End a lease that was not renewed by this time or frame; the state and the event."""
     held = state.conditions.lease
     if held is None or held.ended or not held.over(time_ns, frame_sequence):
         return state, []
@@ -56,7 +56,7 @@ def lease_checked(state: State, time_ns: int, frame_sequence: int) -> tuple[Stat
 
 
 def lease_ended(state: State, why: str) -> tuple[State, list[PendingEvent]]:
-    """The state without the lease in force and without its probe sequence, and the event."""
+    """End the lease in force and its probe sequence; the state and the event."""
     held = state.conditions.lease
     if held is None or held.ended:
         return state, []
@@ -66,20 +66,20 @@ def lease_ended(state: State, why: str) -> tuple[State, list[PendingEvent]]:
 
 
 def permit(settings: Settings, state: State, request: Request) -> tuple[State, str, *tuple[PendingEvent, ...]]:
-    """Whether something on the bench may be moved; for some seconds, the loop is reserved and a closed one holds.
+    """Permit a move on the bench; with a duration, the loop is reserved and a closed one holds its command.
 
     Raises:
-        ValueError: it may not, and why; or the request is not whole.
+        ValueError: the move is refused, with the reason; or the request is incomplete.
     """
     before, drive, closed = state.conditions.lease, state.drive, state.mode is LoopMode.CLOSED
     if before is not None and not before.ended and before.id != request.lease_id:
         raise ValueError(before.reserved(request.time_ns))
     play = None if drive is None else drive.play
     if play is not None and not play.over(state.frame_sequence + 1):
-        raise ValueError("a probe sequence is being played, and would measure what moves")
+        raise ValueError("a probe sequence is being played, and the move would disturb its measurement")
     if not request.values:
         if closed:
-            raise ValueError("the loop is closed, and would follow what moves: ask for it to be held for some seconds")
+            raise ValueError("the loop is closed, and would follow the move: request a hold of some seconds")
         return state, f"granted: the loop is {state.mode.in_words}"
     made = _extended(settings, state, request)._replace(holds=True)
     what = "holds its command" if closed else f"is {state.mode.in_words} and stays so"
@@ -88,7 +88,7 @@ def permit(settings: Settings, state: State, request: Request) -> tuple[State, s
 
 
 def _extended(settings: Settings, state: State, request: Request) -> Lease:
-    """A lease from now on; ValueError says what is wrong with the request."""
+    """A lease from now on; ValueError if the request is wrong."""
     holder, values = request.text.strip(), request.values
     duration_s = values[0] if len(values) == 1 else 0.0
     if not 0 < duration_s <= MAX_S:

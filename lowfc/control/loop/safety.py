@@ -1,7 +1,7 @@
-"""Limits of the mirror, the loop-mode machine and the dead-man: no control law, no estimate, no trust.
+"""Limits of the mirror, the loop-mode machine and the command timeout, independent of control law and estimate.
 
-Used by the controller on what it sends and again by the mirror on what it gets; `docs/explanation/safety.md` lists
-the hazards.
+The controller applies them to the commands that it sends, and the mirror again to those that it receives;
+`docs/explanation/safety.md` lists the hazards.
 """
 
 from dataclasses import dataclass, field
@@ -17,11 +17,11 @@ from lowfc.control.loop.wording import mode_word
 Actuators = npt.NDArray[np.float32]
 
 MARGIN_NM = 1e-3
-"""Kept clear of every limit, at least, so that float32 rounding (6e-5 nm at 750 nm) cannot cross it."""
+"""Least distance kept from every limit, so that float32 rounding (6e-5 nm at 750 nm) cannot cross it."""
 
 
 class LoopMode(IntEnum):
-    """What the controller does with the mirror; numbered as on the wire."""
+    """Mode of the loop; numbered as on the wire."""
 
     IDLE = 1
     OPEN = 2
@@ -30,7 +30,7 @@ class LoopMode(IntEnum):
 
     @property
     def in_words(self) -> str:
-        """As people read it."""
+        """The mode in words."""
         return mode_word(self.name.lower())
 
 
@@ -53,7 +53,7 @@ class Rejection(IntEnum):
 
 
 class Limit(IntEnum):
-    """What kept a command from being followed as it came; numbered as on the wire."""
+    """The limit that changed a command; numbered as on the wire."""
 
     MODAL_LIMIT = 20
     STROKE = 21
@@ -80,15 +80,15 @@ def reason_of(number: int) -> Reason:
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What the mirror may do, in nm of surface.
+    """Limits of the mirror, in nm of surface.
 
     Attributes:
         stroke_nm: largest deviation of an actuator from flat, either way.
         slew_nm: largest change of an actuator from one command to the next.
         neighbour_nm: largest difference between actuators side by side.
-        margin_nm: kept clear of each limit: 1e-3 nm, or sixteen roundings of float32 where the stroke is so long.
-        kept_stroke_nm: stroke without the margin, a float32, so that what was cut to it is not cut again.
-        kept_slew_nm: the same of the slew.
+        margin_nm: distance kept from each limit: 1e-3 nm, or sixteen roundings of float32 for a long stroke.
+        kept_stroke_nm: stroke less the margin, a float32, so that a command cut to it is not cut again.
+        kept_slew_nm: slew less the margin, likewise.
     """
 
     stroke_nm: float
@@ -119,10 +119,10 @@ class Limited(NamedTuple):
 def limit(limits: Limits, previous_nm: Actuators, wanted_nm: Actuators) -> Limited:
     """Return the command nearest to `wanted_nm` that may follow `previous_nm`.
 
-    Both are (rows, columns) float32, nm of surface; the previous one is finite, for it was made here. Stroke, then
-    slew, cut each actuator by itself; the neighbour limit shortens the whole move. Whatever is wanted, the result is
-    finite, no actuator moves further than the slew limit, and if `previous_nm` keeps the stroke and neighbour limits,
-    so does the result; if it does not, it comes back to them at the slew limit.
+    Both are (rows, columns) float32, nm of surface; the previous one is finite, as a result of this function. Stroke,
+    then slew, cut each actuator by itself; the neighbour limit shortens the whole move. For any `wanted_nm`, the result
+    is finite, no actuator moves further than the slew limit, and if `previous_nm` keeps the stroke and neighbour
+    limits, so does the result; otherwise it returns to them at the slew limit.
     """
     if wanted_nm.shape != previous_nm.shape:
         return Limited(previous_nm, (Limit.WRONG_GRID,))
@@ -143,7 +143,7 @@ def limit(limits: Limits, previous_nm: Actuators, wanted_nm: Actuators) -> Limit
         kept = previous_nm + move
         lowest_nm, highest_nm = _range_nm(kept)
     apart_nm = limits.neighbour_nm - limits.margin_nm / 2
-    # Where no two actuators at all are that far apart, no neighbours are; it costs a fraction of looking at each pair.
+    # If no two actuators differ that much, no neighbours do; this check is far cheaper than one of each pair.
     if highest_nm - lowest_nm > apart_nm and neighbour_difference_nm(kept) > apart_nm:
         reasons.append(Limit.NEIGHBOUR)
         kept = _shorten(limits, previous_nm, kept)
@@ -151,9 +151,9 @@ def limit(limits: Limits, previous_nm: Actuators, wanted_nm: Actuators) -> Limit
 
 
 def _shorten(limits: Limits, previous_nm: Actuators, kept_nm: Actuators) -> Actuators:
-    """Go from `previous_nm` towards `kept_nm` as far as neighbours allow; if they are apart already, shrink the shape.
+    """Go from `previous_nm` towards `kept_nm` as far as neighbours allow; if already beyond, shrink the shape.
 
-    It goes half a margin further inside than `limit` asks, so that rounding does not hold the mirror there.
+    It stops half a margin further inside than `limit` requires, so that rounding does not block the mirror there.
     """
     margin_nm = limits.margin_nm
     neighbour_nm = limits.neighbour_nm - margin_nm
@@ -175,8 +175,8 @@ def _shorten(limits: Limits, previous_nm: Actuators, kept_nm: Actuators) -> Actu
 
 
 def _range_nm(actuators_nm: Actuators) -> tuple[float, float]:
-    """Lowest and highest; not finite where any is not."""
-    flat = actuators_nm.ravel()  # where there is a NaN, both functions find it
+    """Lowest and highest value; not finite if any value is not."""
+    flat = actuators_nm.ravel()  # both functions propagate NaN
     return flat.item(flat.argmin()), flat.item(flat.argmax())
 
 
@@ -188,12 +188,12 @@ def neighbour_difference_nm(actuators_nm: npt.NDArray[np.floating]) -> float:
 
 
 def expired(age_ns: int, valid_for_ns: int) -> bool:
-    """Whether a command that came `age_ns` ago may no longer be held: the dead-man; a clock gone back is no excuse."""
+    """Whether a command received `age_ns` ago may no longer be held (command timeout, or the clock went back)."""
     return not 0 <= age_ns <= valid_for_ns
 
 
 def request_mode(mode: LoopMode, request: str, calibrated: bool) -> tuple[LoopMode, str]:
-    """Mode after an operator's request, and why it was refused (empty where it was not).
+    """Mode after an operator's request, and why it was refused (empty if granted).
 
     `safe` is always granted and latched; only `clear` leaves it, and never straight to closed.
     """

@@ -1,4 +1,4 @@
-"""What the controller knows: settings that stay, the state that changes."""
+"""The controller's fixed settings and its changing state."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -24,33 +24,33 @@ from lowfc.control.loop.lease import Lease
 from lowfc.control.loop.safety import Limits, LoopMode, Reason, Rejection
 
 SETTLING_FRAMES = 100
-"""For which a new law only follows."""
+"""Frames for which a new law only observes."""
 FADING_FRAMES = 100
-"""In which a law takes over."""
+"""Frames of the cross-fade in which a law takes over."""
 MOST_COASTED = 100
-"""Frames missing in a row after which a law begins anew."""
+"""Frames missing in a row after which a law restarts."""
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What does not change during a run.
+    """Settings of the controller, fixed during a run.
 
     Attributes:
-        limits: of the mirror, applied here before they are applied again by the mirror.
+        limits: limits of the mirror, applied here and again by the mirror.
         delay_frames: frames from the one a command is made from to the first exposed wholly under it.
         start_mode: mode once a calibration is loaded: open or closed.
         max_frame_age_ns: age above which a frame is refused.
-        frame_timeout_ns: silence after which it is an event, and `on_frame_timeout` is done.
+        frame_timeout_ns: time without frames after which an event is raised and `on_frame_timeout` applies.
         on_frame_timeout: hold the command, or relax the mirror to flat.
         min_flux_fraction: fraction of the expected flux below which a frame is dark.
         max_saturated_pixels: good pixels at full well above which a frame is refused.
-        max_identical_frames: frames in a row that may be measured exactly as the one before; 0 for any number.
+        max_identical_frames: frames in a row that may give exactly the previous measurement; 0 for any number.
         gain: gain, leak and limit (nm) of tip and tilt, then of the other modes.
-        rate_hz: of the frames; 0 where it is not known.
-        guard: laws are guarded.
-        auto_gain: whether the gains of tip and tilt, and of the other modes, follow what is measured.
-        interlocks: conditions on values of the bench.
-        kernel: arithmetic of the usual frame.
+        rate_hz: frame rate; 0 if unknown.
+        guard: whether laws are guarded.
+        auto_gain: whether the gains of tip and tilt, and of the other modes, are automatic.
+        interlocks: conditions on bench values.
+        kernel: fused step for usual frames.
     """
 
     limits: Limits
@@ -72,7 +72,7 @@ class Settings:
     kernel: Kernel = NUMPY
 
     def law(self, noll: tuple[int, ...]) -> Law:
-        """The law for these modes: the first figure of each pair for tip and tilt, the second for the rest."""
+        """The law for these modes: the first value of each pair for tip and tilt, the second for the others."""
 
         def per_mode(pair: tuple[float, float]) -> Single:
             return np.array([pair[0] if index in TIP_TILT else pair[1] for index in noll], dtype=np.float32)
@@ -80,15 +80,15 @@ class Settings:
         return Law(per_mode(self.gain), per_mode(self.leak), per_mode(self.limit_nm))
 
     def automatic(self, noll: tuple[int, ...]) -> Mask:
-        """The modes (modes,) whose gain is automatic to begin with."""
+        """The modes (modes,) whose gain is automatic at the start."""
         return np.array([self.auto_gain[index not in TIP_TILT] for index in noll], dtype=bool)
 
 
 class LawRunner(NamedTuple):
-    """A linear law that follows the measurements: its x (states,), and the frames for which it has done so.
+    """A running linear law: its state x (states,), and the number of frames that it has followed.
 
-    It drives the mirror once it has followed for `SETTLING_FRAMES`; over the next `FADING_FRAMES` it takes over from
-    the integrator, so that the mirror does not jump. A `guard` compares it with the integrator all the time.
+    It observes for `SETTLING_FRAMES`; over the next `FADING_FRAMES` it takes over from the integrator in a cross-fade,
+    so that the mirror does not jump. A `guard` compares it with the integrator throughout.
     """
 
     law: LinearLaw
@@ -98,7 +98,7 @@ class LawRunner(NamedTuple):
 
     @classmethod
     def at_rest(cls, law: LinearLaw, *, guarded: bool) -> "LawRunner":
-        """A law that has seen nothing yet."""
+        """A law that has not followed any frame."""
         return cls(law, linear_law.at_rest(law), 0, Guard.of(law) if guarded else None)
 
     def again(self) -> "LawRunner":
@@ -106,13 +106,13 @@ class LawRunner(NamedTuple):
         return self.at_rest(self.law, guarded=self.guard is not None)
 
     def followed(self, error_nm: Single, pol_nm: Single, kept_nm: Single) -> "LawRunner":
-        """One frame later; all (modes,): both without the loop's target, and the command kept of the last frame."""
+        """One frame later; all (modes,): error and POL without the loop's target, and the last frame's kept command."""
         signal = error_nm if self.law.signal == "error" else pol_nm
         x = linear_law.follow(self.law, self.x, signal, kept_nm)
         return LawRunner(self.law, x, self.frames + 1, self.guard)
 
     def coasted(self, frames: int, kept_nm: Single) -> "LawRunner":
-        """Some frames later, which were missing or of no use."""
+        """Some frames later that were missing or refused."""
         x = self.x
         for _ in range(min(frames, MOST_COASTED)):
             x = linear_law.coast(self.law, x, kept_nm)
@@ -122,23 +122,23 @@ class LawRunner(NamedTuple):
 
     @property
     def weight(self) -> np.float32 | Single:
-        """Its part of the command, or of each mode's (modes,); the integrator's is the rest."""
+        """Its share of the command, or of each mode's (modes,); the integrator has the rest."""
         weight = np.float32(min(max(self.frames - SETTLING_FRAMES, 0) / FADING_FRAMES, 1))
         return weight if self.guard is None or not self.guard.overruled else weight * self.guard.weight
 
     def alone(self, more: int = 0) -> bool:
-        """Whether all of the command is the law's, now or once it has followed some more frames."""
+        """Whether the law makes the whole command, now or `more` frames later."""
         frames = self.frames + more
         return frames >= SETTLING_FRAMES + FADING_FRAMES and (self.guard is None or not self.guard.overruled)
 
     def taking_over(self) -> "LawRunner":
-        """The same where the loop was just closed: it fades in."""
+        """The same law just after the loop was closed: it fades in."""
         guard = None if self.guard is None else self.guard.anew()
         return self._replace(frames=min(self.frames, SETTLING_FRAMES), guard=guard)
 
 
 class Weighting(NamedTuple):
-    """What R is made for: the mean squares (modes,) of the modes that are left alone, nm^2, and the light, DN.
+    """Weighting of R: mean squares (modes,) of the uncorrected modes, nm^2, and the flux, DN.
 
     Attributes:
         prior_nm2: 0 for a mode that the loop corrects.
@@ -149,20 +149,19 @@ class Weighting(NamedTuple):
 
 
 class ActiveLoop(NamedTuple):
-    """What there is once the mirror is known: by a calibration, or without one by what the mirror reported.
+    """The loop once the mirror is known, from a calibration or from the mirror's report.
 
     Attributes:
-        calibration: in use; without modes or pixels where none was loaded.
-        to_actuators: (actuators, modes) as in the calibration, laid out for the quicker product.
+        calibration: the one in use; without modes or pixels if none was loaded.
+        to_actuators: (actuators, modes) as in the calibration, in the memory layout of the faster product.
         inverse: (modes, actuators) modal command of a mirror shape.
-        to_modes: (modes, actuators) what the sensor sees of a mirror shape.
+        to_modes: (modes, actuators) modes that the sensor sees of a mirror shape.
         weights: which commands of the history are seen in an exposure, and how much of each.
-        camera: settings that the calibration goes with: its own, or the first received after it was loaded; None until
-            then.
+        camera: camera settings of the calibration: its own, or the first received after it was loaded; None until then.
         automatic: (modes,) whether the gain of a mode is automatic.
-        weighting: what R is made for; None for the calibration's own.
+        weighting: weighting of R; None for the calibration's own R.
         following: a law in place of the integrator's.
-        command_channels: to what the law commands; None for nothing at all.
+        command_channels: additions to the law's command; None for none.
         history_nm: modal commands, newest first.
         actuators_nm: (rows, columns), the last command.
     """
@@ -184,7 +183,7 @@ class ActiveLoop(NamedTuple):
 
     @classmethod
     def at_rest(cls, settings: Settings, calibration: Calibration) -> "ActiveLoop":
-        """A drive with nothing commanded yet, under the law that the settings begin with."""
+        """A loop before its first command, with the initial law of the settings."""
         modes = len(calibration.noll)
         weights = delay_weights(settings.delay_frames).astype(np.float32)
         inverse = np.linalg.pinv(calibration.modes_to_actuators.astype(np.float64)).astype(np.float32)
@@ -216,7 +215,7 @@ class ActiveLoop(NamedTuple):
         return self._replace(law=replace(law, left=self.automatic & (law.gain == 0)))
 
     def weighted(self, weighting: Weighting | None) -> "ActiveLoop":
-        """With R made for other modes, or another star."""
+        """With R computed for other uncorrected modes or another flux."""
         calibration = self.calibration
         if weighting is not None:
             rows = granted_rows(calibration, weighting.prior_nm2, weighting.flux_dn, self.camera)
@@ -224,30 +223,30 @@ class ActiveLoop(NamedTuple):
         return self._replace(weighting=weighting, estimator=Estimator.of(calibration, self.estimator.kernel))
 
     def added(self) -> CommandChannels:
-        """What is added, though it be nothing."""
+        """Additions to the command, empty ones if there are none."""
         if self.command_channels is not None:
             return self.command_channels
         return CommandChannels.none(self.calibration.grid, len(self.calibration.noll), len(self.history_nm))
 
     @property
     def play(self) -> Play | None:
-        """What is being played."""
+        """The current play."""
         return None if self.command_channels is None else self.command_channels.play
 
     def stopped(self, sequence: int) -> "ActiveLoop":
-        """With nothing more to play after this frame."""
+        """With the play ended after this frame."""
         if self.play is None or self.command_channels is None:
             return self
         return self._replace(command_channels=self.command_channels.stopped(sequence))
 
     def pushed(self, command_nm: Single, actuators_nm: Single) -> "ActiveLoop":
-        """One frame later, under this command."""
+        """One frame later, with this command."""
         fixed = self[:-3]  # `_replace` takes four times as long
         command_channels = None if self.command_channels is None else self.command_channels.passed()
         return ActiveLoop(*fixed, command_channels, (command_nm, *self.history_nm[:-1]), actuators_nm)
 
     def stayed(self, frames: int) -> "ActiveLoop":
-        """Some frames later, the command held under each of them."""
+        """Some frames later, with the command held for each."""
         held = min(frames, len(self.history_nm))
         history_nm = (self.history_nm[:1] * held + self.history_nm)[: len(self.history_nm)]
         if self.command_channels is None:
@@ -255,27 +254,27 @@ class ActiveLoop(NamedTuple):
         return self._replace(history_nm=history_nm, command_channels=self.command_channels.passed(frames))
 
     def missed(self, frames: int) -> "ActiveLoop":
-        """Some frames later, of which nothing was measured."""
+        """Some frames later, without measurements."""
         return self.coasted(frames).stayed(frames)
 
     def coasted(self, frames: int) -> "ActiveLoop":
-        """With a law that has done without the measurements of some frames."""
+        """With the law advanced by some frames without measurements."""
         if self.following is None:
             return self
         return self._replace(following=self.following.coasted(frames, self.history_nm[0]))
 
 
 class Conditions(NamedTuple):
-    """What of the state changes rarely.
+    """The rarely changing part of the state.
 
     Attributes:
         camera: settings of the camera as last received; None before the first.
-        camera_awaited: the camera restarted, and its settings have not been received since.
+        camera_awaited: the camera restarted and its settings have not been received since.
         clear_id: identity of the operator's last clear; 0 without one.
         mode_since_ns: time of the change to this loop mode, and `mode_cause` its cause.
         lease: the reservation of the loop, or the last one that ended; None before the first.
         mirror_fault: why the mirror does not follow commands; empty where it does.
-        acting: interlocks that act.
+        acting: the acting interlocks.
     """
 
     camera: CameraSettings | None = None
@@ -292,15 +291,15 @@ class State(NamedTuple):
     """Everything the next command depends on.
 
     Attributes:
-        frame_sequence: of the newest frame taken; its time is `frame_time_ns`.
+        frame_sequence: sequence of the newest frame; its time is `frame_time_ns`.
         refused: why the last frame was refused, if it was, and how many in a row.
         limits_hit: limits that acted on the last command.
-        frame_timeout: whether the silence has been announced.
-        commanded: whether a command has been sent, so that the mirror is no longer adopted.
-        steps_left: frames until the loop opens by itself; 0 for never.
+        frame_timeout: whether the frame timeout has been reported.
+        commanded: whether a command has been sent, so that the mirror's shape is no longer adopted.
+        steps_left: frames until the loop opens automatically; 0 for never.
         returning_to_zero: the modal command is on its way to zero.
-        estimate: what was last measured, and `identical_frames`, how many in a row were the same as the one before.
-        input_number: inputs that changed something or gave rise to something; the order of what is replayed.
+        estimate: the last measurement, and `identical_frames`, the number in a row equal to the previous one.
+        input_number: count of the inputs that changed the state or produced output; the order of replay.
     """
 
     mode: LoopMode = LoopMode.IDLE
