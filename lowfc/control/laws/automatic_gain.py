@@ -1,4 +1,4 @@
-"""Gains that are measured: a bank of virtual integrators says what each gain would leave, and whether closing harms."""
+"""Automatic gains: a bank of virtual integrators shows what each gain would leave, and whether closing does harm."""
 
 from typing import NamedTuple
 
@@ -9,50 +9,50 @@ from lowfc.control.laws.stability import highest_gain
 from lowfc.control.laws.virtual import VirtualIntegrators, Weights
 
 LEAST_GAIN = 1e-3
-"""Of the rows, which are a factor of two apart from the highest gain with margins down to this one; and gain 0."""
+"""Least gain of the rows, which start at the highest gain with margins and halve each time; another row has gain 0."""
 BLOCKS = 10
-"""Into which a window is cut, for the standard error of what it shows."""
+"""Blocks of a window, for the standard errors of its means."""
 CONFIDENCE = 2.0
-"""Standard errors by which one gain must beat another; or it does so in `MOST_OF` of the blocks, for where the open
-loop wanders, one of them may outweigh all others."""
+"""Standard errors by which one gain must beat another. Winning in `MOST_OF` of the blocks is enough as well, since
+one block may outweigh all others when the open loop wanders."""
 MOST_OF = 9
 GRANTED = 3.0
-"""Standard errors of white noise by which a gain must beat the open loop in a first window, and for a mode at 0: one
-gain that noise was granted on a faint star may add as much contrast as the dark zone has."""
+"""Standard errors of white noise by which a gain must beat the open loop in a first window, and for a mode at 0: on a
+faint star, a single gain granted because of noise may add as much contrast as the dark zone has."""
 EARLY = 5
-"""Blocks of a window after which a mode that is hardly corrected may get a gain before the window ends: one at 0 as
-above, one at the least gain where so many in a row speak for it."""
+"""Blocks of a window after which a mode that is hardly corrected may get a gain before the window ends: a mode
+at 0 as above, one at the least gain after this many blocks in a row in its favour."""
 LONGEST = 16
-"""Times its first length, to which a window grows while it decides nothing."""
+"""Factor of its first length to which a window grows while it decides nothing."""
 FEW = 3
-"""Modes below which they are judged each by itself alone: what most of them show says something of each."""
+"""Number of modes below which each is judged by itself only; with more, the majority is evidence for each."""
 LEAST_CORRECTED = 0.1
-"""Where no gain is shown to be better: injected noise over what is there to correct, below which the least is taken."""
+"""Ratio of injected noise to correctable power below which the least gain is used if no gain is shown to be better."""
 
 SURE = 4.0
-"""Standard errors beyond which another mode is said to show the squares of tip and tilt."""
+"""Standard errors beyond which another mode counts as showing the squares of tip and tilt."""
 SUSPECTED = 2.0
-"""The same for what a gain must be worth: what a faint star does not show beyond doubt may add ten times what the gain
-removes."""
+"""The same in the margin that a gain must have: cross-talk that is uncertain on a faint star may add ten times what
+the gain removes."""
 MARGIN = 5.0
-"""Times the cross-talk found that a gain must stand: beyond its range a sensor shows less of tilt than there is."""
+"""Factor of the measured cross-talk that a gain must tolerate: beyond its range a sensor underestimates tilt."""
 _REGRESSORS = 5
 """Tip, tilt, their squares and their product."""
 
 
 class Verdict(NamedTuple):
-    """What a window of frames has shown; all (modes,), nm^2 of wavefront.
+    """Result of a window of frames; all (modes,), nm^2 of wavefront.
 
     Attributes:
-        gain: the gain that each mode should have from now on.
+        gain: the gain of each mode from now on.
         power_nm2: mean square of the open loop, with the noise of a frame and without the cross-talk of tip and tilt.
-        noise_nm2: of that, noise: as computed, or half the mean square of the change between frames where that
-            is more; None where it was not computed.
-        change_nm2: mean square with the gain of now less that of the open loop: above 0, closing harms.
+        noise_nm2: noise in it: as computed, or half the mean square of the change between frames if that is
+            larger; None if it was not computed.
+        change_nm2: mean square with the current gain less that of the open loop; above 0, closing does harm.
         change_error_nm2: its standard error.
-        loop_nm2: the same of the loop itself, with whatever law drives it; None where it was not closed throughout.
+        loop_nm2: the same for the real loop, with any law; None if it was not closed throughout.
         loop_error_nm2: its standard error.
-        frames: of the window.
+        frames: frames of the window.
     """
 
     gain: Single
@@ -66,10 +66,10 @@ class Verdict(NamedTuple):
 
 
 class GainBank:
-    """Virtual integrators of a group of modes, and windows over which they are compared.
+    """Virtual integrators of a group of modes, compared over windows of frames.
 
     The first window after `restart` may choose any gain; later ones move a gain by at most a factor of two, unless the
-    open loop is better than the gain of now, or that is the least one.
+    open loop is better than the current gain, or that is the least one.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class GainBank:
         delay_frames: float,
         windows: tuple[int, int],
     ) -> None:
-        """A bank of as many modes as there are leaks.
+        """Make a bank with one mode for each leak.
 
         Args:
             kept: (modes,) 1 - leak.
@@ -100,28 +100,28 @@ class GainBank:
         self.restart()
 
     def restart(self) -> None:
-        """Begin anew, as for another star."""
+        """Restart, as for another star."""
         self._loops = self._at_rest
         self._cross_talk = TiltCrossTalk(self._at_rest.kept.size)
         self._before_nm = np.zeros_like(self._at_rest.kept)
         self.begin_again()
 
     def remade(self, of_own: Array | Single) -> None:
-        """Take modes of another R from now on: (modes, modes), what each shows of those of the calibration's own R.
+        """Use modes of another R from now on: (modes, modes), its response to the modes of the calibration's own R.
 
-        The cross-talk of tilt is fitted in the latter, which stay: an R for fewer modes mixes it into those it is for.
+        The cross-talk of tilt is fitted in the latter, which do not change: an R for fewer modes mixes it into them.
         """
         self._of_own, self._to_own = of_own, np.linalg.inv(of_own)
 
     def begin_again(self) -> None:
-        """Let the next window be a first one."""
+        """Make the next window a first one."""
         self.first = True
         self._clear(self._windows[0])
 
     def followed(self, open_nm: Single, error_nm: Single, tilt_nm: Single | None = None, *, closed: bool) -> bool:
-        """Take the modes (modes,) of one frame, of the open loop and of the loop; whether a block is complete.
+        """Add the modes (modes,) of one frame, of the open loop and of the loop; return whether a block is complete.
 
-        A bank of other modes takes tip and tilt (2,), too, as the sensor saw them.
+        A bank of other modes also needs tip and tilt (2,), as the sensor saw them.
         """
         if tilt_nm is not None:
             self._tilt += self._cross_talk.followed(tilt_nm, self._to_own @ open_nm)
@@ -153,13 +153,13 @@ class GainBank:
 
     @property
     def complete(self) -> bool:
-        """Whether the window is, so that there can be a verdict."""
+        """Whether the window is complete, so that there is a verdict."""
         return len(self._blocks) == BLOCKS
 
     def early(self, gain: Single) -> Single:
         """Gains (modes,) before the window is complete.
 
-        Of modes at 0 or the least gain that have begun to wander; and 0 for those that turn out to be cross-talk.
+        Raised for modes at 0 or the least gain that have begun to wander, and 0 for those that prove to be cross-talk.
         """
         if self.first or len(self._blocks) < EARLY:
             return gain
@@ -177,12 +177,12 @@ class GainBank:
         return np.where(absent, 0, gain).astype(np.float32)
 
     def held(self, frames: int) -> None:
-        """Frames of which nothing was measured."""
+        """Advance by frames without measurements."""
         self._loops = self._loops.held(frames)
         self._cross_talk.held()
 
     def verdict(self, gain: Single, noise_nm2: Array | None) -> Verdict:
-        """What the window has shown, at gains (modes,) and with the noise of one frame (modes,), None where unknown."""
+        """Result of the window, at gains (modes,) and with the noise of one frame (modes,), None if unknown."""
         means, power = (np.mean(values, axis=0, dtype=float) for values in (self._means, self._powers))
         cross_talk_nm, suspected_nm = self._cross_talk_nm(self._tilts)
         power -= (2 * means - cross_talk_nm) * cross_talk_nm
@@ -216,28 +216,28 @@ class GainBank:
         return found
 
     def _cross_talk_nm(self, tilts: list[Array]) -> list[Array]:
-        """Cross-talk (modes,) of tip and tilt over these blocks: what is beyond doubt, and what may be."""
+        """Cross-talk (modes,) of tip and tilt over these blocks: the certain part, and the possible."""
         found, error = self._cross_talk.mean_nm(np.mean(tilts, axis=0))
         taken: list[Array] = [np.where(np.abs(found) > errors * error, found, 0) for errors in (SURE, SUSPECTED)]
         return [self._of_own @ one for one in taken]
 
     def _without(self, cross_talk_nm: Array) -> Array:
-        """Mean squares (blocks, rows and the loop itself, modes) less the open loop's, nm^2, of what is there.
+        """Mean squares (blocks, rows and the loop itself, modes) less the open loop's, nm^2, of the true modes.
 
-        Cross-talk (modes,) is measured and not there: a loop of any gain but 0 puts it on the mirror, and then measures
-        nothing of it.
+        Cross-talk (modes,) is measured but not real: a loop of any gain but 0 puts it on the mirror and then no longer
+        measures it.
         """
         blocks = np.array(self._blocks, float)
         blocks[:, 1:] += (2 * np.array(self._means, float) * cross_talk_nm)[:, None]
         return blocks
 
     def _handicapped(self, cross_talk_nm: Array) -> Array:
-        """The same with a margin, for what a gain must be worth; cross-talk that speaks for a gain is not counted."""
+        """The same with the margin that a gain must have; cross-talk in favour of a gain is not counted."""
         against = np.mean(self._means, axis=0) * cross_talk_nm > 0
         return self._without(np.where(against, MARGIN * cross_talk_nm, 0))
 
     def _chosen(self, blocks: Array, now: Whole) -> Whole:
-        """The row (modes,) for each mode whose row is `now`."""
+        """Best row (modes,) of each mode whose current row is `now`."""
         own, modes = blocks[:, :-1], np.arange(now.size)
         rows, helps = own + self._alike(own), own.mean(axis=0) < 0
         if self.first:
@@ -255,21 +255,21 @@ class GainBank:
     def _no_noise(self, mean: Array) -> Mask:
         """Whether a mean over the blocks, of gains (rows, modes) beyond none, is below what white noise would show.
 
-        No command knows the noise of a later frame, so the differences of frames are independent of each other.
+        Commands do not depend on the noise of later frames, so the differences of frames are independent.
         """
         return np.asarray(
             mean < -GRANTED * np.sqrt(np.mean(self._spreads, axis=0) / (len(self._spreads) * self._block))
         )
 
     def _alike(self, blocks: Array) -> Array:
-        """What modes whose disturbance is to their noise as it is with most of them would show."""
+        """Blocks of modes that have the disturbance-to-noise ratio of the majority."""
         if blocks.shape[-1] < FEW:
             return np.zeros_like(blocks)
         noise_nm2 = np.maximum(np.mean(self._changed, axis=0), 1e-12)
         return np.asarray(np.median(blocks / noise_nm2, axis=-1, keepdims=True) * noise_nm2)
 
     def _row_of(self, gain: Single) -> Whole:
-        """The row (modes,) that is nearest to each gain."""
+        """Row (modes,) nearest to each gain."""
         nearest = np.argmin(np.abs(np.log(np.maximum(gain, 1e-9)) - np.log(self.rows[1:, None])), axis=0) + 1
         return np.where(gain < self.rows[1] / 2, 0, nearest)
 
@@ -296,7 +296,7 @@ class GainBank:
         return self._blocks, self._powers, self._changed, self._means, self._tilts, self._spreads
 
     def _lengthen(self) -> None:
-        """Go on with blocks of twice the length; the longest window forgets its older half."""
+        """Continue with blocks of twice the length; the longest window drops its older half."""
         if 2 * self._block > self._longest:
             for values in self._kept():
                 del values[: BLOCKS // 2]
@@ -307,25 +307,25 @@ class GainBank:
 
 
 class TiltCrossTalk:
-    """What the squares of tip and tilt add to other modes, beyond the range in which the sensor is linear.
+    """Cross-talk of the squares of tip and tilt into other modes, beyond the sensor's linear range.
 
-    Changes from frame to frame are compared, so that a drift of both is not taken for it; tip and tilt themselves are
-    taken along, for the noise of a frame is common to all modes. How much a square adds is of the sensor, and is
-    known the better the longer it was looked at.
+    Changes from frame to frame are fitted, so that a common drift does not count; tip and tilt themselves are also
+    regressors, since the noise of a frame is common to all modes. The coefficients belong to the sensor, and their
+    estimate improves with time.
     """
 
     def __init__(self, modes: int) -> None:
-        """Of this many other modes."""
+        """Start with this number of other modes."""
         self._products = np.zeros((_REGRESSORS, _REGRESSORS + modes))
         self._powers = np.zeros(modes)
         self._changes = 0
         self._before: Array | None = None
 
     def followed(self, tilt_nm: Single, open_nm: Array | Single) -> Array:
-        """Take tip and tilt (2,), as the sensor saw them in one frame, and the open loop of the others (modes,), nm.
+        """Add tip and tilt (2,), as the sensor saw them in one frame, and the open loop of the others (modes,), nm.
 
         Returns:
-            (regressors,) of the frame, as `mean_nm` takes their mean.
+            (regressors,) of the frame, whose mean is the argument of `mean_nm`.
         """
         x, y = tilt_nm.tolist()
         row = np.concatenate([(x, y, x * x, x * y, y * y), open_nm])
@@ -338,11 +338,11 @@ class TiltCrossTalk:
         return np.asarray(row[:_REGRESSORS])
 
     def held(self) -> None:
-        """Frames without a measurement: no change over them is taken."""
+        """Skip frames without measurements: changes across them are not used."""
         self._before = None
 
     def mean_nm(self, tilt: Array) -> tuple[Array, Array]:
-        """Mean of it and its standard error (modes,), nm, over frames of this mean (regressors,); 0 where unknown."""
+        """Mean cross-talk and its standard error (modes,), nm, over frames with these mean regressors; 0 if unknown."""
         normal, right = self._products[:, :_REGRESSORS], self._products[:, _REGRESSORS:]
         if self._changes < 4 * _REGRESSORS or not np.all(np.diag(normal) > 0):
             return np.zeros(right.shape[1]), np.zeros(right.shape[1])
@@ -366,14 +366,14 @@ def _better(blocks: Array) -> tuple[Array, Mask]:
 
 
 def injected(gain: Single) -> Single:
-    """Part (modes,) of a frame's noise variance that an integrator of this gain, without delay, puts on the mirror."""
+    """Fraction (modes,) of a frame's noise variance that an integrator of this gain, no delay, puts on the mirror."""
     return gain / (2 - gain)
 
 
 def left_alone_nm2(verdict: Verdict, left: Mask, noise_nm2: Array) -> Single:
-    """Mean square (modes,) of the modes that are `left` alone, nm^2, as `Weighting.prior_nm2`: 0 for the others.
+    """Mean square (modes,) of the uncorrected modes `left`, nm^2, as `Weighting.prior_nm2`: 0 for the others.
 
-    What is measured less the noise, and two standard errors of that noise.
+    The measured power less the noise and two standard errors of that noise.
     """
     if verdict.noise_nm2 is not None:
         noise_nm2 = np.maximum(noise_nm2, verdict.noise_nm2)

@@ -1,10 +1,10 @@
-"""What a loop leaves of the wavefront at every moment, not only at one instant of each frame.
+"""Residual wavefront of a loop in continuous time, not only at one instant of each frame.
 
 The star moves while the mirror holds. A wave e^(i w t) is measured as m e^(i w t_k), its mean over the exposure; the
-command made of it is in force from a to a + 1 periods after t_k, where the wave has the mean h e^(i w (t_k + a)). The
-sampled loop says what the command is; what is left has a floor, `1 - |h|^2`, that no command takes out.
+command computed from it is in force from a to a + 1 periods after t_k, where the wave has the mean h e^(i w (t_k + a)).
+The command follows from the sampled loop; the residual has a floor, `1 - |h|^2`, that no command can remove.
 
-Frequencies are in rad per frame, and may lie above pi: the sampled loop takes such a wave for its alias.
+Frequencies are in rad per frame and may exceed pi, where the sampled loop sees the alias.
 """
 
 from typing import NamedTuple
@@ -19,7 +19,7 @@ from lowfc.control.laws.stability import delay_weights
 _FILTER_POINTS = 4096
 _FILTER_OMEGA = np.linspace(0, np.pi, _FILTER_POINTS // 2 + 1)
 _FILTER_REACH = 48
-"""Frames before and after by which a mean between measurements is told."""
+"""Frames before and after from which a mean between measurements is interpolated."""
 
 _MOMENTS = 8
 _LONGEST = 5  # periods until a command is applied
@@ -32,7 +32,7 @@ class Timing(NamedTuple):
         delay: from the frame a command is made from to the first exposed wholly under it.
         applied: from the start of an exposure until the command made from it is in force.
         exposure: its length; 0 for an instant.
-        held: for how long what a command leaves counts: a period, or 0 for the moment at which it is applied alone.
+        held: time over which the residual counts: a period, or 0 for the instant of the command alone.
     """
 
     delay: float
@@ -47,7 +47,7 @@ class Timing(NamedTuple):
 
     @classmethod
     def measured(cls, delay: float, exposure: float, waited: float) -> "Timing":
-        """A command is in force so long after its exposure's end; impossible or simulated times do not count."""
+        """A command is in force `waited` after its exposure's end; impossible or simulated times are ignored."""
         after = exposure + waited
         if delay != round(delay) or not exposure < after <= _LONGEST:
             return cls.of(delay, exposure)
@@ -55,7 +55,7 @@ class Timing(NamedTuple):
 
     @classmethod
     def sampled(cls, delay: float) -> "Timing":
-        """Nothing counts but one instant of each frame: what a loop leaves between them is not in its figures."""
+        """Only one instant of each frame counts; the residual between them is not included."""
         return cls(delay, delay, 0.0, 0.0)
 
 
@@ -67,29 +67,29 @@ def mean_over(omega: Array, length: float) -> Complex:
 
 
 def hold_floor(omega: Array, held: float = 1.0) -> Array:
-    """Power (frequencies,) that is left of a wave of power 1 by the best command that is held; rad per frame."""
+    """Residual power (frequencies,) of a wave of power 1 under the best held command; rad per frame."""
     return np.asarray(1 - np.abs(mean_over(omega, held)) ** 2)
 
 
 def left_power(law: LinearLaw, omega: Array, timing: Timing) -> Array:
-    """Mean over time (frequencies, modes) of what the loop leaves of a wave of power 1; rad per frame."""
+    """Mean residual power over time (frequencies, modes) of a wave of power 1; rad per frame."""
     return _left(sensitivity(law, omega, timing.delay), omega, timing)
 
 
 def _left(S: Complex, omega: Array, timing: Timing) -> Array:
-    if not timing.held:  # at an instant, of a command what an exposure sees of it
+    if not timing.held:  # at an instant: the part of a command that an exposure sees
         return np.asarray(np.abs(S) ** 2)
     command = _commanded(S, omega, timing.delay) * mean_over(omega, timing.exposure)[:, None]
     return np.asarray(hold_floor(omega, timing.held)[:, None] + np.abs(_ahead(omega, timing)[:, None] + command) ** 2)
 
 
 def _ahead(omega: Array, timing: Timing) -> Complex:
-    """Mean (frequencies,) of a wave over the time for which a command counts, beside the wave at t_k."""
+    """Mean (frequencies,) of a wave over the time for which a command counts, relative to the wave at t_k."""
     return np.asarray(mean_over(omega, timing.held) * np.exp(1j * timing.applied * omega))
 
 
 def spectrum_left(law: LinearLaw, omega: Array, measured: Array, noise_nm2: Array, timing: Timing) -> Array:
-    """Spectrum (frequencies, modes) of what a loop leaves, by the spectrum of what it measures.
+    """Spectrum (frequencies, modes) of the residual, from the spectrum of the measurements.
 
     Args:
         law: of the loop.
@@ -105,7 +105,7 @@ def spectrum_left(law: LinearLaw, omega: Array, measured: Array, noise_nm2: Arra
 
 
 def commanded(law: LinearLaw, omega: Array, delay: float) -> Complex:
-    """Command (frequencies, modes) made of a frame that measures e^(i w t_k), over that wave; rad per frame."""
+    """Command (frequencies, modes) from a frame that measures e^(i w t_k), relative to that wave; rad per frame."""
     return _commanded(sensitivity(law, omega, delay), omega, delay)
 
 
@@ -115,15 +115,15 @@ def _commanded(S: Complex, omega: Array, delay: float) -> Complex:
 
 
 def ahead_of(measured_nm: Array, timing: Timing) -> tuple[Array, Array]:
-    """Mean of each mode over the period in which a command is in force, from what was measured before and after.
+    """Mean of each mode over the period in which a command is in force, from the measurements before and after.
 
     Args:
         measured_nm: (frames, modes), exposure by exposure.
         timing: of the loop.
 
     Returns:
-        (frames, modes), NaN where there are too few neighbours; and the filter's answer (frequencies,) at
-        `_FILTER_OMEGA`, by which noise passes it.
+        (frames, modes), NaN where there are too few neighbours; and the filter's response (frequencies,) at
+        `_FILTER_OMEGA`, for the noise.
     """
     answer = _ahead(_FILTER_OMEGA, timing) / mean_over(_FILTER_OMEGA, timing.exposure)
     full = np.fft.irfft(answer, _FILTER_POINTS)
@@ -141,9 +141,9 @@ def ahead_of(measured_nm: Array, timing: Timing) -> tuple[Array, Array]:
 def held_left_nm2(
     law: LinearLaw, measured_nm: Array, command_nm: Array, noise_nm2: Array, timing: Timing
 ) -> tuple[Array, int]:
-    """Sum of squares (modes,) of what commands left of the means that they were to null, and of how many frames.
+    """Sum of squares (modes,) of the residuals of the means that commands were to null, and the number of frames.
 
-    The means are those of `ahead_of`; what the measurements' noise (modes,) does to the sum is taken off.
+    The means are those of `ahead_of`; the contribution of the measurements' noise (modes,) is subtracted.
     """
     ahead_nm, answer = ahead_of(measured_nm, timing)
     rows = np.isfinite(ahead_nm).all(axis=1)
@@ -155,10 +155,10 @@ def held_left_nm2(
 
 
 def left_all_the_time_nm2(disturbance_nm: Array, mirror_nm: Array) -> Array:
-    """Mean square over each period (frames, modes) of what is left, from its state at the start of each exposure.
+    """Mean square residual over each period (frames, modes), from the states at the start of each exposure.
 
-    The disturbance (frames, modes) between those instants is told from the ones before and after, and the mirror
-    (frames, modes) holds for the period; NaN where there are too few neighbours.
+    The disturbance (frames, modes) is interpolated between those instants, and the mirror (frames, modes) holds for
+    the period; NaN where there are too few neighbours.
     """
     moments = (np.arange(_MOMENTS) + 0.5) / _MOMENTS
     between = (ahead_of(disturbance_nm, Timing(1.0, moment, 0.0, 0.0))[0] for moment in moments.tolist())

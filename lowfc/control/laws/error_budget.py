@@ -1,4 +1,4 @@
-"""The error budget of a closed loop: what noise, delay, cross-talk and nonlinearity each leave of the wavefront.
+"""The error budget of a closed loop: residual wavefront from noise, delay, cross-talk and nonlinearity.
 
 A frame measures error = residual + m, where m is noise, cross-talk and nonlinearity; the loop leaves
 residual = S disturbance - T m, with S and T of `lowfc.control.laws.margins`.
@@ -19,20 +19,20 @@ from lowfc.control.laws.spectra import Pieces, Spectrum, floor_nm2_hz, spectrum
 ROWS_PER_REGRESSOR = 10
 """Frames for each regressor below which a fit mostly explains noise."""
 CERTAIN = 2.0
-"""Standard errors above which a difference of two variances is seen."""
+"""Standard errors above which a difference of two variances counts as detected."""
 
 _ALIKE = 1e-7  # beside the largest singular value of the regressors
 
 
 @dataclass(frozen=True, slots=True)
 class Term:
-    """One term: variance of the true residual (modes,), and its standard error where it is a difference."""
+    """One term: variance of the true residual (modes,), and its standard error if it is a difference."""
 
     variance_nm2: Array
     error_nm2: Array | float = 0.0
 
     def total(self, modes: Mask) -> tuple[float, bool]:
-        """Rms in nm over some of the modes (modes,), and whether it was seen: otherwise it is an upper limit."""
+        """Rms in nm over some of the modes (modes,), and whether it was detected: otherwise it is an upper limit."""
         variance = float(self.variance_nm2[modes].sum())
         error = float(np.sqrt((np.broadcast_to(self.error_nm2, self.variance_nm2.shape)[modes] ** 2).sum()))
         if error == 0 or variance > CERTAIN * error:
@@ -42,7 +42,7 @@ class Term:
 
 @dataclass(frozen=True, slots=True)
 class SensorNoise:
-    """Standard deviation (modes,) of one frame's modes, nm: by the light, and by reading it out."""
+    """Standard deviation (modes,) of one frame's modes, nm: from photon noise and from read noise."""
 
     photon_nm: Array
     read_nm: Array
@@ -62,8 +62,8 @@ def sensor_noise(
         matrix: (modes, pixels) R, nm per flux fraction.
         reference: (pixels,) I0, flux fractions.
         flux_e: Electrons on the good pixels, before multiplication.
-        read_noise_e: Of a pixel, all that is not the light's, as electrons before multiplication.
-        excess: By which a multiplication register raises the photons' variance: 2, or 1 without one.
+        read_noise_e: Noise of a pixel other than photon noise, as electrons before multiplication.
+        excess: Factor by which a multiplication register raises the photon variance: 2, or 1 without one.
     """
     photon = noise_nm(matrix, reference, flux_e, 0.0)
     both = noise_nm(matrix, reference, flux_e, read_noise_e)
@@ -71,20 +71,20 @@ def sensor_noise(
 
 
 def white_noise(law: LinearLaw, noise_nm: Array) -> Term:
-    """What white noise of a frame (modes,) leaves through the loop."""
+    """Residual from the white noise of a frame (modes,)."""
     return Term(noise_nm**2 * noise_gain(law))
 
 
 def lag(law: LinearLaw, disturbance: Spectrum, mean_nm: Array, timing: Timing) -> Term:
-    """What the loop leaves of a disturbance known at the start of each exposure, by spectrum and mean (modes,).
+    """Residual of a disturbance known at the start of each exposure, by spectrum and mean (modes,).
 
-    With a `timing` that counts whole periods this is what is left at every moment.
+    With a `timing` that counts whole periods it is the residual over all time.
     """
     return Term(disturbance.variance_nm2(_passed(law, disturbance, timing)) + _steady_nm2(law, mean_nm))
 
 
 def lag_under_noise(law: LinearLaw, measured: Spectrum, mean_nm: Array, timing: Timing) -> Term:
-    """The same (modes,) of a disturbance that was measured with noise: the floor of its spectrum is taken off."""
+    """The same (modes,) for a disturbance measured with noise: the floor of its spectrum is subtracted."""
     exposed = np.abs(mean_over(_omega(law, measured), timing.exposure)) ** 2
     passed = _passed(law, measured, timing) / exposed[:, None]
     floor = floor_nm2_hz(measured)
@@ -97,7 +97,7 @@ def _omega(law: LinearLaw, found: Spectrum) -> Array:
 
 
 def _passed(law: LinearLaw, found: Spectrum, timing: Timing) -> Array:
-    """(frequencies, modes) of a spectrum that is left."""
+    """Residual spectrum (frequencies, modes)."""
     return left_power(law, _omega(law, found), timing)
 
 
@@ -107,7 +107,7 @@ def _steady_nm2(law: LinearLaw, mean_nm: Array) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class MeasurementError:
-    """What the sensor adds to the true residual, beyond its noise."""
+    """Errors of the sensor other than noise."""
 
     crosstalk: Term
     nonlinearity: Term
@@ -119,9 +119,9 @@ def measurement_error(
     """Split m = error - residual by a fit, and pass each part through the loop.
 
     The part of m that follows linearly from a constant, the true residual and the command is cross-talk: a response
-    that is not the calibration's, light of what is no mode (a static screen, the mirror's print-through). What is left,
-    less the noise (modes,) that a frame must have, is nonlinearity. m's noise is younger than residual and command, so
-    that the fit is not biased by it; what it explains of the noise by chance is taken off.
+    other than the calibration's, or light from outside the modes (static screen, print-through of the mirror). The rest,
+    less the noise (modes,) expected in a frame, is nonlinearity. m's noise is later than residual and command, so it
+    does not bias the fit; the noise that the fit explains by chance is subtracted.
 
     Args:
         law: Of the loop; its delay is the true one.
@@ -131,7 +131,7 @@ def measurement_error(
         noise_nm: Standard deviation of one frame's modes.
 
     Returns:
-        None where the frames are too few for the fit, or for a spectrum.
+        None if there are too few frames for the fit or a spectrum.
     """
     rows = error.frames
     if rows < ROWS_PER_REGRESSOR * (1 + 2 * len(law.noll)):
@@ -153,7 +153,7 @@ def measurement_error(
     passed, at_rest = noise_transfer(law, rough.frequency_hz) ** 2, noise_transfer(law, np.zeros(1))[0] ** 2
     steady = linear.mean(axis=0) ** 2 * at_rest
     freedom = rows - basis.shape[1]
-    # What one unit of noise in each direction of the basis becomes behind the loop, (modes, directions).
+    # Residual from one unit of noise in each direction of the basis, (modes, directions).
     by_chance = passed.T @ each.power_nm2_hz * each.spacing_hz + np.outer(at_rest, basis.mean(axis=0) ** 2)
     noise_nm2 = np.sum(rest**2, axis=0) / freedom
     left = rough.variance_nm2(passed) * rows / freedom - noise_nm**2 * noise_gain(law)

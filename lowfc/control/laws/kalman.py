@@ -1,7 +1,7 @@
-"""LQG: the Kalman filter of a mode's drift and lines, and the command that takes out what it foresees.
+"""LQG: a Kalman filter of a mode's drift and lines, and the command that removes its prediction.
 
-The filter sees pseudo-open-loop modes, so that its steady gain does not depend on the command. The command nulls the
-mean of what is foreseen over the period in which it is in force: not an instant of it, and not the next exposure.
+The filter's input is pseudo-open-loop modes, so its steady gain does not depend on the command. The command nulls the
+mean prediction over the period in which it is in force: not at an instant, and not over the next exposure.
 """
 
 from collections.abc import Sequence
@@ -17,10 +17,10 @@ _DOUBLINGS = 40
 
 
 def lqg(models: Sequence[Model], noll: tuple[int, ...], timing: Timing) -> LinearLaw:
-    """The law of these modes, one model each, as measured: means over an exposure.
+    """The law for these modes, one model each, of measurements that are means over an exposure.
 
     Raises:
-        ValueError: another number of models than of modes, models of different rates, or a filter that has no limit.
+        ValueError: the numbers of models and modes differ, models have different rates, or a filter does not converge.
     """
     rates = {model.rate_hz for model in models}
     if len(rates) != 1:
@@ -40,7 +40,7 @@ def lqg_block(model: Model, timing: Timing) -> Block:
 
 
 def covariance_nm2(model: Model) -> Array:
-    """Covariance (states, states) of what the steady filter does not know of the states before a frame.
+    """Covariance (states, states) of the steady filter's prediction error before a frame.
 
     Raises:
         ValueError: the Riccati equation has no solution.
@@ -52,11 +52,11 @@ def covariance_nm2(model: Model) -> Array:
 def _riccati(A: Array, Q: Array, C: Array) -> Array:
     """Covariance X = A (X - X C' C X / (1 + C X C')) A' + Q of the states before a frame, by doubling.
 
-    Each turn doubles the number of frames that have been filtered, from a start that is certain. Lines that are all
-    but undamped put poles next to the unit circle, which scipy's `solve_discrete_are` cannot tell apart.
+    Each iteration doubles the number of filtered frames, from a start of zero covariance. Lines that are nearly
+    undamped put poles next to the unit circle, which scipy's `solve_discrete_are` cannot separate.
 
     Raises:
-        ValueError: it does not settle.
+        ValueError: it does not converge.
     """
     seen, passed, found = np.outer(C, C), A.T, Q
     identity = np.eye(len(A))

@@ -7,10 +7,10 @@ import numpy as np
 from lowfc.arrays import Mask, Single, single
 
 TIP_TILT = (2, 3)
-"""Noll indices of tip and tilt, which have gains and judgements of their own."""
+"""Noll indices of tip and tilt, which have separate gains and are judged separately."""
 RELAXING = np.float32(0.99)
-"""Part of its command that a mode keeps from frame to frame while its automatic gain is 0: nothing would correct what
-an earlier gain has put on the mirror."""
+"""Fraction of its command that a mode keeps from frame to frame while its automatic gain is 0, since nothing corrects
+what an earlier gain put on the mirror."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,8 +18,8 @@ class Law:
     """Gain, leak and limit of each mode, each (modes,) float32; the limit is nm of wavefront rms.
 
     Attributes:
-        left: (modes,) whether a mode is left alone, its gain being automatic and 0.
-        kept: (modes,) part of the command that stays: 1 - leak, or `RELAXING` of a mode that is left.
+        left: (modes,) whether a mode is uncorrected because its automatic gain is 0.
+        kept: (modes,) fraction of the command that is kept: 1 - leak, or `RELAXING` for an uncorrected mode.
         rows: (3, modes) gain, kept and limit.
     """
 
@@ -33,7 +33,7 @@ class Law:
     def __post_init__(self) -> None:
         if not self.gain.shape == self.leak.shape == self.limit_nm.shape:
             raise ValueError(
-                f"gain, leak and limit must be as long as each other, got {self.gain.shape}, {self.leak.shape} "
+                f"gain, leak and limit must have the same length, got {self.gain.shape}, {self.leak.shape} "
                 f"and {self.limit_nm.shape}"
             )
         for name, array, low, high in (
@@ -48,7 +48,7 @@ class Law:
 
 
 def integrate(law: Law, command_nm: Single, error_nm: Single) -> tuple[Single, bool]:
-    """command[k+1] = kept command[k] - gain error[k], cut to the limit of each mode; and whether any was cut.
+    """Compute command[k+1] = kept command[k] - gain error[k], cut to each mode's limit; and whether any was cut.
 
     All (modes,) float32, nm of wavefront rms.
     """

@@ -1,4 +1,4 @@
-"""A law of any kind as one linear system for all modes: PI, notches and Kalman filters are values of it."""
+"""Any control law as one linear system for all modes: PI, notches and Kalman filters are instances."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -13,16 +13,16 @@ from lowfc.control.laws.stability import delay_weights
 Signal = Literal["error", "pol"]
 
 MOST_STATES = 512
-"""Of a law: a step of so many takes as long as a frame at 1 kHz may."""
+"""Most states of a law: a step with this number takes a frame period at 1 kHz."""
 SIGNALS: tuple[Signal, ...] = ("error", "pol")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearLaw:
-    """x[k] = F x[k-1] + G y[k] + H c[k-1], wanted[k] = K x[k]; single precision, as the loop uses it.
+    """x[k] = F x[k-1] + G y[k] + H c[k-1], wanted[k] = K x[k]; single precision, as in the loop.
 
-    y is the measured error or the pseudo-open-loop modes of frame k, c the modal command that was kept after all
-    limits. In place of a frame that is missing or refused, x[k] = A x[k-1] + H c[k-1].
+    y is the measured error or the pseudo-open-loop modes of frame k, c the modal command after all limits. For a
+    missing or refused frame, x[k] = A x[k-1] + H c[k-1].
 
     Attributes:
         signal: what y is.
@@ -31,11 +31,11 @@ class LinearLaw:
         command_gain: (states, modes) H.
         predict_only: (states, states) A.
         output: (modes, states) K.
-        name: what kind of law it is, for people.
+        name: kind of law, for people.
         noll: Noll index of each mode.
-        delay_frames: the delay it was made for, as `lowfc.control.laws.stability.delay_weights`.
+        delay_frames: the delay it was made for, as in `lowfc.control.laws.stability.delay_weights`.
         rate_hz: the frame rate it was made for.
-        id: identity of the whole.
+        id: identity of the law.
         joined: (states, states + 2 modes) F, G and H side by side.
     """
 
@@ -65,7 +65,7 @@ class LinearLaw:
             object.__setattr__(self, name, array)
         if not (states and modes) or states > MOST_STATES:
             raise ValueError(f"a law must have modes, and 1 to {MOST_STATES} states; got {modes} and {states}")
-        delay_weights(self.delay_frames)  # says what is wrong with a delay
+        delay_weights(self.delay_frames)  # raises for a wrong delay
         if not (np.isfinite(self.rate_hz) and self.rate_hz > 0):
             raise ValueError(f"rate_hz must be above 0, got {self.rate_hz}")
         object.__setattr__(self, "joined", np.hstack([self.transition, self.measurement_gain, self.command_gain]))
@@ -84,7 +84,7 @@ def matrix_shapes(states: int, modes: int) -> dict[str, tuple[int, int]]:
     }
 
 
-# The names that are hashed are those of 0.1, so that laws keep their identities.
+# The hashed names are those of 0.1, so that laws keep their identities.
 _IDENTITY = (
     ("signal", "signal"),
     ("follow", "transition"),
@@ -101,7 +101,7 @@ def at_rest(law: LinearLaw) -> Single:
 
 
 def follow(law: LinearLaw, x: Single, y: Single, kept: Single) -> Single:
-    """The state (states,) after a frame: y (modes,) nm of it, and the command (modes,) nm kept before it."""
+    """The state (states,) after a frame, from its y (modes,), nm, and the command (modes,), nm, kept before it."""
     after: Single = law.transition @ x
     after += law.measurement_gain @ y
     after += law.command_gain @ kept
@@ -109,7 +109,7 @@ def follow(law: LinearLaw, x: Single, y: Single, kept: Single) -> Single:
 
 
 def coast(law: LinearLaw, x: Single, kept: Single) -> Single:
-    """The state (states,) one frame later, where that frame is missing or refused; the command (modes,) in nm."""
+    """The state (states,) after a missing or refused frame; the command (modes,) in nm."""
     after: Single = law.predict_only @ x
     after += law.command_gain @ kept
     return after
@@ -134,10 +134,10 @@ class Block(NamedTuple):
 def of_blocks(
     blocks: Sequence[Block], signal: Signal, name: str, noll: tuple[int, ...], delay_frames: float, rate_hz: float
 ) -> LinearLaw:
-    """The law whose modes are these blocks, one for each mode.
+    """Make a law from one block for each mode.
 
     Raises:
-        ValueError: another number of blocks than of modes, or one of them does not fit itself.
+        ValueError: the numbers of blocks and modes differ, or the matrices of a block do not match.
     """
     if len(blocks) != len(noll):
         raise ValueError(f"a law of {len(noll)} modes needs as many blocks, got {len(blocks)}")
@@ -156,8 +156,8 @@ def of_blocks(
 def integrator_block(gain: float, leak: float, signal: Signal, delay_frames: float) -> Block:
     """c[k] = (1 - leak) c[k-1] - gain e[k], of the error or of pseudo-open-loop modes.
 
-    Of the latter, e[k] = pol[k] + sum_j w_j c[k-1-j], for which the block remembers commands. Where frames are missing
-    it holds, from the second of them on if it remembers commands.
+    For the latter, e[k] = pol[k] + sum_j w_j c[k-1-j], for which the block stores commands. During missing frames it
+    holds, from the second of them on if it stores commands.
     """
     if signal == "error":
         return Block(np.zeros((1, 1)), np.array([-gain]), np.array([1 - leak]), np.zeros((1, 1)), np.ones(1))
@@ -177,10 +177,10 @@ def integrator_block(gain: float, leak: float, signal: Signal, delay_frames: flo
 def integrator(
     gain: Iterable[float], leak: Iterable[float], noll: tuple[int, ...], delay_frames: float, rate_hz: float
 ) -> LinearLaw:
-    """The loop's integrator, of gain and leak (modes,), as a linear law of the error; its limits are not in it.
+    """The loop's integrator, with gain and leak (modes,), as a linear law of the error, without its limits.
 
     Raises:
-        ValueError: they are not of as many modes.
+        ValueError: their lengths differ from the number of modes.
     """
     blocks = [
         integrator_block(float(g), float(lost), "error", delay_frames) for g, lost in zip(gain, leak, strict=True)
