@@ -119,7 +119,7 @@ def measurement_error(
     """Split m = error - residual by a fit, and pass each part through the loop.
 
     The part of m that follows linearly from a constant, the true residual and the command is cross-talk: a response
-    other than the calibration's, or light from outside the modes (static screen, print-through of the mirror). The rest,
+    other than the calibration's, or light from outside the modes (a static screen, mirror print-through). The rest,
     less the noise (modes,) expected in a frame, is nonlinearity. m's noise is later than residual and command, so it
     does not bias the fit; the noise that the fit explains by chance is subtracted.
 
