@@ -1,6 +1,6 @@
-"""A mirror that is driven by volts, by the documented calls of Boston Micromachines' DM-SDK (module `bmc`).
+"""Driver for a voltage-driven mirror with the documented calls of Boston Micromachines' DM-SDK (module `bmc`).
 
-It was tested with a stand-in for that module, and has not met the hardware. Another vendor's calls take its place.
+It was tested with a stand-in for that module, not with hardware. For another vendor, replace these calls.
 
 Example: lowfc mirror examples/boston_mirror.py:BostonMirror --run bench --config bench.toml --serial 17CW000#001
 """
@@ -14,7 +14,7 @@ class BostonMirror:
     """Values are fractions of the voltage range, 0 to 1."""
 
     class Options(VoltOptions):
-        """Beside the maps."""
+        """Options in addition to the maps."""
 
         serial: str
         """Serial number of the mirror."""
@@ -27,16 +27,16 @@ class BostonMirror:
         self.map = VoltMap(options, config, self.dm.num_actuators())
 
     def apply(self, actuators_nm: Single) -> Single:
-        """Send the values; the surface is what they make."""
+        """Send the values and return the surface that they produce."""
         values = self.map.values(actuators_nm)
         self.check(self.dm.send_data(values))
         return self.map.surface_nm(values)
 
     def close(self) -> None:
-        """Let go of the mirror."""
+        """Release the mirror."""
         self.dm.close_dm()
 
     def check(self, status: int) -> None:
-        """Raise what the vendor says of a call that failed."""
+        """Raise OSError with the vendor's message if a call failed."""
         if status != bmc.NO_ERR:
             raise OSError(self.dm.error_string(status))

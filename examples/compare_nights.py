@@ -1,4 +1,4 @@
-"""Set the verdicts of several logs beside each other, and the residual of every mode in nm rms of wavefront.
+"""Compare the verdicts of several logs and the residual of every mode in nm rms of wavefront.
 
 Example: python examples/compare_nights.py logs/20270101T220000Z.mcap logs/20270102T220000Z.mcap
 """
@@ -10,7 +10,7 @@ from typing import Any
 
 
 def report(log: str) -> dict[str, Any]:
-    """What `lowfc report LOG --json` prints."""
+    """Return the output of `lowfc report LOG --json`."""
     words = [sys.executable, "-m", "lowfc", "report", log, "--json"]
     done = subprocess.run(words, check=True, stdout=subprocess.PIPE)  # noqa: S603  # this Python's own lowfc
     found: dict[str, Any] = json.loads(done.stdout)
@@ -18,7 +18,7 @@ def report(log: str) -> dict[str, Any]:
 
 
 def rows(nights: list[dict[str, Any]]) -> dict[str, list[str]]:
-    """Lines by their name, each with one text for every night."""
+    """Return the lines by name, each with one text for every night."""
     found: dict[str, list[str]] = {}
     for place, night in enumerate(nights):
         texts = {"verdict": night["verdict"]["heading"]}

@@ -1,4 +1,4 @@
-"""Which gain, at which delay? Margins of an integrator, and what it leaves of a vibration.
+"""Highest integrator gain within the margins at several delays, and the residual of a vibration.
 
 Example: python examples/loop_design.py 17 500
 """
@@ -12,9 +12,9 @@ from lowfc.control.laws.stability import highest_gain, limiting_gain, open_loop
 
 
 def design(line_hz: float, rate_hz: float) -> Iterator[str]:
-    """A line for each delay: the highest gain within the margins, and what it leaves of a line at `line_hz`."""
+    """Yield a row for each delay: the highest gain within the margins, and the residual of a line at `line_hz`."""
     yield f"a line of {line_hz:g} Hz, {rate_hz:g} frames per second"
-    yield "delay, frames   oscillates at gain   highest gain   left of the line   bandwidth, Hz"
+    yield "delay, frames   oscillates at gain   highest gain   residual of line   bandwidth, Hz"
     frequency_hz = np.linspace(0.1, rate_hz / 2, 20_000)
     for delay in (1.0, 1.5, 2.0, 3.0):
         gain = highest_gain(delay)

@@ -1,4 +1,4 @@
-"""How faint may the star be? Light, and the noise of one frame in each mode, against V magnitude.
+"""Light and noise of one frame in tilt and in the other modes against V magnitude: how faint may the star be?
 
 Example: python examples/photon_budget.py 2 5
 """
@@ -14,7 +14,7 @@ from lowfc.optics.detector.photometry import tilt_nm_per_mas
 
 
 def budget(magnitudes: Sequence[float]) -> Iterator[str]:
-    """A line for each magnitude: the default sensor at the default rate, R made for this light."""
+    """Yield a row for each magnitude: the default sensor at the default rate, R computed for this light."""
     config = Configuration()
     optics = factory.twin(config, None, sys.exit)
     on_nodes = factory.mirror_on_twin(config, optics, sys.exit)

@@ -1,6 +1,6 @@
-"""A camera without this library: zenoh, protobuf and the contract only, as it would be written in another language.
+"""A camera with only zenoh, protobuf and the compiled messages, as it would be written in another language.
 
-It plays a stack of frames, a numpy file of (frames, rows, columns) uint16, over and over.
+It plays a numpy file of frames (frames, rows, columns) uint16 in a loop.
 
 Example: python examples/plain_camera.py camera.json5 frames.npy
 """
@@ -15,12 +15,12 @@ import numpy as np
 import zenoh
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 
-from lowfc.contract.wire.lowfc_pb2 import CameraState, Health  # what protoc makes of lowfc/contract/proto
+from lowfc.contract.wire.lowfc_pb2 import CameraState, Health  # compiled by protoc from lowfc/contract/proto
 
 PERIOD_NS, EXPOSURE_NS, SETTINGS_PERIOD_NS = 4_000_000, 2_000_000, 500_000_000
 
 SESSION, FRAMES = Path(sys.argv[1]), np.load(sys.argv[2])
-# The host's time never steps: CLOCK_MONOTONIC and an offset in a file that all processes of this boot share.
+# The host's time never steps: CLOCK_MONOTONIC plus an offset in a file shared by all processes of this boot.
 base = Path(json.loads(SESSION.read_text())["transport"]["auth"]["usrpwd"]["dictionary_file"]).parents[1]
 boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
 OFFSET_NS = int((base / f"clock-{boot}").read_text())
@@ -35,10 +35,10 @@ START_S = now_ns() // 1_000_000_000
 
 
 class Publisher:
-    """Puts messages with their envelope: 16 bytes, start << 32 | count and the time of the put, little-endian."""
+    """Publish messages with an envelope of 16 bytes: start << 32 | count, and the time of the put, little-endian."""
 
     def __init__(self, session: zenoh.Session, key: str, *, answers: bool = False) -> None:
-        """Publish on a key, and answer who asks for the last message."""
+        """Publish on a key, and answer queries for the last message."""
         self.key, self.count, self.last = key, 0, (b"", b"")
         self._publisher = session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP)
         if answers:

@@ -1,4 +1,4 @@
-"""What stands in for a camera in these examples: the simulated optics, under the shape that your mirror reports."""
+"""Replacement for camera hardware in these examples: the simulated optics with the shape that your mirror reports."""
 
 import time
 
@@ -12,7 +12,7 @@ from sim_camera.driver import scene
 
 
 class Optics:
-    """The coronagraph, the sensor and the detector of a configuration, in the place of hardware."""
+    """The coronagraph, sensor and detector of a configuration, in place of hardware."""
 
     def __init__(self, config: Configuration) -> None:
         """Build the optics."""
@@ -22,11 +22,11 @@ class Optics:
         self._index = self._start_ns = 0
 
     def join(self, service: Service) -> None:
-        """Listen to where the mirror is."""
+        """Subscribe to the shape of the mirror."""
         service.bus.subscribe(MIRROR_STATE, self._hear, self._config.mirror.name)
 
     def expose(self) -> tuple[Pixels, int]:
-        """Wait for the next frame; return it and when its exposure ended, by CLOCK_MONOTONIC."""
+        """Wait for the next frame; return it and the end of its exposure by CLOCK_MONOTONIC."""
         self._start_ns = max(self._start_ns + self._config.period_ns, time.monotonic_ns())
         _sleep_until_ns(self._start_ns)
         there, expected = self._surface_nm.shape, (self._config.mirror.rows, self._config.mirror.columns)
