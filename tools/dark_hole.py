@@ -32,7 +32,7 @@ def measure() -> Figures:
 def render(figures: Figures) -> str:
     """A line for each size of the steps."""
     head = (
-        *("each step, nm rms of surface", "together", "what the sensor sees of it, nm of wavefront", "undone, %"),
+        *("each step, nm rms of surface", "all steps", "as seen by the sensor, nm of wavefront", "undone, %"),
         *("undone without the shift, %", "true residual before -> after, nm"),
     )
     rows = [
@@ -47,8 +47,8 @@ def render(figures: Figures) -> str:
     ]
     return (
         f"{markdown(head, rows)}\n{STEPS} random steps, {SETTLE} frames apart, each added to those before it. Undone "
-        "is how much of what the sensor sees of the channel is found, with the opposite sign, in the loop's own "
-        "command beyond what cancels the disturbance, least squares over all steps and modes; with the standard error. "
-        "Below zero, the loop adds to them. The true residual is the rms of all modes about their mean, over the "
-        "circle, before the first step and after the last."
+        "is the fraction of the channel as seen by the sensor that the loop's own command cancels, "
+        "after subtraction of the part that cancels the disturbance; least squares over all steps and modes, with the "
+        "standard error. A negative value means that the loop adds to the steps. The true residual is the rms of all "
+        "modes about their mean, over the circle, before the first step and after the last."
     )

@@ -34,39 +34,36 @@ API = ("client", "device", "optics", "design", "control")
 _MESSAGES = 4  # numbers of the fields of the descriptors, which the places of comments are made of
 _FIELDS = 2
 _TAKEOVER = (
-    ("frames for which a new law follows before it drives", SETTLING_FRAMES),
-    ("frames in which it then takes over", FADING_FRAMES),
+    ("frames for which a new law observes", SETTLING_FRAMES),
+    ("frames of the cross-fade to a new law", FADING_FRAMES),
 )
 _TUNING = (
-    ("frames in a row that a law is tuned from, at least", FEWEST),
+    ("minimum number of consecutive frames for tuning", FEWEST),
     ("tilt of an open loop above which it is flagged, mas rms per axis", OPTICAL_GAIN_MAS),
-    ("gain margin of an integrator, at least", LEAST_GAIN_MARGIN),
-    ("phase margin of an integrator, at least, deg", LEAST_PHASE_MARGIN_DEG),
-    ("integrator gain, at least", LOWEST_GAIN),
+    ("minimum gain margin of an integrator", LEAST_GAIN_MARGIN),
+    ("minimum phase margin of an integrator, deg", LEAST_PHASE_MARGIN_DEG),
+    ("minimum integrator gain", LOWEST_GAIN),
     *_TAKEOVER,
 )
 _GUARD = (
-    ("duration of a block, s; never fewer frames than the next line", guard.BLOCK_S),
-    ("frames of a block, at least", guard.FEWEST),
-    ("blocks in a row in which the law is worse, until the integrator takes over", guard.WORSE_BLOCKS),
-    ("mean squared error of a law that is worse, over the integrator's, more than", guard.WORSE),
-    (
-        "mean squared error of a loop that amplifies, over the usual mean square, more than",
-        guard.AMPLIFIED,
-    ),
-    ("time constant of what is usual, s", guard.USUAL_S),
-    ("cross-fade from one to the other, s", guard.FADED_S),
-    ("mean squared error of a law that is far better, over the integrator's, less than", guard.BETTER),
-    ("for how long it must be, at first, s", guard.BETTER_S),
-    ("takeovers after which only an operator lets the law drive again", guard.MOST_TAKEOVERS),
+    ("duration of a block, s, unless the minimum number of frames takes longer", guard.BLOCK_S),
+    ("minimum number of frames of a block", guard.FEWEST),
+    ("consecutive worse blocks before the integrator takes over", guard.WORSE_BLOCKS),
+    ("law is worse: ratio of its mean squared error to the integrator's above", guard.WORSE),
+    ("loop amplifies: ratio of its mean squared error to the usual mean square above", guard.AMPLIFIED),
+    ("time constant of the usual mean square, s", guard.USUAL_S),
+    ("duration of a cross-fade, s", guard.FADED_S),
+    ("law is far better: ratio of its mean squared error to the integrator's below", guard.BETTER),
+    ("time for which the law must be far better, at first, s", guard.BETTER_S),
+    ("takeovers after which only an operator reactivates the law", guard.MOST_TAKEOVERS),
 )
 _ACCEPTANCE = (
-    ("rejection: standard errors that must fit into the tolerance, for a line to be judged", transfer_function.SURE),
-    ("rejection: part of a mode's lines that must be judged for its rejection", acceptance_rejection.LEAST_JUDGED),
+    ("rejection: minimum ratio of tolerance to standard error for a line to be evaluated", transfer_function.SURE),
+    ("rejection: minimum fraction of a mode's lines that are evaluated", acceptance_rejection.LEAST_JUDGED),
     ("linearity: amplitudes, times `linear_nm`", *acceptance_linearity.AMPLITUDES),
-    ("linearity: standard errors beyond the limit at which a value is beyond it", linearity.SURE),
-    ("capture-range: sizes, times what is required", *acceptance_capture.SIZES),
-    ("capture-range: part of a shape that may be left over", linearity.MISSED),
+    ("linearity: standard errors above the limit at which a value fails", linearity.SURE),
+    ("capture-range: amplitudes, times the required one", *acceptance_capture.SIZES),
+    ("capture-range: maximum fraction of a shape left over", linearity.MISSED),
 )
 _OPERATING = (
     *_TAKEOVER,
@@ -111,7 +108,7 @@ def limits(rows: Iterable[tuple[str, *tuple[float, ...]]]) -> str:
 def requirements() -> str:
     """What an acceptance run requires."""
     rows = ((f"`{key}`", f"{info.default:g}", sentence(info.description)) for key, info in keys(Acceptance).items())
-    return markdown(("key", "default", "what must be"), rows)
+    return markdown(("key", "default", "requirement"), rows)
 
 
 def agreement() -> str:

@@ -167,9 +167,9 @@ def render(figures: Figures) -> str:
     """A line for each case, and what came of good laws."""
     rows = columns(
         {
-            "disturbance, lines higher by": "`{preset}`, {percent:.0f} %",
+            "disturbance, frequency shift of its lines": "`{preset}`, {percent:.0f} %",
             "guarded law, mas rms per axis": "**{guarded_mas:.2f}**",
-            "the same law alone": "{alone_mas:.2f}",
+            "law without guard": "{alone_mas:.2f}",
             "integrator": "{integrator_mas:.2f}",
             "guarded law over integrator, worst seed": "{worst_ratio:.3f}",
             "overruled": "{overruled} of {seeds}",
@@ -185,8 +185,8 @@ def render(figures: Figures) -> str:
     return (
         f"{rows}\nTrue tilt from 1 s to 3 s after the lines moved, V = 0, 1 kHz. Laws are LQG, "
         f"identified from {_IDENTIFY / RATE_HZ:g} s of the closed loop; the integrator has the best gains for the same "
-        f"frames. Good laws, for {figures['minutes']:g} minutes each, with steps of {2 * STEPS_MAS:g} mas every 2 s "
-        f"that they do not know, were overruled: {good}. The guard of a law of 14 modes takes {cost['driving']:.1f} us "
-        f"of a frame while the law drives, {cost['virtual']:.1f} us while it does not. Modes through the live loop's "
-        "own `advance`, with noise of the covariance of the images'."
+        f"frames. Good laws, for {figures['minutes']:g} minutes each, with unmodelled steps of {2 * STEPS_MAS:g} mas "
+        f"every 2 s, were overruled: {good}. The guard of a law of 14 modes takes {cost['driving']:.1f} us "
+        f"of a frame while the law drives, {cost['virtual']:.1f} us while it does not. Modes pass through the live "
+        "loop's own `advance`, with noise of the images' covariance."
     )

@@ -151,8 +151,8 @@ def optimum_mas(config: Configuration, calibration: Calibration, *, robust: bool
 def render(figures: Figures) -> str:
     """A line for each case and law, and a note for each case."""
     head = (
-        *("sensor", "law", "tilt left, mas rms per axis", "predicted from the log"),
-        *("of it disturbance, noise (theory)", "gain margin", "phase margin, deg"),
+        *("sensor", "law", "residual tilt, mas rms per axis", "predicted from the log"),
+        *("disturbance and noise parts (theory)", "gain margin", "phase margin, deg"),
     )
     rows, notes = [], []
     for name, one in figures["cases"].items():
@@ -166,17 +166,17 @@ def render(figures: Figures) -> str:
             f"{mas:.3f} mas from {int(frames) / RATE_HZ:g} s" for frames, mas in one["theory_by_frames_mas"].items()
         )
         notes.append(
-            f"- {name}: one frame's noise is {one['noise_mas']:.2f} mas; identified from a loop that left "
-            f"{one['identified_under_mas']:.2f} mas; LQG left {got_mas / theory_mas:.2f} times what theory gives for "
-            f"that law ({theory_mas:.3f} mas), and {got_mas / one['optimum_mas']:.2f} times the least of an LQG law "
-            "that knows the wheel's lines exactly and takes the drift for a random walk behind a low-pass "
-            f"({one['optimum_mas']:.3f} mas); from less of that run theory gives for LQG {shorter}; "
-            f"with the lines 2 % higher it left {one['moved']['before_mas']:.2f} mas, and "
-            f"{one['moved']['after_mas']:.3f} after they were identified again from that very run.\n"
+            f"- {name}: the noise of a frame is {one['noise_mas']:.2f} mas; the residual during identification was "
+            f"{one['identified_under_mas']:.2f} mas. LQG left {got_mas / theory_mas:.2f} times the theoretical "
+            f"residual of that law ({theory_mas:.3f} mas), and {got_mas / one['optimum_mas']:.2f} times that of an LQG "
+            "law with the exact lines of the wheel and a random walk behind a low-pass as drift "
+            f"({one['optimum_mas']:.3f} mas). Theory for LQG identified from shorter data: {shorter}. "
+            f"With the lines 2 % higher it left {one['moved']['before_mas']:.2f} mas, and "
+            f"{one['moved']['after_mas']:.3f} mas after identification from the same run.\n"
         )
     return (
-        f"{markdown(head, rows)}\n{''.join(notes)}\nReaction wheel with damped lines, 14 mas rms per axis, V = 0 where "
-        f"no other is named, {RATE_HZ:g} Hz; what is left is the true tilt at every moment (8 instants of a frame); "
+        f"{markdown(head, rows)}\n{''.join(notes)}\nReaction wheel with damped lines, 14 mas rms per axis, V = 0 "
+        f"unless stated, {RATE_HZ:g} Hz; the residual is the true tilt in continuous time (8 instants of a frame); "
         "blurred sensor images through the live loop's own `advance`; laws identified from "
         f"{IDENTIFY / RATE_HZ:g} s of the closed loop, measured over {MEASURE / RATE_HZ:g} s, "
         f"{SETTLE / RATE_HZ:g} s after they were loaded."

@@ -173,13 +173,13 @@ def render(figures: Figures) -> str:
     }
     return (
         f"{columns(heads, table)}\nTrue wavefront open and closed with automatic gains, nm rms over the second half "
-        f"of {figures['seconds']:g} s at {figures['rate_hz']:g} Hz, mean of {figures['seeds']} seeds. Of {len(rows)} "
-        f"cases (V = {stars}; these and `quiet`; {len(rows) - len(modal)} of them "
-        "with every image simulated) those in which "
-        f"closing adds more contrast than three standard errors (of `quiet`: none) and {100 * OF_DARK_ZONE:g} % of the "
-        f"dark zone's own, and how much of that it adds: {names or 'none'}. On bright stars (V = {_listed(bright)}) "
-        f"automatic gains leave {min(compared):.2f} to {max(compared):.2f} times what the best fixed gains leave, "
-        "which were looked for afterwards."
+        f"of {figures['seconds']:g} s at {figures['rate_hz']:g} Hz, mean of {figures['seeds']} seeds. "
+        f"Number of cases: {len(rows)} (V = {stars}; these presets and `quiet`; {len(rows) - len(modal)} of them "
+        "with every image simulated). Cases in which "
+        f"closing adds contrast by more than three standard errors (of `quiet`: none) and {100 * OF_DARK_ZONE:g} % of "
+        f"the dark zone's own, with that ratio: {names or 'none'}. On bright stars (V = {_listed(bright)}) the "
+        f"residual with automatic gains is {min(compared):.2f} to {max(compared):.2f} times that of the best fixed "
+        "gains, found afterwards."
     )
 
 

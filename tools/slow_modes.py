@@ -91,9 +91,9 @@ def render(figures: Figures) -> str:
     first, *_ = cases.values()
     head = ["mode", "drift, nm rms"]
     for name in cases:
-        head += [f"light for {name} of a frame: left, pm rms", "photon-noise bound, pm"]
+        head += [f"light for {name} of a frame: residual, pm rms", "photon-noise bound, pm"]
         head += ["photon and read noise through R, pm", f"below {WANTED_PM:g} pm"]
-    head.append("the mirror's part, pm rms")
+    head.append("mirror's part, pm rms")
     rows = []
     for mode, one in first["modes"].items():
         cells = [mode, f"{one['drift_nm']:.2f}"]
