@@ -1,7 +1,7 @@
-"""What a linear law makes of a loop: closed-loop poles, margins, rejection, noise transfer, for any true delay.
+"""Closed-loop poles, margins, rejection and noise transfer of a linear law, for any true delay.
 
 A frame measures error = disturbance + noise + B command with B(z) = sum_j w_j z^-(1+j), w of the true delay; the law
-answers command = -C error. Then L = C B, S = 1 / (1 + L) and T = L S. Modes that a law couples are taken one by one,
+replies with command = -C error. Then L = C B, S = 1 / (1 + L) and T = L S. Coupled modes are evaluated one by one with
 the others closed: L of a mode is 1/S - 1.
 """
 
@@ -14,25 +14,25 @@ from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.stability import delay_weights
 
 SAME_RATE = 0.01
-"""By which the rate of a law's frames may differ from the camera's."""
+"""Relative difference allowed between a law's frame rate and the camera's."""
 MOST_COUPLED = 100
-"""States that have to do with each other: the poles of so many take 30 ms, within which no frame is answered."""
+"""Most coupled states: computing the poles of this many takes 30 ms, during which no frame is processed."""
 
 _GRID = 2048
 _AROUND_POLE = np.concatenate([-np.geomspace(1e-2, 1e2, 33)[::-1], [0.0], np.geomspace(1e-2, 1e2, 33)])
 _LOWEST = 1e-6  # rad per frame: an integrator has no value at 0 Hz
-_STILL = 1e-6  # pole above 1 by rounding to single precision, where nothing is driven
+_STILL = 1e-6  # excess of a pole above 1 by rounding to single precision, for undriven states
 
 
 @dataclass(frozen=True, slots=True)
 class Margins:
-    """Of each mode, (modes,); all but `radius` mean something only where the loop is stable.
+    """Margins of each mode, (modes,); all but `radius` are valid only if the loop is stable.
 
     Attributes:
-        radius: largest modulus of the closed-loop poles of the mode (and of those that it is coupled with).
-        gain_margin: factor by which the loop's gain may grow, infinite where it may by any.
-        gain_reduction: factor above which it must stay; 0 where it may fall to nothing.
-        phase_margin_deg: lag at which it oscillates; 180 where the loop never has a gain of 1.
+        radius: largest modulus of the closed-loop poles of the mode (and of the modes coupled with it).
+        gain_margin: factor by which the loop's gain may grow; infinite if there is no bound.
+        gain_reduction: factor above which the gain must stay; 0 if there is no bound.
+        phase_margin_deg: lag at which it oscillates; 180 if the loop never has a gain of 1.
         peak: largest `|S|`: 1 over the modulus margin, the least distance of L from -1.
     """
 
@@ -70,10 +70,10 @@ def margins(law: LinearLaw, delay_frames: float) -> Margins:
 
 
 def check_law(law: LinearLaw, delay_frames: float, rate_hz: float) -> None:
-    """Refuse a law that was made for another loop; `rate_hz` is 0 where it is not known.
+    """Refuse a law that was made for another loop; `rate_hz` is 0 if unknown.
 
     Raises:
-        ValueError: it reckons with another delay, is of another rate, or is not stable here.
+        ValueError: its delay or rate differ, or it is not stable here.
     """
     if law.signal == "pol" and abs(law.delay_frames - delay_frames) > 1e-3:
         raise ValueError(
@@ -89,13 +89,12 @@ def check_law(law: LinearLaw, delay_frames: float, rate_hz: float) -> None:
 
 
 def check_stable(law: LinearLaw, delay_frames: float) -> None:
-    """Refuse a law that does not settle, closed or while the loop is open or frames are missing.
+    """Refuse a law that is unstable when closed, when open, or when frames are missing.
 
-    It takes a few milliseconds, for poles are all it needs; `margins` takes a hundred times as long.
+    It takes a few milliseconds, as it only needs poles; `margins` takes a hundred times as long.
 
     Raises:
-        ValueError: it does not settle, and the sentence has the pole; or more than `MOST_COUPLED` states have to do
-            with each other.
+        ValueError: it is unstable (the message has the pole), or more than `MOST_COUPLED` states are coupled.
     """
     weights = delay_weights(delay_frames)
     for part in _parts(law):
@@ -131,15 +130,15 @@ def sentence(found: Margins) -> str:
 
 
 def rejection(law: LinearLaw, frequency_hz: Array, delay_frames: float | None = None) -> Array:
-    """`|S|` (frequencies, modes) at Hz: true residual over disturbance.
+    """`|S|` (frequencies, modes) at frequencies in Hz: true residual over disturbance.
 
-    With the delay of the law where none is given.
+    The default delay is the law's.
     """
     return np.abs(sensitivity(law, 2 * np.pi * np.asarray(frequency_hz, float) / law.rate_hz, delay_frames))
 
 
 def noise_transfer(law: LinearLaw, frequency_hz: Array, delay_frames: float | None = None) -> Array:
-    """`|T|` (frequencies, modes) at Hz: true residual over measurement noise of the same mode."""
+    """`|T|` (frequencies, modes) at frequencies in Hz: true residual over measurement noise of the same mode."""
     return np.abs(sensitivity(law, 2 * np.pi * np.asarray(frequency_hz, float) / law.rate_hz, delay_frames) - 1)
 
 
@@ -161,7 +160,7 @@ def _weights(law: LinearLaw, delay_frames: float | None) -> Array:
 
 
 def sensitivity(law: LinearLaw, omega: Array, delay_frames: float | None = None) -> Complex:
-    """S (frequencies, modes) of each mode, complex, at rad per frame."""
+    """Complex S (frequencies, modes) of each mode, at frequencies in rad per frame."""
     weights, omega = _weights(law, delay_frames), np.maximum(omega, _LOWEST)
     found = np.ones((omega.size, len(law.noll)), complex)
     for part in _parts(law):
@@ -172,7 +171,7 @@ def sensitivity(law: LinearLaw, omega: Array, delay_frames: float | None = None)
 
 @dataclass(frozen=True, slots=True)
 class _Part:
-    """The states and modes of a law that have to do with each other, in double precision."""
+    """Coupled states and modes of a law, in double precision."""
 
     modes: Whole
     F: Array
@@ -181,15 +180,15 @@ class _Part:
     A: Array
     K: Array
     own_weights: Array
-    """Of the delay that the law reckons with in y; empty where y is the error."""
+    """Weights of the law's own delay, used in y; empty if y is the error."""
 
     @property
     def driven(self) -> bool:
-        """Whether what is measured moves the command at all."""
+        """Whether the measurement affects the command."""
         return bool(self.G.any() and self.K.any())
 
     def answer(self, z: Complex) -> Complex:
-        """What the law commands of an error, (frequencies, modes, modes)."""
+        """Response of the command to an error, (frequencies, modes, modes)."""
         identity = np.eye(len(self.F))
         inside = identity - (self.F + self.H @ self.K) / z[:, None, None]
         answer = self.K @ _solved(inside, np.broadcast_to(self.G.astype(complex), (z.size, *self.G.shape)))
@@ -199,14 +198,14 @@ class _Part:
         return _solved(np.eye(len(self.modes)) + answer * believed[:, None, None], answer)
 
     def sensitivity(self, omega: Array, weights: Array) -> Complex:
-        """S (frequencies, modes, modes) at rad per frame."""
+        """S (frequencies, modes, modes), frequencies in rad per frame."""
         z = np.exp(1j * omega)
         seen = np.polynomial.polynomial.polyval(1 / z, weights) / z
         identity = np.eye(len(self.modes), dtype=complex)
         return _solved(identity - seen[:, None, None] * self.answer(z), identity)
 
     def closed(self, weights: Array) -> Array:
-        """The matrix of the closed loop: x[k-1], c[k-1], c[k-2], ... one frame on."""
+        """Transition matrix of the closed loop for x[k-1], c[k-1], c[k-2], ..."""
         states, modes = len(self.F), len(self.modes)
         lags = max(weights.size, self.own_weights.size)
         sees = np.zeros(lags)
@@ -221,7 +220,7 @@ class _Part:
 
 
 def _parts(law: LinearLaw) -> list[_Part]:
-    """The law cut into parts that have nothing to do with each other."""
+    """Split the law into independent parts."""
     matrices = (law.transition, law.measurement_gain, law.command_gain, law.predict_only, law.output)
     F, G, H, A, K = (matrix.astype(np.float64) for matrix in matrices)
     states, modes = len(F), len(law.noll)
@@ -238,7 +237,7 @@ def _parts(law: LinearLaw) -> list[_Part]:
 
 
 def _first_linked(linked: Mask) -> Whole:
-    """The first of those that each (n,) is linked with over others, from (n, n); scipy.sparse takes 0.3 s to import."""
+    """First member of each one's connected group (n,), from links (n, n); scipy.sparse takes 0.3 s to import."""
     while True:
         further = linked.astype(np.float32) @ linked.astype(np.float32) > 0
         if (further == linked).all():
@@ -247,7 +246,7 @@ def _first_linked(linked: Mask) -> Whole:
 
 
 def _solved(of: Complex, right: Complex) -> Complex:
-    """`numpy.linalg.solve` of many; of one unknown it takes several times as long as a division."""
+    """`numpy.linalg.solve` of a stack; for one unknown a division is several times faster."""
     return np.asarray(right / of if of.shape[-1] == 1 else np.linalg.solve(of, right))
 
 

@@ -1,4 +1,4 @@
-"""PI laws, leaky or not, with notches in their rejection: resonators that take out a line each."""
+"""PI laws, leaky or not, with notches in their rejection: each is a resonator that removes one line."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -10,8 +10,8 @@ from lowfc.arrays import Array
 from lowfc.control.laws.linear_law import Block, LinearLaw, of_blocks
 from lowfc.control.laws.stability import delay_weights
 
-_EXACT = 1e-6  # variance of what was kept beside that of the states; the Riccati equation needs some
-_UNKNOWN = 1e-3  # more of it, and a law takes longer to leave a limit; less, and its states forget more slowly
+_EXACT = 1e-6  # variance of kept commands relative to the states'; the Riccati equation needs one above 0
+_UNKNOWN = 1e-3  # a larger one delays the return from a limit, a smaller one makes the states forget more slowly
 
 
 class Notch(NamedTuple):
@@ -31,23 +31,23 @@ def pi_notch(
     delay_frames: float,
     rate_hz: float,
 ) -> LinearLaw:
-    """A PI law with a resonator for each notch, whose phase makes up for the delay at its own frequency.
+    """A PI law with a resonator for each notch, whose phase compensates the delay at its frequency.
 
     Without notches c[k] = (1 - leak) (c[k-1] + proportional e[k-1]) - (gain + proportional) e[k]. Its states follow the
-    command that was kept, so that a limit does not wind it up and closing starts from the command that is held. Whether
-    it is stable, `lowfc.control.laws.margins` says.
+    command after limits, so that limits cause no wind-up and closing starts from the held command. Check its stability
+    with `lowfc.control.laws.margins`.
 
     Args:
         noll: Noll index of each mode.
         gain: (modes,) integral gain, per frame.
         proportional: (modes,) proportional gain, without unit.
-        leak: (modes,) of the integral, per frame.
-        notches: Of each mode.
+        leak: (modes,) leak of the integral, per frame.
+        notches: Notches of each mode.
         delay_frames: See `lowfc.control.laws.stability.delay_weights`.
         rate_hz: Frame rate.
 
     Raises:
-        ValueError: arrays of other lengths, or impossible values.
+        ValueError: wrong array lengths or impossible values.
     """
     for name, values in (("gain", gain), ("proportional", proportional), ("leak", leak), ("notches", notches)):
         if len(values) != len(noll):
@@ -102,10 +102,10 @@ def _block(
 
 
 def _correction(P: Array, B: Array, C: Array) -> Array:
-    """M (states,): how much of kept - wanted goes to each state, so that C (s + M (kept - C s)) = kept.
+    """M (states,): share of kept - wanted for each state, so that C (s + M (kept - C s)) = kept.
 
-    Without notches all of it is the integral's. Otherwise it is the steady Kalman gain for the states of a law that
-    kept commands came from: errors of variance 1, and a little that the law does not know.
+    Without notches the integral has all of it. Otherwise it is the steady Kalman gain of a law's states from its kept
+    commands, for errors of variance 1 and a small unknown part.
     """
     if len(C) == 2:
         return np.array([1.0, 0.0])

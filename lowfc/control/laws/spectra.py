@@ -1,4 +1,4 @@
-"""Power spectra of modes, where frames are missing too: short gaps are bridged, long ones part a run into pieces."""
+"""Power spectra of modes with missing frames: short gaps are interpolated, long ones split a run into pieces."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,9 +9,9 @@ import numpy.typing as npt
 from lowfc.arrays import Array, Sequences, Whole
 
 MOST_BRIDGED = 3
-"""Frames missing in a row that are interpolated; a longer gap begins a new piece."""
+"""Longest gap, in frames, that is interpolated; a longer one starts a new piece."""
 SHORTEST, LONGEST = 64, 2048
-"""Frames in a segment of Welch's method; with less than the shortest there is no spectrum."""
+"""Shortest and longest segment of Welch's method, frames; with fewer than the shortest there is no spectrum."""
 _SEGMENT_SHARE = 4  # of the longest piece: seven segments of it, each over half of the next
 
 
@@ -21,7 +21,7 @@ class Pieces:
 
     Attributes:
         values: (frames, columns) each.
-        bridged: frames among them that were missing and are interpolated.
+        bridged: number of interpolated frames among them.
     """
 
     values: tuple[Array, ...]
@@ -29,7 +29,7 @@ class Pieces:
 
     @property
     def frames(self) -> int:
-        """Frames in all of them."""
+        """Frames of all pieces."""
         return sum(len(piece) for piece in self.values)
 
     def columns(self, which: slice) -> "Pieces":
@@ -48,7 +48,7 @@ class Spectrum:
     Attributes:
         frequency_hz: (frequencies,) from 0 to half of the rate, evenly spaced.
         power_nm2_hz: (frequencies, columns); its sum times the spacing is the variance.
-        segments: averaged; half of each is in the next.
+        segments: number of averaged segments, which overlap by half.
     """
 
     frequency_hz: Array
@@ -57,7 +57,7 @@ class Spectrum:
 
     @property
     def spacing_hz(self) -> float:
-        """From one frequency to the next."""
+        """Distance of neighbouring frequencies."""
         return float(self.frequency_hz[1])
 
     def variance_nm2(self, filtered: Array | float = 1.0) -> Array:
@@ -67,8 +67,8 @@ class Spectrum:
     def error_nm2(self, filtered: Array | float = 1.0) -> Array:
         """Standard error (columns,) of that variance, for noise.
 
-        Hann's window makes neighbours alike: three of them are worth two. Its segments, half over each other, are all
-        but independent.
+        Hann's window correlates neighbours: three of them count as two. Segments that overlap by half are nearly
+        independent.
         """
         squares = np.sum((self.power_nm2_hz * filtered) ** 2, axis=0)
         return np.asarray(np.sqrt(1.5 * squares / self.segments) * self.spacing_hz)
@@ -78,7 +78,7 @@ def pieces(sequence: Sequences, values: npt.NDArray[np.floating]) -> Pieces:
     """Cut a run into evenly sampled pieces.
 
     Args:
-        sequence: (rows,) of each row's frame, consecutive where nothing is missing; what does not grow is left out.
+        sequence: (rows,) of each row's frame, consecutive without gaps; rows that do not increase are left out.
         values: (rows, columns); a row with a NaN is a missing frame.
     """
     there = np.isfinite(values).all(axis=1)
@@ -98,11 +98,11 @@ def pieces(sequence: Sequences, values: npt.NDArray[np.floating]) -> Pieces:
 
 
 def spectrum(run: Pieces, rate_hz: float) -> Spectrum | None:
-    """Welch's estimate over all pieces that hold a segment; None where none does.
+    """Welch's estimate over all pieces longer than a segment; None if there are none.
 
-    Segments have Hann's window and lose their mean; their length, a power of two, follows from the longest piece.
+    Segments have Hann's window and no mean; their length, a power of two, follows from the longest piece.
     """
-    from scipy.signal import welch  # takes half a second, which whoever only reads figures need not wait for
+    from scipy.signal import welch  # takes half a second to import
 
     longest = max((len(piece) for piece in run.values), default=0)
     if longest < SHORTEST:

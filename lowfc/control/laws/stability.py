@@ -1,4 +1,4 @@
-"""The integrator's limits: the gains at which its loop oscillates, or has just the margins that are allowed.
+"""The integrator's limits: the gains at which its loop oscillates, or has exactly the least allowed margins.
 
 The loop of `lowfc.control.laws.law`: command[k+1] = (1 - leak) command[k] - gain error[k], and
 error[k] = disturbance[k] + sum_j w_j command[k - j] + noise[k], with w from the delay in frames.
@@ -13,12 +13,12 @@ from lowfc.arrays import Array, Complex, Single
 LEAST_GAIN_MARGIN = 1.8
 LEAST_PHASE_MARGIN_DEG = 45.0
 LOWEST_GAIN = 0.01
-"""Of a mode whose drift is below the noise of a log: it shall follow nevertheless."""
+"""Gain of a mode whose drift is below the noise of a log, which should follow nevertheless."""
 SETTLING = 5.0
 """Time constants of the slowest mode after which a loop counts as settled."""
 
 _BISECTIONS = 50
-"""Of a 4096th of pi: to the rounding of a double. scipy.optimize would cost every command 0.3 s at its start."""
+"""Bisections of a 4096th of pi, to double precision; importing scipy.optimize would delay every command by 0.3 s."""
 
 
 def settling_frames(gain: Array | Single, leak: Array | Single, least: float = 0.0) -> int:
@@ -28,9 +28,9 @@ def settling_frames(gain: Array | Single, leak: Array | Single, least: float = 0
 
 
 def delay_weights(delay_frames: float) -> Array:
-    """Return w: how much of command[k - j], j = 0, 1, ..., is seen in exposure k; sums to 1.
+    """Return w: the fraction of command[k - j], j = 0, 1, ..., seen in exposure k; sums to 1.
 
-    A delay of d frames (d >= 1) goes from the frame a command was made from to the first exposed wholly under it;
+    A delay of d frames (d >= 1) is counted from the frame a command was made from to the first exposed wholly under it;
     a fraction f of a frame sees (1 - f) of the newer and f of the older command.
 
     Raises:
@@ -75,7 +75,7 @@ def limiting_gain(delay_frames: float, leak: float = 0.0) -> float:
 
 @lru_cache(maxsize=64)
 def highest_gain(delay_frames: float, leak: float = 0.0) -> float:
-    """The integrator gain at which either margin is the least that is allowed."""
+    """Integrator gain at which the first of the margins reaches its least allowed value."""
     omega = np.linspace(1e-4, np.pi, 1 << 14)
     loop = open_loop(omega, 1.0, leak, delay_frames)
     late = np.unwrap(np.angle(loop)) < -np.radians(180 - LEAST_PHASE_MARGIN_DEG)

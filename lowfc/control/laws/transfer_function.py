@@ -1,8 +1,8 @@
-"""The rejection and noise transfer functions of a loop as measured under a multisine, and their departure from theory.
+"""Rejection and noise transfer functions of a loop measured with a multisine, and their departure from theory.
 
-What is added to the loop's input, u (an offset is taken away: u = -offset), and the error that it measures go together
-as error = S (disturbance + noise + u): S = error / u at the lines, and T = 1 - S. All else appears as S (disturbance +
-noise), so that how certain a line is does not depend on how much the loop rejects there.
+With u added to the loop's input (u = -offset), the measured error is S (disturbance + noise + u). So S = error / u at
+the lines, and T = 1 - S. Everything else appears as S (disturbance + noise), so that the relative error of a line does
+not depend on the rejection at its frequency.
 """
 
 from dataclasses import dataclass
@@ -11,13 +11,13 @@ import numpy as np
 
 from lowfc.arrays import Array, Complex, Mask, Whole
 
-_FAINTEST = 1e-3  # beside the highest line of the mode: below is rounding to single precision
+_FAINTEST = 1e-3  # relative to the mode's highest line; below is rounding to single precision
 _BESIDE = np.array([*range(-16, -1), *range(2, 17)])  # bins from which a line's noise is measured
-_OF_FLANKS = 12 / 7  # white noise of a bin under Hann's window, beside that of a flank less the line
+_OF_FLANKS = 12 / 7  # white noise of a bin under Hann's window, relative to that of a flank less the line
 _DB = 20 / np.log(10)
 
 SURE = 3.5
-"""Standard errors that must fit into the tolerance, for a line to be judged."""
+"""Standard errors that must fit into the tolerance for a line to be judged."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,10 +25,10 @@ class Lines:
     """The lines of all modes, ascending within each mode.
 
     Attributes:
-        mode: (lines,) place of its mode.
+        mode: (lines,) index of its mode.
         frequency: (lines,) cycles per frame.
         rejection: (lines,) S, complex.
-        error: (lines,) standard error of S, in each of its two directions.
+        error: (lines,) standard error of each of S's two components.
     """
 
     mode: Whole
@@ -44,13 +44,13 @@ class Lines:
 
 @dataclass(frozen=True, slots=True)
 class Departure:
-    """How far measured lines are from theory.
+    """Departure of measured lines from theory.
 
     Attributes:
         db: (lines,) measured over theory.
         error_db: (lines,) its standard error.
-        judged: (lines,) whether it is certain enough for the tolerance.
-        within: (lines,) whether it was judged and is within.
+        judged: (lines,) whether its error is small enough for the tolerance.
+        within: (lines,) whether it was judged and is within the tolerance.
     """
 
     db: Array
@@ -60,21 +60,21 @@ class Departure:
 
 
 def measured(error_nm: Array, added_nm: Array) -> Lines:
-    """S at the lines of what was added to the loop's input.
+    """S at the lines of the signal added to the loop's input.
 
-    Hann's window keeps what the loop does not reject at high frequencies out of the low ones, where the error is small;
-    lines are at least two bins apart, and it does not mix those. The noise of a line is that of the bins beside it,
-    which takes in what other modes' lines leave there by cross-talk.
+    Hann's window keeps high frequencies, which the loop does not reject, out of the low ones, where the error is small;
+    lines are at least two bins apart, so it does not mix them. The noise of a line is that of the adjacent bins, which
+    includes cross-talk from other modes' lines.
 
     Args:
         error_nm: (frames, modes) of one period.
         added_nm: (frames, modes) in the same frames.
 
     Raises:
-        ValueError: they are not of the same frames, or nothing was added.
+        ValueError: the frames differ, or nothing was added.
     """
     if error_nm.shape != added_nm.shape:
-        raise ValueError(f"errors {error_nm.shape} and what was added {added_nm.shape} are not of the same frames")
+        raise ValueError(f"errors {error_nm.shape} and added signal {added_nm.shape} must have the same frames")
     frames = len(error_nm)
     answer, added = _hann(error_nm), _hann(added_nm)
     found: list[tuple[Whole, Whole, Complex, Array]] = []
@@ -89,7 +89,7 @@ def measured(error_nm: Array, added_nm: Array) -> Lines:
             own[np.clip(places + near, 0, len(plain) - 1)] = True
         beside = np.clip(places[:, None] + _BESIDE, 0, len(plain) - 1)
         power = np.where(own[beside], np.nan, np.abs(answer[beside, mode]) ** 2)
-        # A vibration on the line itself is seen in the bins next to it alone, less the line's own part.
+        # A vibration on the line itself shows only in the adjacent bins, after subtraction of the line.
         flanks = answer[places[:, None] + np.array([-1, 1]), mode] + answer[places, mode][:, None] / 2
         nearest = _OF_FLANKS * np.mean(np.abs(flanks) ** 2, axis=1)
         noise = np.sqrt(np.maximum(np.nanmean(power, axis=1), nearest) / 2)
@@ -102,7 +102,7 @@ def measured(error_nm: Array, added_nm: Array) -> Lines:
 
 
 def seen_of_mirror(played_nm: Array, weights: Array) -> Array:
-    """What exposures see (frames, modes) of modes (frames, modes) played on the mirror in one period after another."""
+    """Modes (frames, modes) that exposures see of modes played periodically on the mirror."""
     seen = np.zeros_like(played_nm)
     for lag, weight in enumerate(weights):
         seen += weight * np.roll(played_nm, 1 + lag, axis=0)

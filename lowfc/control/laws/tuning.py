@@ -1,7 +1,7 @@
 """The best law for a log: integrator gains after Gendron and Lena, PI with notches, LQG, each with its margins.
 
-All start from pseudo-open-loop modes, pol = disturbance + white noise, and minimise what is left of the wavefront at
-every moment, which is more than the sensor sees: its exposures take a mean, and the star moves while the mirror holds.
+All start from pseudo-open-loop modes, pol = disturbance + white noise, and minimise the residual wavefront over all
+time. It exceeds the residual that the sensor sees: exposures average, and the star moves while the mirror holds.
 """
 
 from collections.abc import Sequence
@@ -27,20 +27,20 @@ from lowfc.control.laws.stability import (
 from lowfc.control.laws.vibration import FEWEST, Model, identify, resolution_hz
 from lowfc.control.laws.what_if import counterfactual, driven_by
 
-_NARROWER = (0.1, 0.01, 1e-3)  # what a line's width is tried at, of that fitted, where a log cannot resolve it
-_FASTER = (10.0,)  # and where lines move
+_NARROWER = (0.1, 0.01, 1e-3)  # factors tried on the fitted width of a line that a log cannot resolve
+_FASTER = (10.0,)  # and for lines that move
 _SETTLING_FRAMES = 5000
-_OCTAVES = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # by which noise is overestimated, until the margins hold
+_OCTAVES = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # overestimates of the noise, tried until the margins hold
 _NEAR_ENOUGH = 0.25
-"""Octaves between a filter whose margins hold and one whose do not: they leave the same within half a percent."""
+"""Octaves between a filter with sufficient margins and one without: their residuals agree within half a percent."""
 
 
 @dataclass(frozen=True, slots=True)
 class Tuned:
-    """A law for each mode, and what it leaves.
+    """A law for all modes, and its predicted residual.
 
     Attributes:
-        law: as it would be loaded.
+        law: the law, ready to load.
         margins: for the delay it was made for.
         predicted_nm: (modes,) rms of the true residual.
         kinds: of each mode: integrator, pi-notch or lqg.
@@ -56,13 +56,13 @@ class Tuned:
 
 @dataclass(frozen=True, slots=True)
 class Gains:
-    """Integrator gains (modes,) and what they leave, nm rms.
+    """Integrator gains (modes,) and their residuals, nm rms.
 
     Attributes:
         gain: the best ones.
-        predicted_nm: left by them, at every moment.
-        sensed_nm: of the means over the exposures.
-        noise_nm: of one frame.
+        predicted_nm: residual over all time.
+        sensed_nm: residual of the means over the exposures.
+        noise_nm: noise of one frame.
     """
 
     gain: Array
@@ -72,12 +72,12 @@ class Gains:
 
 
 def best_gains(run: Pieces, rate_hz: float, timing: Timing, leak: Array) -> Gains:
-    """The gain of each mode at which an integrator leaves least of the wavefront (after Gendron and Lena 1994).
+    """The gain of each mode with the least residual wavefront of an integrator (after Gendron and Lena 1994).
 
     Args:
         run: (frames, modes) of pseudo-open-loop modes, in pieces.
         rate_hz: Frame rate.
-        timing: The true one.
+        timing: The loop's true timing.
         leak: (modes,) of the integrators.
 
     Raises:
@@ -94,7 +94,7 @@ def best_gains(run: Pieces, rate_hz: float, timing: Timing, leak: Array) -> Gain
     gains, left_nm2, sensed_nm2 = np.zeros(len(leak)), np.zeros(len(leak)), np.zeros(len(leak))
     longest_nm = max(run.values, key=len)
     for mode, lost in enumerate(leak.tolist()):
-        steady_nm2 = float(longest_nm[:, mode].mean()) ** 2  # of which a leak leaves a part: |S| at 0 Hz
+        steady_nm2 = float(longest_nm[:, mode].mean()) ** 2  # a leak leaves a fraction of it: |S| at 0 Hz
         measured = fine.power_nm2_hz[1:, mode : mode + 1] * rate_hz / 2
 
         def of(gain: float, lost: float = lost) -> LinearLaw:
@@ -140,9 +140,9 @@ def tune_integrator(models: Sequence[Model], gains: Gains, noll: tuple[int, ...]
 def tune_lqg(
     run: Pieces, models: Sequence[Model], gains: Gains, noll: tuple[int, ...], leak: Array, timing: Timing
 ) -> Tuned:
-    """LQG where it beats the best integrator on this very run, that integrator elsewhere; leaks (modes,) without unit.
+    """LQG for modes where it beats the best integrator on this run, otherwise that integrator; leaks (modes,) unitless.
 
-    The run decides, too, how narrow lines are that are narrower than a spectrum tells, and how fast they move.
+    The run also decides the width of lines that the spectrum does not resolve, and how fast lines move.
 
     Raises:
         ValueError: no filter, or an unstable law.
@@ -164,14 +164,14 @@ def tune_lqg(
     left_nm2 = np.nan_to_num([left(blocks) for blocks in robust], nan=np.inf)
     best = left_nm2.argmin(axis=0)
     modes = range(len(noll))
-    wins = left_nm2.min(axis=0) < left(steady)  # of themselves integrators do not
+    wins = left_nm2.min(axis=0) < left(steady)  # integrators do not beat themselves
     chosen = [tried[best[mode]][mode] for mode in modes]
     law = law_of([robust[best[mode]][mode] if wins[mode] else steady[mode] for mode in modes])
     return _tuned(law, timing, ["lqg" if better else "integrator" for better in wins], chosen)
 
 
 def tune_pi_notch(models: Sequence[Model], gains: Gains, noll: tuple[int, ...], leak: Array, timing: Timing) -> Tuned:
-    """An integrator with a notch for each line that it makes smaller within the margins.
+    """An integrator with a notch for each line that it can reduce within the margins.
 
     Leaks (modes,) without unit.
     """
@@ -225,9 +225,9 @@ def predicted_nm(law: LinearLaw, models: Sequence[Model], timing: Timing) -> Arr
 
 
 def predicted_nm2(law: LinearLaw, models: Sequence[Model], noise_nm2: Array, timing: Timing) -> Array:
-    """Covariance (modes, modes) over all time of the true residual, of modes that have nothing in common but noise.
+    """Covariance (modes, modes) over all time of the true residual, for modes coupled by noise alone.
 
-    Of the covariance (modes, modes) of one frame's noise, the models say how large it is.
+    The covariance (modes, modes) of one frame's noise is scaled to the models' noise.
     """
     omega = np.linspace(0, np.pi, 2049)[1:]
     passed = commanded(law, omega, timing.delay)
@@ -237,17 +237,17 @@ def predicted_nm2(law: LinearLaw, models: Sequence[Model], noise_nm2: Array, tim
 
 
 def frame_noise_nm2(models: Sequence[Model], noise_nm2: Array) -> Array:
-    """Covariance (modes, modes) of one frame's noise, as large as these models have it."""
+    """Covariance (modes, modes) of one frame's noise, scaled to these models."""
     scale = np.sqrt([model.noise_nm2 for model in models] / np.diag(noise_nm2))
     return np.asarray(noise_nm2 * np.outer(scale, scale))
 
 
 def left_of(law: LinearLaw, run: Pieces, noise_nm2: Array, timing: Timing) -> Array:
-    """Mean square (modes,) of what a law would have left of the means that its commands are to null.
+    """Mean square (modes,) residual of the means that a law's commands are to null.
 
-    What changes within a period of a command, and no law takes out, is not in it. Every piece of the run, (frames,
-    modes) of pseudo-open-loop modes with noise (modes,), begins with a law at rest and a flat mirror; the frames until
-    it has settled do not count.
+    Changes within a command's period, which no law can remove, are not included. Each piece of the run, (frames, modes)
+    of pseudo-open-loop modes with noise (modes,), starts with a law at rest and a flat mirror; the frames until it has
+    settled do not count.
     """
     weights = delay_weights(timing.delay).astype(np.float32)
     squares, frames = np.zeros(len(law.noll)), 0
@@ -281,9 +281,9 @@ def _scaled(model: Model, factor: float, finest_hz: float) -> Model:
 
 
 def within_margins(model: Model, timing: Timing) -> Block | None:
-    """The filter of a model, its noise taken for as much higher as the margins need; None where no such one has them.
+    """Filter of a model, with its noise overestimated as far as the margins require; None if they cannot be reached.
 
-    A filter that trusts its measurements less foresees more smoothly; of one that knows a line, little is lost.
+    A filter with less weight on its measurements predicts more smoothly; for a model with a known line little is lost.
     """
 
     def held(octaves: float) -> Block | None:

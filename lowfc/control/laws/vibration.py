@@ -1,7 +1,7 @@
-"""What shakes a mode: a model of drift, lines and white noise, fitted to the spectrum of pseudo-open-loop modes.
+"""A mode's disturbance model of drift, lines and white noise, fitted to the spectrum of pseudo-open-loop modes.
 
-The fit is Whittle's: over frequencies, the sum of log S + I / S is least, with I the periodogram (Hann's window) and S
-the model's spectrum. A line more must raise the likelihood by more than chance does among all frequencies.
+The fit is Whittle's: it minimises the sum of log S + I / S over frequencies, with I the periodogram (Hann's window) and
+S the model's spectrum. A further line must raise the likelihood by more than chance does among all frequencies.
 """
 
 from dataclasses import dataclass, replace
@@ -15,19 +15,19 @@ from lowfc.arrays import Array
 from lowfc.control.laws.spectra import Pieces
 
 FEWEST = 2048
-"""Frames in a row below which no model is fitted."""
+"""Least frames in a row for a fit."""
 
 _LONGEST = 1 << 16  # frames of a segment
 _MOST_LINES = 12
-_SCALES = (3, 9, 27, 81)  # frequencies over which a line is looked for
+_SCALES = (3, 9, 27, 81)  # numbers of frequencies over which lines are searched
 _PENALTY = 2.5  # of a line: log-likelihood per log(frequencies); 1.5 is Schwarz's for 3 figures, 1 for choosing a place
 _SHARE = 0.3
-_HANN = 1.5  # neighbours are alike: three are worth two
-_LOBE = 12  # frequencies on either side of a line in which the window leaves something of it
+_HANN = 1.5  # neighbours are correlated: three count as two
+_LOBE = 12  # frequencies on either side of a line into which the window spreads it
 _FULL = 40  # frequencies on either side of a line, and from 0 on, that are not averaged
 _PER_DECADE = 48
 _LEAST_DRIFT = 1e-8  # variance of its step per variance of noise: a constant is followed in 10^4 frames
-_LEAST_NOISE = 1e-3  # of the level of the upper frequencies, all of which drift may explain: no filter is made of none
+_LEAST_NOISE = 1e-3  # of the level of the upper frequencies, all of which drift may explain: a filter needs noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,12 +44,12 @@ class Model:
     """A mode's disturbance and the noise of measuring it.
 
     Attributes:
-        drift_nm2: variance of the step that a random walk makes in a frame, behind the low-pass.
+        drift_nm2: variance of a random walk's step per frame, before the low-pass.
         cutoff_hz: corner of a low-pass of the walk; infinite for none.
-        lines: of frequency, width and variance each.
+        lines: vibration lines.
         noise_nm2: variance of one frame's white measurement noise.
         rate_hz: frame rate.
-        lowest_hz: below it the drift's spectrum is taken as level: a log does not show what is slower than itself.
+        lowest_hz: below it the drift's spectrum is assumed flat: a log does not show slower changes.
     """
 
     drift_nm2: float
@@ -60,9 +60,9 @@ class Model:
     lowest_hz: float = 0.0
 
     def spectrum_nm2(self, omega: Array) -> Array:
-        """Spectrum (frequencies,) of the disturbance at rad per frame, without noise.
+        """Spectrum (frequencies,) of the disturbance without noise, frequencies in rad per frame.
 
-        Its mean over a turn is the variance.
+        Its mean over a full circle is the variance.
         """
         shown = np.maximum(omega, 2 * np.pi * self.lowest_hz / self.rate_hz)
         found = _drift(shown, self.drift_nm2, self.cutoff_hz / self.rate_hz)
@@ -73,7 +73,7 @@ class Model:
     def states(self) -> tuple[Array, Array, Array]:
         """F, Q, C of x[k] = F x[k-1] + q, disturbance[k] = C x[k], with Q the covariance of q."""
         step, seen = [1.0], [1.0]
-        if np.isfinite(self.cutoff_hz):  # x0 the walk, x1 what the low-pass makes of it
+        if np.isfinite(self.cutoff_hz):  # x0 the walk, x1 its low-pass
             step, seen = [1.0, 1 - _kept(self.cutoff_hz / self.rate_hz)], [0.0, 1.0]
         parts = [self.drift_nm2 * np.outer(step, step)]
         for line in self.lines:
@@ -83,7 +83,7 @@ class Model:
         return self.mean_over(1.0, 0.0), block_diag(*parts), np.array(seen)
 
     def mean_over(self, start: float, length: float) -> Array:
-        """Mean (states, states) of A^u over u in [start, start + length] frames: what the states will be meanwhile."""
+        """Mean (states, states) of A^u over u in [start, start + length] frames: the mean prediction of the states."""
 
         def mean_of(turned: complex) -> complex:
             if not length or not turned:
@@ -102,10 +102,10 @@ class Model:
 
 
 def identify(run: Pieces, rate_hz: float) -> Model | None:
-    """The model of a mode, from its pseudo-open-loop values (frames, 1) in pieces; None where they are too few.
+    """The model of a mode, from its pseudo-open-loop values (frames, 1) in pieces; None if there are too few.
 
-    A fit to a closed loop's log serves as well as an open loop's: its pseudo-open-loop modes are the disturbance and
-    white noise too.
+    The log of a closed loop is as good as an open loop's: its pseudo-open-loop modes are also disturbance plus white
+    noise.
     """
     whittle = _Whittle.of(run, rate_hz)
     if whittle is None:
@@ -124,14 +124,14 @@ def identify(run: Pieces, rate_hz: float) -> Model | None:
 
 
 def resolution_hz(run: Pieces, rate_hz: float) -> float:
-    """Distance of two frequencies in the periodogram that `identify` fits; 0 where there is none."""
+    """Frequency spacing of the periodogram that `identify` fits; 0 if there is none."""
     longest = max((len(piece) for piece in run.values), default=0)
     return rate_hz / min(longest, _LONGEST) if longest >= FEWEST else 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class _Whittle:
-    """A periodogram (frequencies,) without the lowest ones, and how many segments it is the mean of."""
+    """A periodogram (frequencies,) without the lowest frequencies, and the number of averaged segments."""
 
     omega: Array
     power: Array
@@ -152,7 +152,7 @@ class _Whittle:
                 values = piece[start : start + frames, 0]
                 found += np.abs(rfft(window * (values - values.mean()))) ** 2
                 segments += 1
-        keep = slice(3, -1)  # the window takes the lowest for a mean
+        keep = slice(3, -1)  # the window removes the lowest with the mean
         omega = 2 * np.pi * np.arange(found.size) / frames
         return cls(omega[keep], np.maximum(found[keep] / segments, 1e-300), segments, rate_hz)
 
@@ -165,7 +165,7 @@ class _Whittle:
         return float((self.omega[1] - self.omega[0]) * self.rate_hz / (2 * np.pi))
 
     def misfit(self, power: Array, spectrum: Array, counts: Array | float) -> float:
-        """Minus the log-likelihood, a constant apart."""
+        """Negative log-likelihood, up to a constant."""
         return float(np.sum(counts * (np.log(spectrum) + power / spectrum))) * self.segments / _HANN
 
     def grouped(self, lines: tuple[Line, ...], robust: bool) -> tuple[Array, Array, Array]:
@@ -181,7 +181,7 @@ class _Whittle:
         starts = np.flatnonzero(fresh)
         counts = np.diff(starts, append=places.size)
         omega, power = (np.add.reduceat(each, starts) / counts for each in (self.omega, self.power))
-        if robust:  # medians: lines that are not yet known hardly move them
+        if robust:  # medians: unknown lines hardly affect them
             parts = np.split(self.power, starts[1:])
             low = 1 if self.segments > 1 else np.log(2)
             power = np.array([np.median(part) / low if part.size > 4 else np.nan for part in parts])
@@ -190,7 +190,7 @@ class _Whittle:
         return omega, power, counts.astype(float)
 
     def fit_floor(self, model: Model, robust: bool) -> Model:
-        """Drift and noise anew, the lines as they are."""
+        """Refit drift and noise with fixed lines."""
         omega, power, counts = self.grouped(model.lines, robust)
         known = replace(model, drift_nm2=0.0).spectrum_nm2(omega)
         white = float(np.median(self.power[self.power.size // 2 :])) / (np.log(2) if self.segments == 1 else 1)
@@ -222,11 +222,11 @@ class _Whittle:
         return replace(best[1], noise_nm2=max(best[1].noise_nm2, _LEAST_NOISE * white))
 
     def another_line(self, model: Model) -> Line | None:
-        """The line that is missing most; None where none is certain."""
+        """The most significant missing line; None if none is certain."""
         spectrum = model.spectrum_nm2(self.omega) + model.noise_nm2
         ratio = self.power / spectrum
         free = np.ones(ratio.size, bool)
-        free[:_LOBE] = False  # there it is drift
+        free[:_LOBE] = False  # drift dominates there
         for line in model.lines:
             free &= np.abs(self.frequency_hz - line.frequency_hz) > max(_LOBE * self.spacing_hz, 1.5 * line.width_hz)
         found = []
@@ -238,7 +238,7 @@ class _Whittle:
         largest = max(gain for gain, _, _ in found)
         if largest < _PENALTY * np.log(ratio.size):
             return None
-        # The narrowest that explains most of it: a wide one could be two that are apart.
+        # The narrowest that explains most of the power: a wide one could be two separate lines.
         place, scale = next((place, scale) for gain, place, scale in found if gain >= _SHARE * largest)
         if scale == _SCALES[0]:  # on the highest of the three
             place += int(np.argmax(self.power[place - 1 : place + 2])) - 1
@@ -262,7 +262,7 @@ class _Whittle:
         return of(minimize(cost, start, method="Nelder-Mead", options={"maxiter": 400, "xatol": 1e-3}).x)
 
     def needed(self, model: Model) -> tuple[Line, ...]:
-        """The lines without which the likelihood is certainly lower: one found early may have stood for others."""
+        """The lines that raise the likelihood significantly: one found early may have represented several."""
         lines, whole = model.lines, self.misfit(self.power, model.spectrum_nm2(self.omega) + model.noise_nm2, 1.0)
         for line in sorted(lines, key=lambda line: line.variance_nm2):
             fewer = tuple(other for other in lines if other is not line)
@@ -273,7 +273,7 @@ class _Whittle:
         return lines
 
     def fit_all(self, model: Model) -> Model:
-        """Everything at once, from a model that is nearly right."""
+        """Fit all parameters together, starting from a nearly right model."""
         omega, power, counts = self.grouped(model.lines, robust=False)
         spacing = self.spacing_hz
         corner = np.isfinite(model.cutoff_hz)
@@ -313,7 +313,7 @@ class _Whittle:
         return replace(fitted, drift_nm2=max(fitted.drift_nm2, _LEAST_DRIFT * fitted.noise_nm2))
 
     def _with_its_power(self, line: Line, model: Model) -> Line:
-        """A line that is too narrow to be resolved, with the variance that is there: so far only its wings counted."""
+        """Set the variance of an unresolved line from the measured power: so far only its wings were fitted."""
         if line.width_hz > self.spacing_hz:
             return line
         near = np.abs(self.frequency_hz - line.frequency_hz) < 3 * self.spacing_hz
@@ -326,7 +326,7 @@ class _Whittle:
 
 
 def _kept(cutoff: float) -> float:
-    """What a low-pass of this corner, in cycles per frame, keeps of its value in a frame."""
+    """Fraction of its value that a low-pass with this corner, in cycles per frame, keeps per frame."""
     return float(np.exp(-2 * np.pi * cutoff))
 
 
@@ -339,7 +339,7 @@ def _drift(omega: Array, step_nm2: float, cutoff: float) -> Array:
 
 
 def _per_frame(line: Line, rate_hz: float) -> tuple[float, float, float]:
-    """Rad per frame, what is left of an amplitude after a frame, variance."""
+    """Frequency in rad per frame, amplitude kept per frame, variance."""
     return 2 * np.pi * line.frequency_hz / rate_hz, float(np.exp(-np.pi * line.width_hz / rate_hz)), line.variance_nm2
 
 

@@ -1,4 +1,4 @@
-"""Virtual integrators: what loops of other gains would leave of the same pseudo-open-loop modes."""
+"""Virtual integrators: residuals of loops with other gains on the same pseudo-open-loop modes."""
 
 from typing import NamedTuple
 
@@ -7,20 +7,20 @@ import numpy as np
 from lowfc.arrays import Single
 
 Weights = tuple[tuple[int, np.float32], ...]
-"""Lag in frames, and how much of that command an exposure sees."""
+"""Lag in frames, and the fraction of that command seen by an exposure."""
 
 
 class VirtualIntegrators(NamedTuple):
-    """Integrators beside the real loop, one for each row, that move no mirror.
+    """Integrators in parallel with the real loop, one for each row, which move no mirror.
 
-    A frame's noise is independent of the commands before it. So the difference between the squares of two rows' errors
-    of one frame has the mean of the difference between their true residuals squared, whatever the noise.
+    A frame's noise is independent of the earlier commands. The difference of two rows' squared errors therefore has the
+    same mean as the difference of their squared true residuals, for any noise.
 
     Attributes:
         gain: (rows, modes); 0 is the open loop.
         kept: (modes,) 1 - leak.
         limit_nm: (modes,) largest command, wavefront rms.
-        weights: which commands are seen in an exposure, as those of the loop.
+        weights: which commands are seen in an exposure, as in the loop.
         history_nm: commands (rows, modes), newest first.
     """
 
@@ -32,12 +32,12 @@ class VirtualIntegrators(NamedTuple):
 
     @classmethod
     def at_rest(cls, gain: Single, kept: Single, limit_nm: Single, weights: Weights) -> "VirtualIntegrators":
-        """With nothing commanded yet."""
+        """Before the first command."""
         lags = 1 + max(lag for lag, _ in weights)
         return cls(gain, kept, limit_nm, weights, (np.zeros_like(gain),) * lags)
 
     def followed(self, pol_nm: Single) -> tuple["VirtualIntegrators", Single]:
-        """One frame later; and the errors (rows, modes) that the frame would have shown, nm of wavefront rms."""
+        """One frame later, and the errors (rows, modes) that would have been measured, nm of wavefront rms."""
         error_nm = np.broadcast_to(pol_nm, self.gain.shape)
         for lag, weight in self.weights:
             error_nm = error_nm + (self.history_nm[lag] if weight == 1 else weight * self.history_nm[lag])
@@ -46,6 +46,6 @@ class VirtualIntegrators(NamedTuple):
         return self._replace(history_nm=(wanted_nm, *self.history_nm[:-1])), error_nm
 
     def held(self, frames: int = 1) -> "VirtualIntegrators":
-        """Some frames later, of which nothing was measured: as the loop's, the commands stay."""
+        """Some frames later, without measurements: commands are held, as in the loop."""
         held = self.history_nm[:1] * min(frames, len(self.history_nm))
         return self._replace(history_nm=(held + self.history_nm)[: len(self.history_nm)])

@@ -1,7 +1,7 @@
-"""What another controller would have made of the disturbance that a log shows.
+"""Simulation of another controller on the disturbance in a log.
 
-Pseudo-open-loop modes are what was measured less the commands that were seen; a sensor in its linear range would have
-measured them plus whatever other commands were given instead.
+Pseudo-open-loop modes are the measurement less the commands seen in it; a sensor in its linear range would have
+measured them plus the commands of the other controller.
 """
 
 from collections.abc import Callable
@@ -20,7 +20,7 @@ Controller = Callable[[Any, Single, Single], tuple[Any, Single]]
 """(state, error_nm, pol_nm) to (state, command_nm); the state is None at first, the arrays are (modes,) float32."""
 
 LONGEST_DELAY = 5
-"""Frames; what is measured as longer is no delay of a loop that works."""
+"""Longest plausible delay of a working loop, frames."""
 _STILL_NM = 0.01
 _FEWEST = 20
 
@@ -41,12 +41,12 @@ def driven_by(law: LinearLaw, limit_nm: Single | None = None) -> Controller:
 
 def as_logged(law: Law) -> Controller:
     """The live loop's integrator with its limits."""
-    noll = tuple(range(2, 2 + law.gain.size))  # these have no part in it, nor have delay and rate
+    noll = tuple(range(2, 2 + law.gain.size))  # not used, like delay and rate
     return driven_by(integrator(law.gain, law.leak, noll, 1.0, 1.0), law.limit_nm)
 
 
 def exposed(sequence: Sequences) -> Mask:
-    """Which steps (steps,) are of an exposure of their own: not of a frame that came again or out of order."""
+    """Mask of the steps (steps,) with a new exposure, not a repeated or out-of-order frame."""
     newest: Sequences = np.maximum.accumulate(sequence)
     return np.concatenate([np.ones(min(1, len(sequence)), bool), sequence[1:] > newest[:-1]])
 
@@ -69,7 +69,7 @@ def seen_nm(weights: Single, command_nm: Single, missing: Whole, first_nm: Singl
     """
     held = np.minimum(missing, len(weights))  # holding longer than that changes nothing
     rows = np.arange(len(command_nm))
-    place = rows + np.cumsum(held)  # of each step on an axis of all exposures
+    place = rows + np.cumsum(held)  # index of each step on an axis of all exposures
     source = np.repeat(rows - 1, held + 1)  # the last step before each exposure
     given = np.concatenate([first_nm[None], command_nm])
     seen = np.zeros_like(command_nm)
@@ -83,10 +83,9 @@ def counterfactual(controller: Controller, weights: Single, pol_nm: Single, miss
     """Fold a controller over a disturbance, from a flat mirror; return its errors and commands (steps, modes).
 
     Args:
-        controller: what to fold; it is not called for refused frames, under which the command is held.
+        controller: the controller to fold; it is not called for refused frames, which hold the command.
         weights: see `lowfc.control.laws.stability.delay_weights`.
-        pol_nm: (steps, modes) disturbance and measurement noise; NaN where the frame was refused, and there the error
-            is NaN too.
+        pol_nm: (steps, modes) disturbance and measurement noise; NaN for refused frames, whose error is then NaN too.
         missing: (steps,) of `missing_before`.
     """
     usable = np.isfinite(pol_nm.sum(axis=1)).tolist()
@@ -109,9 +108,9 @@ def counterfactual(controller: Controller, weights: Single, pol_nm: Single, miss
 
 
 def delay_from_truth(true_nm: Single, command_nm: Single, missing: Whole) -> float | None:
-    """Delay in frames at which the commands (steps, modes) are most like what the mirror truly did (steps, modes).
+    """Delay in frames at which the commands (steps, modes) best match the mirror's true motion (steps, modes).
 
-    The least-squares fit of `delay_weights`; `true_nm` may have rows of NaN. None where the commands hardly move.
+    The least-squares fit of `delay_weights`; `true_nm` may have rows of NaN. None if the commands hardly move.
     """
     rows = np.isfinite(true_nm).all(axis=1)
     if rows.sum() < _FEWEST:
@@ -133,18 +132,18 @@ def delay_from_truth(true_nm: Single, command_nm: Single, missing: Whole) -> flo
 def delay_from_times(
     sequence: Sequences, exposure_start_ns: Whole, applied_sequence: Sequences, applied_ns: Whole
 ) -> float | None:
-    """Mean delay in frames: from the frame behind a command to the first whose exposure began after it was applied.
+    """Mean delay in frames: from a command's frame to the first whose exposure began after the command was applied.
 
     Args:
         sequence: (steps,) of the frames, ascending.
         exposure_start_ns: (steps,) on the clock of `applied_ns`.
-        applied_sequence: (states,) of the frame behind the command that the mirror had.
-        applied_ns: (states,) when the mirror said so.
+        applied_sequence: (states,) of the frame of the mirror's command.
+        applied_ns: (states,) time of the mirror's report.
 
     Returns:
-        None where there are too few of both to tell.
+        None if there are too few of both.
     """
-    behind, first = np.unique(applied_sequence, return_index=True)  # a command may be applied again and again
+    behind, first = np.unique(applied_sequence, return_index=True)  # a command may be applied repeatedly
     after = np.searchsorted(exposure_start_ns, applied_ns[first], side="right")
     known = (after > 0) & (after < len(sequence))
     behind, after = behind[known], after[known]
@@ -155,7 +154,7 @@ def delay_from_times(
 
 
 def frames_since(begins: Mask, running: Mask, missing: Whole) -> Whole:
-    """Frames (steps,) since the loop began to run, or began anew (steps,) although it ran; -1 where it does not run."""
+    """Frames (steps,) since the loop started to run or restarted; -1 where it does not run."""
     place = np.arange(len(running)) + np.cumsum(missing)
     started = running & (begins | ~np.concatenate([[False], running[:-1]]))
     return np.where(running, place - np.maximum.accumulate(np.where(started, place, 0)), -1)
