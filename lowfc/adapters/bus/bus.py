@@ -19,7 +19,7 @@ from lowfc.contract.errors import BadMessageError
 from lowfc.contract.messages import HEALTH, Topic
 
 ALL = "*"
-"""Stands for the name of every mirror, or of every process."""
+"""Wildcard for the name of any mirror or process."""
 
 
 class Sample(NamedTuple):

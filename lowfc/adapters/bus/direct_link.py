@@ -1,4 +1,4 @@
-"""The direct link between two processes of one host that wait for each other: a Unix socket, beside the bus.
+"""The direct link between two processes of the loop on one host: a Unix socket in parallel with the bus.
 
 The bus still carries every message to everybody. The one reader that a topic names (`Topic.direct_subscriber`) gets it
 first by a socket in the run's directory: no thread of the bus is between the put and the reader. Messages of a
@@ -30,7 +30,7 @@ class DirectWriter:
     """Sends to the reader, if there is one; never waits."""
 
     def __init__(self, path: Path) -> None:
-        """Send to whoever listens at `path`, now or later."""
+        """Send to the process that listens at `path`, now or later."""
         self._path = os.fspath(path)
         self._socket: socket.socket | None = None
         self._again_s = 0.0
@@ -67,7 +67,7 @@ class DirectWriter:
         try:
             made.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_BYTES)  # the kernel gives what it allows
             made.connect(self._path)
-        except OSError:  # nobody is there, or not yet
+        except OSError:  # no listener, or not yet
             made.close()
         else:
             self._socket = made
@@ -91,7 +91,7 @@ class DirectCall:
 
 
 class DirectReader:
-    """Hands on each message once, by the socket or by the bus, whichever was quicker.
+    """Forwards each message once, from the socket or the bus, whichever was faster.
 
     A copy is known by its envelope; numbers alone would not do, for two publishers may have started in the same second.
     The bus is left while a publisher that is alone on its topic uses the socket; a message of it that is still on the
@@ -186,7 +186,7 @@ class DirectReader:
         return True
 
     def _leave(self) -> None:
-        """After each message of the socket: leave the bus, where messages come by both ways."""
+        """After each message of the socket: leave the bus while messages arrive by both paths."""
         if self._both and self._leave_bus is not None:
             self._leave_bus()
             self._leave_bus, self._both = None, False
@@ -199,7 +199,7 @@ class DirectReader:
             self._leave_bus = self._subscribe(self._by_bus)
 
     def _accept(self) -> None:
-        """Serve one writer after the other: who comes anew takes the place of the last."""
+        """Serve one writer at a time: a new writer replaces the previous one."""
         served: threading.Thread | None = None
         connection: socket.socket | None = None
         with self._listener:
@@ -237,6 +237,6 @@ class DirectReader:
 
 
 def _end(one: socket.socket) -> None:
-    """End the wait of whoever accepts or receives there."""
+    """Wake the thread that accepts or receives on the socket."""
     with contextlib.suppress(OSError):
         one.shutdown(socket.SHUT_RDWR)

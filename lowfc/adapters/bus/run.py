@@ -38,7 +38,7 @@ _PORT_RANGE = Path("/proc/sys/net/ipv4/ip_local_port_range")
 
 @dataclass(frozen=True, slots=True)
 class Links:
-    """Where the processes of a run listen, and the secret that they share.
+    """Endpoints of the processes of a run, and their shared secret.
 
     Attributes:
         run_id: the run they belong to.
@@ -56,7 +56,7 @@ class Links:
 
     @property
     def secret(self) -> str:
-        """The run's password; DataFileError where its file is missing or damaged."""
+        """The run's password; DataFileError if its file is missing or damaged."""
         try:
             user, _, secret = self.secret_file.read_text().strip().partition(":")
         except OSError as fault:
@@ -66,11 +66,11 @@ class Links:
         return secret
 
     def socket(self, role: str) -> Path | None:
-        """Unix socket of a role, beside its port; None where the directory's name is too long for one."""
+        """Unix socket of a role, in addition to its port; None if the directory's name is too long for one."""
         return self._beside(f"{role}.sock") if role in self.ports else None
 
     def direct_link(self, role: str) -> Path | None:
-        """Socket of a role's direct link; None where the directory's name is too long for one.
+        """Socket of a role's direct link; None if the directory's name is too long for one.
 
         None by a router, whose access control applies to all messages.
         """
@@ -199,7 +199,7 @@ def mirror_role(name: str) -> str:
 
 
 def runtime_path() -> Path:
-    """The user's runtime directory for lowfc, whether it is there or not."""
+    """The user's runtime directory for lowfc, which may not exist."""
     given = os.environ.get("XDG_RUNTIME_DIR")
     return Path(given) / "lowfc" if given else Path("/tmp") / f"lowfc-{os.geteuid()}"  # noqa: S108  # own_directory() checks it
 
@@ -245,14 +245,14 @@ def write_once(path: Path, text: str) -> str:
 
 
 def _absolute(network: Network) -> Network:
-    """The same from wherever a process is started."""
+    """The same for any current directory of a process."""
     if not network.router:
         return Network()
     return network.model_copy(update={"certificates": str(Path(network.certificates).expanduser().absolute())})
 
 
 def _make(path: Path, mirrors: tuple[str, ...], listeners: tuple[str, ...], network: Network) -> None:
-    """Make the directory under another name and rename it; whoever is second leaves the first one's in place."""
+    """Make the directory under another name and rename it; a later process keeps the first one's directory."""
     # Monitors connect and do not listen: there may be several, and no other process searches for one.
     roles = [Role.CAMERA, Role.CONTROLLER, *map(mirror_role, mirrors), Role.RECORDER, *listeners]
     draft = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))  # mode 0700

@@ -30,9 +30,9 @@ from lowfc.contract.errors import BusError
 from lowfc.contract.messages import HEALTH, Role, Topic
 
 TAKEN_S = 0.5
-"""How long the router, or who has one's place already, may take to answer."""
+"""Timeout for an answer of the router, or of a process that already has this role."""
 FLUSH_S = 2.0
-"""How long a session waits at its end for peers that have not received everything yet."""
+"""Time a closing session waits for peers that have not received everything yet."""
 
 
 def declare_publisher(session: zenoh.Session, topic: Topic, key: str, *, lockstep: bool = False) -> zenoh.Publisher:
@@ -92,7 +92,7 @@ class ZenohPublisher:
         return envelope
 
     def close(self) -> None:
-        """Let go of what is not zenoh's."""
+        """Release resources other than zenoh's."""
         if self._direct_link is not None:
             self._direct_link.close()
 
@@ -200,7 +200,7 @@ class ZenohBus:
             self.queryable(CLOCK_KEY, lambda query: query.reply(b""))
 
     def _join_hosts(self) -> None:
-        """Take no place that is taken, which ports prevent on one host; and set envelopes by the router's clock."""
+        """Refuse a role that is already in use (ports prevent it on one host); set envelopes by the router's clock."""
         if self.role in self._links.ports and self.get(HEALTH.at(self.role), timeout_s=TAKEN_S):
             self._session.close()  # type: ignore[no-untyped-call]
             raise BusError(
@@ -325,7 +325,7 @@ class ZenohBus:
             publisher.published = publisher.skipped = 0
 
     def close(self) -> None:
-        """Leave the run, when what was put has been received or the peers have not answered in time.
+        """Leave the run once all published messages have been received or the peers have timed out.
 
         Zenoh interrupts the write of a message when its session closes; to a slow reader that leaves half a message,
         and the rest of the stream is lost. Messages of the lowest priority are sent last, and so is this question.
@@ -373,7 +373,7 @@ def _reader(topic: Topic, name: str) -> str | None:
 
 
 def _known_key(expression: str) -> str | None:
-    """The key of every message, where there is but one."""
+    """The key of every message, if there is only one."""
     return None if ALL in expression else expression
 
 

@@ -1,4 +1,4 @@
-"""What every process of a run does: stop at a signal, publish health and events, receive the health of the others."""
+"""Common tasks of every process of a run: stop at a signal, publish health and events, receive others' health."""
 
 import contextlib
 import os
@@ -30,7 +30,7 @@ HEALTH_PERIOD_NS = 500_000_000
 WAITING_NS = 2_000_000_000
 """A process that is ready and waits longer than this for others names them."""
 WORK: dict[str, str] = {Role.CAMERA: "frame", Role.CONTROLLER: "frame", Role.MIRROR: "command"}
-"""What the processes of the loop count; others have a summary of their own."""
+"""Counters of the processes of the loop; other processes have their own summary."""
 ProcessState = Literal["starting", "ready", "running", "stopping", "stopped"]
 
 _MET_PERIOD_S = 0.02
@@ -161,7 +161,7 @@ class Service:
         signal.signal(signal.SIGINT, self._caught)
 
     def on_stop(self, waker: Callable[[], None]) -> None:
-        """Call `waker` when the process is told to stop, so that a waiting loop notices."""
+        """Call `waker` when the process has to stop, so that a waiting loop notices."""
         self._wakers.append(waker)
 
     def stop(self, why: str) -> None:

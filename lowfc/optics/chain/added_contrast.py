@@ -1,4 +1,4 @@
-"""What a small wavefront adds to the contrast of a coronagraph's dark zone: a quadratic form of its modes.
+"""Contrast that a small wavefront adds to a coronagraph's dark zone: a quadratic form of its modes.
 
 With the field E = E0 + i k sum a_j E_j - k^2 / 2 sum a_j a_l E_jl, the intensity's second order in a has two terms:
 that of the first-order field, and that of the second-order field with E0. The second is as large as the first for a
@@ -18,16 +18,16 @@ from lowfc.optics.chain.science_camera import ScienceCamera
 from lowfc.optics.chain.zernike import mode_group, zernikes
 
 BEYOND_QUADRATIC = 0.1
-"""By which the form may differ from the image before that is said."""
+"""Relative difference between form and image above which it is reported."""
 _SAMPLES_PER = 2  # in each lambda / D: the intensity's band is 1 D to either side
 _DRAWS = 24
 
 
 class ModalContrast:
-    """What wavefronts, known by their modes, add to the contrast of a dark zone: by their form, and by full images.
+    """Contrast that modal wavefronts add to a dark zone, from the quadratic form and from full images.
 
     Attributes:
-        noll: of the modes.
+        noll: Noll index of each mode.
         form: (modes, modes), see `contrast_form`.
     """
 
@@ -39,15 +39,15 @@ class ModalContrast:
         self._camera = ScienceCamera(pupil, noll, wavelength_nm, half_width, _SAMPLES_PER, lyot)
 
     def by_image(self, modes_nm: Array | Single) -> float:
-        """Contrast of the dark zone, the coronagraph's own with it, behind a wavefront (modes,)."""
+        """Contrast of the dark zone with a wavefront (modes,), the coronagraph's own included."""
         return self._camera.mean_contrast(self._camera.image(modes_nm), self._zone)
 
     def by_mode(self, covariance_nm2: Array) -> Array:
-        """What each mode adds (modes,), of wavefronts with a covariance (modes, modes); their sum is added in all."""
+        """Contrast added by each mode (modes,) for wavefronts with a covariance (modes, modes), summing to the total."""
         return np.asarray(np.sum(self.form * covariance_nm2, axis=1))
 
     def is_beyond_quadratic(self, covariance_nm2: Array) -> bool:
-        """Whether full images of wavefronts with a covariance (modes, modes) differ too much from the form."""
+        """Whether full images of wavefronts with this covariance (modes, modes) differ too much from the form."""
         values, vectors = np.linalg.eigh(covariance_nm2)
         drawn = np.random.default_rng(1).standard_normal((_DRAWS, len(values)))
         some_nm = drawn * np.sqrt(np.maximum(values, 0)) @ vectors.T
@@ -58,7 +58,7 @@ class ModalContrast:
 
 
 def by_group(noll: Sequence[int], each: Array) -> dict[str, float]:
-    """Sums of the contrast that each mode adds (modes,) over modes of one kind, such as both comas.
+    """Sums of the added contrast of each mode (modes,) over modes of one kind, such as both comas.
 
     The largest first.
     """
@@ -69,7 +69,7 @@ def by_group(noll: Sequence[int], each: Array) -> dict[str, float]:
 
 
 def costliest(groups: Mapping[str, float]) -> tuple[str, float]:
-    """The kind of modes that adds most, and its share of all; groups as `by_group` sorts them."""
+    """The kind of modes that adds most, and its share of the total; groups as sorted by `by_group`."""
     name, most = next(iter(groups.items()))
     return name, most / (sum(groups.values()) or 1.0)
 

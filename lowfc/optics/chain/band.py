@@ -1,4 +1,4 @@
-"""Wavelengths and weights that stand for a passband (flat in photons per nm)."""
+"""Wavelengths and weights that represent a passband (flat in photons per nm)."""
 
 from dataclasses import dataclass
 

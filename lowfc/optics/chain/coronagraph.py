@@ -1,7 +1,7 @@
-"""The science image of a coronagraph: what a wavefront does to the contrast (Fig. 1).
+"""The science image of a coronagraph: contrast for a given wavefront (Fig. 1).
 
 Behind a shaped pupil it is the pupil's image; a Lyot coronagraph has an opaque mask and a stop in between. Contrast is
-intensity over the peak of the star beside the mask with a flat wavefront; angles are in lambda / D (see `grid`).
+intensity over the peak of the star off the mask with a flat wavefront; angles are in lambda / D (see `grid`).
 """
 
 from dataclasses import dataclass
@@ -39,10 +39,10 @@ DARK_ZONE = Wedge()
 
 @dataclass(frozen=True, eq=False)
 class LyotStop:
-    """What of a Lyot coronagraph follows its pupil: the light that the opaque mask takes out, and the stop.
+    """The elements of a Lyot coronagraph behind its pupil: opaque mask and stop.
 
     Attributes:
-        opaque: (k, k) part of the focal plane that the mask takes out, 0 to 1; it goes to the sensor.
+        opaque: (k, k) part of the focal plane that the mask blocks, 0 to 1; it goes to the sensor.
         stop: (n, n) transmission in the pupil behind it.
         samples_per: Samples of the opaque part per lambda / D.
     """
@@ -52,7 +52,7 @@ class LyotStop:
     samples_per: int = 8
 
     def behind(self, field: Complex) -> Complex:
-        """The field (n, n) behind the stop of one in front of the mask: that less what the mask takes out (Babinet)."""
+        """Field (n, n) behind the stop for one in front of the mask: that field less the blocked part (Babinet)."""
         return np.asarray(self.stop * (field - self._taken_out(field)))
 
     def transposed(self, field: Complex) -> Complex:
@@ -67,11 +67,11 @@ class LyotStop:
 
 @dataclass(frozen=True, eq=False)
 class Coronagraph:
-    """What makes the science image.
+    """The optics of the science image.
 
     Attributes:
         pupil: (n, n) amplitude transmission in front.
-        dark_zone: Where contrast is looked at.
+        dark_zone: Region in which contrast is evaluated.
         lyot: Mask and stop of a Lyot coronagraph; None for a shaped pupil alone.
     """
 
@@ -97,7 +97,7 @@ def contrast(
         wavelength_nm: The wavelength.
         columns: Samples along x.
         rows: Samples along y; as many as columns when None.
-        samples_per: Samples per lambda / D; two are enough for means, for the intensity's band is 1 D to either side.
+        samples_per: Samples per lambda / D; two are enough for means, since the intensity's band is 1 D to either side.
         lyot: Mask and stop of a Lyot coronagraph; None for a shaped pupil alone.
 
     Raises:

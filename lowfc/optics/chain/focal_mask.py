@@ -5,7 +5,7 @@ import numpy as np
 from lowfc.arrays import Array, Complex
 from lowfc.optics.chain.grid import image_axis
 
-_FINE = 16  # by which a sample is divided to find how much of it the phase spot covers
+_FINE = 16  # subsamples of a sample, for the fraction covered by the phase spot
 
 
 def disk(samples_per: int = 8, radius: float = 4.0, inner_radius: float = 0.0) -> Array:
@@ -23,8 +23,8 @@ def disk(samples_per: int = 8, radius: float = 4.0, inner_radius: float = 0.0) -
 def phase_spot(samples_per: int = 8, radius: float = 4.0, spot_diameter: float = 1.06) -> Complex:
     """The disk with a spot in its middle that delays by a quarter of a wave: the Zernike sensor's two masks as one.
 
-    Samples that the spot's edge cuts have the mean of both sides, for the spot is only eight samples wide. The delay
-    is taken to be the same at all wavelengths, the spot's size to be physical.
+    Samples on the spot's edge have the mean of both sides, as the spot is only eight samples wide. The delay is assumed
+    equal at all wavelengths, and the spot's physical size fixed.
 
     Args:
         samples_per: Samples per lambda0 / D.

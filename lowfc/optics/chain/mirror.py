@@ -11,8 +11,8 @@ from lowfc.optics.chain.grid import pupil_axis
 from lowfc.optics.chain.zernike import zernikes
 
 _TIKHONOV = 1e-4
-"""Of the mean influence: the fit's error stays 1.2 %, and no edge actuator needs three times the stroke of the others,
-as some do at 1e-6."""
+"""Regularisation relative to the mean influence: the fit's error stays 1.2 %, and no edge actuator needs three times
+the stroke of the others, as some do at 1e-6."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Mirror:
         columns: Actuators along x.
         pitches_per_pupil: Actuator pitches across the pupil's diameter.
         coupling: Surface at the next actuator over that at the poked one.
-        shift_pitches: How far the actuators lie off the centre along x, and as far along y.
+        shift_pitches: Offset of the actuators from the centre, equal along x and y.
     """
 
     rows: int = 34
@@ -88,7 +88,7 @@ def modes_to_actuators(mirror: Mirror, nolls: Sequence[int], usable: Mask | None
         mirror: The mirror.
         nolls: Noll indices.
         usable: (rows, columns) actuators that may be commanded; all when None. The others stay at zero, and their
-            neighbours make up for them as far as they can.
+            neighbours compensate as far as possible.
 
     Returns:
         (rows times columns, modes); inactive actuators are exactly zero.
@@ -96,7 +96,7 @@ def modes_to_actuators(mirror: Mirror, nolls: Sequence[int], usable: Mask | None
     Raises:
         ValueError: too few actuators are left for so many modes.
     """
-    import scipy.linalg  # takes its time, and most processes load what was built
+    import scipy.linalg  # slow to import, and most processes load a stored result
 
     u = pupil_axis(int(np.ceil(4.0 * mirror.pitches_per_pupil)))
     inside = (np.hypot(u[:, None], u) <= 0.5).astype(np.float64)

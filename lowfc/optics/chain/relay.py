@@ -1,4 +1,4 @@
-"""What lies between the focal-plane mask and the detector: this is where one sensor differs from another."""
+"""The optics between the focal-plane mask and the detector, in which the sensors differ."""
 
 from dataclasses import dataclass
 

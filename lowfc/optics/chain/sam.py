@@ -11,11 +11,11 @@ from lowfc.optics.chain.grid import pupil_axis
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the holes of a sparse aperture mask are.
+    """Holes of a sparse aperture mask.
 
     Attributes:
-        name: What users call it.
-        purpose: One line on what it was designed for.
+        name: Name of the layout.
+        purpose: What it was designed for, in one line.
         holes: Each (x, y, diameter): the centre from the pupil's centre, all in pupil diameters.
     """
 
@@ -76,12 +76,12 @@ def is_even_symmetric(layout: Layout) -> bool:
 
 
 def transmission(layout: Layout, samples: int, points: int = 1) -> Array:
-    """The mask (samples, samples), eqs. (1) and (2): how much of each sample the holes leave open.
+    """The mask (samples, samples), eqs. (1) and (2): open fraction of each sample.
 
     Args:
-        layout: Where the holes are.
+        layout: The holes.
         samples: Across the pupil.
-        points: Across a sample, in either direction, that are looked at; 1 is its centre alone.
+        points: Points evaluated across a sample, in either direction; 1 is its centre alone.
     """
     u = pupil_axis(samples * points)
     mask = np.zeros((samples * points, samples * points), np.bool_)

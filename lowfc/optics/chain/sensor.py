@@ -14,13 +14,13 @@ from lowfc.optics.chain.relay import ApertureMask, Defocus, Relay, direct_kernel
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """The hardware of a wavefront sensor that lives on the light a coronagraph's focal-plane mask rejects.
+    """The hardware of a wavefront sensor that uses the light rejected by a coronagraph's focal-plane mask.
 
     Attributes:
         pupil: (n, n) amplitude transmission of the coronagraph's pupil.
         focal_mask: (k, k) the part of the focal plane that goes to the sensor, k even, centred; complex where it
             delays light, as the spot of a Zernike sensor does.
-        relay: What lies between the focal-plane mask and the detector.
+        relay: The optics between the focal-plane mask and the detector.
         wavelength_nm: The central wavelength, lambda0.
         samples_per: Samples per lambda0 / D in the focal planes.
         binning: Samples per pixel, in each direction.
@@ -69,15 +69,15 @@ class Sensor:
 
 @dataclass(frozen=True)
 class LightBudget:
-    """Where the light goes: each a fraction of what reached the element before it, but `total` and `peak`.
+    """Throughput of each element, as a fraction of the light that reached it, and `total` and `peak`.
 
     Attributes:
-        pupil: Of the open circle's light, what the shaped pupil lets through.
-        focal_mask: Of that, what the focal-plane mask sends to the sensor.
-        relay_mask: Of that, what passes a mask in the relay pupil.
-        sensor: Of the light on the relay mask, what falls on the pixels.
-        total: Of the open circle's light, what falls on the pixels.
-        peak: Of the light on the pixels, what falls on the brightest.
+        pupil: Fraction of the open circle's light that the shaped pupil transmits.
+        focal_mask: Fraction of that which the focal-plane mask sends to the sensor.
+        relay_mask: Fraction of that which passes a mask in the relay pupil.
+        sensor: Fraction of the light on the relay mask that falls on the pixels.
+        total: Fraction of the open circle's light that falls on the pixels.
+        peak: Fraction of the light on the pixels that falls on the brightest.
     """
 
     pupil: float
@@ -187,7 +187,7 @@ def shear_response(sensor: Sensor, band: Band | None = None) -> Array:
     """dI/ds (pixels squared, 2), in the units of `image` per pupil diameter of shear of the beam along x and y.
 
     A shift of the beam in the pupil is a ramp of phase on the focal plane, where -2 pi i x of the field is its slope.
-    It is a nuisance: the beam wanders on the relay mask, which looks like a wavefront and is none.
+    It is a nuisance parameter: beam wander on the relay mask mimics a wavefront error.
 
     Args:
         sensor: The optics.

@@ -40,7 +40,7 @@ _NAMES = (
 
 
 def mode_name(noll: int) -> str:
-    """What an optician calls the mode, such as "focus"; "Zernike 22" and so on above radial degree 5."""
+    """Optical name of a mode, such as "focus"; "Zernike 22" and so on above radial degree 5."""
     noll_to_nm(noll)
     return _NAMES[noll - 1] if noll <= len(_NAMES) else f"Zernike {noll}"
 

@@ -1,4 +1,4 @@
-"""How many electrons a star gives, and what a milliarcsecond is on the wavefront (Sect. 3.3)."""
+"""Electrons from a star, and wavefront tilt per milliarcsecond (Sect. 3.3)."""
 
 from dataclasses import dataclass
 
