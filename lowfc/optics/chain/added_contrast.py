@@ -43,7 +43,7 @@ class ModalContrast:
         return self._camera.mean_contrast(self._camera.image(modes_nm), self._zone)
 
     def by_mode(self, covariance_nm2: Array) -> Array:
-        """Contrast added by each mode (modes,) for wavefronts with a covariance (modes, modes), summing to the total."""
+        """Contrast added per mode (modes,) for wavefronts with a covariance (modes, modes), summing to the total."""
         return np.asarray(np.sum(self.form * covariance_nm2, axis=1))
 
     def is_beyond_quadratic(self, covariance_nm2: Array) -> bool:
