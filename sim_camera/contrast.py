@@ -1,4 +1,4 @@
-"""What the simulated wavefront adds to the contrast of the dark zone: by the full science image, and by its form."""
+"""Contrast that the simulated wavefront adds to the dark zone, from full science images and from the quadratic form."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from lowfc.contract.messages import wire
 from lowfc.optics.chain.added_contrast import ModalContrast
 
 IMAGES = 200
-"""Full images of each that a figure is the mean of, where there were so many frames."""
+"""Full images averaged in a figure, if there were enough frames."""
 
 
 class Contrast:
@@ -33,7 +33,7 @@ class Contrast:
         self._frames += 1
 
     def quadratic(self, modes_nm: Single) -> Single:
-        """What each mode (modes,) of wavefronts (many, modes) adds on average, by the form."""
+        """Mean contrast added by each mode (modes,) of wavefronts (many, modes), from the form."""
         return np.asarray(
             np.einsum("nj,nj->j", modes_nm @ self._form, modes_nm) / np.float32(len(modes_nm)), np.float32
         )

@@ -261,7 +261,7 @@ class SimulatedCamera:
         return self._origin_ns + self._index * self._config.period_ns
 
     def _publish_truth(self) -> None:
-        """The truth of the frame exposed last: its period is over now, and where the mirror was in it is known."""
+        """Truth of the last exposed frame, once its period is over and the mirror's motion in it is known."""
         index, _, end_ns, sequence, seen = self._exposed
         if index < 0:
             return

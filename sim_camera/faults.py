@@ -1,4 +1,4 @@
-"""A seeded fault of a camera: what it publishes instead of its frames, as a function of the frame index."""
+"""A seeded camera fault: the data published in place of frames, as a function of the frame index."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -17,7 +17,7 @@ TRACK_PIXELS = 6
 
 
 class Kind(StrEnum):
-    """What befalls frames."""
+    """Faults of frames."""
 
     LOST = "lost"
     DUPLICATED = "duplicated"
@@ -48,7 +48,7 @@ class Fault:
             raise ValueError(f"a fault begins at frame 1 or later and has frames, got {self.first} and {self.frames}")
 
     def befalling(self, index: int) -> Kind | None:
-        """What befalls the frame of this index."""
+        """The fault of the frame with this index."""
         return self.kind if self.first <= index < self.first + self.frames else None
 
     def random(self, index: int) -> np.random.Generator:
@@ -78,7 +78,7 @@ class Fault:
         return (frame,)
 
     def pixels(self, index: int, frame: Frame, before: Frame, dark: int, highest: int) -> Frame:
-        """What the detector gives instead of a frame (rows, columns).
+        """The detector's output in place of a frame (rows, columns).
 
         Args:
             index: of the frame.

@@ -1,4 +1,4 @@
-"""A camera's publisher with a fault: for tests of what the others make of it."""
+"""A camera's publisher with a fault, to test the reaction of other processes."""
 
 import json
 from collections import deque
@@ -46,7 +46,7 @@ class FaultyFrames:
         self._index = self._start_s = 0
 
     def put(self, payload: bytes) -> Envelope:
-        """Publish what is due at the end of an exposure; return the envelope that its frame has or should have."""
+        """Publish the messages due at the end of an exposure; return the envelope of its frame, sent or not."""
         index, now_ns = self._index, self._now_ns()
         self._index += 1
         message = self._message(index, RawImage.FromString(payload))
@@ -64,7 +64,7 @@ class FaultyFrames:
         return Envelope(sequence_of(self._start_s, index), now_ns)
 
     def _message(self, index: int, sound: RawImage) -> bytes:
-        """What becomes of a frame's message."""
+        """Apply the fault to a frame's message."""
         frame = np.frombuffer(sound.data, "<u2").reshape(sound.height, sound.width)
         before = frame if self._before is None else self._before
         self._before = self._fault.pixels(index, frame, before, self._dark, self._highest)

@@ -40,7 +40,7 @@ class WavefrontFigures:
 
 
 class Figures:
-    """Sums over frames, block by block: what each mode adds to the contrast, and squares of the wavefront."""
+    """Sums over frames, block by block: contrast added by each mode, and squares of the wavefront."""
 
     def __init__(self, noll: tuple[int, ...], nm_per_mas: float, recent: int = 1, instants: int = 0) -> None:
         """Begin without a frame.

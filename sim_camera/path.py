@@ -1,4 +1,4 @@
-"""Where the simulated mirror is at any moment: the moments at which its commands came into force, and its settling."""
+"""Position of the simulated mirror at any time, from the times of its commands and its settling."""
 
 from collections import deque
 

@@ -1,4 +1,4 @@
-"""What the simulated detector's pixels are beyond photon and read noise: unlike, hot, not linear; from the seed."""
+"""Pixel errors of the simulated detector beyond photon and read noise: gain, hot, nonlinear; from the seed."""
 
 from dataclasses import dataclass
 
@@ -32,7 +32,7 @@ def pixel_errors(
     hot_pixels: float,
     hot_pixel_e: float,
 ) -> PixelErrors | None:
-    """Errors drawn from the seed; None where there are none.
+    """Errors drawn from the seed; None if there are none.
 
     Args:
         detector: without errors.

@@ -1,4 +1,4 @@
-"""What the control theory says that a simulated run must leave at every moment, of its disturbance and its noise."""
+"""Residual over all time predicted by control theory for a simulated run, from its disturbance and noise."""
 
 import numpy as np
 

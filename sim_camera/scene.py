@@ -54,7 +54,7 @@ class Truth:
 
 
 class Scene:
-    """Optics, star, detector and disturbance of one run; it draws noise from a generator of its own.
+    """Optics, star, detector and disturbance of one run, with its own noise generator.
 
     Attributes:
         instants: (instants,) of each period over which the continuous truth is the mean, in periods after its start.

@@ -10,7 +10,7 @@ app = new_app("The simulated deformable mirror.\n\nExample: sim-dm --run bench -
 
 @app.command()
 def mirror(run: RunId = DEFAULT_RUN, config: ConfigFile = None) -> None:
-    """Follow the commands of a run within the mirror's own limits, and publish where it is.
+    """Apply the commands of a run within the mirror's own limits, and publish its shape.
 
     Example: sim-dm --run bench
     """

@@ -1,4 +1,4 @@
-"""What actuators do with a command: errors of gain, hysteresis, creep; the part of the mirror that remembers."""
+"""Response of actuators to a command: gain errors, hysteresis, creep; the part of the mirror with memory."""
 
 import numpy as np
 
@@ -33,7 +33,7 @@ class Actuators:
         self._crept_nm = np.zeros((len(CREEP_S), *grid))
 
     def reach(self, driven_nm: Single, elapsed_ns: float) -> Single:
-        """Where they come to (rows, columns), driven so for `elapsed_ns`."""
+        """Positions reached (rows, columns) after this drive for `elapsed_ns`."""
         wanted_nm: Array = driven_nm * self._gain
         if self._hysteresis:
             width_nm = np.array(PLAY_NM)[:, None, None]

@@ -12,7 +12,7 @@ from lowfc.device.guard import Guard, Status
 
 @dataclass(frozen=True)
 class Device(Guard):
-    """What the mirror is, beside what protects it.
+    """Properties of the mirror, apart from its protection.
 
     Attributes:
         settling_ns: time constant of the actuators.
@@ -55,7 +55,7 @@ def responded(device: Device, reached_nm: Single, surface_nm: Single, elapsed_ns
 
 
 def _at_rest(device: Device, surface_nm: Single) -> Single:
-    """Dead and stuck actuators stay where they are."""
+    """Keep dead and stuck actuators in place."""
     if device.fixed is None:
         return surface_nm
     kept = surface_nm.copy()

@@ -43,7 +43,7 @@ class SimulatedMirror:
         return self.settle(actuators_nm, np.inf)
 
     def settle(self, actuators_nm: Single, elapsed_ns: float) -> Single:
-        """Where the actuators are, `elapsed_ns` after the last call."""
+        """Positions of the actuators, `elapsed_ns` after the last call."""
         reached_nm = rounded(self._device, actuators_nm)
         if self._actuators is not None:
             reached_nm = self._actuators.reach(reached_nm, elapsed_ns)

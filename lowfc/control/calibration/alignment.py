@@ -20,7 +20,7 @@ _ANGLES = 72
 
 @dataclass(frozen=True, slots=True)
 class Geometry:
-    """Where a point of the computed image lies on the real sensor.
+    """Position of a point of the computed image on the real sensor.
 
     Attributes:
         scale: Real pixels per pixel of the computed image.
@@ -43,7 +43,7 @@ class Geometry:
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """A fit: the geometry, the light and the uniform background of the real image, and what is left.
+    """A fit: the geometry, the light and the uniform background of the real image, and the residual.
 
     Attributes:
         geometry: The better one of both parities; its rotation may be half a turn off.
@@ -113,7 +113,7 @@ def align(real: Array, computed: Array) -> Alignment:
 
 
 def _placed(spline: Array, geometry: Geometry, light: Array) -> Geometry:
-    """The geometry with its centre where the model is most like the light, to a pixel."""
+    """The geometry centred where the model best matches the light, to a pixel."""
     rows, columns = light.shape
     middle = replace(geometry, row=rows // 2, column=columns // 2)
     model = _sample(spline, middle, (2 * rows, 2 * columns))  # so that it is not cut off on the other side

@@ -20,7 +20,7 @@ FIRST = "+first"
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """What turns a frame into modes and modes into actuators; single precision, as the loop uses it.
+    """Matrices from a frame to modes and from modes to actuators; single precision, as in the loop.
 
     Attributes:
         noll: Noll index of each mode.
@@ -78,14 +78,14 @@ class Calibration:
 
     @classmethod
     def none(cls, grid: tuple[int, int]) -> "Calibration":
-        """What stands for no calibration: a mirror of (rows, columns) actuators, without modes or pixels."""
+        """Placeholder for no calibration: a mirror of (rows, columns) actuators, without modes or pixels."""
         shapes = array_shapes(0, (0, 0), grid)
         arrays: dict[str, Any] = {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
         rest: dict[str, Any] = {"estimator": "none", "wavelength_nm": 0.0, "operator_hash": "", "id": ""}
         return cls((), shape=(0, 0), grid=grid, flux_dn=1.0, saturation_dn=np.inf, **arrays, **rest)
 
     def identity(self) -> str:
-        """What `id` must be: a hash of everything else in it."""
+        """The correct `id`: a hash of everything else in it."""
         camera = self.camera
         settings = camera and (
             *(camera.shape, camera.region, camera.bias_dn, camera.saturation_dn),
@@ -175,7 +175,7 @@ def reconstructor(
     if nuisance is None:
         return np.asarray(np.linalg.pinv(scaled) * root.T)
     both = np.hstack([scaled, root * nuisance])
-    sizes = np.linalg.norm(both, axis=0)  # pinv leaves out singular values that are small beside the largest
+    sizes = np.linalg.norm(both, axis=0)  # pinv drops singular values that are small relative to the largest
     if not (sizes.all() and condition_number(both / sizes) < SINGULAR):
         raise ValueError("the sensor cannot tell the nuisance modes from the others: fit fewer of either")
     inverse = np.linalg.pinv(both / sizes) / sizes[:, None]
@@ -183,7 +183,7 @@ def reconstructor(
 
 
 def condition_number(response: Array) -> float:
-    """Largest over smallest singular value, without unit, of H (pixels, modes); infinite where a mode has no signal."""
+    """Largest over smallest singular value, without unit, of H (pixels, modes); infinite if a mode has no signal."""
     singular = np.linalg.svd(response, compute_uv=False)
     return float(singular[0] / singular[-1]) if singular[-1] > 0 else float("inf")
 

@@ -11,12 +11,12 @@ from lowfc.device import CameraSettings, Configuration, ConfigurationError, Expo
 from lowfc.device.drivers.genicam import WAIT_MS, GenicamOptions
 
 _EXPOSURES = "ExposureTime", "ExposureTimeAbs"
-"""Names of newer and older cameras; the emulation has both, and goes by the older."""
+"""Names in newer and older cameras; the emulation has both, and the older ones take effect."""
 _RATES = "AcquisitionFrameRate", "AcquisitionFrameRateAbs"
 _RESULTS = "ResultingFrameRate", "ResultingFrameRateAbs", "BslResultingAcquisitionFrameRate"
 _BUFFERS = 16
 _QUEUED = 2
-"""Frames that wait while the host stands still; older ones are dropped and counted, for their times would be wrong."""
+"""Frames buffered while the host stands still; older ones are dropped and counted, as their times would be wrong."""
 
 
 def _pylon() -> Any:

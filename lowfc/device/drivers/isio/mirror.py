@@ -62,19 +62,19 @@ class IsioMirror:
         self._service = service
 
     def position(self) -> Single:
-        """What the channel holds."""
+        """The channel's content."""
         held = whole(self._channel)
         return np.zeros(self._grid, np.float32) if held is None else held * np.float32(self._options.nm_per_unit)
 
     def beside(self) -> Single:
-        """What the other channels have on the mirror, but for piston, which is the sum's own affair."""
+        """The other channels' shape on the mirror, without piston, which only the sum has."""
         shape = self._others.sum()
         if shape is not self._beside[0]:
             self._beside = shape, (shape - shape.mean()) * np.float32(self._options.nm_per_unit)
         return self._beside[1]
 
     def apply(self, actuators_nm: Single) -> Single | None:
-        """Write the channel (rows, columns); where the sum of all has followed, return what of it is this one's."""
+        """Write the channel (rows, columns); once the sum has followed, return this channel's part of it."""
         self._check_channel()
         total = self._current_total()
         before = 0 if total is None else total.count
@@ -98,7 +98,7 @@ class IsioMirror:
             raise RuntimeError(f"{f'process {pid}' if pid else 'another process'} writes stream {self._channel.name!r}")
 
     def _current_total(self) -> Stream | None:
-        """The stream of the sum, where there is one; looked for once a second."""
+        """The stream of the sum, if there is one; searched for once a second."""
         if self._total is not None and self._total.current():
             return self._total
         self._total, now_s = None, time.monotonic()
@@ -127,7 +127,7 @@ class IsioMirror:
         return False
 
     def _reached(self, total: Stream, actuators_nm: Single) -> Single | None:
-        """What of the sum is this channel's; None where that is what was written. Piston is the sum's own affair."""
+        """This channel's part of the sum; None if it is as written. Piston belongs to the sum."""
         shape = whole(total)
         if shape is None:
             return None
