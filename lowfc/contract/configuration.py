@@ -113,23 +113,23 @@ class Acceptance(Section):
     """What a loop must show to be accepted: `lowfc acceptance`."""
 
     rejection_db: Positive = 1.0
-    """Largest departure of the measured rejection and noise transfer from theory."""
+    """Largest deviation of the measured rejection and noise transfer from theory."""
     lowest_hz: Positive = 0.1
     """Frequency from which they are measured."""
     highest_of_rate: float = Field(0.3, gt=0, le=0.5)
-    """Frequency up to which they are measured, as a part of the frame rate."""
+    """Frequency up to which they are measured, as a fraction of the frame rate."""
     linear_nm: Positive = 12.0
     """Wavefront rms of a mode up to which the sensor must be linear; 12 nm are 5 mas of tilt at 2 m."""
     gain_error: Positive = 0.05
-    """Largest departure from 1 of a mode's measured over its true size, there."""
+    """Largest deviation from 1 of a mode's measured over its true amplitude, in this range."""
     crosstalk: Positive = 0.05
-    """Largest part of a mode that is measured as another one, there."""
+    """Largest fraction of a mode that is measured as another one, in this range."""
     capture_tilt_nm: Positive = 34.0
     """Wavefront rms of tip or tilt from which the loop must close; 34 nm are 14 mas at 2 m."""
     capture_nm: Positive = 20.0
     """Wavefront rms of any other mode from which the loop must close."""
     noise_ratio: float = Field(1.2, gt=1)
-    """Largest white noise of a mode, beside what photons and read-out make of it."""
+    """Largest white noise of a mode, relative to its photon and read-out noise."""
 
 
 class Recorder(Section):

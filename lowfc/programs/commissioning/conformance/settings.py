@@ -147,7 +147,7 @@ class Agreement(NamedTuple):
 
 _WEIGHTS = "the weights of the pixels in R, the predicted noise"
 _RATES = "laws, margins, spectra, the duration of probe sequences"
-_SATURATED = "where a computed calibration takes a pixel for saturated"
+_SATURATED = "the saturation level of a computed calibration"
 AGREEMENTS = (
     Agreement("period_ns", "camera.rate_hz", "ms", 0.01, True, _RATES),
     Agreement("gain_e_per_dn", "camera.gain_e_per_dn", "e-/DN", 0.02, True, _WEIGHTS),
