@@ -1,7 +1,7 @@
-"""The configuration: every key, its unit, default and range, declared once.
+"""The configuration: every key with its unit, default and range.
 
-A file is TOML with the sections of `Configuration`; what it leaves out has the default. An unknown key is refused with
-the nearest known one. `lowfc config show` prints all keys with their sentences.
+A file is TOML with the sections of `Configuration`; missing keys have their defaults. An unknown key is an error that
+names the nearest known one. `lowfc config show` prints all keys with their descriptions.
 """
 
 import difflib
@@ -36,37 +36,37 @@ from lowfc.contract.sections import (
 from lowfc.control.kernel.tables import KernelName
 
 LATE_NS, HOLD_NS = 20_000_000, 50_000_000
-"""Least age of a late frame and least silence of a camera, where the configuration leaves them open."""
+"""Minimum of max_frame_age_ms and of frame_timeout_ms if the configuration does not set them."""
 MOST_FAULTS = 20
-"""Faults that are explained, of a file that may be something else altogether."""
-_LONGEST_KEY = 100  # characters of one that the nearest known key is looked for
+"""Most faults of one file that are explained."""
+_LONGEST_KEY = 100  # characters of an unknown key that are compared with the known ones
 _ALTERNATIVE = re.compile(r"\.(?:constrained-\w+|literal\[[^]]*\])")  # pydantic's, behind a key of two types
 
 
 Gain = Annotated[float, Field(ge=0, le=4)]
 FIXED_GAINS = {"control.tilt_gain": 0.5, "control.gain": 0.05}
-"""Where a run shall not depend on what is measured in it, as one that measures times."""
+"""For runs that must not depend on automatic gains, such as timing measurements."""
 
 
 class Control(Section):
     """The control law."""
 
     start_mode: Literal["open", "closed"] = "open"
-    """Loop mode once a calibration is loaded; sim-loop starts closed where the file is silent."""
+    """Loop mode once a calibration is loaded; sim-loop starts closed if the file does not set it."""
     delay_frames: float = Field(0.0, ge=0, le=10)
-    """Frames from the one a command is made from to the first exposed wholly under it, as measured; 0 takes the
-    camera's. Twice the delay halves the highest stable gain."""
+    """Measured delay: frames from the frame that a command is computed from to the first frame exposed wholly with it;
+    0: camera.delay_frames. Twice the delay halves the highest stable gain."""
     estimator: Literal["weighted", "pinv"] = "weighted"
     """Noise-weighted or plain pseudo-inverse of H."""
     nuisance: list[Literal["background", "shear"]] = Field(default_factory=list)
-    """What is fitted along with the modes so that it does not pass for them: uniform light, shear of the beam."""
+    """Nuisance parameters fitted together with the modes: uniform background light, shear of the beam."""
     tilt_gain: Gain | Literal["auto"] = "auto"
-    """Integrator gain of tip and tilt; auto: the measured one that leaves least of a mode, 0 where any would harm."""
+    """Integrator gain of tip and tilt; auto: optimised per mode for the least residual, 0 if any gain would harm."""
     gain: Gain | Literal["auto"] = "auto"
     """Integrator gain of the other modes."""
     on_harm: Literal["warn", "open", "integrator"] = "warn"
-    """What follows where the loop has left more than an open loop for long: an event; or the loop opens, too; or the
-    integrator takes over from a law, and where it drives already, the loop opens."""
+    """Action if the residual stays larger than in open loop: warn: event only; open: the loop opens; integrator: the
+    integrator takes over from a law, or the loop opens if the integrator is already in force."""
     tilt_leak: float = Field(0.0, ge=0, le=1)
     """Integrator leak of tip and tilt."""
     leak: float = Field(0.0, ge=0, le=1)
@@ -76,30 +76,30 @@ class Control(Section):
     limit_nm: Positive = 50.0
     """Largest modal command of the other modes, wavefront rms."""
     max_frame_age_ms: NotNegative = 0.0
-    """Age above which a frame is refused; 0 for 20 ms, or two frame periods where they are longer."""
+    """Age above which a frame is refused; 0: 20 ms or two frame periods, whichever is longer."""
     frame_timeout_ms: NotNegative = 0.0
-    """Silence of the camera after which it is an event; 0 for 50 ms, or five frame periods where they are longer."""
+    """Time without a frame after which an event is raised; 0: 50 ms or five frame periods, whichever is longer."""
     on_frame_timeout: Literal["hold", "flat"] = "hold"
-    """During such a silence: hold the command, or relax the mirror to flat."""
+    """Action after a frame timeout: hold the command, or relax the mirror to flat."""
     command_timeout_ms: Positive = 200.0
-    """How long the mirror may hold a command without another one."""
+    """Time without a new command after which the mirror's last command expires."""
     max_start_ahead_h: float = Field(24.0, ge=0)
-    """Hours by which the start in a camera's or a controller's sequences may lie ahead of this host's clock; 0 for any,
-    as on a host whose clock is not set."""
+    """Hours by which a start time in the sequence of a camera or controller may be ahead of this host's clock; 0: no
+    limit, for a host whose clock is not set."""
     min_flux_fraction: float = Field(0.2, ge=0, lt=1)
-    """Fraction of the expected light below which a frame is dark."""
+    """Fraction of the calibration's flux below which a frame is refused as dark."""
     max_saturated_pixels: int = Field(8, ge=0)
-    """Pixels at full well above which a frame is refused."""
+    """Number of saturated pixels above which a frame is refused."""
     max_identical_frames: int = Field(3, ge=0)
-    """Frames in a row that may be the very image of the one before, as a stuck camera sends it; 0 for any number."""
+    """Consecutive frames that may be identical to the one before, as from a stuck camera; 0: no limit."""
     law: str = ""
-    """File (FITS) of a law that `lowfc tune` wrote, which takes over from the integrator; empty for the integrator."""
+    """Law file (FITS) written by `lowfc tune`; empty for the integrator."""
     guard: bool = True
-    """Guard every law: the integrator takes over where it would leave less, or where the law amplifies."""
+    """Guard: the integrator takes over from a law whose residual is larger than the integrator's, or that amplifies."""
 
 
 class Safety(Section):
-    """Limits that the controller keeps; the mirror keeps its own."""
+    """Limits enforced by the controller; the mirror enforces its own."""
 
     stroke_nm: float = Field(700.0, gt=0.01)
     """Largest deviation of an actuator from flat, surface, either way."""
@@ -110,12 +110,12 @@ class Safety(Section):
 
 
 class Acceptance(Section):
-    """What a loop must show to be accepted: `lowfc acceptance`."""
+    """Requirements of `lowfc acceptance`."""
 
     rejection_db: Positive = 1.0
     """Largest deviation of the measured rejection and noise transfer from theory."""
     lowest_hz: Positive = 0.1
-    """Frequency from which they are measured."""
+    """Lowest frequency at which they are measured."""
     highest_of_rate: float = Field(0.3, gt=0, le=0.5)
     """Frequency up to which they are measured, as a fraction of the frame rate."""
     linear_nm: Positive = 12.0
@@ -138,47 +138,47 @@ class Recorder(Section):
     folder: str = "logs"
     """Where log files are written."""
     file_mode: str = Field("0640", pattern=r"^06[0246]{2}$")
-    """Permissions of a log file, octal: 0640 lets its group read it, 0600 nobody else; the umask may take more away."""
+    """Permissions of a log file, octal: 0640 readable by its group, 0600 by its owner only; the umask also applies."""
     largest_mb: float = Field(4000.0, ge=1, le=1_000_000)
-    """Size at which a log is finished and the next one begun; each can be read by itself."""
+    """Size at which the next log is started; every log can be read by itself."""
     longest_s: float = Field(3600.0, ge=1, le=1_000_000)
-    """Age at which a log is finished and the next one begun."""
+    """Duration after which the next log is started."""
     min_free_mb: float = Field(500.0, ge=0, le=1_000_000_000)
-    """Free space on the disk below which recording is refused, or ends with a complete log while the loop goes on."""
+    """Free disk space below which recording is refused or stops with a complete log; the loop goes on."""
     every: int = Field(1, ge=1, le=1_000_000)
-    """Record every Nth frame and mirror state only; steps and commands are always whole. 1: all, as replay needs."""
+    """Record every Nth frame and mirror state; steps and commands are always complete. Replay requires 1."""
     topics: list[str] = Field(default_factory=list)
-    """Of frames, mirror state, mirror surface, truth and timing, the topics or patterns to record; empty for all."""
+    """Topics or patterns to record among frames, mirror state, mirror surface, truth and timing; empty for all."""
     on_event: str = ""
-    """Shell command that the recorder runs on events, told which in the variables LOWFC_EVENT, LOWFC_TEXT, LOWFC_LEVEL,
+    """Shell command that the recorder runs on events, described by the variables LOWFC_EVENT, LOWFC_TEXT, LOWFC_LEVEL,
     LOWFC_PROCESS, LOWFC_TIME, LOWFC_RUN and LOWFC_OTHERS; empty for none."""
     on_event_level: Literal["info", "warning", "error"] = "error"
-    """Least severe level of event that it is run for."""
+    """Lowest event level that runs the command."""
     on_event_every_s: float = Field(10.0, ge=0)
-    """Time from the end of one run of it to the next, which is for the worst event since; LOWFC_OTHERS counts the
-    others."""
+    """Shortest time from the end of the command to its next run, which is for the most severe event since;
+    LOWFC_OTHERS counts the others."""
 
 
 class Realtime(Section):
-    """What is asked of the host, in every process, before its first bus session."""
+    """Real-time measures requested from the host; each process applies them before its first bus session."""
 
     priority: int = Field(50, ge=0, le=98)
     """SCHED_FIFO priority of camera, controller and mirror; 0 for normal scheduling."""
     recorder_priority: int = Field(10, ge=0, le=98)
-    """SCHED_FIFO priority of the recorder, below the loop's; 0, or a loop without, for normal scheduling."""
+    """SCHED_FIFO priority of the recorder, below `priority`; normal scheduling if either is 0."""
     lock_memory: bool = True
-    """Keep the processes' memory from being paged out."""
+    """Lock the processes' memory."""
     disable_cpu_idle: bool = True
-    """Keep idle processors awake while the loop runs: waking one takes longer than a hand-off; it costs power."""
+    """Keep processors out of deep idle states while the loop runs: lower latency, more power."""
     cache_warmup: bool = True
-    """Do each control step a second time for nothing, so that the next frame finds the caches warm; not above 2 kHz."""
+    """Repeat the control step just before the next frame to keep the caches warm; not above 2 kHz."""
     kernel: KernelName = "numpy"
-    """Arithmetic of the controller's usual frame: numpy, or the fused step, compiled by numba (extra `fast`)."""
+    """Implementation of the control step: numpy, or the fused step compiled by numba (extra `fast`)."""
     threads: int = Field(1, ge=1, le=8)
-    """Threads that share the pass of the fused step over large frames (R of 8 MB or more), each on a processor of
-    controller_cpus that nothing else needs."""
+    """Threads of the fused step for large frames (R of 8 MB or more); each needs a processor of controller_cpus to
+    itself."""
     camera_cpus: list[int] = Field(default_factory=list)
-    """Processors of the camera; empty for all. Where the file says nothing, sim-loop gives the controller its own."""
+    """Processors of the camera; empty for all. By default, sim-loop gives the controller a processor of its own."""
     controller_cpus: list[int] = Field(default_factory=list)
     """Processors of the controller; empty for all."""
     mirror_cpus: list[int] = Field(default_factory=list)
@@ -195,7 +195,7 @@ class Configuration(Section):
     lockstep: bool = False
     """Expose the next frame only when the mirror has applied the last command; time is simulated."""
     interlocks: list[InterlockSection] = Field(default_factory=list, max_length=32)
-    """Conditions on values of the bench, each a table [[interlocks]] with name, test (equal, different, above, below),
+    """Conditions on bench values, each a table [[interlocks]] with name, test (equal, different, above, below),
     value, action (hold, open, safe, refuse_close, warn), max_age_s and when_old (acts, passes)."""
     star: Star = Star()
     sensor: SensorSection = SensorSection()
@@ -210,7 +210,7 @@ class Configuration(Section):
     network: Network = Network()
     gateway: Gateway = Gateway()
     drivers: dict[str, dict[str, Any]] = Field(default_factory=dict)
-    """Options of drivers of cameras and mirrors by the driver's name, as each driver declares them: [drivers.NAME]."""
+    """Options of the camera and mirror drivers, as each driver declares them: [drivers.NAME]."""
 
     @model_validator(mode="after")
     def _consistent(self) -> "Configuration":
@@ -258,7 +258,7 @@ class Configuration(Section):
 
     @property
     def imperfections(self) -> dict[str, Any]:
-        """Those of the simulated world that are not off, by key."""
+        """Imperfections of the simulation that are switched on, by key."""
         found = {key: getattr(getattr(self, key.partition(".")[0]), key.partition(".")[2]) for key in IMPERFECTIONS}
         return {key: value for key, value in found.items() if value}
 
@@ -269,7 +269,7 @@ class Configuration(Section):
 
     @property
     def frame_timeout_ns(self) -> int:
-        """Silence of the camera after which it is an event."""
+        """Time without a frame after which an event is raised."""
         return round(self.control.frame_timeout_ms * 1e6) or max(HOLD_NS, 5 * self.period_ns)
 
     @property
@@ -288,12 +288,12 @@ def load(
     defaults: dict[str, Any] | None = None,
     remark: Callable[[str], None] = lambda text: None,
 ) -> Configuration:
-    """Read a TOML file (None: all defaults), lay `overrides` over it and `defaults` under it: dotted keys to values.
+    """Read a TOML file (None: all defaults); `overrides` replace its values, `defaults` fill in missing ones.
 
-    A former key has the meaning of the present one, and `remark` is called with a sentence that names both.
+    Both map dotted keys to values. Former key names are accepted; for each, `remark` is called with a message.
 
     Raises:
-        ConfigurationError: the file is missing or no TOML, or a key or value is wrong.
+        ConfigurationError: the file is missing or not TOML, or a key or value is wrong.
     """
     data: dict[str, Any] = {}
     if path is not None:
@@ -344,7 +344,7 @@ def keys(section: type[BaseModel] = Configuration, prefix: str = "") -> dict[str
 
 
 def _nearest(wanted: str, known: Sequence[str]) -> str:
-    """The known key that is most like a wrong one; where none is, the one whose name in its section is."""
+    """The known key most similar to a wrong one, or else a key with a similar name in another section."""
     names = {one.rpartition(".")[2]: one for one in reversed(known)}
     whole = difflib.get_close_matches(wanted, known, 1, 0.0)
     in_another = difflib.get_close_matches(wanted.rpartition(".")[2], names, 1, 0.75)
@@ -353,7 +353,7 @@ def _nearest(wanted: str, known: Sequence[str]) -> str:
 
 
 def explain(detail: Any) -> str:
-    """One of pydantic's errors as a line for a user."""
+    """One of pydantic's errors as a message for the user."""
     key = _ALTERNATIVE.sub("", ".".join(str(part) for part in detail["loc"]))
     if detail["type"] == "missing":
         return printable(f"{key[:_LONGEST_KEY]} is missing")

@@ -1,4 +1,4 @@
-"""Every event, once: name, level and the sentence an operator reads. They travel as Foxglove log lines."""
+"""Definitions of all events: name, level and sentence for the operator. They are sent as Foxglove log messages."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -20,7 +20,7 @@ class Level(IntEnum):
 
 
 class _Number(int):
-    """A number that can be formatted with its noun: "{count:frame}" is 1 frame or 2 frames."""
+    """A number formatted with its noun: "{count:frame}" is 1 frame or 2 frames."""
 
     def __format__(self, noun: str) -> str:
         return counted(self, noun) if noun.isalpha() and len(noun) > 1 else super().__format__(noun)
@@ -28,7 +28,7 @@ class _Number(int):
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """One kind of event; `sentence` is a format string for its details."""
+    """Definition of an event; `sentence` is a format string for its details."""
 
     name: str
     level: Level
@@ -56,30 +56,30 @@ EVENTS: dict[str, Event] = {
         Event(
             "CLOCK_OFF",
             Level.WARNING,
-            "this boot's clock is {ahead_ms:+.0f} ms from the wall clock, and so are all times; see `lowfc doctor`",
+            "this boot's clock is {ahead_ms:+.0f} ms from the wall clock, and so are all time stamps; see `lowfc doctor`",
         ),
         Event("REALTIME_REFUSED", Level.WARNING, "the host refused {measure}: {cost}"),
-        Event("KERNEL", Level.INFO, "the {kernel} step computes"),
-        Event("KERNEL_MISSING", Level.WARNING, "numpy computes: {advice}"),
+        Event("KERNEL", Level.INFO, "control step: {kernel}"),
+        Event("KERNEL_MISSING", Level.WARNING, "control step: numpy instead of fused: {advice}"),
         Event("CALIBRATION_LOADED", Level.INFO, "calibration {id}: {modes:mode}, {estimator}, from {source}"),
         Event("NOT_CALIBRATED", Level.WARNING, "the loop is idle: {why}"),
         Event("CAMERA_CHANGED", Level.WARNING, "the camera does not fit the calibration: {what}"),
         Event("MODE_CHANGED", Level.INFO, "loop {before} -> {after}: {why}"),
         Event("SAFED", Level.ERROR, "loop in safe mode: {why}; `lowfc ctl clear` when it is safe"),
         Event("FRAMES_REFUSED", Level.WARNING, "frames refused: {reason}"),
-        Event("FRAMES_ACCEPTED", Level.INFO, "frames accepted again after {refused:frame} refused: {reason}"),
+        Event("FRAMES_ACCEPTED", Level.INFO, "frames accepted again; {refused:frame} refused: {reason}"),
         Event("NO_FRAMES", Level.WARNING, "no frame for {silent_ms:.0f} ms; {action}"),
         Event("FRAMES_BACK", Level.INFO, "frames are back after {silent_ms:.0f} ms"),
         Event("FRAMES_MISSING", Level.WARNING, "{count:frame} missing or skipped before frame {number}"),
-        Event("STREAM_SILENT", Level.WARNING, "no image comes in stream {stream}: {why}"),
-        Event("STREAM_RENEWED", Level.WARNING, "stream {stream} was made anew: {columns} x {rows} pixels"),
+        Event("STREAM_SILENT", Level.WARNING, "no image in stream {stream}: {why}"),
+        Event("STREAM_RENEWED", Level.WARNING, "stream {stream} was recreated: {columns} x {rows} pixels"),
         Event("CAMERA_RESTARTED", Level.WARNING, "the camera restarted"),
         Event("MIRROR_ADOPTED", Level.INFO, "starting from the mirror's command, {rms_nm:.1f} nm rms of wavefront"),
         Event(
             "SHAPE_ADOPTED",
             Level.WARNING,
-            "the mirror had {rms_nm:.1f} nm rms of surface beside the modes: kept as the channel 'adopted'; "
-            "`lowfc ctl channel adopted --zero` takes it away",
+            "the mirror had {rms_nm:.1f} nm rms of surface outside the modes: kept as the channel 'adopted'; "
+            "`lowfc ctl channel adopted --zero` removes it",
         ),
         Event("LAW_NOT_IN_FORCE", Level.WARNING, "the law of the configuration is not in force: {why}"),
         Event("LAW_OVERRULED", Level.WARNING, "the integrator takes over {modes} from the law {law!r}: {why}; {until}"),
@@ -87,14 +87,13 @@ EVENTS: dict[str, Event] = {
         Event("NOTE", Level.INFO, "{text}"),
         Event("CLOSING_HARMS", Level.WARNING, "{harm}"),
         Event("GAINS_CHANGED", Level.INFO, "automatic gains: {gains}"),
-        Event("STAR_CHANGED", Level.WARNING, "the light is {ratio:.3g} times what it was: gains are measured anew"),
+        Event("STAR_CHANGED", Level.WARNING, "the flux changed by a factor of {ratio:.3g}: gains are measured again"),
         Event(
             "LOOP_HARMS",
             Level.WARNING,
-            "the loop makes it worse: {closed_nm:.3g} nm rms of {modes} are left, open it would be {open_nm:.3g}; "
-            "{action}",
+            "the loop increases the residual: {closed_nm:.3g} nm rms of {modes}, in open loop {open_nm:.3g}; {action}",
         ),
-        Event("PLAY_ENDED", Level.WARNING, "what was being played ended: {why}"),
+        Event("PLAY_ENDED", Level.WARNING, "the probe sequence ended: {why}"),
         Event("LEASE_TAKEN", Level.INFO, "the loop is reserved for {holder}"),
         Event("LEASE_RELEASED", Level.INFO, "the loop is no longer reserved for {holder}"),
         Event("LEASE_ENDED", Level.WARNING, "the loop is no longer reserved for {holder}: {why}"),
@@ -112,8 +111,8 @@ EVENTS: dict[str, Event] = {
         Event(
             "START_AHEAD",
             Level.ERROR,
-            "{what} refused: their sender started at {start} by its clock, and here it is {here}; set the clocks, or "
-            "control.max_start_ahead_h",
+            "{what} refused: the sender's clock read {start} when it started, but here it is {here}; set the clocks, "
+            "or control.max_start_ahead_h",
         ),
         Event(
             "LATCH_FAILED",
@@ -123,22 +122,22 @@ EVENTS: dict[str, Event] = {
         Event(
             "COMMANDS_LATE",
             Level.WARNING,
-            "{percent:.0f} % of the commands came after the next exposure had begun: the delay is a frame longer than "
-            "control.delay_frames says, and the highest stable gain lower; reduce the rate or set it",
+            "{percent:.0f} % of the commands came after the start of the next exposure: the delay is one frame longer "
+            "than control.delay_frames, and the highest stable gain lower; reduce the frame rate or set the delay",
         ),
         Event("COMMANDS_IN_TIME", Level.INFO, "commands are in time again: {percent:.0f} % late"),
         Event("FRAMES_LOST", Level.WARNING, "{count:frame} lost by the camera"),
-        Event("DRIVER_FAILED", Level.ERROR, "the driver failed, and is tried again: {why}"),
+        Event("DRIVER_FAILED", Level.ERROR, "the driver failed and will be tried again: {why}"),
         Event("DRIVER_HANGS", Level.ERROR, "the driver has not returned for {hangs_s:.1f} s"),
         Event("DRIVER_BACK", Level.INFO, "the driver works again after {count:failure}"),
         Event("RECORDING", Level.INFO, "recording"),
         Event("RECORDING_STOPPED", Level.INFO, "recording stopped: {why}"),
         Event("MESSAGES_LOST", Level.ERROR, "{count:message} lost on {topic}"),
         Event("RECORDING_FAILED", Level.ERROR, "recording stopped: {why}"),
-        Event("DISK_SLOW", Level.WARNING, "the disk took {stall_s:.1f} s for one write; {waiting:message} waited"),
+        Event("DISK_SLOW", Level.WARNING, "one write to disk took {stall_s:.1f} s; {waiting:message} waited"),
         Event("ON_EVENT_FAILED", Level.WARNING, "the command of recorder.on_event failed: {why}"),
-        Event("VIEW_STUCK", Level.WARNING, "the viewer took nothing for {stuck_s:.0f} s; close its window if it hangs"),
-        Event("VIEW_RENEWED", Level.WARNING, "the view began anew: {why}"),
-        Event("BAD_MESSAGE", Level.WARNING, "{count} on {topic} could not be read, the last because: {why}"),
+        Event("VIEW_STUCK", Level.WARNING, "the viewer read nothing for {stuck_s:.0f} s; close its window if it hangs"),
+        Event("VIEW_RENEWED", Level.WARNING, "the view was restarted: {why}"),
+        Event("BAD_MESSAGE", Level.WARNING, "{count:message} on {topic} could not be read; the last: {why}"),
     )
 }

@@ -1,10 +1,10 @@
-"""The network section of the configuration, which every process of a run needs, and what all sections share."""
+"""The network section of the configuration, and the base class of all sections."""
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 
 class Section(BaseModel):
-    """A section: unknown keys are errors, no value is converted but an integer to a float, values do not change."""
+    """A section: unknown keys are errors, values are immutable, and only integers are converted, to floats."""
 
     model_config = ConfigDict(
         extra="forbid", strict=True, frozen=True, use_attribute_docstrings=True, allow_inf_nan=False
@@ -12,19 +12,19 @@ class Section(BaseModel):
 
 
 class Network(Section):
-    """The way between machines; without a router all processes are on this one."""
+    """Connection between hosts; without a router all processes run on this host."""
 
     router: str = Field("", pattern=r"^(tls/.+:[0-9]{1,5})?$")
     """Where the router listens, such as "tls/bench.example.org:7447"; empty for none."""
     certificates: str = ""
-    """Folder with ca.pem and, for each role on this machine, ROLE.pem and ROLE.key, as `lowfc certs` makes them."""
+    """Folder with ca.pem and, for each role on this host, ROLE.pem and ROLE.key, made by `lowfc certs`."""
     listen: str = Field("", pattern=r"^(tls/.+:[0-9]{1,5})?$")
-    """Of the router: where it listens, if that is not what the others connect to."""
+    """Address on which the router listens, if it differs from `router`."""
 
     @model_validator(mode="after")
     def _both(self) -> "Network":
         if self.router and not self.certificates:
-            raise ValueError("certificates: a folder is needed, for the router takes nobody without one")
+            raise ValueError("certificates: a folder is needed, because the router requires a certificate of each peer")
         return self
 
     @property

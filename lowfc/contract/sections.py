@@ -1,4 +1,4 @@
-"""The sections of the configuration that say what the instrument is: star, sensor, camera, disturbance, mirror."""
+"""The sections of the configuration that describe the instrument: star, sensor, camera, disturbance, mirror."""
 
 from typing import Annotated, Any, Literal, get_args
 
@@ -10,48 +10,48 @@ Preset = Literal["quiet", "bench", "thermal", "reaction-wheel", "reaction-wheel-
 PRESETS: tuple[str, ...] = get_args(Preset)
 
 BENCH_NAME = r"^[A-Za-z][A-Za-z0-9_-]{0,63}$"
-"""Of a bench value, a regular expression."""
+"""Regular expression for the name of a bench value."""
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 
 
 class InterlockSection(Section):
-    """A condition on a value that something else on the bench publishes, and what follows while it holds."""
+    """A condition on a bench value, and the action while the condition holds."""
 
     name: str = Field(pattern=BENCH_NAME)
     """Name of the value: the last part of its topic, lowfc/bench/NAME."""
     test: Literal["equal", "different", "above", "below"] = "equal"
-    """How the value compares with `value` where the interlock acts; above and below are for numbers."""
+    """The interlock acts if the bench value is equal to, different from, above or below `value`."""
     value: bool | float | Annotated[str, Field(max_length=200)]
-    """What it is compared with: true or false, a number, or a text."""
+    """Value to compare with: true or false, a number (required for above and below), or a text."""
     action: Literal["hold", "open", "safe", "refuse_close", "warn"]
-    """What follows: a closed loop holds its command, the loop opens, it goes into safe mode, it is not closed, or a
-    warning alone. All but the last refuse to close the loop meanwhile."""
+    """Action: a closed loop holds its command, the loop opens, goes to safe mode, cannot be closed, or only a warning
+    is raised. All but warn refuse to close the loop while the condition holds."""
     max_age_s: float = Field(5.0, ge=0.01, le=3600)
-    """Time without a new value after which the last one is too old; publish at least twice as often."""
+    """Age above which a value is too old; publish at least twice as often."""
     when_old: Literal["acts", "passes"] = "acts"
-    """What counts for a value that is too old, of another kind, or was never received."""
+    """Whether the interlock acts on a value that is too old, of the wrong type, or never received."""
 
     @model_validator(mode="after")
     def _comparable(self) -> "InterlockSection":
         if self.test in ("above", "below") and not isinstance(self.value, float):
-            raise ValueError(f"{self.test} compares numbers, and value is {self.value!r}")
+            raise ValueError(f"{self.test} compares numbers, but value is {self.value!r}")
         return self
 
 
 class Gateway(Section):
-    """The gateways to control systems: `lowfc gateway`."""
+    """Gateways to control systems: `lowfc gateway`."""
 
     prefix: str = Field("lowfc:", pattern=r"^[A-Za-z0-9_:.-]{1,40}$")
-    """Beginning of the name of every variable that it offers."""
+    """Prefix of the names of all offered variables."""
     listen: str = "127.0.0.1"
-    """Address on which it serves; loopback alone unless another is named."""
+    """Address on which it serves; default: loopback only."""
     port: int = Field(5075, ge=1, le=65534)
-    """TCP port; searches are answered at the next UDP port."""
+    """TCP port; searches are answered on the next UDP port."""
     search: str = "127.0.0.1"
-    """Addresses at which variables of others are searched, with a space between two."""
+    """Addresses searched for variables of other servers, separated by spaces."""
     bench: dict[Annotated[str, Field(pattern=BENCH_NAME)], str] = Field(default_factory=dict)
-    """Variables of others that become bench values: name of the value = name of the variable."""
+    """Variables of other servers that become bench values: name of the value = name of the variable."""
 
 
 class Star(Section):
@@ -66,11 +66,11 @@ class Star(Section):
     bandwidth: float = Field(0.2, gt=0, lt=1)
     """Width of the band as a fraction of the central wavelength."""
     throughput: float = Field(0.5, gt=0, le=1)
-    """Light that is left after all reflections upstream of the coronagraph."""
+    """Transmission of the optics upstream of the coronagraph."""
 
 
 class SensorSection(Section):
-    """The wavefront sensor's optics, and of the coronagraph what it lives on."""
+    """Optics of the wavefront sensor and the coronagraph."""
 
     kind: Literal["sam", "clowfs", "zwfs", "bar", "open"] = "sam"
     """Sparse aperture mask, coronagraphic low-order sensor, Zernike sensor, pupil with a bar, or open relay pupil."""
@@ -81,34 +81,34 @@ class SensorSection(Section):
     focal_radius: float = Field(4.0, ge=1, le=10)
     """Radius of its disk, lambda/D."""
     lyot_stop: float = Field(0.9, gt=0, le=1)
-    """Of circle and prolate: diameter of the stop in front of the science camera, pupil diameters."""
+    """For circle and prolate: diameter of the Lyot stop in front of the science camera, pupil diameters."""
     sam: str = "sam27d07"
-    """Of a sam: a shipped layout, or FILE.json, or FILE.json:NAME."""
+    """For sam: a layout of the package, FILE.json, or FILE.json:NAME."""
     hole_samples: int = Field(1, ge=1, le=16)
-    """Of a sam: points across a pupil sample that say how much of it a hole covers. 1, as the paper: all or nothing, by
-    its centre; 4 for a mask that is made."""
+    """For sam: subsamples across a pupil sample for partial coverage by a hole. 1, as in the paper: all or nothing, by
+    the centre; 4 for a real mask."""
     defocus_mm: float = Field(6.0, ge=1, le=50)
-    """Of a clowfs: the detector's distance from focus."""
+    """For clowfs: defocus of the detector."""
     focal_ratio: float = Field(20.0, ge=1, le=200)
-    """Of a clowfs: focal length over pupil diameter at the focal-plane mask."""
+    """For clowfs: focal ratio at the focal-plane mask."""
     inner_radius: float = Field(0.0, ge=0, lt=10)
-    """Of a clowfs: radius of the hole in the reflecting disk, lambda/D."""
+    """For clowfs: radius of the hole in the reflective disk, lambda/D."""
     spot_diameter: float = Field(1.06, gt=0, le=8)
-    """Of a zwfs: the phase spot's diameter, lambda/D."""
+    """For zwfs: diameter of the phase spot, lambda/D."""
     bar_width: float = Field(0.1, gt=0, lt=1)
-    """Of a bar: its width, pupil diameters."""
+    """For bar: its width, pupil diameters."""
     bar_angle_deg: float = Field(20.0, ge=0, lt=360)
-    """Of a bar: its direction from the x axis towards y."""
+    """For bar: its direction from the x axis towards y."""
     modes: int = Field(14, ge=1, le=35)
-    """Zernike modes after piston, from Noll 2 on."""
+    """Number of Zernike modes, from Noll 2."""
     wavelengths: int = Field(1, ge=1, le=9)
     """Wavelengths of the simulated band; 1 is monochromatic."""
     quadrature: Literal["gauss-legendre", "uniform"] = "gauss-legendre"
-    """How the wavelengths are chosen: uniform is the paper's, both ends included, and far less accurate."""
+    """Choice of the wavelengths: uniform, as in the paper, includes both ends and is far less accurate."""
     nodes: Literal[32, 64] = 32
     """Pupil nodes across the diameter in the real-time twin."""
     rank: int = Field(60, ge=20, le=200)
-    """Modes kept of the optical operator in the real-time twin."""
+    """Rank of the compressed optical operator in the real-time twin."""
 
 
 SENSORS: dict[str, dict[str, Any]] = {
@@ -123,7 +123,7 @@ SENSORS: dict[str, dict[str, Any]] = {
     "lyot": {"kind": "sam", "pupil": "circle"},
     "aplc": {"kind": "sam", "pupil": "prolate", "focal_radius": 2.5},
 }
-"""The sensors that have a name on the command line, as keys of [sensor]."""
+"""Named sensors of the command line, as keys of [sensor]."""
 
 
 def sensor_keys(name: str) -> dict[str, Any]:
@@ -137,7 +137,7 @@ class Camera(Section):
     rate_hz: float = Field(250.0, gt=0, le=20_000)
     """Frames per second."""
     exposure_fraction: float = Field(0.5, gt=0, le=1)
-    """Part of the period during which light is collected; the rest is for the loop to react."""
+    """Exposure time as a fraction of the frame period; the loop reacts in the rest."""
     quantum_efficiency: float = Field(0.8, gt=0, le=1)
     """Electrons per photon."""
     read_noise_e: NotNegative = 1.0
@@ -147,32 +147,32 @@ class Camera(Section):
     bias_dn: float = Field(100.0, ge=0, le=60_000)
     """Level without light."""
     full_well_e: Positive = 40_000.0
-    """Electrons that a pixel can hold."""
+    """Full-well capacity of a pixel, electrons."""
     bit_depth: int = Field(16, ge=8, le=16)
     """Bits of the converter."""
     em_gain: float = Field(1.0, ge=1, le=5000)
-    """Electron-multiplying gain; 1 is a plain detector."""
+    """Electron-multiplying gain; 1 for a conventional detector."""
     clock_induced_charge_e: NotNegative = 0.0
     """Spurious electrons per pixel and frame before multiplication."""
     dark_current_e_s: NotNegative = 0.0
-    """Dark current of every pixel, electrons per second; known to an analytic calibration, as from a dark frame."""
+    """Dark current of every pixel, electrons per second; included in an analytic calibration, as by a dark frame."""
     hot_pixels: float = Field(0.0, ge=0, le=0.5)
-    """Of the simulated camera: fraction of pixels that are hot; an analytic calibration does not know of them."""
+    """Simulated camera: fraction of hot pixels, which an analytic calibration does not include."""
     hot_pixel_e_s: Positive = 20_000.0
-    """Of the simulated camera: mean dark current of a hot pixel, electrons per second, exponentially distributed."""
+    """Simulated camera: mean dark current of a hot pixel, electrons per second, exponentially distributed."""
     nonlinearity: float = Field(0.0, ge=0, le=0.5)
-    """Of the simulated camera: by which fraction the gain of a faint pixel exceeds that of one at full well."""
+    """Simulated camera: relative excess of the gain at low signal over the gain at full well."""
     nonuniformity: float = Field(0.0, ge=0, le=0.3)
-    """Of the simulated camera: rms of the pixels' response, a fraction; an analytic calibration does not know of it."""
+    """Simulated camera: rms pixel response non-uniformity, a fraction; not included in an analytic calibration."""
     delay_frames: float = Field(1.0, ge=1, le=3)
-    """Frames from the one a command is made from to the first exposed wholly under it; 1 is the least."""
+    """Delay: frames from the frame that a command is computed from to the first frame exposed wholly with it."""
     instants: int = Field(8, ge=1, le=64)
-    """Of the simulated camera: instants of each period over which the true wavefront is the mean. With 1 it is that of
-    the instant at which the exposure starts, and so is the image, which is not blurred."""
+    """Simulated camera: instants of each period over which the true wavefront is averaged. With 1, wavefront and image
+    are those at the start of the exposure, without blur."""
     noise: bool = True
     """Photon and read noise; off only for tests of the control law."""
     photon_noise: Literal["fast", "exact"] = "fast"
-    """Faint pixels from a table of their law (its variance is 6e-5 e-^2 too large at most), or every electron drawn."""
+    """fast: faint pixels from a tabulated distribution, variance at most 6e-5 e-^2 too large; exact: all electrons."""
 
 
 class Disturbance(Section):
@@ -183,27 +183,27 @@ class Disturbance(Section):
     scale: NotNegative = 1.0
     """Multiplies the preset's amplitude."""
     line_width: float = Field(0.005, ge=0, le=0.05)
-    """Of the reaction wheel's lines, between half-power points, as a fraction of their frequency."""
+    """Width of the reaction wheel's lines between half-power points, as a fraction of their frequency."""
     static_nm: dict[str, float] = Field(default_factory=dict)
-    """Constant wavefront added to it: Noll index = nm rms."""
+    """Constant wavefront added to the preset: Noll index = nm rms."""
     drift_nm: dict[str, float] = Field(default_factory=dict)
-    """Random walk added to it, from 1e-4 to 10 Hz: Noll index = nm per root second."""
+    """Random walk added to the preset, from 1e-4 to 10 Hz: Noll index = nm per root second."""
     drift_slope: float = Field(2.0, ge=0, le=4)
-    """Power of frequency with which the drift's spectrum falls: drift_nm^2 / (2 pi^2 f^slope) per Hz; 2 for a walk."""
+    """Exponent of the drift's spectrum, drift_nm^2 / (2 pi^2 f^slope) per Hz; 2 for a random walk."""
     jitter_mas: NotNegative = 0.0
     """Jitter too fast for the loop, mas rms per axis: white from half the frame rate to one and a half."""
     shear: float = Field(0.0, ge=0, le=0.05)
-    """Slow wander of the beam on the sensor's masks, pupil diameters rms per axis; its effect to first order."""
+    """Slow beam wander on the sensor's masks, pupil diameters rms per axis; computed to first order."""
     wheel_hz: NotNegative = 0.0
-    """Speed of a reaction wheel at the start, turns per second; 0 for none. It shakes tip and tilt at its harmonics."""
+    """Initial speed of a reaction wheel, turns per second (0: none). It excites tip and tilt at its harmonics."""
     wheel_mas: NotNegative = 3.0
-    """Of its first harmonic at high speed, mas rms per axis; the others are a half to a seventh."""
+    """Amplitude of its first harmonic at high speed, mas rms per axis; the others are a half to a seventh of it."""
     wheel_course: Literal["ramp", "walk", "run-down"] = "ramp"
-    """How its speed changes: evenly, at random, or as friction slows it."""
+    """Change of its speed: linear, random walk, or slowed by friction."""
     wheel_change: float = 0.0
-    """Of a ramp and, at its start, of a run-down Hz per second; of a walk Hz per root second; 0 for a steady wheel."""
+    """Rate of that change: Hz per second (run-down: at its start), walk: Hz per root second; 0 for constant speed."""
     second_wheel_hz: float = 0.0
-    """By which a second wheel of the same kind is faster at the start, so that the two beat; 0 for none."""
+    """Initial excess speed of a second, identical wheel, so that the two beat; 0 for no second wheel."""
 
     @model_validator(mode="after")
     def _noll_indices(self) -> "Disturbance":
@@ -219,7 +219,7 @@ IMPERFECTIONS = (
     *("mirror.gain_error", "mirror.hysteresis", "mirror.creep"),
     *("camera.dark_current_e_s", "camera.hot_pixels", "camera.nonlinearity", "camera.nonuniformity"),
 )
-"""Keys by which the simulated world is less kind; each is off by default."""
+"""Keys of the simulated imperfections; each is off by default."""
 
 
 class Mirror(Section):
@@ -236,9 +236,9 @@ class Mirror(Section):
     coupling: float = Field(0.15, gt=0, lt=1)
     """Height of an influence function at the neighbouring actuator."""
     stroke_nm: float = Field(1500.0, gt=0)
-    """Whole range of an actuator, surface."""
+    """Full range of an actuator, nm of surface."""
     driver_bits: int = Field(16, ge=8, le=24)
-    """Bits of the driver over the whole range."""
+    """Bits of the driver over the full range."""
     settling_us: NotNegative = 50.0
     """Time constant of an actuator's first-order response."""
     dead: list[int] = Field(default_factory=list)
@@ -250,20 +250,20 @@ class Mirror(Section):
     neighbour_nm: float = Field(500.0, gt=0.01)
     """Largest difference between neighbouring actuators that the mirror accepts."""
     on_command_timeout: Literal["hold", "flat"] = "flat"
-    """When the last command has expired: hold the shape, or relax to flat within the slew limit."""
+    """Action after a command timeout: hold the shape, or relax to flat within the slew limit."""
     flat: str = ""
-    """File (FITS or .npy) of the flat map, nm of surface, which is on the mirror from the start; empty for none."""
+    """Flat map (FITS or .npy), nm of surface, applied from the start; empty for none."""
     active: str = ""
-    """File (FITS or .npy) of the active actuators, 0 or 1: modes and flat map leave the others out; empty for all."""
+    """Map of the active actuators (FITS or .npy), 0 or 1: modes and flat map exclude the others; empty for all."""
     nm_per_unit: Positive = 1.0
-    """For the mirror's driver: nm of surface that one unit of what it writes to the hardware makes."""
+    """For the mirror's driver: nm of surface per unit written to the hardware."""
     shift_pitches: float = Field(0.0, ge=-2, le=2)
-    """Of the simulated mirror: how far its actuators lie from where they are believed, along x and along y."""
+    """Simulated mirror: misregistration of its actuators along x and along y, pitches."""
     magnification: float = Field(1.0, ge=0.9, le=1.1)
-    """Of the simulated mirror: its size in the pupil, of the one that is believed."""
+    """Simulated mirror: its size in the pupil relative to the configured one."""
     gain_error: float = Field(0.0, ge=0, le=0.5)
-    """Of the simulated mirror: rms error of the actuators' gains, a fraction; from the seed."""
+    """Simulated mirror: rms error of the actuators' gains, a fraction; drawn from the seed."""
     hysteresis: float = Field(0.0, ge=0, le=0.5)
-    """Of the simulated mirror: part of a move that turns back only after a play of 1 to 256 nm; 0.1 for a piezo."""
+    """Simulated mirror: fraction of a move that reverses only after a backlash of 1 to 256 nm; 0.1 for a piezo."""
     creep: float = Field(0.0, ge=0, le=0.1)
-    """Of the simulated mirror: part of a move that follows in each decade of time, 0.1 to 100 s; 0.01 for a piezo."""
+    """Simulated mirror: creep per decade of time, 0.1 to 100 s, as a fraction of a move; 0.01 for a piezo."""

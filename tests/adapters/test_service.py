@@ -148,8 +148,8 @@ def test_a_flood_of_bad_messages_is_one_event_and_the_last_health_has_all_counts
     mirror.stop("enough")
     mirror.finish()
     assert ear.said("BAD_MESSAGE") == [
-        "BAD_MESSAGE 500 on lowfc/mirror/dm/command could not be read, the last because: reason 499",
-        "BAD_MESSAGE 1 on lowfc/mirror/dm/command could not be read, the last because: too short",
+        "BAD_MESSAGE 500 messages on lowfc/mirror/dm/command could not be read; the last: reason 499",
+        "BAD_MESSAGE 1 message on lowfc/mirror/dm/command could not be read; the last: too short",
     ]
     assert not mirror.running
     assert ear.messages(EVENT)[-1].message == "STOPPED mirror-dm stopped: enough"

@@ -581,10 +581,10 @@ def test_the_status_says_everything() -> None:
         "dark-hole 3.54 nm rms",
         "12 of 20",
         "acting: slew",
-        "integrator alone",
+        "integrator only",
     ):
         assert words in text(figures(state))
-    assert text(figures(state)).splitlines()[-1].endswith("abc, the first of a commissioning: without a verdict")
+    assert text(figures(state)).splitlines()[-1].endswith("abc, provisional: from the first step of commissioning")
     assert figures(wire.ControllerState())["mode"] == "starting"
     assert "without a verdict" not in text(figures(wire.ControllerState(calibration_id="abc")))
 
@@ -662,6 +662,6 @@ def test_contrast_is_said_of_a_real_camera_as_measured_and_of_a_simulated_one_as
     processes = {Role.CAMERA: wire.Health(), Role.CONTROLLER: measured}
     real, simulated = (figures(wire.ControllerState(), processes | more) for more in ({}, {Role.CAMERA: true}))
     assert real["added_contrast"] == {"open": 2e-9, "closed": 3e-11}
-    assert "+3.0e-11, as measured by the sensor" in text(real)
+    assert "+3.0e-11, estimated from the sensor" in text(real)
     assert simulated["added_contrast"] == {"open": 4e-9, "closed": 5e-11}
     assert "as measured" not in text(simulated)

@@ -126,7 +126,7 @@ def test_the_promise_is_kept_at_the_default_and_with_halved_amplitudes(snr: floa
 def test_where_the_promise_is_out_of_reach_it_is_said(seed: int, tmp_path: Path) -> None:
     found = outcome("hadamard", SHAKEN, seed, 30.0, tmp_path)
     assert found.verdict.snr_reached < 30
-    assert "was to be reached: find what shakes this mode, or take about" in found.verdict.faults[0]
+    assert "required: find the disturbance of this mode, or take about" in found.verdict.faults[0]
 
 
 @pytest.mark.slow

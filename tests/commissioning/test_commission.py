@@ -185,7 +185,7 @@ def test_it_goes_on_where_it_was_interrupted_and_who_opens_the_loop_at_the_end_i
     with pytest.raises(CalibrationError, match="the lease ended: operator asked to open"):
         bench.commission(resume=True)
     assert "[1/10]" not in bench.shown
-    assert "going on after" in bench.shown
+    assert "continuing after" in bench.shown
     assert "the calibration is good" in bench.shown
     state = bench.loop.status().state
     assert (state.mode, state.calibration_id) == (wire.LOOP_MODE_OPEN, calibration_file.load(bench.out).id)

@@ -89,7 +89,7 @@ def test_the_integrator_takes_over_without_a_jump_and_it_is_told() -> None:
     _, state = run(state, SPANS.faded, first + 1)
     known = status.figures(controller_state(state, WHAT, 1))
     assert known["law"]["overruled"] == ["tip and tilt"]
-    assert "in whose place the integrator drives tip and tilt" in status.text(known)
+    assert "overruled: the integrator drives tip and tilt" in status.text(known)
     weight = state.drive.following.weight
     np.testing.assert_array_equal(weight, [0, 0, 1])
 

@@ -45,7 +45,7 @@ def test_a_running_loop_is_calibrated_interrupted_and_gone_on_with(tmp_path: Pat
             until(lambda: flat(client))
         done = run(tmp_path, "calibrate", "--cycles", "5", "--resume", "--out", "night.fits", "--json")
         assert done.returncode == 0, done.stderr
-        assert "going on after" in done.stderr
+        assert "continuing after" in done.stderr
         found = json.loads(done.stdout)
         assert {"method", "modes", "condition_number", "delay_frames", "noise_gain_nm", "file"} <= found.keys()
         assert found["delay_frames"] == pytest.approx(1.5, abs=0.05)

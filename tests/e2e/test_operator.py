@@ -207,7 +207,7 @@ def test_the_commands_say_what_they_did(night: Night) -> None:
     names = ("camera", "controller", "mirror-dm", "recorder")
     assert [name for name, _ in processes] == list(names)
     assert all(name in said["hosts"] for name in names)
-    assert said["hosts"].endswith("no clock is compared: the run has no router, or none that has a clock\n")
+    assert said["hosts"].endswith("no clock is compared: the run has no router, or its router reports no clock\n")
     assert f"run {night.name}" in said["beginning"]
     assert status["channels"] == []
     assert json.loads(said["lowfc ctl note once --json"])["reply"] == "noted"

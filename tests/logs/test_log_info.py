@@ -110,7 +110,7 @@ def test_a_person_reads_the_same(log: Path) -> None:
     for words in (
         "complete",
         "2026-01-01T00:00:00.000+00:00, 10.000 s",
-        "203; 7 missing by their counts, the recorder counted as lost 4",
+        "203; 7 missing by their sequence numbers, 4 counted as lost by the recorder",
         "open, closed",
         "CAMERA_RESTARTED 2, MESSAGES_LOST 1",
         "config.toml (7 bytes)",
@@ -126,7 +126,7 @@ def test_an_unfinished_and_a_damaged_log_say_so(log: Path) -> None:
     log.write_bytes(data[:-500])
     recover(log, recovered := log.with_name("recovered.mcap"))
     said = lowfc("info", recovered).stdout
-    assert "recovered from night.mcap, which had not been finished; left out: damaged parts 0" in said
+    assert "recovered from night.mcap, which was incomplete; left out: damaged parts 0" in said
     said = lowfc("info", log)
     assert said.exit_code == 0
     assert "truncated" in said.stdout
@@ -135,7 +135,7 @@ def test_an_unfinished_and_a_damaged_log_say_so(log: Path) -> None:
     log.write_bytes(data)
     said = lowfc("info", log)
     assert said.exit_code == 0
-    assert "damaged; `lowfc recover` saves what is whole" in said.stdout
+    assert "damaged; `lowfc recover` saves the intact messages" in said.stdout
     assert "the checksum of an attachment is wrong" in said.stdout
     found = json.loads(lowfc("info", log, "--json").stdout)
     assert (found["state"], len(found["damage"]), found["attachments"]) == ("damaged", 1, {})

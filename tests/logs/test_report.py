@@ -158,7 +158,7 @@ def test_the_verdict_names_what_was_wrong(eventful: dict[str, Any]) -> None:
     assert verdict["level"] == "look"
     assert {name for name, level in levels.items() if level == "look"} == {"commands", "light", "events"}
     assert {name for name, level in levels.items() if level == "good"} == {"log", "loop", "residual", "delay", "mirror"}
-    assert verdict["because"] == "6 of 2250 frames (0.27%) got no command"
+    assert verdict["because"] == "6 of 2250 frames (0.27%) led to no command"
     before_nm = eventful["residual"]["open_pupil"]["disturbance_open_pupil_rms_nm"]
     text = verdict["checks"][2]["text"]
     assert text.startswith(f"{before_nm:.3g} nm before")
@@ -203,8 +203,8 @@ def stopped(good: Path, folder: Path) -> Path:
     [
         (lambda good, folder: good, "good", "complete, no message lost", True),
         (damaged, "look", "1 damaged part left out", False),
-        (cut_off, "look", "its end is missing: the recorder did not finish it", False),
-        (recovered, "look", "recovered from x.mcap.part, which had not been finished; left out: damaged parts 0", True),
+        (cut_off, "look", "truncated: the recorder did not finish it", False),
+        (recovered, "look", "recovered from x.mcap.part, which was incomplete; left out: damaged parts 0", True),
         (stopped, "bad", "recording stopped: the disk is full", True),
     ],
 )
@@ -236,7 +236,7 @@ def test_a_log_without_a_step_still_has_a_page(tmp_path: Path, empty: bool) -> N
         night.samples.clear()
     made = report_of(read_run(night.write(tmp_path / "x.mcap", config=not empty)))
     assert made.figures["verdict"]["level"] == "bad"
-    assert made.figures["verdict"]["because"] == "no step of the control law is in this log"
+    assert made.figures["verdict"]["because"] == "this log has no control steps"
     assert "No step of the control law is in this log" in page(made)
 
 
@@ -304,7 +304,7 @@ def test_a_loop_closed_under_an_unknown_law_is_not_called_open(tmp_path: Path) -
     night.samples = [sample for sample in night.samples if sample.key != CONTROLLER_STATE.key]
     found = figures(night.write(tmp_path / "x.mcap"))
     assert found["mode_steps"] == {"closed": 300}
-    why = "this log does not tell under which law the loop was closed"
+    why = "this log does not contain the law with which the loop was closed"
     assert found["spectra"] == found["error_budget"] == {"why_not": why}
     assert found["verdict"]["checks"][2]["text"] == why
 

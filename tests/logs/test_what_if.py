@@ -188,7 +188,7 @@ def test_a_log_says_what_other_gains_give(runs: dict[str, LoggedRun]) -> None:
 def test_a_wrong_idea_of_the_delay_is_found_and_put_right(runs: dict[str, LoggedRun]) -> None:
     figures = figures_of(runs["other"])
     assert (figures["delay_controller_frames"], figures["delay_frames"]) == (2, 1)
-    assert "reckoned with a delay of 2 frames" in figures["warnings"][0]
+    assert "assumed a delay of 2 frames" in figures["warnings"][0]
     np.testing.assert_allclose(column(figures, "what_if"), column(figures, "was"), atol=1e-5)
 
 
@@ -367,7 +367,7 @@ def test_too_little_to_compare_is_said() -> None:
         rows_compared(LoggedRun(history(saturated_pixels=np.ones(40, np.int64))))
     nothing = np.full((40, 3), np.nan, np.float32)
     for short in (history(error_nm=nothing), replace(history(), calibration=None)):
-        with pytest.raises(DataFileError, match="too few frames that a calibrated controller used"):
+        with pytest.raises(DataFileError, match="too few frames used by a calibrated controller"):
             LoggedRun(short)
     with pytest.raises(DataFileError, match="gains and delay are not known"):
         LoggedRun(replace(history(), controllers=[]))
@@ -413,7 +413,7 @@ def test_an_open_loop_far_out_is_warned_of() -> None:
 @pytest.mark.parametrize(
     ("body", "message"),
     [
-        (None, "FILE.py:NAME of a file that exists"),
+        (None, "FILE.py:NAME of an existing file"),
         ("def step(state, error_nm):\n    return error_nm[0]\n", "TypeError: .* must return"),
         ("def step(state, error_nm):\n    return state, error_nm[:1]\n", "must be 3 finite numbers"),
         ("def step(state, error_nm):\n    return state, [1, 2, float('nan')]\n", "must be 3 finite numbers"),
@@ -444,10 +444,10 @@ def test_the_words_of_the_command_line() -> None:
     ("text", "message"),
     [
         ("gian=0.6", r"unknown key 'gian' \(did you mean 'gain'\?\); known are gain, leak,"),
-        ("gain", "gain needs one value"),
+        ("gain", "gain requires one value"),
         ("gain=high", "gain must be a number, got 'high'"),
-        ("gain=1,gain=2", "gain needs one value"),
-        ("", "a what-if changes something; give --set KEY=VALUE"),
+        ("gain=1,gain=2", "gain requires one value"),
+        ("", "nothing to change: give --set KEY=VALUE"),
         ("estimator=best", "estimator must be weighted or pinv, got 'best'"),
         *((text, "every .* must be between") for text in ("gain=5", "leak=2", "gain=nan", "limit_nm=-1")),
     ],

@@ -203,7 +203,7 @@ def makes_the_bridge_grow(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None
     ("harm", "stuck", "why"),
     [
         (dies, 0, "the viewer was killed"),
-        (takes_nothing, 1, "took nothing for"),
+        (takes_nothing, 1, "read nothing for"),
         (grows, 0, "the viewer holds 16"),
         (makes_the_bridge_grow, 0, "the bridge holds 512 MB"),
     ],

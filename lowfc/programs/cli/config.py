@@ -1,4 +1,4 @@
-"""The commands `lowfc config`: every key with its sentence, a check, the bus session of a role."""
+"""The commands `lowfc config`: print all keys, check a file, print the zenoh configuration of a role."""
 
 import json
 from collections.abc import Iterator
@@ -18,16 +18,16 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BusError, ConfigurationError
 
 _HEADER = (
-    "# A key with a # before it has its default. Remove the # to choose a value; a command may choose another default",
-    "# where the file is silent: sim-loop starts with the loop closed and gives the controller a processor of its own.",
+    "# Keys after a # have their defaults; remove the # to set a value. For keys that are not set, a command may use",
+    "# another default: sim-loop starts with the loop closed and gives the controller a processor of its own.",
     "",
 )
 
 
 def commented(config: Configuration) -> str:
-    """TOML of a configuration: each key below its sentence, commented out unless it was chosen.
+    """TOML of a configuration: each key below its description, commented out unless it was set.
 
-    A key that was not chosen would otherwise replace what a command chooses where the file is silent.
+    If it were not commented out, a default here would replace the command's own default.
     """
     return "\n".join([*_HEADER, *_lines(config)])
 
@@ -49,12 +49,12 @@ def _lines(section: BaseModel, prefix: str = "") -> Iterator[str]:
 
 
 def _tables(value: object) -> list[BaseModel]:
-    """The section that a value is, or the sections in it; none of a plain value."""
+    """The section or the list of sections of a value; empty for a plain value."""
     return [one for one in (value if isinstance(value, list) else [value]) if isinstance(one, BaseModel)]
 
 
 def _assignment(name: str, value: object) -> list[str]:
-    """A key and its value; a table in one line, so that it can stand between other keys."""
+    """A key and its value; a table as one inline line, so that it can be between other keys."""
     if not isinstance(value, dict):
         return tomli_w.dumps({name: value}).splitlines()
     items = ", ".join(" ".join(_assignment(key, one)) for key, one in value.items())
@@ -62,7 +62,7 @@ def _assignment(name: str, value: object) -> list[str]:
 
 
 def config_show(config: ConfigFile = None) -> None:
-    """Print every key with its value and its sentence, as TOML; keys that nobody chose are commented out.
+    """Print every key with its value and description, as TOML; keys that are not set are commented out.
 
     Example: lowfc config show > lowfc.toml
     """
@@ -70,7 +70,7 @@ def config_show(config: ConfigFile = None) -> None:
 
 
 def config_check(config: Annotated[Path, typer.Argument(help="Configuration file (TOML).")]) -> None:
-    """Check a configuration file and the files it names; exit status 2 and one line per mistake where it is wrong.
+    """Check a configuration file and the files it names; on errors exit with status 2 and one line per error.
 
     Example: lowfc config check lowfc.toml
     """
@@ -87,18 +87,18 @@ def config_check(config: Annotated[Path, typer.Argument(help="Configuration file
 def config_zenoh(
     role: Annotated[str, typer.Option(help="Role of your program, such as camera.")],
     run: AnyRun = None,
-    make: Annotated[bool, typer.Option("--make", help="Make the run, if it is not there.")] = False,
+    make: Annotated[bool, typer.Option("--make", help="Create the run if it does not exist.")] = False,
 ) -> None:
-    """Print the zenoh configuration for a program of your own that plays a role in a run.
+    """Print the zenoh configuration with which your own program joins a run in a role.
 
     Example: lowfc config zenoh --role camera --run bench
     """
     try:
         joined = open_run(run or DEFAULT_RUN if make else the_known_run(run))
     except BusError as fault:
-        raise fault if make else BusError(f"{fault}; --make makes a run that is not there") from None
+        raise fault if make else BusError(f"{fault}; --make creates a run that does not exist") from None
     known = sorted({*joined.links.ports, "bench", "operator", "launcher"})
     if role not in known:
-        raise BusError(f"run {run!r} has no role {role!r}; there are {', '.join(known)}")
-    HostClock()  # its file says what time the messages of this host go by
+        raise BusError(f"run {run!r} has no role {role!r}; its roles are {', '.join(known)}")
+    HostClock()  # writes the file with the clock of this host's time stamps
     typer.echo(json.dumps(session_config(joined.links, role), indent=2))

@@ -1,4 +1,4 @@
-"""What the wavefront adds to the contrast of the dark zone: the figures and the sentence that commands share."""
+"""Contrast added to the dark zone by the wavefront: figures and text shared by several commands."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -10,10 +10,10 @@ from lowfc.optics.chain.added_contrast import ModalContrast, by_group, costliest
 
 
 def added_contrast(contrast: ModalContrast | None, covariance_nm2: Mapping[str, Array | None]) -> dict[str, Any] | None:
-    """What wavefronts with these covariances (modes, modes) add, by name; None without a science image.
+    """Contrast added by wavefronts with these covariances (modes, modes), by name; None without a science image.
 
-    Beside each name: `by_group`, what modes of a kind add of each; `beyond_quadratic`, the names of those for which
-    full images say something else.
+    Further keys: `by_group`, the contribution of each group of modes; `beyond_quadratic`, the names for which full
+    images disagree with the quadratic form.
     """
     known = {name: one for name, one in covariance_nm2.items() if one is not None}
     if contrast is None or not known or any(len(one) != len(contrast.noll) for one in known.values()):
@@ -27,21 +27,21 @@ def added_contrast(contrast: ModalContrast | None, covariance_nm2: Mapping[str, 
 
 
 def with_variances(covariance_nm2: Array, rms_nm: Array) -> Array:
-    """A covariance (modes, modes) at instants with the variances (modes,) at all times, which between them are larger.
+    """Replace the variances of a covariance (modes, modes) sampled at instants by the continuous, larger ones (modes,).
 
-    What modes have in common is the noise in their commands, which stays for the period.
+    Off-diagonal terms come from command noise, which is constant over the period.
     """
     return np.asarray(covariance_nm2 + np.diag(rms_nm**2 - np.diag(covariance_nm2)))
 
 
 def most_of(figures: Mapping[str, Any]) -> tuple[str, float] | None:
-    """The costliest modes that a camera reported, among the figures of its wavefront."""
+    """The modes that contribute most to the added contrast, from a camera's wavefront figures."""
     most = figures["costliest_modes"]
     return None if most is None else (most["modes"], most["share"])
 
 
 def with_this_mirror(added: Mapping[str, float]) -> dict[str, float | None]:
-    """Contrast added with a flat mirror, and by the residual with the mirror as it is, in any loop mode."""
+    """Contrast added with a flat mirror, and by the residual with the present mirror shape, in any loop mode."""
     return {"flat mirror": added["open"], "residual": added["closed"]}
 
 

@@ -1,4 +1,4 @@
-"""`lowfc ctl`: a command for each request of `lowfc.client.requests`, with its sentence, by the fields that it has."""
+"""`lowfc ctl`: one command for each request of `lowfc.client.requests`, with the request's fields as arguments."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -17,21 +17,21 @@ from lowfc.programs.commissioning.calibrate.command import dark, reference
 if TYPE_CHECKING:
     from lowfc.client import Answer, Client
 
-ctl_app = new_app("Ask a running controller.\n\nExample: lowfc ctl status")
-record_app = new_app("Start the next log, or finish this one.\n\nExample: lowfc ctl record stop")
+ctl_app = new_app("Operate a running loop.\n\nExample: lowfc ctl status")
+record_app = new_app("Start the next log or finish the current one.\n\nExample: lowfc ctl record stop")
 ctl_app.add_typer(record_app, name="record")
 
 ZERO = "--zero"
 INTEGRATOR = "integrator"
 AUTOMATIC = "auto"
 SIGNAL = (
-    "a controller that cannot be asked is made safe by a signal on its host: "
+    "if the controller does not answer, a signal on its host puts it in safe mode: "
     "pkill -USR1 -f '^[^ ]*python.* (-m |[^ ]*/)lowfc controller'"
 )
 
 
 def number(word: str) -> float:
-    """A number as it was typed; one that is none is shown."""
+    """Parse a number; the error quotes the word."""
     try:
         return float(word)
     except ValueError:
@@ -39,35 +39,35 @@ def number(word: str) -> float:
 
 
 def gain_word(word: str) -> str:
-    """A gain as it was typed, or `auto`."""
+    """Parse a gain, or `auto`."""
     return word if word == AUTOMATIC else str(number(word))
 
 
 def whole(word: str) -> int:
-    """A number of frames as it was typed."""
+    """Parse a number of frames."""
     try:
         return int(word)
     except ValueError:
         raise typer.BadParameter(f"{word!r} is not a whole number: write 50") from None
 
 
-_EACH = "One value for all modes, or one for each."
+_EACH = "One value for all modes, or one for each mode."
 Values = Annotated[list[float], typer.Argument(help=_EACH, parser=number)]
 Gains = Annotated[list[str], typer.Argument(help=f"{_EACH[:-1]}; or {AUTOMATIC}.", parser=gain_word)]
 ValuesIfAny = Annotated[list[float] | None, typer.Argument(help=f"{_EACH} nm rms of wavefront.", parser=number)]
-Zero = Annotated[bool, typer.Option(ZERO, help="Remove it.")]
-Frames = Annotated[int, typer.Argument(help="Frames for which the loop is closed.", parser=whole)]
-Text = Annotated[str, typer.Argument(help="What to remember.")]
-Purpose = Annotated[str, typer.Argument(help="What is moved.")]
+Zero = Annotated[bool, typer.Option(ZERO, help="Set it to zero.")]
+Frames = Annotated[int, typer.Argument(help="Number of frames with the loop closed.", parser=whole)]
+Text = Annotated[str, typer.Argument(help="The note.")]
+Purpose = Annotated[str, typer.Argument(help="What will be moved.")]
 Hold = Annotated[
-    float | None, typer.Option(help="Seconds for which the loop is held; `open` ends that.", parser=number)
+    float | None, typer.Option(help="Hold the loop for this many seconds; `open` ends the hold.", parser=number)
 ]
-BenchName = Annotated[str, typer.Argument(help="Of the value, as in the interlocks of the configuration.")]
+BenchName = Annotated[str, typer.Argument(help="Name of the value, as in [[interlocks]] of the configuration.")]
 BenchValue = Annotated[str, typer.Argument(help="true, false, a number or a text.")]
-Channel = Annotated[str, typer.Argument(help="Of the channel; `flat` does not shift the sensor's zero point.")]
+Channel = Annotated[str, typer.Argument(help="Name of the channel; `flat` does not shift the sensor's zero point.")]
 Shape = Annotated[Path | None, typer.Argument(help="FITS or .npy array (rows, columns), nm of surface.")]
 CalibrationFile = Annotated[Path, typer.Argument(help="Calibration file (FITS).")]
-LawFile = Annotated[str, typer.Argument(help="Law file (FITS), or integrator.")]
+LawFile = Annotated[str, typer.Argument(help="Law file (FITS), or `integrator`.")]
 
 _Command = Callable[..., None]
 
@@ -139,7 +139,7 @@ def _offset(
     values: ValuesIfAny = None, modes: Modes = None, zero: Zero = False, run: AnyRun = None, as_json: Json = False
 ) -> None:
     if zero == bool(values):
-        raise ConfigurationError(f"offset takes values, or {ZERO}")
+        raise ConfigurationError(f"offset requires values or {ZERO}")
     _ask(run, as_json, lambda loop: loop.offset([0.0] if zero else values or (), noll_of(modes)))
 
 
@@ -147,7 +147,7 @@ def _channel(name: Channel, file: Shape = None, zero: Zero = False, run: AnyRun 
     from lowfc.adapters.files.mirror_maps import read_shape
 
     if zero == (file is not None):
-        raise ConfigurationError(f"channel takes a file, or {ZERO}")
+        raise ConfigurationError(f"channel requires a file or {ZERO}")
     shape = None if file is None else read_shape(file)
     _ask(run, as_json, lambda loop: loop.channel(name, shape))
 
@@ -157,7 +157,7 @@ def _permit(text: Purpose, hold: Hold = None, run: AnyRun = None, as_json: Json 
 
 
 def bench(name: BenchName, value: BenchValue, run: AnyRun = None, as_json: Json = False) -> None:
-    """Publish a value of something else on the bench, once, and print which interlocks act.
+    """Publish a bench value once, and print which interlocks act.
 
     Example: lowfc ctl bench mask-moving true
     """
@@ -175,7 +175,7 @@ def bench(name: BenchName, value: BenchValue, run: AnyRun = None, as_json: Json 
         assert state is not None  # noqa: S101  # that is what it answers with
     known = figures(state, run=loop.run_id)
     names = sorted({one.name for one in state.settings.interlocks})
-    unused = "" if name in names else f"; no interlock reads it, they read: {', '.join(names)}" if names else ""
+    unused = "" if name in names else f"; no interlock uses it (they use {', '.join(names)})" if names else ""
     acting = f"interlocks: {interlocks(known)}" if names else "no interlock is configured"
     said = {"run": loop.run_id, "name": name, "value": read, "interlocks": known["interlocks"]}
     put(said, f"{name} is {value}{unused}; {acting} (run {loop.run_id})", as_json=as_json)
@@ -218,7 +218,7 @@ _OWN: dict[str, _Command] = {
     "load": _load,
     "law": _law,
 }
-"""Commands of requests whose arguments are files or whose answer is more than a sentence."""
+"""Commands of requests with files as arguments or with more than a sentence as answer."""
 _BY_FIELDS: dict[tuple[str, ...], Callable[[str], _Command]] = {(): _plain, ("modes", "values"): _of_modes}
 
 for _name, _asked in BY_NAME.items():
@@ -238,7 +238,7 @@ for measured in (dark, reference):
 
 @ctl_app.callback()
 def _of_run(context: typer.Context, run: AnyRun = None) -> None:
-    """Take --run before the request too."""
+    """Accept --run before the request, too."""
     given = {"run": run}
     names = [*BY_NAME, "record", dark.__name__, reference.__name__]
     context.default_map = {key: {**given, "start": given, "stop": given} for key in names}

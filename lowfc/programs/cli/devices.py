@@ -25,7 +25,7 @@ def camera(
     frames: Frames = None,
     wait_for: WaitFor = None,
 ) -> None:
-    """Run a camera: its driver's frames and settings go to the run.
+    """Run a camera: publish the frames and settings of its driver to a run.
 
     The driver's own options are in [drivers.DRIVER] of the configuration; `--name value` here takes precedence.
     `lowfc camera DRIVER --help` lists them.
@@ -39,7 +39,7 @@ def camera(
 
 @mirror_app.command(cls=command_of("mirror"), context_settings=PASSED_ON)
 def mirror(context: typer.Context, driver: Driver, run: RunId = DEFAULT_RUN, config: ConfigFile = None) -> None:
-    """Run a mirror: its driver follows the commands of the run, within the mirror's own limits.
+    """Run a mirror: apply the commands of a run by its driver, within the mirror's own limits.
 
     The driver's own options are in [drivers.DRIVER] of the configuration; `--name value` here takes precedence.
     `lowfc mirror DRIVER --help` lists them.

@@ -1,4 +1,4 @@
-"""The commands for a run on several machines: certificates, the router, and who is there by which clock."""
+"""The commands for a run on several hosts: certificates, the router, and the processes with their clocks."""
 
 import datetime
 import json
@@ -20,18 +20,18 @@ if TYPE_CHECKING:
     from lowfc.contract.messages import wire
 
 LINKED_S = 0.5
-"""In this time a session has its links to all processes that are there."""
+"""Time for a session to connect to all running processes."""
 
 _TURN_S = 0.1
 
 
 class HostProcess(Result):
-    """A process, and its host's clock."""
+    """A process and the clock of its host."""
 
     process: str = figure("process")
     state: str = figure("state")
-    clock_offset_us: float | None = figure("router's clock less its own", "us", "+.0f")
-    clock_error_us: float | None = figure("wrong by at most", "us", ".0f")
+    clock_offset_us: float | None = figure("router's clock minus its own", "us", "+.0f")
+    clock_error_us: float | None = figure("error at most", "us", ".0f")
 
 
 class HostsResult(Result):
@@ -41,25 +41,23 @@ class HostsResult(Result):
     processes: list[HostProcess] = figure("processes")
 
     def remarks(self) -> list[str]:
-        """Why no clock is compared."""
+        """The reason if no clock is compared."""
         one = all(each.clock_offset_us is None for each in self.processes)
-        return ["no clock is compared: the run has no router, or none that has a clock"] if one else []
+        return ["no clock is compared: the run has no router, or its router reports no clock"] if one else []
 
 
 def certs(
-    folder: Annotated[Path, typer.Argument(help="Folder of the authority; made where there is none.")],
+    folder: Annotated[Path, typer.Argument(help="Folder of the certificate authority; created if missing.")],
     router: Annotated[
-        list[str] | None, typer.Option(help="Name or IP address by which the others reach the router; repeat.")
+        list[str] | None, typer.Option(help="Host name or IP address of the router; repeat for several.")
     ] = None,
-    mirror: Annotated[list[str] | None, typer.Option(help="Name of a mirror; repeat. Default: dm.")] = None,
+    mirror: Annotated[list[str] | None, typer.Option(help="Name of a mirror; repeat for several. Default: dm.")] = None,
     days: Annotated[int, typer.Option(min=1, max=3650, help="How long the certificates are valid.")] = 825,
-    renew: Annotated[
-        bool, typer.Option("--renew", help="Sign those that are there anew; they keep their keys.")
-    ] = False,
+    renew: Annotated[bool, typer.Option("--renew", help="Renew existing certificates; they keep their keys.")] = False,
 ) -> None:
-    """Make a certificate for each role of a run on several machines, and the authority that signs them.
+    """Make a certificate for each role of a run on several hosts, and the authority that signs them.
 
-    Give each machine ca.pem, and ROLE.pem and ROLE.key of its roles; ca.key stays where it is.
+    Copy ca.pem to each host, and ROLE.pem and ROLE.key of its roles; keep ca.key secret.
 
     Example: lowfc certs certs --router bench.example.org --router 192.168.7.1
     """
@@ -70,29 +68,27 @@ def certs(
         from lowfc.adapters.bus.certificates import make_certificates
     except ImportError as fault:
         raise ConfigurationError(
-            f"certificates are made with the package cryptography, which is missing here ({fault}): "
+            f"making certificates requires the package cryptography, which is missing ({fault}): "
             f"{install_advice('deploy')}"
         ) from None
     wanted = (ROUTER, *roles(map(mirror_role, mirror or ["dm"])))
     made = make_certificates(folder, wanted, router or [], days, renew=renew)
     for file in made:
         sys.stdout.write(f"{file}\n")
-    sys.stderr.write(
-        f"{len(made)} made, {len(wanted) - len(made)} there already; keep {folder / 'ca.key'} to yourself\n"
-    )
+    sys.stderr.write(f"{len(made)} made, {len(wanted) - len(made)} existed already; keep {folder / 'ca.key'} secret\n")
 
 
 def router(
     config: ConfigFile = None,
     run: RunId = DEFAULT_RUN,
     show: Annotated[
-        bool, typer.Option("--show", help="Print zenoh's configuration of it instead, for a zenohd of your own.")
+        bool, typer.Option("--show", help="Only print its zenoh configuration, for your own zenohd.")
     ] = False,
 ) -> None:
-    """Run the router of a run on several machines: mutual TLS, and only what the table of messages allows.
+    """Run the router of a run on several hosts: mutual TLS, and only the messages that each role may send or receive.
 
-    It listens at network.router of the configuration, or at network.listen. A zenohd of your own does as well, but for
-    the clocks: hosts then set envelopes by their own.
+    It listens on network.listen of the configuration, or else on network.router. Your own zenohd works as well, except
+    that clocks are not compared: each host then stamps envelopes by its own clock.
 
     Example: lowfc router --config lowfc.toml --run bench
     """
@@ -133,7 +129,7 @@ def hosts(
     run: AnyRun = None,
     as_json: Json = False,
 ) -> None:
-    """Say which processes are in a run, and how far the clocks of their machines are from the router's.
+    """List the processes of a run, and the clock offsets of their hosts from the router.
 
     Example: lowfc hosts --config lowfc.toml --run bench
     """
@@ -150,7 +146,7 @@ def hosts(
     settings = configuration(config)
     if not settings.network.router or (run is None and running()):
         run = the_known_run(run)
-    run = run or DEFAULT_RUN  # by a router there is a run, though nobody of it be on this host
+    run = run or DEFAULT_RUN  # with a router, all processes of the run may be on other hosts
     links = open_run(run, (settings.mirror.name,), network=settings.network).links
     with closing(ZenohBus(links, Role.OPERATOR, HostClock())) as bus:
         time.sleep(LINKED_S)

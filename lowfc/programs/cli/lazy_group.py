@@ -1,4 +1,4 @@
-"""A group of commands that are listed by purpose and imported when they are used."""
+"""A group of commands, listed by purpose and imported on use."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import import_module
@@ -12,7 +12,7 @@ from lowfc.adapters.process.terminal import new_app
 
 
 class Row(NamedTuple):
-    """One command: its name, its "module:attribute" below `lowfc.programs` (empty for a group), and what it does.
+    """A command: its name, its "module:attribute" below `lowfc.programs` (empty for a group), and its description.
 
     Name and sentence fit in 80 columns. The attribute is a function or a typer application.
     """
@@ -23,10 +23,10 @@ class Row(NamedTuple):
 
 
 class Commands(Mapping[str, Any]):
-    """The commands of some rows by name; one is imported when it is looked up."""
+    """Commands by name; a command is imported when it is looked up."""
 
     def __init__(self, rows: Sequence[Row], parts: Sequence[Row]) -> None:
-        """Rows of commands, and rows of the commands of their groups."""
+        """Take the rows of the commands, and the rows of the commands in groups."""
         self._rows, self._parts = {row.name: row for row in rows}, parts
 
     def __getitem__(self, name: str) -> Any:
@@ -54,17 +54,14 @@ class Commands(Mapping[str, Any]):
 
 
 def lazy_app(help_text: str, panels: Mapping[str, Sequence[Row]], parts: Sequence[Row] = ()) -> typer.Typer:
-    """A command line of rows by the heading under which its help lists them, and of the rows "group command" of groups.
-
-    It needs a callback.
-    """
+    """A command line from the rows by help heading, and the rows "group command" of its groups. It needs a callback."""
     rows = [row for panel in panels.values() for row in panel]
     wide = max(len(row.name) for row in rows)
 
     class Group(TyperGroup):
         def __init__(self, **settings: Any) -> None:
             super().__init__(**settings)
-            self.commands = Commands(rows, parts)  # type: ignore[assignment]  # nobody adds to them
+            self.commands = Commands(rows, parts)  # type: ignore[assignment]  # read only
 
         def format_commands(self, ctx: Any, formatter: Any) -> None:
             for heading, panel in panels.items():

@@ -1,4 +1,4 @@
-"""The command `lowfc`: a table of all commands, each imported when it is used."""
+"""The command `lowfc`: the table of all commands; each is imported on use."""
 
 import sys
 from typing import Annotated
@@ -13,13 +13,13 @@ COMMANDS = {
     "Run": (
         Row("sim-loop", "launch.command:sim_loop", "Run the simulated loop: camera, mirror, controller, recorder."),
         Row("ctl", "cli.ctl:ctl_app", "Operate a running loop: status, open, close, gain, offset."),
-        Row("console", "console.command:console", "Operate a running loop from one screen, with buttons."),
+        Row("console", "console.command:console", "Operate a running loop from one screen."),
         Row("controller", "cli.processes:controller", "Run the controller: frames in, mirror commands out."),
-        Row("camera", "cli.devices:camera_app", "Run a camera: the frames of its driver to a run."),
-        Row("mirror", "cli.devices:mirror_app", "Run a mirror: its driver follows the commands of a run."),
-        Row("record", "cli.processes:record", "Record the messages of a run in logs."),
+        Row("camera", "cli.devices:camera_app", "Run a camera: publish the frames of its driver."),
+        Row("mirror", "cli.devices:mirror_app", "Run a mirror: apply a run's commands by its driver."),
+        Row("record", "cli.processes:record", "Record the messages of a run."),
         Row("bridge", "", "Run a bridge to another control system."),
-        Row("gateway", "", "Offer a run to a control system, and read its variables."),
+        Row("gateway", "", "Connect a run to a control system."),
         Row("config", "", "Show and check the configuration."),
         Row("certs", "cli.hosts:certs", "Make the certificates of a run on several hosts."),
         Row("router", "cli.hosts:router", "Run the router of a run on several hosts."),
@@ -33,15 +33,15 @@ COMMANDS = {
         Row("info", "logs.info:info", "Summarise a log: what ran, when, and what was recorded."),
         Row("report", "logs.report.command:report", "Summarise a run from its log in one HTML page."),
         Row("replay", "logs.replay.command:replay_log", "Replay a log through the controller and compare."),
-        Row("what-if", "logs.what_if.command:what_if", "Compute what other gains or laws would have made of a log."),
+        Row("what-if", "logs.what_if.command:what_if", "Compute the residual of a log with other gains or laws."),
         Row("publish", "logs.publish.command:publish", "Republish a log on a run's bus."),
         Row("export", "logs.export.command:export", "Write steps, calibration and frames of a log for other tools."),
-        Row("recover", "logs.recover:recover", "Make a complete log of a truncated or damaged one."),
+        Row("recover", "logs.recover:recover", "Recover a truncated or damaged log."),
     ),
     "Commission": (
-        Row("doctor", "commissioning.doctor.command:doctor", "Check whether this host is fit for a real-time loop."),
+        Row("doctor", "commissioning.doctor.command:doctor", "Check this host for real-time operation."),
         Row("conformance", "commissioning.conformance.command:conformance_app", "Check a camera or mirror driver."),
-        Row("commission", "commissioning.commission.command:commission", "Bring a new camera and mirror into use."),
+        Row("commission", "commissioning.commission.command:commission", "Commission a new camera and mirror."),
         Row("calibrate", "commissioning.calibrate.command:calibrate_app", "Measure or compute a calibration."),
         Row("tune", "commissioning.tune.command:tune", "Find the best control law for a log or a running loop."),
         Row("acceptance", "commissioning.acceptance.command:acceptance_app", "Test a loop against its requirements."),
@@ -57,15 +57,15 @@ COMMANDS = {
     ),
     "Design": (Row("design", "design.command:design_app", "Design shaped pupils and sparse aperture masks."),),
 }
-"""By purpose, in the order of `lowfc --help`; a row without a module is a group, whose commands are in `PARTS`."""
+"""By purpose, in the order of `lowfc --help`; a row without a module is a group with its commands in `PARTS`."""
 PARTS = (
-    Row("bridge isio", "bridge.isio:bridge_isio", "Modes as ImageStreamIO streams, others' channels into the loop."),
-    Row("config show", "cli.config:config_show", "Print every key with its value and its sentence, as TOML."),
+    Row("bridge isio", "bridge.isio:bridge_isio", "Write modes to ImageStreamIO streams, read channels from them."),
+    Row("config show", "cli.config:config_show", "Print every key with its value and description, as TOML."),
     Row("config check", "cli.config:config_check", "Check a configuration file and the files it names."),
-    Row("config zenoh", "cli.config:config_zenoh", "Print the zenoh configuration for a program of your own."),
+    Row("config zenoh", "cli.config:config_zenoh", "Print the zenoh configuration for your own program."),
     Row("gateway epics", "gateway.command:epics", "Offer a run by EPICS PV Access."),
     Row("bench twin", "measure.bench.twin:twin", "Time the real-time optical model against the full one."),
-    Row("bench record", "measure.bench.record:bench_record", "Measure what recording costs."),
+    Row("bench record", "measure.bench.record:bench_record", "Measure the cost of recording."),
 )
 
 app = lazy_app(

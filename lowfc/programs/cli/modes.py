@@ -1,4 +1,4 @@
-"""Modes as they are named on a command line."""
+"""Noll indices on the command line."""
 
 from collections.abc import Sequence
 from typing import Annotated
@@ -13,11 +13,11 @@ Modes = Annotated[
 ]
 
 HIGHEST = 1000
-"""Index, far above any that is controlled."""
+"""Highest index accepted, far above any controlled mode."""
 
 
 def noll_of(words: Sequence[str] | None) -> tuple[int, ...]:
-    """Noll indices of words such as "2,3" and "4-11", each once; empty, which is all, where there are no words."""
+    """Noll indices of words such as "2,3" and "4-11", without duplicates; empty, meaning all, without words."""
     if not words:
         return ()
     found: list[int] = []

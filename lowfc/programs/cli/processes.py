@@ -18,22 +18,22 @@ def controller(
     config: ConfigFile = None,
     calibration: Annotated[
         Path | None,
-        typer.Option(help="Calibration file (FITS), or none; default: computed from the configuration."),
+        typer.Option(help="Calibration file (FITS), or `none`; default: computed from the configuration."),
     ] = None,
     camera: Annotated[
         str | None,
         typer.Option(
-            metavar="DRIVER", help="Driver of a camera to read in this process; default: `lowfc camera` is one's own."
+            metavar="DRIVER", help="Read this camera driver in the controller's process; default: a separate process."
         ),
     ] = None,
     wait_for: Annotated[
-        list[str] | None, typer.Option(help="Process that must not miss how the loop begins; repeat.")
+        list[str] | None, typer.Option(help="Process to wait for before the loop starts; repeat for several.")
     ] = None,
 ) -> None:
-    """Run the controller: frames from the bus, commands to it.
+    """Run the controller: frames in, mirror commands out.
 
-    With --camera, frames come from that driver without a process between, about as quickly as a camera allows; the
-    driver's options are in [drivers.DRIVER], and where it crashes the controller goes with it.
+    With --camera, the driver runs in the controller's process for the lowest latency; its options are in
+    [drivers.DRIVER]. If the driver crashes, so does the controller.
 
     Example: lowfc controller --run bench --calibration calibration.fits
     """
@@ -66,7 +66,7 @@ def controller(
         with Console(stderr=True).status("compiling the fused step"):
             compiled.kernel(FUSED)
     service = join(settings, run, Role.CONTROLLER, settings.realtime.controller_cpus)
-    service.meet(wait_for or (), _PATIENCE_S, "the controller will not start without")
+    service.meet(wait_for or (), _PATIENCE_S, "the controller does not start without")
     source = calibration.name if calibration is not None else "the configuration"
     latch = Latch(
         latch_files(open_run(run, (settings.mirror.name,))), lambda why: service.event("LATCH_FAILED", why=why)
@@ -85,24 +85,22 @@ def controller(
 def record(
     run: RunId = DEFAULT_RUN,
     config: ConfigFile = None,
-    calibration: Annotated[Path | None, typer.Option(help="Calibration file to put into the log.")] = None,
-    folder: Annotated[str | None, typer.Option(help="Where logs are written; default: recorder.folder.")] = None,
-    largest_mb: Annotated[float | None, typer.Option(help="Size at which the next log is begun.")] = None,
-    longest_s: Annotated[float | None, typer.Option(help="Age at which the next log is begun.")] = None,
-    min_free_mb: Annotated[
-        float | None, typer.Option(help="Free space on the disk below which nothing is recorded.")
-    ] = None,
+    calibration: Annotated[Path | None, typer.Option(help="Calibration file to include in the log.")] = None,
+    folder: Annotated[str | None, typer.Option(help="Folder of the logs; default: recorder.folder.")] = None,
+    largest_mb: Annotated[float | None, typer.Option(help="Size at which the next log is started.")] = None,
+    longest_s: Annotated[float | None, typer.Option(help="Duration after which the next log is started.")] = None,
+    min_free_mb: Annotated[float | None, typer.Option(help="Free disk space below which recording stops.")] = None,
     every: Annotated[
-        int | None, typer.Option(min=1, help="Record every Nth frame and mirror state; steps and commands are whole.")
+        int | None, typer.Option(min=1, help="Record every Nth frame and mirror state, but all steps and commands.")
     ] = None,
     topics: Annotated[
         list[str] | None,
-        typer.Option(help="Of frames, mirror state and surface, truth and timing, only these; repeat."),
+        typer.Option(help="Record only these of frames, mirror state and surface, truth, timing; repeat."),
     ] = None,
     words: Annotated[list[str] | None, typer.Argument(hidden=True)] = None,
     as_json: Json = False,
 ) -> None:
-    """Record a run's messages into MCAP logs until Ctrl-C or SIGTERM.
+    """Record the messages of a run in MCAP logs until Ctrl-C or SIGTERM.
 
     Example: lowfc record --run bench --folder logs --longest-s 600 --min-free-mb 2000
     """
@@ -120,7 +118,7 @@ def record(
         "recorder.topics": topics or None,
     }
     if words:
-        hint = f"; `lowfc ctl record {words[0]}` asks a recorder that runs" if words[0] in ("start", "stop") else ""
+        hint = f"; `lowfc ctl record {words[0]}` controls a running recorder" if words[0] in ("start", "stop") else ""
         raise ConfigurationError(f"lowfc record takes options only, got {' '.join(words)!r}{hint}")
     settings = configuration(config, overrides)
     joined = open_run(run, (settings.mirror.name,), network=settings.network)

@@ -1,7 +1,7 @@
-"""What a command returns, as one typed object: its `--json` object and its text are made here, from the same fields.
+"""Typed result of a command, from which both its `--json` object and its text are made.
 
-A field is declared once, with `figure`: its label, its unit and how it is formatted. Text has a line for each labelled
-figure, then a table for each list of parts; figures of one length that are declared as columns stand in one table.
+`figure` declares a field with label, unit and format. The text has a line for each labelled figure, then a table for
+each list of parts; figures declared as columns have the same length and share one table.
 """
 
 from collections.abc import Iterator, Sequence
@@ -18,8 +18,8 @@ _LABEL_WIDTH = 18
 def figure(label: str = "", unit: str = "", form: str = "", *, column: bool = False, **field: Any) -> Any:
     """A field of a result.
 
-    Without a label it stands in the JSON alone. `form` is as of `format`, or with something around it, such as "Z{}". A
-    `column` is a list, and stands in the result's own table.
+    Without a label it appears only in the JSON. `form` is a format specification, or a format string such as "Z{}". A
+    `column` is a list and appears in the result's own table.
     """
     return Field(description=label or None, json_schema_extra={"unit": unit, "form": form, "column": column}, **field)
 
@@ -30,11 +30,11 @@ class Result(BaseModel):
     model_config = ConfigDict(arbitrary_types_allowed=True, populate_by_name=True)
 
     def figures(self) -> dict[str, Any]:
-        """What `--json` prints: what was measured or set; what does not apply is left out."""
+        """Object for `--json`; fields that were not set are omitted."""
         return self.model_dump(by_alias=True, exclude_unset=True)
 
     def text(self) -> str:
-        """What a person reads."""
+        """Text for a person."""
         return "\n".join([*self.head(), *self._labelled(), *self._tables(), *self.remarks()])
 
     def head(self) -> Sequence[str]:
@@ -42,7 +42,7 @@ class Result(BaseModel):
         return ()
 
     def remarks(self) -> Sequence[str]:
-        """Lines after the figures: what follows from them, what to do."""
+        """Lines after the figures: conclusions and advice."""
         return ()
 
     def _labelled(self) -> Iterator[str]:
@@ -65,7 +65,7 @@ class Result(BaseModel):
 
 
 def parts_table(parts: Sequence[Result]) -> list[str]:
-    """A row for each part, a column for each of its labelled figures; its remarks stand behind the row."""
+    """A row for each part, a column for each of its labelled figures; its remarks follow the row."""
     shown = [(name, info) for name, info in type(parts[0]).model_fields.items() if info.description]
     rows = [[formatted(info, getattr(part, name)) for name, info in shown] for part in parts]
     lines = table([_heading(info) for _, info in shown], rows)
@@ -73,7 +73,7 @@ def parts_table(parts: Sequence[Result]) -> list[str]:
 
 
 def table(heads: Sequence[str], rows: Any) -> list[str]:
-    """Lines of a table, its first column to the left, the others to the right."""
+    """Lines of a table; first column left-aligned, the others right-aligned."""
     cells = [list(heads), *(list(row) for row in rows)]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     first, *others = widths

@@ -21,7 +21,7 @@ def runs(as_json: Json = False) -> None:
 
 
 def _row(name: str, roles: set[str]) -> dict[str, Any]:
-    """What the processes of a run report of themselves; one that only listens so far is starting."""
+    """State of a run from the Health of its processes; a process that only listens yet is starting."""
     from lowfc.client import Client
     from lowfc.contract.messages import Role
     from lowfc.programs.cli.status import NOBODY, recording_state

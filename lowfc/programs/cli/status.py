@@ -1,4 +1,4 @@
-"""What the controller is doing, as figures and for a person."""
+"""State of the controller, as figures and as text."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -138,7 +138,7 @@ def text(known: dict[str, Any]) -> str:
         "law": law_in_words(known),
         "gain": _values(known["gain"])
         + _automatic(known["gain_automatic"])
-        + ("" if known["law"]["name"] == "integrator" else ", of the integrator alone"),
+        + ("" if known["law"]["name"] == "integrator" else ", for the integrator only"),
         "leak": _values(known["leak"]),
         "limit": _values(known["limit_nm"], " nm"),
         "channels": channels_in_words(known),
@@ -152,7 +152,7 @@ def text(known: dict[str, Any]) -> str:
         "counted": ", ".join(_counted(name, count) for name, count in known["counts"].items()) or "nothing refused",
         "delay": counted(float(known["delay_frames"]), "frame"),
         "calibration": (known["calibration_id"][:12] or "none")
-        + (", the first of a commissioning: without a verdict" if known["calibration_provisional"] else ""),
+        + (", provisional: from the first step of commissioning" if known["calibration_provisional"] else ""),
     }
     return "\n".join([_in_short(known), *(f"{name:14} {value}" for name, value in rows.items())])
 
@@ -160,20 +160,20 @@ def text(known: dict[str, Any]) -> str:
 def _contrast(known: dict[str, Any]) -> dict[str, str]:
     if known["added_contrast"] is None:
         return {}
-    of = ", as measured by the sensor" if known["added_contrast_estimated"] else ""
+    of = ", estimated from the sensor" if known["added_contrast_estimated"] else ""
     return {"contrast": sentence(with_this_mirror(known["added_contrast"]), most_of(known)) + of}
 
 
 def law_in_words(known: dict[str, Any]) -> str:
-    """The law in force, and what of the mirror the integrator drives in its place."""
+    """Text of the law in force and of the modes that the guard returned to the integrator."""
     law, weight = known["law"], known["law"]["weight"]
-    fading = "" if weight == 1 else f", driving with a weight of {weight:.2f}; the integrator has the rest"
-    instead = f", in whose place the integrator drives {' and '.join(law['overruled'])}" if law["overruled"] else ""
+    fading = "" if weight == 1 else f" with weight {weight:.2f}; the integrator has the rest"
+    instead = f"; overruled: the integrator drives {' and '.join(law['overruled'])}" if law["overruled"] else ""
     return f"{law['name']}{fading}{instead}"
 
 
 def channels_in_words(known: dict[str, Any]) -> str:
-    """The shapes that are added to the mirror."""
+    """Text of the command channels."""
     channels = [
         f"{one['name']} {one['rms_nm']:.3g} nm rms of surface"
         f"{'' if one['reached'] else ', on its way'}{'' if one['shifts_zero_point'] else ', zero point not shifted'}"
@@ -183,7 +183,7 @@ def channels_in_words(known: dict[str, Any]) -> str:
 
 
 def interlocks(known: dict[str, Any]) -> str:
-    """Which interlocks act, for a person."""
+    """Text of the interlocks that act."""
     if known["interlocks"]:
         return "; ".join(f"{one['why']} ({one['action'].replace('_', ' ')})" for one in known["interlocks"])
     count = known["interlocks_configured"]
@@ -191,7 +191,7 @@ def interlocks(known: dict[str, Any]) -> str:
 
 
 def recording_state(recorder: wire.Health) -> str:
-    """One word: recording, stopped by an operator, failed, or none without a recorder that is ready."""
+    """State of the recorder: recording, stopped (by an operator), failed, or none (no recorder is ready)."""
     if recorder.recording.failure:
         return "failed"
     if recorder.state not in ("ready", "running"):
@@ -200,12 +200,12 @@ def recording_state(recorder: wire.Health) -> str:
 
 
 def _in_short(known: dict[str, Any]) -> str:
-    """Is it good: mode, residual and light of the last second, frames lost, recording, run, law, last warning."""
+    """Summary line: mode, residual and flux of the last second, lost frames, recording, run, law, last warning."""
     measured = ["no frame used in the last second"]
     if known["frames_used_last_second"]:
         true_nm = known["true_residual_rms_nm"]
         measured = [
-            f"residual {known['residual_rms_nm']:.2f} nm rms with noise"
+            f"residual {known['residual_rms_nm']:.2f} nm rms, noise included"
             + ("" if true_nm is None else f" (true {true_nm:.2f})"),
             f"light {100 * known['flux_fraction']:.0f} %",
         ]
@@ -245,7 +245,7 @@ def _mode(known: dict[str, Any], since: str = "") -> str:
 
 
 def _reason(number: int) -> str:
-    """Its name; of a mirror of a later version, its number."""
+    """Name of a reason, or its number if a mirror of a later version sent an unknown one."""
     return next((reason.name for reason in REASONS if reason == number), str(number))
 
 
@@ -267,7 +267,7 @@ def _acting(limits: list[str]) -> str:
 
 
 def _counted(reason: str, count: int) -> str:
-    """How often a frame was refused for a reason, or a limit acted."""
+    """Text of how often a frame was refused for a reason or a limit acted."""
     if reason == Rejection.NO_FRAME.name:
         return f"no frame {counted(count, 'time')}"
     if reason in Rejection.__members__:
@@ -280,7 +280,7 @@ def _spoken(reason: str) -> str:
 
 
 def _values(values: list[float], unit: str = "") -> str:
-    """One figure where all are the same; none without a calibration."""
+    """All values, or one figure if they are equal; "none" without a calibration."""
     if not values:
         return "none"
     same = len(set(values)) == 1

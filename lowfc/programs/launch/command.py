@@ -23,16 +23,16 @@ def sim_loop(
     ] = None,
     star_magnitude: Annotated[float | None, typer.Option(help="V magnitude of the star.")] = None,
     lockstep: Annotated[
-        bool, typer.Option("--lockstep", help="Deterministic: each frame waits for the mirror.")
+        bool, typer.Option("--lockstep", help="Reproducible: each frame waits for the mirror.")
     ] = False,
     no_record: Annotated[bool, typer.Option("--no-record", help="Write no log.")] = False,
     open_loop: Annotated[bool, typer.Option("--open", help="Start with the loop open.")] = False,
-    view_: Annotated[bool, typer.Option("--view", help="Show the view in a window.")] = False,
-    web: Annotated[bool, typer.Option("--web", help="Show the view in a browser.")] = False,
+    view_: Annotated[bool, typer.Option("--view", help="Open the view in a window.")] = False,
+    web: Annotated[bool, typer.Option("--web", help="Open the view in a browser.")] = False,
     name: Annotated[str | None, typer.Option("--run", help="Name of the run; default: a new one.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Run the simulated loop (camera, mirror, controller, recorder), show its status and end with a summary.
+    """Run the simulated loop (camera, mirror, controller, recorder), show its status and print a summary at the end.
 
     Example: lowfc sim-loop --rate 1000 --duration 20 --disturbance reaction-wheel --star-magnitude 2
     """
@@ -58,7 +58,7 @@ def sim_loop(
         chosen = "--open" if open_loop else f"control.start_mode of {config}"
         typer.echo(f"the loop starts open ({chosen}): `lowfc ctl close` closes it", err=True)
     if view_ and web:
-        raise ConfigurationError("--view and --web exclude each other: choose one")
+        raise ConfigurationError("--view and --web exclude each other: use one")
     if has_screen() and not (view_ or web):
         typer.echo("to view the run: lowfc view", err=True)
     show = Show.NATIVE if view_ else Show.WEB if web else None

@@ -7,13 +7,13 @@ from lowfc.adapters.process.child import Child
 
 
 def program(name: str, arguments: list[str], said: Path) -> Child:
-    """One of our own programs as a child, not started yet."""
-    # -P: a folder called lowfc where the user stands is not ours
+    """A Python program of the project as a child process, not yet started."""
+    # -P: do not import from a folder named lowfc in the working directory
     return Child(name, [sys.executable, "-P", *arguments], said)
 
 
 def start_all(children: list[Child]) -> None:
-    """Start them; if one cannot be started, stop those that were."""
+    """Start all; if one cannot be started, stop the others."""
     try:
         for child in children:
             child.start()
@@ -23,6 +23,6 @@ def start_all(children: list[Child]) -> None:
 
 
 def stop_all(children: list[Child], patience_s: float = 5.0) -> None:
-    """Stop them one after the other, in the order of the list."""
+    """Stop all, one after the other, in the order of the list."""
     for child in children:
         child.stop(patience_s)

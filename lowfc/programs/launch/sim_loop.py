@@ -1,4 +1,4 @@
-"""The launcher of the simulated loop: starts camera, mirror, controller, recorder and view, watches them, sums up."""
+"""The launcher of the simulated loop: starts and supervises camera, mirror, controller, recorder and view."""
 
 import contextlib
 import math
@@ -30,13 +30,13 @@ from lowfc.programs.launch.watch import Watch, summary
 
 POLL_S = 0.02
 SETTLE_S = 0.02
-"""After the last frame, before the controller is stopped: the last command is on its way."""
+"""Time from the last frame to the stop of the controller, for the last command to arrive."""
 LINE_PERIOD_S = 5.0
 SHOW_S = 0.1
 
 
 class ProcessDiedError(LowfcError):
-    """A process of the loop ended by itself."""
+    """A process of the loop ended unexpectedly."""
 
     exit_status = 1
 
@@ -46,7 +46,7 @@ def sim_loop(
 ) -> dict[str, Any]:
     """Run the simulated loop for a time, or until Ctrl-C; return the summary that `--json` prints.
 
-    The loop goes on where the view ends. ProcessDiedError: a process ended by itself; the text has its last words.
+    The end of the view does not stop the loop. ProcessDiedError: another process ended; the text quotes its output.
     """
     console = Console(stderr=True)
     require_screen(show)
@@ -56,7 +56,7 @@ def sim_loop(
         console.print(outlook(config), highlight=False, markup=False, soft_wrap=True)
     watch = Watch({}, [])
     children: list[Child] = []
-    bus = ZenohBus(run.links, Role.LAUNCHER, HostClock())  # it listens: from now on others see that a loop is starting
+    bus = ZenohBus(run.links, Role.LAUNCHER, HostClock())  # listens: shows that a loop starts
     try:
         bus.subscribe(HEALTH, watch.hear)
         bus.subscribe(EVENT, watch.note)
@@ -77,26 +77,26 @@ def sim_loop(
 
 
 def _new_run(config: Configuration, name: str | None) -> Run:
-    """A run for this launcher alone; what a launcher that was killed has left of it is used again."""
+    """Open a run that no other launcher uses; the remains of a killed launcher are reused."""
     run = open_run(name or new_run_id(), (config.mirror.name,), listeners=(Role.LAUNCHER,))
     if living := run.links.live():
-        raise BusError(f"run {run.run_id!r} is running already ({', '.join(sorted(living))}): choose another name")
+        raise BusError(f"run {run.run_id!r} is already running ({', '.join(sorted(living))}): use another name")
     if Role.LAUNCHER not in run.links.ports:
         raise BusError(
-            f"run {run.run_id!r} was made by processes that were started by hand: choose another name, or remove its "
-            f"directory, {run.path}"
+            f"run {run.run_id!r} was created by processes started by hand: use another name, or remove its directory "
+            f"{run.path}"
         )
     return run
 
 
 def prepare(config: Configuration, run: Run, console: Console) -> None:
-    """Put what the processes share into the run's directory: calibration and configuration."""
+    """Write calibration and configuration to the run's directory."""
     calibration_file.save(analytic(config, console), run.path / "calibration.fits")
     (run.path / "config.toml").write_text(config.to_toml(), encoding="utf-8")
 
 
 def children_of(config: Configuration, run: Run, duration_s: float | None, record: bool) -> list[Child]:
-    """The processes, in the order in which they are stopped: from the source of the data to its end."""
+    """The processes in the order in which they are stopped: along the flow of the data."""
     shared = ["--run", run.run_id, "--config", str(run.path / "config.toml")]
     calibration = ["--calibration", str(run.path / "calibration.fits")]
     mirror = mirror_role(config.mirror.name)
@@ -104,7 +104,7 @@ def children_of(config: Configuration, run: Run, duration_s: float | None, recor
     camera = ["-m", "sim_camera", *shared, *(word for name in awaited for word in ("--wait-for", str(name)))]
     if duration_s is not None:
         camera += ["--frames", str(max(1, math.ceil(duration_s * config.camera.rate_hz)))]
-    whole = ["--wait-for", str(Role.RECORDER)] if record and config.lockstep else []  # all logs of a seed begin alike
+    whole = ["--wait-for", str(Role.RECORDER)] if record and config.lockstep else []  # all logs of a seed start alike
     commands = {
         str(Role.CAMERA): camera,
         str(Role.CONTROLLER): ["-m", "lowfc", "controller", *shared, *calibration, *whole],
@@ -116,10 +116,10 @@ def children_of(config: Configuration, run: Run, duration_s: float | None, recor
 
 
 def _view(run: Run, show: Show, console: Console) -> Child:
-    """The view's process; where it is to be seen is said now."""
+    """The view's process; prints its address for a browser."""
     port, web_port = free_ports(2)
     if show is Show.WEB:
-        console.print(f"look at {web_address(stream_url(port), web_port)}", soft_wrap=True, highlight=False)
+        console.print(f"view: {web_address(stream_url(port), web_port)}", soft_wrap=True, highlight=False)
     words = ["-m", "lowfc", "view", "--run", run.run_id, f"--{show}", "--port", str(port), "--web-port", str(web_port)]
     return program(str(Role.VIEWER), words, run.path / f"{Role.VIEWER}.stderr")
 
@@ -152,24 +152,24 @@ def _supervise(
             camera.stop(patience_s=5.0)
         time.sleep(SETTLE_S)
         stop_all([*children[1:], camera])
-        time.sleep(SHOW_S)  # the last Health is on its way
+        time.sleep(SHOW_S)  # for the last Health to arrive
     for child in children:
         if child.name == Role.VIEWER:
             continue
         if child.name == Role.RECORDER and watch.of(Role.RECORDER).recording.failure:
-            continue  # the loop ran to its end without it; the summary says why
-        if child.status not in (0, -signal.SIGTERM, INTERRUPTED):  # told to end before it was ready is no failure
+            continue  # the loop ended normally without it; the summary gives the reason
+        if child.status not in (0, -signal.SIGTERM, INTERRUPTED):  # stopped before it was ready: no failure
             raise died(child)
 
 
 def died(child: Child) -> ProcessDiedError:
-    """The error that says how a process ended."""
+    """The error for a process that ended."""
     words = child.stderr_tail()
     return ProcessDiedError(child.how_it_ended() + (f"; the end of its output:\n{words}" if words else ""))
 
 
 def check(children: list[Child]) -> None:
-    """Raise where a process ended by itself; the camera may end when it is done, and the view whenever it likes."""
+    """Raise if a process ended unexpectedly; the view may end at any time, the camera after its last frame."""
     for child in children:
         done = child.name == Role.VIEWER or (child.name == Role.CAMERA and child.status == 0)
         if child.status is not None and not done:
@@ -181,13 +181,13 @@ def _say_view_ended(view: Child, console: Console) -> None:
     if view.status != 0:
         why = view.stderr_tail().splitlines()[-1:] if view.status is not None and view.status > 0 else []
         ending = "; ".join([view.how_it_ended(), *why])
-        text = f"the loop goes on without its view ({ending}); `lowfc view` starts another"
+        text = f"the loop goes on without a view ({ending}); `lowfc view` opens another"
         console.print(text, markup=False, soft_wrap=True)
 
 
 @contextlib.contextmanager
 def held_back() -> Iterator[Callable[[], bool]]:
-    """Whether Ctrl-C or SIGTERM has come; a second Ctrl-C ends at once."""
+    """Yield a function that tells whether Ctrl-C or SIGTERM was received; a second Ctrl-C ends at once."""
     caught: list[int] = []
 
     def catch(number: int, frame: FrameType | None) -> None:

@@ -17,7 +17,7 @@ from lowfc.programs.cli.contrast import most_of, sentence, with_this_mirror
 from lowfc.programs.launch.watch import Watch, mode_name, topic_count, wavefront
 
 SILENT_S = 2.0
-"""A process sends Health twice a second; after this silence its last figures are no longer shown."""
+"""Processes send Health twice a second; after this time without one, the figures are no longer shown."""
 _FIGURES_S = 2.5
 """Span of the recent wavefront figures, plus the delay of their report."""
 _EVENTS_SHOWN = 4
@@ -39,7 +39,7 @@ def screen(watch: Watch, config: Configuration, duration_s: float | None, elapse
     table.add_row("frame to command", latency(controller.frame_to_command))
     table.add_row("frame to mirror", latency(camera.frame_to_mirror))
     table.add_row("frames", f"{frames.received} received, {frames.skipped} skipped, {frames.missing} missing")
-    table.add_row("mirror", f"{mirror.state or 'not there yet'}, {counted(commands.received, 'command')}")
+    table.add_row("mirror", f"{mirror.state or 'starting'}, {counted(commands.received, 'command')}")
     table.add_row("recorder", recording(recorder))
     for log in watch.events[-_EVENTS_SHOWN:]:
         table.add_row(Text(printable(log.name)), Text(printable(log.message), style=_STYLES.get(Level(log.level), "")))
@@ -65,7 +65,7 @@ def status_line(watch: Watch, elapsed_s: float) -> str:
 
 
 def _only_just(controller: wire.Health, rate_hz: float) -> str:
-    """How long the loop has been closed, if shorter than the span of its residual; else empty."""
+    """Time since the loop closed if shorter than the span of the residual figures; otherwise empty."""
     frames = topic_count(controller, FRAME.key).received
     closed_s = frames / rate_hz - controller.not_closed_ns * 1e-9 if rate_hz else 0.0
     just = controller.mode == wire.LOOP_MODE_CLOSED and 0 < closed_s < _FIGURES_S
@@ -73,7 +73,7 @@ def _only_just(controller: wire.Health, rate_hz: float) -> str:
 
 
 def _silent(watch: Watch) -> str:
-    """A notice that the camera has stopped reporting, so that its figures are old; empty if it reports or never did."""
+    """A notice if the camera stopped reporting, so that its figures are out of date; otherwise empty."""
     silent_s = watch.silent_s(Role.CAMERA)
     known = bool(watch.of(Role.CAMERA).process)
     return f"the camera has been silent for {silent_s:.0f} s" if known and silent_s > SILENT_S else ""
@@ -95,7 +95,7 @@ def _wavefront(camera: wire.Health) -> str:
 
 
 def mode(controller: wire.Health) -> str:
-    """Loop mode in words, and why a closed loop holds its command."""
+    """Text of the loop mode, with the reason if a closed loop holds its command."""
     word = mode_word(mode_name(controller.mode) or "starting")
     return f"{word}, but holding: {controller.holding}" if controller.holding else word
 
@@ -109,7 +109,7 @@ def latency(durations: wire.Latency) -> str:
 
 
 def recording(recorder: wire.Health) -> str:
-    """Messages, bytes and losses of the recorder."""
+    """Text of the recorder's messages, bytes and losses."""
     if not recorder.process:
         return "not recording"
     done = recorder.recording
@@ -122,7 +122,7 @@ def _loop(figures: dict[str, Any]) -> str:
         case None:
             return "no controller reported"
         case "closed":
-            return f"closed; in total not closed for {seconds}: {cause}" if figures["not_closed_s"] else "closed"
+            return f"closed; not closed for {seconds} in total: {cause}" if figures["not_closed_s"] else "closed"
         case "safe":
             return f"{mode_word('safe')}, not closed for {seconds}: {cause}"
         case mode:
@@ -130,14 +130,14 @@ def _loop(figures: dict[str, Any]) -> str:
 
 
 def _when(figures: dict[str, Any], name: str, of: str = "") -> str:
-    """At which times a figure of the true wavefront is sampled."""
+    """Text of the times at which a figure of the true wavefront is sampled."""
     if figures["instants_per_frame"] == 1:
         return "sampled at the start of each exposure"
     return f"continuous ({of}{figures[f'sampled_{name}']:.2f} at exposure start)"
 
 
 def _contrast(figures: dict[str, Any]) -> list[str]:
-    """The line on the contrast that the wavefront adds to the dark zone; empty where it is unknown."""
+    """The line with the contrast added to the dark zone; empty if unknown."""
     added = figures["added_contrast"]
     if added is None:
         return []
@@ -158,8 +158,8 @@ def summary_text(figures: dict[str, Any]) -> str:
         f"rate               {figures['rate_hz']:.1f} Hz",
         f"frames             {figures['frames_published']} published, {figures['frames_processed']} processed, "
         f"{figures['frames_skipped']} skipped, {figures['frames_missing']} missing",
-        f"commands           {figures['commands_applied']} applied, {figures['commands_late']} after the next exposure "
-        "had begun",
+        f"commands           {figures['commands_applied']} applied, {figures['commands_late']} after the start of the "
+        "next exposure",
         f"wavefront          residual {figures['residual_rms_nm']:.2f} of {figures['disturbance_rms_nm']:.2f} nm rms "
         "over the open pupil, second half of the run, "
         + _when(figures, "residual_rms_nm", f"{figures['instants_per_frame']} instants per frame; "),

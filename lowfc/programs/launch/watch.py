@@ -1,4 +1,4 @@
-"""What a launcher hears of a run, and the figures that it sums up from the last Health of each process."""
+"""The launcher's record of a run, and the summary figures from the last Health of each process."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,18 +12,18 @@ from lowfc.optics.chain.added_contrast import BEYOND_QUADRATIC
 
 @dataclass(slots=True)
 class Watch:
-    """What the launcher hears: the last Health of each process and the last events."""
+    """The last Health of each process and the last events."""
 
     health: dict[str, wire.Health]
     events: list[Log]
     _names: Names = field(default_factory=Names)
 
     def of(self, name: str) -> wire.Health:
-        """Last Health of a process; an empty one before the first."""
+        """Last Health of a process; empty before the first."""
         return self.health.get(name, wire.Health())
 
     def silent_s(self, name: str) -> float:
-        """Time since a process's last Health, by the newest of all."""
+        """Time from a process's last Health to the newest Health of all processes."""
         newest_ns = max((health.timestamp.ToNanoseconds() for health in self.health.values()), default=0)
         return (newest_ns - self.of(name).timestamp.ToNanoseconds()) * 1e-9
 
@@ -39,7 +39,7 @@ class Watch:
 
 
 def summary(watch: Watch, record: bool, rate_hz: float) -> dict[str, Any]:
-    """Figures of a run at this frame rate, from the last Health of each process."""
+    """Summary figures of a run with this frame rate, from the last Health of each process."""
     camera, controller = watch.of(Role.CAMERA), watch.of(Role.CONTROLLER)
     frames, not_closed_s = topic_count(controller, FRAME.key), controller.not_closed_ns * 1e-9
     figures: dict[str, Any] = {
@@ -72,7 +72,7 @@ def summary(watch: Watch, record: bool, rate_hz: float) -> dict[str, Any]:
         recorder = watch.of(Role.RECORDER)
         recording, counted = recorder.recording, topic_count(recorder, FRAME.key)
         lost = {topic.topic: topic.missing for topic in recorder.topics if topic.missing}
-        # A recorder that did not receive the camera's last Health knows of no frames after the last one it has.
+        # Without the camera's last Health, the recorder cannot count frames lost after the last recorded one.
         unknown = figures["frames_published"] - counted.received - counted.missing
         if counted.received and unknown > 0:
             lost[FRAME.key] = counted.missing + unknown
@@ -88,7 +88,7 @@ def summary(watch: Watch, record: bool, rate_hz: float) -> dict[str, Any]:
 
 
 def wavefront(known: wire.WavefrontFigures) -> dict[str, Any]:
-    """The true wavefront's figures: at every moment where they were computed, and at the starts of the exposures."""
+    """Figures of the true wavefront: continuous if available, and sampled at the starts of the exposures."""
     names = ("disturbance_rms_nm", "residual_rms_nm", "tilt_disturbance_mas", "tilt_residual_mas")
     kind = "continuous_" if known.instants else ""
     return {
@@ -116,7 +116,7 @@ def mode_name(mode: wire.LoopMode) -> str | None:
 
 
 def topic_count(health: wire.Health, key: str) -> wire.TopicCount:
-    """What a process counted of a topic; zeros where it says nothing."""
+    """A process's counts of a topic; zeros if it reports none."""
     return next((topic for topic in health.topics if topic.topic == key), wire.TopicCount())
 
 

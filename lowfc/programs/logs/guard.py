@@ -1,4 +1,4 @@
-"""What a command writes is never a log that is there already."""
+"""Protection of existing logs from being overwritten by the output of a command."""
 
 from pathlib import Path
 
@@ -8,15 +8,13 @@ from lowfc.contract.errors import DataFileError
 
 
 def refuse_log(out: Path, source: Path) -> None:
-    """Refuse to write over the log that is read, or over another one, whatever its name."""
+    """Refuse to overwrite the log that is read or any other log, whatever its name."""
     if not out.is_file():
         return
     try:
         with out.open("rb") as file:
             is_log = file.read(len(MCAP0_MAGIC)) == MCAP0_MAGIC
     except OSError as fault:
-        raise DataFileError(
-            f"{out} cannot be replaced: whether it is a log cannot be read: {fault.strerror}"
-        ) from fault
+        raise DataFileError(f"{out} is not overwritten: cannot read whether it is a log: {fault.strerror}") from fault
     if is_log or (source.exists() and out.samefile(source)):
         raise DataFileError(f"{out} is a log, which is never overwritten; choose another name (--out)")

@@ -1,4 +1,4 @@
-"""The command `lowfc info`: what a log holds, whether it is whole, and what is missing from it."""
+"""The command `lowfc info`: contents of a log, and what is missing or damaged."""
 
 from collections.abc import Mapping
 from functools import partial
@@ -13,19 +13,19 @@ from lowfc.programs.cli.result import table
 _STATES = {
     "complete": "complete",
     "recording": "being recorded; `lowfc ctl record stop` finishes it",
-    "truncated": "truncated: it was cut off, as when its recorder is killed; `lowfc recover` makes it complete",
-    "damaged": "damaged; `lowfc recover` saves what is whole",
+    "truncated": "truncated, for example because its recorder was killed; `lowfc recover` completes it",
+    "damaged": "damaged; `lowfc recover` saves the intact messages",
 }
 
 
 def info(
     logs: Logs,
     digest: Annotated[
-        bool, typer.Option("--digest", help="SHA-256 of what is deterministic: the same for lockstep runs of one seed.")
+        bool, typer.Option("--digest", help="SHA-256 of the deterministic topics: equal for lockstep runs of one seed.")
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Say what ran, when, what was recorded of each topic, and what is missing or damaged.
+    """Summarise a log: processes, times, messages of each topic, and what is missing or damaged.
 
     Example: lowfc info last --digest
     """
@@ -42,7 +42,7 @@ def info(
 
 
 def render(found: Mapping[str, Any]) -> str:
-    """The figures of a log for a person."""
+    """The figures of a log as text."""
     lines = [f"{name:14}" + value.replace("\n", "\n" + " " * 14) for name, value in _summary(found).items()]
     rows = [
         [
@@ -68,12 +68,12 @@ def _summary(found: Mapping[str, Any]) -> dict[str, str]:
 
     metadata, recording = found["metadata"], found["metadata"].get("recording", {})
     damage = [f"byte {one['position']}, {one['length']} bytes: {one['why']}" for one in found["damage"]]
-    lost = [f"{found['messages_missing']} missing by their counts"]
+    lost = [f"{found['messages_missing']} missing by their sequence numbers"]
     if "messages_lost" in recording:
-        lost.append(f"the recorder counted as lost {recording['messages_lost']}")
+        lost.append(f"{recording['messages_lost']} counted as lost by the recorder")
     lost += [f"{count} of {key} (all)" for key, count in found["missing_topics"].items()]
     if found["unreadable"]:
-        lost.append(f"{found['unreadable']} unreadable: what declares them was damaged")
+        lost.append(f"{found['unreadable']} unreadable, because their channel record was damaged")
     lines = {
         "log": f"{', '.join(found['files'])}, {found['bytes'] / 1e6:.1f} MB",
         "digest": _digest(found),
@@ -98,6 +98,6 @@ def _summary(found: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _digest(found: Mapping[str, Any]) -> str:
-    """The digest; for a live run with a remark that it proves nothing."""
+    """The digest; for a live run with a remark that it is unique."""
     digest = str(found.get("digest", ""))
-    return digest if not digest or found["lockstep"] else f"{digest} (not a lockstep run: no other run has it)"
+    return digest if not digest or found["lockstep"] else f"{digest} (not a lockstep run: cannot be reproduced)"

@@ -1,4 +1,4 @@
-"""The command `lowfc recover`: what is whole of a truncated or damaged log, as a log."""
+"""The command `lowfc recover`: a complete log from the intact part of a truncated or damaged one."""
 
 from functools import partial
 from pathlib import Path
@@ -17,9 +17,9 @@ def recover(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Make a complete, indexed log of what is whole in a truncated or damaged one, which is not changed.
+    """Make a complete, indexed log from the intact part of a truncated or damaged one, which is not changed.
 
-    Each file of a recording is recovered by itself; of a whole one nothing is made.
+    Each file of a recording is recovered separately; intact files are skipped.
 
     Example: lowfc recover logs/20270101T220000Z.mcap.part
     """

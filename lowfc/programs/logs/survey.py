@@ -1,4 +1,4 @@
-"""What a log holds: what ran and when, how much of each topic, and what is missing."""
+"""Contents of a log: processes and times, messages of each topic, and what is missing."""
 
 import contextlib
 import dataclasses
@@ -40,10 +40,10 @@ from lowfc.contract.messages import (
 class Digest:
     """SHA-256 over the payloads of the topics that are `deterministic`, key by key.
 
-    A key's digest is over the SHA-256 of each of its payloads in order, the log's over the lines "KEY DIGEST", sorted.
-    A state that was answered to the recorder may stand in the log before an older one: states are taken in the order of
-    their sequences, and of those from before the first frame the newest, for how many there are depends on who was
-    ready first.
+    A key's digest is over the SHA-256 of each of its payloads in order, the log's over the sorted lines "KEY DIGEST".
+    A state requested by the recorder may precede an older one in the log, so states are sorted by sequence; of the
+    states before the first frame only the newest counts, because their number depends on the order in which the
+    processes start.
     """
 
     def __init__(self) -> None:
@@ -89,7 +89,7 @@ def _time_ns(kind: Any, payload: bytes) -> int:
 
 @dataclass(slots=True)
 class _Line:
-    """Messages of one key; `starts` holds who published them and since when."""
+    """Messages of one key; `starts` holds their publishers and start times."""
 
     schema: str
     first_ns: int
@@ -112,7 +112,7 @@ class _Line:
 
 class _Account:
     def __init__(self, selection: Selection = EVERYTHING) -> None:
-        """Nothing so far, of a log that holds this selection."""
+        """Start the account of a log with this selection of topics."""
         self._selection = selection
         self._ledger = LossAccount(selection)
         self._lines: dict[str, _Line] = {}
@@ -122,7 +122,7 @@ class _Account:
         self._end_ns = 0
 
     def enter(self, topic: Topic | None, message: Sample, schema: str) -> None:
-        """Take account of one message."""
+        """Count a message."""
         now_ns = message.receive_time_ns
         line = self._lines.setdefault(message.key, _Line(schema, now_ns, now_ns))
         line.messages += 1
@@ -132,10 +132,10 @@ class _Account:
             return
         self._end_ns = max(self._end_ns, now_ns)
         if not topic.queryable and (self._begin_ns is None or now_ns < self._begin_ns):
-            self._begin_ns = now_ns  # what was asked for at the log's beginning may be hours old
+            self._begin_ns = now_ns  # messages requested at the log's start may be hours old
         self._ledger.enter(topic, message, recorded=True)
         author = ""
-        with contextlib.suppress(BadMessageError, DecodeError):  # it is in the log as it came
+        with contextlib.suppress(BadMessageError, DecodeError):  # the log holds it as received
             if topic is HEALTH:
                 self._ledger.believe(message, wire.Health.FromString(message.payload))
             elif topic is CONTROLLER_STATE:
@@ -150,7 +150,7 @@ class _Account:
         line.starts.add((author, start_of(message.sequence)))
 
     def figures(self) -> dict[str, Any]:
-        """The account, for a program."""
+        """The account as a dictionary."""
         missing = self._ledger.lost()
         begin = None if self._begin_ns is None else datetime.fromtimestamp(self._begin_ns / 1e9, UTC)
         topics = {}
@@ -172,7 +172,7 @@ class _Account:
 def survey(
     log: LogFiles, progress: Callable[[int, int], None] | None = None, *, digest: bool = False
 ) -> dict[str, Any]:
-    """Figures of a log, whole or not, from all of its messages; with its `Digest`, and that of each topic, if asked."""
+    """Figures of a log, complete or not, from all of its messages; optionally with its and each topic's `Digest`."""
     reader, account, found = WholeLog(log, skip_damaged=True), _Account(), Digest()
     reader.progress = progress
     for number, message in enumerate(reader):
@@ -212,11 +212,11 @@ def _state(reader: WholeLog) -> str:
 
 
 def recovery_in_words(metadata: Mapping[str, Mapping[str, str]]) -> str:
-    """What a recovered log was made from, and what was left out; nothing for another log."""
+    """Text of the source of a recovered log and what was left out; empty for another log."""
     account = metadata.get(RECOVERY)
     if account is None:
         return ""
-    unfinished = ", which had not been finished" if account.get("source_finished") == "false" else ""
+    unfinished = ", which was incomplete" if account.get("source_finished") == "false" else ""
     parts, unreadable = account.get("left_out", "?"), account.get("unreadable", "?")
     return (
         f"recovered from {account.get('source', '?')}{unfinished}; "

@@ -53,7 +53,7 @@ class ViewError(LowfcError):
 
 
 class Bridge:
-    """One live view of a run; `renewals` counts how often it began anew, `most_bytes` is its most memory."""
+    """One live view of a run; `renewals` counts its restarts, `most_bytes` is its peak memory."""
 
     def __init__(self, config: Configuration, run_id: str, clock: Clock, bus: Bus, target: Target) -> None:
         """Subscribe to everything that is shown; drawing starts with `run`."""
@@ -160,7 +160,7 @@ class Bridge:
             if not stuck:
                 self.service.event("VIEW_STUCK", stuck_s=stuck_s)
         elif stuck_s > STUCK_S:
-            self._renew(f"the viewer took nothing for {stuck_s:.0f} s")
+            self._renew(f"the viewer read nothing for {stuck_s:.0f} s")
         elif own_bytes > OWN_BYTES:
             self._renew(f"the bridge holds {own_bytes / 1e6:.0f} MB, more than {OWN_BYTES / 1e6:.0f} MB")
             if resident_bytes() > OWN_BYTES:
@@ -176,7 +176,7 @@ class Bridge:
             now_s = time.monotonic()
             if len(self._renewed_s) == _MOST_RENEWALS and now_s - self._renewed_s[0] < _RENEWALS_S:
                 raise ViewError(
-                    f"the view began anew {_MOST_RENEWALS} times in {_RENEWALS_S:g} s; the last time: {why}"
+                    f"the view was restarted {_MOST_RENEWALS} times in {_RENEWALS_S:g} s; the last time: {why}"
                 )
             self._renewed_s.append(now_s)
             self.service.event("VIEW_RENEWED", why=why)

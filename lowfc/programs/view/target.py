@@ -92,4 +92,4 @@ class Target:
     def print_address(self, viewer: RerunViewer | None) -> None:
         """Print where a browser finds the page."""
         if viewer is not None and viewer.web_address is not None:
-            sys.stderr.write(f"look at {viewer.web_address}\nCtrl-C ends the view\n")
+            sys.stderr.write(f"view: {viewer.web_address}\nCtrl-C ends it\n")

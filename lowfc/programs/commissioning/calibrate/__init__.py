@@ -1,1 +1,1 @@
-"""`lowfc calibrate`: I0, H and R of a running loop, or of its optical model."""
+"""`lowfc calibrate`: measure I0, H and R on a running loop, or compute them from its optical model."""

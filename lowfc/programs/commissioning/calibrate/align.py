@@ -1,4 +1,4 @@
-"""`lowfc calibrate align`: the computed calibration on the pixels of a real sensor."""
+"""`lowfc calibrate align`: resample the computed calibration to the pixels of a real sensor."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -32,16 +32,16 @@ class AlignResult(Result):
     row: float = figure("centre, row", form=".2f")
     column: float = figure("centre, column", form=".2f")
     rotation_deg: float = figure("rotation", "degrees", ".2f")
-    parity: int = figure("parity, -1 where it is reflected")
+    parity: int = figure("parity, -1 if reflected")
     flux_dn: float = figure("light", "DN", ".4g")
     background_dn: float = figure("background", "DN", ".3g")
-    residual: float = figure("part of the image that is left", form=".1%")
-    other_parity_residual: float = figure("left with the other parity", form=".1%")
+    residual: float = figure("residual of the image", form=".1%")
+    other_parity_residual: float = figure("residual, other parity", form=".1%")
     file: str = figure("written")
 
     def remarks(self) -> Sequence[str]:
         """The sign is known."""
-        return ["pokes are seen with the right sign"]
+        return ["the pokes have the right sign"]
 
 
 def aligned(out: Path, run: str | None, frames: int, *, load: bool) -> AlignResult:
@@ -79,7 +79,7 @@ def aligned(out: Path, run: str | None, frames: int, *, load: bool) -> AlignResu
 def on_sensor(
     config: Configuration, computed: Calibration, geometry: Geometry, flux: float, before: Calibration
 ) -> Calibration:
-    """A computed calibration on the pixels of a real sensor, with the dark and the mask of the one before."""
+    """The computed calibration on the pixels of a real sensor, with the dark and mask of the calibration in use."""
     own, pixels = (*computed.shape, -1), before.good.size
     I0 = onto(computed.reference.astype(np.float64).reshape(computed.shape), geometry, before.shape).reshape(-1)
     H = onto(computed.response.astype(np.float64).reshape(own), geometry, before.shape).reshape(pixels, -1)
@@ -108,13 +108,13 @@ def on_sensor(
 
 
 def computed_scale(config: Configuration) -> float:
-    """Pixels per lambda/D of the computed image; per pupil diameter where the sensor sees the pupil."""
+    """Pixels per lambda/D of the computed image; per pupil diameter for a pupil-plane sensor."""
     optics = factory.sensor(config, lambda _: None)
     return 1 / (optics.pitch * optics.binning)
 
 
 def in_words(found: Alignment, scale: float) -> str:
-    """Where the image is, and how much of it differs from the computed one; `scale` in pixels per lambda/D."""
+    """Text of the image's geometry and its residual; `scale` in pixels per lambda/D."""
     geometry = found.geometry
     return (
         f"{scale:.4f} pixels per lambda/D, centre at row {geometry.row:.2f}, column "

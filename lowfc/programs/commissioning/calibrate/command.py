@@ -1,4 +1,4 @@
-"""The command `lowfc calibrate`: options only; what is done is in `tasks` and `align`."""
+"""The command `lowfc calibrate`: options only."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -10,21 +10,21 @@ from lowfc.contract.errors import ConfigurationError
 from lowfc.programs.cli.result import put
 
 calibrate_app = new_app(
-    "Measure or compute what turns a frame into modes.\n\nExample: lowfc calibrate --method hadamard --out night.fits"
+    "Measure or compute a calibration.\n\nExample: lowfc calibrate --method hadamard --out night.fits"
 )
 
 Method = Literal["analytic", "poke", "hadamard", "in-loop"]
-Out = Annotated[Path, typer.Option("--out", help="File to be written (FITS).")]
-Load = Annotated[bool, typer.Option("--load", help="Use it at once; the loop must be open.")]
+Out = Annotated[Path, typer.Option("--out", help="Output file (FITS).")]
+Load = Annotated[bool, typer.Option("--load", help="Load the result into the loop, which must be open.")]
 Snr = Annotated[float, typer.Option(min=1, max=1e4, help="Signal-to-noise ratio to reach in the noisiest mode.")]
-Resume = Annotated[bool, typer.Option("--resume", help="Go on with one that was interrupted.")]
-Frames = Annotated[int, typer.Option(min=16, max=100_000, help="How many frames are averaged.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Continue an interrupted calibration.")]
+Frames = Annotated[int, typer.Option(min=16, max=100_000, help="Number of frames to average.")]
 
 
 @calibrate_app.callback(invoke_without_command=True)
 def calibrate(
     context: typer.Context,
-    method: Annotated[Method, typer.Option(help="How H is found.")] = "hadamard",
+    method: Annotated[Method, typer.Option(help="Method of measuring or computing H.")] = "hadamard",
     out: Out = Path("calibration.fits"),
     run: AnyRun = None,
     config: ConfigFile = None,
@@ -33,37 +33,37 @@ def calibrate(
         float | None,
         typer.Option(
             min=0.01,
-            help="Of a poke, nm rms of wavefront; default: 8 poke, 3 hadamard, 2 in-loop, half of it above --snr 70.",
+            help="Poke amplitude, nm rms of wavefront; default: 8 poke, 3 hadamard, 2 in-loop, half above --snr 70.",
         ),
     ] = None,
-    cycles: Annotated[int | None, typer.Option(min=1, help="How many; --snr then judges them, default 20.")] = None,
+    cycles: Annotated[
+        int | None, typer.Option(min=1, help="Number of cycles; --snr (then 20 by default) is required of them.")
+    ] = None,
     resume: Resume = False,
     truncate: Annotated[
-        float, typer.Option(min=0, max=0.99, help="Leave out singular values below this part of the largest.")
+        float, typer.Option(min=0, max=0.99, help="Discard singular values below this fraction of the largest.")
     ] = 0.0,
     tikhonov: Annotated[
-        float, typer.Option(min=0, max=0.99, help="Damp singular values of about this part of the largest.")
+        float, typer.Option(min=0, max=0.99, help="Damp singular values below about this fraction of the largest.")
     ] = 0.0,
     at: Annotated[
         str | None,
         typer.Option(
-            help="Where --method analytic computes I0 and H: modes in nm rms, as in 4=15,7=-10, or a file with a shape "
-            "of the mirror, nm of surface. Default: flat.",
+            help="Wavefront at which --method analytic computes I0 and H: modes in nm rms, as in 4=15,7=-10, or a file "
+            "with a mirror shape, nm of surface. Default: flat.",
             show_default=False,
         ),
     ] = None,
     load: Load = False,
-    compare: Annotated[
-        tuple[Path, Path] | None, typer.Option(help="Say how two calibration files differ, and do nothing else.")
-    ] = None,
+    compare: Annotated[tuple[Path, Path] | None, typer.Option(help="Only compare two calibration files.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Calibrate a running loop with pokes of its mirror, or compute its calibration.
+    """Calibrate a running loop by poking its mirror, or compute its calibration.
 
-    What was measured is checked on frames of its own. Where it is not recommended, it is written as
-    NAME.rejected.fits, not loaded, and the exit status is 1.
+    The measured calibration is checked on separate frames. If it is not recommended, it is written as
+    NAME.rejected.fits and not loaded, and the exit status is 1.
 
-    The mirror is afterwards where it was, also after Ctrl-C; --resume then goes on with the cycles that were done.
+    The mirror returns to its shape, also after Ctrl-C; --resume then continues after the completed cycles.
 
     Example: lowfc calibrate --method poke --snr 300 --out night.fits
     """
@@ -74,10 +74,7 @@ def calibrate(
     ]
     if context.invoked_subcommand is not None:
         if given:
-            raise ConfigurationError(
-                f"{given[0]} stands before `{context.invoked_subcommand}`, which has options of its own: they stand "
-                "after it"
-            )
+            raise ConfigurationError(f"{given[0]} is before `{context.invoked_subcommand}`: put the options after it")
         return
     from lowfc.adapters.files.calibration_file import load as read
     from lowfc.programs.commissioning.calibrate import tasks
@@ -96,8 +93,8 @@ def calibrate(
     for option in ("--config", "--at"):
         if option in given:
             raise ConfigurationError(
-                f"{option} goes with --method analytic: a running loop is measured where it is, by its own "
-                "configuration"
+                f"{option} requires --method analytic: a running loop is measured at its present wavefront and with "
+                "its own configuration"
             )
     result = tasks.poked(request, run, load=load)
     put(result, as_json=as_json)
@@ -110,18 +107,16 @@ def dark(
     out: Out = Path("calibration.fits"),
     run: AnyRun = None,
     frames: Frames = 400,
-    dark_taken: Annotated[
-        bool, typer.Option("--dark-taken", help="The star is blocked already: do not ask for it.")
-    ] = False,
+    dark_taken: Annotated[bool, typer.Option("--dark-taken", help="The star is already blocked: do not ask.")] = False,
     file: Annotated[
-        Path | None, typer.Option("--file", help="Dark frames from a FITS cube (frames, rows, columns) instead.")
+        Path | None, typer.Option("--file", help="Take the dark frames from a FITS cube (frames, rows, columns).")
     ] = None,
     load: Load = False,
     as_json: Json = False,
 ) -> None:
-    """Take a dark and find bad pixels; write the calibration in use with both.
+    """Take a dark and find bad pixels; write the calibration in use with the new dark and mask.
 
-    Block the star first, by hand.
+    Block the star first.
 
     Example: lowfc calibrate dark --frames 1000 --out night.fits
     """
@@ -140,10 +135,10 @@ def reference(
     load: Load = False,
     as_json: Json = False,
 ) -> None:
-    """Take the present state of the wavefront as the zero point; write the calibration in use with it.
+    """Take the present wavefront as the zero point; write the calibration in use with the new reference image.
 
-    It need not be flat. H stays as it is: far from flat, measure it there with --method poke or hadamard, or compute it
-    with --method analytic --at.
+    The wavefront need not be flat. H does not change: far from flat, measure it there with --method poke or hadamard,
+    or compute it with --method analytic --at.
 
     Example: lowfc calibrate reference --frames 5000 --out night.fits
     """
@@ -162,7 +157,7 @@ def align(
 ) -> None:
     """Fit how the sensor is placed relative to the computed image; write the computed calibration for its pixels.
 
-    A half turn more or less leaves the image as it is and reverses every mode: a poke shows which it is.
+    A rotation by 180 degrees does not change the image but reverses every mode: a poke resolves the ambiguity.
 
     Example: lowfc calibrate align --out aligned.fits
     """

@@ -16,26 +16,26 @@ from lowfc.programs.commissioning.calibrate.recording import AFTERWARDS
 
 AMPLITUDE_NM = {"poke": 8.0, "hadamard": 3.0, "in-loop": 2.0}
 LEAST_SNR = 20.0
-"""Signal-to-noise ratio that a calibration of a given number of cycles must reach to be recommended."""
+"""Signal-to-noise ratio required of a calibration with a given number of cycles."""
 FULL_AMPLITUDE_SNR = 70.0
 """Highest signal-to-noise ratio for the usual amplitude: the error of third-order terms goes as its square."""
 MOST_HADAMARD_NM = 3.0
 """Largest amplitude of a mode: all modes at once add up to some four times that, and the sensor must stay linear."""
 SETTLE = 2
-"""Frames left out after each change: one for a delay that is a fraction, and one for a command that comes late."""
+"""Frames left out after each change: one for a fractional delay, and one for a late command."""
 HOLD = 4
 DITHER_HOLD = 2
-"""Frames between the changes of a dither: the longer, the more of it the loop works against."""
+"""Frames between the changes of a dither: the longer, the more of it the loop corrects."""
 PIECE = 1024
 """Frames of a piece of a dither."""
 MARGIN = 0.9
-"""Part of the promised error that is aimed at, so that the scatter of the cycles seldom asks for more."""
+"""Fraction of the required error to aim for, so that scatter of the cycles seldom requires more cycles."""
 MOST_TIMES = 4
-"""Largest number of cycles over that for photons and read-out alone; beyond it the operator decides."""
+"""Largest ratio of cycles to those required by photon and read noise alone; beyond it the operator decides."""
 MOST_FEW = 32
-"""Cycles within which it is not beyond: of a bright star, four times the fewest are soon over."""
+"""Number of cycles that is always allowed: on a bright star, four times the minimum takes little time."""
 CHECK_PART = 0.25
-"""Cycles that check R, for each one that it is made from."""
+"""Check cycles for each cycle that R is computed from."""
 _LEAST_CHECKS = 3
 _OF_THE_SLEW = 0.8
 SEED = 1
@@ -49,13 +49,13 @@ class CalibrationRequest:
 
     Attributes:
         method: poke, hadamard or in-loop.
-        out: the file to be written; the cycles done are kept beside it.
-        snr: to which R shall be known; where `cycles` says how long, what R must reach to be recommended.
-        cycles: how many; None where `snr` says.
-        amplitude_nm: of a mode, wavefront rms; None for the usual.
-        resume: go on from the cycles done.
-        truncate: leave out singular values below this part of the largest.
-        tikhonov: damp singular values of about this part of the largest.
+        out: output file; completed cycles are kept beside it.
+        snr: signal-to-noise ratio to reach; with `cycles`, the one required for a recommendation.
+        cycles: number of cycles; None to derive it from `snr`.
+        amplitude_nm: of a mode, wavefront rms; None for the default.
+        resume: continue after the completed cycles.
+        truncate: discard singular values below this fraction of the largest.
+        tikhonov: damp singular values below about this fraction of the largest.
     """
 
     method: str
@@ -94,7 +94,7 @@ class Pokes:
         return sequence(min(amplitude, float(self._largest_nm[mode])))
 
     def cycles(self) -> int:
-        """How many are needed, as far as photons and read-out say."""
+        """Number of cycles required by photon and read noise."""
         request = self._request
         if request.cycles is not None:
             return max(request.cycles, LEAST_CYCLES)
@@ -102,13 +102,13 @@ class Pokes:
         return max(-(-frames // self.cycle(0).per_column), LEAST_CYCLES)
 
     def more_cycles(self, cycles: int, error: float) -> int:
-        """How many are needed where so many have left this standard error; no more where that is out of reach."""
+        """Number of cycles required, given the standard error after `cycles`; no more if out of reach."""
         needed = cycles_for(self._request.snr, cycles, error)
         reachable = self._request.cycles is None and needed <= max(MOST_TIMES * self.cycles(), MOST_FEW)
         return needed if reachable and error * self._request.snr > 1 else cycles
 
     def frames(self, cycles: int, done: int = 0) -> int:
-        """Frames of so many cycles, less those done, and of those that check them."""
+        """Frames of the remaining cycles and of their check cycles."""
         return (cycles + checks(cycles) - done) * (len(self.cycle(0)) + AFTERWARDS)
 
     def _cycle(self, number: int, amplitude_nm: float) -> poke_plan.Plan:
@@ -119,7 +119,7 @@ class Pokes:
         patterns = poke_plan.hadamard_patterns if request.method == "hadamard" else poke_plan.poke_patterns
         rest = max(16, len(poke_plan.SIGNS) * HOLD)
         shapes = patterns(self._modes, amplitude_nm)
-        # in an order of its own, so that a vibration disturbs each pair of cycles otherwise, and their scatter shows it
+        # a different order in each pair of cycles, so that their scatter shows vibrations
         shapes = np.random.default_rng([SEED, number // 2]).permutation(shapes)
         return poke_plan.cycle(shapes, HOLD, SETTLE, rest, backwards=number % 2 == 1)
 
@@ -128,7 +128,7 @@ class Pokes:
         requested, method = self._request.amplitude_nm, self._request.method
         if method == "hadamard" and requested is not None and requested > MOST_HADAMARD_NM:
             raise CalibrationError(
-                f"--amplitude {requested:g} nm is too much for hadamard, which pokes all modes at once: at most "
+                f"--amplitude {requested:g} nm is too large for hadamard, which pokes all modes at once: at most "
                 f"{MOST_HADAMARD_NM:g} nm of each"
             )
         shapes = self._cycle(0, 1.0).table @ self._basis
@@ -163,10 +163,10 @@ def usual_nm(method: str, snr: float) -> float:
 
 
 def cycles_for(snr: float, cycles: int, error: float) -> int:
-    """How many cycles reach a signal-to-noise ratio where so many have left this standard error."""
+    """Number of cycles to reach a signal-to-noise ratio, given the standard error after a number of cycles."""
     return max(ceil(min(cycles * (error * snr / MARGIN) ** 2, 1e9)), cycles + 1)
 
 
 def checks(cycles: int) -> int:
-    """How many cycles check a reconstructor made from so many."""
+    """Number of check cycles for a reconstructor made from a number of cycles."""
     return max(_LEAST_CHECKS, round(CHECK_PART * cycles))

@@ -25,36 +25,36 @@ Report = Callable[[str], None]
 T = TypeVar("T")
 
 AFTERWARDS = 8
-"""Frames recorded after the last of a play: the longest delay that can be measured is over by then."""
+"""Frames recorded after the end of a probe sequence: the longest delay that can be measured."""
 MOST_BEHIND = 100
-"""Frames by which the mirror's reports may lag behind the controller's steps; beyond it the mirror counts as dead."""
+"""Frames by which the mirror's reports may lag behind the controller's steps; beyond it the mirror is dead."""
 CHECKED = 100
 """Frames between two renewals of the lease."""
 MOST_REFUSED = 50
-"""Frames refused in a row after which a probe sequence is given up."""
+"""Consecutive refused frames after which a probe sequence is abandoned."""
 ATTEMPTS = 5
-"""Attempts at a sequence where frames are lost or a device restarts."""
+"""Attempts at a sequence if frames are lost or a device restarts."""
 DITHER_SLOWEST = 1 / 16
 """Cycles per frame below which a dither is not used."""
 _LIMITS = frozenset(Limit) - {Limit.MODAL_LIMIT, Limit.LAW_OVERRULED}
 
 
 class PlayInterruptedError(CalibrationError):
-    """A device restarted or stood still while pokes were played: they are to be played again."""
+    """A device restarted or stalled during the pokes, which must be repeated."""
 
 
 class PokesNotSeenError(CalibrationError):
-    """Pokes have no answer in the frames: they may be too small."""
+    """The frames show no response to the pokes, which may be too small."""
 
 
 class Recording(NamedTuple):
-    """Frames of a play, counted from the first whose command had a row.
+    """Frames of a probe sequence, counted from the first whose command had a row.
 
     Attributes:
-        sequence: (frames,) rising; frames that were lost are not there.
+        sequence: (frames,) rising; lost frames are missing.
         pixels: (frames, pixels) uint16, DN.
         steps: (steps,) sequences of the controller's steps, which may be more.
-        commanded: (steps,) whether the frame was used and a command made of it.
+        commanded: (steps,) whether the frame was used for a command.
         command_nm: (steps, modes) the loop's own modal command.
     """
 
@@ -65,13 +65,13 @@ class Recording(NamedTuple):
     command_nm: Array
 
     def played(self, table: Array, delay_frames: float) -> Array:
-        """(frames, columns): what of a table each exposure saw."""
+        """(frames, columns): the table as seen by each exposure."""
         return seen(table, _weights(delay_frames), self.steps, self.commanded)[self._steps_of_frames]
 
     def commands(self, delay_frames: float) -> Array:
-        """(frames, modes): what of the loop's own command each exposure saw."""
+        """(frames, modes): the loop's own command as seen by each exposure."""
         places = np.arange(self.steps[-1] + 1)
-        newest = np.searchsorted(self.steps, places, side="right") - 1  # where a step is missing, the one before held
+        newest = np.searchsorted(self.steps, places, side="right") - 1  # if a step is missing, the one before held
         all_of_them = np.ones(len(self.steps), np.bool_)
         return seen(self.command_nm[newest], _weights(delay_frames), self.steps, all_of_them)[self._steps_of_frames]
 
@@ -90,12 +90,12 @@ class Recording(NamedTuple):
 
 
 def _lag(delay_frames: float) -> int:
-    """Whole frames from a row's frame to the first exposure that sees it; one frame is measured as 0.998, too."""
+    """Whole frames from a row's frame to the first exposure that sees it; 0.998 frames count as one."""
     return int(max(delay_frames, 1.0))
 
 
 def _weights(delay_frames: float) -> Array:
-    """(lags,) part of the row of so many frames before that an exposure sees."""
+    """(lags,) fraction of the row of this many frames before that an exposure sees."""
     return np.concatenate([[0.0], delay_weights(max(delay_frames, 1.0))])
 
 
@@ -134,17 +134,17 @@ def play(loop: Client, basis_nm: npt.NDArray[np.floating], table: npt.NDArray[np
                     step = next(steps)
             _check_devices(mirror, step.frame_sequence, first)
         except StopIteration:
-            raise BusError("the frames came to an end: is the camera still running?") from None
+            raise BusError("frames stopped: is the camera still running?") from None
         loop.check_lease()
     return _recording(images, made, first)
 
 
 def watch(loop: Client, count: int) -> Pixels:
-    """The next `count` frames (count, rows, columns), DN; BusError where they stopped."""
+    """The next `count` frames (count, rows, columns), DN; BusError if they stop."""
     stream = loop.frames(count)
     received = [np.asarray(image.pixels) for image in stream]
     if len(received) < count:
-        raise BusError(f"the frames came to an end after {len(received)} of {count}: is the camera still running?")
+        raise BusError(f"frames stopped after {len(received)} of {count}: is the camera still running?")
     return np.array(received)
 
 
@@ -160,7 +160,7 @@ def check_size(shape: tuple[int, ...], before: Calibration) -> None:
 
 @contextlib.contextmanager
 def _streams(loop: Client) -> Iterator[tuple[Iterator[Frame], Iterator[Step]]]:
-    """Frames and steps from now on; where anything goes wrong, nothing is played any more."""
+    """Frames and steps from now on; an error ends the probe sequence."""
     frames, steps = loop.frames(), loop.steps()
     done = False
     try:
@@ -172,29 +172,29 @@ def _streams(loop: Client) -> Iterator[tuple[Iterator[Frame], Iterator[Step]]]:
             if close is not None:
                 close()
         if not done:
-            with contextlib.suppress(LowfcError):  # the first fault is the one that is raised
+            with contextlib.suppress(LowfcError):  # the first error is the one raised
                 loop.stop()
 
 
 def _check(loop: Client, step: Step, before: LoopMode | None, *, over: bool) -> LoopMode:
-    """The mode of a step; raise where the play has been ended."""
+    """The mode of a step; raise if the probe sequence was ended."""
     if not over and before is not None and step.mode is not before:
-        loop.check_lease()  # which says who ended it
+        loop.check_lease()  # its error names who ended it
         raise CalibrationError(
-            f"the loop went from {before.name.lower()} to {step.mode.name.lower()} while pokes were played, which "
-            "ended them; leave it alone during a calibration"
+            f"the loop went from {before.name.lower()} to {step.mode.name.lower()} during the pokes, which ended them; "
+            "do not operate the loop during a calibration"
         )
     limits = [reason.name for reason in step.reasons if reason in _LIMITS]
     if limits and not over:
         raise CalibrationError(
-            f"a limit of the mirror acted on the pokes ({', '.join(limits)}), which ended them: take a smaller "
-            "--amplitude, or bring the mirror nearer to flat"
+            f"a limit of the mirror acted on the pokes ({', '.join(limits)}), which ended them: use a smaller "
+            "--amplitude, or bring the mirror closer to flat"
         )
     return step.mode
 
 
 def _commanded(step: Step) -> bool:
-    """Whether the mirror followed the sequence with this step: where no law acts, it needs no measurement."""
+    """Whether the mirror followed the sequence with this step; without a law, the frame need not be used."""
     return step.error_nm is not None or (step.mode is not LoopMode.CLOSED and step.reasons[0] in UNMEASURED)
 
 
@@ -203,13 +203,13 @@ def _check_refused(made: list[Step]) -> None:
     if len(last) == MOST_REFUSED and not any(_commanded(step) for step in last):
         reasons = sorted({reason.name for step in last for reason in step.reasons})
         raise CalibrationError(
-            f"the last {MOST_REFUSED} frames were refused as {', '.join(reasons)}: the sequence has ended; correct "
-            "this first, `lowfc ctl status` shows when frames are used again"
+            f"the last {MOST_REFUSED} frames were refused as {', '.join(reasons)}, which ended the sequence; correct "
+            "this first: `lowfc ctl status` shows whether frames are used again"
         )
 
 
 def _check_devices(mirror: MirrorWatch, sequence: int, first: int) -> None:
-    """Raise where the pokes up to a frame were not all on the mirror, or the frame is another camera process's."""
+    """Raise if the pokes up to a frame were not all on the mirror, or the camera restarted."""
     mirror.read()
     behind = sequence - max(mirror.frame_sequence, first)
     if start_of(sequence) != start_of(first):
@@ -217,16 +217,16 @@ def _check_devices(mirror: MirrorWatch, sequence: int, first: int) -> None:
     elif mirror.interruption or behind <= MOST_BEHIND:
         why = mirror.interruption
     else:
-        why = f"the mirror has reported no command as followed for {behind} frames"
+        why = f"the mirror has not reported an applied command for {behind} frames"
     if why:
-        raise PlayInterruptedError(f"{why} while pokes were played")
+        raise PlayInterruptedError(f"{why} during the pokes")
 
 
 def _recording(images: list[Frame], made: list[Step], first: int) -> Recording:
     known = {step.frame_sequence for step in made}
     images = [image for image in images if image.sequence in known]
     if not images:
-        raise CalibrationError("no frame of the play was received: is the loop's camera running?")
+        raise CalibrationError("no frame of the probe sequence was received: is the loop's camera running?")
     modes = max(step.command_nm.size for step in made)
     command = np.zeros((len(made), modes))
     for row, step in enumerate(made):
@@ -242,13 +242,13 @@ def _recording(images: list[Frame], made: list[Step], first: int) -> Recording:
 
 @dataclass(frozen=True, slots=True)
 class Player:
-    """Sequences of pokes on the mirror of a loop, played again where frames were lost or a device restarted.
+    """Sequences of pokes on the mirror of a loop, repeated if frames were lost or a device restarted.
 
     Attributes:
         loop: to play on.
         before: has dark, good pixels, reference and the mirror's commands.
-        report: for people: why a sequence is played again.
-        closed: the loop works against the pokes.
+        report: receives the reason if a sequence is repeated.
+        closed: the loop is closed and corrects the pokes.
     """
 
     loop: Client
@@ -257,7 +257,7 @@ class Player:
     closed: bool = False
 
     def first_poke(self, mode: int, plan: Plan) -> Delay:
-        """Poke the mode at one place in a pseudo-random sequence: the delay, and the image of the poke."""
+        """Poke one mode in a pseudo-random sequence to measure the delay and the image of the poke."""
 
         def attempt() -> Recording:
             played = self._play(plan, slice(mode, mode + 1))
@@ -268,7 +268,7 @@ class Player:
         recording = self._repeated(
             attempt,
             "once more",
-            f"there was no run of {len(plan)} frames without a lost or refused one: `lowfc doctor` looks for why",
+            f"there were no {len(plan)} consecutive frames without a lost or refused one: see `lowfc doctor`",
         )
         command = recording.command_nm[: len(plan), mode] if self.closed else None
         try:
@@ -291,7 +291,7 @@ class Player:
             used = recording.usable(plan, delay_frames).astype(np.float64)
             return cycle_response(fractions, flux, moved, poked, used, DITHER_SLOWEST if self.closed else 0.0)
 
-        return self._repeated(attempt, "a cycle is repeated", "no cycle was of use")
+        return self._repeated(attempt, "a cycle is repeated", "no cycle was usable")
 
     def _play(self, plan: Plan, modes: slice = slice(None)) -> Recording:
         return play(self.loop, self.before.modes_to_actuators.T[modes], plan.table)
@@ -306,4 +306,4 @@ class Player:
             except (PlayInterruptedError, ValueError) as error:
                 why = error
                 self.report(f"{again}: {error}")
-        raise CalibrationError(f"in {ATTEMPTS} attempts {given_up}; the last: {why}")
+        raise CalibrationError(f"in {ATTEMPTS} attempts {given_up}; the last attempt: {why}")

@@ -1,4 +1,4 @@
-"""The result of a calibration: the file's content, its figures, and whether it is recommended."""
+"""The result of a calibration: contents of the file, figures and verdict."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -24,23 +24,23 @@ from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest, cyc
 from lowfc.programs.commissioning.calibrate.run import CalibrationData, Calibrator
 
 MOST_NOISE = 1.5
-"""Largest noise of R over that of the computed R on the same light; far from flat the sensor sees less."""
+"""Largest ratio of the noise of R to that of the computed R at the same flux; far from flat it is higher."""
 DELAY_APART = 0.1
 """Largest error of the configured delay without a warning, frames."""
 
 
 class Verdict(Result):
-    """Verdict on a measured reconstructor; its cross-talk is that on frames that were not used for it."""
+    """Verdict on a measured reconstructor; its cross-talk is measured on separate frames."""
 
     snr: float = figure("signal-to-noise ratio requested", form=".3g")
     snr_reached: float = figure("signal-to-noise ratio reached", form=".3g")
-    check_cycles: int = figure("cycles that check it")
-    check_cross_talk_rms: float = figure("their cross-talk, rms", form=".3g")
-    check_cross_talk_max: float = figure("their cross-talk, largest, with its noise", form=".3g")
-    check_cross_talk_bound: float = figure("good up to, with this noise", form=".3g")
-    check_error: float = figure("noise of an element of it", form=".2g")
-    promised_cross_talk_rms: float = figure("promised cross-talk, rms", form=".3g")
-    promised_cross_talk_max: float = figure("promised cross-talk, largest", form=".3g")
+    check_cycles: int = figure("check cycles")
+    check_cross_talk_rms: float = figure("cross-talk in them, rms", form=".3g")
+    check_cross_talk_max: float = figure("cross-talk in them, largest, with noise", form=".3g")
+    check_cross_talk_bound: float = figure("limit with this noise", form=".3g")
+    check_error: float = figure("noise of an element", form=".2g")
+    promised_cross_talk_rms: float = figure("expected cross-talk, rms", form=".3g")
+    promised_cross_talk_max: float = figure("expected cross-talk, largest", form=".3g")
     recommended: bool = figure()
     faults: list[str] = figure()
 
@@ -57,31 +57,31 @@ class Figures(Result):
     delay_frames: float = figure("delay", "frames", ".3f")
     delay_error_frames: float = figure("standard error of the delay", "frames", ".3f")
     frame_to_effect_ms: float = figure("frame to effect", "ms", ".3g")
-    noise_gain_nm: list[float] = figure("noise of a frame", "nm", ".3g", column=True)
+    noise_gain_nm: list[float] = figure("noise per frame", "nm", ".3g", column=True)
     computed_noise_nm: list[float] | None = figure("computed", "nm", ".3g", column=True, default=None)
     bad_pixels: int = figure("bad pixels")
     flux_dn: float = figure("light", "DN", ".4g")
     cycles: int = figure("cycles")
-    cross_talk: float | None = figure("cross-talk against the computed H, largest", form=".4f", default=None)
+    cross_talk: float | None = figure("largest cross-talk relative to the computed H", form=".4f", default=None)
     cross_talk_error: float | None = figure("standard error of this cross-talk", form=".4f", default=None)
     file: str = figure("written")
 
 
 class CalibrationResult(Verdict, Figures):
-    """A calibration that was measured and judged, or computed: then there is no verdict."""
+    """A measured calibration with its verdict, or a computed one without."""
 
     advice: list[str] = figure(exclude=True, default=[])
     not_loaded: bool = figure(exclude=True, default=False)
 
     def remarks(self) -> Sequence[str]:
-        """What to do, and the verdict."""
+        """Advice and verdict."""
         if "recommended" not in self.model_fields_set:
             return self.advice
         said = [
             "verdict: good" if self.recommended else "verdict: NOT RECOMMENDED",
             *(f"  {one}" for one in self.faults),
         ]
-        return [*self.advice, *said, *(["it is not loaded"] if self.not_loaded else [])]
+        return [*self.advice, *said, *(["not loaded"] if self.not_loaded else [])]
 
 
 class Comparison(Result):
@@ -93,21 +93,21 @@ class Comparison(Result):
     cross_talk: float = figure("largest cross-talk", form=".4f")
     gain: list[float] = figure("gain", form=".4f", column=True)
     reference_shift_nm: list[float] = figure("zero point", "nm", ".3f", column=True)
-    flux_ratio: float = figure("ratio of the light", form=".4f")
+    flux_ratio: float = figure("flux ratio", form=".4f")
     dark_shift_dn: float = figure("shift of the dark", "DN", "+.2f")
     bad_pixels: list[int] = figure("bad pixels")
     same_commands: bool = figure("same commands")
 
 
 def rejected_of(out: Path) -> Path:
-    """Where a calibration is written that is not recommended: what may be a good one stays."""
+    """Path of a calibration that is not recommended, so that an existing one is kept."""
     return out.with_name(f"{out.stem}.rejected{out.suffix}")
 
 
 def finished(
     calibrator: Calibrator, request: CalibrationRequest, data: CalibrationData, computed: Calibration
 ) -> tuple[Calibration, CalibrationResult]:
-    """Make R, check it on other frames, write the file: under another name where it is not recommended."""
+    """Compute R, check it on separate frames, write the file, under another name if it is not recommended."""
     config = calibrator.config
     made, quality = measured_calibration(config, calibrator.before, data.measured, request)
     check = calibrator.check(made, data)
@@ -135,7 +135,7 @@ def reconstructed(
     flux_dn: float,
     **how: Any,
 ) -> Reconstruction:
-    """R of H on the camera of a configuration; the arguments are those of `reconstruct`, the light is in DN."""
+    """R from H with the camera of a configuration; arguments as for `reconstruct`, flux in DN."""
     camera = factory.detector(config)
     flux_e, read_noise_e = flux_dn * camera.gain_e_per_dn / camera.em_gain, factory.equivalent_read_noise_e(camera)
     try:
@@ -147,7 +147,7 @@ def reconstructed(
 def measured_calibration(
     config: Configuration, before: Calibration, found: Measured, request: CalibrationRequest
 ) -> tuple[Calibration, Reconstruction]:
-    """The calibration that cycles of pokes give, with the dark, the mask and the commands of the one before."""
+    """The calibration from cycles of pokes, with dark, mask and mirror commands of the previous one."""
     I0 = found.reference if found.reference is not None else before.reference.astype(np.float64)
     made = reconstructed(
         config,
@@ -174,7 +174,7 @@ def measured_calibration(
 
 
 def computed_noise_nm(config: Configuration, calibration: Calibration, computed: Calibration) -> Array | None:
-    """Noise (modes,) that a computed reconstructor has on the light of a calibration, nm; None for another sensor's."""
+    """Noise (modes,) of a computed reconstructor at the flux of a calibration, nm; None for another sensor."""
     if not comparable(calibration, computed):
         return None
     return factory.frame_noise_nm(config, replace(calibration, reconstructor=computed.reconstructor * calibration.good))
@@ -190,7 +190,7 @@ def result_of(
     computed: Calibration | None = None,
     verdict: Verdict | None = None,
 ) -> CalibrationResult:
-    """The figures of a calibration that was measured, or computed."""
+    """The figures of a measured or computed calibration."""
     delay_frames, error_frames = (configured_delay(config), 0.0) if data is None else data.delay[:2]
     found: dict[str, Any] = {}
     noise = None if computed is None else computed_noise_nm(config, calibration, computed)
@@ -220,7 +220,7 @@ def result_of(
 
 
 def configured_delay(config: Configuration) -> float:
-    """The delay that the loop is configured for, frames."""
+    """The configured delay, frames."""
     return config.control.delay_frames or config.camera.delay_frames
 
 
@@ -230,11 +230,11 @@ def judge(
     """Judge a reconstructor.
 
     Args:
-        asked_snr: signal-to-noise ratio that it must have.
-        cycles: that it was made from.
+        asked_snr: required signal-to-noise ratio.
+        cycles: number of cycles that it was computed from.
         error: (modes,) standard error of the elements of each row of R H.
-        check: its cross-talk on other frames.
-        noise_ratio: (modes,) its noise in a frame over that of the computed one; None where there is none to compare.
+        check: its cross-talk on separate frames.
+        noise_ratio: (modes,) its noise per frame over that of the computed one; None without a computed one.
         noll: Noll index of each mode.
     """
     reached = 1 / max(float(error.max()), 1e-300)
@@ -243,20 +243,20 @@ def judge(
     if reached < asked_snr:
         needed = cycles_for(asked_snr, cycles, float(error.max()))
         faults.append(
-            f"signal-to-noise ratio {reached:.3g} in Z{noll[int(error.argmax())]}, {asked_snr:g} was to be reached: "
-            f"find what shakes this mode, or take about {needed} cycles (the same command with --resume --cycles "
+            f"signal-to-noise ratio {reached:.3g} in Z{noll[int(error.argmax())]}, {asked_snr:g} required: find the "
+            f"disturbance of this mode, or take about {needed} cycles (the same command with --resume --cycles "
             f"{needed})"
         )
     if not check.within(rms, largest):
         faults.append(
-            f"cross-talk on frames that were not used for it: rms {check.rms:.3g} and at most {check.largest:.3g}; "
-            f"expected {rms:.3g} and, with the noise of these frames, {check.bound(largest):.3g}: did the wavefront, "
-            "the light or the sensor change meanwhile?"
+            f"cross-talk on separate frames: rms {check.rms:.3g} and at most {check.largest:.3g}; expected {rms:.3g} "
+            f"and, with the noise of these frames, {check.bound(largest):.3g}: did the wavefront, the flux or the "
+            "sensor change during the calibration?"
         )
     if noise_ratio is not None and noise_ratio.max() > MOST_NOISE:
         faults.append(
             f"Z{noll[int(noise_ratio.argmax())]} has {noise_ratio.max():.2g} times the noise of the computed "
-            f"reconstructor, at most {MOST_NOISE:g} is expected: is the sensor aligned (`lowfc calibrate align`), the "
+            f"reconstructor, expected at most {MOST_NOISE:g}: is the sensor aligned (`lowfc calibrate align`), and the "
             "wavefront near its zero point?"
         )
     return Verdict(
@@ -301,7 +301,7 @@ def comparison(one: Calibration, other: Calibration) -> Comparison:
 
 
 def _seen_of_actuators(config: Configuration, before: Calibration, matrix: Array) -> Array:
-    """Z (modes, actuators): of the commands what was measured, of other shapes what the optical model says."""
+    """Z (modes, actuators): measured for the commands, from the optical model for other shapes."""
     commands = before.modes_to_actuators.astype(np.float64)
     measured = np.asarray(np.linalg.pinv(commands))  # shapes that are no commands pass for some
     optics = factory.twin(config, None, lambda _: None)

@@ -1,6 +1,6 @@
-"""Calibration through the bus: pokes are played by the controller, frames come back, H is fitted to them.
+"""Calibration through the bus: the controller plays pokes, and H is fitted to the frames.
 
-The cycles done are kept beside the calibration's file, as FILE.part.npz, until it is whole.
+Completed cycles are kept beside the output file, as FILE.part.npz, until the calibration is complete.
 """
 
 import contextlib
@@ -40,25 +40,25 @@ from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest, Pok
 from lowfc.programs.commissioning.calibrate.recording import Player, Report, check_size
 
 _LIKE = 0.3
-"""Likeness of the first pokes' picture to the calibration in use below which something is said."""
+"""Correlation of the first pokes' image with the calibration in use below which a warning is printed."""
 
 
 class CalibrationData(NamedTuple):
-    """What was measured."""
+    """The measured data."""
 
     measured: Measured
     delay: Delay
 
 
 class Calibrator:
-    """One calibration of a running loop; the mirror is afterwards where it was.
+    """One calibration of a running loop; afterwards the mirror returns to its shape.
 
     Attributes:
         config: the loop's.
         before: the calibration in use.
         noise_nm: (modes,) of one frame, with that calibration.
-        pokes: what is played.
-        kept: cycles that another calibration can go on from.
+        pokes: the probe sequences.
+        kept: completed cycles, for --resume.
     """
 
     def __init__(
@@ -69,14 +69,14 @@ class Calibrator:
         progress: Counted,
         computed: Calibration | None = None,
     ) -> None:
-        """Ask the controller what it has, and read the cycles to go on from.
+        """Get the controller's calibration, and read the completed cycles with --resume.
 
         Args:
-            loop: A connection to it.
-            request: What is asked for.
-            report: For people.
-            progress: For people: frames so far, and of how many.
-            computed: What the optical model says, of which R is made where its pixels are the loop's.
+            loop: A connection to the controller.
+            request: The requested calibration.
+            report: Receives messages for the user.
+            progress: Receives frames done and total.
+            computed: The computed calibration, used for R if its pixels are the loop's.
         """
         self._loop = loop
         self._request = request
@@ -101,38 +101,38 @@ class Calibrator:
 
     @contextlib.contextmanager
     def holding(self) -> Iterator[None]:
-        """The loop as the method needs it; afterwards it is as it was."""
+        """Context with the loop in the mode required by the method; restores the mode."""
         state = self._loop.status().state
         mode = state.mode if state is not None else wire.LOOP_MODE_OPEN
         if mode not in (wire.LOOP_MODE_OPEN, wire.LOOP_MODE_CLOSED):
-            raise CalibrationError("the loop must be open or closed: `lowfc ctl clear` leaves the safe state")
+            raise CalibrationError("the loop must be open or closed: `lowfc ctl clear` leaves safe mode")
         if self._closed and mode != wire.LOOP_MODE_CLOSED:
             raise CalibrationError(
-                "--method in-loop dithers under a closed loop, but the loop is open: `lowfc ctl close` first"
+                "--method in-loop requires a closed loop, but the loop is open: `lowfc ctl close` first"
             )
         if self._closed or mode != wire.LOOP_MODE_CLOSED:
             yield
             return
-        self._report("the loop is opened for the calibration, and closed again after it")
+        self._report("the loop is opened for the calibration and closed again afterwards")
         self._loop.open_loop()
         try:
             yield
         except BaseException:
             try:
-                self._loop.check_lease()  # whoever ended it has the last word on the loop
+                self._loop.check_lease()  # if another operator ended it, leave the loop to them
                 self._loop.close_loop()
             except LowfcError as fault:  # the first fault is the one that is raised
-                self._report(f"warning: the loop is not closed again: {fault}")
+                self._report(f"warning: the loop was not closed again: {fault}")
             raise
         self._loop.close_loop()
 
     def run(self, delay: Delay | None = None) -> CalibrationData:
-        """Check that pokes are seen, measure the delay unless it is known, then the response."""
+        """Check that pokes are detected, measure the delay unless known, then the response."""
         delay = self.delay() if delay is None else delay
         return CalibrationData(self._cycles(delay), delay)
 
     def check(self, made: Calibration, data: CalibrationData) -> Check:
-        """The cross-talk of a new calibration at the present zero point, from cycles of its own."""
+        """Cross-talk of a new calibration at the present zero point, from separate cycles."""
         R = made.reconstructor.astype(np.float64)
         cycles = data.measured.cycles
         count = checks(cycles)
@@ -145,7 +145,7 @@ class Calibrator:
 
     @property
     def _best(self) -> int:
-        """Place of the mode that is measured best; tip and tilt, which are shaken most, only without others."""
+        """Index of the mode with the lowest noise; tip and tilt, the most disturbed modes, only without others."""
         tilt = np.array([index in TIP_TILT for index in self.before.noll])
         return int(np.where(tilt & ~tilt.all(), np.inf, self.noise_nm).argmin())
 
@@ -153,13 +153,13 @@ class Calibrator:
         """The delay from poke to image, measured with the mode of least noise."""
         mode = self._best
         plan = self.pokes.delay(mode)
-        self._show("looking for pokes", max(self.pokes.cycles(), self.kept), self.kept)
+        self._show("detecting pokes", max(self.pokes.cycles(), self.kept), self.kept)
         found = self._player.first_poke(mode, plan)
         self._compare_picture(found.picture, mode)
         self._report(
-            f"pokes of Z{self.before.noll[mode]} are seen after {found.delay_frames:.3f} +- {found.error_frames:.3f} "
-            f"frames, {found.delay_frames * self.config.period_ns * 1e-6:.3g} ms from the end of one exposure to that "
-            "of the one that sees what was made of it"
+            f"pokes of Z{self.before.noll[mode]} are detected after {found.delay_frames:.3f} +- "
+            f"{found.error_frames:.3f} frames, {found.delay_frames * self.config.period_ns * 1e-6:.3g} ms (from the "
+            "end of an exposure to the end of the exposure that sees the resulting command)"
         )
         return found
 
@@ -168,13 +168,13 @@ class Calibrator:
         like = likeness(picture, known)
         if abs(like) < _LIKE:
             self._report(
-                f"warning: the picture of Z{self.before.noll[mode]} is not like that of the calibration in use (their "
-                f"correlation is {like:.2f}): is the sensor aligned (`lowfc calibrate align`)?"
+                f"warning: the image of Z{self.before.noll[mode]} differs from that of the calibration in use "
+                f"(correlation {like:.2f}): is the sensor aligned (`lowfc calibrate align`)?"
             )
         elif like < 0:
             self._report(
-                f"warning: Z{self.before.noll[mode]} is seen with the opposite sign of the calibration in use: the "
-                "mirror or the camera is reflected or turned; do not close the loop on that one"
+                f"warning: Z{self.before.noll[mode]} has the opposite sign of the calibration in use: the mirror or "
+                "the camera is reflected or rotated; do not close the loop with that calibration"
             )
 
     def _cycles(self, delay: Delay) -> Measured:
@@ -184,10 +184,10 @@ class Calibrator:
             sums = Sums.none(self._initial(delay))
         else:
             sums = self._begun
-            self._report(f"going on after {counted(sums.cycles, 'cycle')}")
+            self._report(f"continuing after {counted(sums.cycles, 'cycle')}")
         needed = max(pokes.cycles(), sums.cycles)
         self._report(
-            f"{needed} cycles of {len(pokes.cycle(0))} frames and {checks(needed)} to check them; "
+            f"{needed} cycles of {len(pokes.cycle(0))} frames and {checks(needed)} check cycles; "
             + self._to_go(needed, sums.cycles)
         )
         while True:
@@ -202,7 +202,7 @@ class Calibrator:
             if more <= needed:
                 return found
             self._report(
-                f"the cycles scatter by more than photons and read-out: {more} of them instead of {needed}; "
+                f"the cycles scatter more than photon and read noise: {more} cycles instead of {needed}; "
                 + self._to_go(more, needed)
             )
             needed = more
@@ -215,15 +215,15 @@ class Calibrator:
         return f"about {self.pokes.frames(needed, done) / self.config.camera.rate_hz:.0f} s to go"
 
     def _initial(self, delay: Delay) -> Initial:
-        """The reconstructor of which the measured one is made: the computed one, unless that in use sees more."""
+        """The prior reconstructor of the measured one: the computed one, unless the one in use sees more."""
         before = self.before
         of = [each for each in (self._computed, before) if each is not None and comparable(each, before)]
         candidates = [Initial(each.reconstructor.astype(np.float64) * before.good, each.estimator) for each in of]
         whole = [each for each in candidates if np.linalg.matrix_rank(each.matrix) == len(before.noll)]
         if not whole:
             raise CalibrationError(
-                "neither the optical model nor the calibration in use tells all modes apart on these pixels, and R is "
-                "made from one of them: `lowfc calibrate align` computes it for this sensor"
+                "neither the optical model nor the calibration in use distinguishes all modes on these pixels, but R "
+                "requires one that does: `lowfc calibrate align` computes it for this sensor"
             )
         camera = factory.detector(self.config)
         variance = pixel_variance(
@@ -235,12 +235,12 @@ class Calibrator:
 
 
 def partial_of(out: Path) -> Path:
-    """Where the cycles done are kept until a calibration is whole."""
+    """File of the completed cycles until the calibration is complete."""
     return out.with_name(out.name + ".part.npz")
 
 
 def keep(path: Path, sums: Sums, what: dict[str, Any]) -> None:
-    """Write the cycles done, and what they are of; DataFileError where it cannot be written."""
+    """Write the completed cycles and their description; DataFileError if it cannot be written."""
     stream = io.BytesIO()
     arrays = sums._asdict() | {"initial": sums.initial.matrix, "estimator": sums.initial.estimator}
     np.savez(stream, what=np.array(json.dumps(what, sort_keys=True)), **arrays)
@@ -248,21 +248,21 @@ def keep(path: Path, sums: Sums, what: dict[str, Any]) -> None:
 
 
 def go_on(path: Path, what: dict[str, Any]) -> Sums:
-    """The cycles done; DataFileError where there are none, the file is damaged, or they are of another calibration."""
+    """Read completed cycles; DataFileError if there are none, the file is damaged or of another calibration."""
     before, sums = begun(path)
     for key, value in what.items():
         if before.get(key) != value:
             raise DataFileError(
                 f"{path} is of another calibration: its {key} is {before.get(key)}, now it is {value}; remove the "
-                "file, or leave --resume out"
+                "file, or omit --resume"
             )
     return sums
 
 
 def begun(path: Path) -> tuple[dict[str, Any], Sums]:
-    """Method, amplitude and calibration of the cycles that were kept, and these cycles."""
+    """Method, amplitude and calibration of the completed cycles, and these cycles."""
     if not path.is_file():
-        raise DataFileError(f"there is nothing to go on from: no {path}; leave --resume out")
+        raise DataFileError(f"nothing to resume: there is no {path}; omit --resume")
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
             sums = Sums(
@@ -276,4 +276,4 @@ def begun(path: Path) -> tuple[dict[str, Any], Sums]:
             return dict(json.loads(str(arrays["what"]))), sums
     except (*fits_file.DAMAGED, zipfile.BadZipFile) as error:
         why = fits_file.in_a_line(error)
-        raise DataFileError(f"{path} is damaged, or no part of a calibration: {why}; remove it") from None
+        raise DataFileError(f"{path} is damaged or not from a calibration: {why}; remove it") from None

@@ -42,7 +42,7 @@ from lowfc.programs.commissioning.calibrate.run import Calibrator, partial_of
 
 
 class DarkResult(Result):
-    """A dark and the bad pixels that it shows."""
+    """A dark and its bad pixels."""
 
     frames: int = figure("frames")
     dark_dn: float = figure("dark, median", "DN", ".4g")
@@ -54,7 +54,7 @@ class DarkResult(Result):
 
 
 class ReferenceResult(Result):
-    """How far the zero point moved."""
+    """Shift of the zero point."""
 
     frames: int = figure("frames")
     noll: list[int] = figure("mode", form="Z{}", column=True)
@@ -64,7 +64,7 @@ class ReferenceResult(Result):
 
 
 def poked(request: CalibrationRequest, run: str | None, *, load: bool) -> CalibrationResult:
-    """Calibrate a running loop and write the file, once nothing else can go wrong."""
+    """Calibrate a running loop and write the file at the end."""
     require_folder(request.out)
     console = Console(stderr=True)
     report = reporter(console)
@@ -86,8 +86,8 @@ def poked(request: CalibrationRequest, run: str | None, *, load: bool) -> Calibr
             if calibrator.kept:
                 kept_cycles = counted(calibrator.kept, "cycle")
                 report(
-                    f"kept in {partial_of(request.out)}: {kept_cycles}, with which the same command with --resume goes "
-                    "on"
+                    f"kept in {partial_of(request.out)}: {kept_cycles}; the same command with --resume continues with "
+                    "them"
                 )
             raise
     result.not_loaded = load and not result.recommended
@@ -96,7 +96,7 @@ def poked(request: CalibrationRequest, run: str | None, *, load: bool) -> Calibr
 
 @contextlib.contextmanager
 def shown_progress(console: Console, report: Callable[[str], None]) -> Iterator[Counted]:
-    """A bar on a terminal, else a line every 10 s."""
+    """Progress bar on a terminal, otherwise a line every 10 s."""
     if not console.is_terminal:
         yield spoken(report)
         return
@@ -133,7 +133,7 @@ def computed(
 
 
 def zero_point(config: Configuration, text: str) -> tuple[str, Wavefront]:
-    """The wavefront of --at: modes as in 4=15,7=-10, Noll index = nm rms, or a file as `lowfc ctl channel` takes it.
+    """The wavefront of --at: modes as in 4=15,7=-10, Noll index = nm rms, or a file as for `lowfc ctl channel`.
 
     Returns:
         Its name in a calibration, and the wavefront.
@@ -156,7 +156,7 @@ def _modes(text: str) -> dict[int, float]:
         try:
             mode, amplitude_nm = int(index), float(value)
         except ValueError:
-            raise ConfigurationError(f"--at takes modes in nm, as in 4=15,7=-10, or a file; got {part!r}") from None
+            raise ConfigurationError(f"--at must be modes in nm, as in 4=15,7=-10, or a file; got {part!r}") from None
         if mode < 2 or mode in found or not np.isfinite(amplitude_nm):
             raise ConfigurationError(
                 f"--at: {part!r} is not a Noll index of 2 or more, named once, and its amplitude in nm"
@@ -166,14 +166,14 @@ def _modes(text: str) -> dict[int, float]:
 
 
 def darkened(out: Path, run: str | None, frames: int, file: Path | None, *, load: bool) -> DarkResult:
-    """The calibration in use with a dark and a mask, from the loop's frames or a cube of them."""
+    """The calibration in use with a new dark and mask, from the loop's frames or a cube."""
     require_folder(out)
     with Client(run) as loop, _in_use(loop) as (before, noise):
         cube = watch(loop, frames) if file is None else images(file)
         if file is None:
             check_size(cube.shape[1:], before)
         elif cube.shape[1:] != before.shape:
-            raise DataFileError(f"{file}: frames of {cube.shape[1:]}, the calibration has {before.shape}")
+            raise DataFileError(f"{file}: its frames are {cube.shape[1:]}, those of the calibration {before.shape}")
         found = dark_of(cube.reshape(len(cube), -1))
         if file is None:
             check_dark(found.dark_dn, before.reference.astype(np.float64), before.flux_dn)
@@ -200,7 +200,7 @@ def referenced(out: Path, run: str | None, frames: int, *, load: bool) -> Refere
 
 @contextlib.contextmanager
 def _in_use(loop: Client) -> Iterator[tuple[Calibration, tuple[float, float]]]:
-    """The calibration in use, and of the camera the read noise of a pixel, e-, and electrons per DN."""
+    """The calibration in use, and the camera's read noise of a pixel, e-, and electrons per DN."""
     camera = factory.detector(configuration_of(loop))
     noise = factory.equivalent_read_noise_e(camera), camera.gain_e_per_dn / camera.em_gain
     try:
@@ -210,7 +210,7 @@ def _in_use(loop: Client) -> Iterator[tuple[Calibration, tuple[float, float]]]:
 
 
 def written(made: Calibration, out: Path, loop: Client | None) -> Calibration:
-    """Write a calibration under its identity; a loop, where there is one, uses it at once."""
+    """Write a calibration with its identity; load it into the loop, if there is one."""
     made = identified(made)
     calibration_file.save(made, out)
     if loop is not None:
@@ -225,7 +225,7 @@ def images(file: Path) -> Array:
 
 
 def reporter(console: Console) -> Report:
-    """A line for people, warnings in yellow."""
+    """Print a line, warnings in yellow."""
 
     def report(text: str) -> None:
         style = "yellow" if text.startswith("warning") else None

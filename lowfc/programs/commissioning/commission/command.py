@@ -48,7 +48,7 @@ def commission(
     from lowfc.programs.commissioning.commission.commissioning import Commission, Commissioning
 
     if dark is not None and no_dark:
-        raise ConfigurationError("--dark FILE and --no-dark exclude each other: choose one")
+        raise ConfigurationError("--dark FILE and --no-dark exclude each other: use one")
     if dark is None and not no_dark and not resume and not sys.stdin.isatty():
         raise ConfigurationError(
             "a dark needs somebody to block the star, and there is no terminal to ask at: give dark frames with --dark "

@@ -1,4 +1,4 @@
-"""The error budget of a run's longest closed stretch, each term with the way it was obtained."""
+"""The error budget of a run's longest closed-loop stretch; each term with its source."""
 
 from dataclasses import replace
 
@@ -21,16 +21,16 @@ from lowfc.programs.logs.report.source import Figures, Run
 Masks = dict[str, Mask]
 
 Entry = tuple[Term | None, str]
-"""A term and how it was obtained; or none, and what it would take."""
+"""A term and its source; or None and what would be required."""
 
 _THROUGH = "times the loop's noise transfer"
 _NO_CAMERA = "the camera's gain and read noise"
-_NO_TRUTH = "the true wavefront, which only a simulation knows"
+_NO_TRUTH = "the true wavefront, known only in simulation"
 _TOO_SHORT = "a longer stretch with the loop closed"
 
 
 def budget_figures(run: Run, stretch: Stretch | None, spectra: Spectra | None, masks: Masks) -> Figures:
-    """Terms, their sum, and what it is compared with, in nm rms over each of the groups of modes."""
+    """Terms, their sum and the figures to compare it with, in nm rms over each group of modes."""
     if stretch is None:
         return {"why_not": why_none(run)}
     noise = noise_of(run.history, stretch.rows)
@@ -62,27 +62,27 @@ def budget_figures(run: Run, stretch: Stretch | None, spectra: Spectra | None, m
 
 
 def _terms(stretch: Stretch, spectra: Spectra | None, noise: SensorNoise | None) -> dict[str, Entry]:
-    """Each term, or None, and how it was obtained, or what it would take."""
+    """Each term and its source, or None and what would be required."""
     law, timing = stretch.law, stretch.timing
     found: dict[str, Entry] = {}
     if noise is None:
-        found = dict.fromkeys(("photon noise", "read noise"), (None, f"it takes {_NO_CAMERA}"))
+        found = dict.fromkeys(("photon noise", "read noise"), (None, f"requires {_NO_CAMERA}"))
     else:
         for name, one_nm, source in (
-            ("photon noise", noise.photon_nm, "flux as measured"),
+            ("photon noise", noise.photon_nm, "measured flux"),
             ("read noise", noise.read_nm, "camera's read noise and rounding"),
         ):
             how = f"{source}, through the reconstructor, {_THROUGH}"
             found[name] = (white_noise(law, one_nm), how if noise.total_nm.any() else "the simulation has no noise")
     if spectra is None:
-        found["lag"] = (None, f"it takes {_TOO_SHORT}")
+        found["lag"] = (None, f"requires {_TOO_SHORT}")
     elif stretch.true:
         mean_nm = stretch.signal(DISTURBANCE).joined().mean(axis=0)
         how = "spectrum of the true disturbance times the rejection"
         found["lag"] = (lag(law, spectra[DISTURBANCE], mean_nm, timing), how)
     else:
         mean_nm = stretch.signal(POL).joined().mean(axis=0)
-        how = "pseudo-open-loop spectrum, its noise floor taken off, times the rejection"
+        how = "pseudo-open-loop spectrum minus its noise floor, times the rejection"
         found["lag"] = (lag_under_noise(law, spectra[POL], mean_nm, timing), how)
     crosstalk, nonlinearity = _measurement_terms(stretch, noise)
     found["cross-talk and aliasing"] = crosstalk
@@ -101,10 +101,10 @@ def _measurement_terms(stretch: Stretch, noise: SensorNoise | None) -> tuple[Ent
         seen = replace(error, values=tuple(a - b for a, b in zip(error.values, pol.values, strict=True)))
         split = measurement_error(stretch.law, error, stretch.signal(SENSED), seen, noise.total_nm)
     if split is None:
-        nothing = (None, f"it takes {missing}")
+        nothing = (None, f"requires {missing}")
         return nothing, nothing
-    linear = "what of error less true residual follows linearly from a constant, the residual and the command"
-    rest = "what is left of error less true residual, beyond the noise of a frame"
+    linear = "linear part of (error - true residual): fit to a constant, the residual and the command"
+    rest = "remainder of (error - true residual) beyond the noise of a frame"
     return (split.crosstalk, f"{linear}, {_THROUGH}"), (split.nonlinearity, f"{rest}, {_THROUGH}")
 
 
@@ -113,7 +113,7 @@ def _mean_square(values: Array) -> Term:
 
 
 def _columns(term: Term | None, masks: Masks) -> Figures:
-    """Rms of each group in nm; `upper_limit` names the groups in which it was not seen."""
+    """Rms of each group in nm; `upper_limit` names the groups in which it was not detected."""
     if term is None:
         return {"rms_nm": dict.fromkeys(masks), "upper_limit": []}
     totals = {name: term.total(mask) for name, mask in masks.items()}

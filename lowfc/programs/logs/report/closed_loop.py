@@ -1,4 +1,4 @@
-"""The longest stretch of a run with the loop closed under one law: its spectra, against the theory, and its budget."""
+"""The longest stretch of a run with the loop closed under one law: spectra, theory and budget."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -17,9 +17,9 @@ from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.logs.report.source import Figures, InForce, Run
 
 MOST_STEPS = 200_000
-"""Of a longer stretch only the last ones are looked at: memory does not grow with the night."""
+"""Only the last steps of a longer stretch are used, to bound the memory."""
 BANDS_HZ = (1.0, 10.0, 100.0, 1000.0)
-"""Where bands of frequency end, above the resolution."""
+"""Upper ends of the frequency bands, above the resolution."""
 
 _TIP, _TILT = 2, 3
 
@@ -30,7 +30,7 @@ class Stretch:
 
     Attributes:
         rows: of the steps, settled.
-        settling: steps before them that are left out, and `earlier` more of a long stretch.
+        settling: steps left out before them for settling, and `earlier` more of a long stretch.
         timing: of the loop, as its truth is: sampled where the log's truth is.
         frames: error, pseudo-open-loop and, where the log has truth, disturbance, residual and the residual's mean over
             the exposure, side by side.
@@ -49,7 +49,7 @@ class Stretch:
 
     @property
     def true(self) -> bool:
-        """Whether the truth is known."""
+        """Whether the true wavefront is known."""
         return self.left_nm2 is not None
 
     def signal(self, number: int) -> Pieces:
@@ -62,7 +62,7 @@ ERROR, POL, DISTURBANCE, RESIDUAL, SENSED = range(5)
 
 
 def longest_stretch(run: Run) -> Stretch | None:
-    """The longest one; None where the loop was never closed, or the log does not tell under which law."""
+    """The longest stretch; None if the loop was never closed, or the log does not contain the law."""
     history, laws = run.history, run.law_rows()
     steps = history.steps
     closed = (steps.mode == LoopMode.CLOSED) & (laws >= 0)
@@ -85,20 +85,20 @@ def longest_stretch(run: Run) -> Stretch | None:
             timing = Timing.of(in_force.delay_frames, history.exposure_fraction)
     found = pieces(steps.sequence[rows], np.hstack(signals))
     noll = tuple(range(2, 2 + gain.size))
-    rate_hz = history.rate_hz or 1.0  # of one step alone none is known, and nothing is reckoned with it
+    rate_hz = history.rate_hz or 1.0  # unknown, and unused, for a single step
     law = integrator(gain, leak, noll, in_force.delay_frames, rate_hz)
     return Stretch(rows, settling, earlier, in_force, law, timing, found, left_nm2)
 
 
 def why_none(run: Run) -> str:
-    """Why there is no stretch."""
+    """The reason if there is no stretch."""
     if (run.history.steps.mode == LoopMode.CLOSED).any():
-        return "this log does not tell under which law the loop was closed"
+        return "this log does not contain the law with which the loop was closed"
     return "the loop was not closed in this log"
 
 
 def stretch_figures(run: Run, stretch: Stretch | None) -> Figures | None:
-    """Which part of the run it is, and under which law."""
+    """Text of the part of the run and its law."""
     if stretch is None:
         return None
     steps = run.history.steps
@@ -128,11 +128,11 @@ def groups_of(noll: tuple[int, ...]) -> dict[str, Mask]:
 
 
 Spectra = list[Spectrum]
-"""Of the signals of a stretch: error, pseudo-open-loop and, where the log has truth, disturbance and residual."""
+"""Signals of a stretch: error, pseudo-open-loop and, if the log has truth, disturbance and residual."""
 
 
 def spectra_of(stretch: Stretch | None) -> Spectra | None:
-    """None where there is no stretch, or it is too short."""
+    """None if there is no stretch or it is too short."""
     if stretch is None:
         return None
     found = [spectrum(stretch.signal(number), stretch.law.rate_hz) for number in range(4 if stretch.true else 2)]
@@ -140,12 +140,12 @@ def spectra_of(stretch: Stretch | None) -> Spectra | None:
 
 
 def spectra_figures(run: Run, stretch: Stretch | None, found: Spectra | None) -> Figures:
-    """Spectra of tip, tilt and the total of the others: in bins, by band, and against the theory."""
+    """Spectra of tip, tilt and the sum of the others: in bins, by band, and compared with theory."""
     if stretch is None:
         return {"why_not": why_none(run)}
     if found is None:
         longest = max((len(piece) for piece in stretch.frames.values), default=0)
-        return {"why_not": f"the longest gap-free stretch has {longest} frames, and a spectrum takes {SHORTEST}"}
+        return {"why_not": f"the longest gap-free stretch has {longest} frames, but a spectrum requires {SHORTEST}"}
     calibration = run.history.calibration
     groups = groups_of(calibration.noll if calibration is not None else ())
     noise = _noise_floor(run, stretch)
@@ -157,7 +157,7 @@ def spectra_figures(run: Run, stretch: Stretch | None, found: Spectra | None) ->
 
 
 def _group(name: str, modes: Mask, law: LinearLaw, found: Spectra, noise_nm2_hz: Array | None) -> Figures:
-    """One group's spectra; what is summed over modes is summed in power."""
+    """Spectra of one group; modes are summed in power."""
 
     def total(one: Spectrum) -> Array:
         return np.asarray(one.power_nm2_hz[:, modes].sum(axis=1))
@@ -199,7 +199,7 @@ def _group(name: str, modes: Mask, law: LinearLaw, found: Spectra, noise_nm2_hz:
 
 
 def _ratio(measured: Array, theory: Array) -> Figures:
-    """Amplitude of the measured over the theory's, over all bins: the middle, and where nine tenths of them lie."""
+    """Ratio of measured to theoretical amplitude over all bins: median and the range of 90 % of them."""
     there = (theory > 0) & (measured > 0)
     if not there.any():
         return {"median": None, "p5": None, "p95": None}
@@ -213,7 +213,7 @@ def _band_rms(frequency_hz: Array, power: Array, low_hz: float, high_hz: float) 
 
 
 def noise_of(history: History, rows: slice) -> SensorNoise | None:
-    """Sensor noise of one frame at the flux that these steps had; None where the log lacks camera or calibration."""
+    """Sensor noise of one frame at the flux of these steps; None if the log lacks camera or calibration."""
     camera, calibration = history.camera, history.calibration
     flux_dn = history.steps.flux_dn[rows]
     flux_dn = flux_dn[flux_dn > 0]

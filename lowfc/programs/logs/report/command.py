@@ -1,4 +1,4 @@
-"""The command `lowfc report`: arguments only; the work is elsewhere."""
+"""The command `lowfc report`: arguments only."""
 
 import sys
 from functools import partial
@@ -20,13 +20,13 @@ _LOGS = (".mcap", ".part")
 def report(
     logs: Logs,
     out: Annotated[
-        Path | None, typer.Option(help="The page (HTML). Default: beside the log, under its name.", show_default=False)
+        Path | None, typer.Option(help="The page (HTML). Default: next to the log, with its name.", show_default=False)
     ] = None,
     as_json: Annotated[
-        bool, typer.Option("--json", help="Print the figures as one JSON object; the page only with --out.")
+        bool, typer.Option("--json", help="Print the figures as one JSON object; write the page only with --out.")
     ] = False,
 ) -> None:
-    """Summarise a run from its log: one HTML page that opens anywhere, and the same figures as JSON.
+    """Summarise a run from its log as a self-contained HTML page; --json prints the same figures.
 
     Example: lowfc report last
     """
@@ -34,7 +34,7 @@ def report(
 
     found = one_by_one(logs, out, as_json=as_json)
     if out is not None and out.suffix in _LOGS:
-        raise DataFileError(f"{out} would be a log, which a report never overwrites; give --out FILE.html")
+        raise DataFileError(f"{out} has the name of a log; use --out FILE.html")
     for log in found:
         _report(log, out, as_json)
 
@@ -67,7 +67,7 @@ def _report(log: "Parts", out: Path | None, as_json: bool) -> None:
     for remark in run.history.remarks:
         sys.stderr.write(f"warning: {remark}\n")
     if as_json:
-        # A log may hold any value, and JSON has no number for some.
+        # A log may hold values that JSON cannot represent, such as NaN.
         sys.stdout.write(to_json(found.figures, inf_nan_mode="null").decode() + "\n")
     else:
         verdict = found.figures["verdict"]

@@ -1,4 +1,4 @@
-"""The course of a run: loop modes, events, requests, light, refused frames, the mirror's stroke."""
+"""The course of a run: loop modes, events, requests, flux, refused frames, stroke of the mirror."""
 
 from collections import Counter
 
@@ -17,7 +17,7 @@ _LEVELS = {level.value: level.name.lower() for level in Level}
 
 
 def mode_spans(run: Run) -> list[Figures]:
-    """Loop modes in their order, from when to when in seconds since the first step."""
+    """Loop modes in order, with start and end in seconds since the first step."""
     mode = run.history.steps.mode
     if not mode.size:
         return []
@@ -37,7 +37,7 @@ def mode_steps(history: History) -> dict[str, int]:
 
 
 def events(run: Run) -> list[Figures]:
-    """Events in their order, with level, process, name and sentence."""
+    """Events in order, with level, process, name and sentence."""
     found = run.history.events
     times_s = run.seconds([time_ns for time_ns, _ in found])
     return [
@@ -53,7 +53,7 @@ def events(run: Run) -> list[Figures]:
 
 
 def requests(run: Run) -> list[Figures]:
-    """What operators asked and were answered, other than for the status."""
+    """Operators' requests and their answers, except for the status."""
     steps = run.history.steps
     found = [request for request in run.history.requests if request.name != "status"]
     return [
@@ -71,7 +71,7 @@ def requests(run: Run) -> list[Figures]:
 
 
 def laws(run: Run) -> list[Figures]:
-    """The laws in force, from when on."""
+    """The laws in force, with their start times."""
     return [
         {
             "from_s": float(run.step_s[law.first]),
@@ -102,7 +102,7 @@ def light_figures(history: History) -> Figures:
 
 
 def mirror_figures(history: History) -> Figures:
-    """Stroke used, and limits that acted, at the controller and at the mirror."""
+    """Stroke used, and limits that acted in the controller and in the mirror."""
     mirror, settings = history.mirror, history.controller.settings if history.controller is not None else None
     limit_nm = settings.stroke_nm if settings is not None and settings.stroke_nm else None
     most_nm = float(mirror.stroke_nm.max()) if mirror.stroke_nm.size else None
@@ -122,7 +122,7 @@ def actuator_extremes_nm(history: History) -> Single:
 
 
 def _limits(reasons: Long) -> dict[str, int]:
-    """Those of the mirror: that a law was overruled is an event."""
+    """Limits of the mirror, without LAW_OVERRULED, which is an event."""
     counts = count_reasons(reasons).items()
     return {
         reason.name.lower(): count
@@ -132,7 +132,7 @@ def _limits(reasons: Long) -> dict[str, int]:
 
 
 def _when(run: Run, request: wire.Request) -> float:
-    """Time of the first step for which a request was in force, or of the last step before."""
+    """Time of the first step with a request in force, or of the last step before it."""
     sequence = run.history.steps.sequence
     later = sequence >= request.frame_sequence
     return float(run.step_s[int(np.argmax(later)) if later.any() else -1])

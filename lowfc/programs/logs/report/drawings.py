@@ -22,15 +22,15 @@ if TYPE_CHECKING:
 INK, FAINT, OPEN, CLOSED = (COLOURS[name] for name in ("ink", "faint", "open", "closed"))
 _MODES = {"open": OPEN, "closed": CLOSED, "safe": COLOURS["safe"], "idle": FAINT}
 _BESIDE_TRUTH: dict[str, Any] = {"linestyle": ":", "linewidth": 0.9, "alpha": 0.7}
-"""Of what was measured, where the log has what was true."""
+"""Style of measured curves if the log also has the true ones."""
 _NEAR = 0.25
-"""Part of the stroke from which on its limit is drawn."""
+"""Fraction of the stroke above which its limit is drawn."""
 _MOST_MARKS = 300
 _SECONDS = "seconds since the first step"
 
 
 def drawings(report: Report, progress: Callable[[str], None] = lambda name: None) -> dict[str, str]:
-    """SVG of every drawing that the log has something for, by name."""
+    """SVG of every drawing for which the log has data, by name."""
     found = {}
     for name, (height_in, draw) in _DRAWINGS.items():
         progress(name)
@@ -97,7 +97,7 @@ def _intervals(figure: "Figure", report: Report) -> bool:
         for (name, values), colour, style in zip(found.items(), (INK, COLOURS["other"]), ("-", "--"), strict=False):
             counts, _ = np.histogram(np.clip(values, edges[0], edges[-1]), edges)
             left.stairs(counts, edges, label=name, color=colour, linestyle=style, linewidth=1.2)
-        left.set(yscale="log", xlabel="interval, µs (the ends hold what lies beyond)", ylabel="number")
+        left.set(yscale="log", xlabel="interval, µs (first and last bin: and beyond)", ylabel="number")
         left.legend()
     colours = (COLOURS["other"], COLOURS["another"], FAINT, COLOURS["error"], INK, INK)
     styles = ("-", "--", "-.", ":", "-", "--")
@@ -107,7 +107,7 @@ def _intervals(figure: "Figure", report: Report) -> bool:
         beyond = 1 - keep / ordered.size
         right.plot(np.maximum(ordered[keep], 0.1), beyond, label=name.replace("_", " "), color=colour, linestyle=style)
     if stages:
-        right.set(xscale="log", yscale="log", xlabel="latency, µs", ylabel="part of the frames that take longer")
+        right.set(xscale="log", yscale="log", xlabel="latency, µs", ylabel="fraction of frames that take longer")
         right.legend(loc="lower left")
     return True
 
@@ -175,7 +175,7 @@ def _spectra(figure: "Figure", report: Report) -> bool:
             above.plot(frequency_hz, power["residual_predicted"], label="closed: theory, rejection and noise", **style)
             clear = power["disturbance_left"] > 0.5 * power["residual_predicted"]
             rejected = np.where(clear, np.sqrt(_over(power["residual"], power["disturbance"])), np.nan)
-            label = "true residual / disturbance, where noise is less"
+            label = "true residual / disturbance, where noise is lower"
             below.plot(frequency_hz, rejected, "o", color=CLOSED, markersize=4, markerfacecolor="none", label=label)
         above.set(title=group["name"], xscale="log", yscale="log")
         below.set(xscale="log", yscale="log", xlabel="frequency, Hz")
@@ -291,7 +291,7 @@ def _stroke(figure: "Figure", report: Report) -> bool:
     limit_nm, title = figures["stroke_limit_nm"], "over time"
     if limit_nm is not None:
         title += f"; the limit is {limit_nm:g} nm"
-        if figures["stroke_most_share"] > _NEAR:  # else it would flatten the line
+        if figures["stroke_most_share"] > _NEAR:  # otherwise it would flatten the curve
             plot.axhline(limit_nm, color=COLOURS["error"], linestyle="--")
     plot.set(ylabel="largest |actuator|, nm of surface", xlabel=_SECONDS, title=title)
     plot.set_ylim(bottom=0)

@@ -1,4 +1,4 @@
-"""The report's page: one file with everything in it, made from figures and drawings."""
+"""The report's self-contained HTML page, made from figures and drawings."""
 
 from collections.abc import Callable
 from importlib.resources import files
@@ -15,7 +15,7 @@ from lowfc.programs.logs.report.drawings import drawings
 from lowfc.programs.logs.report.figures import Report
 
 NOT_HERE = "not in this log"
-"""What stands where a log has no figure: never zero."""
+"""Text in place of a missing figure."""
 
 
 def page(report: Report, progress: Callable[[str], None] = lambda name: None) -> str:
@@ -34,13 +34,13 @@ def page(report: Report, progress: Callable[[str], None] = lambda name: None) ->
 
 
 def require_page() -> None:
-    """Find before the work that a page cannot be made after it."""
+    """Check before the work that the page can be made."""
     _environment()
     figure_class()
 
 
 def number(value: float | str | None, digits: int = 3) -> str:
-    """A figure in running text, with so many significant digits; or that it is not there."""
+    """A figure in running text with this number of significant digits, or `NOT_HERE`."""
     if value is None:
         return NOT_HERE
     if isinstance(value, str | int):
@@ -49,7 +49,7 @@ def number(value: float | str | None, digits: int = 3) -> str:
 
 
 def fixed(value: float | str, decimals: int = 3) -> str:
-    """A figure of a column, with so many decimals; one that would round to zero is shown as less than the least."""
+    """A figure of a column with this number of decimals; one that rounds to zero is shown as less than the smallest."""
     if isinstance(value, str | int):
         return str(value)
     least = 10.0**-decimals
@@ -57,7 +57,7 @@ def fixed(value: float | str, decimals: int = 3) -> str:
 
 
 def _finalized(value: Any) -> Any:
-    """What the page shows of a value: text of the log with its control characters escaped."""
+    """Value for the page; control characters in text from the log are escaped."""
     return printable(value, keep=LINES) if type(value) is str else value  # a drawing is Markup
 
 
@@ -66,8 +66,8 @@ def _environment() -> Any:
         from jinja2 import Environment, StrictUndefined
     except ImportError as error:
         raise ConfigurationError(
-            f"a report's page needs jinja2, which is not there ({error}); install it with: {install_advice('plots')}, "
-            "or take the figures with --json"
+            f"the HTML page requires jinja2, which is missing ({error}); install it with: {install_advice('plots')}, "
+            "or print the figures with --json"
         ) from None
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, finalize=_finalized

@@ -1,4 +1,4 @@
-"""How much of the wavefront is left: rms of each mode, and of tip and tilt on the sky."""
+"""Residual wavefront: rms of each mode, and of tip and tilt on the sky."""
 
 import numpy as np
 
@@ -15,10 +15,9 @@ from lowfc.programs.logs.report.source import Figures, Run
 
 
 def residual_figures(run: Run, stretch: Stretch | None) -> Figures:
-    """Rms in nm of each mode and signal, and of tip and tilt per axis in mas; None for what the log does not have.
+    """Rms in nm of each mode and signal, and of tip and tilt per axis in mas; None for signals not in the log.
 
-    With the loop closed they are of the longest stretch under one law, settled, without and with the correction; with
-    it open of all of those steps.
+    Closed loop: the longest stretch under one law, settled, without and with the correction. Open loop: all its steps.
     """
     history = run.history
     steps = history.steps
@@ -69,7 +68,7 @@ def residual_figures(run: Run, stretch: Stretch | None) -> Figures:
 
 
 def binned_rms(run: Run, most: int = 300) -> dict[str, Array]:
-    """Over time, at most so many bins: `time_s`, and rms of all modes in nm of what the log has of before and after."""
+    """Rms of all modes in nm before and after correction over `time_s`, in a limited number of bins."""
     steps, true = run.history.steps, run.history.true
     columns = {"pseudo_open_loop": steps.pol_nm, "error": steps.error_nm}
     if true is not None:
@@ -87,14 +86,14 @@ def binned_rms(run: Run, most: int = 300) -> dict[str, Array]:
 
 
 def bin_starts(rows: int, most: int) -> Whole:
-    """First row of each of at most so many bins of even width."""
+    """First row of each bin; bins have equal width and limited number."""
     return np.arange(0, rows, max(1, -(-rows // most)))
 
 
 def _contrast(true: Truths, rows: Whole, config: Configuration | None) -> Figures | None:
-    """What disturbance (open) and residual (closed) add to the contrast of the dark zone.
+    """Contrast added to the dark zone by the disturbance (open) and by the residual (closed).
 
-    None without a truth, or for a coronagraph of which there is no science image.
+    None without truth, or for a coronagraph without a science image.
     """
     covariances = {}
     for name, all_the_time, instants_nm in (

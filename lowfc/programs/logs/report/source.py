@@ -1,4 +1,4 @@
-"""What a report is made from: the history of a run, and the law that was in force at each of its steps."""
+"""Input of a report: the history of a run, and the law in force at each step."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -19,7 +19,7 @@ Figures = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class InForce:
-    """A law: gain and leak (modes,), delay; from the step `first` on, which does not tell laws apart."""
+    """A law: gain and leak (modes,), delay; in force from step `first`, which is ignored in comparisons."""
 
     first: int = field(compare=False)
     gain: tuple[float, ...]
@@ -32,21 +32,21 @@ class Run:
     """A log that was read.
 
     Attributes:
-        laws: in order; steps before the first one are under an unknown law.
+        laws: in order; the law of steps before the first one is unknown.
     """
 
     history: History
     laws: tuple[InForce, ...]
 
     def law_rows(self) -> Long:
-        """Index of the law of each step; -1 where it is not known."""
+        """Index of the law of each step; -1 if unknown."""
         firsts = np.array([law.first for law in self.laws])
         return np.searchsorted(firsts, np.arange(self.history.steps.sequence.size), side="right").astype(np.int64) - 1
 
     def seconds(self, host_ns: npt.ArrayLike) -> Array:
-        """Host times as seconds of frame time since the first step, by the frames that were published then.
+        """Convert host times to frame time, seconds since the first step, by the frames published then.
 
-        In lockstep frame time is simulated; otherwise this only takes off the beginning.
+        In lockstep frame time is simulated; otherwise only the start time is subtracted.
         """
         history, host = self.history, np.asarray(host_ns, dtype=np.int64)
         rows = rows_of(history.frame_sequence, history.steps.sequence)
@@ -71,7 +71,7 @@ class Run:
 
 
 def read_run(files: LogFiles, progress: Callable[[int, int], None] | None = None) -> Run:
-    """Read a log, whole or not, to its end; damaged parts are left out and listed by the history's reader."""
+    """Read a log, complete or not, to its end; damaged parts are skipped and listed by the history's reader."""
     log = WholeLog(files, skip_damaged=True)
     log.progress = progress
     history = read_history(log)
@@ -79,7 +79,7 @@ def read_run(files: LogFiles, progress: Callable[[int, int], None] | None = None
 
 
 def _laws(history: History) -> tuple[InForce, ...]:
-    """The laws of a run, from the states that its controllers published at every change."""
+    """The laws of a run, from the states that controllers publish at every change."""
     steps = history.steps
     found: list[InForce] = []
     for state in history.controllers:
@@ -99,5 +99,5 @@ def _laws(history: History) -> tuple[InForce, ...]:
 
 
 def _shortest(singles: Iterable[float]) -> tuple[float, ...]:
-    """Single precision as people wrote it: 0.05, not 0.0500000007."""
+    """Shortest decimal of a single-precision number: 0.05, not 0.0500000007."""
     return tuple(float(str(np.float32(value))) for value in singles)

@@ -1,4 +1,4 @@
-"""Drawings as SVG that stands in a page and takes its colours from it: one drawing for light, dark and paper."""
+"""Inline SVG drawings with the page's colours, so that one drawing serves light, dark and printed pages."""
 
 import io
 import re
@@ -51,7 +51,7 @@ _WIDTH_IN = 10.0
 
 
 def svg(name: str, height_in: float, draw: Callable[["Figure", Report], bool], report: Report) -> str | None:
-    """Draw a figure of the page's width; None where `draw` has nothing to draw.
+    """Draw a figure of the page's width; None if `draw` has nothing to draw.
 
     No prologue, no metadata, no identifier that another drawing of the page has; colours are the page's.
     """

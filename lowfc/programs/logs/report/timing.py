@@ -1,4 +1,4 @@
-"""Rates, jitter and latency of a run, and the frames that got no command."""
+"""Rates, jitter and latency of a run, and the frames without a command."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from lowfc.contract.messages import FRAME, Role
 from lowfc.programs.logs.report.source import Figures, Run
 
 _END_NS = 50_000_000
-"""Before the last frame, in which a command may still be on its way when the log ends."""
+"""Time before the last frame in which commands may be missing because the log ends."""
 
 PERCENTILES = {"p50": 50.0, "p90": 90.0, "p99": 99.0, "p99_9": 99.9}
 FRAME_TO_MIRROR = "frame_to_mirror"
@@ -28,9 +28,9 @@ def timing_figures(run: Run) -> Figures:
 
 
 def intervals_ns(run: Run) -> dict[str, Long]:
-    """Times between frames and between commands, as they were sent; not across a restart of the camera.
+    """Intervals between frames and between commands by their send times, except across a restart of the camera.
 
-    There is none between frames where frames were left out of the log.
+    Intervals between frames are omitted if the log does not have every frame.
     """
     history = run.history
     published = history.frame_publish_ns[: None if history.log.selection.has_every_frame else 0]
@@ -40,7 +40,7 @@ def intervals_ns(run: Run) -> dict[str, Long]:
 
 
 def latencies_ns(history: History) -> dict[str, Long]:
-    """Durations of the controller's stages, and from the camera's put to the first state of the mirror under it."""
+    """Durations of the controller's stages, and from the frame's publication to the mirror's first state with it."""
     rows = rows_of(history.frame_sequence, history.mirror.sequence)
     followed = rows >= 0
     to_mirror = history.mirror.publish_time_ns[rows[followed]] - history.frame_publish_ns[followed]
@@ -48,7 +48,7 @@ def latencies_ns(history: History) -> dict[str, Long]:
 
 
 def percentiles_us(durations_ns: Long) -> Figures:
-    """Count, percentiles and the longest; None for each where there are no durations."""
+    """Count, percentiles and maximum; None for each without durations."""
     if not durations_ns.size:
         return {"count": 0, **dict.fromkeys([*PERCENTILES, "max"])}
     values = np.percentile(durations_ns, list(PERCENTILES.values())) * 1e-3
@@ -60,12 +60,12 @@ def percentiles_us(durations_ns: Long) -> Figures:
 
 
 def frame_counts(history: History) -> Figures:
-    """Frames in the log, those without a command, and what camera and controller counted themselves.
+    """Frames in the log, frames without a command, and the counts of camera and controller.
 
-    A step is made of every frame that reaches the controller, and a command of every step once there is a calibration;
-    what the controller skipped (a newer one came before it was used) or missed (it never came) has neither. Of the last
-    frames the command may be after the end of the log: they are counted apart. The processes' own counts go from the
-    start of a process, which may be before the log's.
+    Every frame that reaches the controller leads to a step and, with a calibration, to a command; frames that the
+    controller skipped (a newer one arrived first) or missed (never arrived) have neither. The last frames, whose
+    commands may be after the end of the log, are counted separately. The processes' own counts begin at their start,
+    which may be before that of the log.
     """
     frames, rows = np.unique(history.frame_sequence, return_index=True)
     without = rows_of(frames, history.steps.sequence) < 0

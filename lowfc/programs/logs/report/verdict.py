@@ -1,4 +1,4 @@
-"""Whether a run was good, in a few lines that can be read within seconds."""
+"""Verdict on a run, in a few lines."""
 
 from lowfc.control.loop.wording import counted
 from lowfc.programs.logs.report.source import Figures
@@ -8,11 +8,11 @@ GOOD, LOOK, BAD, UNKNOWN = "good", "look", "bad", "unknown"
 _MANY_WITHOUT_COMMAND = 0.01
 _MANY_LATE = 0.01
 _MUCH_STROKE = 0.9
-_NO_LOOP = "no step of the control law is in this log"
+_NO_LOOP = "this log has no control steps"
 
 
 def verdict(figures: Figures) -> Figures:
-    """Checks with a level each, and a sentence; the level of the whole is the worst one."""
+    """Checks, each with a level and a sentence; the overall level is the worst one."""
     parts = (_record, _modes, _residual, _commands, _delay, _frames, _mirror, _events)
     checks = [part(figures) for part in parts]
     order = (GOOD, UNKNOWN, LOOK, BAD)
@@ -20,8 +20,8 @@ def verdict(figures: Figures) -> Figures:
     first = next((check["text"] for check in checks if check["level"] == level), "")
     heading = {
         GOOD: "A good run",
-        UNKNOWN: "Nothing wrong, but not everything is known",
-        LOOK: "Have a look",
+        UNKNOWN: "No fault found, but some data are missing",
+        LOOK: "To be checked",
         BAD: "Not a good run",
     }[level]
     return {"level": level, "heading": heading, "because": first if level != GOOD else "", "checks": checks}
@@ -37,13 +37,13 @@ def _record(figures: Figures) -> Figures:
     if log["damage"]:
         faults.append(f"{counted(len(log['damage']), 'damaged part')} left out")
     if not log["finished"]:
-        faults.append("its end is missing: the recorder did not finish it")
+        faults.append("truncated: the recorder did not finish it")
     if log["recovery"]:
         faults.append(log["recovery"])
     if log["messages_lost"]:
         faults.append(f"{counted(log['messages_lost'], 'message')} lost")
     if log["steps_left_out"]:
-        what = "of another calibration's modes, or with impossible values"
+        what = "with the modes of another calibration or impossible values"
         faults.append(f"{counted(log['steps_left_out'], 'step')} {what}, left out")
     if faults:
         return _check("log", BAD if log["stopped"] else LOOK, "; ".join(faults))
@@ -65,7 +65,7 @@ def _modes(figures: Figures) -> Figures:
 
 
 def _residual(figures: Figures) -> Figures:
-    """Before and after: true over the open pupil where the log has truth, else the modes as measured."""
+    """Wavefront before and after: true over the open pupil if the log has truth, otherwise the measured modes."""
     totals, tilts = figures["residual"]["total_rms_nm"], figures["residual"]["tilt_mas"]
     true = totals["residual"] is not None
     before, after = ("disturbance", "residual") if true else ("pseudo_open_loop", "error")
@@ -77,12 +77,12 @@ def _residual(figures: Figures) -> Figures:
         before_nm, after_nm = pupil_nm
         over = "over the open pupil"
     if before_nm is None or after_nm is None or not figures["mode_steps"].get("closed"):
-        why = figures["error_budget"].get("why_not", "no good frame with the loop closed is in this log")
+        why = figures["error_budget"].get("why_not", "this log has no good closed-loop frame")
         return _check("residual", UNKNOWN, why)
     text = f"{before_nm:.3g} nm before, {after_nm:.3g} nm after {over}"
     if tilts[before] and tilts[after]:
         text += f"; tip and tilt {tilts[before]['per_axis']:.3g} mas to {tilts[after]['per_axis']:.3g} mas per axis"
-    text += " (true)" if true else " (as measured, with the sensor's noise in both)"
+    text += " (true)" if true else " (measured, both with sensor noise)"
     return _check("residual", GOOD if after_nm < before_nm else LOOK, text)
 
 
@@ -90,11 +90,11 @@ def _commands(figures: Figures) -> Figures:
     frames = figures["timing"]["frames"]
     without, recorded = frames["without_command"], frames["recorded"] - frames["at_the_end"]
     if not recorded:
-        return _check("commands", UNKNOWN, "no frame is in this log")
+        return _check("commands", UNKNOWN, "this log has no frames")
     if not without:
-        return _check("commands", GOOD, f"every one of {recorded} frames got its command")
+        return _check("commands", GOOD, f"all {recorded} frames led to a command")
     share = without / recorded
-    text = f"{without} of {recorded} frames ({share:.2%}) got no command"
+    text = f"{without} of {recorded} frames ({share:.2%}) led to no command"
     return _check("commands", BAD if share >= _MANY_WITHOUT_COMMAND else LOOK, text)
 
 
@@ -102,10 +102,10 @@ def _delay(figures: Figures) -> Figures:
     frames = figures["timing"]["frames"]
     late, steps = frames["commands_late"], sum(figures["mode_steps"].values())
     if late is None or not steps:
-        return _check("delay", UNKNOWN, "whether commands came in time is not in this log")
+        return _check("delay", UNKNOWN, "this log does not show whether commands were in time")
     if late < _MANY_LATE * steps:
         return _check("delay", GOOD, f"{counted(late, 'command')} late")
-    acted = "after the next exposure had begun, and acted a frame later than the law expects"
+    acted = "after the start of the next exposure, and acted one frame later than the law expects"
     return _check("delay", LOOK, f"{counted(late, 'command')} came {acted}")
 
 
@@ -126,7 +126,7 @@ def _mirror(figures: Figures) -> Figures:
         return _check("mirror", LOOK, f"limits acted: {_listed(limits)}")
     share = mirror["stroke_most_share"]
     if share is None:
-        return _check("mirror", UNKNOWN, "the stroke used is not in this log")
+        return _check("mirror", UNKNOWN, "this log does not show the stroke used")
     text = f"at most {share:.1%} of the stroke used"
     return _check("mirror", LOOK if share > _MUCH_STROKE else GOOD, text)
 

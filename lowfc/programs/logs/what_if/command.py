@@ -1,4 +1,4 @@
-"""The command `lowfc what-if`: what another controller would have made of the same night."""
+"""The command `lowfc what-if`: the residual of a log with another controller."""
 
 from functools import partial
 from pathlib import Path
@@ -16,14 +16,14 @@ def what_if(
         str | None,
         typer.Option("--set", metavar="KEY=VALUE,...", help="Other gains: gain, leak, limit_nm, tilt_gain, ..."),
     ] = None,
-    config: Annotated[Path | None, typer.Option(help="The [control] section of this file.")] = None,
+    config: Annotated[Path | None, typer.Option(help="Use the [control] section of this file.")] = None,
     calibration: Annotated[Path | None, typer.Option(help="Another calibration (FITS).")] = None,
     controller: Annotated[
         str | None, typer.Option(metavar="FILE.py:NAME", help="Your step(state, error_nm) -> (state, command_nm).")
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Compute what other gains, another reconstructor or a controller of your own would have left of the disturbance.
+    """Compute the residual of a log with other gains, another reconstructor or your own controller.
 
     Example: lowfc what-if last --set gain=0.3,leak=0.01
     """

@@ -1,4 +1,4 @@
-"""`lowfc what-if`: what other gains, another reconstructor or another controller would have made of a log."""
+"""`lowfc what-if`: the residual of a log with other gains, another reconstructor or another controller."""
 
 from dataclasses import replace
 from typing import Any
@@ -27,29 +27,28 @@ from lowfc.programs.logs.what_if.options import LAW_KEYS, WhatIf, law
 from lowfc.programs.logs.what_if.run import LoggedRun
 
 LINEAR_WAVES = 5 * tilt_nm_per_mas(2.0) / 550
-"""Rms of a mode up to which the sensor is taken as linear: 5 mas of tilt with 2 m at 550 nm, 0.022 waves."""
+"""Rms of a mode up to which the sensor is assumed linear: 5 mas of tilt with 2 m at 550 nm, 0.022 waves."""
 
 _LIMITS = (Limit.MODAL_LIMIT, Limit.STROKE, Limit.SLEW, Limit.NEIGHBOUR)
 _TITLES = {
     "open": "open loop",
-    "was": "as it was",
+    "was": "as logged",
     "what_if": "what if",
-    "true_was": "true as it was",
+    "true_was": "true as logged",
     "true_what_if": "true what if",
-    "continuous_was": "all the time",
+    "continuous_was": "continuous",
     "continuous_what_if": "what if",
 }
 
 
 def what_if(run: LoggedRun, what: WhatIf) -> dict[str, Any]:
-    """Figures of the logged run, and of the run that it would have been.
+    """Figures of the logged run and of the what-if run.
 
-    The other loop is closed throughout, from a flat mirror, and meets the pseudo-open-loop modes of every frame that
-    was used; where a frame was refused or missing it holds, as the live loop does. Its modal limits act, the
-    actuators' do not. All figures are over the same frames: those at which the logged loop was closed and both had
-    settled (all frames, where it never was closed), without those that have saturated pixels. Where the log has the
-    truth, the true residual is given too: the measured one is noise for the most part where the star is faint.
-    For another reconstructor the frames are read in a second pass.
+    The what-if loop is closed throughout, starts from a flat mirror, and corrects the pseudo-open-loop modes of every
+    used frame; it holds on a refused or missing frame, as the live loop does. Its modal limits act, actuator limits do
+    not. All figures are over the same frames: those with the logged loop closed and both loops settled (all frames, if
+    it was never closed), without saturated pixels. If the log has truth, the true residual is given too, because the
+    measured one is mostly noise for a faint star. For another reconstructor the frames are read in a second pass.
     """
     own, noll = what.step, run.calibration.noll
     after = law(what, noll, run.law)
@@ -107,9 +106,9 @@ def what_if(run: LoggedRun, what: WhatIf) -> dict[str, Any]:
 
 
 def _true(run: LoggedRun, rows: Mask, moved_nm: Single) -> tuple[dict[str, Array], dict[str, Any] | None]:
-    """Rms (modes,) of the true residual, in the frames and all the time, as it was and with the mirror moved by that.
+    """Rms (modes,) of the true residual, sampled in the frames and continuous, as logged and for the what-if.
 
-    The second is what the residual at all times adds to the contrast of the dark zone, where that is known.
+    The second value is the contrast added to the dark zone by the continuous residual, if known.
     """
     assert run.true_nm is not None  # noqa: S101  # the caller knows
     disturbance_nm, residual_nm = (values.astype(np.float64) for values in run.true_nm)
@@ -140,7 +139,7 @@ def render(figures: dict[str, Any]) -> str:
 
     modes = [
         row(f"{mode['noll']:>3} {mode['name']}", mode, "{}_nm", "{gain_was:.3g} -> {gain:.3g}".format(**mode))
-        if "gain" in mode  # a controller of one's own has none
+        if "gain" in mode  # a user's controller has none
         else row(f"{mode['noll']:>3} {mode['name']}", mode, "{}_nm")
         for mode in figures["modes"]
     ]
@@ -155,8 +154,8 @@ def render(figures: dict[str, Any]) -> str:
         "",
         *table(["residual, nm rms", *(_TITLES[name] for name in columns), "gain"], rows),
         "",
-        "measured figures contain the sensor's noise; true: at the start of each exposure; all the "
-        "time: between these instants too, while the mirror holds; a linear sensor, no actuator limits",
+        "measured figures include sensor noise; true: at the start of each exposure; continuous: also between these "
+        "instants, while the mirror holds; assumes a linear sensor and no actuator limits",
         *([] if figures["added_contrast"] is None else [sentence_of(figures["added_contrast"])]),
         *(f"warning: {warning}" for warning in figures["warnings"]),
     ]
@@ -164,7 +163,7 @@ def render(figures: dict[str, Any]) -> str:
 
 
 def _calibration(what: WhatIf, run: LoggedRun) -> Calibration:
-    """The calibration of the what-if; the very one of the log where it is no other."""
+    """The calibration of the what-if; by default the log's."""
     calibration, estimator = run.calibration, what.estimator
     if what.calibration is not None:
         from lowfc.adapters.files.calibration_file import load as load_calibration  # astropy takes its time
@@ -180,8 +179,8 @@ def _calibration(what: WhatIf, run: LoggedRun) -> Calibration:
         return run.calibration if calibration.id == run.calibration.id else calibration
     if estimator not in ESTIMATORS:
         raise ConfigurationError(
-            f"--config: {estimator}: what is fitted along with the modes needs the sensor's optics; leave out "
-            "control.nuisance, or make that calibration and name it with --calibration"
+            f"--config: {estimator}: nuisance parameters require the sensor's optics; leave out control.nuisance, or "
+            "make that calibration and give it with --calibration"
         )
     return _reconstructed(calibration, estimator, run)
 
@@ -189,7 +188,7 @@ def _calibration(what: WhatIf, run: LoggedRun) -> Calibration:
 def _reconstructed(calibration: Calibration, estimator: str, run: LoggedRun) -> Calibration:
     path, configuration = run.history.log.path, run.history.configuration
     if configuration is None:
-        raise ConfigurationError(f"{path}: has no configuration, so that the noise of a pixel is not known")
+        raise ConfigurationError(f"{path}: has no configuration, so the noise of a pixel is unknown")
     camera = detector(configuration)
     try:
         R = reconstructor(
@@ -206,7 +205,7 @@ def _reconstructed(calibration: Calibration, estimator: str, run: LoggedRun) -> 
 
 
 def _in_other_modes(logged: Calibration, other: Calibration, command_nm: Single) -> Single:
-    """Commands (steps, modes) of the logged calibration as those of the other that shape the mirror alike."""
+    """Convert commands (steps, modes) of the logged calibration to the other's for the same mirror shape."""
     if np.array_equal(other.modes_to_actuators, logged.modes_to_actuators):
         return command_nm
     change = np.linalg.pinv(other.modes_to_actuators.astype(float)) @ logged.modes_to_actuators.astype(float)
@@ -218,7 +217,7 @@ def _one(every: Law, row: int, suffix: str = "") -> dict[str, float]:
 
 
 def _tilt_mas(run: LoggedRun, columns: dict[str, Array]) -> dict[str, float]:
-    """Tilt per axis on the sky; nothing where the telescope's diameter is unknown."""
+    """Tilt per axis on the sky; empty if the telescope's diameter is unknown."""
     tilts = np.isin(run.calibration.noll, TIP_TILT)
     if run.history.configuration is None or not tilts.any():
         return {}
@@ -230,26 +229,28 @@ def _doubts_of_log(run: LoggedRun) -> list[str]:
     found, log = list(run.history.remarks), run.history.log
     if log.damage:
         parts = ", ".join(f"byte {one.position}, {one.why}" for one in log.damage)
-        found.append(f"the log is damaged, and these parts are left out: {parts}")
+        found.append(f"the log is damaged; left out: {parts}")
     if not log.finished:
         found.append(no_end(log.paths, finished=False))
     if log.metadata.get("recording", {}).get("stopped"):
         found.append(f"recording stopped: {log.metadata['recording']['stopped']}")
     if run.measured_delay is None:
-        found.append(f"the delay could not be measured in this log; the controller's is {run.delay_frames:g}")
+        found.append(
+            f"the delay could not be measured in this log; the controller's value is used: {run.delay_frames:g}"
+        )
     elif run.delay_frames != run.controller_delay:
         found.append(
-            f"the controller reckoned with a delay of {counted(float(run.controller_delay), 'frame')}, measured from "
-            f"{run.measured_from} it is {run.measured_delay:.2f} in the mean: pseudo-open-loop modes were computed "
-            "again with that for every frame"
+            f"the controller assumed a delay of {counted(float(run.controller_delay), 'frame')}, but the mean measured "
+            f"from {run.measured_from} is {run.measured_delay:.2f}: pseudo-open-loop modes were recomputed with the "
+            "measured delay of every frame"
         )
     counts = count_reasons(run.steps.reasons).items()
     hit = [f"{reason.name.lower()} at {counted(count, 'frame')}" for reason, count in counts if reason in _LIMITS]
     if hit:
-        found.append(f"limits acted in the logged run, {', '.join(hit)}; in the what-if only modal limits do")
+        found.append(f"limits acted in the logged run ({', '.join(hit)}); in the what-if only modal limits act")
     cut = np.count_nonzero(run.history.mirror.limits)
     if cut:
-        few = "" if log.selection.counts(MIRROR_STATE) else f" (of mirror states the log has: {log.selection.sentence})"
+        few = "" if log.selection.counts(MIRROR_STATE) else f" (recorded mirror states: {log.selection.sentence})"
         found.append(
             f"the mirror's own limits acted on {counted(int(cut), 'command')}{few}: pseudo-open-loop modes are wrong "
             "there"
@@ -260,8 +261,8 @@ def _doubts_of_log(run: LoggedRun) -> list[str]:
     torn = np.count_nonzero(run.torn)
     if torn:
         found.append(
-            f"the log does not have every command: {counted(int(torn), 'frame')} that saw a missing one, and the time "
-            "to settle after each, are left out"
+            f"the log lacks some commands: {counted(int(torn), 'frame')} exposed with a missing one, and the settling "
+            "time after each, are left out"
         )
     return found
 
@@ -277,16 +278,16 @@ def _doubts_of_range(calibration: Calibration, columns: dict[str, Array]) -> lis
     if not beyond:
         return []
     return [
-        f"beyond the linear range, {limit_nm:.1f} nm rms of a mode, in which a what-if is right: {', '.join(beyond)}; "
-        "the figures are only approximate"
+        f"beyond the sensor's linear range of {limit_nm:.1f} nm rms per mode: {', '.join(beyond)}; the figures are "
+        "only approximate"
     ]
 
 
 def _doubts_of_law(run: LoggedRun, law: Law, command_nm: Single) -> list[str]:
-    """Where the law makes a loop that does not work; `command_nm` (frames, modes) is what it commanded."""
+    """Remarks on instability and modal limits of the what-if with its commands `command_nm` (frames, modes)."""
     found = []
     noll = run.calibration.noll
-    # A mean of frames on time and late ones is not the steady mixture that a delay with a fraction stands for.
+    # The mean over punctual and late frames is not the constant mixture that a fractional delay describes.
     delay_frames = run.delay_frames if run.delay_frames == run.controller_delay else np.ceil(run.delay_frames)
     highest = {leak: limiting_gain(delay_frames, leak) for leak in set(law.leak.tolist())}
     unstable = [

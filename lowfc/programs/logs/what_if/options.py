@@ -1,4 +1,4 @@
-"""What a what-if changes: the words of the command line, the law they make, a user's own controller."""
+"""Changes of a what-if: options of the command line, the resulting law, a user's own controller."""
 
 import contextlib
 import sys
@@ -24,13 +24,13 @@ KEYS = (*LAW_KEYS, *(f"tilt_{key}" for key in LAW_KEYS), "estimator")
 
 @dataclass(frozen=True, slots=True)
 class WhatIf:
-    """What differs from the logged run; nothing where all is left out.
+    """Changes with respect to the logged run; by default none.
 
     Attributes:
         figures: gain, leak and limit_nm of all modes; tilt_gain, tilt_leak and tilt_limit_nm of tip and tilt over them.
         estimator: another reconstructor made from the same calibration.
-        config: its [control] section has gains, leaks, limits, and the estimator where no calibration is named; the
-            others go over it.
+        config: its [control] section sets gains, leaks, limits and, without `calibration`, the estimator; the other
+            attributes take precedence.
         calibration: FITS file of another calibration of the same modes, frames and mirror.
         controller: name of `step`, which replaces the integrator and its limits.
     """
@@ -49,7 +49,7 @@ def requested(
     calibration: Path | None = None,
     controller: str | None = None,
 ) -> WhatIf:
-    """What the options of the command line ask for.
+    """Parse the options of the command line.
 
     A controller is FILE.py:NAME of a function `step(state, error_nm) -> (state, command_nm)`; the state is None at
     first, both arrays are (modes,) nm of wavefront rms.
@@ -60,17 +60,17 @@ def requested(
         if key not in KEYS:
             raise ConfigurationError(f"--set: unknown key {key!r}{nearest(key, KEYS)}; known are {', '.join(KEYS)}")
         if not value or key in values:
-            raise ConfigurationError(f"--set: {key} needs one value, as in {key}=...")
+            raise ConfigurationError(f"--set: {key} requires one value, as in {key}=...")
         values[key] = value
     if not (values or config or calibration or controller):
         raise ConfigurationError(
-            f"a what-if changes something; give --set KEY=VALUE, such as gain=0.3; known are {', '.join(KEYS)}"
+            f"nothing to change: give --set KEY=VALUE, such as gain=0.3; known are {', '.join(KEYS)}"
         )
     estimator = values.pop("estimator", None)
     if estimator not in (None, *ESTIMATORS):
         raise ConfigurationError(f"--set: estimator must be {' or '.join(ESTIMATORS)}, got {estimator!r}")
     if controller is not None and values:
-        raise ConfigurationError(f"--set: {', '.join(values)} are the integrator's, not of your own controller")
+        raise ConfigurationError(f"--set: {', '.join(values)} apply to the integrator, not to your own controller")
     figures = {key: _number(key, value) for key, value in values.items()}
     return WhatIf(
         figures,
@@ -83,7 +83,7 @@ def requested(
 
 
 def law(what: WhatIf, noll: tuple[int, ...], logged: Law) -> Law:
-    """The law of the what-if: the logged one, or the configuration's, and single figures over it."""
+    """The law of the what-if: the logged or the configured one, with the given values replaced."""
     base = settings(what.config).law(noll) if what.config is not None else logged
     tilts = np.isin(noll, TIP_TILT)
     changed = []
@@ -100,10 +100,10 @@ def law(what: WhatIf, noll: tuple[int, ...], logged: Law) -> Law:
 
 
 def user_controller(where: str) -> Controller:
-    """The function at FILE.py:NAME; what it prints goes to standard error, as standard output is for the figures."""
+    """The function at FILE.py:NAME; its output goes to standard error, because standard output is for the figures."""
     file, _, name = where.rpartition(":")
     if not file.endswith(".py") or not Path(file).is_file():
-        raise ConfigurationError(f"--controller must be FILE.py:NAME of a file that exists, got {where!r}")
+        raise ConfigurationError(f"--controller must be FILE.py:NAME of an existing file, got {where!r}")
     try:
         with contextlib.redirect_stdout(sys.stderr):
             function = run_path(file).get(name)

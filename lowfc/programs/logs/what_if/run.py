@@ -1,4 +1,4 @@
-"""The logged run as a what-if needs it: exposures, the delay as measured, what each of them saw of the commands."""
+"""Input of a what-if: exposures of the logged run, the measured delay, and the command seen by each exposure."""
 
 from collections.abc import Mapping, Sequence
 
@@ -31,25 +31,25 @@ from lowfc.control.loop.estimator import Estimator
 from lowfc.control.loop.safety import LoopMode
 
 DELAY_DIFFERS = 0.05
-"""Frames by which a measured delay must differ from the controller's, or a whole number, to be another one."""
+"""Difference in frames beyond which a measured delay is not the controller's, or not a whole number."""
 _TORN_NM = 0.01
 
 
 class LoggedRun:
-    """Steps of a log that are exposures of their own, from the first that was used.
+    """Steps of a log with distinct exposures, from the first used one.
 
     Attributes:
         steps: those steps; `missing` exposures (steps,) without one before each.
-        true_nm: disturbance and residual (steps, modes), NaN where it is not known; None without any.
+        true_nm: disturbance and residual (steps, modes), NaN where unknown; None without any.
         calibration: of the log.
         used: (steps,) whether the frame was used.
-        law: the one that the run ended with.
-        controller_delay: frames that the controller reckoned with; `measured_delay` is None where it cannot be
-            measured, from `measured_from`; the comparison uses `delay_frames`, of which `weights` are.
-        seen_nm: (steps, modes) commands that the exposures saw; NaN where a frame was not used and the delay is the
+        law: the last one of the run.
+        controller_delay: delay assumed by the controller, frames; `measured_delay`, from `measured_from`, is None if
+            it cannot be measured; the comparison uses `delay_frames`, with `weights`.
+        seen_nm: (steps, modes) commands seen by the exposures; NaN where a frame was not used and the delay is the
             controller's.
-        played: (steps,) where something was played, which moves the mirror beside the commands.
-        torn: (steps,) where the command seen is not the one in the log: a message was not recorded.
+        played: (steps,) True during a probe sequence, which moves the mirror in addition to the commands.
+        torn: (steps,) True where the command seen is not in the log, because a message was not recorded.
     """
 
     def __init__(self, history: History) -> None:
@@ -58,8 +58,8 @@ class LoggedRun:
         rows = exposed(history.steps.sequence)
         used = rows & np.isfinite(history.steps.error_nm).all(axis=1)
         if history.calibration is None or not used.any() or not history.rate_hz:
-            raise DataFileError(f"{history.log.path}: too few frames that a calibrated controller used are in it")
-        rows[: int(np.argmax(used))] = False  # of the disturbance before nothing is known
+            raise DataFileError(f"{history.log.path}: it has too few frames used by a calibrated controller")
+        rows[: int(np.argmax(used))] = False  # the disturbance before is unknown
         self.calibration = history.calibration
         self.steps = history.steps.at(rows)
         true = history.true
@@ -86,9 +86,9 @@ class LoggedRun:
 
     @property
     def timing(self) -> Timing:
-        """When the loop exposed and moved its mirror.
+        """Times of the exposures and of the mirror's moves.
 
-        A log in lockstep does not say when a command was applied: then with the exposure that first saw it whole.
+        A lockstep log has no times of application: commands are then applied with the first exposure wholly with them.
         """
         history, delay = self.history, self.delay_frames
         exposure = history.exposure_fraction
@@ -102,7 +102,7 @@ class LoggedRun:
         return Timing.measured(delay, exposure, float(np.median(waited_ns)) * 1e-9 * history.rate_hz)
 
     def rows_to_compare(self, laws: list[Law], usable: Mask) -> tuple[Mask, int, str]:
-        """Which of the usable steps to compare runs at, the frames in which these laws settle, and in words."""
+        """Usable steps to compare, the settling time of the laws in frames, and a description."""
         steps, missing = self.steps, self.missing
         closed, over = steps.mode == LoopMode.CLOSED, "closed loop"
         if not (closed & usable).any():
@@ -119,12 +119,12 @@ class LoggedRun:
         return rows, settling, over
 
     def measured_again(self, calibration: Calibration) -> Single:
-        """Errors (steps, modes) that another calibration measures in the frames that were used: a second pass."""
+        """Errors (steps, modes) measured in the used frames with another calibration, in a second pass."""
         steps, log = self.steps, self.history.log
         if not log.selection.has_every_frame:
             raise DataFileError(
-                f"{log.path}: not every frame is in it ({log.selection.sentence}), so that no other reconstructor can "
-                "be tried on it; other gains, leaks and limits can"
+                f"{log.path}: it does not have every frame ({log.selection.sentence}): another reconstructor cannot be "
+                "tried, other gains, leaks and limits can"
             )
         error_nm = np.full_like(steps.error_nm, np.nan)
         estimator = Estimator.of(calibration)
@@ -166,9 +166,9 @@ def _played(sequence: Sequences, requests: Sequence[wire.Request], plays: Mappin
 
 
 def _target_nm(states: Sequence[wire.ControllerState], sequence: Sequences, modes: int) -> Single:
-    """Target (steps, modes) of the loop: the offset of the last state before each step, of the first one before that.
+    """Target (steps, modes) of the loop: the offset of the last state before each step, or else of the first state.
 
-    A state is logged at every change; that of a `clear` has no frame, for it forgets the newest one.
+    A state is logged at every change; that of a `clear` has no frame, because it resets the frame sequence.
     """
     known = [(state.frame_sequence, state.offset_nm or [0.0] * modes) for state in states]
     known = [(frame, offset_nm) for frame, offset_nm in known if len(offset_nm) == modes]
@@ -184,8 +184,6 @@ def _law_and_delay(history: History, calibration: Calibration) -> tuple[Law, flo
     if state is not None and len(state.gain) == len(calibration.noll):
         return gains_of(state), state.delay_frames
     if history.configuration is None:
-        raise DataFileError(
-            f"{history.log.path}: its gains and delay are not known: no state of the controller is there"
-        )
+        raise DataFileError(f"{history.log.path}: its gains and delay are unknown: it has no controller state")
     known = settings(history.configuration)
     return known.law(calibration.noll), known.delay_frames

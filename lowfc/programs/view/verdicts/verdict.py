@@ -189,7 +189,7 @@ def _latency(state: RunState) -> Tile:
         return tile(value, f"{detail}; of no effect in simulated time")
     if share > MANY_LATE:
         advice = (
-            f"{counted(late, 'command')}, {100 * share:.2g} %, came after the next exposure had begun: "
+            f"{counted(late, 'command')}, {100 * share:.2g} %, came after the start of the next exposure: "
             "there is more delay than the loop is tuned for. Free the host's processors or lower the rate."
         )
         what = f"{'command' if late == 1 else 'commands'} in {RECENT_S:g} s; {value}, {detail}"
