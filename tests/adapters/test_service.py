@@ -178,8 +178,8 @@ def test_a_message_that_cannot_be_read_is_an_event_and_neither_a_traceback_nor_t
     commands.put(wire.MirrorCommand(actuators=b"1234").SerializeToString())
     mirror.beat()
     assert (mirror.running, read) == (True, [4])
-    assert ear.said("BAD_MESSAGE 1 on lowfc/mirror/dm/command")
-    assert ear.said("BAD_MESSAGE 1 on lowfc/health/*")
+    assert ear.said("BAD_MESSAGE 1 message on lowfc/mirror/dm/command")
+    assert ear.said("BAD_MESSAGE 1 message on lowfc/health/*")
     assert not mirror.bus.faults.counts
     assert "Traceback" not in capsys.readouterr().err
 

@@ -204,7 +204,7 @@ def test_what_cannot_be_calibrated_is_said(monkeypatch: pytest.MonkeyPatch) -> N
     with pytest.raises(CalibrationError, match="slew limit; at most"):
         of(loop, "poke", 4, amplitude_nm=500.0)
     lossy = FoldedLoop(configured(**FEW), lose=lambda index: index % 50 == 49)
-    with pytest.raises(CalibrationError, match="in 2 attempts there was no run of 240 frames"):
+    with pytest.raises(CalibrationError, match="in 2 attempts there were no 240 consecutive frames"):
         taken_of(lossy, "hadamard", 4)
 
 
@@ -321,7 +321,7 @@ def test_what_another_operator_asks_ends_a_calibration_and_has_the_last_word(
         calibrator.run()
     assert mode_of(loop) == mode
     assert loop.stops == 1
-    assert said[-1].startswith(f"warning: the loop is not closed again: {after}")
+    assert said[-1].startswith(f"warning: the loop was not closed again: {after}")
 
 
 @pytest.mark.parametrize("before_the_end", [None, 3])
@@ -331,5 +331,5 @@ def test_a_mirror_that_died_ends_the_calibration(monkeypatch: pytest.MonkeyPatch
     calibrator = of(loop, "hadamard", report=said.append)
     with pytest.raises(BusError, match=r"no mirror state came .* is the mirror's process running"):
         calibrator.run()
-    assert said[-1].startswith("a cycle is repeated: the mirror has reported no command as followed for 101 frames")
+    assert said[-1].startswith("a cycle is repeated: the mirror has not reported an applied command for 101 frames")
     assert go_on(partial_of(OUT), {"method": "hadamard"}).cycles == 1

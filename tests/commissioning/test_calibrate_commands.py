@@ -89,7 +89,7 @@ def test_a_calibration_is_written_once_it_is_whole_and_used_and_its_figures_are_
     words = ["--method", "hadamard", "--cycles", "4", "--out", "night.fits", "--load"]
     done = CliRunner().invoke(calibrate_app, words)
     assert done.exit_code == 130
-    assert done.stderr.splitlines()[-1].startswith("kept in night.fits.part.npz: 4 cycles, with which")
+    assert done.stderr.splitlines()[-1].startswith("kept in night.fits.part.npz: 4 cycles; the same command")
     assert "4 cycles of 226 frames and 3 to check them; about" in done.stderr
     assert not Path("night.fits").exists()
     assert loop.calibration().id == before.id
@@ -196,7 +196,7 @@ def test_a_dark_finds_bad_pixels_and_is_not_taken_in_light(loop: FoldedLoop, mon
     assert made.good.reshape(80, 80)[40, 41] == 0
     assert not made.reconstructor[:, 40 * 80 + 41].any()
     fits.PrimaryHDU(cube[:, :20].astype(np.int16)).writeto("small.fits")
-    with pytest.raises(DataFileError, match=r"frames of \(20, 80\), the calibration has \(80, 80\)"):
+    with pytest.raises(DataFileError, match=r"frames are \(20, 80\), those of the calibration \(80, 80\)"):
         told("dark", "--file", "small.fits")
     np.save("cube.npy", cube)
     assert told("dark", "--file", "cube.npy")["frames"] == 64

@@ -369,7 +369,7 @@ def test_too_little_to_compare_is_said() -> None:
     for short in (history(error_nm=nothing), replace(history(), calibration=None)):
         with pytest.raises(DataFileError, match="too few frames used by a calibrated controller"):
             LoggedRun(short)
-    with pytest.raises(DataFileError, match="gains and delay are not known"):
+    with pytest.raises(DataFileError, match="gains and delay are unknown"):
         LoggedRun(replace(history(), controllers=[]))
 
 
@@ -390,7 +390,7 @@ def test_doubts_are_said() -> None:
         "could not be measured",
         "left out: byte 77, the checksum of a chunk is wrong",
         "the log has no end",
-        "does not have every command: 1 frame that saw",
+        "lacks some commands: 1 frame exposed with a missing",
     ):
         assert words in doubts
 
@@ -455,5 +455,5 @@ def test_the_words_of_the_command_line() -> None:
 def test_words_that_make_no_sense_are_refused(text: str, message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):
         what_if(LoggedRun(history()), requested(text))
-    with pytest.raises(ConfigurationError, match="gain are the integrator's"):
+    with pytest.raises(ConfigurationError, match="gain apply to the integrator"):
         requested("gain=0.3", controller="mine.py:step")
