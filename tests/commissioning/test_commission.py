@@ -212,7 +212,7 @@ def test_the_calibration_from_before_is_in_use_again_after_a_failure(
 def test_there_is_nothing_to_go_on_with_after_the_end(commissioned: tuple[Bench, dict[str, Any]]) -> None:
     bench, _ = commissioned
     first_of(bench.out).unlink(missing_ok=True)
-    with pytest.raises(CalibrationError, match="nothing to go on with"):
+    with pytest.raises(CalibrationError, match="nothing to resume"):
         bench.commission(resume=True)
 
 
@@ -276,7 +276,7 @@ def test_a_calibration_that_is_there_is_not_replaced_unasked(own_runtime: Path) 
     out.write_text("mine")
     done = lowfc("commission", "--no-dark", "--out", out)
     assert isinstance(done.exception, DataFileError)
-    assert "exists already" in str(done.exception)
+    assert "already exists" in str(done.exception)
     for way in ("--force", "--resume"):
         done = lowfc("commission", "--no-dark", "--out", out, way)
         assert isinstance(done.exception, BusError), "it goes on to the loop, of which there is none"

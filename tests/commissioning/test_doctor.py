@@ -147,7 +147,7 @@ def test_a_fit_host_has_no_warning(tmp_path: Path) -> None:
         ("real-time share", "ok", "all of a processor", {"proc/sys/kernel/sched_rt_runtime_us": "-1"}),
         ("processors", "warning", "names 6", {"trial": trial(cpus=6)}),
         ("isolation", "warning", "isolcpus=5-7 nohz_full=5-7", {f"{CPUS}/isolated": "\n"}),
-        ("isolation", "note", "of 2 there is none to spare", {f"{CPUS}/isolated": "\n", f"{CPUS}/online": "0-1"}),
+        ("isolation", "note", "none of the 2 can be spared", {f"{CPUS}/isolated": "\n", f"{CPUS}/online": "0-1"}),
         ("isolation", "warning", "the configuration names 4-6", {f"{CPUS}/isolated": "4-5"}),
         ("isolation", "ok", "without a timer tick: none", {f"{CPUS}/nohz_full": "(null)\n"}),
         ("quota", "warning", "1.5 processors", {"sys/fs/cgroup/user.slice/cpu.max": "150000 100000\n"}),
@@ -171,7 +171,7 @@ def test_a_fit_host_has_no_warning(tmp_path: Path) -> None:
         (
             "virtualisation",
             "warning",
-            "10.00 % of its time went to others since boot; that is much",
+            "10.00 % of its time stolen since boot; that is much",
             {"sys/hypervisor/type": "xen\n", "stolen_share": 0.1},
         ),
         ("clock source", "warning", "hpet", {CLOCKSOURCE: "hpet\n"}),

@@ -1,1 +1,1 @@
-"""`lowfc commission`: from a camera that publishes and a mirror that follows to a closed loop."""
+"""`lowfc commission`: from a running camera and mirror to a calibrated, closed loop."""

@@ -16,26 +16,28 @@ from lowfc.programs.commissioning.calibrate.command import Out, Resume, Snr
 def commission(
     out: Out = Path("calibration.fits"),
     run: AnyRun = None,
-    frames: Annotated[int, typer.Option(min=16, max=100_000, help="For the dark and for the reference image.")] = 400,
+    frames: Annotated[
+        int, typer.Option(min=16, max=100_000, help="Frames of the dark and of the reference image.")
+    ] = 400,
     dark: Annotated[Path | None, typer.Option(help="Dark frames: a FITS or .npy cube (frames, rows, columns).")] = None,
     no_dark: Annotated[
-        bool, typer.Option("--no-dark", help="Take the camera's bias for the dark, and all pixels for good.")
+        bool, typer.Option("--no-dark", help="Use the camera's bias as the dark, and all pixels.")
     ] = False,
     snr: Snr = 50.0,
     cycles: Annotated[
         int | None,
-        typer.Option(min=LEAST_CYCLES, help="How many of the response, in place of --snr, which is 20 then."),
+        typer.Option(min=LEAST_CYCLES, help="Cycles of the response; --snr is then 20 by default."),
     ] = None,
     resume: Resume = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there already.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
     close: Annotated[bool, typer.Option("--close", help="Close the loop at the end.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Commission a new camera and mirror: from frames that are published to a calibration that is in use.
+    """Commission a new camera and mirror: measure a calibration and load it.
 
     Camera, mirror and controller must be running (`lowfc controller --calibration none`); the light must be on the
     sensor. Steps: camera, dark and bad pixels, reference image, delay, orientation and sign, poke amplitude, response,
-    verdict, prediction, closed loop. The mirror is afterwards where it was.
+    verdict, prediction, closed loop. Afterwards the mirror returns to its shape.
 
     Example: lowfc commission --run bench --out calibration.fits --close
     """
@@ -51,11 +53,11 @@ def commission(
         raise ConfigurationError("--dark FILE and --no-dark exclude each other: use one")
     if dark is None and not no_dark and not resume and not sys.stdin.isatty():
         raise ConfigurationError(
-            "a dark needs somebody to block the star, and there is no terminal to ask at: give dark frames with --dark "
-            "FILE, or take the camera's bias with --no-dark"
+            "somebody must block the star for a dark, and there is no terminal to ask on: give dark frames with --dark "
+            "FILE, or use the camera's bias with --no-dark"
         )
     if out.exists() and not (resume or force):
-        raise DataFileError(f"{out} exists already; choose another name (--out), or --force replaces it")
+        raise DataFileError(f"{out} already exists; use another name (--out), or replace it with --force")
     require_folder(out)
     console = Console(stderr=True)
     report = reporter(console)

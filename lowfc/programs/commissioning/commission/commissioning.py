@@ -1,4 +1,4 @@
-"""The steps from a camera that publishes to a calibration that is in use, and to a closed loop."""
+"""The steps from a running camera and mirror to a calibration in use and a closed loop."""
 
 import contextlib
 from collections.abc import Callable
@@ -38,11 +38,11 @@ from lowfc.programs.commissioning.commission.first_light import (
 
 METHOD = "hadamard"
 LOOKED_AT = 32
-"""Frames from which size, rate and light are read."""
+"""Frames for determining size, rate and flux."""
 MAX_OF_PREDICTED = 1.5
-"""Measured over predicted error beyond which the closed loop is not what was expected."""
+"""Largest ratio of measured to predicted error in the closed loop."""
 MIN_PREDICTED = 1000
-"""Frames of the open loop that a residual is predicted from, and of the closed loop that it is measured in."""
+"""Open-loop frames for the prediction of the residual, and closed-loop frames for its measurement."""
 STEPS = (
     *("camera", "dark and bad pixels", "reference image", "delay", "orientation and sign", "poke amplitude"),
     *("response", "verdict", "prediction", "closed loop"),
@@ -64,7 +64,7 @@ class Commission:
 
 
 def first_of(out: Path) -> Path:
-    """Where the first calibration is kept until a better one is made."""
+    """File of the first calibration until a better one is made."""
     return out.with_name(f"{out.name}.first.fits")
 
 
@@ -94,10 +94,10 @@ class Commissioning:
         if options.resume and not kept.is_file():
             if options.out.is_file():
                 raise CalibrationError(
-                    f"there is nothing to go on with: {options.out} is finished; `lowfc ctl load {options.out}` puts "
-                    "it in use, and without --resume a new one is begun"
+                    f"nothing to resume: {options.out} is finished; `lowfc ctl load {options.out}` loads it; without "
+                    "--resume a new one is started"
                 )
-            self._report(f"there is nothing to go on with beside {options.out}: this begins anew")
+            self._report(f"nothing to resume beside {options.out}: starting from the beginning")
         before = self._open()
         try:
             return self._steps_of(kept)
@@ -106,20 +106,22 @@ class Commissioning:
             raise
 
     def _left(self, before: Calibration | None, kept: Path) -> str:
-        """A sentence after a commissioning that ended early: which calibration is in use, and how to go on."""
+        """Text after a commissioning that ended early: the calibration in use, and how to continue."""
         if self._judged:
-            return f"the calibration is good, in {self._options.out} and in use: `lowfc ctl close` closes the loop"
+            return (
+                f"the calibration is good, saved in {self._options.out} and loaded: `lowfc ctl close` closes the loop"
+            )
         if not kept.is_file():
             return "no calibration was changed"
-        text = f"what was done is kept in {kept}: the same command with --resume goes on with it"
+        text = f"the completed steps are kept in {kept}: the same command with --resume continues"
         with contextlib.suppress(LowfcError):
             if before is not None:
                 self._loop.check_lease()
                 self._loop.load(before)
-                return f"{text}; the calibration from before is in use again"
+                return f"{text}; the previous calibration is in use again"
         return (
-            f"{text}; until then the first calibration of this commissioning is in use, without a verdict: "
-            "`lowfc ctl load FILE` puts another one in use"
+            f"{text}; until then the provisional calibration of this commissioning is in use, without a verdict: "
+            "`lowfc ctl load FILE` loads another one"
         )
 
     def _steps_of(self, kept: Path) -> tuple[dict[str, Any], str]:
@@ -131,9 +133,9 @@ class Commissioning:
             if camera is not None and camera.shape != first.shape:
                 raise CalibrationError(
                     f"{kept} is for frames of {first.shape[0]} x {first.shape[1]} pixels, the camera's are "
-                    f"{camera.shape[0]} x {camera.shape[1]}: leave --resume out"
+                    f"{camera.shape[0]} x {camera.shape[1]}: omit --resume"
                 )
-            self._report(f"going on from {kept}: the camera's steps, orientation and sign are done")
+            self._report(f"resuming from {kept}: the steps of the camera, orientation and sign are done")
         else:
             first = self._first()
             calibration_file.save(first, kept)
@@ -156,8 +158,8 @@ class Commissioning:
         self._figures |= result.figures()
         if not result.recommended:
             raise CalibrationError(
-                f"{result.text()}\nit is not used: correct this, then the same command again; with --resume it "
-                "goes on with these cycles, as for more of them (--cycles)"
+                f"{result.text()}\nnot loaded: correct this, then repeat the command; --resume keeps these cycles, "
+                "for example to add more (--cycles)"
             )
         self._loop.load(made)
         self._judged = True
@@ -176,7 +178,7 @@ class Commissioning:
         self._report(f"[{STEPS.index(name) + 1}/{len(STEPS)}] {name}")
 
     def _open(self) -> Calibration | None:
-        """The loop as it must be: open or idle, and a mirror as configured; the calibration in use, if there is one."""
+        """Check the mirror and open the loop unless idle; return the calibration in use, if any."""
         state = self._loop.status().state
         if state is None:
             raise CalibrationError("the controller did not report its state")
@@ -202,7 +204,7 @@ class Commissioning:
         if options.dark is not None:
             sensor = darkened(camera, images(options.dark), self._report)
         elif options.no_dark:
-            self._report(f"no dark: the camera's bias of {camera.bias_dn:g} DN everywhere, and all pixels good")
+            self._report(f"no dark: the camera's bias of {camera.bias_dn:g} DN for all pixels, and no bad pixels")
         else:
             self._confirm("block the star; is it dark?")
             sensor = darkened(camera, watch(self._loop, options.frames), self._report)
@@ -217,7 +219,7 @@ class Commissioning:
         return poked(player, self._config, delay) if first is None else first
 
     def _close(self, law: Law, delay_frames: float) -> str:
-        """Predict the residual; close the loop where that is requested, and compare."""
+        """Predict the residual; if requested, close the loop and compare."""
         rate_hz = self._config.camera.rate_hz
         settling = settling_frames(law.gain, law.leak, rate_hz)
         frames = settling + max(MIN_PREDICTED, settling)
@@ -228,9 +230,9 @@ class Commissioning:
             missing = missing_before(opened.sequence)
             predicted = _rms_nm(counterfactual(as_logged(law), weights, opened.pol_nm, missing)[0], settling)
         except ValueError as error:
-            raise CalibrationError(f"the residual is not predicted: {error}") from None
+            raise CalibrationError(f"the residual cannot be predicted: {error}") from None
         self._figures["predicted_error_nm"] = predicted
-        text = f"the closed loop leaves {predicted:.3g} nm rms of measured error, predicted from {frames} open frames"
+        text = f"predicted measured error in closed loop: {predicted:.3g} nm rms, from {frames} open-loop frames"
         if not self._options.close:
             return f"{text}\n`lowfc ctl close` closes it"
         self._step("closed loop")
@@ -240,21 +242,21 @@ class Commissioning:
             self._figures["measured_error_nm"] = measured
             if measured > MAX_OF_PREDICTED * predicted:
                 raise CalibrationError(
-                    f"the closed loop leaves {measured:.3g} nm rms of measured error, {predicted:.3g} was predicted: "
+                    f"the measured error in closed loop is {measured:.3g} nm rms, but {predicted:.3g} was predicted: "
                     "is the delay right, did the disturbance change? The loop is opened"
                 )
         except BaseException as error:
             with contextlib.suppress(LowfcError):
-                self._loop.check_lease()  # whoever ended it has the last word on the loop
+                self._loop.check_lease()  # if another operator ended it, leave the loop to them
                 self._loop.open_loop()
             if isinstance(error, ValueError):
-                raise CalibrationError(f"the residual is not measured: {error}") from None
+                raise CalibrationError(f"the residual cannot be measured: {error}") from None
             raise
         return f"{text}\nmeasured in the closed loop: {measured:.3g} nm rms, {measured / predicted:.2f} times that"
 
     def _steps(self, frames: int, mode: LoopMode = LoopMode.OPEN) -> Steps:
         steps: list[Step] = []
-        self._report(f"watching {frames} frames, {frames / self._config.camera.rate_hz:.0f} s")
+        self._report(f"observing {frames} frames, {frames / self._config.camera.rate_hz:.0f} s")
         for step in self._loop.steps():
             if step.mode is mode:
                 steps.append(step)
@@ -269,8 +271,8 @@ class Commissioning:
 
 
 def _rms_nm(error_nm: Single, settling: int) -> float:
-    """Root mean square of all modes' measured errors, which have the sensor's noise, after so many frames."""
+    """Root mean square of the measured error of all modes, noise included, after the settling frames."""
     used = np.isfinite(error_nm).all(axis=1) & (np.arange(len(error_nm)) >= settling)
     if used.sum() < settling:
-        raise ValueError(f"{int(used.sum())} frames after {settling} of settling are too few to tell a residual")
+        raise ValueError(f"{int(used.sum())} frames after {settling} of settling are too few for a residual")
     return float(np.linalg.norm(rms(error_nm, used)))

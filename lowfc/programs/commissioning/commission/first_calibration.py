@@ -21,18 +21,18 @@ from lowfc.programs.commissioning.calibrate.result import reconstructed
 
 FIRST_NM = AMPLITUDE_NM["poke"]
 MAX_FIRST_NM = 32.0
-"""Largest amplitude of the first pokes, which is doubled until they are seen, nm rms of wavefront."""
+"""Largest amplitude of the first pokes, nm rms of wavefront; it is doubled until they are detected."""
 MAX_MISFIT = 0.35
-"""Largest residual of the image after the fit of the computed one; above it the sensor is another one."""
+"""Largest residual of the image after the fit of the computed one; above it the sensor is not the configured one."""
 MIN_LIKENESS = 0.5
-"""Least correlation of a poke's image with the computed one; below it the sensor is another one."""
+"""Least correlation of a poke's image with the computed one; below it the sensor is not the configured one."""
 CYCLES = 12
 MAX_NOT_LINEAR = 0.1
 _SURE = 3.0
 
 
 def first_delay(player: Player, config: Configuration) -> Delay:
-    """The delay, and the image of a poke of the first mode: pokes that grow until they are seen."""
+    """Delay and image of a poke of the first mode, with increasing amplitude until it is detected."""
     before, report = player.before, player.report
     amplitude_nm, most_nm = FIRST_NM, float(largest_nm(config, before)[0])
     while True:
@@ -43,10 +43,10 @@ def first_delay(player: Player, config: Configuration) -> Delay:
         except PokesNotSeenError:
             if amplitude_nm >= min(MAX_FIRST_NM, most_nm):
                 raise
-            report(f"pokes of {amplitude_nm:g} nm are not seen: twice as large")
+            report(f"pokes of {amplitude_nm:g} nm are not detected: amplitude doubled")
             amplitude_nm *= 2
     report(
-        f"pokes of Z{before.noll[0]} of {amplitude_nm:g} nm are seen after {found.delay_frames:.3f} +- "
+        f"pokes of Z{before.noll[0]} of {amplitude_nm:g} nm are detected after {found.delay_frames:.3f} +- "
         f"{found.error_frames:.3f} frames, {found.delay_frames * config.period_ns * 1e-6:.3g} ms"
     )
     return found
@@ -60,9 +60,9 @@ def aligned(
     report: Report,
     figures: dict[str, Any],
 ) -> Calibration | None:
-    """The computed calibration on the sensor's pixels, with the sign that the poke shows; None for another sensor.
+    """The computed calibration on the sensor's pixels, with the sign from the poke; None for another sensor.
 
-    How the sensor is placed is added to `figures`.
+    The sensor's geometry is added to `figures`.
     """
     image = (before.reference * before.flux_dn).reshape(before.shape).astype(np.float64)
     model = computed.reference.astype(np.float64).reshape(computed.shape)
@@ -70,7 +70,7 @@ def aligned(
         found = align(image, model)
         made = on_sensor(config, computed, found.geometry, before.flux_dn, before)
     except (ValueError, CalibrationError) as error:
-        report(f"the image is not compared with the computed one: {error}")
+        report(f"the image cannot be compared with the computed one: {error}")
         return None
     like = likeness(poke.picture, made.response[:, 0])
     if like < 0:
@@ -94,7 +94,7 @@ def aligned(
 
 
 def poked(player: Player, config: Configuration, poke: Delay) -> Calibration:
-    """A calibration of each mode's own pokes, without an optical model."""
+    """A calibration from pokes of each mode, without an optical model."""
     before, modes = player.before, len(player.before.noll)
     amplitude_nm = min(FIRST_NM, float(largest_nm(config, before).min()))
     response = np.zeros_like(before.response, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""What a camera sends before anything is calibrated: its size and rate, dark, bad pixels, and the reference image."""
+"""A camera before calibration: size and rate of its frames, dark, bad pixels, and the reference image."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -21,7 +21,7 @@ from lowfc.programs.commissioning.checks import Status
 from lowfc.programs.commissioning.conformance.settings import agreement_checks
 
 RATE_APART = 0.05
-"""Largest relative difference between the rate of the frames' times and that in the camera's settings."""
+"""Largest relative difference between the rate from the frames' times and the rate in the camera's settings."""
 _FULL = 0.9
 _NS = 1e9
 
@@ -45,7 +45,7 @@ class Sensor(NamedTuple):
 def camera_fits(
     config: Configuration, state: wire.CameraState, images: Sequence[Frame], report: Report
 ) -> CameraSettings:
-    """The camera's settings, once its frames and the configuration agree with them."""
+    """The camera's settings, after a check that frames and configuration agree with them."""
     checks = list(agreement_checks(config, state))
     faults = [
         f"{check.name}: the camera has {check.got}, expected {check.expected}; {check.advice}"
@@ -55,7 +55,7 @@ def camera_fits(
     shapes = {image.pixels.shape for image in images}
     if shapes != {(state.rows, state.columns)}:
         sizes = ", ".join(f"{rows} x {columns}" for rows, columns in sorted(shapes))
-        faults.append(f"size: the camera says {state.rows} x {state.columns} pixels, its frames have {sizes}")
+        faults.append(f"size: the camera reports {state.rows} x {state.columns} pixels, its frames have {sizes}")
     period_ns = float(np.median(np.diff([image.time_ns for image in images])))
     if not (state.period_ns and period_ns > 0):
         faults.append(
@@ -63,7 +63,7 @@ def camera_fits(
         )
     elif abs(period_ns / state.period_ns - 1) > RATE_APART:
         faults.append(
-            f"rate: the camera says {_NS / state.period_ns:.5g} Hz, its frames come at {_NS / period_ns:.5g} Hz"
+            f"rate: the camera reports {_NS / state.period_ns:.5g} Hz, its frames arrive at {_NS / period_ns:.5g} Hz"
         )
     brightest = max(int(image.pixels.max()) for image in images)
     if brightest > _FULL * state.saturation_dn:
@@ -72,7 +72,7 @@ def camera_fits(
             "it is below half of that"
         )
     if faults:
-        raise CalibrationError("the camera cannot be used as it is:\n" + "\n".join(f"  {fault}" for fault in faults))
+        raise CalibrationError("the camera cannot be used:\n" + "\n".join(f"  {fault}" for fault in faults))
     for check in checks:
         if check.status is Status.WARNING:
             report(f"remark: {check.name}: the camera has {check.got}, expected {check.expected}")
@@ -84,13 +84,13 @@ def camera_fits(
 
 
 def without_dark(camera: CameraSettings) -> Sensor:
-    """A sensor of which no dark is measured: its bias everywhere, and no bad pixel."""
+    """A sensor without a measured dark: its bias for all pixels, no bad pixels."""
     pixels = camera.shape[0] * camera.shape[1]
     return Sensor(camera, np.full(pixels, float(camera.bias_dn)), np.ones(pixels), measured=False)
 
 
 def darkened(camera: CameraSettings, frames: npt.NDArray[np.number], report: Report) -> Sensor:
-    """A sensor with a dark (frames, rows, columns) and what it shows of bad pixels."""
+    """A sensor with dark and bad pixels from dark frames (frames, rows, columns)."""
     if frames.shape[1:] != camera.shape:
         raise CalibrationError(f"the dark frames have {frames.shape[1:]} pixels, the camera {camera.shape}")
     try:
@@ -111,7 +111,7 @@ def referenced(sensor: Sensor, frames: npt.NDArray[np.number], computed: Calibra
     noise_dn = float(np.std(frames.reshape(len(frames), -1).astype(np.float64) @ sensor.good)) / np.sqrt(len(frames))
     if not flux_dn > max(10 * noise_dn, 0.0):
         raise CalibrationError(
-            f"there is no more light on the sensor than in the dark: {flux_dn:.4g} DN in all, with a noise of "
+            f"no more flux on the sensor than in the dark: {flux_dn:.4g} DN in total, with a noise of "
             f"{noise_dn:.2g} DN; is the star blocked now, or was it not blocked for the dark?"
         )
     reference = image * sensor.good / flux_dn
@@ -121,7 +121,7 @@ def referenced(sensor: Sensor, frames: npt.NDArray[np.number], computed: Calibra
         except ValueError as error:
             raise CalibrationError(str(error)) from None
     modes = len(computed.noll)
-    report(f"{flux_dn:.4g} DN of light in a frame, mean of {len(frames)} frames")
+    report(f"flux {flux_dn:.4g} DN per frame, mean of {len(frames)} frames")
     return replace(
         computed,
         reference=reference.astype(np.float32),

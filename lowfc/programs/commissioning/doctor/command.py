@@ -31,10 +31,10 @@ def doctor(
     undo: Annotated[bool, typer.Option("--undo", help="As root: remove these settings.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Check whether this host is fit for a real-time loop; show what to do where it is not, and what it costs.
+    """Check this host for real-time operation; for each problem, show the remedy and the consequence.
 
-    Only --apply and --undo change anything or need root. What the loop requires of the host is tried in a separate
-    process.
+    Only --apply and --undo change anything or require root. The checks request real-time measures as the loop does, in
+    a separate process.
 
     Example: lowfc doctor --config lowfc.toml --strict
     """
@@ -57,7 +57,7 @@ def doctor(
         if any(check.status is Status.WRONG for check in checks):
             raise typer.Exit(1)
         return
-    sys.stderr.write(f"measuring wake-up delays: 1000 sleeps a second for {TRIAL_S:g} s in each scheduling class\n")
+    sys.stderr.write(f"measuring wake-up latency: 1000 sleeps per second for {TRIAL_S:g} s in each scheduling class\n")
     facts = gather(Host(), settings, TRIAL_S)
     checks = examine(facts)
     put(checks, STATUSES, FIELDS, measured(facts) if as_json else None)
@@ -66,7 +66,7 @@ def doctor(
 
 
 def examine(facts: "Facts") -> list[Check]:
-    """The result of every check; a note where a check cannot read what it needs."""
+    """The result of every check; a note if a check cannot read its data."""
     from lowfc.contract.errors import LowfcError
     from lowfc.programs.commissioning.doctor import room, timing
 

@@ -1,4 +1,4 @@
-"""What a driver needs of this host, and whether it is there: `lowfc doctor --device`."""
+"""Requirements of a driver on this host: `lowfc doctor --device`."""
 
 from collections.abc import Iterator
 
@@ -9,7 +9,7 @@ from lowfc.programs.commissioning.checks import Check, judged, ok, wrong
 
 
 def device_checks(name: str, config: Configuration) -> Iterator[Check]:
-    """A check for each of a driver's needs, of each kind of which there is one; the driver is not opened."""
+    """Check each requirement of the camera and mirror driver of this name, without opening the driver."""
     kinds = [kind for kind in plugins.KINDS if name in plugins.installed(kind)]
     for kind in kinds or plugins.KINDS[:1]:
         what = f"{kind} {name}"
@@ -21,7 +21,7 @@ def device_checks(name: str, config: Configuration) -> Iterator[Check]:
         try:
             options = plugins.options(driver, plugins.table(config, kind, name))
         except ConfigurationError as fault:
-            advice = f"set it in [drivers.{name}] of a configuration, and name that file: --config FILE"
+            advice = f"set it in [drivers.{name}] of a configuration, and give that file with --config FILE"
             yield wrong(str(fault), advice)._replace(name=what)
             continue
         yield ok(f"{driver.__module__}:{driver.__qualname__}")._replace(name=what)

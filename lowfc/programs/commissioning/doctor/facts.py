@@ -1,4 +1,4 @@
-"""What the checks of `lowfc doctor` look at."""
+"""Input of the checks of `lowfc doctor`."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -12,13 +12,13 @@ from lowfc.programs.core.recording.volume import payload_bytes
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """What the checks look at.
+    """Input of the checks.
 
     Attributes:
-        host: the kernel's account of it.
-        config: of the loop that is to run.
-        trial: what was granted and measured; why not, where it could not be tried.
-        busy: other processes while that was measured, as `Host.busy`.
+        host: the host, as reported by its kernel.
+        config: of the loop.
+        trial: granted measures and measurements, or the error if the trial failed.
+        busy: other processes during the measurement, as `Host.busy`.
     """
 
     host: Host
@@ -28,7 +28,7 @@ class Facts:
 
     @property
     def tried(self) -> Trial:
-        """What was granted and measured; OSError where it could not be tried."""
+        """Granted measures and measurements; OSError if the trial failed."""
         if isinstance(self.trial, OSError):
             raise self.trial
         return self.trial
@@ -47,7 +47,7 @@ class Facts:
 
 
 def gather(host: Host, config: Configuration, seconds: float) -> Facts:
-    """Try what the loop asks for and measure wake-ups for so long in each class; note who else is busy meanwhile."""
+    """Request the loop's real-time measures, measure wake-ups in each class, and note other busy processes."""
     facts = Facts(host, config, OSError("not tried"), ())
     host.busy()
     trial: Trial | OSError

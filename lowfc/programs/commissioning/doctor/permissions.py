@@ -1,4 +1,4 @@
-"""What grants a user the loop's real-time rights: files, a group, access to a device; shown, applied, undone."""
+"""Settings that grant a user real-time rights (files, a group, access to a device): show, apply, undo."""
 
 import os
 import shutil
@@ -18,7 +18,7 @@ FILES = {"etc/security/limits.d/90-lowfc.conf": _LIMITS, "etc/udev/rules.d/90-lo
 
 
 def shown(root: Path) -> str:
-    """Files and commands, for a person."""
+    """Text of the files and commands."""
     files = [f"# {root / name}\n{text}" for name, text in FILES.items()]
     user = os.environ.get("SUDO_USER") or os.environ.get("USER", "NAME")
     commands = f"groupadd --system --force {GROUP}\nusermod -aG {GROUP} {user}\n"
@@ -27,7 +27,7 @@ def shown(root: Path) -> str:
 
 
 def apply(root: Path, user: str) -> list[str]:
-    """Write the files, make the group with this user in it, and let it open the device; what was done."""
+    """Write the files, create the group with this user, and give it access to the device; return the actions."""
     _require_root("--apply")
     for name, text in FILES.items():
         file = root / name
@@ -45,12 +45,12 @@ def apply(root: Path, user: str) -> list[str]:
     if (root / DEVICE).exists():
         shutil.chown(root / DEVICE, group=GROUP)
         (root / DEVICE).chmod(0o660)
-        done.append(f"{root / DEVICE} is open to the group {GROUP}")
-    return [*done, f"in force for {user or 'members of the group ' + GROUP} from the next login on"]
+        done.append(f"{root / DEVICE} is accessible to the group {GROUP}")
+    return [*done, f"effective for {user or 'members of the group ' + GROUP} from the next login"]
 
 
 def undo(root: Path) -> list[str]:
-    """Take files, group and the device's rights back, and say what was done; ConfigurationError where not root."""
+    """Remove files, group and access to the device; return the actions. ConfigurationError if not root."""
     _require_root("--undo")
     done = []
     for name, text in FILES.items():
@@ -61,7 +61,7 @@ def undo(root: Path) -> list[str]:
     if (root / DEVICE).exists():
         shutil.chown(root / DEVICE, group=0)
         (root / DEVICE).chmod(0o600)
-        done.append(f"{root / DEVICE} is root's alone")
+        done.append(f"{root / DEVICE} is accessible to root only")
     return [*done, _run("groupdel", "--prefix", str(root), GROUP)]
 
 
@@ -71,7 +71,7 @@ def _require_root(option: str) -> None:
 
 
 def _run(*words: str) -> str:
-    """Run a command of the host; it, and what it said where it failed."""
+    """Run a command of the host; return it, with its error message if it failed."""
     program = shutil.which(words[0], path=f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin")
     if program is None:
         return f"{' '.join(words)}: not on this host, do it by hand"

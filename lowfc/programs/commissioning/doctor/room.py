@@ -1,4 +1,4 @@
-"""Checks of what a process of the loop may keep and use: memory, sockets, files, disk, libraries, the viewer."""
+"""Checks of resources: memory, sockets, files, disk, libraries, the viewer."""
 
 import datetime
 from pathlib import Path
@@ -26,7 +26,7 @@ _LIMITS = "`lowfc doctor --setup` (memlock unlimited in /etc/security/limits.d),
 def _locked_memory(facts: Facts) -> Check:
     """Locking a process's memory, requested as by the loop."""
     if not facts.config.realtime.lock_memory:
-        return note("the configuration does not ask for it: realtime.lock_memory = false")
+        return note("not requested by the configuration: realtime.lock_memory = false")
     if refused := facts.tried.refused.get("lock_memory"):
         what, cost = refused
         return warning(f"refused: {what}", _LIMITS, cost)
@@ -64,7 +64,7 @@ def _huge_pages(facts: Facts) -> Check:
 @CHECKS.check(
     "BLAS",
     advice="start the loop with OMP_NUM_THREADS=1, OPENBLAS_NUM_THREADS=1 and MKL_NUM_THREADS=1",
-    cost="threads of a small product wait for each other on the loop's processors",
+    cost="threads of a small matrix product wait for each other on the loop's processors",
 )
 def _blas(facts: Facts) -> Check:
     """Linear algebra of numpy, and whether it can be limited to one thread, as in the loop."""
@@ -72,7 +72,7 @@ def _blas(facts: Facts) -> Check:
     with threadpool_limits(limits=1):
         held = _blas_threads()
     if held and max(held.values()) == 1:
-        return ok(f"{names}; the loop holds it to one")
+        return ok(f"{names}; the loop limits it to one")
     return warning(names or f"none that threadpoolctl knows, in numpy {np.__version__}")
 
 
@@ -105,7 +105,7 @@ def _socket_buffers(facts: Facts) -> Check:
     return warning(
         detail,
         f"raise the third value of sysctl net.ipv4.tcp_rmem and net.ipv4.tcp_wmem to {need} or more",
-        f"a reader that stands still for more than {held_s * 1e3:.0f} ms loses messages, where it need not",
+        f"a reader that stalls for more than {held_s * 1e3:.0f} ms loses messages unnecessarily",
     )
 
 
@@ -122,7 +122,7 @@ def _disk(facts: Facts) -> Check:
         f"{grows * 3.6e-6:.1f} GB an hour at {rate_hz:g} Hz"
     )
     if not writable:
-        return warning(f"{detail}; not writable", "set recorder.folder to a folder of yours", "nothing is recorded")
+        return warning(f"{detail}; not writable", "set recorder.folder to a writable folder", "nothing is recorded")
     if lasts_s >= section.longest_s:
         return ok(detail)
     return warning(
@@ -145,7 +145,7 @@ def _open_files(facts: Facts) -> Check:
 @CHECKS.check(
     "certificates",
     advice="lowfc certs --renew where the authority's key is, and copy each ROLE.pem here",
-    cost="a link that is up stays up; a process or a router that starts after the end is not let in",
+    cost="existing links persist; processes and routers that start after the expiry are rejected",
 )
 def _certificates(facts: Facts) -> Check:
     """Certificates in this host's folder, `network.certificates`, if the loop uses a router."""

@@ -1,4 +1,4 @@
-"""Checks of what decides when a process of the loop runs: processors, kernel, clocks, other processes."""
+"""Checks of scheduling and timing: processors, kernel, clocks, other processes."""
 
 import re
 import time
@@ -33,7 +33,7 @@ def _scheduling_class(facts: Facts) -> Check:
     """SCHED_FIFO at `realtime.priority`, requested as by the loop."""
     priority = facts.config.realtime.priority
     if not priority:
-        return note("the configuration asks for the normal class: realtime.priority = 0")
+        return note("the configuration requests normal scheduling: realtime.priority = 0")
     if refused := facts.tried.refused.get("priority"):
         what, cost = refused
         advice = f"`lowfc doctor --setup` (rtprio {priority} in limits.d), or the service LimitRTPRIO={priority}"
@@ -43,7 +43,7 @@ def _scheduling_class(facts: Facts) -> Check:
 
 @CHECKS.check("real-time share")
 def _realtime_share(facts: Facts) -> Check:
-    """How much of a processor real-time processes may use: `kernel.sched_rt_runtime_us`."""
+    """Share of a processor for real-time processes: `kernel.sched_rt_runtime_us`."""
     share = "proc/sys/kernel/sched_rt_{}_us"
     runtime_us, period_us = (int(facts.host.text(share.format(name))) for name in ("runtime", "period"))
     if runtime_us < 0:
@@ -51,10 +51,10 @@ def _realtime_share(facts: Facts) -> Check:
     detail = f"real-time processes may use {runtime_us / 1e3:g} ms of every {period_us / 1e3:g} ms"
     advice = "a processor for each of camera, controller and mirror, or sysctl kernel.sched_rt_runtime_us=-1"
     if runtime_us == 0:
-        return warning(detail, "sysctl kernel.sched_rt_runtime_us=950000", "SCHED_FIFO is refused to everybody")
+        return warning(detail, "sysctl kernel.sched_rt_runtime_us=950000", "SCHED_FIFO is refused to all processes")
     if len(facts.host.usable_cpus()) >= _IN_LOOP:
         return ok(detail)
-    cost = f"a processor whose share is used up stands still for {(period_us - runtime_us) / 1e3:g} ms"
+    cost = f"a processor whose share is used up stalls for {(period_us - runtime_us) / 1e3:g} ms"
     return note(detail, advice, cost)
 
 
@@ -73,8 +73,8 @@ def _processors(facts: Facts) -> Check:
     if len(usable | named) < len(PROCESSES):
         return warning(
             f"{detail}, for {len(PROCESSES)} processes: {', '.join(PROCESSES)}",
-            f"a host with {len(PROCESSES)} processors or more; where it has them, a wider affinity (taskset, cpuset)",
-            "the processes wait for each other: a longer tail, and a lower highest rate",
+            f"a host with {len(PROCESSES)} processors or more; if it has them, a wider affinity (taskset, cpuset)",
+            "the processes wait for each other: a longer tail, and a lower maximum rate",
         )
     return ok(detail)
 
@@ -86,7 +86,7 @@ def _isolation(facts: Facts) -> Check:
     cost = "other programs and the kernel's own work share the loop's processors; expect a longer tail"
     if not isolated:
         if len(online) <= len(PROCESSES):
-            return note(f"none, and of {len(online)} there is none to spare")
+            return note(f"none, and none of the {len(online)} can be spared")
         spare = ranges(sorted(online)[-_IN_LOOP:])
         advice = f"boot with isolcpus={spare} nohz_full={spare} and name them in realtime.*_cpus"
         return warning("none", advice, cost)
@@ -104,8 +104,8 @@ def _isolation(facts: Facts) -> Check:
 
 @CHECKS.check(
     "quota",
-    advice="lift it: CPUQuota= of the service, --cpus of the container",
-    cost="once it is used up every process stands still until the quota is renewed",
+    advice="remove it: CPUQuota= of the service, --cpus of the container",
+    cost="once it is used up, every process stalls until the quota is renewed",
 )
 def _quota(facts: Facts) -> Check:
     """Limits of processor time on this process's control groups, such as a container's."""
@@ -116,7 +116,7 @@ def _quota(facts: Facts) -> Check:
 @CHECKS.check(
     "frequency",
     advice="cpupower frequency-set --governor performance",
-    cost="a processor slows down while it waits for a frame, and computes the next one slowly",
+    cost="a processor slows down while waiting for a frame, and computes the next one slowly",
 )
 def _frequency(facts: Facts) -> Check:
     """Frequency governor of the usable processors, and turbo."""
@@ -182,8 +182,8 @@ def _kernel(facts: Facts) -> Check:
 
 @CHECKS.check(
     "virtualisation",
-    advice="the machine itself, or processors that the hypervisor gives to nobody else",
-    cost="the hypervisor stops a processor without saying so, whatever the scheduling class",
+    advice="bare metal, or processors dedicated to this virtual machine",
+    cost="the hypervisor may suspend a processor at any time, in any scheduling class",
 )
 def _virtualisation(facts: Facts) -> Check:
     """Hypervisor, and the processor time stolen by it since boot."""
@@ -195,9 +195,9 @@ def _virtualisation(facts: Facts) -> Check:
     if not kind and flags is not None and "hypervisor" not in flags[1].split():
         return ok("none")
     machine = [read(f"sys/class/dmi/id/{name}") for name in ("sys_vendor", "product_name")]
-    name = " ".join(filter(None, [kind, *machine])) or "it does not say which"
+    name = " ".join(filter(None, [kind, *machine])) or "unknown"
     much = "; that is much" if stolen > _STOLEN else ""
-    return warning(f"a virtual machine ({name}); {100 * stolen:.2f} % of its time went to others since boot{much}")
+    return warning(f"a virtual machine ({name}); {100 * stolen:.2f} % of its time stolen since boot{much}")
 
 
 @CHECKS.check(
@@ -216,15 +216,15 @@ def _clock_source(facts: Facts) -> Check:
 @CHECKS.check(
     "synchronisation",
     advice="run chronyd (with rtcsync), ntpd, systemd-timesyncd or phc2sys before the first run after a boot",
-    cost="no loop notices a step, but the times in a log are as wrong as the clock was at the first run since the "
-    "boot, and those of two hosts cannot be compared",
+    cost="a step does not affect the loop, but the times in a log have the error of the clock at the first run after "
+    "the boot, and those of two hosts cannot be compared",
 )
 def _synchronisation(facts: Facts) -> Check:
     """Whether a daemon synchronises CLOCK_REALTIME, and the error that the kernel reports."""
     kept = facts.host.synchronisation()
     if kept.synchronised:
-        return ok(f"kept; {kept.offset_s * 1e6:.0f} us to correct, error at most {kept.error_s * 1e3:.1f} ms")
-    return warning("not kept: CLOCK_REALTIME may be wrong, and step when somebody sets it")
+        return ok(f"synchronised; {kept.offset_s * 1e6:.0f} us to correct, error at most {kept.error_s * 1e3:.1f} ms")
+    return warning("not synchronised: CLOCK_REALTIME may be wrong, and steps when it is set")
 
 
 @CHECKS.check("boot's clock")
@@ -240,15 +240,15 @@ def _boot_clock(facts: Facts) -> Check:
     return warning(
         detail,
         f"once CLOCK_REALTIME is right: stop all lowfc processes, remove {file} and start them again",
-        "the times in logs are off by so much; the loop does not mind",
+        "the times in logs are off by this much; the loop is not affected",
     )
 
 
 @CHECKS.check(
     "wake-up",
-    advice="see scheduling class, processors, idle states, virtualisation and load; `lowfc latency --trace` says "
-    "which stalls of a loop are the host's",
-    cost="frames wait so long before they are looked at, however fast the loop computes",
+    advice="see scheduling class, processors, idle states, virtualisation and load; `lowfc latency --trace` shows "
+    "which stalls of a loop are caused by the host",
+    cost="every frame waits this long before processing, however fast the loop computes",
 )
 def _wake_up(facts: Facts) -> Check:
     """Lateness of a timer wake-up, 1000 times in one second, in both scheduling classes."""
@@ -265,7 +265,7 @@ def _wake_up(facts: Facts) -> Check:
 
 
 def wake_up_us(trial: Trial) -> dict[str, dict[str, float]]:
-    """Percentiles of how late a process wakes, us, by scheduling class; the best class last."""
+    """Percentiles of the wake-up latency, us, by scheduling class; the best class last."""
     classes = {"normal": trial.normal_ns, "SCHED_FIFO": trial.first_ns}
     return {
         name: dict(zip(("p50", "p99", "max"), (np.percentile(late_ns, (50, 99, 100)) / 1e3).tolist(), strict=True))
@@ -277,10 +277,10 @@ def wake_up_us(trial: Trial) -> dict[str, dict[str, float]]:
 @CHECKS.check(
     "load",
     advice="end them, or keep them off the loop's processors",
-    cost="in the normal class the loop takes turns with them; under SCHED_FIFO they still empty its caches",
+    cost="with normal scheduling they delay the loop; under SCHED_FIFO they still evict its caches",
 )
 def _load(facts: Facts) -> Check:
-    """Load average, and which other processes were busy during the measurement."""
+    """Load average, and other processes that were busy during the measurement."""
     load, cpus = facts.host.load(), len(facts.host.usable_cpus())
     busy = [(name, share) for name, share in facts.busy if share > _BUSY]
     who = ", ".join(f"{name} {100 * share:.0f} %" for name, share in busy[:_BUSY_SHOWN]) or "nobody"
