@@ -108,7 +108,7 @@ def test_an_open_loop_with_much_tilt_is_flagged(tmp_path: Path) -> None:
     run = of_log(LogReader(path))
     larger = replace(run, nm_per_mas=run.nm_per_mas / 10)  # type: ignore[operator]
     warned = result_of(larger, *tuned(larger, "integrator"), "integrator").text()
-    assert "above 10: the sensor shows less than there is (optical gain)" in warned
+    assert "above 10: the optical gain of the sensor is low" in warned
 
 
 class Listening:
@@ -152,7 +152,7 @@ def test_a_running_loop_is_listened_to() -> None:
     assert run.closed
     assert (run.source, run.noll, run.timing) == ("folded", NOLL, Timing.of(1.0, 0.5))
     assert run.rate_hz == pytest.approx(1000)
-    assert run.warnings == ("4 steps did not get here in time",)
+    assert run.warnings == ("4 steps lost on the way to this command",)
     assert run.pol.frames == pytest.approx(5500, abs=5)
 
     result = result_of(run, *tuned(run, "lqg"), "lqg")
@@ -181,7 +181,7 @@ def test_a_running_loop_tells_when_its_commands_are_applied() -> None:
 
 
 def test_too_short_a_time_to_listen_is_refused_before_it_has_passed() -> None:
-    with pytest.raises(DataFileError, match=r"2048 frames in a row, 2.05 s at 1000 Hz; .* for 2 s: --live 3"):
+    with pytest.raises(DataFileError, match=r"2048 consecutive frames, 2.05 s at 1000 Hz, but got 2 s: use --live 3"):
         of_run(Watched(CONFIG), 2.0)
 
 
@@ -240,7 +240,7 @@ def test_the_law_that_drove_goes_on_where_nobody_answers_or_it_is_said_that_it_d
         integrate(loop, [0.3, 0.3, 0.3], NOLL)
     assert loop.known() == before
     loop.deaf = (6, 7)
-    with pytest.raises(RequestRefusedError, match=f"the integrator drives .* law {before[0]!r} could not be put back"):
+    with pytest.raises(RequestRefusedError, match=f"the integrator drives .* law {before[0]!r} could not be restored"):
         integrate(loop, [0.3, 0.3, 0.3], NOLL)
     assert loop.known() == (None, before[1])
 
@@ -249,7 +249,9 @@ def test_a_log_that_is_too_short_is_refused(tmp_path: Path) -> None:
     night = Night()
     night.request("close")
     night.frames(700)
-    with pytest.raises(DataFileError, match="tuned from at least 2048 frames in a row, 2 s; the longest run of good"):
+    with pytest.raises(
+        DataFileError, match="tuning requires at least 2048 consecutive frames, 2 s; the longest stretch of good"
+    ):
         tune(night.write(tmp_path / "short.mcap"))
 
 
@@ -259,9 +261,9 @@ def test_what_is_written_is_never_a_log(log: Path) -> None:
 
 
 def test_a_log_or_a_running_loop_is_named() -> None:
-    with pytest.raises(ConfigurationError, match="name one LOG, or listen to a running loop"):
+    with pytest.raises(ConfigurationError, match="give one LOG, or observe a running loop"):
         tune()
-    with pytest.raises(ConfigurationError, match="name one LOG"):
+    with pytest.raises(ConfigurationError, match="give one LOG"):
         tune("x.mcap", "--live", 3.0)
 
 

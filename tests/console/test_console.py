@@ -142,7 +142,7 @@ def test_every_button_by_its_key(run: LiveRun, tmp_path: Path, monkeypatch: pyte
                 await screen.pilot.press("enter")
             await screen.until(
                 lambda name=name: (
-                    screen.text("answer").startswith(f"{name}: ") and not screen.text("answer").endswith(": asked")
+                    screen.text("answer").startswith(f"{name}: ") and not screen.text("answer").endswith(": requested")
                 )
             )
             if wanted:

@@ -124,7 +124,7 @@ def test_a_smaller_copy_has_the_same_steps(whole: Path, small: Path) -> None:
     assert again.selection == made.sentence
     assert Selection.of(survey(path := Path(again.file))["metadata"]) == made
     assert len(of(list(LogReader(path)), FRAME)) == FRAMES // 20
-    with pytest.raises(DataFileError, match="exists already"):
+    with pytest.raises(DataFileError, match="already exists"):
         thin((whole,), small, Selection(2))
 
 
@@ -193,7 +193,7 @@ def test_an_export_joins_what_is_there(small: Path, tmp_path: Path) -> None:
 def test_an_export_is_one_thing(whole: Path, words: list[str]) -> None:
     done = lowfc("export", whole, *words)
     assert isinstance(done.exception, ConfigurationError)
-    assert "choose one" in str(done.exception)
+    assert "use one" in str(done.exception)
 
 
 def test_what_it_will_take_is_said_before(tmp_path: Path) -> None:

@@ -127,7 +127,7 @@ def test_a_log_without_an_end_is_a_file_for_rerun(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("given", "complaint"),
     [
-        ({"web": True, "native": True}, "choose one"),
+        ({"web": True, "native": True}, "use one"),
         ({"foxglove": True, "web": True}, "--foxglove"),
         ({"run": "nosuch", "web": True}, "there is no run"),
         ({"logs": [Path("nothing.mcap")], "save": Path("x.rrd")}, "nothing.mcap"),

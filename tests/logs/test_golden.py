@@ -94,7 +94,7 @@ def test_it_is_looked_at(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["tune", NIGHT, "--out", "law.fits"], "a law is tuned from at least"),
+        (["tune", NIGHT, "--out", "law.fits"], "tuning requires at least"),
         (["acceptance", "linearity", NIGHT], "no `lowfc acceptance"),
     ],
 )

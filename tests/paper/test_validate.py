@@ -179,7 +179,7 @@ def test_a_fault_of_ours_is_not_called_a_users_mistake(monkeypatch):
 
 
 def test_the_command_prints_a_table_and_tells_who_names_a_sensor_where_that_changes_nothing():
-    told = "of the paper's own sensors, --sensor changes nothing there"
+    told = "for the paper's own sensors only, --sensor has no effect there"
     assert lowfc("validate", "table1", "--sensor", SAM).stderr.startswith(f"table1: {told}\n")
     done = lowfc("validate", "table1")
     assert told not in done.stderr

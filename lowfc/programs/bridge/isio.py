@@ -1,4 +1,4 @@
-"""`lowfc bridge isio`: a run's modes as ImageStreamIO streams, and the other channels of its mirror into the loop."""
+"""`lowfc bridge isio`: write modes to ImageStreamIO streams, and report other channels of the mirror to the loop."""
 
 import contextlib
 import sys
@@ -35,20 +35,24 @@ _REQUESTS_S = 0.1
 
 def bridge_isio(
     run: Annotated[str | None, typer.Option("--run", help="Name of the run; default: the only one.")] = None,
-    prefix: Annotated[str, typer.Option(help="First part of the streams' names.")] = "lowfc",
-    beside: Annotated[str, typer.Option(help="Channel of the loop: the mirror's others are left alone.")] = "",
-    external: Annotated[list[str] | None, typer.Option(help="Channel that is left alone; repeat.")] = None,
-    nm_per_unit: Annotated[float, typer.Option(min=1e-9, help="Surface that a unit of a channel makes.")] = 1000.0,
+    prefix: Annotated[str, typer.Option(help="Prefix of the streams' names.")] = "lowfc",
+    beside: Annotated[
+        str, typer.Option(help="Channel of the loop: it does not undo the mirror's other channels.")
+    ] = "",
+    external: Annotated[list[str] | None, typer.Option(help="Channel that the loop must not undo; repeat.")] = None,
+    nm_per_unit: Annotated[float, typer.Option(min=1e-9, help="Surface per unit of a channel, nm.")] = 1000.0,
 ) -> None:
     """Publish modal error, command, residual and flux as ImageStreamIO streams, until Ctrl-C.
 
-    With --beside or --external the loop also gets what other programs have on the mirror, so that it does not undo it.
+    With --beside or --external the loop also receives other programs' shapes on the mirror, and does not undo them.
 
     Example: lowfc bridge isio --run bench --beside dm00disp03
     """
     names = (*(external or ()), *channel_names(beside))
     if beside and not channel_names(beside):
-        raise ConfigurationError(f"--beside is a channel as dm00disp03, got {beside!r}; name the others by --external")
+        raise ConfigurationError(
+            f"--beside must be a channel such as dm00disp03, got {beside!r}; give other channels with --external"
+        )
     give_way()
     run_id, clock = the_known_run(run), HostClock()
     bus = ZenohBus(open_run(run_id, ()).links, Role.OPERATOR, clock, monitor=True)
@@ -99,7 +103,7 @@ class StepStreams:
 
 
 class ExternalChannels:
-    """What others have on the mirror, told to the loop whenever it changes, and to a controller that starts."""
+    """Shapes of other programs on the mirror, reported to the loop on every change and to a starting controller."""
 
     def __init__(self, client: Client, bus: Bus, names: Sequence[str], nm_per_unit: float) -> None:
         """Watch these channels of the mirror; a unit of theirs is so many nm of surface."""
@@ -133,7 +137,7 @@ class ExternalChannels:
             fault = str(error)
         if fault and fault != self._fault:
             names = ", ".join(self._others.names)
-            sys.stderr.write(f"the loop does not know of {names}: {printable(fault)}\n")
+            sys.stderr.write(f"{names} not reported to the loop: {printable(fault)}\n")
         self._fault = fault
 
 
@@ -143,7 +147,7 @@ def _made(name: str, columns: int) -> Stream:
     with contextlib.suppress(StreamAbsentError):
         stream = Stream(path)
         if pid := stream.other_writer():
-            raise StreamError(f"process {pid} writes stream {name!r}: stop it first, or choose another --prefix")
+            raise StreamError(f"process {pid} writes stream {name!r}: stop it first, or use another --prefix")
         if stream.layout.shape == (1, 1, columns) and stream.layout.dtype == np.float32:
             return stream
         path.unlink(missing_ok=True)

@@ -1,1 +1,1 @@
-"""`lowfc console`: a running loop on one screen, with buttons."""
+"""`lowfc console`: operate a running loop from one screen."""

@@ -1,4 +1,4 @@
-"""Every button of the console: its key, and what it does. Requests are those of `lowfc.client.requests`."""
+"""The buttons of the console with their keys and actions. Requests are those of `lowfc.client.requests`."""
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -13,11 +13,11 @@ from lowfc.control.loop.wording import AUTO
 from lowfc.programs.cli.modes import noll_of
 
 Values = Mapping[str, str]
-"""What an operator typed, by field."""
+"""Input of an operator, by field."""
 
 
 class Field(NamedTuple):
-    """One line of a form: a request's field or an option, what is expected, and what stands there at first."""
+    """One line of a form: a request's field or an option, its label and its initial value."""
 
     name: str
     label: str
@@ -25,10 +25,10 @@ class Field(NamedTuple):
 
 
 class Action(NamedTuple):
-    """One button, and the key that presses it.
+    """A button and its key.
 
-    Its fields are filled in first, or its question `confirm` is answered. Then it asks the loop, or starts the words
-    of `task` as a `lowfc` command, a process of its own, with the fields as options.
+    The operator first fills in its fields or answers its question `confirm`. Then it sends a request to the loop, or
+    starts `task` as a `lowfc` command in a separate process, with the fields as options.
     """
 
     key: str
@@ -75,13 +75,13 @@ _READERS: dict[str, tuple[str, Callable[[str], Any]]] = {
     "law": ("law", _law),
     "calibration": ("calibration", _calibration),
 }
-"""The client's argument, and how it is read, of each field of a request."""
+"""The client's argument and the parser of each field of a request."""
 _LABELS = {
     "modes": "modes: Noll indices as in 2,3 or 4-8; empty for all",
     "actuators": "shape: file (FITS or .npy), nm of surface; empty removes the channel",
     "law": "law: file (FITS); empty for the integrator",
     "calibration": "calibration: file (FITS)",
-    "step values": "frames: how many",
+    "step values": "number of frames",
     "gain values": "gain: one, or one for each mode; auto for automatic gains",
     "leak values": "leak: one, or one for each mode",
     "limit values": "limit: one, or one for each mode, nm rms of wavefront",
@@ -89,12 +89,12 @@ _LABELS = {
     "channel text": "name: up to 32 of a-z, 0-9 and -, a letter first",
     "note text": "note",
 }
-"""What a form says of each field of a request, by the field alone or with the request's name."""
+"""Label of each field of a request in a form, by the field or by request and field."""
 _LAST = "modes"
 
 
 def numbers(text: str) -> list[float]:
-    """Numbers with spaces or commas between; ConfigurationError where something else is there."""
+    """Numbers separated by spaces or commas; ConfigurationError for anything else."""
     try:
         return [float(word) for word in text.replace(",", " ").split()]
     except ValueError:
@@ -102,7 +102,7 @@ def numbers(text: str) -> list[float]:
 
 
 def requested(key: str, name: str, confirm: str = "") -> Action:
-    """A request as it is declared: its fields are a form."""
+    """The button of a declared request, with its fields as a form."""
     declared = BY_NAME[name]
 
     def ask(loop: Client, values: Values) -> Answer:
@@ -128,8 +128,8 @@ def _record(loop: Client, values: Values) -> Answer:
     return answer
 
 
-_OUT = Field("out", "out: file to be written (FITS)", lambda: f"calibration-{datetime.now(UTC):%Y%m%dT%H%M%S}.fits")
-_LOAD = Field(LOAD, "load: use it at once (yes, no); the loop must be open", lambda: "yes")
+_OUT = Field("out", "out: output file (FITS)", lambda: f"calibration-{datetime.now(UTC):%Y%m%dT%H%M%S}.fits")
+_LOAD = Field(LOAD, "load: load it into the loop, which must be open (yes, no)", lambda: "yes")
 _TARGET = (Field("target", "target"), Field("observer", "observer"))
 
 SAFE = requested("s", "safe")
@@ -142,30 +142,30 @@ ACTIONS = (
     requested("l", "leak"),
     requested("x", "limit"),
     requested("w", "law"),
-    Action("i", "no law", "Go back from a linear law to the integrator.", ask=lambda loop, _: loop.law()),
+    Action("i", "no law", "Return from a linear law to the integrator.", ask=lambda loop, _: loop.law()),
     requested("f", "offset"),
     requested("h", "channel"),
     requested("z", "reset"),
     requested("y", "stop"),
-    requested("k", "clear", confirm="Leave the safe state? The loop is open afterwards."),
+    requested("k", "clear", confirm="Leave safe mode? The loop is open afterwards."),
     Action(
         "d",
         "dark",
-        "Take a dark and find bad pixels. Block the star first: by starting it you say that it is dark.",
+        "Take a dark and find bad pixels. Block the star before you start it: it does not ask.",
         (Field("frames", "frames: how many are averaged", lambda: "400"), _OUT, _LOAD),
         task=("calibrate", "dark", "--dark-taken"),
     ),
     Action(
         "e",
         "reference",
-        "Take the present state of the wavefront as the zero point.",
+        "Take the present wavefront as the zero point.",
         (Field("frames", "frames: how many are averaged", lambda: "1000"), _OUT, _LOAD),
         task=("calibrate", "reference"),
     ),
     Action(
         "b",
         "calibrate",
-        "Measure a calibration with pokes of the mirror.",
+        "Measure a calibration by poking the mirror.",
         (
             Field("method", "method: poke, hadamard, in-loop", lambda: "hadamard"),
             Field("snr", "snr: signal-to-noise ratio to reach", lambda: "70"),
@@ -175,9 +175,9 @@ ACTIONS = (
         task=("calibrate",),
     ),
     requested("a", "load"),
-    Action("r", "record", "Begin a new log, with a note of target and observer.", _TARGET, _record),
+    Action("r", "record", "Start a new log, with a note of target and observer.", _TARGET, _record),
     Action("v", "end log", BY_NAME["record/stop"].sentence, ask=lambda loop, _: loop.record(False)),
     requested("n", "note"),
 )
-"""In their order on the screen."""
+"""Buttons in the order of the screen."""
 EVERY = {one.name: one for one in (*ACTIONS, SAFE)}

@@ -1,4 +1,4 @@
-"""The console's screen: what the run is like, five times a second, and its buttons."""
+"""The console's screen: state of the run, updated five times a second, and buttons."""
 
 import threading
 from collections.abc import Callable
@@ -41,9 +41,9 @@ _LEFT = 62
 _MOVED_EVERY = 10
 _OTHERS = (
     ("↑↓ ←→", "knobs", "Choose a gain knob and turn it: largest gain of its modes, whose ratios stay"),
-    ("u", "auto", "Let the gains of the chosen knob be automatic"),
-    ("m", "mute", "Ring the terminal's bell at errors, or do not"),
-    ("? q", "help, quit", "This help, or leave the console (nothing else ends)"),
+    ("u", "auto", "Set the gains of the chosen knob to automatic"),
+    ("m", "mute", "Switch the terminal's bell for errors on or off"),
+    ("? q", "help, quit", "This help, or leave the console (the loop goes on)"),
 )
 
 
@@ -139,7 +139,7 @@ class Console(OrderedKeys):
                 yield Gains()
                 yield Static(id="facts")
         yield Static(id="log")
-        yield Static("? shows what there is to press", id="answer", markup=False)
+        yield Static("? shows the keys", id="answer", markup=False)
         yield Static(id="tasks", markup=False)
         with Horizontal(id="keys"):
             with Grid(id="buttons"):
@@ -182,7 +182,7 @@ class Console(OrderedKeys):
         self._answer(f"the bell is {'off' if self._mute else 'on'}", good=True)
 
     def action_help(self) -> None:
-        """Show what there is to press."""
+        """Show the keys."""
         rows = [
             ("s F12", "SAFE", f"At once, in a form with F12: {SAFE.sentence}"),
             *((one.key, one.name, one.sentence) for one in ACTIONS),
@@ -208,7 +208,7 @@ class Console(OrderedKeys):
 
     def _do(self, action: Action, values: Values) -> None:
         """Start a task, or ask in a thread of its own: only the same button waits for an answer, and SAFE does not."""
-        self._answer(f"{action.name}: asked", good=True)
+        self._answer(f"{action.name}: requested", good=True)
         before = self._asking.get(action.name) if action is not SAFE else None
 
         def ask() -> None:

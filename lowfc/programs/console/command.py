@@ -8,14 +8,14 @@ from lowfc.contract.errors import ConfigurationError
 
 
 def console(run: AnyRun = None) -> None:
-    """Operate a running loop from one screen of a terminal, of 100 x 30 characters and more.
+    """Operate a running loop from one screen of a terminal, at least 100 x 30 characters.
 
-    What it shows is the view's verdict and figures; what it asks, `lowfc ctl` can ask, too. Key ? shows the keys.
+    It shows the verdict and figures of `lowfc view` and sends the requests of `lowfc ctl`. Key ? shows the keys.
 
     Example: lowfc console
     """
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
-        raise ConfigurationError("the console needs a terminal; `lowfc ctl` operates a loop without one")
+        raise ConfigurationError("the console requires a terminal; `lowfc ctl` operates a loop without one")
     from lowfc.adapters.process.realtime import give_way
 
     give_way()
@@ -27,7 +27,7 @@ def console(run: AnyRun = None) -> None:
 
 
 def _operated(run_id: str) -> bool:
-    """Operate a run until the operator leaves; true where it was begun anew meanwhile, and is to be joined again."""
+    """Operate a run until the operator leaves; True if the run restarted and must be joined again."""
     from lowfc.adapters.bus.run import open_run
     from lowfc.adapters.bus.zenoh_bus import ZenohBus
     from lowfc.adapters.process.join import clock_of

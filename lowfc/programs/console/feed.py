@@ -1,4 +1,4 @@
-"""What arrives from the run, as one reading several times a second: the verdict of the view's tiles, and figures."""
+"""Readings of the run, several times a second: the verdict of the view's tiles, and figures."""
 
 import threading
 import time
@@ -26,7 +26,7 @@ from lowfc.programs.view.verdicts.verdict import judge
 from lowfc.programs.view.verdicts.watcher import Watcher
 
 CUT_S = 1.5
-"""Without a message of any process for so long the console is cut off: each sends Health twice a second."""
+"""Time without a message of any process after which the console is disconnected: each sends Health twice a second."""
 TREND = 60
 """Seconds that the sparklines show, one value each."""
 _WAITING = {EVENT: 200, REQUEST: 200, STEP: 4000, TRUTH: 50}  # of the truth so many a reading are enough for an rms
@@ -36,7 +36,7 @@ _LATER, _LATER_S = ("lowfc.control.laws.tuning", "scipy.signal"), 4.0
 _AGAIN_S = 5.0  # after which a busy controller is asked again for what it has not answered
 _POINT_NS = 1_000_000_000
 _UNSEEN = frozenset(("status", "configuration", "renew"))
-"""Requests that change nothing, and come by themselves."""
+"""Periodic requests that change nothing."""
 
 
 class Reading(NamedTuple):
@@ -88,7 +88,7 @@ class Feed:
         later.start()
 
     def read(self) -> Reading:
-        """Take in what has come since the last call."""
+        """Process the messages received since the last call."""
         now_s, host_ns = time.monotonic(), self._clock.host_ns()
         behind_s, self._read_s = max(0.0, now_s - self._read_s - 0.5), now_s
         requests = [_request(sample) for sample in self._rings[REQUEST].drain()]

@@ -1,4 +1,4 @@
-"""What lies over the screen for a moment: the form of a button, and the help."""
+"""Overlays of the screen: the form of a button, and the help."""
 
 import re
 from collections.abc import Iterable
@@ -16,9 +16,9 @@ from textual.widgets import Button, Input, Label, Static
 from lowfc.programs.console.actions import Action
 
 HELP = (
-    "Top line: is all well; below it why. Bars: command of each mode, nm, between its limits. Press a key or click a "
-    "button. In a form: Tab next line, Enter do it, Escape leave. The answer is above the buttons; red: refused. "
-    "When the console ends, the loop and what was started here go on."
+    "Top line: verdict, with the reason below it. Bars: command of each mode, nm, between its limits. Press a key or "
+    "click a button. In a form: Tab next line, Enter send, Escape cancel. The answer is above the buttons; red: "
+    "refused. When the console ends, the loop and commands started here go on."
 )
 
 
@@ -27,7 +27,7 @@ _ENDS = re.compile(r"\. |; |, (?:and|whatever)|: it ")
 
 
 class Form(ModalScreen[None]):
-    """The fields of an action, or its question; it stays until the answer is good, and shows one that is not."""
+    """The fields of an action, or its question; it stays open until the request is accepted, and shows a refusal."""
 
     AUTO_FOCUS = "Input, #ok"
     BINDINGS: ClassVar[list[BindingType]] = [("escape", "dismiss", "leave")]
@@ -56,13 +56,13 @@ class Form(ModalScreen[None]):
                 yield Button("leave", id="leave", compact=True)
 
     def refuse(self, why: str) -> None:
-        """Show why it was refused."""
+        """Show the reason of a refusal."""
         self.query_one("#refusal", Static).update(why)
 
     @on(Input.Submitted)
     @on(Button.Pressed, "#ok")
     def _filled(self) -> None:
-        self.refuse("asked, waiting for the answer")
+        self.refuse("requested, waiting for the answer")
         self.post_message(self.Filled(self.what, {one.name or "": one.value.strip() for one in self.query(Input)}))
 
     @on(Button.Pressed, "#leave")
@@ -71,7 +71,7 @@ class Form(ModalScreen[None]):
 
 
 class Help(ModalScreen[None]):
-    """What there is to press."""
+    """The keys and buttons."""
 
     BINDINGS: ClassVar[list[BindingType]] = [
         (key, "dismiss", "leave") for key in ("escape", "question_mark", "q", "enter")

@@ -1,4 +1,4 @@
-"""What happened and what was asked, newest last; an event that comes again and again has one line."""
+"""Events and requests, newest last; a repeated event has one line."""
 
 import re
 from collections import deque
@@ -10,7 +10,7 @@ from lowfc.programs.console import panels
 
 _MOST = 200
 _WITHIN_S = 10.0
-"""An event that comes again within this time is shown once, with how often it came."""
+"""An event repeated within this time is shown once, with its count."""
 _LOOKED_AT = 8
 _DIGITS = re.compile(r"\d+")
 

@@ -1,4 +1,4 @@
-"""The parts of the screen as text: a reading in, lines out."""
+"""The parts of the screen as lines of text, from a reading."""
 
 import re
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ _MODE_LINES = 7
 _SPARKS = "▁▂▃▄▅▆▇█"
 _NEAR_LIMIT = 0.95
 _GAINS = re.compile(r", gain .*?(?=, leak|;)")
-"""What the knobs show already."""
+"""Part of the law's text that the knobs already show."""
 
 
 @lru_cache(maxsize=4096)
@@ -42,13 +42,13 @@ DIM, WARNED, WRONG, BOLD = style(GREY), style(YELLOW), style(RED, bold=True), st
 
 
 def verdict(reading: Reading, run: str) -> tuple[Level, str]:
-    """The verdict in words, or that there is no connection."""
+    """Text of the verdict, or of a lost connection."""
     if reading.silent_s is None:
-        return Level.WARNING, f"NOT CONNECTED  no message of run {run} has come yet"
+        return Level.WARNING, f"NOT CONNECTED  no message of run {run} yet"
     if not reading.connected:
         return Level.BAD, (
             f"NOT CONNECTED  no message of run {run} for {duration(reading.silent_s)}: figures are hidden. The run was "
-            "killed, or this console is cut off; a loop that runs goes on by itself."
+            "killed, or this console is disconnected; a running loop goes on by itself."
         )
     return reading.verdict.level, f"{WORD[reading.verdict.level]}  {phrased(reading.verdict.headline)}".strip()
 
@@ -59,7 +59,7 @@ def clock(host_ns: int) -> str:
 
 
 def tiles(reading: Reading) -> list[Text]:
-    """A line for each tile: its title, word or figure, and what that means."""
+    """A line for each tile: title, word or figure, and explanation."""
     lines = []
     for tile in reading.verdict.tiles:
         line = Text.assemble((f"{tile.title:10}", DIM), f"{WORD[tile.level]:5} ")
@@ -162,7 +162,7 @@ def _mode(noll: int, command_nm: float, limit_nm: float, width: int) -> Text:
 
 
 def facts(reading: Reading) -> Text:
-    """What is set: law, offset and channels, who has reserved the loop, the last note."""
+    """Settings: law, offset and channels, reservation of the loop, the last note."""
     known, state = reading.verdict.facts, reading.state.snapshot.controller
     law = _GAINS.sub("", known["CONTROL LAW"])
     rows = {"law": law, "shapes": known["OFFSET AND CHANNELS"], "note": known["LAST NOTE"]}
@@ -172,7 +172,7 @@ def facts(reading: Reading) -> Text:
 
 
 def peers(reading: Reading, run: str) -> Text:
-    """Who is alive, and at what rate; in red who is silent."""
+    """Processes and their rates; silent ones in red."""
     line = Text(f"run {run} ", DIM)
     snapshot = reading.state.snapshot
     for name, last in sorted(snapshot.health.items()):
@@ -188,7 +188,7 @@ def peers(reading: Reading, run: str) -> Text:
 
 
 def event_line(event: Log, times: int = 1) -> Text:
-    """An event, and how often it came."""
+    """An event and its count."""
     ink = WRONG if event.level >= Severity.ERROR else WARNED if event.level >= Severity.WARNING else style()
     return Text.assemble(
         (f"{clock(from_timestamp(event.timestamp))} ", DIM),
@@ -199,7 +199,7 @@ def event_line(event: Log, times: int = 1) -> Text:
 
 
 def request_line(asked: wire.Request) -> Text:
-    """What was asked, by whom, the answer, and the frame from which it is in force."""
+    """A request with requester, answer, and the frame from which it is in force."""
     fields = [numbers(list(asked.values)), printable(asked.text)]
     if asked.modes:
         fields.append(f"modes {','.join(map(str, asked.modes))}")
@@ -207,7 +207,7 @@ def request_line(asked: wire.Request) -> Text:
     return Text.assemble(
         (f"{clock(from_timestamp(asked.timestamp))} ", DIM),
         (" ".join(filter(None, [printable(asked.name), *fields])), BOLD),
-        (f" ({printable(asked.requester) or 'who is not said'}): ", DIM),
+        (f" ({printable(asked.requester) or 'unknown requester'}): ", DIM),
         (f"{reply}, from frame {count_of(asked.frame_sequence)} on", style())
         if asked.accepted
         else (f"refused: {reply}", WRONG),

@@ -1,4 +1,4 @@
-"""Sentences of the loop as the console says them: its own keys in place of commands, ranges in place of long lists."""
+"""Adaptation of the loop's sentences to the console: its keys instead of commands, ranges instead of long lists."""
 
 import re
 

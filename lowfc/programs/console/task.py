@@ -1,4 +1,4 @@
-"""A command that the console starts: a process of its own, which goes on when the console ends, however it ends."""
+"""A command started by the console, in a separate process that outlives the console."""
 
 import os
 import subprocess

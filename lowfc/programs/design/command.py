@@ -1,4 +1,4 @@
-"""The commands `lowfc design ...`: arguments only; the work is elsewhere."""
+"""The commands `lowfc design ...`: arguments only."""
 
 import os
 from dataclasses import fields
@@ -16,7 +16,7 @@ from lowfc.programs.design.options import flag, with_options_of
 from lowfc.programs.design.sam_request import Search
 
 Keys = Annotated[Path, typer.Option(help="Configuration file.")]
-Drawn = Annotated[Path | None, typer.Option(help="Draw the figures over the sizes (PNG).")]
+Drawn = Annotated[Path | None, typer.Option(help="Plot the figures of merit against size (PNG).")]
 
 design_app = new_app("Design masks and sensors.\n\nExample: lowfc design spc --help")
 
@@ -26,10 +26,10 @@ design_app = new_app("Design masks and sensors.\n\nExample: lowfc design spc --h
 def spc(
     request: Request,
     out: Annotated[Path, typer.Option(help="Mask file.")] = Path("spc.npz"),
-    plot: Annotated[Path | None, typer.Option(help="Draw mask, image and contrast (PNG).")] = None,
+    plot: Annotated[Path | None, typer.Option(help="Plot mask, image and contrast (PNG).")] = None,
     as_json: Json = False,
 ) -> None:
-    """Design a shaped pupil: by linear programs, the most open mask with a dark zone beside the star.
+    """Design a shaped pupil: the most open mask with a dark zone beside the star, by linear programs.
 
     Example: lowfc design spc --outer 12 --cells 64 --out spc.npz
     """
@@ -49,14 +49,12 @@ def sam(
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes. Default: one for each core.")] = None,
     scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler, to use its workers.")] = None,
     out: Annotated[Path | None, typer.Option(help="Layout file (.json). Default: the layout's name.")] = None,
-    resume: Annotated[
-        Path | None, typer.Option(help="State file of an interrupted search, which it goes on with.")
-    ] = None,
-    front: Annotated[Path | None, typer.Option(help="Write a table of every chain's best (CSV).")] = None,
-    plot: Annotated[Path | None, typer.Option(help="Draw every chain's best (PNG).")] = None,
+    resume: Annotated[Path | None, typer.Option(help="State file of an interrupted search to continue.")] = None,
+    front: Annotated[Path | None, typer.Option(help="Write a table of each chain's best layout (CSV).")] = None,
+    plot: Annotated[Path | None, typer.Option(help="Plot each chain's best layout (PNG).")] = None,
     as_json: Json = False,
 ) -> None:
-    """Search for a sparse aperture mask: where its holes are, how large and how many. Ctrl-C keeps the best so far.
+    """Search for a sparse aperture mask: position, size and number of holes. Ctrl-C keeps the best so far.
 
     Example: lowfc design sam --diameter 0.05:0.2 --holes 8:30 --chains 4 --out mask.json
     """
@@ -68,7 +66,7 @@ def sam(
         names = [field.name for field in fields(Search)]
         given = [name for name in names if str(context.get_parameter_source(name)).endswith("COMMANDLINE")]
         if given:
-            raise ConfigurationError(f"--resume goes on with the search of {resume}: leave out {flag(given[0])}")
+            raise ConfigurationError(f"--resume continues the search of {resume}: omit {flag(given[0])}")
         search, found = resumed(resume)
     else:
         found = begin(search)

@@ -1,4 +1,4 @@
-"""The command `lowfc gateway`: what is offered and by which protocol, until it is stopped."""
+"""The command `lowfc gateway`: offer a run to a control system until stopped."""
 
 import contextlib
 import signal
@@ -21,13 +21,13 @@ from lowfc.programs.gateway.watch import Watch
 PERIOD_S = 0.1
 """Of all variables."""
 TURN_S = 0.005
-"""Least time between two looks, however fast a variable changes."""
+"""Shortest time between two updates, however fast a variable changes."""
 BENCH_PERIOD_S = 0.25
 """How often a bench value is published again while its variable is connected."""
 
 
 def epics(run: AnyRun = None, config: ConfigFile = None) -> None:
-    """Offer a run by EPICS PV Access: figures as PVs, requests as puts, and PVs of others as bench values.
+    """Offer a run by EPICS PV Access: figures as PVs, requests as puts, and other servers' PVs as bench values.
 
     Example: lowfc gateway epics --run bench
     """

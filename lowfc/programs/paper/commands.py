@@ -1,4 +1,4 @@
-"""The command `lowfc validate`: arguments only; the work is elsewhere."""
+"""The command `lowfc validate`: arguments only."""
 
 import os
 import sys
@@ -16,9 +16,9 @@ TABLES = (
 )
 
 BEYOND = ("anchors", "tolerance")
-"""Tables of ours that are not among `all`, which are the paper's."""
+"""Additional tables, not included in `all`, which are the paper's."""
 OF_THE_PAPER = ("table1", "photometry")
-"""What compares the paper's own sensors and takes no others."""
+"""Tables and figures for the paper's own sensors only."""
 
 
 def validate(
@@ -30,8 +30,10 @@ def validate(
             show_default=False,
         ),
     ],
-    trials: Annotated[int, typer.Option(min=2, max=1_000_000, help="Wavefronts, and noise realisations.")] = 100,
-    seed: Annotated[int, typer.Option(min=0, help="Of all random numbers.")] = 1,
+    trials: Annotated[
+        int, typer.Option(min=2, max=1_000_000, help="Number of wavefronts and noise realisations.")
+    ] = 100,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 1,
     jobs: Annotated[int | None, typer.Option(min=1, help="Threads. Default: one for each core.")] = None,
     sensor: Annotated[
         list[str] | None,
@@ -43,7 +45,7 @@ def validate(
         ),
     ] = None,
     plots: Annotated[
-        Path | None, typer.Option(help="Folder for drawings of the figures (PNG).", show_default=False)
+        Path | None, typer.Option(help="Folder for plots of the figures (PNG).", show_default=False)
     ] = None,
     docs: Annotated[
         Path | None,
@@ -54,7 +56,7 @@ def validate(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")] = False,
 ) -> None:
-    """Reproduce the paper's tables and figures: paper, measured, limit and assumption.
+    """Reproduce the paper's tables and figures; each row has paper, measured, limit and assumption.
 
     Example: lowfc validate table3 table4 --trials 20
     """
@@ -77,7 +79,7 @@ def validate(
     context = Context(trials, seed, jobs or len(os.sched_getaffinity(0)), tuple(sensor) if sensor else None)
     fixed = [name for name in wanted if name in OF_THE_PAPER]
     if sensor and fixed:
-        typer.echo(f"{', '.join(fixed)}: of the paper's own sensors, --sensor changes nothing there", err=True)
+        typer.echo(f"{', '.join(fixed)}: for the paper's own sensors only, --sensor has no effect there", err=True)
     found = run(wanted, context, plots if docs is None else docs / PICTURES)
     if docs is not None and pages:
         for table in found:

@@ -14,25 +14,25 @@ from lowfc.programs.view.draw.tabs import Tab
 
 def view(
     logs: LogsIfAny = None,
-    native: Annotated[bool, typer.Option("--native", help="In a window of its own.")] = False,
-    web: Annotated[bool, typer.Option("--web", help="In a browser, at an address of this host.")] = False,
-    save: Annotated[Path | None, typer.Option(help="Into a file (RRD) that rerun opens.")] = None,
-    headless_screenshot: Annotated[Path | None, typer.Option(help="As a picture (PNG), without a screen.")] = None,
-    foxglove: Annotated[bool, typer.Option("--foxglove", help="For Foxglove, by its WebSocket protocol.")] = False,
-    tab: Annotated[Tab, typer.Option(help="Tab that is opened.")] = Tab.OPERATOR,
+    native: Annotated[bool, typer.Option("--native", help="Show in a window.")] = False,
+    web: Annotated[bool, typer.Option("--web", help="Serve a page for a browser on this host.")] = False,
+    save: Annotated[Path | None, typer.Option(help="Write a file (RRD) for rerun.")] = None,
+    headless_screenshot: Annotated[Path | None, typer.Option(help="Write a picture (PNG), without a screen.")] = None,
+    foxglove: Annotated[bool, typer.Option("--foxglove", help="Serve Foxglove by its WebSocket protocol.")] = False,
+    tab: Annotated[Tab, typer.Option(help="Tab to open.")] = Tab.OPERATOR,
     seconds: Annotated[
-        float | None, typer.Option(min=0.1, help="Look at a running loop for so long; for a picture: 8 s.")
+        float | None, typer.Option(min=0.1, help="Show a running loop for this long; default for a picture: 8 s.")
     ] = None,
     run: Annotated[str | None, typer.Option("--run", help="Name of the run; default: the only one.")] = None,
     config: ConfigFile = None,
-    memory_mb: Annotated[float, typer.Option(min=16, help="What the viewer keeps of the past.")] = 512.0,
+    memory_mb: Annotated[float, typer.Option(min=16, help="Memory of the viewer for past data, MB.")] = 512.0,
     port: Annotated[int | None, typer.Option(min=0, max=65535, help="TCP port of the stream, or of Foxglove.")] = None,
     web_port: Annotated[int | None, typer.Option(min=1, max=65535, help="TCP port of the page.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object at the end.")] = False,
 ) -> None:
-    """Look at a running loop, or at logs: in a window, a browser, a picture or a file.
+    """Show a running loop or logs in a window, a browser, a picture or a file.
 
-    Without an option it is a window, or a page for the browser where there is no screen.
+    Default: a window, or a page for a browser if there is no screen.
 
     Example: lowfc view --web
     """

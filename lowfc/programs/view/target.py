@@ -40,10 +40,10 @@ class Target:
         named = {"--native": self.native, "--web": self.web} | {option: file for option, (file, _) in files.items()}
         chosen = [name for name, wanted in named.items() if wanted]
         if len(chosen) > 1:
-            raise ConfigurationError(f"a view is in one place; got {' and '.join(chosen)}: choose one")
+            raise ConfigurationError(f"a view has one target; got {' and '.join(chosen)}: use one")
         for option, (file, suffix) in files.items():
             if file is not None and file.suffix != suffix:
-                raise ConfigurationError(f"{option} writes a file that ends in {suffix}; got {file}")
+                raise ConfigurationError(f"{option} requires a file name that ends in {suffix}; got {file}")
         if self.port and self.port == self.web_port:
             raise ConfigurationError(f"--port and --web-port must differ; both are {self.port}")
         free = free_ports(2)  # now, so that a viewer that is started again is where it was

@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from lowfc.programs.commissioning.acceptance.played import Played
 
 acceptance_app = new_app(
-    "Measure whether a loop does what it must: live, or again from the log of it.\n\n"
-    "Exit status 0 only where it passed.\n\nExample: lowfc acceptance rejection"
+    "Test a loop against its requirements, live or from its log.\n\n"
+    "Exit status 0 only if it passed.\n\nExample: lowfc acceptance rejection"
 )
 
-Plot = Annotated[Path | None, typer.Option(help="Draw it into this file (PNG).", show_default=False)]
+Plot = Annotated[Path | None, typer.Option(help="Plot the result to this file (PNG).", show_default=False)]
 Required = Annotated[
     Path | None,
     typer.Option("--config", help="Configuration with the requirements; default: the loop's own.", show_default=False),
@@ -35,9 +35,9 @@ def rejection(
     logs: LogsIfAny = None,
     duration: Annotated[float, typer.Option(min=0.1, max=1e5, help="Seconds of the multisine.")] = 60.0,
     rms_nm: Annotated[float, typer.Option(min=1e-3, max=1e3, help="Wavefront rms of each mode.")] = 5.0,
-    lines: Annotated[int, typer.Option(min=1, max=1000, help="Frequencies of each mode.")] = 12,
+    lines: Annotated[int, typer.Option(min=1, max=1000, help="Number of frequencies of each mode.")] = 12,
     modes: Modes = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the multisine's phases.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the multisine's phases.")] = 1,
     config: Required = None,
     run: AnyRun = None,
     plot: Plot = None,
@@ -57,14 +57,14 @@ def rejection(
 def linearity(
     logs: LogsIfAny = None,
     hold: Annotated[int, typer.Option(min=2, help="Frames at each level.")] = 10,
-    cycles: Annotated[int, typer.Option(min=2, help="Times that each amplitude is pushed and pulled.")] = 20,
+    cycles: Annotated[int, typer.Option(min=2, help="Push-pull cycles of each amplitude.")] = 20,
     modes: Modes = None,
     config: Required = None,
     run: AnyRun = None,
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
-    """Measure gain and cross-talk of each mode against its size, with the loop open.
+    """Measure gain and cross-talk of each mode against its amplitude, with the loop open.
 
     Example: lowfc acceptance linearity --modes 2,3
     """
@@ -83,7 +83,7 @@ def capture_range(
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
-    """Measure from how large a wavefront the loop closes.
+    """Measure the largest wavefront error from which the loop closes.
 
     Example: lowfc acceptance capture-range --modes 2-6
     """
@@ -96,13 +96,13 @@ def capture_range(
 @acceptance_app.command("noise-floor")
 def noise_floor(
     logs: LogsIfAny = None,
-    duration: Annotated[float, typer.Option(min=0.01, max=1e5, help="Seconds open, and seconds closed.")] = 10.0,
+    duration: Annotated[float, typer.Option(min=0.01, max=1e5, help="Seconds in open loop and in closed loop.")] = 10.0,
     config: Required = None,
     run: AnyRun = None,
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
-    """Measure the white noise of each mode, and compare it with that of photons and read-out.
+    """Measure the white noise of each mode, and compare it with photon and read noise.
 
     Example: lowfc acceptance noise-floor --duration 10
     """
@@ -122,7 +122,7 @@ def _carry_out(
     *,
     by_instrument: bool = False,
 ) -> None:
-    """Judge what was played in a log, or play it now; draw and print the result, and end with the verdict."""
+    """Evaluate a test from a log or run it now; plot and print the result, and exit with the verdict."""
     from rich.console import Console
     from rich.progress import TimeRemainingColumn
 
@@ -141,7 +141,7 @@ def _carry_out(
     figure = None if plot is None else figure_class()(figsize=(10, 5), layout="constrained")  # or it says why not, now
     if logs:
         if run is not None:
-            raise ConfigurationError("a log, or a running loop (--run): choose one")
+            raise ConfigurationError("a log and a running loop (--run) exclude each other: use one")
         log = WholeLog(the_one(logs), skip_damaged=True)
         if plot is not None:
             refuse_log(plot, log.path)
@@ -150,7 +150,7 @@ def _carry_out(
             sys.stderr.write(f"warning: {remark}\n")
         every = logged(history, test.KIND)
         if history.configuration is None or history.calibration is None:
-            raise DataFileError(f"{log.path}: has no configuration, which says what is required")
+            raise DataFileError(f"{log.path}: has no configuration and so no requirements")
         known, calibration = history.configuration, history.calibration
     else:
         with Client(run) as client, counting_bar(Console(stderr=True), TimeRemainingColumn()) as count:

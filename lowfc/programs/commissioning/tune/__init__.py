@@ -1,1 +1,1 @@
-"""`lowfc tune`: the best law for a log or a running loop."""
+"""`lowfc tune`: find the best law for a log or a running loop."""

@@ -1,4 +1,4 @@
-"""The command `lowfc tune`: the best control law for a log, or for a loop that is running."""
+"""The command `lowfc tune`: find the best control law for a log or a running loop."""
 
 from functools import partial
 from pathlib import Path
@@ -20,14 +20,14 @@ Kind = Literal["integrator", "pi-notch", "lqg"]
 def tune(
     logs: LogsIfAny = None,
     controller: Annotated[Kind, typer.Option(help="Kind of law.")] = "integrator",
-    live: Annotated[float | None, typer.Option(min=1.0, help="Seconds for which a running loop is observed.")] = None,
+    live: Annotated[float | None, typer.Option(min=1.0, help="Observe a running loop for this many seconds.")] = None,
     out: Annotated[Path | None, typer.Option(help="Write the law to this file (FITS).")] = None,
-    apply: Annotated[bool, typer.Option("--apply", help="Give the gains, or the law, to the running loop.")] = False,
+    apply: Annotated[bool, typer.Option("--apply", help="Apply the gains or the law to the running loop.")] = False,
     plot: Annotated[Path | None, typer.Option(help="Draw spectra into this file (PNG).")] = None,
     run: AnyRun = None,
     as_json: Json = False,
 ) -> None:
-    """Find the best gains, notches or Kalman filter for what shakes the wavefront, with margins.
+    """Find the best gains, notches or Kalman filter for the measured disturbance, with stability margins.
 
     Example: lowfc tune last --controller lqg --out lqg.fits --plot lqg.png
     """
@@ -43,7 +43,7 @@ def tune(
     from lowfc.programs.logs.guard import refuse_log
 
     if bool(logs) == (live is not None):
-        raise ConfigurationError("name one LOG, or listen to a running loop with --live SECONDS")
+        raise ConfigurationError("give one LOG, or observe a running loop with --live SECONDS")
     console = Console(stderr=True)
     require_folder(out, plot)
     if logs:
@@ -85,7 +85,7 @@ def integrate(loop: "Client", gains: list[float], noll: tuple[int, ...]) -> "Ans
     before = driving(loop.status().state, loop.laws())
     if before is None:
         return loop.gain(gains, noll)
-    loop.law(None)  # another law has no gains
+    loop.law(None)  # only the integrator has gains
     try:
         return loop.gain(gains, noll)
     except BaseException as fault:
@@ -93,7 +93,7 @@ def integrate(loop: "Client", gains: list[float], noll: tuple[int, ...]) -> "Ans
             loop.law(before)
         except LowfcError as another:
             raise RequestRefusedError(
-                f"{fault}; the integrator drives the mirror now, for the law {before.name!r} could not be put back: "
-                f"{another}"
+                f"{fault}; the integrator now drives the mirror, because the law {before.name!r} could not be "
+                f"restored: {another}"
             ) from None
         raise

@@ -1,4 +1,4 @@
-"""What a law is tuned from: pseudo-open-loop modes of a log, or of a loop that is running."""
+"""Data for tuning: pseudo-open-loop modes of a log or of a running loop."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -33,21 +33,21 @@ _SETTLING_S = 0.5  # after the loop was closed
 
 @dataclass(frozen=True, slots=True)
 class Telemetry:
-    """Modes of a run, nm rms of wavefront, and the law it ran under.
+    """Modes of a run, nm rms of wavefront, and its law.
 
     Attributes:
         source: path of the log, or name of the run.
         noll: Noll index of each mode.
-        timing: the true one, as far as it is known.
-        law: the integrator's gains; `driving` is the linear law in its place, where there was one.
+        timing: the true one, as far as known.
+        law: the integrator's gains; `driving` is the linear law in force instead, if any.
         closed: whether the rows are of a closed loop.
         pol: (frames, modes) pseudo-open-loop, in pieces.
         error: (frames, modes) of the same frames.
-        true_nm2: (modes, modes) mean products of the true residual over them; None where nobody knows it.
-        nm_per_mas: of tilt; None where the telescope's size is not known.
-        contrast: what the modes cost, and `noise_nm2` the covariance (modes, modes) of one frame's noise as computed;
-            None without a science image.
-        warnings: what makes the figures less sure.
+        true_nm2: (modes, modes) mean products of the true residual over them; None if unknown.
+        nm_per_mas: of tilt; None if the telescope's size is unknown.
+        contrast: contrast added by the modes, with `noise_nm2`, the computed covariance (modes, modes) of one frame's
+            noise; None without a science image.
+        warnings: doubts about the figures.
     """
 
     source: str
@@ -67,9 +67,9 @@ class Telemetry:
 
 
 def of_log(log: LogReader) -> Telemetry:
-    """The frames of a log that were used while the loop was closed; all of them, where it hardly was.
+    """The used closed-loop frames of a log; all used frames if there are too few of them.
 
-    What was played, by an acceptance test for one, is nothing that a law shall learn: those frames are left out.
+    Frames with a probe sequence, as in an acceptance test, are excluded: a law must not learn from them.
     """
     history = read_history(log)
     run = LoggedRun(history)
@@ -81,12 +81,12 @@ def of_log(log: LogReader) -> Telemetry:
     warnings = list(history.remarks)
     if not same:
         warnings.append(
-            f"the controller reckoned with a delay of {run.controller_delay:g} frames, measured from "
+            f"the controller assumed a delay of {run.controller_delay:g} frames, but measured from "
             f"{run.measured_from} it is {run.measured_delay:.2f}: the law is made for {run.delay_frames:g} frames; set "
             "control.delay_frames"
         )
     if log.damage:
-        warnings.append("the log is damaged; what cannot be read is left out")
+        warnings.append("the log is damaged; unreadable parts are left out")
     config = history.configuration
     return _telemetry(
         str(log.path),
@@ -103,15 +103,15 @@ def of_log(log: LogReader) -> Telemetry:
 
 
 def of_run(loop: Client, seconds: float, progress: Callable[[float], None] | None = None) -> Telemetry:
-    """The steps that a running loop makes in the next seconds."""
+    """The steps of a running loop in the next seconds."""
     state = loop.status().state
     calibration = loop.calibration()
     config = configuration_of(loop)
     if seconds * config.camera.rate_hz < FEWEST:
         needed_s = FEWEST / config.camera.rate_hz
         raise DataFileError(
-            f"run {loop.run_id!r}: a law is tuned from at least {FEWEST} frames in a row, {needed_s:.3g} s at "
-            f"{config.camera.rate_hz:g} Hz; asked for {seconds:g} s: --live {np.ceil(1.2 * needed_s):.0f}"
+            f"run {loop.run_id!r}: tuning requires at least {FEWEST} consecutive frames, {needed_s:.3g} s at "
+            f"{config.camera.rate_hz:g} Hz, but got {seconds:g} s: use --live {np.ceil(1.2 * needed_s):.0f}"
         )
     watch = _watched(loop)
     begun_s = time.monotonic()
@@ -128,7 +128,7 @@ def of_run(loop: Client, seconds: float, progress: Callable[[float], None] | Non
             break
     stream.close()
     if state is None or not state.gain:
-        raise DataFileError(f"run {loop.run_id!r} has no calibration yet: `lowfc ctl load` gives it one")
+        raise DataFileError(f"run {loop.run_id!r} has no calibration: load one with `lowfc ctl load`")
     made = of_steps(steps, len(calibration.noll))
     period_s = float(np.median(np.diff(made.time_ns))) * 1e-9 if len(steps) > 1 else 0.0
     rate_hz = 1 / period_s if period_s > 0 else config.camera.rate_hz
@@ -142,19 +142,19 @@ def of_run(loop: Client, seconds: float, progress: Callable[[float], None] | Non
         None,
         config,
         calibration,
-        [f"{counted(stream.lost, 'step')} did not get here in time"] if stream.lost else [],
+        [f"{counted(stream.lost, 'step')} lost on the way to this command"] if stream.lost else [],
     )
 
 
 def _watched(loop: Client) -> MirrorWatch | None:
     try:
         return loop.mirror_watch()
-    except BusError:  # a mirror of somebody's own need not report
+    except BusError:  # a user's mirror need not report
         return None
 
 
 def _timing(delay: float, exposure: float, steps: Steps, watch: MirrorWatch | None, rate_hz: float) -> Timing:
-    """When commands are applied, by the times at which the mirror reported the last ones."""
+    """Times at which commands are applied, from the mirror's latest reports."""
     ended_ns = dict(zip(steps.sequence.tolist(), steps.time_ns.tolist(), strict=True))
     applied = () if watch is None else watch.applied
     waited_ns = [time_ns - ended_ns[sequence] for sequence, time_ns in applied if sequence in ended_ns]
@@ -185,8 +185,8 @@ def _telemetry(
         pol = pieces(steps.sequence[rows], steps.pol_nm[rows])
     if _longest(pol) < FEWEST:
         raise DataFileError(
-            f"{source}: a law is tuned from at least {FEWEST} frames in a row, {FEWEST / rate_hz:.2g} s; the longest "
-            f"run of good ones has {_longest(pol)}"
+            f"{source}: tuning requires at least {FEWEST} consecutive frames, {FEWEST / rate_hz:.2g} s; the longest "
+            f"stretch of good frames has {_longest(pol)}"
         )
     contrast = contrast_of(config) if config is not None and config.noll == calibration.noll else None
     there_nm = None if true_nm is None or not np.isfinite(true_nm[rows]).all() else true_nm[rows].astype(float)

@@ -1,4 +1,4 @@
-"""The result of `lowfc tune`: what the loop leaves now and what a tuned law would."""
+"""The result of `lowfc tune`: the present residual and the predicted one of the tuned law."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -31,7 +31,7 @@ from lowfc.programs.cli.result import Result, figure
 from lowfc.programs.commissioning.tune.data import Telemetry
 
 OPTICAL_GAIN_MAS = 10.0
-"""Tilt of an open loop, rms per axis, above which the sensor shows less than there is."""
+"""Open-loop tilt, rms per axis, above which the optical gain of the sensor is low."""
 
 
 def tuned(run: Telemetry, controller: str) -> tuple[Tuned, Gains]:
@@ -49,19 +49,19 @@ def tuned(run: Telemetry, controller: str) -> tuple[Tuned, Gains]:
 
 
 def law_now(run: Telemetry) -> LinearLaw:
-    """The law that the run ended with."""
+    """The last law of the run."""
     return run.driving or integrator(run.law.gain, run.law.leak, run.noll, run.timing.delay, run.rate_hz)
 
 
 class TunedMode(Result):
-    """A mode: residual now and under the tuned law, nm rms of wavefront, with the margins of the latter."""
+    """A mode: residual now and with the tuned law, nm rms of wavefront, and the margins of the tuned law."""
 
     noll: int = figure("mode", form="Z{}")
     name: str = figure("name")
     gain_now: float | None = figure("gain now", form=".3g")
     gain_best: float = figure("best", form=".2f")
     achieved_nm: float | None = figure("achieved", "nm", ".3f")
-    predicted_now_nm: float | None = figure("in theory", "nm", ".3f")
+    predicted_now_nm: float | None = figure("theory", "nm", ".3f")
     kind: str = figure("tuned to")
     predicted_nm: float = figure("predicted", "nm", ".3f")
     integrator_predicted_nm: float = figure()
@@ -72,13 +72,13 @@ class TunedMode(Result):
     lines: list[dict[str, float]] = figure()
 
     def remarks(self) -> Sequence[str]:
-        """The lines that were found, behind its row."""
+        """The detected lines, after the row."""
         shown = [f"{line['frequency_hz']:.2f} Hz ({line['rms_nm']:.2g} nm)" for line in self.lines]
         return [", ".join(shown)] if shown else []
 
 
 class TuneResult(Result):
-    """The best law of a kind for a run, and what it would leave."""
+    """The best law of a kind for a run, and its predicted residual."""
 
     source: str = figure()
     controller: str = figure()
@@ -99,14 +99,14 @@ class TuneResult(Result):
     applied: str | None = figure(default=None)
 
     def head(self) -> Sequence[str]:
-        """What the law was tuned from."""
+        """Source of the tuning data."""
         return [
             f"{self.source}: {counted(self.frames, 'frame')} at {self.rate_hz:.4g} Hz, loop "
             f"{'closed' if self.closed else 'open'}, delay {self.delay_frames:.2f} frames, law {self.law_now}"
         ]
 
     def remarks(self) -> Sequence[str]:
-        """Tilt and contrast, warnings, and what came of it."""
+        """Tilt and contrast, warnings, and the actions taken."""
         tilt = {name: rms for name, rms in self.tilt_mas.items() if rms is not None}
         names = {"predicted": f"predicted ({self.controller})", "integrator_predicted": "best integrator"}
         cases = ", ".join(f"{names.get(name, name)} {rms:.2f}" for name, rms in tilt.items())
@@ -120,13 +120,13 @@ class TuneResult(Result):
 
 
 def result_of(run: Telemetry, best: Tuned, gains: Gains, controller: str) -> TuneResult:
-    """What a tuned law would leave of a run, beside what was left."""
+    """Predicted residual of a tuned law, with the residual of the run."""
     now = law_now(run)
     leak = run.law.leak.astype(np.float64)
     integrator_nm = tune_integrator(best.models, gains, run.noll, leak, run.timing).predicted_nm
     now_nm = predicted_nm(now, best.models, run.timing) if margins.margins(now, run.timing.delay).stable else None
     achieved_nm = _achieved_nm(run, gains.noise_nm)
-    if achieved_nm is not None and now_nm is not None:  # nobody has looked between two frames
+    if achieved_nm is not None and now_nm is not None:  # not measured between frames
         sampled_nm = predicted_nm(now, best.models, Timing.sampled(run.timing.delay))
         achieved_nm = np.sqrt(np.maximum(achieved_nm**2 + now_nm**2 - sampled_nm**2, 0.0))
     columns = {
@@ -178,7 +178,7 @@ def result_of(run: Telemetry, best: Tuned, gains: Gains, controller: str) -> Tun
 
 
 def picture(run: Telemetry, best: Tuned) -> bytes:
-    """PNG: spectra of the two largest modes: as it was, as modelled, and what the tuned law would leave."""
+    """PNG: spectra of the two largest modes: measured, modelled, and predicted with the tuned law."""
     from lowfc.adapters.files.drawing import figure_class, png
 
     drawing = figure_class()(figsize=(10, 8), layout="constrained")
@@ -198,9 +198,9 @@ def picture(run: Telemetry, best: Tuned) -> bytes:
         closed = spectrum(run.error, run.rate_hz) if run.closed else None
         if closed is not None:
             binned_hz, (power,) = in_bins(closed.frequency_hz, [closed.power_nm2_hz[:, place]])
-            axes.loglog(binned_hz, power, color="tab:orange", label="error, as it was")
+            axes.loglog(binned_hz, power, color="tab:orange", label="error, measured")
         axes.loglog(found.frequency_hz[1:], modelled, color="tab:blue", lw=1, label="model")
-        axes.loglog(found.frequency_hz[1:], left, color="tab:green", label=f"residual, {best.kinds[place]}, in theory")
+        axes.loglog(found.frequency_hz[1:], left, color="tab:green", label=f"residual, {best.kinds[place]}, theory")
         axes.set(ylabel=f"Z{run.noll[place]} {mode_name(run.noll[place])}, nm$^2$/Hz")
         axes.legend()
     axes.set(xlabel="Hz")
@@ -208,7 +208,7 @@ def picture(run: Telemetry, best: Tuned) -> bytes:
 
 
 def _added_contrast(run: Telemetry, best: Tuned, now: LinearLaw, closed_nm: Array | None) -> dict[str, Any] | None:
-    """What the wavefront adds to the dark zone's contrast: without a loop, as it was, and under the tuned law."""
+    """Contrast added to the dark zone without a loop, as measured, and with the tuned law."""
     if run.noise_nm2 is None:
         return None
     opened, closed = run.pol.joined(), None
@@ -228,7 +228,7 @@ def _added_contrast(run: Telemetry, best: Tuned, now: LinearLaw, closed_nm: Arra
 
 
 def _achieved_nm(run: Telemetry, noise_nm: Array) -> Array | None:
-    """Rms (modes,) of the residual in the frames: the true one where it is known, or the error's less the noise's."""
+    """Rms (modes,) of the residual in the frames: the true one if known, or the error minus the noise."""
     if not run.closed:
         return None
     if run.true_nm2 is not None:
@@ -259,12 +259,12 @@ def _doubts(run: Telemetry, open_mas: float | None, stable: bool) -> list[str]:
     found = []
     if not run.closed and open_mas is not None and open_mas > OPTICAL_GAIN_MAS:
         found.append(
-            f"an open loop with {open_mas:.1f} mas rms of tilt per axis, above {OPTICAL_GAIN_MAS:g}: the sensor shows "
-            "less than there is (optical gain), and lines that are none; close the loop with any stable gain and tune "
-            "from that log"
+            f"an open loop with {open_mas:.1f} mas rms of tilt per axis, above {OPTICAL_GAIN_MAS:g}: the optical gain "
+            "of the sensor is low, and some lines are spurious; close the loop with any stable gain and tune from that "
+            "log"
         )
     if not stable:
-        found.append("the law of the log is unstable with this delay, so that theory says nothing about it")
+        found.append("the law of the log is unstable with this delay: theory cannot predict it")
     return found
 
 

@@ -1,4 +1,4 @@
-"""The command `lowfc export`: a log for the field's own tools."""
+"""The command `lowfc export`: convert a log for other tools."""
 
 import contextlib
 import dataclasses
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class Format(StrEnum):
-    """What a log can become."""
+    """Export formats."""
 
     CSV = "csv"
     NPZ = "npz"
@@ -42,20 +42,22 @@ def export(
     ] = None,
     decimate: Annotated[
         int | None,
-        typer.Option(min=1, help="A smaller log instead: every Nth frame and mirror state, all steps and commands."),
+        typer.Option(min=1, help="Write a smaller log: every Nth frame and mirror state, all steps and commands."),
     ] = None,
     topics: Annotated[
         list[str] | None,
-        typer.Option(help="Decimate: of frames, mirror state and surface, truth and timing, only these; repeat."),
+        typer.Option(help="With --decimate: only these of frames, mirror state and surface, truth, timing; repeat."),
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="File to write; default: the log's name beside the log.")] = None,
-    frames: Annotated[bool, typer.Option("--frames", help="The frames too; with npz as OUT.frames.npy.")] = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there already.")] = False,
+    out: Annotated[Path | None, typer.Option(help="Output file; default: the log's name, next to the log.")] = None,
+    frames: Annotated[
+        bool, typer.Option("--frames", help="Export the frames, too; with npz as OUT.frames.npy.")
+    ] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Write the steps of a log with their units, the calibration, and the frames if asked, for other tools.
+    """Write the steps of a log with units, the calibration and, with --frames, the frames, for other tools.
 
-    Or, with --decimate, a smaller log.
+    With --decimate, write a smaller log.
 
     Example: lowfc export last --to fits --frames
     """
@@ -69,7 +71,7 @@ def export(
     if of_log if decimate is None else (to is not None or of_table):
         raise ConfigurationError(
             "an export is a table (--to FORMAT, with --frames and --force) or a smaller log (--decimate N, with "
-            "--topics): choose one"
+            "--topics): use one"
         )
     console = Console(stderr=True)
     for log in one_by_one(logs, out, as_json=as_json):
@@ -102,7 +104,7 @@ def export_log(
     from lowfc.programs.logs.guard import refuse_log
 
     if frames and to is Format.CSV:
-        raise ConfigurationError("a CSV file has no place for frames: use --to npz, fits or aot, or leave out --frames")
+        raise ConfigurationError("a CSV file cannot hold frames: use --to npz, fits or aot, or omit --frames")
     write = _writer(to, with_frames=frames)
     reader = WholeLog(log, skip_damaged=True)
     out = out if out is not None else reader.path.parent / (stem_of(reader.path) + _ENDINGS[to])
@@ -110,7 +112,7 @@ def export_log(
     for file in files:
         refuse_log(file, reader.path)
         if file.exists() and not force:
-            raise DataFileError(f"{file} exists already; choose another name (--out), or --force replaces it")
+            raise DataFileError(f"{file} already exists; use another name (--out), or replace it with --force")
     with contextlib.ExitStack() as held:
         count = held.enter_context(reading_bar(console))
         reader.progress = partial(count, "reading")
@@ -135,7 +137,7 @@ def export_log(
 
 
 def render(figures: dict[str, Any]) -> str:
-    """What was written, for a person."""
+    """Text of what was written."""
     from lowfc.adapters.logs.recovery import faults
 
     frames = f", {figures['frames']} frames" if figures["frames"] else ""
@@ -149,13 +151,13 @@ def render(figures: dict[str, Any]) -> str:
 
 
 def _writer(to: Format, *, with_frames: bool) -> "Callable[[list[Path], History], None]":
-    """What writes a format: it gets the files to write and the run."""
+    """The writer of a format; it receives the output files and the run."""
     if to is Format.AOT:
         try:
             from lowfc.programs.logs.export.aot import write_aot
         except ModuleNotFoundError as error:
             raise ConfigurationError(
-                f"--to aot needs aotpy, which is not there ({error}); install it with: {install_advice('aot')}"
+                f"--to aot requires aotpy, which is missing ({error}); install it with: {install_advice('aot')}"
             ) from None
         return partial(write_aot, with_frames=with_frames)
     from lowfc.programs.logs.export import files

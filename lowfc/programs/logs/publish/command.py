@@ -1,4 +1,4 @@
-"""The command `lowfc publish`: a recorded run back on the bus."""
+"""The command `lowfc publish`: republish a recorded run on the bus."""
 
 from typing import Annotated
 
@@ -11,15 +11,15 @@ from lowfc.programs.cli.output import put
 def publish(
     logs: Logs,
     run: RunId = DEFAULT_RUN,
-    speed: Annotated[float, typer.Option(help="Times as fast as it was.")] = 1.0,
-    topics: Annotated[list[str] | None, typer.Option(help="Only these keys or patterns; repeat.")] = None,
+    speed: Annotated[float, typer.Option(help="Speed relative to the recorded run.")] = 1.0,
+    topics: Annotated[list[str] | None, typer.Option(help="Publish only these keys or patterns; repeat.")] = None,
     allow_commands: Annotated[
-        bool, typer.Option("--allow-commands", help="Commands too, which a live mirror obeys.")
+        bool, typer.Option("--allow-commands", help="Publish commands, too: a live mirror will follow them.")
     ] = False,
-    wait_for: Annotated[list[str] | None, typer.Option(help="Begin when this role is there; repeat.")] = None,
+    wait_for: Annotated[list[str] | None, typer.Option(help="Wait for this role before starting; repeat.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Put the recorded traffic on the bus again, for a viewer or a controller under test.
+    """Republish recorded messages on the bus, for a viewer or a controller under test.
 
     Example: lowfc publish last --speed 2
     """

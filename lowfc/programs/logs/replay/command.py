@@ -15,11 +15,11 @@ from lowfc.control.kernel.tables import KernelName
 from lowfc.programs.cli.result import put
 
 _HOST = ("lowfc", "git", "python", "numpy", "numba", "scipy", "blas", "processor", "cpu_features")
-"""What the same bytes may depend on; of the processor's features, those that only one of the two has."""
+"""Versions and processor features on which bit-exact results may depend."""
 
 
 def _host_differs(there: dict[str, str]) -> dict[str, tuple[str, str]]:
-    """What of versions and processor is not as it was when the log was recorded: the log's, and here."""
+    """Differences in versions and processor between the log's host and this one."""
     here = provenance()
     found = {key: (there[key], here.get(key, "")) for key in _HOST if key in there and there[key] != here.get(key, "")}
     if "cpu_features" in found:
@@ -31,20 +31,20 @@ def _host_differs(there: dict[str, str]) -> dict[str, tuple[str, str]]:
 def replay_log(
     logs: Logs,
     tolerance: Annotated[
-        float, typer.Option(min=0, help="Largest difference that is none, nm: for a log of another processor.")
+        float, typer.Option(min=0, help="Largest difference to ignore, nm: for a log from another processor.")
     ] = 0.0,
     jobs: Annotated[
-        int | None, typer.Option(min=1, help="Processes, at most; default: one on every processor.")
+        int | None, typer.Option(min=1, help="Largest number of processes; default: one per processor.")
     ] = None,
     kernel: Annotated[
-        KernelName | None, typer.Option(help="Arithmetic of the usual frame; default: the log's own.")
+        KernelName | None, typer.Option(help="Implementation of the control step; default: the log's.")
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Run the loop again on what it took in, and compare every step and command with the log, to the bit.
+    """Replay the recorded inputs through the controller, and compare every step and command with the log, bit by bit.
 
-    Exit status 0 only if they are identical; under another kernel they never count as that. Logs may be complete,
-    rotated, truncated or damaged.
+    Exit status 0 only if they are identical, never with another kernel. Logs may be complete, rotated, truncated or
+    damaged.
 
     Example: lowfc replay last
     """

@@ -31,21 +31,21 @@ _TAKEN = ("messages_recorded", "messages_lost", "longest_wait_ms", "longest_unfl
 
 
 def bench_record(
-    seconds: Annotated[float, typer.Option(min=0.5, max=3600, help="For how long each rate is measured.")] = 5.0,
+    seconds: Annotated[float, typer.Option(min=0.5, max=3600, help="Seconds of measurement at each rate.")] = 5.0,
     rate: Annotated[
         list[float] | None,
         typer.Option(min=10, max=20_000, help="Frames per second; repeat. Default: 1000, 2000 and 5000."),
     ] = None,
     folder: Annotated[
         Path | None,
-        typer.Option(help="Folder on the disk to be measured; default: the system's temporary one."),
+        typer.Option(help="Folder on the disk to measure; default: the system's temporary folder."),
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Measure what recording costs: processor, losses and stalls of a recorder process beside a loop's traffic.
+    """Measure the cost of recording: processor time, losses and stalls of a recorder with the traffic of a loop.
 
-    Another process sends what camera, controller and mirror send for every frame (frame of 80 x 80, command, step,
-    mirror state, truth) and their timing and health, over the real bus. The processor's share is set against that of
+    Another process sends the messages of camera, controller and mirror for every frame (frame of 80 x 80, command,
+    step, mirror state, truth) with timing and health over the real bus. The processor share is compared with that of
     copying the same payloads to the same disk.
 
     Example: lowfc bench record --seconds 5 --json

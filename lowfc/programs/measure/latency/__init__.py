@@ -1,1 +1,1 @@
-"""`lowfc latency`: how long a frame takes to become a command."""
+"""`lowfc latency`: measure the latency from frame to command."""

@@ -1,4 +1,4 @@
-"""The command `lowfc latency`: how long a frame takes to become a command, on this host or in a log."""
+"""The command `lowfc latency`: the latency from frame to command, on this host or in a log."""
 
 import contextlib
 import json
@@ -27,7 +27,7 @@ _LEAK = 0.01
 
 
 class Kernels(StrEnum):
-    """Arithmetic of the control step; both in turns."""
+    """Implementation of the control step; both: in turns."""
 
     NUMPY = "numpy"
     FUSED = "fused"
@@ -35,7 +35,7 @@ class Kernels(StrEnum):
 
 
 class Camera(StrEnum):
-    """Where the frames come from."""
+    """Source of the frames."""
 
     PREPARED = "prepared"
     SIMULATED = "simulated"
@@ -43,34 +43,34 @@ class Camera(StrEnum):
 
 def latency(
     logs: LogsOrMeasure = None,
-    duration: Annotated[float, typer.Option(min=0.5, max=1e5, help="Seconds of each repeat.")] = 10.0,
+    duration: Annotated[float, typer.Option(min=0.5, max=1e5, help="Duration of each repeat, seconds.")] = 10.0,
     rate: Annotated[float | None, typer.Option(help="Frames per second; default: the file's, or 1000.")] = None,
-    camera: Annotated[Camera, typer.Option(help="Frames made beforehand, or the simulated camera.")] = Camera.PREPARED,
-    repeats: Annotated[int, typer.Option(min=1, max=1000, help="Loop and yardsticks in turns, so often.")] = 1,
-    record: Annotated[bool, typer.Option("--record/--no-record", help="With the recorder beside.")] = False,
-    view: Annotated[bool, typer.Option("--view/--no-view", help="With a view served for a browser beside.")] = False,
+    camera: Annotated[Camera, typer.Option(help="Prepared frames, or the simulated camera.")] = Camera.PREPARED,
+    repeats: Annotated[int, typer.Option(min=1, max=1000, help="Number of repeats of loop and references.")] = 1,
+    record: Annotated[bool, typer.Option("--record/--no-record", help="Run the recorder, too.")] = False,
+    view: Annotated[bool, typer.Option("--view/--no-view", help="Run a view for a browser, too.")] = False,
     plain_scheduling: Annotated[
         bool,
-        typer.Option("--plain-scheduling", help="Without real-time class, own processors, locked memory."),
+        typer.Option("--plain-scheduling", help="Without SCHED_FIFO, pinned processors, locked memory."),
     ] = False,
     kernel: Annotated[
-        Kernels | None, typer.Option(help="Arithmetic of the control step; default: the configuration's.")
+        Kernels | None, typer.Option(help="Implementation of the control step; default: as configured.")
     ] = None,
     trace: Annotated[
-        bool, typer.Option("--trace", help="Mark stalls with what held up the host, a bare loop beside.")
+        bool, typer.Option("--trace", help="Trace stalls to their causes, with bare loops as reference.")
     ] = False,
     config: ConfigFile = None,
-    plot: Annotated[Path | None, typer.Option(help="Draw histograms and latency against time (PNG).")] = None,
+    plot: Annotated[Path | None, typer.Option(help="Plot histograms and latency against time (PNG).")] = None,
     compare: Annotated[
         tuple[Path, Path] | None, typer.Option(help="Compare two results of --json.", metavar="A.json B.json")
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Time every frame through the real controller and mirror, and set that against what this host can do.
+    """Measure the latency of every frame through controller and mirror, and compare it with the host's limits.
 
-    A source of frames made beforehand takes the camera's place: on an absolute schedule, late frames counted, so that a
-    stall hides nothing. In turns with the loop, a bare zenoh echo of the same sizes, one control step alone and the
-    host's timer are measured. Times are from just before a frame's put to just after its command's.
+    Prepared frames are sent on an absolute schedule and late frames are counted, so that stalls are not hidden. In
+    turns with the loop, a bare zenoh echo of the same sizes, one control step alone and the host's timer are measured.
+    Times are from just before a frame is put to just after its command is put.
 
     Example: lowfc latency --duration 10 --repeats 5 --json > latency.json
     """
@@ -84,7 +84,7 @@ def latency(
     if plot is not None:
         from lowfc.adapters.files.drawing import figure_class
 
-        figure_class()  # before the work, where it is not there
+        figure_class()  # fail before the work if it is missing
     if logs:
         figures = _of_log(logs)
     else:
@@ -98,7 +98,7 @@ def latency(
         if FUSED in kernels and not compiled.available():
             raise ConfigurationError(compiled.missing())
         if trace and simulated:
-            raise ConfigurationError("stalls are traced with prepared frames: leave out --trace or --camera simulated")
+            raise ConfigurationError("--trace requires prepared frames: omit --trace or --camera simulated")
         figures = _measure(Asked(settings, duration, repeats, simulated, record, view, kernels, trace))
     if plot is not None:
         write_whole(plot, picture(figures))
@@ -106,12 +106,12 @@ def latency(
 
 
 def _configuration(file: Path | None, rate: float | None, camera: Camera, *, plain: bool) -> "Configuration":
-    """The loop's configuration: closed, in real time, and where nothing answers to the mirror with a leak."""
+    """The loop's configuration: closed, real-time, and with a leak if the frames do not respond to the mirror."""
     from lowfc.adapters.process.realtime import spread
     from lowfc.contract.configuration import FIXED_GAINS
 
     overrides: dict[str, Any] = {"camera.rate_hz": rate, "lockstep": False}
-    if camera is Camera.PREPARED:  # the integrator would add up noise without end
+    if camera is Camera.PREPARED:  # or the integrator would accumulate noise
         overrides |= {"control.tilt_leak": _LEAK, "control.leak": _LEAK}
     if plain:
         overrides |= {"realtime.priority": 0, "realtime.lock_memory": False, "realtime.disable_cpu_idle": False}
@@ -166,14 +166,14 @@ def _of_log(names: list[Path]) -> dict[str, Any]:
 
 
 def _compare(files: tuple[Path, Path]) -> dict[str, Any]:
-    """Which of two results is better, and whether by more than the repeats differ; with both names."""
+    """Comparison of two results with their spread over the repeats, and both names."""
     from lowfc.programs.measure.latency.summary import compare
 
     try:
         found = compare(*(_result(file) for file in files))
     except (KeyError, TypeError) as fault:
         raise DataFileError(
-            f"{files[0]} and {files[1]} should be results of `lowfc latency --json`: {fault!r} is not there"
+            f"{files[0]} and {files[1]} must be results of `lowfc latency --json`: {fault!r} is missing"
         ) from None
     return dict(zip("ab", map(str, files), strict=True)) | found
 
@@ -184,7 +184,7 @@ def _result(file: Path) -> dict[str, Any]:
     except OSError as fault:
         raise DataFileError(f"{file} cannot be read: {fault.strerror}") from None
     except ValueError as fault:  # no UTF-8, no JSON
-        raise DataFileError(f"{file} should be a result of `lowfc latency --json`, and is no JSON: {fault}") from None
+        raise DataFileError(f"{file} must be a result of `lowfc latency --json`, but is not JSON: {fault}") from None
     if not isinstance(found, dict) or "latency_us" not in found:
-        raise DataFileError(f"{file} should be a result of `lowfc latency --json`, and has no latency_us")
+        raise DataFileError(f"{file} must be a result of `lowfc latency --json`, but has no latency_us")
     return found

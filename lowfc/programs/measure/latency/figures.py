@@ -1,4 +1,4 @@
-"""Latencies of frames as columns, and the figures of one repeat made of them: percentiles, histograms, counts."""
+"""Latencies of frames as columns, and the figures of one repeat: percentiles, histograms, counts."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,9 +15,9 @@ from lowfc.control.loop.safety import Rejection, reason_of
 from lowfc.programs.launch.watch import topic_count
 
 WARM_UP_S = 0.5
-"""Frames put so soon after the first one are left out."""
+"""Frames put within this time after the first one are left out."""
 STAGES = TIMED[1:-1]
-"""What receive to command is made of, as in ControlTiming."""
+"""Parts of receive to command, as in ControlTiming."""
 LOOP_SPANS = ("frame_to_receive", "receive_to_command", "frame_to_command", "command_to_mirror", "frame_to_mirror")
 PERCENTILES = {"p50": 500, "p90": 900, "p99": 990, "p99_9": 999, "max": 1000}
 """Each in thousandths, so that its place among the values is exact."""
@@ -42,7 +42,7 @@ ALONE = {
     "hot_step_us": "  back to back",
     "timer_us": "timer wake-up",
 }
-"""What the host can do, likewise."""
+"""Names and labels of the host's reference figures."""
 RATIOS = {"ratio": ("step_us", ""), "ratio_hot": ("hot_step_us", " of those back to back")}
 """Ratios of frame to command to half an echo plus the step named here, and what is added to the step's label."""
 RATIOS_AT = ("p50", "p99")
@@ -50,14 +50,14 @@ COUNTS = {
     "frames": "frames",
     "frames_without_command": "without a command",
     "frames_crowded_out": "of these crowded out by the next frame",
-    "frames_untimed": "with a command whose timing is not known",
+    "frames_untimed": "with a command of unknown timing",
     "frames_without_mirror_state": "without a mirror state",
     "frames_sent_late": "put more than a period after they were due",
     "frames_skipped": "skipped by the controller",
     "frames_missing": "missing at the controller",
-    "warm_up_frames": "of the warm-up left out",
+    "warm_up_frames": "left out for warm-up",
     "commands_late": "commands late for the next exposure",
-    "echo_lost": "frames of the bare echo not answered",
+    "echo_lost": "frames of the bare echo without an answer",
     "messages_lost": "messages lost by the recorder",
 }
 """Sums over the repeats, and the words after each; None where it does not apply."""
@@ -70,11 +70,11 @@ _BURST = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Frames:
-    """What became of each frame, in the order in which they were put, just before `put_ns`; all are (frames,).
+    """Outcome of each frame, in the order of their puts, just before `put_ns`; all are (frames,).
 
     Attributes:
-        commanded: whether a command made from it was timed, or followed by the mirror.
-        spans_us: of `SPANS`, NaN where it is not known; those from the moment due only where there was a schedule.
+        commanded: whether a command from it was timed or followed by the mirror.
+        spans_us: of `SPANS`, NaN if unknown; those from the due time only with a schedule.
     """
 
     put_ns: Long
@@ -89,7 +89,7 @@ def join(
     timing: tuple[Sequences, Mapping[str, Long]],
     mirror: tuple[Sequences, Long],
 ) -> Frames:
-    """Frames that were sent, and what is known of each; `due_ns` is None where there was no schedule.
+    """Sent frames with their outcomes; `due_ns` is None without a schedule.
 
     `timing` has sequences and the controller's stages as in ControlTiming, `mirror` the frame sequence and time of each
     state, of which the first of a frame counts.
@@ -117,7 +117,7 @@ def join(
 
 
 def percentiles(values: npt.NDArray[Any]) -> dict[str, float] | None:
-    """Values that these fractions do not exceed (each is one of the values); None where none is known."""
+    """Percentiles at these fractions (each is one of the values); None without values."""
     known = np.sort(values[np.isfinite(values)])
     if not known.size:
         return None
@@ -126,7 +126,7 @@ def percentiles(values: npt.NDArray[Any]) -> dict[str, float] | None:
 
 
 def edges_us() -> Array:
-    """Edges of the histograms' bins; what lies beyond them is in the outermost bins."""
+    """Edges of the histograms' bins; the outermost bins include values beyond them."""
     return np.asarray(_LOWEST_US * 2.0 ** (np.arange(_OCTAVES * _BINS_PER_OCTAVE + 1) / _BINS_PER_OCTAVE))
 
 
@@ -140,8 +140,8 @@ def histogram(values_us: Array) -> Long:
 def repeat_figures(frames: Frames) -> dict[str, Any]:
     """Figures of one repeat, the warm-up left out.
 
-    Of the frames without a command, crowded out are those whose next one was put within half the mean period; untimed
-    are frames that have a command, but no word of how long it took.
+    Frames without a command are crowded out if the next frame was put within half the mean period. Untimed frames have
+    a command but no timing.
     """
     warm = frames.put_ns - frames.put_ns[:1] >= round(WARM_UP_S * 1e9)
     put_ns, commanded = frames.put_ns[warm], frames.commanded[warm]

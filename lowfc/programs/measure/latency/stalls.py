@@ -1,8 +1,8 @@
-"""Stalls of a loop, and what the kernel counted in each: what is the host's is named as such.
+"""Stalls of a loop, and their causes from the kernel's counters.
 
-A frame stalls where its command takes longer than a period, or where it has none. A stall counts from the moment that
-its frame was due. It is the host's where a bare loop on the same processor was held up in it too, where the hypervisor
-gave the processor to others, or where the quota of the control group was used up.
+A frame stalls if its command takes longer than a period or is missing. A stall begins when its frame is due. The host
+is its cause if a bare loop on the same processor was also delayed, if the hypervisor stole processor time, or if the
+quota of the control group was used up.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,18 +15,18 @@ from lowfc.programs.cli.result import Result, figure
 from lowfc.programs.measure.latency.figures import WARM_UP_S, Frames, percentiles
 
 Holder = Literal["host", "loop", "unknown"]
-"""Who held a frame up: the loop where a process of it waited for a processor or for pages, and no bare loop did."""
+"""Cause of a stall: the loop if one of its processes waited for a processor or pages, and no bare loop did."""
 
 _PART = 0.25
-"""Of a period: shorter waits explain no stall."""
+"""Fraction of a period: shorter waits do not explain a stall."""
 _FAULT_US = 1.0
-"""What mapping a page takes, about."""
+"""Approximate time to map a page."""
 _SPANS = {"frame_to_receive": "frame to receive", "wakeup": "waking", "compute": "computing", "publish": "publishing"}
 _SHOWN = 20
 
 
 class Trace(NamedTuple):
-    """What the bare loop beside one process noted; (wakings,), the counts as in `host.Counts`."""
+    """Records of the bare loop beside one process; (wakings,), the counts as in `host.Counts`."""
 
     due_ns: Long
     woke_ns: Long
@@ -39,9 +39,9 @@ class Trace(NamedTuple):
 
 
 class Counted(Result):
-    """What moved from the last waking of a bare loop before a stall to the first one after it, both included.
+    """Changes of the counts from the last waking of a bare loop before a stall to the first after it, inclusive.
 
-    `bare_late_us` is how late it woke at most; the others are those of `host.Counts`, of the process beside it.
+    `bare_late_us` is its largest wake-up latency; the others are those of `host.Counts`, of the process beside it.
     """
 
     bare_late_us: float
@@ -65,7 +65,7 @@ class Stall(Result):
 
 
 class BareLoop(Result):
-    """A loop beside a process of ours that does nothing; `stalled` counts its wakings more than a period late."""
+    """An idle loop beside a process of the control loop; `stalled` counts its wakings more than a period late."""
 
     beside: str = figure("bare loop beside the")
     wakings: int = figure("wakings")
@@ -78,9 +78,11 @@ class Stalls(Result):
 
     frames: int = figure()
     stalled: int = figure("stalled", "frames: no command, or more than a period from frame to command")
-    of_host: int = figure("  by the host", "frames: a bare loop was held up too, a processor stolen, a quota used up")
+    of_host: int = figure(
+        "  by the host", "frames: a bare loop was delayed too, a processor stolen, or a quota used up"
+    )
     of_loop: int = figure("  by the loop", "frames: a process waited for a processor or for pages, no bare loop did")
-    unknown: int = figure("  not known", "frames: nothing was counted")
+    unknown: int = figure("  unknown", "frames: nothing was counted")
     bare: list[BareLoop] = figure()
     stalls: list[Stall] = figure()
 
@@ -92,7 +94,7 @@ class Stalls(Result):
 
 
 def signs_of(counted: Counted, period_us: float) -> tuple[list[str], list[str]]:
-    """Signs of the host's, and signs of the loop's own, in words; what is too short for a stall is none."""
+    """Text of the evidence against the host and against the loop; delays too short for a stall are ignored."""
     long_us = _PART * period_us
     hosts = {
         f"bare loop {counted.bare_late_us:.0f} us late": counted.bare_late_us >= long_us,
@@ -139,7 +141,7 @@ def together(repeats: Sequence[Stalls]) -> Stalls:
 
 
 def _ends_ns(frames: Frames, period_ns: int) -> Array:
-    """When each frame's command was sent; of one without a command, when the next one was."""
+    """Time of each frame's command, or of the next command if it has none."""
     sent_ns = frames.put_ns + frames.spans_us["frame_to_command"] * 1e3
     known_ns = np.where(np.isfinite(sent_ns), sent_ns, np.inf)
     next_ns = np.minimum.accumulate(known_ns[::-1])[::-1]

@@ -1,4 +1,4 @@
-"""What `lowfc latency` prints: repeats brought together, and two of its results compared."""
+"""Results of `lowfc latency`: all repeats combined, and the comparison of two results."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -82,7 +82,7 @@ def spread_of(repeats: Sequence[Mapping[str, float]]) -> dict[str, list[float]]:
 
 
 def ratio(repeat: Mapping[str, Any], at: str, name: str = "ratio") -> float:
-    """Frame to command over what it is made of: half the round trip of the bare echo, and one control step alone."""
+    """Ratio of frame to command to half the round trip of the bare echo plus one control step alone."""
     made_of_us: float = repeat["echo_us"][at] / 2 + repeat[RATIOS[name][0]][at]
     return float(repeat["latency_us"]["frame_to_command"][at] / made_of_us)
 

@@ -11,7 +11,7 @@ from lowfc.programs.measure.latency.summary import OVER
 
 _COMPARED = SPANS | {OVER: "over echo and step"}
 _ALWAYS = ("frames", "frames_without_command", "warm_up_frames", "messages_lost")
-"""Counts that are shown even where they are 0."""
+"""Counts that are shown even if they are 0."""
 _HOST = ("processor", "processors", "kernel", "python", "clock_source", "load")
 _BLOCKS = " ▁▂▃▄▅▆▇█"
 _LINE = 32
@@ -19,13 +19,13 @@ _LINE = 32
 
 
 def table(figures: Mapping[str, Any]) -> str:
-    """The result for a person."""
+    """The result as text."""
     title = f"{'us':<22}" + "".join(f"{name.replace('_', '.'):>9}" for name in PERCENTILES)
     edges = figures["histogram"]["edges_us"]
     lines = [f"{title}   log counts, {edges[0]:.0f} to {edges[-1]:.0f} us"]
     for span, values in figures["latency_us"].items():
         if span == "due_to_frame":
-            lines.append("from the moment the frame was due, not from when it was put:")
+            lines.append("from the time the frame was due instead of the time it was put:")
         bars = sparkline(figures["histogram"]["counts"][span])
         lines.append(f"{_row(SPANS[span], values)}   {bars}")
     for name, words in ALONE.items():
@@ -38,7 +38,7 @@ def table(figures: Mapping[str, Any]) -> str:
 
 
 def compared(comparison: Mapping[str, Any]) -> str:
-    """Two results for a person; a and b are the names of both."""
+    """The comparison of two results, named a and b, as text."""
     lines = [f"{name}: {comparison[name]}" for name in "ab"]
     lines.append(f"{'':<22}{'':>7}{'a':>10}{'b':>10}{'b/a':>8}{'b - a':>10}{'spread':>10}   better")
     for row in comparison["rows"]:
@@ -51,7 +51,7 @@ def compared(comparison: Mapping[str, Any]) -> str:
             f"{row['b']:>10.{digits}f}{over:>8}{row['difference']:>+10.{digits}f}{spread:>10}   {verdict}"
         )
     lines += [f"{COUNTS[name]}: a {a}, b {b}" for name, (a, b) in comparison["counts"].items() if a or b]
-    lines.append("us; spread: the larger of both ranges over the repeats, unknown where one has a single repeat.")
+    lines.append("us; spread: the larger of both ranges over the repeats, unknown if one has a single repeat.")
     return "\n".join(lines)
 
 
@@ -104,13 +104,13 @@ def _remarks(figures: Mapping[str, Any]) -> list[str]:
             f"{at} {figures['kernel_ratio'][at]:.2f} ({low:.2f} to {high:.2f}) of {numpy_us[at]:.1f} us"
             for at, (low, high) in spread.items()
         ]
-        lines.append(f"all of the fused step; frame to command over numpy's, in turns: {', '.join(parts)}")
+        lines.append(f"all figures: fused step; ratio of its frame to command to numpy's, in turns: {', '.join(parts)}")
     counts = {name: figures.get(name) for name in COUNTS}
     shown = [name for name, count in counts.items() if count or (name in _ALWAYS and count is not None)]
     lines.append(", ".join(f"{counts[name]} {COUNTS[name]}" for name in shown))
     if figures["reasons"]:
         reasons = ", ".join(f"{name} {count}" for name, count in figures["reasons"].items())
-        lines.append(f"frames that were refused or limited, the warm-up included: {reasons}")
+        lines.append(f"frames refused or limited, including the warm-up: {reasons}")
     if "stalls" in figures:
         lines.append(Stalls.model_validate(figures["stalls"]).text())
     if figures.get("memory_mb"):
@@ -120,8 +120,8 @@ def _remarks(figures: Mapping[str, Any]) -> list[str]:
     lines.append(", ".join(f"{name} {host[name]}" for name in _HOST if host.get(name)))
     if "clock_error_us" in host:
         lines.append(
-            f"on several hosts, by their clocks' measured offsets: a span from one to another may be wrong by "
-            f"{host['clock_error_us']:.0f} us, however often it was measured"
+            f"on several hosts, with the measured offsets of their clocks: a span between hosts may have a systematic "
+            f"error of {host['clock_error_us']:.0f} us"
         )
     return lines + [f"{word}: {', '.join(host[word])}" for word in ("granted", "refused") if host.get(word)]
 

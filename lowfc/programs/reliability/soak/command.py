@@ -1,4 +1,4 @@
-"""The command `lowfc soak`: does anything grow, drift or get lost in hours?"""
+"""The command `lowfc soak`: check for growth, drift and losses over hours."""
 
 from typing import Annotated
 
@@ -13,11 +13,10 @@ def soak(
     config: ConfigFile = None,
     as_json: Json = False,
 ) -> None:
-    """Run the simulated loop for hours, and watch memory, handles, threads, latency and what is lost; 1 if any grow.
+    """Run the simulated loop for hours and check memory, handles, threads, latency and losses; exit status 1 on growth.
 
-    Its logs are checked for gaps as they are finished, and removed. Slopes are of the last three quarters of the time,
-    with their standard errors; memory grows where its slope is beyond three of them. What the time was too short to
-    judge has not passed either.
+    Finished logs are checked for gaps and removed. Slopes are of the last three quarters of the time, with standard
+    errors; memory grows if its slope exceeds three of them. A check for which the time was too short does not pass.
 
     Example: lowfc soak --hours 0.5
     """
