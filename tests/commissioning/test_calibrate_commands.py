@@ -90,7 +90,7 @@ def test_a_calibration_is_written_once_it_is_whole_and_used_and_its_figures_are_
     done = CliRunner().invoke(calibrate_app, words)
     assert done.exit_code == 130
     assert done.stderr.splitlines()[-1].startswith("kept in night.fits.part.npz: 4 cycles; the same command")
-    assert "4 cycles of 226 frames and 3 to check them; about" in done.stderr
+    assert "4 cycles of 226 frames and 3 check cycles; about" in done.stderr
     assert not Path("night.fits").exists()
     assert loop.calibration().id == before.id
     monkeypatch.setattr(Calibrator, "check", check)
@@ -147,7 +147,7 @@ def test_a_bad_calibration_is_written_not_loaded_and_told(monkeypatch: pytest.Mo
         monkeypatch.setattr(loop.scene, "expose", shifted)
         return own(self, *what)
 
-    assert "cross-talk on frames" not in str(found["faults"])
+    assert "cross-talk on separate frames" not in str(found["faults"])
     monkeypatch.setattr(Calibrator, "check", moved)
     done = CliRunner().invoke(calibrate_app, [*words, "--resume"])
     assert done.exit_code == 1

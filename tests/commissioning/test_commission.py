@@ -206,7 +206,7 @@ def test_the_calibration_from_before_is_in_use_again_after_a_failure(
         bench.commission()
     bench.then.clear()
     assert bench.loop.calibration().id == before
-    assert "the calibration from before is in use again" in bench.shown
+    assert "the previous calibration is in use again" in bench.shown
 
 
 def test_there_is_nothing_to_go_on_with_after_the_end(commissioned: tuple[Bench, dict[str, Any]]) -> None:

@@ -345,7 +345,7 @@ def test_this_host_is_looked_at(briefly: None) -> None:
     assert sum(found["counts"].values()) == len(found["checks"])
     normal = found["wake_up_us"]["normal"]
     assert 0 < normal["p50"] <= normal["p99"] <= normal["max"]
-    assert "1000 sleeps a second" in done.stderr
+    assert "1000 sleeps per second" in done.stderr
 
 
 def test_strict_is_about_warnings(briefly: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

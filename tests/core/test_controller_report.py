@@ -83,7 +83,7 @@ def test_the_summary_and_the_status_say_it() -> None:
     assert "over the open pupil, second half of the run" in summary_text(figures)
     late = {"not_closed_ns": 3 * SECOND, "not_closed_cause": "the camera does not fit"}
     assert first(mode=wire.LOOP_MODE_CLOSED) == "closed"
-    before = "closed; in total not closed for 3.0 s: the camera does not fit"
+    before = "closed; not closed for 3.0 s in total: the camera does not fit"
     assert first(mode=wire.LOOP_MODE_CLOSED, **late) == before
     assert first(mode=wire.LOOP_MODE_OPEN, **late) == "open for 3.0 s: the camera does not fit"
     assert first(mode=wire.LOOP_MODE_SAFE, **late) == "in safe mode, not closed for 3.0 s: the camera does not fit"
@@ -111,7 +111,9 @@ def test_the_first_line_of_the_status_says_whether_all_is_well() -> None:
         message = controller_state(state, USUAL, (START + 12) * SECOND)
         return status.text(status.figures(message, PROCESSES | changes, "night")).splitlines()[0]
 
-    well = "closed · residual 2.50 nm rms with noise (true 2.00) · light 97 % · 3 frames lost · recording logs/a.mcap"
+    well = (
+        "closed · residual 2.50 nm rms, noise included (true 2.00) · light 97 % · 3 frames lost · recording logs/a.mcap"
+    )
     warned = "10 s ago camera: COMMANDS_LATE 9 % late"
     assert first() == f"{well} · run night · law integrator · {warned}"
     stopped = wire.Health(state="ready", recording=wire.Recording(file="logs/a.mcap", stopped=True))

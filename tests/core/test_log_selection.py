@@ -151,7 +151,9 @@ def test_a_what_if_is_the_same(whole: Path, small: Path, tmp_path: Path) -> None
         del figures["log"]
     assert found[0] == found[1]
     other = {"pinv": "weighted", "weighted": "pinv"}[read_history(WholeLog(small)).calibration.estimator]
-    with pytest.raises(DataFileError, match=r"no other reconstructor can be tried.*other gains, leaks and limits can"):
+    with pytest.raises(
+        DataFileError, match=r"another reconstructor cannot be tried.*other gains, leaks and limits can"
+    ):
         what_if(LoggedRun(read_history(LogReader(small))), WhatIf(estimator=other))
 
 

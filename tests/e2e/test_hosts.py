@@ -192,7 +192,7 @@ def test_a_log_of_several_hosts_says_how_far_its_latencies_can_be_trusted(bench:
     for span in ("frame_to_command", "frame_to_mirror", "command_to_mirror"):
         assert -bound_us < figures["latency_us"][span]["p50"] < 100_000
     text = desk.run("-m", "lowfc", "latency", str(log), timeout_s=90)
-    assert "on several hosts, by their clocks' measured offsets" in text.stdout + text.stderr
+    assert "on several hosts, with the measured offsets of their clocks" in text.stdout + text.stderr
     assert desk.run("-m", "lowfc", "ctl", "record", "start", "--run", RUN).returncode == 0
 
 

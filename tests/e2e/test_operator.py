@@ -176,7 +176,8 @@ def test_every_request_is_made_by_a_command_of_the_document() -> None:
 def test_the_commands_say_what_they_did(night: Night) -> None:
     said = night.said
     well = (
-        r"closed · residual [\d.]+ nm rms with noise( \(true [\d.]+\))? · light \d+ % · \d+ frames? lost · recording "
+        r"closed · residual [\d.]+ nm rms, noise included( \(true [\d.]+\))? · light \d+ % · "
+        r"\d+ frames? lost · recording "
     )
     assert re.match(well, said["lowfc ctl status"])
     assert "loop           closed" in said["lowfc ctl status"]

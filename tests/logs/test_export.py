@@ -242,7 +242,7 @@ def test_half_a_file_is_never_left(tmp_path: Path, to: Format, odd: bool) -> Non
 
 
 def test_mistakes(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ConfigurationError, match="no place for frames"):
+    with pytest.raises(ConfigurationError, match="cannot hold frames"):
         export_log(log, Format.CSV, frames=True, console=QUIET)
     with pytest.raises(DataFileError, match="cannot be written"):
         export_log(log, Format.CSV, tmp_path / "nowhere" / "out.csv", console=QUIET)
