@@ -142,7 +142,7 @@ def test_a_fit_host_has_no_warning(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "status", "said", "changes"),
     [
-        ("real-time share", "note", "stands still for 50 ms", {"usable_cpus": {0, 1}}),
+        ("real-time share", "note", "stalls for 50 ms", {"usable_cpus": {0, 1}}),
         ("real-time share", "warning", "0 ms of every", {"proc/sys/kernel/sched_rt_runtime_us": "0"}),
         ("real-time share", "ok", "all of a processor", {"proc/sys/kernel/sched_rt_runtime_us": "-1"}),
         ("processors", "warning", "names 6", {"trial": trial(cpus=6)}),
@@ -181,8 +181,13 @@ def test_a_fit_host_has_no_warning(tmp_path: Path) -> None:
         ("socket buffers", "warning", "550 kB", {"proc/sys/net/ipv4/tcp_rmem": "4096 131072 550000\n"}),
         ("socket buffers", "ok", "560 kB", {"proc/sys/net/ipv4/tcp_rmem": "4096 131072 560000\n"}),
         ("open files", "warning", "64", {"open_files": 64}),
-        ("synchronisation", "ok", "kept; 12 us to correct", {"synchronisation": Synchronisation(True, 12e-6, 0.001)}),
-        ("synchronisation", "warning", "not kept", {"synchronisation": Synchronisation(False, 12e-6, 0.001)}),
+        (
+            "synchronisation",
+            "ok",
+            "synchronised; 12 us to correct",
+            {"synchronisation": Synchronisation(True, 12e-6, 0.001)},
+        ),
+        ("synchronisation", "warning", "not synchronised", {"synchronisation": Synchronisation(False, 12e-6, 0.001)}),
         ("wake-up", "warning", "max 4100 us", {"trial": trial(first_ns=[1000] * 999 + [4_100_000])}),
         (
             "wake-up",
