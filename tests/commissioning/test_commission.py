@@ -140,7 +140,7 @@ def test_a_loop_that_shall_stay_open_is_predicted_only(commissioned: tuple[Bench
     bench, _ = commissioned
     bench.loop.open_loop()
     text = bench.steps(close=False)._close(factory.settings(bench.config).law(bench.config.noll), 1.0)
-    assert "predicted from" in text
+    assert "predicted measured error" in text
     assert "`lowfc ctl close` closes it" in text
     assert bench.loop.status().state.mode == wire.LOOP_MODE_OPEN
 

@@ -400,7 +400,7 @@ def test_the_log_of_the_run_says_the_same(measured: tuple[dict[str, Any], Path])
 
 def test_what_is_no_result_and_no_log_is_said(tmp_path: Path) -> None:
     other = tmp_path / "other.json"
-    for content, expected in (("{", "no JSON"), ("[]", "no latency_us"), ('{"latency_us": {}}', "ratio")):
+    for content, expected in (("{", "not JSON"), ("[]", "no latency_us"), ('{"latency_us": {}}', "ratio")):
         other.write_text(content)
         fault = lowfc("latency", "--compare", other, other).exception
         assert isinstance(fault, DataFileError)
