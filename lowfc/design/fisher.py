@@ -1,4 +1,4 @@
-"""What noise leaves of an estimate: the covariance of a linear one, and the least that any unbiased one can have.
+"""Error of an estimate by noise: covariance of a linear one, and the bound for any unbiased one.
 
 The Cramer-Rao bound is that of a sensor. The quantum limit is that of the light, whatever the sensor.
 """

@@ -27,7 +27,7 @@ _SEED = 1
 
 @dataclass(frozen=True, eq=False)
 class Focus:
-    """What falls on a focal-plane mask.
+    """Light on a focal-plane mask.
 
     Attributes:
         band: Of Table 4.

@@ -1,4 +1,4 @@
-"""What a search for a better sensor minimises."""
+"""The goal that a search for a better sensor minimises."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -1,4 +1,4 @@
-"""What a sensor would measure, and how good that is: the figures that a search can make small.
+"""Predicted performance of a sensor: the figures that a search can minimise.
 
 A `Candidate` says what it sees, as I0 and H of eqs. (6) and (12); from these follow what Tables 3 and 4 would show, and
 what the noise of an exposure adds to the contrast of the dark zone.

@@ -1,4 +1,4 @@
-"""What a sparse aperture mask would measure, predicted fast enough to search for the best one.
+"""Performance of a sparse aperture mask, predicted fast enough to search for the best one.
 
 The fields in the relay pupil, behind the focal-plane mask, do not depend on the holes: that of the flat wavefront and
 the first-order one of each mode are propagated once (`build_optics`). Each hole adds a small product of matrices to

@@ -28,7 +28,7 @@ _FAR, _NEAR = 80.0, 1.5
 
 @dataclass(frozen=True)
 class Bounds:
-    """What every layout of a search keeps to; lengths in thousandths of the pupil's diameter.
+    """Constraints on every layout of a search; lengths in thousandths of the pupil's diameter.
 
     Attributes:
         count: Fewest and most holes.
@@ -150,7 +150,7 @@ def images(orbit: Orbit, symmetry: str) -> tuple[Orbit, ...]:
 
 
 def orbit_fields(optics: Optics, orbit: Orbit, symmetry: str) -> Single:
-    """What the orbit's holes add to the fields at the sensor."""
+    """Contribution of the orbit's holes to the fields at the sensor."""
     return np.asarray(np.sum([hole_fields(optics, hole) for hole in holes((orbit,), symmetry)], axis=0))
 
 

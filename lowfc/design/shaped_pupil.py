@@ -38,7 +38,7 @@ COARSEST_CELLS = 32
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked of a shaped pupil: the options of `lowfc design spc`.
+    """Requirements on a shaped pupil: the options of `lowfc design spc`.
 
     Attributes:
         inner: Where the dark zone begins, in lambda/D.

@@ -53,7 +53,7 @@ class Steps:
 
 @dataclass(frozen=True, slots=True)
 class Truths:
-    """What the simulation knew, one row per frame; empty for a log of real devices.
+    """Truth of a simulation, one row per frame; empty for a log of real devices.
 
     Rms are over the frame's whole period where `instants` is not 0: the star moves while the mirror holds. In older
     logs, and where a simulation does not compute it, they are those at the instant at which the exposure starts.
@@ -185,7 +185,7 @@ class StepRows(_Rows[Steps]):
 
 
 class TruthRows(_Rows[Truths]):
-    """What the simulation knew, with one number of modes."""
+    """Truth of a simulation, with one number of modes."""
 
     def __init__(self, modes: int) -> None:
         wide = ("disturbance_nm", "residual_nm", "sensed_nm", "modes_disturbance_rms_nm", "modes_residual_rms_nm")

@@ -70,7 +70,7 @@ class _Tally:
 
 
 class LossAccount:
-    """Which messages there were: by the counts of those that arrived, and by their publishers' own counts.
+    """Account of all messages, from the counts of those that arrived and from their publishers' own counts.
 
     Attributes:
         names: on the topics; the caller admits a message's name before it enters the message.
@@ -115,12 +115,12 @@ class LossAccount:
                     tally.published = count.published
 
     def settle(self) -> None:
-        """What was recorded so far has been flushed."""
+        """Everything recorded so far has been flushed."""
         for _, tally in self._all():
             tally.safe = tally.recorded, tally.twice
 
     def revert(self) -> None:
-        """What was recorded since `settle` did not reach the disk."""
+        """Everything recorded since `settle` was lost before the disk."""
         for _, tally in self._all():
             tally.recorded, tally.twice = tally.safe
 

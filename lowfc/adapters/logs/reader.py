@@ -99,7 +99,7 @@ class LogReader:
 
     @property
     def selection(self) -> Selection:
-        """What the log was made to hold."""
+        """The selection that the log was recorded with."""
         return Selection.of(self.metadata)
 
     def __iter__(self) -> Iterator[Sample]:

@@ -33,7 +33,7 @@ from lowfc.contract.codecs import input_file
 from lowfc.contract.errors import DataFileError
 
 HEAD = struct.Struct("<BQ")
-"""What every record begins with: opcode, and length of what follows."""
+"""Header of every record: opcode, and length of the rest."""
 
 _FOOTER_BYTES = HEAD.size + 20 + len(MAGIC)
 _BLOCK_BYTES = 1 << 20
@@ -119,7 +119,7 @@ class LogFile:
     def parts(
         self, needed: Callable[[int, Collection[int]], bool] | None = None
     ) -> Iterator[Chunk | Metadata | Attachment | Damage]:
-        """What the file holds, in its order.
+        """The file's content, in order.
 
         Chunks of which `needed` is false are passed over unread; it is asked with the log time at which one ends and
         the channels (ids) of its messages.

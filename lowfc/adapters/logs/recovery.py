@@ -18,7 +18,7 @@ RECOVERY = "recovery"
 
 @dataclass(frozen=True, slots=True)
 class Recovery:
-    """What has been recovered.
+    """Result of a recovery.
 
     Attributes:
         log: which is as it was.

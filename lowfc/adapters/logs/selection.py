@@ -53,7 +53,7 @@ class Selection:
 
     @property
     def sentence(self) -> str:
-        """What is recorded, for a person; empty for everything."""
+        """Description of the selection for people; empty for everything."""
         few = [name for topic, name in _FEWER.items() if topic not in self.left_out]
         parts = [f"1 in {self.every} {' and '.join(few)}"] if self.every > 1 and few else []
         parts += [f"without {', '.join(self._keys)}"] if self.left_out else []

@@ -1,4 +1,4 @@
-"""Which messages of one publisher came, whatever their order: a gap is closed when a late one comes."""
+"""Messages received from one publisher, in any order: a late one closes its gap."""
 
 from lowfc.adapters.bus.bus import Sample
 from lowfc.contract.envelope import count_of, start_of

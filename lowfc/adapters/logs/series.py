@@ -76,7 +76,7 @@ class LogSeries:
 
     @property
     def longest_write_ns(self) -> int:
-        """How long one write took at most."""
+        """Longest duration of a write."""
         return max(self._longest_write_ns, self._log.longest_write_ns if self._log else 0)
 
     @property
