@@ -38,11 +38,12 @@ class VirtualIntegrators(NamedTuple):
 
     def followed(self, pol_nm: Single) -> tuple["VirtualIntegrators", Single]:
         """One frame later, and the errors (rows, modes) that would have been measured, nm of wavefront rms."""
-        error_nm = np.broadcast_to(pol_nm, self.gain.shape)
+        error_nm = pol_nm
         for lag, weight in self.weights:
             error_nm = error_nm + (self.history_nm[lag] if weight == 1 else weight * self.history_nm[lag])
         wanted_nm = self.kept * self.history_nm[0] - self.gain * error_nm
-        np.clip(wanted_nm, -self.limit_nm, self.limit_nm, out=wanted_nm)
+        np.maximum(wanted_nm, -self.limit_nm, out=wanted_nm)
+        np.minimum(wanted_nm, self.limit_nm, out=wanted_nm)
         return self._replace(history_nm=(wanted_nm, *self.history_nm[:-1])), error_nm
 
     def held(self, frames: int = 1) -> "VirtualIntegrators":

@@ -193,7 +193,7 @@ class GainWatch:
         return Remarks((self._gains(step, drive, np.where(drive.automatic, lowered, drive.law.gain)),), events)
 
     def _judge(self, judged: list[_Group], step: Step, state: State, drive: ActiveLoop) -> Remarks:
-        noise_nm2 = self._noise_nm2(drive)
+        noise_nm2 = self._noise_nm2(drive) if any(group.bank.complete for group in judged) else None
         gain, initial, events = drive.law.gain.copy(), False, []
         for group in judged:
             if not group.bank.complete:
