@@ -181,7 +181,7 @@ def test_it_goes_on_where_it_was_interrupted_and_who_opens_the_loop_at_the_end_i
             bench.loop.run(20)
             bench.loop.ask("open", lease_id=0)
 
-    bench.then = {"watching": somebody_opens}
+    bench.then = {"observing": somebody_opens}
     with pytest.raises(CalibrationError, match="the lease ended: operator asked to open"):
         bench.commission(resume=True)
     assert "[1/10]" not in bench.shown
