@@ -155,7 +155,7 @@ def test_forged_names_fill_no_process_and_are_one_event(hub: MemoryHub, forge: C
     assert len(camera.last_health) == MOST_NAMES + 1
     assert "controller" in camera.last_health
     (event,) = heard.said("BAD_MESSAGE")
-    assert event.startswith(f"BAD_MESSAGE {FORGED - MOST_NAMES} on lowfc/health/* could not be read")
+    assert event.startswith(f"BAD_MESSAGE {FORGED - MOST_NAMES} messages on lowfc/health/* could not be read")
 
 
 def test_a_process_that_returns_under_many_numbers_is_remembered_once(hub: MemoryHub) -> None:

@@ -240,7 +240,9 @@ def test_the_law_that_drove_goes_on_where_nobody_answers_or_it_is_said_that_it_d
         integrate(loop, [0.3, 0.3, 0.3], NOLL)
     assert loop.known() == before
     loop.deaf = (6, 7)
-    with pytest.raises(RequestRefusedError, match=f"the integrator drives .* law {before[0]!r} could not be restored"):
+    with pytest.raises(
+        RequestRefusedError, match=f"the integrator now drives .* law {before[0]!r} could not be restored"
+    ):
         integrate(loop, [0.3, 0.3, 0.3], NOLL)
     assert loop.known() == (None, before[1])
 

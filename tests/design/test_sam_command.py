@@ -251,7 +251,7 @@ def test_the_command_records_itself_and_finds_the_same_again(tmp_path, monkeypat
         (("--holes", "40", "--diameter", "0.2"), "40 holes .* could not be placed"),
         (("--scheduler", "nowhere:1"), "no Dask scheduler answers at 'nowhere:1'"),
         (("--resume", "nowhere.json"), "no search to resume in nowhere.json"),
-        (("--resume", "nowhere.json", "--focal-mask", "disk"), "leave out --focal-mask"),
+        (("--resume", "nowhere.json", "--focal-mask", "disk"), "omit --focal-mask"),
         (("--out", "nowhere/mask.json"), "nowhere/mask.json cannot be written: there is no directory nowhere"),
         (("--front", "nowhere/front.csv"), "nowhere/front.csv cannot be written: there is no directory nowhere"),
         (("--plot", "nowhere/front.png"), "nowhere/front.png cannot be written: there is no directory nowhere"),

@@ -102,7 +102,7 @@ def new_log(path: Path, source: Path) -> Iterator[IO[bytes]]:
     Raises:
         DataFileError: there is such a file, or the disk refuses.
     """
-    never = f"{path} exists already; a log is never overwritten; name another one with --out"
+    never = f"{path} already exists; a log is never overwritten; name another one with --out"
     if path.exists():
         raise DataFileError(never)
     with being_written(path, source) as part, part.open("wb") as file:

@@ -79,7 +79,7 @@ def recover(source: Path, out: Path, progress: Callable[[int, int], None] | None
     if source.exists() and being_recorded(source):
         raise DataFileError(f"{source} is being recorded, and nothing is lost: `lowfc ctl record stop` finishes it")
     if out.exists():
-        raise DataFileError(f"{out} exists already; a log is never overwritten; name another one with --out")
+        raise DataFileError(f"{out} already exists; a log is never overwritten; name another one with --out")
     reader = LogReader(source, topics=(), skip_damaged=True)
     for _ in reader:
         pass

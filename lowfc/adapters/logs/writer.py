@@ -107,7 +107,7 @@ class LogWriter:
         self._channels: dict[tuple[str, int], int] = {}
         self._schemas: dict[str, int] = {}
         if self.part.exists() or path.exists():
-            raise DataFileError(f"{path} exists already; a log is never overwritten")
+            raise DataFileError(f"{path} already exists; a log is never overwritten")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._raw = _File(self.part, file_mode)
