@@ -112,7 +112,7 @@ def requirements() -> str:
 
 
 def agreement() -> str:
-    """What a camera's settings and the configuration must say alike."""
+    """Camera settings that must agree with the configuration."""
     head = ("the camera's", "the configuration's", "may differ by", "needed", "used for")
     rows = []
     for one in AGREEMENTS:
@@ -122,12 +122,12 @@ def agreement() -> str:
 
 
 def topics(role: Role, *own: Topic) -> str:
-    """What a role publishes and subscribes."""
+    """Topics that a role publishes and subscribes to."""
     rows = []
     for topic in (*own, EVENT, HEALTH):
         when = f"{topic.rate:g} Hz" if isinstance(topic.rate, float) else str(topic.rate)
         does = "publish" if role in topic.publisher else "subscribe"
-        answers = "; answer who asks for the last" if topic.queryable else ""
+        answers = "; the last one is returned on query" if topic.queryable else ""
         name = topic.message.DESCRIPTOR.full_name
         rows.append((f"`{topic.key}`", f"`{name}`", when, does, topic.sentence.rstrip(".") + answers))
     return markdown(("topic", "message", "when", "you", ""), rows)
