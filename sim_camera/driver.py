@@ -25,7 +25,7 @@ from lowfc.control.laws.stability import delay_weights
 from lowfc.device import CameraSettings, DriverOptions, Exposure, Puts
 from lowfc.optics.detector.detector import saturation_dn
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
-from sim_camera.contrast import Contrast
+from sim_camera.contrast import AddedContrast, Contrast
 from sim_camera.disturbance import Disturbance, disturbance, with_more
 from sim_camera.faulty import FaultyFrames, read_fault
 from sim_camera.figures import Figures
@@ -170,7 +170,7 @@ class SimulatedCamera:
         recent = max(1, round(RECENT_S * config.camera.rate_hz))
         nm_per_mas = tilt_nm_per_mas(config.star.diameter_m)
         self._figures = Figures(config.noll, nm_per_mas, recent, len(self._scene.instants))
-        self._measured: wire.WavefrontFigures | None = None
+        self._measured: AddedContrast | None = None
 
     def join(self, service: Service) -> None:
         """Declare the truth, and listen to the mirror."""
@@ -253,7 +253,7 @@ class SimulatedCamera:
         if (wavefront := self._figures.wavefront()) is not None:
             health.wavefront.CopyFrom(wire.WavefrontFigures(**asdict(wavefront)))
             if self._measured is not None:
-                health.wavefront.MergeFrom(self._measured)
+                health.wavefront.MergeFrom(wire.WavefrontFigures(**asdict(self._measured)))
         if (recent := self._figures.recent()) is not None:
             health.recent_wavefront.CopyFrom(wire.WavefrontFigures(**asdict(recent)))
 

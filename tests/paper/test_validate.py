@@ -125,6 +125,24 @@ def test_the_committed_conditioning_is_as_section_4_says(committed):
     assert holes == sorted(holes, reverse=True)
 
 
+def test_table3_beats_the_paper_with_a_few_wavefronts_already(few):
+    assert {row["estimator"] for row in few["table3"]["rows"]} == {None, *ESTIMATORS}
+    for modes in (14, 20):
+        plain_one, weighted, _, iterated = (find(few["table3"], SAM, RMS, modes, estimator) for estimator in ESTIMATORS)
+        assert plain_one["measured"] < plain_one["paper"]
+        assert iterated["measured"] < weighted["measured"] < plain_one["measured"]
+        assert 0.5 * iterated["limit"] < iterated["measured"] < 1.5 * iterated["limit"]
+
+
+def test_table4s_prediction_beats_the_paper(few):
+    plain_one, weighted = (
+        find(few["table4"], SAM, "std of x tilt, 1 mas, paper's electrons", 2, kind) for kind in ("pinv", "weighted")
+    )
+    assert plain_one["predicted"] < plain_one["paper"] == 0.36
+    assert weighted["predicted"] < 0.25
+    assert weighted["limit"] <= weighted["predicted"] < 1.02 * weighted["limit"]
+
+
 def test_the_papers_inconsistencies_are_numbers(few):
     rows = [row for row in few["photometry"]["rows"] if row["name"].startswith("inconsistency")]
     assert {row["name"].split(":")[0] for row in rows} == {f"inconsistency {k}" for k in (1, 2, 3, 4)}
@@ -136,6 +154,20 @@ def test_the_papers_inconsistencies_are_numbers(few):
     for row in rows:
         if row["paper"] == 0.97:
             assert row["measured"] > 0.985
+
+
+@pytest.mark.slow
+def test_no_figure_depends_on_the_number_of_threads(few):
+    names = ("table3", "table4")
+    again = run(names, Context(FEW, jobs=1, sensors=(SAM,)))
+    assert again == [few[name] for name in names]
+
+
+@pytest.mark.slow
+def test_another_seed_is_another_draw(few):
+    (again,) = run(["table4"], Context(FEW, seed=2, jobs=2, sensors=(SAM,)))
+    assert again["rows"] != few["table4"]["rows"]
+    compare(again, few["table4"])
 
 
 def test_the_command_prints_one_json_object():

@@ -135,8 +135,10 @@ def mean_contrast(
     return float(image[wedge_samples(wedge, columns, rows, samples_per)].mean())
 
 
-def contrast_curve(pupil: Array, opd_nm: Array, wavelength_nm: float, edges: Array) -> Array:
-    """Contrast (rings,) averaged in azimuth within the dark zone's opening, Fig. 1(c); arguments as for `contrast`.
+def contrast_curve(
+    pupil: Array, opd_nm: Array, wavelength_nm: float, edges: Array, wedge: Wedge = DARK_ZONE, samples_per: int = 4
+) -> Array:
+    """Contrast (rings,) averaged in azimuth within a wedge's opening, Fig. 1(c); other arguments as for `contrast`.
 
     Args:
         pupil: The shaped pupil.
@@ -146,11 +148,11 @@ def contrast_curve(pupil: Array, opd_nm: Array, wavelength_nm: float, edges: Arr
         wedge: Its opening alone counts.
         samples_per: Samples per lambda / D.
     """
-    whole = Wedge(0.0, float(edges[-1]), DARK_ZONE.half_opening_deg)
-    columns, rows = _extent(whole, 4)
-    inside = wedge_samples(whole, columns, rows)
-    radius = np.hypot(image_axis(rows, 4)[:, None], image_axis(columns, 4))[inside]
-    values = contrast(pupil, opd_nm, wavelength_nm, columns, rows)[inside]
+    whole = Wedge(0.0, float(edges[-1]), wedge.half_opening_deg)
+    columns, rows = _extent(whole, samples_per)
+    inside = wedge_samples(whole, columns, rows, samples_per)
+    radius = np.hypot(image_axis(rows, samples_per)[:, None], image_axis(columns, samples_per))[inside]
+    values = contrast(pupil, opd_nm, wavelength_nm, columns, rows, samples_per)[inside]
     count, _ = np.histogram(radius, edges)
     total, _ = np.histogram(radius, edges, weights=values)
     return np.asarray(total / count)

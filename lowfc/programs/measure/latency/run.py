@@ -178,10 +178,14 @@ def _children(asked: Asked, run: Run) -> list[Child]:
     else:
         words = ["-m", "lowfc.programs.measure.frame_source", *_shared(run), "--seconds", str(seconds), *waits]
         children[0] = program(str(Role.CAMERA), words, run.path / f"{Role.CAMERA}.stderr")
-    for role in reversed(TRACED) if asked.trace else ():
-        words = ["-m", bare_loop.__name__, str(role), *_shared(run), "--seconds", str(seconds)]
-        children.insert(1, program(f"bare loop beside the {role}", words, run.path / f"bare-{role}.stderr"))
+    if asked.trace:
+        children[1:1] = [_bare_loop(run, role, seconds) for role in TRACED]
     return children
+
+
+def _bare_loop(run: Run, role: Role, seconds: float) -> Child:
+    words = ["-m", bare_loop.__name__, str(role), *_shared(run), "--seconds", str(seconds)]
+    return program(f"bare loop beside the {role}", words, run.path / f"bare-{role}.stderr")
 
 
 def _name_processes(run: Run, children: list[Child]) -> None:
