@@ -58,7 +58,7 @@ class CameraLoop:
             LowfcError: the driver reports a fault that a user has to correct.
         """
         service = self._service
-        service.meet(wait_for, WAIT_S, "the camera will not start without")
+        service.require(wait_for, WAIT_S, "the camera will not start without")
         service.awaited = lambda: "" if service.work else "the camera's first frame"
         service.state = "running"
         getattr(self._driver, "start", _IDLE.start)()

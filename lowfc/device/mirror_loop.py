@@ -107,7 +107,7 @@ class MirrorLoop:
         with contextlib.suppress(_LostError):
             self._start(flat_nm)
         service.fill = self._fill
-        self._leave = service.handover(COMMAND, self._arrived, name, period_ns=config.period_ns)
+        self._leave = service.dispatch(COMMAND, self._arrived, name, period_ns=config.period_ns)
         service.awaited = lambda: "" if self._status.received_ns else "a controller"
         service.state = "ready"
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lowfc.adapters.bus.bus import Sample
-from lowfc.adapters.bus.dispatch import LONG_AGO_NS, Handover
+from lowfc.adapters.bus.dispatch import LONG_AGO_NS, Dispatch
 from lowfc.adapters.bus.mailbox import Mailbox
 from lowfc.adapters.logs.sequence_gaps import REMEMBERED, Gaps
 from lowfc.contract.envelope import count_of, sequence_of
@@ -94,14 +94,14 @@ PERIOD_NS = 1_000_000
 
 
 class Bench:
-    """A handover whose handler takes a given time, and messages that come as soon as they are due."""
+    """A dispatch whose handler takes a given time, and messages that come as soon as they are due."""
 
     def __init__(self, period_ns: int | None = PERIOD_NS, *, told: bool = False) -> None:
         self.now_ns, self.work_ns = 10**9, 100_000
         self.handled: list[int] = []
         self.superseded: list[int] = []
         superseded = self._hear(self.superseded) if told else None
-        self.handover = Handover(FRAME.key, self._hear(self.handled), lambda: self.now_ns, period_ns, superseded)
+        self.dispatch = Dispatch(FRAME.key, self._hear(self.handled), lambda: self.now_ns, period_ns, superseded)
 
     def _hear(self, where: list[int]) -> Callable[[Sample], None]:
         def hear(sample: Sample) -> None:
@@ -112,7 +112,7 @@ class Bench:
 
     def come(self, count: int, put_ns: int) -> None:
         self.now_ns = max(self.now_ns + 10_000, put_ns)  # it takes the bus a moment to hand over the next one
-        self.handover.put(Sample(FRAME.key, b"", sequence_of(7, count), put_ns, self.now_ns))
+        self.dispatch.put(Sample(FRAME.key, b"", sequence_of(7, count), put_ns, self.now_ns))
 
 
 def test_of_what_waited_only_the_newest_is_as_good_as_ever() -> None:
@@ -125,7 +125,7 @@ def test_of_what_waited_only_the_newest_is_as_good_as_ever() -> None:
     for count in range(1, 11):
         bench.come(count, begun_ns + count * PERIOD_NS)
     assert (bench.handled, bench.superseded) == ([0, 10], list(range(1, 10)))
-    assert (bench.handover.received, bench.handover.skipped, bench.handover.missing) == (11, 0, 0)
+    assert (bench.dispatch.received, bench.dispatch.skipped, bench.dispatch.missing) == (11, 0, 0)
 
 
 def test_who_does_not_want_what_was_superseded_skips_it() -> None:
@@ -134,7 +134,7 @@ def test_who_does_not_want_what_was_superseded_skips_it() -> None:
     bench.now_ns = begun_ns + 9 * PERIOD_NS + PERIOD_NS // 2
     for count in range(10):
         bench.come(count, begun_ns + count * PERIOD_NS)
-    assert len(bench.handled) + bench.handover.skipped == 10
+    assert len(bench.handled) + bench.dispatch.skipped == 10
     assert bench.handled == [9]
 
 
@@ -153,7 +153,7 @@ def test_where_each_waits_for_the_last_nothing_is_superseded() -> None:
     for count in range(50):
         bench.come(count, 0)
     assert bench.handled == list(range(50))
-    assert bench.handover.skipped == 0
+    assert bench.dispatch.skipped == 0
 
 
 def test_a_slow_handler_is_never_far_behind() -> None:
@@ -168,7 +168,7 @@ def test_a_slow_handler_is_never_far_behind() -> None:
             behind.append((bench.now_ns - bench.work_ns - put_ns) / PERIOD_NS)
     assert max(behind) < 5
     assert len(bench.handled) > 5
-    assert len(bench.handled) + len(bench.superseded) + bench.handover.skipped == bench.handover.received == 500
+    assert len(bench.handled) + len(bench.superseded) + bench.dispatch.skipped == bench.dispatch.received == 500
 
 
 def test_two_threads_that_receive_take_turns() -> None:
@@ -182,19 +182,19 @@ def test_two_threads_that_receive_take_turns() -> None:
         together = max(together, inside)
         inside -= 1
 
-    handover = Handover(FRAME.key, handle, time.monotonic_ns)
+    dispatch = Dispatch(FRAME.key, handle, time.monotonic_ns)
 
     def receive(start_s: int) -> None:
         entered.wait(PATIENCE_S)
         for count in range(1000):
-            handover.put(Sample(FRAME.key, b"", sequence_of(start_s, count), 0, 0))
+            dispatch.put(Sample(FRAME.key, b"", sequence_of(start_s, count), 0, 0))
 
     threads = [threading.Thread(target=receive, args=(start_s,)) for start_s in (1, 2)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join(PATIENCE_S)
-    assert (handover.received, together) == (2000, 1)
+    assert (dispatch.received, together) == (2000, 1)
 
 
 def test_whatever_the_order_only_what_never_came_is_missing() -> None:

@@ -166,7 +166,7 @@ def test_a_message_that_cannot_be_read_is_an_event_and_neither_a_traceback_nor_t
     ear = Listener(hub, clock, HEALTH)
     mirror = service(hub, clock, "mirror-dm")
     read: list[int] = []
-    mirror.handover(
+    mirror.dispatch(
         COMMAND,
         lambda sample: read.append(len(wire.MirrorCommand.FromString(sample.payload).actuators)),
         "dm",

@@ -427,12 +427,12 @@ def test_frames_that_waited_are_not_all_integrated(calibration: Calibration, sce
         rig.inject(2.0 * np.eye(14)[3])
         pixels = scene.expose(0, rig.offset_nm)
         payload = image(pixels, 1, "camera").SerializeToString()
-        handover = next(one for one in rig.services[0].arrivals if one.key == FRAME.key)
+        dispatch = next(one for one in rig.services[0].arrivals if one.key == FRAME.key)
         until(lambda: rig.controller._adopted)
         now_ns = HostClock().now_ns()
         newest = rig.settings.last[1].sequence + 100
         for age in range(9, -1, -1):  # periods; they arrive one upon the other, after the controller stood still
-            handover.put(Sample(FRAME.key, payload, newest - age, now_ns - age * config.period_ns, now_ns))
+            dispatch.put(Sample(FRAME.key, payload, newest - age, now_ns - age * config.period_ns, now_ns))
         steps = rig.said[STEP.key][-10:]
     used = [step for step in steps if not step.reasons]
     assert len(steps) == 10

@@ -1,4 +1,4 @@
-"""A message handed on where it arrives, on the thread that receives: nobody has to be woken for it."""
+"""Dispatch of messages on the thread that receives them, without waking another thread."""
 
 import threading
 from collections.abc import Callable
@@ -7,19 +7,19 @@ from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.logs.sequence_gaps import Arrivals
 
 MOST_IN_A_ROW = 16
-"""Messages that are handed on one upon the other before some are skipped."""
+"""Messages dispatched back to back before waiting ones are skipped."""
 REST_NS = 50_000
-"""Without a message for so long, there is none that waits."""
+"""A gap of this length means that no message was waiting."""
 LONG_AGO_NS = 5_000_000
-"""Age at which a message is old, whatever came before it, and at three periods where these are longer."""
+"""Age from which any message counts as superseded, or three periods if that is longer."""
 
 
-class Handover(Arrivals):
-    """Hands each message to a handler in the order in which they come, and says which were superseded.
+class Dispatch(Arrivals):
+    """Passes messages to a handler in their order of arrival and identifies superseded ones.
 
-    What comes while its reader stands still waits. One that is a period old when it is handed on, right behind another,
-    has been superseded by a newer one; so has one that is older than `LONG_AGO_NS`. A handler that does not keep up
-    would fall behind for good: after `MOST_IN_A_ROW` messages one upon the other, all that still wait are skipped.
+    Messages queue while the process stands still. A queued message is superseded if it is at least a period old when
+    dispatched, any message if it is older than `LONG_AGO_NS`. So that a slow handler cannot fall further and further
+    behind, messages that still wait after `MOST_IN_A_ROW` back to back are skipped.
     """
 
     def __init__(
@@ -30,14 +30,14 @@ class Handover(Arrivals):
         period_ns: int | None = None,
         superseded: Callable[[Sample], None] | None = None,
     ) -> None:
-        """Hand messages on.
+        """Set the handlers.
 
         Args:
-            key: of the messages.
-            handler: gets them.
-            now_ns: the clock of their `receive_time_ns`.
-            period_ns: of the messages; None where each waits for the answer to the last one: none is ever superseded.
-            superseded: gets those that were superseded, instead of `handler`; they are skipped when None.
+            key: key of the messages.
+            handler: called with each message.
+            now_ns: clock of their `receive_time_ns`.
+            period_ns: period of the messages; None (lockstep): no message is ever superseded.
+            superseded: called with superseded messages instead of `handler`; None skips them.
         """
         super().__init__(key)
         self._handler = handler
@@ -52,23 +52,23 @@ class Handover(Arrivals):
 
     @property
     def skipped(self) -> int:
-        """Messages that were superseded, or waited behind too many others."""
+        """Number of skipped messages: superseded, or queued behind too many others."""
         return self._skipped
 
     def put(self, sample: Sample) -> None:
-        """Hand a message on, or skip it; called on the threads that receive, which take turns."""
+        """Dispatch or skip a message; called on the receive threads, one at a time."""
         with self._turn:
             self._put(sample)
 
     def _put(self, sample: Sample) -> None:
         handler: Callable[[Sample], None] | None = self._handler
         if self._period_ns is not None:
-            crowded = sample.receive_time_ns - self._done_ns <= REST_NS
-            self._in_a_row = self._in_a_row + 1 if crowded else 1
+            queued = sample.receive_time_ns - self._done_ns <= REST_NS
+            self._in_a_row = self._in_a_row + 1 if queued else 1
             age_ns = sample.receive_time_ns - sample.publish_time_ns
             if self._in_a_row > MOST_IN_A_ROW:
                 handler = None
-            elif age_ns >= (self._period_ns if crowded else self._old_ns):
+            elif age_ns >= (self._period_ns if queued else self._old_ns):
                 handler = self._superseded
         if handler is None:
             self._skipped += 1

@@ -13,7 +13,7 @@ from typing import Literal
 
 from lowfc import __version__
 from lowfc.adapters.bus.bus import ALL, UNREADABLE, Bus, Publisher, Sample
-from lowfc.adapters.bus.dispatch import Handover
+from lowfc.adapters.bus.dispatch import Dispatch
 from lowfc.adapters.bus.mailbox import Mailbox
 from lowfc.adapters.bus.names import Names
 from lowfc.adapters.logs.sequence_gaps import Arrivals
@@ -28,24 +28,24 @@ from lowfc.control.loop.wording import counted
 
 HEALTH_PERIOD_NS = 500_000_000
 WAITING_NS = 2_000_000_000
-"""A process that is ready and waits longer than this for others names them."""
+"""A ready process that waits longer than this for others reports their names."""
 WORK: dict[str, str] = {Role.CAMERA: "frame", Role.CONTROLLER: "frame", Role.MIRROR: "command"}
 """Counters of the processes of the loop; other processes have their own summary."""
 ProcessState = Literal["starting", "ready", "running", "stopping", "stopped"]
 
-_MET_PERIOD_S = 0.02
+_POLL_S = 0.02
 
 
 class Service:
     """One process of a run.
 
     Attributes:
-        name: of the process, such as "camera" or "mirror-dm".
-        running: until SIGTERM, SIGINT or `stop`.
-        work: units of work done (frames, commands, messages); `rate_hz` in Health is its rate.
-        last_health: of every other process, by name.
-        announces: that it is ready and which processes it waits for, on standard error.
-        awaited: those processes, in words; empty once it waits for none.
+        name: name of the process, such as "camera" or "mirror-dm".
+        running: True until SIGTERM, SIGINT or `stop`.
+        work: number of frames, commands or messages processed; `rate_hz` in Health is its rate.
+        last_health: newest Health of every other process, by name.
+        announces: whether it prints on standard error that it is ready, and which processes it waits for.
+        awaited: returns the processes it waits for, in words; empty if none.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class Service:
         announces: bool = False,
         supervisor: Supervisor | None = None,
     ) -> None:
-        """Join the run; `fill` adds the role's own fields to each Health, `supervisor` is by default the host's."""
+        """Join the run; `fill` adds the role's own fields to each Health, `supervisor` defaults to the host's."""
         self.name = name
         self.clock = clock
         self.bus = bus
@@ -104,14 +104,14 @@ class Service:
         return publisher
 
     def mailbox(self, topic: Topic, name: str = "") -> Mailbox:
-        """Mailbox that gets a topic, counted in Health and woken at a stop."""
+        """Mailbox that receives a topic, counted in Health and woken by `stop`."""
         mailbox = Mailbox(topic.at(name))
         self.arrivals.append(mailbox)
         self.on_stop(mailbox.wake)
         self.bus.subscribe(topic, mailbox.put, name or ALL)
         return mailbox
 
-    def handover(
+    def dispatch(
         self,
         topic: Topic,
         handler: Callable[[Sample], None],
@@ -120,10 +120,10 @@ class Service:
         period_ns: int,
         superseded: Callable[[Sample], None] | None = None,
     ) -> Callable[[], None]:
-        """Handle a topic's messages on the thread that receives them, counted in Health; what is returned ends it.
+        """Handle a topic's messages on the receive thread, counted in Health; the returned function unsubscribes.
 
-        What a handler raises ends the process, except for a message that cannot be read: `finish` raises it again. The
-        bus would count it and go on. Periods and `superseded` are as for `Handover`; in lockstep none is superseded.
+        An exception of the handler stops the process and `finish` raises it again, except for an unreadable message.
+        `period_ns` and `superseded` are as for `Dispatch`; in lockstep no message is superseded.
         """
 
         def guarded(handle: Callable[[Sample], None]) -> Callable[[Sample], None]:
@@ -134,19 +134,19 @@ class Service:
                     self.unreadable(sample.key, fault)
                 except Exception as fault:
                     self._fault = fault
-                    self.stop("a message could not be dealt with")
+                    self.stop(f"the handler of {topic.at(name)} failed")
 
             return guard
 
-        handover = Handover(
+        dispatch = Dispatch(
             topic.at(name),
             guarded(handler),
             self.clock.host_ns,
             None if self.clock.lockstep else period_ns,
             None if superseded is None else guarded(superseded),
         )
-        self.arrivals.append(handover)
-        return self.bus.subscribe(topic, handover.put, name or ALL)
+        self.arrivals.append(dispatch)
+        return self.bus.subscribe(topic, dispatch.put, name or ALL)
 
     def newcomers(self) -> bool:
         """Whether a process has joined or restarted since the last call."""
@@ -161,11 +161,11 @@ class Service:
         signal.signal(signal.SIGINT, self._caught)
 
     def on_stop(self, waker: Callable[[], None]) -> None:
-        """Call `waker` when the process has to stop, so that a waiting loop notices."""
+        """Call `waker` when the process is stopped, to end a wait of its loop."""
         self._wakers.append(waker)
 
     def stop(self, why: str) -> None:
-        """End the loop: `running` is False from here."""
+        """Stop the process: `running` becomes False."""
         if self.running:
             self.why = why
             self.running = False
@@ -175,7 +175,7 @@ class Service:
 
     @property
     def state(self) -> ProcessState:
-        """Setting it sends Health at once."""
+        """State of the process, as in Health; setting it publishes Health immediately."""
         return self._state
 
     @state.setter
@@ -191,9 +191,9 @@ class Service:
             self._supervisor.stopping()
 
     def beat(self, *, alive: bool = True) -> None:
-        """Send Health when it is due, twice a second, and a sign of life to the service manager where it is `alive`.
+        """Publish Health when due, twice a second, and send the watchdog signal to the service manager if `alive`.
 
-        Call it in every turn of the loop that does the work, and nowhere else.
+        Call it in every iteration of the process's main loop, and nowhere else.
         """
         now_ns = self.clock.host_ns()
         if alive:
@@ -206,10 +206,10 @@ class Service:
             self._send_health(now_ns)
 
     def finish(self) -> None:
-        """Send the last Health, with all counts, after which nothing may be published; raise what a handler raised."""
+        """Publish the last Health, with all counts; publish nothing after it. Raises the fault of a failed handler."""
         if self._fault is not None:
             raise self._fault
-        self._tell_unreadable()
+        self._report_unreadable()
         self.event("STOPPED", process=self.name, why=self.why)
         if noun := WORK.get(self.name.partition("-")[0]):
             self._announce(f"stopped after {counted(self.work, noun)}: {self.why}")
@@ -230,42 +230,42 @@ class Service:
             self._print(f"{what} (run {self.run_id})")
 
     def _print(self, line: str) -> None:
-        with contextlib.suppress(OSError, ValueError):  # a terminal that is gone, or a full disk, ends nobody
+        with contextlib.suppress(OSError, ValueError):  # a closed terminal or a full disk must not end the process
             sys.stderr.write(f"{self.name}: {line}\n")
 
     def unreadable(self, key: str, why: object) -> None:
-        """Count a message that could not be read: a flood is one event with each Health. Callable from any thread."""
+        """Count an unreadable message; each Health reports new ones in one event. Callable from any thread."""
         self.bus.faults.add_unreadable(key, why)
 
     def wait_for(self, names: Iterable[str], timeout_s: float) -> tuple[str, ...]:
-        """Wait until these processes are ready and have heard this one, so that they get its first message.
+        """Wait until these processes are ready and have received this one's Health, so that they get its first message.
 
-        Set `state` to "ready" before: others may be waiting for this one.
+        Set `state` to "ready" before: others may be waiting for this process.
 
         Returns:
-            Names of those that did not answer in time; empty when all did, or the process was told to stop.
+            Names of those that did not answer in time; empty if all did.
         """
-        wanted = tuple(names)
+        awaited = tuple(names)
         deadline_s = time.monotonic() + timeout_s
-        self.awaited = lambda: ", ".join(name for name in wanted if not self._meets(name))
-        while missing := tuple(name for name in wanted if not self._meets(name)):
+        self.awaited = lambda: ", ".join(name for name in awaited if not self._connected(name))
+        while missing := tuple(name for name in awaited if not self._connected(name)):
             if not self.running or time.monotonic() >= deadline_s:
                 return missing
             self.beat()
-            time.sleep(_MET_PERIOD_S)
+            time.sleep(_POLL_S)
         return ()
 
-    def meet(self, names: Iterable[str], timeout_s: float, otherwise: str) -> None:
+    def require(self, names: Iterable[str], timeout_s: float, consequence: str) -> None:
         """Wait for these processes as `wait_for` does.
 
-        BusError where one did not answer in time, with what happens `otherwise`, unless the process was told to stop.
+        BusError, with the `consequence`, if one does not answer in time, unless this process has been stopped.
         """
         missing = self.wait_for(names, timeout_s)
         if missing and self.running:
-            raise BusError(f"no sign of {', '.join(missing)} after {timeout_s:g} s; {otherwise}")
+            raise BusError(f"no sign of {', '.join(missing)} after {timeout_s:g} s; {consequence}")
 
     def health(self) -> wire.Health:
-        """Health of the process, now."""
+        """Current Health of the process."""
         now_ns = self.clock.host_ns()
         span_s = max(now_ns - self._beaten_ns, 1) * 1e-9
         message = wire.Health(
@@ -283,7 +283,7 @@ class Service:
             realtime_refused=[f"{measure}: {cost}" for measure, cost in self._granted.refused],
             clock_offset_ns=self.clock.offset_ns,
             uptime_ns=now_ns - self._started_ns,
-            topics=[*(self._sent(one) for one in self.publishers), *map(_got, self.arrivals)],
+            topics=[*(self._sent(one) for one in self.publishers), *map(_received, self.arrivals)],
         )
         if (warning := self._last_warning) is not None:
             message.last_warning = warning.message
@@ -295,17 +295,17 @@ class Service:
         return message
 
     def _sent(self, publisher: Publisher) -> wire.TopicCount:
-        own = publisher is self._health  # the message that carries the count is one of them
+        own = publisher is self._health  # the Health that reports this count is included
         published = publisher.published + own
         return wire.TopicCount(topic=publisher.key, published=published, missing=publisher.skipped)
 
-    def _tell_unreadable(self) -> None:
+    def _report_unreadable(self) -> None:
         for key, (count, why) in self.bus.faults.take_unreadable().items():
             self.event("BAD_MESSAGE", count=count, topic=key, why=why)
 
     def _send_health(self, now_ns: int) -> None:
         self._due_ns = now_ns + HEALTH_PERIOD_NS
-        self._tell_unreadable()
+        self._report_unreadable()
         message = self.health()
         self._beaten_ns, self._worked = now_ns, self.work
         self._health.put(message.SerializeToString())
@@ -318,9 +318,9 @@ class Service:
         known = self.last_health.get(name)
         self.last_health[name] = health
         if known is None or known.pid != health.pid:
-            self._due_ns = 0  # answer a newcomer at the next beat, so that it need not wait for us
+            self._due_ns = 0  # publish Health at the next beat, so that a newcomer does not wait for it
 
-    def _meets(self, name: str) -> bool:
+    def _connected(self, name: str) -> bool:
         health = self.last_health.get(name)
         return health is not None and health.state in ("ready", "running") and self.name in health.peers_alive
 
@@ -330,7 +330,7 @@ class Service:
         self.stop(signal.Signals(number).name)
 
 
-def _got(arrivals: Arrivals) -> wire.TopicCount:
+def _received(arrivals: Arrivals) -> wire.TopicCount:
     return wire.TopicCount(
         topic=arrivals.key,
         received=arrivals.received,

@@ -94,7 +94,7 @@ class Controller:
         self._turn = threading.Lock()
         self._adopted = False
         self._early: Sample | None = None
-        self._leave_camera = service.handover(
+        self._leave_camera = service.dispatch(
             FRAME, self._arrived, period_ns=config.period_ns, superseded=partial(self._arrived, superseded=True)
         )
         self._mirror = MirrorSigns(service, name)

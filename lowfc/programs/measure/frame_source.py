@@ -107,7 +107,7 @@ class Source:
         """Wait for those named, send, and write what was sent into `folder`."""
         service = self._service
         service.state = "ready"
-        service.meet(wait_for, _WAIT_S, "no frame is sent without")
+        service.require(wait_for, _WAIT_S, "no frame is sent without")
         state = camera_state(CameraSettings.configured(self._config, *self._payloads.shape), service.clock.now_ns())
         self._settings.put(state.SerializeToString())
         service.state = "running"
