@@ -58,18 +58,22 @@ LOOP_COLUMNS = {
 
 
 SHORT_COLUMNS = {
-    "simulated loop under a reaction wheel": "{rate_hz:.0f} frames per second",
-    "latency, frame to command, p50 / p99": "{latency_us[frame_to_command][p50]:.0f} / "
-    "{latency_us[frame_to_command][p99]:.0f} us",
-    "residual tilt per axis, of the disturbance": "{tilt_residual_mas:.1f} of {tilt_disturbance_mas:.1f} mas rms",
+    "simulated loop, reaction-wheel jitter": "{rate_hz:.0f} frames per second",
+    "frame to command, p50 / p99, us": "{latency_us[frame_to_command][p50]:.0f} / "
+    "{latency_us[frame_to_command][p99]:.0f}",
+    "tilt per axis, mas rms: disturbance": "{tilt_disturbance_mas:.1f}",
+    "residual": "{tilt_residual_mas:.1f}",
 }
+
+
+SHORT_NOTE = """The star has V = 2. Latency is from publishing the frame to publishing the command; read-out is not included. The jitter is drawn
+frame by frame, so its realisation differs between rates. [Performance](docs/measured/performance.md) has all runs and the method."""
 
 
 def short(figures: Figures) -> str:
     """Rate, latency and residual of the runs with real-time scheduling."""
     rows = (run for name, run in figures["runs"].items() if "SCHED_FIFO" in name)
-    pointer = "[Performance](docs/measured/performance.md) has all runs, and how they were measured."
-    return f"{columns(SHORT_COLUMNS, rows)}\n{pointer}\n"
+    return f"{columns(SHORT_COLUMNS, rows)}\n{SHORT_NOTE}\n"
 
 
 def render(figures: Figures) -> str:
