@@ -1,8 +1,8 @@
 """Tables of docs/measured/reliability.md: faults injected into the loop, hours of it, damaged inputs.
 
 Example:
-    python -m tools.reliability --seed 1              # the chaos cases that the table lacks, with this seed
-    python -m tools.reliability --seed 1 kill-camera  # this one anew; then `python -m tools.measure` for the page
+    python -m tools.reliability --seed 1              # run the chaos cases missing from the table, with this seed
+    python -m tools.reliability --seed 1 kill-camera  # run this one again; then `python -m tools.measure` for the page
 """
 
 import argparse
@@ -12,6 +12,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from lowfc.control.loop.wording import counted
+from lowfc.programs.reliability.chaos.cases import CASES
 from lowfc.programs.reliability.chaos.command import counts
 from lowfc.programs.reliability.soak.figures import TOO_SHORT, latency_in_words, verdict
 from tools.shared import ROOT, Figures, columns, host, json_of, markdown, of_host
@@ -20,6 +21,13 @@ CHAOS = "lowfc chaos --all --seed N"
 SEEDS = (1, 2, 3, 4, 5)
 CASES_FILE = ROOT / "tools" / "measured" / "chaos.json"
 _STALL = ("before", "during", "after")
+_PHASES = {
+    "without": "not started",
+    "flooded and frozen": "flooded and stopped",
+    "frozen": "stopped",
+    "flood without": "gone; flood goes on",
+}
+"""Phases of the case `console`, as the page names them."""
 
 
 def chaos() -> Figures:
@@ -34,9 +42,7 @@ def _run(cases: str, seed: int) -> Figures:
 
 
 def measure_again(figures: Figures, seed: int, names: Sequence[str]) -> None:
-    """Put cases of a seed among the measured ones: those named, or those that are lacking."""
-    from lowfc.programs.reliability.chaos.cases import CASES
-
+    """Run cases of a seed and store their results: those named, or those without a result."""
     run = next(one for one in figures["runs"] if one["seed"] == seed)
     kept = {case["name"]: case for case in run["cases"] if case["name"] in CASES}
     if wanted := list(names) or [name for name in CASES if name not in kept]:
@@ -49,7 +55,7 @@ def measure_again(figures: Figures, seed: int, names: Sequence[str]) -> None:
 
 
 def render_chaos(figures: Figures) -> str:
-    """A line for each case, over all seeds; what is known of latencies beside stalls and consoles."""
+    """A row for each case, over all seeds; latencies during stalls and with a console."""
     runs = figures["runs"]
     by_name: dict[str, list[Figures]] = {}
     for case in (case for run in runs for case in run["cases"]):
@@ -59,7 +65,7 @@ def render_chaos(figures: Figures) -> str:
     seeds = ", ".join(str(run["seed"]) for run in runs)
     parts = [
         f"{passed} of {passed + failed} passed{left_out}, seeds {seeds}.\n",
-        markdown(("case", "what befalls the loop", "passed", "residual, nm rms: before -> after"), _rows(by_name)),
+        markdown(("case", "injected fault", "passed", "residual, nm rms: before -> after"), _rows(by_name)),
     ]
     failures = [
         f"- `{case['name']}`, seed {run['seed']}: {rule}: {one['found']}"
@@ -72,17 +78,18 @@ def render_chaos(figures: Figures) -> str:
         parts.append("\n".join(["What failed:", "", *failures, ""]))
     if steps_nm := _figures(by_name, "restart_step_nm"):
         parts.append(
-            f"Restarted controllers: {len(steps_nm)}; the first command of one moved an actuator by at most "
-            f"{max(steps_nm):.1f} nm of surface.\n"
+            f"The first command of a restarted controller moved an actuator by at most {max(steps_nm):.1f} nm of "
+            f"surface ({len(steps_nm)} restarts).\n"
         )
     if recovered_s := _figures({"": by_name.get("kill-controller", [])}, "recovered_s"):
         parts.append(
-            "Killed in closed loop and started anew, a controller had the residual back at most "
-            f"{max(recovered_s):.2f} s after the first frame that it used ({len(recovered_s)} times).\n"
+            "After a kill and restart in closed loop, the residual (rms over 50 frames) was within the recovery limit "
+            f"{1e3 * max(recovered_s):.0f} ms after the controller's first used frame or earlier "
+            f"({counted(len(recovered_s), 'restart')}).\n"
         )
     parts += [*_stalls(by_name), *_consoles(by_name.get("console", []))]
     again = ", ".join(f"`{name}`" for name in figures.get("measured_again", ()))
-    parts.append(f"Measured again after a change of what the case itself does: {again}." if again else "")
+    parts.append(f"Measured again after a change of the case itself: {again}." if again else "")
     hosts: dict[str, list[str]] = {}
     for name, about in figures.get("later", {}).items():
         hosts.setdefault(of_host(about), []).append(f"`{name}`")
@@ -92,14 +99,20 @@ def render_chaos(figures: Figures) -> str:
     return "\n".join(parts)
 
 
+def _recovery(found: str) -> str:
+    """The finding of the rule `recovery` without its words; release 0.1 wrote "safed"."""
+    return found.removeprefix("residual ").split(" nm,")[0].replace("safed", "safe")
+
+
 def _rows(by_name: dict[str, list[Figures]]) -> list[Sequence[object]]:
     rows: list[Sequence[object]] = []
     for name, cases in by_name.items():
         ended = counts(cases)
         why = f", {ended['skipped']} skipped ({cases[0]['skipped']})" if ended["skipped"] else ""
         found = [case["findings"].get("recovery", {}).get("found", "-") for case in cases]
-        recovered = "; ".join(text.removeprefix("residual ").split(" nm,")[0] for text in found)
-        rows.append((f"`{name}`", cases[0]["sentence"], f"{ended['passed']} of {len(cases)}{why}", recovered))
+        recovered = "; ".join(_recovery(text) for text in found)
+        sentence = CASES[name].sentence if name in CASES else cases[0]["sentence"]
+        rows.append((f"`{name}`", sentence, f"{ended['passed']} of {len(cases)}{why}", recovered))
     return rows
 
 
@@ -113,25 +126,27 @@ def _stalls(by_name: dict[str, list[Figures]]) -> list[str]:
         for each in (case["figures"] for case in cases if name.startswith("stall-")):
             spans = ", ".join(f"{each['frame_to_command'][span]['p99_us']:.0f}" for span in _STALL)
             rows.append((name.removeprefix("stall-"), spans, each.get("p99_during_over_calm", "-")))
-    head = "stands still for 10 s", "frame to command, p99 us: before, during, after", "during over the mean of both"
+    head = "stopped for 10 s", "frame to command, p99, us: before, during, after", "during / mean of before and after"
     return [markdown(head, rows)] if rows else []
 
 
 def _consoles(cases: Sequence[Figures]) -> list[str]:
-    """Latencies beside a console, in the spans of its case, and what the console took of a processor."""
+    """Latencies with a console, in the phases of its case, and the console's share of a processor."""
     each = [case["figures"] for case in cases if "console" in case["figures"]]
     if not each:
         return []
     rows = []
     for span in each[0]["frame_to_command"]:
         found = [one["frame_to_command"][span] for one in each]
-        rows.append((span, *(", ".join(f"{one[key]:.0f}" for one in found) for key in ("p50_us", "p99_us"))))
+        rows.append(
+            (_PHASES.get(span, span), *(", ".join(f"{one[key]:.0f}" for one in found) for key in ("p50_us", "p99_us")))
+        )
     starts_s, shares = (sorted(one["console"][key] for one in each) for key in ("start_s", "share"))
     cost = (
-        f"A console that was started beside the loop at 1 kHz showed it within {starts_s[-1]:.1f} s at most, and took "
-        f"{100 * shares[-1]:.0f} % of a processor at most ({counted(len(each), 'start')}).\n"
+        f"At 1 kHz a console displayed the loop at most {starts_s[-1]:.1f} s after its start, and used at most "
+        f"{100 * shares[-1]:.0f} % of a processor ({counted(len(each), 'start')}).\n"
     )
-    return [markdown(("the console", "frame to command, p50 us, by seed", "p99 us, by seed"), rows), cost]
+    return [markdown(("the console is", "frame to command, p50, us, by seed", "p99, us, by seed"), rows), cost]
 
 
 SOAK_COLUMNS = {
@@ -145,12 +160,12 @@ GROWTH = "{memory_mb_per_hour:+.2f} +- {memory_mb_per_hour_error:.2f}"
 
 
 def render_soak(figures: Figures) -> str:
-    """A line for each process."""
+    """A row for each process."""
     rows = (
         one | {"name": name, "growth": TOO_SHORT if one["memory_mb_per_hour"] is None else GROWTH.format(**one)}
         for name, one in figures["processes"].items()
     )
-    ended = "Nothing grew and nothing was lost." if figures["passed"] else f"{verdict(figures)}."
+    ended = "No growth beyond the limits below, no loss." if figures["passed"] else f"{verdict(figures)}."
     return (
         f"{ended} {figures['hours']:g} h at {figures['rate_hz']:.0f} Hz: {figures['frames_published']} frames, "
         f"{figures['frames_skipped']} skipped, {figures['frames_missing']} missing; {figures['messages_recorded']} "
@@ -160,8 +175,8 @@ def render_soak(figures: Figures) -> str:
 
 
 def render_fuzz(figures: Figures) -> str:
-    """A line for each decoder and reader."""
-    head = ("what reads", "inputs", "refused", "crashes", "hangs", "memory grown, MB")
+    """A row for each decoder and reader."""
+    head = ("reader", "inputs", "error raised", "crashes", "hangs", "memory growth, MB")
     rows, totals = [], [0, 0, 0]
     for one in figures["targets"]:
         counted = one["inputs"], len(one["crashes"]), len(one["hangs"])
@@ -170,14 +185,15 @@ def render_fuzz(figures: Figures) -> str:
     inputs, crashes, hangs = totals
     return (
         f"{inputs} inputs, {crashes} crashes, {hangs} hangs, in {figures['seconds'] / 60:.0f} minutes.\n\n"
-        f"{markdown(head, rows)}\n"
+        f"{markdown(head, rows)}\nReaders with 0 errors refuse damaged input with a reason or an event, or return "
+        "the readable part.\n"
     )
 
 
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", metavar="CASE", help="of `lowfc chaos`; default: those that are lacking")
+    parser.add_argument("names", nargs="*", metavar="CASE", help="case of `lowfc chaos`; default: all without a result")
     parser.add_argument("--seed", type=int, choices=SEEDS, required=True)
     asked = parser.parse_args()
     figures = json.loads(CASES_FILE.read_text())

@@ -33,7 +33,7 @@ _SHOWN = rb"\b(OPEN|CLOSED)\b"
 
 @case(
     "console",
-    "a console beside the loop is flooded with 2,000 events a second, stands still, and is killed",
+    "a console of a loop at 1 kHz receives 2,000 events a second, is stopped (SIGSTOP), and is killed",
     config={"camera.rate_hz": 1000.0},
     allowed=LOST,
 )

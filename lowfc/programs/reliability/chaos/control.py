@@ -28,7 +28,7 @@ from lowfc.programs.reliability.chaos.processes import killed
 JUST_BELOW = 0.9
 
 
-@case("gain", "the highest gain that is granted, then one above, refused")
+@case("gain", "the highest accepted gain, then one above, which is refused")
 def _highest_gain(bench: ChaosBench) -> None:
     client, limiting = bench.client(), limiting_gain(settings(bench.config).delay_frames)
     try:
@@ -45,7 +45,7 @@ def _highest_gain(bench: ChaosBench) -> None:
 
 @case(
     "law-that-fails",
-    "a law that is stable and corrects next to nothing; the integrator takes over",
+    "a stable law with a gain near zero; the integrator takes over",
     expected=("LAW_OVERRULED the integrator takes over tip and tilt",),
 )
 def _law_that_fails(bench: ChaosBench) -> None:
@@ -66,7 +66,7 @@ def _load_and_close(client: Client, calibration: Calibration) -> None:
 
 @case(
     "reversed-calibration",
-    "a calibration of the right shape that drives the loop away; the operator ends it by `safe`",
+    "a calibration with the sign of R reversed: the loop diverges; the operator requests `safe`",
     expected=("SAFED",),
 )
 def _reversed_calibration(bench: ChaosBench) -> None:
@@ -106,7 +106,7 @@ def _foreign_calibration(bench: ChaosBench) -> None:
 
 @case(
     "damaged-calibration",
-    "the controller is started with NaN in its file, which it refuses, then with a good one",
+    "the controller refuses a calibration file with NaN at its start, then starts with a good one",
     expected=("STARTED controller",),
     statuses={Role.CONTROLLER: 2},
 )
@@ -127,7 +127,7 @@ def _damaged_calibration(bench: ChaosBench) -> None:
 
 @case(
     "safed-restart",
-    "safe mode, then the controller is killed and started anew",
+    "safe mode, then the controller is killed and restarted",
     expected=("SAFED",),
     safe=True,
 )
@@ -143,7 +143,7 @@ FLIPS, FLOOD, FLOOD_HZ = 40, 4000, 2000
 
 @case(
     "interlock",
-    "an interlock is flipped at random and gets 2,000 values a second; then its publisher dies while it acts",
+    "an interlock changes at random and receives 2,000 values a second; then its publisher dies while it acts",
     config={"interlocks": [MASK]},
     expected=("INTERLOCK_ACTS", "INTERLOCK_CLEARED"),
 )
@@ -189,11 +189,11 @@ def _safe_while(unkept: Callable[[Path], contextlib.AbstractContextManager[None]
 unkept_case = partial(case, expected=("SAFED", "LATCH_FAILED"), safe=True)
 unkept_case(
     "safe-without-directory",
-    "safe while the run's directory is gone; then the controller is killed and started anew",
+    "safe mode while the run's directory is missing; then the controller is killed and restarted",
 )(partial(_safe_while, _moved_away))
 unkept_case(
     "safe-read-only",
-    "safe while the run's directory cannot be written; then the controller is killed and started anew",
+    "safe mode while the run's directory is read-only; then the controller is killed and restarted",
     lacks=no_mounts,
 )(partial(_safe_while, read_only))
 
@@ -209,14 +209,14 @@ def _other_clock(bench: ChaosBench, seconds: int) -> None:
 
 case(
     "clock-ahead",
-    "a camera whose clock is an hour ahead takes the place of the camera",
+    "a camera whose clock is an hour ahead replaces the camera",
     expected=("CAMERA_RESTARTED",),
     allowed=LOST,
     lacks=no_other_clock,
 )(partial(_other_clock, seconds=3600))
 case(
     "clock-behind",
-    "a camera whose clock is an hour behind, until the camera is back",
+    "a camera whose clock is an hour behind replaces the camera for a while",
     allowed=LOST,
     lacks=no_other_clock,
 )(partial(_other_clock, seconds=-3600))

@@ -53,7 +53,7 @@ def _full(bench: ChaosBench) -> None:
 
 @case(
     "disk-read-only",
-    "a recorder on a read-only disk refuses, another one records",
+    "a recorder on a read-only disk refuses to start, another one records",
     statuses={Role.RECORDER: 2},
     lacks=no_mounts,
 )
@@ -69,14 +69,14 @@ def _read_only(bench: ChaosBench) -> None:
     bench.restart(Role.RECORDER, [*usual, "--folder", str(bench.folder)])  # the last one wrote its own into the run's
 
 
-@case("disk-slow", "the disk takes 3 s for each write", expected=("DISK_SLOW",), allowed=LOST)
+@case("disk-slow", "each write takes 3 s", expected=("DISK_SLOW",), allowed=LOST)
 def _slow(bench: ChaosBench) -> None:
     _on_slow_disk(bench, SLOW_S, 8, 2)
     bench.wait(lambda: bench.health[Role.RECORDER].recording.messages > 0, "a recording")
     bench.frames(1000)  # of which two writes take the most
 
 
-@case("stall-disk", "the disk takes nothing for 10 s", allowed=LOST)
+@case("stall-disk", "a write blocks for 10 s", allowed=LOST)
 def _stalled(bench: ChaosBench) -> None:
     @contextlib.contextmanager
     def stall() -> Iterator[None]:

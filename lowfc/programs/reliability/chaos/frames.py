@@ -15,17 +15,17 @@ LATEST = 50
 _KINDS = (
     ("lost", "10 % of the frames are not sent", "FRAMES_MISSING", STRUCK, True),
     ("duplicated", "each frame is sent twice", "REPEATED", STRUCK, True),
-    ("reordered", "frames come in pairs, the second one first", "OUT_OF_ORDER", STRUCK, True),
-    ("late", "each frame comes 1 to 50 frames late", "OUT_OF_ORDER", STRUCK, True),
+    ("reordered", "frames arrive in pairs, in reverse order", "OUT_OF_ORDER", STRUCK, True),
+    ("late", "each frame arrives 1 to 50 frames late", "OUT_OF_ORDER", STRUCK, True),
     ("wrong-size", "frames of another size", "WRONG_SIZE", 0, False),
-    ("truncated", "messages cut off anywhere", "WRONG_SIZE", 0, False),
+    ("truncated", "truncated messages", "WRONG_SIZE", 0, False),
     ("random", "random bytes", "WRONG_SIZE", 0, False),
-    ("old-sequence", "numbers of an hour ago", "OUT_OF_ORDER", 0, True),
+    ("old-sequence", "sequence numbers from an hour ago", "OUT_OF_ORDER", 0, True),
     ("saturated", "all pixels at full well", "SATURATED", 0, False),
-    ("dark", "the star is lost, and found", "DARK", 0, False),
+    ("dark", "the star vanishes and returns", "DARK", 0, False),
     ("hot-pixels", "a tenth of the pixels at full well", "SATURATED", 0, False),
     ("cosmic-rays", "a track of six pixels at full well in every fifth frame", "", STRUCK, False),
-    ("stuck", "the same image again and again, as new frames", "STUCK", Control().max_identical_frames, False),
+    ("stuck", "the same image repeated as new frames", "STUCK", Control().max_identical_frames, False),
 )
 
 
@@ -46,12 +46,12 @@ for _kind, _sentence, _reason, _used, _lost in _KINDS:
     )(_through)
 case(
     "stuck-actuators",
-    "dead and stuck actuators",
+    "dead and stuck actuators, whose wavefront the modes cannot correct",
     config={"mirror.dead": [500, 501], "mirror.stuck_nm": {"600": 80.0}},
 )(_through)
 case(
     "saturating",
-    "a disturbance beyond what the modes may do",
+    "a disturbance beyond the modal limit of tip and tilt",
     config={"disturbance.preset": "step", "disturbance.scale": 6.0, "control.tilt_limit_nm": 20.0},
     expected=("LIMIT_HIT",),
 )(_through)

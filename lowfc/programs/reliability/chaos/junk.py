@@ -92,7 +92,7 @@ def _commands(bench: ChaosBench, rng: np.random.Generator) -> Iterator[wire.Mirr
 
 @case(
     "forged-commands",
-    "commands of anything at all by who has the run's secret",
+    "commands with random content from a process with the run's secret",
     expected=("COMMAND_REFUSED command refused: NOT_FINITE", "LIMIT_HIT"),
     allowed=LOST,
 )
@@ -104,7 +104,7 @@ def _forged_commands(bench: ChaosBench) -> None:
             time.sleep(_TURN_S)
 
 
-@case("forged-frames", "frames with numbers of the past, and with none", allowed=LOST, noisy=True)
+@case("forged-frames", "frames with past sequence numbers, and with none", allowed=LOST, noisy=True)
 def _forged_frames(bench: ChaosBench) -> None:
     with Intruder(bench) as intruder:
         for _ in range(FORGED):

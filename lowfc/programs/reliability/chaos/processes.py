@@ -57,26 +57,24 @@ def frozen(role: Role, for_s: tuple[float, float] = (0.5, 2.0)) -> Act:
 
 
 for _role, (_seen, _) in _EVENTS.items():
-    process_case(f"kill-{_role}", f"kill -9 of the {_role}, started anew up to 1 s later", expected=_seen)(
-        killed(_role)
-    )
+    process_case(f"kill-{_role}", f"kill -9 of the {_role}, restarted up to 1 s later", expected=_seen)(killed(_role))
 for _role, (_, _seen) in _EVENTS.items():
     process_case(f"freeze-{_role}", f"SIGSTOP of the {_role}, SIGCONT 0.5 to 2 s later", expected=_seen)(frozen(_role))
 process_case(
     "silent-camera",
-    "kill -9 of the camera, with the mirror to be relaxed meanwhile; started anew after a second",
+    'kill -9 of the camera with `on_frame_timeout = "flat"` and 40 nm of static focus; restarted after 1 s',
     config={"control.on_frame_timeout": "flat", **_STATIC},
     expected=("NO_FRAMES", "CAMERA_RESTARTED"),
 )(killed(Role.CAMERA, (1.0, 1.0)))
 process_case(
     "lost-mirror",
-    "kill -9 of the mirror under a disturbance that stays; started anew after 3 s",
+    "kill -9 of the mirror with 40 nm of static focus; restarted after 3 s",
     config=_STATIC,
     expected=("MIRROR_LOST", "MIRROR_BACK"),
 )(killed(Role.MIRROR, (3.0, 3.0)))
 
 
-@process_case("random", "six kills or stops of any of them, at random times")
+@process_case("random", "six kill -9 or SIGSTOP of random processes, at random times")
 def _at_random(bench: ChaosBench) -> None:
     for _ in range(STRIKES):
         role = bench.rng.choice((Role.CAMERA, Role.CONTROLLER, Role.MIRROR, Role.RECORDER))
@@ -85,12 +83,12 @@ def _at_random(bench: ChaosBench) -> None:
         bench.pause(0.0, 1.0)
 
 
-@process_case("stall-recorder", "the recorder stands still for 10 s")
+@process_case("stall-recorder", "the recorder is stopped (SIGSTOP) for 10 s")
 def _stalled_recorder(bench: ChaosBench) -> None:
     compare(bench, partial(bench.stopped, Role.RECORDER))
 
 
-@process_case("stall-viewer", "the viewer stands still for 10 s")
+@process_case("stall-viewer", "the viewer is stopped (SIGSTOP) for 10 s")
 def _stalled_viewer(bench: ChaosBench) -> None:
     name = bench.process(Role.VIEWER)
     bench.settled()
