@@ -23,7 +23,7 @@ BENCHMARKS = {
 def main() -> int:
     """The command line; returns its exit status."""
     parser = argparse.ArgumentParser("python -m benchmarks", description=__doc__)
-    parser.add_argument("name", choices=BENCHMARKS, help="NAME --help tells what it measures, and its options")
+    parser.add_argument("name", choices=BENCHMARKS, help="NAME --help describes the measurement and its options")
     name = parser.parse_args(sys.argv[1:2]).name
     try:
         return run(name, cast("Benchmark", import_module(BENCHMARKS[name])), sys.argv[2:])
@@ -35,5 +35,5 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # it stops its processes before it ends
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that it stops its processes
     sys.exit(main())

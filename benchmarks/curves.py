@@ -212,8 +212,9 @@ def about(result: Result) -> str:
     """Definitions of the figures."""
     default = Size(**result["default"])
     loops = (
-        f"The loop runs at {result['rate_hz']:g} Hz, real-time set-up included; from just before a frame's put to just "
-        "after its command's; the controller's cpu is that of all its threads, telemetry included, for each frame."
+        f"The loop runs at {result['rate_hz']:g} Hz with its real-time set-up; its latency is from just before "
+        "publishing a frame to just after publishing its command. The controller's cpu is of all its threads, with telemetry, for "
+        "each frame."
         if result["rate_hz"]
         else ""
     )
@@ -221,9 +222,9 @@ def about(result: Result) -> str:
     return (
         f"us; medians over {result['repeats']} repeats of {result['seconds']:g} s each, in brackets the lowest and "
         f"highest p50. Sizes not on the axis: {default.pixels} pixels, {default.modes} modes, {default.actuators} "
-        "actuators. The step: one thread, back to back, normal scheduling, matrices as warm as the caches keep "
-        "them. The limit: as many bytes as a step must touch, read once, by a float32 dot product of one half with the "
-        f"other. {loops}{failed}"
+        "actuators. The step: one thread, back to back, normal scheduling, warm caches. The memory limit: one read of "
+        "as many bytes as a step must touch, by a float32 dot product of one half with the other. "
+        f"{loops}{failed}"
     )
 
 

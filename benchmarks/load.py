@@ -1,4 +1,4 @@
-"""A command of ours run for a benchmark, and what the processes that it starts use of the host meanwhile."""
+"""Run a lowfc command for a benchmark, and measure the processor time and memory of its processes."""
 
 import contextlib
 import json
@@ -23,7 +23,7 @@ MODULES = {
     "lowfc record": "recorder",
     "lowfc view": "view",
 }
-"""Modules that Python runs, and their roles in the loop."""
+"""Roles in the loop by the module that Python runs."""
 LOOP = {"camera", "controller", "mirror"}
 
 _EVERY_S = 0.2
@@ -32,7 +32,7 @@ _START_S, _SLOWEST = 60.0, 12.0
 
 
 class Used(NamedTuple):
-    """What a process has used so far: processor time, where it may run, and its memory."""
+    """Processor time, permitted processors and memory of a process so far."""
 
     used_s: float
     processors: str
@@ -40,7 +40,7 @@ class Used(NamedTuple):
 
 
 class Moment(NamedTuple):
-    """The processes at one time, by role."""
+    """Sample of all processes at one time, by role."""
 
     at_s: float
     roles: dict[str, Used]
@@ -48,7 +48,7 @@ class Moment(NamedTuple):
 
 @contextlib.contextmanager
 def watched() -> Iterator[list[Moment]]:
-    """Look at the processes below this one, five times a second, within a `with` block; see `shares`."""
+    """Sample the child processes five times a second within a `with` block; see `shares`."""
     moments: list[Moment] = []
     ended = threading.Event()
 
@@ -68,7 +68,7 @@ def watched() -> Iterator[list[Moment]]:
 def _moment() -> Moment:
     moment = Moment(time.monotonic(), {})
     for process in psutil.Process().children(recursive=True):
-        with contextlib.suppress(psutil.Error):  # it has just ended
+        with contextlib.suppress(psutil.Error):  # ended meanwhile
             role = role_of(process.cmdline())
             if role is not None:
                 times, cpus = process.cpu_times(), ",".join(map(str, process.cpu_affinity()))
@@ -77,9 +77,9 @@ def _moment() -> Moment:
 
 
 def shares(moments: Sequence[Moment], seconds: float) -> dict[str, Result]:
-    """What each role used over the last four fifths of so many seconds of frames, before its processes ended.
+    """Use by each role over the last four fifths of `seconds` of frames, before the processes ended.
 
-    share is of one processor, all threads; nothing is known where fewer than two moments fall into that time.
+    share is of one processor, all threads; empty if fewer than two samples fall into that time.
     """
     complete = [moment for moment in moments if moment.roles.keys() >= LOOP][:-1]
     inside = [moment for moment in complete if moment.at_s >= complete[-1].at_s - _PART * seconds]
@@ -98,13 +98,13 @@ def shares(moments: Sequence[Moment], seconds: float) -> dict[str, Result]:
 
 
 def role_of(words: Sequence[str]) -> str | None:
-    """Role of a process in the loop, from its command line; None where it has none."""
+    """Role of a process in the loop, from its command line; None if it has none."""
     module = words[words.index("-m") + 1 :] if "-m" in words else []
     return MODULES.get(" ".join(module[:1])) or MODULES.get(" ".join(module[:2]))
 
 
 def run_lowfc(words: Sequence[str], seconds: float) -> dict[str, Any]:
-    """What `lowfc` with these words prints by `--json`, and usage (`shares`); or failure, the last that it wrote."""
+    """JSON of `lowfc` with these arguments, and usage (`shares`); or failure: its last line of standard error."""
     command = [sys.executable, "-P", "-m", "lowfc", *words, "--duration", f"{seconds:g}", "--json"]
     patience_s = _START_S + _SLOWEST * seconds
     with tempfile.TemporaryDirectory() as folder, watched() as moments:

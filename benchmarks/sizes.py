@@ -1,4 +1,4 @@
-"""Loops of any size: random calibrations, frames to go with them, and the real processes run on those."""
+"""Loops of any size: random calibrations with matching frames, run by the real processes."""
 
 import contextlib
 import os
@@ -25,10 +25,10 @@ Single = npt.NDArray[np.float32]
 Frames = npt.NDArray[np.uint16]
 
 FRAMES = 8
-"""Made of each size."""
+"""Different frames of each size."""
 
-_LIGHT_DN = 1000.0  # of a pixel
-_LEAK = 0.01  # nothing answers to the mirror: without it, noise would add up
+_LIGHT_DN = 1000.0  # mean of a pixel
+_LEAK = 0.01  # the frames do not depend on the mirror: without a leak, noise would accumulate
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +72,7 @@ def configuration(size: Size, rate_hz: float, **realtime: Any) -> Configuration:
 
 
 def made_up(size: Size, config: Configuration) -> tuple[Calibration, Frames]:
-    """A random calibration, and frames (frames, rows, columns) whose noise it takes for 1 nm rms in every mode."""
+    """A random calibration, and frames (frames, rows, columns) whose noise is 1 nm rms in every mode."""
     rng = np.random.default_rng(size.bytes)
     light_dn = _LIGHT_DN * rng.uniform(0.5, 1.5, size.pixels)
     flux_dn = float(light_dn.sum())
@@ -100,12 +100,12 @@ def made_up(size: Size, config: Configuration) -> tuple[Calibration, Frames]:
 
 @contextlib.contextmanager
 def laid_out(size: Size, config: Configuration) -> Iterator[Run]:
-    """A run of that size with what its processes share; nothing is left of it afterwards."""
+    """A run of that size with the files of its processes; removed afterwards."""
 
     def fill(config: Configuration, run: Run) -> None:
         calibration, frames = made_up(size, config)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", VerifyWarning)  # hundreds of modes leave no room for a card's comment
+            warnings.simplefilter("ignore", VerifyWarning)  # with hundreds of modes a card's comment is truncated
             calibration_file.save(calibration, run.path / "calibration.fits")
         (run.path / "config.toml").write_text(config.to_toml(), encoding="utf-8")
         np.save(run.path / FRAMES_FILE, frames)

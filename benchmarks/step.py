@@ -1,6 +1,6 @@
 """Time of each stage of the control step, and of one matrix-vector product of the same size in the same run.
 
-The step is the loop's own, from the bytes of a frame to the bytes of a command, with a random calibration of the usual
+The step is the loop's own, from a frame's bytes to a command's, with a random calibration of the default
 size. The step and the product R x are timed back to back, and paced at the frame rate as in the loop. Then the step is
 timed stage by stage, which takes a little longer.
 
@@ -68,13 +68,13 @@ def measure(options: argparse.Namespace, tell: Tell) -> Result:
         durations = _timed(step, payloads, lambda _: calibration.reconstructor @ x, options.seconds, period_ns)
         found[name] = {stage: percentiles(each / 1e3) for stage, each in durations.items()}
     if step.state.mode is not LoopMode.CLOSED or step.state.counts:
-        raise ValueError(f"frames were refused or limits acted: {dict(step.state.counts)}; this is not the usual step")
+        raise ValueError(f"frames were refused or limits acted: {dict(step.state.counts)}; this is not a normal step")
     found["over_product"] = {name: found[name][STEP]["p50"] / found[name][PRODUCT]["p50"] for name in found}
     return found | {"memory": memory, "rate_hz": RATE_HZ, "granted": list(granted.granted)}
 
 
 def allocated(step: ControlStep, payloads: Payloads) -> dict[str, float]:
-    """Memory of a step after warm-up, bytes: its peak, what it keeps on average, and the size of a float32 frame."""
+    """Memory of a step after warm-up, bytes: peak, mean retained, and the size of a float32 frame."""
     for number in range(_WARM_UP):
         step(payloads.at(number, number))
     tracemalloc.start()
@@ -111,8 +111,8 @@ def about(found: Result) -> str:
         f"The step takes {over['hot_us']:.1f} times as long as one product back to back, "
         f"{over['paced_us']:.1f} times at {found['rate_hz']:g} Hz. {size.pixels} pixels, {size.modes} modes, "
         f"{size.actuators} actuators. A step's allocations reach {memory['peak_bytes'] / 1e3:.1f} kB at most "
-        f"(a frame in float32 is {memory['frame_bytes'] / 1e3:.1f} kB), and {memory['kept_bytes']:.1f} bytes of each "
-        "are kept."
+        f"(a frame in float32 is {memory['frame_bytes'] / 1e3:.1f} kB); each step retains {memory['kept_bytes']:.1f} "
+        "bytes."
     )
 
 

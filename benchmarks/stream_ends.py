@@ -1,4 +1,4 @@
-"""The two ends of a camera's stream: who writes prepared frames into it, and a driver that notes when each was written.
+"""Writer and reader of a camera's stream: prepared frames, and a driver that records when each was written.
 
 Example: python -m benchmarks.stream_ends FOLDER STREAM FRAMES, with the folder of a run
 """
@@ -22,7 +22,7 @@ from lowfc.device.drivers.isio.camera import IsioCamera
 from lowfc.programs.measure.frame_source import FRAMES_FILE, SENT_FILE
 
 GO_FILE = "go"
-"""In the run's directory, once the first frame may come."""
+"""File in the run's directory that starts the writer."""
 
 _LOOK_S = 0.02
 _LEAD_NS, _WARM_UP_NS = 10_000_000, 150_000
@@ -30,7 +30,7 @@ _LAST_COMMAND_S = 0.1
 
 
 class TimedCamera(IsioCamera):
-    """The driver `isio` as it is; beside it, the moment before each image was written, which is the image's `atime`."""
+    """The driver `isio`; it also records the image's `atime`, the time just before it was written."""
 
     def __init__(self, options: IsioCamera.Options, config: Configuration) -> None:
         """Open the stream."""
@@ -38,13 +38,13 @@ class TimedCamera(IsioCamera):
         self._sequence, self._put_ns, self._written_ns = array("Q"), array("q"), array("q")
 
     def join(self, service: Service) -> None:
-        """Keep the clock, and the run's folder, where the times go."""
+        """Keep the clock and the run's folder, for the times."""
         super().join(service)
         self._folder = open_run(service.run_id, ()).path
         self._clock = service.clock
 
     def start(self) -> None:
-        """Everybody is there."""
+        """Start the writer."""
         (self._folder / GO_FILE).touch()
 
     def expose(self) -> Exposure | None:
@@ -55,13 +55,13 @@ class TimedCamera(IsioCamera):
         return exposure
 
     def sent(self, envelope: Envelope) -> None:
-        """Note the times of the frame."""
+        """Record the times of the frame."""
         self._sequence.append(envelope.sequence)
         self._put_ns.append(envelope.publish_time_ns)
         self._written_ns.append(self._newest_ns)
 
     def close(self) -> None:
-        """Leave the times: the moment at which a frame was due is that at which it was written into the stream."""
+        """Save the times; a frame's scheduled time is that of its writing into the stream."""
         super().close()
         np.savez(
             self._folder / SENT_FILE,
@@ -72,13 +72,13 @@ class TimedCamera(IsioCamera):
 
 
 def main() -> None:
-    """Write every frame at its moment, whatever became of the last; what is late is written at once.
+    """Write every frame at its scheduled time, or at once if late.
 
-    A camera's program is of C. So as not to be slower than that by far, this one does the same elsewhere just before.
+    A camera's program is in C. To be about as fast, this one writes to another stream just before (cache warm-up).
     """
     folder, name, count = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3])
     config, frames, path = load(folder / "config.toml"), np.load(folder / FRAMES_FILE), stream_path(name)
-    stream, rehearsed = Stream(path), Stream.create(path.with_stem(f"{path.stem}_"), frames.shape[1:], frames.dtype)
+    stream, warm_up = Stream(path), Stream.create(path.with_stem(f"{path.stem}_"), frames.shape[1:], frames.dtype)
     prepare(config, config.realtime.camera_cpus)
     clock = HostClock()
     while not (folder / GO_FILE).exists():
@@ -87,7 +87,7 @@ def main() -> None:
     for index in range(count):
         frame = frames[index % len(frames)]
         clock.sleep_until_ns(due_ns - _WARM_UP_NS)
-        rehearsed.put(frame, time.time_ns())
+        warm_up.put(frame, time.time_ns())
         clock.sleep_until_ns(due_ns)
         stream.put(frame, time.time_ns())
         due_ns += config.period_ns

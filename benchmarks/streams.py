@@ -1,7 +1,7 @@
-"""Frame to command over ImageStreamIO beside the direct link: the same controller, frames and processors, in turns.
+"""Frame to command over ImageStreamIO and over the direct link: same controller, frames and processors, in turns.
 
-Over ImageStreamIO a program writes each frame into a stream, `lowfc camera isio` reads it, or the controller does so
-itself (`lowfc controller --camera isio`), and `lowfc mirror isio` writes the command into a channel. By the direct link
+Over ImageStreamIO a program writes each frame into a stream, `lowfc camera isio` or the controller itself reads it
+(`lowfc controller --camera isio`), and `lowfc mirror isio` writes the command into a channel. Over the direct link
 the source of frames and the mirror are those of `lowfc latency`.
 
 Example:
@@ -29,7 +29,7 @@ from lowfc.programs.measure.latency.run import Asked, one_loop
 
 ROOT = Path(__file__).parents[1]
 SIZE = Size()
-DIRECT, BETWEEN, READ = "direct link", "ImageStreamIO, a process between", "ImageStreamIO, read by the controller"
+DIRECT, BETWEEN, READ = "direct link", "ImageStreamIO, camera process", "ImageStreamIO, read by the controller"
 SPANS = {"frame_to_command": "frame to command", "frame_to_mirror": "frame to mirror"}
 AT = {"p50": "p50", "p99": "p99", "p99_9": "p99.9"}
 FRAMES, CHANNEL = "lowfs", "dm00disp03"
@@ -38,16 +38,16 @@ _MEMORY = Path("/dev/shm")  # noqa: S108  # a folder of one's own is made in it
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    """How long, how often, how fast."""
+    """Add duration, repeats and rate."""
     add_times(parser, seconds=3.0, repeats=9)
     parser.add_argument("--rate", dest="rate_hz", type=float, default=1000.0, help="frames per second (%(default)g)")
 
 
 def measure(options: argparse.Namespace, tell: Tell) -> Result:
-    """Run them in turns, every other time in the opposite order.
+    """Run the loops in turns, every other time in the opposite order.
 
     Returns:
-        turns, of each the figures of all as `one_run` makes them; seconds and rate_hz.
+        turns (the figures of `one_run` by loop), seconds and rate_hz.
     """
     turns: list[dict[str, Result]] = []
     for number in range(options.repeats):
@@ -62,8 +62,8 @@ def one_run(rate_hz: float, seconds: float, name: str) -> Result:
     """Run one of the loops once.
 
     Returns:
-        frame_to_command and frame_to_mirror (percentiles in us), frames, and without_command of them; by streams also
-        stream_to_camera, from just before a frame is written until just before the camera's put.
+        frame_to_command and frame_to_mirror (percentiles in us), frames, without_command; over streams also
+        stream_to_camera: from just before a frame is written until just before the camera publishes it.
     """
     driver = stream_ends.__name__
     config = configuration(SIZE, rate_hz).model_copy(update={"drivers": {driver: {"stream": FRAMES}}})
@@ -104,7 +104,7 @@ def _loop(asked: Asked, run: Run, folder: Path, name: str) -> list[Child]:
 
 
 def tables(result: Result) -> list[Lines]:
-    """Latencies of all, and their ratios turn by turn."""
+    """Latencies of each loop, and their ratios turn by turn."""
     turns = result["turns"]
     lines = [["", *(f"{words}, us: {at}" for words in SPANS.values() for at in AT.values()), "without a command"]]
     for name in (DIRECT, BETWEEN, READ):
@@ -120,14 +120,14 @@ def tables(result: Result) -> list[Lines]:
 
 
 def about(result: Result) -> str:
-    """What the figures are."""
+    """Definitions of the figures."""
     turns = result["turns"]
     before, read = (ranged([turn[name]["stream_to_camera"]["p50"] for turn in turns]) for name in (BETWEEN, READ))
     return (
         f"Medians (lowest to highest) over {len(turns)} turns of {result['seconds']:g} s each at {result['rate_hz']:g} "
-        f"Hz; {SIZE.side} x {SIZE.side} pixels, {SIZE.modes} modes, {SIZE.actuators} actuators. Over ImageStreamIO a "
-        "frame begins just before its writer sets the write flag, by the direct link just before the put; a command "
-        "ends just after the controller's send, and at the mirror just before its state. Of the frame to command over "
-        f"ImageStreamIO {before} us (p50) are from there until just before the camera's put; {read} where the "
-        "controller reads it."
+        f"Hz; {SIZE.side} x {SIZE.side} pixels, {SIZE.modes} modes, {SIZE.actuators} actuators. Latency "
+        "begins just before the writer sets the stream's write flag, or just before the frame is sent over the direct "
+        "link; it ends just after the controller's send, or just before the mirror publishes its state. Over "
+        f"ImageStreamIO {before} us (p50) of it pass until the camera process publishes the frame; {read} us until the "
+        "controller has read it."
     )

@@ -1,9 +1,9 @@
-"""The highest rate that the closed loop sustains, and what its processes use of the processors there.
+"""The highest rate that the closed loop sustains, and the processor time of its processes there.
 
-A rate is sustained where at most one frame in a thousand is without a command, the recorder loses no message, and the
-frames come within 1 % as fast as asked for, in two of up to three runs. The last such rate of a geometric grid is
-found by bisection. The loops are those of `lowfc latency`, which leaves the first half second out, except of what the
-recorder lost and of late commands.
+A rate is sustained if at most one frame in a thousand is without a command, the recorder loses no message, and the
+frame rate is within 1 % of the requested one, in two of up to three runs. The highest such rate of a geometric grid is
+found by bisection. The loops are those of `lowfc latency`, which skips the first half second, except in the counts of
+lost messages and late commands.
 
 Example:
     python -m benchmarks throughput
@@ -35,16 +35,16 @@ _ROLES = ("camera", "controller", "mirror", "recorder")
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    """The grid of rates, and which loops."""
+    """Add the grid of rates and the loops."""
     add_times(parser, seconds=10.0)
     parser.add_argument("--lowest", type=float, default=500.0, help="rate of the grid, Hz (%(default)g)")
     parser.add_argument("--highest", type=float, default=10_000.0, help="rate of the grid, Hz (%(default)g)")
-    parser.add_argument("--step", type=float, default=1.1, help="from one rate to the next (%(default)g times)")
+    parser.add_argument("--step", type=float, default=1.1, help="ratio of one rate to the one before (%(default)g)")
     parser.add_argument("--loop", action="append", choices=LOOPS, help="only this one; repeat")
 
 
 def measure(options: argparse.Namespace, tell: Tell) -> Result:
-    """Look for the highest rate of each loop: loops (of each what `find` returns), seconds and rates_hz."""
+    """Find the highest rate of each loop: loops (results of `find`), seconds and rates_hz."""
     if not (0 < options.lowest <= options.highest and options.step > 1):
         raise ConfigurationError("--lowest must be above 0 and at most --highest, and --step above 1")
     rates = grid(options.lowest, options.highest, options.step)
@@ -78,7 +78,7 @@ def run_once(words: Sequence[str], rate_hz: float, seconds: float) -> Result:
 
 
 def complaints(run: Result) -> list[str]:
-    """Why this rate was not sustained; none where it was."""
+    """Why this rate was not sustained; empty if it was."""
     if "failure" in run:
         return [run["failure"]]
     found = []
@@ -92,13 +92,13 @@ def complaints(run: Result) -> list[str]:
 
 
 def grid(lowest_hz: float, highest_hz: float, step: float) -> list[float]:
-    """Rates from the lowest on, each this many times the last, up to the highest."""
+    """Rates from the lowest to the highest, each `step` times the one before."""
     count = math.floor(math.log(highest_hz / lowest_hz) / math.log(step) + 1e-9)
     return [round(lowest_hz * step**index) for index in range(count + 1)]
 
 
 def search(sustains: Callable[[int], bool], count: int) -> int:
-    """Index of the last of `count` rates that is sustained in two of three runs, by halves; -1 for none."""
+    """Index of the highest of `count` rates sustained in two of three runs, by bisection; -1 for none."""
     low, high = -1, count
     while high - low > 1:
         middle = (low + high) // 2
@@ -109,10 +109,10 @@ def search(sustains: Callable[[int], bool], count: int) -> int:
 
 
 def find(words: Sequence[str], rates: Sequence[float], seconds: float, tell: Tell) -> Result:
-    """Look for the highest rate of one loop; None where not even the lowest is sustained.
+    """Find the highest rate of one loop; None if not even the lowest is sustained.
 
-    run is a sustained one there, above one that was not, one step faster (None where the grid ends), compared one at
-    `COMPARED_HZ`.
+    run: a sustained run at that rate; above: a run one step faster that was not (None at the end of the grid);
+    compared: a run at `COMPARED_HZ`.
     """
     command = shlex.join(["lowfc", "latency", *words])
     runs: list[Result] = []
@@ -138,12 +138,12 @@ def find(words: Sequence[str], rates: Sequence[float], seconds: float, tell: Tel
     }
 
 
-HEADINGS = ("loop", "highest rate, Hz", "frame to command p50, us", "p99", "commands late", "one step faster")
-USE_HEADINGS = ("loop", "at, Hz", *_ROLES, "on one processor")
+HEADINGS = ("loop", "highest rate, Hz", "frame to command p50, us", "p99", "commands late", "fails one step faster")
+USE_HEADINGS = ("loop", "rate, Hz", *_ROLES, "by processor")
 
 
 def tables(result: Result) -> list[Lines]:
-    """Rates, and what the processes used."""
+    """Tables of rates and of processor time."""
     rates, use = [list(HEADINGS)], [list(USE_HEADINGS)]
     for name, loop in result["loops"].items():
         run, above = loop["run"], loop["above"]
@@ -173,14 +173,14 @@ def _use(name: str, run: Result) -> list[str]:
 
 
 def about(result: Result) -> str:
-    """What the figures are."""
+    """Definitions of the figures."""
     rates = result["rates_hz"]
     runs = sum(len(loop["runs"]) for loop in result["loops"].values())
     return (
         f"Sustained over {result['seconds']:g} s: at most {100 * MAX_WITHOUT_COMMAND:g} % of the frames without a "
-        f"command, no message lost by the recorder, the rate within {100 * RATE_WITHIN:g} % of that asked for; {runs} "
-        f"runs on a grid of {len(rates)} rates from {rates[0]:g} to {rates[-1]:g} Hz. Latencies are of one run at that "
-        "rate; late are commands that were not there when the next exposure began, which the simulated camera sees. "
-        "Percent are of one processor, all threads of the process, over the last four fifths of a run; in brackets the "
-        "processors that it may run on, and at the end the sum of those that may run on one only."
+        f"command, no message lost by the recorder, the rate within {100 * RATE_WITHIN:g} % of the requested one; "
+        f"{runs} runs on a grid of {len(rates)} rates from {rates[0]:g} to {rates[-1]:g} Hz. Latencies are of one run at "
+        "that rate. A command is late if it arrives after the start of the next exposure (known for the simulated camera). "
+        "Processor time is a percentage of one processor, all threads of the process, over the last four fifths of a "
+        "run; in brackets the processors that it may run on; last the sum of the processes bound to one processor."
     )

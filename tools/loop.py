@@ -1,4 +1,4 @@
-"""Measurements of the loop as a user starts it: its residual and latency, and its logs."""
+"""Measurements of `lowfc sim-loop`: residual, latency and logs."""
 
 import json
 import os
@@ -36,7 +36,7 @@ def measure() -> Figures:
             file = Path(folder) / "run.toml"
             file.write_text(toml)
             run = json_of(f"{LOOP} --rate {rate_hz}{more} --config run.toml", folder) | {"log": None, "logs": []}
-            # One frame of delay, two where commands were late.
+            # One frame of delay, two if the command was late.
             delay = 1 + run["commands_late"] / run["frames_published"]
             config = load(file, KEYS | {"camera.rate_hz": float(rate_hz)})
             runs[name] = run | {"tilt_predicted_mas": round(tilt_residual_mas(config, delay), 4)}
@@ -46,8 +46,9 @@ def measure() -> Figures:
 LOOP_COLUMNS = {
     "loop": "{name}",
     "rate": "{rate_hz:.1f} Hz",
-    "tilt per axis, mas rms": "{tilt_residual_mas:.2f} of {tilt_disturbance_mas:.1f}",
-    "predicted": "{tilt_predicted_mas:.2f}",
+    "tilt per axis, mas rms: disturbance": "{tilt_disturbance_mas:.1f}",
+    "residual": "{tilt_residual_mas:.2f}",
+    "predicted residual": "{tilt_predicted_mas:.2f}",
     **{
         f"{title}, us": " / ".join(f"{{latency_us[{stage}][{p}]:.0f}}" for p in ("p50", "p99", "p99_9"))
         for title, stage in (("frame to command", "frame_to_command"), ("frame to mirror", "frame_to_mirror"))
@@ -79,7 +80,7 @@ def short(figures: Figures) -> str:
 
 
 def render(figures: Figures) -> str:
-    """A line for each run."""
+    """A row for each run."""
     rows = (
         run
         | {"name": name, "dropped": run["frames_skipped"] + run["frames_missing"]}
@@ -87,15 +88,17 @@ def render(figures: Figures) -> str:
         for name, run in figures["runs"].items()
     )
     return (
-        f"{columns(LOOP_COLUMNS, rows)}\nLatencies are p50 / p99 / p99.9; predicted is for the delay as measured, "
-        "without the frames that were lost; the rate is that of the host's clock."
+        f"{columns(LOOP_COLUMNS, rows)}\nThe rate is by the host's clock. Latencies are p50 / p99 / p99.9. Frame to "
+        "command ends when the controller's send returns; the mirror may have received the command before. The "
+        "prediction is for the disturbance's expected spectrum and the measured delay, without lost frames; a run is "
+        "one realisation."
     )
 
 
 def measure_logs() -> Figures:
-    """Record at several rates; record a minute and ten, replay them in one process and on all processors.
+    """Record at several rates; record one and ten minutes, and replay them in one process and on all processors.
 
-    It takes a quarter of an hour and 10 GB.
+    It takes 15 minutes and 10 GB.
     """
     logs: Figures = {}
     with tempfile.TemporaryDirectory() as folder:
@@ -120,7 +123,7 @@ def measure_logs() -> Figures:
 
 
 def _with_memory(folder: str, words: str) -> tuple[Figures, int]:
-    """What a command prints with --json, and the most memory that it used, bytes."""
+    """JSON printed by a command with --json, and its peak memory, bytes."""
     process = subprocess.Popen(
         [sys.executable, "-m", "lowfc", *words.split()], cwd=folder, stdout=subprocess.PIPE, text=True
     )
@@ -139,24 +142,24 @@ LOG_COLUMNS = {
     "steps replayed": "{frames} of {frames_processed}",
     "unchecked": "{unchecked}",
     "largest difference": "{largest_difference_nm:g} nm",
-    "replayed, one process": "{speed_one:.1f} x",
+    "replay speed, one process": "{speed_one:.1f} x",
     "all processors": "{speed_all:.1f} x",
     "memory, one process": "{replay_mb:.0f} MB",
 }
 RECORDER_COLUMNS = {
     "recorder at": "{offered_hz:.0f} Hz",
-    "processor": "{cpu_percent:.0f} %",
-    "of copying the payloads": "{ratio:.0f} x",
+    "processor time": "{cpu_percent:.0f} %",
+    "over copying the payloads": "{ratio:.0f} x",
     "messages": "{messages_published}",
     "lost": "{messages_lost}",
-    "longest wait": "{longest_wait_ms:.0f} ms",
-    "until flushed": "{longest_unflushed_ms:.0f} ms",
-    "longest write": "{longest_write_ms:.1f} ms",
+    "longest time to write": "{longest_wait_ms:.0f} ms",
+    "to flush": "{longest_unflushed_ms:.0f} ms",
+    "longest write call": "{longest_write_ms:.1f} ms",
 }
 
 
 def render_logs(figures: Figures) -> str:
-    """A line for each log, and one for each rate that the recorder was offered."""
+    """A row for each log, and one for each rate of messages to the recorder."""
     logs = (
         log | {"seconds": seconds, "log_mb": log["log_bytes"] / 1e6, "replay_mb": log["replay_bytes"] / 1e6}
         for seconds, log in figures["logs"].items()
@@ -164,6 +167,6 @@ def render_logs(figures: Figures) -> str:
     rates = (rate | {"cpu_percent": 100 * rate["cpu_share"]} for rate in figures["recording"]["rates"])
     return (
         f"{columns(LOG_COLUMNS, logs)}\n{columns(RECORDER_COLUMNS, rates)}\n"
-        "Replay is in times as fast as it was. The recorder's share is of one processor, all its threads; waits are "
-        "from a message's arrival to its being written, and to its surviving a kill."
+        "Replay speed is relative to real time. The recorder's processor time is of one processor, all its threads; "
+        "times to write and to flush are from a message's arrival until it is written, and until it survives a kill."
     )

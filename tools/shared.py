@@ -1,4 +1,4 @@
-"""What every measurement needs: the host's description, a command's JSON, a table in Markdown."""
+"""Shared by the measurements: description of the host, JSON of a command, tables in Markdown."""
 
 import json
 import os
@@ -17,7 +17,7 @@ Figures = dict[str, Any]
 
 
 def host() -> dict[str, Any]:
-    """What the figures depend on."""
+    """Properties of the host that the figures depend on."""
     known = provenance()
     return {
         "processor": known["processor"],
@@ -30,14 +30,14 @@ def host() -> dict[str, Any]:
 
 
 def json_of(command: str, folder: Path | str = ROOT) -> Figures:
-    """The JSON that a command prints with `--json`, whatever its exit status: a case that failed is a result too.
+    """JSON that a command prints with `--json`, at any exit status: a failed case is a result too.
 
     Args:
-        command: `lowfc ...` or `python -m ...`, as the page shows it.
-        folder: where it runs.
+        command: `lowfc ...` or `python -m ...`, as shown on the page.
+        folder: working directory.
 
     Raises:
-        RuntimeError: it printed nothing.
+        RuntimeError: the command printed nothing.
     """
     words = shlex.split(command.removeprefix("python -m "))
     done = subprocess.run(
@@ -56,12 +56,12 @@ def markdown(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 
 def columns(formats: dict[str, str], rows: Iterable[Figures]) -> str:
-    """A table in Markdown: the head of each column, and how its cells are made of the figures of a row."""
+    """A table in Markdown: heading of each column, and the format of its cells from the figures of a row."""
     return markdown([*formats], ([cell.format(**row) for cell in formats.values()] for row in rows))
 
 
 def where(name: str, figures: Figures) -> str:
-    """When a measurement was made, on which host, and by which commands."""
+    """Date, host and commands of a measurement, as a sentence."""
     about = figures["host"]
     *most, last = [f"`{command}`" for command in figures["commands"]] or [""]
     runs = f", which runs {', '.join(most)}{' and ' if most else ''}{last}" if last else ""
@@ -69,8 +69,8 @@ def where(name: str, figures: Figures) -> str:
 
 
 def of_host(about: Figures) -> str:
-    """When and on which host, from what `host` found."""
+    """Date and host, from the result of `host`."""
     return (
         f"{about['date']} on {about['processors']} cores of {about['processor']} (a virtual machine, Linux "
-        f"{about['kernel']}, Python {about['python']}, load {about['load_before']} before)"
+        f"{about['kernel']}, Python {about['python']}, load before: {about['load_before']})"
     )

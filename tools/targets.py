@@ -9,7 +9,7 @@ from lowfc.control.kernel.tables import KERNELS
 from tools.shared import Figures, markdown
 
 NUMPY = f"lowfc, {KERNELS[0]}"
-HEAD = ("what", "target", "reached", "met", "lower bound", "where the time goes")
+HEAD = ("figure", "target", "reached", "met", "lower bound", "where the time goes")
 
 
 class Target(NamedTuple):
@@ -74,7 +74,7 @@ def _contest(figures: Figures) -> Iterator[Target]:
     for at, most in (("p50", 0.72), ("p99", 0.75)):
         ratios = [mine / its for mine, its in pairs(NUMPY, at)]
         yield Target(f"frame to command, fused over numpy, {at}", most, ratios, "{:.2f}", shared, OBJECTS)
-    ways = "sockets wake two Python processes; the chain's processes wait on semaphores in shared memory"
+    ways = "sockets wake two Python processes; the C chain waits on semaphores in shared memory"
     for other, asked in (("C chain", {"p50": 40.0, "p99": 80.0}), ("pyrtcao, fused", {"p50": 0.0, "p99": 0.0})):
         for at, most in asked.items():
             differences = [mine - its for mine, its in pairs(other, at)]
@@ -85,7 +85,7 @@ def _contest(figures: Figures) -> Iterator[Target]:
 
 def _stalls(figures: Figures) -> Iterator[Target]:
     found = figures["stalls"]
-    bare = ", ".join(f"{one['stalled']} beside the {one['beside']}" for one in found["bare"])
+    bare = ", ".join(f"{one['stalled']} next to the {one['beside']}" for one in found["bare"])
     yield Target(
         f"frames without a command, of {found['frames']}",
         0,

@@ -1,4 +1,4 @@
-"""A contest: other ways to close the same loop, at the same sizes, on this host, at the same time.
+"""Comparison with other implementations of the same loop, on one host, in turns.
 
-Nothing here is needed to run lowfc. `python -m benchmarks peers --help` says how it is run.
+lowfc does not need this package. `python -m benchmarks peers --help` describes its use.
 """

@@ -19,7 +19,7 @@
 
 #include "ImageStreamIO.h"
 
-enum { ROWS = 4 }; /* of the product, added up side by side */
+enum { ROWS = 4 }; /* rows of the product that are summed in parallel */
 _Static_assert(MODES % ROWS == 0, "rows are taken four at a time");
 
 static const uint16_t *frames;
@@ -124,7 +124,7 @@ static void send_frames(double rate_hz, long count, int64_t *published)
         output.md->cnt1 = number;
         ImageStreamIO_UpdateIm(&output);
     }
-    usleep(50000); /* for the last command */
+    usleep(50000); /* wait for the last command */
 }
 
 static void answer(const struct role *role, int semaphore, int64_t *marks)

@@ -54,15 +54,15 @@ _ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM
 _FIRST = ("source", "mirror", "modal_mirror")  # roles on the first processor
 
 DEFINITIONS = {
-    "t0": "just before the source sends a frame: before it writes the stream, before the put, or before pyrtcao's "
-    "WavefrontSensor.expose",
+    "t0": "just before the source sends a frame: before it writes the stream, before the zenoh put, or before "
+    "pyrtcao's WavefrontSensor.expose",
     "t1": "just after the controller has sent the frame's command: after the stream's semaphores are posted, "
-    "after the put, or after pyrtcao's write_stream; for lowfc after its socket's send, before zenoh's",
-    "to the mirror": "from t0 until the actuators are in the mirror's process; for lowfc until just before the put of "
-    "the mirror's state",
+    "after the zenoh put, or after pyrtcao's write_stream; for lowfc after the direct link's send, before zenoh's",
+    "to the mirror": "from t0 until the actuators are in the mirror's process; for lowfc until just before it "
+    "publishes its state",
     "clock": "CLOCK_MONOTONIC, one host",
-    "pacing": "the source sleeps until absolute times; a late frame is sent at once, its t0 is when it was sent, and "
-    "none is left out",
+    "pacing": "the source sleeps until absolute times; a late frame is sent at once, with that time as t0; no frame is "
+    "skipped",
     "cells": "us, median (lowest to highest) over the turns; in every turn each contestant runs once, and every other "
     "turn in the opposite order",
     "without a command": "measured frames that led to no command, in all turns",
@@ -253,7 +253,7 @@ HEADINGS = ["contestant", *PERCENTILES.values(), "without a command", "to the mi
 
 
 def tables(result: Result) -> list[Lines]:
-    """Tables of the latencies, of the differences within a turn, and of what else each contestant does."""
+    """Tables of the latencies, of the differences within a turn, and of the contestants' other functions."""
     runs = result["runs"]
     does = [
         [one.name, str(len(one.roles) or 3), one.log, one.safety, one.elsewhere]
@@ -264,7 +264,10 @@ def tables(result: Result) -> list[Lines]:
     others = [name for name in runs if name != FUSED and _pairs(runs, name)]
     return [
         latencies,
-        [[f"{FUSED}, minus", "p50", "p99", "ahead in p50", "in p99"], *(_difference(runs, name) for name in others)],
+        [
+            [f"{FUSED}, minus", "p50", "p99", "turns ahead in p50", "in p99"],
+            *(_difference(runs, name) for name in others),
+        ],
         [["contestant", "processes", "log", "safety", "other machines"], *does],
     ]
 
@@ -309,7 +312,7 @@ def about(result: Result) -> str:
     lines.append(f"{late} of all {sent} frames were sent more than a period late.")
     if off := [turn["off"] for turn in done if turn["off"] is not None]:
         lines.append(
-            f"In the {len(off)} runs with a command for every frame, the last actuators agree with those of numpy to "
+            f"In the {len(off)} runs with a command for every frame, the last actuators agree with numpy's within "
             f"{max(off):.1g} of the largest actuator; lowfc's step divides by the flux and is not compared."
         )
     lines += [f"{name}: {why}." for name, why in result["missing"].items()]

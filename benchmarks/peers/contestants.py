@@ -24,14 +24,14 @@ _LIMIT_ONLY = "limit of each mode"
 
 
 class ContestError(Exception):
-    """A contestant did not start, or did not end."""
+    """A contestant did not start or did not end."""
 
 
 @dataclass(frozen=True)
 class Contestant:
-    """One way to close the loop: what can be kept of a run, what protects the mirror, and may it be on other machines.
+    """An implementation of the loop: description, log, protection of the mirror, use across machines.
 
-    Its roles are in the order in which they start; the source's end is the end of a run. lowfc has a kernel and none.
+    Roles are in the order of their start; a run ends with the source. lowfc has a kernel and no roles.
     """
 
     name: str
@@ -64,7 +64,7 @@ def _lowfc(kernel: str) -> Contestant:
 CONTESTANTS = (
     Contestant(
         "C chain",
-        "four C processes over ImageStreamIO between source and mirror: pixels less those of the reference image, "
+        "four C processes over ImageStreamIO between source and mirror: pixels minus reference image, "
         "6400 x 20 product, integrator, modes to actuators; CACAO's stages without its process control",
         "its streams keep the newest frame; a logger may read them",
         _LIMIT_ONLY,
@@ -74,7 +74,7 @@ CONTESTANTS = (
     ),
     Contestant(
         "zenoh",
-        "zenoh as it comes, in sessions set up as lowfc's, the step in numpy, in the subscriber's callback",
+        "zenoh with default settings, in sessions set up as lowfc's; the step in numpy, in the subscriber's callback",
         "any process may subscribe",
         _LIMIT_ONLY,
         "yes",
@@ -83,14 +83,14 @@ CONTESTANTS = (
     ),
     _pyrtcao(
         "stock",
-        "WavefrontSensor, a component that makes a signal of the pixels, Loop.leaky_integrator and WavefrontCorrector, "
-        "each a process; its command is modes, of which the corrector makes actuators",
-        "none here; a cap of all actuators where it is asked for (`command_cap`)",
+        "WavefrontSensor, a component that computes the signal from the pixels, Loop.leaky_integrator and "
+        "WavefrontCorrector, each a process; the command is modes, which the corrector converts to actuators",
+        "none here; an optional limit of all actuators (`command_cap`)",
         *("modal_mirror", "source", "signal", "loop"),
     ),
     _pyrtcao(
         "fused",
-        "WavefrontSensor, one component with all of the step compiled by numba and WavefrontCorrector, each a process",
+        "WavefrontSensor, one component with the whole step compiled by numba, and WavefrontCorrector, each a process",
         _LIMIT_ONLY,
         *("mirror", "source", "fused"),
     ),
@@ -114,7 +114,7 @@ def program(contestant: Contestant, options: argparse.Namespace, folder: Path) -
 
 
 def missing(contestant: Contestant, options: argparse.Namespace) -> str:
-    """Why a contestant cannot take part; empty where it can."""
+    """Why a contestant cannot run; empty if it can."""
     if contestant.program == CHAIN:
         if shutil.which("cc") is None:
             return "there is no C compiler (cc); Debian: apt install gcc"
@@ -130,7 +130,7 @@ def missing(contestant: Contestant, options: argparse.Namespace) -> str:
 
 
 def versions(options: argparse.Namespace) -> dict[str, str]:
-    """Versions of what is in the contest; pyrtcao's and ImageStreamIO's where they are there."""
+    """Versions of the software compared; pyrtcao's and ImageStreamIO's if present."""
     found = {name: importlib.metadata.version(name) for name in ("lowfc", "eclipse-zenoh", "numpy")}
     words = [options.pyrtcao, "-c", "import importlib.metadata as m; print(m.version('pyrtcao'))"]
     with contextlib.suppress(OSError):

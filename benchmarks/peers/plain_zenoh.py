@@ -1,6 +1,6 @@
-"""The processes of a loop in plain Python and zenoh: see `shared` for its words.
+"""The processes of a loop in plain Python and zenoh; see `shared` for the arguments.
 
-The source is the mirror as well: it notes when a command is back.
+The source is also the mirror: it records when each command arrives.
 """
 
 import json
@@ -22,15 +22,15 @@ from lowfc.contract.messages import COMMAND, FRAME, Role
 PORTS = "ports.json"
 """File with the loopback TCP port of each role that listens."""
 
-_NUMBER = struct.Struct("<QQ")  # as long as what lowfc sends with every message
+_NUMBER = struct.Struct("<QQ")  # as long as lowfc's envelope
 _ROLES = {"source": Role.CAMERA, "controller": Role.CONTROLLER}
 
 Message = Callable[[int, bytes], None]
-"""Receives or sends a message: number, payload."""
+"""Receives or sends a message: frame number, payload."""
 
 
 def join(part: Part, receive: Message) -> Message:
-    """Join a run with a session set up as lowfc's are; returns what sends."""
+    """Join a run with a session set up as lowfc's; returns the function that sends."""
     ports = json.loads((part.folder / PORTS).read_text())
     links = Links("contest", ports, "contest", part.folder / "credentials")
     session = zenoh.open(zenoh.Config.from_json5(json.dumps(session_config(links, _ROLES[part.role]))))
@@ -53,7 +53,7 @@ def join(part: Part, receive: Message) -> Message:
 
 
 def source(part: Part) -> None:
-    """Send the frames, and note when commands come back."""
+    """Send the frames, and record when their commands arrive."""
     received, published, now_ns = part.marks("received"), part.marks("published"), time.monotonic_ns
     last = part.last_actuators()
 
@@ -69,7 +69,7 @@ def source(part: Part) -> None:
 
 
 def controller(part: Part) -> None:
-    """Answer frames until it is killed."""
+    """Answer frames until the process is killed."""
     commanded, step = part.marks("commanded"), NumpyStep(Problem(part.folder))
 
     def answer(number: int, payload: bytes) -> None:

@@ -1,11 +1,11 @@
-"""The same loop in pyrtcao, each component a process; see `shared` for its words.
+"""The same loop in pyrtcao, each component a process; see `shared` for its arguments.
 
-Stock, as its users build it: a `WavefrontSensor`, a component of one's own that makes a signal of the pixels,
-`Loop.leaky_integrator`, a `WavefrontCorrector`, which makes actuators of modes. Fused: one component of one's own
-between sensor and corrector does the whole step in one compiled function, which is the best that pyrtcao can do.
+Stock: a `WavefrontSensor`, a custom component that computes the signal from the pixels, `Loop.leaky_integrator`, and
+a `WavefrontCorrector`, which converts modes to actuators. Fused: one custom component between sensor and corrector
+computes the whole step in one compiled function, the fastest arrangement that pyrtcao permits.
 
-It runs in an interpreter that has pyrtcao, and needs nothing of lowfc's. Where pyrtcao may, it sets nice -20 in the
-normal class by itself.
+It runs in an interpreter with pyrtcao, and imports nothing of lowfc. If permitted, pyrtcao sets nice -20 under normal
+scheduling by itself.
 """
 
 import os
@@ -32,23 +32,23 @@ _STREAMS = ("wfs_raw", "wfs", "signal", "wfc")
 
 
 class Sensor(WavefrontSensor):
-    """Exposes the frames when they are due."""
+    """Publishes the frames at their scheduled times."""
 
     part: Part
 
     def run(self) -> None:
-        """All frames of a run; ends the process."""
+        """Publish all frames of a run, then end the process."""
         problem, published = Problem(self.part.folder), self.part.marks("published")
         for number in self.part.frames():
             self.data = problem.frame(number)
             published[number] = time.monotonic_ns()
-            self.expose()  # it numbers them from 1, too
+            self.expose()  # pyrtcao numbers frames from 1, too
         clear(self.part)
         os._exit(0)
 
 
 class PixelSignal(Component):
-    """The signal is the pixels without those of the reference image."""
+    """The signal: pixels minus reference image."""
 
     def __init__(self, conf: dict[str, Any], problem: Problem) -> None:
         super().__init__(conf)
@@ -56,29 +56,29 @@ class PixelSignal(Component):
         self._image = np.empty((SIDE, SIDE), np.int32)
         self._signal = np.empty((SIDE, SIDE), np.float32)
         self.register_input_stream("wfs", open_stream(self.input_stream_name("wfs")))
-        self.read_stream("wfs", out=self._image)  # what is there before the first frame
+        self.read_stream("wfs", out=self._image)  # the stream's initial content
         self.register_output_stream("signal", create_stream(self.output_stream_name("signal"), (PIXELS,), np.float32))
 
     def compute_signal(self) -> None:
-        """One frame."""
+        """Process one frame."""
         image = self.read_stream("wfs", out=self._image)
         np.subtract(image, self._reference, out=self._signal, dtype=np.float32, casting="unsafe")
         self.write_stream("signal", self._signal.reshape(-1))
 
 
 class StockLoop(Loop):
-    """Its own loop, with the moment noted when a command is out."""
+    """pyrtcao's loop; records when each command was sent."""
 
     commanded: memoryview
 
     def send_to_wfc(self, correction: Array, slopes: Array | None = None) -> None:
-        """Its own, then the time."""
+        """Send the command, then record the time."""
         super().send_to_wfc(correction, slopes=slopes)
         self.commanded[self.frame_id] = time.monotonic_ns()
 
 
 class FusedLoop(Component):
-    """Everything between frame and actuators."""
+    """The whole step from frame to actuators."""
 
     def __init__(self, conf: dict[str, Any], problem: Problem, commanded: memoryview) -> None:
         super().__init__(conf)
@@ -88,12 +88,12 @@ class FusedLoop(Component):
         self._command = np.zeros(MODES, np.float32)
         self._commanded = commanded
         self.register_input_stream("wfs", open_stream(self.input_stream_name("wfs")))
-        self.read_stream("wfs", out=self._image)  # what is there before the first frame
+        self.read_stream("wfs", out=self._image)  # the stream's initial content
         self.register_output_stream("wfc", open_stream(self.output_stream_name("wfc")))
         _fused(np.zeros(PIXELS, np.int32), *self._arrays, self._difference, self._command.copy())  # compiled here
 
     def step(self) -> None:
-        """One frame."""
+        """Process one frame."""
         image = self.read_stream("wfs", out=self._image).reshape(-1)
         self.write_stream("wfc", _fused(image, *self._arrays, self._difference, self._command))
         self._commanded[self.frame_id] = time.monotonic_ns()
@@ -107,14 +107,14 @@ def _fused(
         difference[pixel] = np.float32(image[pixel]) - I0[pixel]
     error = np.dot(R, difference)
     for mode in range(command.size):
-        wanted = np.float32(1 - LEAK) * command[mode] - np.float32(GAIN) * error[mode]
-        command[mode] = min(max(wanted, np.float32(-LIMIT_NM)), np.float32(LIMIT_NM))
+        unlimited = np.float32(1 - LEAK) * command[mode] - np.float32(GAIN) * error[mode]
+        command[mode] = min(max(unlimited, np.float32(-LIMIT_NM)), np.float32(LIMIT_NM))
     actuators: Array = np.dot(to_actuators, command)
     return actuators
 
 
 class StockMirror(WavefrontCorrector):
-    """Its own corrector without hardware, with the moment noted when the actuators are there."""
+    """pyrtcao's corrector without hardware; records when the actuators arrived."""
 
     received: memoryview
     last: Array
@@ -126,7 +126,7 @@ class StockMirror(WavefrontCorrector):
         return actuators
 
     def send_to_hardware(self) -> None:
-        """Its own, then the time."""
+        """Record when the actuators arrived."""
         actuators = self.shape()
         self.received[self.frame_id] = time.monotonic_ns()
         self.last[:] = actuators
@@ -136,13 +136,13 @@ class FusedMirror(StockMirror):
     """A corrector that receives actuators."""
 
     def shape(self) -> Array:
-        """As they come."""
+        """Actuators of the next command, as received."""
         actuators: Array = self.read_stream("wfc", out=self._wfc_buffer)
         return actuators
 
 
 def clear(part: Part) -> None:
-    """Remove what a run has in shared memory."""
+    """Remove a run's streams from shared memory."""
     clear_shms([_name(part, stream) for stream in _STREAMS])
 
 
@@ -180,22 +180,22 @@ def _component(part: Part) -> Component:
     fused = part.role == "mirror"
     matrix = part.folder / "m2c.npy"
     np.save(matrix, np.eye(ACTUATORS, dtype=np.float32) if fused else problem.to_actuators)
-    of_its_own = {"name": "wfc", "num_actuators": ACTUATORS, "m2c_file": str(matrix)}
-    of_its_own["num_modes"] = ACTUATORS if fused else MODES
-    corrector = (FusedMirror if fused else StockMirror)(_configuration(part, "send_to_hardware") | of_its_own)
+    own_options = {"name": "wfc", "num_actuators": ACTUATORS, "m2c_file": str(matrix)}
+    own_options["num_modes"] = ACTUATORS if fused else MODES
+    corrector = (FusedMirror if fused else StockMirror)(_configuration(part, "send_to_hardware") | own_options)
     corrector.received, corrector.last = part.marks("received"), part.last_actuators()
     return corrector
 
 
 if __name__ == "__main__":
     own = Part(sys.argv[1:])
-    if own.role == "clear":  # after a run that failed
+    if own.role == "clear":  # after a failed run
         clear(own)
         sys.exit()
-    set_affinity_and_priority(own.role, own.cpu, own.priority)  # as its launcher does
+    set_affinity_and_priority(own.role, own.cpu, own.priority)  # as pyrtcao's launcher does
     own.quiet()
     component = _component(own)
     component.start()
-    if own.role != "source":  # which is ready when it is about to wait for the start
+    if own.role != "source":  # the source reports ready in `frames`
         own.ready()
     threading.Event().wait()

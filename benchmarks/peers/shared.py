@@ -1,7 +1,7 @@
-"""What every process of every contestant does alike: its place on the host, its times, its start, its problem.
+"""Shared by all contestants' processes: scheduling, time stamps, start, frames and matrices.
 
-A process is started with the words ROLE FOLDER RATE_HZ FRAMES PROCESSOR PRIORITY; priority 0 is the normal class. The
-folder is in memory that all processes share, so that a process may be killed when the last frame is through. It needs
+A process is started with the arguments ROLE FOLDER RATE_HZ FRAMES PROCESSOR PRIORITY; priority 0 is normal scheduling.
+The files of the folder are in shared memory, so a process may be killed after the last frame. This module needs
 numpy only.
 """
 
@@ -23,7 +23,7 @@ PIXELS, ACTUATORS = SIDE**2, MIRROR_SIDE**2
 GAIN, LEAK, LIMIT_NM = 0.3, 0.01, 100.0
 
 MARKS = ("due", "published", "commanded", "received")
-"""Files with the times of each frame in ns, int64: when it was due and sent, and when its command was out and back."""
+"""Files of int64 times in ns for each frame: scheduled, sent, its command sent, its command at the mirror."""
 
 LAST = "actuators"
 """File with the actuators that the mirror received last, float32."""
@@ -44,7 +44,7 @@ class Part:
         self.cpu, self.priority = int(cpu), int(priority)
 
     def settle(self) -> None:
-        """One processor, the class asked for, sleeps without slack, no garbage collection; for threads to come too."""
+        """Set processor, scheduling class, timer slack and garbage collection, for later threads too."""
         os.sched_setaffinity(0, {self.cpu})
         policy = os.SCHED_FIFO if self.priority else os.SCHED_OTHER
         os.sched_setscheduler(0, policy, os.sched_param(self.priority))
@@ -52,28 +52,28 @@ class Part:
 
     @staticmethod
     def quiet() -> None:
-        """Sleeps without slack, no garbage collection."""
+        """Set the timer slack to 1 ns and switch garbage collection off."""
         ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
         gc.freeze()
         gc.disable()
 
     def marks(self, name: str) -> memoryview:
-        """Times of all frames of one kind, to be written at a frame's number; 0 where there is none."""
+        """Times of one kind, indexed by the frame's number; 0 for none."""
         with (self.folder / name).open("r+b") as file:
             return memoryview(mmap.mmap(file.fileno(), 0)).cast("q")
 
     def last_actuators(self) -> Single:
-        """Where the mirror keeps what it received last."""
+        """The last actuators that the mirror received."""
         return np.memmap(self.folder / LAST, np.float32, "r+")
 
     def ready(self) -> None:
-        """Say that this process has all it needs."""
+        """Report that this process is ready."""
         ready_file(self.folder, self.role).touch()
 
     def frames(self) -> Iterator[int]:
-        """Be ready, wait for the start, then yield each frame's number when it is due: absolute times, none left out.
+        """Report ready, wait for the start, then yield each frame's number at its absolute time; none is skipped.
 
-        After the last there is a moment for its command.
+        After the last it waits for the command.
         """
         self.ready()
         while not (self.folder / _GO).exists():
@@ -89,7 +89,7 @@ class Part:
 
 
 def ready_file(folder: Path, role: str) -> Path:
-    """The file that is there once a role is ready."""
+    """File that a role creates once it is ready."""
     return folder / f"ready-{role}"
 
 
@@ -99,7 +99,7 @@ def go(folder: Path) -> None:
 
 
 class Problem:
-    """Frames, and the matrices that make actuators of them, each a file of a run's folder.
+    """Frames and matrices from frames to actuators, each a file of a run's folder.
 
     frames (frames, 80, 80) uint16 and I0 (6400,), dark included: DN; R (20, 6400): nm per DN; to_actuators (1156, 20):
     nm of surface per nm of wavefront.
@@ -112,13 +112,13 @@ class Problem:
         self.to_actuators: Single = np.fromfile(folder / "to_actuators", np.float32).reshape(ACTUATORS, MODES)
 
     def frame(self, number: int) -> npt.NDArray[np.uint16]:
-        """The frame of a number."""
+        """Frame (80, 80) of this number."""
         image: npt.NDArray[np.uint16] = self.frames[number % len(self.frames)]
         return image
 
 
 class NumpyStep:
-    """Bytes of pixels to bytes of actuators, as one would write it in numpy, into arrays that stay.
+    """Bytes of pixels to bytes of actuators in plain numpy, with preallocated arrays.
 
     y = R (I - I0); command = (1 - leak) command - gain y, cut to the limit; actuators of the command.
     """
@@ -131,7 +131,7 @@ class NumpyStep:
         self._actuators = np.empty(ACTUATORS, np.float32)
 
     def command(self, payload: bytes) -> bytes:
-        """The answer to a frame."""
+        """The actuators for a frame."""
         problem, command = self._problem, self._command
         np.subtract(np.frombuffer(payload, np.uint16), problem.I0, out=self._difference)
         np.matmul(problem.R, self._difference, out=self._error)
