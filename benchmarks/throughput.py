@@ -179,8 +179,9 @@ def about(result: Result) -> str:
     return (
         f"Sustained over {result['seconds']:g} s: at most {100 * MAX_WITHOUT_COMMAND:g} % of the frames without a "
         f"command, no message lost by the recorder, the rate within {100 * RATE_WITHIN:g} % of the requested one; "
-        f"{runs} runs on a grid of {len(rates)} rates from {rates[0]:g} to {rates[-1]:g} Hz. Latencies are of one run at "
-        "that rate. A command is late if it arrives after the start of the next exposure (known for the simulated camera). "
-        "Processor time is a percentage of one processor, all threads of the process, over the last four fifths of a "
-        "run; in brackets the processors that it may run on; last the sum of the processes bound to one processor."
+        f"{runs} runs on a grid of {len(rates)} rates from {rates[0]:g} to {rates[-1]:g} Hz. Latencies are of one run "
+        "at that rate. A command is late if it arrives after the start of the next exposure (known for the simulated "
+        "camera). Processor time is a percentage of one processor, all threads of the process, over the last four "
+        "fifths of a run; in brackets the processors that it may run on; last the sum of the processes bound to one "
+        "processor."
     )
