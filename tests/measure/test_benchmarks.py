@@ -396,7 +396,7 @@ def test_streams_and_the_direct_link_are_compared_turn_by_turn(monkeypatch: pyte
     _, between, _, ratio, _ = by_heading(lines)
     assert (between["without a command"], ratio["frame to command, us: p99"]) == ("2 of 1000", "1.00 (1.00 to 1.00)")
     assert "350 (200 to 500) us (p50)" in streams.about(found)
-    assert "350 (300 to 400) where the controller" in streams.about(found)
+    assert "350 (300 to 400) us until the controller" in streams.about(found)
 
 
 @pytest.mark.exclusive
