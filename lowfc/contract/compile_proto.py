@@ -1,8 +1,8 @@
-"""Compile the `.proto` declaration into `lowfc/contract/wire`; a development tool, run by `make proto`.
+"""Compile the `.proto` file into `lowfc/contract/wire`; a development tool, run by `make proto`.
 
 Example:
-    python -m lowfc.contract.compile_proto            # rewrite the checked-in code
-    python -m lowfc.contract.compile_proto --into DIR # somewhere else, to compare
+    python -m lowfc.contract.compile_proto            # rewrite the committed code
+    python -m lowfc.contract.compile_proto --into DIR # into another folder, to compare
 """
 
 import argparse

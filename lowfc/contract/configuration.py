@@ -35,12 +35,12 @@ from lowfc.contract.sections import (
 )
 from lowfc.control.kernel.tables import KernelName
 
-LATE_NS, HOLD_NS = 20_000_000, 50_000_000
+MIN_FRAME_AGE_NS, MIN_FRAME_TIMEOUT_NS = 20_000_000, 50_000_000
 """Minimum of max_frame_age_ms and of frame_timeout_ms if the configuration does not set them."""
 MOST_FAULTS = 20
-"""Most faults of one file that are explained."""
+"""Most faults of a file that an error explains."""
 _LONGEST_KEY = 100  # characters of an unknown key that are compared with the known ones
-_ALTERNATIVE = re.compile(r"\.(?:constrained-\w+|literal\[[^]]*\])")  # pydantic's, behind a key of two types
+_ALTERNATIVE = re.compile(r"\.(?:constrained-\w+|literal\[[^]]*\])")  # appended by pydantic to a key of two types
 
 
 Gain = Annotated[float, Field(ge=0, le=4)]
@@ -102,7 +102,7 @@ class Safety(Section):
     """Limits enforced by the controller; the mirror enforces its own."""
 
     stroke_nm: float = Field(700.0, gt=0.01)
-    """Largest deviation of an actuator from flat, surface, either way."""
+    """Largest deviation of an actuator from flat, in either direction, nm of surface."""
     slew_nm: float = Field(100.0, gt=0.01)
     """Largest change of an actuator per command."""
     neighbour_nm: float = Field(400.0, gt=0.01)
@@ -119,13 +119,13 @@ class Acceptance(Section):
     highest_of_rate: float = Field(0.3, gt=0, le=0.5)
     """Frequency up to which they are measured, as a fraction of the frame rate."""
     linear_nm: Positive = 12.0
-    """Wavefront rms of a mode up to which the sensor must be linear; 12 nm are 5 mas of tilt at 2 m."""
+    """Wavefront rms of a mode up to which the sensor must be linear; 12 nm is 5 mas of tilt at 2 m."""
     gain_error: Positive = 0.05
-    """Largest deviation from 1 of a mode's measured over its true amplitude, in this range."""
+    """Largest deviation from 1 of the ratio of measured to true amplitude of a mode, in this range."""
     crosstalk: Positive = 0.05
-    """Largest fraction of a mode that is measured as another one, in this range."""
+    """Largest fraction of a mode that is measured as another mode, in this range."""
     capture_tilt_nm: Positive = 34.0
-    """Wavefront rms of tip or tilt from which the loop must close; 34 nm are 14 mas at 2 m."""
+    """Wavefront rms of tip or tilt from which the loop must close; 34 nm is 14 mas at 2 m."""
     capture_nm: Positive = 20.0
     """Wavefront rms of any other mode from which the loop must close."""
     noise_ratio: float = Field(1.2, gt=1)
@@ -265,12 +265,12 @@ class Configuration(Section):
     @property
     def max_frame_age_ns(self) -> int:
         """Age above which a frame is refused."""
-        return round(self.control.max_frame_age_ms * 1e6) or max(LATE_NS, 2 * self.period_ns)
+        return round(self.control.max_frame_age_ms * 1e6) or max(MIN_FRAME_AGE_NS, 2 * self.period_ns)
 
     @property
     def frame_timeout_ns(self) -> int:
         """Time without a frame after which an event is raised."""
-        return round(self.control.frame_timeout_ms * 1e6) or max(HOLD_NS, 5 * self.period_ns)
+        return round(self.control.frame_timeout_ms * 1e6) or max(MIN_FRAME_TIMEOUT_NS, 5 * self.period_ns)
 
     @property
     def noll(self) -> tuple[int, ...]:
@@ -333,7 +333,7 @@ def _put(path: Path | None, data: dict[str, Any], key: str, value: object, *, re
 
 
 def keys(section: type[BaseModel] = Configuration, prefix: str = "") -> dict[str, FieldInfo]:
-    """Every key by its dotted name, in the order of declaration."""
+    """All keys by their dotted names, in the order of declaration."""
     found: dict[str, FieldInfo] = {}
     for name, info in section.model_fields.items():
         if isinstance(info.annotation, type) and issubclass(info.annotation, BaseModel):
@@ -346,10 +346,10 @@ def keys(section: type[BaseModel] = Configuration, prefix: str = "") -> dict[str
 def _nearest(wanted: str, known: Sequence[str]) -> str:
     """The known key most similar to a wrong one, or else a key with a similar name in another section."""
     names = {one.rpartition(".")[2]: one for one in reversed(known)}
-    whole = difflib.get_close_matches(wanted, known, 1, 0.0)
-    in_another = difflib.get_close_matches(wanted.rpartition(".")[2], names, 1, 0.75)
-    alike = difflib.get_close_matches(wanted, known, 1, 0.8)
-    return next(iter(alike or [names[one] for one in in_another] or whole))
+    nearest = difflib.get_close_matches(wanted, known, 1, 0.0)
+    elsewhere = difflib.get_close_matches(wanted.rpartition(".")[2], names, 1, 0.75)
+    similar = difflib.get_close_matches(wanted, known, 1, 0.8)
+    return next(iter(similar or [names[one] for one in elsewhere] or nearest))
 
 
 def explain(detail: Any) -> str:

@@ -1,4 +1,4 @@
-"""The 16 bytes that travel beside every payload: which message of its publisher it is, and when it was sent."""
+"""The 16-byte attachment of every message: its sequence and publication time."""
 
 import struct
 from typing import NamedTuple
@@ -30,19 +30,19 @@ class Envelope(NamedTuple):
 
     @classmethod
     def decode(cls, data: bytes) -> "Envelope":
-        """Envelope of 16 bytes, whatever its numbers; BadMessageError where `data` has another length."""
+        """Decode 16 bytes without a check of the numbers; BadMessageError if `data` has another length."""
         if len(data) != _LAYOUT.size:
             raise BadMessageError(
                 f"an envelope is {_LAYOUT.size} bytes (sequence and publish_time_ns, little-endian uint64), "
-                f"got {len(data)}; attach one to every put"
+                f"got {len(data)}; attach one to every message"
             )
         return cls(*_LAYOUT.unpack(data))
 
     @classmethod
-    def unpack(cls, data: bytes) -> "Envelope":
-        """Envelope of 16 bytes as the bus takes it.
+    def decode_checked(cls, data: bytes) -> "Envelope":
+        """Decode a received envelope, with a check of its numbers.
 
-        BadMessageError as for `decode`, and where the sequence is not below 2^64 - 2^33, or the time above 2^62 ns.
+        BadMessageError as for `decode`, and if the sequence is not below 2^64 - 2^33 or the time is above 2^62 ns.
         """
         sequence, publish_time_ns = found = cls.decode(data)
         if sequence >= SEQUENCES or publish_time_ns > LATEST_NS:
@@ -62,10 +62,10 @@ def sequence_of(start_s: int, count: int) -> int:
 
 
 def start_of(sequence: int) -> int:
-    """Start of the publisher, unix seconds; a larger one means that it was restarted."""
+    """Start of the publisher, unix seconds; it grows with a restart, and by 1 with each 2^32 messages."""
     return sequence >> COUNT_BITS
 
 
 def count_of(sequence: int) -> int:
-    """Number of the message among those of its publisher on this topic, from 0."""
+    """Count of the message on this topic since its publisher started, from 0."""
     return sequence & _COUNT_MASK

@@ -1,12 +1,12 @@
-"""The exceptions a user may see.
+"""The exceptions that a user may see.
 
-    LowfcError              anything the user can put right; one line, exit status 2
+    LowfcError              anything that the user can correct; one line, exit status 2
     ├── ConfigurationError  a key, a value or a combination of values
-    ├── DataFileError       a file that is missing, damaged or of another kind
+    ├── DataFileError       a file that is missing, damaged or of the wrong kind
     ├── CalibrationError    a calibration that does not fit the instrument
     ├── BusError            a port, a socket, or a peer that does not answer
-    │   └── BadMessageError     a message from the bus that breaks the contract
-    └── RequestRefusedError    the controller answered no, and says why
+    │   └── BadMessageError     a message from the bus that violates the contract
+    └── RequestRefusedError    the controller refused the request, with the reason
 
 The numerics raise ValueError; the adapters above them name the file or the key and re-raise one of these.
 """
@@ -17,7 +17,7 @@ from difflib import get_close_matches
 
 
 class LowfcError(Exception):
-    """Base of the errors that a user can put right; the text says what was wrong, expected, got and to do."""
+    """Base of the errors that a user can correct; the text has what is wrong, expected and found, and what to do."""
 
     exit_status = 2
 
@@ -27,7 +27,7 @@ class ConfigurationError(LowfcError):
 
 
 class DataFileError(LowfcError):
-    """A file is missing, damaged or holds something else."""
+    """A file is missing, damaged or of the wrong kind."""
 
 
 class CalibrationError(LowfcError):
@@ -35,11 +35,11 @@ class CalibrationError(LowfcError):
 
 
 class BusError(LowfcError):
-    """The message bus cannot be opened, or nobody answers on it."""
+    """The message bus cannot be opened, or no process answers on it."""
 
 
 class BadMessageError(BusError):
-    """A message from the bus cannot be read; it is counted and left out, and the process goes on."""
+    """A message from the bus cannot be read; it is counted and ignored, and the process continues."""
 
 
 class RequestRefusedError(LowfcError):
@@ -51,7 +51,7 @@ _BRIEF.maxstring = _BRIEF.maxother = _BRIEF.maxlong = 100
 
 
 def brief(value: object) -> str:
-    """`repr` of a value from a file, shortened: an error stays one readable line whatever the file holds."""
+    """Shortened `repr` of a value from a file, so that an error stays one readable line."""
     try:
         return _BRIEF.repr(value)
     except ValueError:  # an integer of more digits than Python converts
@@ -59,6 +59,6 @@ def brief(value: object) -> str:
 
 
 def nearest(wanted: str, known: Iterable[str]) -> str:
-    """What to add to "no such name": the name that was probably meant, or nothing."""
+    """Suffix of a "no such name" error that suggests the nearest known name; empty if none is near."""
     close = get_close_matches(wanted, list(known), n=1)
     return f" (did you mean {close[0]!r}?)" if close else ""

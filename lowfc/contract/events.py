@@ -82,7 +82,11 @@ EVENTS: dict[str, Event] = {
             "`lowfc ctl channel adopted --zero` removes it",
         ),
         Event("LAW_NOT_IN_FORCE", Level.WARNING, "the law of the configuration is not in force: {why}"),
-        Event("LAW_OVERRULED", Level.WARNING, "the integrator takes over {modes} from the law {law!r}: {why}; {until}"),
+        Event(
+            "LAW_OVERRULED",
+            Level.WARNING,
+            "the integrator takes over {modes} from the law {law!r}: {why}; this lasts {until}",
+        ),
         Event("LAW_BACK", Level.INFO, "the law {law!r} drives {modes} again"),
         Event("NOTE", Level.INFO, "{text}"),
         Event("CLOSING_HARMS", Level.WARNING, "{harm}"),
@@ -100,7 +104,9 @@ EVENTS: dict[str, Event] = {
         Event("INTERLOCK_ACTS", Level.WARNING, "interlock: {why}; {action}"),
         Event("INTERLOCK_CLEARED", Level.INFO, "interlock no longer acts: {why}"),
         Event("LOOP_STEPPED", Level.INFO, "the loop opened after its last step"),
-        Event("MIRROR_LOST", Level.ERROR, "the mirror {fault}: a closed loop holds its command until it follows"),
+        Event(
+            "MIRROR_LOST", Level.ERROR, "the mirror {fault}: a closed loop holds its command until the mirror follows"
+        ),
         Event("MIRROR_BACK", Level.INFO, "the mirror follows again"),
         Event("MIRROR_REFUSED", Level.WARNING, "the mirror's shape is not adopted: {why}"),
         Event("LIMIT_HIT", Level.WARNING, "mirror limit reached: {reason}"),

@@ -14,7 +14,7 @@ KEYS = {
     "realtime.stay_awake": "realtime.disable_cpu_idle",
     "realtime.rehearse": "realtime.cache_warmup",
 }
-"""Keys of the configuration, until 0.1."""
+"""Configuration keys: name until version 0.1 to current name."""
 
 FIELDS = {
     **{
@@ -38,10 +38,10 @@ FIELDS = {
     "Health.granted": "realtime_granted",
     "Health.refused": "realtime_refused",
 }
-"""Fields of messages, until 0.1; their numbers, types and labels never change."""
+"""Message fields: name until version 0.1 to current name; their numbers, types and labels never change."""
 
 VALUES = {"LOOP_MODE_SAFED": "LOOP_MODE_SAFE"}
-"""Values of enumerations, until 0.1."""
+"""Values of enumerations: name until version 0.1 to current name."""
 
 LAW_EXTENSIONS = {
     "TRANSITION": "FOLLOW",
@@ -50,13 +50,13 @@ LAW_EXTENSIONS = {
     "PREDICT_ONLY": "COAST",
     "OUTPUT": "OUTPUT",
 }
-"""Extensions of a law file, by their names of today; of kind "lowfc law 1"."""
+"""Extensions of a law file: current name to name in files of kind "lowfc law 1"."""
 
 
 def renamed_keys(data: dict[str, Any]) -> list[str]:
-    """Rename the former keys of a configuration's tables, in place; return one remark for each.
+    """Rename the former keys of a configuration's tables in place; return a remark for each.
 
-    ValueError where a key is there under both names.
+    ValueError if a key is present under both names.
     """
     remarks = []
     for former, name in KEYS.items():
@@ -65,7 +65,7 @@ def renamed_keys(data: dict[str, Any]) -> list[str]:
         table = data.get(section)
         if isinstance(table, dict) and key in table:
             if new in table:
-                raise ValueError(f"{former} is the former name of {name}, and both are there: remove {former}")
+                raise ValueError(f"{former} is the former name of {name}, and both are present: remove {former}")
             table[new] = table.pop(key)
             remarks.append(f"{former} is now called {name}")
     return remarks

@@ -1,4 +1,4 @@
-"""The one table of topics; bus, recorder, health, documentation and access control derive from it.
+"""The table of topics, from which bus, recorder, health, documentation and access control derive.
 
 A topic's key on the bus is its topic in a log without the leading slash. Payloads are protobuf: the project's own
 package `lowfc.v1` (declared in `proto/lowfc/v1/lowfc.proto`) and Foxglove's schemas for images and log lines.
@@ -24,7 +24,7 @@ __all__ = ["TOPICS", "Log", "Message", "RawImage", "Role", "Timestamp", "Topic",
 
 
 class Role(StrEnum):
-    """The processes of a run, by the part they play; a mirror's process is `mirror-<name>`."""
+    """Roles of the processes of a run; a mirror's process is named `mirror-<name>`."""
 
     CAMERA = "camera"
     MIRROR = "mirror"
@@ -43,7 +43,7 @@ _CAMERA, _MIRROR, _CONTROLLER = frozenset({Role.CAMERA}), frozenset({Role.MIRROR
 
 
 class Rate(StrEnum):
-    """How often a topic is published, where it is not a number of hertz."""
+    """Publication rate of a topic without a rate in hertz."""
 
     LOOP = "every frame"
     EVENT = "on event"
@@ -51,21 +51,21 @@ class Rate(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """One line of the table.
+    """A topic of the table.
 
     Attributes:
         key: zenoh key; `{name}` stands for a mirror's or a process's name.
         message: class of the payload.
-        rate: loop, on event, or the number of hertz.
-        publisher: whose it is to put; by a router, nobody else's messages get through.
-        sentence: what it is.
-        subscribers: who gets it.
+        rate: every frame, on event, or a number of hertz.
+        publisher: roles that may publish it; a router drops messages of other roles.
+        sentence: its description.
+        subscribers: roles that receive it.
         deterministic: in lockstep two runs with the same seed write the same payload bytes.
-        queryable: a late joiner may ask the publisher for the last one.
-        latest_only: who looks at a run wants the newest only, and gets no more than eyes can follow.
-        direct_subscriber: who waits for it, and gets it by a way of its own from its publisher on the same host.
-        multiple_publishers: on one host others may put it too, so that its reader hears the bus beside its own way.
-        optional: a recording may leave it out; what the others say of the run needs none of it.
+        queryable: a late joiner can query the publisher for the last message.
+        latest_only: monitors receive only the newest message, at display rate.
+        direct_subscriber: role that receives it over the direct link from a publisher on the same host; None for none.
+        multiple_publishers: other programs may publish it too, so that its direct subscriber also reads the bus.
+        optional: a recording may omit it; the other topics do not depend on it.
     """
 
     key: str
@@ -87,7 +87,7 @@ class Topic:
 
     @property
     def in_loop(self) -> bool:
-        """Whether a late message costs the loop a frame: sent at once, ahead of everything else."""
+        """Whether a late message costs the loop a frame: it is sent at once, before all others."""
         return self.rate is Rate.LOOP and Role.CONTROLLER in self.publisher | self.subscribers
 
     def matches(self, key: str) -> bool:
@@ -124,14 +124,14 @@ CONTROL_INPUT = Topic(
     wire.ControlInput,
     Rate.EVENT,
     _CONTROLLER,
-    "What the controller took in other than frames and requests, with the verdicts of its clock.",
+    "Inputs of the controller other than frames and requests, with all values that depend on its clock.",
 )
 TIMING = Topic(
     "lowfc/control/timing",
     wire.ControlTiming,
     10.0,
     _CONTROLLER,
-    "How long each stage of each step took.",
+    "Durations of the stages of each step.",
     deterministic=False,
     optional=True,
 )
@@ -143,15 +143,13 @@ CONTROLLER_STATE = Topic(
     "Everything the next command depends on, besides the calibration.",
     queryable=True,
 )
-REQUEST = Topic(
-    "lowfc/control/request", wire.Request, Rate.EVENT, _CONTROLLER, "What an operator asked, and the answer."
-)
+REQUEST = Topic("lowfc/control/request", wire.Request, Rate.EVENT, _CONTROLLER, "An operator's request and its reply.")
 COMMAND = Topic(
     "lowfc/mirror/{name}/command",
     wire.MirrorCommand,
     Rate.LOOP,
     _CONTROLLER,
-    "Where the mirror shall be.",
+    "The commanded shape of the mirror.",
     subscribers=_MIRROR | {Role.RECORDER},
     direct_subscriber=Role.MIRROR,
     multiple_publishers=True,
@@ -161,7 +159,7 @@ MIRROR_STATE = Topic(
     wire.MirrorState,
     Rate.LOOP,
     _MIRROR,
-    "Where the mirror is.",
+    "The shape of the mirror.",
     subscribers=_CONTROLLER | _CAMERA | _MONITORS,
     latest_only=True,
     optional=True,
@@ -171,7 +169,7 @@ SURFACE = Topic(
     RawImage,
     30.0,
     _MIRROR,
-    "The mirror's surface over the pupil, 32FC1, nm: for eyes.",
+    "The mirror's surface over the pupil, 32FC1, nm; for display only.",
     latest_only=True,
     optional=True,
 )
@@ -180,7 +178,7 @@ TRUTH = Topic(
     wire.Truth,
     Rate.LOOP,
     _CAMERA,
-    "What the simulation knows and no sensor does.",
+    "The true wavefront of the simulation.",
     optional=True,
 )
 OFFLOAD = Topic(
@@ -195,7 +193,7 @@ LAW = Topic(
     wire.LinearLaw,
     Rate.EVENT,
     _CONTROLLER,
-    "Control law in place of the integrator, with its matrices; states have its identity.",
+    "Control law in use instead of the integrator, with its matrices; states hold its identity.",
     queryable=True,
 )
 PLAY = Topic(
@@ -203,7 +201,7 @@ PLAY = Topic(
     wire.Play,
     Rate.EVENT,
     _CONTROLLER,
-    "Table that is being played, frame by frame; states have its identity.",
+    "Table of the current probe sequence; states hold its identity.",
     queryable=True,
 )
 CALIBRATION = Topic(
@@ -211,7 +209,7 @@ CALIBRATION = Topic(
     wire.Calibration,
     Rate.EVENT,
     _CONTROLLER,
-    "What turns a frame into a command.",
+    "Calibration in use: matrices from a frame to modes and to actuators.",
     queryable=True,
 )
 BENCH = Topic(
@@ -219,7 +217,7 @@ BENCH = Topic(
     wire.BenchValue,
     Rate.EVENT,
     frozenset({Role.BENCH, Role.OPERATOR}),
-    "A value of something else on the bench, for interlocks; the controller subscribes to the configured names.",
+    "A value of another device on the bench, for interlocks; the controller subscribes to the configured names.",
     subscribers=_CONTROLLER | _MONITORS,
     deterministic=False,
     queryable=True,
@@ -229,7 +227,7 @@ EVENT = Topic(
     Log,
     Rate.EVENT,
     EVERYBODY,
-    "A named event, from the table of events.",
+    "An event of the table of events.",
     subscribers=EVERYBODY,
     deterministic=False,
 )
@@ -238,7 +236,7 @@ HEALTH = Topic(
     wire.Health,
     2.0,
     EVERYBODY,
-    "How a process is.",
+    "Health of a process.",
     subscribers=EVERYBODY,
     deterministic=False,
     queryable=True,
@@ -266,10 +264,10 @@ TOPICS: tuple[Topic, ...] = (
 )
 
 REQUEST_KEY = "lowfc/request/{name}"
-"""Key of the queryable for one kind of request; the query's payload is a `lowfc.v1.Request`."""
+"""Key of the queryable for a kind of request; the payload of a query is a `lowfc.v1.Request`."""
 
 RECORD_KEY = "lowfc/record/{name}"
-"""Key of the recorder's queryable: start and stop."""
+"""Key of the recorder's queryables: start and stop."""
 
 MONO16 = "mono16"
 FLOAT32 = "32FC1"
@@ -279,7 +277,7 @@ _LONGEST_KEY = 200
 
 @lru_cache(maxsize=256)
 def topic_of(key: str) -> Topic:
-    """The line of the table for a key on the bus; KeyError where there is no such topic."""
+    """Topic of a key on the bus; KeyError if there is none."""
     if len(key) > _LONGEST_KEY:
         raise KeyError(key)
     for topic in TOPICS:
@@ -300,13 +298,13 @@ def from_timestamp(stamp: Timestamp) -> int:
 
 
 LATEST_NS = 1 << 62
-"""No message is of a later time: the year 2116."""
+"""Latest valid time of a message, in the year 2116."""
 SEQUENCES = (1 << 64) - (1 << 33)
-"""Sequences are below this, so that neither start nor count can overflow; starts go up to the year 2106."""
+"""Bound of valid sequences, so that neither start nor count can overflow; starts go up to the year 2106."""
 
 
 def checked_time_ns(stamp: Timestamp) -> int:
-    """A received message's time, nanoseconds since the epoch; BadMessageError where it cannot be."""
+    """Time of a received message, nanoseconds since the epoch; BadMessageError if it is out of range."""
     time_ns = from_timestamp(stamp)
     if not 0 <= time_ns <= LATEST_NS:
         raise BadMessageError(f"its time is {time_ns} ns since the epoch, not 0 to 2^62")
@@ -314,19 +312,19 @@ def checked_time_ns(stamp: Timestamp) -> int:
 
 
 def checked_sequence(sequence: int) -> int:
-    """A received frame sequence; BadMessageError where it cannot be."""
+    """A received frame sequence; BadMessageError if it is out of range."""
     if not 0 <= sequence < SEQUENCES:
         raise BadMessageError(f"its frame sequence is {sequence}, not below {SEQUENCES}")
     return sequence
 
 
 def floats(data: bytes, *shape: int) -> Single:
-    """Little-endian float32 of a message, in that shape; ValueError where there are more or fewer."""
+    """Array of this shape from a message's little-endian float32; ValueError if the number of values differs."""
     return np.frombuffer(data, dtype="<f4").reshape(shape)
 
 
 def fields_of(source: object, names: Iterable[str]) -> dict[str, Any]:
-    """Fields by their names, which are the same in a value and in its message."""
+    """Attributes of these names; a value and its message share them."""
     return {name: getattr(source, name) for name in names}
 
 

@@ -12,7 +12,7 @@ class Section(BaseModel):
 
 
 class Network(Section):
-    """Connection between hosts; without a router all processes run on this host."""
+    """Connection between hosts; without a router, all processes run on this host."""
 
     router: str = Field("", pattern=r"^(tls/.+:[0-9]{1,5})?$")
     """Where the router listens, such as "tls/bench.example.org:7447"; empty for none."""

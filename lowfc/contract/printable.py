@@ -1,16 +1,16 @@
-"""Text of unknown origin, such as an operator's note, made fit for a terminal."""
+"""Escape control characters in text of unknown origin, such as an operator's note, for a terminal."""
 
 import unicodedata
 
 _HIDDEN = frozenset(("Cc", "Cf", "Cs", "Zl", "Zp"))
-"""Unicode categories of characters that do something instead of being seen."""
+"""Unicode categories of invisible characters: controls, formats, surrogates and separators."""
 
 LINES = "\n\t"
-"""What may stay in a text of several lines."""
+"""Control characters to keep in a text of several lines."""
 
 
 def printable(text: str, keep: str = "") -> str:
-    """Text in which control characters, but for those to `keep`, are shown as escapes, as in a Python string."""
+    """Text with its control characters, except those in `keep`, as escapes of a Python string."""
     if text.isprintable():
         return text
     return "".join(

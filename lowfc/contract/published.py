@@ -1,4 +1,4 @@
-"""Arrays that the controller publishes by themselves, by identity: requests and states name them."""
+"""Calibrations, laws and tables on topics of their own; requests and states refer to them by identity."""
 
 import contextlib
 from dataclasses import dataclass, field
@@ -17,14 +17,14 @@ TOPICS = (CALIBRATION, LAW, PLAY)
 
 @dataclass(slots=True)
 class Published:
-    """Calibrations, laws and tables that can be played, as far as they were received."""
+    """Calibrations, laws and tables of probe sequences received so far, by identity."""
 
     calibrations: dict[str, Calibration] = field(default_factory=dict)
     laws: dict[str, LinearLaw] = field(default_factory=dict)
     plays: dict[str, PlayTable] = field(default_factory=dict)
 
     def take(self, topic: Topic, payload: bytes) -> None:
-        """Keep one of them; one that is not whole is left out, and whoever needs it says so."""
+        """Store a received one; an incomplete one is ignored, and decoding what refers to it raises ValueError."""
         with contextlib.suppress(DecodeError, ValueError):
             if topic is CALIBRATION:
                 calibration = decode_calibration(wire.Calibration.FromString(payload))

@@ -1,4 +1,4 @@
-"""The configuration that a log was recorded with, by this version of lowfc or by another one."""
+"""The configuration in a log, recorded by this or another version of lowfc."""
 
 from typing import Any
 
@@ -18,10 +18,10 @@ _SECTIONS: dict[str, type[BaseModel]] = {
 
 
 def recorded(content: bytes) -> tuple[Configuration, list[str]]:
-    """A recorded configuration, and remarks on what this version would refuse in a file.
+    """Read a recorded configuration; return it with remarks on what this version would refuse in a file.
 
-    An unknown key is ignored, a value that is refused is replaced by the default. Values that only do not go together
-    stay as they are, since the run had them.
+    An unknown key is ignored, and an invalid value is replaced by the default. Values that are valid but contradict
+    each other stay as they are, since the run used them.
 
     Raises:
         ConfigurationError: it is not a readable TOML file.
@@ -54,7 +54,7 @@ def _faults(data: dict[str, Any]) -> list[Any]:
 
 
 def _is_of_key(data: dict[str, Any], detail: Any) -> bool:
-    """Whether one key is at fault, rather than several that do not go together."""
+    """Whether one key is at fault, and not a contradiction between several."""
     if not detail["loc"]:
         return False
     section, *path = detail["loc"]
@@ -62,7 +62,7 @@ def _is_of_key(data: dict[str, Any], detail: Any) -> bool:
 
 
 def _mend(data: dict[str, Any], detail: Any) -> str:
-    """Remove the key at fault; return what that means, in words."""
+    """Remove the key at fault; return the consequence in words."""
     section, *path = detail["loc"]
     table = data.get(section)
     if path and isinstance(table, dict):
@@ -73,7 +73,7 @@ def _mend(data: dict[str, Any], detail: Any) -> str:
 
 
 def _constructed(data: dict[str, Any], contradictory: set[str]) -> Configuration:
-    """A configuration whose keys are sound each for itself."""
+    """A configuration whose keys are valid one by one."""
     sections: dict[str, Any] = {
         name: kind.model_construct(**data[name]) if name in contradictory else kind.model_validate(data[name])
         for name, kind in _SECTIONS.items()

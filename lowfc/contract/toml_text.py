@@ -1,17 +1,17 @@
-"""TOML that may be anything: it is parsed in bounded time, or refused with one sentence."""
+"""Parse untrusted TOML in bounded time, or refuse it with a one-sentence error."""
 
 import re
 import tomllib
 from typing import Any
 
 LARGEST_BYTES = 1 << 20
-"""Size of a configuration, at most; one with every key is 12 kB."""
+"""Largest size of a configuration; one with every key has 12 kB."""
 
-_MOST_DOTS = 100  # in a line: the time to parse a dotted key grows with the square of its parts
+_MOST_DOTS = 100  # in a line: the time to parse a dotted key grows with the square of the number of its parts
 
 
 def parsed(content: bytes) -> dict[str, Any]:
-    """The tables of a TOML file; ValueError, in short, where it is none, too large, or would take long to parse."""
+    """Tables of a TOML file; ValueError, with a short text, if it is invalid, too large or slow to parse."""
     if len(content) > LARGEST_BYTES:
         raise ValueError(f"larger than {LARGEST_BYTES} bytes")
     text = content.decode()

@@ -34,7 +34,7 @@ def test_an_envelope_is_16_little_endian_bytes() -> None:
 
 
 @pytest.mark.parametrize("data", [b"", b"x" * 15, b"x" * 17])
-@pytest.mark.parametrize("read", [Envelope.decode, Envelope.unpack])
+@pytest.mark.parametrize("read", [Envelope.decode, Envelope.decode_checked])
 def test_other_lengths_are_no_envelope(data: bytes, read: Callable[[bytes], object]) -> None:
     with pytest.raises(BusError, match=f"16 bytes.*got {len(data)}"):
         read(data)
@@ -46,13 +46,13 @@ def test_sequences_grow_past_2_to_the_32_messages_in_any_year(year_start_s: int)
     assert after == before + 1
     assert sequence_of(year_start_s, 2**32 + 7) < sequence_of(year_start_s + 2, 0)
     for sequence in (before, after):
-        assert Envelope.unpack(Envelope(sequence, 2**62).encode()) == (sequence, 2**62)
+        assert Envelope.decode_checked(Envelope(sequence, 2**62).encode()) == (sequence, 2**62)
 
 
 @pytest.mark.parametrize("numbers", [(2**64 - 2**33, 0), (2**64 - 1, 0), (0, 2**62 + 1), (0, 2**64 - 1)])
 def test_numbers_that_would_overflow_are_no_envelope(numbers: tuple[int, int]) -> None:
     with pytest.raises(BadMessageError, match=f"below 2.64 - 2.33.*got {numbers[0]} and {numbers[1]} ns"):
-        Envelope.unpack(Envelope(*numbers).encode())
+        Envelope.decode_checked(Envelope(*numbers).encode())
 
 
 NOW_S = SIMULATED_START_NS // 10**9

@@ -145,9 +145,9 @@ def test_every_request_names_its_sender(controller: FakeController, loop: Client
     assert asked.requester.endswith(f"(process {os.getpid()})")
     logged = wire.Request.FromString(codec.encode_request(asked, controller.reply, 1, None))
     assert logged.requester == asked.requester
-    kept = codec.requester_alone(wire.Request(text="\0" * 5000, requester="ann").SerializeToString())
+    kept = codec.only_requester(wire.Request(text="\0" * 5000, requester="ann").SerializeToString())
     assert kept == wire.Request(requester="ann").SerializeToString()
-    assert codec.requester_alone(b"\xff" * 9000) == b""
+    assert codec.only_requester(b"\xff" * 9000) == b""
     assert codec.decode_request(wire.Request(requester="a\n" * 200).SerializeToString(), "open", 0).requester == (
         "a\\n" * 50
     )

@@ -26,9 +26,9 @@ def test_a_state_without_a_calibration_survives() -> None:
 
 def test_a_state_of_another_calibration_is_refused() -> None:
     message = controller_state(loaded(settings()), settings(), 1)
-    with pytest.raises(ValueError, match="calibration toy of the controller's state is not there"):
+    with pytest.raises(ValueError, match="calibration toy of the controller's state is missing"):
         decode_state(message, None)
-    with pytest.raises(ValueError, match="is not there"):
+    with pytest.raises(ValueError, match="is missing"):
         decode_state(message, CALIBRATION)
     message.calibration_id = CALIBRATION.id
     del message.gain[0]
@@ -67,7 +67,7 @@ def test_a_calibration_survives() -> None:
     for field in fields(CALIBRATION):
         assert np.array_equal(getattr(found, field.name), getattr(CALIBRATION, field.name)), field.name
     message.flux_dn += 1
-    with pytest.raises(ValueError, match="is not whole: its content has another identity"):
+    with pytest.raises(ValueError, match="is damaged: its content has another identity"):
         decode_calibration(message)
 
 

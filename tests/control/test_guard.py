@@ -84,7 +84,7 @@ def test_the_integrator_takes_over_without_a_jump_and_it_is_told() -> None:
     assert names(every) == ["LAW_OVERRULED"]
     event = every[0].events[0].details
     assert event["modes"] == "tip and tilt"
-    assert event["until"] == f"until it would be far better for {BETTER_S:g} s"
+    assert event["until"] == f"until the law would be far better for {BETTER_S:g} s"
     assert np.abs(state.drive.history_nm[0] - before).max() < 2  # a hundredth of the way to the integrator's command
     _, state = run(state, SPANS.faded, first + 1)
     known = status.figures(controller_state(state, WHAT, 1))
@@ -256,7 +256,7 @@ def test_a_wrong_delay_is_noticed_though_it_spoils_what_is_compared() -> None:
     bench.run(3000)
     (_, event), *_ = [one for one in bench.events if one[1].name == "LAW_OVERRULED"]
     assert "without correction there would be" in event.details["why"]
-    assert event.details["until"] == "until it is loaded again"
+    assert event.details["until"] == "until the law is loaded again"
     assert bench.tilt_mas(1500) < 10
 
 

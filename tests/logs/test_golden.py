@@ -148,7 +148,7 @@ def test_former_keys_of_a_configuration_are_warned_of() -> None:
 def test_a_key_under_both_names_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "lowfc.toml"
     path.write_text(f"[control]\n{FORMER_KEY} = 50\nframe_timeout_ms = 60\n")
-    with pytest.raises(ConfigurationError, match=r"former name of control\.frame_timeout_ms, and both are there"):
+    with pytest.raises(ConfigurationError, match=r"former name of control\.frame_timeout_ms, and both are present"):
         configuration.load(path)
 
 

@@ -104,7 +104,7 @@ class Loop:
     def frame(self, payload: bytes) -> None:
         """A frame behind the sixteen bytes of its envelope."""
         self.count += 1
-        sequence, time_ns = Envelope.unpack(payload[:16])
+        sequence, time_ns = Envelope.decode_checked(payload[:16])
         self.take(codec.decode_frame(payload[16:], sequence, -time_ns))
 
     def request(self, name: str, payload: bytes) -> None:

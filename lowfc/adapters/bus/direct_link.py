@@ -144,7 +144,7 @@ class DirectReader:
         """Hand on a message of a writer, on the thread that calls; of the socket's, or of one in this process."""
         now_ns = self._now_ns()
         try:
-            self._by_socket(Sample(self._key, payload, *Envelope.unpack(envelope), now_ns))
+            self._by_socket(Sample(self._key, payload, *Envelope.decode_checked(envelope), now_ns))
         except Exception as fault:
             self._failed(fault)
         self._leave()

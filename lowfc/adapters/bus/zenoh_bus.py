@@ -379,7 +379,7 @@ def _known_key(expression: str) -> str | None:
 
 def _sample(sample: zenoh.Sample, receive_time_ns: int, key: str | None = None) -> Sample:
     attachment = sample.attachment
-    sequence, publish_time_ns = Envelope.unpack(b"" if attachment is None else attachment.to_bytes())
+    sequence, publish_time_ns = Envelope.decode_checked(b"" if attachment is None else attachment.to_bytes())
     return Sample(
         str(sample.key_expr) if key is None else key,
         sample.payload.to_bytes(),

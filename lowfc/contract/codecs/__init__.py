@@ -1,1 +1,1 @@
-"""Messages and files to values of the numerics, and back."""
+"""Conversion between messages or files and the values of `lowfc.control`."""

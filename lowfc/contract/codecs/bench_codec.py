@@ -1,4 +1,4 @@
-"""Bench values and interlocks as messages, both ways."""
+"""Encode and decode bench values and interlocks."""
 
 from math import isfinite
 
@@ -9,10 +9,11 @@ from lowfc.contract.messages import checked_time_ns, from_timestamp, timestamp, 
 from lowfc.control.loop.interlocks import MAX_TEXT, Acting, Action, BenchReport, Interlock, Value
 
 LARGEST_BYTES = 4 * MAX_TEXT + 200
+"""Largest size of a bench value: a text of up to four bytes per character, and the other fields."""
 
 
 def encode_bench_value(value: Value, time_ns: int) -> bytes:
-    """BenchValue of a value measured at that time; BadMessageError where the value is none."""
+    """BenchValue of a value measured at this time; BadMessageError if the value is invalid."""
     message = wire_value(value)
     _checked(message)
     message.timestamp.CopyFrom(timestamp(time_ns))
@@ -20,7 +21,7 @@ def encode_bench_value(value: Value, time_ns: int) -> bytes:
 
 
 def decode_bench_value(payload: bytes) -> Value:
-    """Value of a received BenchValue; BadMessageError where it cannot be read, or is none."""
+    """Value of a received BenchValue; BadMessageError if it cannot be read or is invalid."""
     if len(payload) > LARGEST_BYTES:
         raise BadMessageError(f"a bench value has at most {LARGEST_BYTES} bytes, got {len(payload)}")
     try:
@@ -39,7 +40,7 @@ def wire_value(value: Value) -> wire.BenchValue:
 
 
 def value_of(message: wire.BenchValue) -> Value:
-    """Value of a message; ValueError where it holds none, a number that is not finite, or a long text."""
+    """Value of a message; ValueError if it has none, a number that is not finite, or too long a text."""
     match message.WhichOneof("value"):
         case "number" if isfinite(message.number):
             return message.number
@@ -47,7 +48,7 @@ def value_of(message: wire.BenchValue) -> Value:
             return message.truth
         case "text" if len(message.text) <= MAX_TEXT:
             return message.text
-    raise ValueError(f"a bench value is a finite number, a truth, or a text of at most {MAX_TEXT} characters")
+    raise ValueError(f"a bench value is a finite number, true or false, or a text of at most {MAX_TEXT} characters")
 
 
 def _checked(message: wire.BenchValue) -> Value:
@@ -58,14 +59,14 @@ def _checked(message: wire.BenchValue) -> Value:
 
 
 def wire_report(report: BenchReport) -> wire.BenchReport:
-    """Message of a value as it was taken in."""
+    """Message of a value as received."""
     value = None if report.value is None else wire_value(report.value)
     time = timestamp(report.time_ns)
     return wire.BenchReport(timestamp=time, name=report.name, value=value, age_ns=report.age_ns)
 
 
 def report_of(message: wire.BenchReport) -> BenchReport:
-    """Report of a message; ValueError where its value is none."""
+    """Report of a message; ValueError if its value is invalid."""
     value = value_of(message.value) if message.HasField("value") else None
     return BenchReport(from_timestamp(message.timestamp), message.name, value, message.age_ns)
 
@@ -83,16 +84,16 @@ def wire_interlock(one: Interlock) -> wire.Interlock:
 
 
 def interlock_of(message: wire.Interlock) -> Interlock:
-    """Interlock of a message; ValueError where it has no value, or its action is unknown."""
+    """Interlock of a message; ValueError if it has no valid value or its action is unknown."""
     value, action = value_of(message.value), Action(message.action)
     return Interlock(message.name, message.test, value, action, message.max_age_ns, message.acts_when_old)
 
 
 def wire_acting(one: Acting) -> wire.ActingInterlock:
-    """Message of an interlock that acts."""
+    """Message of an acting interlock."""
     return wire.ActingInterlock(number=one.number, action=one.action, why=one.why)
 
 
 def acting_of(message: wire.ActingInterlock) -> Acting:
-    """Interlock that acts, of a message; ValueError where its action is unknown."""
+    """Acting interlock of a message; ValueError if its action is unknown."""
     return Acting(message.number, Action(message.action), message.why)

@@ -1,4 +1,4 @@
-"""Calibrations and camera settings as messages, both ways."""
+"""Encode and decode calibrations and camera settings."""
 
 from dataclasses import replace
 from typing import Any
@@ -10,10 +10,10 @@ from lowfc.control.calibration.calibration import Calibration, array_shapes
 from lowfc.control.loop.camera import CameraSettings
 from lowfc.optics.chain.zernike import mode_name
 
-# What has the same name in the values and in the messages.
+# Fields of the same name in values and messages.
 _PLAIN = ("id", "operator_hash", "estimator", "noll", "wavelength_nm", "flux_dn", "saturation_dn")
 _ARRAYS = ("reference", "response", "reconstructor", "dark", "modes_to_actuators", "actuators_to_modes")
-_OF_CAMERA = ("bias_dn", "saturation_dn", "gain_e_per_dn", "em_gain", "read_noise_e")
+_CAMERA = ("bias_dn", "saturation_dn", "gain_e_per_dn", "em_gain", "read_noise_e")
 
 
 def encode_calibration(calibration: Calibration, time_ns: int) -> bytes:
@@ -34,12 +34,12 @@ def encode_calibration(calibration: Calibration, time_ns: int) -> bytes:
 
 
 def identified(calibration: Calibration) -> Calibration:
-    """The same calibration with its identity: SHA-256 of everything else in it."""
+    """The calibration with its `id` set: SHA-256 of everything else in it."""
     return replace(calibration, id=calibration.identity())
 
 
 def decode_calibration(message: wire.Calibration) -> Calibration:
-    """Calibration of a message; ValueError where it is not whole, or not the one that its identity says."""
+    """Calibration of a message; ValueError if it is incomplete or its content does not match its identity."""
     shape, grid = (message.rows, message.columns), (message.mirror_rows, message.mirror_columns)
     shapes = array_shapes(len(message.noll), shape, grid)
     if not message.actuators_to_modes:
@@ -55,7 +55,7 @@ def decode_calibration(message: wire.Calibration) -> Calibration:
         **arrays,
     )
     if calibration.identity() != message.id:
-        raise ValueError(f"calibration {message.id[:12]} is not whole: its content has another identity")
+        raise ValueError(f"calibration {message.id[:12]} is damaged: its content has another identity")
     return calibration
 
 
@@ -68,7 +68,7 @@ def wire_camera(camera: CameraSettings) -> wire.CameraState:
         rows=camera.shape[0],
         columns=camera.shape[1],
         start_s=camera.start_s,
-        **fields_of(camera, _OF_CAMERA),
+        **fields_of(camera, _CAMERA),
     )
 
 
@@ -79,5 +79,5 @@ def camera_settings(message: wire.CameraState, start_s: int = 0) -> CameraSettin
         (message.rows, message.columns),
         region=(message.region_row, message.region_column),
         start_s=start_s or message.start_s,
-        **fields_of(message, _OF_CAMERA),
+        **fields_of(message, _CAMERA),
     )

@@ -1,4 +1,4 @@
-"""Between the values of the numerics and the messages of the bus, both ways."""
+"""Encode and decode the messages of the bus, as values of `lowfc.control`."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -44,28 +44,28 @@ from lowfc.control.loop.interlocks import BenchReport
 from lowfc.control.loop.safety import LoopMode, Reason
 from lowfc.control.loop.wording import MOST_TEXT
 
-_PIXEL = np.dtype("<u2")  # read from its name, it would cost every frame 0.2 us
+_PIXEL = np.dtype("<u2")  # parsing its name would cost 0.2 us in every frame
 
 
 def decode_frame(payload: bytes, sequence: int, age_ns: int, *, ahead: bool = False) -> Frame:
-    """Frame of a RawImage; its pixels are None where the message holds no whole mono16 image.
+    """Frame of a RawImage; its pixels are None if the message has no complete mono16 image.
 
-    BadMessageError where its time or its sequence cannot be.
+    BadMessageError if its time or sequence is out of range.
     """
     checked_sequence(sequence)
     try:
         image = RawImage.FromString(payload)
     except DecodeError:
         return Frame(sequence, 0, age_ns, None, ahead)
-    pixels, data = None, image.data  # each look at it makes a copy
+    pixels, data = None, image.data  # each access of `data` copies it
     rows, columns, step = image.height, image.width, image.step
     if image.encoding == MONO16 and step == 2 * columns and len(data) == step * rows > 0:
         pixels = np.frombuffer(data, _PIXEL).reshape(rows, columns)
     return Frame(sequence, checked_time_ns(image.timestamp), age_ns, pixels, ahead)
 
 
-def encode_step(step: Step, taken: int) -> bytes:
-    """ControlStep of a step, made from input number `taken`."""
+def encode_step(step: Step, input_number: int) -> bytes:
+    """ControlStep of a step, computed from this input."""
     message = wire.ControlStep(
         timestamp=timestamp(step.time_ns),
         frame_sequence=step.frame_sequence,
@@ -76,13 +76,13 @@ def encode_step(step: Step, taken: int) -> bytes:
         reasons=wire_reasons(step.reasons),
         flux_dn=step.flux_dn,
         saturated_pixels=step.saturated_pixels,
-        input_number=taken,
+        input_number=input_number,
     )
     return message.SerializeToString()
 
 
-def encode_command(command: Command, valid_for_ns: int, channel: str, taken: int) -> bytes:
-    """MirrorCommand of a command, made from input number `taken`."""
+def encode_command(command: Command, valid_for_ns: int, channel: str, input_number: int) -> bytes:
+    """MirrorCommand of a command, computed from this input."""
     rows, columns = command.actuators_nm.shape
     message = wire.MirrorCommand(
         timestamp=timestamp(command.time_ns),
@@ -93,7 +93,7 @@ def encode_command(command: Command, valid_for_ns: int, channel: str, taken: int
         columns=columns,
         actuators=command.actuators_nm.tobytes(),
         command_nm=command.command_nm.tolist(),
-        input_number=taken,
+        input_number=input_number,
         safe=command.safe,
         clear_id=command.clear_id,
     )
@@ -101,14 +101,14 @@ def encode_command(command: Command, valid_for_ns: int, channel: str, taken: int
 
 
 def actuators(message: wire.MirrorCommand | wire.MirrorState) -> Single | None:
-    """Actuators (rows, columns) of a message; None where the bytes are not that many float32."""
+    """Actuators (rows, columns) of a message; None if the number of bytes does not match."""
     if len(message.actuators) != 4 * message.rows * message.columns or not message.actuators:
         return None
     return floats(message.actuators, message.rows, message.columns)
 
 
 def decode_mirror(payload: bytes) -> MirrorShape | None:
-    """Shape of a MirrorState; None where it is none, BadMessageError where its time cannot be."""
+    """Shape of a MirrorState; None if it cannot be read, BadMessageError if its time is out of range."""
     try:
         state = wire.MirrorState.FromString(payload)
     except DecodeError:
@@ -118,9 +118,9 @@ def decode_mirror(payload: bytes) -> MirrorShape | None:
 
 
 def decode_camera(payload: bytes, start_s: int) -> CameraSettings:
-    """What of a CameraState must fit the calibration; it was published by a camera that started at `start_s`.
+    """Settings of a CameraState that must match the calibration, from a camera that started at `start_s`.
 
-    BadMessageError where it cannot be read, is of no camera, or a number in it cannot be.
+    BadMessageError if it cannot be read, has no pixels, or a number in it is invalid.
     """
     try:
         state = wire.CameraState.FromString(payload)
@@ -130,34 +130,35 @@ def decode_camera(payload: bytes, start_s: int) -> CameraSettings:
     found = camera_settings(state, start_s)
     levels = (found.bias_dn, found.saturation_dn, found.gain_e_per_dn, found.em_gain, found.read_noise_e)
     if not all(found.shape) or not np.isfinite(levels).all():
-        raise BadMessageError("these are the settings of no camera")
+        raise BadMessageError("the camera settings have no pixels, or a number that is not finite")
     return found
 
 
-def encode_input(taken: Report, number: int) -> bytes:
-    """ControlInput of what the controller took in as its input `number`."""
-    time = timestamp(taken.time_ns)
-    message = wire.ControlInput(timestamp=time, input_number=number)
-    match taken:
+def encode_input(report: Report, input_number: int) -> bytes:
+    """ControlInput of an input other than a frame or a request."""
+    time = timestamp(report.time_ns)
+    message = wire.ControlInput(timestamp=time, input_number=input_number)
+    match report:
         case MirrorShape():
-            message.mirror.CopyFrom(_wire_shape(taken))
+            message.mirror.CopyFrom(_wire_shape(report))
         case MirrorReport():
-            message.mirror_report.CopyFrom(wire.MirrorReport(timestamp=time, fault=taken.fault))
-            if taken.shape is not None:
-                message.mirror_report.mirror.CopyFrom(_wire_shape(taken.shape))
+            message.mirror_report.CopyFrom(wire.MirrorReport(timestamp=time, fault=report.fault))
+            if report.shape is not None:
+                message.mirror_report.mirror.CopyFrom(_wire_shape(report.shape))
         case BenchReport():
-            message.bench_report.CopyFrom(wire_report(taken))
+            message.bench_report.CopyFrom(wire_report(report))
         case CameraSettings():
-            message.camera.CopyFrom(wire_camera(taken))
+            message.camera.CopyFrom(wire_camera(report))
         case Load():
-            message.load.CopyFrom(wire.Load(timestamp=time, calibration_id=taken.calibration.id, source=taken.source))
+            load = wire.Load(timestamp=time, calibration_id=report.calibration.id, source=report.source)
+            message.load.CopyFrom(load)
         case Tick():
-            message.tick.CopyFrom(wire.Tick(timestamp=time, silent_ns=max(0, taken.silent_ns)))
+            message.tick.CopyFrom(wire.Tick(timestamp=time, silent_ns=max(0, report.silent_ns)))
     return message.SerializeToString()
 
 
 def decode_input(message: wire.ControlInput, calibrations: Mapping[str, Calibration]) -> Input:
-    """What the controller took in; ValueError where it is unknown, or its calibration not among these (by id)."""
+    """Input of a ControlInput; ValueError if it is unknown, or its calibration is not among these (by id)."""
     match message.WhichOneof("input"):
         case "mirror":
             shape = _mirror_shape(message.mirror)
@@ -200,10 +201,10 @@ def _mirror_shape(state: wire.MirrorState) -> MirrorShape | None:
 
 
 MOST_BYTES = 16_000_000
-"""Of any request; the bus loses one that is far larger."""
+"""Largest size of any request; the bus loses a far larger one."""
 _SMALL_BYTES = 8_000
 MOST_REQUESTER = 100
-"""Characters of a sender's name that are kept."""
+"""Most characters of a requester that are kept."""
 _MOST_BYTES = {
     "channel": 4 * 128 * 128 + _SMALL_BYTES,
     "note": 4 * MOST_TEXT + _SMALL_BYTES,
@@ -214,12 +215,12 @@ _MOST_BYTES = {
 
 
 def most_bytes(name: str) -> int:
-    """Size that a request of this name may have; a larger one is refused before it is decoded."""
+    """Largest size of a request of this name; a larger one is refused before it is decoded."""
     return _MOST_BYTES.get(name, _SMALL_BYTES)
 
 
-def requester_alone(payload: bytes) -> bytes:
-    """A request of which nothing but its sender is kept, whatever it is."""
+def only_requester(payload: bytes) -> bytes:
+    """A request with nothing but the requester of this one; empty if it cannot be read."""
     try:
         return wire.Request(requester=wire.Request.FromString(payload[:_SMALL_BYTES]).requester).SerializeToString()
     except DecodeError:
@@ -227,7 +228,7 @@ def requester_alone(payload: bytes) -> bytes:
 
 
 def decode_request(payload: bytes, name: str, time_ns: int) -> Request:
-    """Request under a key's name; ValueError where it is too large, cannot be read, or holds what is not whole."""
+    """Request of this name; ValueError if it is too large, cannot be read, or a part of it is incomplete."""
     if len(payload) > most_bytes(name):
         raise ValueError(f"a request of this name holds at most {most_bytes(name)} bytes, got {len(payload)}")
     try:
@@ -245,14 +246,14 @@ def request(
     laws: Mapping[str, LinearLaw] = MappingProxyType({}),
     plays: Mapping[str, PlayTable] = MappingProxyType({}),
 ) -> Request:
-    """Request of a message; of a logged one, calibration, law and table are identities, and are among those.
+    """Request of a message; a logged one refers to its calibration, law and table, which are passed, by identity.
 
-    ValueError where what it holds is not whole.
+    ValueError if a part of it is incomplete or missing.
     """
     table, basis = floats(message.table, -1, message.columns or 1), floats(message.actuators, -1)
     if message.play_id:
         if message.play_id not in plays:
-            raise ValueError(f"the table {message.play_id[:12]} of a play is not there")
+            raise ValueError(f"the table {message.play_id[:12]} of a play is missing")
         known_table = plays[message.play_id]
         table, basis = known_table.rows, known_table.basis.reshape(-1)
     calibration = None
@@ -276,10 +277,10 @@ def request(
     )
 
 
-def encode_request(request: Request, reply: Reply, taken: int, state: wire.ControllerState | None) -> bytes:
-    """Request with its answer; it was input number `taken`, or 0 where it could not be read.
+def encode_request(request: Request, reply: Reply, input_number: int, state: wire.ControllerState | None) -> bytes:
+    """Request with its reply; the input number is 0 if it could not be read.
 
-    Of the law and the table of a request that was prepared, it has the identity: they are published by themselves.
+    A prepared request holds only the identities of its law and table: these are published on topics of their own.
     """
     played = request.played
     message = wire.Request(
@@ -291,7 +292,7 @@ def encode_request(request: Request, reply: Reply, taken: int, state: wire.Contr
         reply=reply.text,
         frame_sequence=reply.frame_sequence,
         state=state,
-        input_number=taken,
+        input_number=input_number,
         text=request.text,
         actuators=b"" if played is not None else request.actuators_nm.tobytes(),
         table=b"" if played is not None else request.table.tobytes(),
@@ -309,15 +310,15 @@ def encode_request(request: Request, reply: Reply, taken: int, state: wire.Contr
 
 def wire_mode(mode: LoopMode) -> wire.LoopMode:
     """A loop mode as on the wire."""
-    return mode.value  # type: ignore[return-value]  # numbered alike, which a test holds
+    return mode.value  # type: ignore[return-value]  # same numbers, checked by a test
 
 
 def wire_reasons(reasons: tuple[Reason, ...]) -> list[wire.Reason]:
     """Reasons as on the wire."""
-    return [reason.value for reason in reasons]  # type: ignore[misc]  # numbered alike, which a test holds
+    return [reason.value for reason in reasons]  # type: ignore[misc]  # same numbers, checked by a test
 
 
 def latency(durations: Durations) -> wire.Latency:
-    """Percentiles as a message."""
+    """Message of the percentiles of durations."""
     p50, p99, p99_9 = durations.percentiles_ns(0.5, 0.99, 0.999)
     return wire.Latency(count=durations.count, p50_ns=p50, p99_ns=p99, p99_9_ns=p99_9, max_ns=durations.max_ns)

@@ -1,4 +1,4 @@
-"""Files that a user names: regular ones of a bounded size; a device, a pipe or a directory is never read."""
+"""Open files that a user names: only regular files of a bounded size, no device, pipe or directory."""
 
 import errno
 import os
@@ -11,9 +11,9 @@ UNBOUNDED = (1 << 63) - 1
 
 
 def opened(path: Path, largest_bytes: int) -> BinaryIO:
-    """A regular file of at most `largest_bytes`, or a symbolic link to one, open for reading.
+    """Open a regular file of at most `largest_bytes`, or a symbolic link to one, for reading.
 
-    OSError where it is something else, or cannot be opened; `strerror` is a sentence for a user.
+    OSError if it is something else or cannot be opened; its `strerror` is a phrase for the user.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # a pipe without a writer would wait
     try:
@@ -32,10 +32,10 @@ def read_whole(path: Path, largest_bytes: int) -> bytes:
     """Content of a regular file of at most `largest_bytes`; OSError as for `opened`."""
     with opened(path, largest_bytes) as stream:
         content = stream.read(largest_bytes + 1)
-    if len(content) > largest_bytes:  # its size was not known: a file of /proc, or one that grows
+    if len(content) > largest_bytes:  # its size was unknown: a file of /proc, or a growing one
         raise _too_large(path, largest_bytes)
     return content
 
 
 def _too_large(path: Path, largest_bytes: int) -> OSError:
-    return OSError(errno.EFBIG, f"larger than the {largest_bytes} bytes that such a file may have", str(path))
+    return OSError(errno.EFBIG, f"larger than {largest_bytes} bytes, the most for such a file", str(path))

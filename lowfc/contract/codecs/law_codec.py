@@ -1,4 +1,4 @@
-"""Control laws, channels and plays as messages, both ways."""
+"""Encode and decode control laws, command channels and probe sequences."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -13,17 +13,17 @@ from lowfc.control.laws.linear_law import LinearLaw, matrix_shapes
 from lowfc.control.loop.command_channels import Channel, CommandChannels, Play, PlayTable, play_table
 from lowfc.control.loop.guard import NAMES
 
-_PLAIN = ("name", "signal", "delay_frames", "rate_hz")  # of the same name in law and message
+_PLAIN = ("name", "signal", "delay_frames", "rate_hz")  # fields of the same name in law and message
 
 
 def law_header(law: LinearLaw) -> wire.LinearLaw:
-    """A law as a message without its matrices, which are known by its identity."""
+    """Message of a law without its matrices, which follow from its identity."""
     plain = fields_of(law, _PLAIN)
     return wire.LinearLaw(noll=law.noll, states=len(law.transition), id=law.id, **plain)
 
 
 def wire_law(law: LinearLaw, time_ns: int = 0) -> wire.LinearLaw:
-    """A law as a message, whole."""
+    """Message of a complete law."""
     message = law_header(law)
     message.timestamp.CopyFrom(timestamp(time_ns))
     for name in matrix_shapes(0, 0):
@@ -32,13 +32,13 @@ def wire_law(law: LinearLaw, time_ns: int = 0) -> wire.LinearLaw:
 
 
 def law_of(message: wire.LinearLaw, known: Mapping[str, LinearLaw] = MappingProxyType({})) -> LinearLaw:
-    """The law of a message; of one without matrices, that of its identity among the `known` ones.
+    """The law of a message; without matrices, the `known` law of its identity.
 
-    ValueError where it is not whole, or not known.
+    ValueError if it is incomplete or not known.
     """
     if message.id and not message.transition:
         if message.id not in known:
-            raise ValueError(f"the law {message.id[:12]} is not there")
+            raise ValueError(f"the law {message.id[:12]} is missing")
         return known[message.id]
     shapes = matrix_shapes(message.states, len(message.noll))
     matrices: dict[str, Any] = {name: floats(getattr(message, name), *shape) for name, shape in shapes.items()}
@@ -46,12 +46,12 @@ def law_of(message: wire.LinearLaw, known: Mapping[str, LinearLaw] = MappingProx
 
 
 def driving(state: wire.ControllerState | None, laws: Mapping[str, LinearLaw]) -> LinearLaw | None:
-    """The law that drives the mirror of a controller, or will; None for the integrator."""
+    """The law that drives the mirror, or is about to; None for the integrator."""
     return law_of(state.law, laws) if state is not None and state.HasField("law") else None
 
 
 def overruled(state: wire.ControllerState) -> list[str]:
-    """Groups of modes that the integrator drives in place of the law."""
+    """Groups of modes that the integrator drives instead of the law."""
     groups = state.guard.groups
     return [name for name, group in zip(NAMES, groups, strict=False) if group.overruled]
 
@@ -63,7 +63,7 @@ def gains_of(state: wire.ControllerState) -> Law:
 
 
 def wire_play(table: PlayTable, time_ns: int) -> wire.Play:
-    """A table that can be played as a message, whole."""
+    """Message of the complete table of a probe sequence."""
     return wire.Play(
         target=table.target,
         columns=table.rows.shape[1],
@@ -76,12 +76,12 @@ def wire_play(table: PlayTable, time_ns: int) -> wire.Play:
 
 
 def table_of(message: wire.Play) -> PlayTable:
-    """The table of a message; ValueError where it is not whole."""
+    """The table of a message; ValueError if it is incomplete."""
     return play_table(message.target, floats(message.table, -1, message.columns or 1), floats(message.basis, -1))
 
 
 def put_command_channels(message: wire.ControllerState, command_channels: CommandChannels) -> None:
-    """What is added to the law's command, into a state."""
+    """Write the additions to the law's command into a state."""
     message.offset_nm.extend(command_channels.offset_nm.tolist())
     message.shift_history_nm.extend(np.concatenate(command_channels.shifts_nm).tolist())
     for one in command_channels.channels:
@@ -97,19 +97,19 @@ def put_command_channels(message: wire.ControllerState, command_channels: Comman
 
 
 def command_channels_of(
-    message: wire.ControllerState, none: CommandChannels, to_modes: Single, plays: Mapping[str, PlayTable]
+    message: wire.ControllerState, empty: CommandChannels, to_modes: Single, plays: Mapping[str, PlayTable]
 ) -> CommandChannels | None:
-    """What is added, of a state; `none` has its shapes. None where the state has nothing of it.
+    """Additions to the command in a state; None if there are none. `empty` has the same shapes.
 
-    A table that is played is among `plays`, by its identity; before 0.2 the state had it, cut to what was played.
+    The table of a probe sequence is found in `plays` by its identity; before 0.2 the state held the played rows.
 
     Raises:
-        ValueError: it does not fit.
+        ValueError: the shapes do not match, or the table is missing.
     """
     if not (message.offset_nm or message.channels or message.HasField("play")):
         return None
-    rows, columns = none.sum_nm.shape
-    modes, frames = none.shift_nm.size, len(none.shifts_nm)
+    rows, columns = empty.sum_nm.shape
+    modes, frames = empty.shift_nm.size, len(empty.shifts_nm)
     offset_nm = np.array(message.offset_nm, np.float32).reshape(modes)
     shifts_nm = np.array(message.shift_history_nm, np.float32).reshape(frames, modes)
     channels = tuple(
@@ -121,10 +121,10 @@ def command_channels_of(
         one = message.play
         if not one.id:
             table = floats(one.table, -1, one.columns or 1)
-            cut = PlayTable(one.target, table, floats(one.basis, -1, rows * columns), np.zeros(0), 0.0, "")
-            play = Play(cut, one.first_sequence, len(table))
+            played = PlayTable(one.target, table, floats(one.basis, -1, rows * columns), np.zeros(0), 0.0, "")
+            play = Play(played, one.first_sequence, len(table))
         elif one.id not in plays:
-            raise ValueError(f"the table {one.id[:12]} that is played is not there")
+            raise ValueError(f"the table {one.id[:12]} of the probe sequence is missing")
         else:
             play = Play(plays[one.id], one.first_sequence, one.frames)
-    return none._replace(offset_nm=offset_nm, shifts_nm=tuple(shifts_nm), play=play).at(channels, to_modes)
+    return empty._replace(offset_nm=offset_nm, shifts_nm=tuple(shifts_nm), play=play).at(channels, to_modes)

@@ -1,4 +1,4 @@
-"""The controller's state and settings as a message, both ways: whoever reads it goes on with the same next command."""
+"""Encode and decode the controller's state and settings; a controller restored from them continues identically."""
 
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
@@ -22,7 +22,7 @@ from lowfc.control.loop.lease import Lease
 from lowfc.control.loop.safety import Limits, LoopMode, Rejection, reason_of
 from lowfc.control.loop.state import ActiveLoop, Conditions, LawRunner, Settings, State, Weighting
 
-# What has the same name in the values and in the messages.
+# Fields of the same name in values and messages.
 _LIMITS = ("stroke_nm", "slew_nm", "neighbour_nm")
 _PAIRS = ("gain", "leak", "limit_nm")
 _SETTINGS = (
@@ -38,7 +38,7 @@ _LEASE = ("id", "holder", "last_sequence", "ended", "holds")
 
 
 def controller_state(state: State, settings: Settings, time_ns: int) -> wire.ControllerState:
-    """Everything the next command depends on, besides the calibration."""
+    """Message of everything the next command depends on, besides the calibration."""
     conditions, drive, estimate, lease = state.conditions, state.drive, state.estimate, state.conditions.lease
     message = wire.ControllerState(
         timestamp=timestamp(time_ns),
@@ -94,12 +94,12 @@ def decode_state(
     plays: Mapping[str, PlayTable] = MappingProxyType({}),
     kernel: Callable[[str], Kernel] = Kernel,
 ) -> tuple[Settings, State]:
-    """Settings and state of a message; `calibration` is the one that it names, as are one of `laws` and of `plays`.
+    """Settings and state of a message, which refers to its calibration, law and table by identity.
 
-    `kernel` finds the kernel of a name; without it, everything goes the reference's way.
+    `kernel` returns the kernel of a name; without it, the reference implementation is used.
 
     Raises:
-        ValueError: the message is not whole, the calibration is another one, or its law or table is not there.
+        ValueError: the message is incomplete, the calibration is another one, or its law or table is missing.
     """
     settings = _decode_settings(message.settings, kernel)
     drive = None
@@ -107,13 +107,13 @@ def decode_state(
         calibration = Calibration.none((message.mirror_rows, message.mirror_columns))
     if message.calibration_id or message.mirror_rows:
         if calibration is None or calibration.id != message.calibration_id:
-            raise ValueError(f"calibration {message.calibration_id[:12]} of the controller's state is not there")
+            raise ValueError(f"calibration {message.calibration_id[:12]} of the controller's state is missing")
         drive = ActiveLoop.at_rest(settings, calibration)
         law = gains_of(message)
         history = np.array(message.command_history_nm, np.float32).reshape(len(drive.history_nm), -1)
         actuators = floats(message.actuators, *calibration.grid)
         if law.gain.shape != drive.law.gain.shape or history.shape[1] != len(calibration.noll):
-            raise ValueError(f"the controller's state is not of {len(calibration.noll)} modes")
+            raise ValueError(f"the controller's state does not have {len(calibration.noll)} modes")
         following = None
         if message.HasField("law"):
             x = np.array(message.law_state, np.float32)
@@ -183,7 +183,7 @@ def _decode_guard(message: wire.Guard, law: LinearLaw, commands: int) -> Guard:
 
 
 def reason_counts(state: State) -> list[wire.ReasonCount]:
-    """How often each reason was given."""
+    """Counts of the reasons as messages."""
     pairs = zip(wire_reasons(tuple(state.counts)), state.counts.values(), strict=True)
     return [wire.ReasonCount(reason=reason, count=count) for reason, count in pairs]
 

@@ -256,6 +256,10 @@ def _events(law: str, judged: Sequence[tuple[Group, str]]) -> list[PendingEvent]
             events.append(PendingEvent("LAW_BACK", {"law": law, "modes": modes}))
         elif why:
             wait_s = BETTER_S * 2 ** (group.takeovers - 1)
-            until = "until it is loaded again" if group.final else f"until it would be far better for {wait_s:g} s"
+            until = (
+                "until the law is loaded again"
+                if group.final
+                else f"until the law would be far better for {wait_s:g} s"
+            )
             events.append(PendingEvent("LAW_OVERRULED", {"law": law, "modes": modes, "why": why, "until": until}))
     return events

@@ -251,7 +251,7 @@ class Controller:
         now_ns = self._service.clock.now_ns()
         try:
             if query.name == "safe":  # whatever came along with it
-                query.payload = codec.requester_alone(query.payload)
+                query.payload = codec.only_requester(query.payload)
             request = prepared(self._settings, codec.decode_request(query.payload, query.name, now_ns))
         except ValueError as error:
             request = Request(now_ns, query.name)

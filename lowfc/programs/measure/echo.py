@@ -87,7 +87,7 @@ def _ask(config: Configuration, run: Run, payloads: Payloads, seconds: float) ->
     def received(sample: zenoh.Sample) -> None:
         now_ns = clock.host_ns()
         assert sample.attachment is not None  # noqa: S101  # our own
-        index, sent_ns = Envelope.unpack(sample.attachment.to_bytes())
+        index, sent_ns = Envelope.decode_checked(sample.attachment.to_bytes())
         sample.payload.to_bytes()
         round_trip_ns[index] = now_ns - sent_ns
 
