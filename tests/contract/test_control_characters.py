@@ -12,7 +12,7 @@ from lowfc.contract.configuration import load
 from lowfc.contract.errors import ConfigurationError, RequestRefusedError
 from lowfc.contract.messages import EVENT, REQUEST, Log, wire
 from lowfc.contract.printable import LINES, printable
-from lowfc.programs.cli.output import put
+from lowfc.programs.cli.output import print_result
 from lowfc.programs.view.panels.loop import LOG
 from lowfc.programs.view.recorded import draw_logs
 from lowfc.programs.view.renderer import Renderer
@@ -50,7 +50,7 @@ def test_a_process_prints_its_events_so(capsys: pytest.CaptureFixture[str]) -> N
 def test_a_commands_answer_and_error_are_printed_so(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    put({}, f"{HOSTILE}\nframe 3", as_json=False)
+    print_result({}, f"{HOSTILE}\nframe 3", as_json=False)
     check(capsys.readouterr().out)
     failing = new_app("")
 

@@ -11,7 +11,7 @@ from lowfc.client.requests import BY_NAME
 from lowfc.contract.errors import BusError, ConfigurationError, DataFileError
 from lowfc.contract.messages import Role, wire
 from lowfc.programs.cli.modes import Modes, noll_of
-from lowfc.programs.cli.output import put
+from lowfc.programs.cli.output import print_result
 from lowfc.programs.commissioning.calibrate.command import dark, reference
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ def _status(run: AnyRun = None, as_json: Json = False) -> None:
         state, processes = loop.status().state, loop.processes()
         assert state is not None  # noqa: S101  # that is what it answers with
     known = figures(state, processes, loop.run_id)
-    put(known, text(known), as_json=as_json)
+    print_result(known, text(known), as_json=as_json)
 
 
 def _configuration(run: AnyRun = None, as_json: Json = False) -> None:
@@ -124,7 +124,7 @@ def _configuration(run: AnyRun = None, as_json: Json = False) -> None:
 
     with _joined(run) as loop:
         text = loop.configuration()
-    put(tomllib.loads(text), f"# run {loop.run_id}\n{text.rstrip()}", as_json=as_json)
+    print_result(tomllib.loads(text), f"# run {loop.run_id}\n{text.rstrip()}", as_json=as_json)
 
 
 def _step(frames: Frames, run: AnyRun = None, as_json: Json = False) -> None:
@@ -178,7 +178,7 @@ def bench(name: BenchName, value: BenchValue, run: AnyRun = None, as_json: Json 
     unused = "" if name in names else f"; no interlock uses it (they use {', '.join(names)})" if names else ""
     acting = f"interlocks: {interlocks(known)}" if names else "no interlock is configured"
     said = {"run": loop.run_id, "name": name, "value": read, "interlocks": known["interlocks"]}
-    put(said, f"{name} is {value}{unused}; {acting} (run {loop.run_id})", as_json=as_json)
+    print_result(said, f"{name} is {value}{unused}; {acting} (run {loop.run_id})", as_json=as_json)
 
 
 def _load(file: CalibrationFile, run: AnyRun = None, as_json: Json = False) -> None:
@@ -200,7 +200,7 @@ def _recording(name: str) -> _Command:
         with _joined(run) as loop:
             answer = loop.record(name == "record/start")
         said = {"run": answer.run, "accepted": answer.accepted, "reply": answer.reply, "log": answer.text}
-        put(said, f"{answer.reply} (run {answer.run})", as_json=as_json)
+        print_result(said, f"{answer.reply} (run {answer.run})", as_json=as_json)
 
     return ask
 
@@ -254,4 +254,6 @@ def _ask(run: str | None, as_json: bool, ask: "Callable[[Client], Answer]") -> N
     with _joined(run) as loop:
         answer = ask(loop)
     said = {"run": answer.run, "accepted": answer.accepted, "reply": answer.reply}
-    put({**said, "frame": answer.frame, "frame_sequence": answer.frame_sequence}, answer.sentence, as_json=as_json)
+    print_result(
+        {**said, "frame": answer.frame, "frame_sequence": answer.frame_sequence}, answer.sentence, as_json=as_json
+    )

@@ -14,7 +14,7 @@ import typer
 from lowfc.adapters.process.extras import install_advice
 from lowfc.adapters.process.terminal import DEFAULT_RUN, AnyRun, ConfigFile, Json, RunId, configuration
 from lowfc.contract.errors import BusError, ConfigurationError
-from lowfc.programs.cli.result import Result, figure, put
+from lowfc.programs.cli.result import Result, figure, print_result
 
 if TYPE_CHECKING:
     from lowfc.contract.messages import wire
@@ -156,7 +156,7 @@ def hosts(
     if links.network.router:
         for said in ending_certificates(links.network, datetime.datetime.now(datetime.UTC)):
             sys.stderr.write(f"warning: {said}; lowfc certs --renew\n")
-    put(HostsResult(run=run, processes=[_row(health) for _, health in sorted(found.items())]), as_json=as_json)
+    print_result(HostsResult(run=run, processes=[_row(health) for _, health in sorted(found.items())]), as_json=as_json)
 
 
 def _row(health: "wire.Health") -> HostProcess:

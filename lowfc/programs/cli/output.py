@@ -1,4 +1,4 @@
-"""What a command prints."""
+"""Printing the result of a command, as JSON or text."""
 
 import json
 import sys
@@ -8,6 +8,6 @@ from typing import Any
 from lowfc.contract.printable import LINES, printable
 
 
-def put(figures: Mapping[str, Any], text: str, *, as_json: bool) -> None:
-    """Print figures as one JSON object, or the text that says the same to a person, its control characters escaped."""
+def print_result(figures: Mapping[str, Any], text: str, *, as_json: bool) -> None:
+    """Print figures as one JSON object, or the text for a person with its control characters escaped."""
     sys.stdout.write((json.dumps(figures) if as_json else printable(text, keep=LINES)) + "\n")

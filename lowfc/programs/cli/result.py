@@ -96,9 +96,9 @@ def formatted(info: FieldInfo, value: Any, *, with_unit: bool = False) -> str:
     return f"{text} {unit}" if with_unit and unit else text
 
 
-def put(result: Result, *, as_json: bool) -> None:
+def print_result(result: Result, *, as_json: bool) -> None:
     """Print a result: one JSON object, or its text with control characters escaped."""
-    output.put(result.figures(), result.text(), as_json=as_json)
+    output.print_result(result.figures(), result.text(), as_json=as_json)
 
 
 def _heading(info: FieldInfo) -> str:

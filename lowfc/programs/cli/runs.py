@@ -3,7 +3,7 @@
 from typing import Any
 
 from lowfc.adapters.process.terminal import Json
-from lowfc.programs.cli.output import put
+from lowfc.programs.cli.output import print_result
 
 
 def runs(as_json: Json = False) -> None:
@@ -17,7 +17,7 @@ def runs(as_json: Json = False) -> None:
 
     rows = [_row(name, roles) for name, roles in living().items()]
     figures = {"runs": rows, "searched": str(runtime_path())}
-    put(figures, "\n".join(_lines(rows)) if rows else none_here(), as_json=as_json)
+    print_result(figures, "\n".join(_lines(rows)) if rows else none_here(), as_json=as_json)
 
 
 def _row(name: str, roles: set[str]) -> dict[str, Any]:

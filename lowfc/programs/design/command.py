@@ -10,7 +10,7 @@ import typer
 from lowfc.adapters.process.terminal import INTERRUPTED, Json, new_app
 from lowfc.contract.errors import ConfigurationError
 from lowfc.design.shaped_pupil import Request
-from lowfc.programs.cli.output import put
+from lowfc.programs.cli.output import print_result
 from lowfc.programs.design.full_light_request import Defocus, Spot
 from lowfc.programs.design.options import flag, with_options_of
 from lowfc.programs.design.sam_request import Search
@@ -38,7 +38,7 @@ def spc(
     from lowfc.programs.cli import result
     from lowfc.programs.design.spc import design_spc
 
-    result.put(design_spc(request, out, plot, Console(stderr=True)), as_json=as_json)
+    result.print_result(design_spc(request, out, plot, Console(stderr=True)), as_json=as_json)
 
 
 @design_app.command()
@@ -75,7 +75,7 @@ def sam(
     processes = min(jobs or len(os.sched_getaffinity(0)), search.chains)
     with open_executor(processes, scheduler) as executor:
         result = design_sam(search, found, out, state, executor, front, plot)
-    put(result, render(result), as_json=as_json)
+    print_result(result, render(result), as_json=as_json)
     if result["interrupted"]:
         raise typer.Exit(INTERRUPTED)
 
@@ -104,4 +104,4 @@ def _sized(request: Spot | Defocus, out: Path, plot: Path | None, *, as_json: bo
     from lowfc.programs.cli import result
     from lowfc.programs.design.full_light import design
 
-    result.put(design(request.sizes, request.goal, out, plot), as_json=as_json)
+    result.print_result(design(request.sizes, request.goal, out, plot), as_json=as_json)

@@ -8,7 +8,7 @@ import typer
 from lowfc.adapters.process.terminal import ConfigFile, Json, configuration
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.sections import Preset
-from lowfc.programs.cli.output import put
+from lowfc.programs.cli.output import print_result
 
 
 def sim_loop(
@@ -63,6 +63,6 @@ def sim_loop(
         typer.echo("to view the run: lowfc view", err=True)
     show = Show.NATIVE if view_ else Show.WEB if web else None
     figures = run(settings, duration, not no_record, show, name)
-    put(figures, summary_text(figures), as_json=as_json)
+    print_result(figures, summary_text(figures), as_json=as_json)
     if figures["recording_failure"]:
         raise typer.Exit(1)

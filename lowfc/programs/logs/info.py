@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from lowfc.adapters.process.terminal import Json, Logs
-from lowfc.programs.cli.output import put
+from lowfc.programs.cli.output import print_result
 from lowfc.programs.cli.result import table
 
 _STATES = {
@@ -38,7 +38,7 @@ def info(
     for number, log in enumerate(one_by_one(logs, as_json=as_json)):
         with reading_bar(Console(stderr=True)) as count:
             found = survey(log, partial(count, f"reading {titled(log)}"), digest=digest)
-        put(found, ("\n" if number else "") + render(found), as_json=as_json)
+        print_result(found, ("\n" if number else "") + render(found), as_json=as_json)
 
 
 def render(found: Mapping[str, Any]) -> str:

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from lowfc.adapters.process.terminal import Json, Logs
-from lowfc.programs.cli.output import put
+from lowfc.programs.cli.output import print_result
 
 
 def recover(
@@ -33,4 +33,4 @@ def recover(
     for log in in_order(logs, out, as_json=as_json):
         with reading_bar(Console(stderr=True)) as count:
             done = run(log, out or recovered_path(log), partial(count, f"recovering {log.name}"))
-        put(done.figures, str(done), as_json=as_json)
+        print_result(done.figures, str(done), as_json=as_json)

@@ -11,7 +11,7 @@ import typer
 from lowfc.adapters.process.terminal import AnyRun, Json, LogsIfAny, configuration, new_app
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.programs.cli.modes import Modes, noll_of
-from lowfc.programs.cli.result import put
+from lowfc.programs.cli.result import print_result
 
 if TYPE_CHECKING:
     from lowfc.contract.configuration import Acceptance
@@ -164,6 +164,6 @@ def _carry_out(
         test.draw(result.figures(), figure)
         figure.suptitle(result.verdict)
         write_whole(plot, png(figure))
-    put(result, as_json=as_json)
+    print_result(result, as_json=as_json)
     if not result.passed:
         raise typer.Exit(1)

@@ -7,7 +7,7 @@ import typer
 
 from lowfc.adapters.process.terminal import AnyRun, ConfigFile, Json, new_app
 from lowfc.contract.errors import ConfigurationError
-from lowfc.programs.cli.result import put
+from lowfc.programs.cli.result import print_result
 
 calibrate_app = new_app(
     "Measure or compute a calibration.\n\nExample: lowfc calibrate --method hadamard --out night.fits"
@@ -82,13 +82,13 @@ def calibrate(
     from lowfc.programs.commissioning.calibrate.result import comparison
 
     if compare is not None:
-        put(comparison(*map(read, compare)), as_json=as_json)
+        print_result(comparison(*map(read, compare)), as_json=as_json)
         return
     if cycles is not None and "--snr" not in given:
         snr = LEAST_SNR
     request = CalibrationRequest(method, out, snr, cycles, amplitude, resume, truncate, tikhonov)
     if method == "analytic":
-        put(tasks.computed(config, request, at, run if load else None, load=load), as_json=as_json)
+        print_result(tasks.computed(config, request, at, run if load else None, load=load), as_json=as_json)
         return
     for option in ("--config", "--at"):
         if option in given:
@@ -97,7 +97,7 @@ def calibrate(
                 "its own configuration"
             )
     result = tasks.poked(request, run, load=load)
-    put(result, as_json=as_json)
+    print_result(result, as_json=as_json)
     if not result.recommended:
         raise typer.Exit(1)
 
@@ -124,7 +124,7 @@ def dark(
 
     if file is None and not dark_taken:
         typer.confirm("block the star; is it dark?", default=True, abort=True, err=True)
-    put(darkened(out, run, frames, file, load=load), as_json=as_json)
+    print_result(darkened(out, run, frames, file, load=load), as_json=as_json)
 
 
 @calibrate_app.command()
@@ -144,7 +144,7 @@ def reference(
     """
     from lowfc.programs.commissioning.calibrate.tasks import referenced
 
-    put(referenced(out, run, frames, load=load), as_json=as_json)
+    print_result(referenced(out, run, frames, load=load), as_json=as_json)
 
 
 @calibrate_app.command()
@@ -163,4 +163,4 @@ def align(
     """
     from lowfc.programs.commissioning.calibrate.align import aligned
 
-    put(aligned(out, run, frames, load=load), as_json=as_json)
+    print_result(aligned(out, run, frames, load=load), as_json=as_json)

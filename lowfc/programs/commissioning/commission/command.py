@@ -9,7 +9,7 @@ import typer
 from lowfc.adapters.process.terminal import AnyRun, Json
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.control.calibration.response_fit import LEAST_CYCLES
-from lowfc.programs.cli.output import put
+from lowfc.programs.cli.output import print_result
 from lowfc.programs.commissioning.calibrate.command import Out, Resume, Snr
 
 
@@ -70,4 +70,4 @@ def commission(
         config = configuration_of(loop)
         progress = lease.expecting(shown, config.camera.rate_hz)
         found, text = Commissioning(loop, config, analytic(config, console), options, report, progress, confirm).run()
-    put(found, text, as_json=as_json)
+    print_result(found, text, as_json=as_json)

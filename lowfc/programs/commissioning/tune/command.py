@@ -8,7 +8,7 @@ import typer
 
 from lowfc.adapters.process.terminal import AnyRun, Json, LogsIfAny
 from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError, RequestRefusedError
-from lowfc.programs.cli.result import put
+from lowfc.programs.cli.result import print_result
 
 if TYPE_CHECKING:
     from lowfc.client import Answer, Client
@@ -75,7 +75,7 @@ def tune(
             integrator = controller == "integrator"
             answer = integrate(loop, gains.gain.tolist(), telemetry.noll) if integrator else loop.law(best.law)
         found.applied = answer.sentence
-    put(found, as_json=as_json)
+    print_result(found, as_json=as_json)
 
 
 def integrate(loop: "Client", gains: list[float], noll: tuple[int, ...]) -> "Answer":

@@ -14,7 +14,7 @@ from lowfc.adapters.logs.selection import selection
 from lowfc.adapters.process.extras import install_advice
 from lowfc.adapters.process.terminal import Json, Logs
 from lowfc.contract.errors import ConfigurationError, DataFileError
-from lowfc.programs.cli.output import put
+from lowfc.programs.cli.output import print_result
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -79,10 +79,10 @@ def export(
             wanted = selection(decimate, topics or ())
             with reading_bar(console) as count:
                 done = thin(log, out or thinned_path(log[0], wanted), wanted, partial(count, "copying"))
-            put(dataclasses.asdict(done), str(done), as_json=as_json)
+            print_result(dataclasses.asdict(done), str(done), as_json=as_json)
         else:
             figures = export_log(log, to or Format.FITS, out, frames=frames, force=force, console=console)
-            put(figures, render(figures), as_json=as_json)
+            print_result(figures, render(figures), as_json=as_json)
 
 
 def export_log(

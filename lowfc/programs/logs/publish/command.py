@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from lowfc.adapters.process.terminal import DEFAULT_RUN, INTERRUPTED, Json, Logs, RunId
-from lowfc.programs.cli.output import put
+from lowfc.programs.cli.output import print_result
 
 
 def publish(
@@ -30,6 +30,6 @@ def publish(
     figures = play(
         in_order(logs), run, speed=speed, topics=topics or (), allow_commands=allow_commands, wait_for=wait_for or ()
     )
-    put(figures, render(figures), as_json=as_json)
+    print_result(figures, render(figures), as_json=as_json)
     if figures["interrupted"]:
         raise typer.Exit(INTERRUPTED)

@@ -12,7 +12,7 @@ from lowfc.adapters.process.progress import reading_bar
 from lowfc.adapters.process.provenance import provenance
 from lowfc.adapters.process.terminal import Json, Logs
 from lowfc.control.kernel.tables import KernelName
-from lowfc.programs.cli.result import put
+from lowfc.programs.cli.result import print_result
 
 _HOST = ("lowfc", "git", "python", "numpy", "numba", "scipy", "blas", "processor", "cpu_features")
 """Versions and processor features on which bit-exact results may depend."""
@@ -60,6 +60,6 @@ def replay_log(
     found.version, found.tolerance_nm = found.recorded_on.get("lowfc", ""), tolerance
     found.no_end = no_end(files, finished=found.complete)
     found.host_differs = _host_differs(found.recorded_on)
-    put(found, as_json=as_json)
+    print_result(found, as_json=as_json)
     if not found.identical:
         raise typer.Exit(1)

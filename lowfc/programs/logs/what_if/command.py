@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from lowfc.adapters.process.terminal import Json, Logs
-from lowfc.programs.cli.output import put
+from lowfc.programs.cli.output import print_result
 
 
 def what_if(
@@ -42,4 +42,4 @@ def what_if(
     with reading_bar(Console(stderr=True)) as count:
         reader.progress = partial(count, f"reading {titled(log)}")
         figures = compared(LoggedRun(read_history(reader)), what)
-    put(figures, render(figures), as_json=as_json)
+    print_result(figures, render(figures), as_json=as_json)

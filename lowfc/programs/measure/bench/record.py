@@ -17,7 +17,7 @@ import typer
 
 from lowfc.adapters.process.terminal import Json
 from lowfc.contract.errors import BusError, DataFileError
-from lowfc.programs.cli.output import put
+from lowfc.programs.cli.output import print_result
 
 RATES_HZ = (1000.0, 2000.0, 5000.0)
 
@@ -55,7 +55,7 @@ def bench_record(
     except OSError as fault:
         where = folder or tempfile.gettempdir()
         raise DataFileError(f"{where} cannot be written: {fault.strerror or fault}") from fault
-    put(figures, render(figures), as_json=as_json)
+    print_result(figures, render(figures), as_json=as_json)
 
 
 def measure(rates_hz: tuple[float, ...], seconds: float, folder: Path | None = None) -> dict[str, Any]:

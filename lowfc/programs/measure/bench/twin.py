@@ -20,7 +20,7 @@ from lowfc.optics.chain.band import gauss_legendre, monochromatic
 from lowfc.optics.chain.sensor import image, pupil_radii
 from lowfc.optics.chain.zernike import NOLLS_20, zernikes
 from lowfc.optics.twin.twin import ACCURATE, FAST, Evaluator, node_radii
-from lowfc.programs.cli.output import put
+from lowfc.programs.cli.output import print_result
 
 SENSOR, WAVEFRONTS = "sam", 20
 
@@ -31,7 +31,7 @@ def twin(as_json: Json = False) -> None:
     Example: lowfc bench twin --json
     """
     figures = bench_twin()
-    put(figures, render(figures), as_json=as_json)
+    print_result(figures, render(figures), as_json=as_json)
 
 
 def bench_twin(seconds: float = 1.0, cache_dir: Path | None = None) -> dict[str, Any]:

@@ -16,7 +16,7 @@ import typer
 from lowfc.adapters.files.whole_file import require_folder, write_whole
 from lowfc.adapters.process.terminal import ConfigFile, Json, LogsOrMeasure, configuration
 from lowfc.contract.errors import ConfigurationError, DataFileError
-from lowfc.programs.cli.output import put
+from lowfc.programs.cli.output import print_result
 
 if TYPE_CHECKING:
     from lowfc.contract.configuration import Configuration
@@ -78,7 +78,7 @@ def latency(
 
     if compare is not None:
         found = _compare(compare)
-        put(found, compared(found), as_json=as_json)
+        print_result(found, compared(found), as_json=as_json)
         return
     require_folder(plot)
     if plot is not None:
@@ -102,7 +102,7 @@ def latency(
         figures = _measure(Asked(settings, duration, repeats, simulated, record, view, kernels, trace))
     if plot is not None:
         write_whole(plot, picture(figures))
-    put(figures, table(figures), as_json=as_json)
+    print_result(figures, table(figures), as_json=as_json)
 
 
 def _configuration(file: Path | None, rate: float | None, camera: Camera, *, plain: bool) -> "Configuration":

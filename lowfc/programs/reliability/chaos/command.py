@@ -14,7 +14,7 @@ import typer
 
 from lowfc.adapters.process.terminal import INTERRUPTED, Json
 from lowfc.contract.errors import ConfigurationError, LowfcError, nearest
-from lowfc.programs.cli.output import put
+from lowfc.programs.cli.output import print_result
 
 if TYPE_CHECKING:
     from lowfc.contract.configuration import Configuration
@@ -64,7 +64,7 @@ def chaos(
     except KeyboardInterrupt:
         interrupted = True  # what is known is printed all the same
     figures = {"seed": seed, "asked": len(names), **counts(rows), "cases": rows}
-    put(figures, render(figures), as_json=as_json)
+    print_result(figures, render(figures), as_json=as_json)
     if interrupted:
         raise typer.Exit(INTERRUPTED)
     if figures["failed"]:

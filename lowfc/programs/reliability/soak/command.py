@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from lowfc.adapters.process.terminal import ConfigFile, Json, configuration
-from lowfc.programs.cli.output import put
+from lowfc.programs.cli.output import print_result
 
 
 def soak(
@@ -34,6 +34,6 @@ def soak(
     with passing_bar(Console(stderr=True)) as bar:
         task = bar.add_task("soaking", total=hours * 3600)
         figures = soak_loop(settings, hours * 3600, lambda elapsed_s: bar.update(task, completed=elapsed_s))
-    put(figures, render(figures), as_json=as_json)
+    print_result(figures, render(figures), as_json=as_json)
     if not figures["passed"]:
         raise typer.Exit(1)
