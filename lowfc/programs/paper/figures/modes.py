@@ -200,8 +200,8 @@ def fig8(context: Context) -> list[Row]:
 
 def _range_rows(context: Context, name: str) -> Iterator[Row]:
     assumption = (
-        "Pure modes of one sign from 0.005 to 0.15 waves rms, fitted with 14 modes, no noise, images by the twin "
-        "right to about 1e-5; deviation: part by which a mode's own estimate differs from its amplitude."
+        "Pure modes of one sign from 0.005 to 0.15 waves rms, fitted with 14 modes, no noise, images by the twin, "
+        "accurate to about 1e-5; deviation: fraction by which a mode's own estimate differs from its amplitude."
     )
     at = {"lambda/20": int(np.argmin(np.abs(AMPLITUDES - 0.05))), "lambda/10": int(np.argmin(np.abs(AMPLITUDES - 0.1)))}
     linear = dict(zip(at, _PAPER_LINEAR.get(name, (None, None)), strict=True))

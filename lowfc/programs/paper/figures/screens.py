@@ -1,4 +1,4 @@
-"""Figure 9: what 14 modes take off a Kolmogorov screen."""
+"""Figure 9: correction of a Kolmogorov screen by 14 modes."""
 
 from functools import lru_cache, partial
 from pathlib import Path
@@ -82,15 +82,15 @@ def fig9(context: Context) -> list[Row]:
                         rows.append(fitted(f"largest {part} rms", "waves", float(values[key][:, k].max())))
     return assuming(
         rows,
-        f"At most {SCREENS} screens of power law -11/3, scaled to {_INPUT_WAVES} waves rms over the open pupil; how "
-        "the paper makes its one screen is not said, and how much of it is of low order depends on that: both of ours "
-        "have less tilt than the endless screen of the theory, the one of a single diameter hardly any. limit: "
+        f"At most {SCREENS} screens of power law -11/3, scaled to {_INPUT_WAVES} waves rms over the open pupil; "
+        "the paper does not say how it generates its one screen, which determines its low orders: both of ours "
+        "have less tilt than an infinite screen, that of a single diameter hardly any. limit: "
         f"the best fit of 14 modes to the screen itself. {BRIGHT} {FULL_CHAIN}",
     )
 
 
 def plot_fig9(context: Context, path: Path) -> None:
-    """Draw Fig. 9: the first screen, its estimate and what is left, in radians."""
+    """Draw Fig. 9: the first screen, its estimate and the residual, in radians."""
     name, width = context.names("sam")[0], next(iter(WIDTHS))
     ready = prepared(name)
     screen_nm, modes_nm = _screens(context, name, width)[0]
@@ -117,7 +117,7 @@ def plot_fig9(context: Context, path: Path) -> None:
 
 
 def _rms_waves(ready: Prepared, screen: _Screen, key: str) -> tuple[float, float]:
-    """Rms in waves over the open pupil of the estimate and of what it leaves."""
+    """Rms in waves over the open pupil of the estimate and of the residual."""
     opd_nm, modes_nm = screen
     fitted = modes_nm[key] @ ready.open_modes[:MODES]
     left = opd_nm[ready.open] - fitted

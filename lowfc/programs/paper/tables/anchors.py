@@ -1,4 +1,4 @@
-"""Our figures beside those that a specialist knows by heart, by the definition of each, with what is assumed."""
+"""Published figures of other systems, and lowfc's by the same definitions, with the assumptions."""
 
 import json
 import subprocess
@@ -36,41 +36,42 @@ DRIVEN = ("sam", "zwfs_tuned")
 """Sensors whose loops are run."""
 RATE_HZ, MAGNITUDE, EXPOSURE = 1000.0, 2.0, 0.5
 OBSERVED_S, CLOSED_S, MEAN_S = 10.0, 24.0, 2.0
-"""Of the loop from which a law is identified, of the one that is judged, and of an exposure of SCExAO's camera."""
+"""Durations: of the loop that a law is identified from, of the loop that is judged, of a mean as in SCExAO."""
 GAINS = "[control]\ntilt_gain = 0.5\ngain = 0.05\n"
 ROMAN_MAS, SCEXAO_MAS = 0.4, {"laboratory": 0.02, "sky": 0.15}
 HELD_S = 100.0
 DRIFT_PM = 20.0
 REACHED, SHORT = "reached", "not reached"
 
-ABOUT = """What a specialist knows by heart, and our figure by the same definition. *paper* is the field's figure,
-*measured* ours, *limit* the same at the quantum limit of the light. Loops are the real processes in lockstep, judged by
-the true wavefront at all times, over the second half of a run. A verdict says whether our figure, as predicted where
-theory gives it, is as good as the field's; where it is not, we fall short.
+ABOUT = """An anchor is a published figure and lowfc's figure by the same definition. *paper* is the published figure,
+*limit* lowfc's with the noise of the quantum limit of the light. Loops are the real processes in lockstep, judged by
+the true wavefront in continuous time, over the second half of a run. A verdict compares lowfc's figure (the predicted
+one, if theory gives one) with the published one.
 """
 LOOP = (
     f"lowfc sim-loop --lockstep: V = {MAGNITUDE:g}, 2 m, {RATE_HZ:g} Hz, exposure of half the period, delay of one "
-    "frame, 14 modes, 1 e- read noise, monochromatic with the photons of 110 nm; per axis, true, at all times."
+    "frame, 14 modes, 1 e- read noise, monochromatic with the photons of 110 nm; true tilt per axis, continuous time."
 )
 ROMAN = (
-    "Milestone 6: 14 mas rms of jitter and drift held to below 0.4 mas per axis. Ours: preset reaction-wheel, five "
-    "lines 0.5 % wide to 117 Hz and drift; and reaction-wheel-ideal, lines without a width, as a testbed makes them. "
-    f"LQG, identified from {OBSERVED_S:g} s of the closed loop. limit: LQG of what the log shows, at the quantum "
-    "limit. A mirror that holds its command for a frame leaves 0.72 mas of these lines at 1 kHz, whatever the sensor, "
-    "and 0.36 mas at 2 kHz: this anchor needs a faster loop, or lower lines."
+    "Roman (WFIRST) coronagraph, Milestone 6 (Shi et al., final report, 2015): below 0.4 mas rms per axis for most "
+    "reaction-wheel speeds, from about 14 mas of jitter (AAS 17-115). lowfc: preset reaction-wheel, five lines up to "
+    "117 Hz, 0.5 % wide, and drift; reaction-wheel-ideal, the lines without width, as on a testbed. "
+    f"LQG, identified from {OBSERVED_S:g} s of the closed loop. limit: predicted from the log, with the noise of the "
+    "quantum limit; a run may be below it. A mirror that holds its command for a frame leaves 0.72 mas of these lines "
+    "at 1 kHz with any sensor, and 0.36 mas at 2 kHz: 0.4 mas needs a faster loop or lower lines."
 )
 SCEXAO = (
-    f"Standard deviation of means over {MEAN_S:g} s of the tilt per axis. Theirs: 8.2 m, 1.6 um; ours 2 m, 550 nm, "
-    "where 0.15 mas is 0.0026 lambda/D against their 0.0037. Laboratory: preset bench, integrator; sky: "
-    "reaction-wheel, LQG."
+    f"SCExAO LLOWFS (Singh et al.): standard deviation of means over {MEAN_S:g} s of the tilt per axis, "
+    "at 8.2 m and 1.6 um. lowfc: 2 m, 550 nm, where 0.15 mas is 0.0026 lambda/D against their 0.0037. "
+    "Laboratory: preset bench, integrator; sky: reaction-wheel, LQG."
 )
 HICAT = (
-    f"A dark hole is dug on a channel while the loop runs: how much of {STEPS} random steps of 2 nm rms of surface the "
-    "loop undoes (V = -2). Theirs: the loop runs, and nothing of it is in the way; as good here is below 1 %."
+    f"Part of {STEPS} random steps of 2 nm rms of surface on a dark hole's channel that the loop undoes (V = -2). "
+    "HiCAT digs while its low-order loop runs (A&A 663, A49, 2022; arXiv 2301.03242); reached here: below 1 %."
 )
 HUNDRED = (
     f"Standard deviation of a mode's mean over {HELD_S:g} s of frames at {tolerance.RATE_HZ:g} Hz, V = 2, wavefront "
-    "flat, all 14 modes fitted. predicted: by the noise of a frame."
+    "flat, all 14 modes fitted. predicted: from the noise of a frame."
 )
 AGAINST_V = (
     f"Drift of {DRIFT_PM:g} pm/sqrt(s) in each of 14 modes, integrators of the best gains, {tolerance.RATE_HZ:g} Hz; "
@@ -79,7 +80,7 @@ AGAINST_V = (
 
 
 def anchors(context: Context) -> list[Row]:
-    """Rows of every anchor, each with its verdict where the field has a figure."""
+    """Rows of every anchor, with a verdict if there is a published figure."""
     names = context.names(*DRIVEN)
     rows = [row for found in map(partial(_pointing, context), names) for row in found]
     rows += _hicat(context)
@@ -89,7 +90,7 @@ def anchors(context: Context) -> list[Row]:
 
 
 def _judged(row: Row, allowed: float | None = None) -> list[Row]:
-    """A row and its verdict: as good as the field's figure, or as what is allowed; predicted where theory says it."""
+    """A row and its verdict against the published or the allowed figure; by `predicted` if there is one."""
     best, ours = row.paper if allowed is None else allowed, row.measured if row.predicted is None else row.predicted
     assert isinstance(ours, float)  # noqa: S101  # these are
     assert isinstance(best, float)  # noqa: S101
@@ -110,7 +111,7 @@ def _judged(row: Row, allowed: float | None = None) -> list[Row]:
 
 
 def _pointing(context: Context, name: str) -> list[Row]:
-    """Roman's milestone and SCExAO's sensor."""
+    """Rows of Roman's milestone and of SCExAO's sensor."""
     rows: list[Row] = []
     nm_per_mas = tilt_nm_per_mas(2.0)
     made = partial(Row, name, unit="mas", modes=len(NOLLS_14))
@@ -164,7 +165,7 @@ def _means(made: Callable[..., Row], history: History, where: str) -> Row:
 
 
 def _quantum_pointing_nm(history: History, name: str) -> float:
-    """Tilt per axis that LQG leaves of what this log shows, with the noise of the quantum limit."""
+    """Tilt per axis predicted for LQG from this log, with the noise of the quantum limit."""
     steps = history.steps
     models = identified(pieces(steps.sequence, steps.pol_nm[:, :2]), RATE_HZ)
     scale = (EXPOSURE / RATE_HZ) / (tolerance.EXPOSURE / tolerance.RATE_HZ)
@@ -178,7 +179,7 @@ def _hicat(context: Context) -> list[Row]:
     context.progress("anchors, a dark hole while the loop runs", 10, 12)
     with tempfile.TemporaryDirectory() as folder:
         undone, error = dark_hole(Path(folder), 2.0, seed=context.seed).channels[SHIFTED].undone()
-    row = Row("sam", "of a dark hole's steps undone", "%", abs(100 * undone), error=100 * error, assumption=HICAT)
+    row = Row("sam", "part of a dark hole's steps undone", "%", abs(100 * undone), error=100 * error, assumption=HICAT)
     return _judged(row, allowed=1.0)
 
 
@@ -193,7 +194,7 @@ def _table4(context: Context) -> list[Row]:
 
 
 def _hundred_seconds(context: Context, name: str) -> Iterator[Row]:
-    """Picometres per mode: the mean of so many exposures is one exposure of their light, with the read noise of all."""
+    """Noise of each mode's mean over `HELD_S`, as one exposure of all the light with all the read noise."""
     frames = HELD_S * tolerance.RATE_HZ
     sensor, light_e = prepared(name), tolerance.light_e(MAGNITUDE)
     good, H = np.ones(sensor.I0.size), sensor.H[:, : len(NOLLS_14)]
@@ -225,7 +226,7 @@ def _hundred_seconds(context: Context, name: str) -> Iterator[Row]:
 
 
 def added_contrast(name: str, magnitude: float, quantum: bool = False) -> float:
-    """What drift and noise add behind integrators of the best gains."""
+    """Contrast that drift and noise add behind integrators of the best gains."""
     noise = np.diag(tolerance.frame_noise_nm2(name, magnitude))
     noise = tolerance.quantum_noise_nm2(prepared(name), magnitude) if quantum else noise
     step = (DRIFT_PM / 1e3) ** 2 / tolerance.RATE_HZ
@@ -250,7 +251,7 @@ def _against_magnitude(name: str) -> Iterator[Row]:
 
 
 def plot(context: Context, path: Path) -> None:
-    """Added contrast over magnitude for every sensor, beside the quantum limit."""
+    """Draw the added contrast against magnitude for every sensor and the quantum limit."""
     magnitudes = np.arange(0.0, 10.5, 0.5)
     names = context.names(*(name for name in tolerance.HELD if name != "aplc"))
     lines = [
@@ -275,7 +276,7 @@ def _sim_loop(name: str, preset: str, folder: Path, config: str, duration_s: flo
 
 
 def _lowfc(folder: Path, *words: str) -> dict[str, Any]:
-    """What a command prints with --json; LowfcError where it failed."""
+    """JSON printed by a command; LowfcError if it failed."""
     command = [sys.executable, "-m", "lowfc", *words, "--json"]
     done = subprocess.run(  # noqa: S603  # our own program
         command, cwd=folder, capture_output=True, text=True, check=False

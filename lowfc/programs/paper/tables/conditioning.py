@@ -1,4 +1,4 @@
-"""Sect. 4: how well the modes can be told apart behind an open circle, bars, and holes of several sizes."""
+"""Sect. 4: conditioning of the modes behind an open circle, bars, and holes of several sizes."""
 
 from collections.abc import Iterator
 from functools import partial
@@ -28,7 +28,7 @@ HOLES = (0.09, 0.08, 0.07, 0.06, 0.05, 0.04, 0.03)
 MONOCHROMATIC = "H at the central wavelength, in nm rms of each mode over the circle."
 FIXED_STAR = (
     f"Cramer-Rao bound at the central wavelength: V = {STAR.magnitude}, {STAR.diameter_m:g} m, {TABLE4_EXPOSURE_S} s, "
-    "our own masks. Smaller holes are better conditioned and yet worse: the condition number does not know the light."
+    "our own masks. Smaller holes are better conditioned but noisier: the condition number ignores the light."
 )
 NOISE = (
     f"Cramer-Rao bound, all 14 modes fitted, root of the sum of their variances, no read noise: V = {STAR.magnitude}, "
@@ -37,13 +37,13 @@ NOISE = (
 )
 QUANTUM = (
     "limit: quantum Fisher information of the light behind the pupil's mask, 4 N Cov of the modes' phases: no sensor "
-    "of this light does better."
+    "of this light has less noise."
 )
 SHARE = "Median over the modes of the quantum limit's variance over the Cramer-Rao bound's."
 CLAIMS = {
     "open": "Sect. 4: extremely high. limit: above 1e12 is singular in double precision.",
     "bar": "Sect. 4: below 1000 (the limit here), an order of magnitude above the sparse aperture mask's.",
-    "holes": "Sect. 4: smaller holes lower it; said of the 14 modes that the mask was made for.",
+    "holes": "Sect. 4: smaller holes lower it, for the 14 modes that the mask was designed for.",
     "sensor": "limit: an order of magnitude below the bar's.",
 }
 LIMITS = {"open": 1e12, "bar": 1000.0, "holes": None, "sensor": 100.0}

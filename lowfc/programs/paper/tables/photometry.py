@@ -1,4 +1,4 @@
-"""Sect. 3.3: where the light goes, how large the signal of 1 mas is, and where the paper contradicts itself."""
+"""Sect. 3.3: light budget, signal of 1 mas, and contradictions within the paper."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -105,7 +105,7 @@ def _ratios(sam: Prepared, clowfs: Prepared) -> Iterator[Row]:
         counts = [float(paper_count_e(each) / each.band_I0.sum()) if k else 1.0 for each in (clowfs, sam)]
         what, ratio = f"P-V of the signal of 1 mas in electrons, {light}", float(own * counts[0] / counts[1])
         yield Row("clowfs / sam", what, "", ratio, paper, assumption="Band in five wavelengths, x tilt.")
-    predicted = f"Predicted; the paper's own Table 4 has {TABLE4_MAS['sam'][1] / TABLE4_MAS['clowfs'][1]:.1f}."
+    predicted = f"Predicted; the ratio in the paper's Table 4 is {TABLE4_MAS['sam'][1] / TABLE4_MAS['clowfs'][1]:.1f}."
     for k, light in enumerate(("paper's electrons", "own photometry")):
         scatter = []
         for sensor in (sam, clowfs):
@@ -127,8 +127,8 @@ def _inconsistencies(sam: Prepared, clowfs: Prepared) -> Iterator[Row]:
         "",
         light * PAPER_SIGNAL["clowfs"] / PAPER_SIGNAL["sam"],
         PAPER_SIGNAL_RATIO,
-        assumption="No model: light behind the sparse aperture mask, brightest pixel / image and signal / brightest "
-        "pixel, all of Sect. 3.3, multiplied.",
+        assumption="Without a model: light behind the sparse aperture mask, brightest pixel / image and signal / "
+        "brightest pixel, all of Sect. 3.3, multiplied.",
     )
 
 
@@ -141,8 +141,8 @@ def _tilt_contradiction(sam: Prepared) -> Iterator[Row]:
         "",
         2.0 * PAPER_TILT_PEAK * NM_PER_MAS / tilt_nm,
         PAPER_SIGNAL["sam"],
-        assumption=f"No model: lambda/30 is {tilt_nm / NM_PER_MAS:.2f} mas, the signal is proportional to the tilt, "
-        "and its P-V at most twice its largest value.",
+        assumption=f"Without a model: lambda/30 is {tilt_nm / NM_PER_MAS:.2f} mas, the signal is proportional to the "
+        "tilt, and its P-V at most twice its largest value.",
     )
     yield Row(
         name,
@@ -150,7 +150,7 @@ def _tilt_contradiction(sam: Prepared) -> Iterator[Row]:
         "",
         float(np.abs(differential(sam, 2)).max()),
         PAPER_TILT_PEAK,
-        assumption="Where the signal of 1 mas is the paper's or more, that of lambda/30 is more than the paper's.",
+        assumption="If the signal of 1 mas is at least the paper's, that of lambda/30 exceeds the paper's.",
     )
 
 
@@ -184,8 +184,8 @@ def _defocus_contradiction(clowfs: Prepared) -> Iterator[Row]:
         "mm",
         float(found),
         section.defocus_mm,
-        assumption="Only there, and below, is the paper's 0.080 mas in reach, where 14 modes can no longer be fitted: "
-        "see clowfs:1 in Table 4. No defocus gives both of the paper's CLOWFS tables.",
+        assumption="The paper's 0.080 mas is reached only at this defocus or less, where 14 modes can no longer be "
+        "fitted: see clowfs:1 in Table 4. No defocus agrees with both of the paper's CLOWFS tables.",
     )
 
 
@@ -199,7 +199,7 @@ def _r2_contradiction(sam: Prepared) -> Iterator[Row]:
         "",
         1.0 - (paper_out / paper_in) ** 2,
         PAPER_R2,
-        assumption="No model: eq. (15) with the ratio of Table 3.",
+        assumption="Without a model: eq. (15) with the ratio of Table 3.",
     )
     gram, wavelength_nm = sam.gram[:14, :14], sam.sensor.wavelength_nm
     wavefronts = next(reconstruction.inputs(sam, 14, literal=False))
@@ -213,5 +213,5 @@ def _r2_contradiction(sam: Prepared) -> Iterator[Row]:
         "",
         float(expected_r_squared(np.diag(spread), bounds).mean()),
         PAPER_R2,
-        assumption="Modes that look alike through the shaped pupil can err together and leave little; even so.",
+        assumption="Errors of modes that look alike through the shaped pupil partly cancel in the residual.",
     )

@@ -26,14 +26,14 @@ PAPER_PUPIL, PAPER_FOCAL_MASK, PAPER_RELAY_MASK = 0.147, 0.567, 0.091
 
 ASSUMPTION = (
     "Band in five wavelengths with both ends, H averaged over it, 1 e- read noise, whole electrons, total known. The "
-    "paper does not say how many modes it fits: its figures are only compatible with two (tip and tilt); a loop that "
-    "holds 14 modes pays the 14-mode row. predicted: noise of the tilted image through the estimator; limit: the "
+    "paper does not say how many modes it fits: its figures agree only with two (tip and tilt); a loop on 14 "
+    "modes has the noise of the 14-mode row. predicted: noise of the tilted image through the estimator; limit: the "
     "Cramer-Rao bound at the flat wavefront. At 10 mas the weights are still those of the flat image, which costs a "
     "few per cent."
 )
 
 
-CENTRED = "paper: 'the estimate distribution is centered on the true value'; predicted: of the image without noise."
+CENTRED = "paper: 'the estimate distribution is centered on the true value'; predicted: from the image without noise."
 
 
 @dataclass(frozen=True)
@@ -67,13 +67,13 @@ def exposures(sensor: Prepared) -> tuple[Exposure, Exposure]:
 
 
 def dimmed(sensor: Prepared) -> Exposure:
-    """Our own photometry, if our pupil let through no more than the paper's."""
+    """Own photometry with our pupil dimmed to the paper's transmission."""
     own = electrons(STAR, TABLE4_EXPOSURE_S) * PAPER_PUPIL / sensor.budget.pupil
     return Exposure(
         f"own photometry, pupil dimmed to {100 * PAPER_PUPIL:g} %",
         own,
-        f"{own * float(sensor.band_I0.sum()):.3g} e- on the sensor: as own photometry, but as if our pupil, which lets "
-        f"through {100 * sensor.budget.pupil:.1f} %, were as dark as the paper's.",
+        f"{own * float(sensor.band_I0.sum()):.3g} e- on the sensor: own photometry with our pupil, which "
+        f"transmits {100 * sensor.budget.pupil:.1f} %, dimmed to the paper's transmission.",
     )
 
 

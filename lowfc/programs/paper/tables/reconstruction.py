@@ -1,4 +1,4 @@
-"""Table 3: what is left of random wavefronts after their estimate is taken off, for every sensor and estimator."""
+"""Table 3: residual of random wavefronts after subtraction of their estimate, for every sensor and estimator."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -19,9 +19,9 @@ OTHERS = ("bowtie", f"bowtie:{DEFAULT_SAM}", "clowfs", "clowfs_tuned", "zwfs", "
 ITERATIONS = (0, 1, 2)
 WITH_NUISANCES = "weighted, flux and shear fitted along"
 EVEN = (
-    "Where pupil and masks are real and the pupil is symmetric, flux and shear change the image evenly and every mode "
-    "oddly: fitting them along costs a sparse aperture mask nothing. CLOWFS and the Zernike sensor mistake a shear for "
-    "a tilt."
+    "If pupil and masks are real and the pupil is symmetric, flux and shear change the image by an even function of "
+    "position and every mode by an odd one: fitting them too costs a sparse aperture mask nothing. CLOWFS and the "
+    "Zernike sensor mistake shear for tilt."
 )
 
 INPUT_PV_WAVES = {14: 0.097, 20: 0.11}

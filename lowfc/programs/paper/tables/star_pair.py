@@ -18,21 +18,21 @@ from lowfc.programs.paper.tables import tolerance
 STARS = {"reference": (2.0, 20_000.0), "target": (5.0, 5_800.0)}
 """Magnitude V and temperature in K."""
 DRIFT_PM = 20.0
-"""Of each of 14 modes, per root second."""
+"""Drift of each of 14 modes, pm per root second."""
 ROLL_NM, ROLLED = 1.0, 1e-11
-"""A roll's step in every mode, and the contrast below which it is gone."""
+"""Step of every mode by a roll of the telescope, and the contrast to which it must decay."""
 _SAMPLES_PER, _SMALL_NM = 2, 0.3  # and amplitude at which maps of second order are taken
 _PLANCK_NM_K = 1.438777e7
 
 ASSUMPTION = (
-    f"Every mode drifts by {DRIFT_PM:g} pm/sqrt(s), each star has the best gain of each mode, {tolerance.RATE_HZ:g} "
+    f"Every mode drifts by {DRIFT_PM:g} pm/sqrt(s), best gain of each mode for each star, {tolerance.RATE_HZ:g} "
     "Hz; black bodies of 20,000 K (V = 2) and 5,800 K (V = 5) over the band of 20 %, in four wavelengths."
 )
-MAP = "Of the map of the difference of both long exposures, before any photon noise of the science camera."
+MAP = "Over the map of the difference of both long exposures, without photon noise of the science camera."
 
 
 def coloured(temperature_K: float) -> Band:
-    """The band as a black body fills it, by photons."""
+    """The band weighted by a black body's photons."""
     band = gauss_legendre(prepared("sam").sensor.wavelength_nm, count=4)
     nm = np.array(band.wavelengths_nm)
     photons = np.array(band.weights) * nm**-4.0 / np.expm1(_PLANCK_NM_K / (nm * temperature_K))
@@ -57,7 +57,7 @@ def _image(modes_nm: Array, samples: int) -> Array:
 
 
 def zero_point_nm(name: str) -> Array:
-    """Where (14,) a loop with the reference star's I0 and R holds the target, because of its colour."""
+    """Modes (14,) at which a loop with the reference star's I0 and R holds the target, due to its colour."""
     sensor = prepared(name)
     reference_star, target = (coloured(kelvin) for _, kelvin in STARS.values())
     I0, H = reference(sensor.sensor, reference_star).ravel(), response(sensor.sensor, sensor.modes[:14], reference_star)
@@ -87,8 +87,8 @@ def pair_rows(name: str) -> Iterator[Row]:
     by_noise = np.tensordot(left["target"] - left["reference"], maps, 1)
     shift = zero_point_nm(name)
     by_colour = _image(shift, len(flat)) - flat
-    yield made("zero point's shift by colour", unit="nm", measured=float(np.linalg.norm(shift)))
-    for what, change in (("I0 of the reference star", by_noise + by_colour), ("I0 remade", by_noise)):
+    yield made("zero-point shift by colour", unit="nm", measured=float(np.linalg.norm(shift)))
+    for what, change in (("I0 of the reference star", by_noise + by_colour), ("I0 measured again", by_noise)):
         yield made(f"mean change after subtraction, {what}", measured=float(change[zone].mean()))
         yield made(
             f"rms change after subtraction, {what}",
@@ -101,7 +101,7 @@ def pair_rows(name: str) -> Iterator[Row]:
         ROLL_NM**2 * q * (1.0 - g) ** (2.0 * frames) for q, g in zip(form.tolist(), gains.tolist(), strict=True)
     )
     yield made(
-        f"time until a roll's step of {ROLL_NM:g} nm in every mode adds {ROLLED:g}, target",
+        f"time for a roll's step of {ROLL_NM:g} nm in every mode to decay to {ROLLED:g}, target",
         unit="s",
         measured=float((1 + np.count_nonzero(added > ROLLED)) / tolerance.RATE_HZ),
     )

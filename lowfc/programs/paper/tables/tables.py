@@ -1,4 +1,4 @@
-"""Tables 1 and 2, and what each of `lowfc validate`'s tables is called."""
+"""Tables 1 and 2, and the tables of `lowfc validate` by name."""
 
 from collections.abc import Iterator
 
@@ -33,7 +33,7 @@ def table1(context: Context) -> list[Row]:
     sensor, section, clowfs = prepared("sam").sensor, SensorSection(), SensorSection(kind="clowfs")
     layout = load_layout(section.sam)
     diameters = sorted({hole[2] for hole in layout.holes})
-    scaled = "The model knows focal lengths and diameters only by their ratio."
+    scaled = "The model uses focal lengths and diameters only by their ratio."
     ripple = "The paper's ripple pupil is not published: ours is made by linear programming for the same mask."
     waves = defocus_waves(clowfs, sensor.wavelength_nm)
     return [
@@ -69,8 +69,8 @@ def _peaks(context: Context, name: str) -> Iterator[Row]:
 
     found = context.map(f"table2 {name}", peak, NOLLS_14)
     assumption = (
-        "lambda/30 rms with the full exp(i phi). (I - I0) / I0 is read as the peak of |I - I0| over the peak of I0: "
-        "pixel by pixel it has no bound, for I0 has dark pixels."
+        "lambda/30 rms with the full exp(i phi). (I - I0) / I0 is taken as the peak of |I - I0| over the peak of I0: "
+        "the ratio of single pixels has no bound, because I0 has dark pixels."
     )
     for noll, value in zip(NOLLS_14, found, strict=True):
         what, paper = f"peak differential intensity of Z{noll}, {mode_name(noll)}", PAPER_TABLE2[noll]
@@ -87,7 +87,7 @@ TABLES: dict[str, Case] = {
 }
 
 BEYOND: dict[str, Case] = {
-    "anchors": Case("Anchors: the field's figures and ours", anchors.anchors, anchors.plot, None, anchors.ABOUT),
+    "anchors": Case("Anchors: published figures and lowfc's", anchors.anchors, anchors.plot, None, anchors.ABOUT),
     "tolerance": Case(
         "Tolerated drift and lines", tolerance.tolerance, tolerance.plot, tolerance.in_text, tolerance.ABOUT
     ),

@@ -1,4 +1,4 @@
-"""The drift and the lines that a telescope may have for a contrast that they may add: theory, checked by simulation."""
+"""Drift and lines that a telescope may have for a given added contrast: theory, checked by simulation."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -38,26 +38,24 @@ _FRAMES_PER_TRIAL = 20  # over the lowest gain: 100 trials know a variance to 3 
 _SHOWN, _MIDDLE = (2, 4, 8, 11), f"{SHOWN_CONTRAST:g}"
 _LARGEST = 6e-9  # contrast up to which the fourth order is fitted
 
-ABOUT = """How fast a mode may drift, and how large a line may be, for an added contrast of 1e-9, 1e-10 or 1e-11: by the
-theory of `lowfc/design/tolerance.py`, from the contrast's Hessian (and its fourth order, which counts for tilt) and the
-noise of a frame. `--json` has every mode, star and contrast, this page four modes of two stars at 1e-10. Then twelve
-points by simulation, and the pair of stars that a coronagraph observes: a reference of V = 2 and a target of V = 5 of
-another colour and roll, of which one exposure is subtracted from the other. Behind a symmetric pupil and a real mask a
-colour changes the image evenly, and the zero point of an aperture mask stays; those of the Zernike sensor and of CLOWFS
-move, and I0 has to be made again on the target.
+ABOUT = """Drift rate, and amplitude of a line, of one mode that add a contrast of 1e-9, 1e-10 or 1e-11: theory of
+`lowfc/design/tolerance.py`, from the contrast's Hessian (and its fourth order, which matters for tilt) and the noise of
+a frame. `--json` has every mode, star and contrast, this page four modes, two stars and 1e-10. Then twelve points by
+simulation, and a pair of stars as a coronagraph observes it: a reference of V = 2 and a target of V = 5 with another
+colour and roll angle, one exposure subtracted from the other. Behind a symmetric pupil and a real mask, a change of
+colour changes the image by an even function of position, and the zero point of an aperture mask stays; the zero points
+of the Zernike sensor and of CLOWFS move, and I0 has to be measured again on the target.
 """
 LOOP = (
     f"{RATE_HZ:g} Hz, exposure of half the period, delay of one frame, 1 e- read noise, all 14 modes fitted with "
     "weights, monochromatic; 2 m, 110 nm, 50 % throughput, quantum efficiency 0.8. Each mode alone adds the contrast, "
     "on average over the dark zone. limit: the same with the noise of the quantum limit."
 )
-DRIFT = (
-    "A random walk. For drift alone LQG is the integrator of the best gain, but for the margins that bound the latter."
-)
-LINE = f"A line at {LINE_HZ:g} Hz, {100 * LINE_WIDTH:g} % wide between half-power points; LQG knows it."
+DRIFT = "A random walk. For drift alone LQG equals the integrator of the best gain, unless margins bound the latter."
+LINE = f"A line at {LINE_HZ:g} Hz, {100 * LINE_WIDTH:g} % wide between half-power points; LQG has it in its model."
 CHECK = (
-    "predicted: the contrast whose drift this is; measured: variance left in a simulated loop on noisy images, times "
-    "the contrast per variance."
+    "predicted: the contrast that this drift should add; lowfc: residual variance of a simulated loop on noisy images, "
+    "times the contrast per variance."
 )
 
 
@@ -69,17 +67,17 @@ class Contrasts:
     quartic: Array
 
     def variance_nm2(self, mode: int, contrast: float) -> float:
-        """Of a Gaussian mode that adds a contrast."""
+        """Variance of a Gaussian mode that adds this contrast."""
         return tolerated_variance(float(self.form[mode]), float(self.quartic[mode]), contrast)
 
     def added(self, mode: int, variance_nm2: float) -> float:
-        """By a Gaussian mode."""
+        """Contrast added by a Gaussian mode of this variance."""
         return float(self.form[mode] * variance_nm2 + 3.0 * self.quartic[mode] * variance_nm2**2)
 
 
 @lru_cache(maxsize=8)
 def contrasts(pupil: str, focal_radius: float) -> Contrasts:
-    """Of a coronagraph; the fourth order from full images."""
+    """Contrast of a coronagraph's modes; the fourth order from full images."""
     section = SensorSection(pupil=pupil, focal_radius=focal_radius)
     modal = ModalContrast(coronagraph_from(section), NOLLS_14, prepared("sam").sensor.wavelength_nm)
     own, form = modal.by_image(np.zeros(len(NOLLS_14))), np.diag(modal.form)
@@ -101,7 +99,7 @@ def contrasts(pupil: str, focal_radius: float) -> Contrasts:
 
 
 def contrasts_of(name: str) -> Contrasts:
-    """Behind a sensor's coronagraph."""
+    """Contrast of the modes behind a sensor's coronagraph."""
     section = _section(name)
     return contrasts(section.pupil, section.focal_radius)
 
@@ -111,7 +109,7 @@ def _section(name: str) -> SensorSection:
 
 
 def light_e(magnitude: float) -> float:
-    """Electrons of the open circle's light in an exposure."""
+    """Electrons of one exposure, of the light entering the open circle."""
     return electrons(Photometry(magnitude), EXPOSURE / RATE_HZ)
 
 
@@ -180,7 +178,7 @@ def _tolerated(name: str, lines: dict[Kind, Callable[[Array], Array]]) -> Iterat
 
 
 def _checked(context: Context) -> list[Row]:
-    """Twelve points by simulation."""
+    """Rows of the twelve simulated points."""
     cases = list(product(CHECKED_SENSORS, CHECKED_MAGNITUDES, CHECKED_MODES))
 
     def simulated(case: tuple[str, float, int]) -> Row:
@@ -208,7 +206,7 @@ def _checked(context: Context) -> list[Row]:
 
 
 def in_text(row: Mapping[str, Any]) -> bool:
-    """Whether a row stands in the text; the rest is in the JSON object."""
+    """Whether a row is on the page; the JSON object has all."""
     what = row["quantity"]
     if not what.startswith(("drift", "line")):
         return True
@@ -217,7 +215,7 @@ def in_text(row: Mapping[str, Any]) -> bool:
 
 
 def plot(context: Context, path: Path) -> None:
-    """Tolerated drift over magnitude for four modes."""
+    """Draw the tolerated drift against magnitude for four modes."""
     magnitudes = np.arange(0.0, 10.5, 0.5)
     names = context.names(*(name for name in HELD if name != "aplc"))
 
