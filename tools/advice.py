@@ -35,7 +35,7 @@ ADVICE: dict[str, Advice] = {
     ),
     "CALIBRATION_LOADED": Advice("a calibration is in use, at the start or after `load`.", _NOTHING),
     "NOT_CALIBRATED": Advice(
-        "there is no calibration, or its size differs from that of the camera's frames.",
+        "there is no calibration, or its size differs from the camera's frames.",
         "`lowfc ctl load FILE`, `lowfc calibrate` or `lowfc commission`; frames are not used until then.",
     ),
     "CAMERA_CHANGED": Advice(
@@ -63,7 +63,7 @@ ADVICE: dict[str, Advice] = {
         "if frequent: `lowfc doctor`, a lower `camera.rate_hz`, dedicated processors for camera and controller.",
     ),
     "STREAM_SILENT": Advice(
-        "no process writes the ImageStreamIO stream, or its writer died in the middle of an image.",
+        "no process writes the ImageStreamIO stream, or its writer died during an image.",
         "start the writer; the driver resumes by itself.",
     ),
     "STREAM_RENEWED": Advice(
@@ -83,11 +83,11 @@ ADVICE: dict[str, Advice] = {
         "tune a law for this loop (`lowfc tune`), or remove `control.law`; the loop starts open.",
     ),
     "LAW_OVERRULED": Advice(
-        "the guard found that the law leaves more than the integrator would, or amplifies.",
+        "the guard found that the law's residual exceeds the integrator's, or that the loop amplifies.",
         "tune a law again from a recent log; `lowfc ctl law FILE` or `close` reactivates it.",
     ),
-    "LAW_BACK": Advice("the law would have been far better for some time, and is active again.", _NOTHING),
-    "NOTE": Advice("an operator left a note.", _NOTHING),
+    "LAW_BACK": Advice("the law's virtual residual was far smaller for some time; the law is active again.", _NOTHING),
+    "NOTE": Advice("an operator wrote a note.", _NOTHING),
     "CLOSING_HARMS": Advice(
         "at these gains, the noise added to some modes exceeds their disturbance.",
         "`lowfc ctl gain auto`, or lower gains of the modes that the event names.",
@@ -98,8 +98,8 @@ ADVICE: dict[str, Advice] = {
         "nothing after a slew; else check for clouds, a vignetted beam or a changed exposure.",
     ),
     "LOOP_HARMS": Advice(
-        "in three windows in a row the closed loop left more than an open one would: too much noise for the gains, a "
-        "wrong calibration, a wrong delay.",
+        "in three windows in a row the closed loop's residual exceeded that of an open loop: gains too high for the "
+        "noise, a wrong calibration, or a wrong delay.",
         "`lowfc ctl gain auto`; if it returns, check calibration and `control.delay_frames`. `control.on_harm` can "
         "open the loop by itself.",
     ),
@@ -108,7 +108,7 @@ ADVICE: dict[str, Advice] = {
         "remove the cause, and run the calibration or test again (with `--resume` if available).",
     ),
     "LEASE_TAKEN": Advice("a program reserved the loop.", "wait, or `lowfc ctl open`, which ends the reservation."),
-    "LEASE_RELEASED": Advice("the program is done.", _NOTHING),
+    "LEASE_RELEASED": Advice("the program has finished and released the loop.", _NOTHING),
     "LEASE_ENDED": Advice(
         "the holder did not renew it in time, or somebody requested safe, open, pause or stop.",
         "check the program that held it; it must stop by itself.",
@@ -118,7 +118,7 @@ ADVICE: dict[str, Advice] = {
         "remove the cause, or check the publisher of the value.",
     ),
     "INTERLOCK_CLEARED": Advice("the condition no longer holds.", "close the loop again, if the interlock opened it."),
-    "LOOP_STEPPED": Advice("`lowfc ctl step` is done.", "`lowfc ctl close`, if the residual fell."),
+    "LOOP_STEPPED": Advice("`lowfc ctl step` has finished.", "`lowfc ctl close`, if the residual fell."),
     "MIRROR_LOST": Advice(
         "the mirror's process died, hangs, or does not follow; a closed loop holds its command.",
         "check the mirror's process and its driver's events; restart it. The loop resumes by itself.",
@@ -182,7 +182,8 @@ ADVICE: dict[str, Advice] = {
     ),
     "DISK_SLOW": Advice("one write took long; messages waited in memory.", "use a faster or less busy disk."),
     "ON_EVENT_FAILED": Advice(
-        "the shell command of `recorder.on_event` failed or took more than 60 s.", "run it by hand, and fix it."
+        "the shell command of `recorder.on_event` failed or took more than 60 s.",
+        "run the command by hand and correct it.",
     ),
     "VIEW_STUCK": Advice("the viewer accepts no data.", "close its window, or wait: it restarts by itself."),
     "VIEW_RENEWED": Advice(
@@ -203,7 +204,7 @@ REASONS: dict[str, Advice] = {
     "SATURATED": Advice("more than `control.max_saturated_pixels` at full well", "shorter exposure, lower gain"),
     "DARK": Advice(
         "less light than `control.min_flux_fraction` of the calibration's",
-        "is the star on the mask? On a fainter star `lowfc calibrate reference`, or a lower fraction",
+        "centre the star on the mask; for a fainter star `lowfc calibrate reference`, or a lower fraction",
     ),
     "NO_FRAME": Advice("no frame in time", "as for NO_FRAMES"),
     "STUCK": Advice("the same image repeatedly", "restart the camera"),
@@ -213,7 +214,7 @@ REASONS: dict[str, Advice] = {
     ),
     "NO_MIRROR": Advice("the mirror does not follow", "as for MIRROR_LOST"),
     "HELD": Advice("an interlock or a permit holds the loop", "wait, or remove the cause of the interlock"),
-    "MODAL_LIMIT": Advice("a modal command reached its limit", "`lowfc ctl limit`; offload; is the star centred?"),
+    "MODAL_LIMIT": Advice("a modal command reached its limit", "`lowfc ctl limit`; offload; centre the star"),
     "STROKE": Advice("an actuator reached its stroke", "a better flat map, or smaller channels"),
     "SLEW": Advice("an actuator reached its slew limit in one command", "nothing after closing; else lower gains"),
     "NEIGHBOUR": Advice("neighbouring actuators would be too far apart", "smaller channels; look for a stuck actuator"),

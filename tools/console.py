@@ -1,6 +1,6 @@
 """Make the pictures of docs/howto/console.md: `python -m tools.measure console`, about two minutes.
 
-Real processes are brought into each state by hand, and a console without a terminal looks at them.
+Real processes are brought into each state, and a console without a terminal draws them.
 """
 
 import asyncio
@@ -13,14 +13,14 @@ from lowfc.contract.messages import Role
 from tools.pictures import BRIGHT, PICTURES, SMALL_WELL, Night, night
 
 EASY = {"camera.rate_hz": 100.0}
-"""Pictures need no quiet host at this rate."""
+"""At this rate the pictures do not need a quiet host."""
 LOOK_S = 6.0
-"""How long the console looks, before what happens meanwhile and after the console says so."""
+"""Time before the change of state, and after the console shows it."""
 PATIENCE_S = 60
 
 
 def picture(run: Night, name: str, word: str, meanwhile: Callable[[], object]) -> None:
-    """Look at a run, let something happen, look on until the console says `word`, and keep the picture."""
+    """Change the state of a run by `meanwhile`, wait until the console shows `word`, and store the picture."""
     from lowfc.programs.console.app import Console
 
     async def look() -> None:
@@ -60,6 +60,6 @@ def make() -> None:
 
 
 def kill_all(run: Night) -> None:
-    """Kill what is left of a run whose camera is dead."""
+    """Kill the remaining processes of a run whose camera is dead."""
     for name in (Role.CONTROLLER, run.mirror, Role.RECORDER):
         run.kill(name)

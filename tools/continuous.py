@@ -1,4 +1,4 @@
-"""What laws leave of the wheel's five lines at every moment, in theory: a table of docs/howto/tuning.md."""
+"""Theoretical continuous-time residual of the wheel's five lines, by law: a table of docs/howto/tuning.md."""
 
 from dataclasses import replace
 
@@ -21,12 +21,12 @@ _CASES = (Timing.of(1, 0.5), Timing.of(1, 0.9), Timing.of(2, 0.5))
 def table() -> str:
     """A row for each law, a column for each timing; mas rms per axis."""
     laws = {
-        "integrator, its highest gain": [_integrator(timing) for timing in _CASES],
-        "Kalman filter, an instant nulled": [_filter(timing, timing.applied, 0.0) for timing in _CASES],
-        "Kalman filter, the next exposure's mean nulled": [
+        "integrator, highest gain": [_integrator(timing) for timing in _CASES],
+        "Kalman filter that nulls one instant": [_filter(timing, timing.applied, 0.0) for timing in _CASES],
+        "Kalman filter that nulls the mean of the next exposure": [
             _filter(timing, timing.applied, timing.exposure) for timing in _CASES
         ],
-        "Kalman filter, the mean over the command's period nulled (`lqg`)": [
+        "Kalman filter that nulls the mean over the command's period (`lqg`)": [
             _filter(timing, timing.applied, timing.held) for timing in _CASES
         ],
     }
@@ -34,8 +34,8 @@ def table() -> str:
         (name, *(f"{_left(law, t):.3f}" for law, t in zip(made, _CASES, strict=True))) for name, made in laws.items()
     ]
     floor = float(np.sqrt(np.square(LINES_MAS) @ hold_floor(_omega())))
-    rows.append(("the least that a held command can leave", *(f"{floor:.3f}" for _ in _CASES)))
-    head = "left of 14 mas, mas rms per axis, at every moment"
+    rows.append(("lower bound for a command held for a period", *(f"{floor:.3f}" for _ in _CASES)))
+    head = "continuous-time residual of 14 mas, mas rms per axis"
     return markdown((head, *(f"delay {t.delay:g}, exposure {t.exposure:g}" for t in _CASES)), rows)
 
 
@@ -48,7 +48,7 @@ def _integrator(timing: Timing) -> LinearLaw:
 
 
 def _filter(timing: Timing, start: float, length: float) -> LinearLaw:
-    """The filter that knows the lines, its command nulling the mean over [start, start + length] periods."""
+    """Filter with the exact lines whose command nulls the mean over [start, start + length] periods."""
     lines = tuple(Line(hz, _NO_WIDTH_HZ, mas**2) for hz, mas in zip(LINES_HZ, LINES_MAS, strict=True))
     model = Model(_NO_DRIFT_NM2, np.inf, lines, _NO_NOISE_NM2, RATE_HZ)
     foreseen = model.mean_over(start, length) @ np.linalg.inv(model.mean_over(0.0, timing.exposure))

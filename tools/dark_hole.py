@@ -1,4 +1,4 @@
-"""How much of a dark hole's steps the loop undoes: the table of docs/howto/zero_point.md."""
+"""Fraction of a dark hole's steps that the loop undoes: the table of docs/howto/zero_point.md."""
 
 import tempfile
 from pathlib import Path
@@ -15,7 +15,7 @@ __all__ = ["COMMAND", "measure", "render"]
 
 
 def measure() -> Figures:
-    """What is undone of small and of large steps."""
+    """Fractions undone of small and of large steps."""
     runs = {}
     for each_nm in track(EACH_NM, "dark holes"):
         with tempfile.TemporaryDirectory() as folder:
@@ -30,7 +30,7 @@ def measure() -> Figures:
 
 
 def render(figures: Figures) -> str:
-    """A line for each size of the steps."""
+    """A row for each size of the steps."""
     head = (
         *("each step, nm rms of surface", "all steps", "as seen by the sensor, nm of wavefront", "undone, %"),
         *("undone without the shift, %", "true residual before -> after, nm"),
@@ -47,8 +47,8 @@ def render(figures: Figures) -> str:
     ]
     return (
         f"{markdown(head, rows)}\n{STEPS} random steps, {SETTLE} frames apart, each added to those before it. Undone "
-        "is the fraction of the channel as seen by the sensor that the loop's own command cancels, "
-        "after subtraction of the part that cancels the disturbance; least squares over all steps and modes, with the "
+        "is the fraction of the channel, as seen by the sensor, that the loop's own command cancels "
+        "beyond the disturbance; least squares over all steps and modes, with the "
         "standard error. A negative value means that the loop adds to the steps. The true residual is the rms of all "
         "modes about their mean, over the circle, before the first step and after the last."
     )

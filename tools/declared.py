@@ -1,4 +1,4 @@
-"""Tables that the code itself decides: topics, messages, keys, requests, and the limits that the commands keep."""
+"""Tables from the code: topics, messages, keys, requests, and the limits of the commands."""
 
 import ast
 from collections.abc import Callable, Iterable
@@ -31,7 +31,7 @@ from tools.shared import ROOT, markdown
 
 API = ("client", "device", "optics", "design", "control")
 """Packages of the Python API."""
-_MESSAGES = 4  # numbers of the fields of the descriptors, which the places of comments are made of
+_MESSAGES = 4  # field numbers in the descriptors, of which the paths of comments consist
 _FIELDS = 2
 _TAKEOVER = (
     ("frames for which a new law observes", SETTLING_FRAMES),
@@ -50,8 +50,8 @@ _GUARD = (
     ("minimum number of frames of a block", guard.FEWEST),
     ("consecutive worse blocks before the integrator takes over", guard.WORSE_BLOCKS),
     ("law is worse: ratio of its mean squared error to the integrator's above", guard.WORSE),
-    ("loop amplifies: ratio of its mean squared error to the usual mean square above", guard.AMPLIFIED),
-    ("time constant of the usual mean square, s", guard.USUAL_S),
+    ("loop amplifies: ratio of its mean squared error to the long-term mean square above", guard.AMPLIFIED),
+    ("time constant of the long-term mean square, s", guard.USUAL_S),
     ("duration of a cross-fade, s", guard.FADED_S),
     ("law is far better: ratio of its mean squared error to the integrator's below", guard.BETTER),
     ("time for which the law must be far better, at first, s", guard.BETTER_S),
@@ -63,7 +63,7 @@ _ACCEPTANCE = (
     ("linearity: amplitudes, times `linear_nm`", *acceptance_linearity.AMPLITUDES),
     ("linearity: standard errors above the limit at which a value fails", linearity.SURE),
     ("capture-range: amplitudes, times the required one", *acceptance_capture.SIZES),
-    ("capture-range: maximum fraction of a shape left over", linearity.MISSED),
+    ("capture-range: maximum fraction of a shape that remains", linearity.MISSED),
 )
 _OPERATING = (
     *_TAKEOVER,
@@ -73,7 +73,7 @@ _OPERATING = (
 
 
 def packages() -> str:
-    """The packages, each with the first line of its docstring."""
+    """Packages with the first line of their docstrings."""
     folder = ROOT / "lowfc"
     rows = []
     for path in sorted(folder.rglob("*/__init__.py")):
@@ -83,7 +83,7 @@ def packages() -> str:
 
 
 def offered(package: str) -> str:
-    """The names that a package of the Python API offers, or its modules, each with its first sentence."""
+    """Exported names of a package of the Python API, or its modules, with their first sentences."""
     top = import_module(package)
     if hasattr(top, "__all__"):
         found = [(name, _about(getattr(top, name))) for name in top.__all__]
@@ -95,28 +95,28 @@ def offered(package: str) -> str:
 
 
 def _about(value: Any) -> str | None:
-    """Docstring of a class or a function, or what an array's type is."""
+    """Docstring of a class or a function, or the type of an array."""
     types = get_args(value)
     return f"numpy array of {get_args(types[1])[0].__name__}" if types else value.__doc__
 
 
 def limits(rows: Iterable[tuple[str, *tuple[float, ...]]]) -> str:
-    """What is limited, and the values."""
-    return markdown(("what", "value"), ((what, ", ".join(f"{one:g}" for one in values)) for what, *values in rows))
+    """Table of limits."""
+    return markdown(("limit", "value"), ((what, ", ".join(f"{one:g}" for one in values)) for what, *values in rows))
 
 
 def requirements() -> str:
-    """What an acceptance run requires."""
+    """Requirements of an acceptance run."""
     rows = ((f"`{key}`", f"{info.default:g}", sentence(info.description)) for key, info in keys(Acceptance).items())
     return markdown(("key", "default", "requirement"), rows)
 
 
 def agreement() -> str:
     """Camera settings that must agree with the configuration."""
-    head = ("the camera's", "the configuration's", "may differ by", "needed", "used for")
+    head = ("camera setting", "configuration key", "tolerance", "needed", "used for")
     rows = []
     for one in AGREEMENTS:
-        needed, apart = "yes" if one.needed else "no", f"{one.apart:.0%}" if one.apart else "nothing"
+        needed, apart = "yes" if one.needed else "no", f"{one.apart:.0%}" if one.apart else "exactly equal"
         rows.append((f"`{one.field}`", f"`{one.key}`", apart, needed, one.use))
     return markdown(head, rows)
 
@@ -151,7 +151,7 @@ def fields(message: str) -> str:
 
 
 def sentence(text: str | None) -> str:
-    """On one line, without the full stop."""
+    """Text on one line without its full stop."""
     return " ".join((text or "").split()).removesuffix(".")
 
 
@@ -177,4 +177,4 @@ DECLARED: dict[str, Callable[[], str]] = {
     "agreement": agreement,
     **{f"names {one}": partial(offered, f"lowfc.{one}") for one in API},
 }
-"""The tables by the names that the pages call them."""
+"""The tables by their names in the pages."""

@@ -1,4 +1,4 @@
-"""The guard of a law in the simulated loop, where lines move and where laws are good: for docs/howto/tuning.md."""
+"""The guard in the simulated loop, with moved lines and with good laws: the table in docs/howto/tuning.md."""
 
 import timeit
 from collections.abc import Callable
@@ -32,13 +32,13 @@ SEEDS = tuple(range(1, 21))
 MOVED = (("reaction-wheel-ideal", 1.02), ("reaction-wheel", 1.05), ("reaction-wheel", 1.10))
 MAGNITUDES = (0.0, 2.0, 5.0)
 STEPS_MAS = 5.0
-"""Half of the height of a square wave in tip and tilt, of a period of 4 s."""
+"""Half the height of a square wave of period 4 s in tip and tilt."""
 MINUTES = 10.0
 _IDENTIFY, _SETTLE, _BEFORE, _CHUNK = 48_000, 12_000, 2_000, 10_000
 
 
 class Case:
-    """A star and a disturbance, a law for it, and the best gains."""
+    """A star and a disturbance, with a law and the best gains for them."""
 
     def __init__(self, preset: str, magnitude: float, law_of: "LawOf | None" = None) -> None:
         self.keys: dict[str, Any] = {"disturbance.preset": preset, "star.magnitude": magnitude}
@@ -54,12 +54,12 @@ class Case:
         return configured(seed=seed, **self.keys, **changed)
 
     def bench(self, config: Configuration, law: LinearLaw | None, steps_mas: float = 0.0) -> ModalBench:
-        """A closed loop of this case; its law has followed the open loop before, for as long as narrow lines take."""
-        shaken = disturbance_of(config)
+        """A closed loop of this case; its law observed the open loop before, long enough for narrow lines."""
+        disturbance = disturbance_of(config)
         step_nm: Array = (
             steps_mas * tilt_nm_per_mas(config.star.diameter_m) * np.isin(config.noll, TIP_TILT).astype(float)
         )
-        bench = ModalBench(config, self.covariance_nm2, replace(shaken, step_nm=step_nm))
+        bench = ModalBench(config, self.covariance_nm2, replace(disturbance, step_nm=step_nm))
         bench.ask("gain", modes=config.noll, values=tuple(self.gains.tolist()))
         if law is not None:
             bench.load(law)
@@ -73,7 +73,7 @@ LawOf = Callable[[Configuration, Array, ModalBench], tuple[LinearLaw, Array]]
 
 
 def identified_law(config: Configuration, covariance_nm2: Array, bench: ModalBench) -> tuple[LinearLaw, Array]:
-    """As an operator would make them from a log."""
+    """Law and gains identified from a log, as by an operator."""
     bench.forget()
     bench.run(_IDENTIFY)
     run, timing = bench.pol(), timing_of(config)
@@ -81,7 +81,7 @@ def identified_law(config: Configuration, covariance_nm2: Array, bench: ModalBen
 
 
 def known_law(config: Configuration, covariance_nm2: Array, bench: ModalBench) -> tuple[LinearLaw, Array]:
-    """At once, from what the simulation knows of its lines."""
+    """Law and gains from the simulation's exact lines, without identification."""
     width = LINE_WIDTH if config.disturbance.preset == "reaction-wheel" else LINE_WIDTH / 1000
     variances_nm2 = (np.array(LINES_MAS) * bench.nm_per_mas) ** 2
     lines = tuple(Line(hz, width * hz, nm2) for hz, nm2 in zip(LINES_HZ, variances_nm2.tolist(), strict=True))
@@ -94,7 +94,7 @@ def known_law(config: Configuration, covariance_nm2: Array, bench: ModalBench) -
 
 
 def moved(case: Case, factor: float, seed: int, *, guard: bool = True, law: bool = True) -> tuple[float, list[float]]:
-    """Tilt from 1 s to 3 s after lines have moved, mas rms per axis, and when the law was overruled, s after it."""
+    """Tilt from 1 s to 3 s after lines have moved, mas rms per axis, and times of LAW_OVERRULED, s after the move."""
     bench = case.bench(case.configured(seed, **{"control.guard": guard}), case.law if law else None)
     bench.run(_BEFORE)
     if bench.events and bench.events[-1][1].name == "LAW_OVERRULED":
@@ -109,7 +109,7 @@ def moved(case: Case, factor: float, seed: int, *, guard: bool = True, law: bool
 
 
 def undisturbed(case: Case, seed: int, minutes: float = MINUTES) -> int:
-    """How often a good law is overruled, while steps disturb the loop and lines wander within their width."""
+    """Number of times a good law is overruled, with steps and lines that wander within their width."""
     bench = case.bench(case.configured(seed), case.law, STEPS_MAS)
     bench.run(round(minutes * 60 * RATE_HZ), record=False)
     if bench.refused:
@@ -130,7 +130,7 @@ def measure() -> Figures:
 
 
 def cost_us(law: LinearLaw) -> dict[str, float]:
-    """What the guard of a law takes of a frame, at its quickest: while the law drives, and while it is virtual."""
+    """Least time that the guard adds to a frame, while the law drives and while it is virtual."""
     modes = len(law.noll)
     rest, value_nm = np.zeros(modes, np.float32), np.ones(modes, np.float32)
     loop = Law(rest + np.float32(0.5), rest, rest + np.float32(150)), ((0, np.float32(1)),), (rest,)
@@ -148,15 +148,15 @@ def _row(case: Case, preset: str, factor: float) -> Figures:
     guarded = [moved(case, factor, seed) for seed in SEEDS]
     alone = np.array([moved(case, factor, seed, guard=False)[0] for seed in SEEDS])
     integrator = np.array([moved(case, factor, seed, law=False)[0] for seed in SEEDS])
-    left = np.array([mas for mas, _ in guarded])
+    guarded_mas = np.array([mas for mas, _ in guarded])
     times = [times_s[0] for _, times_s in guarded if times_s]
     return {
         "preset": preset,
         "percent": 100 * (factor - 1),
-        "guarded_mas": float(left.mean()),
+        "guarded_mas": float(guarded_mas.mean()),
         "alone_mas": float(alone.mean()),
         "integrator_mas": float(integrator.mean()),
-        "worst_ratio": float((left / integrator).max()),
+        "worst_ratio": float((guarded_mas / integrator).max()),
         "overruled": len(times),
         "seeds": len(SEEDS),
         "latest_s": max(times, default=None),
@@ -164,7 +164,7 @@ def _row(case: Case, preset: str, factor: float) -> Figures:
 
 
 def render(figures: Figures) -> str:
-    """A line for each case, and what came of good laws."""
+    """A row for each case, and the result for good laws."""
     rows = columns(
         {
             "disturbance, frequency shift of its lines": "`{preset}`, {percent:.0f} %",
@@ -186,7 +186,7 @@ def render(figures: Figures) -> str:
         f"{rows}\nTrue tilt from 1 s to 3 s after the lines moved, V = 0, 1 kHz. Laws are LQG, "
         f"identified from {_IDENTIFY / RATE_HZ:g} s of the closed loop; the integrator has the best gains for the same "
         f"frames. Good laws, for {figures['minutes']:g} minutes each, with unmodelled steps of {2 * STEPS_MAS:g} mas "
-        f"every 2 s, were overruled: {good}. The guard of a law of 14 modes takes {cost['driving']:.1f} us "
-        f"of a frame while the law drives, {cost['virtual']:.1f} us while it does not. Modes pass through the live "
+        f"every 2 s, were overruled: {good}. With a law of 14 modes the guard adds {cost['driving']:.1f} us "
+        f"to a frame while the law drives, {cost['virtual']:.1f} us while it does not. Modes pass through the live "
         "loop's own `advance`, with noise of the images' covariance."
     )

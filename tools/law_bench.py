@@ -1,4 +1,4 @@
-"""The simulated loop without processes: sensor images, the live loop's own `advance`, the mirror, true residuals."""
+"""The simulated loop in one process: sensor images, the live loop's own `advance`, the mirror, true residuals."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -37,7 +37,7 @@ RATE_HZ = 1000.0
 def configured(
     sensor: str = "sam27d10_bal14", seed: int = 1, delay_frames: float = 1.0, **changed: Any
 ) -> Configuration:
-    """The reaction wheel's 14 mas rms per axis before a star of V = 0, at 1 kHz; `changed` are more keys."""
+    """Reaction wheel of 14 mas rms per axis, V = 0, 1 kHz; `changed` has further keys."""
     keys: dict[str, Any] = {f"sensor.{key}": value for key, value in sensor_keys(sensor).items()}
     keys |= FIXED_GAINS | {
         "camera.rate_hz": RATE_HZ,
@@ -54,46 +54,46 @@ def calibrated(config: Configuration) -> Calibration:
     return factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, ignore))
 
 
-def with_lines_moved(shaken: Disturbance, factor: float) -> Disturbance:
-    """The same disturbance with its lines at other frequencies."""
-    ideal = np.isin(shaken.frequency_hz, LINES_HZ)
+def with_lines_moved(disturbance: Disturbance, factor: float) -> Disturbance:
+    """The same disturbance with the frequencies of its lines multiplied by `factor`."""
+    ideal = np.isin(disturbance.frequency_hz, LINES_HZ)
     return replace(
-        shaken,
-        frequency_hz=np.where(ideal, factor, 1) * shaken.frequency_hz,
-        lines=tuple(replace(line, frequency_hz=factor * line.frequency_hz) for line in shaken.lines),
+        disturbance,
+        frequency_hz=np.where(ideal, factor, 1) * disturbance.frequency_hz,
+        lines=tuple(replace(line, frequency_hz=factor * line.frequency_hz) for line in disturbance.lines),
     )
 
 
 class Bench:
-    """A loop in one process, its mirror flat to begin with; what it did is kept until `forget`.
+    """A loop in one process that starts with a flat mirror; it records until `forget`.
 
     Attributes:
-        config: the instrument's.
-        nm_per_mas: of tilt.
-        refused: frames that the controller did not use.
-        events: of the controller since the beginning, with the number of the frame.
+        config: configuration of the controller.
+        nm_per_mas: nm rms of wavefront per milliarcsecond of tilt.
+        refused: number of frames that the controller did not use.
+        events: frame number and event of the controller, since the start.
     """
 
     def __init__(
         self,
         config: Configuration,
         first: Calibration | Input,
-        shaken: Disturbance | None = None,
+        disturbance: Disturbance | None = None,
         world: Configuration | None = None,
     ) -> None:
         """Build the optics.
 
         Args:
-            config: the controller's.
-            first: what it begins with: a calibration, or another input.
-            shaken: another disturbance than the configuration's.
-            world: the configuration of optics, detector and mirror, where it is another one.
+            config: configuration of the controller.
+            first: first input: a calibration, or another input.
+            disturbance: replaces the configuration's.
+            world: configuration of optics, detector and mirror, if it differs from `config`.
         """
         self.config, self.world = config, config if world is None else world
         self.nm_per_mas = tilt_nm_per_mas(config.star.diameter_m)
         self.refused = 0
-        self._other = shaken
-        self.scene = scene(self.world, shaken)
+        self._other_disturbance = disturbance
+        self.scene = scene(self.world, disturbance)
         self._settings = factory.settings(config)
         self._watch = GainWatch(self._settings, config.control.on_harm, factory.contrast_of(config).form)
         self.events: list[tuple[int, PendingEvent]] = []
@@ -108,7 +108,7 @@ class Bench:
         self.forget()
 
     def start_mirror(self) -> None:
-        """A mirror that is flat and knows nothing of the one before."""
+        """Replace the mirror by a new, flat one."""
         self._mirror, self._status = SimulatedMirror(DriverOptions(), self.world), initial(self._guard)
 
     def forget(self) -> None:
@@ -118,36 +118,36 @@ class Bench:
 
     @property
     def state(self) -> State:
-        """The controller's."""
+        """State of the controller."""
         return self._state
 
     @property
     def settings(self) -> Settings:
-        """The controller's."""
+        """Settings of the controller."""
         return self._settings
 
     @property
     def closing_harm(self) -> str:
-        """What closing would add, in words; empty for nothing."""
+        """Harm that closing would do, in words; empty for none."""
         return self._watch.closing_harm
 
     def added_contrast(self) -> tuple[float, Array] | None:
-        """What the open loop adds to the dark zone, and each mode (modes,) now, as measured."""
+        """Contrast that the open loop adds to the dark zone, and that of each mode (modes,) now, as measured."""
         return self._watch.added_contrast()
 
     def star(self, magnitude: float) -> None:
         """Point at another star."""
         star = self.config.star.model_copy(update={"magnitude": magnitude})
-        self.scene = scene(self.world.model_copy(update={"star": star}), self._other)
+        self.scene = scene(self.world.model_copy(update={"star": star}), self._other_disturbance)
 
     def ask(self, name: str, **fields: Any) -> None:
-        """An operator's request; ValueError where it is refused."""
+        """Send an operator's request; ValueError if it is refused."""
         outputs = self.take(Request(self._index * self.config.period_ns, name, **fields))
         if outputs.reply is None or not outputs.reply.accepted:
             raise ValueError(f"{name}: {outputs.reply}")
 
     def settle(self, frames: int) -> None:
-        """Close the loop, and begin a new record that many frames later."""
+        """Close the loop, and begin a new record after this number of frames."""
         self.ask("close")
         self.run(frames)
         self.forget()
@@ -159,25 +159,25 @@ class Bench:
     def expose(self) -> tuple[Single, Pixels]:
         """The mirror's shape (rows, columns) in the next exposure, and its frame."""
         self._shapes = [self._status.surface_nm, *self._shapes[:-1]]
-        whole = len(self._weights) == 1
-        seen_nm = self._shapes[0] if whole else np.tensordot(self._weights, np.array(self._shapes), 1)
-        pixels = self.scene.expose(self._index, seen_nm)
+        single = len(self._weights) == 1
+        exposed_nm = self._shapes[0] if single else np.tensordot(self._weights, np.array(self._shapes), 1)
+        pixels = self.scene.expose(self._index, exposed_nm)
         self._index += 1
-        return seen_nm, pixels
+        return exposed_nm, pixels
 
-    def take(self, given: Input) -> Outputs:
+    def take(self, input_: Input) -> Outputs:
         """Give the controller an input."""
-        self._state, outputs = advance(self._settings, self._state, given)
+        self._state, outputs = advance(self._settings, self._state, input_)
         return outputs
 
     def frame(self, pixels: Pixels, start: int = 1 << 32) -> Frame:
-        """The last exposure's."""
+        """Frame of the last exposure."""
         return Frame(start + self._index - 1, 10**18 + (self._index - 1) * self.config.period_ns, 0, pixels)
 
     def follow(self, frame: Frame, command: Commanded) -> None:
-        """Move the mirror by the command made from a frame; ValueError where it refuses."""
-        told = Command("lowfc", frame.sequence, frame.time_ns, 10**9, command.actuators_nm, command.command_nm)
-        self._status, refused = apply_command(self._guard, self._status, told, frame.time_ns, self._mirror.settle)
+        """Move the mirror by the command for a frame; ValueError if it refuses."""
+        received = Command("lowfc", frame.sequence, frame.time_ns, 10**9, command.actuators_nm, command.command_nm)
+        self._status, refused = apply_command(self._guard, self._status, received, frame.time_ns, self._mirror.settle)
         if refused is not None:
             raise ValueError(f"the mirror refused a command: {refused.name}")
         self._path.applied(self._index, self._status.surface_nm)
@@ -186,8 +186,8 @@ class Bench:
         """Expose, control, move the mirror."""
         for _ in range(frames):
             index = self._index
-            seen_nm, pixels = self.expose()
-            truth = self.scene.truth(index, seen_nm, self._path.over(index, self.scene.instants))
+            exposed_nm, pixels = self.expose()
+            truth = self.scene.truth(index, exposed_nm, self._path.over(index, self.scene.instants))
             frame = self.frame(pixels)
             outputs = self.take(frame)
             self._watched(outputs)
@@ -200,7 +200,7 @@ class Bench:
                 self.follow(frame, outputs.command)
 
     def _watched(self, outputs: Outputs) -> None:
-        """Enter what the watch over the gains asks for, as the controller does."""
+        """Apply the requests of the gain watch, as the controller does."""
         events = list(outputs.events)
         if outputs.step is not None:
             found = self._watch.follow(outputs.step, self._state)
@@ -220,19 +220,19 @@ class Bench:
         return np.array([getattr(truth, name).residual_nm for truth in self.truths], np.float64)
 
     def tilt_mas(self, last: int, *, continuous: bool = True) -> float:
-        """True tilt, rms per axis over the last frames: at every moment, or at the starts of the exposures."""
+        """True tilt, mas rms per axis over the last frames: in continuous time, or at the starts of the exposures."""
         residual_nm = self.residual_nm(continuous=continuous)[-last:, :2]
         return float(np.sqrt(np.mean(residual_nm**2)) / self.nm_per_mas)
 
 
 def timing_of(config: Configuration) -> Timing:
-    """When the loop of a configuration exposes and moves its mirror."""
+    """Times of exposure and mirror motion in the loop of a configuration."""
     exposure = config.camera.exposure_fraction if config.camera.instants > 1 else 0.0
     return Timing.of(config.camera.delay_frames, exposure)
 
 
 def tuned(run: Pieces, config: Configuration, kinds: Sequence[str] = ("lqg",)) -> dict[str, Tuned]:
-    """Laws of these kinds for pseudo-open-loop modes (frames, modes), of all modes or the first few."""
+    """Laws of these kinds for pseudo-open-loop modes (frames, modes), all or the first few."""
     noll = config.noll[: run.values[0].shape[1]]
     rate_hz, none = config.camera.rate_hz, np.zeros(len(noll))
     timing = timing_of(config)

@@ -1,4 +1,4 @@
-"""Every control law in the simulated loop, beside its theory: the table of docs/howto/tuning.md."""
+"""Residual of every control law in the simulated loop, and its theory: the table of docs/howto/tuning.md."""
 
 from typing import Any
 
@@ -33,13 +33,13 @@ CASES: dict[str, dict[str, Any]] = {
 }
 KINDS = ("integrator", "pi-notch", "lqg")
 SHORTER = (8_000, 16_000)
-"""Frames of the same loop, the last ones, from which an LQG law is made for comparison."""
+"""Last frames of the same loop, from which further LQG laws are identified for comparison."""
 IDENTIFY, SETTLE, MEASURE = 48_000, 12_000, 12_000
-"""Frames of the closed loop that a law is identified from, until a law has settled, and over which it is measured."""
+"""Frames of the closed loop: for identification of a law, for settling, for the measurement."""
 _DRIFT_BOUNDS = ((-5.0, 2.0), (-1.0, 4.0))
-"""Decades of the walk's step, nm^2, and of its corner, Hz, between which the optimum is looked for.
+"""Bounds of the search for the optimum: log10 of the walk's step, nm^2, and of its corner, Hz.
 
-The highest corners are far above half of every rate: there the walk has no low-pass, and the optimum may lie there.
+The highest corners are far above half the frame rate: there the walk has no low-pass, and the optimum may be there.
 """
 
 
@@ -50,7 +50,7 @@ def measure() -> Figures:
 
 
 def case(config: Configuration) -> Figures:
-    """What each law leaves of the reaction wheel, mas rms per axis, and the theory of it."""
+    """Residual of the reaction wheel with each law, mas rms per axis, and its theory."""
     calibration = calibrated(config)
     bench = Bench(config, calibration)
     if config.camera.delay_frames > 1:
@@ -90,7 +90,7 @@ def tilts(run: Pieces, frames: int) -> Pieces:
 
 
 def moved(config: Configuration, calibration: Calibration, law: LinearLaw) -> dict[str, float]:
-    """The lines 2 % higher: under the law of before, and after identifying them again from that closed loop."""
+    """Residual with lines 2 % higher: with the former law, and after identification from that closed loop."""
     bench = Bench(config, calibration, with_lines_moved(disturbance_of(config), 1.02))
     bench.load(law)
     bench.settle(SETTLE)
@@ -102,33 +102,38 @@ def moved(config: Configuration, calibration: Calibration, law: LinearLaw) -> di
 
 
 def theory_mas(config: Configuration, calibration: Calibration, law: LinearLaw) -> tuple[float, float]:
-    """What a law leaves at every moment of the disturbance's known spectrum, and what it makes of noise; rms, mas."""
+    """Continuous-time residual of the disturbance's known spectrum, and the noise part, mas rms."""
     frequency_hz, variance_nm2 = variances_nm2(disturbance_of(config))
-    left = left_power(law, 2 * np.pi * frequency_hz / RATE_HZ, timing_of(config))[:, :2]
-    waves = np.mean(np.sum(variance_nm2[:, :2] * left, axis=0))
+    passed = left_power(law, 2 * np.pi * frequency_hz / RATE_HZ, timing_of(config))[:, :2]
+    waves = np.mean(np.sum(variance_nm2[:, :2] * passed, axis=0))
     noise = np.mean(frame_noise_nm(config, calibration)[:2] ** 2 * noise_gain(law, config.camera.delay_frames)[:2])
     nm_per_mas = tilt_nm_per_mas(config.star.diameter_m)
     return float(np.sqrt(waves) / nm_per_mas), float(np.sqrt(noise) / nm_per_mas)
 
 
 def optimum_mas(config: Configuration, calibration: Calibration, *, robust: bool = False) -> float:
-    """The least that an LQG law leaves in theory which knows the wheel's lines and the noise, and takes the best drift.
+    """Theoretical residual of an LQG law with the wheel's exact lines, the noise and the best drift model.
 
-    Where it is to be robust, it keeps the margins that `lowfc tune` asks for.
+    Args:
+        config: the loop.
+        calibration: its noise.
+        robust: keep the margins that `lowfc tune` requires.
 
     Raises:
-        RuntimeError: the search ended at its edge: what it found is no least.
+        RuntimeError: the search ended at its bounds, which is no minimum.
     """
-    shaken, timing = disturbance_of(config), timing_of(config)
-    frequency_hz, variance_nm2 = variances_nm2(shaken)
+    disturbance, timing = disturbance_of(config), timing_of(config)
+    frequency_hz, variance_nm2 = variances_nm2(disturbance)
     noise_nm = frame_noise_nm(config, calibration)[:2]
     best = []
     for axis in (0, 1):
         power = variance_nm2[:, axis]
-        known = tuple(Line(line.frequency_hz, line.width_hz, float(line.rms_nm[axis] ** 2)) for line in shaken.lines)
+        known = tuple(
+            Line(line.frequency_hz, line.width_hz, float(line.rms_nm[axis] ** 2)) for line in disturbance.lines
+        )
         variance = float(noise_nm[axis] ** 2)
 
-        def left(
+        def residual(
             drift: Any, axis: int = axis, power: Any = power, known: Any = known, variance: float = variance
         ) -> float:
             step, cutoff_hz = 10.0 ** np.asarray(drift)
@@ -137,19 +142,19 @@ def optimum_mas(config: Configuration, calibration: Calibration, *, robust: bool
             if block is None:
                 return np.inf
             law = of_blocks([block], "pol", "lqg", (2 + axis,), timing.delay, RATE_HZ)
-            left = left_power(law, 2 * np.pi * frequency_hz / RATE_HZ, timing)[:, 0]
-            return float(power @ left + variance * noise_gain(law, timing.delay)[0])
+            passed = left_power(law, 2 * np.pi * frequency_hz / RATE_HZ, timing)[:, 0]
+            return float(power @ passed + variance * noise_gain(law, timing.delay)[0])
 
-        found = minimize(left, (-2.0, 0.7), method="Nelder-Mead", bounds=_DRIFT_BOUNDS, options={"xatol": 0.02})
+        found = minimize(residual, (-2.0, 0.7), method="Nelder-Mead", bounds=_DRIFT_BOUNDS, options={"xatol": 0.02})
         (step, corner), ((least, most), (lowest, _)) = found.x, _DRIFT_BOUNDS
         if min(step - least, most - step, corner - lowest) < 0.05:
-            raise RuntimeError(f"the least is not within {_DRIFT_BOUNDS}: ended at {found.x}")
+            raise RuntimeError(f"no minimum within {_DRIFT_BOUNDS}: ended at {found.x}")
         best.append(found.fun)
     return float(np.sqrt(np.mean(best)) / tilt_nm_per_mas(config.star.diameter_m))
 
 
 def render(figures: Figures) -> str:
-    """A line for each case and law, and a note for each case."""
+    """A row for each case and law, and a note for each case."""
     head = (
         *("sensor", "law", "residual tilt, mas rms per axis", "predicted from the log"),
         *("disturbance and noise parts (theory)", "gain margin", "phase margin, deg"),
@@ -167,11 +172,11 @@ def render(figures: Figures) -> str:
         )
         notes.append(
             f"- {name}: the noise of a frame is {one['noise_mas']:.2f} mas; the residual during identification was "
-            f"{one['identified_under_mas']:.2f} mas. LQG left {got_mas / theory_mas:.2f} times the theoretical "
-            f"residual of that law ({theory_mas:.3f} mas), and {got_mas / one['optimum_mas']:.2f} times that of an LQG "
+            f"{one['identified_under_mas']:.2f} mas. LQG reached {got_mas / theory_mas:.2f} times its "
+            f"theoretical residual ({theory_mas:.3f} mas), and {got_mas / one['optimum_mas']:.2f} times that of an LQG "
             "law with the exact lines of the wheel and a random walk behind a low-pass as drift "
             f"({one['optimum_mas']:.3f} mas). Theory for LQG identified from shorter data: {shorter}. "
-            f"With the lines 2 % higher it left {one['moved']['before_mas']:.2f} mas, and "
+            f"With the lines 2 % higher its residual was {one['moved']['before_mas']:.2f} mas, and "
             f"{one['moved']['after_mas']:.3f} mas after identification from the same run.\n"
         )
     return (

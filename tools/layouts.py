@@ -1,4 +1,4 @@
-"""Layouts for rerun, in deploy/layouts: for a log that rerun opens by itself, and for what `lowfc view` draws.
+"""Layouts for rerun, in deploy/layouts: for a log opened directly in rerun, and for the drawings of `lowfc view`.
 
 Rerun decodes every message into one struct; a mapping selects a field of it. Rerun applies a layout to data with the
 same application id, which for a log is the name of its file: `rerun rrd route` writes that id into the layout.
@@ -23,7 +23,7 @@ from tools.shared import ROOT
 
 LAYOUTS = ROOT / "deploy" / "layouts"
 TIMELINE = "message_publish_time"
-"""The timeline of sending times, of those that rerun gives to a log."""
+"""Rerun's timeline of publish times."""
 
 MIRROR = "dm"
 MODES = tuple(map(mode_name, NOLLS_14))

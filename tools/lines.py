@@ -1,4 +1,4 @@
-"""LQG for damped lines of several widths, beside the best law that keeps the margins."""
+"""LQG for damped lines of several widths, and the best law within the margins."""
 
 from typing import Any
 
@@ -19,33 +19,33 @@ FRAMES = 16_000
 
 
 def case(width: float, magnitude: float, delay: float, seeds: int = SEEDS) -> Figures:
-    """What laws leave in theory of lines of a width (of their frequency), mas rms per axis.
+    """Theoretical residuals of laws for lines of this relative width, mas rms per axis.
 
-    Laws are identified from frames without images: the means over the exposures, and noise as the twin's images have
-    it (`tests/control/laws/test_lines.py` has both side by side).
+    Laws are identified without images, from means over the exposures with the noise of the twin's images
+    (`tests/control/laws/test_lines.py` compares both).
     """
     keys: dict[str, Any] = {"star.magnitude": magnitude, "disturbance.line_width": width}
     config = configured(delay_frames=delay, **keys)
     calibration = calibrated(config)
-    left_mas = []
+    residual_mas = []
     for seed in range(1, 1 + seeds):
         own = configured(delay_frames=delay, seed=seed, **keys)
         law = tuned(tilts_of(own, frame_noise_nm(own, calibration)[:2], FRAMES), own)["lqg"].law
-        left_mas.append(float(np.hypot(*theory_mas(own, calibration, law))))
+        residual_mas.append(float(np.hypot(*theory_mas(own, calibration, law))))
     return {
         "width": width,
         "magnitude": magnitude,
         "delay_frames": delay,
-        "identified_mas": left_mas,
+        "identified_mas": residual_mas,
         "best_within_margins_mas": optimum_mas(config, calibration, robust=True),
         "optimum_mas": optimum_mas(config, calibration),
     }
 
 
 def tilts_of(config: Configuration, noise_nm: Any, frames: int) -> Pieces:
-    """Pseudo-open-loop tilts (frames, 2) as the sensor would measure them: means over exposures under white noise."""
+    """Pseudo-open-loop tilts (frames, 2) as the sensor would measure them: means over exposures, with white noise."""
     instants = config.camera.exposure_fraction * GAUSS_LEGENDRE
     sampler = Sampler(disturbance_of(config), instants, RATE_HZ)
-    seen_nm = np.array([sampler.at(index)[:, :2].mean(axis=0) for index in range(frames)], np.float64)
+    exposure_nm = np.array([sampler.at(index)[:, :2].mean(axis=0) for index in range(frames)], np.float64)
     noise = np.random.default_rng([config.seed, 5]).standard_normal((frames, 2))
-    return Pieces((seen_nm + noise_nm * noise,), 0)
+    return Pieces((exposure_nm + noise_nm * noise,), 0)

@@ -1,11 +1,11 @@
-"""Make every generated part of the documentation: what is measured, and what the code declares.
+"""Generate the tables and pictures of the documentation, from measurements and from the code.
 
-A page says between `[[[cog` and `[[[end]]]` which table stands there. Measured tables come from the JSON files in
-`tools/measured`, the others from the code itself; a test compares every page with them.
+A page names its table between `[[[cog` and `[[[end]]]`. Measured tables come from the JSON files in
+`tools/measured`, the others from the code; a test compares every page with them.
 
 Example:
-    python -m tools.measure                # the pages again, from what was measured and from the code
-    python -m tools.measure laws sensors   # measures these anew, then the pages
+    python -m tools.measure                # regenerate the pages from stored measurements and the code
+    python -m tools.measure laws sensors   # repeat these measurements, then regenerate the pages
     python -m tools.measure pictures       # the pictures of the views, with real processes
     python -m tools.measure console        # the pictures of the console
     python -m tools.measure layouts        # the layouts for rerun in deploy/layouts
@@ -49,10 +49,10 @@ class Measurement(NamedTuple):
     """One table of the documentation.
 
     Attributes:
-        commands: what it runs besides its own code.
-        measure: makes its figures.
-        render: makes the table of them.
-        signed: whether the table says itself when, where and how it was measured.
+        commands: commands that it runs besides its own code.
+        measure: returns its figures.
+        render: returns the table of the figures.
+        signed: whether the table includes date, host and method.
     """
 
     commands: tuple[str, ...]
@@ -62,7 +62,7 @@ class Measurement(NamedTuple):
 
 
 def _of(command: str, render: Callable[[Figures], str], signed: bool = False) -> Measurement:
-    """What one command measures."""
+    """The measurement made by one command."""
     return Measurement((command,), partial(json_of, command), render, signed)
 
 
@@ -103,7 +103,7 @@ COMPOSED: dict[str, Callable[[], str]] = {
     "loop in short": lambda: loop.short(measured("loop")),
     "targets": lambda: targets.render(measured),
 }
-"""Tables of figures that other measurements made."""
+"""Tables composed of other measurements."""
 
 
 def table(name: str) -> str:
@@ -121,13 +121,13 @@ def table(name: str) -> str:
 
 
 def measured(name: str) -> Figures:
-    """The figures of the last measurement."""
+    """Figures of the last measurement."""
     figures: Figures = json.loads((MEASURED / f"{name}.json").read_text())
     return figures
 
 
 def generated(page: Path) -> str:
-    """A page with its tables as they are now."""
+    """A page with its tables regenerated."""
     from cogapp import Cog
 
     cog = Cog()

@@ -1,7 +1,7 @@
-"""The simulated loop without images: the sensor is linear, its noise has the covariance of the twin's images.
+"""The simulated loop without images: a linear sensor with the noise covariance of the twin's images.
 
-The live loop's own `advance` takes frames of a few pixels that hold the modes as measured, so that hours can be folded.
-What is left out: the sensor's curvature, the mirror's print-through and the steps of its driver.
+The live loop's own `advance` receives frames of a few pixels that encode the measured modes, so that hours can be
+simulated. Not included: the sensor's nonlinearity, the mirror's print-through and the steps of its driver.
 """
 
 from dataclasses import replace
@@ -30,7 +30,7 @@ _DRAWN = 1024
 
 
 def _two_pixels_a_mode(noll: tuple[int, ...]) -> Calibration:
-    """A sensor with two pixels for each mode, one brighter and one darker, and a mirror with one actuator for each."""
+    """A sensor with two pixels for each mode, of opposite response, and a mirror with one actuator for each."""
     modes = len(noll)
     flux_dn, pixels = 2 * modes * _LEVEL_DN, 2 * modes
     H = np.vstack([np.eye(modes), -np.eye(modes)]) * _DN_PER_NM / flux_dn
@@ -59,13 +59,13 @@ def _two_pixels_a_mode(noll: tuple[int, ...]) -> Calibration:
 
 
 class ModalBench(Bench):
-    """A loop of modes; what it did is kept until `forget`."""
+    """A loop of modes; it records until `forget`."""
 
-    def __init__(self, config: Configuration, covariance_nm2: Array, shaken: Disturbance | None = None) -> None:
-        """Noise of this covariance (modes, modes); `shaken` is another disturbance than the configuration's."""
+    def __init__(self, config: Configuration, covariance_nm2: Array, disturbance: Disturbance | None = None) -> None:
+        """Noise of this covariance (modes, modes); `disturbance` replaces the configuration's."""
         self.config, self.refused = config, 0
         self.nm_per_mas = tilt_nm_per_mas(config.star.diameter_m)
-        self._shaken = disturbance_of(config) if shaken is None else shaken
+        self._disturbance = disturbance_of(config) if disturbance is None else disturbance
         self._settings = factory.settings(config)
         self._watch = GainWatch(self._settings, config.control.on_harm)
         self.events = []
@@ -74,7 +74,7 @@ class ModalBench(Bench):
         self._mix = np.linalg.cholesky(covariance_nm2).T.astype(np.float32)
         self._noise = np.random.Generator(np.random.SFC64(np.random.SeedSequence([config.seed, 3])))
         self._weights = delay_weights(config.camera.delay_frames).astype(np.float32)
-        self._given = [np.zeros(len(config.noll), np.float32)] * len(self._weights)
+        self._mirror_shapes_nm = [np.zeros(len(config.noll), np.float32)] * len(self._weights)
         self._index = 0
         self.forget()
 
@@ -85,50 +85,52 @@ class ModalBench(Bench):
 
     def _sampled(self) -> Sampler:
         instants = np.concatenate([self.config.camera.exposure_fraction * _SEEN, _INSTANTS])
-        return Sampler(self._shaken, instants, self.config.camera.rate_hz)
+        return Sampler(self._disturbance, instants, self.config.camera.rate_hz)
 
     def move_lines(self, factor: float) -> None:
-        """Put the lines at other frequencies from here on, without a jump; at the beginning of a block of frames."""
+        """Change the frequencies of the lines from now on, without a jump; only at the start of a block of frames."""
         if self._index % BLOCK:
-            raise ValueError(f"lines move at a frame that is a multiple of {BLOCK}, not at {self._index}")
-        moved = with_lines_moved(self._shaken, factor)
-        turns = (self._shaken.frequency_hz - moved.frequency_hz) * self._index / self.config.camera.rate_hz
-        amplitude_nm = self._shaken.amplitude_nm * np.exp(2j * np.pi * turns)[:, None]
-        self._shaken = replace(moved, amplitude_nm=amplitude_nm)
+            raise ValueError(f"lines can move only at a frame that is a multiple of {BLOCK}, not at {self._index}")
+        moved = with_lines_moved(self._disturbance, factor)
+        turns = (self._disturbance.frequency_hz - moved.frequency_hz) * self._index / self.config.camera.rate_hz
+        amplitude_nm = self._disturbance.amplitude_nm * np.exp(2j * np.pi * turns)[:, None]
+        self._disturbance = replace(moved, amplitude_nm=amplitude_nm)
         before, self._sampler = self._sampler, self._sampled()
         was, now = vars(before)["_lines"], vars(self._sampler)["_lines"]
-        for name in ("_rng", "_next", "_vector") if now is not None else ():  # damped lines go on from where they are
+        for name in ("_rng", "_next", "_vector") if now is not None else ():  # damped lines keep their state
             setattr(now, name, getattr(was, name))
 
     def run(self, frames: int, *, record: bool = True) -> None:
-        """Expose, control, move the mirror; events are recorded always."""
+        """Expose, control, move the mirror; events are always recorded."""
         noise_nm = np.zeros((0, 0), np.float32)
         for count in range(frames):
             if not count % _DRAWN:
                 noise_nm = self._noise.standard_normal((_DRAWN, len(self._mix)), np.float32) @ self._mix
-            given_nm: Any = sum(weight * past for weight, past in zip(self._weights, self._given, strict=True))
+            mirror_nm: Any = sum(
+                weight * past for weight, past in zip(self._weights, self._mirror_shapes_nm, strict=True)
+            )
             modes_nm = self._sampler.at(self._index)
-            pixels = _encoded(modes_nm[:2].mean(axis=0) + given_nm + noise_nm[count % _DRAWN])
+            pixels = _encoded(modes_nm[:2].mean(axis=0) + mirror_nm + noise_nm[count % _DRAWN])
             time_ns = 10**18 + self._index * self.config.period_ns
             self._state, outputs = advance(
                 self._settings, self._state, Frame((1 << 32) + self._index, time_ns, 0, pixels)
             )
             self._index += 1
             self._watched(outputs)
-            newest_nm = self._given[0]
+            newest_nm = self._mirror_shapes_nm[0]
             if outputs.command is not None:
                 newest_nm = 2 * outputs.command.actuators_nm.ravel()
-            self._given = [newest_nm, *self._given[:-1]]
+            self._mirror_shapes_nm = [newest_nm, *self._mirror_shapes_nm[:-1]]
             if outputs.step is None or outputs.step.pol_nm is None:
                 self.refused += 1
             elif record:
                 self.steps.append(outputs.step)
-                self._squares.append(np.square(modes_nm[2:] + given_nm).mean(axis=0))
+                self._squares.append(np.square(modes_nm[2:] + mirror_nm).mean(axis=0))
 
     def residual_nm(self, *, continuous: bool = True) -> Array:
         """True residual (frames, modes) of the record, rms over each period."""
         if not continuous:
-            raise ValueError("a modal bench knows means over periods alone")
+            raise ValueError("a modal bench has only means over periods")
         return np.sqrt(np.array(self._squares, np.float64))
 
 

@@ -1,4 +1,4 @@
-"""Automatic gains on every star: what closing the loop changes, and what the best fixed gains would leave."""
+"""Automatic gains for stars of all magnitudes: effect of closing the loop, and comparison with the best fixed gains."""
 
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -22,11 +22,11 @@ MAGNITUDES = tuple(range(-1, 9))
 BRIGHT = (-1, 0, 2)
 SEEDS = tuple(range(1, 9))
 IMAGED = ("sam", "zwfs")
-"""Sensors whose images are simulated, too, for some stars."""
+"""Sensors for which some stars are repeated with simulated images."""
 MODAL = ("sam", "sam27d10_bal14", "clowfs", "zwfs", "bar")
 IMAGED_MAGNITUDES = (2, 5, 8)
 OF_DARK_ZONE = 0.01
-"""Part of the dark zone's own contrast that may be added, besides three standard errors where something disturbs."""
+"""Tolerated added contrast as a fraction of the dark zone's own, in addition to three standard errors."""
 RATE_HZ, SECONDS = 250.0, 20.0
 GAINS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.1)
 _HALF = int(RATE_HZ * SECONDS / 2)
@@ -46,7 +46,7 @@ def _noise(sensor: str, magnitude: float) -> Array:
 
 @lru_cache(maxsize=8)
 def _contrast(sensor: str) -> tuple[Array, float]:
-    """The form of what modes add to the contrast, (modes, modes), per nm^2, and the dark zone's own."""
+    """Quadratic form (modes, modes) of the added contrast, per nm^2, and the dark zone's own contrast."""
     made = factory.contrast_of(_configured(sensor, "bench", 0.0, 1, {}))
     assert made is not None  # noqa: S101  # each of these has a science image
     return made.form, made.by_image(np.zeros(len(made.noll)))
@@ -54,26 +54,26 @@ def _contrast(sensor: str) -> tuple[Array, float]:
 
 @lru_cache(maxsize=64)
 def _open_nm2(preset: str, seed: int) -> Array:
-    """Mean squares (modes,) of the disturbance over the second half; of any sensor and star."""
+    """Mean squares (modes,) of the disturbance over the second half, for any sensor and star."""
     config = _configured("sam", preset, 0.0, seed, FIXED_GAINS)
     bench = ModalBench(config, np.eye(len(config.noll)))
     bench.ask("open")
-    return _left_nm2(bench)
+    return _residual_nm2(bench)
 
 
-def _left_nm2(bench: ModalBench) -> Array:
+def _residual_nm2(bench: ModalBench) -> Array:
     bench.run(_HALF, record=False)
     bench.run(_HALF)
     return np.asarray(np.square(bench.residual_nm()).mean(axis=0))
 
 
 def _modal(sensor: str, preset: str, magnitude: float, seed: int, gains: dict[str, Any]) -> Array:
-    """Mean squares (modes,) that are left over the second half."""
-    return _left_nm2(ModalBench(_configured(sensor, preset, magnitude, seed, gains), _noise(sensor, magnitude)))
+    """Mean squares (modes,) of the residual over the second half."""
+    return _residual_nm2(ModalBench(_configured(sensor, preset, magnitude, seed, gains), _noise(sensor, magnitude)))
 
 
 def of_modes(case: tuple[str, str, float]) -> Figures:
-    """Closed minus open of one sensor, preset and star, in contrast, by modes; on bright stars fixed gains, too."""
+    """Contrast, closed minus open, of one sensor, preset and star, by modes; for bright stars also fixed gains."""
     sensor, preset, magnitude = case
     form, own = _contrast(sensor)
     try:
@@ -96,7 +96,7 @@ def of_modes(case: tuple[str, str, float]) -> Figures:
 
 
 def of_images(case: tuple[str, str, float]) -> Figures:
-    """The same with every image simulated."""
+    """As `of_modes`, with every image simulated."""
     sensor, preset, magnitude = case
     form, own = _contrast(sensor)
     calibration = calibrated(_configured(sensor, preset, magnitude, 1, _AUTO))
@@ -131,7 +131,7 @@ def _row(case: tuple[str, str, float], change: Array, own: float, open_nm: float
 
 
 def harms(row: Figures) -> bool:
-    """Whether closing the loop adds more than it may."""
+    """Whether closing the loop adds more contrast than tolerated."""
     errors = 0 if row["preset"] == "quiet" else 3
     return bool(row["change"] > errors * row["error"] + OF_DARK_ZONE * row["own"])
 
@@ -149,7 +149,7 @@ def measure(
 
 
 def render(figures: Figures) -> str:
-    """A line for each sensor and star: wavefront open and closed by preset, and where closing harms."""
+    """A row for each sensor and star: wavefront open and closed by preset, and cases in which closing harms."""
     rows = [row for row in figures["rows"] if "saturates" not in row]
     modal = [row for row in rows if "images" not in row]
     table = []
@@ -172,14 +172,14 @@ def render(figures: Figures) -> str:
         f"`{name}`": f"{{{name}}}" for name in PRESETS if name != "quiet"
     }
     return (
-        f"{columns(heads, table)}\nTrue wavefront open and closed with automatic gains, nm rms over the second half "
+        f"{columns(heads, table)}\nTrue wavefront, open to closed with automatic gains, nm rms over the second half "
         f"of {figures['seconds']:g} s at {figures['rate_hz']:g} Hz, mean of {figures['seeds']} seeds. "
         f"Number of cases: {len(rows)} (V = {stars}; these presets and `quiet`; {len(rows) - len(modal)} of them "
         "with every image simulated). Cases in which "
-        f"closing adds contrast by more than three standard errors (of `quiet`: none) and {100 * OF_DARK_ZONE:g} % of "
-        f"the dark zone's own, with that ratio: {names or 'none'}. On bright stars (V = {_listed(bright)}) the "
+        f"closing adds more than {100 * OF_DARK_ZONE:g} % of the dark zone's own contrast plus three standard errors "
+        f"(`quiet`: without these), with that ratio: {names or 'none'}. On bright stars (V = {_listed(bright)}) the "
         f"residual with automatic gains is {min(compared):.2f} to {max(compared):.2f} times that of the best fixed "
-        "gains, found afterwards."
+        "gains, chosen afterwards."
     )
 
 

@@ -1,7 +1,7 @@
 """Make the pictures of docs/howto/viewing.md and the README: `python -m tools.measure pictures`, about three minutes.
 
-Real processes are brought into each state by hand, as an operator's bad night would, and `lowfc view
---headless-screenshot` looks at them. Needs a Vulkan driver: `apt install mesa-vulkan-drivers libvulkan1`.
+Real processes are brought into each state, and `lowfc view --headless-screenshot` takes the picture.
+Needs a Vulkan driver: `apt install mesa-vulkan-drivers libvulkan1`.
 """
 
 import contextlib
@@ -26,15 +26,15 @@ from tools.shared import ROOT
 
 PICTURES = ROOT / "docs" / "pictures"
 LOOK_S = 10.0
-"""How long a view looks before its picture is taken; states come about in the middle of it."""
-MENU_BAR = 37  # pixels at the top that say nothing about the loop
+"""Time from the start of a view to its picture; states change in the middle of it."""
+MENU_BAR = 37  # pixels at the top without information on the loop
 SHADES = 192
 BRIGHT = {"control.start_mode": "closed", "sensor.sam": "sam27d10_bal14"}
 SMALL_WELL = {"control.start_mode": "closed", "camera.full_well_e": 1500.0}
 
 
 def picture(name: str, source: str, *more: str, meanwhile: Callable[[], object] | None = None) -> None:
-    """Look at a run or a log, let something happen meanwhile, keep the picture among those of the documentation."""
+    """Take a picture of a run or a log while `meanwhile` runs, and store it in the documentation."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / f"{name}.png"
         words = [sys.executable, "-m", "lowfc", "view", *source.split(), "--headless-screenshot", str(out), *more]
@@ -58,14 +58,14 @@ class Night(ChaosBench):
         picture(name, f"--run {self.run.run_id}", "--tab", tab, "--seconds", f"{LOOK_S}", meanwhile=meanwhile)
 
     def other_camera(self, keys: dict[str, Any]) -> None:
-        """Start the camera anew before another star."""
+        """Restart the camera with another star."""
         file = self.folder / "other.toml"
         file.write_text(load(None, keys).to_toml())
         self.kill(Role.CAMERA)
         self.restart(Role.CAMERA, [*self.children[Role.CAMERA].command, "--config", str(file)], ready=False)
 
     def stumble(self) -> None:
-        """Hold the controller up for a moment, again and again."""
+        """Stop the controller repeatedly for 40 ms."""
         for _ in range(12):
             self.signal(Role.CONTROLLER, signal.SIGSTOP)
             time.sleep(0.04)
@@ -81,7 +81,7 @@ def night(keys: dict[str, Any]) -> Iterator[Night]:
         run = Night(config, Path(name), random.Random(1), None)  # noqa: S311  # nothing secret
         try:
             run.begin()
-            time.sleep(6)  # starting, a loop skips some frames, and the tiles remember that for five seconds
+            time.sleep(6)  # a starting loop skips some frames, and the tiles show that for five seconds
             yield run
         finally:
             run.end()

@@ -30,7 +30,7 @@ GAINS = "[control]\ntilt_gain = 0.5\ngain = 0.05\n"
 COMMAND = f"lowfc sim-loop --sensor NAME --rate {RATE_HZ} --duration {DURATION_S} --lockstep --no-record --config FILE"
 PRESETS = ("bench", "reaction-wheel")
 SHEAR = 1e-3
-"""Pupil diameters."""
+"""Shear whose wavefront error the table gives, pupil diameters."""
 
 
 def configured(name: str, **changed: Any) -> Configuration:
@@ -130,13 +130,13 @@ def render(figures: Figures) -> str:
         "detector; peak is the brightest pixel's share of that; cond14 is the condition number of H for Z2 "
         "to Z15. Quantum is the ratio "
         "of the quantum limit to the Cramer-Rao bound in variance: the median of the modes, without read noise. "
-        "The noise is that of tip and tilt, rms of both axes, in one frame of "
+        "Noise is of tip and tilt, rms of both axes, in one frame of "
         f"{star.exposure_ns / 1e6:g} ms of a star of V = {star.star.magnitude:g}, all {len(star.noll)} modes fitted, "
         "all photons at the central wavelength; then with "
         "the same photons over the band of 20 %, in four wavelengths; then with the shear of the beam as an additional "
         f'fitted parameter. "Shear, nm" is the wavefront error, nm rms over the circle, from a shear of '
         f"{100 * SHEAR:g} % of the diameter that is not fitted. The twin's time is for one frame on one thread. "
-        "The loop's columns are open -> closed: the true wavefront over the open pupil and the true tilt, "
+        "The last columns are open loop -> closed loop: true wavefront over the open pupil, and true tilt, "
         f"in the second half of {DURATION_S} simulated seconds at "
         f"{RATE_HZ} Hz with gains of 0.5 for tilt and 0.05 for the rest, in FILE."
     )

@@ -144,7 +144,7 @@ def _subclasses(kind: type[Result]) -> set[type[Result]]:
 
 
 def events(*levels: Level) -> str:
-    """Every event of these levels: its text, its cause, what to do."""
+    """Every event of these levels: text, cause, remedy."""
     return "\n".join(_event(one) for one in EVENTS.values() if one.level in levels)
 
 

@@ -1,4 +1,4 @@
-"""How well the simulated loop holds slow drifts, mode by mode: the second table of docs/howto/tuning.md."""
+"""Slow drifts of each mode in the simulated loop: the table of slow modes in docs/howto/tuning.md."""
 
 from typing import Any
 
@@ -16,11 +16,11 @@ from tools.law_bench import Bench, calibrated, configured
 from tools.shared import Figures, markdown
 
 WINDOWS, WINDOW_S, SETTLE_S = 10, 100.0, 20.0
-WANTED_PM = 20.0
+TARGET_PM = 20.0
 RATE_HZ = 250.0
-"""The configuration's own; photons per second are what counts, and the drift is a thousand times slower."""
+"""The default; only photons per second matter, and the drift is a thousand times slower."""
 EXPOSED = (0.5, 0.9)
-"""Parts of a frame in which light is collected: the configuration's own, and what the loop's latency leaves of 4 ms."""
+"""Exposures as fractions of a period: the default, and what the loop's latency permits of 4 ms."""
 KEYS: dict[str, Any] = {
     "camera.rate_hz": RATE_HZ,
     "camera.read_noise_e": 1.0,
@@ -39,7 +39,7 @@ def measure() -> Figures:
 
 
 def case(config: Configuration) -> Figures:
-    """What is left of each mode in the means over windows, rms over the windows, and what light and camera allow."""
+    """Mean residual of each mode over windows, rms over the windows, and the bounds by light and camera."""
     calibration = calibrated(config)
     bench = Bench(config, calibration)
     frames = round(WINDOW_S * RATE_HZ)
@@ -75,7 +75,7 @@ def case(config: Configuration) -> Figures:
 
 
 def photon_bound_nm(calibration: Calibration, light_e: float) -> Array:
-    """The least standard deviation (modes,) that any unbiased estimate from so many electrons can have, nm."""
+    """Least standard deviation (modes,) of an unbiased estimate from this number of electrons, nm."""
     H, I0 = calibration.response.astype(np.float64) * light_e, calibration.reference.astype(np.float64) * light_e
     return np.asarray(np.sqrt(np.diag(cramer_rao(H, variance_e(I0, 0.0)))))
 
@@ -86,25 +86,25 @@ def _rms(windows: Array) -> Array:
 
 
 def render(figures: Figures) -> str:
-    """A line for each mode."""
+    """A row for each mode."""
     cases = figures["cases"]
     first, *_ = cases.values()
     head = ["mode", "drift, nm rms"]
     for name in cases:
         head += [f"light for {name} of a frame: residual, pm rms", "photon-noise bound, pm"]
-        head += ["photon and read noise through R, pm", f"below {WANTED_PM:g} pm"]
+        head += ["photon and read noise through R, pm", f"below {TARGET_PM:g} pm"]
     head.append("mirror's part, pm rms")
     rows = []
     for mode, one in first["modes"].items():
         cells = [mode, f"{one['drift_nm']:.2f}"]
         for of in (found["modes"][mode] for found in cases.values()):
-            verdict = "yes" if of["left_pm"] < WANTED_PM else "no"
+            verdict = "yes" if of["left_pm"] < TARGET_PM else "no"
             cells += [f"**{of['left_pm']:.1f}**", f"{of['photon_bound_pm']:.1f}", f"{of['noise_pm']:.1f}", verdict]
         rows.append([*cells, f"{one['mirror_pm']:.1f}"])
     passed = ". ".join(
         f"Light for {name} of a frame, {found['light_e_per_s']:.3g} electrons a second: "
-        f"{sum(one['left_pm'] < WANTED_PM for one in found['modes'].values())} of {len(found['modes'])} modes below "
-        f"{WANTED_PM:g} pm, {found['frames_refused']} frames refused"
+        f"{sum(one['left_pm'] < TARGET_PM for one in found['modes'].values())} of {len(found['modes'])} modes below "
+        f"{TARGET_PM:g} pm, {found['frames_refused']} frames refused"
         for name, found in cases.items()
     )
     return (
@@ -112,6 +112,6 @@ def render(figures: Figures) -> str:
         f"V = {KEYS['star.magnitude']:g}, {KEYS['camera.read_noise_e']:g} e- of read noise, {RATE_HZ:g} Hz; sensor "
         "images through the live loop's own `advance` and the simulated mirror, as in lockstep; integrator with gains "
         f"of {first['tilt_gain']:g} (tilt) and {first['gain']:g}. Means of the true residual over windows of "
-        f"{WINDOW_S:g} s, rms about zero over {WINDOWS} windows after {SETTLE_S:g} s; drift is the same of the "
+        f"{WINDOW_S:g} s, rms about zero over {WINDOWS} windows after {SETTLE_S:g} s; drift is the same for the "
         "disturbance."
     )

@@ -1,4 +1,4 @@
-"""What each imperfection of the simulated world costs: residual and contrast with and without it."""
+"""Residual and added contrast with each imperfection of the simulated bench: the table of docs/measured/world.md."""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -18,7 +18,7 @@ from tools.shared import Figures, markdown
 SENSORS, MAGNITUDES = ("sam27d10_bal14", "zwfs"), (2, 5)
 PRESET, RATE_HZ, SECONDS = "bench", 500.0, 4.0
 _UNTIL_GAINS_S = 2.5
-_FRAMES = 2000  # averaged for a dark and a reference image
+_FRAMES = 2000  # mean for the dark and for the reference image
 WHEEL = {"disturbance.wheel_hz": 12.0}
 CASES: dict[str, dict[str, Any]] = {
     "none": {},
@@ -27,23 +27,23 @@ CASES: dict[str, dict[str, Any]] = {
     "a wheel whose speed wanders": WHEEL | {"disturbance.wheel_course": "walk", "disturbance.wheel_change": 0.5},
     "a wheel that runs down": WHEEL | {"disturbance.wheel_course": "run-down", "disturbance.wheel_change": 3.0},
     "two wheels that beat": WHEEL | {"disturbance.second_wheel_hz": 0.5},
-    "jitter beyond half the rate": {"disturbance.jitter_mas": 1.0},
+    "jitter above half the frame rate": {"disturbance.jitter_mas": 1.0},
     "drift as a random walk": {"disturbance.drift_nm": {str(noll): 0.2 for noll in range(2, 16)}},
-    "drift as flicker": {
+    "drift with a 1/f spectrum": {
         "disturbance.drift_nm": {str(noll): 0.2 for noll in range(2, 16)},
         "disturbance.drift_slope": 1.0,
     },
     "shear of the beam": {"disturbance.shear": 1e-3},
-    "gains of the actuators": {"mirror.gain_error": 0.1},
+    "actuator gain errors": {"mirror.gain_error": 0.1},
     "hysteresis": {"mirror.hysteresis": 0.1},
     "creep": {"mirror.creep": 0.01},
     "dark current": {"camera.dark_current_e_s": 1000.0},
     "hot pixels": {"camera.hot_pixels": 0.005},
-    "response not linear": {"camera.nonlinearity": 0.02},
-    "response not uniform": {"camera.nonuniformity": 0.01},
+    "nonlinear pixel response": {"camera.nonlinearity": 0.02},
+    "pixel gain errors": {"camera.nonuniformity": 0.01},
 }
-CALIBRATED = ("hot pixels", "response not linear", "response not uniform")
-"""Cases that are repeated with a dark and a reference image measured on that detector."""
+CALIBRATED = ("hot pixels", "nonlinear pixel response", "pixel gain errors")
+"""Cases that are repeated with dark and reference image measured on that detector."""
 
 
 def measure(sensors: tuple[str, ...] = SENSORS, seconds: float = SECONDS) -> Figures:
@@ -59,17 +59,17 @@ def measure(sensors: tuple[str, ...] = SENSORS, seconds: float = SECONDS) -> Fig
 
 
 def _configured(sensor: str, magnitude: float, keys: dict[str, Any]) -> Configuration:
-    usual: dict[str, Any] = {
+    base: dict[str, Any] = {
         "disturbance.preset": PRESET,
         "star.magnitude": float(magnitude),
         "camera.rate_hz": RATE_HZ,
     }
-    return configured(sensor, **usual | {"control.start_mode": "closed"} | keys)
+    return configured(sensor, **base | {"control.start_mode": "closed"} | keys)
 
 
 @lru_cache
 def _gains(sensor: str, magnitude: float) -> tuple[float, ...]:
-    """The automatic gains (modes,) in the world without imperfections."""
+    """Automatic gains (modes,) of the loop without imperfections."""
     automatic = {"control.tilt_gain": "auto", "control.gain": "auto"}
     config = _configured(sensor, magnitude, automatic)
     bench = Bench(config, calibrated(config))
@@ -100,12 +100,12 @@ def _residual(sensor: str, magnitude: float, keys: dict[str, Any], seconds: floa
 
 def _measured(config: Configuration, calibration: Calibration) -> Calibration:
     """The calibration with dark and reference image averaged from frames of this detector."""
-    still = config.disturbance.model_copy(update={"preset": "quiet"})
+    quiet = config.disturbance.model_copy(update={"preset": "quiet"})
     flat = np.zeros(calibration.grid, np.float32)
     means = []
     for magnitude in (20.0, config.star.magnitude):
         star = config.star.model_copy(update={"magnitude": magnitude})
-        lit = scene(config.model_copy(update={"disturbance": still, "star": star}))
+        lit = scene(config.model_copy(update={"disturbance": quiet, "star": star}))
         means.append(np.mean([lit.expose(index, flat).ravel() for index in range(_FRAMES)], axis=0))
     light = means[1] - means[0]
     reference = light / light.sum() * calibration.reference.sum()
@@ -125,13 +125,12 @@ def render(figures: Figures) -> str:
         cells = [(f"{one['residual_nm']:.2f}", f"{one['contrast']:.1e}") for one in row["figures"]]
         lines.append([name, keys, *(cell for pair in cells for cell in pair)])
     return (
-        f"{markdown(head, lines)}\nResidual of the true wavefront over the open pupil, continuous, and the mean "
+        f"{markdown(head, lines)}\nTrue residual wavefront over the open pupil in continuous time, and mean "
         "contrast that the modes add to the dark zone (quadratic form), over the second half of "
         f"{figures['seconds']:g} s at {RATE_HZ:g} Hz, disturbance `{PRESET}`, one seed, with the automatic gains "
         "of the loop without imperfections. Sensor images pass through the live loop's own `advance` and the simulated "
-        "mirror. The calibration is the analytic one, which includes dark current and no other "
-        "imperfection, or one with "
-        "the measured dark and reference image of that detector."
+        "mirror. The calibration is analytic and includes no imperfection except dark current, or has dark and "
+        "reference image measured on that detector."
     )
 
 
