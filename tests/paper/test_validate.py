@@ -216,7 +216,7 @@ def test_the_command_prints_a_table_and_tells_who_names_a_sensor_where_that_chan
     done = lowfc("validate", "table1")
     assert told not in done.stderr
     assert "pupil diameters" in done.stdout
-    assert "[1] The model knows focal lengths and diameters only by their ratio." in done.stdout
+    assert "[1] The model uses focal lengths and diameters only by their ratio." in done.stdout
     assert told not in lowfc("validate", "fig3", "--sensor", SAM).stderr
 
 
