@@ -34,7 +34,7 @@ SPANS = {"frame_to_command": "frame to command", "frame_to_mirror": "frame to mi
 AT = {"p50": "p50", "p99": "p99", "p99_9": "p99.9"}
 FRAMES, CHANNEL = "lowfs", "dm00disp03"
 
-_MEMORY = Path("/dev/shm")  # noqa: S108  # a folder of one's own is made in it
+_MEMORY = Path("/dev/shm")  # noqa: S108  # a private folder is created in it
 
 
 def options(parser: argparse.ArgumentParser) -> None:

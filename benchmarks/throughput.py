@@ -56,7 +56,7 @@ def measure(options: argparse.Namespace, tell: Tell) -> Result:
 
 
 def run_once(words: Sequence[str], rate_hz: float, seconds: float) -> Result:
-    """Run a loop once with these options of `lowfc latency`; failure, where it failed, is the last that it wrote.
+    """Run a loop once with these options of `lowfc latency`; `failure` has its last line if it failed.
 
     messages_lost is None without a recorder, commands_late the part of all commands, of a simulated camera alone.
     """

@@ -200,7 +200,7 @@ REASONS: dict[str, Advice] = {
     "WRONG_SIZE": Advice("rows, columns, encoding or bytes differ from the calibration", "set the camera's region"),
     "OUT_OF_ORDER": Advice("an older frame than the last one", "nothing, unless two cameras publish in one run"),
     "REPEATED": Advice("the frame was used before", "nothing, unless frequent"),
-    "LATE": Advice("older than `control.max_frame_age_ms` on arrival", "`lowfc doctor`; a clock of its own host"),
+    "LATE": Advice("older than `control.max_frame_age_ms` on arrival", "`lowfc doctor`; check the clocks of the hosts"),
     "SATURATED": Advice("more than `control.max_saturated_pixels` at full well", "shorter exposure, lower gain"),
     "DARK": Advice(
         "less light than `control.min_flux_fraction` of the calibration's",

@@ -25,7 +25,7 @@ _PHASES = {
     "without": "not started",
     "flooded and frozen": "flooded and stopped",
     "frozen": "stopped",
-    "flood without": "gone; flood goes on",
+    "flood without": "gone; flood continues",
 }
 """Phases of the case `console`, as the page names them."""
 
@@ -195,9 +195,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="CASE", help="case of `lowfc chaos`; default: all without a result")
     parser.add_argument("--seed", type=int, choices=SEEDS, required=True)
-    asked = parser.parse_args()
+    options = parser.parse_args()
     figures = json.loads(CASES_FILE.read_text())
-    measure_again(figures, asked.seed, asked.names)
+    measure_again(figures, options.seed, options.names)
     CASES_FILE.write_text(json.dumps(figures, indent=1) + "\n")
 
 

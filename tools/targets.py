@@ -1,4 +1,4 @@
-"""Targets of the fused step and of the loop around it, and what was measured."""
+"""Targets of the fused step and of the loop around it, and the measured figures."""
 
 from collections.abc import Callable, Iterator
 from statistics import median
@@ -9,7 +9,7 @@ from lowfc.control.kernel.tables import KERNELS
 from tools.shared import Figures, markdown
 
 NUMPY = f"lowfc, {KERNELS[0]}"
-HEAD = ("figure", "target", "reached", "met", "lower bound", "where the time goes")
+HEAD = ("figure", "target", "reached", "met", "lower bound", "what takes the time")
 
 
 class Target(NamedTuple):
@@ -75,8 +75,8 @@ def _contest(figures: Figures) -> Iterator[Target]:
         ratios = [mine / its for mine, its in pairs(NUMPY, at)]
         yield Target(f"frame to command, fused over numpy, {at}", most, ratios, "{:.2f}", shared, OBJECTS)
     ways = "sockets wake two Python processes; the C chain waits on semaphores in shared memory"
-    for other, asked in (("C chain", {"p50": 40.0, "p99": 80.0}), ("pyrtcao, fused", {"p50": 0.0, "p99": 0.0})):
-        for at, most in asked.items():
+    for other, targets in (("C chain", {"p50": 40.0, "p99": 80.0}), ("pyrtcao, fused", {"p50": 0.0, "p99": 0.0})):
+        for at, most in targets.items():
             differences = [mine - its for mine, its in pairs(other, at)]
             what = f"frame to command, fused minus {other}, {at}, us"
             where = ways if other == "C chain" else "the same; also checks, limits and messages that pyrtcao lacks"

@@ -92,7 +92,7 @@ static void actuators(void)
 
 static void mirror(void) { memcpy(last_actuators, input.array.F, ACTUATORS * sizeof *last_actuators); }
 
-/* Streams that a role reads and writes, where it notes the time, and what it does with each frame. */
+/* Streams that a role reads and writes, its array of times, and its work on each frame. */
 static const struct role {
     const char *name, *reads, *writes;
     uint8_t type;

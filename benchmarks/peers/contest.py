@@ -48,7 +48,7 @@ ROOT = Path(__file__).parents[2]
 SIZE = Size(SIDE, MODES, MIRROR_SIDE)
 PRIORITY = 50
 
-_MEMORY = Path("/dev/shm")  # noqa: S108  # a folder of one's own is made in it
+_MEMORY = Path("/dev/shm")  # noqa: S108  # a private folder is created in it
 _READY_S, _SETTLE_S, _LATER_S, _LOOK_S, _PATIENCE_S = 60.0, 0.3, 10.0, 0.02, 0.5
 _ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 _FIRST = ("source", "mirror", "modal_mirror")  # roles on the first processor
@@ -89,7 +89,7 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, tell: Tell) -> Result:
-    """Run all contestants in turns: the figures of each turn, None where it failed, and why a contestant is missing."""
+    """Run all contestants in turns: the figures of each turn (None if it failed), and why a contestant is missing."""
     chosen = [one for one in CONTESTANTS if any(word in one.name for word in options.only or [""])]
     if not chosen:
         raise ConfigurationError(f"--only: none of {'; '.join(one.name for one in CONTESTANTS)}")
@@ -147,7 +147,7 @@ def one_run(contestant: Contestant, rules: argparse.Namespace, priority: int) ->
 def figures(folder: Path, warm_up: int) -> dict[str, Any]:
     """Figures of a run without its first `warm_up` frames; percentiles in us, None without any command.
 
-    off: largest difference of the last actuators from those of numpy, relative to the largest actuator; None where a
+    off: largest difference of the last actuators from those of numpy, relative to the largest actuator; None if a
     command is missing.
     """
     due, published, commanded, received = (np.fromfile(folder / name, np.int64)[1:] for name in MARKS)

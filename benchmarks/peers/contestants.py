@@ -1,4 +1,4 @@
-"""The contestants: what each does, and what it requires on this host."""
+"""The implementations compared, and their requirements on this host."""
 
 import argparse
 import contextlib

@@ -1,1 +1,1 @@
-"""MCAP logs: written, read, recovered, copied."""
+"""MCAP logs: write, read, recover, copy."""

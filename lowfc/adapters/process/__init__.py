@@ -1,1 +1,1 @@
-"""What a process uses of its host: clocks, scheduling, service managers, terminals."""
+"""A process's access to its host: clocks, scheduling, service managers, terminals."""

@@ -1,1 +1,1 @@
-"""The arithmetic of one frame: the reference in numpy, and the compiled (fused) step for the usual case."""
+"""The arithmetic of one frame: the reference in numpy, and the compiled (fused) step for normal frames."""

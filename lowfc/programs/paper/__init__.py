@@ -1,1 +1,1 @@
-"""`lowfc validate`: the paper's tables and figures, reproduced: paper, measured, limit, assumption."""
+"""`lowfc validate`: reproduce the paper's tables and figures, and compare with published results."""

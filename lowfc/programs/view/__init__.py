@@ -1,1 +1,1 @@
-"""The live view: what an operator sees of a run, live or from its log."""
+"""The operator's view of a run, live or from its log."""
