@@ -1,1 +1,1 @@
-"""From a bench to a closed loop: calibrate, tune, acceptance tests, checks of drivers and hosts."""
+"""Commissioning: calibration, tuning, acceptance tests, checks of drivers and hosts."""

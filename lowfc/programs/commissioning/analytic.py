@@ -1,4 +1,4 @@
-"""The analytic calibration of a configured instrument, with a progress bar where the optical model must be built."""
+"""The analytic calibration of a configured instrument, with a progress bar while the optical model is built."""
 
 from collections.abc import Callable
 
@@ -15,16 +15,16 @@ from lowfc.optics.twin.twin import Twin
 from lowfc.optics.twin.twin_mirror import TwinMirror
 
 Wavefront = Callable[[Twin, TwinMirror], Array]
-"""Wavefront, nm, at the used nodes of a twin, from the twin and the mirror on its nodes."""
+"""Function of a twin and the mirror on its nodes that returns the wavefront at the used nodes, nm."""
 
 
 def analytic(config: Configuration, console: Console, at: Wavefront | None = None) -> Calibration:
-    """I0, H and R from the paper's equations; the optical model goes into the cache, from where the camera takes it.
+    """Compute I0, H and R from the paper's equations; the optical model is cached for the simulated camera.
 
     Args:
-        config: The instrument's.
-        console: For people: a progress bar, warnings.
-        at: The wavefront that is the zero point; flat when None.
+        config: Configuration of the instrument.
+        console: Terminal for the progress bar and warnings.
+        at: Wavefront at the zero point; flat when None.
     """
 
     def warn(text: str) -> None:
@@ -38,8 +38,8 @@ def analytic(config: Configuration, console: Console, at: Wavefront | None = Non
     worst = int(np.argmax(noise))
     if noise[worst] > config.control.limit_nm:
         warn(
-            f"Z{made.noll[worst]} is measured with {noise[worst]:.0f} nm rms of noise in each frame, more than the "
-            f"{config.control.limit_nm:g} nm that its command is limited to: "
-            "the star is too faint, or the mask cannot tell so many modes apart"
+            f"Z{made.noll[worst]}: measurement noise is {noise[worst]:.0f} nm rms per frame, more than its "
+            f"modal limit of {config.control.limit_nm:g} nm: "
+            "the star is too faint, or the mask cannot distinguish so many modes"
         )
     return made

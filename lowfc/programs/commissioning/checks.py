@@ -1,4 +1,4 @@
-"""Checks of a host or a device as data: a table of them, what each one found, and the report as text or JSON."""
+"""Tables of checks of a host or a device, their results, and the report as text or JSON."""
 
 import json
 import sys
@@ -11,11 +11,11 @@ from lowfc.control.loop.wording import counted
 
 S = TypeVar("S")
 
-_WIDTH = 120  # where there is no terminal
+_WIDTH = 120  # without a terminal
 
 
 class Status(StrEnum):
-    """How a check ended."""
+    """Result of a check."""
 
     OK = "ok"
     NOTE = "note"
@@ -30,12 +30,12 @@ class Check(NamedTuple):
     """One line of a report.
 
     Attributes:
-        status: wrong breaks the contract; a warning costs something or could not be tried; a note is worth knowing.
-        got: what was found.
-        advice: what to do about it; empty where there is nothing to do.
-        cost: what it costs otherwise.
-        name: what was looked at.
-        expected: what the contract says.
+        status: wrong: violates the contract; warning: has a cost or could not be tested; note: for information.
+        got: result of the check.
+        advice: recommended action; empty if none is needed.
+        cost: consequence of ignoring the advice.
+        name: name of the check.
+        expected: requirement of the contract.
     """
 
     status: Status
@@ -47,39 +47,39 @@ class Check(NamedTuple):
 
 
 Severity = Callable[[str, str], Check]
-"""What makes a check of what was found and what to do about it."""
+"""Function that makes a Check from a finding and an advice: `note`, `warning` or `wrong`."""
 
 
 def ok(got: str) -> Check:
-    """As it should be."""
+    """A check that passed."""
     return Check(Status.OK, got)
 
 
 def note(got: str, advice: str = "", cost: str = "") -> Check:
-    """Something worth knowing."""
+    """A finding for information."""
     return Check(Status.NOTE, got, advice, cost)
 
 
 def warning(got: str, advice: str = "", cost: str = "") -> Check:
-    """Something that costs, or could not be tried."""
+    """A finding that has a cost, or a check that could not be carried out."""
     return Check(Status.WARNING, got, advice, cost)
 
 
 def wrong(got: str, advice: str) -> Check:
-    """Something that breaks the contract."""
+    """A violation of the contract."""
     return Check(Status.WRONG, got, advice)
 
 
 def judged(
     name: str, expected: str, good: bool, got: str, advice: str, but: str = "", severity: Severity = wrong
 ) -> Check:
-    """A check by its name: `got` where it is good, else `but`, or the same again, with what to do."""
+    """A named check: `ok(got)` if good; otherwise `but`, by default `got`, with the advice."""
     check = ok(got) if good else severity(but or got, advice)
     return check._replace(name=name, expected=expected)
 
 
 class Table(Generic[S]):
-    """Checks by name, in the order of the report; each looks at the same thing."""
+    """Checks by name, in the order of the report; all examine the same subject."""
 
     def __init__(self) -> None:
         self.looks: dict[str, tuple[Check, Callable[[S], Check | None]]] = {}
@@ -87,13 +87,13 @@ class Table(Generic[S]):
     def check(
         self, name: str, expected: str = "", advice: str = "", cost: str = ""
     ) -> Callable[[Callable[[S], Check | None]], Callable[[S], object]]:
-        """Enter a function that looks; it returns None where there is nothing to look at.
+        """Register a check function; it returns None if the check does not apply.
 
         Args:
-            name: of the check.
-            expected: what the contract says.
-            advice: what to do, for a warning that does not say it itself.
-            cost: what it costs otherwise.
+            name: Name of the check.
+            expected: Requirement of the contract.
+            advice: Recommended action for a warning that has no advice.
+            cost: Consequence of ignoring the advice.
         """
 
         def enter(look: Callable[[S], Check | None]) -> Callable[[S], object]:
@@ -103,7 +103,7 @@ class Table(Generic[S]):
         return enter
 
     def of(self, seen: S, unknown: tuple[type[Exception], ...] = ()) -> Iterator[Check]:
-        """The result of every check; a note where one raises one of these exceptions."""
+        """Run every check on `seen`; a check that raises one of the `unknown` exceptions gives a note."""
         for usual, look in self.looks.values():
             try:
                 found = look(seen)
@@ -121,10 +121,10 @@ def put(
     """Print a report.
 
     Args:
-        checks: in their order.
-        worst_first: statuses that are counted.
-        fields: attribute of a check by its key in JSON.
-        about: the rest of the JSON object; None for a table.
+        checks: The results, in the order of the report.
+        worst_first: Statuses to count.
+        fields: JSON key to attribute of a check.
+        about: Other members of the JSON object; None for a text table.
     """
     ended = Counter(check.status for check in checks)
     if about is not None:

@@ -1,1 +1,1 @@
-"""`lowfc acceptance`: the tests that a loop must pass before it is used."""
+"""`lowfc acceptance`: acceptance tests of a loop against its requirements."""

@@ -1,4 +1,4 @@
-"""`lowfc acceptance`: arguments only; each test has a module of its own."""
+"""`lowfc acceptance`: command-line arguments; each test is in a separate module."""
 
 import sys
 from collections.abc import Callable
@@ -83,14 +83,14 @@ def capture_range(
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
-    """Measure the largest wavefront error from which the loop closes.
+    """Measure the largest static wavefront error from which the loop converges.
 
     Example: lowfc acceptance capture-range --modes 2-6
     """
     from lowfc.programs.commissioning.acceptance import capture as test
 
-    wanted = noll_of(modes)
-    _carry_out(test, logs, run, config, plot, as_json, lambda live, must: test.play(live, wanted, must))
+    tested = noll_of(modes)
+    _carry_out(test, logs, run, config, plot, as_json, lambda live, must: test.play(live, tested, must))
 
 
 @acceptance_app.command("noise-floor")
@@ -138,7 +138,9 @@ def _carry_out(
 
     required = configuration(config).acceptance if config is not None else None
     require_folder(plot)
-    figure = None if plot is None else figure_class()(figsize=(10, 5), layout="constrained")  # or it says why not, now
+    figure = (
+        None if plot is None else figure_class()(figsize=(10, 5), layout="constrained")
+    )  # raises now if matplotlib is missing
     if logs:
         if run is not None:
             raise ConfigurationError("a log and a running loop (--run) exclude each other: use one")
@@ -148,18 +150,18 @@ def _carry_out(
         history = read_history(log)
         for remark in history.remarks:
             sys.stderr.write(f"warning: {remark}\n")
-        every = logged(history, test.KIND)
+        sequences = logged(history, test.KIND)
         if history.configuration is None or history.calibration is None:
-            raise DataFileError(f"{log.path}: has no configuration and so no requirements")
+            raise DataFileError(f"{log.path}: contains no configuration, which has the requirements")
         known, calibration = history.configuration, history.calibration
     else:
         with Client(run) as client, counting_bar(Console(stderr=True), TimeRemainingColumn()) as count:
             live = Live(client, partial(count, test.KIND))
             known, calibration = live.configuration, live.calibration
-            with client.reserved("lowfc acceptance"), live.kept():
-                every = play(live, required or known.acceptance)
+            with client.reserved("lowfc acceptance"), live.restored():
+                sequences = play(live, required or known.acceptance)
     instrument = (known, calibration) if by_instrument else ()
-    result = test.judge(every, required or known.acceptance, *instrument)
+    result = test.judge(sequences, required or known.acceptance, *instrument)
     if plot is not None and figure is not None:
         test.draw(result.figures(), figure)
         figure.suptitle(result.verdict)

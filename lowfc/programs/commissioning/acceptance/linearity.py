@@ -1,4 +1,4 @@
-"""`lowfc acceptance linearity`: gain and cross-talk of each mode against its size, with the loop open."""
+"""`lowfc acceptance linearity`: gain and cross-talk of each mode as a function of amplitude, with the loop open."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,13 +24,13 @@ from lowfc.programs.commissioning.acceptance.played import (
 
 KIND: Kind = "linearity"
 AMPLITUDES = (0.5, 1.0, 2.0)
-"""Amplitudes that are played, as multiples of the one up to which a mode must be linear."""
-_SPARE_FRAMES = 2  # beside the delay: a mirror that is still settling
+"""Amplitudes tested, as multiples of the required linear range."""
+_SPARE_FRAMES = 2  # skipped in addition to the delay, while the mirror settles
 
 
 @dataclass(frozen=True, slots=True)
 class Staircase:
-    """The probe sequence: frames at each level, cycles at each amplitude, Noll indices (empty for all)."""
+    """Parameters of the staircase: frames per level, cycles per amplitude, Noll indices (empty: all)."""
 
     hold_frames: int
     cycles: int
@@ -38,7 +38,7 @@ class Staircase:
 
 
 class Level(Result):
-    """The gain of a mode, and its largest cross-talk, at one amplitude."""
+    """Gain of a mode and its largest cross-talk at one amplitude."""
 
     amplitude_nm: float = figure()
     gain: float = figure()
@@ -50,7 +50,7 @@ class Level(Result):
 
 
 class LinearityMode(ModeResult):
-    """The amplitude up to which a mode is linear, nm rms of wavefront."""
+    """Linear range of a mode, nm rms of wavefront."""
 
     linear_nm: float = figure("linear to", "nm", ".3g")
     levels: list[Level] = figure()
@@ -66,7 +66,7 @@ class LinearityMode(ModeResult):
 
 
 class LinearityResult(AcceptanceResult):
-    """Linearity; behind each mode stand gain - 1 and the largest cross-talk at each amplitude, nm."""
+    """Linearity; the row of a mode ends with gain - 1 and the largest cross-talk at each amplitude, nm."""
 
     required_nm: float = figure("required linear to", "nm", "g")
     required_gain_error: float = figure("required |gain - 1|", form="g")
@@ -74,19 +74,19 @@ class LinearityResult(AcceptanceResult):
     modes: list[LinearityMode] = figure("modes")
 
     def remarks(self) -> Sequence[str]:
-        """What the marks mean."""
-        key = f"amplitude, nm: gain - 1 (largest cross-talk); {SURE:g} standard errors are forgiven"
+        """Explain the marks; the verdict."""
+        key = f"amplitude, nm: gain - 1 (largest cross-talk); tolerance: plus {SURE:g} standard errors"
         unsure = any(row.within is None for mode in self.modes for row in mode.levels)
-        noisy = ["?: too noisy to say; more cycles, or longer levels, help"] if unsure else []
+        noisy = ["?: too noisy to judge; use more cycles or longer levels"] if unsure else []
         return [key, *noisy, *super().remarks()]
 
 
 def play(live: Live, how: Staircase, required: Acceptance) -> list[Played]:
-    """Play a staircase of each mode to the mirror, with the loop open."""
+    """Play a staircase of each mode on the mirror, with the loop open."""
     skipped = int(np.ceil(live.loop.delay_frames)) + _SPARE_FRAMES
     if how.hold_frames <= skipped:
         raise AcceptanceError(
-            f"{how.hold_frames} frames at each level are too few: {skipped} pass until the mirror is seen there"
+            f"{how.hold_frames} frames at each level are too few: the first {skipped} do not yet show the new shape"
         )
     plan = []
     for noll in chosen(how.modes, live.loop.noll):
@@ -105,10 +105,10 @@ def play(live: Live, how: Staircase, required: Acceptance) -> list[Played]:
     return [live.play(KIND, what, LoopMode.OPEN, table, shape) for what, table, shape in plan]
 
 
-def judge(every: Sequence[Played], required: Acceptance) -> LinearityResult:
-    """Gains and cross-talk of what was played; AcceptanceError where the loop was disturbed meanwhile."""
+def judge(sequences: Sequence[Played], required: Acceptance) -> LinearityResult:
+    """Evaluate gain and cross-talk from the probe sequences; AcceptanceError if the loop was disturbed meanwhile."""
     modes = []
-    for played in every:
+    for played in sequences:
         played.check(LoopMode.OPEN)
         what, noll = played.what, played.loop.noll
         levels_nm, starts = np.array(what["levels_nm"]), np.array(what["starts"], np.intp)
@@ -152,7 +152,7 @@ def judge(every: Sequence[Played], required: Acceptance) -> LinearityResult:
 
 
 def draw(found: dict[str, Any], figure: Any) -> None:
-    """Gain and cross-talk against amplitude."""
+    """Draw gain and cross-talk against amplitude."""
     axes = figure.subplots(1, 2, sharex=True)
     for number, mode in enumerate(found["modes"]):
         x = [row["amplitude_nm"] for row in mode["levels"]]
@@ -173,9 +173,9 @@ def draw(found: dict[str, Any], figure: Any) -> None:
     for side in (-1, 1):
         axes[0].axhline(1 + side * found["required_gain_error"], color="grey", linestyle=":")
     axes[1].axhline(found["required_crosstalk"], color="grey", linestyle=":")
-    for ax, title in zip(axes, ("measured over true size", "largest cross-talk"), strict=True):
+    for ax, title in zip(axes, ("gain: measured / true amplitude", "largest cross-talk"), strict=True):
         ax.axvline(found["required_nm"], color="grey", linestyle=":")
         ax.set_title(title)
-        ax.set_xlabel("size of the mode, nm rms of wavefront")
+        ax.set_xlabel("amplitude of the mode, nm rms of wavefront")
         ax.grid(alpha=0.3)
     axes[0].legend(fontsize=6, ncols=2)

@@ -1,4 +1,4 @@
-"""The live loop as the acceptance tests have it: what they play is announced in its log, and it is left as found."""
+"""Control of the live loop by the acceptance tests: probe sequences announced in its log, mode restored afterwards."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -29,10 +29,10 @@ _LAW = ("gain", "leak", "limit_nm", "law", "calibration_id")
 
 
 class Live:
-    """The live loop, left in the mode in which it was found, with nothing more being played."""
+    """The live loop; `restored` stops probe sequences and restores the mode at the end."""
 
     def __init__(self, client: Client, progress: Callable[[int, int], None]) -> None:
-        """Take hold of the loop."""
+        """Read calibration, configuration and mode of the loop; AcceptanceError unless it is open or closed."""
         self.client = client
         self.calibration = client.calibration()
         self.configuration = configuration_of(client)
@@ -41,33 +41,33 @@ class Live:
             raise AcceptanceError(
                 f"the loop is {LoopMode(state.mode).in_words}: it must be open or closed to be measured"
             )
-        self._found = LoopMode(state.mode)
+        self._initial_mode = LoopMode(state.mode)
         self._progress = progress
-        self._past = self._expected = 0
+        self._done = self._expected = 0
         self.loop = loop_of(state, self.calibration, self.configuration.camera.rate_hz, self.client.laws())
 
     @contextmanager
-    def kept(self) -> Iterator["Live"]:
-        """Leave the loop as it was found, whatever happens meanwhile; but safe mode stays."""
+    def restored(self) -> Iterator["Live"]:
+        """Restore the loop mode at the end, also after an exception; safe mode stays."""
         try:
             yield self
         finally:
-            self.client.check_lease()  # whoever ended it has the last word on the loop
+            self.client.check_lease()  # after somebody ended the lease, the loop is theirs
             self.client.stop()
             now = LoopMode(self._state().mode)
-            if now in (LoopMode.OPEN, LoopMode.CLOSED) and now is not self._found:
-                self.into(self._found)
+            if now in (LoopMode.OPEN, LoopMode.CLOSED) and now is not self._initial_mode:
+                self.set_mode(self._initial_mode)
 
     def expect(self, frames: int) -> None:
-        """Say how many frames all that is to be played will take; otherwise each play counts by itself."""
+        """Set the total number of frames for the progress bar; by default it covers one probe sequence."""
         self._expected = frames
 
-    def left_out(self, frames: int) -> None:
-        """Say that so many of the expected ones will not be played."""
-        self._past += frames
+    def skip(self, frames: int) -> None:
+        """Count expected frames as done without playing them."""
+        self._done += frames
 
-    def into(self, mode: LoopMode) -> None:
-        """Open or close the loop, where it is not."""
+    def set_mode(self, mode: LoopMode) -> None:
+        """Open or close the loop unless it is in that mode already; after closing, wait until it has settled."""
         if LoopMode(self._state().mode) is not mode:
             if mode is LoopMode.OPEN:
                 self.client.open_loop()
@@ -76,8 +76,8 @@ class Live:
             takeover = SETTLING_FRAMES + FADING_FRAMES if isinstance(self.loop.law, LinearLaw) else 0
             self.wait(takeover + self.loop.settling_frames())
 
-    def rest(self) -> None:
-        """Take the command to zero and begin anew."""
+    def return_to_zero(self) -> None:
+        """Open the loop, reset the command and wait until it is zero."""
         self.client.stop()
         self.client.open_loop()
         self.client.reset()
@@ -86,48 +86,48 @@ class Live:
             self.wait(2)
 
     def wait(self, frames: int) -> None:
-        """Let some frames pass."""
+        """Wait for this many frames."""
         for _ in self.client.steps(frames):
             pass
 
     def play(
         self, kind: Kind, what: dict[str, Any], mode: LoopMode, table: Single, basis: Single | None = None
     ) -> Played:
-        """Play a table and keep what the loop does meanwhile; without shapes in `basis` it goes to the offset.
+        """Play a table and return the steps meanwhile; without shapes in `basis` it is added to the offset.
 
-        A table without columns is a stretch in which nothing is played.
+        With a table without columns nothing is played: only the steps are recorded.
         """
         modes = len(self.calibration.noll)
         basis = np.zeros((modes, 0), np.float32) if basis is None else basis
-        self.into(mode)
+        self.set_mode(mode)
         before, frames = self._state(), len(table)
         steps = self.client.steps()
         first = self.client.note(ANNOUNCEMENT + json.dumps({"test": kind, **what, "frames": frames})).frame_sequence
         if table.shape[1]:
             answer = self.client.play(basis, table) if basis.size else self.client.play_offset(table)
             first = answer.frame_sequence
-        kept: list[Step] = []
+        recorded: list[Step] = []
         for step in steps:
             if step.frame_sequence < first:
                 continue
             if step.frame_sequence >= first + frames:
                 break
-            kept.append(step)
+            recorded.append(step)
             passed = step.frame_sequence - first + 1
-            self._progress(self._past + passed, max(self._expected, self._past + frames))
+            self._progress(self._done + passed, max(self._expected, self._done + frames))
             if step.mode is not mode or set(step.reasons) & set(LIMITS):
-                break  # who looks at it says what is wrong
+                break  # `judge` reports the cause
         steps.close()
-        self._past += frames
+        self._done += frames
         after = self._state()
         if [getattr(before, name) for name in _LAW] != [getattr(after, name) for name in _LAW]:
-            raise AcceptanceError("gains, or the law, were changed while the loop was measured: measure again")
+            raise AcceptanceError("gains or control law changed during the measurement: measure again")
         loop = loop_of(before, self.calibration, self.loop.rate_hz, self.client.laws())
         target = "" if not table.shape[1] else MIRROR if basis.size else OFFSET
-        return played(what, loop, target, table, basis, first, of_steps(kept, modes))
+        return played(what, loop, target, table, basis, first, of_steps(recorded, modes))
 
     def _state(self) -> wire.ControllerState:
         state = self.client.status().state
         if state is None or not state.gain:
-            raise AcceptanceError("the controller has no calibration: `lowfc ctl load` gives it one")
+            raise AcceptanceError("the controller has no calibration: load one with `lowfc ctl load`")
         return state

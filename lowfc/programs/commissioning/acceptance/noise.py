@@ -1,4 +1,4 @@
-"""`lowfc acceptance noise-floor`: the sensor's white noise against what photons and read-out make of it."""
+"""`lowfc acceptance noise-floor`: the white noise of each mode compared with photon and read noise."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -23,7 +23,7 @@ _LOOPS = {"open": LoopMode.OPEN, "closed": LoopMode.CLOSED}
 
 
 class NoiseMode(ModeResult):
-    """White noise of a mode in a frame, and what the closed loop leaves of it, nm rms of wavefront."""
+    """White noise of a mode per frame, and the residual it causes in closed loop, nm rms of wavefront."""
 
     expected_nm: float = figure("expected", "nm", ".3f")
     open_nm: float = figure("open", "nm", ".3f")
@@ -34,7 +34,7 @@ class NoiseMode(ModeResult):
 
 
 class NoiseResult(AcceptanceResult):
-    """The noise floor."""
+    """Noise floor of every mode."""
 
     noise_ratio: float = figure("required ratio", form="g")
     law: str = figure("law")
@@ -43,13 +43,13 @@ class NoiseResult(AcceptanceResult):
     modes: list[NoiseMode] = figure("modes")
 
     def remarks(self) -> Sequence[str]:
-        """What the wavefront costs, and the verdict."""
+        """Added contrast, and the verdict."""
         contrast = [] if self.added_contrast is None else [sentence_of(self.added_contrast)]
         return [*contrast, *super().remarks()]
 
 
 def play(live: Live, duration_s: float) -> list[Played]:
-    """Keep what the loop measures with nothing being played: open, then closed, each for so long."""
+    """Record the loop without a probe: open, then closed, each for `duration_s`."""
     frames = max(round(duration_s * live.loop.rate_hz), SHORTEST)
     live.expect(frames * len(_LOOPS))
     nothing = np.zeros((frames, 0), np.float32)
@@ -57,22 +57,24 @@ def play(live: Live, duration_s: float) -> list[Played]:
 
 
 def judge(
-    every: Sequence[Played], required: Acceptance, configuration: Configuration, calibration: Calibration
+    sequences: Sequence[Played], required: Acceptance, configuration: Configuration, calibration: Calibration
 ) -> NoiseResult:
-    """The noise of an open and of a closed stretch."""
-    stretches = {played.what["loop"]: played for played in every}
-    if set(stretches) != set(_LOOPS):
-        raise AcceptanceError(f"there must be an open and a closed stretch, there is {', '.join(stretches) or 'none'}")
+    """Evaluate the noise of the open-loop and of the closed-loop recording."""
+    by_loop = {played.what["loop"]: played for played in sequences}
+    if set(by_loop) != set(_LOOPS):
+        raise AcceptanceError(
+            f"an open-loop and a closed-loop recording are needed, found {', '.join(by_loop) or 'none'}"
+        )
     noise_nm2 = frame_noise_nm2(configuration, calibration)
     floors, rms = {}, {}
-    left_nm2: dict[str, Array | None] = {}
-    for name, played in stretches.items():
+    residual_nm2: dict[str, Array | None] = {}
+    for name, played in by_loop.items():
         played.check(_LOOPS[name])
         error_nm = played.filled(played.error_nm)
-        left_nm2[name] = error_nm.T @ error_nm / len(error_nm) - noise_nm2
+        residual_nm2[name] = error_nm.T @ error_nm / len(error_nm) - noise_nm2
         floors[name] = _floor_nm(played)
         rms[name] = np.nanstd(played.error_nm, axis=0)
-    loop = stretches["closed"].loop
+    loop = by_loop["closed"].loop
     expected = np.sqrt(np.diag(noise_nm2))
     gain = np.sqrt(margins.noise_gain(loop.linear, loop.delay_frames))
     modes = [
@@ -94,28 +96,28 @@ def judge(
         passed=all(mode.passed for mode in modes),
         noise_ratio=required.noise_ratio,
         law=loop.name,
-        frames={name: len(played.error_nm) for name, played in stretches.items()},
-        added_contrast=added_contrast(contrast_of(configuration), left_nm2),
+        frames={name: len(played.error_nm) for name, played in by_loop.items()},
+        added_contrast=added_contrast(contrast_of(configuration), residual_nm2),
         modes=modes,
     )
 
 
 def draw(found: dict[str, Any], figure: Any) -> None:
-    """The noise of each mode, measured and expected."""
+    """Draw measured and expected noise of each mode."""
     ax = figure.subplots()
     x = np.arange(len(found["modes"]))
     for name, marker in (("expected_nm", "k_"), ("open_nm", "C0o"), ("closed_nm", "C1s"), ("residual_floor_nm", "C2^")):
         label = name.removesuffix("_nm").replace("_", " ")
         ax.semilogy(x, [mode[name] for mode in found["modes"]], marker, label=label)
     ax.set_xticks(x, [f"Z{mode['noll']}" for mode in found["modes"]])
-    ax.set_ylabel("nm rms of wavefront in a frame")
+    ax.set_ylabel("nm rms of wavefront per frame")
     ax.grid(alpha=0.3)
     ax.legend()
 
 
 def _floor_nm(played: Played) -> Array:
-    """White noise (modes,) of a frame: of pseudo-open-loop modes, which the loop does not filter."""
-    made = spectrum(Pieces((played.filled(played.pol_nm),), 0), played.loop.rate_hz)
-    if made is None:
+    """White noise (modes,) per frame, nm, from the pseudo-open-loop modes, which the loop does not filter."""
+    power = spectrum(Pieces((played.filled(played.pol_nm),), 0), played.loop.rate_hz)
+    if power is None:
         raise AcceptanceError(f"{len(played.pol_nm)} frames are too few for a spectrum, {SHORTEST} are needed")
-    return np.asarray(np.sqrt(floor_nm2_hz(made) * played.loop.rate_hz / 2))
+    return np.asarray(np.sqrt(floor_nm2_hz(power) * played.loop.rate_hz / 2))

@@ -1,6 +1,6 @@
-"""Probe sequences of the acceptance tests, the steps of the loop under them, and the form of the tests' results.
+"""Probe sequences of the acceptance tests, the loop's steps during them, and the base classes of the results.
 
-Each play is announced by a note that says what it is for, so that a log can be judged as the live loop was.
+A note with the parameters of the test precedes each probe sequence, so that a log is evaluated like the live loop.
 """
 
 import json
@@ -30,21 +30,21 @@ Kind = Literal["rejection", "linearity", "capture-range", "noise-floor"]
 
 LIMITS = (Limit.MODAL_LIMIT, Limit.STROKE, Limit.SLEW, Limit.NEIGHBOUR)
 MOST_MISSING = 0.01
-"""Largest part of the frames that may be missing or refused."""
+"""Largest fraction of the frames that may be missing or refused."""
 LONGEST_SETTLING = 4000
-"""Longest time for a linear law to settle, frames."""
+"""Upper limit of a linear law's settling time, frames."""
 
 ANNOUNCEMENT = "acceptance "
-"""How a note begins that announces a test; its parameters follow as JSON."""
+"""First word of a note that announces a test; its parameters follow as JSON."""
 _CHANGES = ("gain", "leak", "limit", "law", "load", "offset", "channel", "reset")
 
 
 class AcceptanceError(LowfcError):
-    """A loop could not be measured: it was disturbed, or is in no state for it."""
+    """The loop cannot be measured: it was disturbed, or its state does not allow it."""
 
 
 class ModeResult(Result):
-    """A mode, and whether it does what is required of it."""
+    """A mode, and whether it meets the requirement."""
 
     noll: int = figure("mode")
     name: str = figure("name")
@@ -52,12 +52,12 @@ class ModeResult(Result):
     too_noisy: bool = figure(default=False)
 
     def remarks(self) -> Sequence[str]:
-        """The verdict behind its row, where it is not good."""
+        """The verdict at the end of the row, unless it passed."""
         return [] if self.passed else ["too noisy" if self.too_noisy else "FAILED"]
 
 
 class AcceptanceResult(Result):
-    """The result of a test; it passed where every mode did."""
+    """The result of a test; it passed if every mode did."""
 
     test: str = figure()
     passed: bool = figure()
@@ -74,7 +74,7 @@ class AcceptanceResult(Result):
 
 @dataclass(frozen=True, slots=True)
 class Loop:
-    """The loop that is measured: its law, its delay as configured, its rate."""
+    """The measured loop: control law, modes, configured delay and frame rate."""
 
     law: Law | LinearLaw
     noll: tuple[int, ...]
@@ -83,13 +83,13 @@ class Loop:
 
     @property
     def linear(self) -> LinearLaw:
-        """Its law as a linear one."""
+        """The control law as a linear law."""
         if isinstance(self.law, LinearLaw):
             return self.law
         return integrator(self.law.gain, self.law.leak, self.noll, self.delay_frames, self.rate_hz)
 
     def settling_frames(self) -> int:
-        """Time to settle, frames."""
+        """Settling time, frames."""
         if isinstance(self.law, Law):
             return settling_frames(self.law.gain, self.law.leak)
         radius = float(margins.margins(self.law, self.delay_frames).radius.max())
@@ -103,17 +103,17 @@ class Loop:
 
 @dataclass(frozen=True, slots=True)
 class Played:
-    """One play, or a stretch of nothing, frame by frame.
+    """Response of the loop to one probe sequence, or a recording without a probe, frame by frame.
 
     Attributes:
-        what: the parameters that it was announced with.
-        target: of the play; empty for none.
-        table: (frames, columns) of the play; (frames, 0) for none.
-        basis: (columns, actuators) of the play, nm of surface.
-        error_nm: (frames, modes), NaN where a frame is missing or was refused; so is pol_nm.
-        command_nm: (frames, modes) after each frame; NaN where it is missing.
-        mode: (frames,) loop mode, 0 where a frame is missing.
-        reasons: (frames,) bit `1 << reason` for each.
+        what: parameters from the announcing note.
+        target: channel that the probe was added to; empty without a probe.
+        table: probe amplitudes (frames, columns); (frames, 0) without a probe.
+        basis: probe shapes (columns, actuators), nm of surface.
+        error_nm: modal error (frames, modes), NaN where a frame is missing or was refused; pol_nm likewise.
+        command_nm: modal command (frames, modes) after each frame; NaN where the frame is missing.
+        mode: loop mode (frames,), 0 where a frame is missing.
+        reasons: bit `1 << reason` for each reason of a frame (frames,).
     """
 
     what: dict[str, Any]
@@ -129,7 +129,7 @@ class Played:
 
     @property
     def limits_hit(self) -> list[str]:
-        """Names of the limits that acted, which ended the play."""
+        """Names of the limits that acted and ended the probe sequence."""
         return [reason.name for reason in count_reasons(self.reasons) if reason in LIMITS]
 
     @property
@@ -138,26 +138,26 @@ class Played:
         return int(np.count_nonzero(~np.isfinite(self.error_nm).all(axis=1)))
 
     def check(self, mode: LoopMode) -> None:
-        """Refuse what was disturbed; AcceptanceError where it was, and how."""
+        """Raise AcceptanceError with the cause if the measurement was disturbed."""
         other = self.mode[(self.mode != 0) & (self.mode != mode)]
         if other.size:
             raise AcceptanceError(
-                f"the loop became {LoopMode(int(other[0])).in_words} while it was measured "
+                f"the loop became {LoopMode(int(other[0])).in_words} during a measurement in mode "
                 f"{mode.in_words}: measure again"
             )
         if self.limits_hit:
             raise AcceptanceError(
-                f"a limit acted ({', '.join(self.limits_hit)}) and ended what was played: take a smaller amplitude, or "
+                f"a limit acted ({', '.join(self.limits_hit)}) and ended the probe: use a smaller amplitude, or "
                 "measure when the disturbance is smaller"
             )
         if self.missing > MOST_MISSING * len(self.error_nm):
             raise AcceptanceError(
-                f"{self.missing} of {len(self.error_nm)} frames are missing or were refused, at most "
-                f"{MOST_MISSING:.0%} may: `lowfc info` and `lowfc ctl status` say why"
+                f"{self.missing} of {len(self.error_nm)} frames are missing or were refused (limit "
+                f"{MOST_MISSING:.0%}): `lowfc info` and `lowfc ctl status` show the reasons"
             )
 
     def filled(self, values: Array) -> Array:
-        """(frames, modes) with what is missing interpolated."""
+        """`values` (frames, modes) with missing frames interpolated."""
         there = np.isfinite(values).all(axis=1)
         if there.all():
             return values
@@ -165,30 +165,30 @@ class Played:
         return np.stack([np.interp(rows, rows[there], column[there]) for column in values.T], axis=1)
 
 
-def chosen(wanted: Sequence[int], noll: Sequence[int]) -> tuple[int, ...]:
-    """The Noll indices asked for, all where none are; AcceptanceError where one is not the loop's."""
-    unknown = sorted(set(wanted) - set(noll))
+def chosen(requested: Sequence[int], noll: Sequence[int]) -> tuple[int, ...]:
+    """The requested Noll indices, by default all; AcceptanceError if the loop does not control one of them."""
+    unknown = sorted(set(requested) - set(noll))
     if unknown:
-        raise AcceptanceError(f"Noll modes {unknown} are not controlled; there are {noll[0]} to {noll[-1]}")
-    return tuple(wanted or noll)
+        raise AcceptanceError(f"Noll modes {unknown} are not controlled; the loop controls {noll[0]} to {noll[-1]}")
+    return tuple(requested or noll)
 
 
 def logged(history: History, kind: Kind) -> list[Played]:
-    """The probe sequences of a test in a log; DataFileError where nothing was, or the loop was changed meanwhile."""
+    """The probe sequences of a test in a log; DataFileError if there are none or the loop was changed meanwhile."""
     path, calibration = history.log.path, history.calibration
     announced = _announced(history.requests, kind)
     if calibration is None or not announced:
-        raise DataFileError(f"{path}: no `lowfc acceptance {kind}` was carried out while it was written")
+        raise DataFileError(f"{path}: contains no `lowfc acceptance {kind}`")
     modes, found = len(calibration.noll), []
     for what, request in announced:
         frames = what.pop("frames")
         first, play = request.frame_sequence, request.name == "play"
         for other in history.requests:
             if other.accepted and other.name in _CHANGES and first < other.frame_sequence < first + frames:
-                raise DataFileError(f"{path}: {other.name} was asked for while the loop was measured")
+                raise DataFileError(f"{path}: request {other.name!r} changed the loop during the measurement")
         before = [one for one in history.controllers if one.frame_sequence < first and len(one.gain) == modes]
         if not before:
-            raise DataFileError(f"{path}: the state of the controller before the test is not in it")
+            raise DataFileError(f"{path}: does not contain the state of the controller before the test")
         decoded = codec.request(request, request.name, 0, plays=history.published.plays)
         basis = decoded.actuators_nm.reshape(-1, calibration.grid[0] * calibration.grid[1])
         loop = loop_of(before[-1], calibration, history.rate_hz, history.published.laws)
@@ -207,7 +207,7 @@ def _announced(requests: Sequence[wire.Request], kind: Kind) -> list[tuple[dict[
             try:
                 what = json.loads(request.text.removeprefix(ANNOUNCEMENT))
             except (ValueError, RecursionError):
-                what = None  # somebody's own note that begins alike
+                what = None  # another note that starts with the same word
             if not isinstance(what, dict) or what.pop("test", None) != kind or not isinstance(what.get("frames"), int):
                 what = None
             elif kind == "noise-floor":
@@ -227,23 +227,23 @@ def played(
     first: int,
     steps: Steps,
 ) -> Played:
-    """The steps of a play from frame `first` on, one row for each of its frames; the rate is that of these steps."""
+    """The steps of a probe sequence from frame `first` on, one row per frame; the rate is measured from these steps."""
     frames = len(table)
-    own = (steps.reasons & (1 << Rejection.REPEATED | 1 << Rejection.OUT_OF_ORDER)) == 0  # not of a frame seen before
-    steps = steps.at(own & (steps.sequence >= first) & (steps.sequence < first + frames))
-    places = (steps.sequence - np.uint64(first)).astype(np.int64)
-    if len(places) > 1:
-        rate_hz = float((places[-1] - places[0]) * 1e9 / (steps.time_ns[-1] - steps.time_ns[0]))
+    new = (steps.reasons & (1 << Rejection.REPEATED | 1 << Rejection.OUT_OF_ORDER)) == 0
+    steps = steps.at(new & (steps.sequence >= first) & (steps.sequence < first + frames))
+    rows = (steps.sequence - np.uint64(first)).astype(np.int64)
+    if len(rows) > 1:
+        rate_hz = float((rows[-1] - rows[0]) * 1e9 / (steps.time_ns[-1] - steps.time_ns[0]))
         loop = replace(loop, rate_hz=rate_hz)
     error_nm, pol_nm, command_nm = (np.full((frames, steps.error_nm.shape[1]), np.nan) for _ in range(3))
     mode, reasons = np.zeros(frames, np.uint8), np.zeros(frames, np.int64)
-    error_nm[places], pol_nm[places], command_nm[places] = steps.error_nm, steps.pol_nm, steps.command_nm
-    mode[places], reasons[places] = steps.mode, steps.reasons
+    error_nm[rows], pol_nm[rows], command_nm[rows] = steps.error_nm, steps.pol_nm, steps.command_nm
+    mode[rows], reasons[rows] = steps.mode, steps.reasons
     return Played(what, loop, target, table, basis, error_nm, pol_nm, command_nm, mode, reasons)
 
 
 def loop_of(
     state: wire.ControllerState, calibration: Calibration, rate_hz: float, laws: Mapping[str, LinearLaw]
 ) -> Loop:
-    """The loop of a controller's state, whose law is one of these."""
+    """The loop that a controller state describes; `laws` contains its linear law, if it has one."""
     return Loop(driving(state, laws) or gains_of(state), calibration.noll, state.delay_frames, rate_hz)

@@ -1,4 +1,4 @@
-"""`lowfc acceptance rejection`: the loop's rejection and noise transfer functions, measured, against theory."""
+"""`lowfc acceptance rejection`: the loop's measured rejection and noise transfer functions compared with theory."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,16 +30,16 @@ from lowfc.programs.commissioning.acceptance.played import (
 
 KIND: Kind = "rejection"
 LEAST_JUDGED = 0.5
-"""Least part of a mode's lines at which its rejection is certain enough to be judged.
+"""Smallest fraction of a mode's lines whose rejection must be certain enough to judge.
 
-The noise transfer is judged where it can be: where it is small, nothing of it can be seen.
+The noise transfer has no such limit: where it is small, it is below the measurement noise.
 """
-_LEAD_FRAMES = 50  # beside the time to settle: what the bus takes to bring the first steps
+_LEAD_FRAMES = 50  # in addition to the settling time: until the bus delivers the first steps
 
 
 @dataclass(frozen=True, slots=True)
 class Excitation:
-    """The multisine: seconds of a period, rms and lines of each mode, Noll indices (empty for all), and a seed."""
+    """Parameters of the multisine: period, rms and lines per mode, Noll indices (empty: all), seed of the phases."""
 
     duration_s: float
     rms_nm: float
@@ -48,8 +48,8 @@ class Excitation:
     seed: int
 
 
-class Part(Result):
-    """How far a transfer function of a mode is from theory, where that can be judged."""
+class Comparison(Result):
+    """Departure of a mode's transfer function from theory, on the lines that can be judged."""
 
     within: bool = figure()
     lines: int = figure()
@@ -63,14 +63,14 @@ class Part(Result):
 
 
 class RejectionMode(ModeResult):
-    """Departure of a mode's rejection and noise transfer from theory, dB, and on how many lines."""
+    """Departure of a mode's rejection and noise transfer from theory, dB, and the number of lines judged."""
 
-    rejection: Part = figure("rejection", "dB on lines")
-    noise_transfer: Part = figure("noise transfer", "dB on lines")
+    rejection: Comparison = figure("rejection", "dB on lines")
+    noise_transfer: Comparison = figure("noise transfer", "dB on lines")
 
 
 class RejectionResult(AcceptanceResult):
-    """Rejection and noise transfer under a multisine; `points` has each of its lines."""
+    """Rejection and noise transfer under a multisine; `points` has one entry per line."""
 
     law: str = figure("law")
     delay_frames: float = figure("delay", "frames", "g")
@@ -91,36 +91,36 @@ class RejectionResult(AcceptanceResult):
     def remarks(self) -> Sequence[str]:
         """Lines too noisy to judge, missing frames, and the verdict."""
         lines = [
-            f"Z{mode.noll}: rejection too noisy to be judged at "
+            f"Z{mode.noll}: rejection too noisy to judge at "
             f"{', '.join(f'{frequency:.3g}' for frequency in mode.rejection.unsure_hz)} Hz"
             for mode in self.modes
             if mode.rejection.unsure_hz
         ]
         if any(mode.too_noisy for mode in self.modes):
-            lines.append("a longer --duration, a larger --rms-nm or fewer --modes make it more certain")
+            lines.append("a longer --duration, a larger --rms-nm or fewer --modes reduce the noise")
         if self.frames_missing:
             lines.append(f"interpolated: {counted(self.frames_missing, 'frame')}, missing or refused")
         return [*lines, *super().remarks()]
 
 
 def play(live: Live, how: Excitation, required: Acceptance) -> list[Played]:
-    """Play a multisine to the closed loop.
+    """Play a multisine in closed loop.
 
-    It goes to the offset of the loop; to the mirror where the law is one of pseudo-open-loop modes, for how such a law
-    goes to an offset is not how it rejects a disturbance.
+    It is added to the loop's offset. With a law on pseudo-open-loop modes it is added to the mirror, because such a law
+    responds to an offset differently than to a disturbance.
     """
     noll, rate_hz = live.loop.noll, live.loop.rate_hz
-    wanted = chosen(how.modes, noll)
+    tested = chosen(how.modes, noll)
     frames = round(how.duration_s * rate_hz)
     try:
-        places = lines(frames, len(wanted), how.lines_per_mode, required.lowest_hz / rate_hz, required.highest_of_rate)
+        bins = lines(frames, len(tested), how.lines_per_mode, required.lowest_hz / rate_hz, required.highest_of_rate)
     except ValueError as error:
         raise AcceptanceError(
-            f"{how.duration_s:g} s at {rate_hz:.4g} Hz, {len(wanted)} modes, from {required.lowest_hz:g} Hz on: {error}"
+            f"{how.duration_s:g} s at {rate_hz:.4g} Hz, {len(tested)} modes, from {required.lowest_hz:g} Hz up: {error}"
         ) from None
     period = np.zeros((frames, len(noll)), np.float32)
-    period[:, [noll.index(mode) for mode in wanted]] = multisine(frames, places, how.rms_nm, how.seed)
-    live.into(LoopMode.CLOSED)
+    period[:, [noll.index(mode) for mode in tested]] = multisine(frames, bins, how.rms_nm, how.seed)
+    live.set_mode(LoopMode.CLOSED)
     table = led_in(period, live.loop.settling_frames() + _LEAD_FRAMES)
     basis = None
     if isinstance(live.loop.law, LinearLaw) and live.loop.law.signal == "pol":
@@ -129,30 +129,30 @@ def play(live: Live, how: Excitation, required: Acceptance) -> list[Played]:
 
 
 def transfer_function(played: Played) -> Lines:
-    """The lines of what was played, as measured; AcceptanceError where the loop was disturbed meanwhile."""
+    """Measured transfer functions on the lines of the multisine; AcceptanceError if the loop was disturbed."""
     played.check(LoopMode.CLOSED)
     period = played.table[-played.what["period_frames"] :].astype(float)
     added = -period if played.target == OFFSET else seen_of_mirror(period, delay_weights(played.loop.delay_frames))
     return measured(played.filled(played.error_nm)[-len(period) :], added)
 
 
-def judge(every: Sequence[Played], required: Acceptance) -> RejectionResult:
-    """The last of what was played, against theory; AcceptanceError where the loop was disturbed meanwhile."""
-    played = every[-1]
+def judge(sequences: Sequence[Played], required: Acceptance) -> RejectionResult:
+    """Compare the last multisine with theory; AcceptanceError if the loop was disturbed meanwhile."""
+    played = sequences[-1]
     found, rate_hz = transfer_function(played), played.loop.rate_hz
     tolerance_db = required.rejection_db
     frequency_hz = found.frequency * rate_hz
-    places = np.arange(found.mode.size)
+    line_rows = np.arange(found.mode.size)
     law, delay_frames = played.loop.linear, played.loop.delay_frames
-    theory_s = margins.rejection(law, frequency_hz, delay_frames)[places, found.mode]
-    theory_t = margins.noise_transfer(law, frequency_hz, delay_frames)[places, found.mode]
+    theory_s = margins.rejection(law, frequency_hz, delay_frames)[line_rows, found.mode]
+    theory_t = margins.noise_transfer(law, frequency_hz, delay_frames)[line_rows, found.mode]
     of_s = departure(found.rejection, theory_s, found.error, tolerance_db)
     of_t = departure(found.noise_transfer, theory_t, found.error, tolerance_db)
     modes = []
-    for place, noll in enumerate(played.loop.noll):
-        rows = np.flatnonzero(found.mode == place)
+    for mode, noll in enumerate(played.loop.noll):
+        rows = np.flatnonzero(found.mode == mode)
         if rows.size:
-            rejection, noise = _part(of_s, rows, frequency_hz), _part(of_t, rows, frequency_hz)
+            rejection, noise = _comparison(of_s, rows, frequency_hz), _comparison(of_t, rows, frequency_hz)
             within = rejection.within and noise.within
             enough = rejection.judged >= LEAST_JUDGED * rows.size
             modes.append(
@@ -195,13 +195,13 @@ def judge(every: Sequence[Played], required: Acceptance) -> RejectionResult:
                 "noise_transfer_error_db": float(of_t.error_db[row]),
                 "noise_transfer_judged": bool(of_t.judged[row]),
             }
-            for row in places
+            for row in line_rows
         ],
     )
 
 
 def draw(found: dict[str, Any], figure: Any) -> None:
-    """Measured lines over theory, rejection and noise transfer side by side."""
+    """Draw rejection and noise transfer side by side: measured points and theory."""
     axes = figure.subplots(1, 2, sharex=True)
     for ax, name, title in zip(
         axes, ("rejection", "noise_transfer"), ("rejection |S|", "noise transfer |T|"), strict=True
@@ -225,14 +225,14 @@ def draw(found: dict[str, Any], figure: Any) -> None:
         ax.set_title(title)
         ax.set_xlabel("frequency, Hz")
         ax.grid(alpha=0.3)
-    axes[0].set_ylabel("measured (open where too noisy) over theory (lines)")
+    axes[0].set_ylabel("measured (points; open: too noisy) and theory (lines)")
     axes[1].legend(fontsize=6, ncols=2)
 
 
-def _part(of: Departure, rows: Whole, frequency_hz: Array) -> Part:
+def _comparison(of: Departure, rows: Whole, frequency_hz: Array) -> Comparison:
     judged = rows[of.judged[rows]]
     worst = float(of.db[judged][np.argmax(np.abs(of.db[judged]))]) if judged.size else None
-    return Part(
+    return Comparison(
         within=bool(of.within[judged].all()),
         lines=int(rows.size),
         judged=int(judged.size),
