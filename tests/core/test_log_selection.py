@@ -28,7 +28,7 @@ from lowfc.contract.messages import (
     Topic,
     wire,
 )
-from lowfc.programs.core.recording.volume import bytes_per_s, outlook, selected
+from lowfc.programs.core.recording.volume import bytes_per_s, configured_selection, estimate
 from lowfc.programs.logs.survey import survey
 from lowfc.programs.logs.what_if.compare import what_if
 from lowfc.programs.logs.what_if.options import WhatIf, requested
@@ -201,14 +201,14 @@ def test_an_export_is_one_thing(whole: Path, words: list[str]) -> None:
 def test_what_it_will_take_is_said_before(tmp_path: Path) -> None:
     keys = {"recorder.folder": str(tmp_path), "camera.rate_hz": 250.0}
     config = load(None, keys)
-    grows = bytes_per_s(config, selected(config))
+    grows = bytes_per_s(config, configured_selection(config))
     assert 3e6 < grows < 5e6
-    assert outlook(config).startswith(f"recording into {tmp_path}: about {grows * 3600 / 1e9:.0f} GB an hour; ")
-    assert outlook(config).endswith(" h, at 250 Hz")
+    assert estimate(config).startswith(f"recording into {tmp_path}: about {grows * 3600 / 1e9:.0f} GB an hour; ")
+    assert estimate(config).endswith(" h, at 250 Hz")
     assert bytes_per_s(load(None, keys | {"camera.rate_hz": 500.0}), EVERYTHING) > 1.8 * grows
     fewer = load(None, keys | {"recorder.every": 10, "recorder.topics": [FRAME.key, "lowfc/mirror/{name}/state"]})
-    assert bytes_per_s(fewer, selected(fewer)) < 0.5 * grows
-    assert "1 in 10 frames" in outlook(fewer)
+    assert bytes_per_s(fewer, configured_selection(fewer)) < 0.5 * grows
+    assert "1 in 10 frames" in estimate(fewer)
 
 
 def test_record_start_names_the_request(tmp_path: Path) -> None:

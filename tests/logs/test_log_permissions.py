@@ -12,7 +12,7 @@ from lowfc.adapters.logs.series import Limits, LogSeries
 from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.configuration import load
 from lowfc.contract.errors import ConfigurationError
-from lowfc.programs.core.recording.process import limits_of
+from lowfc.programs.core.recording.process import log_limits
 from tests.support.mutated_logs import small_log
 
 
@@ -58,7 +58,7 @@ def test_what_is_written_has_what_the_umask_leaves_and_at_most_its_source_s_mode
 
 
 def test_the_recorder_is_given_the_key() -> None:
-    assert limits_of(load(None, {"recorder.file_mode": "0604"})).file_mode == 0o604
+    assert log_limits(load(None, {"recorder.file_mode": "0604"})).file_mode == 0o604
 
 
 @pytest.mark.parametrize("mode", ["0666 ", "640", "0o640", "0440", "0641", "0x20", "", 416])

@@ -90,7 +90,7 @@ class LossAccount:
 
         One that is left out of the log on purpose counts as recorded, and is `unwanted`.
         """
-        if not self._selection.counts(topic):
+        if not self._selection.records_all(topic):
             return
         count = count_of(sample.sequence)
         tally = self._tally(sample.key, self._author(topic, sample), start_of(sample.sequence), count)
@@ -104,7 +104,7 @@ class LossAccount:
         """
         for count in health.topics:
             topic = _published(health.process, count.topic)
-            if topic is not None and self._selection.counts(topic):
+            if topic is not None and self._selection.records_all(topic):
                 self.names.admit(topic, count.topic)
                 author = self._known(health.process) if topic is EVENT else ""
                 tally = self._tally(count.topic, author, start_of(sample.sequence), count.published)

@@ -64,8 +64,8 @@ class Selection:
         """Whether no frame is left out."""
         return self.every == 1 and FRAME not in self.left_out
 
-    def counts(self, topic: Topic) -> bool:
-        """Whether a gap in the counts of a topic is a loss: nothing of it is left out on purpose."""
+    def records_all(self, topic: Topic) -> bool:
+        """Whether every message of a topic is recorded, so that a gap in its counts is a loss."""
         return topic not in self.left_out and not (self.every > 1 and topic in _FEWER)
 
     def keeps(self, topic: Topic, sequence: int, payload: bytes) -> bool:

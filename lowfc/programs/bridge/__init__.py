@@ -1,1 +1,1 @@
-"""`lowfc bridge`: a run beside other control systems."""
+"""`lowfc bridge`: share a mirror with other control systems."""

@@ -1,4 +1,4 @@
-"""`lowfc bridge isio`: write modes to ImageStreamIO streams, and report other channels of the mirror to the loop."""
+"""`lowfc bridge isio`: write steps to ImageStreamIO streams, and report the mirror's other channels to the loop."""
 
 import contextlib
 import sys
@@ -27,17 +27,17 @@ from lowfc.contract.printable import printable
 from lowfc.control.loop.command_channels import EXTERNAL
 
 WAITING = 2000
-"""Steps that wait while the bridge stands still: two seconds at 1 kHz."""
-_TURN_S = 0.005
+"""Length of the ring buffer of steps: two seconds at 1 kHz."""
+_POLL_S = 0.005
 _REQUESTS_S = 0.1
-"""Between two requests of a channel that changes all the time."""
+"""Shortest time between two requests for a channel that changes continuously."""
 
 
 def bridge_isio(
     run: Annotated[str | None, typer.Option("--run", help="Name of the run; default: the only one.")] = None,
     prefix: Annotated[str, typer.Option(help="Prefix of the streams' names.")] = "lowfc",
     beside: Annotated[
-        str, typer.Option(help="Channel of the loop: it does not undo the mirror's other channels.")
+        str, typer.Option(help="Channel that the loop writes: it does not undo the mirror's other channels.")
     ] = "",
     external: Annotated[list[str] | None, typer.Option(help="Channel that the loop must not undo; repeat.")] = None,
     nm_per_unit: Annotated[float, typer.Option(min=1e-9, help="Surface per unit of a channel, nm.")] = 1000.0,
@@ -64,11 +64,11 @@ def bridge_isio(
             steps.pass_on()
             if others is not None:
                 others.pass_on()
-            time.sleep(_TURN_S)
+            time.sleep(_POLL_S)
 
 
 class StepStreams:
-    """Each step of the control law, written into streams."""
+    """Writes each step of the control law into streams."""
 
     def __init__(self, bus: Bus, clock: Clock, prefix: str) -> None:
         """Write into the streams PREFIX_error, PREFIX_command, PREFIX_residual and PREFIX_flux."""
@@ -78,10 +78,10 @@ class StepStreams:
         self._streams: dict[str, Stream] = {}
 
     def pass_on(self) -> None:
-        """Write the steps that have come.
+        """Write the steps that have arrived.
 
         Raises:
-            StreamError: a stream of that name is another process's, or cannot be made.
+            StreamError: another process writes a stream of that name, or it cannot be created.
         """
         for sample in self._ring.drain():
             step = step_of(sample)
@@ -106,33 +106,33 @@ class ExternalChannels:
     """Shapes of other programs on the mirror, reported to the loop on every change and to a starting controller."""
 
     def __init__(self, client: Client, bus: Bus, names: Sequence[str], nm_per_unit: float) -> None:
-        """Watch these channels of the mirror; a unit of theirs is so many nm of surface."""
+        """Watch these channels of the mirror, with `nm_per_unit` nm of surface per unit."""
         self._client = client
         self._states = bus.ring(CONTROLLER_STATE, 1)
         self._nm_per_unit = np.float32(nm_per_unit)
         self._others = OtherChannels(names, client.calibration().grid)
         self._shape: Single | None = None
-        self._wanted = b""
-        self._known: bytes | None = None  # of the controller, as far as this process was told
-        self._asked_s = -_REQUESTS_S
+        self._requested = b""
+        self._known: bytes | None = None  # the controller's channel as last reported; None if unknown
+        self._request_time_s = -_REQUESTS_S
         self._fault = ""
 
     def pass_on(self) -> None:
-        """Ask for the channel `external` where it is another one than the controller has."""
+        """Request the channel `external` if it differs from the controller's."""
         for sample in self._states.drain():
             with contextlib.suppress(DecodeError):
                 channels = wire.ControllerState.FromString(sample.payload).channels
                 self._known = next((one.actuators for one in channels if one.name == EXTERNAL), b"")
         shape, now_s = self._others.sum(), time.monotonic()
         if shape is not self._shape:
-            self._shape, self._wanted = shape, (shape * self._nm_per_unit).tobytes() if shape.any() else b""
-        if self._wanted == self._known or now_s - self._asked_s < _REQUESTS_S:
+            self._shape, self._requested = shape, (shape * self._nm_per_unit).tobytes() if shape.any() else b""
+        if self._requested == self._known or now_s - self._request_time_s < _REQUESTS_S:
             return
-        self._asked_s, fault = now_s, ""
-        wanted_nm = np.frombuffer(self._wanted, np.float32).reshape(shape.shape) if self._wanted else None
+        self._request_time_s, fault = now_s, ""
+        shape_nm = np.frombuffer(self._requested, np.float32).reshape(shape.shape) if self._requested else None
         try:
-            self._client.channel(EXTERNAL, wanted_nm)
-            self._known = self._wanted
+            self._client.channel(EXTERNAL, shape_nm)
+            self._known = self._requested
         except LowfcError as error:
             fault = str(error)
         if fault and fault != self._fault:
@@ -142,7 +142,7 @@ class ExternalChannels:
 
 
 def _made(name: str, columns: int) -> Stream:
-    """A stream of one row that is this process's to write: a former one of that size, or a new one."""
+    """A stream of one row for this process to write: an existing one of that size, or a new one."""
     path = stream_path(name)
     with contextlib.suppress(StreamAbsentError):
         stream = Stream(path)

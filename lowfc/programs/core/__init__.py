@@ -1,1 +1,1 @@
-"""The processes of controller and recorder."""
+"""Processes of the controller and the recorder."""

@@ -1,4 +1,4 @@
-"""Values that others on the bench publish, as far as interlocks look at them: the newest of each, and its age."""
+"""Bench values used by interlocks: the newest of each, and its age."""
 
 from collections.abc import Callable, Iterable
 from math import inf
@@ -11,22 +11,22 @@ from lowfc.contract.messages import BENCH
 from lowfc.control.loop.interlocks import BenchReport, Interlock, Value
 
 ANSWER_S = 0.2
-"""How long the publisher of a value may take to answer when the controller starts."""
+"""Timeout for the publisher of a value to answer when the controller starts."""
 
 
 class BenchValues:
-    """One slot for each name: a flood of values costs the loop one look at each per frame."""
+    """One slot per name: even a flood of values costs the loop only one check of each slot per frame."""
 
     def __init__(self, service: Service, interlocks: Iterable[Interlock], take: Callable[[BenchReport], None]) -> None:
         self._service = service
         self._take = take
         ages_ns: dict[str, set[int]] = {}
-        for one in interlocks:
-            ages_ns.setdefault(one.name, set()).add(one.max_age_ns)
+        for interlock in interlocks:
+            ages_ns.setdefault(interlock.name, set()).add(interlock.max_age_ns)
         self._slots = [_Slot(service, name, sorted(ages)) for name, ages in ages_ns.items()]
 
     def ask(self) -> None:
-        """Ask the publisher of each value what it is, so that every interlock is judged before the first frame."""
+        """Query the publisher of each value, so that every interlock is evaluated before the first frame."""
         for slot in self._slots:
             for sample in self._service.bus.get(BENCH.at(slot.name), timeout_s=ANSWER_S):
                 slot.mailbox.put(sample)
@@ -34,7 +34,7 @@ class BenchValues:
             self._take(slot.report(now_ns) or BenchReport(now_ns, slot.name, None))
 
     def look(self) -> None:
-        """Take new values, and values that have become too old for an interlock."""
+        """Report new values, and values that have become too old for an interlock."""
         if self._slots:
             now_ns = self._service.clock.now_ns()
             for slot in self._slots:
@@ -43,7 +43,7 @@ class BenchValues:
 
 
 class _Slot:
-    """The newest value under one name; from `due_ns` on it is too old for the next of its interlocks."""
+    """The newest value of one name; after `due_ns` it is too old for another of its interlocks."""
 
     def __init__(self, service: Service, name: str, ages_ns: list[int]) -> None:
         self.name = name
@@ -52,17 +52,19 @@ class _Slot:
         self._unreadable = service.unreadable
         self._ages_ns = ages_ns
         self._value: Value | None = None
-        self._taken_ns = 0
+        self._received_ns = 0
 
     def report(self, now_ns: int) -> BenchReport | None:
-        """Its newest value and how old that is; None where there is none."""
+        """The newest value and its age; None without a value."""
         sample = self.mailbox.take(0.0)
         if sample is not None and self._read(sample):
-            self._taken_ns = now_ns
+            self._received_ns = now_ns
         if self._value is None:
             return None
-        age_ns = now_ns - self._taken_ns
-        self.due_ns = self._taken_ns + next((one for one in self._ages_ns if one >= age_ns), inf)
+        age_ns = now_ns - self._received_ns
+        self.due_ns = self._received_ns + next(
+            (max_age_ns for max_age_ns in self._ages_ns if max_age_ns >= age_ns), inf
+        )
         return BenchReport(now_ns, self.name, self._value, age_ns)
 
     def _read(self, sample: Sample) -> bool:

@@ -1,4 +1,4 @@
-"""The controller's process: `advance` folded over what the bus brings; the command first, then all the rest."""
+"""The controller's process: applies `advance` to each message; sends the command first, then everything else."""
 
 import contextlib
 import threading
@@ -43,34 +43,34 @@ from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import State
 from lowfc.programs.core.bench_values import BenchValues
 from lowfc.programs.core.cache_warmup import CacheWarmup
-from lowfc.programs.core.camera_signs import CameraSigns
+from lowfc.programs.core.camera_reports import CameraReports
 from lowfc.programs.core.controller_report import (
     Arrays,
     LastSecond,
     NotClosed,
     Offload,
     StageTiming,
-    fill_worth,
+    fill_benefit,
 )
 from lowfc.programs.core.gain_watch import GainWatch
-from lowfc.programs.core.mirror_signs import MirrorSigns
+from lowfc.programs.core.mirror_reports import MirrorReports
 from lowfc.programs.core.start_up import StartUp, settings_under
 
 TICK_NS = 10_000_000
-"""Without frames the held command is repeated this often."""
+"""Period at which the held command is repeated without frames."""
 MIRROR_PATIENCE_S = 1.0
-"""How long the start waits to learn where the mirror is."""
+"""Longest time that the start waits for the mirror to report its shape."""
 STATE_PERIOD_NS = 1_000_000_000
 CHANNEL = "lowfc"
 
 
 class Controller:
-    """Receives frames, sends commands, answers operators, until stopped."""
+    """Receives frames, sends commands and answers requests until stopped."""
 
     def __init__(
         self, config: Configuration, service: Service, calibration: Calibration | None, source: str, latch: Latch
     ) -> None:
-        """Declare everything on the bus and load the calibration; without one, the loop is idle."""
+        """Declare publishers, subscribers and queries and load the calibration; without one, the loop is idle."""
         name = config.mirror.name
         self._service = service
         self._latch = latch
@@ -78,8 +78,8 @@ class Controller:
         self._configuration = config.to_toml()
         self._start_up = StartUp(config)
         self._gain_watch = GainWatch(self._settings, config.control.on_harm, contrast_of(config).form)
-        self._measured: deque[Request] = deque()
-        self._kept_safe = latch.safe
+        self._gain_requests: deque[Request] = deque()
+        self._latched_safe = latch.safe
         self._safe_signalled = False
         self._start_check = StartCheck(
             service.clock,
@@ -88,17 +88,17 @@ class Controller:
         )
         warms_up = config.realtime.cache_warmup and not config.lockstep
         self._warmup = CacheWarmup(config.period_ns) if warms_up else None
-        self._last: Sample | None = None
+        self._last_sample: Sample | None = None
         self._valid_ns = round(config.control.command_timeout_ms * 1e6)
         self._state = State()
-        self._turn = threading.Lock()
+        self._lock = threading.Lock()
         self._adopted = False
         self._early: Sample | None = None
         self._leave_camera = service.dispatch(
             FRAME, self._arrived, period_ns=config.period_ns, superseded=partial(self._arrived, superseded=True)
         )
-        self._mirror = MirrorSigns(service, name)
-        self._camera = CameraSigns(service, self._take)
+        self._mirror = MirrorReports(service, name)
+        self._camera = CameraReports(service, self._take)
         self._bench = BenchValues(service, self._settings.interlocks, self._take)
         self._commands = service.publisher(COMMAND, name)
         self._steps = service.publisher(STEP)
@@ -111,7 +111,7 @@ class Controller:
         self._not_closed = NotClosed()
         self._last_second = LastSecond(config.period_ns)
         self._queries: deque[Query] = deque()
-        service.bus.queryable(REQUEST_KEY.format(name=ALL), self._ask)
+        service.bus.queryable(REQUEST_KEY.format(name=ALL), self._queue_query)
         self._frame_to_command = Durations()
         self._state_due_ns = 0
         self._last_frame_ns = service.clock.host_ns()
@@ -123,23 +123,23 @@ class Controller:
         service.state = "ready"
 
     def run(self) -> None:
-        """Do all but the frames: those are dealt with where they arrive, one turn each."""
+        """Do everything except frames, which the receiving thread processes; `_lock` serialises both."""
         self._camera.await_first()
         self._adopt_mirror()
         self._bench.ask()
         self._service.state = "running"
-        with self._turn:
+        with self._lock:
             self._begin()
             self._adopted = True
             if self._early is not None:
                 self._frame(self._early)
         while self._service.running:
-            rest_ns = None if self._warmup is None else self._warmup.rest_ns(self._service.clock.host_ns())
-            camera = self._camera.wait(min(TICK_NS if rest_ns is None else rest_ns, TICK_NS) * 1e-9)
-            if self._warmup is not None and self._warmup.begins(self._service.clock.host_ns()):
+            wait_ns = None if self._warmup is None else self._warmup.wait_ns(self._service.clock.host_ns())
+            camera = self._camera.wait(min(TICK_NS if wait_ns is None else wait_ns, TICK_NS) * 1e-9)
+            if self._warmup is not None and self._warmup.due(self._service.clock.host_ns()):
                 self._warm_up()
-                continue  # the rest can wait until the frame has come
-            with self._turn:
+                continue  # everything else waits until after the frame
+            with self._lock:
                 self._between_frames(camera)
             if self._safe_signalled:
                 self._safe_signalled = False
@@ -147,49 +147,49 @@ class Controller:
                 self._enter(Request(now_ns, "safe", text="SIGUSR1", requester="a signal"))
             for _ in range(len(self._queries)):
                 self._answer(self._queries.popleft())
-            while self._measured:
-                self._enter(self._measured.popleft())
-            self._keep_safe()
-            for sample in self._camera.asked() if self._state.conditions.camera_awaited else ():
-                with self._turn:
+            while self._gain_requests:
+                self._enter(self._gain_requests.popleft())
+            self._update_latch()
+            for sample in self._camera.query() if self._state.conditions.camera_awaited else ():
+                with self._lock:
                     self._camera.take(sample)
             self._service.beat()
         self._leave_camera()
-        with self._turn:
+        with self._lock:
             self._timing.publish(self._service.clock.host_ns())
         self._latch.close()
         self._service.finish()
 
     def fill(self, health: wire.Health) -> None:
-        """Add mode, counts and latency to a Health."""
+        """Add mode, counts, latency and loop figures to a Health."""
         health.mode = self._state.mode.value  # type: ignore[assignment]  # numbered alike
         health.counts.extend(reason_counts(self._state))
         now_ns = self._service.clock.now_ns()
         health.not_closed_ns, health.not_closed_cause = self._not_closed.note(self._state, now_ns)
         if self._state.mode is LoopMode.CLOSED:
             health.holding = holding(self._state)
-        fill_worth(health, self._gain_watch, self._state)
+        fill_benefit(health, self._gain_watch, self._state)
         health.last_second.CopyFrom(self._last_second.figures(self._state, self._service.clock.host_ns()))
         if self._frame_to_command.count:
             health.frame_to_command.CopyFrom(codec.latency(self._frame_to_command))
 
     def _arrived(self, sample: Sample, *, superseded: bool = False) -> None:
-        """On the thread that receives: a frame; the newest one waits until it is known where the mirror is."""
-        with self._turn:
+        """Process a frame, on the receiving thread; until the mirror's shape is known, keep only the newest one."""
+        with self._lock:
             if not self._adopted:
                 self._early = sample
             elif self._service.running:
                 self._frame(sample, superseded)
 
     def _frame(self, sample: Sample, superseded: bool = False) -> None:
-        """One step: the command goes out before anything else is encoded.
+        """Do one control step: send the command before anything else is encoded.
 
-        A frame that was superseded is late, whatever its age, and the command is held: frames exposed under one mirror
-        shape must not all be integrated.
+        A superseded frame counts as late, whatever its age, and the command is held: frames exposed with the same
+        mirror shape must not all be integrated.
         """
         clock, newest = self._service.clock, self._state.frame_sequence
-        taken_ns = clock.host_ns()
-        age_ns = 0 if clock.lockstep else taken_ns - sample.publish_time_ns
+        start_ns = clock.host_ns()
+        age_ns = 0 if clock.lockstep else start_ns - sample.publish_time_ns
         if superseded:
             age_ns = max(age_ns, self._settings.max_frame_age_ns + 1)
         try:
@@ -208,34 +208,34 @@ class Controller:
         let_send()
         self._publish(outputs)
         self._watch_gains(outputs)
-        if self._state.frame_sequence != newest:  # an old one is no sign of a live camera
-            self._last_frame_ns = taken_ns
+        if self._state.frame_sequence != newest:  # an old frame does not show that the camera is alive
+            self._last_frame_ns = start_ns
         self._service.work += 1
         self._frame_to_command.add(sent_ns - sample.publish_time_ns)
-        moments_ns = sample.receive_time_ns, taken_ns, ready_ns, sent_ns
-        self._timing.add(sample.sequence, sample.publish_time_ns, moments_ns)
-        if clock.now_ns() >= self._state_due_ns:  # not by the frame's time: a camera's clock may be another
+        times_ns = sample.receive_time_ns, start_ns, ready_ns, sent_ns
+        self._timing.add(sample.sequence, sample.publish_time_ns, times_ns)
+        if clock.now_ns() >= self._state_due_ns:  # not the frame's time: the camera may have another clock
             self._publish_state(frame.time_ns)
         if self._warmup is not None:
-            self._last = sample
-            self._warmup.came(sample.receive_time_ns)
-            self._camera.wake()  # the warm-up does what else is to be done now, and then knows when to
+            self._last_sample = sample
+            self._warmup.frame_received(sample.receive_time_ns)
+            self._camera.wake()  # `run` does its other work now, then waits until the next warm-up is due
 
     def _warm_up(self) -> None:
-        """Do the last step once more, and forget what came of it: code and data are in the caches for the next frame.
+        """Repeat the last step and discard the result, so that its code and data are cached for the next frame.
 
-        What happens between two frames pushes them out.
+        Work between two frames evicts them.
         """
-        with self._turn:
-            if self._last is None or self._state.frame_sequence + 1 >= SEQUENCES:
+        with self._lock:
+            if self._last_sample is None or self._state.frame_sequence + 1 >= SEQUENCES:
                 return
-            frame = codec.decode_frame(self._last.payload, self._state.frame_sequence + 1, 0)
+            frame = codec.decode_frame(self._last_sample.payload, self._state.frame_sequence + 1, 0)
             _, outputs = advance(self._settings, self._state, frame)
             if outputs.command is not None:
                 codec.encode_command(outputs.command, self._valid_ns, CHANNEL, self._state.input_number)
 
     def _between_frames(self, camera: Sample | None) -> None:
-        """Apply what the camera says of itself; without frames, hold."""
+        """Apply new camera settings, bench values and mirror reports; without frames, hold the command."""
         if camera is not None:
             self._camera.take(camera)
         if not self._service.clock.lockstep:
@@ -247,30 +247,30 @@ class Controller:
             self._take(Tick(self._service.clock.now_ns(), silent_ns))
 
     def _answer(self, query: Query) -> None:
-        """Apply what an operator asked between two frames; they do not wait while it is decoded, nor for its answer."""
+        """Apply an operator's request between two frames; decoding and the reply do not delay frames."""
         now_ns = self._service.clock.now_ns()
         try:
-            if query.name == "safe":  # whatever came along with it
+            if query.name == "safe":  # accepted even if its other fields are invalid
                 query.payload = codec.only_requester(query.payload)
             request = prepared(self._settings, codec.decode_request(query.payload, query.name, now_ns))
         except ValueError as error:
             request = Request(now_ns, query.name)
-            reply, state, taken = Reply(False, str(error)[:MOST_REPLY], self._state.frame_sequence + 1), self._state, 0
+            reply, state, number = Reply(False, str(error)[:MOST_REPLY], self._state.frame_sequence + 1), self._state, 0
         else:
-            reply, state, taken = self._carry_out(request)
+            reply, state, number = self._carry_out(request)
         shown = controller_state(state, self._settings, now_ns) if request.name == "status" else None
         short = Request(request.time_ns, request.name, request.modes, request.values, request.text)
-        query.reply(codec.encode_request(short, reply, taken, shown))  # who asked has the arrays
-        self._requests.put(codec.encode_request(request, reply, taken, shown))
+        query.reply(codec.encode_request(short, reply, number, shown))  # without the arrays: the requester has them
+        self._requests.put(codec.encode_request(request, reply, number, shown))
 
     def _carry_out(
-        self, request: Request, turn: AbstractContextManager[object] | None = None
+        self, request: Request, lock: AbstractContextManager[object] | None = None
     ) -> tuple[Reply, State, int]:
-        """The reply, the state after it, and its number; 0 for one that is no input of the control law."""
+        """The reply, the state after it, and its input number; 0 for a request that is no input of the control law."""
         if request.name == CONFIGURATION:
             return Reply(True, self._configuration, self._state.frame_sequence + 1), self._state, 0
         self._arrays.publish(request)
-        with self._turn if turn is None else turn:
+        with self._lock if lock is None else lock:
             outputs = self._advance(request)
             state = self._state
             self._publish(outputs)
@@ -281,7 +281,7 @@ class Controller:
         return reply, state, state.input_number
 
     def _watch_gains(self, outputs: Outputs) -> None:
-        """After the command: what the loop is worth; in lockstep what follows is entered before the next frame."""
+        """Update the gain watch after the command; in lockstep, apply its requests before the next frame."""
         if outputs.step is None:
             return
         found = self._gain_watch.follow(outputs.step, self._state)
@@ -289,30 +289,30 @@ class Controller:
             self._service.event(event.name, **event.details)
         for request in found.requests:
             if self._service.clock.lockstep:
-                self._enter(request, turn=contextlib.nullcontext())
+                self._enter(request, lock=contextlib.nullcontext())
             else:
-                self._measured.append(request)
+                self._gain_requests.append(request)
                 self._camera.wake()
 
-    def _enter(self, request: Request, turn: AbstractContextManager[object] | None = None) -> None:
-        """Carry out what no operator asked, and publish it as what they ask."""
-        reply, _, taken = self._carry_out(prepared(self._settings, request), turn)
-        self._requests.put(codec.encode_request(request, reply, taken, None))
+    def _enter(self, request: Request, lock: AbstractContextManager[object] | None = None) -> None:
+        """Carry out an internal request and publish it like an operator's."""
+        reply, _, number = self._carry_out(prepared(self._settings, request), lock)
+        self._requests.put(codec.encode_request(request, reply, number, None))
 
     def safe_by_signal(self) -> None:
-        """Make the loop safe as soon as the main thread gets there; to be called from a signal."""
+        """Request safe mode from a signal handler; the main thread carries it out."""
         self._safe_signalled = True
         self._camera.wake()
 
-    def _keep_safe(self) -> None:
-        """Let the latch follow the loop mode: after the answer, and by a thread of its own."""
+    def _update_latch(self) -> None:
+        """Set or clear the latch if safe mode has changed: after the reply, and in a separate thread."""
         safe = self._state.mode is LoopMode.SAFE
-        if safe is not self._kept_safe:
-            self._kept_safe = safe
+        if safe is not self._latched_safe:
+            self._latched_safe = safe
             self._latch.set(safe)
 
     def _adopt_mirror(self) -> None:
-        """Learn where the mirror is before the first command, so that it does not jump."""
+        """Read the mirror's shape before the first command, so that it does not jump."""
         lockstep = self._service.clock.lockstep
         if lockstep and self._state.drive is not None:  # every lockstep run starts from flat
             self._mirror.close()
@@ -332,16 +332,16 @@ class Controller:
             self._judge_mirror()
 
     def _judge_mirror(self) -> None:
-        """Take in whether the mirror follows, while it does not or where that has changed."""
-        late = self._mirror.first()
-        if late is not None:  # before the first command, it is where the loop starts from
-            self._take(late)
+        """Report a fault of the mirror to the loop, and its end."""
+        shape = self._mirror.first()
+        if shape is not None:  # before the first command: the loop starts from this shape
+            self._take(shape)
         fault = self._mirror.fault(self._state)
         if fault or self._state.conditions.mirror_fault:
             self._take(MirrorReport(self._service.clock.now_ns(), fault, self._mirror.last()))
 
     def _begin(self) -> None:
-        """Ask for what the configuration puts on the mirror, and for its law, as an operator would."""
+        """Request the configured mirror shapes and control law, as an operator would."""
         for request in self._start_up.requests(self._state, self._service.clock.now_ns()):
             request = prepared(self._settings, request)
             self._arrays.publish(request)
@@ -350,23 +350,23 @@ class Controller:
             self._requests.put(codec.encode_request(request, outputs.reply, self._state.input_number, None))
             self._publish(outputs)
             if not outputs.reply.accepted and request.name == "law" and misfit(self._state):
-                self._service.event("LAW_NOT_IN_FORCE", why=outputs.reply.text)  # and the loop is open
+                self._service.event("LAW_NOT_IN_FORCE", why=outputs.reply.text)  # the loop stays open
                 continue
             if not outputs.reply.accepted:
                 self._start_up.refused(request, outputs.reply.text)
                 break
 
-    def _advance(self, taken: Input) -> Outputs:
-        self._state, outputs = advance(self._settings, self._state, taken)
+    def _advance(self, input_: Input) -> Outputs:
+        self._state, outputs = advance(self._settings, self._state, input_)
         return outputs
 
-    def _take(self, taken: Report) -> None:
-        """Advance by what is neither a frame nor a request, and log it where it made a difference."""
+    def _take(self, report: Report) -> None:
+        """Advance by an input that is neither a frame nor a request, and log it if it changed the state."""
         before = self._state
-        outputs = self._advance(taken)
+        outputs = self._advance(report)
         self._send(outputs)
         if self._state is not before:
-            self._inputs.put(codec.encode_input(taken, self._state.input_number))
+            self._inputs.put(codec.encode_input(report, self._state.input_number))
         self._publish(outputs)
 
     def _send(self, outputs: Outputs) -> None:
@@ -374,7 +374,7 @@ class Controller:
             self._commands.put(codec.encode_command(outputs.command, self._valid_ns, CHANNEL, self._state.input_number))
 
     def _publish(self, outputs: Outputs) -> None:
-        """Publish the step and the events, and the state where more of it changed than the next frame shows."""
+        """Publish the step and the events; publish the state if more than a frame's ordinary update changed."""
         if outputs.step is not None:
             self._steps.put(codec.encode_step(outputs.step, self._state.input_number))
             self._last_second.add(outputs.step, self._service.clock.host_ns())
@@ -392,7 +392,7 @@ class Controller:
         self._states.put(message.SerializeToString())
         self._state_due_ns = self._service.clock.now_ns() + STATE_PERIOD_NS
 
-    def _ask(self, query: Query) -> None:
-        """On the bus's thread: leave the request for the loop, and wake it."""
+    def _queue_query(self, query: Query) -> None:
+        """Queue a request for the main thread and wake it; runs on the bus's thread."""
         self._queries.append(query)
         self._camera.wake()

@@ -1,4 +1,4 @@
-"""What the controller reports beside its steps: stage durations, mean commands to offload, time not closed."""
+"""Reports of the controller besides its steps: stage durations, mean commands to offload, time not closed."""
 
 import threading
 from collections import Counter
@@ -19,34 +19,34 @@ from lowfc.programs.core.gain_watch import GainWatch
 TIMING_PERIOD_NS = 100_000_000
 SECOND_NS = 1_000_000_000
 CAUSES_NAMED = 4
-"""Causes of a loop that was not closed, which are named with how often they were."""
+"""Number of the most frequent causes of a loop not closed that are listed with their counts."""
 MOST_CAUSES = 20
-"""Causes that are told apart: a cause may have figures in it, and no two be alike."""
+"""Number of different causes counted; a cause may contain figures, so that their number has no limit."""
 
 
 class StageTiming:
-    """Durations of the stages of each step, published ten times a second in columns."""
+    """Durations of the stages of each step, published in columns every TIMING_PERIOD_NS."""
 
     def __init__(self, publisher: Publisher) -> None:
         self._publisher = publisher
         self._message = wire.ControlTiming()
         self._due_ns = 0
 
-    def add(self, frame_sequence: int, published_ns: int, moments_ns: tuple[int, int, int, int]) -> None:
-        """Add a step: when its frame was published, received and taken, when its command was ready and sent."""
-        received_ns, taken_ns, ready_ns, sent_ns = moments_ns
+    def add(self, frame_sequence: int, published_ns: int, times_ns: tuple[int, int, int, int]) -> None:
+        """Add a step: when its frame was published; when it was received, started, computed and its command sent."""
+        received_ns, start_ns, ready_ns, sent_ns = times_ns
         message = self._message
         message.frame_sequence.append(frame_sequence)
         message.transport_ns.append(_column(received_ns - published_ns))
-        message.wakeup_ns.append(_column(taken_ns - received_ns))
-        message.compute_ns.append(_column(ready_ns - taken_ns))
+        message.wakeup_ns.append(_column(start_ns - received_ns))
+        message.compute_ns.append(_column(ready_ns - start_ns))
         message.publish_ns.append(_column(sent_ns - ready_ns))
         message.frame_to_command_ns.append(_column(sent_ns - published_ns))
         if sent_ns >= self._due_ns:
             self.publish(sent_ns)
 
     def publish(self, now_ns: int) -> None:
-        """Publish what there is."""
+        """Publish the columns collected so far."""
         self._due_ns = now_ns + TIMING_PERIOD_NS
         if self._message.frame_sequence:
             self._message.timestamp.CopyFrom(timestamp(now_ns))
@@ -55,7 +55,7 @@ class StageTiming:
 
 
 class Offload:
-    """The mean modal command, once a second by counting frames, as lockstep needs it."""
+    """The mean modal command, published once per `frames` frames: a count, not a clock, for reproducible runs."""
 
     def __init__(self, publisher: Publisher, frames: int) -> None:
         self._publisher = publisher
@@ -64,7 +64,7 @@ class Offload:
         self._sum_nm, self._count = np.zeros(0), 0
 
     def add(self, step: Step, noll: tuple[int, ...]) -> None:
-        """Add a step of these modes; publish when there are enough."""
+        """Add a step with these modes; publish when the count is complete."""
         if self._noll != noll:
             self._sum_nm, self._count, self._noll = np.zeros(len(noll)), 0, noll
         self._sum_nm += step.command_nm
@@ -82,20 +82,20 @@ class Offload:
 
 
 class LastSecond:
-    """Modal error and light of the frames used in the last second."""
+    """Modal error and flux of the frames used in the last second."""
 
     def __init__(self, period_ns: int) -> None:
         self._rows = np.zeros((max(1, SECOND_NS // period_ns + 1), 3))
         self._count = 0
 
     def add(self, step: Step, now_ns: int) -> None:
-        """Add a step; one whose frame was refused measured nothing."""
+        """Add a step; one whose frame was refused has no measurement."""
         if step.error_nm is not None:
             self._rows[self._count % len(self._rows)] = now_ns, step.error_nm @ step.error_nm, step.flux_dn
             self._count += 1
 
     def figures(self, state: State, now_ns: int) -> wire.LoopFigures:
-        """Figures of the last second; without a frame all are zero."""
+        """Figures of the last second; all zero without a frame."""
         rows = self._rows[: self._count]
         rows = rows[rows[:, 0] > now_ns - SECOND_NS]
         if state.drive is None or not len(rows):
@@ -105,27 +105,27 @@ class LastSecond:
         return wire.LoopFigures(frames=len(rows), residual_rms_nm=square_nm2**0.5, flux_fraction=fraction)
 
 
-def fill_worth(health: wire.Health, watch: GainWatch, state: State) -> None:
-    """What closing would add, and what the wavefront adds to the dark zone, as measured."""
+def fill_benefit(health: wire.Health, watch: GainWatch, state: State) -> None:
+    """Add the harm that closing would do, and the measured added contrast, to a Health."""
     health.closing_harm = watch.closing_harm
     measured = watch.added_contrast()
     if measured is None or state.drive is None or not measured[0]:
         return
-    flat, each = measured
-    name, share = costliest(by_group(state.drive.calibration.noll, each))
-    found = health.recent_wavefront
-    found.added_contrast_flat, found.added_contrast = flat, float(each.sum())
-    found.costliest_modes, found.costliest_share = name, share
+    uncorrected, by_mode = measured
+    name, share = costliest(by_group(state.drive.calibration.noll, by_mode))
+    recent = health.recent_wavefront
+    recent.added_contrast_flat, recent.added_contrast = uncorrected, float(by_mode.sum())
+    recent.costliest_modes, recent.costliest_share = name, share
 
 
 class Arrays:
-    """Calibration, law and table that is played, published by themselves: states and requests have their identities."""
+    """Publishes calibration, law and probe table as messages of their own; states and requests refer to them by identity."""
 
     def __init__(self, calibrations: Publisher, laws: Publisher, plays: Publisher) -> None:
         self._calibrations, self._laws, self._plays = calibrations, laws, plays
 
     def publish(self, request: Request) -> None:
-        """Publish what a request brings."""
+        """Publish the arrays of a request."""
         if request.calibration is not None:
             self._calibrations.put(encode_calibration(request.calibration, request.time_ns))
         if request.law is not None:
@@ -134,7 +134,7 @@ class Arrays:
             self._plays.put(wire_play(request.played, request.time_ns).SerializeToString())
 
     def publish_in_use(self, refused: Request, state: State) -> None:
-        """Publish again what a refused request has not replaced: whoever asks for the last one gets what is in use."""
+        """Publish again the arrays in use after a refused request, so that the last published ones are in use."""
         drive = state.drive
         if drive is None:
             return
@@ -150,10 +150,10 @@ class Arrays:
 
 
 class NotClosed:
-    """For how long the loop has not been closed since its first frame, and the causes."""
+    """Time for which the loop has not been closed since its first frame, and the causes."""
 
     def __init__(self) -> None:
-        self._turn = threading.Lock()
+        self._lock = threading.Lock()
         self._total_ns = 0
         self._since_ns: int | None = None
         self._cause = ""
@@ -161,8 +161,8 @@ class NotClosed:
         self._times = 0
 
     def note(self, state: State, now_ns: int) -> tuple[int, str]:
-        """Take note of the loop mode; return the time in ns and the causes, the most frequent first."""
-        with self._turn:  # a step that ends is noted on the frames' thread
+        """Note the loop mode; return the time not closed, ns, and the causes, most frequent first."""
+        with self._lock:  # called from the main and the receiving thread
             if not state.frame_sequence:
                 return self._total_ns, self._listed()
             before_ns, self._since_ns = self._since_ns, None
@@ -187,5 +187,5 @@ class NotClosed:
 
 
 def _column(duration_ns: int) -> int:
-    """Fit a duration into the 32 bits of its column: a camera's clock may be wrong, and a process may be stopped."""
+    """Clip a duration to the 32 bits of its column: a camera's clock may be wrong, or a process was stopped."""
     return min(max(0, duration_ns), 0xFFFF_FFFF)

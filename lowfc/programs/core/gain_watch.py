@@ -1,4 +1,4 @@
-"""Watches what the loop is worth, frame by frame: asks for gains that were measured, and says where the loop harms."""
+"""Automatic gains: requests optimal gains from measurements, and reports if the closed loop does harm."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -15,36 +15,37 @@ from lowfc.control.loop.state import ActiveLoop, Settings, State, Weighting
 from lowfc.control.loop.wording import AUTO, MEASURED_FIRST
 
 FIRST_S = 2.0
-"""Of the first window, of all modes."""
+"""Length of the first window, all modes."""
 TILT_S, OTHERS_S = 1.0, 10.0
-"""Of the windows after it."""
+"""Length of later windows: tip and tilt, other modes."""
 LIGHT_S = 0.25
+"""Averaging time of the flux."""
 STAR_STEP = 0.2
-"""Relative change of the light over two times `LIGHT_S` in a row that means another star."""
+"""Relative change of the flux in two consecutive averages that means another star."""
 HARMFUL = 3
-"""Windows in a row in which an open loop would have left less, before it is said."""
+"""Consecutive windows in which an open loop would have had a smaller residual, before this is reported."""
 CAUTIOUS = 0.05
-"""Highest gain of the other modes before tip and tilt are corrected, whose square looks like other modes."""
+"""Highest gain of the other modes until tip and tilt are corrected: the square of a tilt looks like other modes."""
 LEAST_FRAMES = 50
-"""Of a window, however slow the loop."""
+"""Smallest number of frames in a window."""
 REQUESTER = "automatic gains"
 
 
-class Remarks(NamedTuple):
-    """What is to be asked of the controller, and said."""
+class Actions(NamedTuple):
+    """Requests to the controller, and events to publish."""
 
     requests: tuple[Request, ...] = ()
     events: tuple[PendingEvent, ...] = ()
 
 
-NOTHING = Remarks()
+NOTHING = Actions()
 
 
 class _Group:
-    """Modes that are judged together: tip and tilt, or the others."""
+    """Modes that are evaluated together: tip and tilt, or the others."""
 
     def __init__(self, mask: Mask, tilt: Mask | None, settings: Settings, drive: ActiveLoop, window_s: float) -> None:
-        """Modes (modes,) of the group; and tip and tilt (modes,), where they are others and both there."""
+        """Evaluate the modes in `mask` (modes,); `tilt` (modes,) selects tip and tilt, both in the other group."""
         rate_hz = settings.rate_hz or 1.0
         frames = [max(round(seconds * rate_hz), LEAST_FRAMES) for seconds in (FIRST_S, window_s)]
         self.mask, self.tilt = mask, tilt
@@ -62,35 +63,35 @@ class _Group:
 
 
 class GainWatch:
-    """Follows the steps of one controller; no part of what a step depends on.
+    """Observes the steps of one controller; a step never depends on it.
 
-    `closing_harm` is what closing at the present gains would add, as a sentence; empty where nothing, or once closed.
+    `closing_harm` is a sentence on the harm of closing at the present gains; empty without harm, or once closed.
     """
 
     def __init__(self, settings: Settings, on_harm: str, contrast: Array | None = None) -> None:
-        """Watch a loop; `contrast` (modes, modes) is what the modes add to the dark zone, per nm^2, where known."""
+        """Watch a loop; `contrast` (modes, modes) is the quadratic form of added contrast, per nm^2, if known."""
         self._settings, self._on_harm, self._contrast = settings, on_harm, contrast
         self._groups: list[_Group] = []
-        self._of: tuple[object, ...] = ()
+        self._identity: tuple[object, ...] = ()
         self._weighting: Weighting | None = None
         self._newest = 0
         self._light = self._frames = 0.0
         self._light_was = 0.0
-        self._unlike = 0
+        self._changed_in_a_row = 0
         self._mode = LoopMode.IDLE
         self.closing_harm = ""
 
-    def follow(self, step: Step, state: State) -> Remarks:
-        """Take a step and the state after it."""
+    def follow(self, step: Step, state: State) -> Actions:
+        """Process a step and the state after it."""
         drive = state.drive
         if drive is None or not drive.calibration.noll:
             return NOTHING
         self._begin(drive)
         if drive.weighting is not self._weighting:
             self._weighting = drive.weighting
-            of_own = single(drive.estimator.rows[:-1] @ drive.calibration.response)
+            response = single(drive.estimator.rows[:-1] @ drive.calibration.response)
             for group in self._groups:
-                group.bank.remade(of_own[np.ix_(group.mask, group.mask)])
+                group.bank.remade(response[np.ix_(group.mask, group.mask)])
         missing = step.frame_sequence - self._newest - 1
         if missing < 0:  # an old frame
             return NOTHING
@@ -133,41 +134,41 @@ class GainWatch:
             )
         ]
         if not judged:
-            return Remarks(events=events) if events else NOTHING
+            return Actions(events=events) if events else NOTHING
         found = self._judge(judged, step, state, drive)
         return found._replace(events=(*events, *found.events))
 
     def added_contrast(self) -> tuple[float, Array] | None:
-        """What the open loop adds to the dark zone, and each mode (modes,) now; None while that was not measured."""
+        """Added contrast in open loop, and of each mode now (modes,); None until measured."""
         if self._contrast is None or not self._groups:
             return None
-        before, left = np.zeros((2, len(self._contrast)))
+        open_nm2, now_nm2 = np.zeros((2, len(self._contrast)))
         for group in self._groups:
-            one, mine, closed = group.verdict, group.mask, self._mode is LoopMode.CLOSED
-            if one is None or one.noise_nm2 is None or mine.size != left.size or (closed and one.loop_nm2 is None):
+            one, mask, closed = group.verdict, group.mask, self._mode is LoopMode.CLOSED
+            if one is None or one.noise_nm2 is None or mask.size != now_nm2.size or (closed and one.loop_nm2 is None):
                 return None
-            before[mine] = left[mine] = np.maximum(one.power_nm2 - one.noise_nm2, 0)
+            open_nm2[mask] = now_nm2[mask] = np.maximum(one.power_nm2 - one.noise_nm2, 0)
             if one.loop_nm2 is not None and closed:
-                left[mine] = np.maximum(before[mine] + one.loop_nm2, injected(group.gain) * one.noise_nm2)
-        each = np.diag(self._contrast)
-        return float(each @ before), each * left
+                now_nm2[mask] = np.maximum(open_nm2[mask] + one.loop_nm2, injected(group.gain) * one.noise_nm2)
+        per_nm2 = np.diag(self._contrast)
+        return float(per_nm2 @ open_nm2), per_nm2 * now_nm2
 
     def _begin(self, drive: ActiveLoop) -> None:
-        of = drive.calibration.id, drive.law.leak.tobytes(), drive.law.limit_nm.tobytes()
-        if of == self._of:
+        identity = drive.calibration.id, drive.law.leak.tobytes(), drive.law.limit_nm.tobytes()
+        if identity == self._identity:
             return
-        self._of, self._weighting = of, None
+        self._identity, self._weighting = identity, None
         tilt = np.isin(drive.calibration.noll, TIP_TILT)
         both = tilt if tilt.sum() == len(TIP_TILT) else None
         self._groups = [
-            _Group(mask, seen, self._settings, drive, window_s)
-            for mask, seen, window_s in ((tilt, None, TILT_S), (~tilt, both, OTHERS_S))
+            _Group(mask, cross_talk, self._settings, drive, window_s)
+            for mask, cross_talk, window_s in ((tilt, None, TILT_S), (~tilt, both, OTHERS_S))
             if mask.any()
         ]
         self._light_was = 0.0
 
     def _star(self, flux_dn: float) -> float:
-        """The light over what it was where that has changed for good; else 0."""
+        """Ratio of the flux to the former flux if it has changed in two consecutive averages; else 0."""
         self._light += flux_dn
         self._frames += 1
         if self._frames < max(LIGHT_S * self._settings.rate_hz, 10):
@@ -176,23 +177,23 @@ class GainWatch:
         if not self._light_was:
             self._light_was = mean
         ratio = mean / self._light_was
-        self._unlike = self._unlike + 1 if abs(ratio - 1) > STAR_STEP else 0
-        if self._unlike < 2:
+        self._changed_in_a_row = self._changed_in_a_row + 1 if abs(ratio - 1) > STAR_STEP else 0
+        if self._changed_in_a_row < 2:
             return 0.0
-        self._unlike, self._light_was = 0, mean
+        self._changed_in_a_row, self._light_was = 0, mean
         return ratio
 
-    def _another_star(self, step: Step, drive: ActiveLoop, ratio: float) -> Remarks:
-        """Lower gains until they have been measured: by a row at least, and by more the fainter the star."""
+    def _another_star(self, step: Step, drive: ActiveLoop, ratio: float) -> Actions:
+        """Halve the automatic gains until they are measured again; lower them further if the flux fell by more."""
         for group in self._groups:
             group.bank.restart()
         events = (PendingEvent("STAR_CHANGED", {"ratio": ratio}),)
         if not drive.automatic.any():
-            return Remarks(events=events)
+            return Actions(events=events)
         lowered = drive.law.gain * np.float32(min(ratio, 0.5))
-        return Remarks((self._gains(step, drive, np.where(drive.automatic, lowered, drive.law.gain)),), events)
+        return Actions((self._gains(step, drive, np.where(drive.automatic, lowered, drive.law.gain)),), events)
 
-    def _judge(self, judged: list[_Group], step: Step, state: State, drive: ActiveLoop) -> Remarks:
+    def _judge(self, judged: list[_Group], step: Step, state: State, drive: ActiveLoop) -> Actions:
         noise_nm2 = self._noise_nm2(drive) if any(group.bank.complete for group in judged) else None
         gain, initial, events = drive.law.gain.copy(), False, []
         for group in judged:
@@ -204,8 +205,8 @@ class GainWatch:
             noise = None if noise_nm2 is None else noise_nm2[group.mask]
             group.gain = drive.law.gain[group.mask]
             group.verdict = verdict = group.bank.verdict(drive.law.gain[group.mask], noise)
-            wanted = verdict.gain if group.calm else np.minimum(verdict.gain, CAUTIOUS)
-            gain[group.mask] = np.where(drive.automatic[group.mask], wanted, gain[group.mask])
+            best = verdict.gain if group.calm else np.minimum(verdict.gain, CAUTIOUS)
+            gain[group.mask] = np.where(drive.automatic[group.mask], best, gain[group.mask])
             if not group.calm:
                 group.calm = True
                 group.bank.begin_again()
@@ -214,16 +215,16 @@ class GainWatch:
         if drive.automatic.any() and (initial or not np.array_equal(gain, drive.law.gain)):
             requests.append(self._gains(step, drive, gain))
         self.closing_harm = "" if state.mode is LoopMode.CLOSED else self._closing_harm(gain, drive)
-        waits = state.mode is LoopMode.OPEN and state.conditions.mode_cause == MEASURED_FIRST
-        if waits and all(group.verdict is not None for group in self._groups):
+        close_pending = state.mode is LoopMode.OPEN and state.conditions.mode_cause == MEASURED_FIRST
+        if close_pending and all(group.verdict is not None for group in self._groups):
             requests.append(
                 Request(step.time_ns, "close", text=f"{AUTO}: the gains were measured", requester=REQUESTER)
             )
         requests += [request for event in events for request in self._reaction(event, step, state)]
-        return Remarks(tuple(requests), tuple(events))
+        return Actions(tuple(requests), tuple(events))
 
     def _closing_harm(self, gain: Single, drive: ActiveLoop) -> str:
-        """What closing would add to the wavefront at gains that were judged as they are."""
+        """Sentence on the wavefront that closing would add, from modes evaluated at their present gains."""
         noll, added, harm_nm2 = np.array(drive.calibration.noll), "", np.zeros(len(drive.calibration.noll))
         for group in self._groups:
             one = group.verdict
@@ -238,25 +239,25 @@ class GainWatch:
             added = f"{np.diag(self._contrast) @ harm_nm2:.1e} of contrast, "
         names, indices = ", ".join(f"Z{index}" for index in noise), ",".join(map(str, noise))
         return (
-            f"closing adds {added}{harm_nm2.sum() ** 0.5:.3g} nm rms at this star, for {names} measure more noise than "
-            f"there is to correct: `lowfc ctl gain auto --modes {indices}` chooses their gains, and 0 in place of auto "
-            "leaves them"
+            f"closing adds {added}{harm_nm2.sum() ** 0.5:.3g} nm rms at this star: the noise of {names} exceeds "
+            f"their disturbance; `lowfc ctl gain auto --modes {indices}` chooses their gains, 0 in place of auto "
+            "does not correct them"
         )
 
     def _noise_nm2(self, drive: ActiveLoop) -> Array | None:
-        """Noise of one frame (modes,), nm^2; None where the camera's gain is not known."""
+        """Noise of one frame (modes,), nm^2; None if the camera's gain is unknown."""
         covariance = noise_covariance_nm2(drive.calibration, self._light_was or drive.calibration.flux_dn, drive.camera)
         return None if covariance is None else np.diag(covariance)
 
     def _gains(self, step: Step, drive: ActiveLoop, gain: Single) -> Request:
-        """The request for gains (modes,), and for R of the modes that are corrected."""
-        noise_nm2, left = self._noise_nm2(drive), drive.automatic & (gain == 0)
+        """The request for gains (modes,), with the prior of the uncorrected modes for R."""
+        noise_nm2, uncorrected = self._noise_nm2(drive), drive.automatic & (gain == 0)
         prior_nm2: tuple[float, ...] = ()
         if noise_nm2 is not None and all(group.verdict is not None for group in self._groups):
             prior = np.zeros(gain.size, np.float32)
             for group in self._groups:
-                assert group.verdict is not None  # noqa: S101  # as just asked
-                prior[group.mask] = left_alone_nm2(group.verdict, left[group.mask], noise_nm2[group.mask])
+                assert group.verdict is not None  # noqa: S101  # checked above
+                prior[group.mask] = left_alone_nm2(group.verdict, uncorrected[group.mask], noise_nm2[group.mask])
             prior_nm2 = tuple(prior.tolist())
         flux_dn = float(np.float32(self._light_was))
         values = tuple(gain.astype(np.float32).tolist())
@@ -265,7 +266,7 @@ class GainWatch:
         )
 
     def _harm(self, group: _Group, verdict: Verdict, drive: ActiveLoop) -> list[PendingEvent]:
-        """The event where an open loop would have left less for `HARMFUL` windows in a row."""
+        """The event if an open loop would have had a smaller residual for `HARMFUL` consecutive windows."""
         if verdict.loop_nm2 is None:
             group.harmful = 0
             return []
@@ -275,13 +276,13 @@ class GainWatch:
             return []
         noise_nm2 = self._noise_nm2(drive)
         noise = 0.0 if noise_nm2 is None else float(noise_nm2[group.mask].sum())
-        there = max(float(verdict.power_nm2.sum()) - noise, 0.0)
+        open_nm2 = max(float(verdict.power_nm2.sum()) - noise, 0.0)
         culprits = verdict.loop_nm2 > 2 * verdict.loop_error_nm2
         noll = np.array(drive.calibration.noll)[group.mask]
         details: dict[str, object] = {
             "modes": ", ".join(f"Z{index}" for index in noll[culprits]),
-            "closed_nm": float(np.sqrt(there + worse)),
-            "open_nm": float(np.sqrt(there)),
+            "closed_nm": float(np.sqrt(open_nm2 + worse)),
+            "open_nm": float(np.sqrt(open_nm2)),
             "action": {"warn": "nothing is done", "open": "the loop opens"}.get(
                 self._on_harm, "the integrator takes over"
             ),

@@ -1,4 +1,4 @@
-"""What the configuration has in files: read, checked, and asked of the controller when it starts."""
+"""Files named in the configuration: read, checked, and requested of the controller at its start."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -24,11 +24,11 @@ from lowfc.control.loop.safety import Limit, LoopMode, limit
 from lowfc.control.loop.state import Settings, State
 
 LIKENESS = 0.5
-"""Of a mirror's shape to the flat map, from which on it is taken to be there already."""
+"""Projection of the mirror's shape on the flat map above which the flat map is assumed to be on the mirror already."""
 
 
 def check_files(config: Configuration) -> None:
-    """Open every file that a configuration names; ConfigurationError has a line for each that cannot be used."""
+    """Open every file that a configuration names; ConfigurationError lists those that cannot be used, one per line."""
     checks: tuple[Callable[[Configuration], object], ...] = (
         lambda config: factory.sensor(config, lambda _: None),
         active_actuators,
@@ -46,7 +46,7 @@ def check_files(config: Configuration) -> None:
 
 
 def law(config: Configuration) -> LinearLaw | None:
-    """The law of `control.law`, which suits the loop; None for the integrator."""
+    """The law of `control.law`, checked for the loop's delay and rate; None for the integrator."""
     file = config.control.law
     if not file:
         return None
@@ -62,53 +62,53 @@ def law(config: Configuration) -> LinearLaw | None:
 
 
 def settings_under(latch: Latch, config: Configuration, event: Callable[..., None]) -> Settings:
-    """The settings of a configuration, its kernel ready; what was made safe stays so when the controller dies.
+    """The settings of a configuration with its kernel loaded; safe mode outlives the controller.
 
-    Where that could not be remembered, nothing is driven until somebody is there. An `event` says which kernel computes
-    where it is not numpy's, or ought not to be.
+    If the latch cannot be stored, the loop starts open until an operator closes it. An event names the kernel unless it
+    is numpy as configured.
     """
-    wanted = config.realtime.kernel
-    found = replace(factory.settings(config), kernel=compiled.kernel(wanted, config.realtime.threads))
-    if found.kernel.name != wanted:
+    configured = config.realtime.kernel
+    settings = replace(factory.settings(config), kernel=compiled.kernel(configured, config.realtime.threads))
+    if settings.kernel.name != configured:
         event("KERNEL_MISSING", advice=compiled.missing())
-    elif found.kernel is not NUMPY:
-        event("KERNEL", kernel=wanted)
+    elif settings.kernel is not NUMPY:
+        event("KERNEL", kernel=configured)
     if latch.safe:
-        return replace(found, start_mode=LoopMode.SAFE)
-    return found if latch.kept else replace(found, start_mode=LoopMode.OPEN)
+        return replace(settings, start_mode=LoopMode.SAFE)
+    return settings if latch.kept else replace(settings, start_mode=LoopMode.OPEN)
 
 
 class StartUp:
-    """What a configuration puts on the mirror, and the law that it chooses."""
+    """The configured flat map and control law, requested at the start."""
 
     def __init__(self, config: Configuration) -> None:
         self._file, self._flat_nm = config.mirror.flat, _flat_within_limits(config)
         self._law_file, self._law = config.control.law, law(config)
 
     def requests(self, state: State, time_ns: int) -> list[Request]:
-        """What to ask, in this order, once it is known where the mirror is.
+        """The requests, in this order, once the mirror's shape is known.
 
-        A mirror that has the flat map already, since another controller put it there, goes on with it: it is taken out
-        of the shape that was adopted as it comes in under its own name, so that nothing moves.
+        If the mirror already has the flat map, from an earlier controller, the flat map is subtracted from the adopted
+        shape and added as a channel of its own, so that nothing moves.
         """
-        asks = partial(Request, time_ns, requester="the configuration")
-        asked: list[Request] = []
+        request = partial(Request, time_ns, requester="the configuration")
+        requests: list[Request] = []
         if self._law is not None:
-            asked.append(asks("law", law=self._law))
+            requests.append(request("law", law=self._law))
         if self._flat_nm is not None:
-            there_nm = _adopted_nm(state, self._flat_nm)
-            if there_nm is not None:
-                rest_nm = (there_nm - self._flat_nm).reshape(-1)
+            adopted_nm = _adopted_nm(state, self._flat_nm)
+            if adopted_nm is not None:
+                rest_nm = (adopted_nm - self._flat_nm).reshape(-1)
                 if np.abs(rest_nm).max() <= ADOPTED_NM:
                     rest_nm[:] = 0
-                asked.append(asks("channel", text=ADOPTED, actuators_nm=rest_nm))
-            asked.append(asks("channel", text=FLAT, actuators_nm=self._flat_nm.reshape(-1)))
-        return asked
+                requests.append(request("channel", text=ADOPTED, actuators_nm=rest_nm))
+            requests.append(request("channel", text=FLAT, actuators_nm=self._flat_nm.reshape(-1)))
+        return requests
 
     def refused(self, request: Request, why: str) -> None:
-        """Raise where a request was refused without which the loop would not be as configured.
+        """Raise if a refused request leaves the loop different from the configuration.
 
-        A shape that was adopted and cannot be taken apart stays one: what comes after is then not asked.
+        An adopted shape that cannot be split stays whole; the later requests are then not sent.
         """
         if request.text == ADOPTED:
             return
@@ -117,25 +117,27 @@ class StartUp:
 
 
 def _adopted_nm(state: State, flat_nm: Single) -> Single | None:
-    """The shape (rows, columns) adopted from the mirror if the flat map is in it; what modes can make is left aside."""
+    """The shape (rows, columns) adopted from the mirror if it contains the flat map; controlled modes are ignored."""
     drive = state.drive
     if drive is None or drive.command_channels is None:
         return None
     shapes = [one.wanted_nm for one in drive.command_channels.channels if one.name == ADOPTED]
     if not shapes:
         return None
-    beside = [
+    without_modes = [
         shape - drive.to_actuators @ (drive.inverse @ shape) for shape in (shapes[0].reshape(-1), flat_nm.reshape(-1))
     ]
-    there = float(beside[0] @ beside[1]) > LIKENESS * float(beside[1] @ beside[1])
-    return shapes[0] if there else None
+    adopted, flat = without_modes
+    return shapes[0] if float(adopted @ flat) > LIKENESS * float(flat @ flat) else None
 
 
 def _flat_within_limits(config: Configuration) -> Single | None:
     found = flat_nm(config)
     if found is not None:
         acting = limit(factory.settings(config).limits, found, found).reasons
-        reasons = [reason for reason in acting if reason is not Limit.SLEW]  # the mirror takes its time
+        reasons = [
+            reason for reason in acting if reason is not Limit.SLEW
+        ]  # the flat map is approached within the slew limit
         if reasons:
             raise ConfigurationError(
                 f"mirror.flat = {config.mirror.flat!r}: beyond the limits of [safety]: "
@@ -148,8 +150,8 @@ def _law_of_modes(config: Configuration) -> None:
     found = law(config)
     if found is not None and found.noll != config.noll:
         raise ConfigurationError(
-            f"control.law = {config.control.law!r}: it is of the modes {_modes(found.noll)}, the sensor's "
-            f"{config.sensor.modes} are {_modes(config.noll)}"
+            f"control.law = {config.control.law!r}: it is for modes {_modes(found.noll)}, the sensor's "
+            f"{config.sensor.modes} modes are {_modes(config.noll)}"
         )
 
 

@@ -1,4 +1,4 @@
-"""The command `lowfc gateway`: offer a run to a control system until stopped."""
+"""The command `lowfc gateway`: connect a run to a control system until stopped."""
 
 import contextlib
 import signal
@@ -19,46 +19,46 @@ from lowfc.programs.gateway.offer import Put, status_of, variables
 from lowfc.programs.gateway.watch import Watch
 
 PERIOD_S = 0.1
-"""Of all variables."""
-TURN_S = 0.005
+"""Update period of the variables."""
+SHORTEST_PERIOD_S = 0.005
 """Shortest time between two updates, however fast a variable changes."""
 BENCH_PERIOD_S = 0.25
-"""How often a bench value is published again while its variable is connected."""
+"""Period at which a bench value is published again while its variable is connected."""
 
 
 def epics(run: AnyRun = None, config: ConfigFile = None) -> None:
-    """Offer a run by EPICS PV Access: figures as PVs, requests as puts, and other servers' PVs as bench values.
+    """Serve a run by EPICS PV Access: figures as PVs, requests as puts, and other servers' PVs as bench values.
 
     Example: lowfc gateway epics --run bench
     """
     from lowfc.programs.gateway.epics import EpicsGateway, protocol
 
-    protocol()  # what is missing is missed first
+    protocol()  # raises now if p4p is missing
     joined = open_run(the_run(run), ())
-    own, links = joined.path / "config.toml", joined.links
-    known = configuration(config) if config is not None or not own.exists() else load(own)
+    of_run, links = joined.path / "config.toml", joined.links
+    known = configuration(config) if config is not None or not of_run.exists() else load(of_run)
     clock, stop = clock_of(known), threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
     with contextlib.ExitStack() as stack:
         bus = ZenohBus(links, Role.OPERATOR, clock, monitor=True)
         stack.callback(bus.close)
-        loop, turn = Client(links.run_id, bus=bus), threading.Lock()
-        offered, news = tuple(variables()), threading.Event()
+        loop, lock = Client(links.run_id, bus=bus), threading.Lock()
+        offered, changed = tuple(variables()), threading.Event()
 
-        def ask(put: Put, value: Any) -> None:
-            with turn:
+        def request(put: Put, value: Any) -> None:
+            with lock:
                 put(loop, value)
 
-        gateway = EpicsGateway(known.gateway, offered, ask, news.set)
+        gateway = EpicsGateway(known.gateway, offered, request, changed.set)
         stack.callback(gateway.close)
         where = f"{known.gateway.listen}:{gateway.port}, PVs {known.gateway.prefix}*"
         sys.stderr.write(f"gateway: run {links.run_id} by PV Access at {where}\n")
         watch, due_s, bench_s = Watch(bus, clock), 0.0, 0.0
         while not stop.is_set():
             now_s = time.monotonic()
-            if news.is_set() or now_s >= bench_s:
-                news.clear()
+            if changed.is_set() or now_s >= bench_s:
+                changed.clear()
                 bench_s = now_s + BENCH_PERIOD_S
                 for name, value in list(gateway.bench.items()):
                     loop.bench(name, value)
@@ -68,5 +68,5 @@ def epics(run: AnyRun = None, config: ConfigFile = None) -> None:
                 status = status_of(seen, links.run_id)
                 values = {one.name: one.read(seen, status) for one in offered if one.read is not None}
                 gateway.update(values, "" if seen.connected else "the controller does not answer")
-            news.wait(max(0.0, min(due_s, bench_s) - time.monotonic()))
-            stop.wait(TURN_S)
+            changed.wait(max(0.0, min(due_s, bench_s) - time.monotonic()))
+            stop.wait(SHORTEST_PERIOD_S)

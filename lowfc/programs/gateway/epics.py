@@ -1,4 +1,4 @@
-"""PV Access: variables as PVs of a server, and PVs of others as bench values; loopback unless configured otherwise."""
+"""EPICS PV Access: variables as PVs of a server, other servers' PVs as bench values; by default on loopback only."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -15,13 +15,13 @@ from lowfc.programs.gateway.offer import Kind, Put, Variable
 _CODES = {Kind.TRUTH: "?", Kind.NUMBER: "d", Kind.TEXT: "s", Kind.NUMBERS: "ad"}
 _EMPTY: dict[Kind, Any] = {Kind.TRUTH: False, Kind.NUMBER: 0.0, Kind.TEXT: "", Kind.NUMBERS: []}
 _INVALID = 3
-"""Severity of an alarm: the value is none."""
+"""Alarm severity of an invalid value."""
 Ask = Callable[[Put, Any], object]
-"""Carries a put out; LowfcError has the refusal."""
+"""Function that carries out a put; LowfcError if it is refused."""
 
 
 def protocol() -> Any:
-    """The package p4p, with what is used of it; ConfigurationError where it is not installed."""
+    """The package p4p with the modules used; ConfigurationError if it is not installed."""
     try:
         import p4p
         import p4p.client.thread
@@ -30,16 +30,16 @@ def protocol() -> Any:
     except ImportError as error:
         advice = install_advice("epics")
         raise ConfigurationError(
-            f"lowfc gateway epics needs p4p, which is not there ({error}); install it with: {advice}"
+            f"lowfc gateway epics needs p4p, which is not installed ({error}); install it with: {advice}"
         ) from None
     return p4p
 
 
 class EpicsGateway:
-    """The server of the variables, and monitors of the PVs that become bench values, the valid ones in `bench`."""
+    """Server of the variables, and PV monitors whose valid values are in `bench`."""
 
     def __init__(self, config: Gateway, variables: Sequence[Variable], ask: Ask, changed: Callable[[], None]) -> None:
-        """Serve; `changed` is called after a change of `bench`, on another thread. BusError: it cannot listen."""
+        """Serve; `changed` is called after a change of `bench`, on another thread. BusError if it cannot listen."""
         p4p = protocol()
         self._variables, self.bench, self._changed = variables, dict[str, Value](), changed
         self._last: dict[str, Any] = {}
@@ -51,7 +51,7 @@ class EpicsGateway:
                 continue
             nt = p4p.nt.NTScalar(_CODES[one.kind], display=True)
             described = {"value": _EMPTY[one.kind], "display.description": one.sentence, "display.units": one.unit}
-            handler = {} if one.put is None else {"handler": _Puts(one.kind, one.put, ask)}
+            handler = {} if one.put is None else {"handler": _PutHandler(one.kind, one.put, ask)}
             self._pvs[one.name] = p4p.server.thread.SharedPV(nt=nt, initial=described, **handler)
         address, port = config.listen, config.port
         served = {
@@ -74,11 +74,11 @@ class EpicsGateway:
 
     @property
     def port(self) -> int:
-        """At which it serves."""
+        """TCP port of the server."""
         return int(self._server.conf()["EPICS_PVAS_SERVER_PORT"])
 
     def update(self, values: dict[str, Any], fault: str) -> None:
-        """Post what has changed; with a fault, all are marked as invalid."""
+        """Post the variables that have changed; with a fault, mark all as invalid."""
         for one in self._variables:
             value = values.get(one.name, _EMPTY.get(one.kind))
             if value is None:
@@ -93,7 +93,7 @@ class EpicsGateway:
                 pv.post(value, severity=_INVALID if fault else 0, message=fault, timestamp=time.time())
 
     def close(self) -> None:
-        """Serve and listen no more."""
+        """Stop the server and the monitors."""
         for monitor in self._monitors:
             monitor.close()
         self._context.close()
@@ -111,17 +111,17 @@ class EpicsGateway:
         return received
 
 
-class _Puts:
-    """Carries out what is put to a variable; a put that is refused fails with the controller's sentence."""
+class _PutHandler:
+    """Carries out puts to a variable; a refused put fails with the controller's message."""
 
     def __init__(self, kind: Kind, put: Put, ask: Ask) -> None:
         self._kind, self._put, self._ask = kind, put, ask
 
     def put(self, pv: Any, operation: Any) -> None:
-        """One put, on a thread of the server's."""
+        """Carry out one put, on a thread of the server."""
         try:
             value = operation.value()
-            if self._kind is not Kind.TRUTH or value:  # a screen sets it back
+            if self._kind is not Kind.TRUTH or value:  # a display writes 0 to reset a button
                 self._ask(self._put, value.tolist() if isinstance(value, np.ndarray) else value)
         except LowfcError as fault:
             operation.done(error=str(fault))
@@ -130,7 +130,7 @@ class _Puts:
 
 
 def _value_of(value: Any) -> Value | None:
-    """The bench value of what a monitor brought; None where it is disconnected, invalid, or no scalar."""
+    """The bench value of a monitor's update; None if the PV is disconnected, invalid or not a scalar."""
     if isinstance(value, Exception) or getattr(value, "severity", 0) >= _INVALID:
         return None
     raw = value.raw

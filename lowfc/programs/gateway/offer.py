@@ -1,6 +1,6 @@
-"""What a gateway offers, whatever its protocol: variables with the loop's figures, and puts that are its requests.
+"""Variables of a gateway, independent of its protocol: readings of the loop, and puts that send requests.
 
-Requests derive from the declared ones: those whose fields are numbers, a text, or nothing.
+The puts are generated from the declared requests whose fields are numbers, a text, or none.
 """
 
 from collections.abc import Callable, Iterator
@@ -17,7 +17,7 @@ from lowfc.programs.gateway.watch import Seen
 
 
 class Kind(Enum):
-    """What a variable holds."""
+    """Type of a variable."""
 
     TRUTH = "truth"
     NUMBER = "number"
@@ -32,7 +32,7 @@ Put = Callable[[Client, Any], Answer]
 class Variable(NamedTuple):
     """A variable; its name, in lower case, follows the gateway's prefix.
 
-    A request that has nothing to show has no `read`; what is read only has no `put`.
+    `read` is None for a request without a value; `put` is None for a read-only variable.
     """
 
     name: str
@@ -61,14 +61,14 @@ def _step(field: str) -> Callable[[Seen, dict[str, Any]], Any]:
 
 READINGS = (
     Variable("mode", Kind.TEXT, "", "Loop mode: idle, open, closed, safe.", _status("mode", "")),
-    Variable("verdict", Kind.TEXT, "", "How the loop is, in a sentence.", lambda seen, _: seen.verdict.headline),
-    Variable("verdict_level", Kind.TEXT, "", "The same in a word.", lambda seen, _: seen.verdict.level.name.lower()),
+    Variable("verdict", Kind.TEXT, "", "State of the loop in a sentence.", lambda seen, _: seen.verdict.headline),
+    Variable("verdict_level", Kind.TEXT, "", "Level of the verdict.", lambda seen, _: seen.verdict.level.name.lower()),
     Variable("holding", Kind.TEXT, "", "Why a closed loop holds its command.", _status("holding", "")),
-    Variable("interlocks", Kind.TEXT, "", "Interlocks that act.", lambda _, status: interlocks(status)),
-    Variable("reserved_for", Kind.TEXT, "", "Who has reserved the loop.", _status("reserved_for", "")),
+    Variable("interlocks", Kind.TEXT, "", "Interlocks that are tripped.", lambda _, status: interlocks(status)),
+    Variable("reserved_for", Kind.TEXT, "", "Holder of the loop's reservation.", _status("reserved_for", "")),
     Variable("residual", Kind.NUMBER, "nm", "Modal error, rms of the last second.", _status("residual_rms_nm", 0.0)),
-    Variable("flux", Kind.NUMBER, "", "Light, part of the calibration's.", _status("flux_fraction", 0.0)),
-    Variable("rate", Kind.NUMBER, "Hz", "Frames in a second.", _status("rate_hz", 0.0)),
+    Variable("flux", Kind.NUMBER, "", "Flux relative to the calibration.", _status("flux_fraction", 0.0)),
+    Variable("rate", Kind.NUMBER, "Hz", "Frame rate.", _status("rate_hz", 0.0)),
     Variable("frames_missing", Kind.NUMBER, "", "Frames that never arrived.", _status("frames_missing", 0)),
     Variable("latency_p50", Kind.NUMBER, "us", "From frame to command, median.", _latency("p50")),
     Variable("latency_p99", Kind.NUMBER, "us", "From frame to command, 99th percentile.", _latency("p99")),
@@ -94,7 +94,7 @@ def _request(one: Declaration) -> Variable | None:
     if one.key.startswith("lowfc/record/"):
         starts = name == "start"
         name, kind, put = f"record_{name}", Kind.TRUTH, lambda loop, value: loop.record(starts)
-    elif "text" in fields and "modes" not in fields:  # of `gain` the numbers
+    elif "text" in fields and "modes" not in fields:  # for `gain`, the numbers rather than the text
         kind, put = Kind.TEXT, lambda loop, value: loop.ask(one.name, text=str(value))
     elif "values" in fields:
         kind, put = Kind.NUMBERS, lambda loop, value: loop.ask(one.name, values=value)
@@ -104,7 +104,7 @@ def _request(one: Declaration) -> Variable | None:
 
 
 def variables() -> Iterator[Variable]:
-    """All variables: readings, of which those with the name of a request can be put, then the other requests."""
+    """All variables: readings, writable if a request has the same name, then the other requests."""
     puts = {made.name: made for one in DECLARED if (made := _request(one)) is not None}
     for reading in READINGS:
         declared = puts.pop(reading.name, None)
@@ -113,5 +113,5 @@ def variables() -> Iterator[Variable]:
 
 
 def status_of(seen: Seen, run: str) -> dict[str, Any]:
-    """Figures of `lowfc ctl status` of what was seen, from which variables are read."""
+    """The figures of `lowfc ctl status`, from which most variables are read."""
     return figures(seen.state, seen.processes, run)

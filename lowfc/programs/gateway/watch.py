@@ -1,4 +1,4 @@
-"""What a gateway sees of a run: the newest of everything, several times a second."""
+"""The newest messages of a run for a gateway, read several times a second."""
 
 from typing import NamedTuple
 
@@ -12,13 +12,13 @@ from lowfc.programs.view.verdicts.verdict import judge
 from lowfc.programs.view.verdicts.watcher import Watcher
 
 SILENT_NS = 2_000_000_000
-"""Without a Health of the controller, of which there are two a second."""
+"""Longest time without a Health of the controller, which is sent twice a second."""
 _WAITING = 2000
 _PATIENCE_S = 0.2
 
 
 class Seen(NamedTuple):
-    """The run now: connected where the controller has been received lately; a frame only where it is new."""
+    """Present state of the run; `connected` if the controller has sent Health recently; `frame` only if it is new."""
 
     connected: bool
     state: wire.ControllerState
@@ -29,7 +29,7 @@ class Seen(NamedTuple):
 
 
 class Watch:
-    """Receives as a monitor does, in rings that cost the loop nothing."""
+    """Receives as a monitor, through ring buffers that do not burden the loop."""
 
     def __init__(self, bus: Bus, clock: Clock) -> None:
         self._bus, self._clock = bus, clock
@@ -39,7 +39,7 @@ class Watch:
         self._step: wire.ControlStep | None = None
 
     def look(self) -> Seen:
-        """Take in what has come since the last call."""
+        """Process the messages since the last call."""
         add, now_ns = self._accumulator.add, self._clock.host_ns()
         for topic, ring in self._rings.items():
             samples = ring.drain()

@@ -23,7 +23,7 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BusError, LowfcError
 from lowfc.contract.messages import EVENT, HEALTH, Role
 from lowfc.programs.commissioning.analytic import analytic
-from lowfc.programs.core.recording.volume import outlook
+from lowfc.programs.core.recording.volume import estimate
 from lowfc.programs.launch.processes import program, start_all, stop_all
 from lowfc.programs.launch.status import screen, status_line
 from lowfc.programs.launch.watch import Watch, summary
@@ -53,7 +53,7 @@ def sim_loop(
     run = _new_run(config, name)
     console.print(f"run {run.run_id}", highlight=False)
     if record:
-        console.print(outlook(config), highlight=False, markup=False, soft_wrap=True)
+        console.print(estimate(config), highlight=False, markup=False, soft_wrap=True)
     watch = Watch({}, [])
     children: list[Child] = []
     bus = ZenohBus(run.links, Role.LAUNCHER, HostClock())  # listens: shows that a loop starts

@@ -155,7 +155,7 @@ class _Account:
         begin = None if self._begin_ns is None else datetime.fromtimestamp(self._begin_ns / 1e9, UTC)
         topics = {}
         for key, line in sorted(self._lines.items()):
-            counted = (topic := _topic(key)) is None or self._selection.counts(topic)
+            counted = (topic := _topic(key)) is None or self._selection.records_all(topic)
             topics[key] = line.figures(missing.get(key, 0) if counted else None)
         return {
             "start": None if begin is None else begin.isoformat(timespec="milliseconds"),

@@ -12,7 +12,7 @@ from lowfc.adapters.process import compiled
 from lowfc.control.kernel.tables import FUSED
 from lowfc.programs.commissioning.checks import Check, Table, note, ok, warning
 from lowfc.programs.commissioning.doctor.facts import Facts
-from lowfc.programs.core.recording.volume import bytes_per_s, selected
+from lowfc.programs.core.recording.volume import bytes_per_s, configured_selection
 
 CHECKS: Table[Facts] = Table()
 """The docstring of each says what it looks at; docs/howto/doctor.md also says when it warns."""
@@ -115,7 +115,7 @@ def _disk(facts: Facts) -> Check:
     section, rate_hz = facts.config.recorder, facts.config.camera.rate_hz
     folder = Path(section.folder)
     free_bytes, writable = facts.host.disk(folder)
-    grows = bytes_per_s(facts.config, selected(facts.config))
+    grows = bytes_per_s(facts.config, configured_selection(facts.config))
     lasts_s = max(0.0, free_bytes - section.min_free_mb * 1e6) / grows
     detail = (
         f"{folder.absolute()}: {free_bytes / 1e9:.1f} GB free, {lasts_s / 3600:.1f} h of "

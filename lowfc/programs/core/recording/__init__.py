@@ -1,1 +1,1 @@
-"""`lowfc record`: the recorder, which writes every message of a run into a log."""
+"""`lowfc record`: the recorder writes every message of a run into a log."""

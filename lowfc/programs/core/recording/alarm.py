@@ -1,8 +1,8 @@
-"""The command of `recorder.on_event`, run when an event of its level or above occurs.
+"""Runs the command of `recorder.on_event` when an event of its level or above occurs.
 
-The recorder runs it, because there is one in each run, it receives every event, and it is not in the loop. A console
-may be closed, or open twice. A thread in the normal scheduling class starts the command, which inherits that class.
-Events during the command wait for its end; then the command is run once, for the worst of them.
+The recorder runs it, because each run has one, it receives every event, and it is not in the loop; a console may be
+closed, or open twice. A thread in the normal scheduling class starts the command, which inherits that class. Events
+during the command wait for its end; then the command is run once, for the worst of them.
 """
 
 import contextlib
@@ -31,7 +31,7 @@ class Alarm:
     """Runs a shell command on events of a level, one at a time and not too often."""
 
     def __init__(self, service: Service, command: str, level: Level, every_s: float) -> None:
-        """Start with the next event; a failure of the command is published as an event that does not run it again."""
+        """Run the command from the next event on; its failure is published as an event that does not trigger it."""
         self._command, self._level, self._every_s, self._service = command, level, every_s, service
         self._waiting: deque[Log] = deque(maxlen=_MOST_WAITING)
         self._arrived = threading.Event()
@@ -45,7 +45,7 @@ class Alarm:
             self._arrived.set()
 
     def _work(self) -> None:
-        give_way()  # this thread alone, and what it starts
+        give_way()  # only this thread and its child processes
         while self._arrived.wait():
             self._arrived.clear()
             events = [self._waiting.popleft() for _ in range(len(self._waiting))]
@@ -65,7 +65,7 @@ class Alarm:
             "LOWFC_OTHERS": str(others),
         }
         try:
-            command = subprocess.Popen(  # noqa: S603  # the user's own
+            command = subprocess.Popen(  # noqa: S603  # configured by the user
                 ["/bin/sh", "-c", self._command],
                 stdin=subprocess.DEVNULL,
                 env={**os.environ, **arguments},

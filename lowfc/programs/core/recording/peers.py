@@ -1,4 +1,4 @@
-"""The other processes of a run, as a recorder needs them: their Health, and the states that the logs depend on."""
+"""State of the other processes of a run for the recorder: their Health, and the states that each log starts with."""
 
 from concurrent.futures import Future, ThreadPoolExecutor
 
@@ -8,7 +8,7 @@ from lowfc.contract.messages import HEALTH, TOPICS, wire
 
 
 class Peers:
-    """Processes by their last Health, and `kept`: the newest of each calibration and state, with which a log begins."""
+    """Processes by their last Health, and in `kept` the newest calibration and states, with which a log starts."""
 
     def __init__(self, bus: Bus) -> None:
         self.kept: dict[str, Sample] = {}
@@ -20,7 +20,7 @@ class Peers:
         self._answers: Future[list[Sample]] | None = None
 
     def note(self, sample: Sample, health: wire.Health) -> None:
-        """Keep the state of a process, unless a later start of it has reported already."""
+        """Store the state of a process, unless a later start of it has reported already."""
         name, start_s = name_in(HEALTH, sample.key), start_of(sample.sequence)
         known_s, _ = self._states.get(name, (-1, ""))
         self._newcomers |= start_s > known_s
@@ -28,34 +28,34 @@ class Peers:
             self._states[name] = start_s, health.state
 
     def stopped(self, but: str) -> bool:
-        """Whether all have reported that they stopped, except the process of that name."""
+        """Whether all processes except the one named have reported that they stopped."""
         return all(state == "stopped" for name, (_, state) in self._states.items() if name != but)
 
     def keep(self, sample: Sample) -> bool:
-        """Keep a calibration or state, and return whether it is new; not where a newer one is known."""
+        """Store a calibration or state unless a newer one is known; return whether it is new."""
         kept = self.kept.get(sample.key)
         if kept is None or kept.sequence <= sample.sequence:
             self.kept[sample.key] = sample
         return kept is None or kept.sequence < sample.sequence
 
     def already_received(self, sample: Sample) -> bool:
-        """Whether a query brought this message before the bus did; true once."""
+        """Whether a query returned this message before the bus delivered it; true once per message."""
         known = (sample.key, sample.sequence) in self._queried
         self._queried.discard((sample.key, sample.sequence))
         return known
 
     def query(self) -> list[Sample]:
-        """Calibration and states from before this process started, or lost on their way."""
+        """Query calibration and states published before this process started, or lost; return the new ones."""
         return self._new(self._get())
 
     def query_soon(self) -> None:
-        """Query at the next opportunity: something may have been lost on its way."""
+        """Query at the next opportunity: a message may have been lost."""
         self._newcomers = True
 
     def query_meanwhile(self, *, more: bool) -> list[Sample]:
-        """Query where a process is new, unless no `more` is wanted; what is new among answers since the last call.
+        """Query if a process is new, unless not `more`; return the new messages among answers since the last call.
 
-        That is done in a thread, for a frozen process answers late.
+        A thread does the query, because a frozen process answers late.
         """
         if more and self._newcomers and self._answers is None:
             self._answers = self._thread.submit(self._get)

@@ -1,4 +1,4 @@
-"""The recorder's process: joins a run, and records it until it is stopped."""
+"""The recorder's process: joins a run and records it until stopped."""
 
 import sys
 from collections.abc import Set as AbstractSet
@@ -20,23 +20,24 @@ from lowfc.contract.messages import Role
 from lowfc.programs.core.recording.alarm import Alarm
 from lowfc.programs.core.recording.recorder import Recorder
 from lowfc.programs.core.recording.summary import Summary
-from lowfc.programs.core.recording.volume import bytes_per_s, outlook, selected
+from lowfc.programs.core.recording.volume import bytes_per_s, configured_selection, estimate
 
 _LARGEST_ATTACHMENT_BYTES = 1 << 28
 
 
 def record(run: Run, config: Configuration, calibration: Path | None) -> Summary:
-    """Record a run until SIGTERM or SIGINT; its configuration and the calibration (FITS) go into each log.
+    """Record a run until SIGTERM or SIGINT; its configuration and the calibration (FITS) are attached to each log.
 
     Raises:
-        BusError: another recorder has this run.
+        BusError: another recorder is recording this run.
         DataFileError: a file cannot be read, or no log can be written in the folder.
     """
-    log, realtime, limits, selection = config.recorder, config.realtime, limits_of(config), selected(config)
+    log, realtime = config.recorder, config.realtime
+    limits, selection = log_limits(config), configured_selection(config)
     if short := shortage(Path(log.folder), limits.min_free_bytes):
         raise DataFileError(short)
-    sys.stderr.write(f"{outlook(config)}\n")
-    complete = run.path / "config.toml"  # a file may name only what was chosen; the log names every value
+    sys.stderr.write(f"{estimate(config)}\n")
+    complete = run.path / "config.toml"  # every value, also the defaults that a user's file omits
     write_whole(complete, config.to_toml().encode())
     attachments = [_attached(complete, "application/toml")]
     attachments += [] if calibration is None else [_attached(calibration, "application/fits")]
@@ -67,14 +68,14 @@ def record(run: Run, config: Configuration, calibration: Path | None) -> Summary
         bus.close()
 
 
-def limits_of(config: Configuration) -> Limits:
-    """When the next log is begun, and who may read it."""
+def log_limits(config: Configuration) -> Limits:
+    """Size and duration of a log, free disk space to leave, and file mode."""
     log = config.recorder
     return Limits(round(log.largest_mb * 1e6), log.longest_s, round(log.min_free_mb * 1e6), int(log.file_mode, 8))
 
 
 def _launched(run: Run) -> AbstractSet[str]:
-    """The processes that a launcher starts beside the recorder; it sends no Health itself."""
+    """The processes that a launcher starts besides the recorder; the launcher itself sends no Health."""
     ports = run.links.ports.keys()
     return ports - {Role.LAUNCHER, Role.RECORDER} if Role.LAUNCHER in ports else frozenset()
 

@@ -1,7 +1,7 @@
-"""The recorder: every message of a run into one log, and an account of those that it did not get.
+"""The recorder: writes every message of a run into one log and counts those that it did not receive.
 
-The bus's threads only append to a bounded queue; the loop here empties it, so that a slow disk costs messages, which
-are counted, and never time in the loop. A disk that refuses ends the recording and nothing else.
+The bus's threads only append to a bounded queue, which the recorder's own loop empties: a slow disk costs messages,
+which are counted, but never delays the control loop. A disk error ends the recording and nothing else.
 """
 
 import signal
@@ -27,16 +27,16 @@ from lowfc.contract.errors import BadMessageError, DataFileError
 from lowfc.contract.messages import EVENT, HEALTH, RECORD_KEY, TOPICS, Role, Topic, timestamp, wire
 from lowfc.programs.core.recording.peers import Peers
 from lowfc.programs.core.recording.summary import Summary
-from lowfc.programs.core.recording.volume import in_words
+from lowfc.programs.core.recording.volume import growth_sentence
 
 QUEUE_MESSAGES = 20_000
-"""Messages that may wait for the disk: about 4 s of a 1 kHz loop, 90 MB."""
+"""Largest number of messages waiting for the disk: about 4 s of a 1 kHz loop, 90 MB."""
 QUEUE_BYTES = 256_000_000
-"""Payloads that may wait for the disk, whatever their size."""
+"""Largest total size of payloads waiting for the disk."""
 MOST_CHANNELS = 4096
-"""Starts of publishers after which the next log is begun: each is a channel of the log, and costs memory."""
+"""Number of publisher starts after which the next log is begun: each is a channel of the log and costs memory."""
 
-_TURN_S = 0.02
+_ITERATION_S = 0.02
 _FLUSH_NS = 250_000_000
 _SETTLE_S = (0.3, 1.5)
 _DRAIN_S = 1.0
@@ -45,7 +45,7 @@ _DONE = {"start": "recording into", "stop": "recording stopped:"}
 
 
 class Recorder:
-    """Records a run, from its bus to its logs."""
+    """Records the messages of a run into logs."""
 
     def __init__(
         self,
@@ -62,9 +62,10 @@ class Recorder:
         expected_bytes_per_s: float = 0.0,
         awaited: AbstractSet[str] = frozenset(),
     ) -> None:
-        """Subscribe to everything; `run` begins to record, each log with `metadata` and `attachments` first.
+        """Subscribe to everything; `run` starts the recording. Each log starts with `metadata` and `attachments`.
 
-        It begins once each of the `awaited` processes, or of those on the bus, has sent Health, or after a while.
+        Recording starts once each of the `awaited` processes, by default all on the bus, has sent Health, or after a
+        timeout.
         """
         self._awaited = awaited
         self._bus = bus
@@ -84,7 +85,7 @@ class Recorder:
         self._flush_due_ns = self._most_starts = 0
         self._begun_ns = self._oldest_ns = 0
         self._longest_wait_ns = self._longest_unflushed_ns = self._slowest_ns = 0
-        # Before the service, which subscribes to Health: a process that received it has received all others.
+        # Before the service subscribes to Health: a peer that knows of this subscription knows of all others.
         for topic in TOPICS:
             bus.subscribe(topic, partial(self._backlog.put, topic))
         self.service = Service(Role.RECORDER, run_id, clock, bus, granted=granted, fill=self._fill)
@@ -94,14 +95,14 @@ class Recorder:
     def catch_signals(self) -> None:
         """Finish the log at SIGTERM, Ctrl-C or a lost terminal; for the main thread.
 
-        A second signal does not wait for the last Health of the others.
+        After a second signal the recorder does not wait for the last Health of the others.
         """
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
             if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:  # as nohup leaves it
                 signal.signal(number, self._signalled)
 
     def run(self) -> Summary:
-        """Record until stopped; DataFileError where the first log cannot be opened."""
+        """Record until stopped; DataFileError if the first log cannot be opened."""
         self._settle()
         for sample in self._peers.query():
             self._write(sample)
@@ -110,8 +111,8 @@ class Recorder:
         self.service.awaited = lambda: "" if self.service.last_health else "any other process"
         self.service.state = "ready"
         while self.service.running:
-            self._turn()
-            time.sleep(_TURN_S)
+            self._iterate()
+            time.sleep(_ITERATION_S)
         self.service.state = "stopping"
         self._drain()
         summary = self._close()
@@ -123,31 +124,31 @@ class Recorder:
         self.service.stop(signal.Signals(number).name)
 
     def _settle(self) -> None:
-        """Wait for a Health of each process that is there already or is awaited, so that it can be queried."""
+        """Wait for the Health of each process that is running or awaited, so that it can be queried."""
         begun_s = time.monotonic()
         shortest_s, longest_s = _SETTLE_S
         while self.service.running:
             self.service.beat()
-            time.sleep(_TURN_S)
+            time.sleep(_ITERATION_S)
             age_s = time.monotonic() - begun_s
-            heard = self.service.last_health.keys()
-            all_there = self._awaited <= heard if self._awaited else len(heard) >= self._bus.peers()
-            if age_s >= longest_s or (age_s >= shortest_s and all_there):
+            alive = self.service.last_health.keys()
+            complete = self._awaited <= alive if self._awaited else len(alive) >= self._bus.peers()
+            if age_s >= longest_s or (age_s >= shortest_s and complete):
                 return
 
     def _begin(self, *, anew: bool = True) -> None:
-        """Begin a log, or unless `anew` its next part, with what the messages in it depend on."""
+        """Begin a log, or unless `anew` its next part, with the calibration and states that its messages depend on."""
         self._series.begin(self._peers.kept.values(), anew=anew)
         self._most_starts = self._account.starts + MOST_CHANNELS
         self.service.event("RECORDING")
 
-    def _turn(self) -> None:
-        """Write what has arrived; now and then flush, report and rotate; do what an operator asks."""
+    def _iterate(self) -> None:
+        """Write what has arrived; periodically flush, report and rotate; carry out an operator's request."""
         self._write_waiting()
         for sample in self._peers.query_meanwhile(more=self.service.running):
             self._write(sample)
         if self._clock.host_ns() >= self._flush_due_ns:
-            self._look_after()
+            self._maintain()
         self._answer_operator()
         self.service.beat()
 
@@ -158,10 +159,10 @@ class Recorder:
             now_ns = self._clock.host_ns()
             self._longest_wait_ns = max(self._longest_wait_ns, now_ns - self._arrival_ns(sample))
             if now_ns >= self._flush_due_ns:
-                self._look_after()
+                self._maintain()
 
     def _answer_operator(self) -> None:
-        """Start and stop as asked, and answer with the log; a stop is answered once the disk has the log."""
+        """Start or stop on request and answer with the log's path; a stop is answered once the log is on the disk."""
         while self._queries:
             query = self._queries[0]
             if query.name not in ("start", "stop"):
@@ -172,18 +173,18 @@ class Recorder:
                 return
             self._queries.popleft()
             path = str(self._series.files[-1].absolute()) if self._series.files else ""
-            outlook = self._outlook() if query.name == "start" else ""
+            estimate = self._estimate() if query.name == "start" else ""
             answer = wire.Request(
                 timestamp=timestamp(self._clock.now_ns()),
                 name=query.name,
                 text=path,
                 accepted=not refusal,
-                reply=refusal or "; ".join(filter(None, (f"{_DONE[query.name]} {path}", outlook))),
+                reply=refusal or "; ".join(filter(None, (f"{_DONE[query.name]} {path}", estimate))),
             )
             query.reply(answer.SerializeToString())
 
     def _pause(self) -> str | None:
-        """Finish the log with all that has arrived; return why not, if so, and None until the disk has it."""
+        """Finish the log; return None until it is on the disk, then the reason of a failure or an empty text."""
         try:
             if self._ending is None:
                 if self._failure or self._paused:
@@ -194,7 +195,7 @@ class Recorder:
                 self._flush()
                 self._series.end(self._figures(), wait=False)
                 self._paused = True
-                self._ending = self._ender.submit(self._series.end, {})  # waits for it
+                self._ending = self._ender.submit(self._series.end, {})  # waits until the log is written
             if not self._ending.done():
                 return None
             ending, self._ending = self._ending, None
@@ -202,7 +203,7 @@ class Recorder:
         except DataFileError as fault:
             self._fail(fault)
         self._paused = not self._failure
-        self.service.state = "ready"  # its Health, for who asks next
+        self.service.state = "ready"  # publishes Health, so that the next `status` is current
         return self._failure
 
     def _resume(self) -> str:
@@ -222,8 +223,8 @@ class Recorder:
         self._peers.query_soon()
         return ""
 
-    def _look_after(self) -> None:
-        """Flush, begin the next log when it is time, report losses, publish Health."""
+    def _maintain(self) -> None:
+        """Flush, begin the next log if it is due, report losses, publish Health."""
         self._flush()
         self._flush_due_ns = self._clock.host_ns() + _FLUSH_NS
         self._say_losses()
@@ -251,7 +252,7 @@ class Recorder:
         try:
             _, health = self._account.names.health(sample.key, sample.payload)
         except UNREADABLE:
-            return  # it is in the log as it came; the service counts it
+            return  # the log has it as received; the service counts it
         self._peers.note(sample, health)
         try:
             self._account.believe(sample, health)
@@ -273,7 +274,7 @@ class Recorder:
         return max(sample.receive_time_ns, self._begun_ns)
 
     def _flush(self) -> None:
-        """Make what was written safe; end the log where it is full, and the recording where the disk nearly is."""
+        """Flush; begin the next log if this one is full, and end the recording if the disk is nearly full."""
         try:
             if self._ending is None:
                 self._series.flush()
@@ -291,10 +292,10 @@ class Recorder:
         except DataFileError as fault:
             self._fail(fault)
 
-    def _outlook(self) -> str:
-        """What the recording will take, by what it has taken; empty where nobody knows."""
+    def _estimate(self) -> str:
+        """Sentence on the disk space used, from the growth so far or as expected; empty if unknown."""
         growth = self._series.bytes_per_s or self._expected_bytes_per_s
-        return in_words(growth, self._folder, self._min_free_bytes) if growth else ""
+        return growth_sentence(growth, self._folder, self._min_free_bytes) if growth else ""
 
     def _flushed(self) -> None:
         self._account.settle()
@@ -304,7 +305,7 @@ class Recorder:
             self._oldest_ns = 0
 
     def _fail(self, fault: DataFileError) -> None:
-        """Give up recording, and nothing else: the process lives, and counts what is lost from here."""
+        """End the recording but not the process, which counts the messages lost from here on."""
         self._series.give_up()
         self._account.revert()
         self._failure = str(fault)
@@ -315,20 +316,20 @@ class Recorder:
             self.service.event("MESSAGES_LOST", topic=topic, count=count)
 
     def _drain(self) -> None:
-        """Wait a while for the last Health of the others, which counts what they sent."""
+        """Wait up to _DRAIN_S for the last Health of the others, which counts the messages they sent."""
         deadline_s = time.monotonic() + _DRAIN_S
         while not self._hurried:
-            self._turn()
+            self._iterate()
             if self._peers.stopped(but=self.service.name) or time.monotonic() >= deadline_s:
                 return
-            time.sleep(_TURN_S)
+            time.sleep(_ITERATION_S)
 
     def _close(self) -> Summary:
         while self._ending is not None:
-            self._turn()
-            time.sleep(_TURN_S)
+            self._iterate()
+            time.sleep(_ITERATION_S)
         self._say_losses()
-        self._turn()
+        self._iterate()
         self._flush()
         try:
             self._series.end(self._figures())
@@ -349,7 +350,7 @@ class Recorder:
         )
 
     def _figures(self) -> dict[str, str]:
-        """What a log says of its recording at its end: of all logs so far."""
+        """Figures at the end of a log, for all logs so far."""
         lost = self._account.lost()
         return {
             "messages": str(self._series.messages),
@@ -367,7 +368,7 @@ class Recorder:
         health.recording.failure = self._failure
         health.recording.stopped = self._paused and not self._failure
         health.recording.bytes = self._series.bytes_written
-        counts = {count.topic: count for count in health.topics}  # of its own, those that it sent
+        counts = {count.topic: count for count in health.topics}  # already has this process's sent counts
         for key, recorded in self._account.recorded().items():
             count = counts[key] if key in counts else health.topics.add(topic=key)
             count.received, count.missing = recorded, lost.get(key, 0)

@@ -1,4 +1,4 @@
-"""What a recorder says at its end: to a person, and as figures."""
+"""Summary of a recording at its end: as text and for `--json`."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,10 +7,16 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """What a recorder has done; a log that could not be finished ends in `.part`.
+    """Summary of a recording; the name of a log that could not be finished ends in `.part`.
 
-    The longest times are from a message's arrival, once there was a log, to its being written (wait) and to its
-    surviving a kill -9 (unflushed), and of one write to the disk.
+    Attributes:
+        files: the logs.
+        messages: number of messages recorded.
+        lost: number of messages lost, by topic.
+        failure: reason why the recording ended early; empty if it did not.
+        longest_wait_ns: longest time from the arrival of a message, once there was a log, until it was written.
+        longest_unflushed_ns: longest time from the arrival of a message until a kill -9 could not lose it.
+        longest_write_ns: longest single write to the disk.
     """
 
     files: tuple[Path, ...]
@@ -23,7 +29,7 @@ class Summary:
 
 
 def figures(summary: Summary) -> dict[str, Any]:
-    """What a recorder has done, for `--json`."""
+    """The summary for `--json`."""
     return {
         "messages_recorded": summary.messages,
         "messages_lost": sum(summary.lost.values()),
@@ -37,9 +43,9 @@ def figures(summary: Summary) -> dict[str, Any]:
 
 
 def report(summary: Summary) -> str:
-    """The same for a person."""
+    """The summary as text."""
     if not summary.files and not summary.failure:
-        return "no process of this run was there: no log is kept"
+        return "no other process of this run was running: no log is kept"
     logs = ", ".join(map(str, summary.files))
     lines = [f"{summary.messages} messages in {logs}; {sum(summary.lost.values())} lost"]
     lines += [f"lost {count} of {topic}" for topic, count in sorted(summary.lost.items())]

@@ -1,4 +1,4 @@
-"""How much a recording will take of the disk, said before it begins."""
+"""Estimate of the disk space that a recording will use."""
 
 import shutil
 from pathlib import Path
@@ -10,49 +10,50 @@ from lowfc.contract.messages import COMMAND, FRAME, MIRROR_STATE, STEP, SURFACE,
 from lowfc.optics.chain.sensor import Sensor
 
 _FLOAT_BYTES, _COUNT_BYTES = 4, 2
-_PICTURE_PIXELS = 64  # of the mirror's surface, along a side
-_MESSAGE_BYTES = 110  # times, sequence and flags of a message, its record and its place in the log's index
-_LEFT = {FRAME: 0.6, COMMAND: 0.9, MIRROR_STATE: 0.55}
-"""What LZ4 leaves of a payload, as measured with the simulated camera at V = 2; of others all of it."""
+_SURFACE_PIXELS = 64  # side of the published image of the mirror's surface
+_MESSAGE_BYTES = 110  # times, sequence, flags, record header and index entry of a message
+_COMPRESSED_FRACTION = {FRAME: 0.6, COMMAND: 0.9, MIRROR_STATE: 0.55}
+"""Size of a payload after LZ4 relative to before, measured with the simulated camera at V = 2; 1 for other topics."""
 
 
 def payload_bytes(config: Configuration) -> dict[Topic, int]:
-    """Array bytes in one message of each topic that takes room on the disk, by the sizes of camera and mirror."""
+    """Array bytes in one message of each large topic, from the sizes of camera and mirror."""
     actuators, modes = config.mirror.rows * config.mirror.columns, config.sensor.modes
     return {
         FRAME: Sensor.pixels**2 * _COUNT_BYTES,
         COMMAND: actuators * _FLOAT_BYTES,
         MIRROR_STATE: actuators * _FLOAT_BYTES,
-        SURFACE: _PICTURE_PIXELS**2 * _FLOAT_BYTES,
+        SURFACE: _SURFACE_PIXELS**2 * _FLOAT_BYTES,
         STEP: 3 * modes * _FLOAT_BYTES,
         TRUTH: 2 * modes * _FLOAT_BYTES,
     }
 
 
 def bytes_per_s(config: Configuration, recorded: Selection) -> float:
-    """Growth of a log, bytes per second: topics' sizes times their rates, compressed."""
+    """Growth of a log, bytes per second: compressed message size times rate, summed over the topics."""
     return sum(
-        (size * _LEFT.get(topic, 1.0) + _MESSAGE_BYTES) * _rate_hz(topic, config, recorded)
+        (size * _COMPRESSED_FRACTION.get(topic, 1.0) + _MESSAGE_BYTES) * _rate_hz(topic, config, recorded)
         for topic, size in payload_bytes(config).items()
     )
 
 
-def selected(config: Configuration) -> Selection:
-    """What the configuration says is to be recorded."""
+def configured_selection(config: Configuration) -> Selection:
+    """The selection of messages to record, from the configuration."""
     return selection(config.recorder.every, config.recorder.topics)
 
 
-def outlook(config: Configuration) -> str:
-    """What a recording will take, for a person who is about to begin it."""
-    recorded = selected(config)
-    grows = in_words(bytes_per_s(config, recorded), Path(config.recorder.folder), config.recorder.min_free_mb * 1e6)
-    return f"recording into {config.recorder.folder}: {grows}, at {config.camera.rate_hz:g} Hz" + (
+def estimate(config: Configuration) -> str:
+    """Sentence on the disk space that a recording will use."""
+    recorded = configured_selection(config)
+    min_free_bytes = config.recorder.min_free_mb * 1e6
+    growth = growth_sentence(bytes_per_s(config, recorded), Path(config.recorder.folder), min_free_bytes)
+    return f"recording into {config.recorder.folder}: {growth}, at {config.camera.rate_hz:g} Hz" + (
         f" ({recorded.sentence})" if recorded.sentence else ""
     )
 
 
-def in_words(growth_bytes_per_s: float, folder: Path, min_free_bytes: float) -> str:
-    """Growth by the hour, and how long the disk of `folder` has room for it."""
+def growth_sentence(growth_bytes_per_s: float, folder: Path, min_free_bytes: float) -> str:
+    """Growth per hour, and the time until the disk of `folder` has only `min_free_bytes` left."""
     free_bytes = shutil.disk_usage(existing(folder)).free
     lasts_h = max(0.0, free_bytes - min_free_bytes) / growth_bytes_per_s / 3600
     return f"about {_size(growth_bytes_per_s * 3600)} an hour; {_size(free_bytes)} free, enough for {lasts_h:.1f} h"
@@ -62,7 +63,7 @@ def _rate_hz(topic: Topic, config: Configuration, recorded: Selection) -> float:
     if topic in recorded.left_out:
         return 0.0
     rate_hz = config.camera.rate_hz if topic.rate is Rate.LOOP else float(topic.rate)
-    return rate_hz if recorded.counts(topic) else rate_hz / recorded.every
+    return rate_hz if recorded.records_all(topic) else rate_hz / recorded.every
 
 
 def _size(count: float) -> str:

@@ -250,7 +250,7 @@ def _doubts_of_log(run: LoggedRun) -> list[str]:
         found.append(f"limits acted in the logged run ({', '.join(hit)}); in the what-if only modal limits act")
     cut = np.count_nonzero(run.history.mirror.limits)
     if cut:
-        few = "" if log.selection.counts(MIRROR_STATE) else f" (recorded mirror states: {log.selection.sentence})"
+        few = "" if log.selection.records_all(MIRROR_STATE) else f" (recorded mirror states: {log.selection.sentence})"
         found.append(
             f"the mirror's own limits acted on {counted(int(cut), 'command')}{few}: pseudo-open-loop modes are wrong "
             "there"

@@ -1,4 +1,4 @@
-"""Signs of life of the mirror: its Health, for its states would cost every frame time."""
+"""Liveness of the mirror from its Health: receiving its states would cost time in every frame."""
 
 from collections import deque
 
@@ -14,15 +14,15 @@ from lowfc.contract.messages import HEALTH, MIRROR_STATE, wire
 from lowfc.control.loop.inputs import MirrorShape
 from lowfc.control.loop.state import State
 
-LOOK_NS = 100_000_000
+CHECK_PERIOD_NS = 100_000_000
 SILENT_NS = 1_600_000_000
-"""Without a Health, of which there are two a second: three may be late."""
+"""Longest time without a Health, which is sent twice a second: three may be late."""
 
 
-class MirrorSigns:
-    """What the mirror reports of itself, and since when it has been silent.
+class MirrorReports:
+    """Faults that the mirror reports, and its silence.
 
-    A mirror that never sent a Health is not missed.
+    A mirror that never sent a Health is not reported as silent.
     """
 
     def __init__(self, service: Service, name: str) -> None:
@@ -38,11 +38,11 @@ class MirrorSigns:
 
     @property
     def due(self) -> bool:
-        """Whether it is time to look."""
+        """Whether a check is due."""
         return self._service.clock.host_ns() >= self._due_ns
 
     def first(self, patience_s: float = 0.0) -> MirrorShape | None:
-        """The shape that the mirror reports first; None without one."""
+        """The first shape that the mirror reports; None without one, and later."""
         sample = None if self._reported else self._states.take(patience_s)
         try:
             shape = codec.decode_mirror(sample.payload) if sample is not None else None
@@ -51,16 +51,16 @@ class MirrorSigns:
             return None
         if shape is not None:
             self._reported = True
-            self._leave_states()  # from here they would only cost time
+            self._leave_states()  # further states would only cost time
         return shape
 
     def fault(self, state: State) -> str:
-        """What is wrong with the mirror, to be read after "the mirror"; empty where it follows.
+        """Fault of the mirror, as a predicate after "the mirror"; empty if there is none.
 
-        By its own account it must be wrong twice: the first may be from before the last command.
+        A fault in the mirror's Health counts after two in a row: the first may predate the last command.
         """
         now_ns = self._service.clock.host_ns()
-        self._due_ns = now_ns + LOOK_NS
+        self._due_ns = now_ns + CHECK_PERIOD_NS
         if self._reports:
             self._received_ns = now_ns
             before, self._wrong = self._wrong, _wrong(self._reports.popleft()) if state.commanded else ""
@@ -74,11 +74,11 @@ class MirrorSigns:
         return self._fault if self._reported else "has not reported yet"
 
     def last(self) -> MirrorShape | None:
-        """What was commanded at the last but one sign that it follows, since when it may not have followed."""
+        """The shape commanded at the last but one Health without a fault: the last that the mirror surely applied."""
         return self._commanded[0] if self._commanded else None
 
     def close(self) -> None:
-        """Look no more."""
+        """Unsubscribe."""
         self._leave_health()
         if not self._reported:
             self._leave_states()

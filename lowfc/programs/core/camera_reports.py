@@ -1,4 +1,4 @@
-"""What the camera says of itself: its settings as they come, asked for where frames wait for them."""
+"""The camera's settings: received when published, queried if frames need them."""
 
 import time
 from collections.abc import Callable
@@ -12,21 +12,21 @@ from lowfc.contract.messages import CAMERA_STATE
 from lowfc.control.loop.camera import CameraSettings
 
 PATIENCE_NS = 20_000_000_000
-"""How long the start of a lockstep run waits for the settings."""
+"""Longest time that the start of a lockstep run waits for the settings."""
 PERIOD_NS = 500_000_000
-"""How often a camera that restarted is asked for them."""
+"""Shortest time between two queries of a camera that restarted."""
 
 
-class CameraSigns:
-    """The newest settings of the camera; each is given to `take`."""
+class CameraReports:
+    """Receives the camera's settings and passes them to a callback."""
 
-    def __init__(self, service: Service, take: Callable[[CameraSettings], None]) -> None:
-        self._service, self._give = service, take
+    def __init__(self, service: Service, apply: Callable[[CameraSettings], None]) -> None:
+        self._service, self._apply = service, apply
         self._mailbox = service.mailbox(CAMERA_STATE)
         self._due_ns = 0
 
     def wait(self, timeout_s: float) -> Sample | None:
-        """A message of the camera, or None after a time or `wake`."""
+        """The next message of the camera; None after the timeout or `wake`."""
         return self._mailbox.take(timeout_s)
 
     def wake(self) -> None:
@@ -34,16 +34,16 @@ class CameraSigns:
         self._mailbox.wake()
 
     def take(self, sample: Sample) -> None:
-        """Give the settings of a message on."""
+        """Decode the settings in a message and pass them on."""
         try:
             settings = codec.decode_camera(sample.payload, start_of(sample.sequence))
         except BadMessageError as fault:
             self._service.unreadable(sample.key, fault)
             return
-        self._give(settings)
+        self._apply(settings)
 
-    def asked(self) -> list[Sample]:
-        """Answers of the camera, which may publish its settings seldom; none where it was asked a moment ago."""
+    def query(self) -> list[Sample]:
+        """Query the camera, which may publish its settings rarely; at most once per PERIOD_NS, otherwise empty."""
         now_ns = self._service.clock.host_ns()
         if now_ns < self._due_ns:
             return []
@@ -51,7 +51,7 @@ class CameraSigns:
         return list(self._service.bus.get(CAMERA_STATE.key, timeout_s=0.1))
 
     def await_first(self) -> None:
-        """Take the settings before the first frame; in lockstep wait for them, so that runs are the same."""
+        """Query the settings before the first frame; in lockstep wait for them, so that runs are reproducible."""
         clock = self._service.clock
         deadline_ns = clock.host_ns() + (PATIENCE_NS if clock.lockstep else 0)
         while self._service.running:
