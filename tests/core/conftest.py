@@ -1,4 +1,4 @@
-"""What the tests of controller and recorder share."""
+"""Fixtures shared by the tests of controller and recorder."""
 
 import pytest
 
@@ -7,7 +7,7 @@ from lowfc.programs.core.recording import recorder
 
 @pytest.fixture(autouse=True)
 def _quick_recorder(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A recorder in this process waits for others, and flushes, as long as a bus in memory needs."""
+    """Short waiting and flush times for a recorder in this process, which uses a bus in memory."""
     monkeypatch.setattr(recorder, "_SETTLE_S", (0.03, 0.3))
     monkeypatch.setattr(recorder, "_FLUSH_NS", 50_000_000)
     monkeypatch.setattr(recorder, "_DRAIN_S", 0.2)

@@ -1,4 +1,4 @@
-"""The command of `recorder.on_event`: which events it is run for, its environment, and how often it is run."""
+"""The command of `recorder.on_event`: events that trigger it, its environment, and its minimum interval."""
 
 import os
 import time
@@ -32,7 +32,7 @@ class Alarmed:
         return [event for event in self.events if event.startswith("ON_EVENT_FAILED")]
 
 
-def test_the_command_is_run_again_for_the_worst_event_that_occurred_while_it_ran(tmp_path: Path, monkeypatch) -> None:
+def test_events_during_the_command_run_it_once_more_for_the_worst(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     run = Alarmed(NOTE + "until test -e go; do sleep 0.01; done")
     run.camera.event("MIRROR_BACK")
@@ -53,7 +53,7 @@ def test_the_command_is_run_again_for_the_worst_event_that_occurred_while_it_ran
     assert not run.failures()
 
 
-def test_the_command_has_the_normal_scheduling_class_and_waits_for_its_interval(tmp_path: Path) -> None:
+def test_the_command_runs_in_the_normal_scheduling_class_and_at_most_once_per_interval(tmp_path: Path) -> None:
     notes = tmp_path / "notes"  # absolute: the second run may come when other tests are running
     run = Alarmed(f"chrt -p $$ >> {notes}; nice >> {notes}", every_s=60.0)
     run.camera.event("CAMERA_RESTARTED")
@@ -66,7 +66,7 @@ def test_the_command_has_the_normal_scheduling_class_and_waits_for_its_interval(
     assert niceness == str(os.nice(0) + 5), "the niceness of the alarm's thread, not of the recorder"
 
 
-def test_a_command_that_fails_or_hangs_is_an_event_that_does_not_run_the_command(monkeypatch) -> None:
+def test_a_command_that_fails_or_hangs_raises_an_event_that_does_not_run_it_again(monkeypatch) -> None:
     monkeypatch.setattr(alarms, "PATIENCE_S", 0.2)
     run = Alarmed("if test $LOWFC_EVENT = MIRROR_LOST; then sleep 100; fi; exit 3")
     run.camera.event("CAMERA_RESTARTED")

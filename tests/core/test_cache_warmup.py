@@ -1,4 +1,4 @@
-"""Cache warm-up: once before each frame, by the schedule of the frames."""
+"""Cache warm-up: schedule of the one warm-up before each frame."""
 
 import pytest
 
@@ -11,52 +11,52 @@ START_NS = 5_000_000_000
 def after(*arrivals_ns: int, period_ns: int = PERIOD_NS) -> CacheWarmup:
     warmup = CacheWarmup(period_ns)
     for arrival_ns in arrivals_ns:
-        warmup.came(START_NS + arrival_ns)
+        warmup.frame_received(START_NS + arrival_ns)
     return warmup
 
 
-def begins_after(warmup: CacheWarmup, now_ns: int) -> int:
-    rest_ns = warmup.rest_ns(START_NS + now_ns)
-    return now_ns + rest_ns
+def due_ns(warmup: CacheWarmup, now_ns: int) -> int:
+    """Time of the next warm-up after START_NS."""
+    return now_ns + warmup.wait_ns(START_NS + now_ns)
 
 
-def test_once_before_each_frame_and_not_before_there_was_one() -> None:
+def test_one_warm_up_before_each_frame_after_the_first() -> None:
     warmup = CacheWarmup(PERIOD_NS)
-    assert warmup.rest_ns(START_NS) is None
-    assert not warmup.begins(START_NS)
-    warmup.came(START_NS)
-    begin_ns = START_NS + PERIOD_NS - LEAD_NS
-    assert warmup.rest_ns(START_NS) == PERIOD_NS - LEAD_NS
-    assert not warmup.begins(begin_ns - 1)
-    assert warmup.begins(begin_ns)
-    assert not warmup.begins(begin_ns)
-    assert warmup.rest_ns(begin_ns) is None
+    assert warmup.wait_ns(START_NS) is None
+    assert not warmup.due(START_NS)
+    warmup.frame_received(START_NS)
+    start_ns = START_NS + PERIOD_NS - LEAD_NS
+    assert warmup.wait_ns(START_NS) == PERIOD_NS - LEAD_NS
+    assert not warmup.due(start_ns - 1)
+    assert warmup.due(start_ns)
+    assert not warmup.due(start_ns)
+    assert warmup.wait_ns(start_ns) is None
 
 
-def test_not_where_the_frame_would_have_to_wait_for_it() -> None:
+def test_no_warm_up_that_would_delay_the_frame() -> None:
     late_ns = START_NS + PERIOD_NS - LATEST_NS + 1
     warmup = after(0)
-    assert not warmup.begins(late_ns)
-    assert warmup.rest_ns(late_ns) is None
+    assert not warmup.due(late_ns)
+    assert warmup.wait_ns(late_ns) is None
 
 
-def test_a_late_frame_hardly_moves_the_schedule() -> None:
+def test_a_late_frame_moves_the_schedule_little() -> None:
     late = after(0, PERIOD_NS + LEAD_NS // 4)
-    assert begins_after(late, 2 * PERIOD_NS - 900_000) == pytest.approx(2 * PERIOD_NS - LEAD_NS, abs=3_000)
+    assert due_ns(late, 2 * PERIOD_NS - 900_000) == pytest.approx(2 * PERIOD_NS - LEAD_NS, abs=3_000)
 
 
 @pytest.mark.parametrize("shift_ns", [-1, -300_000, LEAD_NS + 1, 40 * PERIOD_NS])
-def test_a_frame_that_is_early_or_from_another_schedule_sets_it(shift_ns: int) -> None:
+def test_a_frame_that_is_early_or_far_off_resets_the_schedule(shift_ns: int) -> None:
     arrival_ns = PERIOD_NS + shift_ns
-    assert begins_after(after(0, arrival_ns), arrival_ns) == arrival_ns + PERIOD_NS - LEAD_NS
+    assert due_ns(after(0, arrival_ns), arrival_ns) == arrival_ns + PERIOD_NS - LEAD_NS
 
 
 @pytest.mark.parametrize("scale", [0.9995, 1.0005])
-def test_it_keeps_up_with_a_camera_whose_clock_is_another(scale: float) -> None:
+def test_the_schedule_follows_a_camera_with_a_different_clock_rate(scale: float) -> None:
     arrivals_ns = [round(frame * PERIOD_NS * scale) for frame in range(3000)]
-    begin_ns = begins_after(after(*arrivals_ns), arrivals_ns[-1])
-    assert begin_ns == pytest.approx(arrivals_ns[-1] + PERIOD_NS * scale - LEAD_NS, abs=30_000)
+    found_ns = due_ns(after(*arrivals_ns), arrivals_ns[-1])
+    assert found_ns == pytest.approx(arrivals_ns[-1] + PERIOD_NS * scale - LEAD_NS, abs=30_000)
 
 
-def test_no_time_for_it_where_frames_come_faster() -> None:
-    assert after(0, period_ns=SHORTEST_PERIOD_NS).rest_ns(START_NS) is None
+def test_no_warm_up_at_short_frame_periods() -> None:
+    assert after(0, period_ns=SHORTEST_PERIOD_NS).wait_ns(START_NS) is None

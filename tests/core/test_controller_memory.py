@@ -1,4 +1,4 @@
-"""Controller and mirror as they run, on a bus within one process, with a camera that exposes when it is told."""
+"""Controller and mirror on a bus in memory, with a camera that exposes on request."""
 
 import tempfile
 import threading
@@ -70,17 +70,17 @@ CONFIG, CLOSED = configured(), configured(control__start_mode="closed")
 
 
 class Rig:
-    """A run in one process: two roles on threads of their own, and everything that was said."""
+    """A run in one process: controller and mirror in threads, and every message they published."""
 
     def __init__(self, config: Configuration, calibration: Calibration, scene: Scene) -> None:
         self.config, self.calibration, self.scene, self.hub = config, calibration, scene, MemoryHub()
-        self.said: dict[str, list[Any]] = {}
+        self.received: dict[str, list[Any]] = {}
         self.offset_nm = np.zeros((34, 34), np.float32)
         self._index = 0
         self._newest = threading.Condition()
         self.operator = self.bus("operator")
         for topic in (STEP, COMMAND, MIRROR_STATE, EVENT, REQUEST, TIMING):
-            self.operator.subscribe(topic, self._hear(topic.message, topic.key))
+            self.operator.subscribe(topic, self._appender(topic.message, topic.key))
         camera = self.bus("camera")
         self.frames, self.settings = camera.publisher(FRAME), camera.publisher(CAMERA_STATE)
         self.services = [Service(role, "test", self.clock(), self.bus(role)) for role in ("controller", "mirror-dm")]
@@ -99,38 +99,40 @@ class Rig:
     def bus(self, role: str) -> MemoryBus:
         return MemoryBus(self.hub, role, self.clock())
 
-    def _hear(self, kind: type[Message], key: str) -> Callable[[Sample], None]:
-        def heard(sample: Sample) -> None:
+    def _appender(self, kind: type[Message], key: str) -> Callable[[Sample], None]:
+        def append(sample: Sample) -> None:
             with self._newest:
-                self.said.setdefault(key, []).append(kind.FromString(sample.payload))
+                self.received.setdefault(key, []).append(kind.FromString(sample.payload))
                 self._newest.notify_all()
 
-        return heard
+        return append
 
     def until(self, what: str, met: Callable[[], bool]) -> None:
         with self._newest:
             assert self._newest.wait_for(met, PATIENCE_S), f"{what} did not happen"
 
     def put(self, pixels: Pixels, publish_time_ns: int | None = None) -> int:
-        """Publish a frame, and wait until the mirror has answered the command made from it."""
+        """Publish a frame, and wait until the mirror has answered the command of this frame."""
         time_ns = START_NS + (self._index + 1) * self.config.period_ns
         self._index += 1
         payload = image(pixels, time_ns, "camera").SerializeToString()
         sequence = self.frames.put(payload, publish_time_ns).sequence
         key = MIRROR_STATE.key
-        self.until("the mirror's answer", lambda: key in self.said and self.said[key][-1].frame_sequence == sequence)
+        self.until(
+            "the mirror's state", lambda: key in self.received and self.received[key][-1].frame_sequence == sequence
+        )
         return sequence
 
     def expose(self, count: int) -> list[Wavefront]:
-        """Frames of the scene through the mirror as it is, plus the offset."""
+        """Expose and publish frames with the mirror's present shape plus the offset; return the true wavefronts."""
         truths = []
         for _ in range(count):
-            states = self.said.get(MIRROR_STATE.key)
+            states = self.received.get(MIRROR_STATE.key)
             shape = actuators(states[-1]) if states else None
-            seen = self.offset_nm if shape is None else shape + self.offset_nm
-            pixels = self.scene.expose(self._index, seen)
+            total_nm = self.offset_nm if shape is None else shape + self.offset_nm
+            pixels = self.scene.expose(self._index, total_nm)
             self.put(pixels)
-            truths.append(self.scene.truth(self._index - 1, seen).sampled)
+            truths.append(self.scene.truth(self._index - 1, total_nm).sampled)
         return truths
 
     def inject(self, modes_nm: npt.ArrayLike) -> None:
@@ -144,11 +146,11 @@ class Rig:
         return wire.Request.FromString(answer.payload)
 
     def steps(self, count: int) -> list[wire.ControlStep]:
-        self.until("the step", lambda: len(self.said[STEP.key]) >= self._index)
-        return self.said[STEP.key][-count:]
+        self.until("the step", lambda: len(self.received[STEP.key]) >= self._index)
+        return self.received[STEP.key][-count:]
 
     def events(self) -> list[str]:
-        return [log.message.split()[0] for log in self.said.get(EVENT.key, []) if isinstance(log, Log)]
+        return [log.message.split()[0] for log in self.received.get(EVENT.key, []) if isinstance(log, Log)]
 
     def stop(self) -> None:
         for service in self.services:
@@ -187,7 +189,7 @@ def running(config: Configuration, calibration: Calibration, scene: Scene) -> It
     rig = Rig(config, calibration, scene)
     try:
         if not config.lockstep:
-            rig.until("a mirror that waits", lambda: MIRROR_STATE.key in rig.said)
+            rig.until("the mirror's first state", lambda: MIRROR_STATE.key in rig.received)
         yield rig
     finally:
         rig.stop()
@@ -205,7 +207,7 @@ def test_closing_the_loop_corrects_every_mode(rig: Rig) -> None:
     before = rig.expose(3)[0].residual_rms_nm
     assert rig.ask("gain", 0.25).accepted
     assert rig.ask("close").accepted
-    assert rig.expose(120)[-1].residual_rms_nm < 0.2 * before, "the true wavefront gets flat too"
+    assert rig.expose(120)[-1].residual_rms_nm < 0.2 * before, "the true wavefront is corrected"
     last = rig.steps(20)
     assert all(step.mode == wire.LOOP_MODE_CLOSED for step in last)
     command = np.array([step.command_nm for step in last], float)
@@ -218,7 +220,7 @@ def test_closing_the_loop_corrects_every_mode(rig: Rig) -> None:
     assert (np.abs(pol - injected) < allowed).all()
 
 
-def test_requests_are_answered_with_the_frame_they_are_in_force_for(rig: Rig) -> None:
+def test_a_reply_names_the_first_frame_that_the_request_affects(rig: Rig) -> None:
     rig.expose(5)
     newest = rig.steps(1)[0].frame_sequence
     answer = rig.ask("close")
@@ -235,20 +237,20 @@ def test_requests_are_answered_with_the_frame_they_are_in_force_for(rig: Rig) ->
     assert not rig.ask("dance").accepted
     (bad,) = rig.operator.get("lowfc/request/gain", b"\xff\xff", PATIENCE_S)
     assert "could not be read" in wire.Request.FromString(bad.payload).reply
-    rig.until("five published requests", lambda: len(rig.said.get(REQUEST.key, [])) == 5)
-    published = [(one.name, one.accepted) for one in rig.said[REQUEST.key]]
+    rig.until("five published requests", lambda: len(rig.received.get(REQUEST.key, [])) == 5)
+    published = [(one.name, one.accepted) for one in rig.received[REQUEST.key]]
     assert published == [("close", True), ("gain", False), ("status", True), ("dance", False), ("gain", False)]
 
 
-def test_safe_flattens_the_mirror_and_stays(rig: Rig) -> None:
+def test_safe_mode_flattens_the_mirror_and_is_latched(rig: Rig) -> None:
     rig.inject(10.0 * np.ones(14))
     rig.ask("close")
     rig.expose(10)
-    assert actuators(rig.said[MIRROR_STATE.key][-1]).any()
+    assert actuators(rig.received[MIRROR_STATE.key][-1]).any()
     assert rig.ask("safe").accepted
     assert not rig.ask("close").accepted
     rig.expose(5)
-    assert not actuators(rig.said[MIRROR_STATE.key][-1]).any()
+    assert not actuators(rig.received[MIRROR_STATE.key][-1]).any()
     assert rig.steps(1)[0].mode == wire.LOOP_MODE_SAFE
     until(rig.latch.exists)
     assert rig.ask("clear").accepted
@@ -268,10 +270,10 @@ def test_a_camera_that_changes_opens_the_loop(rig: Rig) -> None:
     assert rig.steps(1)[0].mode == wire.LOOP_MODE_OPEN
 
 
-def test_a_camera_with_a_wrong_clock_is_late_and_does_not_stop_the_controller(
+def test_frames_with_wrong_times_are_late_and_do_not_stop_the_controller(
     calibration: Calibration, scene: Scene
 ) -> None:
-    """Durations of years do not fit the columns of the timing; and without frames the command is repeated."""
+    """Durations of years are clipped in the timing columns; without frames the command is repeated."""
     with running(configured(lockstep=False), calibration, scene) as rig:
         pixels = scene.expose(0, rig.offset_nm)
         rig.put(pixels, publish_time_ns=1)
@@ -280,18 +282,18 @@ def test_a_camera_with_a_wrong_clock_is_late_and_does_not_stop_the_controller(
         reasons = [list(step.reasons) for step in rig.steps(3)]
         assert reasons[0] == [wire.REASON_LATE]
         assert reasons[1] == []
-        sent = len(rig.said[COMMAND.key])
-        rig.until("a repeated command", lambda: len(rig.said[COMMAND.key]) > sent + 3)
+        sent = len(rig.received[COMMAND.key])
+        rig.until("a repeated command", lambda: len(rig.received[COMMAND.key]) > sent + 3)
         rig.until("NO_FRAMES", lambda: "NO_FRAMES" in rig.events())
-    assert max(rig.said[TIMING.key][0].transport_ns) == 2**32 - 1
+    assert max(rig.received[TIMING.key][0].transport_ns) == 2**32 - 1
 
 
 def test_a_latch_that_cannot_be_written_starts_open(calibration: Calibration, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    said: list[str] = []
-    _, service, controller = alone(calibration, Latch([tmp_path / "file" / "safe"], said.append), CLOSED)
+    warnings: list[str] = []
+    _, service, controller = alone(calibration, Latch([tmp_path / "file" / "safe"], warnings.append), CLOSED)
     assert service.awaited() == "a camera"
-    assert (mode_of(controller), len(said)) == (LoopMode.OPEN, 1)
+    assert (mode_of(controller), len(warnings)) == (LoopMode.OPEN, 1)
 
 
 def test_a_signal_makes_the_loop_safe(rig: Rig) -> None:
@@ -299,18 +301,18 @@ def test_a_signal_makes_the_loop_safe(rig: Rig) -> None:
     rig.expose(1)
     rig.controller.safe_by_signal()
     rig.until("SAFED", lambda: "SAFED" in rig.events())
-    rig.until("the request in the log", lambda: rig.said[REQUEST.key][-1].text == "SIGUSR1")
-    logged = rig.said[REQUEST.key][-1]
+    rig.until("the request in the log", lambda: rig.received[REQUEST.key][-1].text == "SIGUSR1")
+    logged = rig.received[REQUEST.key][-1]
     assert (logged.name, logged.accepted, logged.requester) == ("safe", True, "a signal")
     rig.expose(3)
-    assert not actuators(rig.said[MIRROR_STATE.key][-1]).any()
-    assert rig.said[COMMAND.key][-1].safe
-    assert rig.said[MIRROR_STATE.key][-1].safe
+    assert not actuators(rig.received[MIRROR_STATE.key][-1]).any()
+    assert rig.received[COMMAND.key][-1].safe
+    assert rig.received[MIRROR_STATE.key][-1].safe
     until(rig.latch.exists)
 
 
-def test_requests_have_sizes(rig: Rig) -> None:
-    """They are refused before they are decoded, and with a short sentence."""
+def test_oversized_requests_are_refused_before_decoding(rig: Rig) -> None:
+    """The reply is short too."""
     for name in ("step", "gain", "note", "channel", "dance"):
         values = wire.Request(modes=range(200_000), values=[1.0] * 200_000, text="x" * 100).SerializeToString()
         (answer,) = rig.operator.get(f"lowfc/request/{name}", values, PATIENCE_S)
@@ -322,13 +324,13 @@ def test_requests_have_sizes(rig: Rig) -> None:
     assert len(wire.Request.FromString(answer.payload).reply) <= 1000
 
 
-def test_states_carry_the_identity_of_a_law_and_of_a_play(rig: Rig) -> None:
-    """Their arrays are published once, by themselves, and can be asked for."""
+def test_states_refer_to_law_and_probe_sequence_by_identity(rig: Rig) -> None:
+    """Their arrays are published once, as separate messages, and can be queried."""
     rig.expose(1)
-    settings_of = factory.settings(rig.config)
+    settings = factory.settings(rig.config)
     noll = rig.calibration.noll
-    now = settings_of.law(noll)
-    law = integrator(now.gain, now.leak, noll, settings_of.delay_frames, rig.config.camera.rate_hz)
+    present = settings.law(noll)
+    law = integrator(present.gain, present.leak, noll, settings.delay_frames, rig.config.camera.rate_hz)
     table = np.zeros((50_000, 14), np.float32)
     play = wire.Request(text="offset", table=table.tobytes(), columns=14)
     for name, request in (("law", wire.Request(law=wire_law(law))), ("play", play)):
@@ -338,7 +340,7 @@ def test_states_carry_the_identity_of_a_law_and_of_a_play(rig: Rig) -> None:
     state = wire.ControllerState.FromString(answer.payload)
     assert (state.law.id, state.law.transition, state.play.table, state.play.frames) == (law.id, b"", b"", 50_000)
     assert len(answer.payload) < 20_000
-    logged = rig.said[REQUEST.key][-1]
+    logged = rig.received[REQUEST.key][-1]
     assert (logged.play_id, logged.table) == (state.play.id, b"")
     published = Published()
     for topic in (CALIBRATION, LAW, PLAY):
@@ -349,14 +351,14 @@ def test_states_carry_the_identity_of_a_law_and_of_a_play(rig: Rig) -> None:
     assert published.plays[state.play.id].rows.shape == (50_000, 14)
 
 
-def test_safed_outlives_the_controller(calibration: Calibration, tmp_path: Path) -> None:
-    """The latch is a file of the run: only an operator's clear removes it."""
+def test_safe_mode_outlives_the_controller(calibration: Calibration, tmp_path: Path) -> None:
+    """The latch is a file of the run: only the request `clear` removes it."""
     file = tmp_path / "safe"
 
     def mode() -> LoopMode:
         latch = Latch([file])
         found = mode_of(alone(calibration, latch, CLOSED)[2])
-        latch.close()  # or it writes the file again
+        latch.close()  # otherwise it would write the file again
         return found
 
     assert mode() is LoopMode.CLOSED
@@ -366,7 +368,7 @@ def test_safed_outlives_the_controller(calibration: Calibration, tmp_path: Path)
     assert mode() is LoopMode.CLOSED
 
 
-def test_another_mirror_than_the_calibrations_is_refused(calibration: Calibration, tmp_path: Path) -> None:
+def test_a_mirror_with_another_grid_than_the_calibration_is_refused(calibration: Calibration, tmp_path: Path) -> None:
     hub, _, controller = alone(calibration, Latch([tmp_path / "safe"]), configured(lockstep=False))
     small = wire.MirrorState(rows=20, columns=20, actuators=np.zeros(400, np.float32).tobytes())
     MemoryBus(hub, "mirror-dm", HostClock()).publisher(MIRROR_STATE, "dm").put(small.SerializeToString())
@@ -374,22 +376,22 @@ def test_another_mirror_than_the_calibrations_is_refused(calibration: Calibratio
         controller.run()
 
 
-def test_a_warm_up_changes_nothing_and_says_nothing(
+def test_a_warm_up_changes_no_state_and_publishes_nothing(
     calibration: Calibration, scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     warmed_up: list[bool] = []
     original = Controller._warm_up
 
-    monkeypatch.setattr(cache_warmup, "LEAD_NS", 30_000_000)  # a host with other tests on it is late now and then
+    monkeypatch.setattr(cache_warmup, "LEAD_NS", 30_000_000)  # a host that runs other tests is sometimes late
     with running(configured(lockstep=False, camera__rate_hz=20.0), calibration, scene) as rig:
 
-        def said() -> list[int]:
-            return [len(rig.said.get(topic.key, ())) for topic in (STEP, COMMAND, TIMING)]
+        def counts() -> list[int]:
+            return [len(rig.received.get(topic.key, ())) for topic in (STEP, COMMAND, TIMING)]
 
         def watched(self: Controller) -> None:
-            before, said_before = self._state, said()
+            before, counts_before = self._state, counts()
             original(self)
-            warmed_up.append(self._state is before and said() == said_before)
+            warmed_up.append(self._state is before and counts() == counts_before)
 
         monkeypatch.setattr(Controller, "_warm_up", watched)
         for index in range(5):
@@ -401,10 +403,10 @@ def test_a_warm_up_changes_nothing_and_says_nothing(
     assert all(warmed_up)
 
 
-def test_a_frame_that_cannot_be_dealt_with_ends_the_controller(
+def test_an_exception_in_frame_processing_ends_the_controller(
     calibration: Calibration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On the bus's thread it would be counted, and the loop would stand still."""
+    """If the bus's thread only counted it, the loop would stop silently."""
     monkeypatch.setattr("lowfc.programs.core.controller.MIRROR_PATIENCE_S", 0.01)
     hub, _, controller = alone(calibration, Latch([tmp_path / "safe"]), configured(lockstep=False))
 
@@ -420,8 +422,8 @@ def test_a_frame_that_cannot_be_dealt_with_ends_the_controller(
     late.join()
 
 
-def test_frames_that_waited_are_not_all_integrated(calibration: Calibration, scene: Scene) -> None:
-    """They saw one and the same mirror: together they may move the command by one gain, not by ten."""
+def test_of_frames_that_waited_only_the_newest_is_integrated(calibration: Calibration, scene: Scene) -> None:
+    """All were exposed with the same mirror shape: together they may change the command by one gain, not by ten."""
     config = configured(lockstep=False, control__start_mode="closed")
     with running(config, calibration, scene) as rig:
         rig.inject(2.0 * np.eye(14)[3])
@@ -431,9 +433,9 @@ def test_frames_that_waited_are_not_all_integrated(calibration: Calibration, sce
         until(lambda: rig.controller._adopted)
         now_ns = HostClock().now_ns()
         newest = rig.settings.last[1].sequence + 100
-        for age in range(9, -1, -1):  # periods; they arrive one upon the other, after the controller stood still
+        for age in range(9, -1, -1):  # periods; all arrive at once, as after a pause of the controller
             dispatch.put(Sample(FRAME.key, payload, newest - age, now_ns - age * config.period_ns, now_ns))
-        steps = rig.said[STEP.key][-10:]
+        steps = rig.received[STEP.key][-10:]
     used = [step for step in steps if not step.reasons]
     assert len(steps) == 10
     assert used == steps[-1:]
@@ -446,10 +448,9 @@ NOT_FINITE = np.full((34, 34), np.nan, np.float32).tobytes()
 
 
 @pytest.mark.parametrize("actuators", [b"", NOT_FINITE])
-def test_what_the_mirror_refuses_does_not_feed_its_dead_man(
+def test_refused_commands_do_not_reset_the_command_timeout(
     calibration: Calibration, scene: Scene, actuators: bytes
 ) -> None:
-    """However much of it comes."""
     with running(configured(lockstep=False, control__command_timeout_ms=50.0), calibration, scene) as rig:
         rig.put(scene.expose(0, rig.offset_nm))
         rig.services[0].stop("the controller has died")

@@ -1,4 +1,4 @@
-"""For how long a loop was not closed, and why: in Health, in the summary and in the status."""
+"""Controller reports: time not closed and its causes, figures of the last second, offload; status and summary."""
 
 import io
 from dataclasses import replace
@@ -44,12 +44,12 @@ PROCESSES = {
 }
 
 
-def test_the_time_not_closed_and_its_cause_add_up() -> None:
+def test_the_time_not_closed_is_summed_and_has_its_cause() -> None:
     account, state = NotClosed(), loaded(USUAL)
     assert account.note(state, 0) == (0, "")
     for one in (CAMERA, frame(1)):
         state, _ = advance(USUAL, state, one)
-    assert account.note(state, 1 * SECOND) == (0, ""), "closed from its first frame on"
+    assert account.note(state, 1 * SECOND) == (0, ""), "closed since its first frame"
     state, _ = advance(USUAL, state, replace(CAMERA, bias_dn=DARK_DN + 300))
     assert account.note(state, 2 * SECOND)[0] == 0
     total_ns, cause = account.note(state, 5 * SECOND)
@@ -74,20 +74,22 @@ def test_every_cause_of_a_loop_that_was_not_closed_is_named() -> None:
     assert cause.endswith("; other causes (48 times)")
 
 
-def test_the_summary_and_the_status_say_it() -> None:
+def test_summary_and_status_show_the_time_not_closed() -> None:
     def first(**health: Any) -> str:
         watch = Watch({"controller": wire.Health(**health)}, [])
         return summary_text(summary(watch, record=False, rate_hz=250.0)).splitlines()[0].split(maxsplit=1)[1]
 
     figures = summary(Watch({}, []), record=False, rate_hz=250.0)
     assert "over the open pupil, second half of the run" in summary_text(figures)
-    late = {"not_closed_ns": 3 * SECOND, "not_closed_cause": "the camera does not fit"}
+    not_closed = {"not_closed_ns": 3 * SECOND, "not_closed_cause": "the camera does not fit"}
     assert first(mode=wire.LOOP_MODE_CLOSED) == "closed"
-    before = "closed; not closed for 3.0 s in total: the camera does not fit"
-    assert first(mode=wire.LOOP_MODE_CLOSED, **late) == before
-    assert first(mode=wire.LOOP_MODE_OPEN, **late) == "open for 3.0 s: the camera does not fit"
-    assert first(mode=wire.LOOP_MODE_SAFE, **late) == "in safe mode, not closed for 3.0 s: the camera does not fit"
-    assert first() == "no controller reported", "a loop that never started was not closed"
+    expected = "closed; not closed for 3.0 s in total: the camera does not fit"
+    assert first(mode=wire.LOOP_MODE_CLOSED, **not_closed) == expected
+    assert first(mode=wire.LOOP_MODE_OPEN, **not_closed) == "open for 3.0 s: the camera does not fit"
+    assert (
+        first(mode=wire.LOOP_MODE_SAFE, **not_closed) == "in safe mode, not closed for 3.0 s: the camera does not fit"
+    )
+    assert first() == "no controller reported", "no time counts before the loop has started"
     state = loaded(USUAL)
     for one in (CAMERA, frame(1), replace(CAMERA, bias_dn=DARK_DN + 300)):
         state, _ = advance(USUAL, state, one)
@@ -98,11 +100,11 @@ def test_the_summary_and_the_status_say_it() -> None:
     assert lines[1].split(maxsplit=1)[1] == "refuses commands: OUT_OF_ORDER"
     held = status.text(status.figures(message, {"controller": wire.Health(holding="no frame comes")})).splitlines()[1]
     assert " open for 12 s (" in held
-    assert held.endswith("), but holding: no frame comes"), "not that none has come for 12 s"
+    assert held.endswith("), but holding: no frame comes"), "12 s is the time open, not the time without frames"
     assert status.figures(message, {"mirror-x": wire.Health(command_expired=True)})["mirrors"]["mirror-x"]["expired"]
 
 
-def test_the_first_line_of_the_status_says_whether_all_is_well() -> None:
+def test_the_first_line_of_the_status_shows_loop_recording_and_warnings() -> None:
     state = loaded(USUAL)
     for one in (CAMERA, frame(1)):
         state, _ = advance(USUAL, state, one)
@@ -111,11 +113,11 @@ def test_the_first_line_of_the_status_says_whether_all_is_well() -> None:
         message = controller_state(state, USUAL, (START + 12) * SECOND)
         return status.text(status.figures(message, PROCESSES | changes, "night")).splitlines()[0]
 
-    well = (
+    normal = (
         "closed · residual 2.50 nm rms, noise included (true 2.00) · light 97 % · 3 frames lost · recording logs/a.mcap"
     )
     warned = "10 s ago camera: COMMANDS_LATE 9 % late"
-    assert first() == f"{well} · run night · law integrator · {warned}"
+    assert first() == f"{normal} · run night · law integrator · {warned}"
     stopped = wire.Health(state="ready", recording=wire.Recording(file="logs/a.mcap", stopped=True))
     assert "· recording stopped ·" in first(recorder=stopped)
     failed = wire.Health(state="ready", recording=wire.Recording(failure="full"))
@@ -136,7 +138,7 @@ def test_the_first_line_of_the_status_says_whether_all_is_well() -> None:
         assert status.figures(controller_state(state, USUAL, 0))["paused"] == (word == "paused")
 
 
-def test_contrast_is_of_a_flat_mirror_and_of_this_one_whether_the_loop_is_closed_or_not() -> None:
+def test_added_contrast_is_shown_for_a_flat_mirror_and_the_present_one() -> None:
     recent = wire.WavefrontFigures(added_contrast_flat=7e-10, added_contrast=-4e-11)
     camera = wire.Health(recent_wavefront=recent, wavefront=recent)
     message = controller_state(loaded(USUAL), USUAL, (START + 12) * SECOND)
@@ -147,7 +149,7 @@ def test_contrast_is_of_a_flat_mirror_and_of_this_one_whether_the_loop_is_closed
     assert "  contrast -4.0e-11 of +7.0e-10  " in status_line(watch, 5.0)
 
 
-def test_the_last_second_forgets_what_was_before_and_what_was_refused() -> None:
+def test_figures_of_the_last_second_exclude_older_and_refused_frames() -> None:
     state, last = loaded(USUAL), LastSecond(SECOND // 4)
     assert last.figures(state, SECOND) == wire.LoopFigures()
     flux_dn = state.drive.calibration.flux_dn
@@ -163,7 +165,7 @@ def test_the_last_second_forgets_what_was_before_and_what_was_refused() -> None:
     assert last.figures(state, 20 * SECOND).frames == 0
 
 
-def test_the_status_line_is_of_the_last_seconds_and_says_nothing_before_the_first_frame() -> None:
+def test_the_status_line_shows_recent_figures_and_none_before_the_first_frame() -> None:
     watch = Watch({"controller": wire.Health(mode=wire.LOOP_MODE_CLOSED), "camera": wire.Health(process="camera")}, [])
     assert status_line(watch, 5.0) == "    5 s  no frame yet"
     whole = wire.WavefrontFigures(residual_rms_nm=27.0, disturbance_rms_nm=31.0)
@@ -173,7 +175,7 @@ def test_the_status_line_is_of_the_last_seconds_and_says_nothing_before_the_firs
     received = wire.TopicCount(topic=FRAME.key, received=900)
     begun = wire.Health(mode=wire.LOOP_MODE_CLOSED, topics=[received], not_closed_ns=2 * SECOND)
     early = Watch(watch.health | {"controller": begun}, [])
-    assert "closed for 1.6 s     250 Hz" in status_line(early, 5.0), "the residual is of the open loop, too"
+    assert "closed for 1.6 s     250 Hz" in status_line(early, 5.0), "the residual includes open-loop frames"
     with Console(width=120, file=io.StringIO(), record=True) as console:
         console.print(screen(watch, Configuration(), None, 10.0))
     assert "residual 2.20 of 30.00 nm rms" in console.export_text()
@@ -182,11 +184,11 @@ def test_the_status_line_is_of_the_last_seconds_and_says_nothing_before_the_firs
     assert status_line(watch, 17.0) == "   17 s  closed  the camera has been silent for 7 s"
     with Console(width=120, file=io.StringIO(), record=True) as console:
         console.print(screen(watch, Configuration(), None, 17.0))
-    assert "2.20" not in console.export_text(), "those figures are of seven seconds ago"
+    assert "2.20" not in console.export_text(), "figures seven seconds old are not shown"
 
 
 @pytest.mark.parametrize(("received", "missing", "lost"), [(500, 0, 0), (371, 129, 129), (309, 0, 191), (0, 0, 0)])
-def test_frames_after_the_last_that_a_recorder_received_are_lost_too(received: int, missing: int, lost: int) -> None:
+def test_frames_published_after_the_last_received_one_count_as_lost(received: int, missing: int, lost: int) -> None:
     recorder = wire.Health(
         recording=wire.Recording(lost=missing),
         topics=[wire.TopicCount(topic=FRAME.key, received=received, missing=missing)],

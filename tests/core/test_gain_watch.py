@@ -1,4 +1,4 @@
-"""Automatic gains and the watch over what the loop is worth, on real diffraction and photons, folded in one process."""
+"""Automatic gains and harm detection with diffraction images and photon noise, in one process."""
 
 from dataclasses import replace
 from functools import cache
@@ -41,7 +41,7 @@ def named(loop: Bench, name: str) -> list[dict[str, object]]:
 
 
 def rms_nm(loop: Bench, frames: int) -> tuple[float, float]:
-    """True wavefront over the last frames: what is left, and what there would be without the loop."""
+    """True residual and disturbance over the last frames, nm rms."""
     truths = [truth.continuous for truth in loop.truths[-frames:]]
     return tuple(
         float(np.sqrt(np.mean([np.sum(np.square(one)) for one in values])))
@@ -54,79 +54,81 @@ def gains(loop: Bench) -> Single:
 
 
 @pytest.fixture(scope="module")
-def of_own() -> list[Array | Single]:
-    """What the banks of the faint star's loop were told of the rows of R."""
+def gain_bank_responses() -> list[Array | Single]:
+    """Arguments of GainBank.remade in the loop of the faint star."""
     return []
 
 
 @pytest.fixture(scope="module")
-def faint(of_own: list[Array | Single]) -> Bench:
+def faint(gain_bank_responses: list[Array | Single]) -> Bench:
     remade = GainBank.remade
 
-    def noted(self: GainBank, rows: Array | Single) -> None:
-        of_own.append(rows)
-        remade(self, rows)
+    def spied(self: GainBank, response: Array | Single) -> None:
+        gain_bank_responses.append(response)
+        remade(self, response)
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(GainBank, "remade", noted)
+        patched.setattr(GainBank, "remade", spied)
         loop = bench(6.5)
         loop.run(1200)
     return loop
 
 
-def test_it_is_measured_first_and_closed_then(faint: Bench) -> None:
+def test_gains_are_measured_in_open_loop_before_it_is_closed(faint: Bench) -> None:
     modes = [step.mode for step in faint.steps]
     closed = modes.index(LoopMode.CLOSED)
-    assert closed == 500
+    assert closed == 500  # first window: FIRST_S at 250 Hz
     assert set(modes[closed:]) == {LoopMode.CLOSED}
     assert named(faint, "MODE_CHANGED")[-1]["why"] == "auto: the gains were measured"
     assert len(named(faint, "GAINS_CHANGED")) >= 1
 
 
-def test_a_faint_star_is_better_closed_than_open(faint: Bench) -> None:
-    """Of a star of V = 6.5 at 250 Hz, gains of 0.5 and 0.05 leave 19 nm of 7."""
-    left_nm, open_nm = rms_nm(faint, 500)
-    assert left_nm < open_nm
+def test_closing_reduces_the_residual_on_a_faint_star(faint: Bench) -> None:
+    """With fixed gains of 0.5 and 0.05 at V = 6.5 and 250 Hz, a disturbance of 7 nm becomes a residual of 19 nm."""
+    residual_nm, open_nm = rms_nm(faint, 500)
+    assert residual_nm < open_nm
 
 
 @pytest.mark.parametrize("duration_s", [7, pytest.param(20, marks=pytest.mark.slow)])
-def test_the_first_minute_is_not_the_price_of_automatic_gains(duration_s: float) -> None:
-    """`make sim-loop`: the default star and disturbance, beside gains of 0.5 and 0.05."""
-    left_nm, known = [], calibrated(load(None))
+def test_automatic_gains_leave_at_most_ten_percent_more_residual_than_fixed_gains(duration_s: float) -> None:
+    """`make sim-loop`, default star and disturbance, compared with gains of 0.5 and 0.05."""
+    residual_nm, known = [], calibrated(load(None))
     for keys in ({}, FIXED_GAINS):
         config = load(None, {"control.start_mode": "closed"} | keys)
         loop = Bench(config, known)
         loop.run(round(duration_s * config.camera.rate_hz))
         assert loop.steps[round(3 * config.camera.rate_hz)].mode is LoopMode.CLOSED
-        left_nm.append(rms_nm(loop, len(loop.truths) // 3)[0])
-    assert left_nm[0] < 1.1 * left_nm[1]
+        residual_nm.append(rms_nm(loop, len(loop.truths) // 3)[0])
+    assert residual_nm[0] < 1.1 * residual_nm[1]
 
 
-def test_modes_that_are_left_alone_bring_less_noise_to_the_others(faint: Bench) -> None:
+def test_modes_not_corrected_reduce_the_noise_of_the_others(faint: Bench) -> None:
     drive = faint.state.drive
-    left = drive.weighting.prior_nm2 > 0
-    assert 0 < left.sum() < left.size
-    np.testing.assert_array_equal(left, drive.law.gain == 0)
-    own, made = (
+    uncorrected = drive.weighting.prior_nm2 > 0
+    assert 0 < uncorrected.sum() < uncorrected.size
+    np.testing.assert_array_equal(uncorrected, drive.law.gain == 0)
+    original, reweighted = (
         np.diag(
             noise_covariance_nm2(replace(drive.calibration, reconstructor=rows), faint.steps[-1].flux_dn, drive.camera)
         )
         for rows in (drive.calibration.reconstructor, drive.estimator.rows[:-1])
     )
-    np.testing.assert_array_equal(made[left], own[left])
-    assert (made[~left] < 1.0001 * own[~left]).all()
-    assert (made[~left] < 0.9 * own[~left]).any()
+    np.testing.assert_array_equal(reweighted[uncorrected], original[uncorrected])
+    assert (reweighted[~uncorrected] < 1.0001 * original[~uncorrected]).all()
+    assert (reweighted[~uncorrected] < 0.9 * original[~uncorrected]).any()
 
 
-def test_the_bank_knows_what_r_for_fewer_modes_shows_of_the_others(faint: Bench, of_own: list[Array | Single]) -> None:
+def test_the_gain_bank_receives_the_response_of_the_reweighted_reconstructor(
+    faint: Bench, gain_bank_responses: list[Array | Single]
+) -> None:
     drive = faint.state.drive
-    shown = drive.estimator.rows[:-1] @ drive.calibration.response
-    np.testing.assert_array_equal(of_own[-1], shown[2:, 2:])
-    assert np.abs(shown - np.eye(len(shown))).max() > 0.1
+    response = drive.estimator.rows[:-1] @ drive.calibration.response
+    np.testing.assert_array_equal(gain_bank_responses[-1], response[2:, 2:])
+    assert np.abs(response - np.eye(len(response))).max() > 0.1
 
 
-def test_the_command_of_a_mode_that_is_left_alone_relaxes_to_zero() -> None:
-    """What an earlier gain put on the mirror does not stay there; at a gain of 0 that a person gave, it does."""
+def test_the_command_of_a_mode_with_automatic_gain_zero_relaxes_to_zero() -> None:
+    """With a manual gain of 0, the command stays."""
     loop = bench(0.0)
     loop.run(560)
     loop.ask("gain", modes=(4,), values=(0.0,))
@@ -142,30 +144,30 @@ def test_the_command_of_a_mode_that_is_left_alone_relaxes_to_zero() -> None:
 
 
 def _contrast_of_open(magnitude: float, seed: int, frames: int) -> float:
-    """What the loop leaves over what there is without it, in contrast, of a Zernike sensor under the wheel; late."""
+    """Ratio of residual to open-loop contrast for a Zernike sensor with reaction-wheel jitter, second half of a run."""
     loop = bench(magnitude, "reaction-wheel", "zwfs", seed=seed)
     form = np.diag(factory.contrast_of(loop.config).form)
     loop.run(frames)
     truths = [truth.continuous for truth in loop.truths[-frames // 2 :]]
-    left, open_ = (
+    residual, disturbance = (
         form @ np.mean(np.square(values), axis=0)
         for values in ([one.residual_nm for one in truths], [one.disturbance_nm for one in truths])
     )
-    return float(left / open_)
+    return float(residual / disturbance)
 
 
-def test_the_cross_talk_of_a_sensor_beyond_its_range_is_not_corrected() -> None:
-    """The squares of the tilt that the wheel leaves look like focus, astigmatism and spherical to a Zernike sensor."""
+def test_closing_reduces_contrast_on_a_zernike_sensor_beyond_its_linear_range() -> None:
+    """The square of the residual tilt looks like focus, astigmatism and spherical aberration to a Zernike sensor."""
     assert _contrast_of_open(2.0, 1, 1250) < 1
 
 
 @pytest.mark.slow
-def test_on_a_faint_star_its_cross_talk_is_seldom_corrected() -> None:
-    """There it is hardly to be told from noise: which frames show it depends on how the host rounds."""
+def test_closing_seldom_adds_contrast_on_a_faint_star_with_a_zernike_sensor() -> None:
+    """The cross-talk is close to the noise: whether it is detected depends on the host's rounding."""
     assert sum(_contrast_of_open(8.0, seed, 2500) > 1 for seed in range(1, 7)) <= 1
 
 
-def test_whoever_reads_the_state_goes_on_with_the_same_reconstructor(faint: Bench) -> None:
+def test_a_decoded_state_has_the_same_reconstructor(faint: Bench) -> None:
     drive = faint.state.drive
     message = controller_state(faint.state, faint.settings, 1)
     settings, again = decode_state(message, drive.calibration)
@@ -176,32 +178,32 @@ def test_whoever_reads_the_state_goes_on_with_the_same_reconstructor(faint: Benc
     assert controller_state(again, settings, 1) == message
 
 
-def test_whoever_reads_the_state_before_gains_are_measured_goes_on_with_the_same_law() -> None:
-    """A loop may be closed by hand before that: what the mirror had before must go on as it does in a replay."""
+def test_a_state_decoded_before_gains_are_measured_has_the_same_law() -> None:
+    """An operator may close the loop before: the replay must continue with the same command."""
     loop = bench(2.0)
     drive, message = loop.state.drive, controller_state(loop.state, loop.settings, 1)
     again = decode_state(message, drive.calibration)[1].drive
     np.testing.assert_array_equal(again.law.rows, drive.law.rows)
 
 
-def test_tilt_is_compared_with_other_modes_as_the_sensor_saw_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The square of an offset of tilt is in the image, though the loop's error is without it."""
-    seen: list[Single] = []
+def test_tilt_cross_talk_uses_the_tilt_on_the_sensor_including_the_offset(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The square of a tilt offset is in the image, but the loop's error excludes the offset."""
+    tilts_nm: list[Single] = []
     followed = TiltCrossTalk.followed
 
-    def noted(self: TiltCrossTalk, tilt_nm: Single, open_nm: Array | Single) -> Array:
-        seen.append(tilt_nm)
+    def spied(self: TiltCrossTalk, tilt_nm: Single, open_nm: Array | Single) -> Array:
+        tilts_nm.append(tilt_nm)
         return followed(self, tilt_nm, open_nm)
 
-    monkeypatch.setattr(TiltCrossTalk, "followed", noted)
+    monkeypatch.setattr(TiltCrossTalk, "followed", spied)
     loop = bench(2.0)
     loop.ask("offset", modes=(2,), values=(40.0,))
     loop.run(20)
     error_nm = loop.steps[-1].error_nm
-    np.testing.assert_allclose(seen[-1], error_nm[:2] + np.float32([40, 0]), atol=1e-3)
+    np.testing.assert_allclose(tilts_nm[-1], error_nm[:2] + np.float32([40, 0]), atol=1e-3)
 
 
-def test_what_the_wavefront_adds_to_the_contrast_is_measured_open_and_closed() -> None:
+def test_added_contrast_is_measured_in_open_and_closed_loop() -> None:
     loop = bench(2.0)
     form = np.diag(factory.contrast_of(loop.config).form)
 
@@ -211,17 +213,16 @@ def test_what_the_wavefront_adds_to_the_contrast_is_measured_open_and_closed() -
 
     assert loop.added_contrast() is None
     loop.run(1000)
-    found = loop.added_contrast()
-    flat, each = found
-    assert flat == pytest.approx(true("disturbance_nm", 667), rel=0.3)
-    assert 0.5 < each.sum() / true("residual_nm", 500) < 2  # a frame's noise is some ten times what is left
+    uncorrected, by_mode = loop.added_contrast()
+    assert uncorrected == pytest.approx(true("disturbance_nm", 667), rel=0.3)
+    assert 0.5 < by_mode.sum() / true("residual_nm", 500) < 2  # the noise of one frame is some ten times the residual
     loop.ask("open")
     loop.run(1)
-    opened = loop.added_contrast()
-    assert opened[1].sum() == pytest.approx(flat)
+    _, opened_by_mode = loop.added_contrast()
+    assert opened_by_mode.sum() == pytest.approx(uncorrected)
 
 
-def test_gains_of_a_person_are_not_touched_and_harm_is_said_before_and_after() -> None:
+def test_manual_gains_are_kept_and_harm_is_reported_before_and_after_closing() -> None:
     loop = bench(6.5, **FIXED_GAINS | {"control.start_mode": "open"})
     loop.run(500)
     assert "closing adds" in loop.closing_harm
@@ -232,11 +233,11 @@ def test_gains_of_a_person_are_not_touched_and_harm_is_said_before_and_after() -
     drive = loop.state.drive
     assert set(drive.law.gain.tolist()) == {np.float32(0.5), np.float32(0.05)}
     assert not named(loop, "GAINS_CHANGED")
-    left_nm, open_nm = rms_nm(loop, 600)
-    assert left_nm > open_nm
+    residual_nm, open_nm = rms_nm(loop, 600)
+    assert residual_nm > open_nm
 
 
-def test_a_loop_that_harms_opens_where_that_is_configured() -> None:
+def test_a_harmful_loop_opens_if_configured() -> None:
     loop = bench(6.5, **FIXED_GAINS | {"control.on_harm": "open"})
     loop.run(1150)
     assert loop.steps[-1].mode is LoopMode.OPEN
@@ -244,16 +245,16 @@ def test_a_loop_that_harms_opens_where_that_is_configured() -> None:
 
 
 @pytest.mark.parametrize("request_name", ["open", "pause"])
-def test_what_an_operator_opens_while_gains_are_measured_stays_open(request_name: str) -> None:
+def test_a_loop_opened_by_an_operator_while_gains_are_measured_stays_open(request_name: str) -> None:
     loop = bench(3.5)
     loop.run(100)
     loop.ask(request_name)
     loop.run(500)
     assert {step.mode for step in loop.steps} == {LoopMode.OPEN}
-    assert gains(loop).any()  # measured all the same
+    assert gains(loop).any()  # measured nevertheless
 
 
-def test_a_mode_can_be_given_a_gain_and_be_made_automatic_again() -> None:
+def test_a_mode_can_have_a_manual_gain_and_return_to_automatic() -> None:
     loop = bench(2.0)
     loop.run(510)
     loop.ask("gain", values=(0.3,), modes=(4,))
@@ -265,7 +266,7 @@ def test_a_mode_can_be_given_a_gain_and_be_made_automatic_again() -> None:
     assert loop.state.drive.automatic.all()
 
 
-def test_another_star_lowers_the_gains_and_measures_them_anew() -> None:
+def test_another_star_lowers_the_gains_and_restarts_their_measurement() -> None:
     loop = bench(1.5)
     loop.run(560)
     bright = gains(loop)

@@ -1,4 +1,4 @@
-"""Recordings and copies with every Nth frame and mirror state: what they hold, and who can use them."""
+"""Recordings and copies with every Nth frame and mirror state: contents, and which commands can read them."""
 
 import json
 from pathlib import Path
@@ -75,8 +75,8 @@ def test_steps_and_commands_are_never_left_out() -> None:
         selection(1, ["lowfc/camera/frames"])
 
 
-def test_the_recorder_records_every_tenth_and_loses_none(tmp_path: Path) -> None:
-    """The frame's number decides, for the mirror's states too; what is lost of the rest is lost."""
+def test_every_tenth_frame_is_recorded_and_the_others_do_not_count_as_lost(tmp_path: Path) -> None:
+    """The frame number selects mirror states too; a selected message that is missing counts as lost."""
     bench = Bench(tmp_path / "logs")
     frames, commands = bench.camera.publisher(FRAME), bench.controller.publisher(COMMAND, "dm")
     mirror = bench.join("mirror-dm")
@@ -90,13 +90,13 @@ def test_the_recorder_records_every_tenth_and_loses_none(tmp_path: Path) -> None
     for _ in range(95):
         sequence = frames.put(b"frame").sequence
         states.put(wire.MirrorState(frame_sequence=sequence).SerializeToString())
-        states.put(wire.MirrorState(frame_sequence=sequence).SerializeToString())  # it is held
+        states.put(wire.MirrorState(frame_sequence=sequence).SerializeToString())  # the mirror repeats its state
     mirror.finish()
     summary = bench.stop()
     messages = logged(summary)
     assert [count_of(one.sequence) for one in of(messages, FRAME)] == [0, 10, 20, 30, 40, 50, 70, 80, 90]
-    shown = [count_of(wire.MirrorState.FromString(one.payload).frame_sequence) for one in of(messages, MIRROR_STATE)]
-    assert shown == [number for ten in range(0, 100, 10) for number in (ten, ten)]
+    recorded = [count_of(wire.MirrorState.FromString(one.payload).frame_sequence) for one in of(messages, MIRROR_STATE)]
+    assert recorded == [number for ten in range(0, 100, 10) for number in (ten, ten)]
     assert len(of(messages, COMMAND)) == 95
     assert not of(messages, SURFACE)
     assert summary.lost == {FRAME.key: 2}
@@ -128,7 +128,7 @@ def test_a_smaller_copy_has_the_same_steps(whole: Path, small: Path) -> None:
         thin((whole,), small, Selection(2))
 
 
-def test_replay_refuses_it_in_one_sentence(small: Path) -> None:
+def test_replay_refuses_a_log_without_all_frames_in_one_sentence(small: Path) -> None:
     for words in (["--jobs", "1"], ["--jobs", "2"]):
         done = lowfc("replay", small, *words)
         assert isinstance(done.exception, LowfcError)
@@ -136,7 +136,7 @@ def test_replay_refuses_it_in_one_sentence(small: Path) -> None:
         assert "1 in 10 frames and mirror states" in str(done.exception)
 
 
-def test_replay_needs_frames_and_nothing_else_that_may_be_left_out(whole: Path) -> None:
+def test_replay_needs_frames_but_no_other_optional_topic(whole: Path) -> None:
     out = whole.with_name("frames.mcap")
     thin((whole,), out, selection(1, [FRAME.key]))
     done = lowfc("replay", out, "--json")
@@ -144,7 +144,7 @@ def test_replay_needs_frames_and_nothing_else_that_may_be_left_out(whole: Path) 
     assert json.loads(done.stdout)["frames"] == FRAMES
 
 
-def test_a_what_if_is_the_same(whole: Path, small: Path, tmp_path: Path) -> None:
+def test_what_if_gives_the_same_result_from_a_smaller_copy(whole: Path, small: Path, tmp_path: Path) -> None:
     asked = requested("gain=0.3", None, None, None)
     found = [what_if(LoggedRun(read_history(LogReader(log))), asked) for log in (whole, small)]
     for figures in found:
@@ -158,7 +158,7 @@ def test_a_what_if_is_the_same(whole: Path, small: Path, tmp_path: Path) -> None
 
 
 @pytest.mark.usefixtures("without_drawings")
-def test_a_report_is_of_the_same_run(whole: Path, small: Path) -> None:
+def test_a_report_of_a_smaller_copy_has_the_same_figures(whole: Path, small: Path) -> None:
     found: list[dict[str, Any]] = []
     for log in (whole, small):
         done = lowfc("report", log, "--json", *(["--out", log.with_suffix(".html")] if log is small else []))
@@ -173,7 +173,7 @@ def test_a_report_is_of_the_same_run(whole: Path, small: Path) -> None:
     assert "1 in 10 frames and mirror states" in small.with_suffix(".html").read_text()
 
 
-def test_an_export_joins_what_is_there(small: Path, tmp_path: Path) -> None:
+def test_an_export_contains_the_frames_of_a_smaller_copy(small: Path, tmp_path: Path) -> None:
     out = tmp_path / "small.npz"
     done = lowfc("export", small, "--to", "npz", "--frames", "--out", out, "--json")
     assert done.exit_code == 0, done.exception
@@ -192,22 +192,22 @@ def test_an_export_joins_what_is_there(small: Path, tmp_path: Path) -> None:
         ["--topics", FRAME.key],
     ],
 )
-def test_an_export_is_one_thing(whole: Path, words: list[str]) -> None:
+def test_contradictory_export_options_are_refused(whole: Path, words: list[str]) -> None:
     done = lowfc("export", whole, *words)
     assert isinstance(done.exception, ConfigurationError)
     assert "use one" in str(done.exception)
 
 
-def test_what_it_will_take_is_said_before(tmp_path: Path) -> None:
+def test_the_estimate_of_disk_space_follows_rate_and_selection(tmp_path: Path) -> None:
     keys = {"recorder.folder": str(tmp_path), "camera.rate_hz": 250.0}
     config = load(None, keys)
-    grows = bytes_per_s(config, configured_selection(config))
-    assert 3e6 < grows < 5e6
-    assert estimate(config).startswith(f"recording into {tmp_path}: about {grows * 3600 / 1e9:.0f} GB an hour; ")
+    growth = bytes_per_s(config, configured_selection(config))
+    assert 3e6 < growth < 5e6
+    assert estimate(config).startswith(f"recording into {tmp_path}: about {growth * 3600 / 1e9:.0f} GB an hour; ")
     assert estimate(config).endswith(" h, at 250 Hz")
-    assert bytes_per_s(load(None, keys | {"camera.rate_hz": 500.0}), EVERYTHING) > 1.8 * grows
+    assert bytes_per_s(load(None, keys | {"camera.rate_hz": 500.0}), EVERYTHING) > 1.8 * growth
     fewer = load(None, keys | {"recorder.every": 10, "recorder.topics": [FRAME.key, "lowfc/mirror/{name}/state"]})
-    assert bytes_per_s(fewer, configured_selection(fewer)) < 0.5 * grows
+    assert bytes_per_s(fewer, configured_selection(fewer)) < 0.5 * growth
     assert "1 in 10 frames" in estimate(fewer)
 
 
@@ -217,7 +217,7 @@ def test_record_start_names_the_request(tmp_path: Path) -> None:
     assert "`lowfc ctl record start`" in str(done.exception)
 
 
-def test_the_answer_to_start_says_what_it_takes(tmp_path: Path) -> None:
+def test_the_answer_to_record_start_contains_the_estimate_of_disk_space(tmp_path: Path) -> None:
     bench = Bench(tmp_path / "logs")
     bench.start(expected_bytes_per_s=1e6)
     operator = bench.join("operator")

@@ -1,4 +1,4 @@
-"""The loop on real diffraction, without processes: stability, pseudo-open-loop, convergence."""
+"""The loop with diffraction images, in one process: stability and convergence."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ QUIET = {
     "mirror.settling_us": 0,
     "mirror.driver_bits": 24,
     "camera.noise": False,
-    "camera.gain_e_per_dn": 0.0008,  # fine steps, so that rounding moves a mode by less than a picometre
+    "camera.gain_e_per_dn": 0.0008,  # small enough that rounding changes a mode by less than a picometre
     "camera.full_well_e": 52.0,
 }
 
@@ -33,10 +33,10 @@ def calibration() -> Calibration:
 
 @pytest.mark.parametrize("delay", [1, 2, 3])
 @pytest.mark.parametrize(("factor", "stable"), [(0.99, True), (1.01, False)])
-def test_the_limiting_gain_is_right_within_a_percent(
+def test_the_limiting_gain_is_accurate_to_one_percent(
     delay: int, factor: float, stable: bool, calibration: Calibration
 ) -> None:
-    """2 sin(pi / (2 (2d - 1))), with noiseless diffraction and a tilt of less than 1 mas."""
+    """2 sin(pi / (2 (2d - 1))), with noiseless diffraction images and a tilt of less than 1 mas."""
     gain = factor * 2 * np.sin(np.pi / (2 * (2 * delay - 1)))
     assert limiting_gain(delay) == pytest.approx(gain / factor, rel=1e-9)
     start_nm = 0.2 * tilt_nm_per_mas(2.0)
@@ -50,8 +50,8 @@ def test_the_limiting_gain_is_right_within_a_percent(
     assert (late < early) == stable
 
 
-def test_a_screen_is_held_as_far_as_the_modes_reach() -> None:
-    """The paper's case (3): 0.05 waves before, high orders are left; they are over a third of the rms."""
+def test_a_kolmogorov_screen_is_corrected_up_to_the_controlled_modes() -> None:
+    """Case (3) of the paper: 0.05 waves rms before correction; the high orders that remain exceed a third of that."""
     run = fold(configured(disturbance__preset="kolmogorov", control__gain=0.2, control__tilt_gain=0.3), 150)
     assert run.disturbance_rms_nm[-1] == pytest.approx(0.05 * 550, rel=1e-5)
     assert 0.35 < run.residual_rms_nm[-1] / run.disturbance_rms_nm[-1] < 0.6

@@ -1,4 +1,4 @@
-"""The recorder: everything on the bus is in the log, or the log says what is missing."""
+"""The recorder: every message on the bus is in the log, or counted in it as missing."""
 
 import threading
 from collections import Counter
@@ -64,29 +64,29 @@ def test_everything_is_recorded_verbatim(bench: Bench) -> None:
     )
 
 
-@pytest.mark.parametrize("there", [False, True])
-def test_a_log_of_a_run_in_which_nobody_was_is_not_kept(tmp_path: Path, there: bool) -> None:
+@pytest.mark.parametrize("camera_present", [False, True])
+def test_a_log_of_a_run_without_other_processes_is_removed(tmp_path: Path, camera_present: bool) -> None:
     hub, clock = MemoryHub(), HostClock()
     recorder = Recorder(MemoryBus(hub, "recorder", clock), clock, "bnch", tmp_path / "logs", metadata={})
     thread = threading.Thread(target=recorder.run, daemon=True)
     thread.start()
     until(lambda: list((tmp_path / "logs").glob("*.part")))
-    if there:  # a camera without Health, which comes after the recorder
+    if camera_present:  # a camera without Health that starts after the recorder
         MemoryBus(hub, "camera", clock).publisher(FRAME).put(b"a frame")
-    recorder.service.stop("told")
+    recorder.service.stop("end of the test")
     thread.join(PATIENCE_S)
-    assert len(list((tmp_path / "logs").iterdir())) == there
-    assert len(recorder.service.health().recording.files) == there
+    assert len(list((tmp_path / "logs").iterdir())) == camera_present
+    assert len(recorder.service.health().recording.files) == camera_present
 
 
-def test_what_came_before_the_recorder_comes_first_and_once(bench: Bench) -> None:
+def test_states_published_before_the_recorder_started_are_first_in_the_log_and_once(bench: Bench) -> None:
     calibrations = bench.controller.publisher(CALIBRATION)
     states = bench.camera.publisher(CAMERA_STATE), bench.controller.publisher(CONTROLLER_STATE)
     put(calibrations, 2)
     for state in states:
         put(state, 3)
     frames = bench.camera.publisher(FRAME)
-    put(frames, 10)  # before the recorder: not its loss
+    put(frames, 10)  # before the recorder started: not lost
     bench.start()
     put(states[0], 1)
     put(frames, 10)
@@ -113,13 +113,13 @@ def test_every_lost_message_is_counted(bench: Bench) -> None:
 
     bench.hub.lose = lose
     bench.start()
-    put(frames, 50)  # the last one is lost too: only the camera knows
+    put(frames, 50)  # the last one is lost too: only the camera's Health reveals it
     put(steps, 5)  # none arrives
     summary = bench.stop()
     assert summary.lost == {FRAME.key: 4, STEP.key: 5}
-    told = [event for event in bench.events if event.startswith("MESSAGES_LOST")]
+    loss_events = [event for event in bench.events if event.startswith("MESSAGES_LOST")]
     counts: Counter[str] = Counter()
-    for event in told:
+    for event in loss_events:
         _, count, *_, topic = event.split()
         counts[topic] += int(count)
     assert counts == summary.lost
@@ -128,7 +128,7 @@ def test_every_lost_message_is_counted(bench: Bench) -> None:
     (path,) = summary.files
     reader = LogReader(path)
     recorded = [Log.FromString(m.payload).message for m in reader if m.key == EVENT.key]
-    assert [event for event in recorded if event.startswith("MESSAGES_LOST")] == told
+    assert [event for event in recorded if event.startswith("MESSAGES_LOST")] == loss_events
     assert reader.metadata["recording"] == {
         "messages": str(summary.messages),
         "messages_lost": "9",
@@ -148,89 +148,91 @@ def entry(topic: Topic, count: int, start_s: int = 100, payload: bytes = b"", ke
     return topic, Sample(key or topic.key, payload, sequence_of(start_s, count), 0, 0)
 
 
-def test_the_ledger_knows_beginnings_gaps_and_restarts() -> None:
-    ledger = LossAccount()
-    for count in (5, 6, 9, 9, 4):  # one that came before, or is older than the first, fills no gap
-        ledger.enter(*entry(FRAME, count), recorded=True)
-    assert ledger.lost() == {FRAME.key: 2}
+def test_the_loss_account_counts_gaps_from_the_first_message_of_each_start() -> None:
+    account = LossAccount()
+    for count in (5, 6, 9, 9, 4):  # a duplicate, or one older than the first, fills no gap
+        account.enter(*entry(FRAME, count), recorded=True)
+    assert account.lost() == {FRAME.key: 2}
     for count in (3, 5):
-        ledger.enter(*entry(FRAME, count, start_s=101), recorded=True)
-    ledger.enter(*entry(FRAME, 6, start_s=101), recorded=False)
-    assert ledger.lost() == {FRAME.key: 4}
-    assert (ledger.news(), ledger.news()) == ({FRAME.key: 4}, {})
-    ledger.enter(*entry(FRAME, 8, start_s=101), recorded=True)
-    assert ledger.news() == {FRAME.key: 1}
+        account.enter(*entry(FRAME, count, start_s=101), recorded=True)
+    account.enter(*entry(FRAME, 6, start_s=101), recorded=False)
+    assert account.lost() == {FRAME.key: 4}
+    assert (account.news(), account.news()) == ({FRAME.key: 4}, {})
+    account.enter(*entry(FRAME, 8, start_s=101), recorded=True)
+    assert account.news() == {FRAME.key: 1}
 
 
-def test_the_ledger_takes_a_loss_back_when_the_message_comes_late() -> None:
-    ledger = LossAccount()
+def test_a_late_message_is_removed_from_the_losses() -> None:
+    account = LossAccount()
     for count in (5, 9, 7):
-        ledger.enter(*entry(FRAME, count), recorded=True)
-    assert (ledger.lost(), ledger.news()) == ({FRAME.key: 2}, {FRAME.key: 2})
-    ledger.enter(*entry(FRAME, 6), recorded=True)
-    ledger.enter(*entry(FRAME, 8), recorded=False)  # the disk did not take it
-    assert (ledger.lost(), ledger.news(), ledger.recorded()) == ({FRAME.key: 1}, {}, {FRAME.key: 4})
-    ledger.enter(*entry(FRAME, 12), recorded=True)
-    assert (ledger.lost(), ledger.news()) == ({FRAME.key: 3}, {FRAME.key: 1}), "two were said already"
+        account.enter(*entry(FRAME, count), recorded=True)
+    assert (account.lost(), account.news()) == ({FRAME.key: 2}, {FRAME.key: 2})
+    account.enter(*entry(FRAME, 6), recorded=True)
+    account.enter(*entry(FRAME, 8), recorded=False)  # not written to the disk
+    assert (account.lost(), account.news(), account.recorded()) == ({FRAME.key: 1}, {}, {FRAME.key: 4})
+    account.enter(*entry(FRAME, 12), recorded=True)
+    assert (account.lost(), account.news()) == ({FRAME.key: 3}, {FRAME.key: 1}), "two were reported already"
 
 
-def test_the_ledger_does_not_count_what_the_camera_lost_before_it_could_send_it() -> None:
-    ledger = LossAccount()
+def test_frames_that_the_camera_missed_before_publishing_are_not_losses() -> None:
+    account = LossAccount()
 
     def health(published: int, missing: int) -> None:
-        said = wire.Health(process="camera")
-        said.topics.add(topic=FRAME.key, published=published, missing=missing)
-        ledger.believe(entry(HEALTH, 0, key=HEALTH.at("camera"))[1], said)
+        message = wire.Health(process="camera")
+        message.topics.add(topic=FRAME.key, published=published, missing=missing)
+        account.believe(entry(HEALTH, 0, key=HEALTH.at("camera"))[1], message)
 
-    ledger.enter(*entry(FRAME, 50), recorded=True)
-    health(51, 7)  # before the first frame that came
-    ledger.enter(*entry(FRAME, 53), recorded=True)
+    account.enter(*entry(FRAME, 50), recorded=True)
+    health(51, 7)  # missed before the first frame received
+    account.enter(*entry(FRAME, 53), recorded=True)
     health(54, 9)
-    assert (ledger.lost(), ledger.news()) == ({}, {})
-    ledger.enter(*entry(FRAME, 56), recorded=True)
-    assert ledger.news() == {}, "the camera may still say that it lost them"
+    assert (account.lost(), account.news()) == ({}, {})
+    account.enter(*entry(FRAME, 56), recorded=True)
+    assert account.news() == {}, "the camera may still report that it missed them"
     health(57, 10)
-    assert (ledger.news(), ledger.news()) == ({FRAME.key: 1}, {}), "one was lost on the way"
+    assert (account.news(), account.news()) == ({FRAME.key: 1}, {}), "one was lost on the bus"
 
 
-def test_the_ledger_counts_nothing_as_lost_that_was_sent_twice() -> None:
-    ledger = LossAccount()
+def test_duplicates_neither_count_as_losses_nor_hide_them() -> None:
+    account = LossAccount()
     for count in (0, 1, 1, 2, 2, 4, 4):
-        ledger.enter(*entry(FRAME, count), recorded=True)
-    ledger.settle()
-    ledger.enter(*entry(FRAME, 4), recorded=True)
-    ledger.revert()
+        account.enter(*entry(FRAME, count), recorded=True)
+    account.settle()
+    account.enter(*entry(FRAME, 4), recorded=True)
+    account.revert()
     for published, lost in ((7, 1), (8, 1), (9, 2)):
         message = wire.Health(process="camera", state="stopped")
         message.topics.add(topic=FRAME.key, published=published)
-        ledger.believe(entry(HEALTH, 0)[1], message)
-        assert ledger.lost() == {FRAME.key: lost}, "3 was not heard, and what the camera sent beyond those seven"
-    assert ledger.recorded() == {FRAME.key: 7}
+        account.believe(entry(HEALTH, 0)[1], message)
+        assert account.lost() == {FRAME.key: lost}, (
+            "frame 3 was not received; more than seven published are further losses"
+        )
+    assert account.recorded() == {FRAME.key: 7}
 
 
-def test_the_ledger_believes_the_last_health_of_each_start() -> None:
-    ledger = LossAccount()
+def test_the_last_health_of_each_start_determines_its_losses() -> None:
+    account = LossAccount()
 
     def health(published: int, state: str, start_s: int = 100) -> None:
         message = wire.Health(process="camera", state=state)
         message.topics.add(topic=FRAME.key, published=published)
         message.topics.add(topic=STEP.key, received=9)
         message.topics.add(topic="lowfc/nothing", published=9)
-        ledger.believe(entry(HEALTH, 0, start_s)[1], message)
+        account.believe(entry(HEALTH, 0, start_s)[1], message)
 
-    health(40, "running")  # what it sent before it was heard is not lost
-    health(90, "running")  # and what is on its way is not lost yet
-    assert ledger.lost() == {}
+    health(40, "running")  # messages before its first Health are not lost
+    health(90, "running")  # messages may still arrive
+    assert account.lost() == {}
     health(100, "stopped")
-    assert ledger.lost() == {FRAME.key: 60}
-    ledger.enter(*entry(FRAME, 2, start_s=101), recorded=True)
+    assert account.lost() == {FRAME.key: 60}
+    account.enter(*entry(FRAME, 2, start_s=101), recorded=True)
     health(5, "stopped", start_s=101)
-    assert ledger.lost() == {FRAME.key: 62}
+    assert account.lost() == {FRAME.key: 62}
 
 
-def test_the_ledger_tells_apart_who_shares_a_topic() -> None:
-    ledger = LossAccount()
+def test_gaps_are_counted_per_publisher_of_a_shared_topic() -> None:
+    account = LossAccount()
     for name, count in (("camera", 0), ("controller", 0), ("camera", 1), ("controller", 2)):
-        ledger.enter(*entry(EVENT, count, payload=Log(name=name).SerializeToString()), recorded=True)
-    ledger.enter(*entry(EVENT, 0, payload=b"\xff"), recorded=True)
-    assert ledger.lost() == {EVENT.key: 1}
+        account.enter(*entry(EVENT, count, payload=Log(name=name).SerializeToString()), recorded=True)
+    account.enter(*entry(EVENT, 0, payload=b"\xff"), recorded=True)
+    assert account.lost() == {EVENT.key: 1}

@@ -1,4 +1,4 @@
-"""What befalls a recorder: disks that refuse, stall, fill up or vanish; frozen processes; the loop goes on."""
+"""Faults injected into a recorder: disks that fail, stall, fill up or vanish; frozen processes; forged messages."""
 
 import os
 import shutil
@@ -44,23 +44,23 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 
 def put_until(frames: Publisher, happened: Callable[[], bool]) -> None:
-    """Put frames that cannot be compressed until something happens, and ten after it."""
+    """Put incompressible frames until `happened`, then ten more."""
 
-    def put_and_look() -> bool:
+    def put_and_check() -> bool:
         for _ in range(4):
             frames.put(np.random.default_rng(frames.published).bytes(12_800))
         return happened()
 
-    until(put_and_look)
+    until(put_and_check)
     put(frames, 10)
 
 
-def told(bench: Bench, event: str) -> bool:
+def event_published(bench: Bench, event: str) -> bool:
     return any(message.startswith(event) for message in bench.events)
 
 
 def check_account(bench: Bench, summary: Summary, frames: Publisher) -> int:
-    """Every frame is in a log or counted: by the summary, the last Health and the events; return how many are lost."""
+    """Check that summary, last Health and events count every frame missing from the logs; return the number lost."""
     messages = logged(summary)
     recorded = len(bodies_of(messages, FRAME))
     lost = frames.published - recorded
@@ -80,32 +80,34 @@ def check_account(bench: Bench, summary: Summary, frames: Publisher) -> int:
 
 
 def refuse(bench: Bench, descriptor: int) -> None:
-    """Put a device that takes no write in the place of the log."""
+    """Replace the log's file by one that refuses writes."""
     os.dup2(descriptor, bench.recorder._series._log._raw.fileno())
     os.close(descriptor)
 
 
 def lose_the_terminal(bench: Bench) -> None:
-    """A terminal whose other end is gone: a write to it fails with EIO."""
+    """Replace the log's file by a terminal without its other end: a write fails with EIO."""
     master, slave = os.openpty()
     os.close(master)
     refuse(bench, slave)
 
 
 @pytest.mark.parametrize(
-    ("harm", "why"),
+    ("fault", "why"),
     [
         (lose_the_terminal, "Input/output error"),
         (lambda bench: refuse(bench, os.open("/dev/full", os.O_WRONLY)), "No space left on device"),
         (lambda bench: shutil.rmtree(bench.folder), "somebody removed it"),
     ],
 )
-def test_a_disk_that_refuses_ends_the_recording_only(bench: Bench, harm: Callable[[Bench], None], why: str) -> None:
+def test_a_disk_error_ends_the_recording_but_not_the_process(
+    bench: Bench, fault: Callable[[Bench], None], why: str
+) -> None:
     bench.start()
     log, frames = bench.recorder._series._log, bench.camera.publisher(FRAME)
     put_until(frames, lambda: log.messages_written > 20)
-    harm(bench)
-    put_until(frames, lambda: told(bench, "RECORDING_FAILED"))
+    fault(bench)
+    put_until(frames, lambda: event_published(bench, "RECORDING_FAILED"))
     assert bench.thread.is_alive()
     summary = bench.stop()
     assert why in summary.failure
@@ -116,11 +118,11 @@ def test_a_disk_that_refuses_ends_the_recording_only(bench: Bench, harm: Callabl
     assert 10 <= check_account(bench, summary, frames) < frames.published - 10
 
 
-def test_a_disk_that_is_nearly_full_leaves_a_complete_log(bench: Bench, small_disk: Path) -> None:
+def test_a_nearly_full_disk_leaves_a_complete_log(bench: Bench, small_disk: Path) -> None:
     bench.folder = small_disk / "logs"
     bench.start(limits=Limits(min_free_bytes=1_500_000))
     frames = bench.camera.publisher(FRAME)
-    put_until(frames, lambda: told(bench, "RECORDING_FAILED"))
+    put_until(frames, lambda: event_published(bench, "RECORDING_FAILED"))
     assert bench.thread.is_alive()
     summary = bench.stop()
     assert "make room" in summary.failure
@@ -133,18 +135,18 @@ def test_a_disk_that_is_nearly_full_leaves_a_complete_log(bench: Bench, small_di
 
 
 @pytest.mark.exclusive
-def test_a_disk_that_stalls_costs_messages_and_they_are_counted(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_messages_lost_while_the_disk_stalls_are_counted(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recorder_module, "QUEUE_MESSAGES", 100)
     monkeypatch.setattr(recorder_module, "_SLOW_NS", 50_000_000)
-    monkeypatch.setattr(writer.os, "fsync", lambda descriptor: None)  # a pipe has no disk
+    monkeypatch.setattr(writer.os, "fsync", lambda descriptor: None)  # fsync fails on a pipe
     bench.start()
-    log, frames, going_on = bench.recorder._series._log, bench.camera.publisher(FRAME), threading.Event()
+    log, frames, resume = bench.recorder._series._log, bench.camera.publisher(FRAME), threading.Event()
     file, (outlet, inlet) = os.dup(log._raw.fileno()), os.pipe()
-    os.dup2(inlet, log._raw.fileno())  # a pipe to the file, through which nothing comes for a while
+    os.dup2(inlet, log._raw.fileno())  # a pipe to the file that blocks until `resume` is set
     os.close(inlet)
 
     def copy() -> None:
-        going_on.wait(PATIENCE_S)
+        resume.wait(PATIENCE_S)
         while data := os.read(outlet, 1 << 16):
             os.write(file, data)
 
@@ -152,8 +154,8 @@ def test_a_disk_that_stalls_costs_messages_and_they_are_counted(bench: Bench, mo
     copier.start()
     put_until(frames, lambda: len(bench.recorder._backlog) >= 100)
     time.sleep(0.1)
-    going_on.set()
-    put_until(frames, lambda: told(bench, "DISK_SLOW"))
+    resume.set()
+    put_until(frames, lambda: event_published(bench, "DISK_SLOW"))
     until(lambda: len(bench.recorder._backlog) == 0)
     put(frames, 10)
     summary = bench.stop()
@@ -170,7 +172,7 @@ def test_a_disk_that_stalls_costs_messages_and_they_are_counted(bench: Bench, mo
 
 
 def slow_disk(monkeypatch: pytest.MonkeyPatch, *, refuses: bool) -> tuple[threading.Event, threading.Event]:
-    """Hold a log up while it is flushed: whether that has begun, and when it may go on."""
+    """Block the flush of a log: events that report that it was reached, and that release it."""
     reached, release, sync = threading.Event(), threading.Event(), os.fsync
 
     def slow(descriptor: int) -> None:
@@ -185,7 +187,7 @@ def slow_disk(monkeypatch: pytest.MonkeyPatch, *, refuses: bool) -> tuple[thread
 
 
 @pytest.mark.parametrize("refused", [False, True])
-def test_the_loop_of_a_recorder_goes_on_while_the_disk_takes_a_stopped_log(
+def test_the_recorder_stays_responsive_while_a_stopped_log_is_written(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, refused: bool
 ) -> None:
     bench.start()
@@ -201,7 +203,7 @@ def test_the_loop_of_a_recorder_goes_on_while_the_disk_takes_a_stopped_log(
     beats: list[int] = []
     operator.subscribe(HEALTH, lambda sample: beats.append(sample.sequence), "recorder")
     until(lambda: len(beats) >= 2)
-    put(bench.camera.publisher(STEP), 5)  # unwanted now, and not lost
+    put(bench.camera.publisher(STEP), 5)  # not recorded while stopped, and not lost
     assert not answers
     release.set()
     asking.join(PATIENCE_S)
@@ -219,7 +221,7 @@ def test_the_loop_of_a_recorder_goes_on_while_the_disk_takes_a_stopped_log(
     assert refused or STEP.key not in summary.lost
 
 
-def test_a_recorder_told_to_end_while_a_log_is_being_stopped_ends_with_it(
+def test_a_recorder_stopped_while_a_log_is_finished_completes_the_log(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench.start()
@@ -227,28 +229,26 @@ def test_a_recorder_told_to_end_while_a_log_is_being_stopped_ends_with_it(
     operator = MemoryBus(bench.hub, "operator", bench.clock)
     operator.get(RECORD_KEY.format(name="stop"), timeout_s=0)
     assert reached.wait(PATIENCE_S)
-    bench.recorder.service.stop("told")
+    bench.recorder.service.stop("end of the test")
     until(lambda: bench.recorder.service.state == "stopping")
     release.set()
     (log,) = bench.stop().files
     assert not log.name.endswith(UNFINISHED)
 
 
-def test_a_frozen_process_that_is_asked_does_not_hold_up_the_recorder(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_frozen_process_does_not_block_the_recorder(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     bench.start()
-    asked, thawed = threading.Event(), threading.Event()
+    queried, thawed = threading.Event(), threading.Event()
 
     def get(key: str, *, timeout_s: float) -> list[Sample]:
-        asked.set()
+        queried.set()
         thawed.wait(PATIENCE_S)
         return []
 
     monkeypatch.setattr(bench.recorder._bus, "get", get)
-    bench.join("camera-2").beat()  # somebody new: the recorder asks
+    bench.join("camera-2").beat()  # a new process: the recorder queries it
     frames = bench.camera.publisher(FRAME)
-    put_until(frames, asked.is_set)
+    put_until(frames, queried.is_set)
     sent = frames.published
     until(lambda: bench.recorder._account.recorded().get(FRAME.key, 0) == sent)
     (part,) = bench.folder.iterdir()
@@ -257,7 +257,7 @@ def test_a_frozen_process_that_is_asked_does_not_hold_up_the_recorder(
     assert check_account(bench, bench.stop(), frames) == 0
 
 
-def test_each_log_of_a_run_can_be_read_by_itself(bench: Bench) -> None:
+def test_each_log_of_a_run_can_be_read_alone(bench: Bench) -> None:
     calibrations, frames = bench.controller.publisher(CALIBRATION), bench.camera.publisher(FRAME)
     put(calibrations, 1)
 
@@ -266,8 +266,8 @@ def test_each_log_of_a_run_can_be_read_by_itself(bench: Bench) -> None:
     bench.start(
         limits=Limits(longest_s=0.2, min_free_bytes=0), attachments=[Attachment("a.toml", "application/toml", b"[a]")]
     )
-    others = bench.recorder._peers
-    until(lambda: len(others._states) == 3 and not others._newcomers and others._answers is None)
+    peers = bench.recorder._peers
+    until(lambda: len(peers._states) == 3 and not peers._newcomers and peers._answers is None)
     (second,) = put(calibrations, 1)
     put_until(frames, lambda: len(bench.recorder._series.files) == 3)
     summary = bench.stop()
@@ -278,7 +278,7 @@ def test_each_log_of_a_run_can_be_read_by_itself(bench: Bench) -> None:
         assert reader.complete
         assert (reader.attachments, reader.metadata["lowfc"]) == ({"a.toml": b"[a]"}, {"run": "night"})
         assert messages[0].key == CALIBRATION.key
-        # The second calibration was lost on its way, and asked for when the second log was begun.
+        # The second calibration was lost, and queried when the second log was begun.
         assert (second in bodies_of(messages, CALIBRATION)) == (number > 0)
 
 
@@ -286,7 +286,7 @@ def waiting(topic: Topic, size: int) -> tuple[Topic, Sample]:
     return topic, Sample(topic.key, bytes(size), 0, 0, 0)
 
 
-def test_what_waits_is_bounded_by_number_and_by_size() -> None:
+def test_the_backlog_is_bounded_by_number_and_size() -> None:
     backlog = Backlog(most_messages=3, most_bytes=1000)
     for size in (400, 400, 400, 200, 0):
         backlog.put(*waiting(FRAME, size))
@@ -294,7 +294,7 @@ def test_what_waits_is_bounded_by_number_and_by_size() -> None:
     for _ in range(9):
         backlog.put(*waiting(STEP, 1))
     assert len(backlog) == 3
-    for topic in (HEALTH, EVENT):  # few, and others are understood by them
+    for topic in (HEALTH, EVENT):  # never dropped: rare, and needed to account for the others
         backlog.put(*waiting(topic, 5000))
     assert len(backlog) == 5
     for _ in range(5):
@@ -303,7 +303,7 @@ def test_what_waits_is_bounded_by_number_and_by_size() -> None:
     assert len(backlog) == 1
 
 
-def test_forged_names_and_starts_fill_neither_the_recorder_nor_a_log(
+def test_forged_names_and_starts_do_not_fill_the_recorder_or_a_log(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("lowfc.programs.core.recording.recorder.MOST_CHANNELS", 100)
@@ -313,7 +313,7 @@ def test_forged_names_and_starts_fill_neither_the_recorder_nor_a_log(
         body = wire.Health(process=f"forged-{number}").SerializeToString()
         forger.publisher(HEALTH, f"forged-{number}").put(body)
         forger.publisher(COMMAND, f"forged-{number}").put(b"")
-    until(lambda: told(bench, "BAD_MESSAGE"))
+    until(lambda: event_published(bench, "BAD_MESSAGE"))
     first = bench.recorder.service.health().recording.file
     for start_s in range(1, 200):
         forger.publisher(FRAME).put(b"", sequence=sequence_of(start_s, 0))

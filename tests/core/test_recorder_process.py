@@ -1,4 +1,4 @@
-"""The recorder as a process: killed, told to stop in any way, refused where there is no room."""
+"""The recorder as a process: killed, stopped by signals or requests, refused without disk space."""
 
 import json
 import os
@@ -23,7 +23,7 @@ from tests.support.loops import lowfc, start, until
 from tests.support.recording import PATIENCE_S, bodies_of
 
 SAFE_S = 0.6
-"""What a kill may cost: the messages published in this time before it."""
+"""A kill -9 may lose only messages published in this time before it."""
 
 
 class Bench:
@@ -46,7 +46,7 @@ class Bench:
         self.service.beat()
 
     def put_many(self, count: int) -> None:
-        """Put so many frames and steps, at a pace that a loaded host keeps, until the recorder has counted them."""
+        """Put `count` frames and steps, slowly enough for a loaded host; wait until the recorder has counted them."""
         for _ in range(count):
             self.put()
             time.sleep(0.002)
@@ -60,10 +60,10 @@ class Bench:
         return "recorder" in self.service.last_health and self.service.last_health["recorder"].state == state
 
     def stop(self, *signals: int) -> tuple[str, str]:
-        """End the recorder by these signals, a moment apart; return what it printed."""
+        """Send the recorder these signals, 50 ms apart; return its output."""
         for number in signals:
             self.recorder.send_signal(number)
-            time.sleep(0.05)  # it waits for the camera's last Health by now
+            time.sleep(0.05)  # by then it waits for the camera's last Health
         if len(signals) == 1 and signals[0] != signal.SIGKILL:
             until(lambda: self.recorder_is("stopping"))
             self.service.finish()
@@ -96,7 +96,7 @@ def bench(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Bench]:
         (signal.SIGKILL,),
     ],
 )
-def test_however_it_ends_the_log_has_all(bench: Bench, signals: tuple[signal.Signals, ...]) -> None:
+def test_the_log_is_complete_after_any_signal(bench: Bench, signals: tuple[signal.Signals, ...]) -> None:
     bench.put_many(50)
     killed = signal.SIGKILL in signals
     if killed:
@@ -115,15 +115,15 @@ def test_however_it_ends_the_log_has_all(bench: Bench, signals: tuple[signal.Sig
 
 
 @pytest.mark.parametrize("bench", [("--longest-s", 1, "--json")], indirect=True)
-def test_the_command_rotates_and_says_what_it_did(bench: Bench) -> None:
+def test_record_rotates_logs_and_reports_messages_and_losses(bench: Bench) -> None:
     def put_until_rotated() -> bool:
         bench.put()
         return len(list(bench.folder.iterdir())) > 1
 
     until(put_until_rotated)
-    bench.frames.published += 3  # of these nobody hears
+    bench.frames.published += 3  # three counts are skipped: lost messages
     bench.put()
-    out, wrong = bench.stop(signal.SIGTERM)
+    out, errors = bench.stop(signal.SIGTERM)
     published = bench.frames.published - 3
     done = json.loads(out)
     logs = [Path(log) for log in done["logs"]]
@@ -131,7 +131,7 @@ def test_the_command_rotates_and_says_what_it_did(bench: Bench) -> None:
     assert sorted(bench.folder.iterdir()) == sorted(logs)
     assert len(logs) > 1
     assert (done["messages_lost"], done["lost"]) == (3, {FRAME.key: 3})
-    assert f"MESSAGES_LOST 3 messages lost on {FRAME.key}" in wrong
+    assert f"MESSAGES_LOST 3 messages lost on {FRAME.key}" in errors
     readers = [LogReader(log) for log in logs]
     messages = [message for reader in readers for message in reader]
     assert all(reader.complete for reader in readers)
@@ -140,7 +140,7 @@ def test_the_command_rotates_and_says_what_it_did(bench: Bench) -> None:
     assert done["longest_unflushed_ms"] >= done["longest_wait_ms"] > 0
 
 
-def test_a_recording_is_ended_where_the_controller_has_died(own_runtime: Path, bench: Bench) -> None:
+def test_a_recording_can_be_stopped_without_a_controller(own_runtime: Path, bench: Bench) -> None:
     stopped = lowfc("ctl", "record", "stop", "--json")
     reader = LogReader(Path(json.loads(stopped.stdout)["log"]))
     assert (len(list(reader)) > 0, reader.complete) == (True, True)
@@ -156,7 +156,7 @@ def test_a_recording_is_ended_where_the_controller_has_died(own_runtime: Path, b
         (("--longest-s", 0.5), "recorder.longest_s = 0.5"),
     ],
 )
-def test_what_cannot_be_recorded_is_refused_before_anything_is_made(
+def test_an_impossible_recording_is_refused_before_any_file_is_created(
     options: tuple[object, ...], complaint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("lowfc.programs.core.recording.process.step_back", lambda *_: NOTHING)
@@ -165,7 +165,7 @@ def test_what_cannot_be_recorded_is_refused_before_anything_is_made(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_provenance_tells_processors_and_linear_algebra_apart() -> None:
+def test_the_provenance_identifies_processor_and_blas() -> None:
     found = provenance("night", seed=3)
     assert (found["run"], found["seed"], found["processors"]) == ("night", "3", str(os.cpu_count()))
     flags = next(line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith(("flags", "Feat")))
@@ -175,6 +175,6 @@ def test_the_provenance_tells_processors_and_linear_algebra_apart() -> None:
     assert {"sse2", "asimd"} & set(features)
     assert all(found[key] for key in ("host", "kernel", "processor", "python", "numpy", "eclipse-zenoh"))
     assert any(digit.isdigit() for digit in found["blas"])
-    import scipy.linalg  # noqa: F401  # brings its own BLAS along, which the loop does not use
+    import scipy.linalg  # noqa: F401  # loads a BLAS of its own, which the loop does not use
 
     assert provenance() == {key: value for key, value in found.items() if key not in ("run", "seed")}

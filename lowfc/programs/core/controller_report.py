@@ -119,7 +119,7 @@ def fill_benefit(health: wire.Health, watch: GainWatch, state: State) -> None:
 
 
 class Arrays:
-    """Publishes calibration, law and probe table as messages of their own; states and requests refer to them by identity."""
+    """Publishes calibration, law and probe table separately; states and requests refer to them by identity."""
 
     def __init__(self, calibrations: Publisher, laws: Publisher, plays: Publisher) -> None:
         self._calibrations, self._laws, self._plays = calibrations, laws, plays
