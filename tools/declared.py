@@ -116,8 +116,8 @@ def agreement() -> str:
     head = ("camera setting", "configuration key", "tolerance", "needed", "used for")
     rows = []
     for one in AGREEMENTS:
-        needed, apart = "yes" if one.needed else "no", f"{one.apart:.0%}" if one.apart else "exactly equal"
-        rows.append((f"`{one.field}`", f"`{one.key}`", apart, needed, one.use))
+        needed, tolerance = "yes" if one.needed else "no", f"{one.tolerance:.0%}" if one.tolerance else "exactly equal"
+        rows.append((f"`{one.field}`", f"`{one.key}`", tolerance, needed, one.use))
     return markdown(head, rows)
 
 

@@ -1,4 +1,4 @@
-"""What `lowfc conformance` says of good publishers, and of those with one mistake: that mistake, and nothing else."""
+"""`lowfc conformance` on correct devices, and on devices with one fault: it reports that fault and nothing else."""
 
 import json
 import socket
@@ -62,9 +62,9 @@ def envelope(sequence: int, time_ns: int) -> bytes | None:
 
 
 class Device:
-    """A line to itself: it publishes with envelopes and Health, rightly but for `changes`: functions, values by name.
+    """A simulated device that is also its own line; correct except for `changes`, functions or values by name.
 
-    Time passes in milliseconds, and only while somebody waits.
+    Time advances in milliseconds, and only in `wait`.
     """
 
     process = ""
@@ -84,14 +84,14 @@ class Device:
         end_ns = self.now_ns() + max(1, round(seconds * 1e9))
         while self.now_ns() < end_ns:
             self.clock.advance(min(MS, end_ns - self.now_ns()))
-            self.turn(self.now_ns())
+            self.iterate(self.now_ns())
 
     def received(self) -> list[Received]:
         found, self._waiting = self._waiting, []
         return found
 
     def put(self, topic: Topic, name: str, payload: bytes) -> None:
-        self.told(payload, self.now_ns())
+        self.receive(payload, self.now_ns())
 
     def ask(self, key: str) -> list[Received]:
         return self.changed("answer", [self.last[key]] if key in self.last else [])
@@ -109,7 +109,7 @@ class Device:
         self.last[key] = Received(self.changed("key", key), payload, attachment, now_ns + LATENCY_NS)
         self._waiting.append(self.last[key])
 
-    def turn(self, now_ns: int) -> None:
+    def iterate(self, now_ns: int) -> None:
         if now_ns >= self._health_ns:
             self._health_ns = now_ns + 500 * MS
             health = wire.Health(timestamp=timestamp(now_ns), process=self.process, state="running")
@@ -121,7 +121,7 @@ class Device:
 
 
 class Camera(Device):
-    """A spot on 12 x 16 pixels with noise, a hundred times a second."""
+    """A camera with a noisy spot on 12 x 16 pixels, 100 frames per second."""
 
     process = "camera"
 
@@ -133,8 +133,8 @@ class Camera(Device):
         self._spot = 100 + 3000 * np.exp(-((y - 5.5) ** 2 + (x - 7.5) ** 2) / 12)
         self._rng = np.random.default_rng(1)
 
-    def turn(self, now_ns: int) -> None:
-        super().turn(now_ns)
+    def iterate(self, now_ns: int) -> None:
+        super().iterate(now_ns)
         if now_ns < self._due_ns:
             return
         self._due_ns = now_ns + CONFIG.period_ns
@@ -152,7 +152,7 @@ class Camera(Device):
 
 
 class Mirror(Device):
-    """The simulated mirror's own functions, with hooks."""
+    """The functions of the simulated mirror, with hooks for faults."""
 
     process = "mirror-dm"
 
@@ -162,25 +162,25 @@ class Mirror(Device):
         self.device = replace(self.device, **changes.get("device", {}))
         self.status = initial(self.device)
         self._published_ns = 0
-        self._told = 0
+        self._received = 0
 
-    def told(self, payload: bytes, now_ns: int) -> None:
-        self._told += 1
-        if self.changes.get("deaf") or self._told % self.changes.get("drops", self._told + 1) == 0:
+    def receive(self, payload: bytes, now_ns: int) -> None:
+        self._received += 1
+        if self.changes.get("deaf") or self._received % self.changes.get("drops", self._received + 1) == 0:
             return
         try:
             command = wire.MirrorCommand.FromString(payload)
         except DecodeError:
             return
-        told = self.changed("told", command_of(payload), command, self.status)
-        self.status, refused = apply_command(self.device, self.status, told, now_ns)
+        decoded = self.changed("command", command_of(payload), command, self.status)
+        self.status, refused = apply_command(self.device, self.status, decoded, now_ns)
         if refused is None:
             self._publish(self.status.time_ns, now_ns)
         elif self.changes.get("renews"):
             self.status = self.status._replace(received_ns=now_ns)
 
-    def turn(self, now_ns: int) -> None:
-        super().turn(now_ns)
+    def iterate(self, now_ns: int) -> None:
+        super().iterate(now_ns)
         self.status = self.changed("tick", tick)(self.device, self.status, now_ns)
         if now_ns - self._published_ns >= 100 * MS and not self.changes.get("silent"):
             self._publish(now_ns, now_ns)
@@ -192,7 +192,7 @@ class Mirror(Device):
 
 
 def found(checks: Iterator[Check]) -> dict[str, str]:
-    """What is not ok, by name."""
+    """Statuses of the checks that are not ok, by name."""
     listed = list(checks)
     assert len({check.name for check in listed}) == len(listed)
     assert all(check.expected and check.got and bool(check.advice) != (check.status == "ok") for check in listed)
@@ -209,7 +209,7 @@ def of_mirror(*, gentle: bool = False, config: Configuration = CONFIG, **changes
 
 
 def setting(**values: Any) -> Callable[..., Any]:
-    """A message with some fields changed."""
+    """Function that sets fields of a message."""
 
     def change(message: Any, *_: Any) -> Any:
         for name, value in values.items():
@@ -258,7 +258,7 @@ CAMERAS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
     "a big-endian envelope": ({"attach": swapped}, {"sequence": WRONG, "publish time": WRONG}),
     "a count without start": ({"attach": lambda s, t: envelope(s & 0xFFFF, t)}, {"sequence": WRONG}),
     "milliseconds for the start": ({"attach": lambda s, t: envelope(s * 1000 % 2**64, t)}, {"sequence": WRONG}),
-    "a count that stands still": ({"count": lambda count, _: 7}, {"sequence": WRONG}),
+    "a constant count": ({"count": lambda count, _: 7}, {"sequence": WRONG}),
     "a count of all topics": ({"count": lambda count, _: 3 * count}, {"sequence": WRONG}),
     "a gap": ({"count": lambda count, _: count + 4 * (count > 100)}, {"sequence": WARNING}),
     "microseconds": ({"attach": put_at(lambda t: t // 1000)}, {"publish time": WRONG}),
@@ -271,9 +271,9 @@ CAMERAS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
     ),
     "no frame time": ({"frame": lambda frame, _: frame.ClearField("timestamp") or frame}, {"frame time": WRONG}),
     "a frame time ahead": ({"frame": stamped(20 * MS)}, {"frame time": WRONG}),
-    "a frame time of long ago": ({"frame": stamped(-3600 * 1000 * MS)}, {"frame time": WRONG}),
+    "a frame time an hour ago": ({"frame": stamped(-3600 * 1000 * MS)}, {"frame time": WRONG}),
     "the start of the exposure": ({"frame": stamped(-5 * MS)}, {"frame time": WARNING}),
-    "bytes that are no message": ({"frame": lambda *_: b"\xff\xff\xff"}, {"frames": WRONG}),
+    "undecodable bytes": ({"frame": lambda *_: b"\xff\xff\xff"}, {"frames": WRONG}),
     "eight bits": ({"frame": halved}, {"bytes": WRONG}),
     "another encoding": ({"frame": setting(encoding="16UC1")}, {"encoding": WRONG}),
     "no step": ({"frame": setting(step=0)}, {"bytes": WRONG}),
@@ -296,7 +296,7 @@ CAMERAS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
     "big-endian pixels": ({"pixels": lambda one, i: one.byteswap()}, {"byte order": WRONG, "settings' range": WRONG}),
     "left-aligned pixels": ({"pixels": lambda one, i: one * 16}, {"byte order": WRONG, "settings' range": WRONG}),
     "no settings": ({"state": lambda *_: None}, {"settings": WRONG}),
-    "settings that are no message": (
+    "undecodable settings": (
         {"state": lambda *_: b"\xff\xff\xff"},
         {"settings": WRONG, "settings on request": WRONG},
     ),
@@ -314,13 +314,13 @@ CAMERAS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
 }
 
 
-def test_a_good_camera_has_nothing_wrong() -> None:
+def test_a_correct_camera_passes() -> None:
     assert of_camera() == {}
 
 
-@pytest.mark.parametrize("mistake", CAMERAS)
-def test_a_cameras_mistake_is_found(mistake: str) -> None:
-    changes, expected = CAMERAS[mistake]
+@pytest.mark.parametrize("fault", CAMERAS)
+def test_a_fault_of_a_camera_is_found(fault: str) -> None:
+    changes, expected = CAMERAS[fault]
     assert of_camera(**changes) == expected
 
 
@@ -338,19 +338,19 @@ def one_dead(shape: Single, height_nm: float = 0.0) -> Single:
 
 
 def careless(what: str) -> Callable[..., Command]:
-    """Repair what should have been refused."""
+    """Function of a driver that repairs an invalid command instead of refusing it."""
 
-    def change(told: Command, command: wire.MirrorCommand, status: Status) -> Command:
-        wanted = told.actuators_nm
-        if what == "bytes" and wanted is None:
-            return replace(told, actuators_nm=np.resize(np.frombuffer(command.actuators, np.float32), (6, 7)))
-        if what == "grid" and wanted is not None:
-            return replace(told, actuators_nm=np.resize(wanted, (6, 7)))
-        if what == "finite" and wanted is not None:
-            return replace(told, actuators_nm=np.nan_to_num(wanted, nan=0.0, posinf=0.0))
+    def change(decoded: Command, command: wire.MirrorCommand, status: Status) -> Command:
+        actuators_nm = decoded.actuators_nm
+        if what == "bytes" and actuators_nm is None:
+            return replace(decoded, actuators_nm=np.resize(np.frombuffer(command.actuators, np.float32), (6, 7)))
+        if what == "grid" and actuators_nm is not None:
+            return replace(decoded, actuators_nm=np.resize(actuators_nm, (6, 7)))
+        if what == "finite" and actuators_nm is not None:
+            return replace(decoded, actuators_nm=np.nan_to_num(actuators_nm, nan=0.0, posinf=0.0))
         if what == "order":
-            return replace(told, frame_sequence=max(told.frame_sequence, status.frame_sequence))
-        return told
+            return replace(decoded, frame_sequence=max(decoded.frame_sequence, status.frame_sequence))
+        return decoded
 
     return change
 
@@ -368,42 +368,42 @@ MIRRORS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
     "no envelope": ({"attach": lambda *_: None}, {"envelope": WRONG}),
     "a count without start": ({"attach": lambda s, t: envelope(s & 0xFFFF, t)}, {"sequence": WRONG}),
     "another clock": ({"attach": put_at(lambda t: t - 35 * MS)}, {"publish time": WRONG}),
-    "no message": ({"state": lambda _: b"\xff\xff\xff"}, {"state": WRONG} | UNTRIED),
+    "undecodable state": ({"state": lambda _: b"\xff\xff\xff"}, {"state": WRONG} | UNTRIED),
     "another grid": ({"state": setting(rows=7, columns=6)}, {"grid": WRONG} | UNTRIED),
     "doubles": ({"state": lambda one: setting(actuators=2 * one.actuators)(one)}, {"grid": WRONG} | UNTRIED),
-    "NaN for who is not there": (
+    "NaN for a missing actuator": (
         {"state": shaped(lambda shape: one_dead(shape, np.nan))},
         {"grid": WRONG} | UNTRIED,
     ),
-    "wavefront": ({"state": shaped(lambda shape: 2 * shape)}, {"applied": WRONG} | UNTRIED),
-    "um": ({"state": shaped(lambda shape: shape / 1000)}, {"applied": WRONG} | UNTRIED),
+    "wavefront instead of surface": ({"state": shaped(lambda shape: 2 * shape)}, {"applied": WRONG} | UNTRIED),
+    "um instead of nm": ({"state": shaped(lambda shape: shape / 1000)}, {"applied": WRONG} | UNTRIED),
     "upside down": ({"state": shaped(lambda shape: shape[::-1])}, {"applied": WRONG} | UNTRIED),
-    "down is up": ({"state": shaped(lambda shape: -shape)}, {"applied": WRONG} | UNTRIED),
+    "wrong sign": ({"state": shaped(lambda shape: -shape)}, {"applied": WRONG} | UNTRIED),
     "another order": ({"state": shaped(lambda shape: shape.reshape(7, 6).T)}, {"applied": WRONG} | UNTRIED),
     "a dead actuator": ({"state": shaped(one_dead)}, {"applied": WARNING}),
-    "a status that says nothing": (
+    "unspecified status": (
         {"state": setting(status=0)},
         {"status": WRONG, "dead-man": WRONG, "longest command": WARNING} | UNTRIED,
     ),
     "its own time": ({"state": lambda one: stamped(3 * MS)(one, 0)}, {"time": WARNING}),
     "no modal command": ({"state": lambda one: one.ClearField("command_nm") or one}, {"modal command": WARNING}),
-    "NaN taken for zero": (
-        {"told": careless("finite")},
+    "NaN replaced by zero": (
+        {"command": careless("finite")},
         {"NaN refused": WRONG, "infinity refused": WRONG, "dead-man": WRONG} | UNTRIED,
     ),
-    "any grid": ({"told": careless("grid")}, {"wrong grid refused": WRONG} | UNTRIED),
-    "any length": ({"told": careless("bytes")}, {"short command refused": WRONG} | UNTRIED),
-    "any order": ({"told": careless("order")}, {"old command refused": WRONG, "clear": WARNING} | UNTRIED),
+    "any grid": ({"command": careless("grid")}, {"wrong grid refused": WRONG} | UNTRIED),
+    "any length": ({"command": careless("bytes")}, {"short command refused": WRONG} | UNTRIED),
+    "any order": ({"command": careless("order")}, {"old command refused": WRONG, "clear": WARNING} | UNTRIED),
     "no dead-man": (
         {"tick": lambda one: lambda device, status, now_ns: status},
         {"dead-man": WRONG, "longest command": WARNING} | UNTRIED,
     ),
-    "a refused command renews": ({"renews": True}, {"dead-man": WRONG} | UNTRIED),
+    "a refused command extends the timeout": ({"renews": True}, {"dead-man": WRONG} | UNTRIED),
     "expired at once": (
         {"tick": lambda one: lambda device, status, now_ns: one(device, status._replace(valid_for_ns=MS), now_ns)},
         {"dead-man": WRONG} | UNTRIED,
     ),
-    "a command named while it relaxes": (
+    "command_nm set while it relaxes": (
         {
             "state": lambda one: (
                 one if one.status != wire.MIRROR_STATUS_EXPIRED else one.command_nm.extend([1.0, 2.0]) or one
@@ -415,7 +415,7 @@ MIRRORS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
     "no stroke limit": ({"device": {"limits": Limits(10_000.0, 150.0, 500.0)}}, {"stroke": WRONG}),
     "no neighbour limit": ({"device": {"limits": Limits(750.0, 150.0, 10_000.0)}}, {"neighbours": WRONG}),
     "a shorter stroke": ({"device": {"limits": Limits(400.0, 150.0, 500.0)}}, {"stroke": WARNING}),
-    "limits that are not named": (
+    "limits_hit empty": (
         {"state": lambda one: one.ClearField("limits_hit") or one},
         {"stroke": WARNING, "slew": WARNING, "neighbours": WARNING},
     ),
@@ -423,25 +423,25 @@ MIRRORS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
 }
 
 
-def test_a_good_mirror_has_nothing_wrong_and_ends_where_it_was() -> None:
+def test_a_correct_mirror_passes_and_returns_to_its_shape() -> None:
     mirror = Mirror()
     start = np.full((6, 7), 40, np.float32)
-    told = Command("lowfc", 5, mirror.device.settling_ns and 1, 10**10, start, np.zeros(2, np.float32))
-    mirror.status, _ = apply_command(replace(mirror.device, flatten=False), mirror.status, told, mirror.now_ns())
+    command = Command("lowfc", 5, mirror.device.settling_ns and 1, 10**10, start, np.zeros(2, np.float32))
+    mirror.status, _ = apply_command(replace(mirror.device, flatten=False), mirror.status, command, mirror.now_ns())
     mirror.device = replace(mirror.device, flatten=False)
     dialogue = Dialogue(mirror, Expected(CONFIG))
     assert found(mirror_checks(dialogue, 0.2, lambda _: None)) == {}
     np.testing.assert_allclose(mirror.status.surface_nm, start, atol=0.03)
-    assert 5 < mirror.status.frame_sequence < 5000  # a camera that ran before is not behind
+    assert 5 < mirror.status.frame_sequence < 5000  # below the sequences of a camera, which are not refused later
 
 
-@pytest.mark.parametrize("mistake", MIRRORS)
-def test_a_mirrors_mistake_is_found(mistake: str) -> None:
-    changes, expected = MIRRORS[mistake]
+@pytest.mark.parametrize("fault", MIRRORS)
+def test_a_fault_of_a_mirror_is_found(fault: str) -> None:
+    changes, expected = MIRRORS[fault]
     assert of_mirror(**changes) == expected
 
 
-def test_gently_the_limits_are_left_alone() -> None:
+def test_gentle_does_not_test_the_limits() -> None:
     mirror = Mirror()
     highest_nm: list[float] = []
     mirror.changes["state"] = shaped(lambda shape: highest_nm.append(float(np.abs(shape).max())) or shape)
@@ -449,11 +449,11 @@ def test_gently_the_limits_are_left_alone() -> None:
     assert 0 < max(highest_nm) < 0.051 * CONFIG.mirror.slew_nm
 
 
-def test_however_it_ends_the_mirror_is_brought_back() -> None:
+def test_an_interrupted_check_returns_the_mirror_to_its_shape() -> None:
     mirror = Mirror()
 
     def interrupted(what: str) -> None:
-        if what == "its limits":
+        if what == "limits":
             mirror.changes["state"] = raising
 
     def raising(state: wire.MirrorState) -> wire.MirrorState:
@@ -468,7 +468,7 @@ def test_however_it_ends_the_mirror_is_brought_back() -> None:
     np.testing.assert_allclose(mirror.status.surface_nm, 0, atol=0.03)
 
 
-def test_dead_and_stuck_actuators_of_the_configuration_are_no_mistake() -> None:
+def test_configured_dead_and_stuck_actuators_are_no_fault() -> None:
     config = load(None, {**SMALL, "mirror.dead": [9, 17], "mirror.stuck_nm": {"24": 30.0}})
     free = Mirror()
     free.device = device(config)
@@ -476,12 +476,12 @@ def test_dead_and_stuck_actuators_of_the_configuration_are_no_mistake() -> None:
     assert found(mirror_checks(Dialogue(free, Expected(config)), 0.2, lambda _: None)) == {}
 
 
-def test_the_report_says_what_to_do_of_what_is_not_right(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_report_has_advice_for_failed_checks(capsys: pytest.CaptureFixture[str]) -> None:
     checks = list(camera_checks(watch(Camera(frame=setting(encoding="16UC1")), 1.0, lambda _: None)))
     put(checks, STATUSES, FIELDS, None)
     text = capsys.readouterr().out
     assert "'16UC1'" in text
-    assert "call it mono16" in text
+    assert "with encoding mono16" in text
     assert text.splitlines()[-1].startswith("1 wrong, 0 warnings")
     put(checks, STATUSES, FIELDS, {"run": "bench"})
     printed = json.loads(capsys.readouterr().out)
@@ -490,7 +490,7 @@ def test_the_report_says_what_to_do_of_what_is_not_right(capsys: pytest.CaptureF
 
 
 @pytest.mark.usefixtures("own_runtime")
-def test_what_cannot_be_checked_is_refused(tmp_path: Path) -> None:
+def test_conformance_refuses_runs_that_it_cannot_check(tmp_path: Path) -> None:
     def complaint(*words: object) -> str:
         return str(lowfc("conformance", *words).exception)
 
@@ -500,13 +500,13 @@ def test_what_cannot_be_checked_is_refused(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", open_run("bench").links.ports[Role.CONTROLLER])):
         assert "has a controller" in complaint("mirror", "--run", "bench")
     (tmp_path / "lockstep.toml").write_text("lockstep = true\n")
-    assert "a mirror has no dead-man" in complaint("mirror", "--config", tmp_path / "lockstep.toml")
+    assert "a mirror has no command timeout" in complaint("mirror", "--config", tmp_path / "lockstep.toml")
     open_run("far", network=Network(router="tls/127.0.0.1:7447", certificates="."))
-    assert "goes by a router" in complaint("camera", "--run", "far")
+    assert "uses a router" in complaint("camera", "--run", "far")
 
 
 @pytest.mark.usefixtures("own_runtime")
-def test_a_camera_that_is_not_there_is_what_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_absent_camera_fails_the_check_of_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     open_run("bench")
     monkeypatch.setattr(conformance, "CONNECT_S", 0.0)
     done = lowfc("conformance", "camera", "--run", "bench", "--duration", "0.2", "--json")
@@ -517,7 +517,7 @@ def test_a_camera_that_is_not_there_is_what_is_wrong(monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.usefixtures("own_runtime")
-def test_a_line_hears_what_has_no_envelope_and_asks() -> None:
+def test_a_line_receives_messages_without_an_envelope_and_queries() -> None:
     links = open_run("bench").links
     with zenoh.open(zenoh.Config.from_json5(json.dumps(session_config(links, Role.CAMERA)))) as session:
         session.declare_queryable(CAMERA_STATE.key, lambda query: query.reply(CAMERA_STATE.key, b"settings"))
@@ -527,19 +527,19 @@ def test_a_line_hears_what_has_no_envelope_and_asks() -> None:
             until(lambda: [one.payload for one in line.ask(CAMERA_STATE.key)] == [b"settings"])
             got: list[Received] = []
 
-            def come() -> bool:
+            def received() -> bool:
                 session.put(FRAME.key, b"frame")
                 got.extend(line.received())
                 return bool(got)
 
-            until(come)
+            until(received)
             assert got[0][:3] == (FRAME.key, b"frame", None)
         finally:
             line.close()
 
 
 @pytest.mark.usefixtures("own_runtime")
-def test_the_controllers_place_is_taken_by_one_at_a_time() -> None:
+def test_only_one_process_may_have_the_role_controller() -> None:
     links = open_run("bench").links
     line = Line(links, Role.CONTROLLER)
     try:

@@ -1,4 +1,4 @@
-"""A camera under test: its frames, settings and times, received for a while."""
+"""A camera under test: its frames, settings and times."""
 
 import zlib
 from collections.abc import Callable
@@ -16,11 +16,11 @@ from lowfc.programs.commissioning.conformance.publisher import LATE_NS
 
 TURN_S = 0.02
 PICTURES = 50
-"""Frames whose pixels are kept."""
+"""Number of frames whose pixels are stored."""
 
 
 class Picture(NamedTuple):
-    """A frame without its pixels; `highest` is its brightest pixel, None where it is not whole."""
+    """A frame without its pixels; `highest` is its brightest pixel, None if its size is wrong."""
 
     receive_time_ns: int
     put_ns: int
@@ -45,10 +45,10 @@ class Camera(Collected):
 
     Attributes:
         frames: every frame, without its pixels.
-        unreadable: payloads that are no RawImage.
-        pixels: (rows, columns) of some of them, as little-endian.
-        states: the camera's settings as they came; None for one that could not be read.
-        answers: to a query for the settings.
+        unreadable: number of payloads that are not a RawImage.
+        pixels: pixels (rows, columns) of the first frames, decoded as little-endian.
+        states: the camera's settings in order of arrival; None for one that could not be decoded.
+        answers: replies to a query for the settings.
     """
 
     def __init__(self, line: Line) -> None:
@@ -60,7 +60,7 @@ class Camera(Collected):
         self.answers: list[Received] = []
 
     def take(self, message: Received) -> None:
-        """Keep what is looked at later."""
+        """Store a message for the checks, frames without their pixels."""
         if message.key == FRAME.key:
             try:
                 self._frame(message, RawImage.FromString(message.payload))
@@ -87,12 +87,12 @@ class Camera(Collected):
 
     @property
     def settings(self) -> wire.CameraState | None:
-        """The last settings that could be read."""
+        """The last settings that could be decoded."""
         return next((state for state in reversed(self.states) if state is not None), None)
 
     @cached_property
     def shapes(self) -> list[tuple[int, int]]:
-        """Rows and columns of the frames: one pair, unless they change."""
+        """Different sizes (rows, columns) of the frames; normally one."""
         return sorted({frame.shape for frame in self.frames})
 
     @cached_property
@@ -102,14 +102,14 @@ class Camera(Collected):
 
     @cached_property
     def put_times_ns(self) -> list[int]:
-        """When each frame was put; when it arrived, where the envelopes' times are no good."""
+        """Publish time of each frame, or its arrival time if the envelopes' times are wrong."""
         puts, arrivals = [frame.put_ns for frame in self.frames], [frame.receive_time_ns for frame in self.frames]
         near = all(abs(arrival - put) <= LATE_NS for put, arrival in zip(puts, arrivals, strict=True))
         return puts if near and all(later > earlier for earlier, later in pairwise(puts)) else arrivals
 
 
 def watch(line: Line, seconds: float, advance: Callable[[float], None]) -> Camera:
-    """Look at a camera for so long; `advance` is called with how long it has been."""
+    """Observe a camera for `seconds`; `advance` is called with the elapsed time."""
     seen, begun_ns = Camera(line), line.now_ns()
     while (elapsed_s := (line.now_ns() - begun_ns) / NS) < seconds:
         advance(elapsed_s)

@@ -1,4 +1,4 @@
-"""The command `lowfc conformance`: options only."""
+"""The command `lowfc conformance`: command-line arguments."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -37,8 +37,8 @@ def camera(
 ) -> None:
     """Check the messages of a camera driver against the contract; exit status 1 if a check fails.
 
-    The check publishes nothing, so the loop may be running. With --config, the camera's settings are compared with the
-    loop's configuration, too.
+    The check publishes nothing, so the loop may be running. With --config it also compares the camera's settings with
+    the loop's configuration.
 
     Example: lowfc conformance camera --run bench --config bench.toml
     """
@@ -66,14 +66,14 @@ def mirror(
     run: RunName = None,
     config: ConfigFile = None,
     duration: Annotated[float, typer.Option(min=0.05, max=3600, help="Seconds of ordinary commands.")] = 5.0,
-    gentle: Annotated[bool, typer.Option("--gentle", help="Do not try its limits.")] = False,
+    gentle: Annotated[bool, typer.Option("--gentle", help="Do not test the mirror's limits.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Command a mirror and check its answers against the contract; exit status 1 if a check fails.
+    """Send commands to a mirror and check its states against the contract; exit status 1 if a check fails.
 
-    It takes the controller's place, so none may be running. The commands are a twentieth of what the configuration
-    allows in one move; only where all of them were answered rightly, and without --gentle, stroke, slew and neighbour
-    limits are exceeded by a little, to see them kept. The mirror ends where it was.
+    The check takes the place of the controller, which must not be running. The commands are 5 % of what the
+    configuration allows in one move. If the mirror passes, the check then exceeds the stroke, slew and neighbour limits
+    a little, unless --gentle, to test that the mirror keeps them. At the end the mirror returns to its shape.
 
     Example: lowfc conformance mirror --run bench --config lowfc.toml
     """
@@ -88,10 +88,10 @@ def mirror(
 
     settings = configuration(config)
     if settings.lockstep:
-        raise ConfigurationError("lockstep = true: time stands still there, and a mirror has no dead-man; leave it out")
+        raise ConfigurationError("lockstep = true: in simulated time a mirror has no command timeout; remove the key")
     found = _run_with(mirror_role(settings.mirror.name), run)
     if Role.CONTROLLER in found.links.live():
-        raise BusError(f"run {found.run_id!r} has a controller, and only one process may command the mirror: stop it")
+        raise BusError(f"run {found.run_id!r} has a controller, but only one process may command the mirror: stop it")
     with _line(found, Role.CONTROLLER) as line, passing_bar(Console(stderr=True)) as bar:
         task, dialogue = bar.add_task("the mirror", total=None), Dialogue(line, Expected(settings))
         checks = mirror_checks(dialogue, duration, lambda what: bar.update(task, description=what), gentle=gentle)
@@ -99,7 +99,7 @@ def mirror(
 
 
 def _run_with(role: str, name: str | None) -> "Run":
-    """The run of that name, or the only one in which such a role listens."""
+    """The run of that name, or the only one with such a device."""
     from lowfc.adapters.bus.run import open_run
     from lowfc.client.runs import living, the_known_run
     from lowfc.contract.errors import BusError
@@ -107,18 +107,18 @@ def _run_with(role: str, name: str | None) -> "Run":
     if name is None:
         found = [run for run, roles in living().items() if role in roles]
         if len(found) > 1:
-            raise BusError(f"say which run with --run: {role} is in {', '.join(found)}")
+            raise BusError(f"several runs have a {role} ({', '.join(found)}): choose one with --run")
         if not found:
             raise BusError(
-                f"no {role} listens in any run of this host: start yours with the session file of "
+                f"no run on this host has a {role}: start yours with the session file of "
                 f"`lowfc config zenoh --role {role} --run NAME --make`, and name the run with --run"
             )
         name = found[0]
     run = open_run(the_known_run(name), ())
     if run.links.network.router:
         raise BusError(
-            f"run {name!r} goes by a router, whose clock its times are of: try the device on its own host, in a run "
-            "of that host alone"
+            f"run {name!r} uses a router, and its times are on the router's clock: check the device on its own host, "
+            "in a local run"
         )
     return run
 

@@ -1,4 +1,4 @@
-"""Commands to a mirror under test, small ones first, and what it answers."""
+"""Commands to a mirror under test, small ones first, and the states that it answers with."""
 
 from collections.abc import Callable
 
@@ -14,12 +14,12 @@ from lowfc.contract.messages import COMMAND, MIRROR_STATE, timestamp, wire
 from lowfc.programs.commissioning.conformance.line import NS, Collected, Line, Received
 
 ANSWER_S = 0.5
-"""A mirror that takes longer cannot be in a loop."""
+"""Timeout for an answer; a slower mirror cannot be used in a loop."""
 VALID_NS = NS
 MODAL_NM = (0.5, -0.25)
-"""Sent as the modal command."""
+"""Modal command of every test command."""
 CHANNEL = "lowfc"
-"""The controller's, so that its next command takes the place of ours."""
+"""The controller's channel, so that its next command replaces the test's."""
 TURN_S = 0.002
 
 Show = Callable[[str], None]
@@ -30,15 +30,15 @@ _MOST_MOVES = 400
 
 
 class Expected:
-    """What a configuration says of its mirror; dead and stuck actuators do not move.
+    """The mirror as configured; dead and stuck actuators do not move.
 
     Attributes:
-        name: in its topics.
+        name: name in the mirror's topics.
         grid: rows and columns of actuators.
-        limits: that it keeps, nm of surface.
-        step_nm: least step of its driver.
-        moving: (rows, columns) which actuators move.
-        period_ns: between two commands of the loop.
+        limits: the mirror's limits, nm of surface.
+        step_nm: smallest step of its driver, nm of surface.
+        moving: whether each actuator moves (rows, columns).
+        period_ns: time between two commands of the loop.
     """
 
     def __init__(self, config: Configuration) -> None:
@@ -57,7 +57,7 @@ class Expected:
 
     @property
     def move_nm(self) -> float:
-        """Largest move on a long way: half the slew limit, nm of surface."""
+        """Largest single move on the way to a distant shape: half the slew limit, nm of surface."""
         return self.limits.slew_nm / 2
 
     @property
@@ -72,8 +72,8 @@ class Dialogue(Collected):
     """Sends commands to a mirror and collects its states.
 
     Attributes:
-        states: every state that could be read, with the message that it came in.
-        unreadable: states that could not be read.
+        states: every state that could be decoded, with its message.
+        unreadable: number of states that could not be decoded.
     """
 
     def __init__(self, line: Line, expected: Expected) -> None:
@@ -85,7 +85,7 @@ class Dialogue(Collected):
         self._commanded_nm: Single = np.zeros(expected.grid, np.float32)
 
     def take(self, message: Received) -> None:
-        """Keep a message."""
+        """Store a message, and decode it if it is a state."""
         super().take(message)
         if message.key == self.key:
             try:
@@ -95,42 +95,42 @@ class Dialogue(Collected):
 
     @property
     def last(self) -> wire.MirrorState | None:
-        """Newest state."""
+        """The newest state; None without one."""
         return self.states[-1][1] if self.states else None
 
     @property
     def where_nm(self) -> Single:
-        """Where the mirror reports to be; where it was commanded to be, if that cannot be read."""
+        """Reported surface (rows, columns), or the last commanded one if the report cannot be decoded."""
         found = self.surface_nm(self.last)
         return self._commanded_nm if found is None else found
 
     def surface_nm(self, state: wire.MirrorState | None) -> Single | None:
-        """Actuators (rows, columns) of a state; None where there is none, or no finite grid of the configured size."""
+        """Actuators (rows, columns) of a state; None without a state, or unless finite and of the configured size."""
         found = None if state is None else actuators(state)
         good = found is not None and found.shape == self.expected.grid and bool(np.isfinite(found).all())
         return found if good else None
 
     def begin(self, shape_nm: Single, last_sequence: int) -> None:
-        """Go on from where the mirror is, with sequences above the last that it followed, and no higher than needed.
+        """Start at the mirror's present shape, with the sequence after the last one that it followed.
 
-        Those of a camera that runs are above; a controller that takes over is not refused.
+        The sequences of a running camera are higher, so that the mirror does not refuse a controller that takes over.
         """
         self._commanded_nm, self._next = shape_nm, last_sequence + 1
 
     def listen(self, seconds: float) -> list[wire.MirrorState]:
-        """States that come in so long a time."""
+        """States received in the next `seconds`."""
         before, end_ns = len(self.states), self.line.now_ns() + round(seconds * NS)
-        while (left_ns := end_ns - self.line.now_ns()) > 0:
-            self.collect(min(TURN_S, left_ns / NS))
+        while (remaining_ns := end_ns - self.line.now_ns()) > 0:
+            self.collect(min(TURN_S, remaining_ns / NS))
         return [state for _, state in self.states[before:]]
 
     def since(self, time_ns: int) -> list[tuple[Received, wire.MirrorState]]:
-        """States that came later."""
+        """States received at or after this time, with their messages."""
         return [(message, state) for message, state in self.states if message.receive_time_ns >= time_ns]
 
     def put(
         self,
-        wanted_nm: Single,
+        surface_nm: Single,
         *,
         valid_ns: int = VALID_NS,
         sequence: int | None = None,
@@ -140,22 +140,22 @@ class Dialogue(Collected):
         """Send a command; return its sequence and its time.
 
         Args:
-            wanted_nm: (rows, columns) nm of surface.
-            valid_ns: how long it may be held.
-            sequence: of its frame; the next one if None.
-            cut: bytes that are missing at the end.
-            clear_id: identity of an operator's clear; 0 for none.
+            surface_nm: Shape (rows, columns), nm of surface.
+            valid_ns: Time for which the command is valid.
+            sequence: Frame sequence; the next one if None.
+            cut: Number of bytes removed from the end.
+            clear_id: Identity of an operator's clear; 0 for none.
         """
         if sequence is None:
             sequence, self._next = self._next, self._next + 1
-        data, time_ns = wanted_nm.astype("<f4").tobytes(), self.line.now_ns()
+        data, time_ns = surface_nm.astype("<f4").tobytes(), self.line.now_ns()
         command = wire.MirrorCommand(
             timestamp=timestamp(time_ns),
             frame_sequence=sequence,
             channel=CHANNEL,
             valid_for_ns=valid_ns,
-            rows=wanted_nm.shape[0],
-            columns=wanted_nm.shape[1],
+            rows=surface_nm.shape[0],
+            columns=surface_nm.shape[1],
             actuators=data[: len(data) - cut],
             command_nm=MODAL_NM,
             clear_id=clear_id,
@@ -163,14 +163,14 @@ class Dialogue(Collected):
         self.line.put(COMMAND, self.expected.name, command.SerializeToString())
         return sequence, time_ns
 
-    def ask(self, wanted_nm: Single, valid_ns: int = VALID_NS) -> tuple[wire.MirrorState | None, int, int]:
-        """Send a command and wait for the state that answers it, None in vain.
+    def ask(self, surface_nm: Single, valid_ns: int = VALID_NS) -> tuple[wire.MirrorState | None, int, int]:
+        """Send a command and wait for the state that answers it.
 
         Returns:
-            The state, the command's time, and how long it took, ns.
+            The state, None without an answer; the command's time; and the time until the answer, ns.
         """
-        self._commanded_nm, before = wanted_nm, len(self.states)
-        sequence, sent_ns = self.put(wanted_nm, valid_ns=valid_ns)
+        self._commanded_nm, before = surface_nm, len(self.states)
+        sequence, sent_ns = self.put(surface_nm, valid_ns=valid_ns)
         end_ns = self.line.now_ns() + round(ANSWER_S * NS)
         while self.line.now_ns() < end_ns:
             for message, state in self.states[before:]:
@@ -179,22 +179,22 @@ class Dialogue(Collected):
             self.collect(TURN_S)
         return None, sent_ns, 0
 
-    def go(self, wanted_nm: Single) -> wire.MirrorState | None:
-        """Go there in moves of half the slew limit; return the answer to the last, None where one was not answered."""
+    def go(self, surface_nm: Single) -> wire.MirrorState | None:
+        """Move to a shape in steps of half the slew limit; return the last answer, None if one was missing."""
         start_nm, state = self.where_nm, None
-        count = max(1, int(np.ceil(float(np.abs(wanted_nm - start_nm).max()) / self.expected.move_nm)))
+        count = max(1, int(np.ceil(float(np.abs(surface_nm - start_nm).max()) / self.expected.move_nm)))
         for index in range(1, count + 1):
-            state, _, _ = self.ask((start_nm + (wanted_nm - start_nm) * np.float32(index / count)).astype(np.float32))
+            state, _, _ = self.ask((start_nm + (surface_nm - start_nm) * np.float32(index / count)).astype(np.float32))
             if state is None:
                 break
         return state
 
     def reachable(self, height_nm: float) -> bool:
-        """Whether all actuators can be moved by so much in a reasonable number of moves."""
+        """Whether all actuators can be moved by this height in a reasonable number of moves."""
         return height_nm / self.expected.move_nm < _MOST_MOVES
 
     def moved(self, before_nm: Single, state: wire.MirrorState) -> bool:
-        """Whether a state differs from where the mirror was by more than a step, or is no finite grid."""
+        """Whether a state differs from a former surface by more than a driver step, or is not a finite grid."""
         found = self.surface_nm(state)
         if found is None:
             return True

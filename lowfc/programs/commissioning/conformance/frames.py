@@ -1,4 +1,4 @@
-"""Checks of a camera's frames: form, time, rate and pixels."""
+"""Checks of a camera's frames: format, time, rate and pixels."""
 
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
@@ -21,11 +21,11 @@ _FULL = 0.01
 _STOPPED_NS = 300_000_000
 _VARIED = 8
 _AGE_NS = 1_000_000
-_OWN_WAIT_NS = 10_000_000  # may be this host's, not the camera's
+_OWN_WAIT_NS = 10_000_000  # shorter waits may be caused by this host, not by the camera
 
 ARRIVED: Table[Camera] = Table()
 FRAMES: Table[Camera] = Table()
-"""Checks of frames, of which there are some."""
+"""Checks that need at least one frame."""
 
 
 def camera_checks(seen: Camera) -> Iterator[Check]:
@@ -44,33 +44,34 @@ def _frames(seen: Camera) -> Check:
     if not count:
         advice = (
             seen.failing
-            or "is the camera in this run, with the session file of `lowfc config zenoh --role camera`, on this key?"
+            or "is the camera in this run, does it use the session file of `lowfc config zenoh --role camera` and this "
+            "key?"
         )
         return wrong(f"none in {seen.seconds:g} s; received: {seen.keys}", advice)
     if seen.unreadable:
-        got = f"{seen.unreadable} of {count} payloads are no foxglove.RawImage"
-        return wrong(got, "encode the message with its declaration, foxglove/RawImage.proto")
+        got = f"{seen.unreadable} of {count} payloads are not a foxglove.RawImage"
+        return wrong(got, "encode the message as declared in foxglove/RawImage.proto")
     return ok(f"{count} in {seen.seconds:g} s")
 
 
-@FRAMES.check("frame time", "end of the exposure, on the clock of the puts, growing")
+@FRAMES.check("frame time", "end of the exposure, on the clock of the publish time, increasing")
 def _frame_time(seen: Camera) -> Check:
     times = [frame.time_ns for frame in seen.frames]
     if not all(times):
         return wrong(f"{times.count(0)} frames without a timestamp", "set it in every frame")
     back = sum(later <= earlier for earlier, later in pairwise(times))
     if back:
-        got = f"not above the one before it, {back} times of {len(times)}"
-        return wrong(got, "take it anew for every exposure, from a clock that never steps")
+        got = f"not later than the previous one, {back} times of {len(times)}"
+        return wrong(got, "read the time for every exposure, from a clock that never steps")
     age_ns = int(np.median(np.subtract(seen.put_times_ns, times)))
     exposure_ns = 0 if seen.settings is None else seen.settings.exposure_ns
-    got = f"{age_ns / 1e6:.3g} ms before the put"
+    got = f"{age_ns / 1e6:.3g} ms before the publish time"
     if age_ns < -_AGE_NS:
-        return wrong(f"{-age_ns / 1e6:.3g} ms after the put", "use the same clock for both")
+        return wrong(f"{-age_ns / 1e6:.3g} ms after the publish time", "use the same clock for both")
     if age_ns > _READOUT_NS + exposure_ns:
         return wrong(got, "use the same clock for both, in nanoseconds since the epoch")
     if exposure_ns > _AGE_NS and 0.9 * exposure_ns <= age_ns < 1.5 * exposure_ns:
-        advice = "about as long as the exposure: is it the time of its start? If the readout takes so long, all is well"
+        advice = "about one exposure: is this the start of the exposure? Ignore this if the readout takes so long"
         return warning(got, advice)
     return ok(got)
 
@@ -80,7 +81,7 @@ def _encoding(seen: Camera) -> Check:
     encodings = {frame.image.encoding for frame in seen.frames}
     if encodings == {MONO16}:
         return ok(MONO16)
-    return wrong(", ".join(map(repr, sorted(encodings))), "send uint16 in DN, little-endian, and call it mono16")
+    return wrong(", ".join(map(repr, sorted(encodings))), "send uint16 in DN, little-endian, with encoding mono16")
 
 
 @FRAMES.check("bytes", "step is 2 x width, and data are step x height bytes")
@@ -89,9 +90,9 @@ def _bytes(seen: Camera) -> Check:
     if last is None:
         return ok(f"step {seen.frames[-1].image.step}, {seen.frames[-1].size} bytes")
     rows, columns = last.shape
-    advice = "send whole rows without padding, with the width and height they have"
+    advice = "send complete rows without padding, and set width and height accordingly"
     if last.size == rows * columns:
-        advice = "these are bytes, not uint16"
+        advice = "the pixels are bytes: send uint16"
     elif last.size == 2 * rows * columns:
         advice = "set step, in bytes"
     return wrong(f"{rows} x {columns} (height x width), step {last.image.step}, {last.size} bytes", advice)
@@ -103,79 +104,79 @@ def _shape(seen: Camera) -> Check:
     return ok(got) if len(seen.shapes) == 1 else wrong(got, "keep one region while the loop runs")
 
 
-@FRAMES.check("steadiness", "frames at an even rate, as long as the camera is looked at")
+@FRAMES.check("steadiness", "frames at a constant rate during the whole check")
 def _steadiness(seen: Camera) -> Check:
     spans = np.diff(seen.put_times_ns)
     if not spans.size:
-        return warning("one frame", "look for longer: --duration")
+        return warning("one frame", "use a longer --duration")
     period_ns = float(np.median(spans))
     elapsed_ns = seen.frames[-1].receive_time_ns - seen.frames[0].receive_time_ns
-    lacking_ns = seen.seconds * NS - elapsed_ns
-    if lacking_ns > max(_SILENT_PERIODS * period_ns, 0.2 * seen.seconds * NS, _STOPPED_NS):
+    missing_ns = seen.seconds * NS - elapsed_ns
+    if missing_ns > max(_SILENT_PERIODS * period_ns, 0.2 * seen.seconds * NS, _STOPPED_NS):
         got = f"frames during {elapsed_ns / 1e9:.1f} of {seen.seconds:g} s"
-        return wrong(got, "does the camera go on, whether or not somebody subscribes? Look again while it runs")
+        return wrong(got, "the camera must publish whether or not a process subscribes; repeat while it is running")
     late_ns, longest_ns = float(np.percentile(np.abs(spans - period_ns), 99)), float(spans.max())
     got = (
         f"every {period_ns / 1e6:.4g} ms, 99 % within {late_ns / 1e6:.3g} ms of it, "
         f"longest wait {longest_ns / 1e6:.3g} ms"
     )
     if longest_ns > max(_SILENT_PERIODS * period_ns, _OWN_WAIT_NS):
-        return warning(got, "what holds the camera up? `lowfc doctor` looks at the host")
+        return warning(got, "what delays the camera? Check the host with `lowfc doctor`")
     if late_ns > _JITTER * period_ns:
         return warning(got, "jitter costs delay: real-time scheduling for the publisher (`lowfc doctor`)")
     return ok(got)
 
 
-@FRAMES.check("live image", "no two frames alike: there is noise in each")
+@FRAMES.check("live image", "no two identical frames: each has noise")
 def _live_image(seen: Camera) -> Check:
     sums = [frame.checksum for frame in seen.frames]
     same = sum(earlier == later for earlier, later in pairwise(sums))
     if len(sums) > 1 and same == len(sums) - 1:
-        return wrong("all are alike", "is the camera read out anew for every frame?")
+        return wrong("all are identical", "read the camera out for every frame")
     if same:
-        advice = "publish each exposure once, and count what the camera dropped"
-        return wrong(f"{same} of {len(sums)} are the one before", advice)
-    return ok(f"{len(set(sums))} different ones of {len(sums)}")
+        advice = "publish each exposure once, and count the frames that the camera dropped"
+        return wrong(f"{same} of {len(sums)} are identical to the previous one", advice)
+    return ok(f"{len(set(sums))} different of {len(sums)}")
 
 
-@FRAMES.check("light", "light above the bias, and hardly a pixel at full well")
+@FRAMES.check("light", "brightest pixel above the bias, and few pixels at full well")
 def _light(seen: Camera) -> Check | None:
     if not seen.pixels:
         return None
     highest, state = seen.brightest_dn, seen.settings or wire.CameraState()
     noise_dn = state.read_noise_e / state.gain_e_per_dn if state.gain_e_per_dn > 0 else 0.0
     if not highest:
-        return wrong("every pixel of every frame is 0", "are the pixels copied into the message?")
+        return wrong("every pixel of every frame is 0", "copy the pixels into the message")
     if highest <= state.bias_dn + 10 * noise_dn:
         got = f"brightest pixel {highest} DN, bias {state.bias_dn:g} DN"
-        return warning(got, "all dark: is the shutter open, is the star there?")
+        return warning(got, "no light: is the shutter open and the star on the sensor?")
     full = np.mean([np.mean(one >= highest) for one in seen.pixels])
     if highest == int(state.saturation_dn) and full > _FULL:
         got = f"{100 * full:.0f} % of the pixels at {highest} DN"
-        return warning(got, "expose for less: what is at full well measures nothing")
+        return warning(got, "shorten the exposure: saturated pixels measure nothing")
     return ok(f"brightest pixel {highest} DN")
 
 
-@FRAMES.check("byte order", "little-endian, in DN from bit 0 on")
+@FRAMES.check("byte order", "little-endian, right-aligned DN")
 def _byte_order(seen: Camera) -> Check | None:
     if not seen.pixels:
         return None
-    picture = seen.pixels[-1]  # not their median: that of swapped bytes is nothing
+    picture = seen.pixels[-1]  # not the median of all, which is meaningless for swapped bytes
     as_is, swapped = _roughness(picture), _roughness(picture.byteswap())
     if as_is > _SMOOTHER * swapped:
-        got = f"neighbours differ {as_is / max(swapped, 1e-9):.0f} times less with the bytes swapped: big-endian?"
+        got = f"the image is {as_is / max(swapped, 1e-9):.0f} times smoother with the bytes swapped: big-endian?"
         return wrong(got, "write the low byte of each pixel first")
     values = np.unique(np.concatenate([one.reshape(-1) for one in seen.pixels]))
     bits = int(np.bitwise_or.reduce(values))
     spare = (bits & -bits).bit_length() - 1 if bits else 0
     if spare >= 2 and values.size > _VARIED:
-        advice = f"shift them right by {spare}: left-aligned data make gain, bias and saturation wrong"
+        advice = f"shift them right by {spare} bits: with left-aligned data gain, bias and saturation are wrong"
         return wrong(f"all pixels are multiples of {1 << spare}", advice)
-    return ok("neighbouring pixels are alike as they are")
+    return ok("the image is smooth as received")
 
 
 def _roughness(picture: Pixels) -> float:
-    """Mean difference of neighbours, as a fraction of the scatter of all pixels."""
+    """Mean difference of neighbouring pixels relative to the standard deviation of all pixels."""
     values = picture.astype(np.float64)
     if values.size < 4 or not values.std():
         return 0.0

@@ -1,4 +1,4 @@
-"""A line to a device under test: every message as it came, with or without an envelope, and puts of our own."""
+"""Connection to a device under test: receives every message, with or without an envelope, and publishes messages."""
 
 import contextlib
 import json
@@ -23,13 +23,13 @@ EVERYTHING = "lowfc/**"
 
 
 class Received(NamedTuple):
-    """One message as it arrived, whatever is wrong with it.
+    """One message as received, valid or not.
 
     Attributes:
-        key: where it was published.
+        key: key under which it was published.
         payload: its bytes.
-        attachment: what should be its envelope; None without one.
-        receive_time_ns: when it was received, by the host's clock.
+        attachment: bytes of the envelope; None without one.
+        receive_time_ns: time of arrival on the host's clock.
     """
 
     key: str
@@ -39,7 +39,7 @@ class Received(NamedTuple):
 
     @property
     def envelope(self) -> Envelope | None:
-        """Its envelope; None where it has none that can be read."""
+        """The decoded envelope; None without a valid one."""
         try:
             return None if self.attachment is None else Envelope.decode(self.attachment)
         except BusError:
@@ -47,14 +47,14 @@ class Received(NamedTuple):
 
 
 class Line:
-    """A session of a run that receives everything; `ZenohBus` would refuse what has no envelope.
+    """A session that receives every message of a run; `ZenohBus` would refuse messages without an envelope.
 
     Attributes:
-        offset_ns: what CLOCK_MONOTONIC is short of the epoch, on this host.
+        offset_ns: the host's clock minus CLOCK_MONOTONIC.
     """
 
     def __init__(self, links: Links, role: str) -> None:
-        """Join a run as `role`; BusError where the role's port is taken."""
+        """Join a run as `role`; BusError if another process has this role."""
         self._clock = HostClock()
         self.offset_ns = self._clock.offset_ns
         self._start_s = links.claim_start(role, self._clock.start_s)
@@ -64,17 +64,17 @@ class Line:
             self._session = zenoh.open(zenoh.Config.from_json5(json.dumps(session_config(links, role))))
         except zenoh.ZError as fault:
             raise BusError(
-                f"cannot join run {links.run_id!r} as its {role}: is one running? Stop it first "
+                f"cannot join run {links.run_id!r} as {role}: is one running? Stop it first "
                 f"(zenoh says: {str(fault).splitlines()[0][:200]})"
             ) from fault
-        self._session.declare_subscriber(EVERYTHING, Callback(self._keep, indirect=False))
+        self._session.declare_subscriber(EVERYTHING, Callback(self._append, indirect=False))
 
     def now_ns(self) -> int:
-        """The host's clock."""
+        """Time of the host's clock."""
         return self._clock.now_ns()
 
     def wait(self, seconds: float) -> None:
-        """Let time pass."""
+        """Sleep."""
         time.sleep(seconds)
 
     def received(self) -> list[Received]:
@@ -82,7 +82,7 @@ class Line:
         return [self._waiting.popleft() for _ in range(len(self._waiting))]
 
     def put(self, topic: Topic, name: str, payload: bytes) -> None:
-        """Publish, with an envelope."""
+        """Publish a payload with an envelope."""
         key = topic.at(name)
         count = self._counts.get(key, 0)
         self._counts[key] = count + 1
@@ -90,11 +90,11 @@ class Line:
         self._session.put(key, payload, attachment=envelope.encode(), priority=zenoh.Priority.REAL_TIME)
 
     def ask(self, key: str) -> list[Received]:
-        """Ask for the last message of a key."""
+        """Query the last message of a key; return the replies."""
         return [self._received(reply.ok) for reply in self._session.get(key, timeout=1.0) if reply.ok is not None]
 
     def peers(self) -> int:
-        """How many processes are connected."""
+        """Number of connected processes."""
         return len(self._session.info.peers_zid())
 
     def close(self) -> None:
@@ -102,7 +102,7 @@ class Line:
         with contextlib.suppress(zenoh.ZError):
             self._session.close()  # type: ignore[no-untyped-call]
 
-    def _keep(self, sample: zenoh.Sample) -> None:
+    def _append(self, sample: zenoh.Sample) -> None:
         self._waiting.append(self._received(sample))
 
     def _received(self, sample: zenoh.Sample) -> Received:
@@ -114,27 +114,27 @@ class Collected:
     """Messages of a device, in the order of arrival.
 
     Attributes:
-        line: to the device.
-        key: of its main topic.
+        line: connection to the device.
+        key: key of its main topic.
         process: name under which it publishes its Health.
-        messages: all of them.
-        seconds: for how long; set at the end.
+        messages: all messages.
+        seconds: duration of the check; set at the end.
     """
 
     def __init__(self, line: Line, key: str, process: str) -> None:
-        """Begin to look at a device."""
+        """Start to collect; no message is stored before `collect`."""
         self.line, self.key, self.process = line, key, process
         self.messages: list[Received] = []
         self.seconds = 0.0
 
     def collect(self, seconds: float) -> None:
-        """Wait, and take what has arrived."""
+        """Wait, then store the messages that have arrived."""
         self.line.wait(seconds)
         for message in self.line.received():
             self.take(message)
 
     def take(self, message: Received) -> None:
-        """Keep a message."""
+        """Store a message."""
         self.messages.append(message)
 
     def on(self, key: str) -> list[Received]:
@@ -143,12 +143,12 @@ class Collected:
 
     @property
     def keys(self) -> str:
-        """Keys under which something came, in words."""
+        """Keys of the messages received, as text."""
         return ", ".join(sorted({message.key for message in self.messages})) or "nothing"
 
     @property
     def failing(self) -> str:
-        """What the device's process says of a driver that fails; empty where it does not, or says nothing."""
+        """Last warning of the device's process if its driver fails; empty otherwise."""
         for message in reversed(self.on(HEALTH.at(self.process))):
             with contextlib.suppress(DecodeError):
                 health = wire.Health.FromString(message.payload)
@@ -157,11 +157,11 @@ class Collected:
 
     @cached_property
     def published(self) -> list[Received]:
-        """Messages of the main topic; for when all have been collected."""
+        """Messages of the main topic; cached, so read it only after the last message."""
         return self.on(self.key)
 
     @cached_property
     def envelopes(self) -> list[Envelope]:
-        """Their envelopes; none unless all have one."""
+        """Envelopes of the main topic's messages; empty unless all have one."""
         found = [message.envelope for message in self.published]
         return [] if None in found else [envelope for envelope in found if envelope is not None]

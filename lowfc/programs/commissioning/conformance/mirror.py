@@ -1,4 +1,4 @@
-"""Checks of a mirror driver: it is commanded, gently at first, and its states are compared with the contract."""
+"""Checks of a mirror driver: sends commands, small ones first, and compares its states with the contract."""
 
 from collections.abc import Iterator
 from itertools import pairwise
@@ -21,14 +21,14 @@ LONGEST_NS = 2_000_000_000
 _FOLLOWING, _EXPIRED = wire.MIRROR_STATUS_FOLLOWING, wire.MIRROR_STATUS_EXPIRED
 _LONG_NS = 60 * NS
 _REFUSED_EVERY_NS = 50_000_000
-_RAISED_NM = 10.0  # above where it relaxes to
+_RAISED_NM = 10.0  # height above the shape to which the mirror relaxes
 _REFUSAL_S = 0.15
-_NEAR, _BEYOND, _FAR = 0.9, 1.05, 2.0  # of a limit
-_SETTLE_S = 0.05  # of actuators that are reported where they are, not where they are going
+_NEAR, _BEYOND, _FAR = 0.9, 1.05, 2.0  # multiples of a limit
+_SETTLE_S = 0.05  # for drivers that report measured actuator heights, not the targets
 
 
 def mirror_checks(mirror: Dialogue, seconds: float, show: Show, *, gentle: bool = False) -> list[Check]:
-    """All checks of a mirror; it ends where it was."""
+    """All checks of a mirror; at the end it returns to its shape."""
     found: list[Check] = []
     base_nm = np.zeros(mirror.expected.grid, np.float32)
     begun_ns = mirror.line.now_ns()
@@ -47,12 +47,12 @@ def mirror_checks(mirror: Dialogue, seconds: float, show: Show, *, gentle: bool 
             show("the command timeout")
             found += _timeout(mirror, base_nm, 0.0 if gentle else min(_RAISED_NM, mirror.expected.move_nm))
         if gentle or _bad(found):
-            untried = warning("not tried: something above is wrong", "put that right first")
+            untried = warning("not tested: another check failed", "correct that first")
             if gentle:
-                untried = warning("not tried: --gentle", "try them before the loop is closed, without --gentle")
-            found.append(untried._replace(name="limits", expected="its own stroke, slew and neighbour limits"))
+                untried = warning("not tested: --gentle", "test them without --gentle before the loop is closed")
+            found.append(untried._replace(name="limits", expected="stroke, slew and neighbour limits of the driver"))
         else:
-            show("its limits")
+            show("limits")
             found += _limit_checks(mirror)
     finally:
         if mirror.states and not _bad(found, "grid", "state"):
@@ -69,15 +69,15 @@ def _idle(mirror: Dialogue) -> Iterator[Check]:
     states = mirror.listen(IDLE_S)
     expected = f"{mirror.key}: lowfc.v1.MirrorState ten times a second without commands"
     if mirror.unreadable:
-        got = f"{mirror.unreadable} states are no lowfc.v1.MirrorState"
-        yield wrong(got, "encode the message with its declaration")._replace(name="state", expected=expected)
+        got = f"{mirror.unreadable} states are not a lowfc.v1.MirrorState"
+        yield wrong(got, "encode the message as declared")._replace(name="state", expected=expected)
         return
     check, rate_hz = ok(f"{len(states) / IDLE_S:.0f} a second"), len(states) / IDLE_S
     if not states:
-        advice = "publish it: a starting controller waits a second to learn where the mirror is, then assumes flat"
+        advice = "publish it: a starting controller waits one second for the mirror's shape, then assumes flat"
         check = wrong(f"none in {IDLE_S:g} s; received: {mirror.keys}", advice)
     elif rate_hz < 4:
-        advice = "publish it ten times a second: a controller waits for one as it starts"
+        advice = "publish it ten times a second: a starting controller waits for one"
         check = warning(f"{rate_hz:.1f} a second", advice)
     yield check._replace(name="idle state", expected=expected)
     if states:
@@ -93,7 +93,7 @@ def _grid(mirror: Dialogue, state: wire.MirrorState) -> Check:
         return wrong(got, f"send float32, row by row: {size} bytes")
     odd = np.count_nonzero(~np.isfinite(np.frombuffer(state.actuators, "<f4")))
     if odd:
-        return wrong(f"{odd} not finite", "NaN is never a value: report 0 for an actuator that is not there")
+        return wrong(f"{odd} not finite", "report 0, not NaN, for a missing actuator")
     return ok(got)
 
 
@@ -101,63 +101,63 @@ def _next_command(mirror: Dialogue, base_nm: Single, seconds: float) -> Iterator
     line, period_ns = mirror.line, mirror.expected.period_ns
     answers: list[wire.MirrorState] = []
     commanded_nm = base_nm
-    took_ns: list[int] = []
+    durations_ns: list[int] = []
     same_time = unanswered = 0
     end_ns, sign = line.now_ns() + round(seconds * NS), 1
     while line.now_ns() < end_ns and (answers or unanswered < 3):
         sign = -sign
-        wanted_nm = base_nm + np.float32(sign) * mirror.expected.pattern_nm
-        state, sent_ns, duration_ns = mirror.ask(wanted_nm)
+        target_nm = base_nm + np.float32(sign) * mirror.expected.pattern_nm
+        state, sent_ns, duration_ns = mirror.ask(target_nm)
         if state is None:
             unanswered += 1
             continue
         answers.append(state)
-        commanded_nm = wanted_nm
-        took_ns.append(duration_ns)
+        commanded_nm = target_nm
+        durations_ns.append(duration_ns)
         same_time += from_timestamp(state.timestamp) == sent_ns
         line.wait(max(0.0, (sent_ns + period_ns - line.now_ns()) / NS))
     expected = f"a state with each command's frame_sequence within {ANSWER_S * 1e3:.0f} ms"
-    yield _answers(mirror, took_ns, unanswered)._replace(name="answers", expected=expected)
+    yield _answers(mirror, durations_ns, unanswered)._replace(name="answers", expected=expected)
     if not answers:
         return
     last = answers[-1]
     mirror.listen(_SETTLE_S)
     settled = [state for _, state in mirror.states if state.frame_sequence == last.frame_sequence]
-    expected = f"the commanded surface within a step of the driver, {mirror.expected.step_nm:.3g} nm"
+    expected = f"the commanded surface within one driver step, {mirror.expected.step_nm:.3g} nm"
     yield _applied(mirror, base_nm, commanded_nm, settled[-1])._replace(name="applied", expected=expected)
     got, advice = wire.MirrorStatus.Name(last.status).removeprefix("MIRROR_STATUS_"), "while a command is in force"
     yield judged("status", "FOLLOWING", last.status == _FOLLOWING, got, f"report FOLLOWING {advice}")
-    others, expected = len(answers) - same_time, "the time of the command that was followed"
-    age_ms, advice = (from_timestamp(last.timestamp) - line.now_ns()) / 1e6, "copy the command's timestamp: logs are "
-    got = f"{others} of {len(answers)} another, the last {age_ms:.3g} ms from now"
-    yield judged("time", expected, not others, "the same", f"{advice}joined by it", got, warning)
-    got, expected = f"{len(last.command_nm)} values", "command_nm of the command that was followed"
-    advice = "copy it; leave it out where your limits changed the command: a restarted controller goes on from it"
+    others, expected = len(answers) - same_time, "timestamp of the applied command"
+    age_ms, advice = (from_timestamp(last.timestamp) - line.now_ns()) / 1e6, "copy the command's timestamp: it joins "
+    got = f"{others} of {len(answers)} differ, the last {age_ms:.3g} ms from now"
+    yield judged("time", expected, not others, "the same", f"{advice}commands and states in logs", got, warning)
+    got, expected = f"{len(last.command_nm)} values", "command_nm of the applied command"
+    advice = "copy it, or omit it if your limits changed the command: a restarted controller continues from it"
     yield judged("modal command", expected, tuple(last.command_nm) == MODAL_NM, got, advice, severity=warning)
 
 
-def _answers(mirror: Dialogue, took_ns: list[int], unanswered: int) -> Check:
-    total = len(took_ns) + unanswered
-    if not took_ns:
+def _answers(mirror: Dialogue, durations_ns: list[int], unanswered: int) -> Check:
+    total = len(durations_ns) + unanswered
+    if not durations_ns:
         got = f"none to {total} commands"
         if mirror.last is not None:
-            got += f"; states say {mirror.last.frame_sequence}"
-        advice = "subscribe the command's key, and publish a state for each with the command's frame_sequence"
+            got += f"; states have frame_sequence {mirror.last.frame_sequence}"
+        advice = "subscribe to the command's key, and publish a state for each with the command's frame_sequence"
         return wrong(got, advice)
     if unanswered:
         got = f"{unanswered} of {total} commands without an answer"
         severity = warning if unanswered <= total // 50 else wrong
-        return severity(got, "publish a state for every command that is followed")
-    p50_ns, worst_ns = np.percentile(took_ns, (50, 100)).tolist()
+        return severity(got, "publish a state for every applied command")
+    p50_ns, worst_ns = np.percentile(durations_ns, (50, 100)).tolist()
     got = f"{total} answered after {p50_ns / 1e6:.2g} ms, the slowest {worst_ns / 1e6:.2g} ms"
     period_ns = mirror.expected.period_ns
     if p50_ns > period_ns / 2:
-        return warning(got, f"more than half of the period, {period_ns / 1e6:g} ms: each adds to the loop's delay")
+        return warning(got, f"more than half the period of {period_ns / 1e6:g} ms: this adds to the loop's delay")
     return ok(got)
 
 
 def _applied(mirror: Dialogue, base_nm: Single, commanded_nm: Single, state: wire.MirrorState) -> Check:
-    """Is the reported surface the commanded one? If not, by what does it differ?"""
+    """Compare the reported surface with the commanded one; the advice names the difference."""
     expected, where_nm = mirror.expected, mirror.surface_nm(state)
     if where_nm is None:
         got = f"{state.rows} x {state.columns}, {len(state.actuators)} bytes"
@@ -173,14 +173,14 @@ def _applied(mirror: Dialogue, base_nm: Single, commanded_nm: Single, state: wir
 
 
 def _difference(base_nm: Single, commanded_nm: Single, where_nm: Single) -> str:
-    """Advice: the mistake that turns the commanded shape into the reported one."""
+    """Advice: the error that transforms the commanded shape into the reported one."""
     commanded, got = commanded_nm.astype(np.float64) - base_nm, where_nm.astype(np.float64) - base_nm
     turns = {
-        "as commanded": got,
+        "with the right orientation": got,
         "with rows and columns exchanged": got.T,
-        "upside down": got[::-1],
-        "left to right": got[:, ::-1],
-        "turned by 180 degrees": got[::-1, ::-1],
+        "with rows reversed": got[::-1],
+        "with columns reversed": got[:, ::-1],
+        "rotated by 180 degrees": got[::-1, ::-1],
     }
     alike = {
         how: float((commanded * one).sum() / max(np.linalg.norm(commanded) * np.linalg.norm(one), 1e-30))
@@ -189,56 +189,56 @@ def _difference(base_nm: Single, commanded_nm: Single, where_nm: Single) -> str:
     }
     how = max(alike, key=lambda one: abs(alike[one]))
     if abs(alike[how]) < 0.9:
-        return "it is another shape altogether: in which order does the driver take the actuators?"
+        return "the shapes are unrelated: check the driver's order of the actuators"
     scale = float((commanded * turns[how]).sum() / (commanded**2).sum())
-    advice = f"it is the shape {how}, times {scale:.3g}"
+    advice = f"the commanded shape {how}, times {scale:.3g}"
     if abs(scale - 2) < 0.02:
         advice += ": report surface, not wavefront"
     elif abs(scale - 1e-3) < 1e-4:
         advice += ": report nm, not um"
     elif scale < 0:
-        advice += ": up is up, in nm of surface"
+        advice += ": the sign is wrong; a positive command raises the surface"
     return advice
 
 
 def _refusals(mirror: Dialogue, base_nm: Single) -> Iterator[Check]:
-    """Commands that no mirror may follow; between them good ones, which it must."""
+    """Send invalid commands, which the mirror must refuse, and valid ones in between, which it must apply."""
     rows, columns = mirror.expected.grid
     other_nm = base_nm + np.float32(0.5) * mirror.expected.pattern_nm[::-1]
     nan_nm, infinite_nm = other_nm.copy(), other_nm.copy()
     nan_nm[rows // 2, columns // 2], infinite_nm[rows // 2, columns // 2] = np.nan, np.inf
-    for name, what, wanted_nm, cut in (
+    for name, what, target_nm, cut in (
         ("NaN refused", "one actuator NaN", nan_nm, 0),
         ("infinity refused", "one actuator infinite", infinite_nm, 0),
-        ("wrong grid refused", "one row more", np.zeros((rows + 1, columns), np.float32), 0),
+        ("wrong grid refused", "one row too many", np.zeros((rows + 1, columns), np.float32), 0),
         ("short command refused", "four bytes missing", other_nm, 4),
         ("old command refused", "the frame_sequence before the last", other_nm, 0),
     ):
-        expected = f"a command with {what} changes nothing, and the next good one is followed"
+        expected = f"a command with {what} changes nothing, and the next valid one is applied"
         state, _, _ = mirror.ask(base_nm)
         before_nm = mirror.surface_nm(state)
         if state is None or before_nm is None:
-            got = "a good command before it is not answered"
-            yield judged(name, expected, False, got, "go on after a command that is refused")
+            got = "a valid command before it is not answered"
+            yield judged(name, expected, False, got, "continue after a refused command")
             return
         earlier = max(0, state.frame_sequence - 1) if name == "old command refused" else None
-        sequence, _ = mirror.put(wanted_nm, sequence=earlier, cut=cut)
+        sequence, _ = mirror.put(target_nm, sequence=earlier, cut=cut)
         after = mirror.listen(_REFUSAL_S)
         bad = [one for one in after if mirror.moved(before_nm, one) or one.frame_sequence == sequence]
-        got = "it was followed" if bad and mirror.surface_nm(bad[-1]) is not None else "the state is no finite grid"
-        advice = "check it before anything moves: shape, byte count, isfinite, frame_sequence not below the last"
+        got = "it was applied" if bad and mirror.surface_nm(bad[-1]) is not None else "the state is not a finite grid"
+        advice = "before any move, check shape, byte count, isfinite, and frame_sequence not below the last"
         yield judged(name, expected, not bad, "nothing changed", advice, got)
     state, _, _ = mirror.ask(base_nm)
     if state is None:
-        expected, advice = "good commands are followed after bad ones", "catch what cannot be read, and go on"
-        yield judged("after bad commands", expected, False, "no answer any more", advice)
+        expected, advice = "valid commands are applied after invalid ones", "catch decoding errors, and continue"
+        yield judged("after bad commands", expected, False, "no more answers", advice)
         return
     mirror.listen(_SETTLE_S)
     sequence, _ = mirror.put(base_nm, sequence=max(0, state.frame_sequence - 1), clear_id=mirror.line.now_ns())
     followed = any(one.frame_sequence == sequence for one in mirror.listen(_REFUSAL_S))
-    expected = "a command with a new clear_id is followed, though its frame_sequence is below the last"
-    advice = "on a new clear_id forget the newest frame_sequence: else an operator's clear cannot bring it back"
-    yield judged("clear", expected, followed, "it was followed", advice, "it was not", warning)
+    expected = "a command with a new clear_id is applied, although its frame_sequence is below the last"
+    advice = "reset the newest frame_sequence on a new clear_id: otherwise an operator's clear has no effect"
+    yield judged("clear", expected, followed, "it was applied", advice, "it was not applied", warning)
 
 
 def _timeout(mirror: Dialogue, base_nm: Single, raised_by_nm: float) -> Iterator[Check]:
@@ -251,34 +251,34 @@ def _timeout(mirror: Dialogue, base_nm: Single, raised_by_nm: float) -> Iterator
         mirror.put(nan_nm, valid_ns=_LONG_NS)
         mirror.listen(_REFUSED_EVERY_NS / NS)
     expired_ns = _expired_ns(mirror, sent_ns)
-    expected = f"EXPIRED after valid_for_ns, {EXPIRES_NS / 1e6:.0f} ms here; refused commands in between renew nothing"
+    expected = f"EXPIRED after valid_for_ns, here {EXPIRES_NS / 1e6:.0f} ms; refused commands do not extend it"
     if expired_ns is None:
-        advice = "watch valid_for_ns by the mirror's own clock, from the command's arrival; then hold or relax, and "
+        advice = "time valid_for_ns on the mirror's own clock, from the command's arrival; then hold or relax, and "
         late = f"not within {(EXPIRES_NS + SLACK_NS) / 1e6:.0f} ms"
         yield judged("dead-man", expected, False, late, f"{advice}report EXPIRED")
     else:
-        held, advice = expired_ns - sent_ns >= 0.8 * EXPIRES_NS, "hold the command for as long as it is valid"
+        held, advice = expired_ns - sent_ns >= 0.8 * EXPIRES_NS, "hold the command while it is valid"
         yield judged("dead-man", expected, held, f"after {(expired_ns - sent_ns) / 1e6:.0f} ms", advice)
     expired = [state for _, state in mirror.since(sent_ns) if state.status == _EXPIRED]
-    silent = not any(mirror.moved(raised_nm, state) and state.command_nm for state in expired)
-    expected, got = "command_nm is empty in the state of a mirror that relaxes", "no modal command is named"
-    advice = "clear command_nm when you relax: a controller that starts takes the difference for a shape to keep"
-    yield judged("relaxing", expected, silent, got, advice, "a modal command is named while the mirror relaxes")
+    empty = not any(mirror.moved(raised_nm, state) and state.command_nm for state in expired)
+    expected, got = "command_nm is empty while the mirror relaxes", "command_nm is empty"
+    advice = "clear command_nm while relaxing: a starting controller would adopt the difference as a shape to keep"
+    yield judged("relaxing", expected, empty, got, advice, "command_nm is set while the mirror relaxes")
     mirror.go(base_nm)
     state, _, _ = mirror.ask(base_nm, _LONG_NS)
-    sent_ns, again = mirror.line.now_ns(), state is not None and state.status != _EXPIRED
-    expected, advice = "a good command is followed again", "let a new command take over"
-    yield judged("after the dead-man", expected, again, "followed", advice, "not followed")
+    sent_ns, applied = mirror.line.now_ns(), state is not None and state.status != _EXPIRED
+    expected, advice = "a valid command is applied again", "apply a new command after the timeout"
+    yield judged("after the dead-man", expected, applied, "applied", advice, "not applied")
     mirror.listen((LONGEST_NS + SLACK_NS) / NS)
-    expected = f"EXPIRED after {LONGEST_NS / 1e9:g} s, however long a command says that it is valid"
+    expected = f"EXPIRED after at most {LONGEST_NS / 1e9:g} s, whatever valid_for_ns"
     late, bounded = f"not within {(LONGEST_NS + SLACK_NS) / 1e9:g} s", _expired_ns(mirror, sent_ns) is not None
-    advice = "bound valid_for_ns yourself: a sender's mistake must not hold the mirror for ever"
+    advice = "limit valid_for_ns in the driver: a sender's mistake must not hold the mirror for ever"
     yield judged("longest command", expected, bounded, "EXPIRED", advice, late, warning)
     arrivals = [message.receive_time_ns for message, _ in mirror.since(sent_ns)]
     longest_s = max((later - earlier for earlier, later in pairwise(arrivals)), default=LONGEST_NS) / 1e9
     expected, got = (
-        "states all the time, ten a second, while no command comes",
-        f"{longest_s:.2g} s at most without one",
+        "ten states a second also without commands",
+        f"longest time without one {longest_s:.2g} s",
     )
     advice, severity = "publish the state ten times a second, also when idle", wrong if longest_s > 1.0 else warning
     yield judged("silence", expected, longest_s <= 0.25, got, advice, severity=severity)
@@ -290,7 +290,7 @@ def _expired_ns(mirror: Dialogue, since_ns: int) -> int | None:
 
 
 def _limit_checks(mirror: Dialogue) -> Iterator[Check]:
-    """Try stroke, slew and neighbour limits, all actuators together where that will do; it ends flat."""
+    """Test stroke and slew limits with all actuators, the neighbour limit with one; the mirror ends flat."""
     limits, flat_nm = mirror.expected.limits, np.zeros(mirror.expected.grid, np.float32)
     even = np.ones_like(flat_nm)
     peak, among = _peak(mirror.expected.moving)
@@ -302,33 +302,33 @@ def _limit_checks(mirror: Dialogue) -> Iterator[Check]:
         ("slew", "no move above", wire.REASON_SLEW, slew_nm, too_far_nm, even, too_far_nm >= _BEYOND * slew_nm),
         ("neighbours", "no step above", wire.REASON_NEIGHBOUR, apart_nm, _BEYOND * apart_nm, peak, fits),
     ):
-        expected = f"{words} {limit_nm:g} nm, when {asked_nm:.4g} nm are asked for"
-        check = warning("not tried: it cannot go there", "do mirror.stroke_nm (whole range) and the limits fit it?")
+        expected = f"{words} {limit_nm:g} nm, with {asked_nm:.4g} nm commanded"
+        check = warning("not tested: out of reach", "do mirror.stroke_nm (full range) and the limits match the mirror?")
         if possible:
-            wanted_nm = np.float32(asked_nm) * shape
-            state = mirror.ask(wanted_nm)[0] if name == "slew" else mirror.go(wanted_nm)
+            target_nm = np.float32(asked_nm) * shape
+            state = mirror.ask(target_nm)[0] if name == "slew" else mirror.go(target_nm)
             where_nm = mirror.surface_nm(state)
             if state is None or where_nm is None:
-                check = wrong("no answer", "follow the command as far as it goes: a refusal stops the loop")
+                check = wrong("no answer", "apply the command as far as the limits allow: a refusal stops the loop")
             else:
                 found_nm = _highest_nm(mirror, where_nm) if shape is even else float(np.ptp(where_nm[among]))
-                check = _kept(state, reason, found_nm, limit_nm + mirror.expected.tolerance_nm)
+                check = _within_limit(state, reason, found_nm, limit_nm + mirror.expected.tolerance_nm)
         yield check._replace(name=name, expected=expected)
         mirror.go(flat_nm)
 
 
-def _kept(state: wire.MirrorState, reason: wire.Reason, found_nm: float, most_nm: float) -> Check:
+def _within_limit(state: wire.MirrorState, reason: wire.Reason, found_nm: float, most_nm: float) -> Check:
     got = f"{found_nm:.4f} nm"
     if found_nm > most_nm:
-        return wrong(got, "cut it in the driver's program, whatever is asked: do not rely on the controller's limits")
+        return wrong(got, "clip every command in the driver: do not rely on the controller's limits")
     if reason in state.limits_hit:
         return ok(got)
-    advice = f"put {wire.Reason.Name(reason)} into limits_hit: an observer should know that the mirror was held"
-    return warning(f"{got}, but limits_hit does not say so", advice)
+    advice = f"add {wire.Reason.Name(reason)} to limits_hit, so that logs and views show that a limit acted"
+    return warning(f"{got}, but limits_hit does not name the limit", advice)
 
 
 def _rises(mirror: Dialogue) -> bool:
-    """Whether the mirror follows to nine tenths of its stroke, in moves of half the slew limit; it stays there."""
+    """Move the mirror to 90 % of its stroke, in moves of half the slew limit; return whether it reached that."""
     stroke_nm = mirror.expected.limits.stroke_nm
     mirror.go(np.zeros(mirror.expected.grid, np.float32))
     if not mirror.reachable(stroke_nm):
@@ -338,9 +338,9 @@ def _rises(mirror: Dialogue) -> bool:
 
 
 def _peak(moving: Mask) -> tuple[Single, tuple[int, list[int]]]:
-    """One actuator half up and all others half down; where it and its two neighbours in its row are.
+    """A shape with one actuator at 0.5 and all others at -0.5; row and columns of that one and its two neighbours.
 
-    It moves, between two that do, as near to the middle as there is one.
+    All three move; the actuator is the nearest such to the centre.
     """
     good = np.zeros_like(moving)
     good[:, 1:-1] = moving[:, 1:-1] & moving[:, :-2] & moving[:, 2:]

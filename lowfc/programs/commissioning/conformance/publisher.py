@@ -1,4 +1,4 @@
-"""Checks of every publisher: envelope, sequence, time of the put, Health, keys."""
+"""Checks of every publisher: envelope, sequence, publish time, Health, keys."""
 
 from itertools import pairwise
 
@@ -12,7 +12,7 @@ from lowfc.programs.commissioning.checks import Check, Table, ok, warning, wrong
 from lowfc.programs.commissioning.conformance.line import NS, Collected
 
 LATE_NS = 20_000_000
-"""A publisher's clock that is this far from ours makes every frame late (`control.max_frame_age_ms`)."""
+"""Clock difference at which every frame would be late (`control.max_frame_age_ms`)."""
 
 _AHEAD_NS = 1_000_000
 _DECADE_S = 10 * 365 * 86_400
@@ -21,7 +21,7 @@ _UNITS = {"microseconds": 1_000, "milliseconds": 1_000_000, "seconds": NS}
 PUBLISHER: Table[Collected] = Table()
 """Checks of the messages of the main topic."""
 PROCESS: Table[Collected] = Table()
-"""Checks of all that the device publishes."""
+"""Checks of everything that the device publishes."""
 
 
 @PUBLISHER.check("envelope", "a zenoh attachment of 16 bytes: sequence and publish_time_ns, little-endian uint64")
@@ -32,39 +32,39 @@ def _envelope(seen: Collected) -> Check | None:
         return ok(f"on all of {len(messages)} messages") if messages else None
     sizes = sorted({"none" if one is None else f"{len(one)} bytes" for one in bare})
     got = f"{len(bare)} of {len(messages)} messages with {', '.join(sizes)}"
-    return wrong(got, "attach it to every put; docs/howto/hardware.md has its bytes")
+    return wrong(got, "attach it to every message; its bytes are in docs/howto/hardware.md")
 
 
-@PUBLISHER.check("sequence", "start of the publisher in unix seconds << 32 | count from 0, one more with each put")
+@PUBLISHER.check("sequence", "start of the publisher in unix seconds << 32 | count of its messages from 0")
 def _sequence(seen: Collected) -> Check | None:
     sequences = [envelope.sequence for envelope in seen.envelopes]
     if not sequences:
         return None
     start, now_s = start_of(sequences[-1]), seen.published[-1].receive_time_ns // NS
     if start == 0:
-        advice = "put the start into the upper 32 bits: without it a restart looks old"
-        return wrong(f"a count alone ({sequences[-1]})", advice)
+        advice = "put the start into the upper 32 bits: without it messages after a restart are refused as old"
+        return wrong(f"only a count ({sequences[-1]})", advice)
     if not now_s - _DECADE_S < start <= now_s + 1:
         swapped = int.from_bytes(sequences[-1].to_bytes(8, "little"), "big")
         big = now_s - _DECADE_S < start_of(swapped) <= now_s + 1
-        advice = "write it little-endian" if big else "put unix seconds at the start of the publisher there"
-        return wrong(f"upper 32 bits {start}, now is {now_s}", advice)
+        advice = "write it little-endian" if big else "put the unix seconds of the publisher's start there"
+        return wrong(f"upper 32 bits {start}, present time {now_s}", advice)
     steps = [later - earlier for earlier, later in pairwise(sequences) if start_of(earlier) == start_of(later)]
     back, gaps = sum(step <= 0 for step in steps), [step - 1 for step in steps if step > 1]
     if back:
-        got = f"not above the one before it, {back} times of {len(steps)}"
-        return wrong(got, "count every put of this topic, in one thread; such messages are refused")
+        got = f"not above the previous one, {back} times of {len(steps)}"
+        return wrong(got, "count every message of this topic, in one thread; such messages are refused")
     if gaps:
-        got = f"{sum(gaps)} left out, in {len(gaps)} gaps of {len(steps)} steps"
+        got = f"{sum(gaps)} missing, in {len(gaps)} gaps of {len(steps)} steps"
         if len(gaps) > len(steps) // 10:
-            return wrong(got, "count the puts of this topic alone, and nothing else")
-        return warning(got, "were they never put, or lost here because this host is busy?")
+            return wrong(got, "count only the messages of this topic")
+        return warning(got, "were they never published, or lost because this host is busy?")
     if len({start_of(sequence) for sequence in sequences}) > 1:
-        return warning("the publisher restarted meanwhile", "let it run, and look again")
+        return warning("the publisher restarted during the check", "repeat the check while it runs")
     return ok(f"{count_of(sequences[0])} to {count_of(sequences[-1])}, start {start}")
 
 
-@PUBLISHER.check("publish time", "the host's clock just before the put, growing")
+@PUBLISHER.check("publish time", "the host's clock just before publishing, increasing")
 def _put_time(seen: Collected) -> Check | None:
     times = [envelope.publish_time_ns for envelope in seen.envelopes]
     if not times:
@@ -72,43 +72,43 @@ def _put_time(seen: Collected) -> Check | None:
     arrivals = [message.receive_time_ns for message in seen.published]
     lag_ns = int(np.median([arrival - time for arrival, time in zip(arrivals, times, strict=True)]))
     if not -_AHEAD_NS <= lag_ns <= LATE_NS:
-        got = f"{lag_ns / 1e6:.3g} ms before it arrived" if abs(lag_ns) < 3600 * NS else f"{times[-1]} ns"
+        got = f"{lag_ns / 1e6:.3g} ms before the arrival" if abs(lag_ns) < 3600 * NS else f"{times[-1]} ns"
         return wrong(got, _clock_advice(times[-1], arrivals[-1], seen.line.offset_ns))
     back = sum(later <= earlier for earlier, later in pairwise(times))
     if back:
-        got = f"not above the one before it, {back} times of {len(times) - 1}"
-        return wrong(got, "take it anew for every put, from a clock that never steps")
-    return ok(f"{lag_ns / 1e3:.0f} us before it arrived, in the middle of {len(times)}")
+        got = f"not later than the previous one, {back} times of {len(times) - 1}"
+        return wrong(got, "read the time for every message, from a clock that never steps")
+    return ok(f"{lag_ns / 1e3:.0f} us before the arrival, median of {len(times)}")
 
 
 def _clock_advice(time_ns: int, now_ns: int, offset_ns: int) -> str:
     for unit, factor in _UNITS.items():
         if abs(time_ns * factor - now_ns) < 3600 * NS:
-            return f"these are {unit}: give nanoseconds"
+            return f"the unit is {unit}: use nanoseconds"
     if abs(time_ns + offset_ns - now_ns) < NS:
         return f"this is CLOCK_MONOTONIC: add the offset of this boot, {offset_ns} ns (Health.clock_offset_ns)"
     return "use CLOCK_MONOTONIC plus the offset of this boot (Health.clock_offset_ns), which all processes share"
 
 
-@PROCESS.check("health", f"{HEALTH.key} twice a second, with the counts of what was put")
+@PROCESS.check("health", f"{HEALTH.key} twice a second, with the counts of published messages")
 def _health(seen: Collected) -> Check:
     payloads = [message.payload for message in seen.on(HEALTH.at(seen.process))]
-    cost = "without it a recorder cannot tell what it lost, nor a view that you are there"
+    cost = "without it a recorder cannot count lost messages, and views do not show the process"
     if not payloads:
         return warning(f"none of {seen.process} in {seen.seconds:.1f} s", f"publish it: {cost}")
     try:
         last = [wire.Health.FromString(payload) for payload in payloads][-1]
     except DecodeError:
-        return wrong("it is no lowfc.v1.Health", "encode it with the message's declaration")
+        return wrong("it is not a lowfc.v1.Health", "encode the message as declared")
     rate_hz = len(payloads) / seen.seconds
     if last.process != seen.process:
         return warning(f"process is {last.process!r}", f"name the process {seen.process!r}, as its key does")
     if seen.seconds >= 2 and not 1 < rate_hz < 10:
         return warning(f"{rate_hz:.1f} a second", "publish it twice a second")
     if not any(count.published for count in last.topics):
-        return warning("topics[].published is missing", f"count the puts of every topic: {cost}")
+        return warning("topics[].published is missing", f"count the messages of every topic: {cost}")
     if not from_timestamp(last.timestamp):
-        return warning("no timestamp", "set it: a process that has gone silent is recognised by it")
+        return warning("no timestamp", "set it: a silent process is recognised by it")
     return ok(f"{len(payloads)} in {seen.seconds:.1f} s, state {last.state!r}")
 
 

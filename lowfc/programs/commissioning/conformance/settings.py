@@ -1,4 +1,4 @@
-"""Checks of a camera's settings: present, possible, unchanged, like its frames, on request, as configured."""
+"""Checks of a camera's settings: present, valid, constant, consistent with its frames and configuration, queryable."""
 
 from collections.abc import Iterator
 from math import isfinite
@@ -25,10 +25,10 @@ SETTINGS: Table[Camera] = Table()
 def _settings(seen: Camera) -> Check:
     count, unreadable = len(seen.states), seen.states.count(None)
     if unreadable:
-        got = f"{unreadable} of {count} are no lowfc.v1.CameraState"
-        return wrong(got, "encode the message with its declaration")
+        got = f"{unreadable} of {count} are not a lowfc.v1.CameraState"
+        return wrong(got, "encode the message as declared")
     if not count:
-        advice = seen.failing or "publish it: calibration, noise and the guard against a changed camera go by it"
+        advice = seen.failing or "publish it: calibration, noise figures and the check for a changed camera use it"
         return wrong(f"none in {seen.seconds:g} s", advice)
     if seen.seconds >= 2 and not 1 < count / seen.seconds < 20:
         return warning(f"{count / seen.seconds:.1f} a second", "publish them twice a second")
@@ -45,15 +45,15 @@ def _values(seen: Camera) -> Check | None:
     if not from_timestamp(state.timestamp):
         impossible.append("no timestamp")
     if state.bit_depth > _MOST_BITS:
-        impossible.append(f"bit_depth {state.bit_depth}, and pixels of {_MOST_BITS} bits")
+        impossible.append(f"bit_depth {state.bit_depth}, but pixels have {_MOST_BITS} bits")
     elif 0 < highest < state.saturation_dn:
-        impossible.append(f"saturation_dn {state.saturation_dn:g} above {highest:g}, the converter's highest")
+        impossible.append(f"saturation_dn {state.saturation_dn:g} above {highest:g}, the converter's largest value")
     if 0 < state.saturation_dn <= state.bias_dn:
         impossible.append(f"bias_dn {state.bias_dn:g} not below saturation_dn {state.saturation_dn:g}")
     if impossible:
-        return wrong(", ".join(impossible), "say what the camera is set to; units are in the names")
+        return wrong(", ".join(impossible), "publish the camera's settings, in the units of the field names")
     if state.em_gain < 1:
-        return warning(f"em_gain {state.em_gain:g}", "1 is a detector without multiplication")
+        return warning(f"em_gain {state.em_gain:g}", "use 1 for a detector without multiplication")
     exposure_ms, period_ms = state.exposure_ns / 1e6, state.period_ns / 1e6
     if exposure_ms > period_ms:
         got = f"exposure {exposure_ms:g} ms, period {period_ms:g} ms"
@@ -61,15 +61,15 @@ def _values(seen: Camera) -> Check | None:
     return ok(f"exposure {exposure_ms:g} of {period_ms:g} ms, saturation {state.saturation_dn:g} DN")
 
 
-@SETTINGS.check("settings kept", "the same all the time: a change opens the loop")
+@SETTINGS.check("settings kept", "constant: a change opens the loop")
 def _kept(seen: Camera) -> Check | None:
     states = [state for state in seen.states if state is not None]
     if not states:
         return None
     changed = [field for field in _FIELDS if len({str(getattr(state, field)) for state in states}) > 1]
     if changed:
-        return warning(f"{', '.join(changed)} changed", "was that wanted? Publish what is set, not what is measured")
-    return ok(f"{len(states)} alike")
+        return warning(f"{', '.join(changed)} changed", "unless intended: publish the set values, not measured ones")
+    return ok(f"{len(states)} identical")
 
 
 @SETTINGS.check("settings' size", "rows and columns of the frames")
@@ -82,7 +82,7 @@ def _size(seen: Camera) -> Check | None:
     if seen.shapes == [size]:
         return ok(got)
     swapped = seen.shapes == [size[::-1]]
-    return wrong(got, "exchange rows and columns" if swapped else "say the size of the region that is sent")
+    return wrong(got, "exchange rows and columns" if swapped else "publish the size of the region that is sent")
 
 
 @SETTINGS.check("settings' range", "no pixel above saturation_dn and the converter")
@@ -90,13 +90,13 @@ def _range(seen: Camera) -> Check | None:
     if (state := seen.settings) is None or not seen.frames:
         return None
     top = min(state.saturation_dn, 2.0**state.bit_depth - 1)
-    got = f"brightest {seen.brightest_dn} DN, highest {top:g} DN"
+    got = f"brightest pixel {seen.brightest_dn} DN, largest possible {top:g} DN"
     if seen.brightest_dn > top > 0:
-        return wrong(got, "raise saturation_dn to what pixels reach, or bit_depth; in DN, bias included")
+        return wrong(got, "raise saturation_dn (DN, bias included) to the largest pixel value, or bit_depth")
     return ok(got)
 
 
-@SETTINGS.check("settings' period", "period_ns is what is between two frames' times")
+@SETTINGS.check("settings' period", "period_ns equals the difference of the frames' times")
 def _period(seen: Camera) -> Check | None:
     spans = np.diff([frame.time_ns for frame in seen.frames])
     period_ns = float(np.median(spans)) if spans.size else 0.0
@@ -105,48 +105,50 @@ def _period(seen: Camera) -> Check | None:
     off = abs(period_ns / state.period_ns - 1)
     got = f"{period_ns / 1e6:.5g} ms, period_ns {state.period_ns / 1e6:.5g} ms"
     if off > 0.1:
-        return wrong(got, "say the real period: gains and spectra go by it")
-    return warning(got, "say the real period: spectra go by it") if off > 0.01 else ok(got)
+        return wrong(got, "publish the real period: gains and spectra depend on it")
+    return warning(got, "publish the real period: spectra depend on it") if off > 0.01 else ok(got)
 
 
-@SETTINGS.check("settings on request", f"the last one, with its envelope, to a zenoh query of {CAMERA_STATE.key}")
+@SETTINGS.check(
+    "settings on request", f"the last settings, with their envelope, in reply to a zenoh query of {CAMERA_STATE.key}"
+)
 def _on_request(seen: Camera) -> Check | None:
     if not seen.states:
         return None
     if not seen.answers:
-        return warning("no answer", "declare a queryable on that key: a late joiner asks, and a log begins with it")
+        return warning("no answer", "declare a queryable on that key: recorder and late processes query it")
     for answer in seen.answers:
         if answer.envelope is None:
-            return wrong("an answer without an envelope", "attach the envelope of the message's put")
+            return wrong("an answer without an envelope", "attach the envelope of the published message")
         try:
             wire.CameraState.FromString(answer.payload)
         except DecodeError:
-            return wrong("an answer that is no lowfc.v1.CameraState", "answer with the last payload")
+            return wrong("an answer that is not a lowfc.v1.CameraState", "answer with the last payload")
     return ok(f"{len(seen.answers)} answer")
 
 
 class Agreement(NamedTuple):
-    """One value that is in both.
+    """One value that is both in the camera's settings and in the configuration.
 
     Attributes:
-        field: of lowfc.v1.CameraState.
-        key: of the configuration, from which the same field is made.
-        unit: in which both are printed.
-        apart: part of the configured value by which they may differ.
-        needed: whether the loop is wrong where they differ; otherwise only what is computed is.
-        use: what is computed from it.
+        field: field of lowfc.v1.CameraState.
+        key: configuration key of the same value.
+        unit: unit in which both are printed.
+        tolerance: largest difference, relative to the configured value.
+        needed: whether a difference is wrong for the loop, or only for computed figures (a warning).
+        use: results that depend on it.
     """
 
     field: str
     key: str
     unit: str
-    apart: float
+    tolerance: float
     needed: bool
     use: str
 
 
 _WEIGHTS = "the weights of the pixels in R, the predicted noise"
-_RATES = "laws, margins, spectra, the duration of probe sequences"
+_RATES = "control laws, margins, spectra, duration of probe sequences"
 _SATURATED = "the saturation level of a computed calibration"
 AGREEMENTS = (
     Agreement("period_ns", "camera.rate_hz", "ms", 0.01, True, _RATES),
@@ -158,7 +160,7 @@ AGREEMENTS = (
     Agreement("saturation_dn", "camera.full_well_e", "DN", 0.01, False, _SATURATED),
 )
 PERIODS_OF_TIMEOUT = 1.5
-"""Frame periods below which `control.frame_timeout_ms` takes every frame for a silence."""
+"""Smallest `control.frame_timeout_ms` in frame periods; below it the timeout acts before every frame."""
 
 
 def agreement_checks(config: Configuration, state: wire.CameraState) -> Iterator[Check]:
@@ -167,20 +169,20 @@ def agreement_checks(config: Configuration, state: wire.CameraState) -> Iterator
     for one in AGREEMENTS:
         configured, found = float(getattr(ours, one.field)), float(getattr(state, one.field))
         if one.field == "em_gain":
-            found = max(found, 1.0)  # 0 from a camera that has none
-        shown = _NS_PER_MS if one.unit == "ms" else 1.0
-        got, expected = (f"{value / shown:.6g} {one.unit}".rstrip() for value in (found, configured))
-        alike, advice = abs(found - configured) <= one.apart * abs(configured), f"it is used for: {one.use}"
+            found = max(found, 1.0)  # a camera without multiplication may report 0
+        divisor = _NS_PER_MS if one.unit == "ms" else 1.0
+        got, expected = (f"{value / divisor:.6g} {one.unit}".rstrip() for value in (found, configured))
+        agree, advice = abs(found - configured) <= one.tolerance * abs(configured), f"it is used for: {one.use}"
         expected, severity = f"{expected}, as configured", wrong if one.needed else warning
         advice = f"set {one.key}, or the camera; {advice}"
-        yield judged(f"{one.field} and {one.key}", expected, alike, got, advice, severity=severity)
+        yield judged(f"{one.field} and {one.key}", expected, agree, got, advice, severity=severity)
     frame_timeout_ms, period_ms = config.frame_timeout_ns * 1e-6, state.period_ns * 1e-6
-    long, expected = (
+    enough, expected = (
         frame_timeout_ms >= PERIODS_OF_TIMEOUT * period_ms,
         f"at least {PERIODS_OF_TIMEOUT:g} frame periods",
     )
     got, advice = (
         f"{frame_timeout_ms:g} ms, the period is {period_ms:g} ms",
-        "leave the key out: it follows camera.rate_hz",
+        "omit the key: its default follows camera.rate_hz",
     )
-    yield judged("control.frame_timeout_ms", expected, long, got, advice)
+    yield judged("control.frame_timeout_ms", expected, enough, got, advice)
