@@ -16,7 +16,7 @@ BENCHMARKS = {
     "kernels": "benchmarks.kernels",
     "streams": "benchmarks.streams",
     "throughput": "benchmarks.throughput",
-    "peers": "benchmarks.peers.contest",
+    "peers": "benchmarks.peers.comparison",
 }
 
 

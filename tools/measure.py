@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from benchmarks import curves, kernels, step, streams, throughput
-from benchmarks.peers import contest
+from benchmarks.peers import comparison
 from benchmarks.runner import Benchmark, in_markdown
 from lowfc.programs.measure.latency import text as latency_text
 from tools import (
@@ -93,7 +93,7 @@ MEASUREMENTS = {
     "stalls": _latency("lowfc latency --duration 60 --kernel fused --trace"),
     "step": _bench("python -m benchmarks step", step),
     "streams": _bench("python -m benchmarks streams", streams),
-    "peers": _bench("python -m benchmarks peers", contest),
+    "peers": _bench("python -m benchmarks peers", comparison),
     "curves": _bench("python -m benchmarks curves --seconds 1 --repeats 2", curves),
     "throughput": _bench("python -m benchmarks throughput --seconds 6", throughput),
 }

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator
 from statistics import median
 from typing import NamedTuple
 
-from benchmarks.peers.contestants import FUSED
+from benchmarks.peers.implementations import FUSED
 from lowfc.control.kernel.tables import KERNELS
 from tools.shared import Figures, markdown
 
@@ -50,7 +50,7 @@ OBJECTS = "decoding and encoding by protobuf, new Python objects for the state, 
 
 def render(measured: Callable[[str], Figures]) -> str:
     """The table; `measured` gives the figures of a measurement by its name."""
-    targets = [*_steps(measured("kernels")), *_contest(measured("peers")), *_stalls(measured("stalls"))]
+    targets = [*_steps(measured("kernels")), *_comparison(measured("peers")), *_stalls(measured("stalls"))]
     return markdown(HEAD, [target.row() for target in targets])
 
 
@@ -63,7 +63,7 @@ def _steps(figures: Figures) -> Iterator[Target]:
         yield Target(f"step, fused, {side} x {side}, in {unit}", most, ratios, "{:.2f}", "1", where)
 
 
-def _contest(figures: Figures) -> Iterator[Target]:
+def _comparison(figures: Figures) -> Iterator[Target]:
     runs = figures["runs"]
 
     def pairs(other: str, at: str) -> list[tuple[float, float]]:

@@ -32,7 +32,7 @@ Message = Callable[[int, bytes], None]
 def join(part: Part, receive: Message) -> Message:
     """Join a run with a session set up as lowfc's; returns the function that sends."""
     ports = json.loads((part.folder / PORTS).read_text())
-    links = Links("contest", ports, "contest", part.folder / "credentials")
+    links = Links("peers", ports, "lowfc", part.folder / "credentials")
     session = zenoh.open(zenoh.Config.from_json5(json.dumps(session_config(links, _ROLES[part.role]))))
     keys = FRAME.key, COMMAND.at("dm")
     sent, received = keys if part.role == "source" else keys[::-1]

@@ -1,4 +1,4 @@
-"""Shared by all contestants' processes: scheduling, time stamps, start, frames and matrices.
+"""Shared by all implementations' processes: scheduling, time stamps, start, frames and matrices.
 
 A process is started with the arguments ROLE FOLDER RATE_HZ FRAMES PROCESSOR PRIORITY; priority 0 is normal scheduling.
 The files of the folder are in shared memory, so a process may be killed after the last frame. This module needs

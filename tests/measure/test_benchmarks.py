@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from benchmarks import curves, kernels, load, runner, step, streams, throughput
-from benchmarks.peers import contest, contestants
-from benchmarks.peers.contestants import CONTESTANTS, FUSED
+from benchmarks.peers import comparison, implementations
+from benchmarks.peers.implementations import FUSED, IMPLEMENTATIONS
 from benchmarks.peers.shared import ACTUATORS, MARKS, NumpyStep, Problem
 from benchmarks.sizes import Size, configuration, made_up
 from lowfc.contract.errors import ConfigurationError
@@ -254,12 +254,12 @@ def test_processes_are_known_by_what_python_was_told_to_run() -> None:
     assert load.role_of(["python", "-m"]) is load.role_of([]) is None
 
 
-# The contest
+# The comparison
 
 
 def rules(*words: str | Path) -> Namespace:
     parser = ArgumentParser()
-    contest.options(parser)
+    comparison.options(parser)
     return parser.parse_args(list(map(str, words)))
 
 
@@ -270,7 +270,7 @@ def one(p50: float, p99: float, without: int = 0) -> dict[str, Any]:
 
 
 def test_the_figures_of_a_run_are_those_of_its_times(tmp_path: Path) -> None:
-    contest.lay_out(tmp_path, 6)
+    comparison.lay_out(tmp_path, 6)
     due = np.arange(7) * 1_000_000 + 50_000_000
     published = due + 10_000
     published[5] += 1_200_000
@@ -278,7 +278,7 @@ def test_the_figures_of_a_run_are_those_of_its_times(tmp_path: Path) -> None:
     commanded[4] = received[4] = 0
     for name, times in zip(MARKS, (due, published, commanded, received), strict=True):
         times.astype(np.int64).tofile(tmp_path / name)
-    found = contest.figures(tmp_path, 2)  # frames 3 to 6
+    found = comparison.figures(tmp_path, 2)  # frames 3 to 6
     assert found["frames"] == 4
     assert found["without_command"] == found["sent_late"] == 1
     assert found["frame_to_command"] == {"p50": 5.0, "p90": 6.0, "p99": 6.0, "p99_9": 6.0, "max": 6.0}
@@ -286,7 +286,7 @@ def test_the_figures_of_a_run_are_those_of_its_times(tmp_path: Path) -> None:
     assert found["off"] is None
     commanded.fill(1)
     commanded.tofile(tmp_path / "commanded")
-    assert contest.figures(tmp_path, 2)["off"] == 1  # no actuators have come
+    assert comparison.figures(tmp_path, 2)["off"] == 1  # no actuators have come
 
 
 def test_the_tables_have_ranges_and_differences_within_a_turn_and_who_is_not_there() -> None:
@@ -307,7 +307,7 @@ def test_the_tables_have_ranges_and_differences_within_a_turn_and_who_is_not_the
         "versions": {"lowfc": "1"},
         "failed": ["pyrtcao, fused: it fell"],
     }
-    latencies, differences, does = (by_heading(lines) for lines in contest.tables(json.loads(json.dumps(result))))
+    latencies, differences, does = (by_heading(lines) for lines in comparison.tables(json.loads(json.dumps(result))))
     chain, absent, failed, fused = latencies
     assert fused["p50"] == "100 (60 to 150)"
     assert fused["max"] == "660 (600 to 690)"
@@ -315,23 +315,23 @@ def test_the_tables_have_ranges_and_differences_within_a_turn_and_who_is_not_the
     assert (absent["p50"], failed["p50"]) == ("not installed", "failed")
     (against,) = differences
     assert list(against.values()) == ["1 of 2", "1 of 2", "-60 (-240 to +120)", "+20 (-6 to +45)", "C chain"]
-    assert [line["contestant"] for line in does] == list(runs)
-    about = contest.about(result)
+    assert [line["implementation"] for line in does] == list(runs)
+    about = comparison.about(result)
     for words in ("CLOCK_MONOTONIC", "get it", "it fell", "refused: that", "SCHED_FIFO 50"):
         assert words in about
 
 
 def test_who_cannot_take_part_is_said_and_how_it_can(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    chain, *_, pyrtcao, _, _ = CONTESTANTS
-    assert "pyrtcao is not installed in /no" in contestants.missing(pyrtcao, rules("--pyrtcao", "/no"))
-    monkeypatch.setattr(contestants.shutil, "which", lambda _: "cc")
-    assert f"{tmp_path} has no ImageStreamIO.c: git clone" in contestants.missing(chain, rules("--isio", tmp_path))
-    monkeypatch.setattr(contestants.shutil, "which", lambda _: None)
-    assert "no C compiler" in contestants.missing(chain, rules("--isio", tmp_path))
+    chain, *_, pyrtcao, _, _ = IMPLEMENTATIONS
+    assert "pyrtcao is not installed in /no" in implementations.missing(pyrtcao, rules("--pyrtcao", "/no"))
+    monkeypatch.setattr(implementations.shutil, "which", lambda _: "cc")
+    assert f"{tmp_path} has no ImageStreamIO.c: git clone" in implementations.missing(chain, rules("--isio", tmp_path))
+    monkeypatch.setattr(implementations.shutil, "which", lambda _: None)
+    assert "no C compiler" in implementations.missing(chain, rules("--isio", tmp_path))
 
 
 def test_the_step_is_an_integrator_with_a_leak(tmp_path: Path) -> None:
-    contest.lay_out(tmp_path, 1)
+    comparison.lay_out(tmp_path, 1)
     problem = Problem(tmp_path)
     plain_step, pixels = NumpyStep(problem), problem.frame(0)
     error_nm = problem.R @ (pixels.ravel() - problem.I0)
@@ -343,15 +343,15 @@ def test_the_step_is_an_integrator_with_a_leak(tmp_path: Path) -> None:
 
 @pytest.mark.exclusive
 @pytest.mark.parametrize(
-    "chosen", [pytest.param(one, id=one.name, marks=[pytest.mark.slow] * bool(one.kernel)) for one in CONTESTANTS]
+    "chosen", [pytest.param(one, id=one.name, marks=[pytest.mark.slow] * bool(one.kernel)) for one in IMPLEMENTATIONS]
 )
-def test_a_contestant_is_really_run(chosen: contestants.Contestant) -> None:
+def test_an_implementation_is_really_run(chosen: implementations.Implementation) -> None:
     """The C chain where ISIO_DIR is a checkout of ImageStreamIO, pyrtcao where PYRTCAO_PYTHON has it."""
     seconds, rate_hz = 0.5, 200.0
     asked = rules("--seconds", str(seconds), "--rate", str(rate_hz), "--warm-up", "10")
-    if why := contestants.missing(chosen, asked):
+    if why := implementations.missing(chosen, asked):
         pytest.skip(why)
-    found = contest.one_run(chosen, asked, 0)
+    found = comparison.one_run(chosen, asked, 0)
     assert found["frames"] == pytest.approx(seconds * rate_hz, abs=10)  # lowfc warms up by time
     assert found["without_command"] < found["frames"]
     there, back = found["frame_to_command"], found["frame_to_mirror"]

@@ -23,12 +23,12 @@ from typing import Any
 import numpy as np
 
 from benchmarks.peers import shared
-from benchmarks.peers.contestants import (
-    CONTESTANTS,
+from benchmarks.peers.implementations import (
     FUSED,
+    IMPLEMENTATIONS,
     PYRTCAO,
-    Contestant,
-    ContestError,
+    ComparisonError,
+    Implementation,
     missing,
     program,
     versions,
@@ -63,8 +63,8 @@ DEFINITIONS = {
     "clock": "CLOCK_MONOTONIC, one host",
     "pacing": "the source sleeps until absolute times; a late frame is sent at once, with that time as t0; no frame is "
     "skipped",
-    "cells": "us, median (lowest to highest) over the turns; in every turn each contestant runs once, and every other "
-    "turn in the opposite order",
+    "cells": "us, median (lowest to highest) over the turns; in every turn each implementation runs once, and every "
+    "other turn in the opposite order",
     "without a command": "measured frames that led to no command, in all turns",
     "pinning": "source and mirror on the first processor, all else on the second",
     "memory": "lowfc's processes lock theirs (`realtime.lock_memory`), the others do not",
@@ -73,11 +73,13 @@ DEFINITIONS = {
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    """Add duration, repeats, rate and contestants."""
+    """Add duration, repeats, rate and implementations."""
     add_times(parser, seconds=3.0, repeats=9)
     parser.add_argument("--warm-up", type=int, default=500, help="warm-up frames (%(default)s)")
     parser.add_argument("--rate", dest="rate_hz", type=float, default=1000.0, help="frames per second (%(default)g)")
-    parser.add_argument("--only", action="append", metavar="WORD", help="contestants with this in their name; repeat")
+    parser.add_argument(
+        "--only", action="append", metavar="WORD", help="implementations with this in their name; repeat"
+    )
     isio = os.environ.get("ISIO_DIR")
     parser.add_argument(
         "--isio", type=Path, default=isio and Path(isio), metavar="DIR", help="a checkout of ImageStreamIO ($ISIO_DIR)"
@@ -89,10 +91,10 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, tell: Tell) -> Result:
-    """Run all contestants in turns: the figures of each turn (None if it failed), and why a contestant is missing."""
-    chosen = [one for one in CONTESTANTS if any(word in one.name for word in options.only or [""])]
+    """Run all implementations in turns: figures of each turn (None if it failed), and reasons for missing ones."""
+    chosen = [one for one in IMPLEMENTATIONS if any(word in one.name for word in options.only or [""])]
     if not chosen:
-        raise ConfigurationError(f"--only: none of {'; '.join(one.name for one in CONTESTANTS)}")
+        raise ConfigurationError(f"--only: none of {'; '.join(one.name for one in IMPLEMENTATIONS)}")
     absent = {one.name: why for one in chosen if (why := missing(one, options))}
     present = [one for one in chosen if one.name not in absent]
     awake = set_up(None, None, lock_memory=False, disable_cpu_idle=True)  # for all, as long as this process lives
@@ -104,7 +106,7 @@ def measure(options: argparse.Namespace, tell: Tell) -> Result:
             tell(f"turn {turn + 1} of {options.repeats}: {one.name}")
             try:
                 runs[one.name].append(one_run(one, options, priority))
-            except (ContestError, LowfcError) as fault:
+            except (ComparisonError, LowfcError) as fault:
                 runs[one.name].append(None)
                 failed.append(f"{one.name}: {fault}")
     return {
@@ -120,15 +122,15 @@ def measure(options: argparse.Namespace, tell: Tell) -> Result:
     }
 
 
-def one_run(contestant: Contestant, rules: argparse.Namespace, priority: int) -> dict[str, Any]:
-    """Run a contestant once; ContestError or LowfcError if it does not start, does not end or sends no command."""
-    if contestant.kernel:
-        return _lowfc(contestant.kernel, rules, priority)
+def one_run(implementation: Implementation, rules: argparse.Namespace, priority: int) -> dict[str, Any]:
+    """Run an implementation once; ComparisonError or LowfcError if it does not start or end, or sends no command."""
+    if implementation.kernel:
+        return _lowfc(implementation.kernel, rules, priority)
     frames = rules.warm_up + round(rules.seconds * rules.rate_hz)
     with tempfile.TemporaryDirectory(prefix="lowfc-peers-", dir=_MEMORY) as name:
         folder = Path(name)
         lay_out(folder, frames)
-        with _processes(contestant, rules, folder, [str(rules.rate_hz), str(frames)], priority) as children:
+        with _processes(implementation, rules, folder, [str(rules.rate_hz), str(frames)], priority) as children:
             time.sleep(_SETTLE_S)
             shared.go(folder)
             pacer = children["source"]
@@ -136,11 +138,11 @@ def one_run(contestant: Contestant, rules: argparse.Namespace, priority: int) ->
             while pacer.status is None and time.monotonic() < deadline_s:
                 time.sleep(_LOOK_S)
             if pacer.status != 0:
-                raise ContestError(f"the frames did not come to an end: {pacer.stderr_tail()}")
+                raise ComparisonError(f"the source of frames did not end: {pacer.stderr_tail()}")
             words = "\n".join(child.stderr_tail() for child in children.values())
         found = figures(folder, rules.warm_up)
         if found["frame_to_command"] is None:
-            raise ContestError(f"no command came: {words}")
+            raise ComparisonError(f"no command was sent: {words}")
         return found
 
 
@@ -198,7 +200,7 @@ def lay_out(folder: Path, frames: int) -> None:
         (folder / name).write_bytes(bytes(8 * (frames + 1)))
     (folder / LAST).write_bytes(bytes(4 * ACTUATORS))
     (folder / PORTS).write_text(json.dumps(dict(zip(("camera", "controller"), free_ports(2), strict=True))))
-    (folder / "credentials").write_text("contest:contest\n")
+    (folder / "credentials").write_text("lowfc:lowfc\n")
 
 
 def processors() -> tuple[int, int]:
@@ -220,27 +222,27 @@ def fifo_granted() -> bool:
 
 @contextlib.contextmanager
 def _processes(
-    contestant: Contestant, rules: argparse.Namespace, folder: Path, words: list[str], priority: int
+    implementation: Implementation, rules: argparse.Namespace, folder: Path, words: list[str], priority: int
 ) -> Iterator[dict[str, Child]]:
-    start = program(contestant, rules, folder)
+    start = program(implementation, rules, folder)
     environment = os.environ | _ONE_THREAD | {"PYTHONPATH": str(ROOT), "MILK_SHM_DIR": str(folder)}
 
     def command(role: str) -> list[str]:
         processor = processors()[role not in _FIRST]
         return [*start, role, str(folder), *words, str(processor), str(priority)]
 
-    children = {role: Child(role, command(role), folder / f"{role}.txt", environment) for role in contestant.roles}
+    children = {role: Child(role, command(role), folder / f"{role}.txt", environment) for role in implementation.roles}
     try:
         for role, child in children.items():
             child.start()
             deadline_s = time.monotonic() + _READY_S
             while not shared.ready_file(folder, role).exists():
                 if child.status is not None or time.monotonic() > deadline_s:
-                    raise ContestError(f"{role} did not get ready: {child.stderr_tail()}")
+                    raise ComparisonError(f"{role} did not become ready: {child.stderr_tail()}")
                 time.sleep(_LOOK_S)
         yield children
     except BaseException:
-        if contestant.program == PYRTCAO:  # it may have left streams in shared memory
+        if implementation.program == PYRTCAO:  # streams may remain in shared memory
             subprocess.run(command("clear"), env=environment, check=False)  # noqa: S603  # our own program
         raise
     finally:
@@ -249,15 +251,15 @@ def _processes(
 
 
 PERCENTILES = {"p50": "p50", "p99": "p99", "p99_9": "p99.9", "max": "max"}
-HEADINGS = ["contestant", *PERCENTILES.values(), "without a command", "to the mirror p50", "p99"]
+HEADINGS = ["implementation", *PERCENTILES.values(), "without a command", "to the mirror p50", "p99"]
 
 
 def tables(result: Result) -> list[Lines]:
-    """Tables of the latencies, of the differences within a turn, and of the contestants' other functions."""
+    """Tables of the latencies, of the differences within a turn, and of the implementations' other functions."""
     runs = result["runs"]
     does = [
         [one.name, str(len(one.roles) or 3), one.log, one.safety, one.elsewhere]
-        for one in CONTESTANTS
+        for one in IMPLEMENTATIONS
         if one.name in runs
     ]
     latencies = [HEADINGS, *(_cells(name, each, name in result["missing"]) for name, each in runs.items())]
@@ -268,7 +270,7 @@ def tables(result: Result) -> list[Lines]:
             [f"{FUSED}, minus", "p50", "p99", "turns ahead in p50", "in p99"],
             *(_difference(runs, name) for name in others),
         ],
-        [["contestant", "processes", "log", "safety", "other machines"], *does],
+        [["implementation", "processes", "log", "safety", "other machines"], *does],
     ]
 
 
@@ -301,7 +303,7 @@ def _difference(runs: Result, other: str) -> list[str]:
 def about(result: Result) -> str:
     """Definitions and conditions of the tables."""
     rules, runs = result["rules"], result["runs"]
-    what = {one.name: one.what for one in CONTESTANTS if one.name in runs}
+    what = {one.name: one.what for one in IMPLEMENTATIONS if one.name in runs}
     lines = [f"{name}: {what}." for name, what in (DEFINITIONS | what).items()]
     lines.append(
         f"{rules['repeats']} turns of {rules['seconds']:g} s at {rules['rate_hz']:g} Hz after {rules['warm_up']} "

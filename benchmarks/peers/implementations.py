@@ -23,12 +23,12 @@ _CONSTANTS = ("SIDE", "PIXELS", "MODES", "MIRROR_SIDE", "ACTUATORS", "GAIN", "LE
 _LIMIT_ONLY = "limit of each mode"
 
 
-class ContestError(Exception):
-    """A contestant did not start or did not end."""
+class ComparisonError(Exception):
+    """An implementation did not start or did not end."""
 
 
 @dataclass(frozen=True)
-class Contestant:
+class Implementation:
     """An implementation of the loop: description, log, protection of the mirror, use across machines.
 
     Roles are in the order of their start; a run ends with the source. lowfc has a kernel and no roles.
@@ -44,13 +44,13 @@ class Contestant:
     kernel: str = ""
 
 
-def _pyrtcao(name: str, what: str, safety: str, *roles: str) -> Contestant:
+def _pyrtcao(name: str, what: str, safety: str, *roles: str) -> Implementation:
     log = "its streams keep the newest frame; its telemetry recorder reads them"
-    return Contestant(f"pyrtcao, {name}", what, log, safety, "no; commanded from elsewhere", roles, PYRTCAO)
+    return Implementation(f"pyrtcao, {name}", what, log, safety, "no; commanded from elsewhere", roles, PYRTCAO)
 
 
-def _lowfc(kernel: str) -> Contestant:
-    return Contestant(
+def _lowfc(kernel: str) -> Implementation:
+    return Implementation(
         f"lowfc, {kernel}",
         "its real controller and mirror with prepared frames: the loop of `lowfc latency`, with this size",
         log="every frame, command, mirror state and step is published for a recorder; bit-exact replay",
@@ -61,8 +61,8 @@ def _lowfc(kernel: str) -> Contestant:
     )
 
 
-CONTESTANTS = (
-    Contestant(
+IMPLEMENTATIONS = (
+    Implementation(
         "C chain",
         "four C processes over ImageStreamIO between source and mirror: pixels minus reference image, "
         "6400 x 20 product, integrator, modes to actuators; CACAO's stages without its process control",
@@ -72,7 +72,7 @@ CONTESTANTS = (
         ("source", "acquire", "product", "filter", "actuators", "mirror"),
         CHAIN,
     ),
-    Contestant(
+    Implementation(
         "zenoh",
         "zenoh with default settings, in sessions set up as lowfc's; the step in numpy, in the subscriber's callback",
         "any process may subscribe",
@@ -98,33 +98,33 @@ CONTESTANTS = (
 )
 
 
-def program(contestant: Contestant, options: argparse.Namespace, folder: Path) -> list[str]:
-    """The program of a contestant's processes; the C chain is compiled into the folder."""
-    if contestant.program != CHAIN:
-        python = options.pyrtcao if contestant.program == PYRTCAO else sys.executable
-        return [python, "-m", f"{__package__}.{contestant.program}"]
+def program(implementation: Implementation, options: argparse.Namespace, folder: Path) -> list[str]:
+    """The program of an implementation's processes; the C chain is compiled into the folder."""
+    if implementation.program != CHAIN:
+        python = options.pyrtcao if implementation.program == PYRTCAO else sys.executable
+        return [python, "-m", f"{__package__}.{implementation.program}"]
     constants = {name: getattr(shared, name) for name in _CONSTANTS} | {"DIFFERENT": FRAMES}
     words = ["cc", "-O3", "-march=native", "-ffast-math", *(f"-D{name}={value}" for name, value in constants.items())]
     sources = [Path(__file__).with_name(CHAIN), options.isio / "ImageStreamIO.c"]
     words += [f"-I{options.isio}", *map(str, sources), "-o", str(folder / "chain"), "-lpthread", "-lrt", "-lm"]
     done = subprocess.run(words, capture_output=True, text=True, check=False)  # noqa: S603  # the user's own compiler
     if done.returncode:
-        raise ContestError(f"cc failed: {done.stderr}")
+        raise ComparisonError(f"cc failed: {done.stderr}")
     return [str(folder / "chain")]
 
 
-def missing(contestant: Contestant, options: argparse.Namespace) -> str:
-    """Why a contestant cannot run; empty if it can."""
-    if contestant.program == CHAIN:
+def missing(implementation: Implementation, options: argparse.Namespace) -> str:
+    """Why an implementation cannot run; empty if it can."""
+    if implementation.program == CHAIN:
         if shutil.which("cc") is None:
             return "there is no C compiler (cc); Debian: apt install gcc"
         if options.isio is None or not (options.isio / "ImageStreamIO.c").is_file():
             what = f"{options.isio} has no ImageStreamIO.c" if options.isio else "no checkout of ImageStreamIO is given"
             return f"{what}: git clone https://github.com/milk-org/ImageStreamIO DIR, then --isio DIR"
-    if contestant.program == PYRTCAO and "pyrtcao" not in versions(options):
+    if implementation.program == PYRTCAO and "pyrtcao" not in versions(options):
         how = "python -m venv DIR && DIR/bin/pip install pyrtcao, then --pyrtcao DIR/bin/python"
         return f"pyrtcao is not installed in {options.pyrtcao}: {how}"
-    if contestant.kernel == FUSED_KERNEL and not compiled.available():
+    if implementation.kernel == FUSED_KERNEL and not compiled.available():
         return compiled.missing()
     return ""
 
