@@ -1,4 +1,4 @@
-"""`lowfc calibrate` and what stands beside it: files, figures, mistakes, other wavefronts; on a loop in one process."""
+"""`lowfc calibrate` and its subcommands: files, figures, errors, other wavefronts; on a loop in one process."""
 
 import json
 from dataclasses import replace
@@ -58,7 +58,7 @@ def connect(loop: FoldedLoop, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(module, "Client", lambda run: loop)
 
 
-def told(*words: str) -> dict[str, Any]:
+def json_of(*words: str) -> dict[str, Any]:
     """The JSON of a command that must succeed."""
     done = CliRunner().invoke(calibrate_app, [*words, "--json"], catch_exceptions=False)
     assert done.exit_code == 0, done.output
@@ -72,18 +72,21 @@ def toml(config: Configuration) -> str:
 
 
 def frames_to_go(stderr: str) -> float:
-    """What was said of the time to go, which is in whole seconds."""
-    said = next(line for line in stderr.splitlines() if "to go" in line)
-    return float(said.partition("about ")[2].split()[0]) * 250
+    """Frames to go, from the reported time in whole seconds."""
+    line = next(line for line in stderr.splitlines() if "to go" in line)
+    return float(line.partition("about ")[2].split()[0]) * 250
 
 
-def test_a_calibration_is_written_once_it_is_whole_and_used_and_its_figures_are_told(
+def test_a_resumed_calibration_is_written_loaded_and_reported_when_complete(
     loop: FoldedLoop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def stop(*what: object) -> None:
+    def stop(*_: object) -> None:
         raise KeyboardInterrupt
 
-    check, begun = Calibrator.check, 240 + 2 * 8  # frames of the delay, which is measured before the time to go is said
+    check, begun = (
+        Calibrator.check,
+        240 + 2 * 8,
+    )  # frames for measuring the delay, before the first report of the time to go
     monkeypatch.setattr(Calibrator, "check", stop)
     before = loop.calibration()
     words = ["--method", "hadamard", "--cycles", "4", "--out", "night.fits", "--load"]
@@ -108,12 +111,12 @@ def test_a_calibration_is_written_once_it_is_whole_and_used_and_its_figures_are_
     assert abs(found["delay_frames"] - 1) < 0.05
     assert found["frame_to_effect_ms"] == pytest.approx(4.0, rel=0.05)
     assert len(found["noise_gain_nm"]) == len(found["singular_values"]) == 3
-    # H was measured 6 nm from flat, where the computed one is a little off
+    # H was measured 6 nm from flat, where it differs a little from the computed H
     assert found["cross_talk"] < 0.1 + 4 * found["cross_talk_error"]
     assert (found["recommended"], found["snr"]) == (True, 20)
     assert loop.calibration().id == made.id != before.id
     assert list(Path().glob("*.part.npz")) == []
-    same = told("--compare", "night.fits", "night.fits")
+    same = json_of("--compare", "night.fits", "night.fits")
     assert same["cross_talk"] < 1e-4
     assert same["same_commands"]
     assert same["reference_shift_nm"] == [0.0] * 3
@@ -121,8 +124,10 @@ def test_a_calibration_is_written_once_it_is_whole_and_used_and_its_figures_are_
     assert "largest cross-talk" in done.stdout
 
 
-def test_a_bad_calibration_is_written_not_loaded_and_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """The star is faint; the second time, its image moves before R is checked, which shows in the verdict, too."""
+def test_a_calibration_that_is_not_recommended_is_written_but_not_loaded(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """First with a faint star; then its image also moves before R is checked, which the verdict reports too."""
     monkeypatch.chdir(tmp_path)
     loop = FoldedLoop(load(None, CONFIG | {"star.magnitude": 3.0}))
     connect(loop, monkeypatch)
@@ -136,19 +141,19 @@ def test_a_bad_calibration_is_written_not_loaded_and_told(monkeypatch: pytest.Mo
     assert "200 required: find the disturbance of this mode, or take about" in found["faults"][0]
     assert found["file"] == "night.rejected.fits"
     assert calibration_file.load(Path("night.rejected.fits")).id != before.id
-    assert not Path("night.fits").exists(), "a good one of that name would have been lost"
+    assert not Path("night.fits").exists(), "an existing calibration would be overwritten"
     assert loop.calibration().id == before.id
-    own, expose = Calibrator.check, loop.scene.expose
+    check, expose = Calibrator.check, loop.scene.expose
 
     def shifted(index: int, surface_nm: np.ndarray) -> Any:
         return np.roll(expose(index, surface_nm), 2, axis=1)
 
-    def moved(self: Calibrator, *what: Any) -> Any:
+    def check_shifted(self: Calibrator, *arguments: Any) -> Any:
         monkeypatch.setattr(loop.scene, "expose", shifted)
-        return own(self, *what)
+        return check(self, *arguments)
 
     assert "cross-talk on separate frames" not in str(found["faults"])
-    monkeypatch.setattr(Calibrator, "check", moved)
+    monkeypatch.setattr(Calibrator, "check", check_shifted)
     done = CliRunner().invoke(calibrate_app, [*words, "--resume"])
     assert done.exit_code == 1
     assert "verdict: NOT RECOMMENDED" in done.stdout
@@ -156,26 +161,26 @@ def test_a_bad_calibration_is_written_not_loaded_and_told(monkeypatch: pytest.Mo
     assert done.stdout.endswith("not loaded\n")
 
 
-def test_without_a_terminal_a_line_every_10_s() -> None:
-    said, times = list[str](), iter(np.arange(0.0, 100.0, 0.5))
-    count = spoken(said.append, lambda: float(next(times)))
+def test_progress_without_a_terminal_is_a_line_every_10_s() -> None:
+    lines, times = list[str](), iter(np.arange(0.0, 100.0, 0.5))
+    count = spoken(lines.append, lambda: float(next(times)))
     for done in range(0, 2000, 20):
         count("hadamard cycle 3 of 8", done, 4000)
-    assert said[0] == "hadamard cycle 3 of 8: 10%, about 90 s to go"
-    assert len(said) == 4
+    assert lines[0] == "hadamard cycle 3 of 8: 10%, about 90 s to go"
+    assert len(lines) == 4
 
 
-def test_what_comes_before_the_first_cycle_does_not_lengthen_the_time_to_go() -> None:
-    said, times = list[str](), iter([0.0, 7.0, 10.0, 13.0])
-    count = spoken(said.append, lambda: next(times))
+def test_work_before_the_first_cycle_does_not_affect_the_time_to_go() -> None:
+    lines, times = list[str](), iter([0.0, 7.0, 10.0, 13.0])
+    count = spoken(lines.append, lambda: next(times))
     count("detecting pokes", 400, 1000)
     for done in (400, 500, 600):
         count("hadamard cycle", done, 1000)
-    assert said == ["hadamard cycle: 50%, about 15 s to go"]
+    assert lines == ["hadamard cycle: 50%, about 15 s to go"]
 
 
-def test_the_reference_is_the_present_state(loop: FoldedLoop) -> None:
-    found = told("reference", "--frames", "200", "--out", "there.fits")
+def test_the_reference_is_the_present_image(loop: FoldedLoop) -> None:
+    found = json_of("reference", "--frames", "200", "--out", "there.fits")
     shift = dict(zip(found["noll"], found["reference_shift_nm"], strict=True))
     assert shift[4] == pytest.approx(6.0, abs=0.6)
     made = calibration_file.load(Path("there.fits"))
@@ -183,32 +188,32 @@ def test_the_reference_is_the_present_state(loop: FoldedLoop) -> None:
     assert np.array_equal(made.response, loop.calibration().response)
 
 
-def test_a_dark_finds_bad_pixels_and_is_not_taken_in_light(loop: FoldedLoop, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_dark_finds_bad_pixels_and_is_refused_with_light(loop: FoldedLoop, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(CalibrationError, match=r"not dark: .*; block the star|not dark"):
-        told("dark", "--dark-taken", "--frames", "50")
+        json_of("dark", "--dark-taken", "--frames", "50")
     rng = np.random.default_rng(5)
     cube = np.rint(100 + 1.5 * rng.standard_normal((64, 80, 80)))
     cube[:, 40, 41] += 500
     fits.PrimaryHDU(cube.astype(np.int16)).writeto("dark.fits")
-    found = told("dark", "--file", "dark.fits", "--out", "masked.fits")
+    found = json_of("dark", "--file", "dark.fits", "--out", "masked.fits")
     assert (found["hot"], found["noisy"], found["dead"]) == (1, 0, 0)
     made = calibration_file.load(Path("masked.fits"))
     assert made.good.reshape(80, 80)[40, 41] == 0
     assert not made.reconstructor[:, 40 * 80 + 41].any()
     fits.PrimaryHDU(cube[:, :20].astype(np.int16)).writeto("small.fits")
-    with pytest.raises(DataFileError, match=r"frames are \(20, 80\), those of the calibration \(80, 80\)"):
-        told("dark", "--file", "small.fits")
+    with pytest.raises(DataFileError, match=r"frames have \(20, 80\) pixels, the calibration \(80, 80\)"):
+        json_of("dark", "--file", "small.fits")
     np.save("cube.npy", cube)
-    assert told("dark", "--file", "cube.npy")["frames"] == 64
+    assert json_of("dark", "--file", "cube.npy")["frames"] == 64
     dark = FoldedLoop(load(None, CONFIG), world=load(None, CONFIG | {"star.magnitude": 20.0}))
     connect(dark, monkeypatch)
-    found = told("dark", "--dark-taken", "--frames", "50", "--out", "night.fits")
+    found = json_of("dark", "--dark-taken", "--frames", "50", "--out", "night.fits")
     assert found["dark_dn"] == pytest.approx(100, abs=0.5)
     assert found["hot"] < 5
 
 
 @pytest.mark.parametrize("words", ["", "reference", "align", "dark --dark-taken"])
-def test_frames_of_another_size_than_the_calibration_are_named(
+def test_frames_of_another_size_than_the_calibration_are_refused(
     loop: FoldedLoop, monkeypatch: pytest.MonkeyPatch, words: str
 ) -> None:
     other = replace(loop.calibration(), shape=(64, 100))
@@ -217,37 +222,37 @@ def test_frames_of_another_size_than_the_calibration_are_named(
     with pytest.raises(
         CalibrationError, match=r"80 x 80 pixels and are refused as WRONG_SIZE: .* is for 64 x 100: load"
     ):
-        told(*words.split(), *(["--frames", "16"] if words else []))
+        json_of(*words.split(), *(["--frames", "16"] if words else []))
 
 
-def test_the_computed_calibration_is_carried_to_a_sensor_that_lies_otherwise(loop: FoldedLoop) -> None:
+def test_the_computed_calibration_is_resampled_to_a_scaled_and_rotated_sensor(loop: FoldedLoop) -> None:
     before, shape = loop.calibration(), (90, 96)
     geometry = Geometry(1.08, 44.0, 47.5, 12.0, -1)
     model = before.reference.astype(float).reshape(80, 80)
     light = np.random.default_rng(2).poisson(np.maximum(3e5 * onto(model, geometry, shape) + 3, 0))
     found = align(light.astype(float), model)
-    none = np.zeros((90 * 96, len(before.noll)), np.float32)
-    blank = {"dark": none[:, 0], "reference": none[:, 0], "response": none, "reconstructor": none.T}
-    real = replace(before, shape=shape, good=none[:, 0] + 1, **blank)
+    zeros = np.zeros((90 * 96, len(before.noll)), np.float32)
+    blank = {"dark": zeros[:, 0], "reference": zeros[:, 0], "response": zeros, "reconstructor": zeros.T}
+    real = replace(before, shape=shape, good=zeros[:, 0] + 1, **blank)
     made = on_sensor(loop.config, before, found.geometry, found.flux, real)
     H = onto(before.response.astype(float).reshape(80, 80, -1), geometry, shape).reshape(90 * 96, -1)
     assert np.abs(cross_talk(made.reconstructor, H)).max() < 0.03
 
 
-def test_pokes_tell_the_half_turn(loop: FoldedLoop) -> None:
-    found = told("align", "--out", "aligned.fits", "--frames", "200")
+def test_a_poke_resolves_the_rotation_by_180_degrees(loop: FoldedLoop) -> None:
+    found = json_of("align", "--out", "aligned.fits", "--frames", "200")
     assert (found["pixels_per_lambda_d"], found["parity"]) == (pytest.approx(4, rel=0.003), 1)
     made = calibration_file.load(Path("aligned.fits"))
     assert np.abs(cross_talk(made.reconstructor, loop.calibration().response)).max() < 0.05
 
 
-def test_a_computed_calibration_may_leave_combinations_out(loop: FoldedLoop) -> None:
+def test_a_computed_calibration_may_truncate_singular_values(loop: FoldedLoop) -> None:
     config = toml(loop.config)
-    found = told("--method", "analytic", "--config", config, "--out", "all.fits")
+    found = json_of("--method", "analytic", "--config", config, "--out", "all.fits")
     assert found["kept"] == [1.0] * 3
     smallest = found["singular_values"][-1] / found["singular_values"][0]
-    cut = told("--method", "analytic", "--config", config, "--out", "few.fits", "--truncate", str(1.01 * smallest))
-    assert np.count_nonzero(cut["kept"]) == 2
+    few = json_of("--method", "analytic", "--config", config, "--out", "few.fits", "--truncate", str(1.01 * smallest))
+    assert np.count_nonzero(few["kept"]) == 2
     one, other = (calibration_file.load(Path(name)) for name in ("all.fits", "few.fits"))
     assert np.linalg.matrix_rank(one.reconstructor) == 3
     assert np.linalg.matrix_rank(other.reconstructor) == 2
@@ -255,11 +260,11 @@ def test_a_computed_calibration_may_leave_combinations_out(loop: FoldedLoop) -> 
     assert "no regularisation needed" in done.stdout
 
 
-def test_a_computed_calibration_may_be_of_another_wavefront(loop: FoldedLoop) -> None:
+def test_a_calibration_can_be_computed_at_another_wavefront(loop: FoldedLoop) -> None:
     config = toml(loop.config)
-    told("--method", "analytic", "--config", config, "--out", "flat.fits")
-    told("--method", "analytic", "--config", config, "--out", "there.fits", "--at", "3=-10,4=15")
-    found = told("--compare", "flat.fits", "there.fits")
+    json_of("--method", "analytic", "--config", config, "--out", "flat.fits")
+    json_of("--method", "analytic", "--config", config, "--out", "there.fits", "--at", "3=-10,4=15")
+    found = json_of("--compare", "flat.fits", "there.fits")
     assert found["estimators"] == ["weighted", "weighted+at 3=-10,4=15"]
     assert found["cross_talk"] > 0.02
     shift = dict(zip(found["noll"], found["reference_shift_nm"], strict=True))
@@ -275,14 +280,14 @@ def test_a_computed_calibration_may_be_of_another_wavefront(loop: FoldedLoop) ->
         ("--at 4=15", "--at requires --method analytic"),
     ],
 )
-def test_an_option_that_would_be_of_no_effect_is_refused(loop: FoldedLoop, words: str, why: str) -> None:
+def test_an_option_without_effect_is_refused(loop: FoldedLoop, words: str, why: str) -> None:
     before = {path.name for path in Path().iterdir()}
     with pytest.raises(ConfigurationError, match=why):
         CliRunner().invoke(calibrate_app, words.split(), catch_exceptions=False)
     assert {path.name for path in Path().iterdir()} == before
 
 
-def test_calibrations_of_different_sensors_are_not_compared(loop: FoldedLoop) -> None:
+def test_a_comparison_of_different_sensors_is_refused(loop: FoldedLoop) -> None:
     one = loop.calibration()
     calibration_file.save(one, Path("one.fits"))
     other = replace(
@@ -295,9 +300,9 @@ def test_calibrations_of_different_sensors_are_not_compared(loop: FoldedLoop) ->
     )
     calibration_file.save(identified(other), Path("other.fits"))
     with pytest.raises(CalibrationError, match="cannot be compared"):
-        told("--compare", "one.fits", "other.fits")
+        json_of("--compare", "one.fits", "other.fits")
     with pytest.raises(DataFileError, match="there is no directory"):
-        told("--method", "hadamard", "--out", "nowhere/night.fits")
+        json_of("--method", "hadamard", "--out", "nowhere/night.fits")
 
 
 THERE = "4=20,7=-20"
@@ -319,18 +324,18 @@ def there(config: Configuration) -> Calibration:
     return analytic(config, SILENT, zero_point(config, THERE)[1])
 
 
-def test_the_slopes_are_the_derivatives_of_the_image(optics: Twin) -> None:
+def test_the_response_is_the_derivative_of_the_image(optics: Twin) -> None:
     modes = zernikes((2, 4, 11), *node_radii(optics))
     state_nm = 15.0 * modes[1] - 10.0 * modes[2]
     H = response(optics, modes, state_nm)
     for k, mode in enumerate(modes):
-        apart = (reference(optics, state_nm + 0.1 * mode) - reference(optics, state_nm - 0.1 * mode)).reshape(-1) / 0.2
-        assert np.abs(H[:, k] - apart).max() < 1e-5 * np.abs(apart).max()
+        slope = (reference(optics, state_nm + 0.1 * mode) - reference(optics, state_nm - 0.1 * mode)).reshape(-1) / 0.2
+        assert np.abs(H[:, k] - slope).max() < 1e-5 * np.abs(slope).max()
     flat = response(optics, modes)
     assert np.abs(response(optics, modes, 0 * state_nm) - flat).max() < 1e-12 * np.abs(flat).max()
 
 
-def test_a_shape_of_the_mirror_is_the_wavefront_that_it_makes(
+def test_a_mirror_shape_for_at_equals_the_wavefront_it_makes(
     config: Configuration, optics: Twin, there: Calibration, tmp_path: Path
 ) -> None:
     flat = analytic(config, SILENT)
@@ -342,13 +347,13 @@ def test_a_shape_of_the_mirror_is_the_wavefront_that_it_makes(
     assert np.linalg.norm(shaped.reference - there.reference) < 0.1 * np.linalg.norm(moved)
     assert there.id != flat.id
     assert there.operator_hash == flat.operator_hash
-    one = np.eye(len(flat.noll))
-    assert np.abs(there.actuators_to_modes @ there.modes_to_actuators - one).max() < 1e-4
+    identity = np.eye(len(flat.noll))
+    assert np.abs(there.actuators_to_modes @ there.modes_to_actuators - identity).max() < 1e-4
     changed = there.response - flat.response
     assert np.linalg.norm(shaped.response - there.response) < 0.1 * np.linalg.norm(changed)
 
 
-def test_a_loop_on_it_goes_to_that_wavefront_and_holds_it() -> None:
+def test_a_loop_with_such_a_calibration_converges_to_that_wavefront() -> None:
     few = load(None, BRIGHT | {"sensor.modes": 6})
     world = load(None, BRIGHT | {"sensor.modes": 6, "disturbance.static_nm": {"4": 35.0, "6": 20.0}})
     made = analytic(few, SILENT, zero_point(few, "4=15,7=-10")[1])
@@ -359,7 +364,7 @@ def test_a_loop_on_it_goes_to_that_wavefront_and_holds_it() -> None:
     assert held == pytest.approx([0, 0, 15, 0, 0, -10], abs=0.02 * 20)
 
 
-def test_what_is_no_wavefront_is_said(config: Configuration, tmp_path: Path) -> None:
+def test_an_invalid_wavefront_for_at_is_an_error(config: Configuration, tmp_path: Path) -> None:
     assert zero_point(config, " 4=15, 7 = -1e1")[0] == "4=15,7=-10"
     for text, why in {
         "4=": "as in 4=15,7=-10, or a file; got '4='",

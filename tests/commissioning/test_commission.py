@@ -1,4 +1,4 @@
-"""`lowfc commission` step by step on a loop in one process, and what camera and configuration must agree on."""
+"""`lowfc commission` on a loop in one process, and the agreement of camera and configuration."""
 
 import tomllib
 from collections.abc import Callable, Iterator
@@ -21,7 +21,7 @@ from lowfc.programs.commissioning.checks import Status
 from lowfc.programs.commissioning.commission import commissioning
 from lowfc.programs.commissioning.commission.commissioning import Commission, Commissioning, first_of
 from lowfc.programs.commissioning.commission.first_calibration import linear_nm
-from lowfc.programs.commissioning.conformance.settings import AGREEMENTS, agreement_checks
+from lowfc.programs.commissioning.conformance.settings import AGREEMENTS, Agreement, agreement_checks
 from tests.support.folded_loop import FoldedLoop, computed
 from tests.support.loops import lowfc
 
@@ -40,51 +40,51 @@ columns = 12
 pitches_per_pupil = 10
 """
 CONFIG = Configuration.model_validate(tomllib.loads(TOML))
-SHAKEN = CONFIG.model_copy(update={"sensor": SensorSection(modes=3)})
-"""Few modes, so that a cycle is short."""
-QUIET = SHAKEN.model_copy(update={"disturbance": Disturbance(preset="quiet")})
+DISTURBED = CONFIG.model_copy(update={"sensor": SensorSection(modes=3)})
+"""Few modes, so that a cycle is short; default disturbance."""
+QUIET = DISTURBED.model_copy(update={"disturbance": Disturbance(preset="quiet")})
 NOISELESS = QUIET.model_copy(update={"camera": QUIET.camera.model_copy(update={"noise": False})})
-"""For what does not hang on noise: a frame takes half the time."""
+"""For tests that do not depend on noise: a frame takes half the time."""
 
 
 class Bench:
-    """A loop without a calibration, and what is said while it is commissioned."""
+    """A loop without a calibration, and the reports and questions of its commissioning."""
 
     def __init__(self, folder: Path, config: Configuration = QUIET) -> None:
         self.config, self.out = config, folder / "calibration.fits"
         self.loop = FoldedLoop(config, cut=8)
         self.loop.run(5)
-        self.said: list[str] = []
-        self.asked: list[str] = []
-        self.then: dict[str, Callable[[], None]] = {}
+        self.reports: list[str] = []
+        self.questions: list[str] = []
+        self.actions: dict[str, Callable[[], None]] = {}
 
     def report(self, text: str) -> None:
-        """What is reported; something happens after some of it."""
-        self.said.append(text)
-        for begin, happens in self.then.items():
-            if text.startswith(begin):
-                happens()
+        """Store a report, and carry out the actions for its first words."""
+        self.reports.append(text)
+        for start, action in self.actions.items():
+            if text.startswith(start):
+                action()
 
-    def steps(self, *, model: Configuration | None = None, **asked: Any) -> Commissioning:
-        usual = {"dark": None, "no_dark": True, "frames": 100, "snr": 30.0, "cycles": 4, "resume": False}
+    def steps(self, *, model: Configuration | None = None, **options: Any) -> Commissioning:
+        defaults = {"dark": None, "no_dark": True, "frames": 100, "snr": 30.0, "cycles": 4, "resume": False}
         return Commissioning(
             self.loop,
             self.config,
             computed((model or self.config).to_toml()),
-            Commission(self.out, **{**usual, "close": True, **asked}),
+            Commission(self.out, **{**defaults, "close": True, **options}),
             self.report,
             lambda what, done, total: None,
-            self.asked.append,
+            self.questions.append,
         )
 
-    def commission(self, **asked: Any) -> dict[str, Any]:
+    def commission(self, **options: Any) -> dict[str, Any]:
         with self.loop.reserved("a test"):
-            figures, _ = self.steps(**asked).run()
+            figures, _ = self.steps(**options).run()
         return figures
 
     @property
     def shown(self) -> str:
-        return "\n".join(self.said)
+        return "\n".join(self.reports)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -97,11 +97,11 @@ def _few_frames() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def commissioned(tmp_path_factory: pytest.TempPathFactory) -> tuple[Bench, dict[str, Any]]:
-    bench = Bench(tmp_path_factory.mktemp("bench"), SHAKEN)
+    bench = Bench(tmp_path_factory.mktemp("bench"), DISTURBED)
     return bench, bench.commission(cycles=6)
 
 
-def test_frames_of_another_size_come_to_a_closed_loop(commissioned: tuple[Bench, dict[str, Any]]) -> None:
+def test_commissioning_closes_a_loop_with_another_frame_size(commissioned: tuple[Bench, dict[str, Any]]) -> None:
     bench, figures = commissioned
     assert figures["recommended"]
     assert figures["measured_error_nm"] == pytest.approx(figures["predicted_error_nm"], rel=0.15)
@@ -115,8 +115,8 @@ def test_frames_of_another_size_come_to_a_closed_loop(commissioned: tuple[Bench,
 
 
 @pytest.mark.parametrize(("scatter", "chosen_nm"), [(0.0, 1.5), (0.2, 3.0)])
-def test_a_shaken_mode_is_not_taken_for_a_sensor_that_is_not_linear(scatter: float, chosen_nm: float) -> None:
-    """Z3 answers a fifth less to the larger poke; its own cycles say whether that means something."""
+def test_disturbance_of_a_mode_is_not_mistaken_for_nonlinearity(scatter: float, chosen_nm: float) -> None:
+    """The gain of Z3 is 20 % lower for the larger poke; whether that is significant depends on the scatter."""
     first, gains = computed(CONFIG.to_toml()), np.ones((4, 14))
     gains[:, 1] = 0.8 + scatter / 2, 0.8 - scatter / 2, 1 + scatter / 2, 1 - scatter / 2
     answers = iter(gains)
@@ -129,14 +129,14 @@ def test_a_shaken_mode_is_not_taken_for_a_sensor_that_is_not_linear(scatter: flo
     assert linear_nm(player, CONFIG, delay, 3.0) == chosen_nm
 
 
-def test_the_wavefront_is_held_where_the_reference_was_taken(commissioned: tuple[Bench, dict[str, Any]]) -> None:
+def test_the_loop_holds_the_wavefront_of_the_reference_image(commissioned: tuple[Bench, dict[str, Any]]) -> None:
     bench, figures = commissioned
     bench.loop.run(200)
     true = bench.loop.residual_nm(-200)
-    assert float(np.sqrt(true.var(axis=0).sum())) < figures["measured_error_nm"]  # in which there is noise, too
+    assert float(np.sqrt(true.var(axis=0).sum())) < figures["measured_error_nm"]  # which includes noise
 
 
-def test_a_loop_that_shall_stay_open_is_predicted_only(commissioned: tuple[Bench, dict[str, Any]]) -> None:
+def test_without_close_the_residual_is_only_predicted(commissioned: tuple[Bench, dict[str, Any]]) -> None:
     bench, _ = commissioned
     bench.loop.open_loop()
     text = bench.steps(close=False)._close(factory.settings(bench.config).law(bench.config.noll), 1.0)
@@ -147,7 +147,7 @@ def test_a_loop_that_shall_stay_open_is_predicted_only(commissioned: tuple[Bench
 
 @pytest.mark.slow
 def test_a_sensor_unlike_the_configured_one_is_measured_without_the_model(tmp_path: Path) -> None:
-    """The optical model is of another sensor; it gives only the modes and the mirror's commands."""
+    """The optical model of another sensor provides only the modes and the mirror's commands."""
     other = Configuration.model_validate({**tomllib.loads(TOML), "sensor": {"kind": "clowfs"}})
     bench = Bench(tmp_path, CONFIG)
     figures = bench.commission(model=other, close=False, cycles=None)
@@ -155,33 +155,33 @@ def test_a_sensor_unlike_the_configured_one_is_measured_without_the_model(tmp_pa
     assert figures["recommended"]
 
 
-def test_it_goes_on_where_it_was_interrupted_and_who_opens_the_loop_at_the_end_is_named(tmp_path: Path) -> None:
+def test_a_resumed_commissioning_continues_and_reports_an_operator_who_opens_the_loop(tmp_path: Path) -> None:
     bench = Bench(tmp_path, NOISELESS)
     bench.loop.ask("stop")
-    lost = bench.loop.ask
+    ask = bench.loop.ask
 
     def interrupted(name: str, **fields: Any) -> Any:
-        if "[7/10] response" in bench.said and partial_of(bench.out).exists():
+        if "[7/10] response" in bench.reports and partial_of(bench.out).exists():
             raise KeyboardInterrupt
-        return lost(name, **fields)
+        return ask(name, **fields)
 
     bench.loop.ask = interrupted  # type: ignore[method-assign]
     with pytest.raises(KeyboardInterrupt):
         bench.commission()
-    bench.loop.ask = lost  # type: ignore[method-assign]
+    bench.loop.ask = ask  # type: ignore[method-assign]
     bench.loop.ask("release", lease_id=1)
     assert first_of(bench.out).exists()
     assert "without a verdict" in bench.shown
     assert "has no verdict" in bench.loop.ask("close", lease_id=0).reply
     bench.loop.ask("open", lease_id=0)
-    bench.said.clear()
+    bench.reports.clear()
 
     def somebody_opens() -> None:
-        if "[10/10] closed loop" in bench.said:
+        if "[10/10] closed loop" in bench.reports:
             bench.loop.run(20)
             bench.loop.ask("open", lease_id=0)
 
-    bench.then = {"observing": somebody_opens}
+    bench.actions = {"observing": somebody_opens}
     with pytest.raises(CalibrationError, match="the lease ended: operator asked to open"):
         bench.commission(resume=True)
     assert "[1/10]" not in bench.shown
@@ -191,7 +191,7 @@ def test_it_goes_on_where_it_was_interrupted_and_who_opens_the_loop_at_the_end_i
     assert (state.mode, state.calibration_id) == (wire.LOOP_MODE_OPEN, calibration_file.load(bench.out).id)
 
 
-def test_the_calibration_from_before_is_in_use_again_after_a_failure(
+def test_a_failed_commissioning_restores_the_previous_calibration(
     commissioned: tuple[Bench, dict[str, Any]],
 ) -> None:
     bench, _ = commissioned
@@ -200,30 +200,30 @@ def test_the_calibration_from_before_is_in_use_again_after_a_failure(
     def give_up() -> None:
         raise KeyboardInterrupt
 
-    bench.said.clear()
-    bench.then = {"[7/10] response": give_up}
+    bench.reports.clear()
+    bench.actions = {"[7/10] response": give_up}
     with pytest.raises(KeyboardInterrupt):
         bench.commission()
-    bench.then.clear()
+    bench.actions.clear()
     assert bench.loop.calibration().id == before
     assert "the previous calibration is in use again" in bench.shown
 
 
-def test_there_is_nothing_to_go_on_with_after_the_end(commissioned: tuple[Bench, dict[str, Any]]) -> None:
+def test_a_finished_commissioning_cannot_be_resumed(commissioned: tuple[Bench, dict[str, Any]]) -> None:
     bench, _ = commissioned
     first_of(bench.out).unlink(missing_ok=True)
     with pytest.raises(CalibrationError, match="nothing to resume"):
         bench.commission(resume=True)
 
 
-def test_a_dark_is_asked_for_with_a_person(tmp_path: Path) -> None:
+def test_the_operator_is_asked_to_block_and_unblock_the_star(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     with pytest.raises(CalibrationError, match="was it not blocked for the dark"):
         bench.commission(no_dark=False)
-    assert bench.asked == ["block the star; is it dark?", "unblock the star; is it there?"]
+    assert bench.questions == ["block the star; is it dark?", "unblock the star; is it there?"]
 
 
-def test_a_camera_that_is_not_as_configured_is_refused(tmp_path: Path) -> None:
+def test_a_camera_that_differs_from_the_configuration_is_refused(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     wrong = {"camera": Camera(rate_hz=250.0, gain_e_per_dn=3.0), "control": Control(frame_timeout_ms=12.0)}
     bench.config = CONFIG.model_copy(update=wrong)
@@ -234,7 +234,7 @@ def test_a_camera_that_is_not_as_configured_is_refused(tmp_path: Path) -> None:
     assert not bench.out.exists()
 
 
-def test_in_safe_mode_nothing_begins(tmp_path: Path) -> None:
+def test_commissioning_is_refused_in_safe_mode(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     bench.loop.ask("safe")
     with pytest.raises(RequestRefusedError, match="safe mode"):
@@ -265,13 +265,13 @@ def test_the_simulated_camera_agrees_with_its_configuration(em_gain: float, bits
 
 
 @pytest.mark.parametrize("one", AGREEMENTS, ids=lambda one: one.field)
-def test_a_value_that_differs_is_found(one: object) -> None:
-    field, needed = one.field, one.needed  # type: ignore[attr-defined]
+def test_a_difference_of_camera_and_configuration_is_found(one: Agreement) -> None:
+    field, needed = one.field, one.needed
     found = faults(Configuration(), changed(**{field: getattr(changed(), field) * 2}))
     assert found[field] is (Status.WRONG if needed else Status.WARNING)
 
 
-def test_a_calibration_that_is_there_is_not_replaced_unasked(own_runtime: Path) -> None:
+def test_an_existing_calibration_is_replaced_only_with_force(own_runtime: Path) -> None:
     out = own_runtime / "calibration.fits"
     out.write_text("mine")
     done = lowfc("commission", "--no-dark", "--out", out)
@@ -279,7 +279,7 @@ def test_a_calibration_that_is_there_is_not_replaced_unasked(own_runtime: Path) 
     assert "already exists" in str(done.exception)
     for way in ("--force", "--resume"):
         done = lowfc("commission", "--no-dark", "--out", out, way)
-        assert isinstance(done.exception, BusError), "it goes on to the loop, of which there is none"
+        assert isinstance(done.exception, BusError), "it continues to the connection, which fails without a loop"
     assert out.read_text() == "mine"
 
 
@@ -287,13 +287,15 @@ def test_a_calibration_that_is_there_is_not_replaced_unasked(own_runtime: Path) 
     ("rate_hz", "max_frame_age_ms", "frame_timeout_ms"),
     [(1000, 20, 50), (250, 20, 50), (100, 20, 50), (50, 40, 100), (5, 400, 1000)],
 )
-def test_the_times_follow_the_rate(rate_hz: float, max_frame_age_ms: float, frame_timeout_ms: float) -> None:
+def test_frame_age_and_timeout_follow_the_rate(
+    rate_hz: float, max_frame_age_ms: float, frame_timeout_ms: float
+) -> None:
     config = Configuration(camera=Camera(rate_hz=rate_hz))
     assert (config.max_frame_age_ns, config.frame_timeout_ns) == (max_frame_age_ms * 1e6, frame_timeout_ms * 1e6)
     assert "control.frame_timeout_ms" not in faults(config, configured(config))
 
 
-def test_what_was_chosen_holds_and_is_checked() -> None:
+def test_configured_times_apply_and_are_checked() -> None:
     config = Configuration(camera=Camera(rate_hz=20.0), control=Control(max_frame_age_ms=7.0, frame_timeout_ms=50.0))
     assert (config.max_frame_age_ns, config.frame_timeout_ns) == (7_000_000, 50_000_000)
     assert faults(config, configured(config)) == {"control.frame_timeout_ms": Status.WRONG}

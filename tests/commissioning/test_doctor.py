@@ -1,4 +1,4 @@
-"""What `lowfc doctor` says of hosts that are fit, of hosts that are not, and of the one that runs the tests."""
+"""`lowfc doctor` on suitable hosts, on unsuitable ones, and on the host that runs the tests."""
 
 import ctypes
 import json
@@ -34,7 +34,7 @@ NO_RIGHTS = [
     *(["setpriv", "--inh-caps=-all", "--bounding-set=-sys_nice,-ipc_lock,-sys_resource"] if os.geteuid() == 0 else []),
     *("prlimit", "--rtprio=0", "--memlock=65536", sys.executable, "-P", "-c"),
 ]
-"""What runs a Python that may neither have a real-time class nor lock its memory, whoever runs the tests."""
+"""Command that runs Python without the rights to a real-time class and locked memory, for any user."""
 
 CPUS = "sys/devices/system/cpu"
 CLOCKSOURCE = "sys/devices/system/clocksource/clocksource0/current_clocksource"
@@ -71,7 +71,7 @@ METAL = {
     "stolen_share": 0.0,
     "load": 0.15,
 }
-"""A computer that is fit: eight processors, four of them kept free for the loop. Files by path, readings by name."""
+"""A suitable host: eight processors, four of them reserved for the loop. Files by path, readings by name."""
 
 OF_THE_HOST = [
     *("real-time share", "processors", "isolation", "quota", "frequency", "idle states", "kernel", "virtualisation"),
@@ -93,16 +93,16 @@ DEEP = {f"{CPUS}/cpu0/cpuidle/state2/disable": "0\n"}
 
 
 def trial(refused: dict[str, tuple[str, str]] | None = None, cpus: int = 8, **late_ns: list[int]) -> Trial:
-    usual = {"normal_ns": [40_000] * 99 + [900_000], "first_ns": [20_000] * 99 + [60_000]}
-    return Trial(refused=refused or {}, cpus=set(range(cpus)), **{**usual, **late_ns})
+    defaults = {"normal_ns": [40_000] * 99 + [900_000], "first_ns": [20_000] * 99 + [60_000]}
+    return Trial(refused=refused or {}, cpus=set(range(cpus)), **{**defaults, **late_ns})
 
 
 def machine(root: Path, changes: dict[str, object]) -> Host:
-    """A host of these files and readings; None takes one away."""
+    """The suitable host with some files and readings changed; None removes one."""
     host = Host(root)
 
     def unreadable() -> None:
-        raise OSError("there is none")
+        raise OSError("not readable")
 
     for what, value in {**METAL, **changes}.items():
         if "/" not in what:
@@ -124,11 +124,11 @@ def examine(facts: Facts) -> dict[str, Check]:
 
 @pytest.fixture
 def briefly(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The command measures for a moment."""
+    """Shorten the wake-up measurement."""
     monkeypatch.setattr(command, "TRIAL_S", 0.02)
 
 
-def test_a_fit_host_has_no_warning(tmp_path: Path) -> None:
+def test_a_suitable_host_has_no_warning(tmp_path: Path) -> None:
     found = examine(facts(tmp_path))
     assert {name: found[name] for name in OF_THE_HOST if found[name].status != "ok"} == {}
     assert found["isolation"].got == "4-7; of these without a timer tick: 4-6"
@@ -140,7 +140,7 @@ def test_a_fit_host_has_no_warning(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "status", "said", "changes"),
+    ("name", "status", "text", "changes"),
     [
         ("real-time share", "note", "stalls for 50 ms", {"usable_cpus": {0, 1}}),
         ("real-time share", "warning", "0 ms of every", {"proc/sys/kernel/sched_rt_runtime_us": "0"}),
@@ -205,51 +205,51 @@ def test_a_fit_host_has_no_warning(tmp_path: Path) -> None:
         ("locked memory", "note", "lock_memory = false", {"config": UNASKED}),
     ],
 )
-def test_every_host_is_called_what_it_is(
-    tmp_path: Path, name: str, status: str, said: str, changes: dict[str, object]
+def test_each_property_of_a_host_has_its_status_and_text(
+    tmp_path: Path, name: str, status: str, text: str, changes: dict[str, object]
 ) -> None:
     others = {key: changes[key] for key in ("trial", "config", "busy") if key in changes}
     check = examine(facts(tmp_path, {key: changes[key] for key in changes.keys() - others.keys()}, **others))[name]
-    assert (check.status, said in " ".join([check.got, check.advice, check.cost])) == (status, True), check
+    assert (check.status, text in " ".join([check.got, check.advice, check.cost])) == (status, True), check
     assert (status == "warning") <= bool(check.advice and check.cost)
 
 
-def test_what_cannot_be_read_is_a_note_and_never_a_fault(tmp_path: Path) -> None:
-    nothing = dict.fromkeys(METAL)
+def test_unreadable_data_gives_a_note(tmp_path: Path) -> None:
+    unreadable = dict.fromkeys(METAL)
     failed = OSError("the process that tries it ended with exit status 1: no")
-    found = examine(facts(tmp_path, nothing, trial=failed))
+    found = examine(facts(tmp_path, unreadable, trial=failed))
     unknown = {name for name, check in found.items() if check.got.startswith("not known: ")}
     assert unknown >= set(OF_THE_HOST)
     assert {found[name].status for name in unknown} == {"note"}
     assert found["scheduling class"].got == f"not known: {failed}"
-    assert command.measured(facts(tmp_path, nothing, trial=failed))["wake_up_us"] == {}
+    assert command.measured(facts(tmp_path, unreadable, trial=failed))["wake_up_us"] == {}
     files = {path: "\x00 ?" for path in METAL if "/" in path}
     nonsense = examine(facts(tmp_path, files))
     assert {nonsense[name].status for name in ("isolation", "huge pages")} == {"note"}
 
 
-def test_the_disk_is_judged_by_what_the_loop_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_check_of_the_disk_uses_the_recorders_volume(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     usage = SimpleNamespace(free=0)
     monkeypatch.setattr(host_module.psutil, "disk_usage", lambda path: usage)
     keys = {"recorder.folder": "/not/yet", "recorder.min_free_mb": 500, "camera.rate_hz": 1000}
-    looked = facts(tmp_path, config=load(None, {**keys, "mirror.rows": 10, "mirror.columns": 10}))
-    assert looked.bytes_per_s == 1000 * (80 * 80 * 2 + 2 * 100 * 4)
-    grows = bytes_per_s(looked.config, EVERYTHING)
-    an_hour = 500_000_000 + round(grows * 3600) + 1
+    of_disk = facts(tmp_path, config=load(None, {**keys, "mirror.rows": 10, "mirror.columns": 10}))
+    assert of_disk.bytes_per_s == 1000 * (80 * 80 * 2 + 2 * 100 * 4)
+    growth = bytes_per_s(of_disk.config, EVERYTHING)
+    an_hour = 500_000_000 + round(growth * 3600) + 1
     for free, status in ((an_hour, "ok"), (an_hour - 10**6, "warning"), (10**6, "warning")):
         usage.free = free
-        found = examine(looked)["disk"]
+        found = examine(of_disk)["disk"]
         assert found.status == status
-        assert (f"1.0 h of {grows * 3600 / 1e9:.1f} GB an hour at 1000 Hz" in found.got) == (free > 10**9)
+        assert (f"1.0 h of {growth * 3600 / 1e9:.1f} GB an hour at 1000 Hz" in found.got) == (free > 10**9)
     monkeypatch.setattr(host_module.os, "access", lambda path, mode: False)
     usage.free = an_hour
-    assert "not writable" in examine(looked)["disk"].got
+    assert "not writable" in examine(of_disk)["disk"].got
 
 
 @pytest.mark.parametrize(("behind_ms", "status"), [(50, "ok"), (1000, "warning"), (-1000, "warning")])
-def test_a_boots_clock_that_was_set_wrong_is_a_warning(own_runtime: Path, behind_ms: int, status: str) -> None:
+def test_a_wrong_boot_clock_is_a_warning(own_runtime: Path, behind_ms: int, status: str) -> None:
     assert examine(facts(own_runtime))["boot's clock"][:2] == ok("not set yet: the first process of a run does it")[:2]
-    assert not (own_runtime / "lowfc").exists(), "looking changes nothing"
+    assert not (own_runtime / "lowfc").exists(), "the check changes nothing"
     file = boot_file(runtime_base())
     file.write_text(str(time.time_ns() - time.monotonic_ns() - behind_ms * 1_000_000))
     finding = examine(facts(own_runtime))["boot's clock"]
@@ -259,28 +259,28 @@ def test_a_boots_clock_that_was_set_wrong_is_a_warning(own_runtime: Path, behind
     assert "not known" in examine(facts(own_runtime))["boot's clock"].got
 
 
-def test_certificates_that_end_are_a_warning(tmp_path: Path) -> None:
+def test_expiring_certificates_are_a_warning(tmp_path: Path) -> None:
     certificates = pytest.importorskip("lowfc.adapters.bus.certificates")
     folder = tmp_path / "certs"
-    way = load(None, {"network.router": "tls/bench:7447", "network.certificates": str(folder), **NAMED})
+    routed = load(None, {"network.router": "tls/bench:7447", "network.certificates": str(folder), **NAMED})
     certificates.make_certificates(folder, ("camera",), [])
     assert examine(facts(tmp_path))["certificates"].status == "ok"
-    assert examine(facts(tmp_path, config=way))["certificates"].status == "ok"
+    assert examine(facts(tmp_path, config=routed))["certificates"].status == "ok"
     certificates.make_certificates(folder, ("camera",), [], 59, renew=True)
-    finding = examine(facts(tmp_path, config=way))["certificates"]
+    finding = examine(facts(tmp_path, config=routed))["certificates"]
     assert finding.status == "warning"
     assert "certificate of camera ends in 58 days" in finding.got
 
 
-def test_the_kernels_account_of_the_clock_is_read_where_it_is() -> None:
+def test_the_kernels_clock_state_is_read_from_the_right_fields() -> None:
     timex = Timex(modes=0)
     assert ctypes.CDLL(None).adjtimex(ctypes.byref(timex)) >= 0
-    seconds = timex.rest[3]  # after constant, precision and tolerance: the time itself
+    seconds = timex.rest[3]  # the time, after constant, precision and tolerance
     assert abs(seconds - time.time()) < 60
     assert Host().synchronisation().error_s >= 0
 
 
-def test_a_wake_up_that_is_missed_counts_as_late(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missed_wake_ups_count_as_late(monkeypatch: pytest.MonkeyPatch) -> None:
     now_ns = [0]
     stalls = iter([500_000, 3_200_000])
 
@@ -291,7 +291,7 @@ def test_a_wake_up_that_is_missed_counts_as_late(monkeypatch: pytest.MonkeyPatch
     assert lateness_ns(7, 1_000_000) == [500_000, 3_200_000, 2_200_000, 1_200_000, 200_000, 0, 0]
 
 
-def test_what_was_tried_does_not_stay() -> None:
+def test_a_trial_leaves_no_real_time_class_or_affinity() -> None:
     before = os.sched_getscheduler(0), os.sched_getaffinity(0)
     tried = try_out(Realtime(), {min(before[1])}, 0.02)
     assert (os.sched_getscheduler(0), os.sched_getaffinity(0)) == before
@@ -300,7 +300,7 @@ def test_what_was_tried_does_not_stay() -> None:
     assert len(tried.first_ns) == (0 if "priority" in tried.refused else 20)
 
 
-def test_a_user_without_rights_is_told_what_is_refused() -> None:
+def test_a_trial_without_rights_reports_what_is_refused() -> None:
     program = """
 from lowfc.adapters.process.trial import try_out
 from lowfc.contract.configuration import Realtime
@@ -316,7 +316,7 @@ print(*trial.refused["priority"], *trial.refused["lock_memory"], len(trial.norma
     assert (normal, first) == ("10", "0")
 
 
-def test_a_trial_that_fails_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_trial_has_its_cause(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(multiprocessing.spawn, "get_executable", lambda: b"/bin/false")
     with pytest.raises(OSError, match="the process that tries it ended"):
         try_out(Realtime(), set(), 0.01)
@@ -325,7 +325,7 @@ def test_a_trial_that_fails_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
     assert found["wake-up"].status == "note"
 
 
-def test_a_process_is_seen_at_work() -> None:
+def test_busy_finds_a_process_that_uses_the_cpu() -> None:
     host, here = Host(), f"({os.getpid()})"
     with subprocess.Popen([sys.executable, "-c", "while True: pass"]) as process:
         try:
@@ -335,11 +335,11 @@ def test_a_process_is_seen_at_work() -> None:
     assert not any(name.endswith(here) for name, _ in host.busy())
 
 
-def test_processors_are_written_as_the_kernel_writes_them() -> None:
+def test_processors_are_written_as_ranges() -> None:
     assert ranges({3, 0, 1, 8}) == "0-1,3,8"
 
 
-def test_this_host_is_looked_at(briefly: None) -> None:
+def test_doctor_checks_this_host(briefly: None) -> None:
     done = lowfc("doctor", "--json")
     assert done.exit_code == 0, done.output
     (line,) = done.stdout.splitlines()
@@ -353,7 +353,9 @@ def test_this_host_is_looked_at(briefly: None) -> None:
     assert "1000 sleeps per second" in done.stderr
 
 
-def test_strict_is_about_warnings(briefly: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_strict_fails_on_warnings_but_not_on_notes(
+    briefly: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     config = tmp_path / "lowfc.toml"
     config.write_text("[realtime]\ncamera_cpus = [8000]\n")
     done = lowfc("doctor", "--config", config)
@@ -366,7 +368,7 @@ def test_strict_is_about_warnings(briefly: None, tmp_path: Path, monkeypatch: py
     assert lowfc("doctor", "--strict").exit_code == 0, "a note is no warning"
 
 
-def test_the_document_has_every_check_in_its_own_words() -> None:
+def test_the_document_describes_every_check_by_its_docstring() -> None:
     rows = [line.split(" | ") for line in DOCUMENT.read_text().splitlines() if line.startswith("| ")]
     assert [(name.removeprefix("| "), looks_at) for name, looks_at, _ in rows[1:]] == [
         (name, look.__doc__) for name, (_, look) in LOOKS.items()
@@ -374,7 +376,7 @@ def test_the_document_has_every_check_in_its_own_words() -> None:
 
 
 @pytest.mark.parametrize(
-    ("kernel", "there", "status", "said"),
+    ("kernel", "available", "status", "text"),
     [
         ("fused", True, "ok", "the fused step"),
         ("fused", False, "warning", "numba"),
@@ -382,19 +384,19 @@ def test_the_document_has_every_check_in_its_own_words() -> None:
         ("numpy", False, "note", "numba"),
     ],
 )
-def test_the_kernel_that_computes_is_named(
-    kernel: str, there: bool, status: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_the_check_of_the_control_step_names_the_kernel(
+    kernel: str, available: bool, status: str, text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(room.compiled, "available", lambda: there)
+    monkeypatch.setattr(room.compiled, "available", lambda: available)
     found = examine(facts(tmp_path, config=load(None, {"realtime.kernel": kernel})))["control step"]
     assert found.status == status
-    assert said in f"{found.got} {found.advice}"
+    assert text in f"{found.got} {found.advice}"
 
 
-def test_real_time_rights_are_shown_set_up_and_taken_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[tuple[str, ...]] = []
-    monkeypatch.setattr(permissions, "_run", lambda *words: asked.append(words) or " ".join(words))
-    monkeypatch.setattr(permissions.shutil, "chown", lambda path, group: asked.append((str(group),)))
+def test_real_time_rights_are_shown_applied_and_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[tuple[str, ...]] = []
+    monkeypatch.setattr(permissions, "_run", lambda *words: calls.append(words) or " ".join(words))
+    monkeypatch.setattr(permissions.shutil, "chown", lambda path, group: calls.append((str(group),)))
     monkeypatch.setattr(permissions.os, "geteuid", lambda: 1000)
     for change in (lambda: permissions.apply(tmp_path, "me"), lambda: permissions.undo(tmp_path)):
         with pytest.raises(ConfigurationError, match="needs root"):
@@ -408,7 +410,7 @@ def test_real_time_rights_are_shown_set_up_and_taken_back(tmp_path: Path, monkey
         assert (tmp_path / name).read_text() == text
         assert text in lowfc("doctor", "--setup").stdout
     assert device.stat().st_mode & 0o777 == 0o660
-    assert [words[0] for words in asked] == ["groupadd", "usermod", "lowfc"]
+    assert [words[0] for words in calls] == ["groupadd", "usermod", "lowfc"]
     permissions.undo(tmp_path)
     assert not [path for path in tmp_path.rglob("*") if path.is_file() and path != device]
     assert device.stat().st_mode & 0o777 == 0o600
@@ -417,6 +419,6 @@ def test_real_time_rights_are_shown_set_up_and_taken_back(tmp_path: Path, monkey
         permissions.apply(tmp_path, "me")
 
 
-def test_the_udev_rule_is_the_one_of_the_services() -> None:
+def test_the_udev_rule_equals_that_of_the_services() -> None:
     shipped = Path(__file__).parents[2] / "deploy/udev/70-lowfc.rules"
     assert permissions.FILES["etc/udev/rules.d/90-lowfc-user.rules"] == shipped.read_text()

@@ -1,4 +1,4 @@
-"""Flat map, active actuators, law and registration error: from the configuration to the mirror."""
+"""Configured flat map, active actuators, control law and registration error, from the files to the mirror."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -63,16 +63,16 @@ def complaint(overrides: dict[str, Any]) -> str:
 
 @pytest.mark.parametrize("name", ["map.npy", "map.fits"])
 @pytest.mark.parametrize("kind", [np.float64, np.float32, np.int16, ">f4"])
-def test_a_map_is_read_from_fits_and_from_numpy(tmp_path: Path, name: str, kind: npt.DTypeLike) -> None:
+def test_a_map_is_read_from_fits_and_numpy_files(tmp_path: Path, name: str, kind: npt.DTypeLike) -> None:
     shape = np.round(wavy()).astype(kind)
     found = read_shape(Path(saved(tmp_path, name, shape)))
     assert found.dtype == np.float32
     np.testing.assert_array_equal(found, shape)
 
 
-def test_what_is_no_map_is_named_in_one_line(tmp_path: Path) -> None:
-    whole = Path(saved(tmp_path, "whole.fits", wavy())).read_bytes()
-    (tmp_path / "short.fits").write_bytes(whole[: len(whole) // 2])
+def test_an_invalid_map_gives_an_error_of_one_line(tmp_path: Path) -> None:
+    intact = Path(saved(tmp_path, "intact.fits", wavy())).read_bytes()
+    (tmp_path / "short.fits").write_bytes(intact[: len(intact) // 2])
     np.savez(tmp_path / "many.npz", wavy())
     (tmp_path / "many.npz").rename(tmp_path / "archive.npy")
     fits.HDUList([fits.PrimaryHDU()]).writeto(tmp_path / "empty.fits")
@@ -104,7 +104,7 @@ def test_the_flat_map_is_zero_where_no_actuator_is_active(tmp_path: Path) -> Non
     assert active_actuators(load(None)) is None
 
 
-def test_every_file_that_cannot_be_used_is_a_line(tmp_path: Path) -> None:
+def test_each_unusable_file_is_a_line_of_the_error(tmp_path: Path) -> None:
     config = load(None)
     small, tall = saved(tmp_path, "small.npy", np.ones((5, 6))), saved(tmp_path, "tall.npy", wavy(900.0))
     assert complaint({"mirror.flat": small}).endswith("5 x 6 values, the mirror has 34 x 34 actuators")
@@ -129,10 +129,10 @@ def test_every_file_that_cannot_be_used_is_a_line(tmp_path: Path) -> None:
     assert all(words in line for words, line in zip(("none.json", "mirror.flat", "control.law"), several, strict=True))
 
 
-def test_inactive_actuators_are_not_commanded_and_the_modes_are_measured_as_they_are(
+def test_inactive_actuators_get_no_command_and_the_modes_are_still_measured_correctly(
     tmp_path: Path, calibration: Calibration
 ) -> None:
-    """With five actuators of the pupil out of use, a mode is what the sensor measures of it all the same."""
+    """Five actuators in the pupil are inactive; the sensor still measures each commanded mode correctly."""
     dead = [34 * row + column for row, column in ((10, 12), (16, 17), (17, 17), (22, 9), (25, 24))]
     active = np.ones(GRID)
     active.flat[dead] = 0
@@ -141,32 +141,32 @@ def test_inactive_actuators_are_not_commanded_and_the_modes_are_measured_as_they
     assert not made.modes_to_actuators[dead].any()
     assert not made.actuators_to_modes[:, dead].any()
     assert np.abs(calibration.modes_to_actuators[dead]).max() > 0.01
-    seen = made.actuators_to_modes @ made.modes_to_actuators
-    assert np.abs(seen - np.eye(14)).max() < 1e-4
-    ignorant = calibration.modes_to_actuators.copy()
-    ignorant[dead] = 0
-    wrong = np.abs(made.actuators_to_modes @ ignorant - np.eye(14)).max()
-    assert wrong > 0.01, "the map makes a difference"
+    response = made.actuators_to_modes @ made.modes_to_actuators
+    assert np.abs(response - np.eye(14)).max() < 1e-4
+    without_map = calibration.modes_to_actuators.copy()
+    without_map[dead] = 0
+    error = np.abs(made.actuators_to_modes @ without_map - np.eye(14)).max()
+    assert error > 0.01, "without the map of active actuators the modes are wrong"
 
 
-def test_a_registration_error_is_the_mirrors_and_not_the_calibrations(calibration: Calibration) -> None:
-    wrong = {"mirror.magnification": 1.01, "mirror.shift_pitches": 0.31}
-    config = load(None, QUIET | wrong)
-    believed = calibrated(config)
-    np.testing.assert_array_equal(believed.modes_to_actuators, calibration.modes_to_actuators)
+def test_a_registration_error_affects_the_mirror_but_not_the_computed_calibration(calibration: Calibration) -> None:
+    misregistered = {"mirror.magnification": 1.01, "mirror.shift_pitches": 0.31}
+    config = load(None, QUIET | misregistered)
+    computed = calibrated(config)
+    np.testing.assert_array_equal(computed.modes_to_actuators, calibration.modes_to_actuators)
     poked = (20.0 * calibration.modes_to_actuators[:, 2]).reshape(GRID)  # defocus
-    straight = scene(load(None, QUIET)).truth(0, poked).sampled.residual_nm
+    aligned = scene(load(None, QUIET)).truth(0, poked).sampled.residual_nm
     moved = scene(config).truth(0, poked).sampled.residual_nm
-    assert straight[2] == pytest.approx(20, rel=0.01)
-    assert abs(straight[0]) < 0.1
-    assert 19 < moved[2] < 19.9, "a larger mirror has a gentler defocus"
+    assert aligned[2] == pytest.approx(20, rel=0.01)
+    assert abs(aligned[0]) < 0.1
+    assert 19 < moved[2] < 19.9, "magnification reduces the defocus in the pupil"
     # dZ4/dx = 2 sqrt(3) Z2 over the circle, and the shift is 2 x 0.31 / 31 radii.
     assert moved[0] == pytest.approx(-20 * 2 * np.sqrt(3) * 2 * 0.31 / 31, rel=0.1)
     assert moved[1] == pytest.approx(moved[0], rel=0.05)
 
 
 def begun(config: Configuration, calibration: Calibration, shape: MirrorShape | None) -> tuple[State, list[Request]]:
-    """The controller's start: calibration, mirror, and what the configuration asks; all granted."""
+    """Start a controller: load the calibration, report the mirror, carry out the configured requests; all accepted."""
     settings = factory.settings(config)
     state, _ = advance(settings, State(), Load(0, calibration, "test"))
     if shape is not None:
@@ -180,7 +180,7 @@ def begun(config: Configuration, calibration: Calibration, shape: MirrorShape | 
 
 
 def commands(config: Configuration, state: State, frames: int) -> tuple[list[Single], list[str]]:
-    """What is commanded over some frames of any light, for which the loop is open, and the channels at their end."""
+    """Commands over some frames of uniform light in open loop, and the names of the channels at their end."""
     settings, shape = (
         replace(factory.settings(config), min_flux_fraction=0.0, max_identical_frames=0),
         state.drive.calibration.shape,
@@ -193,7 +193,7 @@ def commands(config: Configuration, state: State, frames: int) -> tuple[list[Sin
     return sent, [one.name for one in state.drive.added().channels]
 
 
-def test_the_flat_map_is_put_on_the_mirror_at_the_start(tmp_path: Path, calibration: Calibration) -> None:
+def test_the_flat_map_is_applied_at_the_start(tmp_path: Path, calibration: Calibration) -> None:
     config = load(None, {"mirror.flat": saved(tmp_path, "flat.fits", wavy(120.0))})
     state, requests = begun(config, calibration, None)
     assert [(one.name, one.text) for one in requests] == [("channel", FLAT)]
@@ -205,24 +205,25 @@ def test_the_flat_map_is_put_on_the_mirror_at_the_start(tmp_path: Path, calibrat
     assert not StartUp(load(None)).requests(state, 0)
 
 
-@pytest.mark.parametrize("told", [True, False])
-def test_a_restarted_controller_does_not_put_the_flat_map_on_twice(
-    tmp_path: Path, calibration: Calibration, told: bool
+@pytest.mark.parametrize("command_reported", [True, False])
+def test_a_restarted_controller_does_not_apply_the_flat_map_twice(
+    tmp_path: Path, calibration: Calibration, command_reported: bool
 ) -> None:
-    """Whether or not the mirror says which modal command it has, it does not move."""
+    """The mirror does not move, whether or not it reports its modal command."""
     config = load(None, {"mirror.flat": saved(tmp_path, "flat.npy", wavy(120.0))})
     modal_nm = np.linspace(-10, 10, 14, dtype=np.float32)
-    there = wavy(120.0) + (calibration.modes_to_actuators @ modal_nm).reshape(GRID)
-    state, requests = begun(config, calibration, MirrorShape(0, there, modal_nm if told else np.zeros(0, np.float32)))
+    mirror_nm = wavy(120.0) + (calibration.modes_to_actuators @ modal_nm).reshape(GRID)
+    reported_nm = modal_nm if command_reported else np.zeros(0, np.float32)
+    state, requests = begun(config, calibration, MirrorShape(0, mirror_nm, reported_nm))
     assert [one.text for one in requests] == [ADOPTED, FLAT]
     sent, names = commands(config, state, 10)
     for shape in sent:
-        np.testing.assert_allclose(shape, there, atol=2e-3)
-    # Where the mirror does not say, its modal command has the flat map's modes too, and a channel takes them out again.
-    assert names == ([FLAT] if told else [ADOPTED, FLAT])
+        np.testing.assert_allclose(shape, mirror_nm, atol=2e-3)
+    # Without a report, the adopted modal command includes the flat map's modes, and the channel ADOPTED cancels them.
+    assert names == ([FLAT] if command_reported else [ADOPTED, FLAT])
 
 
-def test_the_configured_law_takes_over(tmp_path: Path, calibration: Calibration) -> None:
+def test_the_configured_law_is_requested_at_the_start(tmp_path: Path, calibration: Calibration) -> None:
     path = tmp_path / "law.fits"
     config = load(None, {"control.law": str(path)})
     law_file.save(law_of(config), path)
@@ -234,8 +235,8 @@ def test_the_configured_law_takes_over(tmp_path: Path, calibration: Calibration)
         StartUp(config).refused(requests[0], "the law is of the modes 2 to 15, the loop of 2 to 9")
 
 
-def test_a_controller_does_not_start_without_what_it_is_configured_with(tmp_path: Path) -> None:
-    """One line, and the process ends."""
+def test_a_controller_does_not_start_without_a_configured_file(tmp_path: Path) -> None:
+    """It ends with one line of error."""
     done = run(tmp_path, "controller", "--run", "lawless", config='[control]\nlaw = "none.fits"\n', timeout_s=30)
     assert done.returncode == 2
     assert done.stderr.splitlines()[-1].startswith("error: control.law: none.fits: there is no such law file")

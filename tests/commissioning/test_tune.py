@@ -1,4 +1,4 @@
-"""`lowfc tune`: figures, files and mistakes, on a log that the live loop's own `advance` makes; and law files."""
+"""`lowfc tune`: figures, files and errors, on a log made by the live loop's own `advance`; and law files."""
 
 import json
 from collections.abc import Iterator
@@ -58,7 +58,7 @@ def telemetry(log: Path) -> Telemetry:
 
 @pytest.mark.parametrize("controller", ["integrator", "pi-notch", "lqg"])
 def test_each_law_is_tuned_from_a_closed_loop(telemetry: Telemetry, controller: str) -> None:
-    """Tip is a sine of 12 nm at 7 Hz under noise: it is found, and each law leaves less than the loop did."""
+    """Tip is a sine of 12 nm at 7 Hz with noise: the line is found, and each law predicts a smaller residual."""
     best, gains = tuned(telemetry, controller)
     found = result_of(telemetry, best, gains, controller)
     tip = found.modes[0]
@@ -79,8 +79,8 @@ def test_the_command_writes_the_law_and_draws_it(log: Path, telemetry: Telemetry
     assert law_file.load(out).id == tuned(telemetry, "lqg")[0].law.id
 
 
-def test_what_was_played_is_neither_tuned_for_nor_taken_for_the_delay(tmp_path: Path) -> None:
-    """The loop follows what is played to the mirror frames later: the true wavefront then moves unlike the commands."""
+def test_probe_sequences_affect_neither_the_tuning_nor_the_delay(tmp_path: Path) -> None:
+    """During a probe sequence on the mirror, the true wavefront does not follow the loop's commands alone."""
     night = Night()
     night.request("close")
     night.frames(1000)
@@ -111,8 +111,8 @@ def test_an_open_loop_with_much_tilt_is_flagged(tmp_path: Path) -> None:
     assert "above 10: the optical gain of the sensor is low" in warned
 
 
-class Listening:
-    """Steps of a loop as a client gets them; every thousandth does not come, and every hundredth was refused."""
+class StepStream:
+    """Steps of a loop as a client receives them; one in a thousand is missing, one in a hundred was refused."""
 
     lost = 4
 
@@ -141,14 +141,14 @@ class Listening:
         self.steps = iter(())
 
 
-class Watched(FoldedLoop):
-    def steps(self, count: int | None = None, patience_s: float = 0.0) -> Listening:
-        return Listening(6000)
+class StreamedLoop(FoldedLoop):
+    def steps(self, count: int | None = None, patience_s: float = 0.0) -> StepStream:
+        return StepStream(6000)
 
 
-def test_a_running_loop_is_listened_to() -> None:
-    """Missing and refused frames are bridged; the first half second after closing does not count."""
-    run = of_run(Watched(CONFIG), 60.0)
+def test_tuning_uses_the_steps_of_a_running_loop() -> None:
+    """Missing and refused frames are bridged; the first half second after closing is excluded."""
+    run = of_run(StreamedLoop(CONFIG), 60.0)
     assert run.closed
     assert (run.source, run.noll, run.timing) == ("folded", NOLL, Timing.of(1.0, 0.5))
     assert run.rate_hz == pytest.approx(1000)
@@ -167,84 +167,84 @@ def test_a_running_loop_is_listened_to() -> None:
     assert f"closed {added['closed']:+.1e}, predicted {added['predicted']:+.1e}; focus contributes most (" in text
 
 
-class Applying(Watched):
-    """Its mirror reports each command a fifth of a frame after the exposure's end."""
+class ReportingLoop(StreamedLoop):
+    """A loop whose mirror reports each command a fifth of a frame period after the end of the exposure."""
 
     def mirror_watch(self) -> Any:
         applied = [(frame_sequence(index), index * PERIOD_NS + PERIOD_NS // 5) for index in range(4000, 5000)]
         return SimpleNamespace(applied=applied, read=lambda: None)
 
 
-def test_a_running_loop_tells_when_its_commands_are_applied() -> None:
-    run = of_run(Applying(CONFIG), 60.0)
+def test_the_mirrors_reports_give_the_time_of_application() -> None:
+    run = of_run(ReportingLoop(CONFIG), 60.0)
     assert (run.timing.delay, run.timing.applied) == (1.0, pytest.approx(0.7, abs=1e-3))
 
 
-def test_too_short_a_time_to_listen_is_refused_before_it_has_passed() -> None:
+def test_a_too_short_live_time_is_refused_at_once() -> None:
     with pytest.raises(DataFileError, match=r"2048 consecutive frames, 2.05 s at 1000 Hz, but got 2 s: use --live 3"):
-        of_run(Watched(CONFIG), 2.0)
+        of_run(StreamedLoop(CONFIG), 2.0)
 
 
-class Steered(FoldedLoop):
-    """It notes what is asked of it, and does not answer some of it."""
+class RequestedLoop(FoldedLoop):
+    """A loop that records the requests, and does not answer those whose number is in `unanswered`."""
 
     def __init__(self) -> None:
-        self.asked: list[str] = []
-        self.deaf: tuple[int, ...] = ()
+        self.requests: list[str] = []
+        self.unanswered: tuple[int, ...] = ()
         super().__init__(CONFIG)
 
     def ask(self, name: str, modes: Any = (), values: Any = (), **fields: Any) -> Answer:
         if name != "status":
-            self.asked.append(name)
-            if len(self.asked) in self.deaf:
+            self.requests.append(name)
+            if len(self.requests) in self.unanswered:
                 raise BusError("the controller did not answer")
         return super().ask(name, modes, values, **fields)
 
     def laws(self) -> dict[str, LinearLaw]:
         return {law.id: law for law in LAWS.values()}
 
-    def known(self) -> tuple[str | None, list[float]]:
+    def law_and_gains(self) -> tuple[str | None, list[float]]:
         state = self.status().state
         law = driving(state, self.laws())
         return (None if law is None else law.name), [round(gain, 6) for gain in state.gain]
 
 
-def test_gains_are_given_to_whatever_law_drives() -> None:
-    loop = Steered()
+def test_tuned_gains_are_applied_whichever_law_is_active() -> None:
+    loop = RequestedLoop()
     answer = integrate(loop, [0.3, 0.25, 0.1], NOLL)
     assert answer.reply == "gain is now 0.3 0.25 0.1"
-    assert loop.asked == ["gain"]
+    assert loop.requests == ["gain"]
     loop.law(LAWS["pi"])
     integrate(loop, [0.2, 0.2, 0.1], NOLL)
-    assert loop.known() == (None, [0.2, 0.2, 0.1])
+    assert loop.law_and_gains() == (None, [0.2, 0.2, 0.1])
 
 
-def test_the_law_that_drove_goes_on_where_the_gains_are_refused() -> None:
-    loop = Steered()
+def test_the_previous_law_stays_active_if_the_gains_are_refused() -> None:
+    loop = RequestedLoop()
     loop.law(LAWS["pi"])
-    before = loop.known()
+    before = loop.law_and_gains()
     with pytest.raises(RequestRefusedError, match=r"^gain refused: gain must be at least 0 and below"):
         integrate(loop, [0.3, 0.3, 9.0], NOLL)
-    assert loop.known() == before == (LAWS["pi"].name, [0.4, 0.4, 0.2])
+    assert loop.law_and_gains() == before == (LAWS["pi"].name, [0.4, 0.4, 0.2])
     with pytest.raises(RequestRefusedError, match="are not controlled"):
         integrate(loop, [0.3, 0.3], (2, 9))
-    assert loop.known() == before
+    assert loop.law_and_gains() == before
 
 
-def test_the_law_that_drove_goes_on_where_nobody_answers_or_it_is_said_that_it_does_not() -> None:
-    loop = Steered()
+def test_the_previous_law_is_restored_without_an_answer_or_the_error_says_that_it_is_not() -> None:
+    loop = RequestedLoop()
     loop.law(LAWS["pi"])
-    before = loop.known()
-    loop.deaf = (3,)
+    before = loop.law_and_gains()
+    loop.unanswered = (3,)
     with pytest.raises(BusError, match="did not answer"):
         integrate(loop, [0.3, 0.3, 0.3], NOLL)
-    assert loop.known() == before
-    loop.deaf = (6, 7)
+    assert loop.law_and_gains() == before
+    loop.unanswered = (6, 7)
     with pytest.raises(
         RequestRefusedError, match=f"the integrator now drives .* law {before[0]!r} could not be restored"
     ):
         integrate(loop, [0.3, 0.3, 0.3], NOLL)
-    assert loop.known() == (None, before[1])
+    assert loop.law_and_gains() == (None, before[1])
 
 
 def test_a_log_that_is_too_short_is_refused(tmp_path: Path) -> None:
@@ -252,17 +252,17 @@ def test_a_log_that_is_too_short_is_refused(tmp_path: Path) -> None:
     night.request("close")
     night.frames(700)
     with pytest.raises(
-        DataFileError, match="tuning requires at least 2048 consecutive frames, 2 s; the longest stretch of good"
+        DataFileError, match="tuning requires at least 2048 consecutive frames, 2 s; the longest sequence of good"
     ):
         tune(night.write(tmp_path / "short.mcap"))
 
 
-def test_what_is_written_is_never_a_log(log: Path) -> None:
+def test_tune_never_overwrites_a_log(log: Path) -> None:
     with pytest.raises(DataFileError, match="is a log, which is never overwritten"):
         tune(log, "--out", log)
 
 
-def test_a_log_or_a_running_loop_is_named() -> None:
+def test_tune_needs_either_a_log_or_a_running_loop() -> None:
     with pytest.raises(ConfigurationError, match="give one LOG, or observe a running loop"):
         tune()
     with pytest.raises(ConfigurationError, match="give one LOG"):
@@ -270,14 +270,14 @@ def test_a_log_or_a_running_loop_is_named() -> None:
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_a_law_comes_back_from_its_file_as_it_was(name: str, tmp_path: Path) -> None:
+def test_a_law_is_unchanged_after_saving_and_loading(name: str, tmp_path: Path) -> None:
     law_file.save(LAWS[name], tmp_path / "law.fits")
     again = law_file.load(tmp_path / "law.fits")
     assert again.id == LAWS[name].id
     assert (again.name, again.noll, again.delay_frames) == (LAWS[name].name, LAWS[name].noll, 1.0)
 
 
-def test_damage_of_a_law_file_is_found(tmp_path: Path) -> None:
+def test_a_damaged_law_file_is_an_error(tmp_path: Path) -> None:
     path = tmp_path / "law.fits"
     with pytest.raises(DataFileError, match="there is no such law file: make one with `lowfc tune"):
         law_file.load(path)

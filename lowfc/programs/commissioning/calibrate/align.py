@@ -25,7 +25,7 @@ from lowfc.programs.commissioning.calibrate.tasks import reporter, written
 
 
 class AlignResult(Result):
-    """How the sensor is placed relative to the computed image."""
+    """Geometry of the sensor relative to the computed image."""
 
     pixels_per_lambda_d: float = figure("scale", "pixels per lambda/D", ".4f")
     scale: float = figure()
@@ -40,12 +40,12 @@ class AlignResult(Result):
     file: str = figure("written")
 
     def remarks(self) -> Sequence[str]:
-        """The sign is known."""
+        """Confirmation that a poke determined the sign."""
         return ["the pokes have the right sign"]
 
 
 def aligned(out: Path, run: str | None, frames: int, *, load: bool) -> AlignResult:
-    """Fit the geometry, resample the computed calibration, write it."""
+    """Fit the sensor's geometry, resample the computed calibration to its pixels and write the file."""
     require_folder(out)
     console = Console(stderr=True)
     with Client(run) as loop, loop.reserved("lowfc calibrate align"):
@@ -60,8 +60,8 @@ def aligned(out: Path, run: str | None, frames: int, *, load: bool) -> AlignResu
             raise CalibrationError(str(error)) from None
         made = on_sensor(config, computed, found.geometry, found.flux, before)
         mode = int(np.argmax(np.linalg.norm(made.response, axis=0)))
-        seen = Player(loop, made, reporter(console)).first_poke(mode, sequence(AMPLITUDE_NM["poke"]))
-        if seen.picture @ made.response[:, mode] < 0:
+        poke = Player(loop, made, reporter(console)).first_poke(mode, sequence(AMPLITUDE_NM["poke"]))
+        if poke.picture @ made.response[:, mode] < 0:
             found = replace(found, geometry=found.geometry.turned())
             made = on_sensor(config, computed, found.geometry, found.flux, before)
         written(made, out, loop if load else None)

@@ -1,4 +1,4 @@
-"""The command `lowfc calibrate`: options only."""
+"""The command `lowfc calibrate`: command-line arguments."""
 
 from pathlib import Path
 from typing import Annotated, Literal

@@ -15,32 +15,35 @@ from lowfc.control.calibration.response_fit import LEAST_CYCLES
 from lowfc.programs.commissioning.calibrate.recording import AFTERWARDS
 
 AMPLITUDE_NM = {"poke": 8.0, "hadamard": 3.0, "in-loop": 2.0}
+"""Default amplitude of a mode by method, nm rms of wavefront."""
 LEAST_SNR = 20.0
 """Signal-to-noise ratio required of a calibration with a given number of cycles."""
 FULL_AMPLITUDE_SNR = 70.0
-"""Highest signal-to-noise ratio for the usual amplitude: the error of third-order terms goes as its square."""
+"""Highest signal-to-noise ratio for the default amplitude: the error of third-order terms goes as its square."""
 MOST_HADAMARD_NM = 3.0
-"""Largest amplitude of a mode: all modes at once add up to some four times that, and the sensor must stay linear."""
+"""Largest amplitude of a mode, nm rms: all modes at once add up to some four times that, within the linear range."""
 SETTLE = 2
 """Frames left out after each change: one for a fractional delay, and one for a late command."""
 HOLD = 4
+"""Frames for which each poke is held."""
 DITHER_HOLD = 2
-"""Frames between the changes of a dither: the longer, the more of it the loop corrects."""
+"""Frames for which each value of a dither is held: the longer, the more of it the loop corrects."""
 PIECE = 1024
-"""Frames of a piece of a dither."""
+"""Length of a piece of a dither, frames."""
 MARGIN = 0.9
-"""Fraction of the required error to aim for, so that scatter of the cycles seldom requires more cycles."""
+"""Error to aim for, as a fraction of the required one, so that scatter of the cycles seldom requires more cycles."""
 MOST_TIMES = 4
-"""Largest ratio of cycles to those required by photon and read noise alone; beyond it the operator decides."""
+"""Largest ratio of cycles to the number required by photon and read noise; beyond it the operator decides."""
 MOST_FEW = 32
-"""Number of cycles that is always allowed: on a bright star, four times the minimum takes little time."""
+"""Number of cycles always allowed, whatever MOST_TIMES: on a bright star they take little time."""
 CHECK_PART = 0.25
-"""Check cycles for each cycle that R is computed from."""
+"""Number of check cycles relative to the cycles that R is computed from."""
 _LEAST_CHECKS = 3
 _OF_THE_SLEW = 0.8
+"""Largest fraction of the slew limit that a poke uses."""
 SEED = 1
 DELAY_FRAMES = 600
-"""Length of the sequence that measures the delay."""
+"""Length of the sequence that measures the delay, frames."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +55,7 @@ class CalibrationRequest:
         out: output file; completed cycles are kept beside it.
         snr: signal-to-noise ratio to reach; with `cycles`, the one required for a recommendation.
         cycles: number of cycles; None to derive it from `snr`.
-        amplitude_nm: of a mode, wavefront rms; None for the default.
+        amplitude_nm: amplitude of a mode, nm rms of wavefront; None for the default.
         resume: continue after the completed cycles.
         truncate: discard singular values below this fraction of the largest.
         tikhonov: damp singular values below about this fraction of the largest.
@@ -69,12 +72,12 @@ class CalibrationRequest:
 
 
 class Pokes:
-    """The plans of one calibration, at an amplitude `amplitude_nm` of a mode, wavefront rms."""
+    """The poke plans of one calibration; `amplitude_nm` is the amplitude of a mode, nm rms of wavefront."""
 
     def __init__(
         self, config: Configuration, calibration: Calibration, noise_nm: Array, request: CalibrationRequest
     ) -> None:
-        """Choose the amplitude; `noise_nm` is that of one frame (modes,)."""
+        """Choose the amplitude; `noise_nm` (modes,) is the noise of one frame."""
         self._request = request
         self._noise_nm = noise_nm
         self._modes = len(calibration.noll)
@@ -84,11 +87,11 @@ class Pokes:
         self.amplitude_nm = self._amplitude()
 
     def cycle(self, number: int) -> poke_plan.Plan:
-        """The cycle of this number."""
+        """The plan of cycle `number`."""
         return self._cycle(number, self.amplitude_nm)
 
     def delay(self, mode: int) -> poke_plan.Plan:
-        """For the delay: one column, in a closed loop of the wavefront that all columns of a dither add up to."""
+        """The plan for measuring the delay: pokes of one mode; in closed loop with the total rms of a dither."""
         closed = self._request.method == "in-loop"
         amplitude = self.amplitude_nm * float(np.sqrt(self._modes)) if closed else AMPLITUDE_NM["poke"]
         return sequence(min(amplitude, float(self._largest_nm[mode])))
@@ -102,7 +105,7 @@ class Pokes:
         return max(-(-frames // self.cycle(0).per_column), LEAST_CYCLES)
 
     def more_cycles(self, cycles: int, error: float) -> int:
-        """Number of cycles required, given the standard error after `cycles`; no more if out of reach."""
+        """Number of cycles required, given the standard error after `cycles`; `cycles` if too many are required."""
         needed = cycles_for(self._request.snr, cycles, error)
         reachable = self._request.cycles is None and needed <= max(MOST_TIMES * self.cycles(), MOST_FEW)
         return needed if reachable and error * self._request.snr > 1 else cycles
@@ -124,7 +127,7 @@ class Pokes:
         return poke_plan.cycle(shapes, HOLD, SETTLE, rest, backwards=number % 2 == 1)
 
     def _amplitude(self) -> float:
-        """The requested amplitude or the usual one, within the mirror's slew limit."""
+        """The requested or default amplitude, within the mirror's slew limit."""
         requested, method = self._request.amplitude_nm, self._request.method
         if method == "hadamard" and requested is not None and requested > MOST_HADAMARD_NM:
             raise CalibrationError(
@@ -135,7 +138,7 @@ class Pokes:
         steepest = float(np.abs(np.diff(shapes, axis=0)).max())
         largest = _OF_THE_SLEW * self._slew_nm / max(steepest, 1e-9)
         if requested is None:
-            return min(usual_nm(method, self._request.snr), largest)
+            return min(default_nm(method, self._request.snr), largest)
         if requested > largest:
             raise CalibrationError(
                 f"--amplitude {requested:g} nm: from push to pull an actuator would move by more than {_OF_THE_SLEW:g} "
@@ -145,19 +148,19 @@ class Pokes:
 
 
 def sequence(amplitude_nm: float) -> poke_plan.Plan:
-    """The sequence of pokes of one mode, of this amplitude (wavefront rms), for `Player.first_poke`."""
+    """The pokes of one mode for `Player.first_poke`; amplitude in nm rms of wavefront."""
     return poke_plan.dither(1, amplitude_nm, DELAY_FRAMES, 1, SEED)
 
 
 def largest_nm(config: Configuration, calibration: Calibration) -> Array:
-    """(modes,) amplitude at which the mirror goes from push to pull within its slew limit, wavefront rms."""
+    """Largest amplitude (modes,) at which push to pull stays within the slew limit, nm rms of wavefront."""
     slew_nm = min(config.safety.slew_nm, config.mirror.slew_nm)
     steepest = np.abs(calibration.modes_to_actuators).max(axis=0)
     return np.asarray(_OF_THE_SLEW * slew_nm / (2 * np.maximum(steepest, 1e-9)), dtype=np.float64)
 
 
-def usual_nm(method: str, snr: float) -> float:
-    """Amplitude of a mode: halved above `FULL_AMPLITUDE_SNR`, and again for each four times that."""
+def default_nm(method: str, snr: float) -> float:
+    """Default amplitude of a mode, nm rms: halved above `FULL_AMPLITUDE_SNR`, and again for each factor of four."""
     halvings = max(0, ceil(log(snr / FULL_AMPLITUDE_SNR, 4)))
     return float(AMPLITUDE_NM[method] / 2**halvings)
 

@@ -51,11 +51,11 @@ class Recording(NamedTuple):
     """Frames of a probe sequence, counted from the first whose command had a row.
 
     Attributes:
-        sequence: (frames,) rising; lost frames are missing.
-        pixels: (frames, pixels) uint16, DN.
-        steps: (steps,) sequences of the controller's steps, which may be more.
-        commanded: (steps,) whether the frame was used for a command.
-        command_nm: (steps, modes) the loop's own modal command.
+        sequence: frame numbers (frames,), increasing; lost frames are missing.
+        pixels: pixels (frames, pixels), uint16, DN.
+        steps: frame numbers (steps,) of the controller's steps, of which there may be more.
+        commanded: whether the frame of each step was used for a command (steps,).
+        command_nm: the loop's own modal command (steps, modes).
     """
 
     sequence: Long
@@ -65,22 +65,22 @@ class Recording(NamedTuple):
     command_nm: Array
 
     def played(self, table: Array, delay_frames: float) -> Array:
-        """(frames, columns): the table as seen by each exposure."""
+        """The table as seen by each exposure (frames, columns)."""
         return seen(table, _weights(delay_frames), self.steps, self.commanded)[self._steps_of_frames]
 
     def commands(self, delay_frames: float) -> Array:
-        """(frames, modes): the loop's own command as seen by each exposure."""
-        places = np.arange(self.steps[-1] + 1)
-        newest = np.searchsorted(self.steps, places, side="right") - 1  # if a step is missing, the one before held
+        """The loop's own command as seen by each exposure (frames, modes)."""
+        frames = np.arange(self.steps[-1] + 1)
+        newest = np.searchsorted(self.steps, frames, side="right") - 1  # for a missing step, the command before it
         all_of_them = np.ones(len(self.steps), np.bool_)
         return seen(self.command_nm[newest], _weights(delay_frames), self.steps, all_of_them)[self._steps_of_frames]
 
     def usable(self, plan: Plan, delay_frames: float) -> Mask:
-        """(frames,) whether each frame may be used."""
+        """Whether each frame may be used (frames,)."""
         return usable(plan, self.steps, self.commanded, _lag(delay_frames))[self._steps_of_frames]
 
     @property
-    def whole(self) -> bool:
+    def complete(self) -> bool:
         """Whether no frame was lost or refused."""
         return bool(self.commanded.all()) and len(self.sequence) == len(self.steps) == self.steps[-1] + 1
 
@@ -90,12 +90,12 @@ class Recording(NamedTuple):
 
 
 def _lag(delay_frames: float) -> int:
-    """Whole frames from a row's frame to the first exposure that sees it; 0.998 frames count as one."""
+    """Integer part of the delay, frames, at least 1."""
     return int(max(delay_frames, 1.0))
 
 
 def _weights(delay_frames: float) -> Array:
-    """(lags,) fraction of the row of this many frames before that an exposure sees."""
+    """Fraction of the row `lag` frames before that an exposure sees (lags,)."""
     return np.concatenate([[0.0], delay_weights(max(delay_frames, 1.0))])
 
 
@@ -104,8 +104,8 @@ def play(loop: Client, basis_nm: npt.NDArray[np.floating], table: npt.NDArray[np
 
     Args:
         loop: A connection to the controller.
-        basis_nm: (shapes, actuators) nm of surface.
-        table: (frames, shapes).
+        basis_nm: Shapes (shapes, actuators), nm of surface.
+        table: Amplitude of each shape (frames, shapes).
     """
     loop.check_lease()
     with _streams(loop) as (frames, steps):
@@ -114,7 +114,7 @@ def play(loop: Client, basis_nm: npt.NDArray[np.floating], table: npt.NDArray[np
         last = first + len(table) - 1
         end = last + 1 + AFTERWARDS
         images: list[Frame] = []
-        made: list[Step] = []
+        recorded: list[Step] = []
         try:
             image, step = next(frames), next(steps)
             mode = None
@@ -127,16 +127,16 @@ def play(loop: Client, basis_nm: npt.NDArray[np.floating], table: npt.NDArray[np
                     if first <= step.frame_sequence:
                         mode = _check(loop, step, mode, over=step.frame_sequence > last)
                         _check_devices(mirror, step.frame_sequence, first)
-                        made.append(step)
-                        _check_refused(made)
-                        if len(made) % CHECKED == 0:
+                        recorded.append(step)
+                        _check_refused(recorded)
+                        if len(recorded) % CHECKED == 0:
                             loop.check_lease()
                     step = next(steps)
             _check_devices(mirror, step.frame_sequence, first)
         except StopIteration:
             raise BusError("frames stopped: is the camera still running?") from None
         loop.check_lease()
-    return _recording(images, made, first)
+    return _recording(images, recorded, first)
 
 
 def watch(loop: Client, count: int) -> Pixels:
@@ -194,12 +194,12 @@ def _check(loop: Client, step: Step, before: LoopMode | None, *, over: bool) -> 
 
 
 def _commanded(step: Step) -> bool:
-    """Whether the mirror followed the sequence with this step; without a law, the frame need not be used."""
+    """Whether the mirror received the next row with this step; in open loop, also if the frame was not measured."""
     return step.error_nm is not None or (step.mode is not LoopMode.CLOSED and step.reasons[0] in UNMEASURED)
 
 
-def _check_refused(made: list[Step]) -> None:
-    last = made[-MOST_REFUSED:]
+def _check_refused(steps: list[Step]) -> None:
+    last = steps[-MOST_REFUSED:]
     if len(last) == MOST_REFUSED and not any(_commanded(step) for step in last):
         reasons = sorted({reason.name for step in last for reason in step.reasons})
         raise CalibrationError(
@@ -222,20 +222,20 @@ def _check_devices(mirror: MirrorWatch, sequence: int, first: int) -> None:
         raise PlayInterruptedError(f"{why} during the pokes")
 
 
-def _recording(images: list[Frame], made: list[Step], first: int) -> Recording:
-    known = {step.frame_sequence for step in made}
+def _recording(images: list[Frame], steps: list[Step], first: int) -> Recording:
+    known = {step.frame_sequence for step in steps}
     images = [image for image in images if image.sequence in known]
     if not images:
         raise CalibrationError("no frame of the probe sequence was received: is the loop's camera running?")
-    modes = max(step.command_nm.size for step in made)
-    command = np.zeros((len(made), modes))
-    for row, step in enumerate(made):
+    modes = max(step.command_nm.size for step in steps)
+    command = np.zeros((len(steps), modes))
+    for row, step in enumerate(steps):
         command[row] = step.command_nm if step.command_nm.size == modes else command[max(row - 1, 0)]
     return Recording(
         np.array([image.sequence - first for image in images]),
         np.array([image.pixels for image in images]).reshape(len(images), -1),
-        np.array([step.frame_sequence - first for step in made]),
-        np.array([_commanded(step) for step in made]),
+        np.array([step.frame_sequence - first for step in steps]),
+        np.array([_commanded(step) for step in steps]),
         command,
     )
 
@@ -245,10 +245,10 @@ class Player:
     """Sequences of pokes on the mirror of a loop, repeated if frames were lost or a device restarted.
 
     Attributes:
-        loop: to play on.
-        before: has dark, good pixels, reference and the mirror's commands.
-        report: receives the reason if a sequence is repeated.
-        closed: the loop is closed and corrects the pokes.
+        loop: connection to the controller.
+        before: calibration in use: dark, good pixels, reference image and the mirror's commands.
+        report: function that receives the reason if a sequence is repeated.
+        closed: whether the loop is closed and corrects the pokes.
     """
 
     loop: Client
@@ -261,13 +261,13 @@ class Player:
 
         def attempt() -> Recording:
             played = self._play(plan, slice(mode, mode + 1))
-            if not played.whole:
-                raise ValueError("frames were lost or refused while the delay was measured")
+            if not played.complete:
+                raise ValueError("frames were lost or refused during the measurement of the delay")
             return played
 
         recording = self._repeated(
             attempt,
-            "once more",
+            "the delay is measured again",
             f"there were no {len(plan)} consecutive frames without a lost or refused one: see `lowfc doctor`",
         )
         command = recording.command_nm[: len(plan), mode] if self.closed else None
@@ -281,7 +281,7 @@ class Player:
             raise CalibrationError(str(error)) from None
 
     def cycle(self, plan: Plan, delay_frames: float) -> Cycle:
-        """Play a cycle of pokes of all modes; `delay_frames` pass from a poke to its image."""
+        """Play a cycle of pokes of all modes; `delay_frames` is the delay from a poke to its image."""
 
         def attempt() -> Cycle:
             recording = self._play(plan)
@@ -299,11 +299,11 @@ class Player:
     def _normalised(self, recording: Recording) -> tuple[Array, Array]:
         return normalised(recording.pixels, self.before.dark.astype(float), self.before.good.astype(float))
 
-    def _repeated(self, attempt: Callable[[], T], again: str, given_up: str) -> T:
+    def _repeated(self, attempt: Callable[[], T], repeat_text: str, failure_text: str) -> T:
         for _ in range(ATTEMPTS):
             try:
                 return attempt()
             except (PlayInterruptedError, ValueError) as error:
-                why = error
-                self.report(f"{again}: {error}")
-        raise CalibrationError(f"in {ATTEMPTS} attempts {given_up}; the last attempt: {why}")
+                cause = error
+                self.report(f"{repeat_text}: {error}")
+        raise CalibrationError(f"in {ATTEMPTS} attempts {failure_text}; the last attempt: {cause}")

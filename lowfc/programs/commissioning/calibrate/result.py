@@ -24,9 +24,9 @@ from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest, cyc
 from lowfc.programs.commissioning.calibrate.run import CalibrationData, Calibrator
 
 MOST_NOISE = 1.5
-"""Largest ratio of the noise of R to that of the computed R at the same flux; far from flat it is higher."""
+"""Largest ratio of the noise of R to that of the computed R at the same flux; far from flat the ratio is higher."""
 DELAY_APART = 0.1
-"""Largest error of the configured delay without a warning, frames."""
+"""Largest difference between measured and configured delay without a warning, frames."""
 
 
 class Verdict(Result):
@@ -46,7 +46,7 @@ class Verdict(Result):
 
 
 class Figures(Result):
-    """The figures of a calibration; those of each mode are in the order of `noll`."""
+    """Figures of a calibration; figures of each mode are in the order of `noll`."""
 
     method: str = figure("method")
     modes: int = figure("modes")
@@ -68,7 +68,7 @@ class Figures(Result):
 
 
 class CalibrationResult(Verdict, Figures):
-    """A measured calibration with its verdict, or a computed one without."""
+    """A measured calibration with its verdict, or a computed one without a verdict."""
 
     advice: list[str] = figure(exclude=True, default=[])
     not_loaded: bool = figure(exclude=True, default=False)
@@ -77,15 +77,15 @@ class CalibrationResult(Verdict, Figures):
         """Advice and verdict."""
         if "recommended" not in self.model_fields_set:
             return self.advice
-        said = [
+        verdict = [
             "verdict: good" if self.recommended else "verdict: NOT RECOMMENDED",
-            *(f"  {one}" for one in self.faults),
+            *(f"  {fault}" for fault in self.faults),
         ]
-        return [*self.advice, *said, *(["not loaded"] if self.not_loaded else [])]
+        return [*self.advice, *verdict, *(["not loaded"] if self.not_loaded else [])]
 
 
 class Comparison(Result):
-    """How two calibrations differ; what is of each mode is in the order of `noll`."""
+    """Differences of two calibrations; figures of each mode are in the order of `noll`."""
 
     modes: int = figure("modes")
     noll: list[int] = figure("mode", form="Z{}", column=True)
@@ -100,7 +100,7 @@ class Comparison(Result):
 
 
 def rejected_of(out: Path) -> Path:
-    """Path of a calibration that is not recommended, so that an existing one is kept."""
+    """Path of a calibration that is not recommended; it differs from `out`, so that an existing file is kept."""
     return out.with_name(f"{out.stem}.rejected{out.suffix}")
 
 
@@ -117,10 +117,10 @@ def finished(
     file = rejected_of(request.out) if verdict.faults else request.out
     found = result_of(config, made, quality, request.method, file, data, computed, verdict)
     calibration_file.save(made, file)
-    counted = configured_delay(config)
-    if abs(data.delay.delay_frames - counted) > DELAY_APART:
+    configured = configured_delay(config)
+    if abs(data.delay.delay_frames - configured) > DELAY_APART:
         found.advice.append(
-            f"warning: the loop is configured for a delay of {counted:g} frames; set control.delay_frames = "
+            f"warning: the configured delay is {configured:g} frames: set control.delay_frames = "
             f"{max(data.delay.delay_frames, 1):.2f}"
         )
     return made, found
@@ -168,7 +168,7 @@ def measured_calibration(
         flux_dn=found.flux_dn,
         estimator="+".join(names),
         operator_hash="",
-        actuators_to_modes=single(_seen_of_actuators(config, before, made.matrix)),
+        actuators_to_modes=single(_actuators_to_modes(config, before, made.matrix)),
     )
     return identified(calibration), made
 
@@ -225,25 +225,25 @@ def configured_delay(config: Configuration) -> float:
 
 
 def judge(
-    asked_snr: float, cycles: int, error: Array, check: Check, noise_ratio: Array | None, noll: tuple[int, ...]
+    required_snr: float, cycles: int, error: Array, check: Check, noise_ratio: Array | None, noll: tuple[int, ...]
 ) -> Verdict:
     """Judge a reconstructor.
 
     Args:
-        asked_snr: required signal-to-noise ratio.
-        cycles: number of cycles that it was computed from.
-        error: (modes,) standard error of the elements of each row of R H.
-        check: its cross-talk on separate frames.
-        noise_ratio: (modes,) its noise per frame over that of the computed one; None without a computed one.
+        required_snr: Required signal-to-noise ratio.
+        cycles: Number of cycles that the reconstructor was computed from.
+        error: Standard error of the elements of each row of R H (modes,).
+        check: Cross-talk on separate frames.
+        noise_ratio: Noise per frame relative to the computed reconstructor (modes,); None without a computed one.
         noll: Noll index of each mode.
     """
     reached = 1 / max(float(error.max()), 1e-300)
-    rms, largest = MOST_RMS / asked_snr, MOST_LARGEST / asked_snr
+    rms, largest = MOST_RMS / required_snr, MOST_LARGEST / required_snr
     faults = []
-    if reached < asked_snr:
-        needed = cycles_for(asked_snr, cycles, float(error.max()))
+    if reached < required_snr:
+        needed = cycles_for(required_snr, cycles, float(error.max()))
         faults.append(
-            f"signal-to-noise ratio {reached:.3g} in Z{noll[int(error.argmax())]}, {asked_snr:g} required: find the "
+            f"signal-to-noise ratio {reached:.3g} in Z{noll[int(error.argmax())]}, {required_snr:g} required: find the "
             f"disturbance of this mode, or take about {needed} cycles (the same command with --resume --cycles "
             f"{needed})"
         )
@@ -260,7 +260,7 @@ def judge(
             "wavefront near its zero point?"
         )
     return Verdict(
-        snr=asked_snr,
+        snr=required_snr,
         snr_reached=reached,
         check_cycles=check.cycles,
         check_cross_talk_rms=check.rms,
@@ -275,7 +275,7 @@ def judge(
 
 
 def comparison(one: Calibration, other: Calibration) -> Comparison:
-    """How two calibrations differ; what is of each mode is in the order of `noll`."""
+    """Differences of two calibrations; figures of each mode are in the order of `noll`."""
     if not comparable(one, other):
         raise CalibrationError(
             f"they cannot be compared: {one.shape[0]} x {one.shape[1]} pixels and modes {_span(one)} against "
@@ -300,10 +300,10 @@ def comparison(one: Calibration, other: Calibration) -> Comparison:
     )
 
 
-def _seen_of_actuators(config: Configuration, before: Calibration, matrix: Array) -> Array:
-    """Z (modes, actuators): measured for the commands, from the optical model for other shapes."""
+def _actuators_to_modes(config: Configuration, before: Calibration, matrix: Array) -> Array:
+    """Z (modes, actuators): measured for the modal commands, from the optical model for other shapes."""
     commands = before.modes_to_actuators.astype(np.float64)
-    measured = np.asarray(np.linalg.pinv(commands))  # shapes that are no commands pass for some
+    measured = np.asarray(np.linalg.pinv(commands))  # without a model: other shapes are projected on the commands
     optics = factory.twin(config, None, lambda _: None)
     light = twin_reference(optics)
     if light.shape != before.shape:

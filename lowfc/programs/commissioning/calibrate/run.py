@@ -40,11 +40,11 @@ from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest, Pok
 from lowfc.programs.commissioning.calibrate.recording import Player, Report, check_size
 
 _LIKE = 0.3
-"""Correlation of the first pokes' image with the calibration in use below which a warning is printed."""
+"""Smallest correlation of the first poke's image with the calibration in use without a warning."""
 
 
 class CalibrationData(NamedTuple):
-    """The measured data."""
+    """Measured response and delay."""
 
     measured: Measured
     delay: Delay
@@ -54,11 +54,11 @@ class Calibrator:
     """One calibration of a running loop; afterwards the mirror returns to its shape.
 
     Attributes:
-        config: the loop's.
-        before: the calibration in use.
-        noise_nm: (modes,) of one frame, with that calibration.
+        config: configuration of the loop.
+        before: calibration in use.
+        noise_nm: noise of one frame with that calibration (modes,), nm rms.
         pokes: the probe sequences.
-        kept: completed cycles, for --resume.
+        kept: number of completed cycles stored for --resume.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class Calibrator:
             loop: A connection to the controller.
             request: The requested calibration.
             report: Receives messages for the user.
-            progress: Receives frames done and total.
+            progress: Receives the number of frames done and in total.
             computed: The computed calibration, used for R if its pixels are the loop's.
         """
         self._loop = loop
@@ -96,12 +96,12 @@ class Calibrator:
             "amplitude_nm": self.pokes.amplitude_nm,
             "calibration": self.before.id,
         }
-        self._begun = go_on(partial_of(request.out), self._what) if request.resume else None
-        self.kept = self._begun.cycles if self._begun else 0
+        self._resumed = resumed(partial_of(request.out), self._what) if request.resume else None
+        self.kept = self._resumed.cycles if self._resumed else 0
 
     @contextlib.contextmanager
-    def holding(self) -> Iterator[None]:
-        """Context with the loop in the mode required by the method; restores the mode."""
+    def required_mode(self) -> Iterator[None]:
+        """Context with the loop in the mode that the method requires; restores the mode at the end."""
         state = self._loop.status().state
         mode = state.mode if state is not None else wire.LOOP_MODE_OPEN
         if mode not in (wire.LOOP_MODE_OPEN, wire.LOOP_MODE_CLOSED):
@@ -127,7 +127,7 @@ class Calibrator:
         self._loop.close_loop()
 
     def run(self, delay: Delay | None = None) -> CalibrationData:
-        """Check that pokes are detected, measure the delay unless known, then the response."""
+        """Measure the delay unless known, which checks that pokes are detected, then the response."""
         delay = self.delay() if delay is None else delay
         return CalibrationData(self._cycles(delay), delay)
 
@@ -145,12 +145,12 @@ class Calibrator:
 
     @property
     def _best(self) -> int:
-        """Index of the mode with the lowest noise; tip and tilt, the most disturbed modes, only without others."""
+        """Index of the mode with the lowest noise; not tip or tilt, the most disturbed, unless there is no other."""
         tilt = np.array([index in TIP_TILT for index in self.before.noll])
         return int(np.where(tilt & ~tilt.all(), np.inf, self.noise_nm).argmin())
 
     def delay(self) -> Delay:
-        """The delay from poke to image, measured with the mode of least noise."""
+        """Measure the delay from poke to image with the mode of lowest noise."""
         mode = self._best
         plan = self.pokes.delay(mode)
         self._show("detecting pokes", max(self.pokes.cycles(), self.kept), self.kept)
@@ -180,10 +180,10 @@ class Calibrator:
     def _cycles(self, delay: Delay) -> Measured:
         pokes, request = self.pokes, self._request
         path = partial_of(request.out)
-        if self._begun is None:
+        if self._resumed is None:
             sums = Sums.none(self._initial(delay))
         else:
-            sums = self._begun
+            sums = self._resumed
             self._report(f"continuing after {counted(sums.cycles, 'cycle')}")
         needed = max(pokes.cycles(), sums.cycles)
         self._report(
@@ -215,12 +215,12 @@ class Calibrator:
         return f"about {self.pokes.frames(needed, done) / self.config.camera.rate_hz:.0f} s to go"
 
     def _initial(self, delay: Delay) -> Initial:
-        """The prior reconstructor of the measured one: the computed one, unless the one in use sees more."""
+        """The initial R of the fit: the computed one, unless the one in use measures pokes with less noise."""
         before = self.before
-        of = [each for each in (self._computed, before) if each is not None and comparable(each, before)]
-        candidates = [Initial(each.reconstructor.astype(np.float64) * before.good, each.estimator) for each in of]
-        whole = [each for each in candidates if np.linalg.matrix_rank(each.matrix) == len(before.noll)]
-        if not whole:
+        known = [each for each in (self._computed, before) if each is not None and comparable(each, before)]
+        candidates = [Initial(each.reconstructor.astype(np.float64) * before.good, each.estimator) for each in known]
+        full_rank = [each for each in candidates if np.linalg.matrix_rank(each.matrix) == len(before.noll)]
+        if not full_rank:
             raise CalibrationError(
                 "neither the optical model nor the calibration in use distinguishes all modes on these pixels, but R "
                 "requires one that does: `lowfc calibrate align` computes it for this sensor"
@@ -231,7 +231,7 @@ class Calibrator:
             before.flux_dn * camera.gain_e_per_dn / camera.em_gain,
             factory.equivalent_read_noise_e(camera),
         )
-        return initial_of(whole, delay.picture, self._best, variance)
+        return initial_of(full_rank, delay.picture, self._best, variance)
 
 
 def partial_of(out: Path) -> Path:
@@ -247,20 +247,20 @@ def keep(path: Path, sums: Sums, what: dict[str, Any]) -> None:
     write_whole(path, stream.getvalue())
 
 
-def go_on(path: Path, what: dict[str, Any]) -> Sums:
+def resumed(path: Path, what: dict[str, Any]) -> Sums:
     """Read completed cycles; DataFileError if there are none, the file is damaged or of another calibration."""
-    before, sums = begun(path)
+    before, sums = stored(path)
     for key, value in what.items():
         if before.get(key) != value:
             raise DataFileError(
-                f"{path} is of another calibration: its {key} is {before.get(key)}, now it is {value}; remove the "
+                f"{path} is of another calibration: {key} is {before.get(key)} in the file, now {value}; remove the "
                 "file, or omit --resume"
             )
     return sums
 
 
-def begun(path: Path) -> tuple[dict[str, Any], Sums]:
-    """Method, amplitude and calibration of the completed cycles, and these cycles."""
+def stored(path: Path) -> tuple[dict[str, Any], Sums]:
+    """Read the completed cycles, with the method, amplitude and calibration that they are of."""
     if not path.is_file():
         raise DataFileError(f"nothing to resume: there is no {path}; omit --resume")
     try:

@@ -1,4 +1,4 @@
-"""The tasks of `lowfc calibrate` on a running loop and files; each returns its typed result."""
+"""The tasks of `lowfc calibrate` on a running loop or files; each returns its result."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -64,7 +64,7 @@ class ReferenceResult(Result):
 
 
 def poked(request: CalibrationRequest, run: str | None, *, load: bool) -> CalibrationResult:
-    """Calibrate a running loop and write the file at the end."""
+    """Calibrate a running loop with pokes; write the file at the end."""
     require_folder(request.out)
     console = Console(stderr=True)
     report = reporter(console)
@@ -76,7 +76,7 @@ def poked(request: CalibrationRequest, run: str | None, *, load: bool) -> Calibr
         progress = lease.expecting(progress, configuration_of(loop).camera.rate_hz)
         calibrator = Calibrator(loop, request, report, progress, computed)
         try:
-            with calibrator.holding():
+            with calibrator.required_mode():
                 made, result = finished(calibrator, request, calibrator.run(), computed)
                 if result.recommended:
                     partial_of(request.out).unlink(missing_ok=True)
@@ -136,7 +136,7 @@ def zero_point(config: Configuration, text: str) -> tuple[str, Wavefront]:
     """The wavefront of --at: modes as in 4=15,7=-10, Noll index = nm rms, or a file as for `lowfc ctl channel`.
 
     Returns:
-        Its name in a calibration, and the wavefront.
+        The wavefront's name in a calibration, and the function that computes it.
     """
     if "=" not in text:
         shape = shape_of(config, "--at", text)
@@ -166,14 +166,14 @@ def _modes(text: str) -> dict[int, float]:
 
 
 def darkened(out: Path, run: str | None, frames: int, file: Path | None, *, load: bool) -> DarkResult:
-    """The calibration in use with a new dark and mask, from the loop's frames or a cube."""
+    """Write the calibration in use with a new dark and mask, from the loop's frames or a cube."""
     require_folder(out)
     with Client(run) as loop, _in_use(loop) as (before, noise):
         cube = watch(loop, frames) if file is None else images(file)
         if file is None:
             check_size(cube.shape[1:], before)
         elif cube.shape[1:] != before.shape:
-            raise DataFileError(f"{file}: its frames are {cube.shape[1:]}, those of the calibration {before.shape}")
+            raise DataFileError(f"{file}: its frames have {cube.shape[1:]} pixels, the calibration {before.shape}")
         found = dark_of(cube.reshape(len(cube), -1))
         if file is None:
             check_dark(found.dark_dn, before.reference.astype(np.float64), before.flux_dn)
@@ -184,12 +184,12 @@ def darkened(out: Path, run: str | None, frames: int, file: Path | None, *, load
 
 
 def referenced(out: Path, run: str | None, frames: int, *, load: bool) -> ReferenceResult:
-    """The calibration in use with the present image as its reference."""
+    """Write the calibration in use with the present image as its reference."""
     require_folder(out)
     with Client(run) as loop, _in_use(loop) as (before, noise):
-        taken = watch(loop, frames)
-        check_size(taken.shape[1:], before)
-        pixels = taken.reshape(frames, -1)
+        cube = watch(loop, frames)
+        check_size(cube.shape[1:], before)
+        pixels = cube.reshape(frames, -1)
         light, flux = normalised(pixels, before.dark.astype(np.float64), before.good.astype(np.float64))
         image = light.mean(axis=0)
         made = written(with_reference(before, image, float(flux.mean()), *noise), out, loop if load else None)
@@ -200,7 +200,7 @@ def referenced(out: Path, run: str | None, frames: int, *, load: bool) -> Refere
 
 @contextlib.contextmanager
 def _in_use(loop: Client) -> Iterator[tuple[Calibration, tuple[float, float]]]:
-    """The calibration in use, and the camera's read noise of a pixel, e-, and electrons per DN."""
+    """The calibration in use; the camera's read noise per pixel, e-, and gain, e-/DN."""
     camera = factory.detector(configuration_of(loop))
     noise = factory.equivalent_read_noise_e(camera), camera.gain_e_per_dn / camera.em_gain
     try:
@@ -225,7 +225,7 @@ def images(file: Path) -> Array:
 
 
 def reporter(console: Console) -> Report:
-    """Print a line, warnings in yellow."""
+    """Function that prints a line, warnings in yellow."""
 
     def report(text: str) -> None:
         style = "yellow" if text.startswith("warning") else None

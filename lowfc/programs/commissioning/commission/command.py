@@ -1,4 +1,4 @@
-"""The command `lowfc commission`: options only."""
+"""The command `lowfc commission`: command-line arguments."""
 
 import sys
 from pathlib import Path
@@ -53,8 +53,8 @@ def commission(
         raise ConfigurationError("--dark FILE and --no-dark exclude each other: use one")
     if dark is None and not no_dark and not resume and not sys.stdin.isatty():
         raise ConfigurationError(
-            "somebody must block the star for a dark, and there is no terminal to ask on: give dark frames with --dark "
-            "FILE, or use the camera's bias with --no-dark"
+            "without a terminal nobody can be asked to block the star for a dark: give dark frames with --dark FILE, "
+            "or use the camera's bias with --no-dark"
         )
     if out.exists() and not (resume or force):
         raise DataFileError(f"{out} already exists; use another name (--out), or replace it with --force")

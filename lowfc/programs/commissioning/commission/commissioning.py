@@ -26,7 +26,7 @@ from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.commissioning.calibrate.pokes import LEAST_SNR, CalibrationRequest, Pokes
 from lowfc.programs.commissioning.calibrate.recording import CHECKED, Player, Report, watch
 from lowfc.programs.commissioning.calibrate.result import finished
-from lowfc.programs.commissioning.calibrate.run import Calibrator, begun, partial_of
+from lowfc.programs.commissioning.calibrate.run import Calibrator, partial_of, stored
 from lowfc.programs.commissioning.calibrate.tasks import images
 from lowfc.programs.commissioning.commission.first_calibration import aligned, first_delay, linear_nm, poked
 from lowfc.programs.commissioning.commission.first_light import (
@@ -64,7 +64,7 @@ class Commission:
 
 
 def first_of(out: Path) -> Path:
-    """File of the first calibration until a better one is made."""
+    """File of the provisional calibration until the final one is written."""
     return out.with_name(f"{out.name}.first.fits")
 
 
@@ -81,7 +81,7 @@ class Commissioning:
         progress: Counted,
         confirm: Callable[[str], None],
     ) -> None:
-        """Take what it is made with."""
+        """Commission the loop of `loop`; `computed` is the calibration of the optical model."""
         self._loop, self._config, self._computed, self._options = loop, config, computed, options
         self._report, self._progress, self._confirm = report, progress, confirm
         self._figures: dict[str, Any] = {}
@@ -89,7 +89,7 @@ class Commissioning:
         self._judged = False
 
     def run(self) -> tuple[dict[str, Any], str]:
-        """All steps; the figures, and the text for people."""
+        """Carry out all steps; return the figures, and the text for people."""
         options, kept = self._options, first_of(self._options.out)
         if options.resume and not kept.is_file():
             if options.out.is_file():
@@ -102,10 +102,10 @@ class Commissioning:
         try:
             return self._steps_of(kept)
         except BaseException:
-            self._report(self._left(before, kept))
+            self._report(self._how_to_continue(before, kept))
             raise
 
-    def _left(self, before: Calibration | None, kept: Path) -> str:
+    def _how_to_continue(self, before: Calibration | None, kept: Path) -> str:
         """Text after a commissioning that ended early: the calibration in use, and how to continue."""
         if self._judged:
             return (
@@ -144,11 +144,11 @@ class Commissioning:
         delay = self._delay if self._delay is not None else first_delay(player, config)
         resume = resumed and partial_of(options.out).is_file()
         if resume:
-            amplitude_nm = float(begun(partial_of(options.out))[0]["amplitude_nm"])
+            amplitude_nm = float(stored(partial_of(options.out))[0]["amplitude_nm"])
         else:
             self._step("poke amplitude")
-            usual_nm = Pokes(config, first, factory.frame_noise_nm(config, first), self._request()).amplitude_nm
-            amplitude_nm = linear_nm(player, config, delay, usual_nm)
+            default_nm = Pokes(config, first, factory.frame_noise_nm(config, first), self._request()).amplitude_nm
+            amplitude_nm = linear_nm(player, config, delay, default_nm)
         self._step("response")
         request = self._request(amplitude_nm, resume=resume)
         calibrator = Calibrator(self._loop, request, self._report, self._progress, self._computed)
@@ -197,8 +197,8 @@ class Commissioning:
 
     def _first(self) -> Calibration:
         self._step("camera")
-        seen = list(self._loop.frames(LOOKED_AT))
-        camera = camera_fits(self._config, self._loop.camera_state(), seen, self._report)
+        images_seen = list(self._loop.frames(LOOKED_AT))
+        camera = camera_fits(self._config, self._loop.camera_state(), images_seen, self._report)
         self._step("dark and bad pixels")
         options, sensor = self._options, without_dark(camera)
         if options.dark is not None:
@@ -252,7 +252,7 @@ class Commissioning:
             if isinstance(error, ValueError):
                 raise CalibrationError(f"the residual cannot be measured: {error}") from None
             raise
-        return f"{text}\nmeasured in the closed loop: {measured:.3g} nm rms, {measured / predicted:.2f} times that"
+        return f"{text}\nmeasured in closed loop: {measured:.3g} nm rms, {measured / predicted:.2f} of the prediction"
 
     def _steps(self, frames: int, mode: LoopMode = LoopMode.OPEN) -> Steps:
         steps: list[Step] = []
@@ -260,8 +260,8 @@ class Commissioning:
         for step in self._loop.steps():
             if step.mode is mode:
                 steps.append(step)
-            elif steps:  # those before are of the mode before
-                self._loop.check_lease()  # which says who ended it
+            elif steps:  # the first steps may still be of the previous mode
+                self._loop.check_lease()  # its error names who ended the lease
                 raise CalibrationError(f"the loop went from {mode.in_words} to {step.mode.in_words}")
             if len(steps) >= frames:
                 break

@@ -1,4 +1,4 @@
-"""A first calibration, from the image of one poke and the computed response, or from pokes of all modes."""
+"""The provisional calibration: from the image of one poke and the computed response, or from pokes of all modes."""
 
 from dataclasses import replace
 from typing import Any
@@ -25,10 +25,11 @@ MAX_FIRST_NM = 32.0
 MAX_MISFIT = 0.35
 """Largest residual of the image after the fit of the computed one; above it the sensor is not the configured one."""
 MIN_LIKENESS = 0.5
-"""Least correlation of a poke's image with the computed one; below it the sensor is not the configured one."""
+"""Smallest correlation of a poke's image with the computed one; below it the sensor is not the configured one."""
 CYCLES = 12
 MAX_NOT_LINEAR = 0.1
-_SURE = 3.0
+"""Largest relative change of the gain between full and half amplitude."""
+_SURE = 3.0  # standard errors
 
 
 def first_delay(player: Player, config: Configuration) -> Delay:
@@ -114,10 +115,10 @@ def poked(player: Player, config: Configuration, poke: Delay) -> Calibration:
     return identified(made)
 
 
-def linear_nm(player: Player, config: Configuration, delay: Delay, usual_nm: float) -> float:
+def linear_nm(player: Player, config: Configuration, delay: Delay, default_nm: float) -> float:
     """Amplitude at which all modes may be poked at once, nm rms of each.
 
-    It is the usual one, halved where single pokes and those of half their amplitude show a sensor that is not linear.
+    It is the default, halved if single pokes at full and half amplitude show that the sensor is not linear.
     """
     first = player.before
     R, modes = first.reconstructor.astype(np.float64), len(first.noll)
@@ -129,13 +130,13 @@ def linear_nm(player: Player, config: Configuration, delay: Delay, usual_nm: flo
             plan = _poke_cycle(modes, amplitude_nm, again)
             gains[level, again] = np.diag(R @ player.cycle(plan, delay.delay_frames).response)
     off = np.abs(gains[0].mean(axis=0) / gains[1].mean(axis=0) - 1)
-    # of the mean of two, doubled: two amplitudes; a mode's own where it is more than most, as of tip and tilt
+    # variance of the mean of two, times two amplitudes; at least the average over modes (tip and tilt scatter more)
     squares = np.square(np.diff(gains, axis=1)).mean(axis=(0, 1)) / 2
     error = np.sqrt(np.maximum(squares, squares.mean()))
     worst = int((off - _SURE * error).argmax())
-    chosen_nm = usual_nm / 2 if off[worst] > MAX_NOT_LINEAR + _SURE * error[worst] else usual_nm
+    chosen_nm = default_nm / 2 if off[worst] > MAX_NOT_LINEAR + _SURE * error[worst] else default_nm
     player.report(
-        f"pokes of {top_nm:.3g} nm and of half of it answer alike within {off[worst]:.1%} (+- {error[worst]:.1%}; "
+        f"the gains at {top_nm:.3g} nm and at half of that agree within {off[worst]:.1%} (+- {error[worst]:.1%}; "
         f"Z{first.noll[worst]}): {chosen_nm:.3g} nm in each mode"
     )
     return chosen_nm

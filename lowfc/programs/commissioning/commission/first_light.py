@@ -22,18 +22,18 @@ from lowfc.programs.commissioning.conformance.settings import agreement_checks
 
 RATE_APART = 0.05
 """Largest relative difference between the rate from the frames' times and the rate in the camera's settings."""
-_FULL = 0.9
+_FULL = 0.9  # brightest pixel allowed, as a fraction of saturation
 _NS = 1e9
 
 
 class Sensor(NamedTuple):
-    """A camera without light.
+    """Settings, dark and bad pixels of a camera.
 
     Attributes:
-        camera: its settings.
-        dark_dn: (pixels,) mean.
-        good: (pixels,) 1 where a pixel is used, else 0.
-        measured: Whether the dark was measured.
+        camera: settings of the camera.
+        dark_dn: mean dark (pixels,), DN.
+        good: 1 for each pixel used, 0 otherwise (pixels,).
+        measured: whether the dark was measured.
     """
 
     camera: CameraSettings
@@ -58,9 +58,7 @@ def camera_fits(
         faults.append(f"size: the camera reports {state.rows} x {state.columns} pixels, its frames have {sizes}")
     period_ns = float(np.median(np.diff([image.time_ns for image in images])))
     if not (state.period_ns and period_ns > 0):
-        faults.append(
-            f"times: the camera's period_ns is {state.period_ns}, the times of its frames are {period_ns:g} ns apart"
-        )
+        faults.append(f"times: the camera's period_ns is {state.period_ns}, but its frames are {period_ns:g} ns apart")
     elif abs(period_ns / state.period_ns - 1) > RATE_APART:
         faults.append(
             f"rate: the camera reports {_NS / state.period_ns:.5g} Hz, its frames arrive at {_NS / period_ns:.5g} Hz"
@@ -111,7 +109,7 @@ def referenced(sensor: Sensor, frames: npt.NDArray[np.number], computed: Calibra
     noise_dn = float(np.std(frames.reshape(len(frames), -1).astype(np.float64) @ sensor.good)) / np.sqrt(len(frames))
     if not flux_dn > max(10 * noise_dn, 0.0):
         raise CalibrationError(
-            f"no more flux on the sensor than in the dark: {flux_dn:.4g} DN in total, with a noise of "
+            f"no flux above the dark: {flux_dn:.4g} DN in total, with a noise of "
             f"{noise_dn:.2g} DN; is the star blocked now, or was it not blocked for the dark?"
         )
     reference = image * sensor.good / flux_dn

@@ -27,4 +27,4 @@ def device_checks(name: str, config: Configuration) -> Iterator[Check]:
         yield ok(f"{driver.__module__}:{driver.__qualname__}")._replace(name=what)
         for need in getattr(driver, "needs", lambda _: ())(options):
             found = need.found
-            yield judged(f"{what}: {need.what}", "", bool(found), found or "it is not there", need.advice)
+            yield judged(f"{what}: {need.what}", "", bool(found), found or "not found", need.advice)

@@ -16,9 +16,9 @@ class Facts:
 
     Attributes:
         host: the host, as reported by its kernel.
-        config: of the loop.
-        trial: granted measures and measurements, or the error if the trial failed.
-        busy: other processes during the measurement, as `Host.busy`.
+        config: configuration of the loop.
+        trial: granted real-time measures and wake-up latencies, or the error if the trial failed.
+        busy: other processes during the measurement, as from `Host.busy`.
     """
 
     host: Host
@@ -28,7 +28,7 @@ class Facts:
 
     @property
     def tried(self) -> Trial:
-        """Granted measures and measurements; OSError if the trial failed."""
+        """Granted real-time measures and wake-up latencies; OSError if the trial failed."""
         if isinstance(self.trial, OSError):
             raise self.trial
         return self.trial
@@ -41,7 +41,7 @@ class Facts:
 
     @property
     def bytes_per_s(self) -> float:
-        """Of frames, commands and the mirror's states; all else that is sent for a frame is small."""
+        """Traffic of frames, commands and mirror states, bytes per second; other messages are small."""
         sizes = payload_bytes(self.config)
         return (sizes[FRAME] + sizes[COMMAND] + sizes[MIRROR_STATE]) * self.config.camera.rate_hz
 

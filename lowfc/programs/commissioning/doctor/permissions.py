@@ -14,7 +14,7 @@ _RULE = f"""# The loop's processes keep idle processors awake (realtime.disable_
 SUBSYSTEM=="misc", KERNEL=="cpu_dma_latency", GROUP="{GROUP}", MODE="0660"
 """
 FILES = {"etc/security/limits.d/90-lowfc.conf": _LIMITS, "etc/udev/rules.d/90-lowfc-user.rules": _RULE}
-"""By path below the root of the host; of other names than those of `deploy`, which --undo leaves alone."""
+"""Contents by path; the names differ from those in `deploy`, which --undo does not remove."""
 
 
 def shown(root: Path) -> str:
@@ -74,6 +74,6 @@ def _run(*words: str) -> str:
     """Run a command of the host; return it, with its error message if it failed."""
     program = shutil.which(words[0], path=f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin")
     if program is None:
-        return f"{' '.join(words)}: not on this host, do it by hand"
+        return f"{' '.join(words)}: command not found on this host; do it by hand"
     run = subprocess.run([program, *words[1:]], capture_output=True, text=True, check=False)  # noqa: S603  # as shown
     return " ".join(words) + (f": {run.stderr.strip()}" if run.returncode else "")

@@ -15,7 +15,7 @@ from lowfc.programs.commissioning.doctor.facts import Facts
 from lowfc.programs.core.recording.volume import bytes_per_s, configured_selection
 
 CHECKS: Table[Facts] = Table()
-"""The docstring of each says what it looks at; docs/howto/doctor.md also says when it warns."""
+"""The docstring of each check describes its subject; docs/howto/doctor.md also describes its warning."""
 
 _STALL_S = 0.1
 _OPEN_FILES = 256
@@ -70,8 +70,8 @@ def _blas(facts: Facts) -> Check:
     """Linear algebra of numpy, and whether it can be limited to one thread, as in the loop."""
     names = ", ".join(f"{name}, {threads} threads" for name, threads in sorted(_blas_threads().items()))
     with threadpool_limits(limits=1):
-        held = _blas_threads()
-    if held and max(held.values()) == 1:
+        limited = _blas_threads()
+    if limited and max(limited.values()) == 1:
         return ok(f"{names}; the loop limits it to one")
     return warning(names or f"none that threadpoolctl knows, in numpy {np.__version__}")
 
@@ -79,11 +79,11 @@ def _blas(facts: Facts) -> Check:
 @CHECKS.check("control step")
 def _control_step(facts: Facts) -> Check:
     """Implementation of the control step, `realtime.kernel`: numpy, or the fused step, which needs the extra `fast`."""
-    there = compiled.available()
+    available = compiled.available()
     if facts.config.realtime.kernel == FUSED:
-        return ok("the fused step") if there else warning("numpy, not the fused step", compiled.missing())
-    advice = 'realtime.kernel = "fused"' if there else compiled.missing()
-    return note("numpy", advice, "a frame takes longer to become a command: see `lowfc latency --kernel both`")
+        return ok("the fused step") if available else warning("numpy, not the fused step", compiled.missing())
+    advice = 'realtime.kernel = "fused"' if available else compiled.missing()
+    return note("numpy", advice, "a longer latency from frame to command: see `lowfc latency --kernel both`")
 
 
 @CHECKS.check("socket buffers")
@@ -115,11 +115,11 @@ def _disk(facts: Facts) -> Check:
     section, rate_hz = facts.config.recorder, facts.config.camera.rate_hz
     folder = Path(section.folder)
     free_bytes, writable = facts.host.disk(folder)
-    grows = bytes_per_s(facts.config, configured_selection(facts.config))
-    lasts_s = max(0.0, free_bytes - section.min_free_mb * 1e6) / grows
+    growth = bytes_per_s(facts.config, configured_selection(facts.config))
+    lasts_s = max(0.0, free_bytes - section.min_free_mb * 1e6) / growth
     detail = (
         f"{folder.absolute()}: {free_bytes / 1e9:.1f} GB free, {lasts_s / 3600:.1f} h of "
-        f"{grows * 3.6e-6:.1f} GB an hour at {rate_hz:g} Hz"
+        f"{growth * 3.6e-6:.1f} GB an hour at {rate_hz:g} Hz"
     )
     if not writable:
         return warning(f"{detail}; not writable", "set recorder.folder to a writable folder", "nothing is recorded")
@@ -152,10 +152,10 @@ def _certificates(facts: Facts) -> Check:
     network = facts.config.network
     if not network.router:
         return ok("none needed: the configuration names no router")
-    said = ending_certificates(network, datetime.datetime.now(datetime.UTC))
-    if not said:
+    ending = ending_certificates(network, datetime.datetime.now(datetime.UTC))
+    if not ending:
         return ok(f"all in {network.certificates} are valid for more than {WARN_DAYS} days")
-    return warning("; ".join(said))
+    return warning("; ".join(ending))
 
 
 def _blas_threads() -> dict[str, int]:

@@ -13,11 +13,11 @@ from lowfc.programs.commissioning.checks import Check, Table, note, ok, warning
 from lowfc.programs.commissioning.doctor.facts import Facts, ranges
 
 CHECKS: Table[Facts] = Table()
-"""The docstring of each says what it looks at; docs/howto/doctor.md also says when it warns."""
+"""The docstring of each check describes its subject; docs/howto/doctor.md also describes its warning."""
 
 PROCESSES = ("camera", "controller", "mirror", "recorder")
 
-_IN_LOOP = 3  # of them
+_IN_LOOP = 3  # number of these processes that are in the control loop
 _SLOW_EXIT_US = 50
 _SLOW_SOURCES = ("hpet", "acpi_pm", "jiffies", "refined-jiffies", "pit")
 _SLOW_READING_NS = 1000
@@ -191,7 +191,7 @@ def _virtualisation(facts: Facts) -> Check:
     flags = re.search(r"^flags\s*:(.*)$", facts.host.text("proc/cpuinfo"), re.MULTILINE)
     kind, stolen = read("sys/hypervisor/type"), facts.host.stolen_share()
     if not kind and flags is None:
-        raise ValueError("this processor's /proc/cpuinfo does not say whether there is a hypervisor")
+        raise ValueError("this processor's /proc/cpuinfo does not show whether there is a hypervisor")
     if not kind and flags is not None and "hypervisor" not in flags[1].split():
         return ok("none")
     machine = [read(f"sys/class/dmi/id/{name}") for name in ("sys_vendor", "product_name")]
@@ -283,6 +283,6 @@ def _load(facts: Facts) -> Check:
     """Load average, and other processes that were busy during the measurement."""
     load, cpus = facts.host.load(), len(facts.host.usable_cpus())
     busy = [(name, share) for name, share in facts.busy if share > _BUSY]
-    who = ", ".join(f"{name} {100 * share:.0f} %" for name, share in busy[:_BUSY_SHOWN]) or "nobody"
-    detail = f"{load:.2f} in the last minute, {cpus} processors; busy now: {who}"
+    names = ", ".join(f"{name} {100 * share:.0f} %" for name, share in busy[:_BUSY_SHOWN]) or "none"
+    detail = f"{load:.2f} in the last minute, {cpus} processors; busy now: {names}"
     return ok(detail) if not busy and load <= cpus else warning(detail)

@@ -28,23 +28,23 @@ from lowfc.optics.chain.added_contrast import ModalContrast
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.logs.what_if.run import LoggedRun
 
-_SETTLING_S = 0.5  # after the loop was closed
+_SETTLING_S = 0.5  # time excluded after the loop was closed
 
 
 @dataclass(frozen=True, slots=True)
 class Telemetry:
-    """Modes of a run, nm rms of wavefront, and its law.
+    """Modal errors and control law of a run, nm rms of wavefront.
 
     Attributes:
         source: path of the log, or name of the run.
         noll: Noll index of each mode.
-        timing: the true one, as far as known.
+        timing: delay and exposure of the loop, measured if possible.
         law: the integrator's gains; `driving` is the linear law in force instead, if any.
-        closed: whether the rows are of a closed loop.
-        pol: (frames, modes) pseudo-open-loop, in pieces.
-        error: (frames, modes) of the same frames.
-        true_nm2: (modes, modes) mean products of the true residual over them; None if unknown.
-        nm_per_mas: of tilt; None if the telescope's size is unknown.
+        closed: whether the loop was closed in these frames.
+        pol: pseudo-open-loop modes (frames, modes), in pieces without gaps.
+        error: modal error of the same frames (frames, modes).
+        true_nm2: mean products of the true residual over these frames (modes, modes); None if unknown.
+        nm_per_mas: wavefront rms of a tilt of 1 mas; None if the telescope's diameter is unknown.
         contrast: contrast added by the modes, with `noise_nm2`, the computed covariance (modes, modes) of one frame's
             noise; None without a science image.
         warnings: doubts about the figures.
@@ -77,7 +77,7 @@ def of_log(log: LogReader) -> Telemetry:
     same = run.delay_frames == run.controller_delay
     pol_nm = steps.pol_nm if same else steps.error_nm - run.seen_nm
     usable = run.used & np.isfinite(pol_nm).all(axis=1) & ~run.torn & ~run.played & (steps.saturated_pixels == 0)
-    mode = np.where(run.played, np.uint8(0), steps.mode)  # it settles after a play as after it was closed
+    mode = np.where(run.played, np.uint8(0), steps.mode)  # the loop also settles after a probe sequence
     warnings = list(history.remarks)
     if not same:
         warnings.append(
@@ -103,7 +103,7 @@ def of_log(log: LogReader) -> Telemetry:
 
 
 def of_run(loop: Client, seconds: float, progress: Callable[[float], None] | None = None) -> Telemetry:
-    """The steps of a running loop in the next seconds."""
+    """The steps of a running loop in the next `seconds`."""
     state = loop.status().state
     calibration = loop.calibration()
     config = configuration_of(loop)
@@ -129,16 +129,16 @@ def of_run(loop: Client, seconds: float, progress: Callable[[float], None] | Non
     stream.close()
     if state is None or not state.gain:
         raise DataFileError(f"run {loop.run_id!r} has no calibration: load one with `lowfc ctl load`")
-    made = of_steps(steps, len(calibration.noll))
-    period_s = float(np.median(np.diff(made.time_ns))) * 1e-9 if len(steps) > 1 else 0.0
+    columns = of_steps(steps, len(calibration.noll))
+    period_s = float(np.median(np.diff(columns.time_ns))) * 1e-9 if len(steps) > 1 else 0.0
     rate_hz = 1 / period_s if period_s > 0 else config.camera.rate_hz
     return _telemetry(
         loop.run_id,
         rate_hz,
-        _timing(float(state.delay_frames), config.camera.exposure_fraction, made, watch, rate_hz),
+        _timing(float(state.delay_frames), config.camera.exposure_fraction, columns, watch, rate_hz),
         (gains_of(state), driving(state, loop.laws())),
-        made,
-        np.isfinite(made.pol_nm).all(axis=1) & (made.saturated_pixels == 0),
+        columns,
+        np.isfinite(columns.pol_nm).all(axis=1) & (columns.saturated_pixels == 0),
         None,
         config,
         calibration,
@@ -149,7 +149,7 @@ def of_run(loop: Client, seconds: float, progress: Callable[[float], None] | Non
 def _watched(loop: Client) -> MirrorWatch | None:
     try:
         return loop.mirror_watch()
-    except BusError:  # a user's mirror need not report
+    except BusError:  # reports of a user's mirror are optional
         return None
 
 
@@ -175,10 +175,10 @@ def _telemetry(
     calibration: Calibration,
     warnings: Sequence[str],
 ) -> Telemetry:
-    was_closed, places = steps.mode == LoopMode.CLOSED, np.arange(len(steps.mode))
+    was_closed, index = steps.mode == LoopMode.CLOSED, np.arange(len(steps.mode))
     opened = np.flatnonzero(~was_closed)
-    since = places - np.concatenate([[-1], opened])[np.searchsorted(opened, places)]
-    closed, rows = True, usable & was_closed & (since > _SETTLING_S * rate_hz)
+    frames_closed = index - np.concatenate([[-1], opened])[np.searchsorted(opened, index)]
+    closed, rows = True, usable & was_closed & (frames_closed > _SETTLING_S * rate_hz)
     pol = pieces(steps.sequence[rows], steps.pol_nm[rows])
     if _longest(pol) < FEWEST:
         closed, rows = False, usable
@@ -186,10 +186,10 @@ def _telemetry(
     if _longest(pol) < FEWEST:
         raise DataFileError(
             f"{source}: tuning requires at least {FEWEST} consecutive frames, {FEWEST / rate_hz:.2g} s; the longest "
-            f"stretch of good frames has {_longest(pol)}"
+            f"sequence of good frames has {_longest(pol)}"
         )
     contrast = contrast_of(config) if config is not None and config.noll == calibration.noll else None
-    there_nm = None if true_nm is None or not np.isfinite(true_nm[rows]).all() else true_nm[rows].astype(float)
+    used_nm = None if true_nm is None or not np.isfinite(true_nm[rows]).all() else true_nm[rows].astype(float)
     return Telemetry(
         source=source,
         noll=calibration.noll,
@@ -200,7 +200,7 @@ def _telemetry(
         closed=closed,
         pol=pol,
         error=pieces(steps.sequence[rows], steps.error_nm[rows]),
-        true_nm2=None if there_nm is None else there_nm.T @ there_nm / len(there_nm),
+        true_nm2=None if used_nm is None else used_nm.T @ used_nm / len(used_nm),
         nm_per_mas=tilt_nm_per_mas(config.star.diameter_m) if config is not None else None,
         contrast=contrast,
         noise_nm2=frame_noise_nm2(config, calibration) if config is not None and contrast is not None else None,

@@ -35,7 +35,7 @@ OPTICAL_GAIN_MAS = 10.0
 
 
 def tuned(run: Telemetry, controller: str) -> tuple[Tuned, Gains]:
-    """The best law of a kind for a run; ValueError where there are too few frames, or no law of this kind is stable."""
+    """The best law of a kind for a run; ValueError if there are too few frames, or no law of this kind is stable."""
     leak = run.law.leak.astype(np.float64)
     gains = best_gains(run.pol, run.rate_hz, run.timing, leak)
     models = identified(run.pol, run.rate_hz)
@@ -48,8 +48,8 @@ def tuned(run: Telemetry, controller: str) -> tuple[Tuned, Gains]:
             return tune_lqg(run.pol, models, gains, run.noll, leak, run.timing), gains
 
 
-def law_now(run: Telemetry) -> LinearLaw:
-    """The last law of the run."""
+def present_law(run: Telemetry) -> LinearLaw:
+    """The control law in force at the end of the run."""
     return run.driving or integrator(run.law.gain, run.law.leak, run.noll, run.timing.delay, run.rate_hz)
 
 
@@ -121,12 +121,14 @@ class TuneResult(Result):
 
 def result_of(run: Telemetry, best: Tuned, gains: Gains, controller: str) -> TuneResult:
     """Predicted residual of a tuned law, with the residual of the run."""
-    now = law_now(run)
+    now = present_law(run)
     leak = run.law.leak.astype(np.float64)
     integrator_nm = tune_integrator(best.models, gains, run.noll, leak, run.timing).predicted_nm
     now_nm = predicted_nm(now, best.models, run.timing) if margins.margins(now, run.timing.delay).stable else None
     achieved_nm = _achieved_nm(run, gains.noise_nm)
-    if achieved_nm is not None and now_nm is not None:  # not measured between frames
+    if (
+        achieved_nm is not None and now_nm is not None
+    ):  # frames sample the residual; the law's residual between them is added
         sampled_nm = predicted_nm(now, best.models, Timing.sampled(run.timing.delay))
         achieved_nm = np.sqrt(np.maximum(achieved_nm**2 + now_nm**2 - sampled_nm**2, 0.0))
     columns = {
@@ -183,7 +185,7 @@ def picture(run: Telemetry, best: Tuned) -> bytes:
 
     drawing = figure_class()(figsize=(10, 8), layout="constrained")
     found = spectrum(run.pol, run.rate_hz)
-    if found is None:  # a run that can be tuned from has one
+    if found is None:  # cannot happen: tuning needs more frames than a spectrum
         return b""
     largest = np.argsort(-found.variance_nm2())[:2]
     for axes, place in zip(drawing.subplots(2, 1, sharex=True), largest.tolist(), strict=False):
@@ -193,14 +195,14 @@ def picture(run: Telemetry, best: Tuned) -> bytes:
         modelled = one_sided * (model.spectrum_nm2(omega) + model.noise_nm2)
         noise_nm2 = np.array([one.noise_nm2 for one in best.models])
         measured = np.repeat((model.spectrum_nm2(omega) + model.noise_nm2)[:, None], len(noise_nm2), axis=1)
-        left = one_sided * spectrum_left(best.law, omega, measured, noise_nm2, run.timing)[:, place]
+        residual = one_sided * spectrum_left(best.law, omega, measured, noise_nm2, run.timing)[:, place]
         axes.loglog(found.frequency_hz[1:], found.power_nm2_hz[1:, place], color="0.6", label="pseudo-open-loop")
         closed = spectrum(run.error, run.rate_hz) if run.closed else None
         if closed is not None:
             binned_hz, (power,) = in_bins(closed.frequency_hz, [closed.power_nm2_hz[:, place]])
             axes.loglog(binned_hz, power, color="tab:orange", label="error, measured")
         axes.loglog(found.frequency_hz[1:], modelled, color="tab:blue", lw=1, label="model")
-        axes.loglog(found.frequency_hz[1:], left, color="tab:green", label=f"residual, {best.kinds[place]}, theory")
+        axes.loglog(found.frequency_hz[1:], residual, color="tab:green", label=f"residual, {best.kinds[place]}, theory")
         axes.set(ylabel=f"Z{run.noll[place]} {mode_name(run.noll[place])}, nm$^2$/Hz")
         axes.legend()
     axes.set(xlabel="Hz")
@@ -208,13 +210,13 @@ def picture(run: Telemetry, best: Tuned) -> bytes:
 
 
 def _added_contrast(run: Telemetry, best: Tuned, now: LinearLaw, closed_nm: Array | None) -> dict[str, Any] | None:
-    """Contrast added to the dark zone without a loop, as measured, and with the tuned law."""
+    """Contrast added to the dark zone: in open loop, in closed loop as measured, and predicted with the tuned law."""
     if run.noise_nm2 is None:
         return None
     opened, closed = run.pol.joined(), None
     if closed_nm is not None:
         instants_nm2 = run.true_nm2
-        if instants_nm2 is None:  # the error's own has the sensor's noise, which may be more than all that is left
+        if instants_nm2 is None:  # predicted: the measured error contains noise that may exceed the residual
             instants_nm2 = predicted_nm2(now, best.models, run.noise_nm2, run.timing)
         closed = with_variances(instants_nm2, closed_nm)
     return added_contrast(
