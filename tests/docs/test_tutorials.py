@@ -89,7 +89,7 @@ def test_bad_night(tmp_path: Path) -> None:
     assert verdict["heading"] == "Not a good run"
     assert (tmp_path / "night.html").is_file()
     assert "163 frames" in replay
-    assert "answered otherwise" in replay
+    assert "rule changed" in replay
     assert "completes it" in killed
     assert "whole.mcap" in recovered
     assert re.search(r"^state +complete$", whole, re.MULTILINE)

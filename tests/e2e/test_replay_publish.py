@@ -191,7 +191,7 @@ def test_whose_places_are_taken(run: Run) -> None:
 
 
 def test_nothing_to_play(log: Path, run: Run) -> None:
-    with pytest.raises(DataFileError, match="no message of the topics to play"):
+    with pytest.raises(DataFileError, match="no message of the selected topics"):
         publish([log], run.run_id, topics=["lowfc/control/request"])
 
 

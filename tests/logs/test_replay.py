@@ -46,7 +46,7 @@ from lowfc.control.loop.state import Settings, State
 from lowfc.programs.logs.replay import frames as frames_of_log
 from lowfc.programs.logs.replay import workers
 from lowfc.programs.logs.replay.account import Account
-from lowfc.programs.logs.replay.controller_replay import PATIENCE_NS, Share
+from lowfc.programs.logs.replay.controller_replay import PATIENCE_NS, Segment
 from lowfc.programs.logs.replay.fold import replay
 from lowfc.programs.logs.replay.frames import Frames
 from tests.support import happenings, report_log
@@ -153,7 +153,7 @@ def test_a_log_of_the_fused_step_is_replayed_by_it_to_the_bit_and_by_numpy_with_
 
 
 def of_another_camera(taken: list[Input]) -> list[Input]:
-    """The same after a restart of the camera, so that no two frames share sequence and time."""
+    """The same after a restart of the camera, so that no two frames segment sequence and time."""
     return [
         one._replace(sequence=one.sequence + (1 << 32), time_ns=one.time_ns + 10**9) if isinstance(one, Frame) else one
         for one in taken
@@ -265,14 +265,14 @@ def test_shares_are_together_what_the_whole_is(
     span_ns = messages[-1].receive_time_ns - messages[0].receive_time_ns if messages else 0
     edges = sorted({begun_ns + 1 + int(cut * span_ns) for cut in cuts})
     whole = replay(messages)
-    parts = [replay(messages, share=Share(begin, end)) for begin, end in pairwise([0, *edges, 1 << 63])]
+    parts = [replay(messages, segment=Segment(begin, end)) for begin, end in pairwise([0, *edges, 1 << 63])]
     steps = sum(message.key == STEP.key for message in messages)
     assert sum(part.steps for part in parts) == whole.steps == steps
     assert whole.frames + whole.unchecked == steps
     for count in ("frames", "commands", "requests", "different", "commands_missing"):
         assert sum(getattr(part, count) for part in parts) == getattr(whole, count), count
     unchecked = sum(part.unchecked for part in parts)
-    assert unchecked >= whole.unchecked  # where states are missing, two shares may count the same step
+    assert unchecked >= whole.unchecked  # where states are missing, two segments may count the same step
     if not holes:
         assert unchecked == 0
 
@@ -328,7 +328,7 @@ def tampered(made: Night, topic: Topic, number: int, how: str) -> Account:
         (STEP, "body.mode = 2", "mode: log 2, replay 3"),
         (STEP, "body.command_nm[0] = float('nan')", "command_nm: log [nan"),
         (STEP, "body.timestamp.nanos += 1", "timestamp.nanos: log"),
-        (STEP, "body.MergeFromString(bytes([0xA0, 0x06, 1]))", "bytes that no value explains"),
+        (STEP, "body.MergeFromString(bytes([0xA0, 0x06, 1]))", "the bytes, but no value"),
         (COMMAND, "body.valid_for_ns = 10**12", "valid_for_ns: log 1000000000000"),
         (CONTROLLER_STATE, "body.command_history_nm[0] += 0.5", "command_history_nm: [0] log"),
         (CONTROLLER_STATE, "body.settings.slew_nm += 1", "settings.slew_nm: [0] log"),
@@ -354,7 +354,7 @@ def test_a_second_message_for_one_input_differs() -> None:
     place = [index for index, message in enumerate(made.messages) if message.key == STEP.key][20]
     account = replay([*made.messages, made.messages[place]])
     assert account.different == 1
-    assert account.first_difference.fields == ["a second one of input 22"]
+    assert account.first_difference.fields == ["a second message of input 22"]
 
 
 def test_commands_that_are_not_in_the_log_are_counted() -> None:

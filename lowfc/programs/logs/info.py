@@ -98,6 +98,6 @@ def _summary(found: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _digest(found: Mapping[str, Any]) -> str:
-    """The digest; for a live run with a remark that it is unique."""
+    """Digest, with a remark unless the run was a lockstep run."""
     digest = str(found.get("digest", ""))
     return digest if not digest or found["lockstep"] else f"{digest} (not a lockstep run: cannot be reproduced)"

@@ -13,7 +13,7 @@ from lowfc.programs.cli.output import print_result
 def recover(
     logs: Logs,
     out: Annotated[
-        Path | None, typer.Option(help="The new log; default: NAME-recovered.mcap beside it.", show_default=False)
+        Path | None, typer.Option(help="The new log; default: NAME-recovered.mcap next to it.", show_default=False)
     ] = None,
     as_json: Json = False,
 ) -> None:

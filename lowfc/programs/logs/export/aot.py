@@ -1,28 +1,28 @@
-"""Adaptive Optics Telemetry (AOT): a log as the field's exchange format, written and checked by `aotpy`.
+"""Export to Adaptive Optics Telemetry (AOT), the exchange format of the field, written and checked by `aotpy`.
 
-Its world is a telescope with a Shack-Hartmann or pyramid sensor; ours maps to it so:
+AOT describes a telescope with a Shack-Hartmann or pyramid sensor. A log is mapped to it as follows:
 
     AOSystem            the run; versions, camera and star in its metadata, the configuration as JSON in its config
     MainTelescope       the open circular aperture
-    NaturalGuideStar    the star, which is the coronagraph's and the sensor's
-    Pyramid             the sensor: AOT has no other class for one whose pixels are the measurement. Each good pixel is
-                        a subaperture with one signal, and there is one image, so that n_sides is 1
-      measurements        not in the file: (frame - dark) / flux - reference over the good pixels makes them
+    NaturalGuideStar    the star, observed by both coronagraph and sensor
+    Pyramid             the sensor; AOT has no other class whose measurements are pixels. Each good pixel
+                        is a subaperture with one signal; n_sides is 1 because there is one image
+      measurements        not in the file; they are (frame - dark) / flux - reference over the good pixels
       ref_measurements    I0, fraction of the flux
     Detector            the camera: dark, bad pixels, exposure, and the frames if asked for
-    DeformableMirror    the mirror; actuators in m across the pupil, row by row; stroke either way
+    DeformableMirror    the mirror; actuator positions in m across the pupil, row by row; stroke in each direction
     ControlLoop         one row for each step, in the log's order
-      time                end of exposure, and the frame's count
-      modal_coefficients  measured modal error, nm rms of wavefront; NaN where the frame was refused
-      commands            surface at each actuator as sent, m; NaN where no command of this frame is in the log
+      time                end of the exposure, and frame count
+      modal_coefficients  measured modal error, nm rms of wavefront; NaN if the frame was refused
+      commands            surface at each actuator as sent, m; NaN if the log has no command for this frame
       modes               Zernike polynomials in Noll's order, over the circle
       measurements_to_modes, modes_to_measurements, modes_to_commands: R, H and MODES2ACT
-      time_filter_num, _den: the integrator g / (z - (1 - leak)) of each mode, as it was at the end
+      time_filter_num, _den: the integrator g / (z - (1 - leak)) of each mode, at the end of the log
       delay               from mid-exposure to the middle of the command's period: delay_frames + (1 - exposure /
                           period) / 2
       closed              whether the loop was closed for more than half of the steps
 
-Flux, reasons, durations and truth have no place there; the other formats have them.
+AOT has no fields for flux, reasons, durations and truth; the other formats contain them.
 """
 
 import json
@@ -56,11 +56,11 @@ _NM = 1e-9
 
 
 def write_aot(files: list[Path], history: History, *, with_frames: bool) -> None:
-    """Write a run as AOT, and have `aotpy` read it and check it."""
-    step_columns(history)  # there are some
+    """Write a run as AOT; `aotpy` reads the file back and checks it."""
+    step_columns(history)  # raises DataFileError without steps
     path = files[0]
     if history.calibration is None:
-        raise DataFileError(f"{history.log.path} has no calibration, and AOT describes the loop by it")
+        raise DataFileError(f"{history.log.path} has no calibration, which AOT requires")
     system = _System(history, history.calibration, with_frames=with_frames).system
     units = AOTFITSWriter(system).get_hdulist()
     units.writeto(path, overwrite=True)
@@ -74,7 +74,7 @@ def write_aot(files: list[Path], history: History, *, with_frames: bool) -> None
 
 
 class _System:
-    """A run in AOT's classes; what is copied from the log later is there as an empty image."""
+    """A run in AOT's classes; commands and frames, which are copied from the log later, are empty images."""
 
     def __init__(self, history: History, calibration: Calibration, *, with_frames: bool) -> None:
         self._history = history
@@ -119,7 +119,7 @@ class _System:
 
     def _sensor(self, source: aotpy.Source, detector: aotpy.Detector) -> aotpy.Pyramid:
         good, shape = self._good, self._calibration.shape
-        numbers = np.where(good, np.cumsum(good) - 1, -1).astype(np.int32).reshape(shape)
+        indices = np.where(good, np.cumsum(good) - 1, -1).astype(np.int32).reshape(shape)
         return aotpy.Pyramid(
             uid="sensor",
             source=source,
@@ -127,7 +127,7 @@ class _System:
             n_sides=1,
             n_valid_subapertures=int(good.sum()),
             ref_measurements=aotpy.Image("REFERENCE", self._calibration.reference[None, good]),
-            subaperture_mask=aotpy.Image("SUBAPERTURES", numbers),
+            subaperture_mask=aotpy.Image("SUBAPERTURES", indices),
             mask_offsets=[aotpy.Coordinates(0.0, 0.0)],
             subaperture_size=1.0,
             wavelength=self._calibration.wavelength_nm * _NM,
@@ -184,11 +184,11 @@ class _System:
         closed = float(np.mean(history.steps.mode == LoopMode.CLOSED))
         recorded = history.log.metadata.get("lowfc", {})
         found: dict[str, tuple[Any, str | None]] = {
-            "LOG": (history.log.path.name, None),  # a card of 80 characters has no room for more than these
+            "LOG": (history.log.path.name, None),  # no comments: a card has 80 characters
             "RUN": (recorded.get("run", ""), None),
             "CALID": (calibration.id, None),
             "NOLL": (" ".join(map(str, calibration.noll)), None),
-            "VERSION": (recorded.get("lowfc", ""), "of lowfc, when it was recorded"),
+            "VERSION": (recorded.get("lowfc", ""), "lowfc version that recorded the log"),
             "FLUX": (calibration.flux_dn, "[adu] expected sum of the good pixels"),
             "CLOSED": (closed, "fraction of the steps with the loop closed"),
             "GAINSETS": (sum(one.name in ("gain", "leak") for one in history.requests), "changes of gain or leak"),
@@ -202,14 +202,14 @@ class _System:
             }
         if history.configuration is not None:
             found["STARMAG"] = (history.configuration.star.magnitude, "V magnitude of the star")
-            found["SENSOR"] = (history.configuration.sensor.kind, "kind of wavefront sensor: no pyramid")
+            found["SENSOR"] = (history.configuration.sensor.kind, "kind of wavefront sensor (not a pyramid)")
         return [aotpy.Metadatum(key, value, comment) for key, (value, comment) in found.items()]
 
 
 def _copy_commands(path: Path, image: fits.ImageHDU, history: History, calibration: Calibration) -> None:
     sequence = history.steps.sequence
     shape = (len(sequence), calibration.grid[0] * calibration.grid[1])
-    there = {int(one): row for row, one in reversed(list(enumerate(sequence)))}
+    row_of = {int(one): row for row, one in reversed(list(enumerate(sequence)))}
     rows = fits_cube(path, image, shape)
     rows[:] = np.nan
     for message in history.again(COMMAND):
@@ -218,7 +218,7 @@ def _copy_commands(path: Path, image: fits.ImageHDU, history: History, calibrati
         except DecodeError:
             continue
         surface_nm = actuators(command)
-        row = there.pop(command.frame_sequence, None)  # later ones only repeat what is held
+        row = row_of.pop(command.frame_sequence, None)  # later commands of this frame only repeat it
         if row is not None and surface_nm is not None and surface_nm.size == shape[1]:
             rows[row] = surface_nm.ravel() * np.float32(_NM)
 

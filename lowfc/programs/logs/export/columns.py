@@ -1,4 +1,4 @@
-"""Columns of an export, of every step and of the calibration: names with units, arrays, a sentence for each."""
+"""Columns of an export: quantities of the steps and arrays of the calibration, each with unit and description."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,19 +20,19 @@ class Column:
     """One quantity of every step, or one array of the calibration.
 
     Attributes:
-        name: with its unit at the end.
-        values: (steps,) or (steps, modes); of a calibration any shape.
-        unit: as FITS writes it; empty for none.
-        sentence: what it is.
+        name: name that ends in the unit.
+        values: array (steps,) or (steps, modes); any shape for a calibration.
+        unit: unit in FITS notation; empty for none.
+        description: description of the quantity.
     """
 
     name: str
     values: npt.NDArray[Any]
     unit: str
-    sentence: str
+    description: str
 
     def headings(self, noll: tuple[int, ...]) -> list[str]:
-        """Names of its columns where each mode has one of its own, such as "error_z2_nm"."""
+        """Names of the columns in a table with one column for each mode, such as "error_z2_nm"."""
         if self.values.ndim == 1:
             return [self.name]
         stem, _, unit = self.name.rpartition("_")
@@ -40,27 +40,27 @@ class Column:
 
 
 def step_columns(history: History) -> list[Column]:
-    """Every quantity of a run's steps, one row per step in the order they were recorded.
+    """All quantities of a run's steps, one row for each step in the order of recording.
 
-    What is joined by the frame's sequence (truth, durations, mirror) is NaN where the log does not have it.
+    Quantities joined by frame sequence (truth, durations, mirror) are NaN if the log does not have them.
     """
     steps = history.steps
     if not steps.sequence.size:
-        others = f" that fit its calibration ({history.left_out} do not)" if history.left_out else ""
-        raise DataFileError(f"{history.log.path} has no steps{others}: there is nothing to export")
+        fitting = f" that fit its calibration ({history.left_out} do not)" if history.left_out else ""
+        raise DataFileError(f"{history.log.path} has no steps{fitting}: there is nothing to export")
 
     def reasons(bits: int) -> str:
         return " ".join(reason.name.lower() for reason in REASONS if bits >> reason & 1)
 
     columns = [
-        Column("sequence", steps.sequence, "", "of the frame: start of the camera in unix seconds << 32 | count"),
-        Column("count", np.array([count_of(int(one)) for one in steps.sequence]), "", "of the frame"),
+        Column("sequence", steps.sequence, "", "frame sequence: camera start in Unix seconds << 32 | count"),
+        Column("count", np.array([count_of(int(one)) for one in steps.sequence]), "", "frame count"),
         Column("time_ns", steps.time_ns, "ns", "end of the frame's exposure, since 1970-01-01 UTC"),
-        Column("time_utc", steps.time_ns.astype("datetime64[ns]"), "", "the same as a date"),
-        Column("mode", _named(steps.mode, mode_name), "", "of the loop"),
-        Column("reasons", _named(steps.reasons, reasons), "", "why the frame was refused, or which limits acted"),
+        Column("time_utc", steps.time_ns.astype("datetime64[ns]"), "", "time_ns as a date"),
+        Column("mode", _named(steps.mode, mode_name), "", "loop mode"),
+        Column("reasons", _named(steps.reasons, reasons), "", "reason why the frame was refused, or limits that acted"),
         Column("flux_dn", steps.flux_dn, "adu", "sum of the good pixels, dark subtracted"),
-        Column("saturated_pixels", steps.saturated_pixels, "pix", "good pixels at full well"),
+        Column("saturated_pixels", steps.saturated_pixels, "pix", "number of good pixels at full well"),
         Column("error_nm", steps.error_nm, "nm", "measured modal error, wavefront rms"),
         Column("pol_nm", steps.pol_nm, "nm", "pseudo-open-loop modes, wavefront rms"),
         Column("command_nm", steps.command_nm, "nm", "modal command after the step, wavefront rms"),
@@ -69,7 +69,7 @@ def step_columns(history: History) -> list[Column]:
 
 
 def calibration_columns(calibration: Calibration) -> list[Column]:
-    """Arrays of a calibration, those of pixels and actuators as images."""
+    """Arrays of a calibration; arrays over pixels or actuators are images."""
     frame, grid, modes = calibration.shape, calibration.grid, len(calibration.noll)
     return [
         Column("reference", calibration.reference.reshape(frame), "", "reference image I0, fraction of the flux"),
@@ -85,25 +85,25 @@ def calibration_columns(calibration: Calibration) -> list[Column]:
             "nm",
             "reconstructor R of each mode, nm rms of wavefront per fraction of the flux",
         ),
-        Column("good", calibration.good.reshape(frame), "", "1 where a pixel is used"),
+        Column("good", calibration.good.reshape(frame), "", "1 for pixels in use"),
         Column("dark_dn", calibration.dark.reshape(frame), "adu", "frame without light"),
         Column(
             "modes_to_actuators",
             calibration.modes_to_actuators.T.reshape(modes, *grid),
             "",
-            "each mode on the mirror, nm of surface per nm rms of wavefront",
+            "mirror shape of each mode, nm of surface per nm rms of wavefront",
         ),
     ]
 
 
 def _truth(history: History) -> list[Column]:
-    true, modes, pupil = history.true, "of each mode, wavefront rms", "over the open pupil, no piston"
+    true, modes, pupil = history.true, "each mode, wavefront rms", "over the open pupil, without piston"
     if true is None:
         return []
-    when = "rms over the period" if true.continuous else "as the exposure starts"
+    when = "rms over the frame period" if true.continuous else "at the start of the exposure"
     return [
-        Column("true_disturbance_nm", true.disturbance_nm, "nm", f"{modes}, as the exposure starts"),
-        Column("true_residual_nm", true.residual_nm, "nm", f"{modes}, as the exposure starts"),
+        Column("true_disturbance_nm", true.disturbance_nm, "nm", f"{modes}, at the start of the exposure"),
+        Column("true_residual_nm", true.residual_nm, "nm", f"{modes}, at the start of the exposure"),
         Column("true_residual_mode_rms_nm", true.modes_residual_rms_nm, "nm", f"{modes}, {when}"),
         Column("true_disturbance_rms_nm", true.disturbance_rms_nm, "nm", f"{pupil}, {when}"),
         Column("true_residual_rms_nm", true.residual_rms_nm, "nm", f"{pupil}, {when}"),
@@ -129,5 +129,5 @@ def _durations(history: History) -> list[Column]:
 
 
 def _named(codes: npt.NDArray[Any], name: Callable[[int], str]) -> npt.NDArray[np.str_]:
-    different, places = np.unique(codes, return_inverse=True)
-    return np.array([name(int(code)) for code in different])[places]
+    distinct, indices = np.unique(codes, return_inverse=True)
+    return np.array([name(int(code)) for code in distinct])[indices]

@@ -67,8 +67,8 @@ def export(
     from lowfc.adapters.logs.thinning import thin, thinned_path
     from lowfc.adapters.process.progress import reading_bar
 
-    of_table, of_log = bool(frames or force), bool(topics)
-    if of_log if decimate is None else (to is not None or of_table):
+    table_options, log_options = bool(frames or force), bool(topics)
+    if log_options if decimate is None else (to is not None or table_options):
         raise ConfigurationError(
             "an export is a table (--to FORMAT, with --frames and --force) or a smaller log (--decimate N, with "
             "--topics): use one"
@@ -76,9 +76,9 @@ def export(
     console = Console(stderr=True)
     for log in one_by_one(logs, out, as_json=as_json):
         if decimate is not None:
-            wanted = selection(decimate, topics or ())
+            chosen = selection(decimate, topics or ())
             with reading_bar(console) as count:
-                done = thin(log, out or thinned_path(log[0], wanted), wanted, partial(count, "copying"))
+                done = thin(log, out or thinned_path(log[0], chosen), chosen, partial(count, "copying"))
             print_result(dataclasses.asdict(done), str(done), as_json=as_json)
         else:
             figures = export_log(log, to or Format.FITS, out, frames=frames, force=force, console=console)
@@ -137,7 +137,7 @@ def export_log(
 
 
 def render(figures: dict[str, Any]) -> str:
-    """Text of what was written."""
+    """Summary of an export as text."""
     from lowfc.adapters.logs.recovery import faults
 
     frames = f", {figures['frames']} frames" if figures["frames"] else ""

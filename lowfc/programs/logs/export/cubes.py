@@ -1,4 +1,4 @@
-"""Big arrays from a log into a file: frames and actuator commands are never in memory all at once."""
+"""Copy large arrays from a log to a file: frames and actuator commands are never all in memory."""
 
 import itertools
 import math
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 
 _FITS_BLOCK = 2880
 _FITS_ZERO = 0x8000
-"""FITS has no unsigned integers of 16 bits: it stores them less this."""
+"""Offset BZERO: FITS has no unsigned 16-bit integers and stores the value minus this offset."""
 
 
 def fits_cube(path: Path, image: "fits.ImageHDU", shape: tuple[int, ...]) -> npt.NDArray[Any]:
-    """Array ">f4" in a new extension at the end of a FITS file, mapped into memory.
+    """Memory-mapped array ">f4" in a new extension at the end of a FITS file.
 
-    Its cards are those of `image`, whose own data is not used and has as many axes. The disk has room for all of it, or
-    this is an OSError: a map onto a full disk would kill the process.
+    The header is that of `image`, whose data is not used but has the same number of axes. OSError if the disk has no
+    room for the array: a write to a memory map on a full disk would kill the process.
     """
     with path.open("ab") as stream:
         stream.write(_header(image, shape, BITPIX=-32))
@@ -39,13 +39,15 @@ def fits_cube(path: Path, image: "fits.ImageHDU", shape: tuple[int, ...]) -> npt
 
 
 def copy_frames_to_fits(path: Path, image: "fits.ImageHDU", history: History) -> tuple[npt.NDArray[Any], ...]:
-    """Copy the frames of a run into a new extension with the cards of `image`; see `_copy_frames`."""
+    """Copy the frames of a run into a new extension with the header of `image`; see `_copy_frames`."""
 
-    def begin(shape: tuple[int, ...]) -> None:
+    def write_header(shape: tuple[int, ...]) -> None:
         stream.write(_header(image, shape, BITPIX=16, BSCALE=1, BZERO=_FITS_ZERO))
 
     with path.open("ab") as stream:
-        copied = _copy_frames(history, stream, begin, lambda pixels: (pixels ^ np.uint16(_FITS_ZERO)).astype(">u2"))
+        copied = _copy_frames(
+            history, stream, write_header, lambda pixels: (pixels ^ np.uint16(_FITS_ZERO)).astype(">u2")
+        )
         stream.write(bytes(-stream.tell() % _FITS_BLOCK))
     return copied
 
@@ -53,11 +55,11 @@ def copy_frames_to_fits(path: Path, image: "fits.ImageHDU", history: History) ->
 def copy_frames_to_npy(path: Path, history: History) -> tuple[npt.NDArray[Any], ...]:
     """Copy the frames of a run into a .npy file, which `numpy.load` maps with `mmap_mode="r"`; see `_copy_frames`."""
 
-    def begin(shape: tuple[int, ...]) -> None:
+    def write_header(shape: tuple[int, ...]) -> None:
         np.lib.format.write_array_header_1_0(stream, {"descr": "<u2", "fortran_order": False, "shape": shape})
 
     with path.open("wb") as stream:
-        return _copy_frames(history, stream, begin, lambda pixels: pixels.astype("<u2"))
+        return _copy_frames(history, stream, write_header, lambda pixels: pixels.astype("<u2"))
 
 
 def _header(image: "fits.ImageHDU", shape: tuple[int, ...], **cards: int) -> bytes:
@@ -69,13 +71,13 @@ def _header(image: "fits.ImageHDU", shape: tuple[int, ...], **cards: int) -> byt
 def _copy_frames(
     history: History,
     stream: IO[bytes],
-    begin: Callable[[tuple[int, ...]], None],
-    stored: Callable[[Pixels], npt.NDArray[Any]],
+    write_header: Callable[[tuple[int, ...]], None],
+    encode: Callable[[Pixels], npt.NDArray[Any]],
 ) -> tuple[npt.NDArray[Any], ...]:
-    """Copy frames from a run's log, as they are `stored`, behind what `begin` writes for (frames, rows, columns).
+    """Copy the frames of a log, encoded by `encode`, after the header for the shape (frames, rows, columns).
 
     Returns:
-        Sequence and time in ns of each frame, in the order they were recorded.
+        Sequence and time in ns of each frame, in the order of recording.
     """
     path, count = history.log.path, history.frame_sequence.size
     sequence, time_ns = np.zeros(count, np.uint64), np.zeros(count, np.int64)
@@ -83,15 +85,15 @@ def _copy_frames(
     row = -1
     for row, message in enumerate(itertools.islice(history.again(FRAME), count)):
         frame = decode_frame(message.payload, message.sequence, 0)
-        found = None if frame.pixels is None else frame.pixels.shape
-        if shape is None and found is not None:
-            begin((count, *(shape := found)))
-        if frame.pixels is None or found != shape:
+        frame_shape = None if frame.pixels is None else frame.pixels.shape
+        if shape is None and frame_shape is not None:
+            write_header((count, *(shape := frame_shape)))
+        if frame.pixels is None or frame_shape != shape:
             raise DataFileError(
-                f"{path}: frame {frame.sequence} is {found}, others are {shape}: they make no cube; "
+                f"{path}: frame {frame.sequence} has shape {frame_shape}, but earlier frames have {shape}; "
                 "export without --frames"
             )
-        stream.write(stored(frame.pixels).tobytes())
+        stream.write(encode(frame.pixels).tobytes())
         sequence[row], time_ns[row] = frame.sequence, frame.time_ns
     if row + 1 < count:
         raise DataFileError(f"{path} changed while it was read: it has {row + 1} frames now, and had {count}")

@@ -1,4 +1,4 @@
-"""Exports that spreadsheets, numpy and FITS readers open: the table of steps, the calibration, and the frames."""
+"""Exports as CSV, NPZ and FITS: the table of steps, the calibration and the frames."""
 
 import csv
 import json
@@ -22,9 +22,9 @@ _ROWS_AT_ONCE = 1000
 
 
 def write_csv(files: list[Path], history: History) -> None:
-    """A table of the steps as comma-separated values: a column for each mode, nothing where there is no value.
+    """Write the steps as comma-separated values: one column for each mode, empty cells for missing values.
 
-    A number is the shortest that becomes the log's when it is read in the log's precision.
+    Numbers have the fewest digits that reproduce the log's value in the log's precision.
     """
     columns = step_columns(history)
     noll = _noll(history)
@@ -37,9 +37,9 @@ def write_csv(files: list[Path], history: History) -> None:
 
 
 def write_npz(files: list[Path], history: History) -> None:
-    """Arrays of the steps and of the calibration under names with units, none pickled.
+    """Write the arrays of the steps and the calibration, without pickling; the names end in the unit.
 
-    Frames (frames, rows, columns) in DN go to a second file, if there is one, a .npy in the order of `frame_sequence`,
+    Frames (frames, rows, columns) in DN go to the second of `files`, if given: a .npy in the order of `frame_sequence`,
     which `numpy.load` maps with `mmap_mode="r"`.
     """
     arrays = {column.name: column.values for column in step_columns(history)}
@@ -62,12 +62,12 @@ def write_npz(files: list[Path], history: History) -> None:
 
 
 def write_fits(files: list[Path], history: History, *, with_frames: bool) -> None:
-    """The steps as binary table STEPS, each array of the calibration as an image, the frames as cube FRAMES."""
+    """Write the steps as binary table STEPS, each array of the calibration as an image, the frames as cube FRAMES."""
     units = [_primary(history), _table("STEPS", step_columns(history))]
     for column in calibration_columns(history.calibration) if history.calibration is not None else ():
         image = fits.ImageHDU(column.values, name=column.name)
         image.header["BUNIT"] = column.unit
-        image.header["CONTENT"] = column.sentence
+        image.header["CONTENT"] = column.description
         units.append(image)
     fits.HDUList(units).writeto(files[0], overwrite=True, checksum=True)
     if not with_frames:
@@ -76,7 +76,7 @@ def write_fits(files: list[Path], history: History, *, with_frames: bool) -> Non
     cube.header["BUNIT"] = "adu"
     sequence, time_ns = copy_frames_to_fits(files[0], cube, history)
     identity = [
-        Column("sequence", sequence, "", "of the frame"),
+        Column("sequence", sequence, "", "frame sequence"),
         Column("time_ns", time_ns, "ns", "end of the exposure, since 1970-01-01 UTC"),
     ]
     with fits.open(files[0], mode="append") as file:
@@ -120,10 +120,10 @@ def _table(name: str, columns: list[Column]) -> fits.BinTableHDU:
         if values.dtype.kind == "M":
             values = np.datetime_as_string(values)
         elif values.dtype == np.uint64:
-            values = values.astype(np.int64)  # FITS has no unsigned one, and a start in seconds << 32 fits
+            values = values.astype(np.int64)  # FITS has no uint64; a start in seconds << 32 fits in int64
         rows[column.name] = TableColumn(values, unit=column.unit or None)
     unit = fits.table_to_hdu(rows)
     unit.name = name
     for number, column in enumerate(columns, 1):
-        unit.header.set(f"TCOMM{number}", column.sentence)
+        unit.header.set(f"TCOMM{number}", column.description)
     return unit

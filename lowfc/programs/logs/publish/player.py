@@ -1,7 +1,7 @@
-"""A log back on the bus, in its own time: a viewer, a controller under test or a user's tool sees the night again.
+"""Republish a log on the bus at its own pace, for a viewer, a controller under test or a user's tool.
 
-Payloads and sequences are those of the log, so that frame, step, command and mirror state still join; the time of
-publication is fresh, so that nothing passes for late. Deadlines are absolute: an error does not add to the next.
+Payloads and sequences are those of the log, so that frame, step, command and mirror state can be joined. Publication
+times are new, so that no message counts as late. Deadlines are absolute: timing errors do not accumulate.
 """
 
 import contextlib
@@ -29,13 +29,13 @@ from lowfc.control.durations import Durations
 from lowfc.programs.logs.publish.selection import Selection, role_of
 
 BEHIND_NS = 1_000_000
-"""A message that is sent later than this after its time is counted as behind."""
+"""Delay after which a message is counted as behind."""
 
-_SLICE_NS = 100_000_000
-_SHOW_NS = 200_000_000
-_SETTLE_S = 0.5  # a program that only connects tries at least every 0.2 s
+_LONGEST_SLEEP_NS = 100_000_000
+_PROGRESS_NS = 200_000_000
+_SETTLE_S = 0.5  # other programs retry their connection at least every 0.2 s
 _PATIENCE_S = 2.0
-_ORDER_NS = 2_000_000_000
+_REORDERING_NS = 2_000_000_000  # by which messages in a log may be out of order
 
 
 def publish(
@@ -47,23 +47,23 @@ def publish(
     allow_commands: bool = False,
     wait_for: Collection[str] = (),
 ) -> dict[str, Any]:
-    """Play logs into a run until their end, or until SIGTERM or SIGINT.
+    """Publish logs on the bus of a run until their end, or until SIGTERM or SIGINT.
 
     Args:
-        logs: files in the order of their recording, finished or not.
-        run_id: the run to play into; made where there is none of that name.
-        speed: 2 is twice as fast, a large one as fast as it goes. As from a live camera, whoever does not keep up loses
-            messages.
-        topics: names or shell patterns of keys; all topics but commands when empty.
-        allow_commands: play commands too, and frames where a live mirror may follow them.
-        wait_for: roles that must be live and linked before the first message; their topics are left to them.
+        logs: files in the order of recording, finished or not.
+        run_id: name of the run; created if it does not exist.
+        speed: 2 is twice as fast, a large number as fast as possible. Subscribers that do not keep up lose messages, as
+            with a live camera.
+        topics: keys or shell patterns of keys; if empty, all topics except commands.
+        allow_commands: publish commands too, and frames even if they would move a live mirror.
+        wait_for: roles that must be running and connected before the first message; their topics are not published.
 
     Returns:
         Figures for `render` and `--json`.
     """
     if not 0 < speed < float("inf"):
-        raise ConfigurationError(f"--speed is a factor above 0, 1 as recorded; got {speed:g}")
-    shown = Console(stderr=True)
+        raise ConfigurationError(f"--speed must be above 0 (1: as recorded); got {speed:g}")
+    console = Console(stderr=True)
     run = open_run(run_id, _mirrors(logs[0]))
     for role in wait_for:
         if role not in run.links.ports:
@@ -74,19 +74,19 @@ def publish(
     selection = Selection(run.links, topics, run.links.live() | set(wait_for), allow_commands=allow_commands)
     granted = set_up(None, None, lock_memory=False, disable_cpu_idle=False)
     with _joined(run, selection, granted) as (service, buses):
-        shown.print(f"playing into run {run_id!r} as {', '.join(buses)}", highlight=False)
+        console.print(f"publishing in run {run_id!r} as {', '.join(buses)}", highlight=False)
         player = Player(service, buses, selection, speed)
-        if _linked(service, selection.live, wait_for, shown):
+        if _linked(service, selection.live, wait_for, console):
             service.state = "running"
-        found = player.play(logs, shown)
+        found = player.play(logs, console)
         return {"run": run_id, "logs": [str(path) for path in logs], "speed": speed, **found}
 
 
 class Player:
-    """Puts the messages of logs on the bus, each at its time."""
+    """Publishes the messages of logs, each at its time."""
 
     def __init__(self, service: Service, buses: dict[str, ZenohBus], selection: Selection, speed: float) -> None:
-        """Play `selection` as the roles of `buses`, until `service` stops."""
+        """Publish `selection` as the roles of `buses` until `service` stops."""
         self._service = service
         self._clock = service.clock
         self._buses = buses
@@ -98,26 +98,26 @@ class Player:
         self._behind = 0
         self._first_log_ns = self._last_log_ns = 0
         self._begun_ns = self._sent_ns = 0
-        self._at_once: set[str] = set()
+        self._initial_keys: set[str] = set()
 
     def play(self, logs: Sequence[Path], console: Console) -> dict[str, Any]:
-        """Play logs, one after the other; return what was played, and how well its times were kept."""
-        log, show_ns = WholeLog(logs, skip_damaged=True), 0
+        """Publish logs one after the other; return what was published, and the timing errors."""
+        log, progress_due_ns = WholeLog(logs, skip_damaged=True), 0
         with passing_bar(console, TextColumn("{task.description}"), BarColumn()) as bar:
             task = bar.add_task(titled(log.paths))
             for message in log:
                 if not self._service.running:
                     break
                 self._play(message)
-                if self._sent_ns >= show_ns:
-                    show_ns = self._sent_ns + _SHOW_NS
+                if self._sent_ns >= progress_due_ns:
+                    progress_due_ns = self._sent_ns + _PROGRESS_NS
                     self._service.beat()
                     bar.update(task, completed=log.position, total=log.size, description=_utc(message.receive_time_ns))
-        if self._service.running and not self._at_once and not self._errors.count:
-            raise DataFileError(f"{titled(log.paths)}: there is no message of the topics to play")
+        if self._service.running and not self._initial_keys and not self._errors.count:
+            raise DataFileError(f"{titled(log.paths)}: no message of the selected topics")
         p50_ns, p99_ns = self._errors.percentiles_ns(0.5, 0.99)
         return {
-            "messages": self._errors.count + len(self._at_once),
+            "messages": self._errors.count + len(self._initial_keys),
             "published": {key: one.published for key, one in sorted(self._publishers.items()) if one is not None},
             "left_out": dict(sorted(self._left_out.items())),
             "span_s": (self._last_log_ns - self._first_log_ns) * 1e-9,
@@ -137,13 +137,13 @@ class Player:
         publisher = self._publishers[message.key]
         if publisher is None:
             return
-        kept = publisher.topic.queryable and publisher.topic is not HEALTH
-        if kept and not self._begun_ns and message.key not in self._at_once:
-            # A log begins with the calibration and states that were valid then, as old as they may be.
-            self._at_once.add(message.key)
+        is_state = publisher.topic.queryable and publisher.topic is not HEALTH
+        if is_state and not self._begun_ns and message.key not in self._initial_keys:
+            # A log begins with the calibration and the states then in force, which may be old.
+            self._initial_keys.add(message.key)
             publisher.put(message.payload, None, message.sequence)
-        elif not kept and message.receive_time_ns < self._last_log_ns - _ORDER_NS:
-            raise DataFileError("a log begins before the log given before it ends; give them in the order of recording")
+        elif not is_state and message.receive_time_ns < self._last_log_ns - _REORDERING_NS:
+            raise DataFileError("a log begins before the previous one ends; give them in the order of recording")
         else:
             self._send(publisher, message)
 
@@ -163,20 +163,20 @@ class Player:
 
     def _sleep_until(self, due_ns: int) -> None:
         while (left_ns := due_ns - self._clock.host_ns()) > 0 and self._service.running:
-            time.sleep(min(left_ns, _SLICE_NS) * 1e-9)
-            if left_ns > _SLICE_NS:
+            time.sleep(min(left_ns, _LONGEST_SLEEP_NS) * 1e-9)
+            if left_ns > _LONGEST_SLEEP_NS:
                 self._service.beat()
 
     def _publisher(self, key: str) -> Publisher | None:
-        """Publisher of a key in its role's place; None where it is not played."""
+        """Publisher of a key, in its role; None if the key is not published."""
         try:
             topic = topic_of(key)
         except KeyError:
-            self._left_out[key] = "no topic of this version"
+            self._left_out[key] = "unknown to this version"
             return None
-        if not self._selection.asked(key):
+        if not self._selection.matches(key):
             return None
-        if why := self._selection.why_not(key):
+        if why := self._selection.why_left_out(key):
             self._left_out[key] = why
             return None
         bus = self._buses.get(role_of(key)) or next(iter(self._buses.values()))
@@ -184,12 +184,12 @@ class Player:
 
 
 def render(figures: dict[str, Any]) -> str:
-    """The summary for a person."""
+    """Summary as text."""
     error = ", ".join(f"{name} {value:.0f} us" for name, value in figures["timing_error_us"].items())
     lines = [
-        f"played             {figures['messages']} messages into run {figures['run']!r}: {figures['span_s']:.1f} s of "
+        f"published          {figures['messages']} messages in run {figures['run']!r}: {figures['span_s']:.1f} s of "
         f"log in {figures['took_s']:.1f} s" + (", interrupted" if figures["interrupted"] else ""),
-        f"times              off by {error}",
+        f"timing error       {error}",
         f"behind             {figures['messages_behind']} messages by more than {BEHIND_NS / 1e6:g} ms",
     ]
     lines += faults(figures["damaged"], figures["no_end"])
@@ -200,7 +200,7 @@ def render(figures: dict[str, Any]) -> str:
 
 @contextlib.contextmanager
 def _joined(run: Run, selection: Selection, granted: Granted) -> Iterator[tuple[Service, dict[str, ZenohBus]]]:
-    """Take the places of the roles to be played; a replay of events alone takes none."""
+    """Join the run in the roles of the selected topics, or as `replay` if events are the only topic."""
     with contextlib.ExitStack() as held:
         clock = HostClock()
         buses: dict[str, ZenohBus] = {}
@@ -214,7 +214,7 @@ def _joined(run: Run, selection: Selection, granted: Granted) -> Iterator[tuple[
 
 
 def _linked(service: Service, live: Collection[str], wait_for: Collection[str], console: Console) -> bool:
-    """Wait for the processes that receive the first message; False when stopped meanwhile."""
+    """Wait for the processes that receive the first message; False if stopped meanwhile."""
     service.state = "ready"
     missing = service.wait_for(wait_for, _PATIENCE_S)
     if missing and service.running:
@@ -222,14 +222,14 @@ def _linked(service: Service, live: Collection[str], wait_for: Collection[str], 
     while missing and service.running:
         missing = service.wait_for(missing, _PATIENCE_S)
     begun_s = time.monotonic()
-    service.wait_for(live, _PATIENCE_S)  # a user's own program need not have a health
+    service.wait_for(live, _PATIENCE_S)  # a user's own program may not send Health
     while service.running and time.monotonic() - begun_s < _SETTLE_S:
         time.sleep(0.02)
     return service.running
 
 
 def _mirrors(log: Path) -> tuple[str, ...]:
-    """Names of the mirrors in a log, for a run that is yet to be made; of an unfinished log only the first one's."""
+    """Names of the mirrors in a log, for a new run; in an unfinished log only the first mirror is found."""
     topics = MIRROR_STATE, COMMAND
     reader = LogReader(log, topics=topics, skip_damaged=True)
     next(iter(reader), None)

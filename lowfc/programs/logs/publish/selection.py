@@ -1,7 +1,7 @@
-"""Which messages of a log go back on a run's bus, and in whose place.
+"""Selection of the messages of a log to republish, and of the roles to republish them in.
 
-Every topic of a log was published by a role of the loop. A replay takes the places of those roles, ports included, so
-that a role is played either by the log or by a live process and never by both.
+Each topic of a log was published by a role of the loop. `lowfc publish` takes over these roles, including their ports,
+so that each role belongs either to the log or to a live process, never to both.
 """
 
 from collections.abc import Collection, Sequence
@@ -14,12 +14,12 @@ from lowfc.contract.messages import BENCH, COMMAND, FRAME, HEALTH, TOPICS, Role,
 
 
 class Selection:
-    """Decides for every key of a log whether it is played.
+    """Decides for every key of a log whether it is published.
 
     Attributes:
-        roles: whose places the replay takes, in the order of the topics; those of all mirrors with frames, unless a
-            live mirror may be moved.
-        live: roles that others play.
+        roles: roles to take over, in the order of the topics; with frames also those of all mirrors, unless a live
+            mirror may be moved.
+        live: roles of live processes.
     """
 
     def __init__(
@@ -28,9 +28,9 @@ class Selection:
         """Choose among the topics of a run.
 
         Args:
-            links: of the run.
-            patterns: names or shell patterns of keys; everything when empty.
-            live: roles of the run that processes play, or shall play.
+            links: links of the run.
+            patterns: keys or shell patterns of keys; if empty, everything.
+            live: roles of the run that live processes have or will have.
             allow_commands: whether a live mirror may be moved.
         """
         self.live = frozenset(live)
@@ -40,53 +40,53 @@ class Selection:
         for pattern in self._patterns:
             if COMMAND.matches(pattern) and not allow_commands:
                 raise ConfigurationError(
-                    f"{pattern} would move a mirror that listens in {run}; add --allow-commands if that is meant"
+                    f"{pattern} would move a live mirror of {run}; add --allow-commands if that is intended"
                 )
             if not any(fnmatchcase(key, pattern) for key in keys) and not any(one.matches(pattern) for one in TOPICS):
                 raise ConfigurationError(
                     f"no topic fits {pattern!r}{nearest(pattern, keys)}; give a key or a shell pattern, "
                     "such as 'lowfc/camera/*'"
                 )
-        asked = list(filter(self.asked, keys))
-        for key in asked:
-            # A live device and a recorded one must not mix; what a live controller publishes is left out unless named.
+        selected = list(filter(self.matches, keys))
+        for key in selected:
+            # Live and recorded devices must not mix; topics of a live controller are left out unless named.
             role = role_of(key)
             if role in self.live and (role != Role.CONTROLLER or key in self._patterns):
                 raise BusError(
                     f"{role} of {run} is live and publishes {key} itself; stop it, replay into another run (--run), "
                     "or choose topics that it does not publish (--topics)"
                 )
-        wanted = [role_of(key) for key in asked if not self.why_not(key)]
-        if FRAME.key in asked and not allow_commands:  # a mirror that came up later would follow the frames
-            wanted += links.mirrors
+        roles = [role_of(key) for key in selected if not self.why_left_out(key)]
+        if FRAME.key in selected and not allow_commands:  # commands computed from the frames would move a mirror
+            roles += links.mirrors
             if mirrors := sorted(self.live.intersection(links.mirrors)):
                 raise BusError(
-                    f"{mirrors[0]} of {run} is live, and a controller that gets the frames of a log would move it; "
-                    "stop it, or add --allow-commands if that is meant"
+                    f"{mirrors[0]} of {run} is live, and a controller that receives the frames of a log would move it; "
+                    "stop it, or add --allow-commands if that is intended"
                 )
-        self.roles = tuple(role for role in dict.fromkeys(wanted) if role)
+        self.roles = tuple(role for role in dict.fromkeys(roles) if role)
 
-    def asked(self, key: str) -> bool:
-        """Whether the patterns fit a key."""
+    def matches(self, key: str) -> bool:
+        """Whether a key matches the patterns."""
         return not self._patterns or any(fnmatchcase(key, pattern) for pattern in self._patterns)
 
-    def why_not(self, key: str) -> str:
-        """Why a key is left out although the patterns fit; empty where it is played."""
+    def why_left_out(self, key: str) -> str:
+        """Reason why a matching key is left out; empty if it is published."""
         if COMMAND.matches(key) and not self._allow_commands:
-            return "commands move a mirror; --allow-commands plays them"
+            return "commands move a mirror; --allow-commands publishes them"
         role = role_of(key)
         if role and not _in_loop(role):
-            return f"{role} is no part of the loop"
+            return f"{role} is not part of the loop"
         return f"{role} is live" if role in self.live else ""
 
 
 def role_of(key: str) -> str:
-    """Role of the process that publishes a key; empty for a topic that all share."""
+    """Role of the process that publishes a key; empty for a topic with several publishers."""
     topic = topic_of(key)
     name = name_in(topic, key)
     if topic is HEALTH:
         return name
-    if topic is BENCH:  # of a log, it would speak for what is on the bench now
+    if topic is BENCH:  # a recorded one would describe the devices connected now
         return Role.BENCH
     if len(topic.publisher) > 1:
         return ""

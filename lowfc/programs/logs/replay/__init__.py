@@ -1,1 +1,1 @@
-"""`lowfc replay`: repeat a log through the controller's function and compare every result."""
+"""`lowfc replay`: rerun the controller's function on a log and compare every result."""

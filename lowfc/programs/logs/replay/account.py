@@ -19,24 +19,24 @@ _SUMS = (
 
 
 class Account(Result):
-    """What a replay has found, and what the logs were like.
+    """Result of a replay, and the state of the logs.
 
     Attributes:
-        frames: steps that were checked; `commands`, `states` and `requests` likewise.
-        unchecked_because: steps of the log that could not be checked, by why.
-        inputs_missing: inputs of the controller that the log does not have, by the input number of a later state.
-        commands_missing: commands that the replay sends and the log does not have.
-        steps: in the log.
-        different: messages that differ by more than the tolerance, of them the first, and the largest difference of any
-            number in nm.
-        other_kernel: arithmetic of the replay where the log's was another; empty where it was the same.
-        rules_changed: inputs of another version's log that this version answers otherwise on purpose, by the rule.
-        version: that recorded the first log; `host_differs` is what of versions and processor is not as it was then.
-        log_s: from the first frame to the last; `speed` is that in parts of the time that the replay took.
-        complete: every log has its end; `no_end` is why not, `damaged` what was left out of them, a sentence each.
-        runs: names of the runs that are in the logs.
-        stopped: why a recording ended early, a sentence each.
-        recorded_on: versions and host, as the first log has them.
+        frames: number of steps checked; `commands`, `states` and `requests` likewise.
+        unchecked_because: number of steps that could not be checked, by reason.
+        inputs_missing: number of controller inputs missing from the log, from the input number of a later state.
+        commands_missing: number of commands that the replay sends but the log does not have.
+        steps: number of steps in the log.
+        different: number of messages that differ by more than the tolerance; `first_difference` is the first of them,
+            `largest_difference_nm` the largest difference of a number in nm.
+        other_kernel: kernel of the replay if it is not the log's; otherwise empty.
+        rules_changed: number of inputs that this version handles differently on purpose, by rule.
+        version: lowfc version of the first log; `host_differs` has the versions and processor features that differ.
+        log_s: time from the first frame to the last; `speed` is `log_s` over the time of the replay.
+        complete: whether every log has its end; `no_end` is the reason if not, `damaged` lists the parts left out.
+        runs: names of the runs in the logs.
+        stopped: reasons why a recording ended early.
+        recorded_on: versions and host in the first log.
     """
 
     frames: int = 0
@@ -78,7 +78,7 @@ class Account(Result):
         return self.frames > 0 and same and (self.commands > 0 or not self.commands_missing)
 
     def add(self, later: "Account") -> None:
-        """Add what was found in the next share, whose worker has read the logs further."""
+        """Add the account of the next segment, whose worker has read the logs further."""
         for name in _SUMS:
             setattr(self, name, getattr(self, name) + getattr(later, name))
         self.first_difference = self.first_difference or later.first_difference
@@ -88,7 +88,7 @@ class Account(Result):
         self.complete, self.runs, self.stopped = later.complete, later.runs, later.stopped
 
     def figures(self) -> dict[str, Any]:
-        """All of them."""
+        """All figures."""
         return self.model_dump()
 
     def leave_out(self, why: str, steps: int) -> None:
@@ -97,7 +97,7 @@ class Account(Result):
             self.unchecked_because[why] += steps
 
     def enter(self, found: Difference | None, tolerance_nm: float) -> None:
-        """Account for two messages that are not the same bytes, and for what differs in them."""
+        """Count the difference between two messages."""
         if found is None:
             return
         self.largest_difference_nm = max(self.largest_difference_nm, found.largest_nm)
@@ -106,7 +106,7 @@ class Account(Result):
             self.first_difference = self.first_difference or found
 
     def head(self) -> Sequence[str]:
-        """The verdict, and what was checked."""
+        """Verdict, and counts of what was checked."""
         frames = f"{self.frames} frames"
         if not self.frames:
             verdict = "nothing could be replayed"
@@ -122,20 +122,21 @@ class Account(Result):
             verdict = f"{frames}, {counted(self.different, 'message differs', 'messages differ')}"
         return (
             f"{verdict}, largest difference {self.largest_difference_nm:.3g} nm",
-            f"compared too       {counted(self.commands, 'command')}, {counted(self.states, 'state')}, "
+            f"also compared      {counted(self.commands, 'command')}, {counted(self.states, 'state')}, "
             f"{counted(self.requests, 'answer')}",
         )
 
     def remarks(self) -> Sequence[str]:
-        """What could not be checked, what differs, and how fast it was."""
+        """Remarks on what could not be checked, what differs, and the speed."""
         missing = ((self.inputs_missing, "input"), (self.commands_missing, "command"))
-        lines = [f"answered otherwise {n} since {self.version}: {rule}" for rule, n in self.rules_changed.items()]
+        changed = f"inputs since {self.version}"
+        lines = [f"rule changed       {n} {changed}: {rule}" for rule, n in self.rules_changed.items()]
         lines += [f"unchecked          {counted(n, 'step')} {why}" for why, n in self.unchecked_because.items()]
         lines += [f"missing            the log lacks {counted(n, what)} of the controller" for n, what in missing if n]
         lines += faults(self.damaged, self.no_end)
         lines += [f"recording stopped  {why}" for why in self.stopped]
         if len(self.runs) > 1:
-            lines.append(f"of several runs    {', '.join(self.runs)}")
+            lines.append(f"several runs       {', '.join(self.runs)}")
         if first := self.first_difference:
             lines.append(
                 f"first difference   {first.message} of frame {count_of(first.frame_sequence)} "
@@ -144,4 +145,4 @@ class Account(Result):
             lines += [f"                   {line}" for line in first.fields]
         for key, (there, here) in self.host_differs.items():
             lines.append(f"{key:18} {there or 'none'} in the log, {here or 'none'} here")
-        return [*lines, f"speed              {self.log_s:.1f} s of log, {self.speed:.1f} times as fast as it was"]
+        return [*lines, f"speed              {self.log_s:.1f} s of log, {self.speed:.1f} times as fast as recorded"]

@@ -1,4 +1,4 @@
-"""One controller of a log, run again: its inputs in the order it took them, every result compared."""
+"""Replay of one controller of a log: its inputs in their order, every result compared."""
 
 import contextlib
 from collections import deque
@@ -21,174 +21,176 @@ from lowfc.control.loop.requests import prepared
 from lowfc.control.loop.state import Settings, State
 from lowfc.programs.logs.replay.account import Account
 from lowfc.programs.logs.replay.difference import Difference, difference
-from lowfc.programs.logs.replay.former import Former, changed_rule
+from lowfc.programs.logs.replay.former import FormerVersion, changed_rule
 from lowfc.programs.logs.replay.frames import Frames
 
 PATIENCE_NS = 2_000_000_000
-"""Messages of several publishers are recorded in the order they arrive; what is later than this is missing."""
+"""Messages of several publishers are recorded in the order of arrival; one later than this counts as missing."""
 _STATES_KEPT = 256
 _BEFORE = "recorded before the first complete state of the controller"
 
 
 @dataclass(slots=True)
 class _Entry:
-    """What the log has of one input of the controller, `taken`, and of the command that it gave rise to."""
+    """One input of the controller as logged, and the command that it led to."""
 
     receive_time_ns: int
-    taken: wire.ControlStep | wire.Request | wire.ControlInput | None = None
-    taken_bytes: bytes = b""
+    logged: wire.ControlStep | wire.Request | wire.ControlInput | None = None
+    logged_bytes: bytes = b""
     command: wire.MirrorCommand | None = None
     command_bytes: bytes = b""
 
     @property
-    def commands(self) -> bool:
-        """Whether a controller with a calibration sends a command."""
-        taken = self.taken
-        return isinstance(taken, wire.ControlStep) or (isinstance(taken, wire.ControlInput) and taken.HasField("tick"))
+    def leads_to_command(self) -> bool:
+        """Whether a controller with a calibration sends a command for it."""
+        logged = self.logged
+        return isinstance(logged, wire.ControlStep) or (
+            isinstance(logged, wire.ControlInput) and logged.HasField("tick")
+        )
 
 
 @dataclass(frozen=True, slots=True)
-class Share:
-    """The part of a log that one worker replays: from the first state at `from_ns` to the first one at `until_ns`.
+class Segment:
+    """Part of a log that one worker replays: from the first state after `from_ns` to the first after `until_ns`.
 
-    Log times; a worker is given the messages around its share too.
+    Both are log times; the worker also receives the messages around its segment.
     """
 
     from_ns: int = 0
     until_ns: int = 1 << 63
 
 
-WHOLE = Share()
+WHOLE = Segment()
 
 
 @dataclass(slots=True)
 class Context:
-    """What the controllers of a replay have in common.
+    """Data shared by the controllers of a replay.
 
     Attributes:
-        tolerance_nm: differences up to this are none.
-        kernel: that computes; empty for the log's own.
-        former: what is compared of the log of another version; to be set before the first message.
+        tolerance_nm: largest difference to ignore.
+        kernel: name of the kernel; empty for the log's own.
+        former: fields to compare in a log of another version; set before the first message.
     """
 
     tolerance_nm: float = 0.0
-    share: Share = WHOLE
+    segment: Segment = WHOLE
     frames: Frames = field(default_factory=Frames)
     published: Published = field(default_factory=Published)
     account: Account = field(default_factory=Account)
     kernel: str = ""
-    former: Former | None = None
+    former: FormerVersion | None = None
 
 
 class ControllerReplay:
-    """One start of a controller: its inputs in the order it took them, folded again.
+    """Replay of a controller since one of its starts: `advance` folded over its inputs in their order.
 
     Attributes:
-        done: the state where the next share begins has been reached.
-        retry_pending: a state or a calibration has come since it was last tried to go on from one.
+        done: whether the state at the start of the next segment has been reached.
+        retry_pending: whether a state or calibration has arrived since the last attempt to adopt a state.
     """
 
     def __init__(self, context: Context, begun_ns: int) -> None:
-        """A controller whose first message has the log time `begun_ns`: of the share in which that is."""
-        self.done = begun_ns >= context.share.until_ns
+        """Replay a controller whose first message has the log time `begun_ns`, which decides its segment."""
+        self.done = begun_ns >= context.segment.until_ns
         self.retry_pending = False
         self._context, self._account = context, context.account
         self._last: int | None = None
         self._lost_at: int | None = None
         self._forgotten = 0
         self._began = 0
-        self._first: int | None = None  # of the inputs in the log
+        self._first: int | None = None  # lowest input number in the log
         self._form: tuple[int, str] | None = None
         self._entries: dict[int, _Entry] = {}
         self._states: dict[int, wire.ControllerState] = {}
         self._settings: Settings | None = None
         self._state: State | None = None
         self._past: deque[State] = deque(maxlen=_STATES_KEPT)
-        self._why = _BEFORE if begun_ns >= context.share.from_ns else ""
+        self._why = _BEFORE if begun_ns >= context.segment.from_ns else ""
         self._counts = bool(self._why)
 
     def take(self, message: Sample, kind: type[Message]) -> None:
-        """Take one of the controller's messages; the fold goes on as far as it can."""
+        """Add one of the controller's messages, and replay as far as possible."""
         if self.done:
             return
         body = kind.FromString(message.payload)
         if isinstance(body, wire.ControllerState):
             self._take_state(body, message.receive_time_ns)
         else:
-            number: int = body.input_number  # type: ignore[attr-defined]  # all others of the controller have it
-            if not number:  # a request that could not be read, a command of somebody else
+            number: int = body.input_number  # type: ignore[attr-defined]  # all its other messages have one
+            if not number:  # an unreadable request, or a command of another program
                 if kind is wire.ControlStep:
                     raise DataFileError(
-                        "the steps in this log are not numbered: it was recorded by a version before replay, or by "
-                        "another controller; `lowfc what-if` and `lowfc report` read it"
+                        "the steps in this log are not numbered: it was recorded by a version without replay, or by "
+                        "another controller; use `lowfc what-if` or `lowfc report`"
                     )
                 return
             self._first = number if self._first is None else min(number, self._first)
             if self._state is not None and number <= self._state.input_number:
-                self._come_late(number, body)
+                self._account_for_late(number, body)
                 return
             entry = self._entries.get(number)
             if entry is None:
                 entry = self._entries[number] = _Entry(message.receive_time_ns)
-            if isinstance(body, wire.MirrorCommand):  # what it was made from comes after it
+            if isinstance(body, wire.MirrorCommand):  # its input is published after it
                 entry.command, entry.command_bytes = body, message.payload
                 return
-            entry.taken, entry.taken_bytes = body, message.payload  # type: ignore[assignment]  # one of the three
+            entry.logged, entry.logged_bytes = body, message.payload  # type: ignore[assignment]  # one of the three
             if isinstance(body, wire.ControlStep):
                 self._context.frames.note_step(body)
         self.go_on(message.receive_time_ns)
 
-    def _come_late(self, number: int, body: Message) -> None:
-        """A message of an input that is behind: from before the state that was begun with, or there a second time."""
+    def _account_for_late(self, number: int, body: Message) -> None:
+        """Account for a message of a past input: from before the adopted state, or a duplicate."""
         if number <= self._began:
             if self._counts:
                 self._account.leave_out(_BEFORE, int(isinstance(body, wire.ControlStep)))
         elif not isinstance(body, wire.MirrorCommand) and self._state is not None:
             name = body.DESCRIPTOR.name
-            second = Difference(name, number, self._state.frame_sequence, [f"a second one of input {number}"])
-            second.otherwise = True
-            self._account.enter(second, self._context.tolerance_nm)
+            duplicate = Difference(name, number, self._state.frame_sequence, [f"a second message of input {number}"])
+            duplicate.otherwise = True
+            self._account.enter(duplicate, self._context.tolerance_nm)
             self._account.frames += isinstance(body, wire.ControlStep)
 
     def go_on(self, now_ns: int, *, ended: bool = False) -> None:
-        """Take every input that is complete, or too old to become so; all that is left when the log has `ended`."""
+        """Replay every input that is complete or overdue; all remaining ones once the log has `ended`."""
         while (self._entries or self._states) and not self.done:
             if self._state is None and not self._adopt():
                 if not self.done:
                     self._forget(now_ns, ended=ended)
                 return
-            assert self._state is not None  # noqa: S101  # adopted
+            assert self._state is not None  # noqa: S101  # adopted above
             number = self._state.input_number + 1
             entry = self._entries.get(number)
             if entry is None:
                 waiting = next(iter(self._entries.values()), None)
                 if waiting is None or not (ended or now_ns - waiting.receive_time_ns > PATIENCE_NS):
                     return
-                earlier = self._first is not None and number < self._first  # than the recording
-                self._lose(_BEFORE if earlier else "after an input that the log does not have")
+                before_log = self._first is not None and number < self._first
+                self._lose(_BEFORE if before_log else "after an input that the log does not have")
                 continue
             late = ended or now_ns - entry.receive_time_ns > PATIENCE_NS
-            if not late and entry.command is None and entry.commands and self._state.drive is not None:
+            if not late and entry.command is None and entry.leads_to_command and self._state.drive is not None:
                 return
-            rule = changed_rule(entry.taken) if self._context.former is not None else ""
+            rule = changed_rule(entry.logged) if self._context.former is not None else ""
             if rule and number not in self._states and not late:
-                return  # the state after it is what may have to be gone on from
-            taken = self._input(entry, late=late)
-            if taken is not None and rule and number in self._states:
+                return  # the replay may have to continue from the state after it
+            input_ = self._input(entry, late=late)
+            if input_ is not None and rule and number in self._states:
                 del self._entries[number]
-                self._go_on_by_rule(rule, taken, self._states.pop(number))
-            elif taken is not None:
+                self._apply_changed_rule(rule, input_, self._states.pop(number))
+            elif input_ is not None:
                 del self._entries[number]
-                self._check(entry, taken)
+                self._check(entry, input_)
             elif late:
-                self._lose(f"after {'an input' if entry.taken is None else 'a frame'} that the log does not have")
+                self._lose(f"after {'an input' if entry.logged is None else 'a frame'} that the log does not have")
             else:
                 return
 
     def _take_state(self, message: wire.ControllerState, receive_time_ns: int) -> None:
-        if receive_time_ns < self._context.share.from_ns:
+        if receive_time_ns < self._context.segment.from_ns:
             return
-        if receive_time_ns >= self._context.share.until_ns:
+        if receive_time_ns >= self._context.segment.until_ns:
             self._last = message.input_number if self._last is None else min(self._last, message.input_number)
         past = next((state for state in self._past if state.input_number == message.input_number), None)
         if past is not None:
@@ -198,7 +200,7 @@ class ControllerReplay:
             self.retry_pending = True
 
     def _adopt(self) -> bool:
-        """Go on from the earliest complete state whose calibration is known."""
+        """Continue from the earliest complete state whose calibration is known."""
         if not self.retry_pending:
             return False
         self.retry_pending = False
@@ -235,13 +237,13 @@ class ControllerReplay:
 
     def _leave_out(self, upto: int) -> None:
         for number in [number for number in self._entries if number <= upto]:
-            taken = self._entries.pop(number).taken
-            self._forgotten += taken is not None
-            if self._why:  # else they are another share's
-                self._account.leave_out(self._why, int(isinstance(taken, wire.ControlStep)))
+            logged = self._entries.pop(number).logged
+            self._forgotten += logged is not None
+            if self._why:  # otherwise they belong to another segment
+                self._account.leave_out(self._why, int(isinstance(logged, wire.ControlStep)))
 
     def _forget(self, now_ns: int, *, ended: bool) -> None:
-        """While there is no state to go on from, forget what the next one will not need, and states of no use."""
+        """Without a state to continue from, drop inputs that the next state will not need, and surplus states."""
         old = [number for number, entry in self._entries.items() if now_ns - entry.receive_time_ns > 2 * PATIENCE_NS]
         self._leave_out(max(self._entries if ended else old, default=0))
         while len(self._states) > _STATES_KEPT:
@@ -256,12 +258,12 @@ class ControllerReplay:
         self._past.clear()
 
     def _input(self, entry: _Entry, *, late: bool) -> Input | None:
-        """What the controller took; None where the log does not have it (yet); nothing more comes when it is `late`."""
-        match entry.taken:
+        """The controller's input; None if the log does not have it (yet). If `late`, nothing more will arrive."""
+        match entry.logged:
             case wire.ControlStep() as step:
                 late_ns = 0 if self._settings is None else self._settings.max_frame_age_ns + 1
                 age_ns = late_ns if wire.REASON_LATE in step.reasons else 0
-                # With no other left, a frame of another time: then the step is wrong, which the comparison finds.
+                # If late, a frame with another time is used: the step then differs, which the comparison reports.
                 frame = self._context.frames.frame(
                     step.frame_sequence, from_timestamp(step.timestamp), age_ns, last=late
                 )
@@ -271,20 +273,20 @@ class ControllerReplay:
             case wire.Request() as request:
                 with contextlib.suppress(ValueError):
                     time_ns, known = from_timestamp(request.timestamp), self._context.published
-                    asked = codec.request(request, request.name, time_ns, known.calibrations, known.laws, known.plays)
-                    return asked if self._settings is None else prepared(self._settings, asked)
+                    decoded = codec.request(request, request.name, time_ns, known.calibrations, known.laws, known.plays)
+                    return decoded if self._settings is None else prepared(self._settings, decoded)
             case wire.ControlInput() as other:
                 with contextlib.suppress(ValueError):
                     return codec.decode_input(other, self._context.published.calibrations)
         return None
 
-    def _go_on_by_rule(self, rule: str, taken: Input, logged: wire.ControllerState) -> None:
-        """Take an input for which a rule has changed since; where it makes a difference, go on from the log's state."""
+    def _apply_changed_rule(self, rule: str, input_: Input, logged: wire.ControllerState) -> None:
+        """Apply an input whose rule has changed since; if the result differs, continue from the logged state."""
         assert self._settings is not None  # noqa: S101  # there is a state
         assert self._state is not None  # noqa: S101
-        state, _ = advance(self._settings, self._state, taken)
-        again = controller_state(state, self._settings, from_timestamp(logged.timestamp))
-        found = self._difference(state, logged, again)
+        state, _ = advance(self._settings, self._state, input_)
+        replayed = controller_state(state, self._settings, from_timestamp(logged.timestamp))
+        found = self._difference(state, logged, replayed)
         if found is None or found.within(self._context.tolerance_nm):
             self._account.states += 1
         else:
@@ -294,13 +296,13 @@ class ControllerReplay:
             except ValueError as error:
                 self._lose(f"not replayed: {error}")
                 return
-        self._account.requests += isinstance(taken, Request)
+        self._account.requests += isinstance(input_, Request)
         self._state = state
         self._past.append(state)
         self.done = state.input_number == self._last
 
     def _difference(self, state: State, logged: Message, replayed: Message | None) -> Difference | None:
-        """What differs in all that is compared; None where nothing does."""
+        """Difference between the compared fields; None without any."""
         if self._context.former is not None and type(replayed) is type(logged):
             if isinstance(logged, wire.ControllerState):
                 logged = self._in_todays_form(logged)
@@ -309,49 +311,49 @@ class ControllerReplay:
                 logged.state.CopyFrom(self._in_todays_form(logged.state))
             logged, replayed = self._context.former.compared(logged), self._context.former.compared(replayed)
         if replayed == logged and (self._context.former is not None or isinstance(logged, wire.ControllerState)):
-            return None  # of other messages the bytes differ
+            return None  # other messages are compared byte by byte
         return difference(state.input_number, state.frame_sequence, logged, replayed)
 
     def _in_todays_form(self, logged: wire.ControllerState) -> wire.ControllerState:
-        """A state with the same content; one that cannot be decoded as it is."""
+        """Re-encode a state in the form of this version; unchanged if it cannot be decoded."""
         with contextlib.suppress(ValueError):
             settings, state = self._decoded(logged)
             return controller_state(state, settings, from_timestamp(logged.timestamp))
         return logged
 
-    def _check(self, entry: _Entry, taken: Input) -> None:
+    def _check(self, entry: _Entry, input_: Input) -> None:
         assert self._settings is not None  # noqa: S101  # there is a state
         assert self._state is not None  # noqa: S101
-        state, outputs = advance(self._settings, self._state, taken)
+        state, outputs = advance(self._settings, self._state, input_)
         self._state = state
         self._past.append(state)
         account = self._account
-        if outputs.step is not None and entry.taken is not None:
+        if outputs.step is not None and entry.logged is not None:
             account.frames += 1
-            self._compare(entry.taken, entry.taken_bytes, codec.encode_step(outputs.step, state.input_number))
+            self._compare(entry.logged, entry.logged_bytes, codec.encode_step(outputs.step, state.input_number))
         if entry.command is not None:
             account.commands += 1
-            again = None
+            replayed = None
             if outputs.command is not None:
                 self._form = self._form or (entry.command.valid_for_ns, entry.command.channel)
-                again = codec.encode_command(outputs.command, *self._form, state.input_number)
-            self._compare(entry.command, entry.command_bytes, again)
+                replayed = codec.encode_command(outputs.command, *self._form, state.input_number)
+            self._compare(entry.command, entry.command_bytes, replayed)
         elif outputs.command is not None:
             account.commands_missing += 1
-        if isinstance(entry.taken, wire.Request):
+        if isinstance(entry.logged, wire.Request):
             account.requests += 1
-            assert isinstance(taken, Request)  # noqa: S101
-            self._compare(entry.taken, entry.taken_bytes, self._answer(entry.taken, taken, outputs, state))
+            assert isinstance(input_, Request)  # noqa: S101
+            self._compare(entry.logged, entry.logged_bytes, self._answer(entry.logged, input_, outputs, state))
         logged = self._states.pop(state.input_number, None)
         if logged is not None:
             self._compare_state(state, logged)
 
-    def _answer(self, request: wire.Request, asked: Request, outputs: Outputs, state: State) -> bytes | None:
+    def _answer(self, logged: wire.Request, request: Request, outputs: Outputs, state: State) -> bytes | None:
         assert self._settings is not None  # noqa: S101
         if outputs.reply is None:
             return None
-        shown = controller_state(state, self._settings, asked.time_ns) if request.HasField("state") else None
-        return codec.encode_request(asked, outputs.reply, state.input_number, shown)
+        shown = controller_state(state, self._settings, request.time_ns) if logged.HasField("state") else None
+        return codec.encode_request(request, outputs.reply, state.input_number, shown)
 
     def _compare_state(self, state: State, logged: wire.ControllerState) -> None:
         assert self._settings is not None  # noqa: S101
@@ -362,7 +364,7 @@ class ControllerReplay:
         if found is None:
             return
         self._account.enter(found, self._context.tolerance_nm)
-        if self._state is state and not self.done:  # or what differs here would differ for the rest of the log
+        if self._state is state and not self.done:  # otherwise the difference would persist for the rest of the log
             self._states[state.input_number] = logged
             self._lose("")
             self._adopt()

@@ -12,21 +12,21 @@ from lowfc.arrays import Array
 _FLOAT32_FIELDS = ("actuators", "offset")
 """Bytes that hold little-endian float32, nm."""
 _IN_NM = ("_nm", "actuators", "law_state")
-"""Ends of the names of fields in nm; a law's state has the unit that its author gave it, which for ours is nm."""
-_SHOWN = 4
+"""Endings of the names of fields in nm; a law's state has the unit of its author, nm for lowfc's own laws."""
+_MOST_SHOWN = 4
 
 
 @dataclass(slots=True)
 class Difference:
-    """The log's message and the replayed one.
+    """Difference between a logged message and the replayed one.
 
     Attributes:
-        message: kind of it, such as ControlStep.
-        taken: which input of the controller it belongs to.
-        frame_sequence: of the newest frame then.
-        fields: sentences, one for each field that differs.
+        message: message type, such as ControlStep.
+        taken: input number of the message.
+        frame_sequence: sequence of the newest frame at this input.
+        fields: one sentence for each field that differs.
         largest_nm: largest difference of a number in nm.
-        otherwise: something else than numbers in nm differs.
+        otherwise: whether anything other than numbers in nm differs.
     """
 
     message: str
@@ -37,20 +37,20 @@ class Difference:
     otherwise: bool = False
 
     def within(self, tolerance_nm: float) -> bool:
-        """Whether only numbers in nm differ, by no more than this; nothing is within 0."""
+        """Whether only numbers in nm differ, by no more than this; False for 0."""
         return tolerance_nm > 0 and not self.otherwise and self.largest_nm <= tolerance_nm
 
 
-def difference(taken: int, frame_sequence: int, logged: Message, replayed: Message | None) -> Difference:
-    """Compare a message of the log with the replayed one, which is None where the replay sent nothing."""
-    found = Difference(logged.DESCRIPTOR.name, taken, frame_sequence)
+def difference(input_number: int, frame_sequence: int, logged: Message, replayed: Message | None) -> Difference:
+    """Compare a message of the log with the replayed one, which is None if the replay sent nothing."""
+    found = Difference(logged.DESCRIPTOR.name, input_number, frame_sequence)
     if replayed is None:
         found.fields.append("the replay sends none")
         found.otherwise = True
     else:
         _compare(found, "", logged, replayed)
         if not found.fields:
-            found.fields.append("bytes that no value explains: a sign of zero, or a field that this version lacks")
+            found.fields.append("the bytes, but no value: the sign of a zero, or a field unknown to this version")
     return found
 
 
@@ -68,16 +68,16 @@ def _compare(found: Difference, prefix: str, logged: Message, replayed: Message)
             found.fields.append(f"{prefix}{name}: log {_short(was)}, replay {_short(now)}")
             found.otherwise = True
             continue
-        apart = np.abs(after - before)
-        places = np.flatnonzero(apart)
-        shown = ", ".join(f"[{place}] log {before[place]:.9g}, replay {after[place]:.9g}" for place in places[:_SHOWN])
-        more = f" and {len(places) - _SHOWN} more" if len(places) > _SHOWN else ""
-        found.fields.append(f"{prefix}{name}: {shown}{more}; at most {apart.max():.3g} nm apart")
-        found.largest_nm = max(found.largest_nm, float(apart.max()))
+        difference_nm = np.abs(after - before)
+        indices = np.flatnonzero(difference_nm)
+        shown = ", ".join(f"[{i}] log {before[i]:.9g}, replay {after[i]:.9g}" for i in indices[:_MOST_SHOWN])
+        more = f" and {len(indices) - _MOST_SHOWN} more" if len(indices) > _MOST_SHOWN else ""
+        found.fields.append(f"{prefix}{name}: {shown}{more}; largest difference {difference_nm.max():.3g} nm")
+        found.largest_nm = max(found.largest_nm, float(difference_nm.max()))
 
 
 def _numbers(descriptor: Any, value: Any) -> Array | None:
-    """Numbers of a field as an array; None where it holds none, or not finite ones."""
+    """Numbers of a field as an array; None if it has no numbers or they are not finite."""
     found = None
     if descriptor.name in _FLOAT32_FIELDS:
         found = np.frombuffer(value, "<f4").astype(float) if len(value) % 4 == 0 else None

@@ -1,8 +1,8 @@
-"""Replay: the live loop's own `advance`, folded over a log, and every step, command, answer and state compared.
+"""Replay: the live loop's `advance` is applied to a log, and every step, command, answer and state is compared.
 
-A log numbers what its controller took in. From a complete state on, input after input is taken again and what comes
-out is compared with what the log has, byte by byte. Where an input is not in the log, the fold waits for the next
-state and counts the steps that it could not check.
+A log numbers the inputs of its controller. From a complete state on, the inputs are applied one by one, and the results
+are compared with the log byte by byte. If an input is missing from the log, the replay waits for the next state and
+counts the steps that it could not check.
 """
 
 import contextlib
@@ -15,33 +15,33 @@ from lowfc.contract import published
 from lowfc.contract.envelope import start_of
 from lowfc.contract.messages import COMMAND, CONTROL_INPUT, CONTROLLER_STATE, FRAME, REQUEST, STEP, topic_of
 from lowfc.programs.logs.replay.account import Account
-from lowfc.programs.logs.replay.controller_replay import PATIENCE_NS, WHOLE, Context, ControllerReplay, Share
+from lowfc.programs.logs.replay.controller_replay import PATIENCE_NS, WHOLE, Context, ControllerReplay, Segment
 
 TOPICS = (FRAME, STEP, COMMAND, CONTROL_INPUT, CONTROLLER_STATE, REQUEST, *published.TOPICS)
-"""What a replay reads of a log."""
+"""Topics that a replay reads."""
 
 
 class Replay:
-    """Takes the messages of a log, or of several that follow each other, and keeps the account."""
+    """Replay of a log, or of consecutive logs, message by message."""
 
-    def __init__(self, tolerance_nm: float = 0.0, share: Share = WHOLE, kernel: str = "") -> None:
-        """Differences up to `tolerance_nm` are none: for a log of another kind of processor, or another `kernel`."""
-        self.context = Context(tolerance_nm, share, kernel=kernel)
+    def __init__(self, tolerance_nm: float = 0.0, segment: Segment = WHOLE, kernel: str = "") -> None:
+        """Differences up to `tolerance_nm` are ignored: for a log of another processor, or another `kernel`."""
+        self.context = Context(tolerance_nm, segment, kernel=kernel)
         self._controllers: dict[int, ControllerReplay] = {}
         self._last_ns = self._begun_ns = self._ended_ns = 0
 
     @property
     def duration_s(self) -> float:
-        """From the first frame of the share to its last, by their log times."""
+        """Time from the first frame of the segment to its last, by their log times."""
         return (self._ended_ns - self._begun_ns) * 1e-9
 
     def take(self, message: Sample) -> None:
-        """Take the next message."""
+        """Add the next message."""
         context, topic = self.context, topic_of(message.key)
         self._last_ns = now_ns = message.receive_time_ns
-        if now_ns < context.share.from_ns - PATIENCE_NS and topic not in published.TOPICS:
+        if now_ns < context.segment.from_ns - PATIENCE_NS and topic not in published.TOPICS:
             return
-        inside = context.share.from_ns <= now_ns < context.share.until_ns
+        inside = context.segment.from_ns <= now_ns < context.segment.until_ns
         if topic is FRAME:
             context.frames.add(message.sequence, message.payload)
             if inside:
@@ -52,19 +52,19 @@ class Replay:
                 controller.retry_pending = True
         elif topic in TOPICS:
             context.account.steps += topic is STEP and inside
-            with contextlib.suppress(DecodeError):  # its number is missing then, which the fold will find
+            with contextlib.suppress(DecodeError):  # its input number is then found to be missing
                 self._controller(message).take(message, topic.message)
 
     @property
     def done(self) -> bool:
-        """Whether the share has been replayed by every controller."""
-        if self._last_ns - self.context.share.until_ns <= PATIENCE_NS:
+        """Whether the segment has been replayed by every controller."""
+        if self._last_ns - self.context.segment.until_ns <= PATIENCE_NS:
             return False
         newest = max(self._controllers, default=0)
         return all(controller.done or start_s < newest for start_s, controller in self._controllers.items())
 
     def finish(self) -> Account:
-        """The log, or the share, has ended."""
+        """Replay the rest at the end of the log or segment, and return the account."""
         for controller in self._controllers.values():
             controller.go_on(self._last_ns, ended=True)
         return self.context.account
@@ -76,9 +76,11 @@ class Replay:
         return self._controllers[start_s]
 
 
-def replay(messages: Iterable[Sample], tolerance_nm: float = 0.0, share: Share = WHOLE, kernel: str = "") -> Account:
-    """Replay a log's messages from beginning to end, or a share of them."""
-    run = Replay(tolerance_nm, share, kernel)
+def replay(
+    messages: Iterable[Sample], tolerance_nm: float = 0.0, segment: Segment = WHOLE, kernel: str = ""
+) -> Account:
+    """Replay a log's messages from beginning to end, or a segment of them."""
+    run = Replay(tolerance_nm, segment, kernel)
     for message in messages:
         run.take(message)
         if run.done:

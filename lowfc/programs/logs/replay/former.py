@@ -1,4 +1,4 @@
-"""The log of another version: which of its fields are compared, and which rules have changed since on purpose."""
+"""Logs of other versions: the fields to compare, and the rules that were changed on purpose since."""
 
 import contextlib
 from collections.abc import Mapping
@@ -17,30 +17,30 @@ CLOSE_RULE = "the loop is not closed while frames are refused, or on a camera th
 CLEAR_RULE = "clear forgets the newest frame sequence"
 
 _REQUEST_RULES = {"close": CLOSE_RULE, "step": CLOSE_RULE, "law": CLOSE_RULE, "clear": CLEAR_RULE}
-# What a request brought along is its input and not compared; sentences may change.
+# Not compared: the inputs that a request contains, and the wording of its reply, which may change.
 _NOT_COMPARED = {"lowfc.v1.Request": ("reply", "law", "table", "columns", "actuators", "calibration", "play_id")}
 
 
-def changed_rule(taken: Message | None) -> str:
-    """The rule for an input that was another one in former versions; empty where none has changed."""
-    if isinstance(taken, wire.Request) and taken.accepted:
-        return _REQUEST_RULES.get(taken.name, "")
-    if isinstance(taken, wire.ControlInput) and taken.HasField("camera"):
+def changed_rule(logged: Message | None) -> str:
+    """The rule of an input that was different in former versions; empty if unchanged."""
+    if isinstance(logged, wire.Request) and logged.accepted:
+        return _REQUEST_RULES.get(logged.name, "")
+    if isinstance(logged, wire.ControlInput) and logged.HasField("camera"):
         return CAMERA_RULE
     return ""
 
 
-class Former:
-    """A former version's messages: the fields that its log declares, by number."""
+class FormerVersion:
+    """Fields of the messages of a former version, by number, as declared in its log."""
 
     def __init__(self, schemas: Mapping[int, Schema]) -> None:
-        """Read the schemas of a log, by their numbers; while it is read they become more."""
+        """`schemas` are those of the log by number; more are added while the log is read."""
         self._schemas = schemas
         self._read: set[int] = set()
         self._fields: dict[str, set[int]] = {}
 
     def _known(self, name: str) -> set[int] | None:
-        """Numbers of the fields of a message; None where the log does not declare it."""
+        """Numbers of the fields of a message; None if the log does not declare it."""
         for number in self._schemas.keys() - self._read if name not in self._fields else ():
             self._read.add(number)
             with contextlib.suppress(DecodeError):
@@ -56,7 +56,7 @@ class Former:
             self._declare(f"{name}.{nested.name}", nested)
 
     def compared(self, message: M) -> M:
-        """A copy with what is compared of it."""
+        """A copy of a message with only the fields to compare."""
         copy = type(message)()
         copy.CopyFrom(message)
         self._prune(copy)

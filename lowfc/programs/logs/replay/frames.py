@@ -1,4 +1,4 @@
-"""The newest frames of a log, from which its steps are made again."""
+"""The newest frames of a log, from which its steps are recomputed."""
 
 import contextlib
 from collections import deque
@@ -9,11 +9,11 @@ from lowfc.contract.messages import from_timestamp, wire
 from lowfc.control.loop.inputs import Frame
 
 FRAMES_BYTES = 64 << 20
-_STEPS_KEPT = 10_000  # of which it is known from which frame they were made
+_STEPS_KEPT = 10_000  # steps whose frame is remembered
 
 
 class Frames:
-    """The newest frames of a log, by sequence, within a budget of memory."""
+    """The newest frames of a log, by sequence, within a limit of memory."""
 
     def __init__(self) -> None:
         self._payloads: dict[int, list[bytes]] = {}
@@ -22,7 +22,7 @@ class Frames:
         self._steps: deque[tuple[int, int]] = deque(maxlen=_STEPS_KEPT)
 
     def add(self, sequence: int, payload: bytes) -> None:
-        """Keep a frame; the oldest ones go."""
+        """Add a frame; drop the oldest ones beyond the limit."""
         self._payloads.setdefault(sequence, []).append(payload)
         self._order.append(sequence)
         self._bytes += len(payload)
@@ -34,15 +34,15 @@ class Frames:
                 del self._payloads[oldest]
 
     def note_step(self, step: wire.ControlStep) -> None:
-        """Remember which frame a step of the log was made from."""
+        """Remember the frame of a logged step."""
         self._steps.append((step.frame_sequence, from_timestamp(step.timestamp)))
 
     def frame(self, sequence: int, time_ns: int, age_ns: int, *, last: bool = False) -> Frame | None:
-        """The frame of this sequence and time, for a sequence may come twice; or the `last` one that no step has."""
+        """The frame with this sequence, which may occur twice, and time; if `last`, else the newest without a step."""
         found = []
         for payload in self._payloads.get(sequence, ()):
-            with contextlib.suppress(BadMessageError):  # the controller left it out, too
+            with contextlib.suppress(BadMessageError):  # the controller skipped it, too
                 found.append(codec.decode_frame(payload, sequence, age_ns))
-        alike = next((frame for frame in found if frame.time_ns == time_ns), None)
-        others = (frame for frame in reversed(found) if (sequence, frame.time_ns) not in self._steps)
-        return next(others, None) if alike is None and last else alike
+        exact = next((frame for frame in found if frame.time_ns == time_ns), None)
+        unused = (frame for frame in reversed(found) if (sequence, frame.time_ns) not in self._steps)
+        return next(unused, None) if exact is None and last else exact

@@ -1,4 +1,4 @@
-"""Replaying log files, a long one in shares on several processors."""
+"""Replay of log files, long ones in segments on several processors."""
 
 import contextlib
 import gc
@@ -19,14 +19,14 @@ from lowfc.adapters.logs.records import LogFile
 from lowfc.contract import published
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.programs.logs.replay.account import Account
-from lowfc.programs.logs.replay.controller_replay import PATIENCE_NS, WHOLE, Share
+from lowfc.programs.logs.replay.controller_replay import PATIENCE_NS, WHOLE, Segment
 from lowfc.programs.logs.replay.fold import TOPICS, Replay
-from lowfc.programs.logs.replay.former import Former
+from lowfc.programs.logs.replay.former import FormerVersion
 
 _WORTH_BYTES = 50_000_000
-"""Of log, for another process: below that it costs more time than it saves."""
-_SHARES_PER_JOB = 4  # so that progress is seen, and no process is idle for long at the end
-_NEWS_EVERY = 5000
+"""Size of log that justifies another process; for less, its start takes longer than it saves."""
+_SEGMENTS_PER_JOB = 4  # for steady progress, and short idle times at the end
+_PROGRESS_EVERY = 5000
 
 Progress = Callable[[int], None]
 
@@ -34,7 +34,7 @@ Progress = Callable[[int], None]
 def replay_files(
     paths: Sequence[Path], tolerance_nm: float, jobs: int, progress: Progress, kernel: str = ""
 ) -> Account:
-    """Replay logs that follow each other, in as many processes as `jobs`, 0 for one on every processor, at most.
+    """Replay consecutive logs in at most `jobs` processes, 0 for one per processor.
 
     `progress` is called with the bytes replayed so far.
     """
@@ -43,17 +43,17 @@ def replay_files(
         raise ConfigurationError("a log is named twice; name each once, in the order they were recorded")
     size = sum(path.stat().st_size for path in paths)
     jobs = jobs or len(os.sched_getaffinity(0))
-    count = min(_SHARES_PER_JOB * jobs, size // _WORTH_BYTES) if ends_ns and jobs > 1 else 1
+    count = min(_SEGMENTS_PER_JOB * jobs, size // _WORTH_BYTES) if ends_ns and jobs > 1 else 1
     if count < 2:
-        accounts = [_replay_share(paths, tolerance_nm, kernel, WHOLE, progress)]
+        accounts = [_replay_segment(paths, tolerance_nm, kernel, WHOLE, progress)]
     else:
-        edges = [0, *(ends_ns[len(ends_ns) * share // count] for share in range(1, count)), WHOLE.until_ns]
-        shares = [Share(from_ns, until_ns) for from_ns, until_ns in pairwise(edges)]
+        edges = [0, *(ends_ns[len(ends_ns) * segment // count] for segment in range(1, count)), WHOLE.until_ns]
+        segments = [Segment(from_ns, until_ns) for from_ns, until_ns in pairwise(edges)]
         accounts = []
-        # Ctrl-C is for the parent, which ends its workers.
+        # Only the parent handles Ctrl-C; it ends its workers.
         context = multiprocessing.get_context("spawn")
         with context.Pool(min(jobs, count), signal.signal, (signal.SIGINT, signal.SIG_IGN)) as pool:
-            for account in pool.imap(partial(_replay_share, paths, tolerance_nm, kernel), shares):
+            for account in pool.imap(partial(_replay_segment, paths, tolerance_nm, kernel), segments):
                 accounts.append(account)
                 progress(size * len(accounts) // count)
     whole = accounts[0]
@@ -70,16 +70,16 @@ def _chunk_ends_ns(path: Path) -> list[int]:
         return [chunk.message_end_time for chunk in file.index()]
 
 
-def _replay_share(
-    paths: Sequence[Path], tolerance_nm: float, kernel: str, share: Share, progress: Progress = lambda done: None
+def _replay_segment(
+    paths: Sequence[Path], tolerance_nm: float, kernel: str, segment: Segment, progress: Progress = lambda done: None
 ) -> Account:
-    """Replay a share, on one thread as the live loop: more threads sum in another order."""
-    run = Replay(tolerance_nm, share, kernel)
+    """Replay a segment, on one thread like the live loop: several threads sum in another order."""
+    run = Replay(tolerance_nm, segment, kernel)
     log = WholeLog(
         paths,
         skip_damaged=True,
         topics=TOPICS,
-        from_ns=max(0, share.from_ns - PATIENCE_NS),
+        from_ns=max(0, segment.from_ns - PATIENCE_NS),
         always=published.TOPICS,
     )
     part = None
@@ -92,7 +92,7 @@ def _replay_share(
                     _refuse_thinned(part)
                     run.context.former = _former(part)
                 run.take(message)
-                if number % _NEWS_EVERY == 0:
+                if number % _PROGRESS_EVERY == 0:
                     progress(log.position)
                 if run.done:
                     break
@@ -111,14 +111,14 @@ def _replay_share(
 def _refuse_thinned(reader: LogReader) -> None:
     if not reader.selection.has_every_frame:
         raise DataFileError(
-            f"{reader.path} cannot be replayed, as it was made without all frames ({reader.selection.sentence}): steps "
-            "are computed again from every frame; `lowfc what-if` and `lowfc report` read it"
+            f"{reader.path} cannot be replayed, because it does not have every frame ({reader.selection.sentence}): "
+            "steps are recomputed from the frames; use `lowfc what-if` or `lowfc report`"
         )
 
 
-def _former(reader: LogReader) -> Former | None:
-    """What is compared of a log, by the version that it names at its start; None for all, of this version's."""
+def _former(reader: LogReader) -> FormerVersion | None:
+    """Fields to compare in a log of another version; None for a log of this version."""
     version = reader.metadata.get("lowfc", {}).get("lowfc", __version__)
     if version == __version__:
         return None
-    return Former(reader.schemas)
+    return FormerVersion(reader.schemas)

@@ -41,13 +41,13 @@ def budget_figures(run: Run, stretch: Stretch | None, spectra: Spectra | None, m
     ]
     found = [term for term, _ in terms.values() if term is not None]
     total = Term(np.sum([np.maximum(term.variance_nm2, 0) for term in found], axis=0)) if found else None
-    left = [name for name, (term, _) in terms.items() if term is None]
-    true = Term(stretch.left_nm2) if stretch.left_nm2 is not None and stretch.frames.values else None
+    missing = [name for name, (term, _) in terms.items() if term is None]
+    true = Term(stretch.residual_ms_nm2) if stretch.residual_ms_nm2 is not None and stretch.frames.values else None
     measured = _mean_square(stretch.signal(ERROR).joined()) if stretch.frames.values else None
     return {
         "terms": rows,
         "sum": _columns(total, masks),
-        "sum_lacks": left,
+        "sum_lacks": missing,
         "true_residual": _columns(true, masks),
         "measured_error": _columns(measured, masks),
         "sum_over_true": _over(total, true, masks),
@@ -98,8 +98,8 @@ def _measurement_terms(stretch: Stretch, noise: SensorNoise | None) -> tuple[Ent
         missing = _NO_CAMERA
     else:
         error, pol = stretch.signal(ERROR), stretch.signal(POL)
-        seen = replace(error, values=tuple(a - b for a, b in zip(error.values, pol.values, strict=True)))
-        split = measurement_error(stretch.law, error, stretch.signal(SENSED), seen, noise.total_nm)
+        command_seen = replace(error, values=tuple(a - b for a, b in zip(error.values, pol.values, strict=True)))
+        split = measurement_error(stretch.law, error, stretch.signal(SENSED), command_seen, noise.total_nm)
     if split is None:
         nothing = (None, f"requires {missing}")
         return nothing, nothing
@@ -119,7 +119,7 @@ def _columns(term: Term | None, masks: Masks) -> Figures:
     totals = {name: term.total(mask) for name, mask in masks.items()}
     return {
         "rms_nm": {name: rms_nm for name, (rms_nm, _) in totals.items()},
-        "upper_limit": [name for name, (_, seen) in totals.items() if not seen],
+        "upper_limit": [name for name, (_, detected) in totals.items() if not detected],
     }
 
 
@@ -128,6 +128,6 @@ def _over(total: Term | None, true: Term | None, masks: Masks) -> dict[str, floa
         return dict.fromkeys(masks)
     ratios = {}
     for name, mask in masks.items():
-        below = true.total(mask)[0]
-        ratios[name] = total.total(mask)[0] / below if below > 0 else None
+        true_nm = true.total(mask)[0]
+        ratios[name] = total.total(mask)[0] / true_nm if true_nm > 0 else None
     return ratios

@@ -29,13 +29,13 @@ class Stretch:
     """Steps with the loop closed under one law.
 
     Attributes:
-        rows: of the steps, settled.
-        settling: steps left out before them for settling, and `earlier` more of a long stretch.
-        timing: of the loop, as its truth is: sampled where the log's truth is.
-        frames: error, pseudo-open-loop and, where the log has truth, disturbance, residual and the residual's mean over
-            the exposure, side by side.
-        left_nm2: (modes,) mean square of the true residual over the frames, at all times where the truth is continuous;
-            None without any.
+        rows: steps of the stretch, after settling.
+        settling: number of steps left out for settling; `earlier`: further steps left out of a long stretch.
+        timing: timing of the loop; sampled if the log's truth is sampled.
+        frames: columns of error, pseudo-open-loop and, if the log has truth, disturbance, residual and the residual's
+            mean over the exposure.
+        residual_ms_nm2: (modes,) mean square of the true residual, over all times if the truth is continuous, otherwise
+            over the frames; None without truth.
     """
 
     rows: slice
@@ -45,12 +45,12 @@ class Stretch:
     law: LinearLaw
     timing: Timing
     frames: Pieces
-    left_nm2: Array | None
+    residual_ms_nm2: Array | None
 
     @property
     def true(self) -> bool:
         """Whether the true wavefront is known."""
-        return self.left_nm2 is not None
+        return self.residual_ms_nm2 is not None
 
     def signal(self, number: int) -> Pieces:
         """One of `ERROR`, `POL`, `DISTURBANCE`, `RESIDUAL` and `SENSED`, (frames, modes)."""
@@ -77,17 +77,17 @@ def longest_stretch(run: Run) -> Stretch | None:
     rows = slice(max(first + settling, last - MOST_STEPS), last)
     earlier = rows.start - first - settling
     signals = [steps.error_nm[rows], steps.pol_nm[rows]]
-    left_nm2, timing, true = None, Timing.sampled(in_force.delay_frames), history.true
+    residual_ms_nm2, timing, true = None, Timing.sampled(in_force.delay_frames), history.true
     if true is not None and np.isfinite(true.residual_nm[rows]).any():
         signals += [true.disturbance_nm[rows], true.residual_nm[rows], true.sensed_nm[rows]]
-        left_nm2 = np.nanmean(true.modes_residual_rms_nm[rows].astype(float) ** 2, axis=0)
+        residual_ms_nm2 = np.nanmean(true.modes_residual_rms_nm[rows].astype(float) ** 2, axis=0)
         if true.continuous and history.exposure_fraction is not None:
             timing = Timing.of(in_force.delay_frames, history.exposure_fraction)
     found = pieces(steps.sequence[rows], np.hstack(signals))
     noll = tuple(range(2, 2 + gain.size))
     rate_hz = history.rate_hz or 1.0  # unknown, and unused, for a single step
     law = integrator(gain, leak, noll, in_force.delay_frames, rate_hz)
-    return Stretch(rows, settling, earlier, in_force, law, timing, found, left_nm2)
+    return Stretch(rows, settling, earlier, in_force, law, timing, found, residual_ms_nm2)
 
 
 def why_none(run: Run) -> str:
@@ -98,7 +98,7 @@ def why_none(run: Run) -> str:
 
 
 def stretch_figures(run: Run, stretch: Stretch | None) -> Figures | None:
-    """Text of the part of the run and its law."""
+    """Figures of the stretch and its law."""
     if stretch is None:
         return None
     steps = run.history.steps
@@ -172,11 +172,11 @@ def _group(name: str, modes: Mask, law: LinearLaw, found: Spectra, noise_nm2_hz:
     }
     if true:
         disturbance, residual = true
-        left = (passed * disturbance.power_nm2_hz[:, modes]).sum(axis=1)
-        columns |= {"disturbance": total(disturbance), "residual": total(residual), "disturbance_left": left}
+        rejected = (passed * disturbance.power_nm2_hz[:, modes]).sum(axis=1)
+        columns |= {"disturbance": total(disturbance), "residual": total(residual), "disturbance_left": rejected}
         if noise_nm2_hz is not None:
             added = noise_transfer(law, frequency_hz)[:, modes] ** 2 * noise_nm2_hz[modes]
-            columns["residual_predicted"] = left + added.sum(axis=1)
+            columns["residual_predicted"] = rejected + added.sum(axis=1)
     centres_hz, means = in_bins(frequency_hz, list(columns.values()))
     binned = dict(zip(columns, means, strict=True))
     over = {"measured_over_theory": _ratio(binned["error"], binned["error_predicted"])}
@@ -200,10 +200,10 @@ def _group(name: str, modes: Mask, law: LinearLaw, found: Spectra, noise_nm2_hz:
 
 def _ratio(measured: Array, theory: Array) -> Figures:
     """Ratio of measured to theoretical amplitude over all bins: median and the range of 90 % of them."""
-    there = (theory > 0) & (measured > 0)
-    if not there.any():
+    known = (theory > 0) & (measured > 0)
+    if not known.any():
         return {"median": None, "p5": None, "p95": None}
-    p5, median, p95 = np.percentile(np.sqrt(measured[there] / theory[there]), [5, 50, 95])
+    p5, median, p95 = np.percentile(np.sqrt(measured[known] / theory[known]), [5, 50, 95])
     return {"median": float(median), "p5": float(p5), "p95": float(p95)}
 
 
@@ -227,12 +227,12 @@ def noise_of(history: History, rows: slice) -> SensorNoise | None:
         charge_e = history.configuration.dark_e
     em_gain = max(camera.em_gain, 1.0)
     excess = 2.0 if em_gain > 1 else 1.0
-    behind_e2 = camera.read_noise_e**2 + camera.gain_e_per_dn**2 / 12  # rounding to whole DN
+    readout_e2 = camera.read_noise_e**2 + camera.gain_e_per_dn**2 / 12  # after the EM gain; rounding to whole DN
     return sensor_noise(
         calibration.reconstructor.astype(float),
         calibration.reference.astype(float),
         float(flux_dn.mean()) * camera.gain_e_per_dn / em_gain,
-        float(np.sqrt(behind_e2 / em_gain**2 + excess * charge_e)),
+        float(np.sqrt(readout_e2 / em_gain**2 + excess * charge_e)),
         excess,
     )
 

@@ -113,7 +113,7 @@ def _intervals(figure: "Figure", report: Report) -> bool:
 
 
 def _spread(size: int, most: int = 400) -> Long:
-    """Places in an ordered column, ever closer towards its end."""
+    """Indices into a sorted column, denser towards its end."""
     return size - 1 - np.unique(np.geomspace(1, size, min(most, size)).astype(np.int64) - 1)
 
 

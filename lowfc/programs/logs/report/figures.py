@@ -1,4 +1,4 @@
-"""All figures of a report: one object, of what JSON has."""
+"""All figures of a report, as one object for JSON."""
 
 import re
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ from lowfc.programs.logs.report.timing import timing_figures
 from lowfc.programs.logs.report.verdict import verdict
 from lowfc.programs.logs.survey import recovery_in_words
 
-_NOT_VERSIONS = ("host", "kernel", "processor", "processors", "cpu_features", "blas", "run", "seed", "git")
+_OTHER_KEYS = ("host", "kernel", "processor", "processors", "cpu_features", "blas", "run", "seed", "git")
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class Report:
 
 
 def report_of(run: Run) -> Report:
-    """Work everything out."""
+    """Compute all figures."""
     history = run.history
     stretch = longest_stretch(run)
     spectra = spectra_of(stretch)
@@ -83,7 +83,7 @@ def _log(run: Run) -> Figures:
 
 
 def _count(text: str) -> int | None:
-    return int(text) if re.fullmatch("[0-9]{1,20}", text) else None  # whatever stands there, it is the log's text
+    return int(text) if re.fullmatch("[0-9]{1,20}", text) else None  # the log may have any text
 
 
 def _run(run: Run) -> Figures:
@@ -102,8 +102,8 @@ def _run(run: Run) -> Figures:
         if configuration is not None and history.truths.sequence.size
         else {},
         "lockstep": configuration.lockstep if configuration is not None else None,
-        **{key: about.get(key) for key in _NOT_VERSIONS},
-        "versions": {name: value for name, value in about.items() if name not in _NOT_VERSIONS},
+        **{key: about.get(key) for key in _OTHER_KEYS},
+        "versions": {name: value for name, value in about.items() if name not in _OTHER_KEYS},
         "calibration": None
         if calibration is None
         else {

@@ -34,7 +34,7 @@ def page(report: Report, progress: Callable[[str], None] = lambda name: None) ->
 
 
 def require_page() -> None:
-    """Check before the work that the page can be made."""
+    """Check that the page can be made; called before the work."""
     _environment()
     figure_class()
 

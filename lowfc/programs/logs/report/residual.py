@@ -96,15 +96,15 @@ def _contrast(true: Truths, rows: Whole, config: Configuration | None) -> Figure
     None without truth, or for a coronagraph without a science image.
     """
     covariances = {}
-    for name, all_the_time, instants_nm in (
+    for name, rms_nm, sampled_nm in (
         ("open", true.modes_disturbance_rms_nm, true.disturbance_nm),
         ("closed", true.modes_residual_rms_nm, true.residual_nm),
     ):
-        each_nm = _rms(all_the_time, rows)
-        if each_nm is None:
+        modes_nm = _rms(rms_nm, rows)
+        if modes_nm is None:
             return None
-        some_nm = instants_nm[rows][np.isfinite(instants_nm[rows]).all(axis=1)].astype(float)
-        covariances[name] = with_variances(some_nm.T @ some_nm / len(some_nm), each_nm)
+        known_nm = sampled_nm[rows][np.isfinite(sampled_nm[rows]).all(axis=1)].astype(float)
+        covariances[name] = with_variances(known_nm.T @ known_nm / len(known_nm), modes_nm)
     return added_contrast(contrast_of(config), covariances) if config is not None else None
 
 

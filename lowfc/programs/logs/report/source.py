@@ -14,12 +14,12 @@ from lowfc.arrays import Array, Long
 from lowfc.contract.messages import from_timestamp
 
 Figures = dict[str, Any]
-"""As JSON has them."""
+"""Values that JSON can represent."""
 
 
 @dataclass(frozen=True, slots=True)
 class InForce:
-    """A law: gain and leak (modes,), delay; in force from step `first`, which is ignored in comparisons."""
+    """A law: gain and leak (modes,), delay; in force from step `first` on, which comparisons ignore."""
 
     first: int = field(compare=False)
     gain: tuple[float, ...]
@@ -32,7 +32,8 @@ class Run:
     """A log that was read.
 
     Attributes:
-        laws: in order; the law of steps before the first one is unknown.
+        history: contents of the log.
+        laws: laws in order; the law of steps before the first one is unknown.
     """
 
     history: History

@@ -22,8 +22,8 @@ COLOURS = {
     "safe": "#7f3c8e",
     "paper": "#fcfbfa",
 }
-"""Stand-ins, each replaced by the page's variable of that name; near Okabe and Ito's, which the colour-blind can tell
-apart. Open and closed are the same everywhere."""
+"""Placeholders, replaced by the page's variables of these names; near Okabe and Ito's palette, which is safe for colour
+blindness. Open loop and closed loop have the same colours in all drawings."""
 
 _STYLE: Any = {
     "svg.fonttype": "none",
@@ -53,7 +53,7 @@ _WIDTH_IN = 10.0
 def svg(name: str, height_in: float, draw: Callable[["Figure", Report], bool], report: Report) -> str | None:
     """Draw a figure of the page's width; None if `draw` has nothing to draw.
 
-    No prologue, no metadata, no identifier that another drawing of the page has; colours are the page's.
+    The SVG has no prologue and no metadata; its identifiers are unique on the page, its colours are the page's.
     """
     figure_type = figure_class()
     from matplotlib import rc_context

@@ -42,8 +42,8 @@ def intervals_ns(run: Run) -> dict[str, Long]:
 def latencies_ns(history: History) -> dict[str, Long]:
     """Durations of the controller's stages, and from the frame's publication to the mirror's first state with it."""
     rows = rows_of(history.frame_sequence, history.mirror.sequence)
-    followed = rows >= 0
-    to_mirror = history.mirror.publish_time_ns[rows[followed]] - history.frame_publish_ns[followed]
+    applied = rows >= 0
+    to_mirror = history.mirror.publish_time_ns[rows[applied]] - history.frame_publish_ns[applied]
     return {**{stage: history.stages_ns[stage] for stage in STAGES}, FRAME_TO_MIRROR: to_mirror}
 
 
@@ -65,7 +65,7 @@ def frame_counts(history: History) -> Figures:
     Every frame that reaches the controller leads to a step and, with a calibration, to a command; frames that the
     controller skipped (a newer one arrived first) or missed (never arrived) have neither. The last frames, whose
     commands may be after the end of the log, are counted separately. The processes' own counts begin at their start,
-    which may be before that of the log.
+    which may be before the start of the log.
     """
     frames, rows = np.unique(history.frame_sequence, return_index=True)
     without = rows_of(frames, history.steps.sequence) < 0

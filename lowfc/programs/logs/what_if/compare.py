@@ -50,8 +50,8 @@ def what_if(run: LoggedRun, what: WhatIf) -> dict[str, Any]:
     it was never closed), without saturated pixels. If the log has truth, the true residual is given too, because the
     measured one is mostly noise for a faint star. For another reconstructor the frames are read in a second pass.
     """
-    own, noll = what.step, run.calibration.noll
-    after = law(what, noll, run.law)
+    user_step, noll = what.step, run.calibration.noll
+    new_law = law(what, noll, run.law)
     calibration = _calibration(what, run)
 
     was_nm, seen_nm = run.steps.error_nm, run.seen_nm
@@ -61,11 +61,11 @@ def what_if(run: LoggedRun, what: WhatIf) -> dict[str, Any]:
         error_nm = run.measured_again(calibration)
         seen_nm = _in_other_modes(run.calibration, calibration, seen_nm)
     pol_nm = error_nm - seen_nm
-    what_if_nm, command_nm = counterfactual(own or as_logged(after), run.weights, pol_nm, run.missing)
+    what_if_nm, command_nm = counterfactual(user_step or as_logged(new_law), run.weights, pol_nm, run.missing)
 
     usable = run.used & np.isfinite(what_if_nm).all(axis=1)
     lost = np.count_nonzero(run.used & ~usable)
-    rows, settling, over = run.rows_to_compare([run.law, after], usable)
+    rows, settling, over = run.rows_to_compare([run.law, new_law], usable)
     contrast = None
     columns = {"open": rms(pol_nm, rows), "was": rms(was_nm, rows), "what_if": rms(what_if_nm, rows)}
     if run.true_nm is not None:
@@ -89,7 +89,8 @@ def what_if(run: LoggedRun, what: WhatIf) -> dict[str, Any]:
         "estimator": calibration.estimator,
         "calibration": calibration.id,
         "modes": [
-            {"noll": index, "name": mode_name(index), **_one(run.law, row, "_was"), **({} if own else _one(after, row))}
+            {"noll": index, "name": mode_name(index), **_law_values(run.law, row, "_was")}
+            | ({} if user_step else _law_values(new_law, row))
             | {f"{name}_nm": float(values[row]) for name, values in columns.items()}
             for row, index in enumerate(noll)
         ],
@@ -97,10 +98,10 @@ def what_if(run: LoggedRun, what: WhatIf) -> dict[str, Any]:
         **_tilt_mas(run, columns),
         "added_contrast": contrast,
         "warnings": [
-            *_doubts_of_log(run),
+            *_log_warnings(run),
             *([f"the log lacks {counted(int(lost), 'frame')} that were used: the what-if holds there"] if lost else []),
-            *_doubts_of_range(run.calibration, columns),
-            *([] if own else _doubts_of_law(run, after, command_nm[rows])),
+            *_range_warnings(run.calibration, columns),
+            *([] if user_step else _law_warnings(run, new_law, command_nm[rows])),
         ],
     }
 
@@ -114,17 +115,17 @@ def _true(run: LoggedRun, rows: Mask, moved_nm: Single) -> tuple[dict[str, Array
     disturbance_nm, residual_nm = (values.astype(np.float64) for values in run.true_nm)
     found, covariances = dict[str, Array](), dict[str, Array | None]()
     known = rows & np.isfinite(residual_nm).all(axis=1)
-    for name, left_nm in (("was", residual_nm), ("what_if", residual_nm + moved_nm)):
+    for name, after_nm in (("was", residual_nm), ("what_if", residual_nm + moved_nm)):
         if known.any():
-            found[f"true_{name}"] = rms(left_nm, known)
-        squares = np.full(left_nm.shape, np.nan)
+            found[f"true_{name}"] = rms(after_nm, known)
+        squares = np.full(after_nm.shape, np.nan)
         for piece in np.split(np.arange(len(rows)), np.flatnonzero(run.missing)):
-            squares[piece] = left_all_the_time_nm2(disturbance_nm[piece], (left_nm - disturbance_nm)[piece])
-        there = rows & np.isfinite(squares).all(axis=1)
-        if there.any():
-            found[f"continuous_{name}"] = np.sqrt(squares[there].mean(axis=0))
-            instants_nm2 = left_nm[there].T @ left_nm[there] / np.count_nonzero(there)
-            covariances[name.replace("_", " ")] = with_variances(instants_nm2, found[f"continuous_{name}"])
+            squares[piece] = left_all_the_time_nm2(disturbance_nm[piece], (after_nm - disturbance_nm)[piece])
+        settled = rows & np.isfinite(squares).all(axis=1)
+        if settled.any():
+            found[f"continuous_{name}"] = np.sqrt(squares[settled].mean(axis=0))
+            sampled_nm2 = after_nm[settled].T @ after_nm[settled] / np.count_nonzero(settled)
+            covariances[name.replace("_", " ")] = with_variances(sampled_nm2, found[f"continuous_{name}"])
     config = run.history.configuration
     contrast = added_contrast(contrast_of(config), covariances) if config is not None else None
     return {name: found[name] for name in _TITLES if name in found}, contrast
@@ -166,7 +167,7 @@ def _calibration(what: WhatIf, run: LoggedRun) -> Calibration:
     """The calibration of the what-if; by default the log's."""
     calibration, estimator = run.calibration, what.estimator
     if what.calibration is not None:
-        from lowfc.adapters.files.calibration_file import load as load_calibration  # astropy takes its time
+        from lowfc.adapters.files.calibration_file import load as load_calibration  # the import of astropy is slow
 
         calibration = load_calibration(what.calibration)
         for name in ("noll", "shape", "grid"):
@@ -212,8 +213,8 @@ def _in_other_modes(logged: Calibration, other: Calibration, command_nm: Single)
     return np.asarray(command_nm @ change.T, np.float32)
 
 
-def _one(every: Law, row: int, suffix: str = "") -> dict[str, float]:
-    return {f"{key}{suffix}": round(float(getattr(every, key)[row]), 6) for key in LAW_KEYS}
+def _law_values(law: Law, row: int, suffix: str = "") -> dict[str, float]:
+    return {f"{key}{suffix}": round(float(getattr(law, key)[row]), 6) for key in LAW_KEYS}
 
 
 def _tilt_mas(run: LoggedRun, columns: dict[str, Array]) -> dict[str, float]:
@@ -225,7 +226,7 @@ def _tilt_mas(run: LoggedRun, columns: dict[str, Array]) -> dict[str, float]:
     return {f"tilt_{name}_mas": float(np.sqrt(np.mean(rms[tilts] ** 2))) / nm_per_mas for name, rms in columns.items()}
 
 
-def _doubts_of_log(run: LoggedRun) -> list[str]:
+def _log_warnings(run: LoggedRun) -> list[str]:
     found, log = list(run.history.remarks), run.history.log
     if log.damage:
         parts = ", ".join(f"byte {one.position}, {one.why}" for one in log.damage)
@@ -245,14 +246,14 @@ def _doubts_of_log(run: LoggedRun) -> list[str]:
             "measured delay of every frame"
         )
     counts = count_reasons(run.steps.reasons).items()
-    hit = [f"{reason.name.lower()} at {counted(count, 'frame')}" for reason, count in counts if reason in _LIMITS]
-    if hit:
-        found.append(f"limits acted in the logged run ({', '.join(hit)}); in the what-if only modal limits act")
-    cut = np.count_nonzero(run.history.mirror.limits)
-    if cut:
+    acted = [f"{reason.name.lower()} at {counted(count, 'frame')}" for reason, count in counts if reason in _LIMITS]
+    if acted:
+        found.append(f"limits acted in the logged run ({', '.join(acted)}); in the what-if only modal limits act")
+    count = np.count_nonzero(run.history.mirror.limits)
+    if count:
         few = "" if log.selection.records_all(MIRROR_STATE) else f" (recorded mirror states: {log.selection.sentence})"
         found.append(
-            f"the mirror's own limits acted on {counted(int(cut), 'command')}{few}: pseudo-open-loop modes are wrong "
+            f"the mirror's own limits acted on {counted(int(count), 'command')}{few}: pseudo-open-loop modes are wrong "
             "there"
         )
     changes = sum(one.accepted and one.name in LAW_KEYS for one in run.history.requests)
@@ -267,7 +268,7 @@ def _doubts_of_log(run: LoggedRun) -> list[str]:
     return found
 
 
-def _doubts_of_range(calibration: Calibration, columns: dict[str, Array]) -> list[str]:
+def _range_warnings(calibration: Calibration, columns: dict[str, Array]) -> list[str]:
     limit_nm = LINEAR_WAVES * calibration.wavelength_nm
     largest = np.max([columns[name] for name in ("open", "was", "what_if")], axis=0)
     beyond = [
@@ -283,11 +284,11 @@ def _doubts_of_range(calibration: Calibration, columns: dict[str, Array]) -> lis
     ]
 
 
-def _doubts_of_law(run: LoggedRun, law: Law, command_nm: Single) -> list[str]:
+def _law_warnings(run: LoggedRun, law: Law, command_nm: Single) -> list[str]:
     """Remarks on instability and modal limits of the what-if with its commands `command_nm` (frames, modes)."""
     found = []
     noll = run.calibration.noll
-    # The mean over punctual and late frames is not the constant mixture that a fractional delay describes.
+    # The measured delay is a mean over punctual and late frames, not the constant weighting of a fractional delay.
     delay_frames = run.delay_frames if run.delay_frames == run.controller_delay else np.ceil(run.delay_frames)
     highest = {leak: limiting_gain(delay_frames, leak) for leak in set(law.leak.tolist())}
     unstable = [

@@ -32,18 +32,18 @@ from lowfc.control.loop.safety import LoopMode
 
 DELAY_DIFFERS = 0.05
 """Difference in frames beyond which a measured delay is not the controller's, or not a whole number."""
-_TORN_NM = 0.01
+_TORN_NM = 0.01  # difference of the command seen from the logged commands that shows a missing one
 
 
 class LoggedRun:
     """Steps of a log with distinct exposures, from the first used one.
 
     Attributes:
-        steps: those steps; `missing` exposures (steps,) without one before each.
+        steps: these steps; `missing`: (steps,) number of exposures without a step before each.
         true_nm: disturbance and residual (steps, modes), NaN where unknown; None without any.
-        calibration: of the log.
+        calibration: calibration of the log.
         used: (steps,) whether the frame was used.
-        law: the last one of the run.
+        law: last law of the run.
         controller_delay: delay assumed by the controller, frames; `measured_delay`, from `measured_from`, is None if
             it cannot be measured; the comparison uses `delay_frames`, with `weights`.
         seen_nm: (steps, modes) commands seen by the exposures; NaN where a frame was not used and the delay is the
@@ -53,13 +53,13 @@ class LoggedRun:
     """
 
     def __init__(self, history: History) -> None:
-        """Take the run out of a history."""
+        """Extract the run from a history."""
         self.history = history
         rows = exposed(history.steps.sequence)
         used = rows & np.isfinite(history.steps.error_nm).all(axis=1)
         if history.calibration is None or not used.any() or not history.rate_hz:
             raise DataFileError(f"{history.log.path}: it has too few frames used by a calibrated controller")
-        rows[: int(np.argmax(used))] = False  # the disturbance before is unknown
+        rows[: int(np.argmax(used))] = False  # before it, the disturbance is unknown
         self.calibration = history.calibration
         self.steps = history.steps.at(rows)
         true = history.true
@@ -71,18 +71,18 @@ class LoggedRun:
 
         weights = delay_weights(self.controller_delay).astype(np.float32)
         target_nm = _target_nm(history.controllers, self.steps.sequence, len(self.calibration.noll))
-        believed_nm = self.steps.error_nm + target_nm - self.steps.pol_nm
-        reckoned_nm = seen_nm(weights, self.steps.command_nm, self.missing, believed_nm[0])
-        self.torn: Mask = np.abs(reckoned_nm - believed_nm).max(axis=1) > _TORN_NM
+        assumed_nm = self.steps.error_nm + target_nm - self.steps.pol_nm
+        computed_nm = seen_nm(weights, self.steps.command_nm, self.missing, assumed_nm[0])
+        self.torn: Mask = np.abs(computed_nm - assumed_nm).max(axis=1) > _TORN_NM
 
         self.measured_delay, self.measured_from = self._measured_delay()
-        self.delay_frames, self.weights, self.seen_nm = self.controller_delay, weights, believed_nm
+        self.delay_frames, self.weights, self.seen_nm = self.controller_delay, weights, assumed_nm
         if self.measured_delay is not None and abs(self.measured_delay - self.controller_delay) > DELAY_DIFFERS:
             whole = round(self.measured_delay)
             near = abs(self.measured_delay - whole) <= DELAY_DIFFERS
             self.delay_frames = float(whole) if near else self.measured_delay
             self.weights = delay_weights(self.delay_frames).astype(np.float32)
-            self.seen_nm = seen_nm(self.weights, self.steps.command_nm, self.missing, believed_nm[0])
+            self.seen_nm = seen_nm(self.weights, self.steps.command_nm, self.missing, assumed_nm[0])
 
     @property
     def timing(self) -> Timing:
