@@ -121,10 +121,10 @@ def _true(run: LoggedRun, rows: Mask, moved_nm: Single) -> tuple[dict[str, Array
         squares = np.full(after_nm.shape, np.nan)
         for piece in np.split(np.arange(len(rows)), np.flatnonzero(run.missing)):
             squares[piece] = left_all_the_time_nm2(disturbance_nm[piece], (after_nm - disturbance_nm)[piece])
-        settled = rows & np.isfinite(squares).all(axis=1)
-        if settled.any():
-            found[f"continuous_{name}"] = np.sqrt(squares[settled].mean(axis=0))
-            sampled_nm2 = after_nm[settled].T @ after_nm[settled] / np.count_nonzero(settled)
+        with_squares = rows & np.isfinite(squares).all(axis=1)
+        if with_squares.any():
+            found[f"continuous_{name}"] = np.sqrt(squares[with_squares].mean(axis=0))
+            sampled_nm2 = after_nm[with_squares].T @ after_nm[with_squares] / np.count_nonzero(with_squares)
             covariances[name.replace("_", " ")] = with_variances(sampled_nm2, found[f"continuous_{name}"])
     config = run.history.configuration
     contrast = added_contrast(contrast_of(config), covariances) if config is not None else None
