@@ -181,7 +181,7 @@ def render(figures: Figures) -> str:
         )
     return (
         f"{markdown(head, rows)}\n{''.join(notes)}\nReaction wheel with damped lines, 14 mas rms per axis, V = 0 "
-        f"unless stated, {RATE_HZ:g} Hz; the residual is the true tilt in continuous time (8 instants of a frame); "
+        f"unless stated, {RATE_HZ:g} Hz; the residual is the true tilt in continuous time (8 samples in each frame); "
         "blurred sensor images through the live loop's own `advance`; laws identified from "
         f"{IDENTIFY / RATE_HZ:g} s of the closed loop, measured over {MEASURE / RATE_HZ:g} s, "
         f"{SETTLE / RATE_HZ:g} s after they were loaded."

@@ -24,8 +24,8 @@ from sim_camera.driver import disturbance_of
 from tools.law_bench import Bench, with_lines_moved
 
 _LEVEL_DN, _DN_PER_NM = 32_000.0, 80.0
-_SEEN = (1 + np.array([-1, 1]) / np.sqrt(3)) / 2
-_INSTANTS = (np.arange(8) + 0.5) / 8
+_EXPOSURE_NODES = (1 + np.array([-1, 1]) / np.sqrt(3)) / 2
+_TRUTH_SAMPLES = (np.arange(8) + 0.5) / 8
 _DRAWN = 1024
 
 
@@ -84,7 +84,7 @@ class ModalBench(Bench):
         self._squares: list[Single] = []
 
     def _sampled(self) -> Sampler:
-        instants = np.concatenate([self.config.camera.exposure_fraction * _SEEN, _INSTANTS])
+        instants = np.concatenate([self.config.camera.exposure_fraction * _EXPOSURE_NODES, _TRUTH_SAMPLES])
         return Sampler(self._disturbance, instants, self.config.camera.rate_hz)
 
     def move_lines(self, factor: float) -> None:
