@@ -26,7 +26,7 @@ from tools.law_bench import Bench, with_lines_moved
 _LEVEL_DN, _DN_PER_NM = 32_000.0, 80.0
 _EXPOSURE_NODES = (1 + np.array([-1, 1]) / np.sqrt(3)) / 2
 _TRUTH_SAMPLES = (np.arange(8) + 0.5) / 8
-_DRAWN = 1024
+_FRAMES_OF_NOISE = 1024
 
 
 def _two_pixels_a_mode(noll: tuple[int, ...]) -> Calibration:
@@ -104,13 +104,13 @@ class ModalBench(Bench):
         """Expose, control, move the mirror; events are always recorded."""
         noise_nm = np.zeros((0, 0), np.float32)
         for count in range(frames):
-            if not count % _DRAWN:
-                noise_nm = self._noise.standard_normal((_DRAWN, len(self._mix)), np.float32) @ self._mix
+            if not count % _FRAMES_OF_NOISE:
+                noise_nm = self._noise.standard_normal((_FRAMES_OF_NOISE, len(self._mix)), np.float32) @ self._mix
             mirror_nm: Any = sum(
                 weight * past for weight, past in zip(self._weights, self._mirror_shapes_nm, strict=True)
             )
             modes_nm = self._sampler.at(self._index)
-            pixels = _encoded(modes_nm[:2].mean(axis=0) + mirror_nm + noise_nm[count % _DRAWN])
+            pixels = _encoded(modes_nm[:2].mean(axis=0) + mirror_nm + noise_nm[count % _FRAMES_OF_NOISE])
             time_ns = 10**18 + self._index * self.config.period_ns
             self._state, outputs = advance(
                 self._settings, self._state, Frame((1 << 32) + self._index, time_ns, 0, pixels)

@@ -1,4 +1,4 @@
-"""Tables that are not the paper's: tolerances and anchors, and the pages that are made of them."""
+"""The tables `tolerance` and `anchors`, which are not the paper's, and their pages."""
 
 import json
 from pathlib import Path
@@ -21,14 +21,14 @@ def committed(name: str) -> dict:
 
 
 @pytest.mark.parametrize("name", BEYOND)
-def test_the_page_is_that_of_its_figures(name):
+def test_the_page_is_rendered_from_its_json_file(name):
     table = committed(name)
     assert (DOCS / f"{name}.md").read_text() == to_page(table)
     assert (DOCS / PICTURES / f"{name}.png").is_file()
     assert table["seed"] == 1
 
 
-def test_a_long_table_has_its_most_telling_rows_in_the_text():
+def test_a_long_table_prints_selected_rows_and_agrees_with_simulation():
     table = committed("tolerance")
     assert all(CASES["tolerance"].in_text(row) for row in table["rows"])
     more = table | {
@@ -40,22 +40,22 @@ def test_a_long_table_has_its_most_telling_rows_in_the_text():
     for row in checked:
         assert row["measured"] == pytest.approx(row["predicted"], rel=0.1)
     for row in table["rows"]:
-        if row["limit"] is not None:
+        if row["limit"] is not None:  # the largest tolerance of any sensor of this light
             assert row["measured"] <= 1.0001 * row["limit"]
 
 
-def test_every_anchor_has_its_verdict_and_none_is_beyond_the_light():
+def test_every_anchor_has_a_verdict_and_no_noise_is_below_the_quantum_limit():
     rows = committed("anchors")["rows"]
     verdicts = [row for row in rows if row["quantity"].startswith("verdict")]
-    judged = [row for row in rows if row["paper"] is not None]
-    assert len(verdicts) >= len(judged) > 10
+    published = [row for row in rows if row["paper"] is not None]
+    assert len(verdicts) >= len(published) > 10
     assert {row["measured"] for row in verdicts} <= {anchors.REACHED, anchors.SHORT}
     for row in rows:
-        if row["limit"] is not None and row["error"] is None and row["unit"] != "mas":
+        if row["limit"] is not None and row["error"] is None and row["unit"] != "mas":  # computed, without scatter
             assert row["measured"] >= row["limit"]
 
 
-def test_pages_are_written_whole(tmp_path):
+def test_docs_is_refused_for_parts_of_a_page(tmp_path):
     app = new_app("Test.")
     app.command("validate")(validate)
     app.command("other")(lambda: None)

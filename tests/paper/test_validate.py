@@ -1,4 +1,4 @@
-"""`lowfc validate`: its rows against the committed ones, the paper's claims, and what the command prints."""
+"""`lowfc validate`: its rows against the committed ones, the paper's claims, and the command's output."""
 
 import json
 import sys
@@ -53,7 +53,7 @@ def committed():
 
 @pytest.fixture(scope="module")
 def few():
-    """A few trials of one sensor, and what needs no trials at all."""
+    """Tables of one sensor with a few trials, and those without trials."""
     names = ("table1", "table2", "table3", "table4", "conditioning", "photometry")
     with pytest.MonkeyPatch.context() as fewer:
         fewer.setattr(conditioning, "BARS", ((0.1, 45.0),))
@@ -62,34 +62,34 @@ def few():
 
 
 def agree(measured, reference):
-    """Whether the figures of two rows are the same: to 1 %, and where chance is in them to five standard errors."""
+    """Assert that the figures of two rows agree: to 1 %, or to five standard errors if they have one."""
     for figure in ("paper", "predicted", "limit", "measured"):
-        found, wanted = measured[figure], reference[figure]
-        if isinstance(wanted, (int, float)) and figure == "measured" and reference["error"] is not None:
-            # The committed standard error is of many trials: that of few ones follows from it.
+        found, expected = measured[figure], reference[figure]
+        if isinstance(expected, (int, float)) and figure == "measured" and reference["error"] is not None:
+            # The committed standard error is of many trials; scale it to few.
             allowed = 5.0 * reference["error"] * (1.0 + reference["trials"] / measured["trials"]) ** 0.5
-        elif isinstance(wanted, (int, float)):
-            size = 1.0 - wanted if "R^2" in reference["quantity"] else abs(wanted)  # of an R^2 what is left to 1 counts
-            allowed = 0.01 * size + (1e-5 if reference["unit"] else 0.0)  # contrasts are small, and not zero
-            if wanted > 1e12:  # rounding errors: singular
+        elif isinstance(expected, (int, float)):
+            size = 1.0 - expected if "R^2" in reference["quantity"] else abs(expected)  # R^2: distance from 1
+            allowed = 0.01 * size + (1e-5 if reference["unit"] else 0.0)  # contrasts have no unit and are small
+            if expected > 1e12:  # singular: rounding errors
                 allowed = float("inf") if found > 1e12 else 0.0
         else:
-            assert found == wanted, (key(reference), figure)
+            assert found == expected, (key(reference), figure)
             continue
-        assert found == pytest.approx(wanted, abs=allowed), (key(reference), figure)
+        assert found == pytest.approx(expected, abs=allowed), (key(reference), figure)
 
 
 def compare(found, committed):
-    """Rows that both tables have agree; gives the keys that only one of them has."""
+    """Assert that common rows agree; returns the keys that only one table has."""
     rows = {key(row): row | {"trials": found["trials"]} for row in found["rows"]}
     references = {key(row): row | {"trials": committed["trials"]} for row in committed["rows"]}
-    assert len(rows) == len(found["rows"]), "two rows have one key"
+    assert len(rows) == len(found["rows"]), "two rows with the same key"
     for each in rows.keys() & references.keys():
         agree(rows[each], references[each])
     return rows.keys() ^ references.keys()
 
 
-def test_the_document_is_what_its_results_render_to(committed):
+def test_the_document_is_rendered_from_its_results(committed):
     assert (DOCS / DOCUMENT).read_text() == to_markdown(list(committed.values()))
     assert tuple(committed) == commands.TABLES
     for name, *rest in GLANCE:
@@ -100,15 +100,15 @@ def test_the_document_is_what_its_results_render_to(committed):
 
 
 @pytest.mark.parametrize("name", ["table1", "photometry", "table2", "table3", "table4", "conditioning"])
-def test_a_table_of_one_sensor_is_as_committed(few, committed, name):
+def test_a_table_of_one_sensor_agrees_with_the_committed_one(few, committed, name):
     others = {each[0] for each in compare(few[name], committed[name])}
     own = {row["name"] for row in few[name]["rows"]} & {row["name"] for row in committed[name]["rows"]}
-    # In the whole Table 3 the pupil's first sensor stands for the input.
+    # In the complete Table 3 the pupil's first sensor represents the input.
     assert others == {row["name"] for row in few[name]["rows"] + committed[name]["rows"]} - own
     assert (SAM in own) == (name not in ("table1", "photometry"))
 
 
-def test_the_committed_conditioning_is_as_section_4_says(committed):
+def test_the_committed_conditioning_confirms_section_4(committed):
     condition = {
         row["name"]: row["measured"]
         for row in committed["conditioning"]["rows"]
@@ -125,7 +125,7 @@ def test_the_committed_conditioning_is_as_section_4_says(committed):
     assert holes == sorted(holes, reverse=True)
 
 
-def test_table3_beats_the_paper_with_a_few_wavefronts_already(few):
+def test_table3_is_better_than_the_paper_with_few_wavefronts(few):
     assert {row["estimator"] for row in few["table3"]["rows"]} == {None, *ESTIMATORS}
     for modes in (14, 20):
         plain_one, weighted, _, iterated = (find(few["table3"], SAM, RMS, modes, estimator) for estimator in ESTIMATORS)
@@ -134,7 +134,7 @@ def test_table3_beats_the_paper_with_a_few_wavefronts_already(few):
         assert 0.5 * iterated["limit"] < iterated["measured"] < 1.5 * iterated["limit"]
 
 
-def test_table4s_prediction_beats_the_paper(few):
+def test_the_prediction_for_table4_is_better_than_the_paper(few):
     plain_one, weighted = (
         find(few["table4"], SAM, "std of x tilt, 1 mas, paper's electrons", 2, kind) for kind in ("pinv", "weighted")
     )
@@ -143,7 +143,7 @@ def test_table4s_prediction_beats_the_paper(few):
     assert weighted["limit"] <= weighted["predicted"] < 1.02 * weighted["limit"]
 
 
-def test_the_papers_inconsistencies_are_numbers(few):
+def test_the_papers_inconsistencies_are_computed(few):
     rows = [row for row in few["photometry"]["rows"] if row["name"].startswith("inconsistency")]
     assert {row["name"].split(":")[0] for row in rows} == {f"inconsistency {k}" for k in (1, 2, 3, 4)}
     found = {row["quantity"]: row for row in rows}
@@ -164,7 +164,7 @@ def test_no_figure_depends_on_the_number_of_threads(few):
 
 
 @pytest.mark.slow
-def test_another_seed_is_another_draw(few):
+def test_another_seed_gives_other_draws_that_agree(few):
     (again,) = run(["table4"], Context(FEW, seed=2, jobs=2, sensors=(SAM,)))
     assert again["rows"] != few["table4"]["rows"]
     compare(again, few["table4"])
@@ -182,7 +182,7 @@ def test_the_command_prints_one_json_object():
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (("tabel3",), "did you mean 'table3'"),
         (("table2", "--sensor", "sam27d07_bal15"), "did you mean"),
@@ -194,14 +194,14 @@ def test_the_command_prints_one_json_object():
         (("all", "--docs", ".", "--sensor", "sam"), "use it with all"),
     ],
 )
-def test_mistakes_are_one_line(words, said):
+def test_user_errors_are_one_line(words, message):
     error = lowfc("validate", *words).exception
     assert isinstance(error, ConfigurationError)
-    assert said in str(error)
+    assert message in str(error)
     assert "\n" not in str(error)
 
 
-def test_a_fault_of_ours_is_not_called_a_users_mistake(monkeypatch):
+def test_a_programming_error_is_not_reported_as_a_user_error(monkeypatch):
     def broken(context):
         raise ValueError("a fault")
 
@@ -210,17 +210,17 @@ def test_a_fault_of_ours_is_not_called_a_users_mistake(monkeypatch):
         run(["table1"], Context())
 
 
-def test_the_command_prints_a_table_and_tells_who_names_a_sensor_where_that_changes_nothing():
-    told = "for the paper's own sensors only, --sensor has no effect there"
-    assert lowfc("validate", "table1", "--sensor", SAM).stderr.startswith(f"table1: {told}\n")
+def test_the_command_prints_a_table_and_warns_if_a_sensor_has_no_effect():
+    warning = "for the paper's own sensors only, --sensor has no effect there"
+    assert lowfc("validate", "table1", "--sensor", SAM).stderr.startswith(f"table1: {warning}\n")
     done = lowfc("validate", "table1")
-    assert told not in done.stderr
+    assert warning not in done.stderr
     assert "pupil diameters" in done.stdout
     assert "[1] The model uses focal lengths and diameters only by their ratio." in done.stdout
-    assert told not in lowfc("validate", "fig3", "--sensor", SAM).stderr
+    assert warning not in lowfc("validate", "fig3", "--sensor", SAM).stderr
 
 
-def test_without_matplotlib_nothing_is_worked_out_in_vain(monkeypatch, tmp_path):
+def test_missing_matplotlib_is_reported_before_computing(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     monkeypatch.setitem(report.CASES, "table1", Case("never run", pytest.fail))
     with pytest.raises(ConfigurationError, match="matplotlib"):
@@ -228,7 +228,7 @@ def test_without_matplotlib_nothing_is_worked_out_in_vain(monkeypatch, tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_document_goes_into_its_folder(monkeypatch, tmp_path):
+def test_docs_writes_document_results_and_pictures(monkeypatch, tmp_path):
     drawn = {
         name: Case("drawn", lambda context: [Row("a", "b", "", 1.0)], lambda context, path: path.write_bytes(b"new"))
         for name in CASES
@@ -244,7 +244,7 @@ def test_the_document_goes_into_its_folder(monkeypatch, tmp_path):
     )
 
 
-def test_a_folder_that_cannot_be_written_is_a_users_mistake(tmp_path):
+def test_an_unwritable_folder_is_a_user_error(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(DataFileError, match="cannot be made"):
         run(["table1"], Context(), tmp_path / "file" / "plots")
@@ -252,7 +252,7 @@ def test_a_folder_that_cannot_be_written_is_a_users_mistake(tmp_path):
         write_document(tmp_path / "nowhere", [])
 
 
-def test_rows_become_cells():
+def test_rows_are_formatted_as_text_markdown_and_json():
     rows = [
         Row("sensor", "scatter", "mas", 0.123456, 0.36, 0.004, 0.12, 0.1, 2, "pinv", "Dim."),
         Row("a | b", "condition number", "", float("inf"), assumption="Dim."),
@@ -276,25 +276,25 @@ def test_every_table_is_as_committed(committed):
 @pytest.mark.slow
 def test_every_figure_is_as_committed(committed):
     for table in run(tuple(FIGURES), Context(10, jobs=2)):
-        name, wanted = table["table"], committed[table["table"]]
-        for row, reference in zip(table["rows"], wanted["rows"], strict=True):
+        name, reference_table = table["table"], committed[table["table"]]
+        for row, reference in zip(table["rows"], reference_table["rows"], strict=True):
             assert key(row) == key(reference), name
             by_chance = CHANCE.get((name, row["quantity"]))
             if by_chance is not None:
                 assert abs(row["measured"] - reference["measured"]) < by_chance(reference["measured"]), (name, row)
                 row, reference = row | {"measured": None}, reference | {"measured": None}
-            if name == "fig9" and row["limit"] is not None:  # the best fit, a mean over the screens as well
+            if name == "fig9" and row["limit"] is not None:  # the best fit is a mean over the screens too
                 assert row["limit"] == pytest.approx(reference["limit"], rel=0.2), row
                 row, reference = row | {"limit": None}, reference | {"limit": None}
-            agree(row | {"trials": 10}, reference | {"trials": FIGURE_DRAWS.get(name, wanted["trials"])})
+            agree(row | {"trials": 10}, reference | {"trials": FIGURE_DRAWS.get(name, reference_table["trials"])})
 
 
 FIGURE_DRAWS = {"fig1": REALISATIONS, "fig7": REALISATIONS, "fig9": SCREENS}
-"""Where fewer than the trials are behind the committed standard errors."""
+"""Figures whose committed standard errors are from fewer draws than trials."""
 
 
 def _unexplained(coefficient):
-    """Five times what an R^2 or a correlation leaves to 1: of ten wavefronts that scatters by half of itself."""
+    """Five times 1 minus an R^2 or a correlation, whose scatter over ten wavefronts is half of it."""
     return 5.0 * (1.0 - coefficient)
 
 
@@ -307,7 +307,7 @@ CHANCE = {
     **{("fig6", quantity): _unexplained for quantity in ("R^2", "least R^2", "mean R^2")},
     **{("fig9", quantity): _a_fifth for quantity in ("least residual rms", "largest residual rms")},
 }
-"""Figures that depend on the draw and have no standard error: how far ten trials may be from the committed ones."""
+"""Tolerance of ten trials for figures that depend on the draw and have no standard error."""
 
 
 TABLE3 = {
@@ -322,13 +322,13 @@ TABLE3 = {
 
 
 @pytest.mark.parametrize(("name", "estimator"), TABLE3)
-def test_the_committed_table3_beats_the_paper(committed, name, estimator):
+def test_the_committed_table3_is_better_than_the_paper(committed, name, estimator):
     for modes, most in zip((14, 20), TABLE3[name, estimator], strict=True):
         assert find(committed["table3"], name, RMS, modes, estimator)["measured"] < most
 
 
 @pytest.mark.parametrize(("name", "light"), [*product(("sam", "sam27d10_bal14"), LIGHT), (SAM, LIGHT[0])])
-def test_the_committed_table4_beats_the_paper(committed, name, light):
+def test_the_committed_table4_is_better_than_the_paper(committed, name, light):
     for mas, (kind, most) in product((1, 10), (("pinv", 0.36), ("weighted", 0.25))):
         row = find(committed["table4"], name, f"std of x tilt, {mas} mas, {light}", 2, kind)
         assert row["predicted"] < most, row
@@ -338,18 +338,18 @@ def test_the_committed_table4_beats_the_paper(committed, name, light):
 @pytest.mark.parametrize(
     ("better", "worse", "modes", "estimator"),
     [
-        ("sam", "clowfs", 14, "pinv"),  # as the document says before its tables
+        ("sam", "clowfs", 14, "pinv"),  # stated in the document's introduction
         ("clowfs", "sam", 14, "weighted + 2 iterations"),
         *(("sam18_sized", "sam", modes, "pinv") for modes in (14, 20)),
         *(("bowtie", "sam", 14, estimator) for estimator in ESTIMATORS),
     ],
 )
-def test_one_sensor_leaves_less_than_another_in_the_committed_table3(committed, better, worse, modes, estimator):
+def test_order_of_sensors_in_the_committed_table3(committed, better, worse, modes, estimator):
     good, bad = (find(committed["table3"], name, RMS, modes, estimator)["measured"] for name in (better, worse))
     assert good < bad
 
 
-def test_the_committed_table4_prefers_the_zernike_sensor_and_holes_of_several_sizes(committed):
+def test_zernike_sensor_and_sized_holes_are_best_in_the_committed_table4(committed):
     def scatter(name, axis="x", kind="weighted"):
         return find(committed["table4"], name, f"std of {axis} tilt, 1 mas, {LIGHT[1]}", 2, kind)["predicted"]
 
@@ -358,11 +358,11 @@ def test_the_committed_table4_prefers_the_zernike_sensor_and_holes_of_several_si
         assert scatter("sam18_sized", axis, kind) < scatter("sam", axis, kind)
 
 
-def test_only_clowfs_and_the_zernike_sensor_mistake_a_shear_for_a_tilt(committed):
-    """A real pupil and mask make flux and shear even images, and modes odd ones: to fit them along costs nothing."""
-    plain_one, careful = (
+def test_fitting_flux_and_shear_adds_noise_for_clowfs_but_not_for_sam(committed):
+    """With real pupil and mask, flux and shear change the image evenly and modes oddly: fitting them costs nothing."""
+    plain_one, with_nuisances = (
         {name: find(committed["table3"], name, RMS, 14, kind)["measured"] for name in ("sam", "clowfs")}
         for kind in ("weighted", WITH_NUISANCES)
     )
-    assert careful["sam"] == pytest.approx(plain_one["sam"], rel=1e-6)
-    assert careful["clowfs"] > 1.5 * plain_one["clowfs"]
+    assert with_nuisances["sam"] == pytest.approx(plain_one["sam"], rel=1e-6)
+    assert with_nuisances["clowfs"] > 1.5 * plain_one["clowfs"]

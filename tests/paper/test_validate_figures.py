@@ -20,7 +20,7 @@ FEW = Context(trials=4, seed=1, sensors=("sam",))
 
 @pytest.fixture(scope="module")
 def tables():
-    """Rows of every figure by its name, of few trials with the default sensor."""
+    """Rows of every figure by name, with few trials and the default sensor."""
     return {name: case.run(FEW) for name, case in FIGURES.items()}
 
 
@@ -35,7 +35,7 @@ def values(rows, quantity, estimator=None, name=""):
 
 
 @pytest.mark.parametrize("figure", FIGURES)
-def test_every_row_is_finite_and_says_what_was_assumed(tables, figure):
+def test_every_row_is_finite_and_states_its_assumptions(tables, figure):
     rows = tables[figure]
     assert len({row.key for row in rows}) == len(rows)
     for row in rows:
@@ -67,7 +67,7 @@ def test_the_estimate_restores_the_contrast(tables):
         assert max(values(rows, "corrected over flat", estimator)) < 2
 
 
-def test_masks_and_light_are_those_of_the_sensors(tables):
+def test_masks_and_throughputs_are_those_of_the_sensors(tables):
     assert values(tables["fig3"], "outer radius") == [4.0]
     assert values(tables["fig3"], "reflecting area")[0] == pytest.approx(16 * np.pi, rel=0.01)
     light = {row.quantity: row.measured for row in tables["fig2"]}
@@ -75,17 +75,17 @@ def test_masks_and_light_are_those_of_the_sensors(tables):
     assert all(0 < part < 1 for part in light.values())
 
 
-def test_estimates_follow_the_truth(tables):
+def test_estimates_agree_with_true_coefficients(tables):
     assert values(tables["fig5"], "slope", "pinv") == pytest.approx([1.0] * 4, abs=0.1)
     assert min(values(tables["fig5"], "correlation", "pinv")) > 0.95
     rows = tables["fig6"]
     assert all(row.limit < 1.0 for row in rows)
     assert len(values(rows, "R^2", "pinv")) == 14
     assert values(rows, "mean R^2", "pinv")[0] > 0.97
-    assert values(rows, "least R^2", "pinv")[0] > 0.8  # of four wavefronts; of a hundred below
+    assert values(rows, "least R^2", "pinv")[0] > 0.8  # four wavefronts; a hundred in the last test
 
 
-def test_two_iterations_come_close_to_the_limit(tables):
+def test_two_iterations_approach_the_limit(tables):
     rows = tables["fig7"]
     assert {row.estimator for row in rows} == set(ESTIMATORS)
     for name in ("sam, coma Z7", "sam, coma Z8"):
@@ -103,19 +103,19 @@ def test_pure_modes_are_linear_and_iterations_widen_the_range(tables):
     assert len(values(rows, "amplitude of 10 % deviation", "pinv", "sam, Z")) == 14
 
 
-def test_screens_lose_what_fourteen_modes_can_take(tables):
+def test_correction_of_screens_approaches_the_best_fit_of_fourteen_modes(tables):
     rows = tables["fig9"]
     for name in ("sam, cut from", "sam, periodic"):
         best = values(rows, "residual rms", "best possible fit", name)[0]
         assert 0.01 < best < 0.03
         together = np.hypot(best, values(rows, "reconstructed rms", "best possible fit", name)[0])
-        assert together == pytest.approx(0.05, rel=0.03)  # squares add for each screen, these are means of them
+        assert together == pytest.approx(0.05, rel=0.03)  # squares add for each screen; these are means over screens
         assert all((row.limit is None) == (row.quantity != "residual rms") for row in rows)
         for estimator in ("pinv", "weighted", "weighted + 2 iterations"):
             assert best < values(rows, "residual rms", estimator, name)[0] < 2.5 * best
 
 
-def test_a_milliarcsecond_is_as_large_as_the_slope_of_the_image(tables):
+def test_the_signal_of_a_milliarcsecond_agrees_with_the_slope_of_the_image(tables):
     rows = tables["fig10"]
     ready = prepared("sam")
     u = 2 * pupil_axis(512)
@@ -125,7 +125,7 @@ def test_a_milliarcsecond_is_as_large_as_the_slope_of_the_image(tables):
     assert values(rows, "P-V change over peak", name="sam, tilt x")[0] == pytest.approx(np.ptp(slope), rel=0.02)
 
 
-def test_the_signal_over_noise_of_an_image_is_what_the_bound_of_its_tilt_says(tables):
+def test_the_signal_to_noise_ratio_of_an_image_agrees_with_the_bound_of_tilt(tables):
     rows, ready = tables["fig10"], prepared("sam")
     light_e = electrons(STAR, TABLE4_EXPOSURE_S)
     slope_e, noise_e2 = light_e * NM_PER_MAS * ready.band_H[:, 1:2], variance_e(light_e * ready.band_I0, 1.0)
@@ -139,14 +139,14 @@ def test_the_signal_over_noise_of_an_image_is_what_the_bound_of_its_tilt_says(ta
     assert brightest < ratio
 
 
-def test_rows_depend_on_the_seed_and_not_on_the_threads():
+def test_rows_depend_on_the_seed_but_not_on_the_number_of_threads():
     few = replace(FEW, trials=2)
     once, again = FIGURES["fig7"].run(few), FIGURES["fig7"].run(replace(few, jobs=2))
     assert once == again
     assert once != FIGURES["fig7"].run(replace(few, seed=2))
 
 
-def test_the_linear_range_ends_where_the_deviation_passes_a_tenth():
+def test_the_linear_range_ends_at_a_deviation_of_ten_per_cent():
     estimates = np.stack([AMPLITUDES * (1 - 2 * AMPLITUDES), AMPLITUDES * 1.05, AMPLITUDES * (1 - 50 * AMPLITUDES)])
     off = deviations(estimates)
     np.testing.assert_allclose(off[0], 2 * AMPLITUDES)
@@ -156,7 +156,7 @@ def test_the_linear_range_ends_where_the_deviation_passes_a_tenth():
 
 
 @pytest.mark.slow
-def test_the_papers_figures_are_reached_with_a_hundred_trials():
+def test_hundred_trials_reach_the_papers_figures():
     many = Context(trials=100, seed=1, jobs=2)
     fig6 = FIGURES["fig6"].run(many)
     assert values(fig6, "least R^2", "pinv", "sam")[0] > 0.95
