@@ -1,6 +1,6 @@
-"""What is shipped for a host of its own: units that systemd likes, and processes that answer to their supervisor.
+"""Files in deploy: valid systemd units, containers, and processes that report to their supervisor.
 
-The processes here are started as their units start them, with a socket of the test in place of systemd's.
+The processes are started as by their units, with a socket of the test in place of systemd's.
 """
 
 import contextlib
@@ -36,11 +36,11 @@ COMMON = "lowfc-.service.d/10-common.conf"
 INSTALLED = "/opt/lowfc/bin/"
 CONFIGURED = "/etc/lowfc/lowfc.toml"
 MOST_EXPOSED = 2.0
-needs_systemd = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="there is no systemd-analyze")
+needs_systemd = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
 
 
 def settings(name: str) -> dict[str, list[str]]:
-    """Every value of every key of a unit and of what all have in common, in order."""
+    """Every value of every key of a unit and of the common drop-in, in order."""
     found = defaultdict(list)
     for line in (DEPLOY / "systemd" / name).read_text().splitlines() + (
         (DEPLOY / "systemd" / COMMON).read_text().splitlines() if name.endswith(".service") else []
@@ -52,21 +52,21 @@ def settings(name: str) -> dict[str, list[str]]:
 
 
 def processors(name: str) -> set[int]:
-    """A unit's, of a host that has sixteen."""
+    """Processors of a unit on a host with sixteen."""
     (words,) = settings(name)["CPUAffinity"]
     ends = [[int(end) for end in word.split("-")] for word in words.split()]
     return {cpu for first, *last in ends for cpu in range(first, max([first, *last]) + 1) if cpu < 16}
 
 
 def command(name: str) -> list[str]:
-    """What a unit starts, without the path and with no calibration."""
+    """Command of a unit, without path and calibration."""
     (line,) = settings(name)["ExecStart"]
     assert line.startswith(INSTALLED)
     return line.removeprefix(INSTALLED).replace("$CALIBRATION", "").split()
 
 
 def program(words: list[str]) -> str:
-    """Which of our programs a command line is, whose options it takes; typer ends the test where one is unknown."""
+    """Name of the program in a command line; typer ends the test on an unknown option."""
     import sim_camera.__main__ as camera
     import sim_dm.__main__ as mirror
     from lowfc.programs.cli import main
@@ -82,7 +82,7 @@ def program(words: list[str]) -> str:
 
 @pytest.fixture(scope="module")
 def units(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The units, for the programs that are installed here."""
+    """The units with the paths of the programs installed here."""
     folder = tmp_path_factory.mktemp("units") / "systemd"
     shutil.copytree(DEPLOY / "systemd", folder)
     for path in folder.glob("*.service"):
@@ -100,27 +100,27 @@ def exposure(folder: Path, name: str) -> float:
 
 
 @needs_systemd
-def test_systemd_finds_nothing_wrong_with_the_units(units: Path) -> None:
+def test_systemd_accepts_the_units(units: Path) -> None:
     verify = ("verify", "--man=no", "--generators=no", "--recursive-errors=yes")
     names = [*UNITS, "lowfc.target"]
     done = analyze(units, *verify, *names)
     assert (done.returncode, done.stdout + done.stderr) == (0, "")
     wrong = units / COMMON
-    kept = wrong.read_text()
-    wrong.write_text(kept.replace("ProtectSystem=", "ProtectSystme="))  # the test can fail: what is shared is read
+    original = wrong.read_text()
+    wrong.write_text(original.replace("ProtectSystem=", "ProtectSystme="))  # the check fails on a typing error
     assert "ProtectSystme" in analyze(units, *verify, *names).stderr
-    wrong.write_text(kept)
+    wrong.write_text(original)
 
 
 @needs_systemd
 def test_the_units_are_hardened(units: Path, tmp_path: Path) -> None:
     assert {name: exposure(units, name) for name in UNITS if exposure(units, name) >= MOST_EXPOSED} == {}
     shutil.copy(units / UNITS[0], tmp_path)
-    assert exposure(tmp_path, UNITS[0]) > 3 * MOST_EXPOSED  # without what they share
+    assert exposure(tmp_path, UNITS[0]) > 3 * MOST_EXPOSED  # without the common drop-in
 
 
 @needs_systemd
-def test_user_and_folders_are_made(tmp_path: Path) -> None:
+def test_user_and_folders_are_created(tmp_path: Path) -> None:
     (tmp_path / "etc").mkdir()
     for words in (["systemd-sysusers"], ["systemd-tmpfiles", "--create"]):
         of = words[0].removeprefix("systemd-")
@@ -130,19 +130,19 @@ def test_user_and_folders_are_made(tmp_path: Path) -> None:
             text=True,
             check=False,
         )
-        if os.geteuid() == 0:  # others may not give folders away
+        if os.geteuid() == 0:  # only root may change owners
             assert done.returncode == 0, done.stderr
     (line,) = (tmp_path / "etc" / "passwd").read_text().splitlines()
     name, _, number, _, _, home, shell = line.split(":")
     assert (name, home, Path(shell).name) == ("lowfc", "/var/lib/lowfc", "nologin")
-    made = {"run/lowfc": 0o700, "var/lib/lowfc": 0o750, "etc/lowfc": 0o755}
-    assert {path: (tmp_path / path).stat().st_mode & 0o777 for path in made} == made
+    modes = {"run/lowfc": 0o700, "var/lib/lowfc": 0o750, "etc/lowfc": 0o755}
+    assert {path: (tmp_path / path).stat().st_mode & 0o777 for path in modes} == modes
     if os.geteuid() == 0:
-        owners = [(tmp_path / path).stat().st_uid for path in made]
+        owners = [(tmp_path / path).stat().st_uid for path in modes]
         assert owners == [int(number), int(number), 0]
 
 
-def test_the_units_fit_the_programs_and_the_configuration() -> None:
+def test_the_units_match_the_programs_and_the_configuration() -> None:
     realtime = Configuration().realtime
     programs = ["controller", "record", "router", "sim-camera", "sim-dm", "view"]
     assert sorted(program(command(name)) for name in UNITS) == programs
@@ -161,7 +161,7 @@ def test_the_units_fit_the_programs_and_the_configuration() -> None:
         assert all(processors(name).isdisjoint(other) for other in others)
         assert len(processors(name)) == 1 or name not in LOOP
     assert Path(_LATENCY_DEVICE).name in (DEPLOY / "udev" / "70-lowfc.rules").read_text()
-    # What may take long without a sign of life is no hang.
+    # Operations that may take this long do not trigger the watchdog.
     assert float(settings("lowfc-controller.service")["WatchdogSec"][0]) > MIRROR_PATIENCE_S
     assert float(settings("lowfc-sim-camera.service")["WatchdogSec"][0]) > PATIENCE_S
 
@@ -172,17 +172,20 @@ def test_the_documented_commands_install_every_file(tmp_path: Path) -> None:
     for line in lines:
         subprocess.run(["bash", "-ec", line.replace(" /etc/", f" {tmp_path}/")], cwd=DEPLOY, check=True)
     installed = {path.relative_to(tmp_path).as_posix(): path.read_text() for path in files_in(tmp_path)}
-    wanted = {f"systemd/system/{path.relative_to(DEPLOY / 'systemd')}": path for path in files_in(DEPLOY / "systemd")}
-    wanted |= {f"{kind}/lowfc.conf": DEPLOY / kind / "lowfc.conf" for kind in ("sysusers.d", "tmpfiles.d")}
-    wanted |= {"udev/rules.d/70-lowfc.rules": DEPLOY / "udev/70-lowfc.rules", "lowfc/lowfc.toml": DEPLOY / "lowfc.toml"}
-    assert installed == {name: path.read_text() for name, path in wanted.items()}
+    expected = {f"systemd/system/{path.relative_to(DEPLOY / 'systemd')}": path for path in files_in(DEPLOY / "systemd")}
+    expected |= {f"{kind}/lowfc.conf": DEPLOY / kind / "lowfc.conf" for kind in ("sysusers.d", "tmpfiles.d")}
+    expected |= {
+        "udev/rules.d/70-lowfc.rules": DEPLOY / "udev/70-lowfc.rules",
+        "lowfc/lowfc.toml": DEPLOY / "lowfc.toml",
+    }
+    assert installed == {name: path.read_text() for name, path in expected.items()}
 
 
 def files_in(folder: Path) -> list[Path]:
     return [path for path in folder.rglob("*") if path.is_file()]
 
 
-def test_the_configuration_file_is_the_configuration() -> None:
+def test_the_shipped_configuration_file_has_the_defaults() -> None:
     shipped = DEPLOY / "lowfc.toml"
     advice = "lowfc config show > deploy/lowfc.toml"
     assert shipped.read_text() == commented(Configuration()) + "\n", advice
@@ -192,11 +195,11 @@ def test_the_configuration_file_is_the_configuration() -> None:
     assert all(before.startswith("# ") for before, line in itertools.pairwise(lines) if keys.match(line))
 
 
-def test_the_containers_run_the_same_as_the_units() -> None:
+def test_the_containers_run_the_commands_of_the_units() -> None:
     services = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]
-    ours = {"controller": "controller", "recorder": "recorder", "viewer": "viewer"}
+    units = {"controller": "controller", "recorder": "recorder", "viewer": "viewer"}
     for name, service in services.items():
-        unit = f"lowfc-{ours.get(name, f'sim-{name}')}.service"
+        unit = f"lowfc-{units.get(name, f'sim-{name}')}.service"
         assert service["command"] == command(unit)
         assert program(service["command"])
         assert service["cap_drop"] == ["ALL"]
@@ -207,9 +210,9 @@ def test_the_containers_run_the_same_as_the_units() -> None:
         assert set(map(int, service["cpuset"].split(","))) <= processors(unit)
         assert [str(service.get("ulimits", {}).get("rtprio", ""))] == (settings(unit)["LimitRTPRIO"] or [""])
         assert f"./lowfc.toml:{CONFIGURED}:ro" in service["volumes"]
-    assert len(services) == len(UNITS) - 1  # all but the router, which is for several hosts
+    assert len(services) == len(UNITS) - 1  # all except the router
     assert program(services["controller"]["healthcheck"]["test"][1:]) == "ctl"
-    for name in ("controller", "recorder"):  # the latch and the logs; the root is read only
+    for name in ("controller", "recorder"):  # latch and logs; the root is read-only
         assert any(volume.endswith(":/var/lib/lowfc") for volume in services[name]["volumes"])
     built = (DEPLOY / "Containerfile").read_text()
     last = built.rpartition("\nFROM ")[2]
@@ -220,7 +223,7 @@ def test_the_containers_run_the_same_as_the_units() -> None:
 
 
 class Manager:
-    """What systemd is to a process: who listens to it, and misses what does not fit into a socket's short queue."""
+    """Stand-in for systemd: receives a process's notifications; the short queue of its socket may drop some."""
 
     def __init__(self, path: Path, wait_s: float) -> None:
         self.environment = {"NOTIFY_SOCKET": str(path), "WATCHDOG_USEC": str(round(wait_s * 1e6))}
@@ -231,7 +234,7 @@ class Manager:
         self.socket.setblocking(False)
 
     @property
-    def said(self) -> list[str]:
+    def notifications(self) -> list[str]:
         with contextlib.suppress(BlockingIOError):
             while True:
                 self._received.append(self.socket.recv(4096).decode())
@@ -239,10 +242,12 @@ class Manager:
 
     @property
     def beats(self) -> int:
-        return self.said.count("WATCHDOG=1")
+        return self.notifications.count("WATCHDOG=1")
 
     def status(self) -> str:
-        return next((one.removeprefix("STATUS=") for one in reversed(self.said) if one.startswith("STATUS=")), "")
+        return next(
+            (one.removeprefix("STATUS=") for one in reversed(self.notifications) if one.startswith("STATUS=")), ""
+        )
 
 
 WAIT_S = 0.2
@@ -251,18 +256,18 @@ import os, sys, time
 import lowfc.programs.core.controller as process
 from lowfc.__main__ import main
 advance = process.advance
-def advance_or_hang(*taken):
+def advance_or_hang(*arguments):
     while os.path.exists(HANGS):
         time.sleep(1)
-    return advance(*taken)
+    return advance(*arguments)
 process.advance = advance_or_hang
 main()
 """
-"""The controller, whose control law does not return once a file is there."""
+"""A controller whose control law does not return while a file exists."""
 
 
 class Supervised:
-    """A process as its unit starts it, in a run of the test, with a stand-in for systemd."""
+    """A process started as by its unit, with a stand-in for systemd."""
 
     def __init__(self, name: str, folder: Path) -> None:
         unit = f"lowfc-{name}.service"
@@ -273,10 +278,10 @@ class Supervised:
         start = [str(Path(sys.executable).parent / program)]
         if name == "controller":
             start = [sys.executable, "-c", HANGING.replace("HANGS", repr(str(folder / "hang")))]
-        self.words_file = folder / f"{name}.stderr"
-        with self.words_file.open("wb") as said:
+        self.stderr_file = folder / f"{name}.stderr"
+        with self.stderr_file.open("wb") as stderr:
             environment = os.environ | self.manager.environment | {"PYTHONFAULTHANDLER": "1"}
-            self.process = subprocess.Popen([*start, *words], cwd=folder, stderr=said, env=environment)
+            self.process = subprocess.Popen([*start, *words], cwd=folder, stderr=stderr, env=environment)
 
     def close(self) -> None:
         self.process.kill()
@@ -285,20 +290,20 @@ class Supervised:
 
 
 @pytest.mark.exclusive
-def test_processes_are_ready_alive_and_stopping(tmp_path: Path) -> None:
+def test_processes_notify_ready_watchdog_and_stopping(tmp_path: Path) -> None:
     with contextlib.ExitStack() as stack:
         names = ("recorder", "sim-mirror", "controller", "sim-camera")
         found = {name: stack.enter_context(contextlib.closing(Supervised(name, tmp_path))) for name in names}
         for one in found.values():
-            until(lambda one=one: "READY=1" in one.manager.said and one.manager.beats > 5)
+            until(lambda one=one: "READY=1" in one.manager.notifications and one.manager.beats > 5)
             most = (time.monotonic() - one.manager.begun_s) / (WAIT_S / 2) + 2
-            assert one.manager.beats <= most, f"{one.name} says so too often"
+            assert one.manager.beats <= most, f"{one.name} sends WATCHDOG=1 too often"
         controller, mirror = found["controller"], found["sim-mirror"]
         until(lambda: re.fullmatch(r"running, open, \d+ Hz", controller.manager.status()))
 
         def quiet() -> bool:
-            """Whether the controller is silent while the mirror gives five signs of life: for longer than the wait."""
-            time.sleep(0.05)  # what it had sent is taken
+            """Whether the controller sends no WATCHDOG=1 while the mirror sends five: for longer than its period."""
+            time.sleep(0.05)  # receive what was sent before
             before, others = controller.manager.beats, mirror.manager.beats
             until(lambda: mirror.manager.beats >= others + 5)
             return controller.manager.beats == before
@@ -309,43 +314,45 @@ def test_processes_are_ready_alive_and_stopping(tmp_path: Path) -> None:
         controller.process.send_signal(signal.SIGCONT)
         assert not quiet()
         (tmp_path / "hang").touch()
-        until(lambda: "COMMAND_EXPIRED" in mirror.words_file.read_text())  # nothing comes from the controller
+        until(lambda: "COMMAND_EXPIRED" in mirror.stderr_file.read_text())  # the controller sends nothing
         assert quiet()
-        controller.process.send_signal(signal.SIGABRT)  # as systemd does then
+        controller.process.send_signal(signal.SIGABRT)  # as by systemd
         assert controller.process.wait(20) == -signal.SIGABRT
-        assert "advance_or_hang" in controller.words_file.read_text()  # what hung is in the journal
+        assert "advance_or_hang" in controller.stderr_file.read_text()  # the journal shows where it hung
         stopped = [one for one in found.values() if one is not controller]
         for one in stopped:
-            assert "STOPPING=1" not in one.manager.said
+            assert "STOPPING=1" not in one.manager.notifications
             one.process.send_signal(signal.SIGTERM)
-        until(lambda: False not in [bool(one.manager.said) and one.process.poll() is not None for one in stopped])
+        until(
+            lambda: False not in [bool(one.manager.notifications) and one.process.poll() is not None for one in stopped]
+        )
         for one in stopped:
-            assert one.process.returncode == 0, one.words_file.read_text()
-            assert one.manager.said.count("READY=1") == one.manager.said.count("STOPPING=1") == 1
+            assert one.process.returncode == 0, one.stderr_file.read_text()
+            assert one.manager.notifications.count("READY=1") == one.manager.notifications.count("STOPPING=1") == 1
             assert one.manager.status().startswith("stopped")
 
 
-def test_a_managers_watchdog_is_not_a_parents_and_nobody_has_to_listen(tmp_path: Path) -> None:
-    given = {"NOTIFY_SOCKET": str(tmp_path / "nobody"), "WATCHDOG_USEC": "1000000"}
-    assert Supervisor(given | {"WATCHDOG_PID": str(os.getpid())}).period_ns == 500_000_000
-    no_wait = given | {"WATCHDOG_USEC": "0"}
-    for environment in ({"WATCHDOG_USEC": "1000000"}, given | {"WATCHDOG_PID": str(os.getppid())}, no_wait):
-        nobody = Supervisor(environment)
-        assert nobody.period_ns is None
-        nobody.ready()
-        nobody.alive(0)
-        nobody.stopping()
-        nobody.tell(wire.Health())
+def test_a_watchdog_of_another_process_and_a_missing_manager_are_ignored(tmp_path: Path) -> None:
+    variables = {"NOTIFY_SOCKET": str(tmp_path / "nobody"), "WATCHDOG_USEC": "1000000"}
+    assert Supervisor(variables | {"WATCHDOG_PID": str(os.getpid())}).period_ns == 500_000_000
+    no_wait = variables | {"WATCHDOG_USEC": "0"}
+    for environment in ({"WATCHDOG_USEC": "1000000"}, variables | {"WATCHDOG_PID": str(os.getppid())}, no_wait):
+        unsupervised = Supervisor(environment)
+        assert unsupervised.period_ns is None
+        unsupervised.ready()
+        unsupervised.alive(0)
+        unsupervised.stopping()
+        unsupervised.tell(wire.Health())
 
 
 def test_the_loop_does_not_wait_for_a_manager_that_does_not_read() -> None:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as deaf:
-        deaf.bind("")  # the kernel gives it a name without a file, as systemd may have
-        name = deaf.getsockname().decode().replace("\0", "@", 1)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind("")  # an abstract socket, as systemd may use
+        name = manager.getsockname().decode().replace("\0", "@", 1)
         supervisor = Supervisor({"NOTIFY_SOCKET": name, "WATCHDOG_USEC": "2"})
-        for turn in range(2000):  # more than a socket holds
-            supervisor.alive(turn * 1000)
-        assert deaf.recv(4096) == b"WATCHDOG=1"
+        for count in range(2000):  # more than the socket's queue
+            supervisor.alive(count * 1000)
+        assert manager.recv(4096) == b"WATCHDOG=1"
 
 
 def test_a_status_is_one_line() -> None:

@@ -1,4 +1,4 @@
-"""Documents that cannot rot: every command in them is run, every figure comes from a file."""
+"""Every command in the documentation is run, and every link leads to a file."""
 
 import json
 import re
@@ -18,7 +18,7 @@ from tests.support.viewers import on_screen
 
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
-# Run by CI itself, which runs this test; and by the tests of rerun and of its layouts.
+# Commands that CI itself or another test runs, and where.
 ROUTE = "rerun rrd route --application-id $(basename $log .mcap) deploy/layouts/log.rbl | rerun $log -"
 ELSEWHERE = {
     "make sim-loop": ".ci/run",
@@ -41,20 +41,20 @@ PROGRAMS = ("lowfc", "sim-camera", "sim-dm", "make", "rerun", "python")
 
 
 def commands(document: Path) -> list[str]:
-    """Command lines of a document: indented by four, without the comment behind them."""
+    """Command lines of a document: indented by four, without trailing comments."""
     lines = re.findall(r"^    (\S.*)$", document.read_text(), flags=re.MULTILINE)
     bare = [line.split("  #")[0].strip() for line in lines]
     return [line for line in bare if line.split()[0] in PROGRAMS]
 
 
 def run(folder: Path, line: str) -> str:
-    """Run a documented command as it stands, only shorter."""
+    """Run a documented command, shortened by `SHORTER`."""
     for long, short in SHORTER.items():
         line = line.replace(long, short)
     return command(folder, line)
 
 
-def test_every_command_of_the_documents_is_known() -> None:
+def test_every_command_in_the_documentation_is_tested() -> None:
     found = [
         line
         for document in (README, *ROOT.glob("docs/**/*.md"), *ROOT.glob("deploy/*.md"))
@@ -121,7 +121,7 @@ STAYING = (
     "lowfc view --foxglove",
     "lowfc view last",
 )
-"""They go on until Ctrl-C."""
+"""Commands that run until Ctrl-C."""
 LOOKING = (
     "lowfc view --headless-screenshot now.png",
     "lowfc view --save night.rrd --seconds 60",
@@ -156,31 +156,31 @@ def test_the_requests(tmp_path: Path, own_runtime: Path) -> None:
         until(
             lambda: "closed · residual " in subprocess.run(status, capture_output=True, text=True, check=False).stdout
         )
-        said = [run(tmp_path, line) for line in REQUESTS]
+        printed = [run(tmp_path, line) for line in REQUESTS]
     finally:
         out, complaints = interrupt(loop)
     assert loop.returncode == 0, complaints
-    assert said[0].startswith("closed · residual ")
-    assert said[1].startswith("gain is now 0.3 0.3 0.0"), "of tip and tilt alone"
-    assert said[2].startswith("the gain of Z2"), "of all modes"
-    replies = [text.split(",")[0] for text in said[3:7]]
+    assert printed[0].startswith("closed · residual ")
+    assert printed[1].startswith("gain is now 0.3 0.3 0.0"), "only tip and tilt"
+    assert printed[2].startswith("the gain of Z2"), "all modes"
+    replies = [text.split(",")[0] for text in printed[3:7]]
     assert replies == ["loop open", "loop closed", "loop in safe mode", "loop open"]
-    assert re.match(r"\S+  open at \d+ Hz, up \d+ s; camera, controller, mirror-dm; not recording\n", said[7])
+    assert re.match(r"\S+  open at \d+ Hz, up \d+ s; camera, controller, mirror-dm; not recording\n", printed[7])
     assert "frame to command" in out
 
 
 @pytest.mark.exclusive
 @pytest.mark.slow
 @pytest.mark.parametrize("recorder", [BY_HAND[3], FEWER])
-def test_the_processes_by_hand(tmp_path: Path, recorder: str) -> None:
+def test_the_processes_started_separately(tmp_path: Path, recorder: str) -> None:
     with going_on(tmp_path, *BY_HAND[:3], recorder) as complaints:
         status = [sys.executable, "-m", "lowfc", "ctl", "status", "--run", "bench"]
         until(lambda: subprocess.run(status, cwd=tmp_path, capture_output=True, check=False).returncode == 0, 120)
         until(lambda: recorded_bytes(tmp_path) > 4e6)
         session = json.loads(run(tmp_path, SESSION[0]))
         assert session["listen"]["endpoints"][0].startswith("tcp/127.0.0.1:")
-    for name, said in zip(("camera", "mirror-dm", "controller", "recorder"), complaints, strict=True):
-        assert f"{name}: ready (run bench)\n" in said
+    for name, stderr in zip(("camera", "mirror-dm", "controller", "recorder"), complaints, strict=True):
+        assert f"{name}: ready (run bench)\n" in stderr
     assert len(list((tmp_path / "logs").glob("*.mcap"))) == 1
 
 
@@ -211,23 +211,22 @@ def test_the_views(tmp_path: Path) -> None:
 
 
 def look(folder: Path, line: str) -> None:
-    """Run a view until it says where it is to be seen, then Ctrl-C."""
+    """Run a view until it prints its address, then Ctrl-C."""
     process = start(folder, *line.split()[1:])
-    said = process.stderr.readline()
-    assert "127.0.0.1" in said
+    assert "127.0.0.1" in process.stderr.readline()
     _, complaints = interrupt(process)
     assert process.returncode == 0, complaints
 
 
 @pytest.mark.slow
 def test_the_validation(tmp_path: Path) -> None:
-    said = run(tmp_path, VALIDATE[0])
-    assert "tilt" in said
-    assert "peak" in said
+    printed = run(tmp_path, VALIDATE[0])
+    assert "tilt" in printed
+    assert "peak" in printed
 
 
 @pytest.mark.slow
-def test_the_designs_are_taken_by_the_loop(tmp_path: Path) -> None:
+def test_the_loop_runs_with_the_designs(tmp_path: Path) -> None:
     for line in DESIGN:
         run(tmp_path, line)
     (tmp_path / "own.toml").write_text('[sensor]\npupil = "pupil.npz"\nsam = "mask.json"\n')
@@ -237,15 +236,15 @@ def test_the_designs_are_taken_by_the_loop(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_logs(tmp_path: Path) -> None:
     run(tmp_path, "lowfc sim-loop --lockstep --rate 200 --duration 2 --json")
-    said = [run(tmp_path, line) for line in LOGS]
-    assert "lowfc/camera/frame" in said[0]
-    assert "400 frames, commands identical, largest difference 0 nm" in said[1]
-    assert "what if" in said[2]
-    assert "played" in said[3]
-    assert "is whole" in said[4]
-    assert "1 in 10 frames and mirror states" in said[7]
-    assert "digest " in said[8]
-    assert "-every-10.mcap" not in said[8], "the newest log is the one that was recorded"
+    printed = [run(tmp_path, line) for line in LOGS]
+    assert "lowfc/camera/frame" in printed[0]
+    assert "400 frames, commands identical, largest difference 0 nm" in printed[1]
+    assert "what if" in printed[2]
+    assert "played" in printed[3]
+    assert "is whole" in printed[4]
+    assert "1 in 10 frames and mirror states" in printed[7]
+    assert "digest " in printed[8]
+    assert "-every-10.mcap" not in printed[8], "`last` is the recorded log"
     assert {path.suffix for path in (tmp_path / "logs").iterdir()} == {".mcap", ".html", ".fits"}
 
 

@@ -1,4 +1,4 @@
-"""Example scripts of the numerics and of logs, as their first lines say to run them."""
+"""Example scripts on numerical code and on logs, run as in their docstrings."""
 
 import re
 import subprocess
@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def run(name: str, log: str = "") -> list[str]:
-    """Lines that an example prints, run with the arguments of its docstring."""
+    """Output lines of an example, run with the arguments in its docstring."""
     script = ROOT / "examples" / f"{name}.py"
     (words,) = re.findall(rf"^Example: python examples/{name}.py (.*)$", script.read_text(), re.MULTILINE)
     done = subprocess.run(
@@ -32,8 +32,8 @@ def test_photon_budget() -> None:
 def test_loop_design() -> None:
     rows = [[float(word) for word in line.split()] for line in run("loop_design")[2:]]
     assert [row[1] for row in rows if row[0] in (1, 2)] == [2, 1]  # 2 sin(pi / (2 (2d - 1)))
-    left = [row[3] for row in rows]
-    assert left == sorted(left)
+    residuals = [row[3] for row in rows]
+    assert residuals == sorted(residuals)
 
 
 def test_log_to_pandas() -> None:
@@ -54,7 +54,7 @@ def test_compare_nights() -> None:
     assert float(lines[tilt + 1]) == float(lines[tilt + 2]) > 0
 
 
-def test_the_package_offers_few_names_and_imports_them_when_they_are_named() -> None:
+def test_the_package_imports_its_exported_names_on_first_use() -> None:
     script = (
         "import sys, lowfc; assert not [name for name in sys.modules if name.startswith('lowfc.')]\n"
         "assert {*lowfc.__all__} <= {*dir(lowfc)}\n"

@@ -1,6 +1,6 @@
-"""Tutorials: every command of each page, in its order; the first page in a short form too, the others as slow tests.
+"""Tutorials: every command of each page in order; the first page also in a short form, the others as slow tests.
 
-Commands of a loop in real time, and of views, are run by the tests that `test_docs` names.
+The tests named in `test_docs` run the commands of real-time loops and of views.
 """
 
 import json
@@ -31,12 +31,12 @@ _ALONE = re.compile(r"lowfc (?!sim-loop)")
 
 
 def followed_here(line: str) -> bool:
-    """Whether a command ends by itself, and does not need a loop in real time."""
+    """Whether a command ends by itself and needs no real-time loop."""
     return not _LIVE.search(line)
 
 
 def followed(folder: Path, page: str, *, shorter: bool = False) -> dict[str, str]:
-    """What each command of a page prints, run in its order in this folder; only loops as processes of their own."""
+    """Output of each command of a page, run in order in this folder; only loops are separate processes."""
     text = (PAGES / f"{page}.md").read_text()
     for name, content in re.findall(r"Save this as `(\S+)`.*?```\w+\n(.*?)```", text, re.DOTALL):
         (folder / name).write_text(content)
@@ -50,7 +50,7 @@ def followed(folder: Path, page: str, *, shorter: bool = False) -> dict[str, str
 
 
 def tilt_mas(summary: str) -> float:
-    """Residual tilt of a summary."""
+    """Residual tilt in a summary, mas."""
     return float(re.findall(r"tilt per axis +(\S+) mas", summary)[0])
 
 
@@ -75,10 +75,10 @@ def test_tuned_law(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_design_mask(tmp_path: Path) -> None:
-    design, *flown = followed(tmp_path, "design_mask").values()
+    design, *loops = followed(tmp_path, "design_mask").values()
     assert "written to mask.json" in design
-    assert len(flown) == 3
-    assert all("frame to command" in one for one in flown)
+    assert len(loops) == 3
+    assert all("frame to command" in one for one in loops)
 
 
 def test_bad_night(tmp_path: Path) -> None:
@@ -97,22 +97,22 @@ def test_bad_night(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.exclusive
-def test_tuned_law_on_a_loop_in_real_time(tmp_path: Path, own_runtime: Path) -> None:
+def test_tuned_law_with_a_real_time_loop(tmp_path: Path, own_runtime: Path) -> None:
     command(tmp_path, "lowfc calibrate --method analytic --out computed.fits")
     loop = start(tmp_path, *LIVE[0].split()[1:])
     try:
         until(lambda: recorded_bytes(tmp_path) > 4e6)
-        said = [command(tmp_path, line) for line in LIVE[1:]]
+        printed = [command(tmp_path, line) for line in LIVE[1:]]
     finally:
         _, complaints = interrupt(loop)
     assert loop.returncode == 0, complaints
-    assert "good" in said[0]
-    assert "loop closed" in said[-1]
+    assert "good" in printed[0]
+    assert "loop closed" in printed[-1]
 
 
 @pytest.mark.slow
 @pytest.mark.exclusive
-def test_bad_night_of_ones_own(tmp_path: Path, own_runtime: Path) -> None:
+def test_bad_night_with_an_injected_fault(tmp_path: Path, own_runtime: Path) -> None:
     command(tmp_path, CHAOS)
     assert list((tmp_path / "bad").rglob("*.mcap"))
 
@@ -120,7 +120,7 @@ def test_bad_night_of_ones_own(tmp_path: Path, own_runtime: Path) -> None:
 @pytest.mark.basler
 @pytest.mark.slow
 @pytest.mark.exclusive
-def test_your_camera_by_the_vendors_emulation(
+def test_your_camera_with_the_vendors_emulation(
     tmp_path: Path, own_runtime: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = (PAGES / "your_camera.md").read_text()
