@@ -116,7 +116,7 @@ class Scene:
 @pytest.fixture(autouse=True)
 def _quickly(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bridges, "_CHECK_S", 0.05)
-    monkeypatch.setattr(bridges, "_TURN_S", 0.02)
+    monkeypatch.setattr(bridges, "_POLL_S", 0.02)
     monkeypatch.setattr(render_threads, "PICTURES_HZ", 100.0)
     monkeypatch.setattr(bridges, "resident_bytes", lambda: 0)  # that of all tests in this process is no view's
 
@@ -204,8 +204,8 @@ def makes_the_bridge_grow(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None
     [
         (dies, 0, "the viewer was killed"),
         (takes_nothing, 1, "read nothing for"),
-        (grows, 0, "the viewer holds 16"),
-        (makes_the_bridge_grow, 0, "the bridge holds 512 MB"),
+        (grows, 0, "the viewer uses 16"),
+        (makes_the_bridge_grow, 0, "the bridge uses 512 MB"),
     ],
 )
 def test_a_viewer_that_fails_is_started_again_and_shows_everything(
@@ -252,7 +252,7 @@ def test_a_window_that_takes_nothing_is_waited_for_in_bounded_memory(
 def test_memory_that_stays_ends_the_view(scenes: Scenes, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = scenes()
     monkeypatch.setattr(bridges, "resident_bytes", lambda: bridges.OWN_BYTES + 1)
-    assert "even when new" in failed(scene)
+    assert "even after a restart" in failed(scene)
 
 
 def test_a_view_that_fails_again_and_again_ends(scenes: Scenes, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -263,7 +263,7 @@ def test_a_view_that_fails_again_and_again_ends(scenes: Scenes, monkeypatch: pyt
 def test_a_view_into_a_file_is_not_begun_anew(scenes: Scenes, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = scenes(None)
     monkeypatch.setattr(Tape, "set_time", None)
-    assert "the view into a file ended: drawing failed" in failed(scene)
+    assert "writing the view to a file failed: drawing failed" in failed(scene)
 
 
 @pytest.mark.parametrize(("pause_s", "every_one"), [(0.1, True), (0.0, False)])

@@ -167,7 +167,7 @@ def test_an_app_that_comes_late_gets_the_calibration(bus: MemoryBus) -> None:
     bus.publisher(CALIBRATION).put(calibration, publish_time_ns=3)
     with running(bus) as bridge:
         bus.publisher(HEALTH, "controller").put(wire.Health(process="controller", pid=1).SerializeToString())
-        until(lambda: CALIBRATION.key in bridge.kept)
+        until(lambda: CALIBRATION.key in bridge.last_states)
         for _ in range(2):
             with connected(bridge.port) as client:
                 client.subscribe("/" + CALIBRATION.key)

@@ -16,7 +16,7 @@ from lowfc.programs.view.layout import layout
 from lowfc.programs.view.panels import mirror, pointing, sensor, tiles, trend, wavefront
 from lowfc.programs.view.recorded import Drawn, draw_logs
 from lowfc.programs.view.renderer import Renderer
-from lowfc.programs.view.session import forgotten
+from lowfc.programs.view.session import memory_remarks
 from lowfc.programs.view.target import Target
 from lowfc.programs.view.verdicts import course
 from lowfc.programs.view.verdicts.course import Course
@@ -108,8 +108,8 @@ def test_the_trend_holds_a_night_in_so_many_spans() -> None:
 
 def test_a_log_of_which_the_viewer_forgets_a_part_is_said_so() -> None:
     target = Target(picture=Path("night.png"))
-    assert forgotten(511_000_000, target) == []
-    [remark] = forgotten(1_652_000_000, target)
+    assert memory_remarks(511_000_000, target) == []
+    [remark] = memory_remarks(1_652_000_000, target)
     assert remark.startswith(
         "the log has 1652 MB, the viewer keeps 512 MB (--memory-mb): curves of every frame may begin late"
     )
@@ -152,7 +152,7 @@ def test_logs_of_two_runs_are_not_laid_over_each_other(tmp_path: Path, monkeypat
     assert drawn(*logs)[0].snapshots > 0
     monkeypatch.setitem(report_log.METADATA["lowfc"], "run", "another")
     other = night(120).write(tmp_path / "c.mcap")
-    with pytest.raises(DataFileError, match="one at a time"):
+    with pytest.raises(DataFileError, match="one run at a time"):
         drawn(logs[0], other)
 
 
@@ -180,7 +180,7 @@ def test_events_from_before_come_from_the_log_finished_or_not(tmp_path: Path, fi
 @pytest.mark.parametrize(
     ("recorder", "text"),
     [
-        (None, "no recorder has kept them"),
+        (None, "there is no recorder"),
         (recorder_of(Path("/nowhere/a.mcap"), "another"), "in the log on another"),
         (recorder_of(Path("/nowhere/a.mcap")), "/nowhere/a.mcap cannot be read"),
     ],

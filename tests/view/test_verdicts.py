@@ -12,7 +12,7 @@ from PIL import Image
 from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import CONTROLLER_STATE, EVENT, FRAME, wire
 from lowfc.control.loop.safety import Limit, LoopMode, Rejection
-from lowfc.programs.view.panels.tiles import FILL, GROUND, HEIGHT, TILES, WIDTH, Tiles, picture, places, png
+from lowfc.programs.view.panels.tiles import FILL, GROUND, HEIGHT, TILES, WIDTH, Tiles, picture, png, tile_boxes
 from lowfc.programs.view.snapshot import Accumulator
 from lowfc.programs.view.verdicts.facts import facts
 from lowfc.programs.view.verdicts.run_state import RunState
@@ -117,7 +117,7 @@ STATES: dict[str, tuple[Callable[[Stage], object], str, str]] = {
     "late commands": (health("camera", commands_late=80), "LATENCY 80 LATE WARNING", "80 commands, "),
     "slow": (setting(latency_us=30_000), "LATENCY 30000 us WARNING", "longer than a frame"),
     "recorder failed": (recording(failure="no space left"), "RECORDER FAILED BAD", "no space left"),
-    "recording stopped": (recording(file="a", stopped=True), "RECORDER STOPPED WARNING", "the night is not kept"),
+    "recording stopped": (recording(file="a", stopped=True), "RECORDER STOPPED WARNING", "stopped by an operator"),
     "recorder stopped": (stop("recorder"), "RECORDER STOPPED WARNING", "The recorder was stopped"),
     "recorder losing": (recording(file="a", lost=5), "RECORDER LOSING BAD", "lost 5 messages"),
     "view behind": (setting(behind_s=3.0), "VIEW 3 s WARNING", "This view is 3 s behind"),
@@ -284,7 +284,7 @@ def test_what_the_gains_could_leave_is_computed_from_the_loop_itself(monkeypatch
         if number % 2500 == 0 or number == len(night.samples):
             watcher.feed(accumulator.snapshot(one.publish_time_ns))
     found = watcher.state().attained
-    assert 0 < found.best_nm <= 1.05 * found.left_nm
+    assert 0 < found.best_nm <= 1.05 * found.residual_nm
     assert found.noise_nm > 0
     assert tile(judge(watcher.state()), "WAVEFRONT").detail.endswith("without noise")
 
@@ -296,7 +296,7 @@ def test_a_shape_that_the_loop_holds_is_not_called_harm() -> None:
     stage.send(CONTROLLER_STATE, wire.ControllerState(mode=stage.mode.value, channels=channels))
     verdict = stage.run(4)
     assert verdict.level is Level.NEUTRAL
-    assert "the shapes of offset and channels in it" in verdict.headline
+    assert "including the shapes of offset and channels" in verdict.headline
 
 
 def test_refusals_that_are_over_are_said_to_be_over() -> None:
@@ -304,7 +304,7 @@ def test_refusals_that_are_over_are_said_to_be_over() -> None:
     stage.reasons = (Rejection.DARK,)
     stage.run(2)
     stage.reasons = ()
-    assert "too dark: that is over" in stage.run(2).headline
+    assert "too dark: it has ended" in stage.run(2).headline
 
 
 # What is set.
@@ -352,7 +352,7 @@ def test_all_words_are_within_their_tile_and_nothing_is_on_its_border(level: Lev
     verdict = Verdict(LONG, level, tuple(Tile("RECORDER", "NOTHING HEARD OF IT", LONG, level) for _ in range(tiles)))
     shown = picture_of(verdict)
     rest = np.ones((HEIGHT, WIDTH), bool)
-    for x0, y0, x1, y1 in places(tiles):
+    for x0, y0, x1, y1 in tile_boxes(tiles):
         inside = shown[y0:y1, x0:x1]
         border = np.ones(inside.shape[:2], bool)
         border[2:-2, 2:-2] = False
@@ -370,7 +370,7 @@ def test_the_picture_shows_every_letter_and_the_time_of_day_at_its_right_end() -
     assert (noon != longer).any(), "a letter more is a smaller text, not a text that is cut"
     differs = np.argwhere((noon != second).any(axis=2))
     (top, left), (bottom, right) = differs.min(axis=0), differs.max(axis=0)
-    assert 0 < top < bottom < places(7)[0][3]
+    assert 0 < top < bottom < tile_boxes(7)[0][3]
     assert WIDTH - 190 < left < right < WIDTH
 
 

@@ -1,7 +1,7 @@
-"""The bridge from a run to a viewer: it may start, hang, die and start again, and the loop never notices.
+"""Bridge from a run to a viewer, which may start, hang, die and restart without any effect on the loop.
 
-Messages wait in rings that keep the newest, a render thread draws from them, and the main thread watches that thread,
-the viewer's process and the memory of both. After a failure the view begins anew, with an event that has the reason.
+Messages wait in ring buffers that keep the newest. A render thread draws them; the main thread monitors that thread,
+the viewer's process and the memory of both. After a failure the view restarts, with an event that gives the reason.
 """
 
 import platform
@@ -28,18 +28,18 @@ from lowfc.programs.view.snapshot import SHOWN
 from lowfc.programs.view.target import Target
 
 WAITING = {topic: 1 if topic.latest_only else 100 for topic in SHOWN} | {STEP: 2000, TRUTH: 2000}
-"""Messages that wait, by topic: of pictures the newest, of rows two seconds at 1 kHz; each may hold 16 kB."""
+"""Lengths of the ring buffers: the newest picture, two seconds of rows at 1 kHz; a message may have 16 kB."""
 OWN_BYTES = 512_000_000
-"""Memory of this process above which the view begins anew: 160 MB, 80 MB of rings and 150 MB unsent stay below it."""
+"""Memory of this process above which the view restarts; 160 MB, 80 MB of ring buffers and 150 MB unsent are less."""
 VIEWER_SPARE_BYTES = 1_500_000_000
-"""Memory of a viewer beyond what it may keep of the stream: its textures, plots and window are not in that limit."""
+"""Memory granted to a viewer for textures, plots and window, beyond its limit for the stream."""
 STUCK_S = 10.0
-"""Without a snapshot drawn, the viewer counts as hung."""
+"""Time without a drawn snapshot after which the viewer counts as hung."""
 MOST_EARLIER = 1000
-"""Events that are shown from before the view began, the newest."""
+"""Largest number of events shown from before the start of the view."""
 
-_RECORDER_S = 3.0  # after which a recorder that has sent no Health is absent
-_TURN_S = 0.1
+_RECORDER_S = 3.0  # after which a recorder without Health counts as absent
+_POLL_S = 0.1
 _CHECK_S = 1.0
 _FROZEN_S = 3.0
 _MOST_RENEWALS = 5
@@ -47,7 +47,7 @@ _RENEWALS_S = 60.0
 
 
 class ViewError(LowfcError):
-    """The view cannot go on."""
+    """The view cannot continue."""
 
     exit_status = 1
 
@@ -70,35 +70,35 @@ class Bridge:
         self._rings = {topic: bus.ring(topic, WAITING[topic]) for topic in SHOWN}
         self.service = Service(Role.VIEWER, run_id, clock, bus)
 
-    def run(self, until_s: float | None = None, ready: Callable[[], None] = lambda: None) -> None:
-        """Show the run until it is stopped, until a window is closed, or for a time; `ready` once the viewer is there.
+    def run(self, duration_s: float | None = None, ready: Callable[[], None] = lambda: None) -> None:
+        """Show the run until stopped, the window is closed or `duration_s` is over; call `ready` once the viewer runs.
 
         Raises:
-            ViewerError, ViewError: no viewer starts, it fails again and again, or memory stays beyond its bound.
+            ViewerError, ViewError: no viewer starts, it fails repeatedly, or memory stays above its limit.
         """
         try:
             self._begin()
             ready()
             self.service.state = "ready"
             began_s = checked_s = time.monotonic()
-            while self.service.running and (until_s is None or time.monotonic() - began_s < until_s):
+            while self.service.running and (duration_s is None or time.monotonic() - began_s < duration_s):
                 self.service.work = self.snapshots
                 self.service.beat()
-                time.sleep(_TURN_S)
+                time.sleep(_POLL_S)
                 now_s = time.monotonic()
                 if now_s - checked_s >= _CHECK_S:
                     if now_s - checked_s > _FROZEN_S:
-                        self._awake_s = now_s  # this process stood still, and so did the render thread
+                        self._awake_s = now_s  # this process was stopped, and the render thread with it
                     checked_s = now_s
                     self._check(now_s)
         finally:
             self.service.finish()
             if self.viewer is not None and not self.viewer.answers():
-                self.viewer.stop()  # or the render thread would wait for it
+                self.viewer.stop()  # otherwise the render thread would wait for it
             self._end_render()
 
     def close(self) -> None:
-        """Close the viewer, which frees a stream that it held up."""
+        """Close the viewer; this releases a stream that is blocked on it."""
         if self.viewer is not None:
             self.viewer.stop()
 
@@ -124,7 +124,7 @@ class Bridge:
             self._render = None
 
     def _add_earlier(self, render: RenderThread) -> None:
-        """Add what was sent before this view received anything; in a thread, for a peer that is frozen answers late."""
+        """Add messages from before this view; in a thread, because a frozen peer answers late."""
         recorder = self.service.last_health.get(Role.RECORDER)
         events_due = not self._past_known and (recorder is not None or self._recorder_absent(time.monotonic()))
         self._past_known |= events_due
@@ -156,22 +156,24 @@ class Bridge:
                 self._renew(viewer.how_it_ended())
         elif render.fault is not None:
             self._renew(f"drawing failed: {render.fault!r}")
-        elif self._stuck:  # a window belongs to the person at it: it is waited for
+        elif self._stuck:  # a window belongs to its user and is not restarted
             if not stuck:
                 self.service.event("VIEW_STUCK", stuck_s=stuck_s)
         elif stuck_s > STUCK_S:
             self._renew(f"the viewer read nothing for {stuck_s:.0f} s")
         elif own_bytes > OWN_BYTES:
-            self._renew(f"the bridge holds {own_bytes / 1e6:.0f} MB, more than {OWN_BYTES / 1e6:.0f} MB")
+            self._renew(f"the bridge uses {own_bytes / 1e6:.0f} MB, more than {OWN_BYTES / 1e6:.0f} MB")
             if resident_bytes() > OWN_BYTES:
-                raise ViewError(f"the view holds more than {OWN_BYTES / 1e6:.0f} MB even when new; start it again")
+                raise ViewError(
+                    f"the view uses more than {OWN_BYTES / 1e6:.0f} MB even after a restart; start it again"
+                )
         elif viewer_bytes > self._target.memory_mb * 1e6 + VIEWER_SPARE_BYTES:
-            self._renew(f"the viewer holds {viewer_bytes / 1e6:.0f} MB")
+            self._renew(f"the viewer uses {viewer_bytes / 1e6:.0f} MB")
 
     def _renew(self, why: str) -> None:
-        """Begin anew, with a new viewer on the same ports; a file cannot be begun anew, and is kept as far as it is."""
+        """Restart with a new viewer on the same ports; a file cannot be continued and is kept as it is."""
         if self.viewer is None:
-            raise ViewError(f"the view into a file ended: {why}")
+            raise ViewError(f"writing the view to a file failed: {why}")
         while True:
             now_s = time.monotonic()
             if len(self._renewed_s) == _MOST_RENEWALS and now_s - self._renewed_s[0] < _RENEWALS_S:
@@ -191,12 +193,12 @@ class Bridge:
 
 
 def earlier_events(recorder: wire.Health | None, now_ns: int) -> list[Sample]:
-    """The newest events in a recorder's logs; where they cannot be read, a line with the reason.
+    """The newest events in a recorder's logs; if they cannot be read, a line with the reason.
 
-    Only the chunks that hold events are read: a second for a log of 4 GB.
+    Only chunks with events are read, which takes a second for a log of 4 GB.
     """
     if recorder is None:
-        return [_line("earlier events are not shown: no recorder has kept them", now_ns)]
+        return [_line("earlier events are not shown: there is no recorder", now_ns)]
     if recorder.host and recorder.host != platform.node():
         return [_line(f"earlier events are not shown: they are in the log on {recorder.host}", now_ns)]
     found: list[Sample] = []

@@ -1,8 +1,8 @@
 """The bus as a Foxglove WebSocket server, for Foxglove and Lichtblick.
 
-Payloads go out as they came: the schemas are those of the log. A channel hands its message to the server's own threads
-and returns at once, and a client that does not read loses its oldest messages (at most 1024 wait for it). Therefore the
-bus's threads log directly.
+Payloads are passed on unchanged; the schemas are those of the log. A channel hands its message to the server's threads
+and returns at once, so the bus's threads log directly. A client that does not read loses its oldest messages: at most
+1024 wait for it.
 """
 
 import logging
@@ -29,46 +29,46 @@ if TYPE_CHECKING:
 
 HOST = "127.0.0.1"
 DEFAULT_PORT = 8765
-"""Where Foxglove and Lichtblick look first."""
+"""Default port of Foxglove and Lichtblick."""
 SHOWN = tuple(topic for topic in TOPICS if Role.VIEWER in topic.subscribers)
-"""What a viewer subscribes to."""
+"""Topics to which a viewer subscribes."""
 
-_TURN_S = 0.05
+_POLL_S = 0.05
 _PATIENCE_S = 0.2
 
 
 class FoxgloveBridge:
-    """Passes on the messages of a bus to the apps that connect to `port` on loopback.
+    """Passes the messages of a bus to the applications that connect to `port` on loopback.
 
-    `subscriptions` are client and topic of each that there is now, `kept` the states in force, by key.
+    `subscriptions`: client and topic of each current subscription; `last_states`: the states in force by key.
     """
 
     def __init__(self, bus: Bus, clock: Clock, run_id: str, port: int = DEFAULT_PORT) -> None:
-        """Serve at `port`, or at a free one where it is 0, and subscribe.
+        """Serve at `port`, or at a free one if it is 0, and subscribe.
 
         Raises:
-            BusError: the port is taken.
+            BusError: the port is in use.
             ConfigurationError: foxglove-sdk is not installed.
         """
         try:
             import foxglove
         except ImportError as error:
             raise ConfigurationError(
-                f"--foxglove needs foxglove-sdk, which is not there ({error}); install it with: "
+                f"--foxglove requires foxglove-sdk, which is missing ({error}); install it with: "
                 f"{install_advice('foxglove')}"
             ) from None
-        logging.getLogger("foxglove").setLevel(logging.CRITICAL)  # an app that is closed meanwhile is no error
+        logging.getLogger("foxglove").setLevel(logging.CRITICAL)  # a client that disconnects is not an error
         self._foxglove: Any = foxglove
         self._context = self._foxglove.Context()
         self._bus = bus
         self._names = Names()
         self._channels: dict[str, Channel] = {}
         self._channels_lock = threading.Lock()
-        self.kept: dict[str, Sample] = {}
+        self.last_states: dict[str, Sample] = {}
         self.subscriptions: set[tuple[int, str]] = set()
         self._messages = 0
         for topic in SHOWN:
-            if topic.key == topic.at(ALL):  # the names in the others' keys are not known yet
+            if topic.key == topic.at(ALL):  # other keys contain names that are not known yet
                 self._channel(topic, topic.key)
         try:
             self._server = self._foxglove.start_server(
@@ -76,10 +76,10 @@ class FoxgloveBridge:
             )
         except RuntimeError as fault:
             raise BusError(
-                f"cannot listen on {HOST}:{port} ({fault}); stop what is there, or choose another with --port"
+                f"cannot listen on {HOST}:{port} ({fault}); stop the program that uses it, or use another --port"
             ) from None
         self.port: int = self._server.port
-        # Before the service, which subscribes to Health: a peer with that subscription has all others, too.
+        # Before the service, which subscribes to Health: peers take that subscription to mean that all others exist.
         for topic in SHOWN:
             bus.subscribe(topic, partial(self._publish, topic))
         self.service = Service(Role.VIEWER, run_id, clock, bus)
@@ -89,22 +89,22 @@ class FoxgloveBridge:
         self.service.state = "running"
         while self.service.running:
             if self.service.newcomers():
-                for topic, sample in states(self._bus, SHOWN, _PATIENCE_S):  # published before they were linked to this
-                    kept = self.kept.get(sample.key)
-                    if kept is None or kept.sequence < sample.sequence:
+                for topic, sample in states(self._bus, SHOWN, _PATIENCE_S):  # published before the connection
+                    last = self.last_states.get(sample.key)
+                    if last is None or last.sequence < sample.sequence:
                         self._publish(topic, sample)
             self.service.work = self._messages
             self.service.beat()
-            time.sleep(_TURN_S)
+            time.sleep(_POLL_S)
         self.service.finish()
         self._server.stop()
 
     def on_subscribe(self, client: "Client", channel: "ChannelView") -> None:
-        """Give a client the state that is in force; called by the server."""
+        """Send a client the state in force; called by the server."""
         self.subscriptions.add((client.id, channel.topic))
-        kept = self.kept.get(channel.topic.removeprefix("/"))
-        if kept is not None:
-            self._channels[kept.key].log(kept.payload, log_time=kept.publish_time_ns)
+        last = self.last_states.get(channel.topic.removeprefix("/"))
+        if last is not None:
+            self._channels[last.key].log(last.payload, log_time=last.publish_time_ns)
 
     def on_unsubscribe(self, client: "Client", channel: "ChannelView") -> None:
         """Forget a subscription; called by the server."""
@@ -113,12 +113,12 @@ class FoxgloveBridge:
     def _publish(self, topic: Topic, sample: Sample) -> None:
         self._names.admit(topic, sample.key)
         if topic.queryable:
-            self.kept[sample.key] = sample
+            self.last_states[sample.key] = sample
         self._messages += 1
         self._channel(topic, sample.key).log(sample.payload, log_time=sample.publish_time_ns)
 
     def _channel(self, topic: Topic, key: str) -> "Channel":
-        with self._channels_lock:  # two processes may be the first with an event
+        with self._channels_lock:  # two threads may publish on a new key at once
             if key not in self._channels:
                 self._channels[key] = self._foxglove.Channel(
                     "/" + key,

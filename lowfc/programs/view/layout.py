@@ -54,7 +54,7 @@ def layout(
     """The blueprint, with the tab `active` in front.
 
     Plots show the last `window_s` seconds or, for a log, the interval `span_ns`; with neither, the viewer chooses. In a
-    `still` picture of a whole log, the operator's tab omits what shows only the last instant.
+    `still` picture of a whole log, the operator's tab omits panels that show only the last instant.
     """
     tabs = {
         Tab.OPERATOR: _whole_log() if still else _operator(),
@@ -63,9 +63,9 @@ def layout(
     }
     relative, absolute = rrb.TimeRangeBoundary.cursor_relative, rrb.TimeRangeBoundary.absolute
     if window_s is not None:
-        _timed(tabs.values(), relative(seconds=-window_s), relative())
+        _set_time_range(tabs.values(), relative(seconds=-window_s), relative())
     elif span_ns is not None:
-        _timed(tabs.values(), absolute(nanos=span_ns[0]), absolute(nanos=span_ns[1]))
+        _set_time_range(tabs.values(), absolute(nanos=span_ns[0]), absolute(nanos=span_ns[1]))
     return rrb.Blueprint(
         rrb.Tabs(*tabs.values(), active_tab=list(tabs).index(active)),
         rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),  # at the end of a log
@@ -137,11 +137,13 @@ def _events(*, worst: bool = False) -> rrb.View:
     )
 
 
-def _timed(parts: Iterable[rrb.Container | rrb.View], start: rrb.TimeRangeBoundary, end: rrb.TimeRangeBoundary) -> None:
+def _set_time_range(
+    parts: Iterable[rrb.Container | rrb.View], start: rrb.TimeRangeBoundary, end: rrb.TimeRangeBoundary
+) -> None:
     """Set the time range of all plots among the parts."""
     for part in parts:
         if isinstance(part, rrb.Container):
-            _timed(part.contents, start, end)
+            _set_time_range(part.contents, start, end)
         elif isinstance(part, rrb.TimeSeriesView | rrb.StateTimelineView):
             part.properties["VisibleTimeRanges"] = rrb.VisibleTimeRanges(
                 [rrb.VisibleTimeRange(TIMELINE, start=start, end=end)]

@@ -1,4 +1,4 @@
-"""A log drawn as the live view would have drawn it."""
+"""Draw a log as the live view draws a run."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -15,14 +15,14 @@ from lowfc.programs.view.renderer import Renderer
 from lowfc.programs.view.snapshot import PICTURES_HZ, PICTURES_PER_COMPLETE, SHOWN, Accumulator, LogEnd
 
 _PERIOD_NS = round(1e9 / PICTURES_HZ)
-_STRIDE = 500  # messages between two reports of the progress
+_STRIDE = 500  # messages between progress reports
 
 
 @dataclass(slots=True)
 class Drawn:
-    """What was drawn of some logs: snapshots, seconds, and `remarks` on what is damaged, truncated or unreadable.
+    """Summary of drawn logs: number of snapshots, duration, and `remarks` on damaged, truncated or unreadable parts.
 
-    `span_ns` has the times of the first and the last snapshot with a frame, on the timeline; None without one.
+    `span_ns`: times on the timeline of the first and last snapshot with a frame; None without one.
     """
 
     snapshots: int = 0
@@ -37,14 +37,14 @@ def draw_logs(
     make_renderer: Callable[[Configuration], Renderer],
     progress: Callable[[int], None] = lambda done: None,
 ) -> Drawn:
-    """Draw logs that follow each other.
+    """Draw consecutive logs.
 
     Raises:
-        DataFileError: one is no log, they are of several runs, or there is nothing to see in any of them.
+        DataFileError: a file is not a log, the logs are of several runs, or they have nothing to show.
     """
     drawn, accumulator = Drawn(), Accumulator()
     renderer: Renderer | None = None
-    due_ns = first_ns = last_ns = behind = 0
+    due_ns = first_ns = last_ns = earlier_bytes = 0
     complete, run, host = True, "", ""
     for log in logs:
         reader = LogReader(log, topics=SHOWN, skip_damaged=True)
@@ -52,7 +52,9 @@ def draw_logs(
             if renderer is None:
                 found, remarks = (config, []) if config else attached_configuration(reader)
                 if found is None:
-                    remarks.append("the default configuration is used for pupil and telescope, as the log has none")
+                    remarks.append(
+                        "the default configuration is used for pupil and telescope, because the log has none"
+                    )
                 drawn.remarks += remarks
                 own = found or Configuration()
                 renderer = make_renderer(own)
@@ -60,10 +62,10 @@ def draw_logs(
                 first_ns = message.receive_time_ns
             if number == 0:
                 recorded = reader.metadata.get("lowfc", {})
-                before, run, host = run, recorded.get("run", "") or run, host or recorded.get("host", "")
-                if before not in ("", run):
+                previous_run, run, host = run, recorded.get("run", "") or run, host or recorded.get("host", "")
+                if previous_run not in ("", run):
                     raise DataFileError(
-                        f"{log} is of run {run!r}, and the log before it of {before!r}: look at one at a time"
+                        f"{log} is of run {run!r}, and the log before it of {previous_run!r}: show one run at a time"
                     )
             last_ns = message.receive_time_ns
             accumulator.add(message)
@@ -75,14 +77,14 @@ def draw_logs(
                 drawn.snapshots += 1
                 due_ns = last_ns + _PERIOD_NS
             if number % _STRIDE == 0:
-                progress(behind + reader.position)
-        behind += reader.size
+                progress(earlier_bytes + reader.position)
+        earlier_bytes += reader.size
         complete &= reader.complete
         drawn.remarks += [f"{log.name}: {damage}" for damage in reader.damage]
         if not reader.complete and not reader.damage:
             drawn.remarks.append(f"{log.name}: {no_end([log], finished=False)}")
     if renderer is None:
-        raise DataFileError(f"there is nothing to see in {', '.join(map(str, logs))}: no message that a view shows")
+        raise DataFileError(f"nothing to show in {', '.join(map(str, logs))}: no message that a view shows")
     ended = LogEnd(logs[-1].name.partition(".")[0], complete, run, host, no_end(logs, finished=complete))
     renderer.draw(accumulator.snapshot(last_ns, ended=ended))
     if accumulator.unreadable:

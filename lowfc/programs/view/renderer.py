@@ -1,4 +1,4 @@
-"""Everything that is shown, drawn onto a stream snapshot by snapshot; of a live run in a thread of its own."""
+"""Draw all panels onto a stream, snapshot by snapshot; for a live run in a separate thread."""
 
 import threading
 import time
@@ -30,14 +30,14 @@ from lowfc.programs.view.panels.wavefront import Wavefront
 from lowfc.programs.view.snapshot import PICTURES_HZ, PICTURES_PER_COMPLETE, Accumulator, Snapshot
 
 RETRY_NS = 5_000_000_000
-"""After which a panel that failed is made again."""
+"""Time after which a panel that failed is created again."""
 
 
 class Renderer:
     """All panels of a view.
 
-    An unforeseen message must take no more from the operator than the panel that it breaks, and not for ever: the
-    panel is left out, with a line in the view's log, and made again a little later.
+    An unforeseen message disables only the panel that fails on it, and only for a while: the panel is left out, with a
+    line in the view's log, and created again after `RETRY_NS`.
     """
 
     def __init__(self, config: Configuration, stream: rr.RecordingStream) -> None:
@@ -60,19 +60,19 @@ class Renderer:
         except LowfcError as error:
             self._remarks.append(f"no science camera: {error}")
         self._makers = made
-        self._panels = [self._begun(make) for make in made]
+        self._panels = [self._started(make) for make in made]
         self._again_ns = [0] * len(made)
 
     @property
     def panels(self) -> list[Panel]:
-        """Those that are drawn."""
+        """Panels that are drawn."""
         return [panel for panel in self._panels if panel is not None]
 
     def draw(self, snapshot: Snapshot) -> None:
-        """Draw what is new."""
+        """Draw a snapshot."""
         for number, panel in enumerate(self._panels):
             if panel is None and snapshot.time_ns >= self._again_ns[number]:
-                panel = self._panels[number] = self._begun(self._makers[number])
+                panel = self._panels[number] = self._started(self._makers[number])
             if panel is not None and (snapshot.complete or panel.pictures):
                 try:
                     panel.draw(self._stream, snapshot)
@@ -84,16 +84,16 @@ class Renderer:
             self._stream.log(f"{LOG}/view", rr.TextLog(remark, level=rr.TextLogLevel.ERROR))
         self._remarks.clear()
 
-    def _begun(self, make: Callable[[], Panel]) -> Panel | None:
+    def _started(self, make: Callable[[], Panel]) -> Panel | None:
         panel = make()
         panel.begin(self._stream)
         return panel
 
 
 class RenderThread(threading.Thread):
-    """Draws what arrived, thirty times a second, until it is abandoned or ends with a `fault`.
+    """Draws new messages, thirty times a second, until it is abandoned or ends with a `fault`.
 
-    `drawn_s` is when it last had drawn everything, by time.monotonic().
+    `drawn_s`: end of the last drawing, by time.monotonic().
     """
 
     def __init__(
@@ -103,7 +103,7 @@ class RenderThread(threading.Thread):
         rings: Mapping[Topic, Ring],
         make_stream: Callable[[], rr.RecordingStream],
     ) -> None:
-        """Make it; `rings` hold what arrives."""
+        """Create the thread; `rings` receive the messages."""
         super().__init__(name="render", daemon=True)
         self.drawn_s = time.monotonic()
         self.snapshots = 0
@@ -116,18 +116,18 @@ class RenderThread(threading.Thread):
         self._abandoned = False
 
     def add_earlier(self, samples: Iterable[Sample]) -> None:
-        """Draw messages, too, that were sent before the view received anything."""
+        """Also draw messages from before the view."""
         self._earlier.extend(samples)
 
     def abandon(self) -> None:
-        """Let it end by itself: at once, or when the call that it hangs in returns."""
+        """Ask the thread to end: at once, or when the call in which it hangs returns."""
         self._abandoned = True
 
     def run(self) -> None:
-        """Draw."""
+        """Draw until abandoned."""
         try:
             self._draw()
-        except Exception as fault:  # the bridge begins anew, and reports why
+        except Exception as fault:  # the bridge restarts the view and reports the reason
             self.fault = fault
 
     def _draw(self) -> None:
@@ -137,12 +137,12 @@ class RenderThread(threading.Thread):
         due_s = began_s = complete_due_s = time.monotonic()
         while not self._abandoned:
             now_s = time.monotonic()
-            behind_s, began_s = max(0.0, now_s - began_s - 1 / PICTURES_HZ), now_s  # what arrived may be that old
+            behind_s, began_s = max(0.0, now_s - began_s - 1 / PICTURES_HZ), now_s  # the messages may be that old
             if complete := now_s >= complete_due_s:
-                complete_due_s = now_s + (PICTURES_PER_COMPLETE - 0.5) / PICTURES_HZ  # by time: rings wait no longer
+                complete_due_s = now_s + (PICTURES_PER_COMPLETE - 0.5) / PICTURES_HZ  # by time: the rings hold no more
             arrived = [self._earlier.popleft() for _ in range(len(self._earlier))]
             for topic, ring in self._rings.items():
-                if complete or topic.latest_only:  # many messages in a row cost less each
+                if complete or topic.latest_only:  # rows are cheaper in large batches
                     arrived += ring.drain()
             for sample in arrived:
                 accumulator.add(sample)

@@ -1,4 +1,4 @@
-"""Showing a run or logs from the beginning to the end."""
+"""Show a run or logs."""
 
 import contextlib
 import sys
@@ -24,15 +24,15 @@ from lowfc.programs.view.renderer import Renderer
 from lowfc.programs.view.target import Target
 
 PICTURE_AFTER_S = 8.0
-"""Of a running loop: its plots have something to show by then."""
+"""Time before a picture of a running loop is taken, so that its plots have data."""
 _POLL_S = 0.1
 
 
 def show_run(run_id: str, config: Configuration | None, target: Target, seconds: float | None) -> dict[str, Any]:
-    """Show a running loop until it is stopped, until the window is closed, or for some seconds.
+    """Show a running loop until stopped, until the window is closed, or for some seconds.
 
     Raises:
-        ViewerError, ViewError: there is no viewer, or it fails again and again.
+        ViewerError, ViewError: no viewer starts, or it fails repeatedly.
         DataFileError: a file cannot be written.
     """
     require_folder(target.written)
@@ -50,14 +50,14 @@ def show_run(run_id: str, config: Configuration | None, target: Target, seconds:
         bridge.service.catch_signals()
         bridge.service.announces = True
         bridge.service.awaited = lambda: "" if bridge.service.last_health else "any other process"
-        until_s = seconds if seconds is not None or target.picture is None else PICTURE_AFTER_S
+        duration_s = seconds if seconds is not None or target.picture is None else PICTURE_AFTER_S
         try:
-            bridge.run(until_s, lambda: target.print_address(bridge.viewer))
+            bridge.run(duration_s, lambda: target.print_address(bridge.viewer))
         except ViewError as error:
             if target.part is None:
                 raise
             rest = target.part.replace(f"{target.save}.part")
-            raise ViewError(f"{error}; what there is of it is in {rest}") from error
+            raise ViewError(f"{error}; the part written so far is in {rest}") from error
         if not bridge.service.last_health and target.written is not None:
             raise ViewError(f"no message of run {run_id!r} has arrived: nothing is written")
         if target.picture is not None and bridge.viewer is not None:
@@ -72,15 +72,15 @@ def show_run(run_id: str, config: Configuration | None, target: Target, seconds:
 
 
 def show_logs(logs: list[Path], config: Configuration | None, target: Target) -> dict[str, Any]:
-    """Show logs that follow each other; a window or page stays until it is closed or Ctrl-C.
+    """Show consecutive logs; a window or page stays until it is closed or Ctrl-C.
 
     Raises:
-        ViewerError: there is no viewer, or it ended while it was drawn on.
+        ViewerError: no viewer starts, or it ended during drawing.
         DataFileError: a file cannot be read or written.
     """
     require_folder(target.written)
     for log in logs:
-        with LogFile(log):  # one that cannot be read is named before a viewer starts
+        with LogFile(log):  # an unreadable log is an error before a viewer starts
             pass
     drawn = Drawn()
     with contextlib.ExitStack() as stack:
@@ -91,7 +91,7 @@ def show_logs(logs: list[Path], config: Configuration | None, target: Target) ->
             stack.callback(viewer.stop)
         stream = target.stream(viewer, logs[0].stem, None)
         stack.callback(_end, stream, viewer)
-        if target.written is None:  # Ctrl-C ends what is watched, whether everything is drawn yet or not
+        if target.written is None:  # Ctrl-C ends the view, even before everything is drawn
             with contextlib.suppress(KeyboardInterrupt):
                 target.print_address(viewer)
                 drawn = _draw(logs, config, stream, target)
@@ -99,7 +99,7 @@ def show_logs(logs: list[Path], config: Configuration | None, target: Target) ->
                     time.sleep(_POLL_S)
         else:
             drawn = _draw(logs, config, stream, target)
-            stream.disconnect()  # a viewer keeps what it has
+            stream.disconnect()  # the viewer keeps its data
             if viewer is not None:
                 viewer.screenshot(target.picture)
     return {
@@ -111,13 +111,13 @@ def show_logs(logs: list[Path], config: Configuration | None, target: Target) ->
     }
 
 
-def forgotten(log_bytes: int, target: Target) -> list[str]:
-    """A remark where a viewer may not keep all of a log of this size; a file keeps it."""
+def memory_remarks(log_bytes: int, target: Target) -> list[str]:
+    """A remark if a viewer may not keep all of a log of this size; a file keeps everything."""
     if target.save is not None or log_bytes <= target.memory_mb * 1e6:
         return []
     return [
         f"the log has {log_bytes / 1e6:.0f} MB, the viewer keeps {target.memory_mb:g} MB (--memory-mb): curves of "
-        "every frame may begin late; trend, tiles and mode are of the whole log"
+        "every frame may begin late; trend, tiles and mode cover the whole log"
     ]
 
 
@@ -129,14 +129,14 @@ def _draw(logs: list[Path], config: Configuration | None, stream: rr.RecordingSt
             logs, config, lambda own: Renderer(own, stream), lambda done: bar.update(task, completed=done)
         )
     target.show_all(stream, drawn.span_ns)
-    drawn.remarks += forgotten(total, target)
+    drawn.remarks += memory_remarks(total, target)
     for remark in drawn.remarks:
         sys.stderr.write(f"{remark}\n")
     return drawn
 
 
 def _end(stream: rr.RecordingStream, viewer: RerunViewer | None) -> None:
-    """End a stream; one into a viewer that hangs would wait for it, so that the viewer is stopped first."""
+    """End a stream; a viewer that hangs is stopped first, because the stream would wait for it."""
     if viewer is not None and not viewer.answers():
         viewer.stop()
     stream.disconnect()

@@ -1,4 +1,4 @@
-"""What is new on the bus or in a log since the last look: columns, pictures, and the last of each state."""
+"""Snapshots of the new data on the bus or in a log: columns, pictures, and the latest states."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -43,24 +43,24 @@ SHOWN = (FRAME, STEP, TRUTH, TIMING, MIRROR_STATE, SURFACE, CALIBRATION, CAMERA_
 
 PICTURES_HZ = 30.0
 PICTURES_PER_COMPLETE = 8
-"""Snapshots for each that is complete: curves grow four times a second, for many rows cost hardly more than one."""
+"""Snapshots per complete one. Curves grow four times a second, because many rows cost hardly more than one."""
 
 _KNOWN_EVENTS = 5000
 _UNREADABLE = (BadMessageError, DecodeError, KeyError, OverflowError, ValueError)
 
 
 class Waves(NamedTuple):
-    """The wavefront of some frames, nm, each with the mirror as it was (`left`) and with a flat one (`open`).
+    """The wavefront of some frames, nm: `residual`, and `open`, as it would be with a flat mirror.
 
-    Of the modes (frames, modes): at an instant of each frame, and rms over each frame where it is known. `rms_nm`
-    (frames, 2) is of all modes or over the open pupil, left and open.
+    The modes (frames, modes) are values at one instant of each frame, and rms over each frame if known. `rms_nm`
+    (frames, 2): residual and open, of all modes or over the open pupil.
     """
 
     sequence: Sequences
     time_ns: Long
-    left_nm: Single
+    residual_nm: Single
     open_nm: Single
-    left_rms_nm: Single
+    residual_rms_nm: Single
     open_rms_nm: Single
     rms_nm: Single
 
@@ -74,7 +74,7 @@ class LastHealth(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class LogEnd:
-    """The end of the logs that are shown; `no_end` is a sentence about one that is not `complete`."""
+    """End of the logs shown; `no_end` is the reason if they are not `complete`."""
 
     name: str
     complete: bool
@@ -85,18 +85,18 @@ class LogEnd:
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """What is new, and the last of what stays.
+    """New data, and the latest states.
 
     Attributes:
-        time_ns: on the timeline: that of the newest data, and what has passed since. In lockstep it is simulated time.
-        host_ns: host clock, the one of `sent_ns` (of the last message of each topic) and of `LastHealth`.
-        steps, truths, timings, events: new ones; timings are the durations of the controller's stages.
-        frame, mirror, surface: newest frame (DN, at `frame_ns`), state and surface over the pupil (nm); None without
-            a new one.
-        calibration, camera, controller, health: the last of each; None before the first.
-        complete: everything is in it; otherwise only what is newest, and rows and events wait for a later snapshot.
-        behind_s: how late this snapshot is.
-        ended: the end of the logs, at their last snapshot.
+        time_ns: time on the timeline: that of the newest data plus the time since. In lockstep it is simulated time.
+        host_ns: time of the host clock, as are `sent_ns` (last message of each topic) and `LastHealth`.
+        steps, truths, timings, events: new rows and events; timings are the durations of the controller's stages.
+        frame, mirror, surface: newest frame (DN, at `frame_ns`), state and surface over the pupil (nm); None if not
+            new.
+        calibration, camera, controller, health: the latest of each; None before the first.
+        complete: whether all new data are included; otherwise only the newest pictures, and rows and events wait.
+        behind_s: delay of this snapshot.
+        ended: end of the logs, in their last snapshot.
     """
 
     time_ns: int
@@ -120,17 +120,17 @@ class Snapshot:
 
     @property
     def period_ns(self) -> int:
-        """Of the frames; 0 where the camera does not report it."""
+        """Frame period; 0 if the camera does not report it."""
         return self.camera.period_ns if self.camera is not None else 0
 
     @property
     def noll(self) -> tuple[int, ...]:
-        """Modes of the calibration; empty before there is one."""
+        """Modes of the calibration; empty before the first."""
         return self.calibration.noll if self.calibration is not None else ()
 
     @property
     def stroke_nm(self) -> float:
-        """Limit of an actuator's deviation from flat; 0 where the controller has not reported it."""
+        """Limit of an actuator's deviation from flat; 0 if the controller has not reported it."""
         return self.controller.settings.stroke_nm if self.controller is not None else 0.0
 
     @property
@@ -140,7 +140,7 @@ class Snapshot:
         return np.asarray(np.isfinite(error_nm).all(axis=1) & (error_nm.shape[1] > 0))
 
     def waves(self, *, true: bool) -> Waves:
-        """The new wavefronts that a simulation knows, or those that were measured on the frames that were used."""
+        """New wavefronts: the true ones of a simulation, or those measured in the frames that were used."""
         if true:
             new = self.truths
             rms_nm = np.stack([new.residual_rms_nm, new.disturbance_rms_nm], axis=1)
@@ -153,10 +153,10 @@ class Snapshot:
 
 
 class Accumulator:
-    """Receives messages and makes snapshots of them; what cannot be read is left out and counted in `unreadable`."""
+    """Receives messages and makes snapshots of them; unreadable messages are left out and counted in `unreadable`."""
 
     def __init__(self, simulated_ns: int | None = None) -> None:
-        """With the time at which a run in lockstep begins: its data's clock is not the host's."""
+        """`simulated_ns`: start of a lockstep run, whose data has times of a simulated clock."""
         self._simulated_ns = simulated_ns
         self.unreadable = 0
         self._steps, self._truths, self._timings = StepRows(0), TruthRows(0), TimingRows()
@@ -171,7 +171,7 @@ class Accumulator:
         self._data_ns = self._data_host_ns = 0
 
     def add(self, message: Sample) -> None:
-        """Add one message of one of `SHOWN`; a state that is older than the last one is left out."""
+        """Add a message of one of the topics `SHOWN`; a state older than the last one is left out."""
         key, sequence = message.key, message.sequence
         try:
             topic = topic_of(key)
@@ -193,10 +193,10 @@ class Accumulator:
     def snapshot(
         self, host_ns: int, *, complete: bool = True, behind_s: float = 0.0, ended: LogEnd | None = None
     ) -> Snapshot:
-        """Return what is new at this time of the host's clock; the next snapshot begins here. See `Snapshot`."""
+        """Return the data since the last snapshot; `host_ns` is the present host time. See `Snapshot`."""
         frame: Frame | None = self._newest_of(FRAME, _frame)
         if frame is not None:
-            self._date(frame.time_ns, self._sent_ns[FRAME])
+            self._set_data_time(frame.time_ns, self._sent_ns[FRAME])
         new = StepRows(0), TruthRows(0), TimingRows(), list[Log]()
         if complete:
             new = self._steps, self._truths, self._timings, self._events
@@ -225,7 +225,7 @@ class Accumulator:
         )
 
     def _is_new(self, sequence: int, payload: bytes) -> bool:
-        """Whether an event is new: those of the last minutes come by the bus, and in a log that is being written."""
+        """Whether an event is new: recent events arrive on the bus and again from the log that is being written."""
         known, identity = self._known_events, (sequence, payload)
         if identity in known:
             return False
@@ -240,18 +240,18 @@ class Accumulator:
         return self._data_ns + max(0, host_ns - self._data_host_ns) if self._data_ns else host_ns
 
     def _read(self, topic: Topic, key: str, payload: bytes, publish_time_ns: int) -> None:
-        """Read a message of which every one counts; one of another number of modes begins the rows anew."""
+        """Read a message of a topic that keeps them all; another number of modes restarts the rows."""
         if topic is STEP:
             step = wire.ControlStep.FromString(payload)
             if not self._steps.add(step):
-                self._steps = _begun(StepRows(len(step.command_nm)), step)
-            self._date(from_timestamp(step.timestamp), publish_time_ns)
+                self._steps = _added(StepRows(len(step.command_nm)), step)
+            self._set_data_time(from_timestamp(step.timestamp), publish_time_ns)
         elif topic is TRUTH:
             truth = wire.Truth.FromString(payload)
             if not self._truths.add(truth):
-                self._truths = _begun(TruthRows(len(truth.residual_nm)), truth)
+                self._truths = _added(TruthRows(len(truth.residual_nm)), truth)
         elif topic is TIMING:
-            _begun(self._timings, wire.ControlTiming.FromString(payload))
+            _added(self._timings, wire.ControlTiming.FromString(payload))
         elif topic is HEALTH:
             name, health = self._names.health(key, payload)
             self._health[name] = LastHealth(publish_time_ns, health)
@@ -261,7 +261,7 @@ class Accumulator:
             state = topic.message.FromString(payload)
             self._states[topic] = decode_calibration(state) if isinstance(state, wire.Calibration) else state
 
-    def _date(self, data_ns: int, publish_time_ns: int) -> None:
+    def _set_data_time(self, data_ns: int, publish_time_ns: int) -> None:
         if data_ns >= self._data_ns:
             self._data_ns, self._data_host_ns = data_ns, publish_time_ns
 
@@ -275,9 +275,9 @@ class Accumulator:
             return None
 
 
-def _begun(rows: Any, message: Message) -> Any:
+def _added(rows: Any, message: Message) -> Any:
     if not rows.add(message):
-        raise ValueError("a message whose columns or modes differ in number")
+        raise ValueError("a message with another number of columns or modes")
     return rows
 
 

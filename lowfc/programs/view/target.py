@@ -1,4 +1,4 @@
-"""Where a view is shown: a window, a page for the browser, a picture or a file."""
+"""Target of a view: a window, a page for the browser, a picture or a file."""
 
 import sys
 from dataclasses import dataclass
@@ -15,9 +15,9 @@ from lowfc.programs.view.layout import APPLICATION, layout
 
 @dataclass(slots=True)
 class Target:
-    """At most one of window, page, file and picture; by default a window, or a page where there is no screen.
+    """At most one of window, page, file and picture; by default a window, or a page if there is no screen.
 
-    `part` is where the file is written until it is whole.
+    `part`: path of the file while it is being written.
     """
 
     native: bool = False
@@ -31,14 +31,14 @@ class Target:
     part: Path | None = None
 
     def __post_init__(self) -> None:
-        """Check it, and choose the ports.
+        """Check the target, and choose the ports.
 
         Raises:
-            ConfigurationError: two are named, or one that cannot be.
+            ConfigurationError: two targets, a wrong file name, or equal ports.
         """
         files = {"--save": (self.save, ".rrd"), "--headless-screenshot": (self.picture, ".png")}
-        named = {"--native": self.native, "--web": self.web} | {option: file for option, (file, _) in files.items()}
-        chosen = [name for name, wanted in named.items() if wanted]
+        options = {"--native": self.native, "--web": self.web} | {option: file for option, (file, _) in files.items()}
+        chosen = [name for name, given in options.items() if given]
         if len(chosen) > 1:
             raise ConfigurationError(f"a view has one target; got {' and '.join(chosen)}: use one")
         for option, (file, suffix) in files.items():
@@ -46,12 +46,12 @@ class Target:
                 raise ConfigurationError(f"{option} requires a file name that ends in {suffix}; got {file}")
         if self.port and self.port == self.web_port:
             raise ConfigurationError(f"--port and --web-port must differ; both are {self.port}")
-        free = free_ports(2)  # now, so that a viewer that is started again is where it was
+        free = free_ports(2)  # now, so that a restarted viewer has the same ports
         self.port, self.web_port = self.port or free[0], self.web_port or free[1]
 
     @property
     def show(self) -> Show | None:
-        """Kind of the viewer; None where a file is written."""
+        """Kind of the viewer; None if a file is written."""
         if self.save is not None:
             return None
         if self.picture is not None:
@@ -64,16 +64,16 @@ class Target:
         return self.save or self.picture
 
     def viewer(self) -> RerunViewer | None:
-        """Start the viewer; None where a file is written. ViewerError where it cannot be started."""
+        """Start the viewer; None if a file is written. ViewerError if it cannot be started."""
         if self.show is None:
             return None
         memory = f"{self.memory_mb:.0f}MB"
         return RerunViewer(self.show, memory_limit=memory, port=self.port, web_port=self.web_port)
 
     def stream(self, viewer: RerunViewer | None, recording: str, window_s: float | None) -> rr.RecordingStream:
-        """Stream to the viewer, or into the file; plots show the last `window_s` seconds, or as `show_all` sets.
+        """Stream to the viewer, or into the file; plots show the last `window_s` seconds, or the span of `show_all`.
 
-        What a viewer does not take waits, and then holds up.
+        Data that the viewer does not read is buffered; when the buffer is full, the stream blocks.
         """
         stream = rr.RecordingStream(APPLICATION, recording_id=recording)
         stream.set_log_time_enabled(False)  # one timeline, that of the data
@@ -86,10 +86,10 @@ class Target:
         return stream
 
     def show_all(self, stream: rr.RecordingStream, span_ns: tuple[int, int] | None) -> None:
-        """Let the plots show all of a log that was drawn; a picture has nothing of its last instant alone."""
+        """Make the plots show all of a drawn log; a picture omits panels that show only its last instant."""
         stream.send_blueprint(layout(self.tab, None, span_ns=span_ns, still=self.picture is not None))
 
     def print_address(self, viewer: RerunViewer | None) -> None:
-        """Print where a browser finds the page."""
+        """Print the address of the page."""
         if viewer is not None and viewer.web_address is not None:
             sys.stderr.write(f"view: {viewer.web_address}\nCtrl-C ends it\n")

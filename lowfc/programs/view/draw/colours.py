@@ -1,4 +1,4 @@
-"""Colours of images and lines: few, distinct for colour-blind people too, on the viewer's dark ground."""
+"""Colours of images and lines: few, safe for colour blindness, on the viewer's dark background."""
 
 import numpy as np
 import numpy.typing as npt
@@ -9,7 +9,7 @@ Colour = tuple[int, int, int]
 _LEVELS = 256
 _BLACK, _DARK = (6, 6, 12), (26, 27, 32)
 
-# Okabe and Ito's palette, its black left out for the ground's sake, then the same again, lighter and darker.
+# Okabe and Ito's palette without black, because the background is dark.
 _OKABE_ITO: tuple[Colour, ...] = (
     (86, 180, 233),
     (230, 159, 0),
@@ -38,27 +38,27 @@ _DIVERGING = _table(
 )
 
 
-def sequential(share: npt.NDArray[np.floating]) -> Rgb:
-    """Colours (..., 3) of shares from 0, black, to 1, nearly white; each level is brighter than the one below."""
-    return _colours_of(_SEQUENTIAL, share)
+def sequential(values: npt.NDArray[np.floating]) -> Rgb:
+    """Colours (..., 3) of values from 0 (black) to 1 (nearly white); brightness increases with the value."""
+    return _colours_of(_SEQUENTIAL, values)
 
 
-def diverging(share: npt.NDArray[np.floating]) -> Rgb:
-    """Colours (..., 3) of shares from -1, light blue, by 0, dark, to 1, light orange."""
-    return _colours_of(_DIVERGING, 0.5 + 0.5 * share)
+def diverging(values: npt.NDArray[np.floating]) -> Rgb:
+    """Colours (..., 3) of values from -1 (light blue) through 0 (dark) to 1 (light orange)."""
+    return _colours_of(_DIVERGING, 0.5 + 0.5 * values)
 
 
 def distinct(count: int) -> list[Colour]:
-    """Colours for so many lines in one plot; from the eighth on lighter and darker ones of the first seven."""
+    """Colours for `count` lines in one plot; from the eighth on, lighter and darker shades of the first seven."""
     return [_shaded(_OKABE_ITO[number % 7], number // 7) for number in range(count)]
 
 
-def _shaded(colour: Colour, turn: int) -> Colour:
-    towards, share = (0, 0.0) if turn == 0 else (255, 0.45) if turn % 2 else (0, 0.35)
+def _shaded(colour: Colour, cycle: int) -> Colour:
+    towards, share = (0, 0.0) if cycle == 0 else (255, 0.45) if cycle % 2 else (0, 0.35)
     red, green, blue = (round((1 - share) * one + share * towards) for one in colour)
     return red, green, blue
 
 
-def _colours_of(table: Rgb, share: npt.NDArray[np.floating]) -> Rgb:
-    levels = np.clip(share * (_LEVELS - 1) + 0.5, 0, _LEVELS - 1).astype(np.uint8)
+def _colours_of(table: Rgb, values: npt.NDArray[np.floating]) -> Rgb:
+    levels = np.clip(values * (_LEVELS - 1) + 0.5, 0, _LEVELS - 1).astype(np.uint8)
     return np.asarray(np.take(table, levels, axis=0))  # four times as fast as table[levels]

@@ -8,14 +8,14 @@ import rerun as rr
 from rerun.components import ImageBufferBatch, ImageFormat
 
 from lowfc.programs.view.draw.colours import Rgb, diverging
-from lowfc.programs.view.draw.plots import at, words
+from lowfc.programs.view.draw.plots import at, labels
 
 _STEPS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0)
 _SHRINK_NS = 2_000_000_000
 
 
 class Scale:
-    """The largest magnitude shown, a round number: it grows at once, and shrinks after two seconds."""
+    """Largest magnitude shown, a round number, which grows at once and shrinks after two seconds."""
 
     def __init__(self, least: float) -> None:
         self.least = least
@@ -23,20 +23,20 @@ class Scale:
         self._needed_ns = 0
 
     def fit(self, values: npt.NDArray[np.floating], time_ns: int) -> bool:
-        """Take values into account; True where the limit changed."""
+        """Adapt the limit to values; True if it changed."""
         largest = max(self.least, float(np.abs(values[np.isfinite(values)]).max(initial=0.0)))
         decade = 10.0 ** floor(log10(largest))
-        wanted = next(step * decade for step in _STEPS if largest <= step * decade * (1 + 1e-9))
-        if wanted >= self.limit:
+        fitted = next(step * decade for step in _STEPS if largest <= step * decade * (1 + 1e-9))
+        if fitted >= self.limit:
             self._needed_ns = time_ns
-        if wanted > self.limit or (wanted < self.limit and time_ns - self._needed_ns > _SHRINK_NS):
-            self.limit, self._needed_ns = wanted, time_ns
+        if fitted > self.limit or (fitted < self.limit and time_ns - self._needed_ns > _SHRINK_NS):
+            self.limit, self._needed_ns = fitted, time_ns
             return True
         return False
 
 
 class Picture:
-    """Pictures at one path; their format is sent when it changes, which takes two thirds off the cost of each."""
+    """Pictures at one path; the format is sent only when it changes, which saves two thirds of the time for each."""
 
     def __init__(self, path: str) -> None:
         self.path = path
@@ -44,7 +44,7 @@ class Picture:
         self._captioned: object = None
 
     def show(self, stream: rr.RecordingStream, time_ns: int, colours: Rgb, caption: str = "") -> None:
-        """Show colours (rows, columns, 3) with a line of words at the lower edge."""
+        """Show colours (rows, columns, 3) with a caption at the lower edge."""
         at(stream, time_ns)
         rows, columns, _ = colours.shape
         if colours.shape != self._shape:
@@ -52,10 +52,10 @@ class Picture:
             image_format = ImageFormat(width=columns, height=rows, color_model="RGB", channel_datatype="U8")
             stream.log(self.path, rr.Image.from_fields(format=image_format))
         buffer = rr.DescribedComponentBatch(ImageBufferBatch(colours.tobytes()), rr.Image.descriptor_buffer())
-        stream.log(self.path, [buffer])  # the same as Image.from_fields() makes, for two thirds of its time
+        stream.log(self.path, [buffer])  # as Image.from_fields() does, in two thirds of the time
         if caption and self._captioned != (caption, rows, columns):
             self._captioned = caption, rows, columns
-            stream.log(f"{self.path}/caption", words([(columns / 2, rows * 0.86)], [caption]))
+            stream.log(f"{self.path}/caption", labels([(columns / 2, rows * 0.86)], [caption]))
 
 
 class SignedPicture(Picture):

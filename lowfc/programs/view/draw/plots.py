@@ -1,4 +1,4 @@
-"""Plots on a rerun stream, all on one timeline: curves against time, and plots with axes of their own."""
+"""Plots on a rerun stream, all on one timeline: curves against time, and plots with custom axes."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,29 +15,29 @@ from lowfc.programs.view.draw.colours import WHITE, Colour
 
 TIMELINE = "time"
 BOX_HEIGHT = 90.0
-"""Of a plot with axes of its own."""
+"""Height of a plot with custom axes."""
 LABEL = 5.0
-"""By which the viewer sets a label below its place, for a box of this height."""
+"""Distance by which the viewer draws a label below its position, in a box of this height."""
 
 Ticks = Sequence[tuple[float, str]]
 """Values and their labels."""
 
 
 def at(stream: rr.RecordingStream, time_ns: int) -> None:
-    """Set the time of what is logged next."""
+    """Set the time of the data logged next."""
     stream.set_time(TIMELINE, timestamp=np.datetime64(time_ns, "ns"))
 
 
-def words(places: npt.ArrayLike, texts: Sequence[str], colours: Sequence[Colour] = (WHITE,)) -> rr.Points2D:
-    """Words at places (words, 2); the viewer sets them a little below."""
-    return rr.Points2D(places, radii=0.0, colors=colours, labels=texts, show_labels=True)
+def labels(positions: npt.ArrayLike, texts: Sequence[str], colours: Sequence[Colour] = (WHITE,)) -> rr.Points2D:
+    """Labels at positions (labels, 2); the viewer draws them a little lower."""
+    return rr.Points2D(positions, radii=0.0, colors=colours, labels=texts, show_labels=True)
 
 
 @dataclass(frozen=True, slots=True)
 class Plot:
-    """Curves against time, as a panel declares them: name and colour of each, the last one on top.
+    """Curves against time: `curves` has the name and colour of each, the last one on top.
 
-    There are none where they depend on the run. The legend's place is the viewer's choice where it is None.
+    It is empty if the curves depend on the run. If `legend` is None, the viewer chooses its position.
     """
 
     path: str
@@ -47,18 +47,18 @@ class Plot:
     legend: rrb.Corner2D | rrb.PlotLegend | None = rrb.Corner2D.LeftTop
 
     def name(self, stream: rr.RecordingStream, curves: Mapping[str, Colour] | None = None) -> None:
-        """Send names and colours for all times: the declared ones, or these."""
+        """Send the names and colours of the curves, for all times; by default the declared ones."""
         named = self.curves if curves is None else curves
         style = rr.SeriesLines(
             names=list(named),
             colors=list(named.values()),
             widths=[self.width] * len(named),
-            aggregation_policy=AggregationPolicy.MinMax,  # where a pixel holds many rows: peaks stay
+            aggregation_policy=AggregationPolicy.MinMax,  # keeps the peaks if a pixel has many rows
         )
         stream.log(self.path, style, static=True)
 
     def add(self, stream: rr.RecordingStream, times_ns: Long, values: npt.NDArray[np.floating]) -> None:
-        """Add (rows,) or (rows, curves) values in one message; of rows that are not finite one is left, as a gap."""
+        """Add (rows,) or (rows, curves) values in one message; rows that are not finite become one row, a gap."""
         if not len(times_ns):
             return
         columns = values.reshape(len(times_ns), -1)
@@ -77,12 +77,12 @@ class Plot:
         self.add(stream, np.array([time_ns]), np.array([values], np.float64))
 
     def view(self, **options: Any) -> rrb.TimeSeriesView:
-        """The plot's place in a layout, with the viewer's own options."""
+        """View of the plot for a layout, with further options of the viewer."""
         return rrb.TimeSeriesView(**({"origin": self.path, "name": self.title, "plot_legend": self.legend} | options))
 
 
 class Axes:
-    """A box with linear axes of its own: rerun's plots are never logarithmic, and forget the oldest points."""
+    """A box with its own linear axes: rerun's plots have no logarithmic axes and drop the oldest points."""
 
     def __init__(self, path: str, width: float) -> None:
         self.path = path
@@ -94,28 +94,28 @@ class Axes:
     def fit(
         self, stream: rr.RecordingStream, x: tuple[float, float], y: tuple[float, float], x_ticks: Ticks, y_ticks: Ticks
     ) -> None:
-        """Span from the first to the second value of each axis; the grid is drawn when it changes."""
-        wanted = x, y, tuple(x_ticks), tuple(y_ticks)
-        if wanted == self._fitted:
+        """Set the first and last value of each axis; the grid is drawn when it changes."""
+        fitted = x, y, tuple(x_ticks), tuple(y_ticks)
+        if fitted == self._fitted:
             return
-        self._x, self._y, self._fitted = x, y, wanted
+        self._x, self._y, self._fitted = x, y, fitted
         width, height = self._width, BOX_HEIGHT
-        columns = [float(self.places([value], [y[0]])[0, 0]) for value, _ in x_ticks]
-        rows = [float(self.places([x[0]], [value])[0, 1]) for value, _ in y_ticks]
+        columns = [float(self.positions([value], [y[0]])[0, 0]) for value, _ in x_ticks]
+        rows = [float(self.positions([x[0]], [value])[0, 1]) for value, _ in y_ticks]
         box = np.array([[0, 0], [width, 0], [width, height], [0, height], [0, 0]])
         lines = [box, *(np.array([[at_x, 0], [at_x, height]]) for at_x in columns)]
         lines += [np.array([[0, at_y], [width, at_y]]) for at_y in rows]
         grid = rr.LineStrips2D(lines, colors=[(70, 72, 80)], radii=rr.Radius.ui_points(0.5), draw_order=-1.0)
         stream.log(f"{self.path}/grid", grid)
-        places = [(at_x, height + 1) for at_x in columns] + [(-11.0, at_y - LABEL) for at_y in rows]
-        stream.log(f"{self.path}/ticks", words(places, [label for _, label in (*x_ticks, *y_ticks)]))
+        positions = [(at_x, height + 1) for at_x in columns] + [(-11.0, at_y - LABEL) for at_y in rows]
+        stream.log(f"{self.path}/ticks", labels(positions, [label for _, label in (*x_ticks, *y_ticks)]))
 
     def name(self, stream: rr.RecordingStream, names: Sequence[str], colours: Sequence[Colour]) -> None:
-        """Names of the curves above the box, drawn when they change."""
+        """Draw the names of the curves above the box when they change."""
         if names != self._named:
             self._named = names
-            places = [(self._width * (number + 0.5) / len(names), -LABEL - 7) for number in range(len(names))]
-            stream.log(f"{self.path}/names", words(places, names, colours))
+            positions = [(self._width * (number + 0.5) / len(names), -LABEL - 7) for number in range(len(names))]
+            stream.log(f"{self.path}/names", labels(positions, names, colours))
 
     def draw(
         self,
@@ -129,19 +129,19 @@ class Axes:
         strips: list[tuple[Array, Colour, float]] = []
         for y, colour, width in zip(curves, colours, widths, strict=False):
             for piece in np.ma.clump_unmasked(np.ma.masked_invalid(y)):  # type: ignore[no-untyped-call]
-                points = self.places(x[piece], y[piece])
+                points = self.positions(x[piece], y[piece])
                 strips.append((points if len(points) > 1 else np.repeat(points, 2, axis=0), colour, width))
-        places, shades, points_wide = zip(*strips, strict=True) if strips else ((), (), ())
+        positions, shades, points_wide = zip(*strips, strict=True) if strips else ((), (), ())
         radii = rr.Radius.ui_points(list(points_wide))
-        stream.log(f"{self.path}/curves", rr.LineStrips2D(places, colors=list(shades), radii=radii))
+        stream.log(f"{self.path}/curves", rr.LineStrips2D(positions, colors=list(shades), radii=radii))
 
-    def places(self, x: npt.ArrayLike, y: npt.ArrayLike) -> Array:
-        """Places of values (points, 2) on the view, whose y axis points down."""
+    def positions(self, x: npt.ArrayLike, y: npt.ArrayLike) -> Array:
+        """Positions of values (points, 2) in the view, whose y axis points down."""
         share_x = (np.asarray(x, np.float64) - self._x[0]) / (self._x[1] - self._x[0])
         share_y = (np.asarray(y, np.float64) - self._y[0]) / (self._y[1] - self._y[0])
         return np.stack([self._width * share_x, BOX_HEIGHT * (1 - share_y)], axis=1)
 
 
 def bounds(width: float) -> rrb.VisualBounds2D:
-    """Room for a box of this width with its labels and names."""
+    """Bounds of the view of a box of this width with its labels and names."""
     return rrb.VisualBounds2D(x_range=[-20, width + 8], y_range=[-17, BOX_HEIGHT + 11])

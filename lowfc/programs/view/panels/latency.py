@@ -1,4 +1,4 @@
-"""How fast the loop is: percentiles of the last second, their histogram, and what was skipped or lost."""
+"""Latency panel: percentiles and histogram of the last second, frames skipped and missing, messages lost."""
 
 from collections import deque
 
@@ -26,22 +26,22 @@ COUNTS = Plot(
     "latency/frames",
     "Frames skipped and missing, messages lost, since the start",
     {
-        "skipped: a newer one was there": ORANGE,
+        "skipped: a newer one was waiting": ORANGE,
         "missing: never arrived": RED,
         "messages lost by the recorder": GREY,
     },
 )
 WINDOW_NS = 1_000_000_000
 BINS = 40
-"""Bars of the histogram; whatever took longer than its axis is in the last."""
+"""Bars of the histogram; the last one includes all longer latencies."""
 
 _LEAST_US = 100.0
-_BODY = 99.0
-"""Percentile that the histogram's axis has to hold: a single late frame does not squeeze all others into one bar."""
+_AXIS_PERCENTILE = 99.0
+"""Percentile at the end of the histogram's axis: a single late frame does not squeeze all others into one bar."""
 
 
 class Latency(Panel):
-    """From a frame to its command, and the stages of it."""
+    """Latency from a frame to its command, and its stages."""
 
     plots = (WHOLE, PARTS, COUNTS)
     period_ns = 500_000_000
@@ -51,7 +51,7 @@ class Latency(Panel):
         self._scale = Scale(_LEAST_US)
 
     def draw(self, stream: rr.RecordingStream, snapshot: Snapshot) -> None:
-        """Keep a second; twice in it, draw."""
+        """Keep the durations of one second; draw twice a second."""
         now_ns = snapshot.time_ns
         if snapshot.timings[STAGES[-1]].size:
             stages_us = np.stack([snapshot.timings[stage] for stage in STAGES], axis=1) / 1e3
@@ -64,7 +64,7 @@ class Latency(Panel):
         if len(us):
             WHOLE.add_one(stream, now_ns, *np.percentile(us[:, -1], [50, 99, 100]))
             PARTS.add_one(stream, now_ns, *np.percentile(us[:, :-1], 99, axis=0))
-            self._scale.fit(np.percentile(us[:, -1], [_BODY]), now_ns)
+            self._scale.fit(np.percentile(us[:, -1], [_AXIS_PERCENTILE]), now_ns)
         self._draw_histogram(stream, now_ns, us[:, -1])
         controller, recorder = (snapshot.health.get(role) for role in (Role.CONTROLLER, Role.RECORDER))
         if controller is not None:
@@ -73,7 +73,7 @@ class Latency(Panel):
             COUNTS.add_one(stream, now_ns, frames.skipped, frames.missing, lost)
 
     def _draw_histogram(self, stream: rr.RecordingStream, time_ns: int, us: Array) -> None:
-        """Draw bars of even width from 0 to the axis' end, which changes seldom."""
+        """Draw bars of even width from 0 to the end of the axis, which changes rarely."""
         width_us = max(self._scale.limit, _LEAST_US) / BINS
         counts = np.bincount(np.minimum(us // width_us, BINS - 1).astype(int), minlength=BINS)
         middles_us = (np.arange(BINS) + 0.5) * width_us

@@ -1,4 +1,4 @@
-"""How the loop runs: its mode as a band, the light, saturated pixels, and the events of every process."""
+"""Loop panel: loop mode as a band, flux, saturated pixels, and the events of all processes."""
 
 from datetime import UTC, datetime
 
@@ -35,7 +35,7 @@ _LEVELS: dict[int, rr.TextLogLevel] = {
 
 
 class Loop(Panel):
-    """Mode changes, light, saturation, events."""
+    """Mode changes, flux, saturation, events."""
 
     plots = (FLUX, SATURATED)
 
@@ -43,7 +43,7 @@ class Loop(Panel):
         self._mode = 0
 
     def begin(self, stream: rr.RecordingStream) -> None:
-        """Name what is drawn."""
+        """Send names and colours."""
         style = rr.StateConfiguration(
             values=[mode.name for mode in MODE_COLOURS],
             labels=list(MODE_NAMES.values()),
@@ -53,11 +53,11 @@ class Loop(Panel):
         super().begin(stream)
 
     def draw(self, stream: rr.RecordingStream, snapshot: Snapshot) -> None:
-        """Add what is new."""
+        """Add the new data."""
         steps, state = snapshot.steps, snapshot.controller
         if not self._mode and state is not None and state.mode in _NAMES and state.HasField("mode_timestamp"):
             since_ns = from_timestamp(state.mode_timestamp)
-            if not steps.time_ns.size or since_ns < steps.time_ns[0]:  # before the view began
+            if not steps.time_ns.size or since_ns < steps.time_ns[0]:  # before the start of the view
                 self._change(stream, state.mode, since_ns)
         for row in np.flatnonzero(np.diff(steps.mode.astype(int), prepend=self._mode)):
             self._change(stream, int(steps.mode[row]), int(steps.time_ns[row]))
@@ -67,7 +67,9 @@ class Loop(Panel):
                 plot.add(stream, steps.time_ns, np.where(snapshot.used, values, np.nan))
         for event in snapshot.events:
             time_ns = from_timestamp(event.timestamp)
-            clock = datetime.fromtimestamp(time_ns * 1e-9, UTC).strftime("%H:%M:%S")  # rerun's own column is cut
+            clock = datetime.fromtimestamp(time_ns * 1e-9, UTC).strftime(
+                "%H:%M:%S"
+            )  # rerun truncates its own time column
             at(stream, time_ns)
             level = _LEVELS.get(event.level, rr.TextLogLevel.INFO)
             name, message = printable(event.name), printable(event.message)

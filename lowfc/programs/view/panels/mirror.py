@@ -1,4 +1,4 @@
-"""The mirror's pictures: the surface at each actuator, which of them are at a limit, and the surface over the pupil."""
+"""Mirror panel: the surface at each actuator with marks at those at a limit, and the surface over the pupil."""
 
 import numpy as np
 import rerun as rr

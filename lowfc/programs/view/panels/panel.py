@@ -1,4 +1,4 @@
-"""One part of what is shown."""
+"""Base class of the panels."""
 
 from abc import ABC, abstractmethod
 
@@ -9,12 +9,12 @@ from lowfc.programs.view.snapshot import Snapshot
 
 
 class Panel(ABC):
-    """Draws its part of every snapshot, and keeps what it needs of those before.
+    """Draws its part of every snapshot, and keeps what it needs from earlier ones.
 
     Attributes:
-        pictures: it shows what is newest, and is therefore drawn for incomplete snapshots too.
-        plots: those whose curves are the same in every run.
-        period_ns: between two drawings of a panel that asks whether it is `due`.
+        pictures: whether it shows the newest data, so that it is drawn for incomplete snapshots too.
+        plots: plots whose curves are the same in every run.
+        period_ns: time between two drawings of a panel that checks whether it is `due`.
     """
 
     pictures = False
@@ -23,16 +23,16 @@ class Panel(ABC):
     _drawn_ns = 0
 
     def begin(self, stream: rr.RecordingStream) -> None:
-        """Send what holds for all times, such as names and colours."""
+        """Send data for all times, such as names and colours."""
         for plot in self.plots:
             plot.name(stream)
 
     @abstractmethod
     def draw(self, stream: rr.RecordingStream, snapshot: Snapshot) -> None:
-        """Draw what is new."""
+        """Draw the new data."""
 
     def due(self, snapshot: Snapshot) -> bool:
-        """Whether the period is over, or the clock was set back; the next period begins then."""
+        """Whether the period has passed or the clock was set back; if so, the next period begins."""
         over = not 0 <= snapshot.time_ns - self._drawn_ns < self.period_ns
         if over:
             self._drawn_ns = snapshot.time_ns

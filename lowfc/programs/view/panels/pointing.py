@@ -1,4 +1,4 @@
-"""Where the star's image wanders: tip against tilt of the last two seconds, in mas, over rings."""
+"""Pointing panel: residual tip against tilt of the last two seconds, in mas, with rings."""
 
 from collections import deque
 
@@ -11,14 +11,14 @@ from lowfc.arrays import Long
 from lowfc.control.laws.law import TIP_TILT
 from lowfc.programs.view.draw.colours import BLUE, GREY, YELLOW
 from lowfc.programs.view.draw.pictures import Scale
-from lowfc.programs.view.draw.plots import at, words
+from lowfc.programs.view.draw.plots import at, labels
 from lowfc.programs.view.panels.panel import Panel
 from lowfc.programs.view.snapshot import Snapshot
 
 TRAIL = "pointing/trail"
 BOUNDS = rrb.VisualBounds2D(x_range=[-1.15, 1.15], y_range=[-1.15, 1.15])
-_KEPT = 400
-"""Points of the trail; of a faster loop not every one."""
+_MOST_POINTS = 400
+"""Points of the trail; for a fast loop not every frame has one."""
 _TRAIL_NS = 2_000_000_000
 _RINGS = (0.25, 0.5, 1.0)
 _LEAST_MAS = 0.5
@@ -35,42 +35,42 @@ class Pointing(Panel):
         self._pieces: deque[tuple[Long, Points]] = deque()
 
     def draw(self, stream: rr.RecordingStream, snapshot: Snapshot) -> None:
-        """Move the trail on."""
+        """Update the trail."""
         if snapshot.calibration is None or not set(TIP_TILT) <= set(snapshot.calibration.noll):
             return
         noll = snapshot.calibration.noll
         waves = snapshot.waves(true=snapshot.truths.time_ns.size > 0)
-        if not waves.time_ns.size or waves.left_nm.shape[1] != len(noll):
+        if not waves.time_ns.size or waves.residual_nm.shape[1] != len(noll):
             return
-        mas = waves.left_nm[:, [noll.index(index) for index in TIP_TILT]] / self._nm_per_mas
+        mas = waves.residual_nm[:, [noll.index(index) for index in TIP_TILT]] / self._nm_per_mas
         finite = np.isfinite(mas).all(axis=1)
         self._pieces.append((waves.time_ns[finite], mas[finite]))
         while self._pieces and self._pieces[0][0].max(initial=0) < snapshot.time_ns - _TRAIL_NS:
             self._pieces.popleft()
         mas = np.concatenate([piece for _, piece in self._pieces] or [mas[:0]])
-        mas = mas[:: max(1, len(mas) // _KEPT)]
+        mas = mas[:: max(1, len(mas) // _MOST_POINTS)]
         if not len(mas):
             return
         at(stream, snapshot.time_ns)
         if self._scale.fit(mas, snapshot.time_ns):
             self._draw_rings(stream)
-        places = _screen(mas / self._scale.limit)
-        fading = np.linspace(40, 220, len(places)).astype(np.uint8)
-        colours = np.concatenate([np.tile(BLUE, (len(places), 1)), fading[:, None]], axis=1).astype(np.uint8)
-        stream.log(f"{TRAIL}/points", rr.Points2D(places, colors=colours, radii=0.012))
-        stream.log(f"{TRAIL}/now", rr.Points2D(places[-1:], colors=[YELLOW], radii=0.035))
+        positions = _screen(mas / self._scale.limit)
+        fading = np.linspace(40, 220, len(positions)).astype(np.uint8)
+        colours = np.concatenate([np.tile(BLUE, (len(positions), 1)), fading[:, None]], axis=1).astype(np.uint8)
+        stream.log(f"{TRAIL}/points", rr.Points2D(positions, colors=colours, radii=0.012))
+        stream.log(f"{TRAIL}/now", rr.Points2D(positions[-1:], colors=[YELLOW], radii=0.035))
 
     def _draw_rings(self, stream: rr.RecordingStream) -> None:
-        turn = np.linspace(0, 2 * np.pi, 97)
-        circle = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+        angle = np.linspace(0, 2 * np.pi, 97)
+        circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
         cross = [np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([[0.0, -1.0], [0.0, 1.0]])]
         lines = [*(circle * ring for ring in _RINGS), *cross]
         stream.log(f"{TRAIL}/rings", rr.LineStrips2D(lines, colors=[GREY], radii=0.003))
-        labels = [f"{ring * self._scale.limit:g} mas" for ring in _RINGS]
-        places = _screen(np.array([[0.0, ring] for ring in _RINGS]))
-        stream.log(f"{TRAIL}/labels", words(places, labels))
+        texts = [f"{ring * self._scale.limit:g} mas" for ring in _RINGS]
+        positions = _screen(np.array([[0.0, ring] for ring in _RINGS]))
+        stream.log(f"{TRAIL}/labels", labels(positions, texts))
 
 
 def _screen(points: Points) -> Points:
-    """Turn the y axis down, as a screen's is."""
+    """Flip the y axis, which points down on a screen."""
     return np.asarray(points * np.array([1.0, -1.0]))

@@ -1,4 +1,4 @@
-"""What the science camera sees: the dark zone's contrast with the wavefront as it is, and with a flat mirror."""
+"""Science camera panel: contrast of the dark zone for the residual wavefront, and with a flat mirror."""
 
 from collections import deque
 
@@ -12,33 +12,33 @@ from lowfc.optics.chain.coronagraph import Coronagraph, Wedge
 from lowfc.optics.chain.science_camera import ScienceCamera
 from lowfc.programs.view.draw.colours import BLUE, GREEN, GREY, Rgb, sequential
 from lowfc.programs.view.draw.pictures import Picture
-from lowfc.programs.view.draw.plots import Plot, words
+from lowfc.programs.view.draw.plots import Plot, labels
 from lowfc.programs.view.panels.panel import Panel
 from lowfc.programs.view.snapshot import Snapshot
 
 IMAGE = "science/image"
 CONTRAST = Plot("science/contrast", "Mean contrast over 2 λ/D from the mask's edge, log10", width=1.6)
 _WIDE = 2.0
-"""Contrast is averaged over so many lambda / D from the inner edge of the dark zone on."""
+"""Width of the zone in which contrast is averaged, from the inner edge of the dark zone on, lambda / D."""
 
 _MEAN_OF = 5
-"""Wavefronts, each the newest of a snapshot, that one image is the mean of."""
+"""Number of wavefronts averaged in one image, each the newest of a snapshot."""
 _DARKEST, _BRIGHTEST = -10, -4
-"""Decades of contrast that the colours span."""
+"""Range of the colour scale, log10 of contrast."""
 _HALF_WIDTH, _SAMPLES_PER = 12, 4
 _SAMPLES = 2 * _HALF_WIDTH * _SAMPLES_PER
-_GAP, _BAR = 6, 5  # samples between the pictures, and of the colour scale
-_SECOND = _SAMPLES + _GAP  # where the second picture begins, and the colour scale
+_GAP, _BAR = 6, 5  # samples between the pictures, and across the colour scale
+_SECOND = _SAMPLES + _GAP  # start of the second picture; `_SCALE`: start of the colour scale
 _SCALE = 2 * _SECOND
 _WIDTH = _SCALE + _BAR
-_LABEL = 5  # samples by which the viewer sets a label below its place
+_LABEL = 5  # samples by which the viewer draws a label below its position
 BOUNDS = rrb.VisualBounds2D(x_range=[-4, _WIDTH + 24], y_range=[-2 * _GAP - _LABEL, _SAMPLES + 14])
 CONTRAST_AXIS = rrb.ScalarAxis(range=(_DARKEST, _BRIGHTEST - 1))
 _NAMES = {
     "true": ("with a flat mirror, true wavefront", "now, true wavefront"),
     "measured": ("with a flat mirror, pseudo-open-loop", "now, measured error"),
 }
-"""Names of the curves by kind of wavefront; those of a simulation are preferred."""
+"""Names of the curves for true and measured wavefronts; true ones are preferred."""
 
 
 class Science(Panel):
@@ -59,20 +59,20 @@ class Science(Panel):
         self._named = ""
 
     def begin(self, stream: rr.RecordingStream) -> None:
-        """Draw what stays: where the mask ends and contrast is averaged, and the scale of the colours."""
+        """Draw the static parts: the edge of the mask, the zone of the mean contrast, and the colour scale."""
         lines = [line + np.array([start, 0]) for start in (0, _SECOND) for line in _outlines(self._wedge)]
         outlines = rr.LineStrips2D(lines, colors=[GREY], radii=rr.Radius.ui_points(0.7))
         stream.log(f"{IMAGE}/outlines", outlines, static=True)
         decades = range(_DARKEST, _BRIGHTEST + 1)
         places = [(_WIDTH + 12, _SAMPLES * (1 - float(_share(decade))) - _LABEL) for decade in decades]
-        stream.log(f"{IMAGE}/scale", words(places, [f"1e{decade}" for decade in decades]), static=True)
+        stream.log(f"{IMAGE}/scale", labels(places, [f"1e{decade}" for decade in decades]), static=True)
 
     def draw(self, stream: rr.RecordingStream, snapshot: Snapshot) -> None:
-        """Keep the newest wavefront; now and then, draw."""
+        """Keep the newest wavefront; draw when due."""
         if snapshot.calibration is None:
             return
         noll = snapshot.calibration.noll
-        if self._camera is None or noll != self._noll:  # wavefronts of other modes are forgotten
+        if self._camera is None or noll != self._noll:  # wavefronts of other modes are dropped
             self._noll = noll
             pupil, lyot = self._coronagraph.pupil, self._coronagraph.lyot
             self._camera = ScienceCamera(pupil, noll, self._wavelength_nm, _HALF_WIDTH, _SAMPLES_PER, lyot)
@@ -80,8 +80,8 @@ class Science(Panel):
             self._clear()
         for source, waves in self._waves.items():
             new = snapshot.waves(true=source == "true")
-            if new.time_ns.size and new.left_nm.shape[1] == len(self._noll):
-                waves.append((new.left_nm[-1], new.open_nm[-1]))
+            if new.time_ns.size and new.residual_nm.shape[1] == len(self._noll):
+                waves.append((new.residual_nm[-1], new.open_nm[-1]))
         source = next((name for name, waves in self._waves.items() if waves), "")
         if source and self.due(snapshot):
             self._show(stream, snapshot.time_ns, self._camera, source)
@@ -101,32 +101,32 @@ class Science(Panel):
         self._picture.show(stream, time_ns, _side_by_side(*images))
         captions = [f"{title}: {mean:.1e}" for title, mean in zip(("now", "flat mirror"), means, strict=True)]
         places = [(start + _SAMPLES / 2, -_LABEL - _GAP) for start in (0, _SECOND)]
-        stream.log(f"{IMAGE}/captions", words(places, captions))
+        stream.log(f"{IMAGE}/captions", labels(places, captions))
         CONTRAST.add_one(stream, time_ns, *np.log10([*reversed(means), self._flat]))
 
 
 def _share(decade: npt.NDArray[np.floating] | float) -> npt.NDArray[np.floating]:
-    """Place of a logarithm of contrast among the colours, from 0 to 1."""
+    """Position on the colour scale, from 0 to 1, of log10 of a contrast."""
     return np.clip((np.asarray(decade) - _DARKEST) / (_BRIGHTEST - _DARKEST), 0, 1)
 
 
-def _side_by_side(now: Single, as_open: Single) -> Rgb:
-    """Colours of both images and of the scale beside them, on black."""
+def _side_by_side(now: Single, flat: Single) -> Rgb:
+    """Colours of both images and of the colour scale next to them, on black."""
     shares = np.zeros((_SAMPLES, _WIDTH))
-    tiny = 10.0 ** (_DARKEST - 1)  # a logarithm has no value at zero
+    tiny = 10.0 ** (_DARKEST - 1)  # the logarithm of zero is undefined
     shares[:, :_SAMPLES] = _share(np.log10(now + tiny))
-    shares[:, _SECOND : _SECOND + _SAMPLES] = _share(np.log10(as_open + tiny))
+    shares[:, _SECOND : _SECOND + _SAMPLES] = _share(np.log10(flat + tiny))
     shares[:, _SCALE:] = np.linspace(1, 0, _SAMPLES)[:, None]
     return sequential(shares)
 
 
 def _outlines(wedge: Wedge) -> list[Array]:
     """Lines (points, 2) in pixels of one image: the mask's edge, and the wedge on either side of the star."""
-    turn = np.linspace(0, 2 * np.pi, 97)
+    angle = np.linspace(0, 2 * np.pi, 97)
     opening = np.deg2rad(wedge.half_opening_deg) * np.linspace(-1, 1, 33)
     arcs = [radius * _directions(opening) for radius in (wedge.inner, wedge.outer)]
     right = np.concatenate([arcs[0], arcs[1][::-1], arcs[0][:1]])
-    return [_SAMPLES / 2 + _SAMPLES_PER * line for line in (wedge.inner * _directions(turn), right, -right)]
+    return [_SAMPLES / 2 + _SAMPLES_PER * line for line in (wedge.inner * _directions(angle), right, -right)]
 
 
 def _directions(angle: Array) -> Array:

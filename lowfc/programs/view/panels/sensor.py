@@ -1,4 +1,4 @@
-"""The sensor's pictures: the frame, its difference from the reference, and the reference itself."""
+"""Sensor panel: the frame, its difference from the reference, and the reference."""
 
 import numpy as np
 import rerun as rr
@@ -16,7 +16,7 @@ _RAW_PERIOD_NS = 500_000_000
 
 
 class Sensor(Panel):
-    """Frame and difference as they come; the reference of each new calibration."""
+    """Pictures of the newest frame and its difference from the reference, and of the reference of a new calibration."""
 
     pictures = True
 
@@ -43,7 +43,7 @@ class Sensor(Panel):
         dark_dn = 0
         if calibration is not None and calibration.shape == frame.shape:
             dark_dn = round(float(calibration.dark[0]))
-            # Without light nothing differs.
+            # Without light the difference is undefined; zero is shown.
             flux_dn = difference(calibration, frame.ravel(), 0.0, self._difference) or 0.0
             change_dn = self._difference * flux_dn * calibration.good if flux_dn else np.zeros(frame.size)
             self._change.show_values(stream, time_ns, change_dn.reshape(frame.shape))
@@ -58,6 +58,6 @@ class Sensor(Panel):
 
 
 def _log_stretched(light_dn: Single, limit_dn: float) -> Rgb:
-    """Two decades below the limit, in colours; less light is nearly black."""
+    """Colours of the two decades below the limit, logarithmic; less light is nearly black."""
     knee_dn = np.float32(limit_dn * 1e-2)
     return sequential(np.log1p(np.maximum(light_dn, 0) / knee_dn) / np.log1p(limit_dn / knee_dn))

@@ -1,4 +1,4 @@
-"""Power spectra of the wavefront: open against closed, and what the law should leave of it."""
+"""Panel of power spectra: pseudo-open-loop, measured error, and the prediction from the law's rejection."""
 
 from math import ceil, floor, log10
 
@@ -12,7 +12,7 @@ from lowfc.control.laws.margins import rejection
 from lowfc.control.laws.spectra import Spectrum, in_bins, pieces, spectrum
 from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.view.draw.colours import GREEN, GREY, YELLOW
-from lowfc.programs.view.draw.plots import BOX_HEIGHT, Axes, at, words
+from lowfc.programs.view.draw.plots import BOX_HEIGHT, Axes, at, labels
 from lowfc.programs.view.panels.loop import MODE_NAMES
 from lowfc.programs.view.panels.panel import Panel
 from lowfc.programs.view.snapshot import Snapshot
@@ -24,18 +24,18 @@ WIDTH = 150.0
 _HIGHEST_TILT = 3
 _SEGMENT = 1024
 _MOST_DECADES = 2
-"""Decades by which a plot's scale may be taller than it has to."""
+"""Decades by which a scale may exceed the range of the data before it shrinks."""
 _MOST_LABELS = 6
 _STATE = (WIDTH - 34.0, BOX_HEIGHT - 12.0)
 _LEAST = 1e-12
-"""Of the highest power: what is below is drawn there."""
+"""Lowest power drawn, as a fraction of the highest; lower values are drawn there."""
 _NAMES, _COLOURS = ("pseudo-open-loop", "measured error", "rejection² x open"), (GREY, GREEN, YELLOW)
 _WIDTHS = (1.2, 1.8, 0.6)
 _MODES = {mode.value: name for mode, name in MODE_NAMES.items()}
 
 
 class Spectra(Panel):
-    """Spectra of the last frames under one loop mode and one law, every other second."""
+    """Spectra of the last frames under one loop mode and one law, drawn every two seconds."""
 
     def __init__(self) -> None:
         self._steady = Steady()
@@ -48,7 +48,7 @@ class Spectra(Panel):
             axes.name(stream, _NAMES, _COLOURS)
 
     def draw(self, stream: rr.RecordingStream, snapshot: Snapshot) -> None:
-        """Keep what is new; now and then, draw."""
+        """Keep the new frames; draw when due."""
         calibration, steady = snapshot.calibration, self._steady
         if not steady.feed(snapshot) or calibration is None or not self.due(snapshot):
             return
@@ -68,10 +68,10 @@ class Spectra(Panel):
                 self._fit(stream, axes, rate_hz, np.concatenate(powers))
             axes.draw(stream, np.log10(frequency_hz), [np.log10(power) for power in powers], _COLOURS, _WIDTHS)
             text = f"loop {_MODES.get(steady.mode, 'unknown')}{state}"
-            stream.log(f"{axes.path}/state", words([_STATE], [text]))
+            stream.log(f"{axes.path}/state", labels([_STATE], [text]))
 
     def _fit(self, stream: rr.RecordingStream, axes: Axes, rate_hz: float, power: Array) -> None:
-        """Fit the axes: they grow at once, and shrink where they are far too large."""
+        """Fit the axes: they grow at once, and shrink only if they are far too large."""
         low, high = floor(log10(power.min())), ceil(log10(power.max()) + 1e-9)
         drawn_low, drawn_high = self._decades[axes.path]
         if drawn_low <= low and high <= drawn_high and drawn_high - drawn_low <= high - low + _MOST_DECADES:
@@ -84,17 +84,17 @@ class Spectra(Panel):
 
 
 def power_curves(found: Spectrum, modes: Mask, law: LawInForce | None, rate_hz: float) -> tuple[Array, list[Array]]:
-    """Frequency, Hz, and the power of some modes, nm^2/Hz: open, measured and, under an integrator, in theory.
+    """Frequency, Hz, and the power of some modes, nm^2/Hz: pseudo-open-loop, error and, for an integrator, prediction.
 
-    `found` are spectra of the errors and, after them, of the pseudo-open-loop, all with noise; `law` is None for an
-    open loop. There are no curves of a wavefront that stands still.
+    `found` has the spectra of the errors, then those of the pseudo-open-loop, all with noise; `law` is None for an open
+    loop. A constant wavefront has no curves.
     """
-    error, as_open = found.power_nm2_hz[:, : modes.size], found.power_nm2_hz[:, modes.size :]
-    columns = [as_open[:, modes].sum(axis=1), error[:, modes].sum(axis=1)]
+    error, pol = found.power_nm2_hz[:, : modes.size], found.power_nm2_hz[:, modes.size :]
+    columns = [pol[:, modes].sum(axis=1), error[:, modes].sum(axis=1)]
     if law is not None and not law.linear:
         integrating = integrator(law.gain, law.leak, tuple(range(2, 2 + modes.size)), law.delay_frames, rate_hz)
         passed = rejection(integrating, found.frequency_hz)[:, modes] ** 2
-        columns.append((passed * as_open[:, modes]).sum(axis=1))
+        columns.append((passed * pol[:, modes]).sum(axis=1))
     if not any(column[1:].any() for column in columns):
         return np.zeros(0), []
     frequency_hz, means = in_bins(found.frequency_hz, columns)

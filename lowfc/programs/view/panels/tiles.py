@@ -1,4 +1,4 @@
-"""The annunciator: the verdict as a picture, a headline above large coloured tiles with words on them."""
+"""Annunciator panel: the verdict as a picture, with a headline above large coloured tiles."""
 
 import io
 import re
@@ -24,30 +24,30 @@ from lowfc.programs.view.verdicts.watcher import Watcher
 TILES = "status/tiles"
 WIDTH, HEIGHT = 1760, 256
 GROUND: Colour = (13, 16, 17)
-"""Rerun's own, so that only the tiles are seen."""
+"""Rerun's background, so that only the tiles are visible."""
 SHORTEST_NS = 250_000_000
-"""Between pictures with another word or colour. Where only figures differ, there is one for each second of the clock:
-nobody reads them faster, and each stays in the viewer's memory."""
+"""Shortest time between pictures with another word or colour. If only figures differ, there is one picture per second:
+more cannot be read, and each stays in the viewer's memory."""
 
 _GAP, _INSET, _BAND, _CLOCK = 6, 9, 46, 190
 _TILES_END = 196
-_FACTS = (3, 4, 4, 4)  # widths of the facts below the tiles, to each other
+_FACTS = (3, 4, 4, 4)  # relative widths of the facts below the tiles
 _SMALLEST = 8
 _SHADES = 16
-_PITCH = 1.16
+_PITCH = 1.16  # of lines, in font sizes
 
 Box = tuple[int, int, int, int]
-"""Left, top, and right, bottom just outside."""
+"""Left and top inside the box, right and bottom just outside."""
 Text = tuple[Box, str, int]
-"""Words, their place, and their largest size."""
+"""Box, words, and largest font size."""
 Shades = npt.NDArray[np.uint8]
 
 
 class Tiles(Panel):
-    """Draws the verdict on the run when it changes; at the end of a log, that on all of it."""
+    """Draws the verdict on the run when it changes; at the end of a log, the verdict on all of it."""
 
     def __init__(self, nm_per_mas: float | None = None) -> None:
-        """With the wavefront rms of a tilt of 1 mas, where the telescope is known."""
+        """`nm_per_mas`: wavefront rms of a tilt of 1 mas, if the telescope is known."""
         self._nm_per_mas = nm_per_mas
         self._watcher = Watcher()
         self._night = Night()
@@ -55,7 +55,7 @@ class Tiles(Panel):
         self._judged_ns = 0
 
     def draw(self, stream: rr.RecordingStream, snapshot: Snapshot) -> None:
-        """Judge, and show the verdict if it changed, or the clock did."""
+        """Judge the run, and show the verdict if it or the clock has changed."""
         self._watcher.feed(snapshot)
         self._night.feed(snapshot)
         if snapshot.ended is not None:
@@ -75,7 +75,7 @@ class Tiles(Panel):
 
 
 def picture(verdict: Verdict, time_ns: int) -> Image.Image:
-    """The verdict and its time as a picture with a palette: of each level, shades from its fill to its ink."""
+    """The verdict and its time as a picture with a palette: for each level, shades from its fill to its ink."""
     colours = np.full((HEIGHT, WIDTH), _SHADES * len(Level), np.uint8)
     for (x0, y0, x1, y1), level, texts in _parts(verdict, time_ns):
         colours[y0:y1, x0:x1] = level * _SHADES + _shades(x1 - x0, y1 - y0, texts)
@@ -84,22 +84,22 @@ def picture(verdict: Verdict, time_ns: int) -> Image.Image:
     return image
 
 
-def places(tiles: int) -> list[Box]:
-    """Where the headline and so many tiles are."""
+def tile_boxes(tiles: int) -> list[Box]:
+    """Boxes of the headline and of this number of tiles."""
     edges = [(WIDTH + _GAP) * number // tiles for number in range(tiles + 1)]
     return [(0, 0, WIDTH, _BAND), *((x0, _BAND + _GAP, x1 - _GAP, _TILES_END) for x0, x1 in pairwise(edges))]
 
 
 def png(image: Image.Image) -> bytes:
-    """As PNG: a thirtieth of the pixels' size, which a viewer would keep for all of the night."""
+    """Encode as PNG, a thirtieth of the size: the viewer keeps every picture of a night."""
     content = io.BytesIO()
     image.save(content, "PNG", compress_level=1)
     return content.getvalue()
 
 
 def _parts(verdict: Verdict, time_ns: int) -> Iterator[tuple[Box, Level, tuple[Text, ...]]]:
-    """Coloured boxes and the words on each, placed from its corner."""
-    headline, *boxes = places(len(verdict.tiles))
+    """Coloured boxes with their levels and texts; text boxes are relative to the corner."""
+    headline, *boxes = tile_boxes(len(verdict.tiles))
     word, top, bottom = WORD[verdict.level].upper(), _INSET // 2, _BAND - _INSET // 2
     left = _INSET + round(_width(word, 30)) + (_INSET if word else 0)
     sentence = ((left, top, WIDTH - _CLOCK - _INSET, bottom), verdict.headline, 27)
@@ -129,7 +129,7 @@ def _tile(tile: Tile, right: int, height: int) -> tuple[Text, ...]:
 
 @lru_cache(maxsize=96)
 def _shades(width: int, height: int, texts: tuple[Text, ...]) -> Shades:
-    """(rows, columns) from 0 for the ground to `_SHADES` - 1 for ink; most are the same in the next picture."""
+    """Shades (rows, columns) from 0 for the fill to `_SHADES` - 1 for ink; cached, because few boxes change."""
     image = Image.new("L", (width, height))
     pen = ImageDraw.Draw(image)
     for box, text, largest in texts:
@@ -138,7 +138,7 @@ def _shades(width: int, height: int, texts: tuple[Text, ...]) -> Shades:
 
 
 def _write(pen: ImageDraw.ImageDraw, box: Box, text: str, largest: int) -> None:
-    """Words in lines, as large as all of them fit: in the middle of a low box, from the top of a high one."""
+    """Draw wrapped text in the largest size that fits: centred in a low box, from the top of a high one."""
     x0, y0, x1, y1 = box
     for size in range(largest, _SMALLEST - 1, -1):
         lines, pitch = _wrapped(text, size, x1 - x0), size * _PITCH
@@ -150,7 +150,7 @@ def _write(pen: ImageDraw.ImageDraw, box: Box, text: str, largest: int) -> None:
 
 
 def _wrapped(text: str, size: int, width: int) -> list[str]:
-    """Lines of words; a very long word may be broken."""
+    """Lines of text; very long words may be broken."""
     lines = [""]
     for word in re.findall(r"\S{1,24}\s*", text):
         if lines[-1] and _width(lines[-1] + word.rstrip(), size) > width:
@@ -160,19 +160,19 @@ def _wrapped(text: str, size: int, width: int) -> list[str]:
 
 
 def _width(text: str, size: int) -> float:
-    """Of a line of text, a little too much."""
+    """Width of a line of text, slightly overestimated."""
     return sum(map(_advance, text)) * size * 1.02
 
 
 @lru_cache(maxsize=1024)
 def _advance(letter: str) -> float:
-    """Width per size: measuring costs more than drawing."""
+    """Width of a letter per font size; cached, because measuring is slower than drawing."""
     return float(_font(64).getlength(letter)) / 64
 
 
 @lru_cache
 def _palette() -> list[int]:
-    """Red, green, blue, one after the other, of every shade of every level, and of the ground."""
+    """Red, green and blue of every shade of every level and of the background, in one list."""
     shares = np.linspace(0, 1, _SHADES)[:, None]
     colours = [np.array(FILL[level]) * (1 - shares) + np.array(INK[level]) * shares for level in Level]
     return [round(value) for value in (*np.concatenate(colours).ravel().tolist(), *GROUND)]

@@ -1,6 +1,6 @@
-"""The slow trend: the residual wavefront since the view began, or over a whole log, however long that is.
+"""Trend panel: the residual wavefront since the start of the view, or over a whole log of any length.
 
-It is drawn anew each time, as lines: of curves the viewer forgets the oldest when its memory is full.
+It is redrawn as lines each time, because the viewer drops the oldest data of curves when its memory is full.
 """
 
 from datetime import UTC, datetime
@@ -20,35 +20,35 @@ TREND = "residual/trend"
 WIDTH = 200.0
 
 _FIRST_SPAN_S, _LONGER = 60.0, 1.4
-"""Span of the time axis, and by how much it grows when it is full."""
+"""First span of the time axis, and the factor by which it grows when it is full."""
 _TICKS_S = (10, 30, 60, 120, 300, 600, 1800, 3600, 7200, 10_800, 21_600, 86_400)
 _MOST_TICKS = 6
 
 
 class Trend(Panel):
-    """Rms of each span, every other second and at the end of a log."""
+    """Rms of each span, drawn every two seconds and at the end of a log."""
 
     def __init__(self) -> None:
         self._course = Course()
         self._axes = Axes(TREND, WIDTH)
 
     def draw(self, stream: rr.RecordingStream, snapshot: Snapshot) -> None:
-        """Add what is new; now and then, draw."""
+        """Add the new data; draw when due."""
         course = self._course
         course.feed(snapshot)
         if not self.due(snapshot) and snapshot.ended is None:
             return
         after_ns, rms_nm = course.wavefront()
-        there = np.isfinite(rms_nm).all(axis=1) & (rms_nm > 0).all(axis=1)
-        if not there.any() or course.begin_ns is None:
+        known = np.isfinite(rms_nm).all(axis=1) & (rms_nm > 0).all(axis=1)
+        if not known.any() or course.begin_ns is None:
             return
         at(stream, snapshot.time_ns)
         after_s, logarithms = after_ns * 1e-9, np.full(rms_nm.shape, np.nan)
-        logarithms[there] = np.log10(rms_nm[there])
-        span_s = max(float(after_s[there][-1]), 1.0)
+        logarithms[known] = np.log10(rms_nm[known])
+        span_s = max(float(after_s[known][-1]), 1.0)
         if snapshot.ended is None:
             span_s = _FIRST_SPAN_S * _LONGER ** max(0, ceil(log(span_s / _FIRST_SPAN_S, _LONGER)))
-        y_ticks = _nm_ticks(float(rms_nm[there].min()), float(rms_nm[there].max()))
+        y_ticks = _nm_ticks(float(rms_nm[known].min()), float(rms_nm[known].max()))
         y = (y_ticks[0][0], y_ticks[-1][0])
         if len(y_ticks) > _MOST_TICKS:
             y_ticks = [tick for tick in y_ticks if tick[0] == round(tick[0])]
@@ -60,7 +60,7 @@ class Trend(Panel):
 
 
 def _nm_ticks(least: float, most: float) -> list[tuple[float, str]]:
-    """Logarithms of 1, 2 and 5 times powers of ten, from the last one below to the first one above."""
+    """Ticks (log10) at 1, 2 and 5 times powers of ten, from the last below `least` to the first above `most`."""
     decades = range(floor(log10(least)), ceil(log10(most)) + 1)
     values: Array = np.array([step * 10.0**decade for decade in decades for step in (1, 2, 5)])
     first = int(np.flatnonzero(values <= least * (1 + 1e-9))[-1])
@@ -69,7 +69,7 @@ def _nm_ticks(least: float, most: float) -> list[tuple[float, str]]:
 
 
 def _clock_ticks(begin_ns: int, span_s: float) -> Ticks:
-    """Times of the day, UTC, at seconds after the beginning."""
+    """Ticks at round times of day, UTC, in seconds since `begin_ns`."""
     step_s = next((one for one in _TICKS_S if span_s / one <= (_MOST_TICKS if one >= 60 else 3)), _TICKS_S[-1])
     form = "%H:%M" if step_s >= 60 else "%H:%M:%S"
     first_s = -(-begin_ns // (step_s * 10**9)) * step_s

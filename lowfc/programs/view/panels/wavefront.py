@@ -1,4 +1,4 @@
-"""The wavefront against time: every mode, tip and tilt in mas, and what is left in all and by group."""
+"""Panel of the wavefront against time: every mode, tip and tilt in mas, residual in total and by group of modes."""
 
 import numpy as np
 import numpy.typing as npt
@@ -30,7 +30,7 @@ Values = npt.NDArray[np.floating]
 
 
 class Wavefront(Panel):
-    """Every step and, in a simulation, every truth."""
+    """Curves of every step and, in a simulation, of every true wavefront."""
 
     def __init__(self, nm_per_mas: float) -> None:
         self._nm_per_mas = nm_per_mas
@@ -40,7 +40,7 @@ class Wavefront(Panel):
         self._tilts: list[int] = []
 
     def draw(self, stream: rr.RecordingStream, snapshot: Snapshot) -> None:
-        """Add what is new."""
+        """Add the new data."""
         steps, truths = snapshot.steps, snapshot.truths
         if snapshot.calibration is None:
             return
@@ -53,13 +53,13 @@ class Wavefront(Panel):
                 plot.add(stream, steps.time_ns, values)
             if steps.sequence.size and not self._true:
                 rms_nm = np.stack([_rss(steps.pol_nm), _rss(steps.error_nm)], axis=1)
-                self._sum_up(stream, steps.time_ns, steps.error_nm, rms_nm, steps.error_nm)
+                self._add_sums(stream, steps.time_ns, steps.error_nm, rms_nm, steps.error_nm)
         if true:
             TRUTH.add(stream, truths.time_ns, truths.residual_nm)
             rms_nm = np.stack([truths.disturbance_rms_nm, truths.residual_rms_nm], axis=1)
-            self._sum_up(stream, truths.time_ns, truths.modes_residual_rms_nm, rms_nm, truths.residual_nm)
+            self._add_sums(stream, truths.time_ns, truths.modes_residual_rms_nm, rms_nm, truths.residual_nm)
 
-    def _sum_up(
+    def _add_sums(
         self, stream: rr.RecordingStream, times_ns: Long, modes_nm: Values, rms_nm: Values, signed_nm: Values
     ) -> None:
         RMS.add(stream, times_ns, rms_nm)
@@ -82,7 +82,7 @@ class Wavefront(Panel):
         colours = [_GROUP_COLOURS[number % len(_GROUP_COLOURS)] for number in range(len(found))]
         GROUPS.name(stream, dict(zip(group_names, colours, strict=True)))
         self._tilts = [noll.index(index) for index in TIP_TILT if index in noll]
-        TILT.name(stream, {f"{names[place]}, {kind}": (BLUE, ORANGE)[n] for n, place in enumerate(self._tilts)})
+        TILT.name(stream, {f"{names[row]}, {kind}": (BLUE, ORANGE)[n] for n, row in enumerate(self._tilts)})
 
 
 def _rss(values: Values) -> Values:

@@ -1,4 +1,4 @@
-"""Judgement on the camera: do frames arrive, are they used, is there light on them."""
+"""Verdict on the camera: whether frames arrive and are used, and how much light there is."""
 
 from functools import partial
 
@@ -8,33 +8,36 @@ from lowfc.programs.view.verdicts.run_state import RECENT_S, Liveness, RunState
 from lowfc.programs.view.verdicts.tile import Level, Tile, absent, duration, worst_of
 
 SLOW = 0.9
-"""Frames at less than this share of the camera's own rate are a camera or host that does not keep up."""
+"""Fraction of the camera's nominal rate below which camera or host does not keep up."""
 FEW = 0.005
-"""Fewer frames than this share, lost or refused, do no measurable harm: they are reported, no more."""
+"""Fraction of frames lost or refused below which no harm is measurable: reported without a warning."""
 MANY_LOST = 0.1
-"""Where a tenth of the frames is lost, the loop is no longer the one that was tuned."""
+"""Fraction of frames lost above which the loop no longer behaves as tuned."""
 DARK, DIM, BRIGHT = 0.2, 0.5, 2.0
-"""A fifth of the light is what a controller refuses as dark by default; half the light is 1.4 times the
-noise; twice the light is not the star that was calibrated."""
+"""Fractions of the expected light. Below a fifth the controller refuses frames by default; half of it makes 1.4 times
+the noise; more than twice is not the star of the calibration."""
 SURELY_S = 4.0
-"""A camera that has died is silent by then."""
+"""Time after which a camera that has died sends no Health either."""
 LATELY = f"in the last {RECENT_S:g} s"
 
 REFUSED: dict[Reason, tuple[str, str]] = {
-    Rejection.DARK: ("too dark", "the star is gone; look at pointing, shutter and clouds"),
-    Rejection.SATURATED: ("detector saturated", "there is too much light; shorten the exposure or dim the star"),
-    Rejection.WRONG_SIZE: ("wrong size", "they are not what was calibrated; set the camera back or calibrate again"),
-    Rejection.LATE: ("too late", "host or link is too slow; look at the latency, lower the rate"),
+    Rejection.DARK: ("too dark", "the star is gone; check pointing, shutter and clouds"),
+    Rejection.SATURATED: ("detector saturated", "too much light; shorten the exposure or dim the star"),
+    Rejection.WRONG_SIZE: (
+        "wrong size",
+        "they do not match the calibration; restore the camera's settings or calibrate again",
+    ),
+    Rejection.LATE: ("too late", "host or link is too slow; check the latency, lower the rate"),
     Rejection.NO_CALIBRATION: ("no calibration", "load a calibration"),
-    Rejection.STUCK: ("stuck", "the camera sends one image again and again; restart it"),
+    Rejection.STUCK: ("stuck", "the camera repeats one image; restart it"),
     Rejection.REPEATED: ("repeated", "the camera sends a frame twice; restart it"),
     Rejection.OUT_OF_ORDER: ("out of order", "there may be a second camera on the bus; stop one"),
 }
-"""The reasons for which a frame is refused: in words, and what to do."""
+"""Reasons for refusing a frame: text and advice."""
 
 
 def frames(state: RunState) -> Tile:
-    """Whether frames arrive, at their rate, and are used."""
+    """Tile FRAMES: whether frames arrive at the nominal rate and are used."""
     tile, camera, silent_s = partial(Tile, "FRAMES"), state.camera, state.frame_silent_s
     gone = absent("FRAMES", "camera", camera, state.running_s, "the loop holds")
     if gone is not None and camera.life is not Liveness.SILENT:
@@ -45,7 +48,7 @@ def frames(state: RunState) -> Tile:
         alive = camera.life is not Liveness.SILENT and silent_s > SURELY_S
         who = "the camera runs, but sends none" if alive else "camera silent"
         since = duration(silent_s)
-        advice = f"No frame for {since}, {who}: the loop holds. See the camera's last output, restart it."
+        advice = f"No frame for {since}, {who}: the loop holds. Check the camera's last output and restart it."
         return tile("NO FRAMES", f"for {since}: {who}", Level.BAD, advice)
     refused = sum(state.recent[reason] for reason in REFUSED)
     lost = state.recent["skipped"] + state.recent["missing"]
@@ -59,12 +62,12 @@ def _rate(state: RunState, refused: int, nominal_hz: float) -> Tile:
     tile, rate_hz = partial(Tile, "FRAMES"), state.rate_hz
     if rate_hz is None:
         if state.now["steps"]:
-            return tile("STARTING", "too few for a rate")
-        return tile("UNUSED", "frames arrive, no controller uses them")
+            return tile("STARTING", "too few frames for a rate")
+        return tile("UNUSED", "frames arrive, but no controller uses them")
     value = f"{rate_hz:.0f} Hz" if rate_hz >= 10 else f"{rate_hz:.2g} Hz"
     if rate_hz < SLOW * nominal_hz:
         advice = f"The camera runs at {rate_hz:.3g} Hz, not at {nominal_hz:.3g} Hz: the host does not keep up."
-        return tile(value, f"slow: {nominal_hz:.3g} Hz wanted", Level.WARNING, advice)
+        return tile(value, f"slow: nominal {nominal_hz:.3g} Hz", Level.WARNING, advice)
     unused = {"skipped": state.recent["skipped"], "never arrived": state.recent["missing"], "refused": refused}
     few = ", ".join(f"{counted(count, 'frame')} {what}" for what, count in unused.items() if count)
     detail = f"{few} {LATELY}" if few else "none lost, none refused"
@@ -81,22 +84,22 @@ def _lost(state: RunState, lost: int, due: float) -> Tile:
 
 
 def _refused(state: RunState, refused: int, due: float) -> Tile:
-    every = all_refused(state)
-    most = max(REFUSED, key=lambda reason: (state.now if every else state.recent)[reason])
-    word, what = REFUSED[most]
-    if every:
-        advice = f"Every frame is refused, {word}: {what}. The mirror holds."
+    all_are = all_refused(state)
+    most = max(REFUSED, key=lambda reason: (state.now if all_are else state.recent)[reason])
+    word, advised = REFUSED[most]
+    if all_are:
+        advice = f"Every frame is refused, {word}: {advised}. The mirror holds."
         return Tile("FRAMES", "REFUSED", f"all: {word}", Level.BAD, advice)
-    advice = f"{counted(refused, 'frame')} refused {LATELY}, {word}: {what if state.now[most] else 'that is over'}."
+    advice = f"{counted(refused, 'frame')} refused {LATELY}, {word}: {advised if state.now[most] else 'it has ended'}."
     level = Level.WARNING if refused >= FEW * due else Level.NEUTRAL
     return Tile("FRAMES", f"{refused} REFUSED", f"{word}, {LATELY}", level, advice)
 
 
 def star(state: RunState) -> Tile:
-    """How much light there is, of what the calibration expects."""
+    """Tile STAR: light, as a fraction of what the calibration expects."""
     tile, flux, stopped = partial(Tile, "STAR"), state.flux, state.camera.life is Liveness.STOPPED
     if flux is None or (state.frame_silent_s is not None and not stopped):
-        return tile("?", "light not known now")
+        return tile("?", "light unknown")
     value, detail = f"{100 * flux:.0f} %" if flux >= 0.01 else "< 1 %", "of the expected light"
     if stopped:
         return tile(f"last: {value}", detail)
@@ -105,18 +108,18 @@ def star(state: RunState) -> Tile:
         advice = f"The detector is saturated, {full}: shorten the exposure or dim the star."
         return tile("SATURATED", f"{full}; {value} {detail}", Level.BAD, advice)
     if (state.now[Rejection.DARK] > steps / 2 and flux < DIM) or (not steps and flux < DARK):
-        advice = f"The star is gone, {value} of its light: look at pointing, shutter and clouds. The mirror holds."
+        advice = f"The star is gone, {value} of its light: check pointing, shutter and clouds. The mirror holds."
         return tile("GONE", f"{value} {detail}", Level.BAD, advice)
     if state.saturated:
         advice = f"Near saturation, {full}: shorten the exposure."
         return tile(value, f"{full}; {detail}", Level.WARNING, advice)
     if not DIM <= flux <= BRIGHT:
-        word, what = ("dim", "look for clouds") if flux < DIM else ("bright", "is it the one that was calibrated?")
+        word, what = ("dim", "check for clouds") if flux < DIM else ("bright", "check that it is the calibrated star")
         return tile(value, f"{word}: {detail}", Level.WARNING, f"The star is {word}, {value} {detail}: {what}.")
     return tile(value, f"{detail}, no pixel saturated", Level.GOOD)
 
 
 def all_refused(state: RunState) -> bool:
-    """Whether no frame of the last second was used."""
+    """Whether all frames of the last second were refused."""
     steps = state.now["steps"]
     return steps > 0 and sum(state.now[reason] for reason in REFUSED) >= steps

@@ -1,4 +1,4 @@
-"""The wavefront and the light of a whole run, in at most some hundreds of spans of even length."""
+"""Wavefront and light of a whole run, averaged in at most `MOST` spans of equal length."""
 
 import numpy as np
 import numpy.typing as npt
@@ -7,9 +7,9 @@ from lowfc.arrays import Array, Long
 from lowfc.programs.view.snapshot import Snapshot
 
 MOST = 600
-"""Spans kept: at one more, two and two become one, so that a night is kept in as much memory as ten minutes."""
+"""Largest number of spans: beyond it, pairs are merged, so that a night needs no more memory than ten minutes."""
 _FIRST_NS = 1_000_000_000
-_FARTHEST_NS = 7 * 86_400 * 10**9  # a camera's clock that jumps farther is wrong
+_FARTHEST_NS = 7 * 86_400 * 10**9  # a longer jump is an error of the camera's clock
 _TRUE, _MEASURED, _LIGHT = slice(0, 3), slice(3, 6), slice(6, 8)  # columns: a count, then sums
 _COLUMNS = 8
 
@@ -17,7 +17,7 @@ _COLUMNS = 8
 class Course:
     """Means of each span of `span_ns`, one second long at first, from `begin_ns` on (None before the first row).
 
-    The wavefront is the `true` one of a simulation, else the measured one.
+    The wavefront is the `true` one of a simulation, otherwise the measured one.
     """
 
     def __init__(self) -> None:
@@ -45,7 +45,7 @@ class Course:
         return np.asarray((np.arange(len(sums)) + 0.5) * self.span_ns, np.float64), np.asarray(np.sqrt(_means(sums)))
 
     def light(self) -> Array:
-        """Light (spans,) on used frames, of what the calibration expects; NaN in a span without one."""
+        """Light (spans,) of used frames as a fraction of the calibration's; NaN in a span without one."""
         return _means(self._sums[:, _LIGHT])[:, 0]
 
     def add(self, time_ns: Long, where: slice, values: npt.NDArray[np.floating]) -> None:
@@ -53,8 +53,8 @@ class Course:
         if self.begin_ns is None and time_ns.size:
             self.begin_ns = int(time_ns.min())
         after_ns = time_ns - (self.begin_ns or 0)
-        right = (after_ns >= 0) & (after_ns < _FARTHEST_NS)
-        after_ns, values = after_ns[right], values[right]
+        valid = (after_ns >= 0) & (after_ns < _FARTHEST_NS)
+        after_ns, values = after_ns[valid], values[valid]
         if not after_ns.size:
             return
         while (last := int(after_ns.max()) // self.span_ns) >= MOST:
@@ -67,6 +67,6 @@ class Course:
 
 
 def _means(sums: Array) -> Array:
-    """Sums (spans, columns) over counts, the first column."""
+    """Sums (spans, columns) divided by the counts in the first column."""
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(sums[:, 1:] / sums[:, :1])

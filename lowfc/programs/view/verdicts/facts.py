@@ -1,4 +1,4 @@
-"""What is set, in words: run and host, control law and gains, offset and channels, the last note."""
+"""Facts of a run as text: run and host, control law and gains, offset and channels, last note."""
 
 from datetime import UTC, datetime
 
@@ -14,7 +14,7 @@ from lowfc.programs.view.verdicts.run_state import RunState
 from lowfc.programs.view.verdicts.tile import numbers, short
 
 _MOST = 3
-"""Modes of an offset that are named one by one."""
+"""Largest number of modes of an offset that are named one by one."""
 
 
 def facts(state: RunState) -> dict[str, str]:

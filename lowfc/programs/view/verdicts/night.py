@@ -1,4 +1,4 @@
-"""The verdict on a whole log, at its end: how the night was, not its last instant."""
+"""Verdict on a whole log, shown at its end in place of the verdict on its last seconds."""
 
 from collections import Counter
 from datetime import UTC, datetime
@@ -20,17 +20,17 @@ from lowfc.programs.view.verdicts.verdict import LIMITS, stroke, stroke_used_nm
 from lowfc.programs.view.verdicts.wavefront_verdict import GOOD_FACTOR
 
 _LONGEST_STEP_NS = 1_000_000_000
-"""A pause between two steps that is longer counts as time without steps."""
+"""A longer gap between two steps counts as time without steps."""
 _MODES = {mode.value: mode for mode in LoopMode}
 _NAMES = {LoopMode.OPEN: "open", LoopMode.SAFE: "safe", LoopMode.IDLE: "idle", None: "without frames"}
 
 
 class Night:
-    """Everything since the first snapshot, in sums."""
+    """Sums over all snapshots of a log."""
 
     def __init__(self) -> None:
         self._course = Course()
-        self._closed = np.zeros(3)  # rows while the loop was closed, and the squares of what was left, and of flat
+        self._closed = np.zeros(3)  # while closed: rows, sums of squares of residual and open
         self._mode_ns: Counter[LoopMode | None] = Counter()
         self._first_ns = self._last_ns = 0
         self._latency = Durations()
@@ -52,7 +52,7 @@ class Night:
             self._lost = max(self._lost, recorder.health.recording.lost)
 
     def verdict(self, state: RunState, ended: LogEnd) -> Verdict:
-        """Tiles of the whole log, and a sentence; the worst of them where somebody should look."""
+        """Tiles of the whole log, and a headline, with the advice of the worst tile if it needs attention."""
         loop, wavefront = self._loop(), self._wavefront()
         others = _frames(state), self._star(), self._mirror(state), self._timing(state), self._log(ended)
         tiles = (loop, wavefront, *others)
@@ -91,19 +91,19 @@ class Night:
         return Tile("LOOP", value, detail, Level.GOOD if closed_ns > 0.5 * total_ns else Level.NEUTRAL)
 
     def _wavefront(self) -> Tile:
-        count, left_nm2, flat_nm2 = self._closed
+        count, residual_nm2, flat_nm2 = self._closed
         if not count:
             return Tile("WAVEFRONT", "?", "never measured with the loop closed")
-        left_nm, flat_nm = float(np.sqrt(left_nm2 / count)), float(np.sqrt(flat_nm2 / count))
+        residual_nm, flat_nm = float(np.sqrt(residual_nm2 / count)), float(np.sqrt(flat_nm2 / count))
         worst_nm = float(np.nanmax(self._course.wavefront()[1][:, 0], initial=0.0))
-        better = flat_nm / left_nm if left_nm else 1.0
+        factor = flat_nm / residual_nm if residual_nm else 1.0
         detail = (
-            f"while closed, {better:.1f} x better than {figure(flat_nm)} nm with a flat mirror; "
+            f"while closed, {factor:.1f} x better than {figure(flat_nm)} nm with a flat mirror; "
             f"worst {self._span}: {figure(worst_nm)} nm; {'true' if self._course.true else 'measured, with noise'}"
         )
-        level = Level.GOOD if better >= GOOD_FACTOR else Level.NEUTRAL
-        value = f"{figure(left_nm)} nm rms"
-        return Tile("WAVEFRONT", value, detail, level, f"{value} left of {figure(flat_nm)} nm")
+        level = Level.GOOD if factor >= GOOD_FACTOR else Level.NEUTRAL
+        value = f"{figure(residual_nm)} nm rms"
+        return Tile("WAVEFRONT", value, detail, level, f"residual {value}, {figure(flat_nm)} nm with a flat mirror")
 
     @property
     def _span(self) -> str:
@@ -115,7 +115,7 @@ class Night:
         if not light.size:
             return Tile("STAR", "?", "no frame was used")
         value, dimmest = f"{np.median(light):.0f} %", f"{light.min():.0f}"
-        detail = f"of the expected light; in {self._span} between {dimmest} and {light.max():.0f} %"
+        detail = f"of the expected light; means over {self._span}: {dimmest} to {light.max():.0f} %"
         if light.min() < 100 * DIM:
             return Tile("STAR", value, detail, Level.WARNING, f"The star was dim, down to {dimmest} %.")
         return Tile("STAR", value, detail, Level.GOOD)
@@ -132,11 +132,11 @@ class Night:
     def _timing(self, state: RunState) -> Tile:
         if not self._latency.count:
             return Tile("LATENCY", "?", "not measured")
-        middle, long, most = (f"{figure(ns / 1e3)} us" for ns in self._latency.percentiles_ns(0.5, 0.99, 1.0))
-        detail = f"frame to command; 1 in 100 over {long}, at most {most}"
+        p50, p99, most = (f"{figure(ns / 1e3)} us" for ns in self._latency.percentiles_ns(0.5, 0.99, 1.0))
+        detail = f"frame to command; 1 in 100 over {p99}, at most {most}"
         if state.simulated:
-            return Tile("LATENCY", middle, f"{detail}; of no effect in simulated time")
-        return Tile("LATENCY", middle, detail, Level.GOOD)
+            return Tile("LATENCY", p50, f"{detail}; without effect in simulated time")
+        return Tile("LATENCY", p50, detail, Level.GOOD)
 
     def _log(self, ended: LogEnd) -> Tile:
         lost = counted(self._lost, "message")
@@ -144,7 +144,7 @@ class Night:
         if not ended.complete:
             return Tile("LOG", "NO END", f"{detail} up to here", Level.WARNING, f"{ended.no_end.capitalize()}.")
         if self._lost:
-            advice = f"The recorder lost {lost}: disk or processor was too slow for it."
+            advice = f"The recorder lost {lost}: disk or processor was too slow."
             return Tile("LOG", "FINISHED", detail, Level.WARNING, advice)
         return Tile("LOG", "FINISHED", detail, Level.GOOD)
 

@@ -1,4 +1,4 @@
-"""The state of a run in the last seconds, from which the verdict is made."""
+"""State of a run in the last seconds, the input of the verdict."""
 
 from collections import Counter
 from dataclasses import dataclass, field
@@ -11,19 +11,19 @@ from lowfc.programs.view.snapshot import Accumulator, Snapshot
 from lowfc.programs.view.verdicts.steady import Attained
 
 NOW_S = 1.0
-"""What is called "now": long enough for an rms of vibrations, short enough to follow a person's hand."""
+"""Length of "now": long enough for an rms of vibrations, short enough to show the effect of an operator's action."""
 RECENT_S = 5.0
-"""An incident stays visible so long after its last time, so that a person who looks up sees it."""
+"""Time for which an incident stays visible, so that an operator notices it."""
 GRACE_S = 10.0
-"""Processes need a few seconds to start; one that has not after this is missed."""
+"""Time for processes to start, after which an absent one is reported."""
 OTHER_CLOCK_NS = 3_600_000_000_000
-"""Clocks of one host do not differ by an hour: frame times that do are simulated, or another clock's."""
+"""Difference from host time at which frame times count as simulated, or as those of another clock."""
 
 Counts = Counter[Reason | str]
 
 
 class Liveness(Enum):
-    """How a process is, judged by its messages."""
+    """Whether a process runs, judged by its messages."""
 
     NEVER = auto()
     STARTING = auto()
@@ -33,7 +33,7 @@ class Liveness(Enum):
 
 
 class Process(NamedTuple):
-    """How a process is, and for how long it has sent nothing."""
+    """Liveness of a process, and the time since its last message."""
 
     life: Liveness = Liveness.NEVER
     silent_s: float = 0.0
@@ -44,7 +44,7 @@ _NOTHING = Accumulator().snapshot(0)
 
 
 class Rms(NamedTuple):
-    """Root mean squares of a wavefront, and of what it would be without the mirror; tilt per axis."""
+    """Rms of the residual wavefront, and of the wavefront without the mirror (`open`); tilt per axis."""
 
     residual_nm: float
     open_nm: float
@@ -57,22 +57,22 @@ class RunState:
     """The last seconds of a run.
 
     Attributes:
-        snapshot: the last one.
-        mode: of the loop; None before the first message about it. `why` is the cause of its last change.
-        running_s: since the first message.
-        rate_hz: of the frames behind the steps; None with less than two of them.
-        controller, camera, mirror, recorder: the processes; of several mirrors the one that is worst.
-        frame_silent_s, step_silent_s: time without a frame or step, where the frame rate does not explain it.
-        recent, now, totals: counts of each reason, of "steps", and of what was "skipped", "missing", "late" or "lost",
-            in `RECENT_S`, in `NOW_S` and since the start.
-        flux: light on the newest frame, of what the calibration expects; None without both.
-        saturated: good pixels at full well in the newest frame.
-        wavefront: of the last second; once the controller was stopped, of the last one with a step. `latest` is the
-            end of it. They are `true` in a simulation, otherwise measured.
-        attained: what the loop leaves, and what it could leave.
-        latency_us: p50 and p99 from frame to command of the same second.
-        mirror_state: the last one; None before the first.
-        note: the operator's last one.
+        snapshot: last snapshot.
+        mode: loop mode; None before the first message about it. `why` is the cause of its last change.
+        running_s: time since the first message.
+        rate_hz: rate of the frames of the steps; None with less than two steps.
+        controller, camera, mirror, recorder: liveness of the processes; with several mirrors that of the worst.
+        frame_silent_s, step_silent_s: time without a frame or step; None if the frame rate explains it.
+        recent, now, totals: counts of each reason, of "steps", and of "skipped", "missing", "late" and "lost", in
+            `RECENT_S`, in `NOW_S` and since the start.
+        flux: light on the newest frame as a fraction of the calibration's; None without both.
+        saturated: number of good pixels at full well in the newest frame.
+        wavefront: rms of the last second; once the controller was stopped, of its last second with a step. `latest` is
+            the rms of the end of that second. Both are `true` in a simulation, otherwise measured.
+        attained: residual of the loop, and of the best gains.
+        latency_us: p50 and p99 from frame to command in the same second.
+        mirror_state: last state of the mirror; None before the first.
+        note: last note of the operator.
     """
 
     snapshot: Snapshot = _NOTHING
@@ -101,5 +101,5 @@ class RunState:
 
     @property
     def simulated(self) -> bool:
-        """Whether the frames' times are not this host's."""
+        """Whether the frame times are not those of this host."""
         return abs(self.snapshot.time_ns - self.snapshot.host_ns) > OTHER_CLOCK_NS

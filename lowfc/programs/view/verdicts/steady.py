@@ -1,4 +1,4 @@
-"""The last frames under one loop mode and one control law, and what the law leaves beside what it could leave."""
+"""The last frames under one loop mode and control law, and their residual compared with that of the best gains."""
 
 from collections import deque
 from typing import NamedTuple
@@ -16,11 +16,11 @@ from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.view.snapshot import Snapshot
 
 FRAMES = 6144
-"""Frames kept: for spectra eleven segments of 1024."""
+"""Frames kept, for spectra of eleven segments of 1024."""
 
 
 class LawInForce(NamedTuple):
-    """The integrator, and the linear law in its place, if any; one that is overruled is another than before."""
+    """The integrator, and the linear law that replaces it, if any; an overruled law counts as another law."""
 
     gain: tuple[float, ...]
     leak: tuple[float, ...]
@@ -29,9 +29,9 @@ class LawInForce(NamedTuple):
 
 
 class Steady:
-    """Measured error and pseudo-open-loop of the last frames since loop mode or law changed, and the law has settled.
+    """Measured error and pseudo-open-loop of the last frames since loop mode or law changed, after settling.
 
-    `mode` is 0 before the first step; `law` None where the controller reports none, or one for other modes.
+    `mode` is 0 before the first step; `law` is None if the controller reports none, or one for other modes.
     """
 
     def __init__(self) -> None:
@@ -41,7 +41,7 @@ class Steady:
         self._kept: deque[tuple[Sequences, Single]] = deque()
 
     def feed(self, snapshot: Snapshot) -> bool:
-        """Add the steps of a snapshot; False where it has none that belong to its calibration."""
+        """Add the steps of a snapshot; False if it has none for its calibration."""
         steps, calibration = snapshot.steps, snapshot.calibration
         if calibration is None or not len(steps.error_nm) or steps.error_nm.shape[1] != len(calibration.noll):
             return False
@@ -70,22 +70,22 @@ class Steady:
 
 
 class Attained(NamedTuple):
-    """What a law leaves, and what integrators with the best gains would leave: rms of all modes without noise, nm.
+    """Residual of a law, and of integrators with the best gains: rms of all modes without noise, nm.
 
     `noise_nm` is the sensor's noise in one frame.
     """
 
-    left_nm: float
+    residual_nm: float
     best_nm: float
     noise_nm: float
 
 
 def attained(steady: Steady, rate_hz: float, camera: wire.CameraState | None) -> Attained | None:
-    """The loop of the last frames; None where it is open, not known, or there are too few frames under one law."""
+    """Evaluate the last frames; None if the loop is open, its law unknown, or one law has too few frames."""
     law, modes = steady.law, len(steady.law.gain) if steady.law is not None else 0
     if law is None or steady.mode != LoopMode.CLOSED or not rate_hz:
         return None
-    from lowfc.control.laws.tuning import best_gains  # scipy, which takes as long to import as all else of a view
+    from lowfc.control.laws.tuning import best_gains  # scipy's import takes as long as that of the rest of a view
 
     sequence, signals = steady.rows()
     try:
@@ -95,8 +95,8 @@ def attained(steady: Steady, rate_hz: float, camera: wire.CameraState | None) ->
         return None  # too few frames in a row
     error_nm = signals[np.isfinite(signals).all(axis=1), :modes].astype(np.float64)
     noise_nm2 = float(np.sum(best.noise_nm**2))
-    left_nm2 = max(float(np.mean(np.sum(error_nm**2, axis=1))) - noise_nm2, 0.0)
-    return Attained(left_nm2**0.5, float(np.linalg.norm(best.sensed_nm)), noise_nm2**0.5)
+    residual_nm2 = max(float(np.mean(np.sum(error_nm**2, axis=1))) - noise_nm2, 0.0)
+    return Attained(residual_nm2**0.5, float(np.linalg.norm(best.sensed_nm)), noise_nm2**0.5)
 
 
 def _law_of(state: wire.ControllerState | None, modes: int) -> LawInForce | None:

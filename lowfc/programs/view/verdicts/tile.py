@@ -1,4 +1,4 @@
-"""The verdict as tiles, before it is drawn, and how figures are written on them."""
+"""Tiles of the verdict, and the format of the figures on them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,7 +11,7 @@ _LONGEST = 110  # letters
 
 
 class Level(IntEnum):
-    """How a tile is; from `WARNING` on somebody should look."""
+    """Level of a tile; `WARNING` and above need attention."""
 
     NEUTRAL = 0
     GOOD = 1
@@ -25,7 +25,7 @@ FILL: dict[Level, Colour] = {
     Level.WARNING: (240, 200, 40),
     Level.BAD: (222, 80, 10),
 }
-"""They differ in lightness too: dark grey, green, orange red, bright yellow."""
+"""They also differ in lightness: dark grey, green, orange red, bright yellow."""
 INK: dict[Level, Colour] = {
     Level.NEUTRAL: (235, 235, 240),
     Level.GOOD: (235, 245, 240),
@@ -33,12 +33,12 @@ INK: dict[Level, Colour] = {
     Level.BAD: (255, 255, 255),
 }
 WORD: dict[Level, str] = {Level.NEUTRAL: "", Level.GOOD: "ok", Level.WARNING: "CHECK", Level.BAD: "ALARM"}
-"""Never colour alone."""
+"""Words, so that levels do not depend on colour alone."""
 
 
 @dataclass(frozen=True, slots=True)
 class Tile:
-    """One tile of the annunciator: one word or figure, what it means, and for the headline what to do."""
+    """One tile of the annunciator: a word or figure, its explanation, and the advice for the headline."""
 
     title: str
     value: str
@@ -49,7 +49,7 @@ class Tile:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """The tiles, the worst of them in one sentence, and the facts: what is set, in words by title."""
+    """The tiles, a headline for the worst of them, and the facts of the run by title."""
 
     headline: str
     level: Level
@@ -58,17 +58,17 @@ class Verdict:
 
 
 def worst_of(tiles: Sequence[Tile]) -> Tile:
-    """The first of the highest level: causes stand before what follows from them."""
+    """The first tile of the highest level: causes precede their consequences."""
     return max(tiles, key=lambda tile: tile.level)
 
 
 def figure(value: float) -> str:
-    """In two or three digits: nobody reads more at a glance."""
+    """Text of a number with two or three digits, readable at a glance."""
     return f"{value:.0f}" if value >= 100 else f"{value:.1f}" if value >= 1 else f"{value:.2f}"
 
 
 def numbers(values: Sequence[float]) -> str:
-    """A few numbers as they are, more of them by their range."""
+    """Text of up to three numbers, or of the range of more."""
     if len(values) < 4:
         return " ".join(f"{value:g}" for value in values)
     lowest, highest = f"{min(values):.3g}", f"{max(values):.3g}"
@@ -76,7 +76,7 @@ def numbers(values: Sequence[float]) -> str:
 
 
 def duration(seconds: float) -> str:
-    """A span of time in words, up to a night."""
+    """Text of a time span, up to a night."""
     if seconds < 120:
         return f"{seconds:.0f} s" if seconds >= 10 else f"{seconds:.2g} s"
     minutes = round(seconds / 60)
@@ -84,18 +84,18 @@ def duration(seconds: float) -> str:
 
 
 def short(text: str) -> str:
-    """A text from outside, as long as a tile has room for."""
+    """Text from a message, truncated to the length of a tile."""
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
 
 
 def absent(title: str, name: str, process: Process, running_s: float, harm: str) -> Tile | None:
-    """Tile of a process that is silent, was stopped, or has not sent anything yet; None for one that runs.
+    """Tile of a process that is silent, was stopped, or has not sent anything yet; None if it runs.
 
-    `running_s` is the time since the first message of any process, `harm` what its silence means.
+    `running_s` is the time since the first message of any process, `harm` the consequence of its absence.
     """
     since = duration(process.silent_s)
     if process.life is Liveness.SILENT:
-        advice = f"{name.capitalize()} silent for {since}: {harm}. See its last output, restart it."
+        advice = f"{name.capitalize()} silent for {since}: {harm}. Check its last output and restart it."
         return Tile(title, "DEAD", f"{name} silent for {since}", Level.BAD, advice)
     if process.life is Liveness.STOPPED:
         return Tile(title, "STOPPED", f"the {name}, on request", advice=f"The {name} was stopped.")

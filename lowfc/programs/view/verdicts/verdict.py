@@ -1,6 +1,6 @@
-"""Judgement on a run, for a person who has never seen one: is the loop closed, how good is it, is anything wrong.
+"""Verdict on a run, for an operator who has never seen one: whether the loop is closed, how good it is, what is wrong.
 
-Pure: the state of the last seconds in, tiles out.
+`judge` is a pure function from the state of the last seconds to tiles.
 """
 
 from datetime import UTC, datetime
@@ -21,13 +21,13 @@ from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict, absent, dura
 from lowfc.programs.view.verdicts.wavefront_verdict import WORSE, contrast, wavefront
 
 NEAR_STROKE = 0.9
-"""From here on a mirror has next to nothing left for what comes."""
+"""Fraction of the stroke above which the mirror has little reserve."""
 LIMITED = 0.5
-"""A limit that acts on half of the commands is no passing gust."""
+"""Fraction of limited commands above which the limit is not transient."""
 MANY_LATE = 0.05
-"""One late command in twenty is the host's; more of them are another delay than the one that was tuned for."""
+"""Fraction of late commands that a busy host causes; above it, the delay is longer than the loop is tuned for."""
 BEHIND_S, FAR_BEHIND_S = 1.0, 5.0
-"""A view is a glance old at best; a second shows, and after five it is history."""
+"""Delay of the view for a warning, and for an alarm."""
 
 LIMITS: dict[Reason, str] = {
     Limit.MODAL_LIMIT: "modal limit",
@@ -40,10 +40,10 @@ LIMITS: dict[Reason, str] = {
 
 
 def judge(state: RunState, nm_per_mas: float | None = None) -> Verdict:
-    """Judge the last seconds; without the wavefront rms of a tilt of 1 mas, tilt is left out."""
+    """Judge the last seconds; tilt is left out without `nm_per_mas`, the wavefront rms of a tilt of 1 mas."""
     loop = _loop(state)
-    left = wavefront(state, nm_per_mas, loop)
-    tiles = [loop, left, frames(state), star(state), _mirror(state), _latency(state), _recorder(state)]
+    residual = wavefront(state, nm_per_mas, loop)
+    tiles = [loop, residual, frames(state), star(state), _mirror(state), _latency(state), _recorder(state)]
     reported = (state.snapshot.health.get(role) for role in (Role.CAMERA, Role.CONTROLLER))
     known = (one.health.recent_wavefront for one in reported if one is not None)
     if figures := next((one for one in known if one.costliest_modes), None):
@@ -54,9 +54,9 @@ def judge(state: RunState, nm_per_mas: float | None = None) -> Verdict:
     headline, level = worst.advice, worst.level
     if worst.level < Level.WARNING:
         headline, level = loop.advice, loop.level
-        if loop.level is Level.GOOD and left.advice:
-            wrong = ", nothing is wrong" if left.level is Level.GOOD else ""
-            headline, level = f"Loop closed{wrong}. {left.advice}", left.level
+        if loop.level is Level.GOOD and residual.advice:
+            wrong = ", nothing is wrong" if residual.level is Level.GOOD else ""
+            headline, level = f"Loop closed{wrong}. {residual.advice}", residual.level
     return Verdict(headline, level, tuple(tiles), facts(state))
 
 
@@ -66,7 +66,7 @@ def _loop(state: RunState) -> Tile:
     others, reported = {camera.life, mirror.life}, state.snapshot.controller
     if controller.life is Liveness.SILENT and others <= {Liveness.SILENT, Liveness.NEVER}:
         since = duration(controller.silent_s)
-        advice = f"No message from any process for {since}: the run was killed, or this view is cut off from it. "
+        advice = f"No message from any process for {since}: the run was killed, or this view has lost its connection. "
         return tile("NO MESSAGES", f"for {since}", Level.BAD, f"{advice}Check that its processes run.")
     if controller.life is Liveness.STOPPED and others <= {Liveness.STOPPED, Liveness.NEVER}:
         return tile("ENDED", "all processes stopped on request", advice="The run has ended.")
@@ -78,7 +78,7 @@ def _loop(state: RunState) -> Tile:
         advice = "Loop in safe mode: the mirror stays flat until `lowfc ctl clear`; do that when it is safe."
         return tile("SAFE", state.why or "mirror flat, latched", Level.BAD, advice)
     if mode is LoopMode.IDLE:
-        advice = "The controller has no calibration: it refuses every frame. Give it one."
+        advice = "The controller has no calibration: it refuses every frame. Load one."
         return tile("IDLE", "no calibration", Level.WARNING, advice)
     if mode is LoopMode.OPEN:
         return _open(state)
@@ -86,7 +86,7 @@ def _loop(state: RunState) -> Tile:
         return tile("WAITING", "closed, no frame yet", advice="Waiting for the first frame.")
     if held := _held(reported):
         return tile("HOLDING", f"closed, but {held}: command held", Level.WARNING)
-    if mirror.life is Liveness.SILENT:  # in logs of version 0.1 it is not missed
+    if mirror.life is Liveness.SILENT:  # logs of version 0.1 do not report it
         return tile("CLOSED", "but the mirror is silent", Level.WARNING)
     if camera.life is Liveness.STOPPED:
         advice = "The camera was stopped: the loop is closed and holds its command."
@@ -94,7 +94,7 @@ def _loop(state: RunState) -> Tile:
     if state.frame_silent_s is not None:
         return tile("HOLDING", "closed, but no frames: command held", Level.WARNING)
     if state.step_silent_s is not None:
-        advice = "The controller processes no frames: the mirror holds or relaxes by itself. See its last output."
+        advice = "The controller processes no frames: the mirror holds or relaxes by itself. Check its last output."
         return tile("HOLDING", "closed, but no step in the last second", Level.WARNING, advice)
     if all_refused(state):
         return tile("HOLDING", "closed, but every frame is refused: command held", Level.WARNING)
@@ -105,7 +105,7 @@ def _loop(state: RunState) -> Tile:
 
 
 def _held(state: wire.ControllerState | None) -> str:
-    """What holds a closed loop: the mirror, a permit or an interlock; empty where nothing does."""
+    """Reason why a closed loop holds: the mirror, a lease or an interlock; empty if it does not hold."""
     if state is None:
         return ""
     if state.mirror_fault:
@@ -129,13 +129,13 @@ def _open(state: RunState) -> Tile:
     level, advice = Level.NEUTRAL, "The loop is open: nothing is corrected, `lowfc ctl close` closes it."
     if "camera" in state.why:
         level = Level.WARNING
-        advice = "The loop opened by itself, the camera changed: set it back or calibrate, then `lowfc ctl close`."
+        advice = "The loop opened by itself, as the camera changed: restore it or calibrate, then `lowfc ctl close`."
     return Tile("LOOP", "OPEN", f"{state.why or 'measuring only'}; {shape}", level, f"{advice} The {shape}.")
 
 
 def _mirror(state: RunState) -> Tile:
     tile, reported = partial(Tile, "MIRROR"), state.mirror_state
-    gone = absent("MIRROR", "mirror", state.mirror, state.running_s, "commands go nowhere")
+    gone = absent("MIRROR", "mirror", state.mirror, state.running_s, "commands have no effect")
     if gone is not None:
         return gone
     if reported is None or reported.status == wire.MIRROR_STATUS_WAITING:
@@ -143,7 +143,7 @@ def _mirror(state: RunState) -> Tile:
     if reported.status == wire.MIRROR_STATUS_EXPIRED and state.controller.life is not Liveness.STARTING:
         level = Level.NEUTRAL if state.controller.life is Liveness.STOPPED else Level.BAD
         advice = "The mirror receives no commands: the last one has expired, it holds or relaxes by itself. "
-        return tile("EXPIRED", "no commands: holds or relaxes by itself", level, f"{advice}Look at the controller.")
+        return tile("EXPIRED", "no commands: holds or relaxes by itself", level, f"{advice}Check the controller.")
     used_nm, limit_nm = stroke_used_nm(reported), state.snapshot.stroke_nm
     value, of = stroke(used_nm, limit_nm)
     acting = {words: state.recent[reason] for reason, words in LIMITS.items() if state.recent[reason]}
@@ -152,7 +152,7 @@ def _mirror(state: RunState) -> Tile:
         words, times = ", ".join(acting or own), counted(max(acting.values(), default=0), "time")
         often = max(state.now[reason] for reason in LIMITS) > LIMITED * max(1, state.now["steps"])
         advice = (
-            f"The mirror is at a limit ({words}), {times} {LATELY}: too large a disturbance, or too high a gain. "
+            f"The mirror is at a limit ({words}), {times} {LATELY}: the disturbance is too large or the gain too high. "
             "Lower the gain, offload, or raise the limit."
         )
         detail = f"{words}: {times} in {RECENT_S:g} s; {value} {of}"
@@ -164,13 +164,13 @@ def _mirror(state: RunState) -> Tile:
 
 
 def stroke_used_nm(mirror: wire.MirrorState | None) -> float:
-    """Largest deviation of an actuator from flat; 0 where it is not known."""
+    """Largest deviation of an actuator from flat; 0 if unknown."""
     surface_nm = actuators(mirror) if mirror is not None else None
     return float(np.abs(surface_nm).max(initial=0.0)) if surface_nm is not None else 0.0
 
 
 def stroke(used_nm: float, limit_nm: float) -> tuple[str, str]:
-    """The stroke used, and of what; the limit is 0 where it is not known."""
+    """Texts of the stroke used and of its limit; `limit_nm` is 0 if unknown."""
     if limit_nm:
         return f"{100 * used_nm / limit_nm:.0f} %", f"of {limit_nm:g} nm stroke used"
     return f"{used_nm:.0f} nm", "of stroke used"
@@ -180,22 +180,22 @@ def _latency(state: RunState) -> Tile:
     tile = partial(Tile, "LATENCY")
     if state.latency_us is None:
         return tile("?", "not measured now")
-    middle, long = map(figure, state.latency_us)
-    value, detail = f"{middle} us", f"frame to command; 1 in 100 over {long} us"
+    p50, p99 = map(figure, state.latency_us)
+    value, detail = f"{p50} us", f"frame to command; 1 in 100 over {p99} us"
     late, share = state.recent["late"], state.recent["late"] / max(1, state.recent["steps"])
     if state.controller.life is Liveness.STOPPED:
         return tile(f"last: {value}", detail)
     if state.simulated:
-        return tile(value, f"{detail}; of no effect in simulated time")
+        return tile(value, f"{detail}; without effect in simulated time")
     if share > MANY_LATE:
         advice = (
             f"{counted(late, 'command')}, {100 * share:.2g} %, came after the start of the next exposure: "
-            "there is more delay than the loop is tuned for. Free the host's processors or lower the rate."
+            "the delay is longer than the loop is tuned for. Free the host's processors or lower the rate."
         )
         what = f"{'command' if late == 1 else 'commands'} in {RECENT_S:g} s; {value}, {detail}"
         return tile(f"{late} LATE", what, Level.WARNING, advice)
     if 0 < state.snapshot.period_ns < state.latency_us[1] * 1e3:
-        advice = f"1 command in 100 takes over {long} us, longer than a frame. Free the host or lower the rate."
+        advice = f"1 command in 100 takes over {p99} us, longer than a frame. Free the host or lower the rate."
         return tile(value, f"slow: {detail}", Level.WARNING, advice)
     return tile(value, detail, Level.GOOD)
 
@@ -218,11 +218,11 @@ def _recorder(state: RunState) -> Tile:
         advice = "The recorder was stopped, the loop goes on: nothing is recorded. Start `lowfc record` again."
         return tile("STOPPED", f"{log} is complete; nothing is recorded now", Level.WARNING, advice)
     if done.stopped:
-        advice = "Recording was stopped by an operator: the night is not kept. `lowfc ctl record start` goes on."
+        advice = "Recording was stopped by an operator: nothing is recorded. `lowfc ctl record start` resumes."
         return tile("STOPPED", f"not recording since {log} was finished", Level.WARNING, advice)
     if state.recent["lost"]:
         messages = counted(state.recent["lost"], "message")
-        advice = f"The recorder lost {messages} {LATELY}: disk or processor is too slow for it."
+        advice = f"The recorder lost {messages} {LATELY}: disk or processor is too slow."
         return tile("LOSING", f"{messages} in {RECENT_S:g} s, {done.lost} in all", Level.BAD, advice)
     if not done.file:
         return tile("WAITING", "no log yet")
@@ -232,5 +232,5 @@ def _recorder(state: RunState) -> Tile:
 
 def _view(behind_s: float) -> Tile:
     since, level = duration(behind_s), Level.BAD if behind_s > FAR_BEHIND_S else Level.WARNING
-    advice = f"This view is {since} behind: what it shows is old. The loop does not suffer; close other programs."
+    advice = f"This view is {since} behind and shows old data. The loop is not affected; close other programs."
     return Tile("VIEW", since, "behind the loop", level, advice)

@@ -1,4 +1,4 @@
-"""The state of a run, gathered from snapshots of its messages."""
+"""State of a run, derived from snapshots of its messages."""
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
@@ -31,15 +31,15 @@ from lowfc.programs.view.verdicts.run_state import NOW_S, RECENT_S, Counts, Live
 from lowfc.programs.view.verdicts.steady import Attained, Steady, attained
 
 LATEST_S = 0.3
-"""The end of the last second: a loop that has just begun, or caught up, is better by then."""
+"""End of the last second, by which a loop that has just closed, or caught up, has improved."""
 SILENT_S = 2.0
-"""A process sends Health twice a second; four of them do not get lost by chance."""
+"""A process sends Health twice a second; four are not lost by chance."""
 FRAMES_SILENT_S = 1.0
-"""Without a frame for so long, and for `PERIODS` of its own, a camera is not merely slow."""
+"""A camera without a frame for this time, and for `PERIODS` frame periods, is not merely slow."""
 PERIODS = 10
-"""Frames of a slow camera that "now" holds."""
+"""Frame periods that "now" spans for a slow camera."""
 ATTAINED_NS = 30_000_000_000
-"""Between two computations of the best gains, which take 0.3 s for 14 modes."""
+"""Time between two computations of the best gains, which take 0.3 s for 14 modes."""
 _SAMPLES = 1000
 _MODES: dict[int, LoopMode] = {mode.value: mode for mode in LoopMode}
 _COUNTED: dict[str, tuple[Role, Callable[[wire.Health], int]]] = {
@@ -48,11 +48,11 @@ _COUNTED: dict[str, tuple[Role, Callable[[wire.Health], int]]] = {
     "late": (Role.CAMERA, lambda health: health.commands_late),
     "lost": (Role.RECORDER, lambda health: health.recording.lost),
 }
-"""What processes count, and where it is in their Health."""
+"""Counts of the processes, and where they are in Health."""
 
 
 class _Sample(NamedTuple):
-    """Rows and counts of one snapshot; `squares` of truth and measurement are a count and the sums of `Rms`."""
+    """Rows and counts of a snapshot; `squares`: of truth and measurement, a count and the sums of squares of `Rms`."""
 
     host_ns: int
     counts: Counts
@@ -63,7 +63,7 @@ class _Sample(NamedTuple):
 
 
 class Watcher:
-    """Makes the state of a run from its snapshots."""
+    """Derives the state of a run from its snapshots."""
 
     def __init__(self) -> None:
         self._snapshot: Snapshot = Accumulator().snapshot(0)
@@ -79,10 +79,10 @@ class Watcher:
         self._attained: Attained | None = None
         self._samples: deque[_Sample] = deque(maxlen=_SAMPLES)
         self._counted: dict[str, tuple[int, int]] = {}
-        self._last_worked: list[_Sample] = []
+        self._last_active: list[_Sample] = []
 
     def feed(self, snapshot: Snapshot) -> None:
-        """Add what is new."""
+        """Add a snapshot."""
         self._snapshot = snapshot
         if not self._begun_ns and snapshot.sent_ns:
             self._begun_ns = snapshot.host_ns
@@ -96,7 +96,7 @@ class Watcher:
         while self._samples[0].host_ns < snapshot.host_ns - RECENT_S * 1e9 - PERIODS * self._snapshot.period_ns:
             self._samples.popleft()
         if snapshot.steps.mode.size:
-            self._last_worked = self._last(NOW_S)
+            self._last_active = self._last(NOW_S)
 
     def state(self) -> RunState:
         """The state at the last snapshot."""
@@ -105,9 +105,9 @@ class Watcher:
         stopped = controller.life is Liveness.STOPPED
         wavefront, true = _rms(now)
         if wavefront is None and stopped:
-            wavefront, true = _rms(self._last_worked)
-        worked = self._last_worked if stopped else now
-        durations_us = np.concatenate([np.zeros(0), *(one.durations_ns / 1e3 for one in worked)])
+            wavefront, true = _rms(self._last_active)
+        active = self._last_active if stopped else now
+        durations_us = np.concatenate([np.zeros(0), *(one.durations_ns / 1e3 for one in active)])
         return RunState(
             snapshot=snapshot,
             mode=self._mode,
@@ -115,7 +115,7 @@ class Watcher:
             running_s=(snapshot.host_ns - self._begun_ns) * 1e-9 if self._begun_ns else 0.0,
             rate_hz=_rate_hz(now),
             controller=controller,
-            camera=self._process((Role.CAMERA,), FRAME),  # one of the user's own may send nothing else
+            camera=self._process((Role.CAMERA,), FRAME),  # a user's own camera may send nothing else
             mirror=self._worst_mirror(),
             recorder=self._process((Role.RECORDER,)),
             frame_silent_s=self._silent_s(FRAME),
@@ -139,7 +139,7 @@ class Watcher:
         return [one for one in self._samples if one.host_ns > begin_ns]
 
     def _worst_mirror(self) -> Process:
-        """The mirror that is silent longest, and a stopped one only if all are."""
+        """The mirror that is silent longest; a stopped one only if all are stopped."""
         names = [name for name in self._snapshot.health if name.startswith(mirror_role(""))]
         if len(names) <= 1:
             return self._process(names, MIRROR_STATE)
@@ -149,7 +149,7 @@ class Watcher:
         )
 
     def _process(self, names: Iterable[str], *topics: Topic) -> Process:
-        """A process by its Health or by topics that are signs of life, too."""
+        """Liveness of a process by its Health or its other topics."""
         last = next((self._snapshot.health[name] for name in names if name in self._snapshot.health), None)
         sent_ns = max((self._snapshot.sent_ns.get(topic, 0) for topic in topics), default=0)
         last_ns = max(sent_ns, last.time_ns if last is not None else 0)
@@ -166,23 +166,23 @@ class Watcher:
     def _silent_s(self, topic: Topic) -> float | None:
         if not self._begun_ns:
             return None
-        sent_ns = self._snapshot.sent_ns  # a step stands for its frame, which a log need not have
+        sent_ns = self._snapshot.sent_ns  # a step implies a frame, which a log may not have
         silent_s = self._since_s(max(sent_ns.get(topic, self._begun_ns), sent_ns.get(STEP, 0)))
         return silent_s if silent_s > max(FRAMES_SILENT_S, PERIODS * self._snapshot.period_ns * 1e-9) else None
 
     def _since_s(self, time_ns: int) -> float:
-        """Silence, without the delay of this view."""
+        """Time since `time_ns`, minus the delay of this view."""
         return max(0.0, (self._snapshot.host_ns - time_ns) * 1e-9 - self._snapshot.behind_s)
 
     def _update_mode(self, snapshot: Snapshot) -> None:
-        """Keep the mode of the last step; without a new one that of the last state or, where there is none, Health."""
+        """Keep the mode of the last step; without a new step, that of the last state or, without one, of Health."""
         last = snapshot.health.get(Role.CONTROLLER)
         report = snapshot.controller or (last.health if last is not None else None)
         mode = snapshot.steps.mode[-1] if snapshot.steps.mode.size else report.mode if report is not None else 0
         self._mode = _MODES.get(int(mode), self._mode)
 
     def _update_events(self, events: Iterable[Log]) -> None:
-        """Keep the newest note and cause: events from before a view began come after those that it received itself."""
+        """Keep the newest note and cause: events from before the view arrive after its own."""
         for event in events:
             time_ns = from_timestamp(event.timestamp)
             if event.message.startswith("MODE_CHANGED") and time_ns >= self._why_ns:
@@ -207,7 +207,7 @@ class Watcher:
         if not self._steady.feed(snapshot):
             return
         if before != (self._steady.mode, self._steady.law):
-            self._attained, self._attained_ns = None, snapshot.time_ns  # of another law
+            self._attained, self._attained_ns = None, snapshot.time_ns  # it was of another law
         if snapshot.time_ns - self._attained_ns >= ATTAINED_NS:
             self._attained_ns = snapshot.time_ns
             rate_hz = frame_rate_hz(snapshot.camera, snapshot.steps)
@@ -222,7 +222,7 @@ class Watcher:
         return _Sample(snapshot.host_ns, counts, squares, steps.sequence, steps.time_ns, durations_ns)
 
     def _grown(self, snapshot: Snapshot) -> dict[str, int]:
-        """By how much the counts of the processes have grown since the last snapshot; a restarted one begins anew."""
+        """Increase of the processes' counts since the last snapshot; none for a restarted process."""
         grown: dict[str, int] = {}
         for name, (role, count_in) in _COUNTED.items():
             last = snapshot.health.get(role)
@@ -237,7 +237,7 @@ class Watcher:
 
 
 def _rms(samples: list[_Sample]) -> tuple[Rms | None, bool]:
-    """Of the truth, or without one of the measurement, and whether it is the truth; None without either."""
+    """Rms of the truth, or without it of the measurement, and whether it is the truth; None without either."""
     for column in (0, 1):
         total: Array = sum((one.squares[column] for one in samples), np.zeros(5))
         if total[0]:
@@ -246,22 +246,22 @@ def _rms(samples: list[_Sample]) -> tuple[Rms | None, bool]:
 
 
 def _rate_hz(samples: list[_Sample]) -> float | None:
-    """Rate of the frames behind the steps, by their own times since the camera's start."""
-    worked = [one for one in samples if one.sequence.size]
-    last = int(worked[-1].sequence[-1]) if worked else 0
-    first = next((one for one in worked if start_of(int(one.sequence[0])) == start_of(last)), None)
+    """Frame rate of the steps since the camera's last start, by their frame times."""
+    active = [one for one in samples if one.sequence.size]
+    last = int(active[-1].sequence[-1]) if active else 0
+    first = next((one for one in active if start_of(int(one.sequence[0])) == start_of(last)), None)
     if first is None:
         return None
-    frames, elapsed_ns = last - int(first.sequence[0]), int(worked[-1].time_ns[-1] - first.time_ns[0])
+    frames, elapsed_ns = last - int(first.sequence[0]), int(active[-1].time_ns[-1] - first.time_ns[0])
     return frames * 1e9 / elapsed_ns if elapsed_ns > 0 and frames > 0 else None
 
 
 def _squares(snapshot: Snapshot, waves: Waves) -> Array:
-    """Count of rows, and the sums of squares of `Rms`; tip and tilt where the calibration is for so many modes."""
-    noll = snapshot.noll if len(snapshot.noll) == waves.left_nm.shape[1] else ()
+    """Count of rows, and sums of squares of `Rms`; tip and tilt only if the calibration has as many modes."""
+    noll = snapshot.noll if len(snapshot.noll) == waves.residual_nm.shape[1] else ()
     tilts = [place for place, index in enumerate(noll) if index in TIP_TILT]
     tilt_nm2 = [
         np.square(one[:, tilts], dtype=float).sum() / max(1, len(tilts))
-        for one in (waves.left_rms_nm, waves.open_rms_nm)
+        for one in (waves.residual_rms_nm, waves.open_rms_nm)
     ]
     return np.array([len(waves.rms_nm), *np.square(waves.rms_nm, dtype=float).sum(axis=0), *tilt_nm2])
