@@ -33,13 +33,13 @@ def analytic(config: Configuration, console: Console, at: Wavefront | None = Non
     with counting_bar(console, TimeElapsedColumn()) as count:
         optics = factory.twin(config, lambda done, total: count("building the optical model", done, total), warn)
     on_nodes = factory.mirror_on_twin(config, optics, lambda _: None)
-    made = factory.analytic_calibration(config, optics, on_nodes, None if at is None else at(optics, on_nodes))
-    noise = factory.frame_noise_nm(config, made)
+    calibration = factory.analytic_calibration(config, optics, on_nodes, None if at is None else at(optics, on_nodes))
+    noise = factory.frame_noise_nm(config, calibration)
     worst = int(np.argmax(noise))
     if noise[worst] > config.control.limit_nm:
         warn(
-            f"Z{made.noll[worst]}: measurement noise is {noise[worst]:.0f} nm rms per frame, more than its "
+            f"Z{calibration.noll[worst]}: measurement noise is {noise[worst]:.0f} nm rms per frame, more than its "
             f"modal limit of {config.control.limit_nm:g} nm: "
             "the star is too faint, or the mask cannot distinguish so many modes"
         )
-    return made
+    return calibration

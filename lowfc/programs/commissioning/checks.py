@@ -102,11 +102,11 @@ class Table(Generic[S]):
 
         return enter
 
-    def of(self, seen: S, unknown: tuple[type[Exception], ...] = ()) -> Iterator[Check]:
-        """Run every check on `seen`; a check that raises one of the `unknown` exceptions gives a note."""
+    def of(self, subject: S, unknown: tuple[type[Exception], ...] = ()) -> Iterator[Check]:
+        """Run every check on `subject`; a check that raises one of the `unknown` exceptions gives a note."""
         for usual, look in self.looks.values():
             try:
-                found = look(seen)
+                found = look(subject)
             except unknown as fault:
                 found = note(f"not known: {fault}")
             if found is not None and found.status is Status.WARNING and not found.advice:

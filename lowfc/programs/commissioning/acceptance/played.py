@@ -158,11 +158,11 @@ class Played:
 
     def filled(self, values: Array) -> Array:
         """`values` (frames, modes) with missing frames interpolated."""
-        there = np.isfinite(values).all(axis=1)
-        if there.all():
+        present = np.isfinite(values).all(axis=1)
+        if present.all():
             return values
         rows = np.arange(len(values))
-        return np.stack([np.interp(rows, rows[there], column[there]) for column in values.T], axis=1)
+        return np.stack([np.interp(rows, rows[present], column[present]) for column in values.T], axis=1)
 
 
 def chosen(requested: Sequence[int], noll: Sequence[int]) -> tuple[int, ...]:

@@ -21,7 +21,7 @@ from lowfc.programs.commissioning.analytic import analytic
 from lowfc.programs.commissioning.calibrate.pokes import AMPLITUDE_NM, sequence
 from lowfc.programs.commissioning.calibrate.recording import Player, check_size, watch
 from lowfc.programs.commissioning.calibrate.result import reconstructed
-from lowfc.programs.commissioning.calibrate.tasks import reporter, written
+from lowfc.programs.commissioning.calibrate.tasks import reporter, write
 
 
 class AlignResult(Result):
@@ -58,13 +58,13 @@ def aligned(out: Path, run: str | None, frames: int, *, load: bool) -> AlignResu
             found = align(pixels.mean(axis=0) - dark, computed.reference.astype(np.float64).reshape(computed.shape))
         except ValueError as error:
             raise CalibrationError(str(error)) from None
-        made = on_sensor(config, computed, found.geometry, found.flux, before)
-        mode = int(np.argmax(np.linalg.norm(made.response, axis=0)))
-        poke = Player(loop, made, reporter(console)).first_poke(mode, sequence(AMPLITUDE_NM["poke"]))
-        if poke.picture @ made.response[:, mode] < 0:
+        calibration = on_sensor(config, computed, found.geometry, found.flux, before)
+        mode = int(np.argmax(np.linalg.norm(calibration.response, axis=0)))
+        poke = Player(loop, calibration, reporter(console)).first_poke(mode, sequence(AMPLITUDE_NM["poke"]))
+        if poke.picture @ calibration.response[:, mode] < 0:
             found = replace(found, geometry=found.geometry.turned())
-            made = on_sensor(config, computed, found.geometry, found.flux, before)
-        written(made, out, loop if load else None)
+            calibration = on_sensor(config, computed, found.geometry, found.flux, before)
+        write(calibration, out, loop if load else None)
     return AlignResult(
         **asdict(found.geometry),
         pixels_per_lambda_d=found.geometry.scale * computed_scale(config),
@@ -86,7 +86,7 @@ def on_sensor(
     good = before.good.astype(np.float64)
     try:
         I0, H = normalise_flux(np.maximum(I0, 0), H, good)
-        made = reconstructed(config, I0, H, None, good, flux, estimator=config.control.estimator)
+        reconstruction = reconstructed(config, I0, H, None, good, flux, estimator=config.control.estimator)
     except (ValueError, CalibrationError) as error:
         raise CalibrationError(f"too little of the image falls on the sensor: {error}") from None
     return identified(
@@ -94,7 +94,7 @@ def on_sensor(
             computed,
             reference=single(I0),
             response=single(H),
-            reconstructor=single(made.matrix),
+            reconstructor=single(reconstruction.matrix),
             good=before.good,
             dark=before.dark,
             shape=before.shape,

@@ -109,21 +109,21 @@ def finished(
 ) -> tuple[Calibration, CalibrationResult]:
     """Compute R, check it on separate frames, write the file, under another name if it is not recommended."""
     config = calibrator.config
-    made, quality = measured_calibration(config, calibrator.before, data.measured, request)
-    check = calibrator.check(made, data)
-    noise = computed_noise_nm(config, made, computed)
-    ratio = None if noise is None else factory.frame_noise_nm(config, made) / noise
-    verdict = judge(request.snr, data.measured.cycles, data.measured.error, check, ratio, made.noll)
+    calibration, quality = measured_calibration(config, calibrator.before, data.measured, request)
+    check = calibrator.check(calibration, data)
+    noise = computed_noise_nm(config, calibration, computed)
+    ratio = None if noise is None else factory.frame_noise_nm(config, calibration) / noise
+    verdict = judge(request.snr, data.measured.cycles, data.measured.error, check, ratio, calibration.noll)
     file = rejected_of(request.out) if verdict.faults else request.out
-    found = result_of(config, made, quality, request.method, file, data, computed, verdict)
-    calibration_file.save(made, file)
+    found = result_of(config, calibration, quality, request.method, file, data, computed, verdict)
+    calibration_file.save(calibration, file)
     configured = configured_delay(config)
     if abs(data.delay.delay_frames - configured) > DELAY_APART:
         found.advice.append(
             f"warning: the configured delay is {configured:g} frames: set control.delay_frames = "
             f"{max(data.delay.delay_frames, 1):.2f}"
         )
-    return made, found
+    return calibration, found
 
 
 def reconstructed(
@@ -149,7 +149,7 @@ def measured_calibration(
 ) -> tuple[Calibration, Reconstruction]:
     """The calibration from cycles of pokes, with dark, mask and mirror commands of the previous one."""
     I0 = found.reference if found.reference is not None else before.reference.astype(np.float64)
-    made = reconstructed(
+    reconstruction = reconstructed(
         config,
         I0,
         found.response,
@@ -164,13 +164,13 @@ def measured_calibration(
         before,
         reference=single(I0),
         response=single(found.response),
-        reconstructor=single(made.matrix),
+        reconstructor=single(reconstruction.matrix),
         flux_dn=found.flux_dn,
         estimator="+".join(names),
         operator_hash="",
-        actuators_to_modes=single(_actuators_to_modes(config, before, made.matrix)),
+        actuators_to_modes=single(_actuators_to_modes(config, before, reconstruction.matrix)),
     )
-    return identified(calibration), made
+    return identified(calibration), reconstruction
 
 
 def computed_noise_nm(config: Configuration, calibration: Calibration, computed: Calibration) -> Array | None:
@@ -183,7 +183,7 @@ def computed_noise_nm(config: Configuration, calibration: Calibration, computed:
 def result_of(
     config: Configuration,
     calibration: Calibration,
-    made: Reconstruction,
+    reconstruction: Reconstruction,
     method: str,
     file: Path,
     data: CalibrationData | None = None,
@@ -202,9 +202,9 @@ def result_of(
         method=method,
         modes=len(calibration.noll),
         noll=list(calibration.noll),
-        condition_number=made.condition_number,
-        singular_values=made.singular_values.tolist(),
-        kept=made.kept.tolist(),
+        condition_number=reconstruction.condition_number,
+        singular_values=reconstruction.singular_values.tolist(),
+        kept=reconstruction.kept.tolist(),
         delay_frames=delay_frames,
         delay_error_frames=error_frames,
         frame_to_effect_ms=delay_frames * config.period_ns * 1e-6,
@@ -213,7 +213,7 @@ def result_of(
         flux_dn=calibration.flux_dn,
         cycles=0 if data is None else data.measured.cycles,
         file=str(file),
-        advice=[advice(made, calibration.noll, config.control.limit_nm)],
+        advice=[advice(reconstruction, calibration.noll, config.control.limit_nm)],
         **found,
         **({} if verdict is None else verdict.figures()),
     )

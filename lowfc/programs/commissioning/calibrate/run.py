@@ -58,7 +58,7 @@ class Calibrator:
         before: calibration in use.
         noise_nm: noise of one frame with that calibration (modes,), nm rms.
         pokes: the probe sequences.
-        kept: number of completed cycles stored for --resume.
+        completed: number of completed cycles stored for --resume.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class Calibrator:
             "calibration": self.before.id,
         }
         self._resumed = resumed(partial_of(request.out), self._what) if request.resume else None
-        self.kept = self._resumed.cycles if self._resumed else 0
+        self.completed = self._resumed.cycles if self._resumed else 0
 
     @contextlib.contextmanager
     def required_mode(self) -> Iterator[None]:
@@ -131,9 +131,9 @@ class Calibrator:
         delay = self.delay() if delay is None else delay
         return CalibrationData(self._cycles(delay), delay)
 
-    def check(self, made: Calibration, data: CalibrationData) -> Check:
+    def check(self, calibration: Calibration, data: CalibrationData) -> Check:
         """Cross-talk of a new calibration at the present zero point, from separate cycles."""
-        R = made.reconstructor.astype(np.float64)
+        R = calibration.reconstructor.astype(np.float64)
         cycles = data.measured.cycles
         count = checks(cycles)
         answers = []
@@ -153,7 +153,7 @@ class Calibrator:
         """Measure the delay from poke to image with the mode of lowest noise."""
         mode = self._best
         plan = self.pokes.delay(mode)
-        self._show("detecting pokes", max(self.pokes.cycles(), self.kept), self.kept)
+        self._show("detecting pokes", max(self.pokes.cycles(), self.completed), self.completed)
         found = self._player.first_poke(mode, plan)
         self._compare_picture(found.picture, mode)
         self._report(
@@ -196,7 +196,7 @@ class Calibrator:
                 self._show(f"{request.method} cycle {done + 1} of {needed}", needed, done)
                 sums = sums.plus(self._player.cycle(pokes.cycle(done), delay.delay_frames))
                 keep(path, sums, self._what)
-                self.kept = sums.cycles
+                self.completed = sums.cycles
             found = measured(sums)
             more = pokes.more_cycles(needed, float(found.error.max()))
             if more <= needed:

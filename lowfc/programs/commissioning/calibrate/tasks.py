@@ -68,26 +68,25 @@ def poked(request: CalibrationRequest, run: str | None, *, load: bool) -> Calibr
     require_folder(request.out)
     console = Console(stderr=True)
     report = reporter(console)
-    with contextlib.ExitStack() as held:
-        loop = held.enter_context(Client(run))
+    with contextlib.ExitStack() as stack:
+        loop = stack.enter_context(Client(run))
         computed = analytic(configuration_of(loop), console)
-        progress = held.enter_context(shown_progress(console, report))
-        lease = held.enter_context(loop.reserved(f"lowfc calibrate --method {request.method}"))
+        progress = stack.enter_context(shown_progress(console, report))
+        lease = stack.enter_context(loop.reserved(f"lowfc calibrate --method {request.method}"))
         progress = lease.expecting(progress, configuration_of(loop).camera.rate_hz)
         calibrator = Calibrator(loop, request, report, progress, computed)
         try:
             with calibrator.required_mode():
-                made, result = finished(calibrator, request, calibrator.run(), computed)
+                calibration, result = finished(calibrator, request, calibrator.run(), computed)
                 if result.recommended:
                     partial_of(request.out).unlink(missing_ok=True)
                     if load:
-                        loop.load(made)
+                        loop.load(calibration)
         except BaseException:
-            if calibrator.kept:
-                kept_cycles = counted(calibrator.kept, "cycle")
+            if calibrator.completed:
+                cycles = counted(calibrator.completed, "cycle")
                 report(
-                    f"kept in {partial_of(request.out)}: {kept_cycles}; the same command with --resume continues with "
-                    "them"
+                    f"kept in {partial_of(request.out)}: {cycles}; the same command with --resume continues with them"
                 )
             raise
     result.not_loaded = load and not result.recommended
@@ -111,25 +110,27 @@ def computed(
     require_folder(request.out)
     config = configuration(file)
     name, wavefront = ("", None) if at is None else zero_point(config, at)
-    made = analytic(config, Console(stderr=True), wavefront)
+    calibration = analytic(config, Console(stderr=True), wavefront)
     quality = reconstructed(
         config,
-        made.reference.astype(np.float64),
-        made.response.astype(np.float64),
+        calibration.reference.astype(np.float64),
+        calibration.response.astype(np.float64),
         None,
-        made.good.astype(np.float64),
-        made.flux_dn,
+        calibration.good.astype(np.float64),
+        calibration.flux_dn,
         estimator=config.control.estimator,
         truncate=request.truncate,
         tikhonov=request.tikhonov,
     )
     if name:
-        made = replace(made, estimator=f"{made.estimator}+at {name}")
+        calibration = replace(calibration, estimator=f"{calibration.estimator}+at {name}")
     if request.truncate or request.tikhonov:
-        made = replace(made, reconstructor=single(quality.matrix), estimator=f"{made.estimator}+regularised")
+        calibration = replace(
+            calibration, reconstructor=single(quality.matrix), estimator=f"{calibration.estimator}+regularised"
+        )
     with Client(run) if load else contextlib.nullcontext() as loop:
-        made = written(made, request.out, loop)
-    return result_of(config, made, quality, "analytic", request.out)
+        calibration = write(calibration, request.out, loop)
+    return result_of(config, calibration, quality, "analytic", request.out)
 
 
 def zero_point(config: Configuration, text: str) -> tuple[str, Wavefront]:
@@ -177,7 +178,7 @@ def darkened(out: Path, run: str | None, frames: int, file: Path | None, *, load
         found = dark_of(cube.reshape(len(cube), -1))
         if file is None:
             check_dark(found.dark_dn, before.reference.astype(np.float64), before.flux_dn)
-        written(with_dark(before, found.dark_dn, found.good, *noise), out, loop if load else None)
+        write(with_dark(before, found.dark_dn, found.good, *noise), out, loop if load else None)
     counts = {name: int(np.count_nonzero(getattr(found, name))) for name in ("hot", "noisy", "dead")}
     level, noise_dn = float(np.median(found.dark_dn)), float(np.median(found.noise_dn))
     return DarkResult(frames=len(cube), dark_dn=level, noise_dn=noise_dn, **counts, file=str(out))
@@ -192,10 +193,12 @@ def referenced(out: Path, run: str | None, frames: int, *, load: bool) -> Refere
         pixels = cube.reshape(frames, -1)
         light, flux = normalised(pixels, before.dark.astype(np.float64), before.good.astype(np.float64))
         image = light.mean(axis=0)
-        made = written(with_reference(before, image, float(flux.mean()), *noise), out, loop if load else None)
-    moved = before.reconstructor.astype(np.float64) @ (image - before.reference)
-    shift_nm, noll = moved.tolist(), list(made.noll)
-    return ReferenceResult(frames=frames, noll=noll, reference_shift_nm=shift_nm, flux_dn=made.flux_dn, file=str(out))
+        calibration = write(with_reference(before, image, float(flux.mean()), *noise), out, loop if load else None)
+    shift = before.reconstructor.astype(np.float64) @ (image - before.reference)
+    shift_nm, noll = shift.tolist(), list(calibration.noll)
+    return ReferenceResult(
+        frames=frames, noll=noll, reference_shift_nm=shift_nm, flux_dn=calibration.flux_dn, file=str(out)
+    )
 
 
 @contextlib.contextmanager
@@ -209,13 +212,13 @@ def _in_use(loop: Client) -> Iterator[tuple[Calibration, tuple[float, float]]]:
         raise CalibrationError(str(error)) from None
 
 
-def written(made: Calibration, out: Path, loop: Client | None) -> Calibration:
+def write(calibration: Calibration, out: Path, loop: Client | None) -> Calibration:
     """Write a calibration with its identity; load it into the loop, if there is one."""
-    made = identified(made)
-    calibration_file.save(made, out)
+    calibration = identified(calibration)
+    calibration_file.save(calibration, out)
     if loop is not None:
-        loop.load(made)
-    return made
+        loop.load(calibration)
+    return calibration
 
 
 def images(file: Path) -> Array:

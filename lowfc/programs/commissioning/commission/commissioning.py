@@ -86,12 +86,12 @@ class Commissioning:
         self._report, self._progress, self._confirm = report, progress, confirm
         self._figures: dict[str, Any] = {}
         self._delay: Delay | None = None
-        self._judged = False
+        self._recommended = False
 
     def run(self) -> tuple[dict[str, Any], str]:
         """Carry out all steps; return the figures, and the text for people."""
-        options, kept = self._options, first_of(self._options.out)
-        if options.resume and not kept.is_file():
+        options, first_file = self._options, first_of(self._options.out)
+        if options.resume and not first_file.is_file():
             if options.out.is_file():
                 raise CalibrationError(
                     f"nothing to resume: {options.out} is finished; `lowfc ctl load {options.out}` loads it; without "
@@ -100,20 +100,20 @@ class Commissioning:
             self._report(f"nothing to resume beside {options.out}: starting from the beginning")
         before = self._open()
         try:
-            return self._steps_of(kept)
+            return self._carry_out(first_file)
         except BaseException:
-            self._report(self._how_to_continue(before, kept))
+            self._report(self._how_to_continue(before, first_file))
             raise
 
-    def _how_to_continue(self, before: Calibration | None, kept: Path) -> str:
+    def _how_to_continue(self, before: Calibration | None, first_file: Path) -> str:
         """Text after a commissioning that ended early: the calibration in use, and how to continue."""
-        if self._judged:
+        if self._recommended:
             return (
                 f"the calibration is good, saved in {self._options.out} and loaded: `lowfc ctl close` closes the loop"
             )
-        if not kept.is_file():
+        if not first_file.is_file():
             return "no calibration was changed"
-        text = f"the completed steps are kept in {kept}: the same command with --resume continues"
+        text = f"the completed steps are kept in {first_file}: the same command with --resume continues"
         with contextlib.suppress(LowfcError):
             if before is not None:
                 self._loop.check_lease()
@@ -124,21 +124,21 @@ class Commissioning:
             "`lowfc ctl load FILE` loads another one"
         )
 
-    def _steps_of(self, kept: Path) -> tuple[dict[str, Any], str]:
+    def _carry_out(self, first_file: Path) -> tuple[dict[str, Any], str]:
         options, config = self._options, self._config
-        resumed = options.resume and kept.is_file()
+        resumed = options.resume and first_file.is_file()
         if resumed:
-            first = calibration_file.load(kept)
+            first = calibration_file.load(first_file)
             camera = self._loop.camera()
             if camera is not None and camera.shape != first.shape:
                 raise CalibrationError(
-                    f"{kept} is for frames of {first.shape[0]} x {first.shape[1]} pixels, the camera's are "
+                    f"{first_file} is for frames of {first.shape[0]} x {first.shape[1]} pixels, the camera's are "
                     f"{camera.shape[0]} x {camera.shape[1]}: omit --resume"
                 )
-            self._report(f"resuming from {kept}: the steps of the camera, orientation and sign are done")
+            self._report(f"resuming from {first_file}: the steps of the camera, orientation and sign are done")
         else:
             first = self._first()
-            calibration_file.save(first, kept)
+            calibration_file.save(first, first_file)
         self._loop.load(first)
         player = Player(self._loop, first, self._report)
         delay = self._delay if self._delay is not None else first_delay(player, config)
@@ -154,19 +154,19 @@ class Commissioning:
         calibrator = Calibrator(self._loop, request, self._report, self._progress, self._computed)
         data = calibrator.run(delay)
         self._step("verdict")
-        made, result = finished(calibrator, request, data, self._computed)
+        calibration, result = finished(calibrator, request, data, self._computed)
         self._figures |= result.figures()
         if not result.recommended:
             raise CalibrationError(
                 f"{result.text()}\nnot loaded: correct this, then repeat the command; --resume keeps these cycles, "
                 "for example to add more (--cycles)"
             )
-        self._loop.load(made)
-        self._judged = True
-        for path in (kept, partial_of(options.out)):
+        self._loop.load(calibration)
+        self._recommended = True
+        for path in (first_file, partial_of(options.out)):
             path.unlink(missing_ok=True)
         self._report(result.text())
-        law = factory.settings(config).law(made.noll)
+        law = factory.settings(config).law(calibration.noll)
         return self._figures, self._close(law, delay.delay_frames)
 
     def _request(self, amplitude_nm: float | None = None, *, resume: bool = False) -> CalibrationRequest:
@@ -197,8 +197,8 @@ class Commissioning:
 
     def _first(self) -> Calibration:
         self._step("camera")
-        images_seen = list(self._loop.frames(LOOKED_AT))
-        camera = camera_fits(self._config, self._loop.camera_state(), images_seen, self._report)
+        frames = list(self._loop.frames(LOOKED_AT))
+        camera = camera_fits(self._config, self._loop.camera_state(), frames, self._report)
         self._step("dark and bad pixels")
         options, sensor = self._options, without_dark(camera)
         if options.dark is not None:

@@ -69,15 +69,15 @@ def aligned(
     model = computed.reference.astype(np.float64).reshape(computed.shape)
     try:
         found = align(image, model)
-        made = on_sensor(config, computed, found.geometry, before.flux_dn, before)
+        calibration = on_sensor(config, computed, found.geometry, before.flux_dn, before)
     except (ValueError, CalibrationError) as error:
         report(f"the image cannot be compared with the computed one: {error}")
         return None
-    like = likeness(poke.picture, made.response[:, 0])
+    like = likeness(poke.picture, calibration.response[:, 0])
     if like < 0:
         found = replace(found, geometry=found.geometry.turned())
-        made = on_sensor(config, computed, found.geometry, before.flux_dn, before)
-        like = likeness(poke.picture, made.response[:, 0])
+        calibration = on_sensor(config, computed, found.geometry, before.flux_dn, before)
+        like = likeness(poke.picture, calibration.response[:, 0])
     scale = found.geometry.scale * computed_scale(config)
     report(f"{in_words(found, scale)}; the poke's image correlates by {like:.2f} with the computed one")
     if found.residual > MAX_MISFIT or like < MIN_LIKENESS:
@@ -90,8 +90,8 @@ def aligned(
         "image_residual": found.residual,
         "poke_correlation": like,
     }
-    made = replace(made, reference=before.reference, estimator=f"{made.estimator}{FIRST}")
-    return identified(made)
+    calibration = replace(calibration, reference=before.reference, estimator=f"{calibration.estimator}{FIRST}")
+    return identified(calibration)
 
 
 def poked(player: Player, config: Configuration, poke: Delay) -> Calibration:
@@ -106,13 +106,13 @@ def poked(player: Player, config: Configuration, poke: Delay) -> Calibration:
     good, reference = before.good.astype(np.float64), before.reference.astype(np.float64)
     matrix = reconstructed(config, reference, response, None, good, before.flux_dn).matrix
     player.report(f"{CYCLES} pokes of each mode by {amplitude_nm:.3g} nm")
-    made = replace(
+    calibration = replace(
         before,
         response=single(response),
         reconstructor=single(matrix),
         estimator=f"{config.control.estimator}+poke{FIRST}",
     )
-    return identified(made)
+    return identified(calibration)
 
 
 def linear_nm(player: Player, config: Configuration, delay: Delay, default_nm: float) -> float:

@@ -110,10 +110,10 @@ class Camera(Collected):
 
 def watch(line: Line, seconds: float, advance: Callable[[float], None]) -> Camera:
     """Observe a camera for `seconds`; `advance` is called with the elapsed time."""
-    seen, begun_ns = Camera(line), line.now_ns()
+    camera, begun_ns = Camera(line), line.now_ns()
     while (elapsed_s := (line.now_ns() - begun_ns) / NS) < seconds:
         advance(elapsed_s)
-        seen.collect(min(TURN_S, seconds - elapsed_s))
-    seen.seconds = seconds
-    seen.answers = line.ask(CAMERA_STATE.key)
-    return seen
+        camera.collect(min(TURN_S, seconds - elapsed_s))
+    camera.seconds = seconds
+    camera.answers = line.ask(CAMERA_STATE.key)
+    return camera

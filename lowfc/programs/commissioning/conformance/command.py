@@ -54,10 +54,10 @@ def camera(
     found = _run_with(Role.CAMERA, run)
     with _line(found, Role.OPERATOR) as line, passing_bar(Console(stderr=True)) as bar:
         task = bar.add_task(f"observing the camera for {duration:g} s", total=duration)
-        seen = watch(line, duration, lambda done_s: bar.update(task, completed=done_s))
-    checks = list(camera_checks(seen))
-    if settings is not None and seen.settings is not None:
-        checks += agreement_checks(settings, seen.settings)
+        observed = watch(line, duration, lambda done_s: bar.update(task, completed=done_s))
+    checks = list(camera_checks(observed))
+    if settings is not None and observed.settings is not None:
+        checks += agreement_checks(settings, observed.settings)
     _end("camera", found.run_id, checks, as_json)
 
 

@@ -28,43 +28,43 @@ FRAMES: Table[Camera] = Table()
 """Checks that need at least one frame."""
 
 
-def camera_checks(seen: Camera) -> Iterator[Check]:
+def camera_checks(camera: Camera) -> Iterator[Check]:
     """All checks of a camera."""
-    yield from ARRIVED.of(seen)
-    yield from PUBLISHER.of(seen)
-    if seen.frames:
-        yield from FRAMES.of(seen)
-    yield from SETTINGS.of(seen)
-    yield from PROCESS.of(seen)
+    yield from ARRIVED.of(camera)
+    yield from PUBLISHER.of(camera)
+    if camera.frames:
+        yield from FRAMES.of(camera)
+    yield from SETTINGS.of(camera)
+    yield from PROCESS.of(camera)
 
 
 @ARRIVED.check("frames", f"{FRAME.key}: foxglove.RawImage, one for each exposure")
-def _frames(seen: Camera) -> Check:
-    count = len(seen.published)
+def _frames(camera: Camera) -> Check:
+    count = len(camera.published)
     if not count:
         advice = (
-            seen.failing
+            camera.failing
             or "is the camera in this run, does it use the session file of `lowfc config zenoh --role camera` and this "
             "key?"
         )
-        return wrong(f"none in {seen.seconds:g} s; received: {seen.keys}", advice)
-    if seen.unreadable:
-        got = f"{seen.unreadable} of {count} payloads are not a foxglove.RawImage"
+        return wrong(f"none in {camera.seconds:g} s; received: {camera.keys}", advice)
+    if camera.unreadable:
+        got = f"{camera.unreadable} of {count} payloads are not a foxglove.RawImage"
         return wrong(got, "encode the message as declared in foxglove/RawImage.proto")
-    return ok(f"{count} in {seen.seconds:g} s")
+    return ok(f"{count} in {camera.seconds:g} s")
 
 
 @FRAMES.check("frame time", "end of the exposure, on the clock of the publish time, increasing")
-def _frame_time(seen: Camera) -> Check:
-    times = [frame.time_ns for frame in seen.frames]
+def _frame_time(camera: Camera) -> Check:
+    times = [frame.time_ns for frame in camera.frames]
     if not all(times):
         return wrong(f"{times.count(0)} frames without a timestamp", "set it in every frame")
     back = sum(later <= earlier for earlier, later in pairwise(times))
     if back:
         got = f"not later than the previous one, {back} times of {len(times)}"
         return wrong(got, "read the time for every exposure, from a clock that never steps")
-    age_ns = int(np.median(np.subtract(seen.put_times_ns, times)))
-    exposure_ns = 0 if seen.settings is None else seen.settings.exposure_ns
+    age_ns = int(np.median(np.subtract(camera.put_times_ns, times)))
+    exposure_ns = 0 if camera.settings is None else camera.settings.exposure_ns
     got = f"{age_ns / 1e6:.3g} ms before the publish time"
     if age_ns < -_AGE_NS:
         return wrong(f"{-age_ns / 1e6:.3g} ms after the publish time", "use the same clock for both")
@@ -77,18 +77,18 @@ def _frame_time(seen: Camera) -> Check:
 
 
 @FRAMES.check("encoding", MONO16)
-def _encoding(seen: Camera) -> Check:
-    encodings = {frame.image.encoding for frame in seen.frames}
+def _encoding(camera: Camera) -> Check:
+    encodings = {frame.image.encoding for frame in camera.frames}
     if encodings == {MONO16}:
         return ok(MONO16)
     return wrong(", ".join(map(repr, sorted(encodings))), "send uint16 in DN, little-endian, with encoding mono16")
 
 
 @FRAMES.check("bytes", "step is 2 x width, and data are step x height bytes")
-def _bytes(seen: Camera) -> Check:
-    last = next((frame for frame in reversed(seen.frames) if frame.highest is None), None)
+def _bytes(camera: Camera) -> Check:
+    last = next((frame for frame in reversed(camera.frames) if frame.highest is None), None)
     if last is None:
-        return ok(f"step {seen.frames[-1].image.step}, {seen.frames[-1].size} bytes")
+        return ok(f"step {camera.frames[-1].image.step}, {camera.frames[-1].size} bytes")
     rows, columns = last.shape
     advice = "send complete rows without padding, and set width and height accordingly"
     if last.size == rows * columns:
@@ -99,21 +99,21 @@ def _bytes(seen: Camera) -> Check:
 
 
 @FRAMES.check("shape", "the same rows and columns in every frame")
-def _shape(seen: Camera) -> Check:
-    got = ", ".join(f"{rows} x {columns}" for rows, columns in seen.shapes)
-    return ok(got) if len(seen.shapes) == 1 else wrong(got, "keep one region while the loop runs")
+def _shape(camera: Camera) -> Check:
+    got = ", ".join(f"{rows} x {columns}" for rows, columns in camera.shapes)
+    return ok(got) if len(camera.shapes) == 1 else wrong(got, "keep one region while the loop runs")
 
 
 @FRAMES.check("steadiness", "frames at a constant rate during the whole check")
-def _steadiness(seen: Camera) -> Check:
-    spans = np.diff(seen.put_times_ns)
+def _steadiness(camera: Camera) -> Check:
+    spans = np.diff(camera.put_times_ns)
     if not spans.size:
         return warning("one frame", "use a longer --duration")
     period_ns = float(np.median(spans))
-    elapsed_ns = seen.frames[-1].receive_time_ns - seen.frames[0].receive_time_ns
-    missing_ns = seen.seconds * NS - elapsed_ns
-    if missing_ns > max(_SILENT_PERIODS * period_ns, 0.2 * seen.seconds * NS, _STOPPED_NS):
-        got = f"frames during {elapsed_ns / 1e9:.1f} of {seen.seconds:g} s"
+    elapsed_ns = camera.frames[-1].receive_time_ns - camera.frames[0].receive_time_ns
+    missing_ns = camera.seconds * NS - elapsed_ns
+    if missing_ns > max(_SILENT_PERIODS * period_ns, 0.2 * camera.seconds * NS, _STOPPED_NS):
+        got = f"frames during {elapsed_ns / 1e9:.1f} of {camera.seconds:g} s"
         return wrong(got, "the camera must publish whether or not a process subscribes; repeat while it is running")
     late_ns, longest_ns = float(np.percentile(np.abs(spans - period_ns), 99)), float(spans.max())
     got = (
@@ -128,8 +128,8 @@ def _steadiness(seen: Camera) -> Check:
 
 
 @FRAMES.check("live image", "no two identical frames: each has noise")
-def _live_image(seen: Camera) -> Check:
-    sums = [frame.checksum for frame in seen.frames]
+def _live_image(camera: Camera) -> Check:
+    sums = [frame.checksum for frame in camera.frames]
     same = sum(earlier == later for earlier, later in pairwise(sums))
     if len(sums) > 1 and same == len(sums) - 1:
         return wrong("all are identical", "read the camera out for every frame")
@@ -140,17 +140,17 @@ def _live_image(seen: Camera) -> Check:
 
 
 @FRAMES.check("light", "brightest pixel above the bias, and few pixels at full well")
-def _light(seen: Camera) -> Check | None:
-    if not seen.pixels:
+def _light(camera: Camera) -> Check | None:
+    if not camera.pixels:
         return None
-    highest, state = seen.brightest_dn, seen.settings or wire.CameraState()
+    highest, state = camera.brightest_dn, camera.settings or wire.CameraState()
     noise_dn = state.read_noise_e / state.gain_e_per_dn if state.gain_e_per_dn > 0 else 0.0
     if not highest:
         return wrong("every pixel of every frame is 0", "copy the pixels into the message")
     if highest <= state.bias_dn + 10 * noise_dn:
         got = f"brightest pixel {highest} DN, bias {state.bias_dn:g} DN"
         return warning(got, "no light: is the shutter open and the star on the sensor?")
-    full = np.mean([np.mean(one >= highest) for one in seen.pixels])
+    full = np.mean([np.mean(one >= highest) for one in camera.pixels])
     if highest == int(state.saturation_dn) and full > _FULL:
         got = f"{100 * full:.0f} % of the pixels at {highest} DN"
         return warning(got, "shorten the exposure: saturated pixels measure nothing")
@@ -158,15 +158,15 @@ def _light(seen: Camera) -> Check | None:
 
 
 @FRAMES.check("byte order", "little-endian, right-aligned DN")
-def _byte_order(seen: Camera) -> Check | None:
-    if not seen.pixels:
+def _byte_order(camera: Camera) -> Check | None:
+    if not camera.pixels:
         return None
-    picture = seen.pixels[-1]  # not the median of all, which is meaningless for swapped bytes
+    picture = camera.pixels[-1]  # not the median of all, which is meaningless for swapped bytes
     as_is, swapped = _roughness(picture), _roughness(picture.byteswap())
     if as_is > _SMOOTHER * swapped:
         got = f"the image is {as_is / max(swapped, 1e-9):.0f} times smoother with the bytes swapped: big-endian?"
         return wrong(got, "write the low byte of each pixel first")
-    values = np.unique(np.concatenate([one.reshape(-1) for one in seen.pixels]))
+    values = np.unique(np.concatenate([one.reshape(-1) for one in camera.pixels]))
     bits = int(np.bitwise_or.reduce(values))
     spare = (bits & -bits).bit_length() - 1 if bits else 0
     if spare >= 2 and values.size > _VARIED:

@@ -25,8 +25,8 @@ PROCESS: Table[Collected] = Table()
 
 
 @PUBLISHER.check("envelope", "a zenoh attachment of 16 bytes: sequence and publish_time_ns, little-endian uint64")
-def _envelope(seen: Collected) -> Check | None:
-    messages = seen.published
+def _envelope(device: Collected) -> Check | None:
+    messages = device.published
     bare = [message.attachment for message in messages if message.envelope is None]
     if not bare:
         return ok(f"on all of {len(messages)} messages") if messages else None
@@ -36,11 +36,11 @@ def _envelope(seen: Collected) -> Check | None:
 
 
 @PUBLISHER.check("sequence", "start of the publisher in unix seconds << 32 | count of its messages from 0")
-def _sequence(seen: Collected) -> Check | None:
-    sequences = [envelope.sequence for envelope in seen.envelopes]
+def _sequence(device: Collected) -> Check | None:
+    sequences = [envelope.sequence for envelope in device.envelopes]
     if not sequences:
         return None
-    start, now_s = start_of(sequences[-1]), seen.published[-1].receive_time_ns // NS
+    start, now_s = start_of(sequences[-1]), device.published[-1].receive_time_ns // NS
     if start == 0:
         advice = "put the start into the upper 32 bits: without it messages after a restart are refused as old"
         return wrong(f"only a count ({sequences[-1]})", advice)
@@ -65,15 +65,15 @@ def _sequence(seen: Collected) -> Check | None:
 
 
 @PUBLISHER.check("publish time", "the host's clock just before publishing, increasing")
-def _put_time(seen: Collected) -> Check | None:
-    times = [envelope.publish_time_ns for envelope in seen.envelopes]
+def _put_time(device: Collected) -> Check | None:
+    times = [envelope.publish_time_ns for envelope in device.envelopes]
     if not times:
         return None
-    arrivals = [message.receive_time_ns for message in seen.published]
+    arrivals = [message.receive_time_ns for message in device.published]
     lag_ns = int(np.median([arrival - time for arrival, time in zip(arrivals, times, strict=True)]))
     if not -_AHEAD_NS <= lag_ns <= LATE_NS:
         got = f"{lag_ns / 1e6:.3g} ms before the arrival" if abs(lag_ns) < 3600 * NS else f"{times[-1]} ns"
-        return wrong(got, _clock_advice(times[-1], arrivals[-1], seen.line.offset_ns))
+        return wrong(got, _clock_advice(times[-1], arrivals[-1], device.line.offset_ns))
     back = sum(later <= earlier for earlier, later in pairwise(times))
     if back:
         got = f"not later than the previous one, {back} times of {len(times) - 1}"
@@ -91,30 +91,30 @@ def _clock_advice(time_ns: int, now_ns: int, offset_ns: int) -> str:
 
 
 @PROCESS.check("health", f"{HEALTH.key} twice a second, with the counts of published messages")
-def _health(seen: Collected) -> Check:
-    payloads = [message.payload for message in seen.on(HEALTH.at(seen.process))]
+def _health(device: Collected) -> Check:
+    payloads = [message.payload for message in device.on(HEALTH.at(device.process))]
     cost = "without it a recorder cannot count lost messages, and views do not show the process"
     if not payloads:
-        return warning(f"none of {seen.process} in {seen.seconds:.1f} s", f"publish it: {cost}")
+        return warning(f"none of {device.process} in {device.seconds:.1f} s", f"publish it: {cost}")
     try:
         last = [wire.Health.FromString(payload) for payload in payloads][-1]
     except DecodeError:
         return wrong("it is not a lowfc.v1.Health", "encode the message as declared")
-    rate_hz = len(payloads) / seen.seconds
-    if last.process != seen.process:
-        return warning(f"process is {last.process!r}", f"name the process {seen.process!r}, as its key does")
-    if seen.seconds >= 2 and not 1 < rate_hz < 10:
+    rate_hz = len(payloads) / device.seconds
+    if last.process != device.process:
+        return warning(f"process is {last.process!r}", f"name the process {device.process!r}, as its key does")
+    if device.seconds >= 2 and not 1 < rate_hz < 10:
         return warning(f"{rate_hz:.1f} a second", "publish it twice a second")
     if not any(count.published for count in last.topics):
         return warning("topics[].published is missing", f"count the messages of every topic: {cost}")
     if not from_timestamp(last.timestamp):
         return warning("no timestamp", "set it: a silent process is recognised by it")
-    return ok(f"{len(payloads)} in {seen.seconds:.1f} s, state {last.state!r}")
+    return ok(f"{len(payloads)} in {device.seconds:.1f} s, state {last.state!r}")
 
 
 @PROCESS.check("topics", "only keys of the table of topics")
-def _topics(seen: Collected) -> Check:
-    keys = {message.key for message in seen.messages}
+def _topics(device: Collected) -> Check:
+    keys = {message.key for message in device.messages}
     unknown = sorted(key for key in keys if not _known(key))
     if not unknown:
         return ok(f"{len(keys)} keys")

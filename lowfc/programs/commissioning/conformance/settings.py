@@ -22,22 +22,22 @@ SETTINGS: Table[Camera] = Table()
 
 
 @SETTINGS.check("settings", f"{CAMERA_STATE.key}: lowfc.v1.CameraState on change and twice a second")
-def _settings(seen: Camera) -> Check:
-    count, unreadable = len(seen.states), seen.states.count(None)
+def _settings(camera: Camera) -> Check:
+    count, unreadable = len(camera.states), camera.states.count(None)
     if unreadable:
         got = f"{unreadable} of {count} are not a lowfc.v1.CameraState"
         return wrong(got, "encode the message as declared")
     if not count:
-        advice = seen.failing or "publish it: calibration, noise figures and the check for a changed camera use it"
-        return wrong(f"none in {seen.seconds:g} s", advice)
-    if seen.seconds >= 2 and not 1 < count / seen.seconds < 20:
-        return warning(f"{count / seen.seconds:.1f} a second", "publish them twice a second")
-    return ok(f"{count} in {seen.seconds:g} s")
+        advice = camera.failing or "publish it: calibration, noise figures and the check for a changed camera use it"
+        return wrong(f"none in {camera.seconds:g} s", advice)
+    if camera.seconds >= 2 and not 1 < count / camera.seconds < 20:
+        return warning(f"{count / camera.seconds:.1f} a second", "publish them twice a second")
+    return ok(f"{count} in {camera.seconds:g} s")
 
 
 @SETTINGS.check("settings' values", "a timestamp; period, gain, saturation, rows, columns and bit depth above 0")
-def _values(seen: Camera) -> Check | None:
-    if (state := seen.settings) is None:
+def _values(camera: Camera) -> Check | None:
+    if (state := camera.settings) is None:
         return None
     values, highest = {field: float(getattr(state, field)) for field in _FIELDS}, 2.0**state.bit_depth - 1
     impossible = [f"{field} {value:g}" for field, value in values.items() if not isfinite(value) or value < 0]
@@ -62,8 +62,8 @@ def _values(seen: Camera) -> Check | None:
 
 
 @SETTINGS.check("settings kept", "constant: a change opens the loop")
-def _kept(seen: Camera) -> Check | None:
-    states = [state for state in seen.states if state is not None]
+def _kept(camera: Camera) -> Check | None:
+    states = [state for state in camera.states if state is not None]
     if not states:
         return None
     changed = [field for field in _FIELDS if len({str(getattr(state, field)) for state in states}) > 1]
@@ -73,34 +73,34 @@ def _kept(seen: Camera) -> Check | None:
 
 
 @SETTINGS.check("settings' size", "rows and columns of the frames")
-def _size(seen: Camera) -> Check | None:
-    if (state := seen.settings) is None or not seen.frames:
+def _size(camera: Camera) -> Check | None:
+    if (state := camera.settings) is None or not camera.frames:
         return None
     size = (state.rows, state.columns)
-    shapes = ", ".join(f"{rows} x {columns}" for rows, columns in seen.shapes)
+    shapes = ", ".join(f"{rows} x {columns}" for rows, columns in camera.shapes)
     got = f"{size[0]} x {size[1]}, frames {shapes}"
-    if seen.shapes == [size]:
+    if camera.shapes == [size]:
         return ok(got)
-    swapped = seen.shapes == [size[::-1]]
+    swapped = camera.shapes == [size[::-1]]
     return wrong(got, "exchange rows and columns" if swapped else "publish the size of the region that is sent")
 
 
 @SETTINGS.check("settings' range", "no pixel above saturation_dn and the converter")
-def _range(seen: Camera) -> Check | None:
-    if (state := seen.settings) is None or not seen.frames:
+def _range(camera: Camera) -> Check | None:
+    if (state := camera.settings) is None or not camera.frames:
         return None
     top = min(state.saturation_dn, 2.0**state.bit_depth - 1)
-    got = f"brightest pixel {seen.brightest_dn} DN, largest possible {top:g} DN"
-    if seen.brightest_dn > top > 0:
+    got = f"brightest pixel {camera.brightest_dn} DN, largest possible {top:g} DN"
+    if camera.brightest_dn > top > 0:
         return wrong(got, "raise saturation_dn (DN, bias included) to the largest pixel value, or bit_depth")
     return ok(got)
 
 
 @SETTINGS.check("settings' period", "period_ns equals the difference of the frames' times")
-def _period(seen: Camera) -> Check | None:
-    spans = np.diff([frame.time_ns for frame in seen.frames])
+def _period(camera: Camera) -> Check | None:
+    spans = np.diff([frame.time_ns for frame in camera.frames])
     period_ns = float(np.median(spans)) if spans.size else 0.0
-    if (state := seen.settings) is None or period_ns <= 0 or not state.period_ns:
+    if (state := camera.settings) is None or period_ns <= 0 or not state.period_ns:
         return None
     off = abs(period_ns / state.period_ns - 1)
     got = f"{period_ns / 1e6:.5g} ms, period_ns {state.period_ns / 1e6:.5g} ms"
@@ -112,19 +112,19 @@ def _period(seen: Camera) -> Check | None:
 @SETTINGS.check(
     "settings on request", f"the last settings, with their envelope, in reply to a zenoh query of {CAMERA_STATE.key}"
 )
-def _on_request(seen: Camera) -> Check | None:
-    if not seen.states:
+def _on_request(camera: Camera) -> Check | None:
+    if not camera.states:
         return None
-    if not seen.answers:
+    if not camera.answers:
         return warning("no answer", "declare a queryable on that key: recorder and late processes query it")
-    for answer in seen.answers:
+    for answer in camera.answers:
         if answer.envelope is None:
             return wrong("an answer without an envelope", "attach the envelope of the published message")
         try:
             wire.CameraState.FromString(answer.payload)
         except DecodeError:
             return wrong("an answer that is not a lowfc.v1.CameraState", "answer with the last payload")
-    return ok(f"{len(seen.answers)} answer")
+    return ok(f"{len(camera.answers)} answer")
 
 
 class Agreement(NamedTuple):
