@@ -203,7 +203,7 @@ class Bench:
         """Apply the requests of the gain watch, as the controller does."""
         events = list(outputs.events)
         if outputs.step is not None:
-            found = self._watch.follow(outputs.step, self._state)
+            found = self._watch.observe(outputs.step, self._state)
             events += found.events
             for request in found.requests:
                 self._state, others = advance(self._settings, self._state, request)

@@ -93,13 +93,16 @@ class Controller:
         self._state = State()
         self._lock = threading.Lock()
         self._adopted = False
-        self._early: Sample | None = None
-        self._leave_camera = service.dispatch(
-            FRAME, self._arrived, period_ns=config.period_ns, superseded=partial(self._arrived, superseded=True)
+        self._first_frame: Sample | None = None
+        self._unsubscribe_frames = service.dispatch(
+            FRAME,
+            self._frame_received,
+            period_ns=config.period_ns,
+            superseded=partial(self._frame_received, superseded=True),
         )
         self._mirror = MirrorReports(service, name)
-        self._camera = CameraReports(service, self._take)
-        self._bench = BenchValues(service, self._settings.interlocks, self._take)
+        self._camera = CameraReports(service, self._apply_report)
+        self._bench = BenchValues(service, self._settings.interlocks, self._apply_report)
         self._commands = service.publisher(COMMAND, name)
         self._steps = service.publisher(STEP)
         self._inputs = service.publisher(CONTROL_INPUT)
@@ -118,7 +121,7 @@ class Controller:
         now_ns = service.clock.now_ns()
         if calibration is not None:
             self._arrays.publish(Request(now_ns, "load", calibration=calibration))
-            self._take(Load(now_ns, calibration, source))
+            self._apply_report(Load(now_ns, calibration, source))
         service.awaited = lambda: "" if self._state.frame_sequence else "a camera"
         service.state = "ready"
 
@@ -129,10 +132,10 @@ class Controller:
         self._bench.ask()
         self._service.state = "running"
         with self._lock:
-            self._begin()
+            self._send_start_requests()
             self._adopted = True
-            if self._early is not None:
-                self._frame(self._early)
+            if self._first_frame is not None:
+                self._frame(self._first_frame)
         while self._service.running:
             wait_ns = None if self._warmup is None else self._warmup.wait_ns(self._service.clock.host_ns())
             camera = self._camera.wait(min(TICK_NS if wait_ns is None else wait_ns, TICK_NS) * 1e-9)
@@ -144,17 +147,17 @@ class Controller:
             if self._safe_signalled:
                 self._safe_signalled = False
                 now_ns = self._service.clock.now_ns()
-                self._enter(Request(now_ns, "safe", text="SIGUSR1", requester="a signal"))
+                self._carry_out_internal(Request(now_ns, "safe", text="SIGUSR1", requester="a signal"))
             for _ in range(len(self._queries)):
                 self._answer(self._queries.popleft())
             while self._gain_requests:
-                self._enter(self._gain_requests.popleft())
+                self._carry_out_internal(self._gain_requests.popleft())
             self._update_latch()
             for sample in self._camera.query() if self._state.conditions.camera_awaited else ():
                 with self._lock:
                     self._camera.take(sample)
             self._service.beat()
-        self._leave_camera()
+        self._unsubscribe_frames()
         with self._lock:
             self._timing.publish(self._service.clock.host_ns())
         self._latch.close()
@@ -173,11 +176,11 @@ class Controller:
         if self._frame_to_command.count:
             health.frame_to_command.CopyFrom(codec.latency(self._frame_to_command))
 
-    def _arrived(self, sample: Sample, *, superseded: bool = False) -> None:
+    def _frame_received(self, sample: Sample, *, superseded: bool = False) -> None:
         """Process a frame, on the receiving thread; until the mirror's shape is known, keep only the newest one."""
         with self._lock:
             if not self._adopted:
-                self._early = sample
+                self._first_frame = sample
             elif self._service.running:
                 self._frame(sample, superseded)
 
@@ -241,10 +244,10 @@ class Controller:
         if not self._service.clock.lockstep:
             self._bench.look()
             if self._mirror.due:
-                self._judge_mirror()
+                self._report_mirror()
         silent_ns = self._service.clock.host_ns() - self._last_frame_ns
         if silent_ns >= TICK_NS and not self._service.clock.lockstep:
-            self._take(Tick(self._service.clock.now_ns(), silent_ns))
+            self._apply_report(Tick(self._service.clock.now_ns(), silent_ns))
 
     def _answer(self, query: Query) -> None:
         """Apply an operator's request between two frames; decoding and the reply do not delay frames."""
@@ -258,10 +261,12 @@ class Controller:
             reply, state, number = Reply(False, str(error)[:MOST_REPLY], self._state.frame_sequence + 1), self._state, 0
         else:
             reply, state, number = self._carry_out(request)
-        shown = controller_state(state, self._settings, now_ns) if request.name == "status" else None
+        state_message = controller_state(state, self._settings, now_ns) if request.name == "status" else None
         short = Request(request.time_ns, request.name, request.modes, request.values, request.text)
-        query.reply(codec.encode_request(short, reply, number, shown))  # without the arrays: the requester has them
-        self._requests.put(codec.encode_request(request, reply, number, shown))
+        query.reply(
+            codec.encode_request(short, reply, number, state_message)
+        )  # without the arrays: the requester has them
+        self._requests.put(codec.encode_request(request, reply, number, state_message))
 
     def _carry_out(
         self, request: Request, lock: AbstractContextManager[object] | None = None
@@ -284,17 +289,17 @@ class Controller:
         """Update the gain watch after the command; in lockstep, apply its requests before the next frame."""
         if outputs.step is None:
             return
-        found = self._gain_watch.follow(outputs.step, self._state)
+        found = self._gain_watch.observe(outputs.step, self._state)
         for event in found.events:
             self._service.event(event.name, **event.details)
         for request in found.requests:
             if self._service.clock.lockstep:
-                self._enter(request, lock=contextlib.nullcontext())
+                self._carry_out_internal(request, lock=contextlib.nullcontext())
             else:
                 self._gain_requests.append(request)
                 self._camera.wake()
 
-    def _enter(self, request: Request, lock: AbstractContextManager[object] | None = None) -> None:
+    def _carry_out_internal(self, request: Request, lock: AbstractContextManager[object] | None = None) -> None:
         """Carry out an internal request and publish it like an operator's."""
         reply, _, number = self._carry_out(prepared(self._settings, request), lock)
         self._requests.put(codec.encode_request(request, reply, number, None))
@@ -325,22 +330,22 @@ class Controller:
                     f"the mirror has {grid} actuators, the calibration is for {drive.calibration.grid}; use the "
                     "mirror's own calibration"
                 )
-            self._take(shape)
+            self._apply_report(shape)
         if lockstep:
             self._mirror.close()
         elif self._service.running:
-            self._judge_mirror()
+            self._report_mirror()
 
-    def _judge_mirror(self) -> None:
+    def _report_mirror(self) -> None:
         """Report a fault of the mirror to the loop, and its end."""
         shape = self._mirror.first()
         if shape is not None:  # before the first command: the loop starts from this shape
-            self._take(shape)
+            self._apply_report(shape)
         fault = self._mirror.fault(self._state)
         if fault or self._state.conditions.mirror_fault:
-            self._take(MirrorReport(self._service.clock.now_ns(), fault, self._mirror.last()))
+            self._apply_report(MirrorReport(self._service.clock.now_ns(), fault, self._mirror.last()))
 
-    def _begin(self) -> None:
+    def _send_start_requests(self) -> None:
         """Request the configured mirror shapes and control law, as an operator would."""
         for request in self._start_up.requests(self._state, self._service.clock.now_ns()):
             request = prepared(self._settings, request)
@@ -360,7 +365,7 @@ class Controller:
         self._state, outputs = advance(self._settings, self._state, input_)
         return outputs
 
-    def _take(self, report: Report) -> None:
+    def _apply_report(self, report: Report) -> None:
         """Advance by an input that is neither a frame nor a request, and log it if it changed the state."""
         before = self._state
         outputs = self._advance(report)

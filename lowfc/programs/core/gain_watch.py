@@ -18,13 +18,13 @@ FIRST_S = 2.0
 """Length of the first window, all modes."""
 TILT_S, OTHERS_S = 1.0, 10.0
 """Length of later windows: tip and tilt, other modes."""
-LIGHT_S = 0.25
+FLUX_S = 0.25
 """Averaging time of the flux."""
 STAR_STEP = 0.2
 """Relative change of the flux in two consecutive averages that means another star."""
-HARMFUL = 3
+HARMFUL_WINDOWS = 3
 """Consecutive windows in which an open loop would have had a smaller residual, before this is reported."""
-CAUTIOUS = 0.05
+CAUTIOUS_GAIN = 0.05
 """Highest gain of the other modes until tip and tilt are corrected: the square of a tilt looks like other modes."""
 LEAST_FRAMES = 50
 """Smallest number of frames in a window."""
@@ -59,7 +59,7 @@ class _Group:
         self.verdict: Verdict | None = None
         self.gain = drive.law.gain[mask]
         self.harmful = 0
-        self.calm = window_s == TILT_S
+        self.unrestricted = window_s == TILT_S
 
 
 class GainWatch:
@@ -75,13 +75,13 @@ class GainWatch:
         self._identity: tuple[object, ...] = ()
         self._weighting: Weighting | None = None
         self._newest = 0
-        self._light = self._frames = 0.0
-        self._light_was = 0.0
+        self._flux_sum_dn = self._flux_frames = 0.0
+        self._former_flux_dn = 0.0
         self._changed_in_a_row = 0
         self._mode = LoopMode.IDLE
         self.closing_harm = ""
 
-    def follow(self, step: Step, state: State) -> Actions:
+    def observe(self, step: Step, state: State) -> Actions:
         """Process a step and the state after it."""
         drive = state.drive
         if drive is None or not drive.calibration.noll:
@@ -165,22 +165,22 @@ class GainWatch:
             for mask, cross_talk, window_s in ((tilt, None, TILT_S), (~tilt, both, OTHERS_S))
             if mask.any()
         ]
-        self._light_was = 0.0
+        self._former_flux_dn = 0.0
 
     def _star(self, flux_dn: float) -> float:
         """Ratio of the flux to the former flux if it has changed in two consecutive averages; else 0."""
-        self._light += flux_dn
-        self._frames += 1
-        if self._frames < max(LIGHT_S * self._settings.rate_hz, 10):
+        self._flux_sum_dn += flux_dn
+        self._flux_frames += 1
+        if self._flux_frames < max(FLUX_S * self._settings.rate_hz, 10):
             return 0.0
-        mean, self._light, self._frames = self._light / self._frames, 0.0, 0.0
-        if not self._light_was:
-            self._light_was = mean
-        ratio = mean / self._light_was
+        mean, self._flux_sum_dn, self._flux_frames = self._flux_sum_dn / self._flux_frames, 0.0, 0.0
+        if not self._former_flux_dn:
+            self._former_flux_dn = mean
+        ratio = mean / self._former_flux_dn
         self._changed_in_a_row = self._changed_in_a_row + 1 if abs(ratio - 1) > STAR_STEP else 0
         if self._changed_in_a_row < 2:
             return 0.0
-        self._changed_in_a_row, self._light_was = 0, mean
+        self._changed_in_a_row, self._former_flux_dn = 0, mean
         return ratio
 
     def _another_star(self, step: Step, drive: ActiveLoop, ratio: float) -> Actions:
@@ -205,10 +205,10 @@ class GainWatch:
             noise = None if noise_nm2 is None else noise_nm2[group.mask]
             group.gain = drive.law.gain[group.mask]
             group.verdict = verdict = group.bank.verdict(drive.law.gain[group.mask], noise)
-            best = verdict.gain if group.calm else np.minimum(verdict.gain, CAUTIOUS)
+            best = verdict.gain if group.unrestricted else np.minimum(verdict.gain, CAUTIOUS_GAIN)
             gain[group.mask] = np.where(drive.automatic[group.mask], best, gain[group.mask])
-            if not group.calm:
-                group.calm = True
+            if not group.unrestricted:
+                group.unrestricted = True
                 group.bank.begin_again()
             events += self._harm(group, verdict, drive)
         requests = []
@@ -246,7 +246,9 @@ class GainWatch:
 
     def _noise_nm2(self, drive: ActiveLoop) -> Array | None:
         """Noise of one frame (modes,), nm^2; None if the camera's gain is unknown."""
-        covariance = noise_covariance_nm2(drive.calibration, self._light_was or drive.calibration.flux_dn, drive.camera)
+        covariance = noise_covariance_nm2(
+            drive.calibration, self._former_flux_dn or drive.calibration.flux_dn, drive.camera
+        )
         return None if covariance is None else np.diag(covariance)
 
     def _gains(self, step: Step, drive: ActiveLoop, gain: Single) -> Request:
@@ -259,20 +261,20 @@ class GainWatch:
                 assert group.verdict is not None  # noqa: S101  # checked above
                 prior[group.mask] = left_alone_nm2(group.verdict, uncorrected[group.mask], noise_nm2[group.mask])
             prior_nm2 = tuple(prior.tolist())
-        flux_dn = float(np.float32(self._light_was))
+        flux_dn = float(np.float32(self._former_flux_dn))
         values = tuple(gain.astype(np.float32).tolist())
         return Request(
             step.time_ns, "gain", (), values, AUTO, requester=REQUESTER, prior_nm2=prior_nm2, flux_dn=flux_dn
         )
 
     def _harm(self, group: _Group, verdict: Verdict, drive: ActiveLoop) -> list[PendingEvent]:
-        """The event if an open loop would have had a smaller residual for `HARMFUL` consecutive windows."""
+        """The event if an open loop would have had a smaller residual for `HARMFUL_WINDOWS` consecutive windows."""
         if verdict.loop_nm2 is None:
             group.harmful = 0
             return []
         worse, error = verdict.loop_nm2.sum(), np.sqrt(np.square(verdict.loop_error_nm2).sum())
         group.harmful = group.harmful + 1 if worse > 3 * error else 0
-        if group.harmful != HARMFUL:
+        if group.harmful != HARMFUL_WINDOWS:
             return []
         noise_nm2 = self._noise_nm2(drive)
         noise = 0.0 if noise_nm2 is None else float(noise_nm2[group.mask].sum())

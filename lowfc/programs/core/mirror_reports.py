@@ -28,12 +28,12 @@ class MirrorReports:
     def __init__(self, service: Service, name: str) -> None:
         self._service = service
         self._states = Mailbox(MIRROR_STATE.at(name))
-        self._leave_states = service.bus.subscribe(MIRROR_STATE, self._states.put, name)
-        self._leave_health = service.bus.subscribe(HEALTH, self._received, mirror_role(name))
+        self._unsubscribe_states = service.bus.subscribe(MIRROR_STATE, self._states.put, name)
+        self._unsubscribe_health = service.bus.subscribe(HEALTH, self._received, mirror_role(name))
         self._reports: deque[wire.Health] = deque(maxlen=1)
         self._received_ns = self._due_ns = 0
         self._reported = False
-        self._fault = self._wrong = ""
+        self._fault = self._health_fault = ""
         self._commanded: deque[MirrorShape] = deque(maxlen=2)
 
     @property
@@ -51,7 +51,7 @@ class MirrorReports:
             return None
         if shape is not None:
             self._reported = True
-            self._leave_states()  # further states would only cost time
+            self._unsubscribe_states()  # further states would only cost time
         return shape
 
     def fault(self, state: State) -> str:
@@ -63,9 +63,12 @@ class MirrorReports:
         self._due_ns = now_ns + CHECK_PERIOD_NS
         if self._reports:
             self._received_ns = now_ns
-            before, self._wrong = self._wrong, _wrong(self._reports.popleft()) if state.commanded else ""
-            if self._wrong == before or not self._wrong:
-                self._fault = self._wrong
+            before, self._health_fault = (
+                self._health_fault,
+                _fault_in(self._reports.popleft()) if state.commanded else "",
+            )
+            if self._health_fault == before or not self._health_fault:
+                self._fault = self._health_fault
             if not self._fault and state.drive is not None:
                 shape = MirrorShape(now_ns, state.drive.actuators_nm, state.drive.history_nm[0])
                 self._commanded.append(shape)
@@ -79,9 +82,9 @@ class MirrorReports:
 
     def close(self) -> None:
         """Unsubscribe."""
-        self._leave_health()
+        self._unsubscribe_health()
         if not self._reported:
-            self._leave_states()
+            self._unsubscribe_states()
 
     def _received(self, sample: Sample) -> None:
         try:
@@ -90,7 +93,7 @@ class MirrorReports:
             return
 
 
-def _wrong(health: wire.Health) -> str:
+def _fault_in(health: wire.Health) -> str:
     if health.command_refused:
         return f"refuses commands: {wire.Reason.Name(health.command_refused).removeprefix('REASON_')}"
     return "gets no commands" if health.command_expired else ""

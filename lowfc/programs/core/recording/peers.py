@@ -8,13 +8,13 @@ from lowfc.contract.messages import HEALTH, TOPICS, wire
 
 
 class Peers:
-    """Processes by their last Health, and in `kept` the newest calibration and states, with which a log starts."""
+    """Processes by their last Health, and in `newest` the newest calibration and states, with which a log starts."""
 
     def __init__(self, bus: Bus) -> None:
-        self.kept: dict[str, Sample] = {}
+        self.newest: dict[str, Sample] = {}
         self._bus = bus
         self._states: dict[str, tuple[int, str]] = {}
-        self._newcomers = False
+        self._new_processes = False
         self._queried: set[tuple[str, int]] = set()
         self._thread = ThreadPoolExecutor(1, "query")
         self._answers: Future[list[Sample]] | None = None
@@ -23,7 +23,7 @@ class Peers:
         """Store the state of a process, unless a later start of it has reported already."""
         name, start_s = name_in(HEALTH, sample.key), start_of(sample.sequence)
         known_s, _ = self._states.get(name, (-1, ""))
-        self._newcomers |= start_s > known_s
+        self._new_processes |= start_s > known_s
         if start_s >= known_s:
             self._states[name] = start_s, health.state
 
@@ -31,11 +31,11 @@ class Peers:
         """Whether all processes except the one named have reported that they stopped."""
         return all(state == "stopped" for name, (_, state) in self._states.items() if name != but)
 
-    def keep(self, sample: Sample) -> bool:
+    def store(self, sample: Sample) -> bool:
         """Store a calibration or state unless a newer one is known; return whether it is new."""
-        kept = self.kept.get(sample.key)
+        kept = self.newest.get(sample.key)
         if kept is None or kept.sequence <= sample.sequence:
-            self.kept[sample.key] = sample
+            self.newest[sample.key] = sample
         return kept is None or kept.sequence < sample.sequence
 
     def already_received(self, sample: Sample) -> bool:
@@ -50,16 +50,16 @@ class Peers:
 
     def query_soon(self) -> None:
         """Query at the next opportunity: a message may have been lost."""
-        self._newcomers = True
+        self._new_processes = True
 
     def query_meanwhile(self, *, more: bool) -> list[Sample]:
         """Query if a process is new, unless not `more`; return the new messages among answers since the last call.
 
         A thread does the query, because a frozen process answers late.
         """
-        if more and self._newcomers and self._answers is None:
+        if more and self._new_processes and self._answers is None:
             self._answers = self._thread.submit(self._get)
-            self._newcomers = False
+            self._new_processes = False
         if self._answers is None or not self._answers.done():
             return []
         answers, self._answers = self._answers, None
@@ -69,6 +69,6 @@ class Peers:
         return [sample for _, sample in states(self._bus, TOPICS)]
 
     def _new(self, answers: list[Sample]) -> list[Sample]:
-        new = [sample for sample in answers if self.keep(sample)]
+        new = [sample for sample in answers if self.store(sample)]
         self._queried.update((sample.key, sample.sequence) for sample in new)
         return new

@@ -80,7 +80,7 @@ class Recorder:
         self._paused = False
         self._ender = ThreadPoolExecutor(1, "end-log")
         self._ending: Future[None] | None = None
-        self._hurried = False
+        self._skip_drain = False
         self._failure = ""
         self._flush_due_ns = self._most_starts = 0
         self._begun_ns = self._oldest_ns = 0
@@ -120,7 +120,7 @@ class Recorder:
         return summary
 
     def _signalled(self, number: int, frame: FrameType | None) -> None:
-        self._hurried = not self.service.running
+        self._skip_drain = not self.service.running
         self.service.stop(signal.Signals(number).name)
 
     def _settle(self) -> None:
@@ -138,7 +138,7 @@ class Recorder:
 
     def _begin(self, *, anew: bool = True) -> None:
         """Begin a log, or unless `anew` its next part, with the calibration and states that its messages depend on."""
-        self._series.begin(self._peers.kept.values(), anew=anew)
+        self._series.begin(self._peers.newest.values(), anew=anew)
         self._most_starts = self._account.starts + MOST_CHANNELS
         self.service.event("RECORDING")
 
@@ -155,7 +155,7 @@ class Recorder:
     def _write_waiting(self) -> None:
         for _ in range(len(self._backlog)):
             topic, sample = self._backlog.take()
-            self._take(topic, sample)
+            self._record(topic, sample)
             now_ns = self._clock.host_ns()
             self._longest_wait_ns = max(self._longest_wait_ns, now_ns - self._arrival_ns(sample))
             if now_ns >= self._flush_due_ns:
@@ -190,7 +190,7 @@ class Recorder:
                 if self._failure or self._paused:
                     return self._failure or "nothing is being recorded"
                 self.service.event("RECORDING_STOPPED", why="operator asked")
-                self._say_losses()
+                self._report_losses()
                 self._write_waiting()
                 self._flush()
                 self._series.end(self._figures(), wait=False)
@@ -227,13 +227,13 @@ class Recorder:
         """Flush, begin the next log if it is due, report losses, publish Health."""
         self._flush()
         self._flush_due_ns = self._clock.host_ns() + _FLUSH_NS
-        self._say_losses()
+        self._report_losses()
         if self._series.longest_write_ns > max(_SLOW_NS, self._slowest_ns):
             self._slowest_ns = self._series.longest_write_ns
             self.service.event("DISK_SLOW", stall_s=self._slowest_ns * 1e-9, waiting=len(self._backlog))
         self.service.beat()
 
-    def _take(self, topic: Topic, sample: Sample) -> None:
+    def _record(self, topic: Topic, sample: Sample) -> None:
         try:
             self._account.names.admit(topic, sample.key)
         except BadMessageError as fault:
@@ -244,11 +244,11 @@ class Recorder:
         recorded = not self._failure if queried else not unwanted and self._write(sample)
         self._account.enter(topic, sample, recorded=recorded, unwanted=unwanted)
         if topic is HEALTH:
-            self._take_health(topic, sample)
+            self._note_health(topic, sample)
         elif topic.queryable:
-            self._peers.keep(sample)
+            self._peers.store(sample)
 
-    def _take_health(self, topic: Topic, sample: Sample) -> None:
+    def _note_health(self, topic: Topic, sample: Sample) -> None:
         try:
             _, health = self._account.names.health(sample.key, sample.payload)
         except UNREADABLE:
@@ -311,14 +311,14 @@ class Recorder:
         self._failure = str(fault)
         self.service.event("RECORDING_FAILED", why=fault)
 
-    def _say_losses(self) -> None:
+    def _report_losses(self) -> None:
         for topic, count in self._account.news().items():
             self.service.event("MESSAGES_LOST", topic=topic, count=count)
 
     def _drain(self) -> None:
         """Wait up to _DRAIN_S for the last Health of the others, which counts the messages they sent."""
         deadline_s = time.monotonic() + _DRAIN_S
-        while not self._hurried:
+        while not self._skip_drain:
             self._iterate()
             if self._peers.stopped(but=self.service.name) or time.monotonic() >= deadline_s:
                 return
@@ -328,13 +328,13 @@ class Recorder:
         while self._ending is not None:
             self._iterate()
             time.sleep(_ITERATION_S)
-        self._say_losses()
+        self._report_losses()
         self._iterate()
         self._flush()
         try:
             self._series.end(self._figures())
             own = {EVENT.key, HEALTH.at(self.service.name)}
-            peers_recorded = self.service.last_health or self._peers.kept or set(self._account.recorded()) - own
+            peers_recorded = self.service.last_health or self._peers.newest or set(self._account.recorded()) - own
             if not (self._failure or peers_recorded):
                 self._series.remove()
         except DataFileError as fault:
