@@ -49,8 +49,8 @@ def rejection(
     """
     from lowfc.programs.commissioning.acceptance import rejection as test
 
-    how = test.Excitation(duration, rms_nm, lines, noll_of(modes), seed)
-    _carry_out(test, logs, run, config, plot, as_json, lambda live, must: test.play(live, how, must))
+    excitation = test.Excitation(duration, rms_nm, lines, noll_of(modes), seed)
+    _carry_out(test, logs, run, config, plot, as_json, lambda live, required: test.play(live, excitation, required))
 
 
 @acceptance_app.command()
@@ -70,8 +70,8 @@ def linearity(
     """
     from lowfc.programs.commissioning.acceptance import linearity as test
 
-    how = test.Staircase(hold, cycles, noll_of(modes))
-    _carry_out(test, logs, run, config, plot, as_json, lambda live, must: test.play(live, how, must))
+    staircase = test.Staircase(hold, cycles, noll_of(modes))
+    _carry_out(test, logs, run, config, plot, as_json, lambda live, required: test.play(live, staircase, required))
 
 
 @acceptance_app.command("capture-range")
@@ -90,7 +90,7 @@ def capture_range(
     from lowfc.programs.commissioning.acceptance import capture as test
 
     tested = noll_of(modes)
-    _carry_out(test, logs, run, config, plot, as_json, lambda live, must: test.play(live, tested, must))
+    _carry_out(test, logs, run, config, plot, as_json, lambda live, required: test.play(live, tested, required))
 
 
 @acceptance_app.command("noise-floor")
@@ -108,7 +108,7 @@ def noise_floor(
     """
     from lowfc.programs.commissioning.acceptance import noise as test
 
-    _carry_out(test, logs, run, config, plot, as_json, lambda live, must: test.play(live, duration), by_instrument=True)
+    _carry_out(test, logs, run, config, plot, as_json, lambda live, _: test.play(live, duration), by_instrument=True)
 
 
 def _carry_out(
@@ -153,15 +153,15 @@ def _carry_out(
         sequences = logged(history, test.KIND)
         if history.configuration is None or history.calibration is None:
             raise DataFileError(f"{log.path}: contains no configuration, which has the requirements")
-        known, calibration = history.configuration, history.calibration
+        config_in_use, calibration = history.configuration, history.calibration
     else:
         with Client(run) as client, counting_bar(Console(stderr=True), TimeRemainingColumn()) as count:
             live = Live(client, partial(count, test.KIND))
-            known, calibration = live.configuration, live.calibration
+            config_in_use, calibration = live.configuration, live.calibration
             with client.reserved("lowfc acceptance"), live.restored():
-                sequences = play(live, required or known.acceptance)
-    instrument = (known, calibration) if by_instrument else ()
-    result = test.judge(sequences, required or known.acceptance, *instrument)
+                sequences = play(live, required or config_in_use.acceptance)
+    instrument = (config_in_use, calibration) if by_instrument else ()
+    result = test.judge(sequences, required or config_in_use.acceptance, *instrument)
     if plot is not None and figure is not None:
         test.draw(result.figures(), figure)
         figure.suptitle(result.verdict)

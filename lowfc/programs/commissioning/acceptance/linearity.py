@@ -81,24 +81,24 @@ class LinearityResult(AcceptanceResult):
         return [key, *noisy, *super().remarks()]
 
 
-def play(live: Live, how: Staircase, required: Acceptance) -> list[Played]:
+def play(live: Live, staircase: Staircase, required: Acceptance) -> list[Played]:
     """Play a staircase of each mode on the mirror, with the loop open."""
     skipped = int(np.ceil(live.loop.delay_frames)) + _SPARE_FRAMES
-    if how.hold_frames <= skipped:
+    if staircase.hold_frames <= skipped:
         raise AcceptanceError(
-            f"{how.hold_frames} frames at each level are too few: the first {skipped} do not yet show the new shape"
+            f"{staircase.hold_frames} frames at each level are too few: the first {skipped} do not show it yet"
         )
     plan = []
-    for noll in chosen(how.modes, live.loop.noll):
+    for noll in chosen(staircase.modes, live.loop.noll):
         shape = live.calibration.modes_to_actuators[:, live.loop.noll.index(noll)][None]
         step_nm = live.configuration.safety.slew_nm / 2 / float(np.abs(shape).max())
-        levels_nm = levels(np.array(AMPLITUDES) * required.linear_nm, how.cycles)
-        stairs, starts = climb(levels_nm, how.hold_frames, step_nm)
+        levels_nm = levels(np.array(AMPLITUDES) * required.linear_nm, staircase.cycles)
+        stairs, starts = climb(levels_nm, staircase.hold_frames, step_nm)
         what = {
             "noll": noll,
             "levels_nm": levels_nm.tolist(),
             "starts": (starts + skipped).tolist(),
-            "averaged": how.hold_frames - skipped,
+            "averaged": staircase.hold_frames - skipped,
         }
         plan.append((what, stairs.astype(np.float32)[:, None], shape))
     live.expect(sum(len(table) for _, table, _ in plan))

@@ -103,23 +103,26 @@ class RejectionResult(AcceptanceResult):
         return [*lines, *super().remarks()]
 
 
-def play(live: Live, how: Excitation, required: Acceptance) -> list[Played]:
+def play(live: Live, excitation: Excitation, required: Acceptance) -> list[Played]:
     """Play a multisine in closed loop.
 
     It is added to the loop's offset. With a law on pseudo-open-loop modes it is added to the mirror, because such a law
     responds to an offset differently than to a disturbance.
     """
     noll, rate_hz = live.loop.noll, live.loop.rate_hz
-    tested = chosen(how.modes, noll)
-    frames = round(how.duration_s * rate_hz)
+    tested = chosen(excitation.modes, noll)
+    frames = round(excitation.duration_s * rate_hz)
     try:
-        bins = lines(frames, len(tested), how.lines_per_mode, required.lowest_hz / rate_hz, required.highest_of_rate)
+        bins = lines(
+            frames, len(tested), excitation.lines_per_mode, required.lowest_hz / rate_hz, required.highest_of_rate
+        )
     except ValueError as error:
         raise AcceptanceError(
-            f"{how.duration_s:g} s at {rate_hz:.4g} Hz, {len(tested)} modes, from {required.lowest_hz:g} Hz up: {error}"
+            f"{excitation.duration_s:g} s at {rate_hz:.4g} Hz, {len(tested)} modes, from {required.lowest_hz:g} Hz up: "
+            f"{error}"
         ) from None
     period = np.zeros((frames, len(noll)), np.float32)
-    period[:, [noll.index(mode) for mode in tested]] = multisine(frames, bins, how.rms_nm, how.seed)
+    period[:, [noll.index(mode) for mode in tested]] = multisine(frames, bins, excitation.rms_nm, excitation.seed)
     live.set_mode(LoopMode.CLOSED)
     table = led_in(period, live.loop.settling_frames() + _LEAD_FRAMES)
     basis = None

@@ -35,7 +35,7 @@ def _locked_memory(facts: Facts) -> Check:
 
 @CHECKS.check("swap")
 def _swap(facts: Facts) -> Check:
-    """Swap space, and whether the loop's memory can go there."""
+    """Swap space, and whether the loop's memory can be swapped out."""
     total_bytes, used_bytes = facts.host.swap()
     if not total_bytes:
         return ok("none")
@@ -55,7 +55,7 @@ def _swap(facts: Facts) -> Check:
     cost="a page fault may clear or gather 2 MB in the middle of a frame",
 )
 def _huge_pages(facts: Facts) -> Check:
-    """When the kernel uses huge pages by itself: `transparent_hugepage/enabled`."""
+    """When the kernel uses huge pages automatically: `transparent_hugepage/enabled`."""
     text = facts.host.text("sys/kernel/mm/transparent_hugepage/enabled")
     when = text[text.index("[") + 1 : text.index("]")]
     return ok(when) if when != "always" else warning(when)
