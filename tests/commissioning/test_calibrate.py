@@ -121,7 +121,7 @@ def closed(config: Configuration, calibration: Calibration, frames: int, world: 
     return loop.residual_nm(frames // 2)
 
 
-def test_the_residual_is_the_same_with_the_measured_and_the_computed_calibration() -> None:
+def test_measured_and_computed_calibrations_give_residuals_within_5_percent() -> None:
     loop = FoldedLoop(configured(**FEW))
     made, _ = calibrated(loop, "hadamard", 4)
     disturbed = configured(**FEW, disturbance__preset="bench")

@@ -38,11 +38,12 @@ BRIGHT = (
     | {"sensor.sam": "sam27d10_bal14", "star.magnitude": 0.0, "disturbance.preset": "quiet", "camera.instants": 1}
 )
 CONFIG = BRIGHT | {"sensor.modes": 3}
+RATE_HZ, DELAY_FRAMES = 250, 240
 
 
 @pytest.fixture(autouse=True)
 def _few_frames(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pokes, "DELAY_FRAMES", 240)
+    monkeypatch.setattr(pokes, "DELAY_FRAMES", DELAY_FRAMES)
 
 
 @pytest.fixture
@@ -74,7 +75,7 @@ def toml(config: Configuration) -> str:
 def frames_to_go(stderr: str) -> float:
     """Frames to go, from the reported time in whole seconds."""
     line = next(line for line in stderr.splitlines() if "to go" in line)
-    return float(line.partition("about ")[2].split()[0]) * 250
+    return float(line.partition("about ")[2].split()[0]) * RATE_HZ
 
 
 def test_a_resumed_calibration_is_written_loaded_and_reported_when_complete(
@@ -83,10 +84,8 @@ def test_a_resumed_calibration_is_written_loaded_and_reported_when_complete(
     def stop(*_: object) -> None:
         raise KeyboardInterrupt
 
-    check, begun = (
-        Calibrator.check,
-        240 + 2 * 8,
-    )  # frames for measuring the delay, before the first report of the time to go
+    check = Calibrator.check
+    begun = DELAY_FRAMES + 2 * 8  # frames for measuring the delay, before the first report of the time to go
     monkeypatch.setattr(Calibrator, "check", stop)
     before = loop.calibration()
     words = ["--method", "hadamard", "--cycles", "4", "--out", "night.fits", "--load"]
@@ -100,8 +99,8 @@ def test_a_resumed_calibration_is_written_loaded_and_reported_when_complete(
     cycles = len(loop.surfaces_nm) - begun
     again = CliRunner().invoke(calibrate_app, [*words, "--resume", "--json"])
     checks = len(loop.surfaces_nm) - cycles - 2 * begun
-    assert frames_to_go(again.stderr) == pytest.approx(checks, abs=0.6 * 250)
-    assert frames_to_go(done.stderr) == pytest.approx(cycles + checks, abs=0.6 * 250)
+    assert frames_to_go(again.stderr) == pytest.approx(checks, abs=0.6 * RATE_HZ)
+    assert frames_to_go(done.stderr) == pytest.approx(cycles + checks, abs=0.6 * RATE_HZ)
     found = json.loads(again.stdout)
     made = calibration_file.load(Path("night.fits"))
     assert (found["method"], found["cycles"]) == ("hadamard", 4)

@@ -12,8 +12,8 @@ from lowfc.contract.sections import Gateway
 from lowfc.control.loop.interlocks import Value
 from lowfc.programs.gateway.offer import Kind, Put, Variable
 
-_CODES = {Kind.TRUTH: "?", Kind.NUMBER: "d", Kind.TEXT: "s", Kind.NUMBERS: "ad"}
-_EMPTY: dict[Kind, Any] = {Kind.TRUTH: False, Kind.NUMBER: 0.0, Kind.TEXT: "", Kind.NUMBERS: []}
+_CODES = {Kind.BOOLEAN: "?", Kind.NUMBER: "d", Kind.TEXT: "s", Kind.NUMBERS: "ad"}
+_EMPTY: dict[Kind, Any] = {Kind.BOOLEAN: False, Kind.NUMBER: 0.0, Kind.TEXT: "", Kind.NUMBERS: []}
 _INVALID = 3
 """Alarm severity of an invalid value."""
 Ask = Callable[[Put, Any], object]
@@ -121,7 +121,7 @@ class _PutHandler:
         """Carry out one put, on a thread of the server."""
         try:
             value = operation.value()
-            if self._kind is not Kind.TRUTH or value:  # a display writes 0 to reset a button
+            if self._kind is not Kind.BOOLEAN or value:  # a display writes 0 to reset a button
                 self._ask(self._put, value.tolist() if isinstance(value, np.ndarray) else value)
         except LowfcError as fault:
             operation.done(error=str(fault))

@@ -19,7 +19,7 @@ from lowfc.programs.gateway.watch import Seen
 class Kind(Enum):
     """Type of a variable."""
 
-    TRUTH = "truth"
+    BOOLEAN = "boolean"
     NUMBER = "number"
     TEXT = "text"
     NUMBERS = "numbers"
@@ -93,13 +93,13 @@ def _request(one: Declaration) -> Variable | None:
     put: Put
     if one.key.startswith("lowfc/record/"):
         starts = name == "start"
-        name, kind, put = f"record_{name}", Kind.TRUTH, lambda loop, value: loop.record(starts)
+        name, kind, put = f"record_{name}", Kind.BOOLEAN, lambda loop, value: loop.record(starts)
     elif "text" in fields and "modes" not in fields:  # for `gain`, the numbers rather than the text
         kind, put = Kind.TEXT, lambda loop, value: loop.ask(one.name, text=str(value))
     elif "values" in fields:
         kind, put = Kind.NUMBERS, lambda loop, value: loop.ask(one.name, values=value)
     else:
-        kind, put = Kind.TRUTH, lambda loop, value: loop.ask(one.name)
+        kind, put = Kind.BOOLEAN, lambda loop, value: loop.ask(one.name)
     return Variable(name, kind, "", one.sentence, None, put)
 
 

@@ -138,9 +138,8 @@ def _carry_out(
 
     required = configuration(config).acceptance if config is not None else None
     require_folder(plot)
-    figure = (
-        None if plot is None else figure_class()(figsize=(10, 5), layout="constrained")
-    )  # raises now if matplotlib is missing
+    # an error now rather than after the test if matplotlib is missing
+    figure = None if plot is None else figure_class()(figsize=(10, 5), layout="constrained")
     if logs:
         if run is not None:
             raise ConfigurationError("a log and a running loop (--run) exclude each other: use one")
