@@ -81,7 +81,7 @@ class Commissioning:
         progress: Counted,
         confirm: Callable[[str], None],
     ) -> None:
-        """Commission the loop of `loop`; `computed` is the calibration of the optical model."""
+        """Commission the loop that `loop` is connected to; `computed` is the calibration of the optical model."""
         self._loop, self._config, self._computed, self._options = loop, config, computed, options
         self._report, self._progress, self._confirm = report, progress, confirm
         self._figures: dict[str, Any] = {}
