@@ -95,10 +95,7 @@ class Controller:
         self._adopted = False
         self._first_frame: Sample | None = None
         self._unsubscribe_frames = service.dispatch(
-            FRAME,
-            self._frame_received,
-            period_ns=config.period_ns,
-            superseded=partial(self._frame_received, superseded=True),
+            FRAME, self._received, period_ns=config.period_ns, superseded=partial(self._received, superseded=True)
         )
         self._mirror = MirrorReports(service, name)
         self._camera = CameraReports(service, self._apply_report)
@@ -176,7 +173,7 @@ class Controller:
         if self._frame_to_command.count:
             health.frame_to_command.CopyFrom(codec.latency(self._frame_to_command))
 
-    def _frame_received(self, sample: Sample, *, superseded: bool = False) -> None:
+    def _received(self, sample: Sample, *, superseded: bool = False) -> None:
         """Process a frame, on the receiving thread; until the mirror's shape is known, keep only the newest one."""
         with self._lock:
             if not self._adopted:
@@ -261,12 +258,10 @@ class Controller:
             reply, state, number = Reply(False, str(error)[:MOST_REPLY], self._state.frame_sequence + 1), self._state, 0
         else:
             reply, state, number = self._carry_out(request)
-        state_message = controller_state(state, self._settings, now_ns) if request.name == "status" else None
+        message = controller_state(state, self._settings, now_ns) if request.name == "status" else None
         short = Request(request.time_ns, request.name, request.modes, request.values, request.text)
-        query.reply(
-            codec.encode_request(short, reply, number, state_message)
-        )  # without the arrays: the requester has them
-        self._requests.put(codec.encode_request(request, reply, number, state_message))
+        query.reply(codec.encode_request(short, reply, number, message))  # without the arrays: the requester has them
+        self._requests.put(codec.encode_request(request, reply, number, message))
 
     def _carry_out(
         self, request: Request, lock: AbstractContextManager[object] | None = None
