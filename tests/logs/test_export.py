@@ -1,4 +1,4 @@
-"""Exports, read back with other people's readers and compared with the messages of the log."""
+"""Exports, read back with independent readers and compared with the messages of the log."""
 
 import csv
 import json
@@ -39,7 +39,7 @@ from tests.support import toy
 from tests.support.loops import lowfc
 from tests.support.report_log import METADATA, Night
 
-STEPS, REFUSED, UNSENT, UNTRUE = 30, 4, 7, 9
+STEPS, REFUSED, WITHOUT_COMMAND, WITHOUT_TRUTH = 30, 4, 7, 9
 MODES, ACTUATORS = len(toy.NOLL), toy.GRID[0] * toy.GRID[1]
 QUIET = Console(quiet=True)
 GOOD = np.arange(toy.SHAPE[0] * toy.SHAPE[1]) != 10
@@ -55,29 +55,29 @@ def a_night() -> Night:
     night.frames(STEPS // 2 - 1, dark={REFUSED - 1})
     night.start_camera()
     night.frames(STEPS // 2)
-    for topic, number in ((COMMAND, UNSENT), (TRUTH, UNTRUE)):
+    for topic, number in ((COMMAND, WITHOUT_COMMAND), (TRUTH, WITHOUT_TRUTH)):
         del night.samples[[place for place, one in enumerate(night.samples) if topic.matches(one.key)][number]]
-    held = COMMAND.message.FromString(of(night, COMMAND)[0])
+    held = COMMAND.message.FromString(payloads_of(night, COMMAND)[0])
     held.actuators = bytes(4 * ACTUATORS)  # type: ignore[attr-defined]
-    night.put(COMMAND, held)  # repeated while no frame came
+    night.put(COMMAND, held)  # repeated without a new frame
     return night
 
 
-def of(night: Night, topic: Topic) -> list[bytes]:
+def payloads_of(night: Night, topic: Topic) -> list[bytes]:
     return [sample.payload for sample in night.samples if topic.matches(sample.key)]
 
 
 NIGHT = a_night()
-STEPS_SENT = [STEP.message.FromString(payload) for payload in of(NIGHT, STEP)]
+STEPS_SENT = [STEP.message.FromString(payload) for payload in payloads_of(NIGHT, STEP)]
 SEQUENCES = [step.frame_sequence for step in STEPS_SENT]  # type: ignore[attr-defined]
 TIMES_NS = [from_timestamp(step.timestamp) for step in STEPS_SENT]  # type: ignore[attr-defined]
-FRAMES = np.array([decode_frame(payload, 0, 0).pixels for payload in of(NIGHT, FRAME)])
+FRAMES = np.array([decode_frame(payload, 0, 0).pixels for payload in payloads_of(NIGHT, FRAME)])
 
 
 def sent(topic: Topic, name: str, width: int = MODES) -> Array:
-    """A quantity of each step, as float32; NaN where it was not sent."""
+    """A quantity of each step, as float32; NaN if it was not sent."""
     rows = np.full((STEPS, width), np.nan, np.float32)
-    for payload in reversed(of(NIGHT, topic)):
+    for payload in reversed(payloads_of(NIGHT, topic)):
         body: Any = topic.message.FromString(payload)
         value = getattr(body, name)
         if len(value):
@@ -108,7 +108,7 @@ def test_csv(log: Path, tmp_path: Path) -> None:
     assert rows[1]["time_utc"] == f"{np.datetime64(TIMES_NS[1], 'ns')}"
     assert [row["mode"] for row in rows[:2]] == ["open", "closed"]
     assert (rows[0]["reasons"], rows[REFUSED]["reasons"]) == ("", "dark")
-    assert rows[REFUSED]["error_z2_nm"] == rows[UNTRUE]["true_residual_rms_nm"] == ""
+    assert rows[REFUSED]["error_z2_nm"] == rows[WITHOUT_TRUTH]["true_residual_rms_nm"] == ""
     assert float(rows[3]["transport_us"]) == 90
     for place, noll in enumerate(toy.NOLL):
         for stem, topic, name in (("error", STEP, "error_nm"), ("true_disturbance", TRUTH, "disturbance_nm")):
@@ -172,7 +172,7 @@ def test_aot(log: Path, tmp_path: Path) -> None:
         np.testing.assert_array_equal(found.data, expected)
 
     commands_nm = sent(COMMAND, "actuators", ACTUATORS)
-    assert np.flatnonzero(np.isnan(commands_nm[:, 0])).tolist() == [UNSENT]
+    assert np.flatnonzero(np.isnan(commands_nm[:, 0])).tolist() == [WITHOUT_COMMAND]
     check(loop.modal_coefficients, "nm", sent(STEP, "error_nm"))
     check(loop.commands, "m", commands_nm * np.float32(1e-9))
     check(loop.measurements_to_modes, "nm", calibration.reconstructor[:, None, good])
@@ -199,13 +199,13 @@ def test_aot(log: Path, tmp_path: Path) -> None:
     across = [coordinate.x for coordinate in mirror.actuator_coordinates[: toy.GRID[1]]]
     np.testing.assert_allclose(np.diff(across), 2.0 / 31.0)
     assert system.main_telescope.enclosing_diameter == 2.0
-    told = {one.key: one.value for one in system.metadata}
-    assert (told["CALID"], told["RUN"], told["EPERADU"]) == (calibration.id, "night", 1.0)
+    metadata = {one.key: one.value for one in system.metadata}
+    assert (metadata["CALID"], metadata["RUN"], metadata["EPERADU"]) == (calibration.id, "night", 1.0)
     assert json.loads(system.config) == Configuration().model_dump()
 
 
 @pytest.mark.parametrize("to", list(Format))
-def test_a_truncated_log_without_truth(tmp_path: Path, to: Format) -> None:
+def test_a_truncated_log_without_truth_is_exported(tmp_path: Path, to: Format) -> None:
     part = written(tmp_path / "cut.mcap", TRUTH, finish=False)
     part.write_bytes(part.read_bytes()[:-2000])
     figures = export_log(part, to, console=QUIET)
@@ -219,7 +219,7 @@ def test_a_truncated_log_without_truth(tmp_path: Path, to: Format) -> None:
         assert "true" not in heading
 
 
-def test_no_steps(tmp_path: Path) -> None:
+def test_a_log_without_steps_is_refused(tmp_path: Path) -> None:
     empty = written(tmp_path / "empty.mcap", STEP)
     for to in Format:
         with pytest.raises(DataFileError, match="no steps"):
@@ -228,20 +228,20 @@ def test_no_steps(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("to", [Format.NPZ, Format.FITS, Format.AOT])
-@pytest.mark.parametrize("odd", [True, False])
-def test_half_a_file_is_never_left(tmp_path: Path, to: Format, odd: bool) -> None:
+@pytest.mark.parametrize("mixed_sizes", [True, False])
+def test_a_failed_export_leaves_no_file(tmp_path: Path, to: Format, mixed_sizes: bool) -> None:
     """Frames of several sizes, or none at all."""
     night = a_night()
-    night.samples = [one for one in night.samples if odd or one.key != FRAME.key]
-    if odd:
+    night.samples = [one for one in night.samples if mixed_sizes or one.key != FRAME.key]
+    if mixed_sizes:
         night.put(FRAME, image(np.zeros((3, 3), np.uint16), 0, "sensor"))
-    path = night.write(tmp_path / "odd.mcap")
+    path = night.write(tmp_path / "mixed_sizes.mcap")
     with pytest.raises(DataFileError, match="export without --frames"):
         export_log(path, to, frames=True, console=QUIET)
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_mistakes(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invalid_exports_are_refused(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ConfigurationError, match="cannot hold frames"):
         export_log(log, Format.CSV, frames=True, console=QUIET)
     with pytest.raises(DataFileError, match="cannot be written"):
@@ -252,7 +252,7 @@ def test_mistakes(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         export_log(log, Format.AOT, console=QUIET)
 
 
-def test_a_file_is_beside_the_log_with_its_permissions_and_replaced_only_if_forced(tmp_path: Path) -> None:
+def test_an_export_is_next_to_the_log_with_its_permissions_and_replaced_only_by_force(tmp_path: Path) -> None:
     log = NIGHT.write(tmp_path / "night.mcap")
     log.chmod(0o600)
     done = lowfc("export", log)
@@ -280,7 +280,7 @@ def test_a_log_is_not_replaced_even_if_forced(log: Path, tmp_path: Path, name: s
     assert (tmp_path / name).read_bytes() == log.read_bytes()
 
 
-@pytest.mark.parametrize("to", [Format.NPZ, Format.FITS])  # with aot they are copied as with fits
+@pytest.mark.parametrize("to", [Format.NPZ, Format.FITS])  # AOT copies frames as FITS does
 def test_frames_are_not_held_in_memory(tmp_path: Path, to: Format) -> None:
     frames, shape = 90, (200, 200)
     night = a_night()
@@ -289,7 +289,7 @@ def test_frames_are_not_held_in_memory(tmp_path: Path, to: Format) -> None:
         noise = np.random.default_rng(number).integers(0, 65536, shape, dtype=np.uint16)
         night.put(FRAME, image(noise, number, "sensor"))
     big = night.write(tmp_path / "big.mcap")
-    export_log(big, to, tmp_path / "warm.out", console=QUIET)  # imports
+    export_log(big, to, tmp_path / "warm.out", console=QUIET)  # warm up the imports
     tracemalloc.start()
     figures = export_log(big, to, tmp_path / "out.out", frames=True, console=QUIET)
     _, peak = tracemalloc.get_traced_memory()
@@ -301,7 +301,7 @@ def test_frames_are_not_held_in_memory(tmp_path: Path, to: Format) -> None:
 
 def test_a_loop_mode_of_a_newer_version_is_exported_by_its_number(tmp_path: Path) -> None:
     night = a_night()
-    step = STEP.message.FromString(of(night, STEP)[-1])
+    step = STEP.message.FromString(payloads_of(night, STEP)[-1])
     step.mode = 9  # type: ignore[attr-defined]
     night.put(STEP, step)
     export_log(night.write(tmp_path / "night.mcap"), Format.CSV, tmp_path / "out.csv", console=QUIET)

@@ -1,4 +1,4 @@
-"""What released versions wrote stays readable, and a replay of their logs is identical."""
+"""Files of released versions stay readable, and a replay of their logs is identical."""
 
 import json
 import os
@@ -29,7 +29,7 @@ CALIBRATION_ID = "88418bc31223bb21a6b588e0b43a360fda6133511792fa03b8c6af46764afa
 LAW_ID = "15560553d408bce3394be8a5123a916a091b94f0a6f0d423cc89d546b4e967f3"
 
 
-def asked(*words: object, status: int = 0) -> dict[str, Any]:
+def json_of(*words: object, status: int = 0) -> dict[str, Any]:
     done = lowfc(*words, "--json")
     assert done.exit_code == status, (done.output, done.exception)
     found: dict[str, Any] = json.loads(done.stdout)
@@ -37,18 +37,18 @@ def asked(*words: object, status: int = 0) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(("log", "frames", "changed"), [(NIGHT, 163, {"the": 1, "clear": 1}), (KILLED, 18, {})])
-def test_a_replay_is_identical_but_for_rules_that_changed_on_purpose(
+def test_a_replay_is_identical_except_for_rules_that_changed_on_purpose(
     log: Path, frames: int, changed: dict[str, int]
 ) -> None:
-    # Another processor's linear algebra rounds otherwise; the tolerance is nothing where it is the same.
-    figures = asked("replay", log, "--tolerance", 1e-3)
+    # Linear algebra rounds differently on another processor; on the same one there must be no difference.
+    figures = json_of("replay", log, "--tolerance", 1e-3)
     assert (figures["frames"], figures["different"], figures["unchecked"]) == (frames, 0, 0)
     assert {rule.split()[0]: count for rule, count in figures["rules_changed"].items()} == changed
     if not {"blas", "cpu_features", "numpy"} & figures["host_differs"].keys():
         assert (figures["identical"], figures["largest_difference_nm"]) == (True, 0.0)
 
 
-def test_another_linear_algebra_differs_by_rounding_alone() -> None:
+def test_another_blas_kernel_differs_only_by_rounding() -> None:
     words = [sys.executable, "-m", "lowfc", "replay", str(NIGHT), "--json", "--tolerance", "1e-3"]
     environment = os.environ | {"OPENBLAS_CORETYPE": "Prescott"}  # SSE3: every processor has it
     done = subprocess.run(words, capture_output=True, text=True, env=environment, check=False)
@@ -60,31 +60,33 @@ def test_another_linear_algebra_differs_by_rounding_alone() -> None:
 
 @pytest.mark.parametrize("log", [NIGHT, KILLED])
 @pytest.mark.parametrize("command", ["info", "report"])
-def test_readers_of_logs(command: str, log: Path, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+def test_info_and_report_read_a_log_of_0_1(
+    command: str, log: Path, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
     if log == KILLED:
         request.getfixturevalue("without_drawings")
     out = ["--out", tmp_path / "page.html"] if command == "report" else []
-    assert asked(command, log, *out)
+    assert json_of(command, log, *out)
 
 
 @pytest.mark.parametrize("form", ["csv", "npz", "fits", "aot"])
-def test_exports(form: str, tmp_path: Path) -> None:
-    assert asked("export", NIGHT, "--to", form, "--out", tmp_path / f"night.{form}")
+def test_a_log_of_0_1_is_exported(form: str, tmp_path: Path) -> None:
+    assert json_of("export", NIGHT, "--to", form, "--out", tmp_path / f"night.{form}")
 
 
-def test_what_if_another_gain() -> None:
-    assert asked("what-if", NIGHT, "--set", "gain=0.3")["frames"] > 20
+def test_a_what_if_of_a_log_of_0_1() -> None:
+    assert json_of("what-if", NIGHT, "--set", "gain=0.3")["frames"] > 20
 
 
 def test_a_killed_recorders_log_is_recovered_and_replays_as_before(tmp_path: Path) -> None:
     path = tmp_path / KILLED.name
     path.write_bytes(KILLED.read_bytes())
-    assert asked("recover", path)
+    assert json_of("recover", path)
     recovered = tmp_path / "killed-recovered.mcap"
-    assert asked("replay", recovered, "--tolerance", 1e-3)["frames"] == 18
+    assert json_of("replay", recovered, "--tolerance", 1e-3)["frames"] == 18
 
 
-def test_it_is_looked_at(tmp_path: Path) -> None:
+def test_a_log_of_0_1_is_drawn(tmp_path: Path) -> None:
     out = tmp_path / "night.rrd"
     done = run(tmp_path, "view", str(NIGHT), "--save", str(out))
     assert done.returncode == 0, done.stderr
@@ -98,11 +100,11 @@ def test_it_is_looked_at(tmp_path: Path) -> None:
         (["acceptance", "linearity", NIGHT], "no `lowfc acceptance"),
     ],
 )
-def test_what_the_log_is_too_short_for_is_said(words: list[object], sentence: str) -> None:
+def test_commands_that_need_a_longer_log_say_so(words: list[object], sentence: str) -> None:
     assert sentence in str(lowfc(*words).exception)
 
 
-def test_the_log_has_every_kind_of_input() -> None:
+def test_the_log_of_0_1_has_every_kind_of_input() -> None:
     history = read_history(LogReader(NIGHT, skip_damaged=True))
     names = {request.name for request in history.requests}
     assert {"law", "channel", "play", "offset", "load", "safe", "clear", "step", "reset", "note"} <= names
@@ -111,13 +113,13 @@ def test_the_log_has_every_kind_of_input() -> None:
     assert any(state.HasField("play") for state in history.controllers)
 
 
-def test_identities_are_what_they_were() -> None:
+def test_identities_of_calibration_and_law_are_unchanged() -> None:
     assert calibration_file.load(FOLDER / "calibration.fits").identity() == CALIBRATION_ID
     assert law_file.load(FOLDER / "law.fits").id == LAW_ID
 
 
-def test_former_messages_and_enumerations_are_todays() -> None:
-    """No field of 0.1 has changed its number, type or label, and none its name but those in the table."""
+def test_messages_and_enumerations_of_0_1_are_unchanged_except_for_names() -> None:
+    """No field of 0.1 has changed its number, type or label; only the names in the table have changed."""
     former, now = ({}, {})
     for names, folder in ((former, FOLDER), (now, WIRE)):
         for file in FileDescriptorSet.FromString((folder / "lowfc.desc").read_bytes()).file:
@@ -132,10 +134,10 @@ def test_former_messages_and_enumerations_are_todays() -> None:
     }
     assert {key: now.get(key) for key in renamed} == renamed
     names = {f"{kind}.{name}" for (kind, _), (*_, name) in former.items()}
-    assert former_names.FIELDS.keys() <= names, "the table has a name that 0.1 had not"
+    assert former_names.FIELDS.keys() <= names, "the table has a name that 0.1 did not have"
 
 
-def test_former_keys_of_a_configuration_are_warned_of() -> None:
+def test_former_keys_of_a_configuration_give_a_remark() -> None:
     remarks: list[str] = []
     config = configuration.load(FOLDER / "lowfc.toml", remark=remarks.append)
     former = tomllib.loads((FOLDER / "lowfc.toml").read_text())
@@ -152,7 +154,7 @@ def test_a_key_under_both_names_is_refused(tmp_path: Path) -> None:
         configuration.load(path)
 
 
-def test_a_calibration_and_a_law_of_0_1_are_taken_by_a_loop() -> None:
+def test_a_calibration_and_a_law_of_0_1_are_accepted_by_a_loop() -> None:
     config = configuration.load(FOLDER / "lowfc.toml")
     settings = factory.settings(config)
     state, _ = advance(settings, State(), Load(0, calibration_file.load(FOLDER / "calibration.fits"), "golden"))

@@ -1,4 +1,4 @@
-"""A history of a log whose values protobuf allows, and nobody of the loop would send."""
+"""Histories of logs with values that protobuf allows but the loop never sends."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +15,7 @@ from tests.support.report_log import Night
 STEPS = 20
 
 
-def changed(night: Night, topic: Topic, change: Callable[[Any], object]) -> None:
+def change_one(night: Night, topic: Topic, change: Callable[[Any], object]) -> None:
     """Change one message of a topic, the tenth from the end."""
     number = [place for place, sample in enumerate(night.samples) if topic.matches(sample.key)][-10]
     sample = night.samples[number]
@@ -41,10 +41,10 @@ def history_of(night: Night, path: Path) -> History:
         lambda step: step.pol_nm.pop(),
     ],
 )
-def test_an_impossible_step_is_left_out_whole(tmp_path: Path, change: Callable[[Any], object]) -> None:
+def test_an_invalid_step_is_left_out_of_every_column(tmp_path: Path, change: Callable[[Any], object]) -> None:
     night = Night()
     night.frames(STEPS)
-    changed(night, STEP, change)
+    change_one(night, STEP, change)
     steps = (history := history_of(night, tmp_path / "x.mcap")).steps
     assert history.left_out == 1
     assert {len(getattr(steps, column)) for column in steps.__slots__} == {STEPS - 1}
@@ -52,10 +52,10 @@ def test_an_impossible_step_is_left_out_whole(tmp_path: Path, change: Callable[[
     assert len(history.truths.sequence) == len(history.mirror.sequence) == STEPS
 
 
-def test_a_reason_given_twice_is_one_bit(tmp_path: Path) -> None:
+def test_a_repeated_reason_sets_one_bit(tmp_path: Path) -> None:
     night = Night()
     night.frames(STEPS)
-    changed(night, STEP, lambda step: step.reasons.extend([62, 62, 5]))
+    change_one(night, STEP, lambda step: step.reasons.extend([62, 62, 5]))
     history = history_of(night, tmp_path / "x.mcap")
     assert history.left_out == 0
     assert history.steps.reasons.max() == 1 << 62 | 1 << 5
@@ -71,25 +71,25 @@ def test_a_reason_given_twice_is_one_bit(tmp_path: Path) -> None:
         (TIMING, lambda timing: timing.ClearField("frame_sequence")),
     ],
 )
-def test_an_impossible_message_leaves_no_column_longer(
+def test_an_invalid_message_is_left_out_of_every_column(
     tmp_path: Path, topic: Topic, change: Callable[[Any], object]
 ) -> None:
     night = Night()
     night.frames(STEPS)
     before = history_of(night, tmp_path / "before.mcap")
-    changed(night, topic, change)
+    change_one(night, topic, change)
     history = history_of(night, tmp_path / "x.mcap")
     for kind, name in ((MIRROR_STATE, "mirror"), (TRUTH, "truths")):
-        had, columns = len(getattr(before, name).sequence), getattr(history, name)
+        count, columns = len(getattr(before, name).sequence), getattr(history, name)
         extremes = ("highest_nm", "lowest_nm")
         lengths = {len(getattr(columns, column)) for column in columns.__slots__ if column not in extremes}
-        assert lengths == {had - (kind is topic)}
+        assert lengths == {count - (kind is topic)}
     assert {len(stage) for stage in history.stages_ns.values()} == {len(history.timed_sequence)}
     assert len(history.timed_sequence) == STEPS - (topic is TIMING)
     assert len(history.steps.sequence) == STEPS
 
 
-def test_a_time_that_no_clock_has_is_left_out(tmp_path: Path) -> None:
+def test_a_message_with_an_impossible_time_is_left_out(tmp_path: Path) -> None:
     night = Night()
     night.frames(STEPS)
     night.put(EVENT, wire.Tick(), late_ns=(1 << 63) - night.now_ns)

@@ -1,4 +1,4 @@
-"""Files made to harm: whatever is named on a command line or in a configuration, it ends with one sentence."""
+"""Hostile files: any file named on a command line or in a configuration leads to a one-line error."""
 
 import os
 import struct
@@ -20,17 +20,17 @@ from lowfc.programs.core.start_up import check_files
 from lowfc.programs.design.sam_files import read_state
 from lowfc.programs.logs.replay.workers import replay_files
 
-LONGEST = 500
-"""Characters of a sentence."""
+MOST_CHARACTERS = 500
+"""Longest error."""
 
 
-def sentence(call: Callable[[], object]) -> str:
+def error_of(call: Callable[[], object]) -> str:
     with pytest.raises(LowfcError) as caught:
         call()
-    said = str(caught.value)
-    assert len(said) < LONGEST + len(str(Path.cwd()))
-    assert said.isprintable(), "it has one line"
-    return said
+    text = str(caught.value)
+    assert len(text) < MOST_CHARACTERS + len(str(Path.cwd()))
+    assert text.isprintable(), "the error has one line"
+    return text
 
 
 @pytest.mark.parametrize(
@@ -52,15 +52,15 @@ def sentence(call: Callable[[], object]) -> str:
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_a_configuration(tmp_path: Path, content: bytes, expected: str) -> None:
+def test_a_hostile_configuration_is_refused(tmp_path: Path, content: bytes, expected: str) -> None:
     path = tmp_path / "hostile.toml"
     path.write_bytes(content)
-    said = sentence(lambda: load(path))
-    assert said.startswith(f"{path}: ")
-    assert expected in said
+    text = error_of(lambda: load(path))
+    assert text.startswith(f"{path}: ")
+    assert expected in text
 
 
-def test_of_very_many_mistakes_the_first_are_explained(tmp_path: Path) -> None:
+def test_only_the_first_of_many_mistakes_are_listed(tmp_path: Path) -> None:
     path = tmp_path / "hostile.toml"
     path.write_text("".join(f"k{number} = 1\n" for number in range(50_000)))
     with pytest.raises(ConfigurationError) as caught:
@@ -69,8 +69,8 @@ def test_of_very_many_mistakes_the_first_are_explained(tmp_path: Path) -> None:
     assert (len(lines), lines[-1]) == (MOST_FAULTS + 1, f"{path}: and {50_000 - MOST_FAULTS} more")
 
 
-def test_a_line_with_many_floats_in_a_comment_or_a_list_is_no_key(tmp_path: Path) -> None:
-    path = tmp_path / "usual.toml"
+def test_many_dots_in_a_comment_or_a_list_are_accepted(tmp_path: Path) -> None:
+    path = tmp_path / "valid.toml"
     values = ", ".join(f'"{number}" = {number}.5' for number in range(90))
     path.write_text(f"# {'.' * 1000}\n[mirror]\nstuck_nm = {{ {values} }}\n")
     assert load(path).mirror.stuck_nm["7"] == 7.5
@@ -116,14 +116,12 @@ READERS: dict[str, Callable[[Path], object]] = {
     ],
     ids=["loop", "pipe", "device", "directory"],
 )
-def test_what_is_no_regular_file_is_never_read(
-    tmp_path: Path, kind: str, make: Callable[[Path], Path], expected: str
-) -> None:
+def test_only_regular_files_are_read(tmp_path: Path, kind: str, make: Callable[[Path], Path], expected: str) -> None:
     path = tmp_path / f"named.{kind}"
     path.symlink_to(make(tmp_path))
-    said = sentence(lambda: READERS[kind](path))
-    assert str(path) in said
-    assert expected in said
+    text = error_of(lambda: READERS[kind](path))
+    assert str(path) in text
+    assert expected in text
 
 
 def npy(header: bytes) -> bytes:
@@ -131,53 +129,53 @@ def npy(header: bytes) -> bytes:
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + bytes(64)
 
 
-BOAST = npy(b"{'descr': '<f4', 'fortran_order': False, 'shape': (4000000, 4000000), }")
-"""An array of 58 TiB, as its header says."""
+HUGE_ARRAY = npy(b"{'descr': '<f4', 'fortran_order': False, 'shape': (4000000, 4000000), }")
+"""A header of an array of 58 TiB, without the data."""
 
 
 @pytest.mark.parametrize(
     ("content", "key"),
     [
-        (BOAST, "mirror.flat"),
-        (BOAST, "mirror.active"),
+        (HUGE_ARRAY, "mirror.flat"),
+        (HUGE_ARRAY, "mirror.active"),
         (npy(b"{'descr': '<f4', 'fortran_order': False, 'shape': " + b"(" * 9000 + b"}"), "mirror.flat"),
         (npy(b"(" * 9000 + b")" * 9000), "mirror.flat"),
     ],
 )
-def test_an_array_that_is_not_there(tmp_path: Path, content: bytes, key: str) -> None:
+def test_an_array_with_a_hostile_header_is_refused(tmp_path: Path, content: bytes, key: str) -> None:
     path = tmp_path / "hostile.npy"
     path.write_bytes(content)
-    said = sentence(lambda: check_files(load(None, {key: str(path)})))
-    assert said.startswith(f"{key}: {path}: neither a FITS image nor a numpy array")
+    text = error_of(lambda: check_files(load(None, {key: str(path)})))
+    assert text.startswith(f"{key}: {path}: neither a FITS image nor a numpy array")
 
 
-def test_fits_images_and_pupils_that_boast(tmp_path: Path) -> None:
+def test_fits_images_and_pupils_with_a_huge_header_are_refused(tmp_path: Path) -> None:
     cards = ("SIMPLE  = T", "BITPIX  = -32", "NAXIS   = 2", "NAXIS1  = 4000000", "NAXIS2  = 4000000", "END")
     fields = (card.partition(" = ") for card in cards)
     header = "".join(f"{name}{equals}{value:>20}".ljust(80) for name, equals, value in fields)
     fits, npz = tmp_path / "hostile.fits", tmp_path / "hostile.npz"
     fits.write_bytes(header.ljust(2880).encode() + bytes(2880))
     with zipfile.ZipFile(npz, "w") as archive:
-        archive.writestr("quarter.npy", BOAST)
+        archive.writestr("quarter.npy", HUGE_ARRAY)
     for path, key in ((fits, "mirror.flat"), (fits, "control.law"), (npz, "sensor.pupil")):
-        assert str(path) in sentence(lambda path=path, key=key: check_files(load(None, {key: str(path)})))
+        assert str(path) in error_of(lambda path=path, key=key: check_files(load(None, {key: str(path)})))
 
 
 @pytest.mark.parametrize("content", [b"[" * 100_000, b'{"holes": ' + b"[" * 900 + b"]" * 900 + b"}", b"9" * 100_000])
-def test_a_layout(tmp_path: Path, content: bytes) -> None:
+def test_a_hostile_layout_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "hostile.json"
     path.write_bytes(content)
-    assert str(path) in sentence(lambda: load_layout(str(path)))
-    assert str(path) in sentence(lambda: read_state(path, "pupil"))
+    assert str(path) in error_of(lambda: load_layout(str(path)))
+    assert str(path) in error_of(lambda: read_state(path, "pupil"))
 
 
-def test_a_file_is_read_whole_up_to_its_largest_size(tmp_path: Path) -> None:
+def test_a_file_is_read_up_to_the_size_limit(tmp_path: Path) -> None:
     path = tmp_path / "file"
     path.write_bytes(b"12345")
     assert input_file.read_whole(path, 5) == b"12345"
     with pytest.raises(OSError, match="larger than 4 bytes"):
         input_file.read_whole(path, 4)
-    with pytest.raises(OSError, match="larger than 4 bytes"):  # it says that it is empty
+    with pytest.raises(OSError, match="larger than 4 bytes"):  # its reported size is 0
         input_file.read_whole(Path("/proc/self/status"), 4)
     before = set(Path("/proc/self/fd").iterdir())
     with pytest.raises(OSError, match="not a regular file"):
@@ -185,7 +183,7 @@ def test_a_file_is_read_whole_up_to_its_largest_size(tmp_path: Path) -> None:
     assert set(Path("/proc/self/fd").iterdir()) == before
 
 
-def test_a_missing_file_is_still_said_to_be_missing(tmp_path: Path) -> None:
+def test_a_missing_file_is_reported_as_missing(tmp_path: Path) -> None:
     for kind in ("calibration.fits", "law.fits", "npy", "fits"):
         with pytest.raises(DataFileError, match="there is no such "):
             READERS[kind](tmp_path / f"none.{kind}")

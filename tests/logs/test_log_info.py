@@ -1,4 +1,4 @@
-"""`lowfc info`: what it says of a log is what was written into it."""
+"""`lowfc info` reports what was written into a log."""
 
 import json
 from pathlib import Path
@@ -37,7 +37,7 @@ def log(tmp_path: Path) -> Path:
         {"lowfc": {"lowfc": "0.1.0", "host": "bench", "run": "night", "seed": "3"}},
         [Attachment("config.toml", "application/toml", b"[loop]\n")],
     )
-    writer.write(sample(CALIBRATION.key, wire.Calibration(id="c1"), 0, START_NS - 3600 * SECOND))  # asked for
+    writer.write(sample(CALIBRATION.key, wire.Calibration(id="c1"), 0, START_NS - 3600 * SECOND))  # requested
     frames = [n for n in range(50) if n not in (5, 6, 7)]
     for number in range(101):
         now_ns = START_NS + number * SECOND // 10
@@ -59,12 +59,12 @@ def log(tmp_path: Path) -> Path:
     return writer.finish({"recording": {"messages": str(writer.messages), "messages_lost": "4"}})
 
 
-def test_what_was_written_is_said(log: Path) -> None:
+def test_info_reports_what_was_written(log: Path) -> None:
     done = lowfc("info", log, "--json")
     assert done.exit_code == 0, done.output
     found = json.loads(done.stdout)
     frame = found["topics"].pop(FRAME.key)
-    assert not any(line["restarts"] for line in found["topics"].values()), "starts of one publisher"
+    assert not any(line["restarts"] for line in found["topics"].values()), "starts are counted by publisher"
     assert {key: line["messages"] for key, line in found.pop("topics").items()} == {
         CALIBRATION.key: 1,
         CONTROLLER_STATE.key: 3,
@@ -105,8 +105,8 @@ def test_what_was_written_is_said(log: Path) -> None:
     }
 
 
-def test_a_person_reads_the_same(log: Path) -> None:
-    said = lowfc("info", log).stdout
+def test_the_text_has_the_same_figures(log: Path) -> None:
+    text = lowfc("info", log).stdout
     for words in (
         "complete",
         "2026-01-01T00:00:00.000+00:00, 10.000 s",
@@ -116,54 +116,54 @@ def test_a_person_reads_the_same(log: Path) -> None:
         "config.toml (7 bytes)",
         "lowfc 0.1.0, host bench, run night, seed 3",
     ):
-        assert words in said
-    line = next(line.split() for line in said.splitlines() if line.startswith(FRAME.key))
+        assert words in text
+    line = next(line.split() for line in text.splitlines() if line.startswith(FRAME.key))
     assert line[1:] == ["94", "9.3", "0.09", "1", "6", "foxglove.RawImage"]
 
 
-def test_an_unfinished_and_a_damaged_log_say_so(log: Path) -> None:
+def test_truncated_and_damaged_logs_are_reported(log: Path) -> None:
     data = bytearray(log.read_bytes())
     log.write_bytes(data[:-500])
     recover(log, recovered := log.with_name("recovered.mcap"))
-    said = lowfc("info", recovered).stdout
-    assert "recovered from night.mcap, which was incomplete; left out: damaged parts 0" in said
-    said = lowfc("info", log)
-    assert said.exit_code == 0
-    assert "truncated" in said.stdout
+    text = lowfc("info", recovered).stdout
+    assert "recovered from night.mcap, which was incomplete; left out: damaged parts 0" in text
+    done = lowfc("info", log)
+    assert done.exit_code == 0
+    assert "truncated" in done.stdout
     assert json.loads(lowfc("info", log, "--json").stdout)["state"] == "truncated"
     data[data.index(b"[loop]")] ^= 1
     log.write_bytes(data)
-    said = lowfc("info", log)
-    assert said.exit_code == 0
-    assert "damaged; `lowfc recover` saves the intact messages" in said.stdout
-    assert "the checksum of an attachment is wrong" in said.stdout
+    done = lowfc("info", log)
+    assert done.exit_code == 0
+    assert "damaged; `lowfc recover` saves the intact messages" in done.stdout
+    assert "the checksum of an attachment is wrong" in done.stdout
     found = json.loads(lowfc("info", log, "--json").stdout)
     assert (found["state"], len(found["damage"]), found["attachments"]) == ("damaged", 1, {})
 
 
-def test_a_log_that_is_being_recorded_says_so_and_is_not_recovered(tmp_path: Path) -> None:
+def test_a_log_that_is_being_recorded_is_reported_and_not_recovered(tmp_path: Path) -> None:
     log = LogWriter(tmp_path / "20270101T000000Z.mcap", START_NS, {"lowfc": {"run": "night"}})
-    said = lowfc("info", log.part)
-    assert "being recorded; `lowfc ctl record stop` finishes it" in said.stdout
+    done = lowfc("info", log.part)
+    assert "being recorded; `lowfc ctl record stop` finishes it" in done.stdout
     assert json.loads(lowfc("info", log.part, "--json").stdout)["state"] == "recording"
     assert "it is being recorded" in no_end([log.part], finished=False)
     with pytest.raises(DataFileError, match="is being recorded, and nothing is lost: `lowfc ctl record stop`"):
         recover(log.part, recovered_path(log.part))
     assert list(tmp_path.iterdir()) == [log.part]
-    log.abandon()  # as when it is killed
+    log.abandon()  # as if killed
     assert json.loads(lowfc("info", log.part, "--json").stdout)["state"] == "truncated"
     assert "it was cut off" in no_end([log.part], finished=False)
     assert recover(log.part, recovered_path(log.part)).recovered == recovered_path(log.part)
 
 
-def test_a_log_that_is_finished_while_it_is_read_was_not_cut_off(tmp_path: Path) -> None:
+def test_a_log_that_is_finished_while_it_is_read_is_not_called_truncated(tmp_path: Path) -> None:
     log = LogWriter(tmp_path / "20270101T000000Z.mcap", START_NS, {"lowfc": {"run": "night"}})
     log.finish({})
     assert "it was finished while it was read" in no_end([log.part], finished=False)
-    assert being_recorded(log.part), "for a summary of what had been read"
+    assert being_recorded(log.part), "a summary is of the file as it was read"
 
 
-def test_an_empty_log_is_a_log(tmp_path: Path) -> None:
+def test_an_empty_log_is_summarised(tmp_path: Path) -> None:
     path = LogWriter(tmp_path / "a.mcap", START_NS, {}).finish({"recording": {"stopped": "the disk is full"}})
     assert "recording stopped: the disk is full" in lowfc("info", path).stdout
     found = json.loads(lowfc("info", path, "--json").stdout)

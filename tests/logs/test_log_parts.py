@@ -27,15 +27,15 @@ TOML = [Attachment("config.toml", "application/toml", Configuration().to_toml().
 
 
 def recorded(folder: Path, samples: Sequence[Sample], files: int, *, finish: bool = True) -> list[Path]:
-    """What a recorder makes that begins the next file every so often, with the newest calibration and states."""
+    """Files of a recorder that starts new ones, each with the newest calibration and states at its beginning."""
     series = LogSeries(folder, HostClock(), METADATA, TOML, STANDARD)
-    kept: dict[str, Sample] = {}
+    states: dict[str, Sample] = {}
     for number in range(files):
-        series.begin(kept.values(), anew=not number)
+        series.begin(states.values(), anew=not number)
         for sample in samples[len(samples) * number // files : len(samples) * (number + 1) // files]:
             series.write(sample)
             if topic_of(sample.key).queryable:
-                kept[sample.key] = sample
+                states[sample.key] = sample
         if finish or number < files - 1:
             series.end({"messages": str(len(samples)), "messages_lost": "0"})
     if not finish:
@@ -60,7 +60,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_last_is_the_newest_log_with_all_its_files(folder: Path, samples: list[Sample]) -> None:
     (older,) = recorded(folder, samples[:20], 1)
-    newer = recorded(folder, samples[:60], 11)  # `-2` to `-12`: not in the order of the alphabet
+    newer = recorded(folder, samples[:60], 11)  # `-2` to `-12`: not in alphabetical order
     assert [older, *newer] != sorted([older, *newer])
     Path(folder, "notes.txt").touch()
     Path(folder, "zzz.mcap").touch()
@@ -76,7 +76,7 @@ def test_last_is_the_newest_log_with_all_its_files(folder: Path, samples: list[S
     assert in_order([Path(LAST)]) == [Path(LAST)]
 
 
-def test_where_there_is_no_log_it_is_said(folder: Path) -> None:
+def test_last_without_a_log_is_an_error(folder: Path) -> None:
     with pytest.raises(DataFileError, match=r"newest log in logs, which cannot be read: No such file.*FOLDER/last"):
         in_order([Path(LAST)])
     folder.mkdir()
@@ -93,8 +93,8 @@ def test_a_log_of_a_killed_recorder_is_the_last_until_it_is_recovered(folder: Pa
     assert in_order([Path(LAST)]) == [files[0], saved]
 
 
-def test_logs_that_do_not_say_where_they_belong_are_by_themselves(folder: Path) -> None:
-    """As those of 0.1."""
+def test_logs_without_the_name_of_their_series_are_separate(folder: Path) -> None:
+    """Logs of 0.1 have no such name."""
     logs = [LogWriter(folder / f"20260101T00000{n}Z.mcap", 0, METADATA).finish({}) for n in range(3)]
     assert one_by_one(logs) == [(log,) for log in logs]
     assert in_order([Path(LAST)]) == logs[-1:]
@@ -133,27 +133,27 @@ OF_FILES = {
 
 
 def without_files(figures: Any) -> Any:
-    """Figures but for those that are of files and of how long it took."""
+    """Figures without those that depend on the files or on the time taken."""
     if isinstance(figures, dict):
         return {key: without_files(value) for key, value in figures.items() if key not in OF_FILES}
     return figures
 
 
 @pytest.fixture(scope="module")
-def ten_and_one(tmp_path_factory: pytest.TempPathFactory, samples: list[Sample]) -> Path:
+def ten_files_and_one(tmp_path_factory: pytest.TempPathFactory, samples: list[Sample]) -> Path:
     folder = tmp_path_factory.mktemp("recorded")
     calibration_file.save(Night().calibration, folder / "other.fits")
-    recorded(folder / "logs", samples[:9], 1)  # there is an older one
+    recorded(folder / "logs", samples[:9], 1)  # an older log
     recorded(folder / "logs", samples, 10)
     recorded(folder / "one", samples, 1)
     return folder
 
 
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
-def test_every_command_reads_ten_files_as_it_reads_one(
-    ten_and_one: Path, monkeypatch: pytest.MonkeyPatch, words: list[str]
+def test_every_command_gives_the_same_figures_for_ten_files_as_for_one(
+    ten_files_and_one: Path, monkeypatch: pytest.MonkeyPatch, words: list[str]
 ) -> None:
-    monkeypatch.chdir(ten_and_one)
+    monkeypatch.chdir(ten_files_and_one)
     figures = []
     for log in (LAST, f"one/{LAST}"):
         done = lowfc(words[0], log, *words[1:], "--json")
@@ -162,8 +162,8 @@ def test_every_command_reads_ten_files_as_it_reads_one(
     assert figures[0] == figures[1]
 
 
-def test_acceptance_takes_several_files(folder: Path, samples: list[Sample]) -> None:
-    """Nothing was tested in this one, which it says of the log and not of a file."""
+def test_acceptance_reads_several_files(folder: Path, samples: list[Sample]) -> None:
+    """The log has no such test; the error is about the log and not about one of its files."""
     files = recorded(folder, samples, 3)
     for words in ([LAST], [str(path) for path in files]):
         done = lowfc("acceptance", "rejection", *words)
@@ -171,12 +171,12 @@ def test_acceptance_takes_several_files(folder: Path, samples: list[Sample]) -> 
         assert "contains no `lowfc acceptance rejection`" in str(done.exception)
 
 
-IN_TURN = [["info"], ["report"], ["export", "--to", "csv", "--force"], ["recover"]]
+ONE_BY_ONE = [["info"], ["report"], ["export", "--to", "csv", "--force"], ["recover"]]
 
 
 @pytest.mark.usefixtures("without_drawings")
-@pytest.mark.parametrize("words", IN_TURN, ids=lambda words: words[0])
-def test_several_logs_are_taken_in_turn(folder: Path, words: list[str]) -> None:
+@pytest.mark.parametrize("words", ONE_BY_ONE, ids=lambda words: words[0])
+def test_several_logs_are_processed_one_by_one(folder: Path, words: list[str]) -> None:
     (night := Night()).frames(3)
     first, second = (str(night.write(Path(f"{name}.mcap"))) for name in "ab")
     several = lowfc(*words, first, second)
@@ -189,12 +189,12 @@ def test_several_logs_are_taken_in_turn(folder: Path, words: list[str]) -> None:
         assert f"name one log, not 2 ({Path(first).name}, {Path(second).name})" in str(done.exception)
 
 
-@pytest.mark.parametrize("words", [*IN_TURN, ["replay"], ["what-if", "--set", "gain=1"]], ids=lambda words: words[0])
-def test_what_is_no_log_is_an_error(tmp_path: Path, words: list[str]) -> None:
+@pytest.mark.parametrize("words", [*ONE_BY_ONE, ["replay"], ["what-if", "--set", "gain=1"]], ids=lambda words: words[0])
+def test_a_file_that_is_not_a_log_is_an_error(tmp_path: Path, words: list[str]) -> None:
     (tmp_path / "text").write_text("this is not an MCAP file, by far")
-    for name, said in (("text", "is not an MCAP file"), ("gone", "cannot be read: No such file")):
+    for name, expected in (("text", "is not an MCAP file"), ("gone", "cannot be read: No such file")):
         done = lowfc(*words, tmp_path / name)
         assert isinstance(done.exception, DataFileError)
-        assert said in str(done.exception)
+        assert expected in str(done.exception)
         assert done.stdout == ""
     assert [path.name for path in tmp_path.iterdir()] == ["text"]

@@ -1,4 +1,4 @@
-"""Who may read a log: its owner, and others only as `recorder.file_mode` says."""
+"""Permissions of a log: its owner may read it, and others as `recorder.file_mode` allows."""
 
 import os
 from collections.abc import Iterator
@@ -34,12 +34,12 @@ def test_every_log_of_a_series_has_the_configured_mode(tmp_path: Path, umask: in
     for _ in range(2):
         series.begin([])
         (part,) = series.files[0].parent.glob("*.part")
-        assert mode_of(part) == (mode or 0o640) & ~umask, "0640 where nothing else is configured"
+        assert mode_of(part) == (mode or 0o640) & ~umask, "0640 by default"
         series.end({})
     assert [mode_of(path) for path in series.files] == [(mode or 0o640) & ~umask] * 2
 
 
-def test_what_is_recovered_has_the_mode_of_its_source(tmp_path: Path) -> None:
+def test_a_recovered_log_has_the_mode_of_its_source(tmp_path: Path) -> None:
     source = small_log(tmp_path / "night.mcap", finished=False)
     for mode in (0o600, 0o640, 0o644):
         source.chmod(mode)
@@ -48,7 +48,7 @@ def test_what_is_recovered_has_the_mode_of_its_source(tmp_path: Path) -> None:
         assert mode_of(out) == mode
 
 
-def test_what_is_written_has_what_the_umask_leaves_and_at_most_its_source_s_mode(tmp_path: Path, umask: int) -> None:
+def test_a_written_file_obeys_the_umask_and_the_mode_of_its_source(tmp_path: Path, umask: int) -> None:
     source = small_log(tmp_path / "night.mcap", finished=True)
     source.chmod(0o640)
     write_whole(tmp_path / "plot.png", b"")
@@ -57,11 +57,11 @@ def test_what_is_written_has_what_the_umask_leaves_and_at_most_its_source_s_mode
     assert mode_of(tmp_path / "night.html") == 0o640 & ~umask
 
 
-def test_the_recorder_is_given_the_key() -> None:
+def test_the_recorder_uses_the_configured_mode() -> None:
     assert log_limits(load(None, {"recorder.file_mode": "0604"})).file_mode == 0o604
 
 
 @pytest.mark.parametrize("mode", ["0666 ", "640", "0o640", "0440", "0641", "0x20", "", 416])
-def test_what_is_no_mode_is_refused(mode: object) -> None:
+def test_an_invalid_mode_is_refused(mode: object) -> None:
     with pytest.raises(ConfigurationError, match=r"recorder\.file_mode = "):
         load(None, {"recorder.file_mode": mode})

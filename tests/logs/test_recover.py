@@ -1,4 +1,4 @@
-"""`lowfc recover`: what is whole of a damaged log is a log again, for every reader there is."""
+"""`lowfc recover`: the intact part of a damaged log becomes a complete log for every reader."""
 
 import json
 from collections import Counter
@@ -15,17 +15,17 @@ from tests.support.loops import lowfc
 from tests.support.mutated_logs import ATTACHMENTS, identity, mutations, small_log, small_samples
 from tests.support.other_readers import foxglove, rerun
 
-RECOVERED = 120  # of the mutations
+MUTATIONS = 120  # of complete and of unfinished logs together
 
 
 @pytest.fixture(scope="module")
 def recovered(tmp_path_factory: pytest.TempPathFactory) -> dict[Path, Counter[str]]:
-    """Logs recovered from damaged ones, and how many messages of each topic could be read of those."""
+    """Recovered logs, and the number of readable messages of each topic in the damaged ones."""
     folder = tmp_path_factory.mktemp("recovered")
     found = {}
     for finished in (True, False):
         data = small_log(folder / f"whole-{finished}.mcap", finished=finished).read_bytes()
-        for number, kind, changed in mutations(data, range(RECOVERED // 2)):
+        for number, kind, changed in mutations(data, range(MUTATIONS // 2)):
             source = folder / f"{finished}-{number}-{kind}.mcap"
             source.write_bytes(changed)
             reader = LogReader(source, skip_damaged=True)
@@ -39,11 +39,11 @@ def recovered(tmp_path_factory: pytest.TempPathFactory) -> dict[Path, Counter[st
             assert source.read_bytes() == changed
             assert (done.messages, done.damage) == (counts.total(), reader.damage)
             found[recovered_path(source)] = counts
-    assert len(found) > 0.9 * RECOVERED
+    assert len(found) > 0.9 * MUTATIONS
     return found
 
 
-def test_recovered_logs_are_whole(recovered: dict[Path, Counter[str]]) -> None:
+def test_recovered_logs_are_complete(recovered: dict[Path, Counter[str]]) -> None:
     for path, counts in recovered.items():
         reader = LogReader(path)
         assert Counter("/" + message.key for message in reader) == counts
@@ -58,13 +58,13 @@ def test_recovered_logs_are_whole(recovered: dict[Path, Counter[str]]) -> None:
 
 
 @pytest.mark.node
-def test_recovered_logs_are_whole_for_the_reader_of_foxglove(recovered: dict[Path, Counter[str]]) -> None:
+def test_foxglove_reads_recovered_logs_completely(recovered: dict[Path, Counter[str]]) -> None:
     found = foxglove(recovered)
     assert [(one["counts"], one["counted"]) for one in found] == [(c, c.total()) for c in recovered.values()]
     assert all("recovery" in one["metadata"] for one in found)
 
 
-def test_recovered_logs_are_whole_for_rerun(recovered: dict[Path, Counter[str]]) -> None:
+def test_rerun_reads_recovered_logs_completely(recovered: dict[Path, Counter[str]]) -> None:
     for path, counts in [one for one in recovered.items() if one[1]][::4]:
         checked = rerun("check", path)
         lines = [line.split() for line in rerun("info", path).splitlines()]
@@ -78,7 +78,7 @@ def test_recovered_logs_are_whole_for_rerun(recovered: dict[Path, Counter[str]])
         assert all(topic in checked for topic in counts)
 
 
-def test_an_unfinished_log_is_finished(tmp_path: Path) -> None:
+def test_an_unfinished_log_is_completed(tmp_path: Path) -> None:
     part = small_log(tmp_path / "night.mcap", finished=False)
     before = part.read_bytes()
     done = lowfc("recover", part, "--json")
@@ -100,14 +100,14 @@ def test_an_unfinished_log_is_finished(tmp_path: Path) -> None:
     assert copy.described[:-1] == old.described
     assert copy.attachments == {attachment.name: attachment.data for attachment in ATTACHMENTS}
     assert copy.metadata.keys() == {"lowfc", "recovery"}
-    for reader in (old, copy):  # but for the numbers that files give them
+    for reader in (old, copy):  # except for the numbers, which each file assigns
         for channel in reader.channels.values():
             channel.schema_id = reader.schemas[channel.schema_id].data
             channel.id = 0
     assert copy.channels == old.channels
 
 
-def test_what_is_left_out_is_said(tmp_path: Path) -> None:
+def test_parts_left_out_are_reported(tmp_path: Path) -> None:
     path = small_log(tmp_path / "night.mcap")
     data = bytearray(path.read_bytes())
     middle = len(data) // 2
@@ -132,28 +132,28 @@ def test_what_is_left_out_is_said(tmp_path: Path) -> None:
     assert damage[0]["position"] < middle < damage[0]["position"] + damage[0]["length"]
 
 
-def test_a_whole_log_is_left_alone(tmp_path: Path) -> None:
+def test_an_intact_log_is_not_recovered(tmp_path: Path) -> None:
     path = small_log(tmp_path / "night.mcap")
     done = lowfc("recover", path)
     assert (done.exit_code, done.stdout) == (0, f"{path} is whole; there is nothing to recover\n")
     assert json.loads(lowfc("recover", path, "--json").stdout)["recovered"] is None
     assert [path.name for path in tmp_path.iterdir()] == ["night.mcap"]
-    part = path.rename(tmp_path / "night.mcap.part")  # its recorder died between its last write and this
+    part = path.rename(tmp_path / "night.mcap.part")  # its recorder died before renaming it
     assert lowfc("recover", part).stdout == f"{part} is whole; only rename it to night.mcap\n"
 
 
-def test_nothing_is_overwritten(tmp_path: Path) -> None:
+def test_an_existing_file_is_not_overwritten(tmp_path: Path) -> None:
     part = small_log(tmp_path / "night.mcap", finished=False)
-    taken = recovered_path(part)
-    taken.write_text("mine")
-    for out in (taken, part):
+    existing = recovered_path(part)
+    existing.write_text("mine")
+    for out in (existing, part):
         with pytest.raises(DataFileError, match="never overwritten"):
             recover(part, out)
-    assert taken.read_text() == "mine"
+    assert existing.read_text() == "mine"
 
 
 @pytest.mark.parametrize("fault", [KeyboardInterrupt(), OSError(28, "No space left on device")])
-def test_what_fails_half_way_leaves_nothing(
+def test_a_failed_recovery_leaves_no_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: BaseException
 ) -> None:
     part = small_log(tmp_path / "night.mcap", finished=False)
@@ -161,7 +161,7 @@ def test_what_fails_half_way_leaves_nothing(
     def fail(*_: object) -> None:
         raise fault
 
-    monkeypatch.setattr(recovery, "account", fail)  # all messages are written by then
+    monkeypatch.setattr(recovery, "account", fail)  # after all messages are written
     with pytest.raises((KeyboardInterrupt, DataFileError)) as caught:
         recover(part, tmp_path / "new.mcap")
     assert isinstance(caught.value, KeyboardInterrupt) or "cannot be written: No space left" in str(caught.value)

@@ -1,4 +1,4 @@
-"""Replay finds what is the same, says what is not, and counts what it cannot know."""
+"""Replay confirms identical results, reports differences, and counts the steps that it cannot check."""
 
 from collections import Counter
 from itertools import pairwise
@@ -61,18 +61,18 @@ EXAMPLES = 40
 
 
 class Night:
-    """A log as the controller's process and its neighbours make it, from a list of inputs."""
+    """Log of a controller and its peers, made from a list of inputs."""
 
-    def __init__(self, what: Settings) -> None:
+    def __init__(self, loop_settings: Settings) -> None:
         self.messages: list[Sample] = []
-        self.what = what
+        self.loop_settings = loop_settings
         self.start_s = START_S
         self.now_ns = START_S * 10**9
         self._counts: dict[tuple[str, int], int] = {}
         self._start()
 
     def restart(self) -> None:
-        """The controller dies and comes back."""
+        """The controller dies and restarts."""
         self.start_s += 1
         self._start()
 
@@ -81,12 +81,12 @@ class Night:
         if isinstance(taken, Frame):
             self._frame(taken)
         if isinstance(taken, Request):
-            taken = prepared(self.what, taken)
+            taken = prepared(self.loop_settings, taken)
             if taken.law is not None:
                 self._put(LAW, wire_law(taken.law, taken.time_ns).SerializeToString())
             if taken.played is not None:
                 self._put(PLAY, wire_play(taken.played, taken.time_ns).SerializeToString())
-        self.state, outputs = advance(self.what, self.state, taken)
+        self.state, outputs = advance(self.loop_settings, self.state, taken)
         number = self.state.input_number
         if outputs.command is not None:
             self._put(COMMAND, codec.encode_command(outputs.command, 200, "lowfc", number), "dm")
@@ -94,24 +94,24 @@ class Night:
             self._put(STEP, codec.encode_step(outputs.step, number))
         if isinstance(taken, Request):
             assert outputs.reply is not None
-            shown = controller_state(self.state, self.what, taken.time_ns) if taken.name == "status" else None
+            shown = controller_state(self.state, self.loop_settings, taken.time_ns) if taken.name == "status" else None
             self._put(REQUEST, codec.encode_request(taken, outputs.reply, number, shown))
-        elif not isinstance(taken, Frame) and number > self._told:
+        elif not isinstance(taken, Frame) and number > self._last_number:
             self._put(CONTROL_INPUT, codec.encode_input(taken, number))
-        self._told = number
+        self._last_number = number
         if outputs.changed or number % STATE_EVERY == 0:
-            self._say_state()
+            self._put_state()
 
     def steps(self) -> int:
         return sum(message.key == STEP.key for message in self.messages)
 
     def _start(self) -> None:
-        self.state, self._told = State(), 0
+        self.state, self._last_number = State(), 0
         self._put(CALIBRATION, encode_calibration(happenings.CALIBRATION, self.now_ns))
         self.take(Load(self.now_ns, happenings.CALIBRATION, "a test"))
 
-    def _say_state(self) -> None:
-        message = controller_state(self.state, self.what, self.now_ns)
+    def _put_state(self) -> None:
+        message = controller_state(self.state, self.loop_settings, self.now_ns)
         self._put(CONTROLLER_STATE, message.SerializeToString())
 
     def _frame(self, taken: Frame) -> None:
@@ -137,7 +137,7 @@ def night(taken: list[Input], **changes: object) -> Night:
 
 
 @pytest.mark.skipif(not compiled.available(), reason="needs the extra `fast`")
-def test_a_log_of_the_fused_step_is_replayed_by_it_to_the_bit_and_by_numpy_with_a_difference() -> None:
+def test_a_log_of_the_fused_kernel_is_replayed_bit_by_bit_with_it_and_with_a_difference_by_numpy() -> None:
     channel = Request(0, "channel", text="dark-hole", actuators_nm=np.full(20, 3, np.float32))
     law = Request(0, "law", law=integrator([0.3] * 3, [0.0] * 3, NOLL, 2.5, 1000.0))
     taken = [*frames(60, 1), channel, *frames(100, 61), law, *frames(400, 161)]
@@ -152,8 +152,8 @@ def test_a_log_of_the_fused_step_is_replayed_by_it_to_the_bit_and_by_numpy_with_
     assert (tolerant.frames, tolerant.different, tolerant.identical) == (560, 0, False)
 
 
-def of_another_camera(taken: list[Input]) -> list[Input]:
-    """The same after a restart of the camera, so that no two frames segment sequence and time."""
+def after_camera_restart(taken: list[Input]) -> list[Input]:
+    """The same inputs after a restart of the camera, so that no two frames share sequence and time."""
     return [
         one._replace(sequence=one.sequence + (1 << 32), time_ns=one.time_ns + 10**9) if isinstance(one, Frame) else one
         for one in taken
@@ -167,36 +167,36 @@ def frames(count: int, first: int = 0) -> list[Input]:
 
 @effort(deadline=None, max_examples=EXAMPLES)
 @given(*[inputs()] * 2, *map(st.sampled_from, (["hold", "flat"], [1.0, 2.5], ["numpy", "fused"])))
-def test_whatever_happens_is_replayed_to_the_bit(
+def test_any_sequence_of_inputs_is_replayed_bit_by_bit(
     before: list[Input], after: list[Input], silence: str, delay_frames: float, kernel: str
 ) -> None:
     made = night(before, on_frame_timeout=silence, delay_frames=delay_frames, kernel=compiled.kernel(kernel))
     made.restart()
-    for one in of_another_camera(after):
+    for one in after_camera_restart(after):
         made.take(one)
     account, sent = replay(made.messages), Counter(message.key for message in made.messages)
     assert (account.different, account.largest_difference_nm, account.unchecked_because) == (0, 0.0, {})
     assert account.frames == sent[STEP.key]
     assert account.commands == sent[COMMAND.at("dm")]
     assert account.requests == sent[REQUEST.key]
-    assert account.states == sent[CONTROLLER_STATE.key] - 2  # each start is begun from one
+    assert account.states == sent[CONTROLLER_STATE.key] - 2  # each start of the controller is replayed from one
 
 
-def test_a_law_that_is_overruled_is_replayed_to_the_bit_also_from_the_middle_of_it() -> None:
+def test_an_overruled_law_is_replayed_bit_by_bit_even_from_the_middle() -> None:
     made = night([], guard=True, rate_hz=1000.0, limit_nm=(150.0, 150.0))
     made.take(Request(made.now_ns, "law", law=integrator((0.05,) * len(NOLL), (0.0,) * len(NOLL), NOLL, 1.0, 1000.0)))
     for count in range(860):
         wave_nm = 20 * np.sin(0.04 * count + np.arange(len(NOLL)))
         made.take(frame(count, wave_nm + made.state.drive.history_nm[0]))
-    told = [message for message in made.messages if message.key == STEP.key]
-    overruled = [Limit.LAW_OVERRULED in wire.ControlStep.FromString(message.payload).reasons for message in told]
+    steps = [message for message in made.messages if message.key == STEP.key]
+    overruled = [Limit.LAW_OVERRULED in wire.ControlStep.FromString(message.payload).reasons for message in steps]
     assert overruled == [False] * 598 + [True] * 262
     account = replay(made.messages)
     assert account.identical
     for first in (300, 640, 800):
-        cut = [message for message in made.messages if message.key in (CALIBRATION.key, LAW.key)]
-        cut += [message for message in made.messages if message.receive_time_ns >= told[first].receive_time_ns]
-        account = replay(cut)
+        truncated = [message for message in made.messages if message.key in (CALIBRATION.key, LAW.key)]
+        truncated += [message for message in made.messages if message.receive_time_ns >= steps[first].receive_time_ns]
+        account = replay(truncated)
         assert account.identical
         assert account.frames >= 860 - first - 2 * STATE_EVERY
 
@@ -206,7 +206,7 @@ def test_a_law_that_is_overruled_is_replayed_to_the_bit_also_from_the_middle_of_
 def test_lost_messages_are_never_a_difference_and_every_step_is_accounted_for(
     taken: list[Input], random: st.DataObject, losses: int
 ) -> None:
-    made = night([*frames(30, 9000), *of_another_camera([*taken, *frames(30, 5000)])])
+    made = night([*frames(30, 9000), *after_camera_restart([*taken, *frames(30, 5000)])])
     kept = list(made.messages)
     for _ in range(losses):
         kept.pop(random.randrange(len(kept)))  # type: ignore[attr-defined]
@@ -239,31 +239,31 @@ def test_the_order_between_publishers_does_not_matter(taken: list[Input], random
     st.booleans(),
     st.sampled_from([1, 30, 300]),
 )
-def test_shares_are_together_what_the_whole_is(
+def test_segments_together_give_the_account_of_the_whole_log(
     before: list[Input],
     after: list[Input],
-    cuts: list[float],
-    holes: list[tuple[float, int]],
+    edge_fractions: list[float],
+    gaps: list[tuple[float, int]],
     only_states: bool,
-    slower: int,
+    slowdown: int,
 ) -> None:
-    """Whatever is lost, a message or a second of them or of the states, and however slowly the night went by."""
+    """With single messages or seconds of messages or states missing, at different message rates."""
     made = night([*before, *frames(60, 9000)])
     made.restart()
-    for one in of_another_camera([*after, *frames(60, 9000)]):
+    for one in after_camera_restart([*after, *frames(60, 9000)]):
         made.take(one)
     begun_ns = made.messages[0].receive_time_ns
     messages = [
-        message._replace(receive_time_ns=begun_ns + slower * (message.receive_time_ns - begun_ns))
+        message._replace(receive_time_ns=begun_ns + slowdown * (message.receive_time_ns - begun_ns))
         for message in made.messages
     ]
-    for place, count in holes:
+    for place, count in gaps:
         first = int(place * (len(messages) - 1))
         states = [index for index, message in enumerate(messages) if message.key == CONTROLLER_STATE.key]
         gone = [index for index in (states if only_states else range(len(messages))) if index >= first][:count]
         messages = [message for index, message in enumerate(messages) if index not in gone]
     span_ns = messages[-1].receive_time_ns - messages[0].receive_time_ns if messages else 0
-    edges = sorted({begun_ns + 1 + int(cut * span_ns) for cut in cuts})
+    edges = sorted({begun_ns + 1 + int(cut * span_ns) for cut in edge_fractions})
     whole = replay(messages)
     parts = [replay(messages, segment=Segment(begin, end)) for begin, end in pairwise([0, *edges, 1 << 63])]
     steps = sum(message.key == STEP.key for message in messages)
@@ -273,11 +273,11 @@ def test_shares_are_together_what_the_whole_is(
         assert sum(getattr(part, count) for part in parts) == getattr(whole, count), count
     unchecked = sum(part.unchecked for part in parts)
     assert unchecked >= whole.unchecked  # where states are missing, two segments may count the same step
-    if not holes:
+    if not gaps:
         assert unchecked == 0
 
 
-def test_after_a_hole_it_goes_on_at_the_next_state_and_says_what_it_could_not_check() -> None:
+def test_after_a_gap_the_replay_continues_at_the_next_state_and_reports_unchecked_steps() -> None:
     made = night(frames(100))
     steps = [index for index, message in enumerate(made.messages) if message.key == STEP.key]
     account = replay([*made.messages[: steps[30]], *made.messages[steps[40] :]])
@@ -293,7 +293,7 @@ def test_after_a_hole_it_goes_on_at_the_next_state_and_says_what_it_could_not_ch
 
 
 def test_a_recording_that_begins_in_the_middle_of_a_run_lacks_no_input() -> None:
-    """A recorder that starts is answered with the newest state; the inputs after it were before the recording."""
+    """A recorder that starts receives the newest state; the inputs since then are from before the recording."""
     made = night(frames(100)).messages
     head = [message for message in made if message.key == CALIBRATION.key]
     later = made[len(made) // 2 :]
@@ -305,7 +305,7 @@ def test_a_recording_that_begins_in_the_middle_of_a_run_lacks_no_input() -> None
 
 
 def tampered(made: Night, topic: Topic, number: int, how: str) -> Account:
-    """Change one message a little, and replay."""
+    """Change one message slightly, and replay."""
     messages = list(made.messages)
     places = [index for index, message in enumerate(messages) if topic.matches(message.key)]
     index = places[number]
@@ -321,7 +321,7 @@ def tampered(made: Night, topic: Topic, number: int, how: str) -> Account:
 
 
 @pytest.mark.parametrize(
-    ("topic", "how", "said"),
+    ("topic", "how", "expected"),
     [
         (COMMAND, "actuators", "actuators: [7] log"),
         (STEP, "body.error_nm[1] += 1e-6", "error_nm: [1] log"),
@@ -335,11 +335,11 @@ def tampered(made: Night, topic: Topic, number: int, how: str) -> Account:
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_the_smallest_difference_is_found_and_named(topic: Topic, how: str, said: str) -> None:
+def test_the_smallest_difference_is_found_and_reported(topic: Topic, how: str, expected: str) -> None:
     account = tampered(night(frames(60)), topic, 2, how)
     assert not account.identical
     assert account.first_difference.message == topic.message.DESCRIPTOR.name
-    assert any(line.startswith(said) for line in account.first_difference.fields), account.first_difference.fields
+    assert any(line.startswith(expected) for line in account.first_difference.fields), account.first_difference.fields
     if how == "actuators":
         assert 0 < account.largest_difference_nm < 1e-5
         assert (account.different, account.first_difference.taken, account.first_difference.frame_sequence & 0xFF) == (
@@ -368,7 +368,7 @@ def test_commands_that_are_not_in_the_log_are_counted() -> None:
     assert not none.identical
 
 
-def test_a_log_from_before_inputs_were_numbered_is_refused() -> None:
+def test_a_log_without_input_numbers_is_refused() -> None:
     made = night(frames(3))
     with pytest.raises(DataFileError, match="the steps in this log are not numbered"):
         tampered(made, STEP, 0, "body.input_number = 0")
@@ -376,13 +376,13 @@ def test_a_log_from_before_inputs_were_numbered_is_refused() -> None:
     assert replay(made.messages).identical
 
 
-def test_nothing_to_check_is_not_identical() -> None:
+def test_a_log_with_nothing_to_check_is_not_identical() -> None:
     assert not replay([]).identical
     made = night(frames(5))
     assert not replay([message for message in made.messages if message.key != CALIBRATION.key]).identical
 
 
-def test_frames_are_kept_within_a_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_are_kept_within_a_limit_of_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(frames_of_log, "FRAMES_BYTES", 1000)
     kept = Frames()
     pixels = np.arange(100, dtype=np.uint16).reshape(10, 10)
@@ -403,7 +403,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made.write(tmp_path_factory.mktemp("night") / "night.mcap")
 
 
-def test_several_processes_find_what_one_finds(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_several_processes_give_the_account_of_one(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(workers, "_WORTH_BYTES", 1)
     one, two = (workers.replay_files([log], 0.0, jobs, lambda done: None) for jobs in (1, 2))
     assert one.identical
@@ -411,26 +411,26 @@ def test_several_processes_find_what_one_finds(log: Path, monkeypatch: pytest.Mo
     assert one == two
 
 
-def test_a_log_with_a_hole_is_replayed_but_for_the_hole(log: Path, tmp_path: Path) -> None:
-    hole = bytearray(log.read_bytes())
+def test_a_damaged_log_is_replayed_except_for_the_damage(log: Path, tmp_path: Path) -> None:
+    damaged = bytearray(log.read_bytes())
     with log.open("rb") as stream:
         summary = make_reader(stream).get_summary()
     assert summary is not None
     chunk = summary.chunk_indexes[len(summary.chunk_indexes) // 2]
-    hole[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 0x40
-    (tmp_path / "hole.mcap").write_bytes(hole)
-    found = workers.replay_files([tmp_path / "hole.mcap"], 0.0, 1, lambda done: None)
-    there = len(list(LogReader(tmp_path / "hole.mcap", topics=[STEP], skip_damaged=True)))
+    damaged[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 0x40
+    (tmp_path / "damaged.mcap").write_bytes(damaged)
+    found = workers.replay_files([tmp_path / "damaged.mcap"], 0.0, 1, lambda done: None)
+    steps = len(list(LogReader(tmp_path / "damaged.mcap", topics=[STEP], skip_damaged=True)))
     assert found.identical
     assert len(found.damaged) == 1
-    assert found.frames + found.unchecked == there < STEPS
-    assert found.inputs_missing == STEPS - there
-    text = lowfc("replay", tmp_path / "hole.mcap").stdout
+    assert found.frames + found.unchecked == steps < STEPS
+    assert found.inputs_missing == STEPS - steps
+    text = lowfc("replay", tmp_path / "damaged.mcap").stdout
     assert "unchecked" in text
     assert "damaged" in text
 
 
-def test_a_forged_command_and_another_host_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_forged_command_and_another_host_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = report_log.Night()
     made.frames(STEPS)
     place = [index for index, sample in enumerate(made.samples) if COMMAND.matches(sample.key)][700]

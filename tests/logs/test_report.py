@@ -37,7 +37,7 @@ def figures(log: Path) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def eventful(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """Opened, closed, frames lost and dark, gains changed, controller and camera restarted."""
+    """A log with the loop open and closed, frames lost and dark, gains changed, controller and camera restarted."""
     night = Night()
     night.request("open")
     night.frames(300)
@@ -57,7 +57,7 @@ def eventful(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return figures(night.write(tmp_path_factory.mktemp("eventful") / "night.mcap"))
 
 
-def test_the_loop_s_course_is_told(eventful: dict[str, Any]) -> None:
+def test_modes_laws_and_requests_are_listed(eventful: dict[str, Any]) -> None:
     assert eventful["mode_steps"] == {"open": 300, "closed": 1944}
     assert [span["mode"] for span in eventful["mode_spans"]] == ["open", "closed"]
     assert eventful["mode_spans"][1]["from_s"] == pytest.approx(0.3)
@@ -100,7 +100,7 @@ def test_latencies_are_those_of_the_messages(eventful: dict[str, Any]) -> None:
     assert eventful["timing"]["interval_us"]["commands"]["max"] == pytest.approx(6006)  # five frames lost in a row
 
 
-def test_the_longest_stretch_under_one_law_is_taken(eventful: dict[str, Any]) -> None:
+def test_the_longest_stretch_under_one_law_is_analysed(eventful: dict[str, Any]) -> None:
     stretch = eventful["closed_stretch"]
     assert stretch["gain"] == [0.4, 0.4, 0.2]
     assert stretch["steps_settling"] == 25
@@ -110,7 +110,7 @@ def test_the_longest_stretch_under_one_law_is_taken(eventful: dict[str, Any]) ->
     assert stretch["frames"] == 1475 - 5
 
 
-def test_the_budget_is_what_the_toy_is_made_of(eventful: dict[str, Any]) -> None:
+def test_the_error_budget_agrees_with_the_toy(eventful: dict[str, Any]) -> None:
     made = Night().calibration
     noise = sensor_noise(
         made.reconstructor.astype(float), made.reference.astype(float), made.flux_dn, np.hypot(READ_NOISE_E, 12**-0.5)
@@ -130,7 +130,7 @@ def test_the_budget_is_what_the_toy_is_made_of(eventful: dict[str, Any]) -> None
     assert eventful["error_budget"]["sum_lacks"] == []
 
 
-def test_the_residual_is_before_and_after(eventful: dict[str, Any]) -> None:
+def test_the_residual_is_given_before_and_after_correction(eventful: dict[str, Any]) -> None:
     tip = eventful["residual"]["modes"][0]
     assert tip["name"] == "tilt x"
     assert tip["disturbance_rms_nm"] == pytest.approx(12 / np.sqrt(2), rel=0.05)
@@ -143,7 +143,7 @@ def test_the_residual_is_before_and_after(eventful: dict[str, Any]) -> None:
     assert tilt["per_axis"] == pytest.approx(np.sqrt((tilt["x"] ** 2 + tilt["y"] ** 2) / 2))
 
 
-def test_spectra_are_held_against_theory(eventful: dict[str, Any]) -> None:
+def test_spectra_are_compared_with_theory(eventful: dict[str, Any]) -> None:
     tip = eventful["spectra"]["groups"][0]
     assert tip["measured_over_theory"]["median"] == pytest.approx(1, abs=0.02)
     assert tip["true_over_theory"]["median"] == pytest.approx(1, abs=0.15)
@@ -165,7 +165,7 @@ def test_the_verdict_names_what_was_wrong(eventful: dict[str, Any]) -> None:
     assert "nm after over the open pupil;" in text
 
 
-def quiet(night: Night, number: int = 700) -> Night:
+def uneventful(night: Night, number: int = 700) -> Night:
     night.frames(number)
     night.health("camera", state="stopped")
     return night
@@ -173,7 +173,7 @@ def quiet(night: Night, number: int = 700) -> Night:
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return quiet(Night(), 1500).write(tmp_path_factory.mktemp("good") / "x.mcap")
+    return uneventful(Night(), 1500).write(tmp_path_factory.mktemp("good") / "x.mcap")
 
 
 def damaged(good: Path, folder: Path) -> Path:
@@ -195,7 +195,7 @@ def recovered(good: Path, folder: Path) -> Path:
 
 
 def stopped(good: Path, folder: Path) -> Path:
-    return quiet(Night()).write(folder / "x.mcap", stopped="the disk is full")
+    return uneventful(Night()).write(folder / "x.mcap", stopped="the disk is full")
 
 
 @pytest.mark.parametrize(
@@ -221,7 +221,7 @@ def test_the_state_of_the_log_is_in_the_verdict(
     assert made.figures["verdict"]["because"] == ("" if level == "good" else check["text"])
 
 
-def test_of_a_very_long_stretch_the_end_is_taken(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_the_end_of_a_very_long_stretch_is_analysed(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(closed_loop, "MOST_STEPS", 400)
     stretch = figures(good)["closed_stretch"]
     assert stretch["frames"] == 400
@@ -242,14 +242,14 @@ def test_a_log_without_a_step_still_has_a_page(tmp_path: Path, empty: bool) -> N
 
 @pytest.mark.usefixtures("without_drawings")
 def test_imperfections_of_the_simulated_world_are_named(tmp_path: Path) -> None:
-    night, unkind = quiet(Night()), {"disturbance.wheel_hz": 40.0, "camera.hot_pixels": 0.01}
-    made = report_of(read_run(night.write(tmp_path / "x.mcap", toml=load(None, unkind).to_toml())))
-    assert made.figures["run"]["imperfections"] == unkind
+    night, imperfect = uneventful(Night()), {"disturbance.wheel_hz": 40.0, "camera.hot_pixels": 0.01}
+    made = report_of(read_run(night.write(tmp_path / "x.mcap", toml=load(None, imperfect).to_toml())))
+    assert made.figures["run"]["imperfections"] == imperfect
     assert "simulated with disturbance.wheel_hz = 40.0, camera.hot_pixels = 0.01;" in page(made)
 
 
-def test_an_error_or_a_safed_loop_is_not_good(tmp_path: Path) -> None:
-    night = quiet(Night())
+def test_a_loop_in_safe_mode_is_not_a_good_run(tmp_path: Path) -> None:
+    night = uneventful(Night())
     night.request("safe")
     night.frames(50)
     found = figures(night.write(tmp_path / "x.mcap"))
@@ -258,8 +258,8 @@ def test_an_error_or_a_safed_loop_is_not_good(tmp_path: Path) -> None:
     assert [event["name"] for event in found["events"] if event["level"] == "error"] == ["SAFED"]
 
 
-def test_without_truth_its_terms_are_missing_and_not_zero(tmp_path: Path) -> None:
-    found = figures(quiet(Night(truth=False), 1500).write(tmp_path / "x.mcap"))
+def test_without_truth_the_terms_that_need_it_are_missing_and_not_zero(tmp_path: Path) -> None:
+    found = figures(uneventful(Night(truth=False), 1500).write(tmp_path / "x.mcap"))
     terms = {term["name"]: term for term in found["error_budget"]["terms"]}
     for name in ("cross-talk and aliasing", "nonlinearity"):
         assert terms[name]["missing"]
@@ -279,7 +279,7 @@ def test_without_truth_its_terms_are_missing_and_not_zero(tmp_path: Path) -> Non
 def test_a_log_of_an_open_loop_has_neither_spectra_nor_budget(tmp_path: Path) -> None:
     night = Night()
     night.request("open")
-    found = figures(quiet(night, 300).write(tmp_path / "x.mcap"))
+    found = figures(uneventful(night, 300).write(tmp_path / "x.mcap"))
     assert found["closed_stretch"] is None
     assert found["spectra"] == found["error_budget"] == {"why_not": "the loop was not closed in this log"}
     assert found["residual"]["total_rms_nm"]["open_error"] > 5
@@ -287,7 +287,7 @@ def test_a_log_of_an_open_loop_has_neither_spectra_nor_budget(tmp_path: Path) ->
     assert found["verdict"]["level"] == "unknown"
 
 
-def test_a_loop_without_a_calibration_left_no_residual(tmp_path: Path) -> None:
+def test_a_loop_without_a_calibration_has_no_residual(tmp_path: Path) -> None:
     night = Night()
     night.samples = [sample for sample in night.samples if sample.key != CALIBRATION.key]
     night._state = State()
@@ -309,7 +309,7 @@ def test_a_loop_closed_under_an_unknown_law_is_not_called_open(tmp_path: Path) -
     assert found["verdict"]["checks"][2]["text"] == why
 
 
-def test_a_closed_loop_without_a_good_frame_has_neither(tmp_path: Path) -> None:
+def test_a_closed_loop_without_a_good_frame_has_neither_spectra_nor_budget(tmp_path: Path) -> None:
     night = Night()
     night.frames(200, dark=range(200))
     found = figures(night.write(tmp_path / "x.mcap"))
@@ -317,7 +317,7 @@ def test_a_closed_loop_without_a_good_frame_has_neither(tmp_path: Path) -> None:
     assert "has 0 frames" in found["spectra"]["why_not"]
     assert {term["missing"] for term in found["error_budget"]["terms"]} == {True}
     assert found["light"]["refused"] == {"dark": 200}
-    assert found["verdict"]["checks"][2]["level"] == "look"  # truly the wavefront is as it was
+    assert found["verdict"]["checks"][2]["level"] == "look"  # the true wavefront is uncorrected
 
 
 @pytest.mark.parametrize(("lost", "without", "at_the_end"), [(1, 0, 1), (50, 0, 50), (80, 30, 50)])
@@ -331,7 +331,7 @@ def test_the_last_frames_may_have_their_command_after_the_log(
 
 
 def test_the_command_prints_one_object_or_writes_one_page(tmp_path: Path) -> None:
-    night = quiet(Night(), 3)
+    night = uneventful(Night(), 3)
     night.put(REQUEST, wire.Request(name="gain", values=[np.nan, np.inf, 0.5]))
     log = night.write(tmp_path / "night.mcap")
     printed = lowfc("report", str(log), "--json")
@@ -343,7 +343,7 @@ def test_the_command_prints_one_object_or_writes_one_page(tmp_path: Path) -> Non
     assert [term["missing"] for term in found["error_budget"]["terms"]] == [False, False, True, True, True]
     assert not log.with_name("night.html").exists()
 
-    out = tmp_path / "told.html"
+    out = tmp_path / "page.html"
     written = lowfc("report", str(log), "--out", str(out))
     assert written.exit_code == 0, written.output
     assert written.stdout.splitlines() == ["A good run", str(out)]
@@ -363,8 +363,8 @@ def test_the_command_prints_one_object_or_writes_one_page(tmp_path: Path) -> Non
 MARKUP = '<script>alert("x")</script>'
 
 
-def test_text_of_a_log_is_no_markup(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    night = quiet(Night(), 30)
+def test_text_of_a_log_is_escaped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    night = uneventful(Night(), 30)
     for name in (f"1 {MARKUP}", r"2 $\foo{$", "3 $x^2$"):
         night.put(REQUEST, wire.Request(name=name, reply=f"4 {MARKUP}", accepted=False))
     night.put(EVENT, Log(name=f"5 {MARKUP}", message=f"6{MARKUP} 7 {MARKUP}", level=3))
@@ -383,7 +383,7 @@ def test_text_of_a_log_is_no_markup(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize("module", ["jinja2", "matplotlib.figure"])
-def test_what_a_page_needs_is_missed_before_the_log_is_read(
+def test_missing_packages_are_reported_before_the_log_is_read(
     good: Path, monkeypatch: pytest.MonkeyPatch, module: str
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
@@ -398,7 +398,7 @@ def test_what_a_page_needs_is_missed_before_the_log_is_read(
 
 @pytest.mark.parametrize("name", ["night.mcap", "other.mcap.part", "link.html"])
 def test_a_report_never_overwrites_a_log(tmp_path: Path, name: str) -> None:
-    log = quiet(Night(), 3).write(tmp_path / "night.mcap")
+    log = uneventful(Night(), 3).write(tmp_path / "night.mcap")
     before = log.read_bytes()
     (tmp_path / "link.html").hardlink_to(log)
     done = lowfc("report", str(log), "--out", str(tmp_path / name))

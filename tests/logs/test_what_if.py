@@ -1,4 +1,4 @@
-"""What-ifs of logs: against runs with the gains in question, and the mistakes a user may make."""
+"""What-ifs of logs, compared with runs with the same gains, and errors in the options."""
 
 import json
 from dataclasses import replace
@@ -35,7 +35,7 @@ from tools.law_bench import calibrated
 
 RATE_HZ = 250
 Gains = tuple[float, float, float]
-"""Gain of tip and tilt and gain of the others, in parts of the highest stable one; leak of all."""
+"""Gain of tip and tilt and gain of the others, as fractions of the highest stable gain; leak of all modes."""
 
 HARD, SOFT, LEAKY = (0.45, 0.03, 0.0), (0.1, 0.35, 0.0), (0.5, 0.02, 0.03)
 
@@ -62,7 +62,7 @@ def settled_rms(values: np.ndarray) -> np.ndarray:
 
 
 def as_if(run: SimpleNamespace, config: Configuration) -> np.ndarray:
-    """Errors (frames, modes) that the run would have had under another configuration's law."""
+    """Errors (frames, modes) of the run under the law of another configuration."""
     settings = factory.settings(config)
     weights = delay_weights(settings.delay_frames).astype(np.float32)
     pol_nm = run.pol_nm.astype(np.float32)
@@ -76,7 +76,7 @@ BENCH = {"disturbance__preset": "bench", "disturbance__scale": 0.7}
 @pytest.mark.parametrize(
     ("frames", "pair", "delay", "within_nm", "overrides"),
     [
-        # Two runs of 1250 frames differ by 2.8 % rms by their noise alone; it is 10 % at most of 28 modes.
+        # Noise alone makes two runs of 1250 frames differ by 2.8 % rms, at most by 10 % in 28 modes.
         (1000, (SOFT, LEAKY), 2, 0.0, {}),
         *(
             pytest.param(4000, pair, delay, 0.0, overrides, marks=pytest.mark.slow)
@@ -84,19 +84,19 @@ BENCH = {"disturbance__preset": "bench", "disturbance__scale": 0.7}
             for delay in (1, 1.4, 2, 3)
             for overrides in ({}, BENCH)
         ),
-        # Without noise tilt near 5 mas looks like a tenth of a nanometre of other modes, which is all some then have.
+        # Without noise, tilt near 5 mas appears as 0.1 nm of other modes, which is all that some of them have.
         *(
             pytest.param(2000, pair, 1, 0.1, {"camera__noise": False}, marks=pytest.mark.slow)
             for pair in ((HARD, SOFT), (SOFT, LEAKY))
         ),
     ],
 )
-def test_in_the_linear_range_it_agrees_with_a_run_with_those_gains(
+def test_in_the_linear_range_a_what_if_agrees_with_a_run_with_those_gains(
     frames: int, pair: tuple[Gains, Gains], delay: float, within_nm: float, overrides: dict[str, Any]
 ) -> None:
-    """Both ways between two laws: each mode within 10 % of the simulated run, and the law itself to the rounding."""
+    """In both directions between two laws, each mode is within 10 % of the simulated run; its own law to rounding."""
     configs = [configured(gains, delay, **overrides) for gains in pair]
-    calibration = calibrated(configs[0])  # which knows no gains
+    calibration = calibrated(configs[0])  # independent of the gains
     runs = [fold(config, frames, calibration) for config in configs]
     for run, config in zip(runs, configs, strict=True):
         tilt_mas = settled_rms(run.disturbance_nm)[:2] / tilt_nm_per_mas(config.star.diameter_m)
@@ -105,7 +105,7 @@ def test_in_the_linear_range_it_agrees_with_a_run_with_those_gains(
     for run, other, config in ((runs[0], runs[1], configs[1]), (runs[1], runs[0], configs[0])):
         expected = settled_rms(other.error_nm)
         np.testing.assert_allclose(settled_rms(as_if(run, config)), expected, rtol=0.1, atol=within_nm)
-        # and not because the two runs were alike
+        # The two runs differ.
         assert np.abs(settled_rms(run.error_nm) / expected - 1).max() > 0.08
 
 
@@ -116,11 +116,11 @@ OTHER = "gain=0.3,tilt_gain=0.2,leak=0.01"
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, LoggedRun]:
-    """A closed loop, and one with other gains and a wrong idea of the delay."""
+    """A closed loop, and one with other gains whose controller has a wrong delay."""
     folder, made = tmp_path_factory.mktemp("logs"), {}
     other = {"gain": (0.2, 0.3), "leak": (0.01, 0.01), "delay_frames": 2.0}
-    toml = load(None, {"sensor.modes": 10}).to_toml()  # of 10 modes no contrast is computed, which takes its time
-    for name, changes in (("usual", {}), ("other", other)):
+    toml = load(None, {"sensor.modes": 10}).to_toml()  # with 10 modes no contrast is computed, which is slow
+    for name, changes in (("default", {}), ("other", other)):
         night = Night(**changes)
         night.frames(FRAMES)
         made[name] = LoggedRun(read_history(LogReader(night.write(folder / f"{name}.mcap", toml=toml))))
@@ -137,8 +137,8 @@ def column(figures: dict[str, Any], name: str) -> np.ndarray:
     return np.array([mode[f"{name}_nm"] for mode in figures["modes"]])
 
 
-def test_the_gains_that_were_used_give_the_logged_run(runs: dict[str, LoggedRun]) -> None:
-    figures = figures_of(runs["usual"])
+def test_the_logged_gains_reproduce_the_logged_run(runs: dict[str, LoggedRun]) -> None:
+    figures = figures_of(runs["default"])
     np.testing.assert_allclose(column(figures, "what_if"), column(figures, "was"), atol=1e-5)
     for kind in ("true", "continuous"):
         np.testing.assert_allclose(column(figures, f"{kind}_what_if"), column(figures, f"{kind}_was"), atol=1e-5)
@@ -148,7 +148,7 @@ def test_the_gains_that_were_used_give_the_logged_run(runs: dict[str, LoggedRun]
     assert figures["warnings"] == []
 
 
-def test_contrast_is_told_of_every_coronagraph() -> None:
+def test_added_contrast_of_shaped_pupil_and_lyot_coronagraph() -> None:
     """A tenth of a nm of spherical in one run, none in the other."""
     spherical = np.diag(0.01 * np.eye(14)[9])
 
@@ -170,33 +170,33 @@ def test_contrast_is_told_of_every_coronagraph() -> None:
     assert behind_lyot["what if"] > 0
 
 
-def test_a_log_says_what_other_gains_give(runs: dict[str, LoggedRun]) -> None:
-    """Measured residual with measured residual, mode by mode, of two runs."""
-    guess, run = figures_of(runs["usual"], requested(OTHER)), figures_of(runs["other"])
-    np.testing.assert_allclose(column(guess, "what_if"), column(run, "was"), rtol=0.1)
-    np.testing.assert_allclose(column(guess, "open"), column(run, "open"), rtol=0.1)
-    assert np.abs(column(guess, "was") / column(run, "was") - 1).max() > 0.1
-    assert guess["what_if_nm"] == pytest.approx(run["was_nm"], rel=0.05)
-    assert guess["true_what_if_nm"] == pytest.approx(run["true_was_nm"], rel=0.05)
-    assert guess["tilt_what_if_mas"] == pytest.approx(run["tilt_was_mas"], rel=0.05)
-    tilt_nm = np.sqrt(np.mean(column(guess, "was")[:2] ** 2))
-    assert guess["tilt_was_mas"] == pytest.approx(tilt_nm / tilt_nm_per_mas(2.0), rel=1e-6)
-    laws = {key: guess["modes"][2][key] for key in ("name", "gain_was", "gain", "leak_was", "leak")}
+def test_a_what_if_predicts_the_residual_of_a_run_with_other_gains(runs: dict[str, LoggedRun]) -> None:
+    """Measured residuals of two runs are compared mode by mode."""
+    predicted, run = figures_of(runs["default"], requested(OTHER)), figures_of(runs["other"])
+    np.testing.assert_allclose(column(predicted, "what_if"), column(run, "was"), rtol=0.1)
+    np.testing.assert_allclose(column(predicted, "open"), column(run, "open"), rtol=0.1)
+    assert np.abs(column(predicted, "was") / column(run, "was") - 1).max() > 0.1
+    assert predicted["what_if_nm"] == pytest.approx(run["was_nm"], rel=0.05)
+    assert predicted["true_what_if_nm"] == pytest.approx(run["true_was_nm"], rel=0.05)
+    assert predicted["tilt_what_if_mas"] == pytest.approx(run["tilt_was_mas"], rel=0.05)
+    tilt_nm = np.sqrt(np.mean(column(predicted, "was")[:2] ** 2))
+    assert predicted["tilt_was_mas"] == pytest.approx(tilt_nm / tilt_nm_per_mas(2.0), rel=1e-6)
+    laws = {key: predicted["modes"][2][key] for key in ("name", "gain_was", "gain", "leak_was", "leak")}
     assert laws == {"name": "focus", "gain_was": 0.2, "gain": 0.3, "leak_was": 0.0, "leak": 0.01}
 
 
-def test_a_wrong_idea_of_the_delay_is_found_and_put_right(runs: dict[str, LoggedRun]) -> None:
+def test_a_wrong_delay_of_the_controller_is_found_and_corrected(runs: dict[str, LoggedRun]) -> None:
     figures = figures_of(runs["other"])
     assert (figures["delay_controller_frames"], figures["delay_frames"]) == (2, 1)
     assert "assumed a delay of 2 frames" in figures["warnings"][0]
     np.testing.assert_allclose(column(figures, "what_if"), column(figures, "was"), atol=1e-5)
 
 
-def test_a_configuration_says_the_same_as_the_words(runs: dict[str, LoggedRun], tmp_path: Path) -> None:
+def test_a_configuration_file_gives_the_same_as_the_options(runs: dict[str, LoggedRun], tmp_path: Path) -> None:
     path = tmp_path / "other.toml"
     path.write_text("[control]\ntilt_gain=0.2\ngain=0.9\nleak=0.01\ntilt_leak=0.01\n")
-    by_file = figures_of(runs["usual"], requested("gain=0.3,tilt_gain=0.2,limit_nm=150,tilt_limit_nm=150", path))
-    assert by_file == figures_of(runs["usual"], requested(OTHER + ",limit_nm=150"))
+    by_file = figures_of(runs["default"], requested("gain=0.3,tilt_gain=0.2,limit_nm=150,tilt_limit_nm=150", path))
+    assert by_file == figures_of(runs["default"], requested(OTHER + ",limit_nm=150"))
     table = render(by_file).splitlines()
     assert sum(" -> " in line for line in table) == len(by_file["modes"])
     assert any("0.4 -> 0.2" in line and "tilt x" in line for line in table)
@@ -204,20 +204,20 @@ def test_a_configuration_says_the_same_as_the_words(runs: dict[str, LoggedRun], 
 
 
 def test_another_reconstructor_measures_the_same_frames(runs: dict[str, LoggedRun], tmp_path: Path) -> None:
-    """pinv by name and as a file are the same; and back from there to the logged one."""
-    by_name = figures_of(runs["usual"], requested("estimator=pinv"))
+    """pinv by name and as a file are the same; `weighted` of that file is the logged one."""
+    by_name = figures_of(runs["default"], requested("estimator=pinv"))
     assert by_name["estimator"] == "pinv"
     assert by_name["what_if_nm"] != pytest.approx(by_name["was_nm"], rel=1e-3)
-    np.testing.assert_allclose(column(by_name, "open")[:2], column(figures_of(runs["usual"]), "open")[:2], rtol=0.1)
+    np.testing.assert_allclose(column(by_name, "open")[:2], column(figures_of(runs["default"]), "open")[:2], rtol=0.1)
 
     calibration = toy.calibration()
     I0, H, good = (array.astype(float) for array in (calibration.reference, calibration.response, calibration.good))
     R = reconstructor(I0, H, good, 1.0, 0.0, "pinv").astype(np.float32)
     path = tmp_path / "pinv.fits"
     calibration_file.save(identified(replace(calibration, reconstructor=R, estimator="pinv")), path)
-    by_file = figures_of(runs["usual"], requested(calibration=path))
+    by_file = figures_of(runs["default"], requested(calibration=path))
     np.testing.assert_allclose(column(by_file, "what_if"), column(by_name, "what_if"), rtol=1e-4)
-    back = figures_of(runs["usual"], requested("estimator=weighted", calibration=path))
+    back = figures_of(runs["default"], requested("estimator=weighted", calibration=path))
     np.testing.assert_allclose(column(back, "what_if"), column(back, "was"), rtol=1e-2)
 
 
@@ -225,7 +225,7 @@ def test_frames_that_are_not_in_the_log_are_counted(
     runs: dict[str, LoggedRun], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Another reconstructor cannot measure them, and the what-if holds, as it would without those frames."""
-    run = runs["usual"]
+    run = runs["default"]
     found = run.measured_again(run.calibration)
     np.testing.assert_allclose(found, run.steps.error_nm, atol=1e-4)
     found[1107::20] = np.nan
@@ -235,7 +235,7 @@ def test_frames_that_are_not_in_the_log_are_counted(
     assert "the log lacks 5 frames that were used" in figures["warnings"][0]
 
 
-def test_modes_of_another_size_shape_the_mirror_alike(runs: dict[str, LoggedRun], tmp_path: Path) -> None:
+def test_commands_are_converted_to_modes_of_another_scale(runs: dict[str, LoggedRun], tmp_path: Path) -> None:
     """A calibration in which every mode is twice as large measures half of everything."""
     calibration = toy.calibration()
     twice = replace(
@@ -245,7 +245,7 @@ def test_modes_of_another_size_shape_the_mirror_alike(runs: dict[str, LoggedRun]
         modes_to_actuators=calibration.modes_to_actuators * 2,
     )
     calibration_file.save(identified(twice), tmp_path / "twice.fits")
-    figures = figures_of(runs["usual"], requested(calibration=tmp_path / "twice.fits"))
+    figures = figures_of(runs["default"], requested(calibration=tmp_path / "twice.fits"))
     np.testing.assert_allclose(column(figures, "what_if"), column(figures, "was") / 2, rtol=1e-4)
 
 
@@ -253,10 +253,10 @@ def test_calibrations_that_do_not_fit_are_refused(runs: dict[str, LoggedRun], tm
     path = tmp_path / "other.fits"
     calibration_file.save(identified(replace(toy.calibration(), noll=(2, 3, 11))), path)
     with pytest.raises(CalibrationError, match=r"its noll is \(2, 3, 11\), in the log it is \(2, 3, 4\)"):
-        figures_of(runs["usual"], requested(calibration=path))
+        figures_of(runs["default"], requested(calibration=path))
     (tmp_path / "shear.toml").write_text('[control]\nnuisance = ["shear"]\n')
     with pytest.raises(ConfigurationError, match=r"weighted\+shear: .* --calibration"):
-        figures_of(runs["usual"], requested(config=tmp_path / "shear.toml"))
+        figures_of(runs["default"], requested(config=tmp_path / "shear.toml"))
 
 
 INTEGRATOR = """
@@ -280,12 +280,12 @@ def step(state: State | None, error_nm: np.ndarray) -> tuple[State, np.ndarray]:
 """
 
 
-def test_a_controller_of_ones_own_is_folded_like_the_integrator(
+def test_a_users_controller_is_run_like_the_integrator(
     runs: dict[str, LoggedRun], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "mine.py").write_text(INTEGRATOR)
     where = f"{tmp_path / 'mine.py'}:step"
-    own, ours = figures_of(runs["usual"], requested(controller=where)), figures_of(runs["usual"], requested(OTHER))
+    own, ours = figures_of(runs["default"], requested(controller=where)), figures_of(runs["default"], requested(OTHER))
     np.testing.assert_allclose(column(own, "what_if"), column(ours, "what_if"), rtol=1e-4)
     assert own["controller"] == where
     assert "gain" not in own["modes"][0]
@@ -299,7 +299,7 @@ def test_a_controller_of_ones_own_is_folded_like_the_integrator(
 def history(frames: int = 40, **columns: Any) -> History:
     """The toy's history: an open loop that measures 4 nm of each mode, frame by frame."""
     values = np.full((frames, 3), 4.0, np.float32)
-    usual: dict[str, Any] = {
+    default: dict[str, Any] = {
         "sequence": np.array([toy.frame_sequence(count) for count in range(frames)], np.uint64),
         "time_ns": 10**18 + toy.PERIOD_NS * np.arange(frames),
         "mode": np.full(frames, LoopMode.CLOSED, np.uint8),
@@ -318,8 +318,8 @@ def history(frames: int = 40, **columns: Any) -> History:
         calibration=toy.calibration(),
         controllers=[ends],
         camera=wire.CameraState(period_ns=toy.PERIOD_NS * 200, exposure_ns=toy.PERIOD_NS),
-        frame_sequence=usual["sequence"],
-        steps=Steps(**(usual | columns)),
+        frame_sequence=default["sequence"],
+        steps=Steps(**(default | columns)),
     )
 
 
@@ -327,8 +327,8 @@ def rows_compared(run: LoggedRun) -> list[int]:
     return np.flatnonzero(run.rows_to_compare([run.law], run.used)[0]).tolist()
 
 
-def test_a_target_is_no_missing_command() -> None:
-    """Under an offset the error is less the target, which the state in the log has; the frames count."""
+def test_an_offset_is_not_reported_as_a_missing_command() -> None:
+    """With an offset the error is smaller by the target, which is in the logged state; its frames are compared."""
     known = history(error_nm=np.r_[np.full((20, 3), 4, np.float32), np.full((20, 3), 1, np.float32)])
     [ends] = known.controllers
     states = [wire.ControllerState(), wire.ControllerState(), wire.ControllerState(offset_nm=[3] * 3), ends]
@@ -353,16 +353,16 @@ def test_which_rows_are_compared() -> None:
     assert rows_compared(LoggedRun(history(mode=mode))) == list(range(25, 40))
 
     pol = np.full((60, 3), 4, np.float32)
-    pol[20] -= 1  # it saw a command that the log does not have: it settles anew
+    pol[20] -= 1  # exposed with a command missing from the log: settling restarts
     run = LoggedRun(history(60, pol_nm=pol))
     assert np.flatnonzero(run.torn).tolist() == [20]
     assert rows_compared(run) == [*range(10, 20), *range(30, 60)]
 
-    error[:6] = np.nan  # the run begins with the first frame that was used
+    error[:6] = np.nan  # the run begins with the first used frame
     assert len(LoggedRun(history(error_nm=error, pol_nm=error.copy())).steps.sequence) == 34
 
 
-def test_too_little_to_compare_is_said() -> None:
+def test_too_few_frames_to_compare_are_an_error() -> None:
     with pytest.raises(DataFileError, match="no frame is left to compare: of 40, 0 were refused and 40 have saturated"):
         rows_compared(LoggedRun(history(saturated_pixels=np.ones(40, np.int64))))
     nothing = np.full((40, 3), np.nan, np.float32)
@@ -373,7 +373,7 @@ def test_too_little_to_compare_is_said() -> None:
         LoggedRun(replace(history(), controllers=[]))
 
 
-def test_doubts_are_said() -> None:
+def test_warnings_name_what_makes_the_figures_doubtful() -> None:
     reasons = np.zeros(40, np.int64)
     reasons[3:7] = 1 << Limit.STROKE | 1 << Limit.SLEW
     pol = np.full((40, 3), 4, np.float32)
@@ -382,7 +382,7 @@ def test_doubts_are_said() -> None:
     known.mirror.limits = np.array([0, 1, 1])
     known.log.finished = False
     known.log.damage.append(Damage(77, 5, "the checksum of a chunk is wrong"))
-    doubts = "\n".join(what_if(LoggedRun(known), WhatIf())["warnings"])
+    warnings = "\n".join(what_if(LoggedRun(known), WhatIf())["warnings"])
     for words in (
         "stroke at 4 frames, slew at 4 frames",
         "the mirror's own limits acted on 2 commands",
@@ -392,10 +392,10 @@ def test_doubts_are_said() -> None:
         "the log has no end",
         "lacks some commands: 1 frame exposed with a missing",
     ):
-        assert words in doubts
+        assert words in warnings
 
 
-def test_an_open_loop_far_out_is_warned_of() -> None:
+def test_an_open_loop_beyond_the_linear_range_gives_warnings() -> None:
     far = np.full((40, 3), [20.0, -30.0, 12.0], np.float32)
     run = LoggedRun(history(error_nm=far, pol_nm=far.copy(), mode=np.full(40, LoopMode.OPEN, np.uint8)))
     figures = what_if(run, requested("tilt_gain=2.5"))
@@ -423,7 +423,7 @@ def test_an_open_loop_far_out_is_warned_of() -> None:
         ("raise SystemExit(0)\n", "cannot be run: SystemExit: 0"),
     ],
 )
-def test_a_controllers_mistakes_are_made_plain(tmp_path: Path, body: str | None, message: str) -> None:
+def test_errors_of_a_users_controller_are_reported(tmp_path: Path, body: str | None, message: str) -> None:
     path = tmp_path / "mine.py"
     if body is not None:
         path.write_text(body)
@@ -435,9 +435,9 @@ def test_a_controllers_mistakes_are_made_plain(tmp_path: Path, body: str | None,
         call()
 
 
-def test_the_words_of_the_command_line() -> None:
-    asked = requested(" gain=0.6, leak=0.01,tilt_limit_nm=80,estimator=pinv", controller=None)
-    assert asked == WhatIf({"gain": 0.6, "leak": 0.01, "tilt_limit_nm": 80.0}, "pinv")
+def test_options_are_parsed() -> None:
+    parsed = requested(" gain=0.6, leak=0.01,tilt_limit_nm=80,estimator=pinv", controller=None)
+    assert parsed == WhatIf({"gain": 0.6, "leak": 0.01, "tilt_limit_nm": 80.0}, "pinv")
 
 
 @pytest.mark.parametrize(
@@ -452,7 +452,7 @@ def test_the_words_of_the_command_line() -> None:
         *((text, "every .* must be between") for text in ("gain=5", "leak=2", "gain=nan", "limit_nm=-1")),
     ],
 )
-def test_words_that_make_no_sense_are_refused(text: str, message: str) -> None:
+def test_invalid_options_are_refused(text: str, message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):
         what_if(LoggedRun(history()), requested(text))
     with pytest.raises(ConfigurationError, match="gain apply to the integrator"):

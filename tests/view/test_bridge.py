@@ -1,4 +1,4 @@
-"""The bridge: it draws what the bus says, mends what goes wrong, and holds nobody up."""
+"""The bridge draws the messages of the bus, restarts failed viewers and never blocks the bus."""
 
 import contextlib
 import threading
@@ -29,23 +29,23 @@ from tests.support.stage import Tape
 PATIENCE_S = 10.0
 
 
-class Screen:
-    """In place of the viewer's process and of the stream to it, which takes nothing while the viewer hangs."""
+class FakeViewer:
+    """Stand-in for the viewer's process and the stream to it, which blocks while the viewer hangs."""
 
     def __init__(self, show: Show | None, hangs: bool) -> None:
-        self.show, self.hangs, self.alive, self.held_bytes = show, hangs, True, 0
-        self.stopped, self.holds_up = threading.Event(), threading.Event()
+        self.show, self.hangs, self.alive, self.memory_bytes = show, hangs, True, 0
+        self.stopped, self.blocked = threading.Event(), threading.Event()
         self.tape = Tape()
         self.tape.log, self._log = self.log, self.tape.log
 
     def log(self, path: str, *archetypes: Any, static: bool = False) -> None:
         if self.hangs and not static:
-            self.holds_up.set()
+            self.blocked.set()
             self.stopped.wait(PATIENCE_S)
         self._log(path, *archetypes, static=static)
 
     def resident_bytes(self) -> int:
-        return self.held_bytes
+        return self.memory_bytes
 
     def answers(self) -> bool:
         return not self.stopped.is_set()
@@ -59,7 +59,7 @@ class Screen:
 
 
 class Scene:
-    """A bridge on a bus in memory, running in a thread, and a run that was there before it; `stuck` viewers hang."""
+    """A bridge on an in-memory bus, in a thread, and a run that started before it; the first `stuck` viewers hang."""
 
     memory_mb = 100.0
 
@@ -75,30 +75,30 @@ class Scene:
             for sample in self.night.samples
         }
         self.publish()
-        self.screens: list[Screen] = []
+        self.viewers: list[FakeViewer] = []
         self.show, self.stuck = show, stuck
         self.bridge = Bridge(Configuration(), "night", self.clock, MemoryBus(self.hub, "viewer", self.clock), self)
         self.failure: Exception | None = None
         self.thread = threading.Thread(target=self._run, daemon=True)
         self.thread.start()
-        until(lambda: self.screens)
+        until(lambda: self.viewers)
 
-    def viewer(self) -> Screen | None:
-        """Of the target: this."""
-        self.screens.append(Screen(self.show, len(self.screens) < self.stuck))
-        return self.screens[-1] if self.show is not None else None
+    def viewer(self) -> FakeViewer | None:
+        """Stand-in for `Target.viewer`."""
+        self.viewers.append(FakeViewer(self.show, len(self.viewers) < self.stuck))
+        return self.viewers[-1] if self.show is not None else None
 
-    def stream(self, screen: Screen | None, recording: str, window_s: float) -> Tape:
-        """Of the target: this."""
-        return self.screens[-1].tape
+    def stream(self, viewer: FakeViewer | None, recording: str, window_s: float) -> Tape:
+        """Stand-in for `Target.stream`."""
+        return self.viewers[-1].tape
 
     def publish(self) -> None:
         for sample in self.night.samples:
             self.publishers[sample.key].put(sample.payload)
 
     def drawn(self, number: int) -> bool:
-        """Whether the newest view has this number, and shows steps with their calibration."""
-        return len(self.screens) == number and wavefront.ERROR.path in self.screens[-1].tape.rows
+        """Whether there are this many viewers, and the newest shows steps with their calibration."""
+        return len(self.viewers) == number and wavefront.ERROR.path in self.viewers[-1].tape.rows
 
     def end(self) -> None:
         self.bridge.service.stop("the test is over")
@@ -118,7 +118,7 @@ def _quickly(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bridges, "_CHECK_S", 0.05)
     monkeypatch.setattr(bridges, "_POLL_S", 0.02)
     monkeypatch.setattr(render_threads, "PICTURES_HZ", 100.0)
-    monkeypatch.setattr(bridges, "resident_bytes", lambda: 0)  # that of all tests in this process is no view's
+    monkeypatch.setattr(bridges, "resident_bytes", lambda: 0)  # the memory of the test process is not that of a view
 
 
 Scenes = Callable[..., Scene]
@@ -137,25 +137,25 @@ def scenes() -> Iterator[Scenes]:
 
 
 def failed(scene: Scene) -> str:
-    """How the view ended by itself."""
+    """Wait until the view fails; return its error."""
     scene.thread.join(PATIENCE_S)
     assert isinstance(scene.failure, ViewError)
     return str(scene.failure)
 
 
-def test_a_view_that_comes_late_asks_for_the_calibration(scenes: Scenes) -> None:
+def test_a_late_view_requests_the_calibration(scenes: Scenes) -> None:
     assert topic_of(CALIBRATION.key).queryable
     scene = scenes()
     step = next(one.payload for one in scene.night.samples if one.key == STEP.key)
 
     def drawn() -> bool:
-        scene.publishers[STEP.key].put(step)  # again and again: a step from before the answer is not drawn
+        scene.publishers[STEP.key].put(step)  # repeatedly: steps before the calibration are not drawn
         return scene.drawn(1)
 
     until(drawn)
 
 
-def test_a_view_that_comes_late_shows_the_events_from_before_once(scenes: Scenes, tmp_path: Path) -> None:
+def test_a_late_view_shows_earlier_events_once(scenes: Scenes, tmp_path: Path) -> None:
     before = Night()
     before.event("NOTE", text="before the view")
     assert before.write(tmp_path / "night.mcap", finish=False).name.endswith(".part")
@@ -165,77 +165,77 @@ def test_a_view_that_comes_late_shows_the_events_from_before_once(scenes: Scenes
     MemoryBus(scene.hub, "recorder", scene.clock).publisher(HEALTH, "recorder").put(health.SerializeToString())
 
     def notes() -> list[str]:
-        return [text for screen in scene.screens for text in screen.tape.texts("log/controller") if "NOTE" in text]
+        return [text for viewer in scene.viewers for text in viewer.tape.texts("log/controller") if "NOTE" in text]
 
     until(notes)
     assert len(notes()) == 1
 
 
-def test_without_a_recorder_a_line_says_that_earlier_events_are_missing(
+def test_without_a_recorder_a_line_reports_that_earlier_events_are_missing(
     scenes: Scenes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(bridges, "_RECORDER_S", 0.0)
     scene = scenes()
-    until(lambda: scene.screens[0].tape.logged["log/view"])
+    until(lambda: scene.viewers[0].tape.logged["log/view"])
 
 
-def dies(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene.screens[0].alive = False
+def viewer_dies(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene.viewers[0].alive = False
 
 
-def takes_nothing(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def reads_nothing(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bridges, "STUCK_S", 0.1)
 
 
-def grows(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene.screens[0].held_bytes = 100_000_000 + bridges.VIEWER_SPARE_BYTES - 1
+def viewer_grows(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene.viewers[0].memory_bytes = 100_000_000 + bridges.VIEWER_SPARE_BYTES - 1
     time.sleep(0.1)
-    assert len(scene.screens) == 1
-    scene.screens[0].held_bytes += 2
+    assert len(scene.viewers) == 1
+    scene.viewers[0].memory_bytes += 2
 
 
-def makes_the_bridge_grow(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def bridge_grows(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     held = [bridges.OWN_BYTES + 1]
     monkeypatch.setattr(bridges, "resident_bytes", lambda: held.pop() if held else 0)
 
 
 @pytest.mark.parametrize(
-    ("harm", "stuck", "why"),
+    ("fail", "stuck", "why"),
     [
-        (dies, 0, "the viewer was killed"),
-        (takes_nothing, 1, "read nothing for"),
-        (grows, 0, "the viewer uses 16"),
-        (makes_the_bridge_grow, 0, "the bridge uses 512 MB"),
+        (viewer_dies, 0, "the viewer was killed"),
+        (reads_nothing, 1, "read nothing for"),
+        (viewer_grows, 0, "the viewer uses 16"),
+        (bridge_grows, 0, "the bridge uses 512 MB"),
     ],
 )
-def test_a_viewer_that_fails_is_started_again_and_shows_everything(
-    scenes: Scenes, monkeypatch: pytest.MonkeyPatch, harm: Callable[..., None], stuck: int, why: str
+def test_a_failed_viewer_is_restarted_and_shows_everything(
+    scenes: Scenes, monkeypatch: pytest.MonkeyPatch, fail: Callable[..., None], stuck: int, why: str
 ) -> None:
     scene = scenes(stuck=stuck)
     scene.publish()
     until(lambda: stuck or scene.drawn(1))
-    harm(scene, monkeypatch)
-    until(lambda: len(scene.screens) == 2)
-    assert scene.screens[0].stopped.is_set()
+    fail(scene, monkeypatch)
+    until(lambda: len(scene.viewers) == 2)
+    assert scene.viewers[0].stopped.is_set()
     scene.publish()
     until(lambda: scene.drawn(2))
     assert any("VIEW_RENEWED" in event and why in event for event in scene.events)
     assert scene.failure is None
 
 
-def test_a_window_that_was_closed_ends_the_view(scenes: Scenes) -> None:
+def test_closing_the_window_ends_the_view(scenes: Scenes) -> None:
     scene = scenes(Show.NATIVE)
-    scene.screens[0].alive = False
+    scene.viewers[0].alive = False
     scene.thread.join(PATIENCE_S)
     assert (scene.failure, scene.bridge.renewals) == (None, 0)
 
 
-def test_a_window_that_takes_nothing_is_waited_for_in_bounded_memory(
+def test_a_hung_window_is_not_restarted_and_memory_stays_bounded(
     scenes: Scenes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(bridges, "STUCK_S", 0.1)
     scene = scenes(Show.NATIVE, stuck=1)
-    until(lambda: scene.screens[0].holds_up.is_set())
+    until(lambda: scene.viewers[0].blocked.is_set())
     for _ in range(100):
         scene.publish()
     waiting = {topic: len(ring.waiting) for topic, ring in scene.bridge._rings.items()}
@@ -244,31 +244,31 @@ def test_a_window_that_takes_nothing_is_waited_for_in_bounded_memory(
     until(lambda: any("VIEW_STUCK" in event for event in scene.events))
     time.sleep(0.2)
     assert sum("VIEW_STUCK" in event for event in scene.events) == 1
-    assert len(scene.screens) == 1
-    scene.screens[0].stopped.set()
+    assert len(scene.viewers) == 1
+    scene.viewers[0].stopped.set()
     until(lambda: scene.drawn(1))
 
 
-def test_memory_that_stays_ends_the_view(scenes: Scenes, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_above_the_limit_after_a_restart_ends_the_view(scenes: Scenes, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = scenes()
     monkeypatch.setattr(bridges, "resident_bytes", lambda: bridges.OWN_BYTES + 1)
     assert "even after a restart" in failed(scene)
 
 
-def test_a_view_that_fails_again_and_again_ends(scenes: Scenes, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Screen, "alive", property(lambda self: False, lambda self, value: None), raising=False)
+def test_repeated_failures_end_the_view(scenes: Scenes, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(FakeViewer, "alive", property(lambda self: False, lambda self, value: None), raising=False)
     assert "5 times" in failed(scenes())
 
 
-def test_a_view_into_a_file_is_not_begun_anew(scenes: Scenes, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_view_to_a_file_is_not_restarted(scenes: Scenes, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = scenes(None)
     monkeypatch.setattr(Tape, "set_time", None)
     assert "writing the view to a file failed: drawing failed" in failed(scene)
 
 
-@pytest.mark.parametrize(("pause_s", "every_one"), [(0.1, True), (0.0, False)])
-def test_rows_are_taken_by_time_however_slow_the_drawing_is(
-    monkeypatch: pytest.MonkeyPatch, pause_s: float, every_one: bool
+@pytest.mark.parametrize(("pause_s", "all_complete"), [(0.1, True), (0.0, False)])
+def test_complete_snapshots_are_due_by_time_even_if_drawing_is_slow(
+    monkeypatch: pytest.MonkeyPatch, pause_s: float, all_complete: bool
 ) -> None:
     complete: list[bool] = []
 
@@ -283,5 +283,5 @@ def test_rows_are_taken_by_time_however_slow_the_drawing_is(
     thread.abandon()
     thread.join()
     assert thread.fault is None
-    assert all(complete) == every_one
+    assert all(complete) == all_complete
     assert complete[0]

@@ -50,7 +50,7 @@ from tests.support.viewers import listening
 pytest.importorskip("foxglove")
 
 PATIENCE_S = 10.0
-COUNT = 200  # messages of each topic, one a millisecond
+COUNT = 200  # messages of each topic, one per millisecond
 _DATA = struct.Struct("<BIQ")  # 1, the subscription's number, time
 
 STEP_BYTES = wire.ControlStep(frame_sequence=7, mode=wire.LOOP_MODE_CLOSED, error_nm=[1.5, -2.0]).SerializeToString()
@@ -58,7 +58,7 @@ FRAME_BYTES = image(np.arange(12, dtype=np.uint16).reshape(3, 4), 5, "camera").S
 
 
 class Client:
-    """One app: what the server advertises, and the messages of the topics asked for."""
+    """A client: the channels that the server advertises, and the messages of subscribed topics."""
 
     def __init__(self, connection: Any) -> None:
         self.connection = connection
@@ -66,15 +66,15 @@ class Client:
         self._topics: dict[int, str] = {}
 
     def subscribe(self, *topics: str) -> None:
-        """Wait until the topics are advertised, and ask for them."""
+        """Wait until the topics are advertised, and subscribe to them."""
         while not self.channels.keys() >= set(topics):
             assert self._receive() is None
-        wanted = []
+        subscriptions = []
         for topic in topics:
             number = len(self._topics)
             self._topics[number] = topic
-            wanted.append({"id": number, "channelId": self.channels[topic]["id"]})
-        self.connection.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+            subscriptions.append({"id": number, "channelId": self.channels[topic]["id"]})
+        self.connection.send(json.dumps({"op": "subscribe", "subscriptions": subscriptions}))
 
     def next(self) -> tuple[str, int, bytes]:
         """Topic, time and payload of the next message."""
@@ -83,7 +83,7 @@ class Client:
         return message
 
     def decode(self, topic: str, payload: bytes) -> dict[str, Any]:
-        """A message decoded with nothing but what the server advertised."""
+        """A message decoded only with the schema that the server advertised."""
         channel = self.channels[topic]
         assert (channel["encoding"], channel["schemaEncoding"]) == ("protobuf", "protobuf")
         pool = descriptor_pool.DescriptorPool()
@@ -123,7 +123,7 @@ def running(bus: MemoryBus) -> Iterator[FoxgloveBridge]:
 
 @pytest.fixture
 def bus() -> MemoryBus:
-    """Of the process that publishes."""
+    """Bus of the publishing process."""
     return MemoryBus(MemoryHub(), Role.CONTROLLER, FakeClock())
 
 
@@ -133,10 +133,10 @@ def bridge(bus: MemoryBus) -> Iterator[FoxgloveBridge]:
         yield one
 
 
-def test_the_channels_are_those_of_the_table_and_explain_themselves(bridge: FoxgloveBridge, bus: MemoryBus) -> None:
+def test_channels_are_those_of_the_topic_table_and_have_their_schemas(bridge: FoxgloveBridge, bus: MemoryBus) -> None:
     shown = {"/" + topic.at("dm"): topic for topic in SHOWN if topic not in (BENCH, HEALTH, SURFACE)}
     with connected(bridge.port) as client:
-        bus.publisher(COMMAND, "dm").put(b"")  # which is nothing for a viewer, and must not appear
+        bus.publisher(COMMAND, "dm").put(b"")  # not a topic of the viewer: no channel may appear
         bus.publisher(MIRROR_STATE, "dm").put(b"")
         own = "/" + HEALTH.at(Role.VIEWER)
         client.subscribe("/lowfc/mirror/dm/state", own)
@@ -146,7 +146,7 @@ def test_the_channels_are_those_of_the_table_and_explain_themselves(bridge: Foxg
             assert client.decode(key, b"") == {}
 
 
-def test_messages_arrive_as_they_were_sent(bridge: FoxgloveBridge, bus: MemoryBus) -> None:
+def test_messages_arrive_unchanged(bridge: FoxgloveBridge, bus: MemoryBus) -> None:
     with connected(bridge.port) as client:
         client.subscribe("/" + FRAME.key, "/" + STEP.key, "/" + CAMERA_STATE.key)
         until(lambda: len(bridge.subscriptions) == 3)
@@ -155,15 +155,15 @@ def test_messages_arrive_as_they_were_sent(bridge: FoxgloveBridge, bus: MemoryBu
         assert client.next() == ("/" + FRAME.key, 11, FRAME_BYTES)
         assert client.next() == ("/" + STEP.key, 12, STEP_BYTES)
         states = bus.publisher(CAMERA_STATE)
-        for sequence in (9, 9, 4):  # a log that is played twice, and then an older one
+        for sequence in (9, 9, 4):  # a log published twice, and then an older one
             states.put(b"", publish_time_ns=13, sequence=sequence)
             assert client.next() == ("/" + CAMERA_STATE.key, 13, b"")
         assert client.decode("/" + STEP.key, STEP_BYTES)["mode"] == "LOOP_MODE_CLOSED"
     until(lambda: not bridge.subscriptions)
 
 
-def test_an_app_that_comes_late_gets_the_calibration(bus: MemoryBus) -> None:
-    calibration = wire.Calibration(id="before anybody was there", noll=[2, 3]).SerializeToString()
+def test_a_late_client_receives_the_calibration(bus: MemoryBus) -> None:
+    calibration = wire.Calibration(id="before the bridge", noll=[2, 3]).SerializeToString()
     bus.publisher(CALIBRATION).put(calibration, publish_time_ns=3)
     with running(bus) as bridge:
         bus.publisher(HEALTH, "controller").put(wire.Health(process="controller", pid=1).SerializeToString())
@@ -174,26 +174,26 @@ def test_an_app_that_comes_late_gets_the_calibration(bus: MemoryBus) -> None:
                 assert client.next() == ("/" + CALIBRATION.key, 3, calibration)
 
 
-def test_a_client_that_does_not_read_loses_messages_and_holds_up_nobody(bridge: FoxgloveBridge, bus: MemoryBus) -> None:
+def test_a_client_that_does_not_read_loses_messages_and_blocks_nobody(bridge: FoxgloveBridge, bus: MemoryBus) -> None:
     truth = bus.publisher(TRUTH)
     payload = wire.Truth(residual_nm=[1.0] * 4000).SerializeToString()
     count = 3000  # 48 MB: more than the sockets hold
-    with connected(bridge.port, most_waiting=1) as frozen, connected(bridge.port) as awake:
+    with connected(bridge.port, most_waiting=1) as frozen, connected(bridge.port) as reading:
         frozen.subscribe("/" + TRUTH.key)
-        awake.subscribe("/" + STEP.key)
+        reading.subscribe("/" + STEP.key)
         until(lambda: len(bridge.subscriptions) == 2)
         for number in range(1, count + 1):
             truth.put(payload, publish_time_ns=number)
         bus.publisher(STEP).put(STEP_BYTES)
-        awake.next()
+        reading.next()
         got = [0]
         while got[-1] < count:
             got.append(frozen.next()[1])
     assert got == sorted(got)
-    assert 1000 < len(got) < count, "it has a bounded number of the newest"
+    assert 1000 < len(got) < count, "a bounded number of messages waits for it"
 
 
-def test_only_this_host_is_listened_to_and_what_is_missing_is_one_line(
+def test_the_port_is_on_loopback_only_and_errors_have_one_line(
     bridge: FoxgloveBridge, bus: MemoryBus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert {host for host, port in listening(os.getpid()) if port == bridge.port} == {"127.0.0.1"}
@@ -206,7 +206,7 @@ def test_only_this_host_is_listened_to_and_what_is_missing_is_one_line(
 
 
 @pytest.mark.exclusive
-def test_a_process_of_a_real_run(tmp_path: Path) -> None:
+def test_the_process_serves_a_real_run(tmp_path: Path) -> None:
     run = open_run(new_run_id())
     process = start(tmp_path, "view", "--foxglove", "--port", 0, "--run", run.run_id)
     bus = ZenohBus(run.links, Role.CONTROLLER, HostClock())
@@ -226,15 +226,15 @@ def test_a_process_of_a_real_run(tmp_path: Path) -> None:
             got = {"/" + FRAME.key: 0, "/" + STEP.key: 0}
             while got["/" + STEP.key] < COUNT:
                 got[client.next()[0]] += 1
-            assert 0 < got["/" + FRAME.key] < COUNT / 2, "images are thinned, and nothing else is"
-            client.connection.socket.close()  # as an app that was killed
+            assert 0 < got["/" + FRAME.key] < COUNT / 2, "only images are thinned"
+            client.connection.socket.close()  # like a killed client
             until(lambda: steps.put(STEP_BYTES * 1000) and steps.published > COUNT + 20)
         assert set(received) == {Role.VIEWER}
         process.send_signal(signal.SIGTERM)
-        _, complaints = process.communicate(timeout=PATIENCE_S)
+        _, stderr = process.communicate(timeout=PATIENCE_S)
     finally:
         process.kill()
         process.wait()
         bus.close()
         run.remove()
-    assert (process.returncode, complaints) == (0, "")
+    assert (process.returncode, stderr) == (0, "")

@@ -1,4 +1,4 @@
-"""A log as it is drawn: the verdict on all of it, the trend, and the events from before a view began."""
+"""Drawing of a log: the verdict on all of it, the trend, and the events from before the start of a view."""
 
 import platform
 from pathlib import Path
@@ -55,19 +55,21 @@ def night(frames: int) -> Night:
 @pytest.mark.parametrize(
     ("finish", "value", "level"), [(True, "FINISHED", Level.GOOD), (False, "NO END", Level.WARNING)]
 )
-def test_the_end_of_a_log_is_no_recording(tmp_path: Path, shown: Shown, finish: bool, value: str, level: Level) -> None:
+def test_the_final_verdict_is_on_the_log_and_not_on_a_recording(
+    tmp_path: Path, shown: Shown, finish: bool, value: str, level: Level
+) -> None:
     made = Night()
     for _ in range(10):
         made.frames(50)
         made.health("recorder", state="running", recording=wire.Recording(file="logs/a.mcap"))
     drawn(made.write(tmp_path / "night.mcap", finish=finish))
-    assert tile(shown[-2], "RECORDER").value == "RECORDING"  # so it was
+    assert tile(shown[-2], "RECORDER").value == "RECORDING"  # while it was recorded
     end = shown[-1]
     assert (tile(end, "LOG").value, tile(end, "LOG").level) == (value, level)
     assert [one.title for one in end.tiles if "RECORD" in one.value] == []
 
 
-def test_the_verdict_at_the_end_of_a_log_is_on_all_of_it(tmp_path: Path, shown: Shown) -> None:
+def test_the_final_verdict_covers_the_whole_log(tmp_path: Path, shown: Shown) -> None:
     made = night(750)
     made.frames(50, dark=range(50))
     made.request("safe")
@@ -85,7 +87,7 @@ def test_the_verdict_at_the_end_of_a_log_is_on_all_of_it(tmp_path: Path, shown: 
     assert float(tile(end, "WAVEFRONT").value.split()[0]) == pytest.approx(rms_nm, rel=0.05)
 
 
-def test_a_log_without_a_step_has_nothing_to_judge(tmp_path: Path, shown: Shown) -> None:
+def test_a_log_without_steps_has_no_verdict_on_the_loop(tmp_path: Path, shown: Shown) -> None:
     made = Night()
     made.health("recorder", state="running", recording=wire.Recording(lost=3))
     drawn(made.write(tmp_path / "night.mcap"))
@@ -93,20 +95,20 @@ def test_a_log_without_a_step_has_nothing_to_judge(tmp_path: Path, shown: Shown)
     assert [one.value for one in shown[-1].tiles] == ["NOT CLOSED", "?", "1000 Hz", "?", "0 %", "?", "FINISHED"]
 
 
-def test_the_trend_holds_a_night_in_so_many_spans() -> None:
-    kept, snapshot = Course(), snapshot_of(night(200).samples)
-    kept.feed(snapshot)
-    _, rms_nm = kept.wavefront()
+def test_the_trend_of_a_night_has_a_limited_number_of_spans() -> None:
+    averages, snapshot = Course(), snapshot_of(night(200).samples)
+    averages.feed(snapshot)
+    _, rms_nm = averages.wavefront()
     squares = np.stack([snapshot.truths.residual_rms_nm, snapshot.truths.disturbance_rms_nm], axis=1).astype(float) ** 2
     np.testing.assert_allclose(rms_nm[0], np.sqrt(squares.mean(axis=0)), rtol=1e-6)
-    kept.add(np.array([snapshot.truths.time_ns[0] + 10 * 3600 * 10**9]), slice(0, 3), np.ones((1, 2)))
-    after_ns, rms_nm = kept.wavefront()
+    averages.add(np.array([snapshot.truths.time_ns[0] + 10 * 3600 * 10**9]), slice(0, 3), np.ones((1, 2)))
+    after_ns, rms_nm = averages.wavefront()
     assert course.MOST / 2 <= len(after_ns) <= course.MOST
     np.testing.assert_allclose(rms_nm[0], np.sqrt(squares.mean(axis=0)), rtol=1e-6)
     assert np.isnan(rms_nm[1:-1]).all()  # nothing in between: a gap
 
 
-def test_a_log_of_which_the_viewer_forgets_a_part_is_said_so() -> None:
+def test_a_log_larger_than_the_memory_of_the_viewer_gives_a_remark() -> None:
     target = Target(picture=Path("night.png"))
     assert memory_remarks(511_000_000, target) == []
     [remark] = memory_remarks(1_652_000_000, target)
@@ -115,7 +117,7 @@ def test_a_log_of_which_the_viewer_forgets_a_part_is_said_so() -> None:
     )
 
 
-def test_every_view_of_the_layout_has_something_and_the_plots_show_all_of_a_log(tmp_path: Path) -> None:
+def test_every_view_of_the_layout_has_data_and_the_plots_span_the_whole_log(tmp_path: Path) -> None:
     made = night(120)
     made.health("controller")
     made.put(SURFACE, image(np.eye(8, dtype=np.float32), made.now_ns, "dm"))
@@ -129,7 +131,7 @@ def test_every_view_of_the_layout_has_something_and_the_plots_show_all_of_a_log(
     origins = {str(view.origin) for view in views(layout().root_container)}
     assert not [origin for origin in origins if not any(path.startswith(origin) for path in tape.paths)]
     flat, residual = values_of(tape.last(f"{trend.TREND}/curves").strips)  # the residual on top
-    assert np.mean([y for _, y in flat]) < np.mean([y for _, y in residual])  # upwards is less
+    assert np.mean([y for _, y in flat]) < np.mean([y for _, y in residual])  # y points down: the flat mirror is above
     assert len(residual) == len(flat) > 1
     names = tape.last(f"{trend.TREND}/names").labels.as_arrow_array().to_pylist()
     assert names == ["flat mirror", "residual", "true, 1 s mean"]
@@ -147,7 +149,7 @@ def views(part: rrb.Container | rrb.View) -> list[rrb.View]:
     return [part] if isinstance(part, rrb.View) else [view for one in part.contents for view in views(one)]
 
 
-def test_logs_of_two_runs_are_not_laid_over_each_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_logs_of_two_runs_are_not_drawn_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     logs = [night(120).write(tmp_path / f"{name}.mcap") for name in "ab"]
     assert drawn(*logs)[0].snapshots > 0
     monkeypatch.setitem(report_log.METADATA["lowfc"], "run", "another")
@@ -156,7 +158,7 @@ def test_logs_of_two_runs_are_not_laid_over_each_other(tmp_path: Path, monkeypat
         drawn(logs[0], other)
 
 
-# From before the view began.
+# Events from before the start of the view.
 
 
 def recorder_of(log: Path, host: str = "") -> wire.Health:
@@ -164,17 +166,17 @@ def recorder_of(log: Path, host: str = "") -> wire.Health:
 
 
 @pytest.mark.parametrize("finish", [True, False])
-def test_events_from_before_come_from_the_log_finished_or_not(tmp_path: Path, finish: bool) -> None:
+def test_earlier_events_are_read_from_the_log_finished_or_not(tmp_path: Path, finish: bool) -> None:
     made = night(100)
     made.request("note", text="new star")
     made.frames(100)
     made.event("RECORDING_STOPPED", why="operator asked")
     made.write(tmp_path / "night.mcap", finish=finish)
-    wanted = [one for one in made.samples if one.key == EVENT.key]
+    expected = [one for one in made.samples if one.key == EVENT.key]
     found = earlier_events(recorder_of(tmp_path / "night.mcap", platform.node()), 0)
-    assert [(one.sequence, one.payload) for one in found] == [(one.sequence, one.payload) for one in wanted]
-    accumulator = accumulated([*wanted[-1:], *found])  # the last one came by the bus, too
-    assert len(accumulator.snapshot(1).events) == len(wanted)
+    assert [(one.sequence, one.payload) for one in found] == [(one.sequence, one.payload) for one in expected]
+    accumulator = accumulated([*expected[-1:], *found])  # the last one also arrived on the bus
+    assert len(accumulator.snapshot(1).events) == len(expected)
 
 
 @pytest.mark.parametrize(

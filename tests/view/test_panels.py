@@ -1,4 +1,4 @@
-"""What is drawn of a run, at once or once a second: the right numbers under the right names."""
+"""The panels draw the right numbers under the right names."""
 
 import dataclasses
 from typing import Any
@@ -76,7 +76,7 @@ def test_every_step_and_truth_is_drawn_under_its_name() -> None:
     assert tape.names(wavefront.ERROR.path) == [mode_name(index) for index in NOLL]
     rms_nm = [[one.disturbance_rms_nm, one.residual_rms_nm] for one in truths]
     np.testing.assert_allclose(tape.column(wavefront.RMS.path)[1], rms_nm, rtol=1e-6)
-    assert tape.names(wavefront.RMS.path) == ["with a flat mirror, true", "residual, true"]  # the last lies on top
+    assert tape.names(wavefront.RMS.path) == ["with a flat mirror, true", "residual, true"]  # the last one is on top
     mas = residual_nm[:, :2] / tilt_nm_per_mas(Configuration().star.diameter_m)
     np.testing.assert_allclose(tape.column(wavefront.TILT.path)[1], mas, rtol=1e-6)
     groups_nm = tape.column(wavefront.GROUPS.path)[1]
@@ -84,7 +84,7 @@ def test_every_step_and_truth_is_drawn_under_its_name() -> None:
     np.testing.assert_allclose(np.sum(groups_nm**2, axis=1), np.sum(residual_nm**2, axis=1), rtol=1e-5)
 
 
-def test_without_truth_the_wavefront_is_measured_and_named_so() -> None:
+def test_without_truth_the_wavefront_is_labelled_measured() -> None:
     made = night(truth=False)
     tape = rendered(snapshot_of(made.samples))
     steps = [wire.ControlStep.FromString(one.payload) for one in made.samples if one.key == STEP.key]
@@ -94,7 +94,7 @@ def test_without_truth_the_wavefront_is_measured_and_named_so() -> None:
     assert wavefront.TRUTH.path not in tape.rows
 
 
-def test_the_pictures_are_those_of_the_newest_messages() -> None:
+def test_pictures_show_the_newest_frame() -> None:
     snapshot = snapshot_of(night().samples)
     tape = rendered(snapshot)
     frame, calibration = snapshot.frame, snapshot.calibration
@@ -113,9 +113,9 @@ def test_actuators_at_their_limit_are_marked() -> None:
     snapshot = snapshot_of(night().samples)
     marks = f"{mirror.COMMAND}/at_limit"
     assert marks not in rendered(snapshot).logged
-    pushed = actuators(snapshot.mirror).copy()
-    pushed[1, 3] = -snapshot.stroke_nm
-    snapshot.mirror.actuators = pushed.tobytes()
+    surface_nm = actuators(snapshot.mirror).copy()
+    surface_nm[1, 3] = -snapshot.stroke_nm
+    snapshot.mirror.actuators = surface_nm.tobytes()
     tape = rendered(snapshot)
     assert values_of(tape.last(marks).positions) == [[3.5, 1.5]]
     assert tape.column(mirror.STROKE.path)[1][-1, 0] == pytest.approx(100)
@@ -133,7 +133,7 @@ def test_the_mode_is_a_band_and_events_have_their_level() -> None:
     assert levels["RECORDING_FAILED"] == ["ERROR"]
 
 
-def test_the_band_of_the_mode_begins_before_the_view() -> None:
+def test_the_mode_band_begins_at_the_last_change_before_the_view() -> None:
     tape, accumulator = Tape(), Accumulator()
     state = wire.ControllerState(mode=LoopMode.CLOSED.value, mode_timestamp=timestamp(5))
     accumulator.add(Sample(CONTROLLER_STATE.key, state.SerializeToString(), 1, 9, 9))
@@ -142,19 +142,19 @@ def test_the_band_of_the_mode_begins_before_the_view() -> None:
     assert (at_ns, values_of(change.state)) == (5, ["CLOSED"])
 
 
-def test_the_light_of_refused_frames_is_a_gap() -> None:
+def test_the_flux_of_refused_frames_is_a_gap() -> None:
     made = Night()
     made.frames(100, dark=range(40, 60))
     tape = Tape()
     loop.Loop().draw(tape, snapshot_of(made.samples))
     for plot in (loop.FLUX, loop.SATURATED):
         _, values = tape.column(plot.path)
-        assert np.isnan(values).sum() == 1  # one row, so that the line is broken
+        assert np.isnan(values).sum() == 1  # one row breaks the line
         assert len(values) == 81
     assert np.nanmin(tape.column(loop.FLUX.path)[1]) > 50
 
 
-def test_an_unforeseen_message_costs_itself_alone() -> None:
+def test_unreadable_messages_and_unknown_values_do_not_affect_other_panels() -> None:
     samples = []
     for number, sample in enumerate(night().samples):
         payload = sample.payload
@@ -171,7 +171,7 @@ def test_an_unforeseen_message_costs_itself_alone() -> None:
         samples.append(sample._replace(payload=payload))
     accumulator = accumulated(samples)
     tape = rendered(accumulator.snapshot(samples[-1].publish_time_ns))
-    assert accumulator.unreadable == 2, "of pictures only the newest is looked at"
+    assert accumulator.unreadable == 2, "only the newest picture of a topic is decoded"
     assert wavefront.ERROR.path in tape.rows
 
 
@@ -190,7 +190,7 @@ def test_a_panel_that_fails_is_left_out_for_a_while() -> None:
     assert sensor.DIFFERENCE in tape.logged
 
 
-def test_without_a_model_of_the_science_camera_the_view_has_the_rest() -> None:
+def test_without_a_model_of_the_science_camera_the_other_panels_are_drawn() -> None:
     tape, config = Tape(), Configuration()
     section = config.sensor.model_copy(update={"pupil": "nosuch"})
     renderer = Renderer(config.model_copy(update={"sensor": section}), tape)
@@ -205,16 +205,16 @@ def test_an_older_state_does_not_replace_a_newer_one() -> None:
     assert accumulated([new, old]).snapshot(0).controller == wire.ControllerState()
 
 
-def test_an_odd_step_costs_itself_alone() -> None:
+def test_a_malformed_step_is_left_out_and_counted() -> None:
     steps = [one for one in night().samples if one.key == STEP.key]
-    odd = wire.ControlStep.FromString(steps[0].payload)
-    del odd.error_nm[1:]
-    accumulator = accumulated([*steps, steps[0]._replace(payload=odd.SerializeToString())])
+    malformed = wire.ControlStep.FromString(steps[0].payload)
+    del malformed.error_nm[1:]
+    accumulator = accumulated([*steps, steps[0]._replace(payload=malformed.SerializeToString())])
     assert len(accumulator.snapshot(2).steps.sequence) == FRAMES
     assert accumulator.unreadable == 1
 
 
-def test_before_the_first_frame_of_a_run_in_lockstep_its_own_time_holds() -> None:
+def test_before_the_first_frame_a_lockstep_run_has_simulated_time() -> None:
     assert Accumulator(simulated_ns=5).snapshot(10**18).time_ns == 5
     assert Accumulator().snapshot(10**18).time_ns == 10**18
 
@@ -227,7 +227,7 @@ def test_rows_that_are_not_finite_are_a_gap() -> None:
     assert np.isfinite(values[:, 0]).tolist() == [True, False, True, False, True]
 
 
-def test_a_scale_grows_at_once_and_shrinks_after_a_while() -> None:
+def test_a_scale_grows_at_once_and_shrinks_after_two_seconds() -> None:
     scale = Scale(1.0)
     steps = [(0.1, 0, True, 1.0), (-33.0, 1, True, 50.0), (1.1, 10**9, False, 50.0), (1.1, 3 * 10**9, True, 1.5)]
     for value, time_ns, changed, limit in steps:
@@ -271,9 +271,9 @@ def truths(residual_nm: Any, disturbance_nm: Any) -> Truths:
 def drawn(panel: Panel, tape: Tape, after_ns: int, **changes: Any) -> None:
     """Draw a snapshot with nothing new but the changes."""
     empty = Accumulator().snapshot(0)
-    nothing = {"steps": steps(0, *np.zeros((2, 0, MODES))), "truths": truths(*np.zeros((2, 0, MODES)))}
-    given = {"time_ns": START_NS + after_ns, "calibration": CALIBRATION} | nothing | changes
-    panel.draw(tape, dataclasses.replace(empty, **given))
+    no_rows = {"steps": steps(0, *np.zeros((2, 0, MODES))), "truths": truths(*np.zeros((2, 0, MODES)))}
+    fields = {"time_ns": START_NS + after_ns, "calibration": CALIBRATION} | no_rows | changes
+    panel.draw(tape, dataclasses.replace(empty, **fields))
 
 
 def mean_of(pupil: Any, modes_nm: Any) -> float:
@@ -281,24 +281,24 @@ def mean_of(pupil: Any, modes_nm: Any) -> float:
     return mean_contrast(pupil, np.tensordot(modes_nm, zernikes(NOLL, radii, radii[:, None]), 1), NM, Wedge(4.0, 6.0))
 
 
-def test_contrast_is_that_of_the_newest_wavefronts() -> None:
+def test_contrast_is_the_mean_over_the_newest_wavefronts() -> None:
     pupil, rng = load_pupil(), np.random.default_rng(3)
-    left_nm, open_nm = rng.normal(0, 30.0, (4, MODES)), rng.normal(0, 80.0, (4, MODES))
+    residual_nm, open_nm = rng.normal(0, 30.0, (4, MODES)), rng.normal(0, 80.0, (4, MODES))
     refused = np.full((1, MODES), np.nan)
     tape, panel = Tape(), science.Science(Coronagraph(pupil), NM)
     panel.begin(tape)
-    measured = steps(0, np.vstack([left_nm[:2], refused]), np.vstack([open_nm[:2], refused]))
+    measured = steps(0, np.vstack([residual_nm[:2], refused]), np.vstack([open_nm[:2], refused]))
     drawn(panel, tape, 0, steps=measured, calibration=None)
     assert not tape.rows
     drawn(panel, tape, 0, steps=measured)  # the first snapshot is drawn at once
-    drawn(panel, tape, TICK_NS, steps=measured, truths=truths(left_nm[2:3], open_nm[2:3]))
-    drawn(panel, tape, science.Science.period_ns, truths=truths(left_nm[3:4], open_nm[3:4]))
+    drawn(panel, tape, TICK_NS, steps=measured, truths=truths(residual_nm[2:3], open_nm[2:3]))
+    drawn(panel, tape, science.Science.period_ns, truths=truths(residual_nm[3:4], open_nm[3:4]))
     times_ns, found = tape.column(science.CONTRAST.path)
     np.testing.assert_array_equal(times_ns - START_NS, [0, science.Science.period_ns])
     flat = mean_of(pupil, np.zeros(MODES))
     expected = [
-        [mean_of(pupil, open_nm[1]), mean_of(pupil, left_nm[1]), flat],  # the last row was refused
-        [*(np.mean([mean_of(pupil, modes_nm[row]) for row in (2, 3)]) for modes_nm in (open_nm, left_nm)), flat],
+        [mean_of(pupil, open_nm[1]), mean_of(pupil, residual_nm[1]), flat],  # the last row was refused
+        [*(np.mean([mean_of(pupil, modes_nm[row]) for row in (2, 3)]) for modes_nm in (open_nm, residual_nm)), flat],
     ]
     np.testing.assert_allclose(10**found, expected, rtol=3e-3)
     assert np.ptp(np.unique(found)) > 1
@@ -311,10 +311,11 @@ def test_a_brighter_dark_zone_is_brighter_in_the_picture() -> None:
     open_nm = np.full((1, MODES), 90.0)
     drawn(panel, tape, 0, truths=truths(0 * open_nm, open_nm))
     shown = pixels(tape, f"{science.IMAGE}/contrast").astype(float).sum(axis=2)
-    rows = slice(44, 52)  # about the x axis, from 5 to 11 lambda/D right of each star; the second begins at 102
-    now, as_open = (shown[rows, start + 68 : start + 92].mean() for start in (0, 102))
-    assert as_open > 2 * now
-    assert shown[48, 48] == shown[48, 102 + 48] == shown.max()  # both stars
+    star, second = science._SAMPLES // 2, science._SECOND
+    zone = slice(star + 20, star + 44)  # 5 to 11 lambda/D right of the star, at 4 samples per lambda/D
+    now, flat = (shown[star - 4 : star + 4, start:][:, zone].mean() for start in (0, second))
+    assert flat > 2 * now
+    assert shown[star, star] == shown[star, second + star] == shown.max()  # both stars
     drawn(panel, tape, science.Science.period_ns)  # nothing new, nothing drawn
     assert len(tape.rows[science.CONTRAST.path]) == 1
 
@@ -326,7 +327,7 @@ CAMERA = wire.CameraState(period_ns=round(1e9 / RATE_HZ))
 
 @pytest.fixture(scope="module")
 def tone() -> tuple[Any, Any]:
-    """Pseudo-open-loop of a tone in the first mode and white noise in all, and the error that the law leaves of it."""
+    """Pseudo-open-loop, a tone in the first mode and white noise in all, and the error under the law."""
     frames = 3000
     pol_nm = np.random.default_rng(1).normal(0, 0.2, (frames, MODES))
     pol_nm[:, 0] += TONE_NM * np.sqrt(2) * np.sin(2 * np.pi * TONE_HZ / RATE_HZ * np.arange(frames))
@@ -337,30 +338,32 @@ def tone() -> tuple[Any, Any]:
     return pol_nm, error_nm
 
 
-def test_a_tone_stands_at_its_frequency_with_its_power(tone: tuple[Any, Any]) -> None:
+def test_a_tone_has_its_frequency_and_power_in_the_spectrum(tone: tuple[Any, Any]) -> None:
     pol_nm, error_nm = tone
     signals = np.concatenate([error_nm, pol_nm], axis=1).astype(np.float32)
     found = spectrum(pieces(np.arange(len(signals), dtype=np.uint64), signals), RATE_HZ)
     tilts = np.array(NOLL) <= 3
-    hz, (as_open, error, theory) = spectra.power_curves(found, tilts, LAW, RATE_HZ)
-    tone_at = int(as_open.argmax())
+    hz, (pol, error, theory) = spectra.power_curves(found, tilts, LAW, RATE_HZ)
+    tone_at = int(pol.argmax())
     assert hz[tone_at] == pytest.approx(TONE_HZ, rel=0.05)
-    noise = 2 * 0.2**2 * 2 / RATE_HZ  # of two modes, one-sided
+    noise = 2 * 0.2**2 * 2 / RATE_HZ  # two modes, one-sided
     widths_hz = np.diff(np.sqrt(hz[1:] * hz[:-1]))[tone_at - 3 : tone_at + 2]
-    power = np.sum((as_open[tone_at - 2 : tone_at + 3] - noise) * widths_hz)
+    power = np.sum((pol[tone_at - 2 : tone_at + 3] - noise) * widths_hz)
     assert power == pytest.approx(TONE_NM**2, rel=0.15)
     expected = rejection(np.array([TONE_HZ]), RATE_HZ, 0.4, 0.01, 2.0)[0] ** 2
-    assert error[tone_at] / as_open[tone_at] == pytest.approx(expected, rel=0.1)
+    assert error[tone_at] / pol[tone_at] == pytest.approx(expected, rel=0.1)
     np.testing.assert_allclose(np.log10(error[2:]), np.log10(theory[2:]), atol=0.15)
-    hz, (others, _, left) = spectra.power_curves(found, ~tilts, LAW, RATE_HZ)
+    hz, (others, _, predicted) = spectra.power_curves(found, ~tilts, LAW, RATE_HZ)
     high = hz > 50
     assert np.median(others[high]) == pytest.approx(noise / 2 * (MODES - 2), rel=0.1)
-    np.testing.assert_allclose(left[high] / others[high], rejection(hz[high], RATE_HZ, 0.4, 0.01, 2.0) ** 2, rtol=0.15)
-    for law in (None, LAW._replace(linear="lqg")):  # the theory is of the integrator that is in force
+    np.testing.assert_allclose(
+        predicted[high] / others[high], rejection(hz[high], RATE_HZ, 0.4, 0.01, 2.0) ** 2, rtol=0.15
+    )
+    for law in (None, LAW._replace(linear="lqg")):  # only an integrator in force has a prediction
         assert len(spectra.power_curves(found, tilts, law, RATE_HZ)[1]) == 2
 
 
-def test_spectra_are_in_their_box_and_after_a_change_there_is_no_past(tone: tuple[Any, Any]) -> None:
+def test_spectra_stay_in_their_box_and_restart_when_the_mode_changes(tone: tuple[Any, Any]) -> None:
     tape, panel = Tape(), spectra.Spectra()
     panel.begin(tape)
     controller = wire.ControllerState(gain=LAW.gain, leak=LAW.leak, delay_frames=LAW.delay_frames)
@@ -379,9 +382,9 @@ def test_spectra_are_in_their_box_and_after_a_change_there_is_no_past(tone: tupl
     assert values_of(tape.last(state).labels) == ["loop open: too few frames yet"]
 
 
-def test_a_wavefront_that_stands_still_has_no_spectrum() -> None:
-    tape, still = Tape(), np.zeros((2000, MODES))
-    drawn(spectra.Spectra(), tape, 0, steps=steps(0, still, still))
+def test_a_constant_wavefront_has_no_spectrum() -> None:
+    tape, constant = Tape(), np.zeros((2000, MODES))
+    drawn(spectra.Spectra(), tape, 0, steps=steps(0, constant, constant))
     assert not values_of(tape.last(f"{spectra.OTHERS}/curves").strips)
 
 

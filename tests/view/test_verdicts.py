@@ -1,4 +1,4 @@
-"""The verdict on a run in words, levels and a picture: each state by itself, and what deserves green."""
+"""The verdict on a run as text, levels and picture: each state by itself, and the conditions for a good loop."""
 
 import io
 from collections import Counter
@@ -25,7 +25,7 @@ from tests.support.report_log import Night
 from tests.support.stage import MAS, Stage, Tape, tile
 from tests.support.toy import START
 
-CALM = {Level.NEUTRAL, Level.GOOD}
+NO_WARNING = {Level.NEUTRAL, Level.GOOD}
 
 
 def levels(verdict: Verdict) -> dict[str, Level]:
@@ -41,7 +41,7 @@ def begun(seconds: float = 0.0, **values: object) -> Stage:
 
 
 def staged(change: Callable[[Stage], object], after_s: float = 4.0) -> Verdict:
-    """A healthy run for a second, and then something is changed."""
+    """Verdict on a run that is healthy for a second, then changed for `after_s`."""
     stage = begun(1)
     change(stage)
     return stage.run(after_s)
@@ -77,22 +77,22 @@ def opened_by_itself(stage: Stage) -> None:
     stage.send(EVENT, EVENTS["MODE_CHANGED"].log("controller", stage.data_ns, **details))
 
 
-EVERYBODY = ("camera", "controller", "mirror-dm", "recorder")
+ALL_PROCESSES = ("camera", "controller", "mirror-dm", "recorder")
 HARMFUL = "worse than a flat mirror: `lowfc ctl safe` flattens it"
 STATES: dict[str, tuple[Callable[[Stage], object], str, str]] = {
-    # name: what changes; title, value and level of the tile that shows it; words of the headline
+    # name: the change; title, value and level of the tile that shows it; words of the headline
     "healthy": (setting(), "LOOP CLOSED GOOD", "nothing is wrong"),
     "open": (setting(mode=LoopMode.OPEN), "LOOP OPEN NEUTRAL", "lowfc ctl close"),
     "open, worse than flat": (setting(mode=LoopMode.OPEN, residual_nm=60.0), "LOOP OPEN NEUTRAL", HARMFUL),
     "camera changed": (opened_by_itself, "LOOP OPEN WARNING", "opened by itself"),
-    "safed": (setting(mode=LoopMode.SAFE), "LOOP SAFE BAD", "lowfc ctl clear"),
+    "safe": (setting(mode=LoopMode.SAFE), "LOOP SAFE BAD", "lowfc ctl clear"),
     "idle": (setting(mode=LoopMode.IDLE, reasons=(Rejection.NO_CALIBRATION,)), "FRAMES REFUSED BAD", "no calibration"),
     "controller dead": (silence("controller"), "LOOP DEAD BAD", "Controller silent for 4 s"),
     "camera dead": (silence("camera"), "FRAMES NO FRAMES BAD", "No frame for 4 s, camera silent"),
     "mirror dead": (silence("mirror-dm"), "MIRROR DEAD BAD", "Mirror silent for 4 s"),
     "recorder dead": (silence("recorder"), "RECORDER DEAD BAD", "Recorder silent"),
-    "everybody dead": (silence(*EVERYBODY), "LOOP NO MESSAGES BAD", "No message from any process for 4 s"),
-    "ended": (stop(*EVERYBODY), "LOOP ENDED NEUTRAL", "The run has ended"),
+    "all dead": (silence(*ALL_PROCESSES), "LOOP NO MESSAGES BAD", "No message from any process for 4 s"),
+    "ended": (stop(*ALL_PROCESSES), "LOOP ENDED NEUTRAL", "The run has ended"),
     "controller stopped": (stop("controller"), "LOOP STOPPED NEUTRAL", "The controller was stopped"),
     "camera stopped": (stop("camera"), "LOOP HOLDING NEUTRAL", "The camera was stopped"),
     "skipped": (counting(skipped=12), "FRAMES 12 LOST WARNING", "12 skipped (controller busy)"),
@@ -130,7 +130,7 @@ def verdicts() -> dict[str, Verdict]:
 
 
 @pytest.mark.parametrize("name", STATES)
-def test_each_state_has_its_tile_its_level_and_its_words(verdicts: dict[str, Verdict], name: str) -> None:
+def test_each_state_has_its_tile_level_and_headline(verdicts: dict[str, Verdict], name: str) -> None:
     _, expected, words = STATES[name]
     verdict = verdicts[name]
     found = tile(verdict, expected.split()[0])
@@ -144,12 +144,14 @@ def test_no_two_states_have_the_same_headline(verdicts: dict[str, Verdict]) -> N
     assert [line for line, count in Counter(one.headline for one in verdicts.values()).items() if count > 1] == []
 
 
-def test_a_loop_without_frames_holds(verdicts: dict[str, Verdict]) -> None:
+def test_a_closed_loop_without_usable_frames_is_shown_as_holding(verdicts: dict[str, Verdict]) -> None:
     assert tile(verdicts["camera dead"], "LOOP").value == tile(verdicts["star gone"], "LOOP").value == "HOLDING"
 
 
-@pytest.mark.parametrize("name", ["open", "safed", "controller dead", "star gone", "ended"])
-def test_a_wavefront_is_called_uncorrected_only_where_nothing_corrects(verdicts: dict[str, Verdict], name: str) -> None:
+@pytest.mark.parametrize("name", ["open", "safe", "controller dead", "star gone", "ended"])
+def test_the_wavefront_is_called_not_corrected_only_if_no_loop_corrects_it(
+    verdicts: dict[str, Verdict], name: str
+) -> None:
     found = tile(verdicts[name], "WAVEFRONT")
     compared = "of" if name in ("star gone", "ended") else "not corrected;"
     assert found.detail.startswith(f"{compared} 40.0 nm with a flat mirror")
@@ -157,14 +159,14 @@ def test_a_wavefront_is_called_uncorrected_only_where_nothing_corrects(verdicts:
 
 
 @pytest.mark.parametrize("after_s", [0.5, 20.0])
-def test_what_is_left_of_an_ended_run_is_called_the_last_of_it_and_is_grey(after_s: float) -> None:
-    verdict = staged(stop(*EVERYBODY), after_s=after_s)
+def test_values_of_an_ended_run_are_labelled_last_and_are_neutral(after_s: float) -> None:
+    verdict = staged(stop(*ALL_PROCESSES), after_s=after_s)
     last = [tile(verdict, title).value for title in ("WAVEFRONT", "STAR", "LATENCY")]
     assert last == ["last: 5.0 nm", "last: 100 %", "last: 500 us"]
     assert set(levels(verdict).values()) == {Level.NEUTRAL}
 
 
-def test_few_unused_frames_are_reported_without_an_alarm_and_for_five_seconds() -> None:
+def test_few_unused_frames_are_reported_for_five_seconds_without_a_warning() -> None:
     stage = begun(3)
     counting(skipped=1)(stage)
     stage.reasons = (Rejection.LATE,)
@@ -181,13 +183,13 @@ def test_few_unused_frames_are_reported_without_an_alarm_and_for_five_seconds() 
     assert tile(stage.run(3), "FRAMES").detail == "none lost, none refused"
 
 
-def test_a_camera_that_restarts_is_never_called_unused() -> None:
+def test_a_camera_restart_does_not_change_the_frame_rate() -> None:
     stage = begun(3)
     stage.start_s += 100
     assert {tile(stage.run(0.1), "FRAMES").value for _ in range(15)} == {"50 Hz"}
 
 
-def test_a_dead_mirror_is_not_hidden_by_one_that_was_stopped_or_runs() -> None:
+def test_a_dead_mirror_is_shown_even_if_another_runs_or_was_stopped() -> None:
     stage = begun()
     stage.states |= {"mirror-dm": "running", "mirror-tt": "running", "mirror-old": "stopped"}
     stage.run(1)
@@ -197,23 +199,23 @@ def test_a_dead_mirror_is_not_hidden_by_one_that_was_stopped_or_runs() -> None:
     assert (tile(stage.run(3), "MIRROR").value, tile(stage.run(3), "LOOP").level) == ("DEAD", Level.WARNING)
 
 
-def test_without_truth_the_wavefront_is_the_measured_one_and_named_so() -> None:
+def test_without_truth_the_wavefront_tile_is_labelled_measured() -> None:
     found = tile(begun(truth=False).run(3), "WAVEFRONT")
     tilt = f"tilt {5 / np.sqrt(2) / MAS:.1f} of {40 / np.sqrt(2) / MAS:.1f} mas per axis"
     assert found.value == "5.0 nm rms"
     assert found.detail == f"8.0 x better than 40.0 nm with a flat mirror; {tilt}; measured, with noise"
 
 
-def test_simulated_time_is_neither_silence_nor_latency() -> None:
+def test_simulated_time_is_not_reported_as_silence_or_latency() -> None:
     stage = Stage(data_ns=10**18)
     stage.latency_us = 30_000
     stage.begin()
     verdict = stage.run(5)
     assert verdict.level is Level.GOOD
-    assert set(levels(verdict).values()) == CALM
+    assert set(levels(verdict).values()) == NO_WARNING
 
 
-def test_a_run_that_starts_is_waited_for_and_missed_only_later() -> None:
+def test_absent_processes_are_reported_only_after_a_grace_time() -> None:
     watcher = Watcher()
     watcher.feed(Accumulator().snapshot(START * 10**9))
     nothing = judge(watcher.state())
@@ -225,21 +227,21 @@ def test_a_run_that_starts_is_waited_for_and_missed_only_later() -> None:
     assert late.level is Level.WARNING
 
 
-def test_steps_of_a_camera_without_settings_are_judged_too() -> None:
+def test_steps_are_judged_without_a_state_of_the_camera() -> None:
     stage = Stage()
     stage.states = {"controller": "running", "camera": "running"}
     assert tile(stage.run(0.1), "FRAMES").value == "50 Hz"
     assert levels(stage.run(3))["FRAMES"] is Level.GOOD
 
 
-def test_a_view_that_is_behind_does_not_take_the_run_for_dead() -> None:
+def test_a_view_that_is_behind_does_not_report_the_run_as_dead() -> None:
     stage = begun(3)
     stage.behind_s = 30.0
-    stage.silent = set(EVERYBODY)  # nothing newer has got here yet
+    stage.silent = set(ALL_PROCESSES)  # nothing newer has arrived yet
     assert [one.title for one in stage.run(20).tiles if one.level >= Level.WARNING] == ["VIEW"]
 
 
-# What deserves green.
+# Conditions for a good loop.
 
 
 @pytest.mark.parametrize(
@@ -248,12 +250,12 @@ def test_a_view_that_is_behind_does_not_take_the_run_for_dead() -> None:
         (1.5, None, Level.NEUTRAL),
         (2.5, None, Level.GOOD),
         (2.5, Attained(2.0, 1.9, 0.5), Level.GOOD),
-        (2.5, Attained(4.0, 1.9, 0.5), Level.NEUTRAL),  # other gains would leave half
+        (2.5, Attained(4.0, 1.9, 0.5), Level.NEUTRAL),  # the best gains would leave half
         (1.5, Attained(2.0, 1.9, 0.5), Level.NEUTRAL),
-        (5.0, Attained(2.0, 1.0, 8.0), Level.GOOD),  # within what is known of the noise
+        (5.0, Attained(2.0, 1.0, 8.0), Level.GOOD),  # within the uncertainty of the noise
     ],
 )
-def test_green_is_a_loop_that_corrects_and_does_what_it_could(
+def test_a_loop_is_good_if_it_corrects_and_other_gains_would_not_do_better(
     better: float, attained: Attained | None, level: Level
 ) -> None:
     assert merit(better, attained)[0] is level
@@ -264,7 +266,7 @@ def test_noise_is_subtracted_before_a_measured_wavefront_is_judged() -> None:
     assert factor(5.0, 13.0, 4.0) == pytest.approx(np.sqrt(13**2 - 4**2) / 3)
 
 
-def test_a_loop_that_corrects_little_is_grey_and_so_is_its_headline() -> None:
+def test_a_loop_that_corrects_little_is_neutral_and_so_is_its_headline() -> None:
     stage = begun(residual_nm=20.0, open_nm=30.0)
     verdict = stage.run(3)
     assert tile(verdict, "WAVEFRONT").detail.startswith("1.5 x better")
@@ -274,7 +276,7 @@ def test_a_loop_that_corrects_little_is_grey_and_so_is_its_headline() -> None:
     assert stage.run(2).level is Level.GOOD
 
 
-def test_what_the_gains_could_leave_is_computed_from_the_loop_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_residual_of_the_best_gains_is_computed_from_the_measured_loop(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lowfc.programs.view.verdicts.watcher.ATTAINED_NS", 1_000_000_000)
     night = Night(truth=False)
     night.frames(3000)
@@ -289,7 +291,7 @@ def test_what_the_gains_could_leave_is_computed_from_the_loop_itself(monkeypatch
     assert tile(judge(watcher.state()), "WAVEFRONT").detail.endswith("without noise")
 
 
-def test_a_shape_that_the_loop_holds_is_not_called_harm() -> None:
+def test_a_shape_held_on_purpose_is_not_reported_as_harm() -> None:
     stage = begun(3)
     stage.residual_nm = 60.0
     channels = [wire.Channel(name="dark-hole")]
@@ -299,7 +301,7 @@ def test_a_shape_that_the_loop_holds_is_not_called_harm() -> None:
     assert "including the shapes of offset and channels" in verdict.headline
 
 
-def test_refusals_that_are_over_are_said_to_be_over() -> None:
+def test_past_refusals_are_reported_as_ended() -> None:
     stage = begun(3)
     stage.reasons = (Rejection.DARK,)
     stage.run(2)
@@ -307,7 +309,7 @@ def test_refusals_that_are_over_are_said_to_be_over() -> None:
     assert "too dark: it has ended" in stage.run(2).headline
 
 
-# What is set.
+# The facts.
 
 
 def test_the_facts_are_run_host_law_offset_channels_and_note() -> None:
@@ -348,8 +350,8 @@ def picture_of(verdict: Verdict, time_ns: int = NOON_NS) -> npt.NDArray[np.uint8
 
 @pytest.mark.parametrize("tiles", [7, 8])
 @pytest.mark.parametrize("level", Level)
-def test_all_words_are_within_their_tile_and_nothing_is_on_its_border(level: Level, tiles: int) -> None:
-    verdict = Verdict(LONG, level, tuple(Tile("RECORDER", "NOTHING HEARD OF IT", LONG, level) for _ in range(tiles)))
+def test_text_stays_inside_its_tile_and_off_its_border(level: Level, tiles: int) -> None:
+    verdict = Verdict(LONG, level, tuple(Tile("RECORDER", "NO MESSAGES FROM IT", LONG, level) for _ in range(tiles)))
     shown = picture_of(verdict)
     rest = np.ones((HEIGHT, WIDTH), bool)
     for x0, y0, x1, y1 in tile_boxes(tiles):
@@ -362,24 +364,24 @@ def test_all_words_are_within_their_tile_and_nothing_is_on_its_border(level: Lev
     assert (shown[rest] == GROUND).all()
 
 
-def test_the_picture_shows_every_letter_and_the_time_of_day_at_its_right_end() -> None:
+def test_the_picture_shows_the_whole_text_and_the_time_of_day_at_its_right_edge() -> None:
     noon, longer, second = (
         picture_of(Verdict(LONG, Level.GOOD, (Tile("A", "B", LONG + end, Level.BAD),) * 7), at_ns)
         for end, at_ns in (("a", NOON_NS), ("ab", NOON_NS), ("a", NOON_NS + 86_401 * 10**9))
     )
-    assert (noon != longer).any(), "a letter more is a smaller text, not a text that is cut"
+    assert (noon != longer).any(), "a longer text is drawn smaller and not truncated"
     differs = np.argwhere((noon != second).any(axis=2))
     (top, left), (bottom, right) = differs.min(axis=0), differs.max(axis=0)
     assert 0 < top < bottom < tile_boxes(7)[0][3]
     assert WIDTH - 190 < left < right < WIDTH
 
 
-def test_levels_differ_in_lightness_too() -> None:
+def test_levels_differ_in_lightness() -> None:
     light = sorted(float(np.dot(FILL[level], (0.2126, 0.7152, 0.0722))) for level in Level)
     assert min(np.diff(light)) > 8
 
 
-def test_the_clock_is_drawn_each_second_and_more_only_when_something_changes() -> None:
+def test_a_picture_is_drawn_each_second_and_when_the_verdict_changes() -> None:
     tape, panel, stage = Tape(), Tiles(MAS), Stage()
     stage.each = lambda snapshot: panel.draw(tape, snapshot)
     stage.begin()
