@@ -4,7 +4,7 @@ import numpy as np
 
 from lowfc.adapters.files import factory
 from lowfc.contract.configuration import Configuration
-from lowfc.control.laws.continuous import Timing, left_power
+from lowfc.control.laws.continuous import Timing, residual_power
 from lowfc.control.laws.linear_law import integrator
 from lowfc.control.laws.margins import noise_gain
 from lowfc.control.laws.stability import highest_gain
@@ -24,7 +24,7 @@ def tilt_residual_mas(config: Configuration, delay_frames: float) -> float:
     law = integrator([gain], [control.tilt_leak], (2,), delay_frames, config.camera.rate_hz)
     timing = Timing.of(delay_frames, config.camera.exposure_fraction)
     frequency_hz, variance_nm2 = variances_nm2(shaken)
-    left = left_power(law, 2 * np.pi * frequency_hz / config.camera.rate_hz, timing)
+    left = residual_power(law, 2 * np.pi * frequency_hz / config.camera.rate_hz, timing)
     waves = np.sum(variance_nm2[:, :2] * left, axis=0)
     optics = factory.twin(config, None, ignore)
     calibration = factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, ignore))

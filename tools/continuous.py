@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from lowfc.arrays import Array
-from lowfc.control.laws.continuous import Timing, hold_floor, left_power
+from lowfc.control.laws.continuous import Timing, hold_floor, residual_power
 from lowfc.control.laws.kalman import lqg
 from lowfc.control.laws.linear_law import LinearLaw, integrator
 from lowfc.control.laws.stability import highest_gain
@@ -56,4 +56,4 @@ def _filter(timing: Timing, start: float, length: float) -> LinearLaw:
 
 
 def _left(law: LinearLaw, timing: Timing) -> float:
-    return float(np.sqrt(np.square(LINES_MAS) @ left_power(law, _omega(), timing)[:, 0]))
+    return float(np.sqrt(np.square(LINES_MAS) @ residual_power(law, _omega(), timing)[:, 0]))

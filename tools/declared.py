@@ -51,7 +51,7 @@ _GUARD = (
     ("consecutive worse blocks before the integrator takes over", guard.WORSE_BLOCKS),
     ("law is worse: ratio of its mean squared error to the integrator's above", guard.WORSE),
     ("loop amplifies: ratio of its mean squared error to the long-term mean square above", guard.AMPLIFIED),
-    ("time constant of the long-term mean square, s", guard.USUAL_S),
+    ("time constant of the long-term mean square, s", guard.LONG_TERM_S),
     ("duration of a cross-fade, s", guard.FADED_S),
     ("law is far better: ratio of its mean squared error to the integrator's below", guard.BETTER),
     ("time for which the law must be far better, at first, s", guard.BETTER_S),

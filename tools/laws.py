@@ -10,7 +10,7 @@ from threadpoolctl import threadpool_limits
 from lowfc.adapters.files.factory import frame_noise_nm
 from lowfc.contract.configuration import Configuration
 from lowfc.control.calibration.calibration import Calibration
-from lowfc.control.laws.continuous import left_power
+from lowfc.control.laws.continuous import residual_power
 from lowfc.control.laws.kalman import lqg_block
 from lowfc.control.laws.linear_law import LinearLaw, of_blocks
 from lowfc.control.laws.margins import noise_gain
@@ -104,7 +104,7 @@ def moved(config: Configuration, calibration: Calibration, law: LinearLaw) -> di
 def theory_mas(config: Configuration, calibration: Calibration, law: LinearLaw) -> tuple[float, float]:
     """Continuous-time residual of the disturbance's known spectrum, and the noise part, mas rms."""
     frequency_hz, variance_nm2 = variances_nm2(disturbance_of(config))
-    passed = left_power(law, 2 * np.pi * frequency_hz / RATE_HZ, timing_of(config))[:, :2]
+    passed = residual_power(law, 2 * np.pi * frequency_hz / RATE_HZ, timing_of(config))[:, :2]
     waves = np.mean(np.sum(variance_nm2[:, :2] * passed, axis=0))
     noise = np.mean(frame_noise_nm(config, calibration)[:2] ** 2 * noise_gain(law, config.camera.delay_frames)[:2])
     nm_per_mas = tilt_nm_per_mas(config.star.diameter_m)
@@ -142,7 +142,7 @@ def optimum_mas(config: Configuration, calibration: Calibration, *, robust: bool
             if block is None:
                 return np.inf
             law = of_blocks([block], "pol", "lqg", (2 + axis,), timing.delay, RATE_HZ)
-            passed = left_power(law, 2 * np.pi * frequency_hz / RATE_HZ, timing)[:, 0]
+            passed = residual_power(law, 2 * np.pi * frequency_hz / RATE_HZ, timing)[:, 0]
             return float(power @ passed + variance * noise_gain(law, timing.delay)[0])
 
         found = minimize(residual, (-2.0, 0.7), method="Nelder-Mead", bounds=_DRIFT_BOUNDS, options={"xatol": 0.02})

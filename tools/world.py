@@ -74,8 +74,8 @@ def _gains(sensor: str, magnitude: float) -> tuple[float, ...]:
     config = _configured(sensor, magnitude, automatic)
     bench = Bench(config, calibrated(config))
     bench.run(round(_UNTIL_GAINS_S * RATE_HZ))
-    assert bench.state.drive is not None  # noqa: S101  # a calibration is loaded
-    return tuple(bench.state.drive.law.gain.tolist())
+    assert bench.state.loop is not None  # noqa: S101  # a calibration is loaded
+    return tuple(bench.state.loop.law.gain.tolist())
 
 
 def _residual(sensor: str, magnitude: float, keys: dict[str, Any], seconds: float, again: bool) -> Figures:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from lowfc.adapters.process.host import by_this_process
 from lowfc.contract.errors import BusError, CalibrationError, LowfcError, RequestRefusedError
-from lowfc.control.loop.lease import LEASE_OVER, OUTLOOK
+from lowfc.control.loop.lease import LEASE_OVER, REMAINING_TIME_SEPARATOR
 
 if TYPE_CHECKING:
     from lowfc.adapters.process.progress import Counted
@@ -92,4 +92,4 @@ class Lease:
     def _holder(self) -> str:
         if self._end_s is None:
             return self._purpose
-        return f"{self._purpose}{OUTLOOK}{max(0.0, self._end_s - time.monotonic()):.0f} s to go"
+        return f"{self._purpose}{REMAINING_TIME_SEPARATOR}{max(0.0, self._end_s - time.monotonic()):.0f} s to go"

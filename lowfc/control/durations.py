@@ -1,4 +1,4 @@
-"""Percentiles of durations, gathered one by one without keeping them."""
+"""Percentiles of durations, which are counted in bins and not stored."""
 
 from math import log
 
@@ -10,7 +10,7 @@ _BINS = 2_000
 
 
 class Durations:
-    """Counts durations in bins of 1 % of their value, from 1 us to 400 s; the largest is kept exactly."""
+    """Histogram of durations with bins of 1 %, from 1 us to 400 s; the largest duration is exact."""
 
     def __init__(self) -> None:
         self._counts = [0] * _BINS
@@ -25,7 +25,7 @@ class Durations:
         self.max_ns = max(self.max_ns, duration_ns)
 
     def percentiles_ns(self, *fractions: float) -> list[int]:
-        """Durations that these fractions do not exceed, to the upper edge of a bin; 0 where nothing was counted."""
+        """Percentiles for these fractions, to the upper edge of a bin; 0 if nothing was counted."""
         places = np.searchsorted(np.cumsum(self._counts), np.ceil(np.array(fractions) * self.count))
         edges_ns = [round(_SMALLEST_NS * RATIO ** int(place)) if place < _BINS - 1 else self.max_ns for place in places]
         return [min(edge_ns, self.max_ns) for edge_ns in edges_ns]

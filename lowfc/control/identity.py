@@ -1,4 +1,4 @@
-"""Identity of a calibration, a law or a table: a hash of everything in it, whatever it is called."""
+"""Identity of a calibration, a law or a table: a hash of its content."""
 
 import hashlib
 from collections.abc import Iterable
@@ -7,7 +7,7 @@ import numpy as np
 
 
 def identity(parts: Iterable[tuple[str, object]]) -> str:
-    """SHA-256 of named parts in their order; an array without numbers, and None, are as if they were not there.
+    """SHA-256 of named parts in their order; empty arrays and None are skipped.
 
     The names are those of 0.1 and never change, so that files and logs keep their identities.
     """

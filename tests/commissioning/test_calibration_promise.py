@@ -133,7 +133,7 @@ def test_the_verdict_names_the_mode_if_the_snr_is_out_of_reach(seed: int, tmp_pa
 
 @pytest.mark.slow
 def test_pokes_below_the_disturbance_give_an_error(tmp_path: Path) -> None:
-    with pytest.raises(CalibrationError, match="too small for what shakes the wavefront"):
+    with pytest.raises(CalibrationError, match="too small for the disturbance"):
         outcome("hadamard", WHEEL, 3, 30.0, tmp_path)
 
 

@@ -118,7 +118,7 @@ def test_each_unusable_file_is_a_line_of_the_error(tmp_path: Path) -> None:
     check_files(load(None, {"control.law": str(law)}))
     assert "Z2 to Z15" in complaint({"control.law": str(law), "sensor.modes": 9})
     assert "made for 250 Hz, the frames come at 500 Hz" in complaint({"control.law": str(law), "camera.rate_hz": 500})
-    assert "is made for a delay of 1 frames, the loop has 3" in complaint(
+    assert "was made for a delay of 1 frame, the loop has 3" in complaint(
         {"control.law": str(law), "control.delay_frames": 3}
     )
     law_file.save(law_of(config, gain=0.95, signal="error"), law)
@@ -183,14 +183,14 @@ def commands(config: Configuration, state: State, frames: int) -> tuple[list[Sin
     """Commands over some frames of uniform light in open loop, and the names of the channels at their end."""
     settings, shape = (
         replace(factory.settings(config), min_flux_fraction=0.0, max_identical_frames=0),
-        state.drive.calibration.shape,
+        state.loop.calibration.shape,
     )
-    dark = np.rint(state.drive.calibration.dark + 100).reshape(shape).astype(np.uint16)
+    dark = np.rint(state.loop.calibration.dark + 100).reshape(shape).astype(np.uint16)
     sent = []
     for index in range(frames):
         state, outputs = advance(settings, state, Frame(1 + index, index, 0, dark))
         sent.append(outputs.command.actuators_nm)
-    return sent, [one.name for one in state.drive.added().channels]
+    return sent, [one.name for one in state.loop.additions().channels]
 
 
 def test_the_flat_map_is_applied_at_the_start(tmp_path: Path, calibration: Calibration) -> None:
@@ -230,7 +230,7 @@ def test_the_configured_law_is_requested_at_the_start(tmp_path: Path, calibratio
     state, requests = begun(config, calibration, None)
     assert [one.name for one in requests] == ["law"]
     assert state.mode is LoopMode.OPEN
-    assert state.drive.following.law.name == "leaky"
+    assert state.loop.law_runner.law.name == "leaky"
     with pytest.raises(ConfigurationError, match="the law is of the modes"):
         StartUp(config).refused(requests[0], "the law is of the modes 2 to 15, the loop of 2 to 9")
 

@@ -1,4 +1,4 @@
-"""Calibrations as FITS: nothing is lost, damage is found, units are in the headers."""
+"""Calibrations as FITS files: no loss, damage is detected, units are in the headers."""
 
 import io
 from dataclasses import fields, replace
@@ -17,7 +17,7 @@ from tests.support import toy
 
 
 def calibration() -> Calibration:
-    """The toy's, with bad pixels and noise in every array."""
+    """The toy's calibration with bad pixels and noise in some arrays."""
     made, rng = toy.calibration(), np.random.default_rng(3)
     arrays = {
         name: single(rng.standard_normal(getattr(made, name).shape)) for name in ("reference", "response", "dark")
@@ -28,7 +28,7 @@ def calibration() -> Calibration:
     )
 
 
-def test_what_is_saved_is_loaded_bit_for_bit(tmp_path: Path) -> None:
+def test_a_saved_calibration_is_loaded_bit_for_bit(tmp_path: Path) -> None:
     saved, path = calibration(), tmp_path / "night.fits"
     save(saved, path)
     found = load(path)
@@ -59,7 +59,7 @@ def test_the_file_is_fits_with_named_extensions_and_units() -> None:
         assert units[0].header["NOLL"] == "2 3 4"
 
 
-def test_damage_is_found(tmp_path: Path) -> None:
+def test_a_damaged_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "night.fits"
     content = to_bytes(calibration())
     path.write_bytes(content)
@@ -72,7 +72,7 @@ def test_damage_is_found(tmp_path: Path) -> None:
         load(path)
 
 
-def test_another_kind_of_file_is_refused(tmp_path: Path) -> None:
+def test_files_of_another_kind_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "picture.fits"
     for content in (b"", b"not FITS at all" * 400):
         path.write_bytes(content)
@@ -94,14 +94,14 @@ def test_another_kind_of_file_is_refused(tmp_path: Path) -> None:
         {"dark": np.zeros(42, np.float32)},
     ],
 )
-def test_the_identity_is_of_everything(change: dict[str, object]) -> None:
+def test_the_identity_depends_on_every_field(change: dict[str, object]) -> None:
     one = calibration()
     assert calibration_codec.identified(one).id == one.id
     assert len(one.id) == 64
     assert calibration_codec.identified(replace(one, **change)).id != one.id
 
 
-def test_what_r_makes_of_each_actuator_is_kept_and_may_be_missing(tmp_path: Path) -> None:
+def test_actuators_to_modes_are_stored_and_optional(tmp_path: Path) -> None:
     one, path = calibration(), tmp_path / "night.fits"
     seen = np.arange(60, dtype=np.float32).reshape(3, 20)
     whole = calibration_codec.identified(replace(one, actuators_to_modes=seen))

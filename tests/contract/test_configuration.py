@@ -1,4 +1,4 @@
-"""The configuration: defaults that work, and one clear line for everything that does not."""
+"""The configuration: valid defaults, and one clear line for each error."""
 
 import re
 import tomllib
@@ -25,13 +25,13 @@ def write(folder: Path, text: str) -> Path:
     return path
 
 
-def complaint(path: Path | None, overrides: dict[str, Any] | None = None) -> str:
+def error_of(path: Path | None, overrides: dict[str, Any] | None = None) -> str:
     with pytest.raises(ConfigurationError) as caught:
         load(path, overrides)
     return str(caught.value)
 
 
-def test_the_defaults_are_valid_and_make_every_part() -> None:
+def test_the_defaults_are_valid_for_every_component() -> None:
     config = load(None)
     assert config == Configuration()
     detector(config)
@@ -41,11 +41,11 @@ def test_the_defaults_are_valid_and_make_every_part() -> None:
     assert device(config).tighter.stroke_nm > config.safety.stroke_nm
 
 
-def test_every_key_has_a_sentence() -> None:
+def test_every_key_has_a_description() -> None:
     assert [key for key, info in KEYS.items() if not (info.description or "").endswith(".")] == []
 
 
-def test_toml_round_trip(tmp_path: Path) -> None:
+def test_a_configuration_round_trips_through_toml(tmp_path: Path) -> None:
     config = load(None, {"seed": 7, "mirror.stuck_nm": {"3": 25.0}, "mirror.dead": [1, 2], "camera.delay_frames": 1.5})
     assert load(write(tmp_path, config.to_toml())) == config
     written = tomllib.loads(config.to_toml())
@@ -74,9 +74,9 @@ def test_an_unknown_key_is_refused_with_the_nearest_known_one(
     tmp_path: Path, text: str, unknown: str, near: str
 ) -> None:
     path = write(tmp_path, text)
-    said = complaint(path)
-    assert said.startswith(f"{path}: unknown key {unknown!r}; the nearest known one is '{near}")
-    assert "\n" not in said
+    message = error_of(path)
+    assert message.startswith(f"{path}: unknown key {unknown!r}; the nearest known one is '{near}")
+    assert "\n" not in message
 
 
 @pytest.mark.parametrize(
@@ -98,15 +98,15 @@ def test_an_unknown_key_is_refused_with_the_nearest_known_one(
         ("safety.slew_nm", 0),
     ],
 )
-def test_a_value_out_of_range_is_one_line_with_key_and_value(tmp_path: Path, key: str, value: object) -> None:
-    said = complaint(None, {key: value})
-    assert said.startswith(f"{key}")
-    assert repr(value) in said or repr(value)[1:-1] in said
-    assert "\n" not in said
+def test_an_invalid_value_is_reported_in_one_line_with_key_and_value(tmp_path: Path, key: str, value: object) -> None:
+    message = error_of(None, {key: value})
+    assert message.startswith(f"{key}")
+    assert repr(value) in message or repr(value)[1:-1] in message
+    assert "\n" not in message
 
 
-def test_what_is_shown_chooses_nothing_that_was_not_chosen(tmp_path: Path) -> None:
-    """Written to a file and read again, it leaves a command's own defaults in force."""
+def test_config_show_sets_only_keys_that_were_set(tmp_path: Path) -> None:
+    """Read from a file, the output of `config show` leaves the defaults of a command in force."""
     silent = write(tmp_path, commented(load(None)))
     assert tomllib.loads(silent.read_text()) == {name: {} for name in tomllib.loads(silent.read_text())}
     assert load(silent, None, {"control.start_mode": "closed"}).control.start_mode == "closed"
@@ -114,7 +114,7 @@ def test_what_is_shown_chooses_nothing_that_was_not_chosen(tmp_path: Path) -> No
         key.rpartition(".")[2] for key in KEYS
     }
     chosen = {
-        "control": {"start_mode": "open"},  # the default, and yet a choice
+        "control": {"start_mode": "open"},  # the default, but set
         "disturbance": {"static_nm": {"4": 1.5}},
         "mirror": {"dead": [1, 2], "stuck_nm": {"3": 25.0, "5": -2.0}},
     }
@@ -123,20 +123,20 @@ def test_what_is_shown_chooses_nothing_that_was_not_chosen(tmp_path: Path) -> No
     assert {name: keys for name, keys in tomllib.loads(shown.read_text()).items() if keys} == chosen
     assert load(shown, None, {"control.start_mode": "closed"}) == config
     uncommented = "\n".join(re.sub(r"^#(?! )", "", line) for line in commented(load(None)).splitlines())
-    assert load(write(tmp_path, uncommented)) == Configuration(), "each key can be uncommented as it stands"
+    assert load(write(tmp_path, uncommented)) == Configuration(), "each key can be uncommented unchanged"
 
 
-def test_a_fault_names_the_key_as_it_is_written() -> None:
-    assert complaint(None, {"control.gain": [1.0], "camera.rate_hz": "x"}).splitlines() == [
+def test_errors_name_the_key_as_written() -> None:
+    assert error_of(None, {"control.gain": [1.0], "camera.rate_hz": "x"}).splitlines() == [
         "camera.rate_hz = 'x': must be a valid number",
         "control.gain = [1.0]: must be a valid number",
         "control.gain = [1.0]: must be 'auto'",
     ]
 
 
-def test_every_fault_gets_its_own_line(tmp_path: Path) -> None:
-    said = complaint(write(tmp_path, "[camera]\nrate_hz = -1\ngain = 2\n[safety]\nslew_nm = 0"))
-    lines = said.splitlines()
+def test_each_error_has_its_own_line(tmp_path: Path) -> None:
+    message = error_of(write(tmp_path, "[camera]\nrate_hz = -1\ngain = 2\n[safety]\nslew_nm = 0"))
+    lines = message.splitlines()
     assert len(lines) == 3
     assert all(line.startswith(f"{tmp_path / 'lowfc.toml'}: ") for line in lines)
 
@@ -153,38 +153,38 @@ def test_every_fault_gets_its_own_line(tmp_path: Path) -> None:
         ({"disturbance.static_nm": {"1": 3.0}}, ("'1'", "Noll")),
     ],
 )
-def test_values_that_do_not_go_together_are_refused(overrides: dict[str, Any], words: tuple[str, ...]) -> None:
-    said = complaint(None, overrides)
-    assert all(word in said for word in words), said
-    assert "\n" not in said
+def test_contradicting_values_are_refused(overrides: dict[str, Any], words: tuple[str, ...]) -> None:
+    message = error_of(None, overrides)
+    assert all(word in message for word in words), message
+    assert "\n" not in message
 
 
-def test_imperfections_of_the_world_are_off_by_default_and_all_of_them_are_measured() -> None:
+def test_imperfections_are_off_by_default_and_all_are_measured() -> None:
     assert load(None).imperfections == {}
     assert {key for keys in CASES.values() for key in load(None, keys).imperfections} == set(IMPERFECTIONS)
 
 
-def test_an_integer_will_do_for_a_float() -> None:
+def test_an_integer_is_accepted_for_a_float() -> None:
     config = load(None, {"camera.rate_hz": 500, "mirror.stuck_nm": {"3": 25}})
     assert (config.camera.rate_hz, config.mirror.stuck_nm["3"]) == (500.0, 25.0)
     assert isinstance(config.camera.rate_hz, float)
 
 
-def test_a_file_that_is_missing_or_no_toml_is_named(tmp_path: Path) -> None:
-    assert complaint(tmp_path / "none.toml") == f"{tmp_path / 'none.toml'}: there is no such configuration file"
-    assert "not a readable TOML file" in complaint(write(tmp_path, "seed = = 3"))
+def test_a_missing_or_invalid_file_is_named(tmp_path: Path) -> None:
+    assert error_of(tmp_path / "none.toml") == f"{tmp_path / 'none.toml'}: there is no such configuration file"
+    assert "not a readable TOML file" in error_of(write(tmp_path, "seed = = 3"))
     (tmp_path / "latin.toml").write_bytes(b"seed = 3 # caf\xe9")
-    assert "not a readable TOML file" in complaint(tmp_path / "latin.toml")
-    assert "not a readable TOML file" in complaint(tmp_path)
+    assert "not a readable TOML file" in error_of(tmp_path / "latin.toml")
+    assert "not a readable TOML file" in error_of(tmp_path)
 
 
-def test_overrides_lie_over_the_file(tmp_path: Path) -> None:
+def test_overrides_replace_values_of_the_file(tmp_path: Path) -> None:
     path = write(tmp_path, "seed = 3\n[camera]\nrate_hz = 500")
     config = load(path, {"camera.rate_hz": 250.0})
     assert (config.seed, config.camera.rate_hz) == (3, 250.0)
-    assert "must be a section" in complaint(path, {"seed.deep": 1})
+    assert "must be a section" in error_of(path, {"seed.deep": 1})
 
 
-def test_times_follow_from_the_rate() -> None:
+def test_period_and_exposure_follow_from_the_frame_rate() -> None:
     config = load(None, {"camera.rate_hz": 800.0, "camera.exposure_fraction": 0.4, "sensor.modes": 3})
     assert (config.period_ns, config.exposure_ns, config.noll) == (1_250_000, 500_000, (2, 3, 4))

@@ -1,4 +1,4 @@
-"""Control characters in notes and other text of unknown origin: shown as escapes, never given to a terminal."""
+"""Control characters in notes and other text of unknown origin are escaped and never sent to a terminal."""
 
 import signal
 import sys
@@ -27,27 +27,27 @@ HOSTILE = "clouds\x1b[2J\x07 \x9b31mred \u202egnorts \u2028 caf\u00e9 5\u2009nm\
 SHOWN = r"clouds\x1b[2J\x07 \x9b31mred \u202egnorts \u2028 café 5" + "\u2009" + r"nm\r\nerror: fine"
 
 
-def check(said: str, *, keep: str = "\n") -> None:
-    """No control character is in what was printed, and what was said is."""
-    assert printable(said, keep) == said
-    assert "clouds\\x1b[2J" in said
+def check(output: str, *, keep: str = "\n") -> None:
+    """The output contains the text, but no control character."""
+    assert printable(output, keep) == output
+    assert "clouds\\x1b[2J" in output
 
 
-def test_control_characters_are_shown_and_nothing_else_is_changed() -> None:
+def test_only_control_characters_are_escaped() -> None:
     assert printable(HOSTILE) == SHOWN
     assert printable(HOSTILE, LINES) == SHOWN.replace("\\n", "\n")
-    usual = "R = 3 µm, \u00a0 ±2 \\n 日本 🔭 \u2009"
-    assert printable(usual) == usual
+    harmless = "R = 3 µm, \u00a0 ±2 \\n 日本 🔭 \u2009"
+    assert printable(harmless) == harmless
     assert printable("a\udc80b") == r"a\udc80b"
 
 
-def test_a_process_prints_its_events_so(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_process_escapes_its_events(capsys: pytest.CaptureFixture[str]) -> None:
     clock = FakeClock()
     Service("camera", "night", clock, MemoryBus(MemoryHub(), "camera", clock)).event("RECORDING_FAILED", why=HOSTILE)
     assert capsys.readouterr().err == f"camera: RECORDING_FAILED recording stopped: {SHOWN}\n"
 
 
-def test_a_commands_answer_and_error_are_printed_so(
+def test_a_command_escapes_its_output_and_errors(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     print_result({}, f"{HOSTILE}\nframe 3", as_json=False)
@@ -69,7 +69,7 @@ def test_a_commands_answer_and_error_are_printed_so(
     check(capsys.readouterr().err)
 
 
-def test_a_configuration_is_complained_of_so() -> None:
+def test_configuration_errors_are_escaped() -> None:
     with pytest.raises(ConfigurationError) as caught:
         load(None, {"mirror.stuck_nm": {HOSTILE: "high"}})
     check(str(caught.value))
@@ -77,7 +77,7 @@ def test_a_configuration_is_complained_of_so() -> None:
 
 @pytest.fixture
 def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A log whose recorder escaped nothing."""
+    """A log whose recorder did not escape anything."""
     monkeypatch.setattr(report_log, "METADATA", {"lowfc": {"host": HOSTILE, "numpy": HOSTILE}})
     night = Night()
     night.frames(200)
@@ -90,17 +90,17 @@ def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.usefixtures("without_drawings")
 @pytest.mark.parametrize("command", ["info", "report", "replay"])
-def test_readers_of_a_log_print_them_so(log: Path, command: str) -> None:
+def test_readers_of_a_log_escape_their_output(log: Path, command: str) -> None:
     done = lowfc(command, log)
     assert done.exit_code == 0, done.output
     check(done.output)
     if command == "report":
         page = log.with_suffix(".html").read_text()
         check(page.replace("\u2028", ""), keep=LINES)
-        assert page.count("clouds\\x1b[2J") >= 6, "events, requests, what ran"
+        assert page.count("clouds\\x1b[2J") >= 6, "events, requests, versions"
 
 
-def test_a_view_shows_them(log: Path) -> None:
+def test_a_view_escapes_events(log: Path) -> None:
     tape = Tape()
     draw_logs([log], None, lambda config: Renderer(config, tape))  # type: ignore[arg-type]
     paths = [path for path in tape.paths if path.startswith(LOG)]

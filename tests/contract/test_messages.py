@@ -1,6 +1,6 @@
-"""The wire contract: a schema that only grows, topics and events that are whole.
+"""The wire contract: a schema that only grows, consistent topics and events.
 
-After a field was added on purpose: `python tests/contract/test_messages.py` writes `tests/golden/lowfc_v1.txt` anew.
+After a new field: `python tests/contract/test_messages.py` rewrites `tests/golden/lowfc_v1.txt`.
 """
 
 import ast
@@ -38,7 +38,7 @@ GOLDEN = Path(__file__).parents[1] / "golden" / "lowfc_v1.txt"
 
 
 def declared() -> FileDescriptorProto:
-    """The project's file in the descriptor that is checked in, comments included."""
+    """The project's file in the committed descriptor, with comments."""
     every = FileDescriptorSet.FromString((WIRE / "lowfc.desc").read_bytes())
     return next(file for file in every.file if file.package == "lowfc.v1")
 
@@ -52,30 +52,30 @@ def comments(file: FileDescriptorProto) -> dict[tuple[int, ...], str]:
 def schema() -> list[str]:
     """One line for each field and each enum value: message, number, name, type, label, comment."""
     file, lines = declared(), []
-    said = comments(file)
+    sentences = comments(file)
     for index, message in enumerate(file.message_type):
         for position, field in enumerate(message.field):
             kind = field.type_name.lstrip(".") or FieldDescriptorProto.Type.Name(field.type)[5:].lower()
             label = FieldDescriptorProto.Label.Name(field.label)[6:].lower()
-            sentence = said.get((4, index, 2, position), "")
+            sentence = sentences.get((4, index, 2, position), "")
             lines.append(f"{message.name} | {field.number} | {field.name} | {kind} | {label} | {sentence}".rstrip())
     for index, enum in enumerate(file.enum_type):
         for position, value in enumerate(enum.value):
-            sentence = said.get((5, index, 2, position), "")
+            sentence = sentences.get((5, index, 2, position), "")
             lines.append(f"{enum.name} | {value.number} | {value.name} | value | | {sentence}".rstrip())
     return lines
 
 
 def test_the_schema_only_grows() -> None:
-    """What 0.1 had is compared with its own descriptor (tests/logs/test_golden.py)."""
+    """tests/logs/test_golden.py compares with the descriptor of 0.1."""
     assert GOLDEN.read_text(encoding="utf-8").splitlines() == schema(), (
-        "the schema is another one: a number, name, type or label that there is stays as it is, a new field gets a new "
-        f"number; if that is so, run `python {Path(__file__).relative_to(ROOT)}` and commit the golden file"
+        "the schema has changed: existing numbers, names, types and labels must stay, and a new field needs a new "
+        f"number; if they do, run `python {Path(__file__).relative_to(ROOT)}` and commit the golden file"
     )
 
 
-def test_the_generated_code_is_what_the_declaration_compiles_to(tmp_path: Path) -> None:
-    pytest.importorskip("grpc_tools", reason="grpcio-tools, which carries protoc, is for development only")
+def test_the_generated_code_matches_the_proto_file(tmp_path: Path) -> None:
+    pytest.importorskip("grpc_tools", reason="needs grpcio-tools, which contains protoc, for development only")
     command = [sys.executable, "-m", "lowfc.contract.compile_proto", "--into", str(tmp_path)]
     subprocess.run(command, check=True, cwd=ROOT)
     made = sorted(path.name for path in tmp_path.iterdir())
@@ -84,31 +84,31 @@ def test_the_generated_code_is_what_the_declaration_compiles_to(tmp_path: Path) 
         assert (tmp_path / name).read_bytes() == (WIRE / name).read_bytes(), f"{name} is stale: run `make proto`"
 
 
-@pytest.mark.parametrize(("ours", "prefix"), [(LoopMode, "LOOP_MODE_"), (REASONS, "REASON_")])
-def test_enums_are_numbered_as_on_the_wire(ours: Iterable[IntEnum], prefix: str) -> None:
-    theirs = dict((wire.LoopMode if ours is LoopMode else wire.Reason).items())
-    assert theirs == {f"{prefix}UNSPECIFIED": 0} | {f"{prefix}{one.name}": one.value for one in ours}
+@pytest.mark.parametrize(("enum", "prefix"), [(LoopMode, "LOOP_MODE_"), (REASONS, "REASON_")])
+def test_enums_have_the_numbers_of_the_wire(enum: Iterable[IntEnum], prefix: str) -> None:
+    theirs = dict((wire.LoopMode if enum is LoopMode else wire.Reason).items())
+    assert theirs == {f"{prefix}UNSPECIFIED": 0} | {f"{prefix}{one.name}": one.value for one in enum}
 
 
-def test_levels_are_numbered_as_in_foxgloves_schema() -> None:
+def test_levels_have_the_numbers_of_foxgloves_schema() -> None:
     theirs = {value.name: value.number for value in Log.DESCRIPTOR.enum_types_by_name["Level"].values}
     assert theirs == {"UNKNOWN": 0} | {level.name: level.value for level in Level}
 
 
 def test_every_message_and_every_field_has_a_comment() -> None:
     file = declared()
-    said = comments(file)
-    bare = [message.name for index, message in enumerate(file.message_type) if not said.get((4, index))]
+    sentences = comments(file)
+    bare = [message.name for index, message in enumerate(file.message_type) if not sentences.get((4, index))]
     for index, message in enumerate(file.message_type):
         for position, field in enumerate(message.field):
-            if field.name != "timestamp" and not said.get((4, index, 2, position)):
+            if field.name != "timestamp" and not sentences.get((4, index, 2, position)):
                 bare.append(f"{message.name}.{field.name}")
     for index, enum in enumerate(file.enum_type):
-        bare += [one.name for at, one in enumerate(enum.value) if one.number and not said.get((5, index, 2, at))]
+        bare += [one.name for at, one in enumerate(enum.value) if one.number and not sentences.get((5, index, 2, at))]
     assert bare == []
 
 
-def test_topics_are_found_by_their_keys_and_are_whole() -> None:
+def test_topics_are_unique_and_found_by_their_keys() -> None:
     assert len({topic.key for topic in TOPICS}) == len(TOPICS)
     for topic in TOPICS:
         assert topic_of(topic.at("dm")) is topic
@@ -121,7 +121,7 @@ def test_topics_are_found_by_their_keys_and_are_whole() -> None:
             topic_of(key)
 
 
-def test_only_what_the_loop_waits_for_is_in_the_loop() -> None:
+def test_only_frames_steps_commands_and_mirror_states_are_in_the_loop() -> None:
     keys = {topic.key for topic in TOPICS if topic.in_loop}
     assert keys == {
         "lowfc/camera/frame",
@@ -131,8 +131,8 @@ def test_only_what_the_loop_waits_for_is_in_the_loop() -> None:
     }
 
 
-def raised() -> Iterator[tuple[str, str, set[str]]]:
-    """Where an event is raised, its name, and the keys of its details: every Raised(...) and ...event(...) call."""
+def raised_events() -> Iterator[tuple[str, str, set[str]]]:
+    """Place, name and keys of the details of every raised event: PendingEvent(...) and ...event(...) calls."""
     for package in ("lowfc", "sim_camera", "sim_dm"):
         for path in sorted((ROOT / package).rglob("*.py")):
             text = path.read_text(encoding="utf-8")
@@ -153,38 +153,38 @@ def _raised_in(scope: ast.FunctionDef, path: Path) -> Iterator[tuple[str, str, s
         called, where = ast.unparse(node.func), f"{path.relative_to(ROOT)}:{node.lineno}"
         if called == "PendingEvent":
             details = dicts.get(ast.unparse(node.args[1]), node.args[1])
-            assert isinstance(details, ast.Dict), f"{where}: the details are no dict that can be checked"
+            assert isinstance(details, ast.Dict), f"{where}: the details are not a dict that can be checked"
             yield where, node.args[0].value, {ast.literal_eval(key) for key in details.keys if key}
         elif called.endswith(".event") and all(keyword.arg for keyword in node.keywords):
             yield where, node.args[0].value, {str(keyword.arg) for keyword in node.keywords}
 
 
-def wanted(sentence: str) -> set[str]:
+def details_of(sentence: str) -> set[str]:
     return {name for _, name, _, _ in string.Formatter().parse(sentence) if name}
 
 
-def test_every_event_that_is_raised_is_in_the_table_with_its_details() -> None:
-    found = list(raised())
+def test_every_raised_event_is_in_the_table_with_the_same_details() -> None:
+    found = list(raised_events())
     wrong = [
         f"{where}: {name} with {sorted(details)}"
         for where, name, details in found
-        if name not in EVENTS or details != wanted(EVENTS[name].sentence)
+        if name not in EVENTS or details != details_of(EVENTS[name].sentence)
     ]
     assert wrong == []
     assert len(found) > 25
     assert {"MODE_CHANGED", "CALIBRATION_LOADED", "COMMAND_EXPIRED"} <= {name for _, name, _ in found}
 
 
-def test_every_event_makes_a_line() -> None:
+def test_every_event_formats_as_a_line() -> None:
     for name, event in EVENTS.items():
         assert re.fullmatch(r"[A-Z]+(_[A-Z]+)*", name)
-        log = event.log("controller", 1_500_000_000_123_456_789, **dict.fromkeys(wanted(event.sentence), 3))
+        log = event.log("controller", 1_500_000_000_123_456_789, **dict.fromkeys(details_of(event.sentence), 3))
         assert re.fullmatch(rf"{name} [^{{]*", log.message)
         assert log.level == event.level
         assert from_timestamp(log.timestamp) == 1_500_000_000_123_456_789
 
 
-def test_a_frame_survives() -> None:
+def test_a_frame_is_decoded() -> None:
     pixels = np.arange(12, dtype=np.uint16).reshape(3, 4) * 5000
     time_ns = 1_767_225_600_123_456_789
     frame = codec.decode_frame(image(pixels, time_ns, "camera").SerializeToString(), 5, 9)
@@ -203,11 +203,11 @@ def test_a_frame_survives() -> None:
         RawImage(width=4, height=3, step=9, encoding="mono16", data=bytes(27)).SerializeToString(),
     ],
 )
-def test_what_is_no_frame_has_no_pixels(payload: bytes) -> None:
+def test_an_invalid_frame_has_no_pixels(payload: bytes) -> None:
     assert codec.decode_frame(payload, 1, 0).pixels is None
 
 
-def test_a_step_a_command_and_a_request_survive() -> None:
+def test_steps_commands_and_requests_round_trip() -> None:
     modes, shape = np.array([1.5, -2.25], np.float32), np.arange(6, dtype=np.float32).reshape(2, 3)
     step = Step(9, 77, LoopMode.CLOSED, modes, (Limit.SLEW, Limit.NEIGHBOUR), modes + 1, modes + 2, 12.5, 3)
     sent = wire.ControlStep.FromString(codec.encode_step(step, 4))
@@ -219,24 +219,24 @@ def test_a_step_a_command_and_a_request_survive() -> None:
     assert list(sent.pol_nm) == (modes + 2).tolist()
     assert (sent.flux_dn, sent.saturated_pixels) == (12.5, 3)
 
-    told = wire.MirrorCommand.FromString(codec.encode_command(Command(9, 77, shape, modes), 5, "lowfc", 4))
-    assert (told.frame_sequence, told.valid_for_ns, told.channel, told.input_number) == (9, 5, "lowfc", 4)
-    assert np.array_equal(codec.actuators(told), shape)
-    told.actuators += b"\0"
-    assert codec.actuators(told) is None
-    told.actuators = b""
-    assert codec.actuators(told) is None
+    command = wire.MirrorCommand.FromString(codec.encode_command(Command(9, 77, shape, modes), 5, "lowfc", 4))
+    assert (command.frame_sequence, command.valid_for_ns, command.channel, command.input_number) == (9, 5, "lowfc", 4)
+    assert np.array_equal(codec.actuators(command), shape)
+    command.actuators += b"\0"
+    assert codec.actuators(command) is None
+    command.actuators = b""
+    assert codec.actuators(command) is None
 
-    asked = Request(77, "gain", (2, 3), (0.5, 0.25))
-    answered = codec.encode_request(asked, Reply(True, "done", 10), 4, None)
-    assert codec.decode_request(answered, "gain", 77) == asked
+    request = Request(77, "gain", (2, 3), (0.5, 0.25))
+    answered = codec.encode_request(request, Reply(True, "done", 10), 4, None)
+    assert codec.decode_request(answered, "gain", 77) == request
     reply = wire.Request.FromString(answered)
     assert (reply.accepted, reply.reply, reply.frame_sequence, reply.input_number) == (True, "done", 10, 4)
     with pytest.raises(ValueError, match="could not be read"):
         codec.decode_request(b"\xff", "gain", 77)
 
 
-def test_a_mirrors_state_survives() -> None:
+def test_a_mirror_state_is_decoded() -> None:
     shape = np.arange(6, dtype=np.float32).reshape(2, 3)
     state = wire.MirrorState(timestamp=timestamp(77), rows=2, columns=3, actuators=shape.tobytes(), command_nm=[1, 2])
     found = codec.decode_mirror(state.SerializeToString())

@@ -1,4 +1,4 @@
-"""The configuration in a log of another version: what this one cannot use is a remark, and the log is read."""
+"""The configuration in a log of another version: unusable parts cause remarks, and the log is still read."""
 
 import json
 import tempfile
@@ -19,7 +19,7 @@ from tests.support.report_log import Night
 from tests.support.stage import Tape
 
 OTHER = "[camera]\nrate_hz = 300.0\nshutter = 'rolling'\n[control]\nleak = 7.0\n[weather]\nwind = 3\n"
-"""Two keys that this version does not know, and a value that it refuses."""
+"""Two unknown keys and an invalid value."""
 REMARKS = [
     "unknown key 'camera.shutter'; the nearest known one is 'camera.noise'; it is ignored",
     "control.leak = 7.0: must be less than or equal to 1; the default is used",
@@ -27,7 +27,7 @@ REMARKS = [
 ]
 
 
-def test_what_this_version_knows_is_used() -> None:
+def test_known_keys_are_used_and_the_rest_are_remarks() -> None:
     config, remarks = recorded(OTHER.encode())
     assert config == load(None, {"camera.rate_hz": 300.0})
     assert remarks == REMARKS
@@ -44,7 +44,7 @@ def test_what_this_version_knows_is_used() -> None:
         ("[[control]]\ngain = 0.1", {}, "control = [{'gain': 0.1}]"),
     ],
 )
-def test_a_value_that_is_refused_has_the_default(toml: str, changed: dict[str, object], remark: str) -> None:
+def test_an_invalid_value_is_replaced_by_the_default(toml: str, changed: dict[str, object], remark: str) -> None:
     config, remarks = recorded(toml.encode())
     assert config == load(None, changed)
     (found,) = remarks
@@ -52,7 +52,7 @@ def test_a_value_that_is_refused_has_the_default(toml: str, changed: dict[str, o
     assert found.endswith("; the default is used")
 
 
-def test_values_that_do_not_go_together_stay_as_the_run_had_them() -> None:
+def test_contradicting_values_stay_as_recorded() -> None:
     toml = "[safety]\nstroke_nm = 900.0\n[mirror]\nrows = 33\n[disturbance.static_nm]\nfocus = 3.0\n[camera]\nfoo = 1\n"
     config, remarks = recorded(toml.encode())
     assert (config.safety.stroke_nm, config.mirror.rows, config.disturbance.static_nm) == (900.0, 33, {"focus": 3.0})
@@ -67,14 +67,14 @@ def test_values_that_do_not_go_together_stay_as_the_run_had_them() -> None:
     assert "stroke_nm = 900.0" in config.to_toml()
 
 
-def test_of_very_many_remarks_the_first_are_made() -> None:
+def test_the_number_of_remarks_is_limited() -> None:
     _, remarks = recorded("".join(f"k{number} = 1\n" for number in range(2000)).encode())
     assert len(remarks) == MOST_FAULTS + 1
     assert remarks[-1] == f"and {2000 - MOST_FAULTS} more"
 
 
 @pytest.mark.parametrize("toml", ["[camera", "a = " + "[" * 100_000, "#" * (1 << 20) + "#"])
-def test_what_is_no_configuration_is_a_remark_too(tmp_path: Path, toml: str) -> None:
+def test_an_unreadable_configuration_is_a_remark(tmp_path: Path, toml: str) -> None:
     with pytest.raises(ConfigurationError, match="not a readable TOML file"):
         recorded(toml.encode())
     night = Night()
@@ -89,13 +89,13 @@ def test_what_is_no_configuration_is_a_remark_too(tmp_path: Path, toml: str) -> 
 @pytest.fixture(scope="module")
 def night() -> Night:
     """A loop that was open, then closed, with an acceptance test of its noise."""
-    made = Night()
+    night_ = Night()
     for loop, frames in (("open", 500), ("closed", 1200)):
-        made.request({"open": "open", "closed": "close"}[loop])
-        made.frames(200)
-        made.request("note", text=ANNOUNCEMENT + json.dumps({"test": "noise-floor", "loop": loop, "frames": 400}))
-        made.frames(frames)
-    return made
+        night_.request({"open": "open", "closed": "close"}[loop])
+        night_.frames(200)
+        night_.request("note", text=ANNOUNCEMENT + json.dumps({"test": "noise-floor", "loop": loop, "frames": 400}))
+        night_.frames(frames)
+    return night_
 
 
 @pytest.fixture
@@ -116,14 +116,14 @@ def log(tmp_path: Path, night: Night) -> Path:
     ],
     ids=" ".join,
 )
-def test_every_reader_reads_the_log_and_says_what_it_does_not_use(log: Path, words: tuple[str, ...]) -> None:
+def test_every_reader_reads_the_log_and_reports_the_remarks(log: Path, words: tuple[str, ...]) -> None:
     done = lowfc(*words, log)
     assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
     assert done.exit_code == (1 if "acceptance" in words and "FAILED" in done.output else 0), done.output
-    said = "".join(done.output.split())
+    output = "".join(done.output.split())
     for remark in attached_configuration_of(log):
-        assert "".join(remark.split()) in said
-    assert tempfile.gettempdir() not in said.replace("".join(str(log.parent).split()), "")
+        assert "".join(remark.split()) in output
+    assert tempfile.gettempdir() not in output.replace("".join(str(log.parent).split()), "")
     if "--json" in words:
         assert json.loads(done.stdout)
     if words == ("report",):
@@ -139,14 +139,16 @@ def attached_configuration_of(log: Path) -> list[str]:
     return remarks
 
 
-def test_a_replay_does_not_depend_on_it(log: Path) -> None:
+def test_a_replay_does_not_depend_on_the_configuration(log: Path) -> None:
     done = lowfc("replay", log)
     assert (done.exit_code, done.exception) == (0, None)
     assert "commands identical" in done.stdout
 
 
 @pytest.mark.parametrize(("toml", "rate_hz"), [(OTHER, 300.0), ("[camera", Configuration().camera.rate_hz)])
-def test_a_view_has_it_or_the_default(tmp_path: Path, night: Night, toml: str, rate_hz: float) -> None:
+def test_a_view_uses_the_recorded_or_the_default_configuration(
+    tmp_path: Path, night: Night, toml: str, rate_hz: float
+) -> None:
     log, tape = night.write(tmp_path / "night.mcap", toml=toml), Tape()
     used: list[Configuration] = []
     drawn = draw_logs([log], None, lambda config: used.append(config) or Renderer(config, tape))  # type: ignore[arg-type]
@@ -155,9 +157,9 @@ def test_a_view_has_it_or_the_default(tmp_path: Path, night: Night, toml: str, r
     assert toml != OTHER or drawn.remarks == attached_configuration_of(log)
 
 
-def test_what_needs_the_configuration_says_so(tmp_path: Path, night: Night) -> None:
+def test_an_acceptance_test_needs_a_configuration(tmp_path: Path, night: Night) -> None:
     log = night.write(tmp_path / "night.mcap", toml="[camera")
     done = lowfc("acceptance", "noise-floor", log)
     assert isinstance(done.exception, DataFileError)
-    assert "has no configuration" in str(done.exception)
+    assert "contains no configuration" in str(done.exception)
     assert f"{log}: its config.toml cannot be used" in done.stderr

@@ -1,4 +1,4 @@
-"""Whoever reads a controller's state from the wire goes on as the controller does, to the bit."""
+"""Encoded states, inputs and calibrations are decoded without loss."""
 
 from dataclasses import fields
 
@@ -17,14 +17,14 @@ from tests.support.happenings import CALIBRATION
 from tests.support.toy import frame, loaded, settings
 
 
-def test_a_state_without_a_calibration_survives() -> None:
-    what = settings()
-    state, _ = advance(what, State(), frame(3))
-    again, resumed = decode_state(controller_state(state, what, 1), None)
-    assert (again, resumed) == (what, state._replace(counts=dict(state.counts)))
+def test_a_state_without_a_calibration_round_trips() -> None:
+    setup = settings()
+    state, _ = advance(setup, State(), frame(3))
+    decoded, resumed = decode_state(controller_state(state, setup, 1), None)
+    assert (decoded, resumed) == (setup, state._replace(counts=dict(state.counts)))
 
 
-def test_a_state_of_another_calibration_is_refused() -> None:
+def test_a_state_with_the_wrong_calibration_is_refused() -> None:
     message = controller_state(loaded(settings()), settings(), 1)
     with pytest.raises(ValueError, match="calibration toy of the controller's state is missing"):
         decode_state(message, None)
@@ -32,12 +32,12 @@ def test_a_state_of_another_calibration_is_refused() -> None:
         decode_state(message, CALIBRATION)
     message.calibration_id = CALIBRATION.id
     del message.gain[0]
-    with pytest.raises(ValueError, match=r"must have the same length|is not of 3 modes"):
+    with pytest.raises(ValueError, match=r"must have the same length|does not have 3 modes"):
         decode_state(message, CALIBRATION)
 
 
 @pytest.mark.parametrize(
-    "taken",
+    "input_",
     [
         Tick(5, 7),
         CameraSettings(5, (3, 4), 100.0, 65535.0),
@@ -48,18 +48,18 @@ def test_a_state_of_another_calibration_is_refused() -> None:
     ],
     ids=lambda one: type(one).__name__,
 )
-def test_an_input_survives(taken: Report) -> None:
-    message = wire.ControlInput.FromString(codec.encode_input(taken, 9))
+def test_inputs_round_trip(input_: Report) -> None:
+    message = wire.ControlInput.FromString(codec.encode_input(input_, 9))
     assert message.input_number == 9
     found = codec.decode_input(message, {CALIBRATION.id: CALIBRATION})
-    assert type(found) is type(taken)
-    for field in fields(taken):
-        assert np.array_equal(getattr(found, field.name), getattr(taken, field.name)), field.name
+    assert type(found) is type(input_)
+    for field in fields(input_):
+        assert np.array_equal(getattr(found, field.name), getattr(input_, field.name)), field.name
     with pytest.raises(ValueError, match="input 0 of the controller cannot be read"):
         codec.decode_input(wire.ControlInput(), {})
 
 
-def test_a_calibration_survives() -> None:
+def test_a_calibration_round_trips() -> None:
     message = wire.Calibration.FromString(encode_calibration(CALIBRATION, 5_000_000_001))
     assert message.timestamp.ToNanoseconds() == 5_000_000_001
     assert list(message.mode_names) == ["tilt x", "tilt y", "focus"]
@@ -71,11 +71,11 @@ def test_a_calibration_survives() -> None:
         decode_calibration(message)
 
 
-def test_only_what_makes_a_difference_is_counted() -> None:
-    what = settings()
-    state = loaded(what)
+def test_only_inputs_with_an_effect_are_counted() -> None:
+    setup = settings()
+    state = loaded(setup)
     camera = CameraSettings(1, CALIBRATION.shape, 100.0, CALIBRATION.saturation_dn)
     bad = frame(2)._replace(pixels=None)
-    for taken, count in ((camera, 2), (camera, 2), (Tick(1, 1), 2), (frame(1), 3), (Tick(1, 1), 4), (bad, 5)):
-        state, _ = advance(what, state, taken)
+    for input_, count in ((camera, 2), (camera, 2), (Tick(1, 1), 2), (frame(1), 3), (Tick(1, 1), 4), (bad, 5)):
+        state, _ = advance(setup, state, input_)
         assert state.input_number == count

@@ -1,4 +1,4 @@
-"""`advance`: refusals, silence, requests, no jumps, no wind-up, and purity."""
+"""`advance`: refusals, frame timeouts, requests, no jumps, no wind-up, and purity."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -32,12 +32,12 @@ from tests.support.toy import (
     settings,
 )
 
-USUAL = settings()
+DEFAULTS = settings()
 
 
-def running(what: Settings = USUAL, frames: int = 5) -> State:
+def running(setup: Settings = DEFAULTS, frames: int = 5) -> State:
     """A closed loop with a mirror that is not flat."""
-    return feed(what, loaded(what), *(frame(count, SOME) for count in range(1, frames + 1)))[0]
+    return feed(setup, loaded(setup), *(frame(count, SOME) for count in range(1, frames + 1)))[0]
 
 
 def ask(name: str, *values: float, modes: tuple[int, ...] = ()) -> Request:
@@ -45,7 +45,7 @@ def ask(name: str, *values: float, modes: tuple[int, ...] = ()) -> Request:
 
 
 def hot(pixels: int) -> Pixels:
-    """An image with so many pixels at full well."""
+    """An image with this number of pixels at full well."""
     image = TOY.pixels(SOME)
     image.flat[:pixels] = SATURATION_DN
     return image
@@ -53,7 +53,7 @@ def hot(pixels: int) -> Pixels:
 
 BAD: dict[Reason, Callable[[int], Frame]] = {
     Rejection.WRONG_SIZE: lambda count: frame(count, pixels=np.full((7, 6), 5000, np.uint16)),
-    Rejection.LATE: lambda count: frame(count, SOME, age_ns=USUAL.max_frame_age_ns + 1),
+    Rejection.LATE: lambda count: frame(count, SOME, age_ns=DEFAULTS.max_frame_age_ns + 1),
     Rejection.SATURATED: lambda count: frame(count, pixels=np.full(SHAPE, SATURATION_DN, np.uint16)),
     Rejection.DARK: lambda count: frame(count, pixels=np.full(SHAPE, DARK_DN + 10, np.uint16)),
     Rejection.OUT_OF_ORDER: lambda count: frame(count, SOME, sequence=frame_sequence(3)),
@@ -62,10 +62,10 @@ BAD: dict[Reason, Callable[[int], Frame]] = {
 
 
 @pytest.mark.parametrize("reason", BAD)
-def test_a_bad_frame_is_refused_counted_and_named_and_the_command_holds(reason: Reason) -> None:
+def test_a_bad_frame_is_refused_with_an_event_and_the_command_holds(reason: Reason) -> None:
     before = running()
-    state, every = feed(USUAL, before, *(BAD[reason](count) for count in range(6, 9)))
-    held = before.drive
+    state, every = feed(DEFAULTS, before, *(BAD[reason](count) for count in range(6, 9)))
+    held = before.loop
     for outputs in every:
         assert outputs.step.reasons == (reason,)
         assert outputs.step.error_nm is None
@@ -75,36 +75,36 @@ def test_a_bad_frame_is_refused_counted_and_named_and_the_command_holds(reason: 
     assert state.counts == {reason: 3}
     assert state.frames_used == before.frames_used
     follows = 6 if reason in (Rejection.OUT_OF_ORDER, Rejection.REPEATED) else 9
-    state, back = feed(USUAL, state, frame(follows, SOME), frame(follows + 1, SOME))
+    state, back = feed(DEFAULTS, state, frame(follows, SOME), frame(follows + 1, SOME))
     assert names(every + back) == ["FRAMES_REFUSED", "FRAMES_ACCEPTED"]
     assert every[0].events[0].details == {"reason": reason.name}
     assert back[0].events[0].details == {"refused": 3, "reason": reason.name}
     assert state.frames_used == before.frames_used + 2
 
 
-def test_a_camera_that_is_stuck_is_refused_until_its_image_changes() -> None:
-    what = settings(max_identical_frames=3)
-    state, every = feed(what, loaded(what), *(frame(count, SOME) for count in range(1, 8)))
+def test_frames_of_a_stuck_camera_are_refused_until_the_image_changes() -> None:
+    setup = settings(max_identical_frames=3)
+    state, every = feed(setup, loaded(setup), *(frame(count, SOME) for count in range(1, 8)))
     reasons = [outputs.step.reasons for outputs in every if outputs.step is not None]
     assert reasons == [()] * 4 + [(Rejection.STUCK,)] * 3
-    used = feed(what, loaded(what), *(frame(count, SOME) for count in range(1, 5)))[0].drive
-    assert np.array_equal(state.drive.actuators_nm, used.actuators_nm)
+    used = feed(setup, loaded(setup), *(frame(count, SOME) for count in range(1, 5)))[0].loop
+    assert np.array_equal(state.loop.actuators_nm, used.actuators_nm)
     pixels = frame(8, SOME).pixels.copy()
     pixels.flat[0] += 1
-    state, back = feed(what, state, frame(8, pixels=pixels), frame(9, SOME))
+    state, back = feed(setup, state, frame(8, pixels=pixels), frame(9, SOME))
     assert names(every + back) == ["FRAMES_REFUSED", "FRAMES_ACCEPTED"]
     assert state.counts == {Rejection.STUCK: 3}
     assert state.frames_used == 6
 
 
 def test_without_a_calibration_a_frame_gives_a_step_and_no_command() -> None:
-    state, every = feed(USUAL, State(), frame(1), frame(2))
+    state, every = feed(DEFAULTS, State(), frame(1), frame(2))
     for outputs in every:
         assert outputs.command is None
         assert outputs.step.reasons == (Rejection.NO_CALIBRATION,)
         assert outputs.step.command_nm.size == 0
     assert names(every) == ["FRAMES_REFUSED"]
-    state, every = feed(USUAL, state, Load(0, calibration(), "test"), frame(3))
+    state, every = feed(DEFAULTS, state, Load(0, calibration(), "test"), frame(3))
     assert names(every) == ["CALIBRATION_LOADED", "MODE_CHANGED", "FRAMES_ACCEPTED"]
     assert state.counts == {Rejection.NO_CALIBRATION: 2}
 
@@ -112,103 +112,103 @@ def test_without_a_calibration_a_frame_gives_a_step_and_no_command() -> None:
 @pytest.mark.parametrize(
     ("changes", "reasons"),
     [
-        ({"age_ns": USUAL.max_frame_age_ns}, ()),
-        ({"age_ns": USUAL.max_frame_age_ns + 1}, (Rejection.LATE,)),
+        ({"age_ns": DEFAULTS.max_frame_age_ns}, ()),
+        ({"age_ns": DEFAULTS.max_frame_age_ns + 1}, (Rejection.LATE,)),
         ({"age_ns": -(10**12)}, ()),
         ({"pixels": None}, (Rejection.WRONG_SIZE,)),
         ({"pixels": hot(8)}, ()),
         ({"pixels": hot(9)}, (Rejection.SATURATED,)),
     ],
 )
-def test_a_frame_is_used_up_to_each_bound(changes: dict[str, object], reasons: tuple[Reason, ...]) -> None:
-    _, (outputs,) = feed(USUAL, running(), frame(6, SOME, **changes))
+def test_a_frame_is_used_up_to_each_limit(changes: dict[str, object], reasons: tuple[Reason, ...]) -> None:
+    _, (outputs,) = feed(DEFAULTS, running(), frame(6, SOME, **changes))
     assert outputs.step.reasons == reasons
     assert (outputs.step.error_nm is None) is bool(reasons)
 
 
-def test_each_kind_of_refusal_in_a_row_is_named_once() -> None:
+def test_each_reason_in_a_row_raises_one_event() -> None:
     reasons = Rejection.LATE, Rejection.LATE, Rejection.DARK
     inputs = [BAD[reason](count) for count, reason in enumerate(reasons, start=6)]
-    state, every = feed(USUAL, running(), *inputs, frame(9, SOME))
+    state, every = feed(DEFAULTS, running(), *inputs, frame(9, SOME))
     assert names(every) == ["FRAMES_REFUSED", "FRAMES_REFUSED", "FRAMES_ACCEPTED"]
     assert state.counts == {Rejection.LATE: 2, Rejection.DARK: 1}
 
 
 @pytest.mark.parametrize("delay", [1.0, 2.0, 2.5])
-def test_missing_and_refused_frames_move_the_history_on(delay: float) -> None:
-    """After a gap, pseudo-open-loop still knows which command the exposure saw: the held one."""
-    what = settings(delay_frames=delay)
-    before = running(what)
-    held = before.drive.history_nm[0]
-    missing, every = feed(what, before, frame(12, SOME))
+def test_missing_and_refused_frames_advance_the_command_history(delay: float) -> None:
+    """After a gap, pseudo-open-loop modes use the command that the exposure saw: the held one."""
+    setup = settings(delay_frames=delay)
+    before = running(setup)
+    held = before.loop.history_nm[0]
+    missing, every = feed(setup, before, frame(12, SOME))
     assert names(every) == ["FRAMES_MISSING"]
     assert every[0].events[0].details == {"count": 6, "number": 12}
     assert every[0].step.error_nm is not None
     assert np.array_equal(every[0].step.pol_nm, every[0].step.error_nm - held)
-    refused, _ = feed(what, before, *(BAD[Rejection.LATE](count) for count in range(6, 12)))
-    assert all(np.array_equal(command, held) for command in refused.drive.history_nm)
-    assert missing.drive.history_nm[0] is not held
+    refused, _ = feed(setup, before, *(BAD[Rejection.LATE](count) for count in range(6, 12)))
+    assert all(np.array_equal(command, held) for command in refused.loop.history_nm)
+    assert missing.loop.history_nm[0] is not held
 
 
-def test_one_missing_frame_moves_the_history_by_one() -> None:
-    what = settings(delay_frames=3.0)
-    before = running(what)
-    newest, middle, _ = before.drive.history_nm
-    _, (outputs,) = feed(what, before, frame(7, SOME))  # frame 6 is missing: exposure 7 sees the command of frame 4
+def test_one_missing_frame_advances_the_history_by_one() -> None:
+    setup = settings(delay_frames=3.0)
+    before = running(setup)
+    newest, middle, _ = before.loop.history_nm
+    _, (outputs,) = feed(setup, before, frame(7, SOME))  # frame 6 is missing: exposure 7 sees the command of frame 4
     assert outputs.step.error_nm is not None
     assert np.array_equal(outputs.step.pol_nm, outputs.step.error_nm - middle)
     assert not np.array_equal(newest, middle)
 
 
-def test_a_camera_that_restarts_is_followed_and_named() -> None:
+def test_frames_of_a_restarted_camera_are_used_with_an_event() -> None:
     before = running()
-    again = frame(0, SOME, sequence=frame_sequence(0, START + 60), time_ns=(START + 60) * 10**9)
-    state, every = feed(USUAL, before, again)
+    restarted = frame(0, SOME, sequence=frame_sequence(0, START + 60), time_ns=(START + 60) * 10**9)
+    state, every = feed(DEFAULTS, before, restarted)
     assert names(every) == ["CAMERA_RESTARTED"]
     assert state.frames_used == before.frames_used + 1
-    _, every = feed(USUAL, state, frame(6, SOME))
+    _, every = feed(DEFAULTS, state, frame(6, SOME))
     assert every[0].step.reasons == (Rejection.OUT_OF_ORDER,)
 
 
-def test_silence_is_named_once_at_its_start_and_once_at_its_end() -> None:
+def test_a_frame_timeout_raises_an_event_at_its_start_and_at_its_end() -> None:
     before = running()
-    short = Tick(0, USUAL.frame_timeout_ns)
-    long = Tick(0, USUAL.frame_timeout_ns + 1)
+    short = Tick(0, DEFAULTS.frame_timeout_ns)
+    long = Tick(0, DEFAULTS.frame_timeout_ns + 1)
     state, every = feed(
-        USUAL, before, short, long, Tick(0, 10 * USUAL.frame_timeout_ns), BAD[Rejection.REPEATED](5), short, long
+        DEFAULTS, before, short, long, Tick(0, 10 * DEFAULTS.frame_timeout_ns), BAD[Rejection.REPEATED](5), short, long
     )
     assert [name for name in names(every) if name != "FRAMES_REFUSED"] == ["NO_FRAMES"]
     assert all(outputs.command is not None for outputs in every)
     for outputs in every:
-        assert np.array_equal(outputs.command.actuators_nm, before.drive.actuators_nm)
+        assert np.array_equal(outputs.command.actuators_nm, before.loop.actuators_nm)
         assert outputs.command.frame_sequence == before.frame_sequence
-    state, back = feed(USUAL, state, frame(500, SOME), frame(501, SOME))
+    state, back = feed(DEFAULTS, state, frame(500, SOME), frame(501, SOME))
     assert names(back) == ["FRAMES_BACK", "FRAMES_MISSING", "FRAMES_ACCEPTED"]
     assert state.counts[Rejection.NO_FRAME] == 1
 
 
-def test_in_silence_the_mirror_relaxes_to_flat_where_that_is_configured() -> None:
-    what = settings(on_frame_timeout="flat")
-    state = running(what)
+def test_a_frame_timeout_relaxes_the_mirror_if_configured() -> None:
+    setup = settings(on_frame_timeout="flat")
+    state = running(setup)
     for _ in range(20):
-        before = state.drive.actuators_nm
-        state, (outputs,) = feed(what, state, Tick(0, what.frame_timeout_ns + 1))
-        assert violations(what.limits, before, outputs.command.actuators_nm) == []
-    assert not state.drive.actuators_nm.any()
-    assert not any(command.any() for command in state.drive.history_nm)
-    state, (outputs,) = feed(what, state, frame(400, SOME))
+        before = state.loop.actuators_nm
+        state, (outputs,) = feed(setup, state, Tick(0, setup.frame_timeout_ns + 1))
+        assert violations(setup.limits, before, outputs.command.actuators_nm) == []
+    assert not state.loop.actuators_nm.any()
+    assert not any(command.any() for command in state.loop.history_nm)
+    state, (outputs,) = feed(setup, state, frame(400, SOME))
     assert outputs.command.actuators_nm.any()
 
 
-def test_before_the_first_command_a_tick_does_nothing_unless_the_loop_is_safed() -> None:
-    state = loaded(USUAL)
-    after, (outputs,) = feed(USUAL, state, Tick(0, 10**12))
+def test_before_the_first_command_a_tick_does_nothing_except_in_safe_mode() -> None:
+    state = loaded(DEFAULTS)
+    after, (outputs,) = feed(DEFAULTS, state, Tick(0, 10**12))
     assert after == state._replace(frame_timeout=True, input_number=after.input_number)
     assert outputs == Outputs()
-    safed, (_, outputs) = feed(USUAL, state, ask("safe"), Tick(0, 0))
+    in_safe_mode, (_, outputs) = feed(DEFAULTS, state, ask("safe"), Tick(0, 0))
     assert not outputs.command.actuators_nm.any()
-    adopted, _ = feed(USUAL, safed, MirrorShape(0, np.ones(GRID, np.float32), np.zeros(3, np.float32)))
-    assert adopted is safed
+    adopted, _ = feed(DEFAULTS, in_safe_mode, MirrorShape(0, np.ones(GRID, np.float32), np.zeros(3, np.float32)))
+    assert adopted is in_safe_mode
 
 
 @pytest.mark.parametrize("mode", list(LoopMode))
@@ -216,50 +216,50 @@ def test_safe_latches_from_every_mode(mode: LoopMode) -> None:
     state = running()._replace(mode=mode)
     if mode is LoopMode.IDLE:
         state = State()
-    state, every = feed(USUAL, state, ask("safe"), ask("close"), ask("open"), Load(0, calibration(), "test"))
+    state, every = feed(DEFAULTS, state, ask("safe"), ask("close"), ask("open"), Load(0, calibration(), "test"))
     assert state.mode is LoopMode.SAFE
     assert [outputs.reply.accepted for outputs in every if outputs.reply] == [True, False, False]
     expected = [] if mode is LoopMode.SAFE else ["MODE_CHANGED", "SAFED"]
     assert [name for name in names(every) if name != "CALIBRATION_LOADED"] == expected
-    state, _ = feed(USUAL, state, ask("clear"))
+    state, _ = feed(DEFAULTS, state, ask("clear"))
     assert state.mode is LoopMode.OPEN
 
 
-def test_safed_relaxes_the_mirror_frame_by_frame_within_the_limits() -> None:
-    what = settings(limits=replace(USUAL.limits, slew_nm=1.0))
-    state, _ = feed(what, running(what, 30), ask("safe"))
-    largest = np.abs(state.drive.actuators_nm).max()
+def test_safe_mode_relaxes_the_mirror_frame_by_frame_within_the_limits() -> None:
+    setup = settings(limits=replace(DEFAULTS.limits, slew_nm=1.0))
+    state, _ = feed(setup, running(setup, 30), ask("safe"))
+    largest = np.abs(state.loop.actuators_nm).max()
     for count in range(31, 70):
-        before = state.drive.actuators_nm
-        taken = BAD[Rejection.DARK](count) if count % 3 == 0 else frame(count, SOME)
-        state, (outputs,) = feed(what, state, taken)
-        assert violations(what.limits, before, outputs.command.actuators_nm) == []
+        before = state.loop.actuators_nm
+        input_ = BAD[Rejection.DARK](count) if count % 3 == 0 else frame(count, SOME)
+        state, (outputs,) = feed(setup, state, input_)
+        assert violations(setup.limits, before, outputs.command.actuators_nm) == []
         assert np.abs(outputs.command.actuators_nm).max() <= np.abs(before).max()
     assert largest > 2
-    assert not state.drive.actuators_nm.any()
+    assert not state.loop.actuators_nm.any()
 
 
 @pytest.mark.parametrize("reason", [Rejection.OUT_OF_ORDER, Rejection.REPEATED])
-def test_safe_flattens_the_mirror_under_a_stuck_camera(reason: Reason) -> None:
-    """Its frames are refused, the commands go out under the newest sequence, so that the mirror takes them."""
-    state, _ = feed(USUAL, running(), ask("safe"))
+def test_safe_mode_flattens_the_mirror_while_frames_are_refused(reason: Reason) -> None:
+    """The frames are refused; commands have the newest sequence, so that the mirror accepts them."""
+    state, _ = feed(DEFAULTS, running(), ask("safe"))
     newest = state.frame_sequence
     for _ in range(200):
-        state, (outputs,) = feed(USUAL, state, BAD[reason](6))
+        state, (outputs,) = feed(DEFAULTS, state, BAD[reason](6))
         assert outputs.command.frame_sequence == newest
-    assert not state.drive.actuators_nm.any()
+    assert not state.loop.actuators_nm.any()
 
 
 @pytest.mark.parametrize("name", ["gain", "leak"])
-def test_gain_and_leak_for_all_modes_for_some_and_for_each(name: str) -> None:
+def test_gain_and_leak_are_set_for_all_some_or_each_mode(name: str) -> None:
     def now(state: State) -> list[float]:
-        return getattr(state.drive.law, name).tolist()
+        return getattr(state.loop.law, name).tolist()
 
-    state, _ = feed(USUAL, running(), ask(name, 0.25))
+    state, _ = feed(DEFAULTS, running(), ask(name, 0.25))
     assert now(state) == [0.25, 0.25, 0.25]
-    state, _ = feed(USUAL, state, ask(name, 0.5, modes=(3,)))
+    state, _ = feed(DEFAULTS, state, ask(name, 0.5, modes=(3,)))
     assert now(state) == [0.25, 0.5, 0.25]
-    state, (outputs,) = feed(USUAL, state, ask(name, 0.125, 0.75, modes=(4, 2)))
+    state, (outputs,) = feed(DEFAULTS, state, ask(name, 0.125, 0.75, modes=(4, 2)))
     assert now(state) == [0.75, 0.5, 0.125]
     assert outputs.changed
     assert outputs.reply.text == f"{name} is now 0.75 0.5 0.125"
@@ -284,120 +284,120 @@ def test_gain_and_leak_for_all_modes_for_some_and_for_each(name: str) -> None:
 )
 def test_a_bad_value_is_refused_and_changes_nothing(request_: Request, message: str) -> None:
     state = running()
-    after, (outputs,) = feed(USUAL, state, request_)
+    after, (outputs,) = feed(DEFAULTS, state, request_)
     answered(outputs, False, message)
     assert not outputs.changed
-    assert after.drive.law is state.drive.law
+    assert after.loop.law is state.loop.law
 
 
 @pytest.mark.parametrize("delay", [1.0, 1.5, 2.0, 3.0])
-def test_an_unstable_gain_is_refused_for_the_delay_there_is(delay: float) -> None:
-    what, highest = settings(delay_frames=delay, gain=(0.1, 0.1)), limiting_gain(delay)
+def test_an_unstable_gain_is_refused_for_the_configured_delay(delay: float) -> None:
+    setup, highest = settings(delay_frames=delay, gain=(0.1, 0.1)), limiting_gain(delay)
     _, every = feed(
-        what, loaded(what), ask("gain", 0.999 * highest), ask("gain", highest), ask("gain", 1.001 * highest)
+        setup, loaded(setup), ask("gain", 0.999 * highest), ask("gain", highest), ask("gain", 1.001 * highest)
     )
     assert [outputs.reply.accepted for outputs in every if outputs.reply] == [True, False, False]
 
 
-def test_the_first_step_after_closing_moves_by_gain_times_error_only() -> None:
-    state, _ = feed(USUAL, running(), ask("open"), *(frame(count, SOME) for count in range(6, 20)), ask("close"))
-    before = state.drive.history_nm[0]
-    _, (outputs,) = feed(USUAL, state, frame(20, (1.0, 0, 0)))
+def test_the_first_step_after_closing_is_gain_times_error() -> None:
+    state, _ = feed(DEFAULTS, running(), ask("open"), *(frame(count, SOME) for count in range(6, 20)), ask("close"))
+    before = state.loop.history_nm[0]
+    _, (outputs,) = feed(DEFAULTS, state, frame(20, (1.0, 0, 0)))
     assert outputs.step.command_nm - before == pytest.approx([-0.5, 0, 0], abs=0.02)
 
 
 def test_in_open_loop_the_command_holds() -> None:
-    state, _ = feed(USUAL, running(), ask("open"))
-    after, every = feed(USUAL, state, *(frame(count, SOME) for count in range(6, 12)))
-    assert after.drive.actuators_nm is state.drive.actuators_nm
+    state, _ = feed(DEFAULTS, running(), ask("open"))
+    after, every = feed(DEFAULTS, state, *(frame(count, SOME) for count in range(6, 12)))
+    assert after.loop.actuators_nm is state.loop.actuators_nm
     assert all(outputs.step is not None and outputs.step.error_nm is not None for outputs in every)
 
 
 @pytest.mark.parametrize("noll", [NOLL, (2, 3)])
 def test_a_loaded_calibration_does_not_make_the_mirror_jump(noll: tuple[int, ...]) -> None:
     before = running()
-    state, (outputs,) = feed(USUAL, before, Load(0, calibration(noll, scale=2.0), "another"))
-    beyond = [] if noll == NOLL else ["SHAPE_ADOPTED"]  # what the other modes cannot make
+    state, (outputs,) = feed(DEFAULTS, before, Load(0, calibration(noll, scale=2.0), "another"))
+    beyond = [] if noll == NOLL else ["SHAPE_ADOPTED"]  # the part outside the new modes
     assert names([outputs]) == ["CALIBRATION_LOADED", *beyond]
-    assert np.array_equal(state.drive.actuators_nm, before.drive.actuators_nm)
-    _, (outputs,) = feed(USUAL, state, Tick(0, 0))
-    assert np.array_equal(outputs.command.actuators_nm, before.drive.actuators_nm)
+    assert np.array_equal(state.loop.actuators_nm, before.loop.actuators_nm)
+    _, (outputs,) = feed(DEFAULTS, state, Tick(0, 0))
+    assert np.array_equal(outputs.command.actuators_nm, before.loop.actuators_nm)
     if noll == NOLL:
-        assert state.drive.history_nm[0] == pytest.approx(before.drive.history_nm[0], abs=1e-3)
-        _, (outputs,) = feed(USUAL, state, frame(6))
-        assert np.abs(outputs.command.actuators_nm - before.drive.actuators_nm).max() < 0.01
+        assert state.loop.history_nm[0] == pytest.approx(before.loop.history_nm[0], abs=1e-3)
+        _, (outputs,) = feed(DEFAULTS, state, frame(6))
+        assert np.abs(outputs.command.actuators_nm - before.loop.actuators_nm).max() < 0.01
 
 
 @pytest.mark.parametrize("with_modes", [True, False])
-def test_a_restarted_controller_goes_on_from_the_mirrors_shape(with_modes: bool) -> None:
-    before = running().drive
+def test_a_restarted_controller_continues_from_the_mirrors_shape(with_modes: bool) -> None:
+    before = running().loop
     modes = before.history_nm[0] if with_modes else np.zeros(0, np.float32)
     shape = MirrorShape(0, before.actuators_nm, modes)
-    state, (outputs,) = feed(USUAL, loaded(USUAL), shape)
+    state, (outputs,) = feed(DEFAULTS, loaded(DEFAULTS), shape)
     assert names([outputs]) == ["MIRROR_ADOPTED"]
-    state, (outputs,) = feed(USUAL, state, frame(1))
+    state, (outputs,) = feed(DEFAULTS, state, frame(1))
     assert np.abs(outputs.command.actuators_nm - before.actuators_nm).max() < 0.01
     assert outputs.step.pol_nm == pytest.approx(-before.history_nm[0], abs=0.02)
-    later, (outputs,) = feed(USUAL, state, MirrorShape(0, np.zeros(GRID, np.float32), np.zeros(3, np.float32)))
+    later, (outputs,) = feed(DEFAULTS, state, MirrorShape(0, np.zeros(GRID, np.float32), np.zeros(3, np.float32)))
     assert later is state
 
 
-@pytest.mark.parametrize("told_nm", [np.nan, np.inf, 1e30, -200.0])
-def test_a_modal_command_that_cannot_be_is_not_believed(told_nm: float) -> None:
-    before = running().drive
-    shape = MirrorShape(0, before.actuators_nm, np.full(3, told_nm, np.float32))
-    state, _ = feed(USUAL, loaded(USUAL), shape)
-    assert state.drive.history_nm[0] == pytest.approx(before.history_nm[0], abs=1e-3)
+@pytest.mark.parametrize("reported_nm", [np.nan, np.inf, 1e30, -200.0])
+def test_an_implausible_modal_command_is_not_adopted(reported_nm: float) -> None:
+    before = running().loop
+    shape = MirrorShape(0, before.actuators_nm, np.full(3, reported_nm, np.float32))
+    state, _ = feed(DEFAULTS, loaded(DEFAULTS), shape)
+    assert state.loop.history_nm[0] == pytest.approx(before.history_nm[0], abs=1e-3)
 
 
 @pytest.mark.parametrize("shape", [np.zeros((5, 4), np.float32), np.full(GRID, np.nan, np.float32)])
 def test_a_shape_of_another_mirror_is_not_adopted(shape: np.ndarray) -> None:
-    state = loaded(USUAL)
-    after, (outputs,) = feed(USUAL, state, MirrorShape(0, shape, np.zeros(3, np.float32)))
+    state = loaded(DEFAULTS)
+    after, (outputs,) = feed(DEFAULTS, state, MirrorShape(0, shape, np.zeros(3, np.float32)))
     assert names([outputs]) == ["MIRROR_REFUSED"]
-    assert after.drive is state.drive
+    assert after.loop is state.loop
 
 
 def test_the_modal_limit_holds_for_each_mode_and_does_not_wind_up() -> None:
-    what = settings(limit_nm=(20.0, 5.0))
-    state = loaded(what)
-    for count in range(1, 101):  # a hundred frames of an error far beyond what the limits allow to correct
-        state, (outputs,) = feed(what, state, frame(count, (60, -60, 60)))
+    setup = settings(limit_nm=(20.0, 5.0))
+    state = loaded(setup)
+    for count in range(1, 101):  # a hundred frames of an error far beyond the limits
+        state, (outputs,) = feed(setup, state, frame(count, (60, -60, 60)))
         assert (np.abs(outputs.step.command_nm) <= [20, 20, 5]).all()
     assert outputs.step.reasons == (Limit.MODAL_LIMIT,)
     assert outputs.step.command_nm.tolist() == [-20, 20, -5]
-    state, (outputs,) = feed(what, state, frame(101, (-10, 10, -10)))
+    state, (outputs,) = feed(setup, state, frame(101, (-10, 10, -10)))
     assert outputs.step.command_nm == pytest.approx([-15, 15, -2], abs=0.1)
     assert names([outputs]) == ["LIMIT_CLEARED"]
 
 
-def test_after_the_mirror_saturates_the_stored_command_is_what_it_was_given() -> None:
-    what = settings(limits=replace(USUAL.limits, stroke_nm=5.0), limit_nm=(150.0, 150.0))
-    state, events = loaded(what), []
+def test_after_saturation_the_stored_command_is_the_limited_one() -> None:
+    setup = settings(limits=replace(DEFAULTS.limits, stroke_nm=5.0), limit_nm=(150.0, 150.0))
+    state, events = loaded(setup), []
     for count in range(1, 61):
-        state, (outputs,) = feed(what, state, frame(count, (60, 0, 0)))
+        state, (outputs,) = feed(setup, state, frame(count, (60, 0, 0)))
         events += names([outputs])
-    drive = state.drive
+    loop = state.loop
     assert state.limits_hit == (Limit.STROKE,)
     assert events.count("LIMIT_HIT") == len(set(events) & {"LIMIT_HIT"}) == 1
-    assert np.abs(drive.actuators_nm).max() <= 5
-    fitted = np.linalg.lstsq(drive.calibration.modes_to_actuators, drive.actuators_nm.reshape(-1), rcond=None)[0]
-    assert drive.history_nm[0] == pytest.approx(fitted, abs=1e-3)
-    assert np.abs(drive.history_nm[0]).max() < 15
-    # One frame of the opposite error is enough to leave the stop: nothing had wound up behind it.
-    state, (outputs,) = feed(what, state, frame(61, (-10, 0, 0)))
+    assert np.abs(loop.actuators_nm).max() <= 5
+    fitted = np.linalg.lstsq(loop.calibration.modes_to_actuators, loop.actuators_nm.reshape(-1), rcond=None)[0]
+    assert loop.history_nm[0] == pytest.approx(fitted, abs=1e-3)
+    assert np.abs(loop.history_nm[0]).max() < 15
+    # One frame of the opposite error is enough to leave the limit: there is no wind-up.
+    state, (outputs,) = feed(setup, state, frame(61, (-10, 0, 0)))
     assert np.abs(outputs.command.actuators_nm).max() < 4
     assert names([outputs]) == ["LIMIT_CLEARED"]
 
 
-def test_a_few_pixels_at_full_well_are_left_out_of_the_estimate() -> None:
-    """Of a star that is brighter than expected, too."""
+def test_saturated_pixels_hardly_affect_the_estimate() -> None:
+    """Also for a star that is brighter than expected."""
     plain = TOY.pixels(SOME, 1.3 * FLUX_DN)
     hit = plain.copy()
     hit.flat[[3, 17]] = SATURATION_DN
     errors = []
     for pixels in (plain, hit):
-        _, (outputs,) = feed(USUAL, loaded(USUAL), frame(1, pixels=pixels))
+        _, (outputs,) = feed(DEFAULTS, loaded(DEFAULTS), frame(1, pixels=pixels))
         assert outputs.step.error_nm is not None
         errors.append(outputs.step.error_nm)
         assert outputs.step.saturated_pixels == 2 * (pixels is hit)

@@ -1,4 +1,4 @@
-"""The fused step against the reference: random frames and states, step by step from the same state."""
+"""The fused step against the reference: random frames and states, each step from the same state."""
 
 from collections import Counter
 from dataclasses import dataclass, field
@@ -28,18 +28,18 @@ from tests.support import toy
 RATE_HZ = 1000.0
 SAME_NM = 1e-4
 ROUNDINGS = 10
-"""Of float32, of the largest number of a step: a bright spot on a sensor without full well makes errors of 500 nm."""
-COMMANDS = 2
-"""Of the numbers of a step."""
+"""Allowed float32 roundings of a step's largest number: without full well a bright spot causes errors of 500 nm."""
+COMMAND_ARRAYS = 2
+"""Number of arrays of a step that are commands."""
 pytestmark = pytest.mark.skipif(not compiled.available(), reason="needs the extra `fast`")
 
 
 @dataclass
 class Bench:
-    """A random sensor, mirror and controller, and what may happen to them."""
+    """A random sensor, mirror and controller, with random frames and requests."""
 
     rng: np.random.Generator
-    found: Counter[str] = field(default_factory=Counter)
+    counts: Counter[str] = field(default_factory=Counter)
     largest_nm: float = 0.0
     repeats: int = 0
 
@@ -87,18 +87,18 @@ class Bench:
             kernel=compiled.kernel(FUSED),
         )
         self.state, _ = advance(self.settings, State(), Load(0, self.calibration, "random"))
-        self.last, self.count, self.again = self.state, 0, np.zeros(self.shape, np.uint16)
+        self.last, self.count, self.last_image = self.state, 0, np.zeros(self.shape, np.uint16)
 
     def law(self) -> LinearLaw:
-        """A law that is stable in the loop, or none."""
+        """A law that is stable in the loop."""
         modes, delay = len(self.noll), self.settings.delay_frames
         if self.rng.random() < 0.5:
             return integrator([0.2] * modes, [0.02] * modes, self.noll, delay, RATE_HZ)
-        none = np.zeros(modes)
-        return pi_notch(self.noll, none + 0.1, none + 0.05, none + 0.02, [()] * modes, delay, RATE_HZ)
+        zeros = np.zeros(modes)
+        return pi_notch(self.noll, zeros + 0.1, zeros + 0.05, zeros + 0.02, [()] * modes, delay, RATE_HZ)
 
     def request(self) -> Request:
-        """What an operator may ask."""
+        """A random request of an operator."""
         rng, modes, actuators = self.rng, len(self.noll), int(np.prod(self.calibration.grid))
         values = tuple(map(float, rng.uniform(0.05, 0.4, modes).astype(np.float32)))
         shape = rng.normal(0, 5, actuators).astype(np.float32)
@@ -115,23 +115,23 @@ class Bench:
         ][rng.integers(9)]
 
     def pixels(self) -> Pixels:
-        """An image, seldom a bad one."""
+        """An image, rarely a bad one."""
         rng = self.rng
         kind = str(rng.choice(list("dDsSar"))) if rng.random() < 0.04 else "usual"
         self.repeats = max(self.repeats - 1, 4 * (kind == "a"))
         if self.repeats:
-            return self.again
+            return self.last_image
         wave_nm = rng.normal(0, 40 if kind == "r" else 4, len(self.noll))
-        light = self.flux_dn * rng.uniform(0.8, 1.2) * (self.I0 + self.H @ wave_nm)
-        light *= {"d": 0.0, "D": rng.uniform(0.15, 0.25)}.get(kind, 1.0)
-        image = np.clip(np.rint(self.dark + light + rng.normal(0, 3, light.size)), 0, 65535).astype(np.uint16)
+        image_dn = self.flux_dn * rng.uniform(0.8, 1.2) * (self.I0 + self.H @ wave_nm)
+        image_dn *= {"d": 0.0, "D": rng.uniform(0.15, 0.25)}.get(kind, 1.0)
+        image = np.clip(np.rint(self.dark + image_dn + rng.normal(0, 3, image_dn.size)), 0, 65535).astype(np.uint16)
         if kind in "sS":
             image[rng.integers(0, image.size, 1 if kind == "s" else 6)] = 65535
-        self.again = image.reshape(self.shape)
-        return self.again
+        self.last_image = image.reshape(self.shape)
+        return self.last_image
 
     def run(self, frames: int) -> None:
-        """Take so many frames; each by both arithmetics from the same state."""
+        """Process frames, each by both implementations from the same state."""
         for _ in range(frames):
             if self.rng.random() < 0.01:
                 for request in (self.request(), Request(0, "clear"), Request(0, "close"))[:: self.rng.choice([1, 2])]:
@@ -141,24 +141,24 @@ class Bench:
             self.frame(Frame(toy.frame_sequence(self.count), self.count * 1_000_000, age_ns, self.pixels()))
 
     def frame(self, frame: Frame) -> None:
-        """Take a frame by both, and compare."""
-        drive = self.state.drive
-        assert drive is not None
-        alone = drive._replace(estimator=drive.estimator._replace(tables=None))
+        """Process a frame with both implementations, and compare."""
+        loop = self.state.loop
+        assert loop is not None
+        reference_loop = loop._replace(estimator=loop.estimator._replace(tables=None))
         known = {"estimate": self.last.estimate, "identical_frames": self.last.identical_frames}
-        self.last, expected = advance(self.settings, self.state._replace(drive=alone, **known), frame)
+        self.last, expected = advance(self.settings, self.state._replace(loop=reference_loop, **known), frame)
         self.state, outputs = advance(self.settings, self.state, frame)
         self.compare(outputs, expected)
         assert self.state.identical_frames == self.last.identical_frames
         assert (self.state.mode, self.state.returning_to_zero) == (self.last.mode, self.last.returning_to_zero)
 
     def amplified(self) -> float:
-        """By how much the projection makes rounding of the actuators larger, where a limit has acted."""
-        assert self.state.drive is not None
-        return max(1.0, float(np.abs(self.state.drive.inverse).sum(axis=1).max()))
+        """Factor by which the projection onto modes amplifies rounding of the actuators, if a limit acted."""
+        assert self.state.loop is not None
+        return max(1.0, float(np.abs(self.state.loop.inverse).sum(axis=1).max()))
 
     def compare(self, outputs: Outputs, expected: Outputs) -> None:
-        """The same verdicts and events, the same numbers but for rounding."""
+        """Compare decisions and events exactly, and numbers up to rounding."""
         step, other = outputs.step, expected.step
         assert step is not None
         assert other is not None
@@ -168,69 +168,67 @@ class Bench:
             assert outputs.events == expected.events
         else:
             assert {*step.reasons} ^ {*other.reasons} <= {*Limit}
-            self.found["limits that only one saw"] += 1
-        self.found.update(reason.name for reason in step.reasons)
-        self.found["frames"] += 1
+            self.counts["limits that only one saw"] += 1
+        self.counts.update(reason.name for reason in step.reasons)
+        self.counts["frames"] += 1
         assert (outputs.command is None) is (expected.command is None)
         numbers = list(zip(_numbers(outputs), _numbers(expected), strict=True))
-        most_nm = max(SAME_NM, ROUNDINGS * np.spacing(max(np.abs(two).max(initial=0) for _, two in numbers)))
+        allowed_nm = max(SAME_NM, ROUNDINGS * np.spacing(max(np.abs(two).max(initial=0) for _, two in numbers)))
         for place, (one, two) in enumerate(numbers):
             assert np.isfinite(one).all()
-            apart_nm = float(np.abs(one - two).max(initial=0))
-            assert apart_nm < most_nm * (self.amplified() if place == 0 and step.reasons else 1)
-            if place < COMMANDS:
-                self.largest_nm = max(self.largest_nm, apart_nm)
+            difference_nm = float(np.abs(one - two).max(initial=0))
+            assert difference_nm < allowed_nm * (self.amplified() if place == 0 and step.reasons else 1)
+            if place < COMMAND_ARRAYS:
+                self.largest_nm = max(self.largest_nm, difference_nm)
 
 
 def _numbers(outputs: Outputs) -> list[Single]:
-    """Modal command and actuators, then error and pseudo-open-loop modes; empty where there are none."""
-    step, command, none = outputs.step, outputs.command, np.zeros(0, np.float32)
+    """Modal command and actuators, then error and pseudo-open-loop modes; empty if there are none."""
+    step, command, zeros = outputs.step, outputs.command, np.zeros(0, np.float32)
     assert step is not None
-    found = (step.command_nm, None if command is None else command.actuators_nm, step.error_nm, step.pol_nm)
-    return [none if one is None else one for one in found]
+    counts = (step.command_nm, None if command is None else command.actuators_nm, step.error_nm, step.pol_nm)
+    return [zeros if one is None else one for one in counts]
 
 
-def compared(frames: int, each: int, monkeypatch: pytest.MonkeyPatch) -> tuple[Counter[str], float]:
-    """What came of so many random frames, and the largest difference."""
-    found: Counter[str] = Counter()
+def compared(frames: int, frames_per_bench: int, monkeypatch: pytest.MonkeyPatch) -> tuple[Counter[str], float]:
+    """Counts of events in random frames, and the largest difference."""
+    counts: Counter[str] = Counter()
     largest_nm, original = 0.0, stepping._fused
 
-    def counting(*given: object) -> object:
-        made = original(*given)  # type: ignore[arg-type]
-        found["fused"] += made is not None
-        return made
+    def counting(*arguments: object) -> object:
+        result = original(*arguments)  # type: ignore[arg-type]
+        counts["fused"] += result is not None
+        return result
 
     monkeypatch.setattr(stepping, "_fused", counting)
-    for seed in range(frames // each):
+    for seed in range(frames // frames_per_bench):
         bench = Bench(np.random.default_rng(seed))
-        bench.run(each)
-        found.update(bench.found)
+        bench.run(frames_per_bench)
+        counts.update(bench.counts)
         largest_nm = max(largest_nm, bench.largest_nm)
-    return found, largest_nm
+    return counts, largest_nm
 
 
-def test_which_kernel_computes_is_an_event_and_without_numba_it_is_numpys(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_the_kernel_in_use_is_an_event_and_numpy_without_numba(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     config, latch, events = load(None, {"realtime.kernel": "fused"}), Latch([tmp_path / "latch"]), []
     latch.set(False)
-    for there, name, event in ((True, FUSED, "KERNEL"), (False, "numpy", "KERNEL_MISSING")):
-        monkeypatch.setattr(compiled, "available", lambda there=there: there)
+    for available, name, event in ((True, FUSED, "KERNEL"), (False, "numpy", "KERNEL_MISSING")):
+        monkeypatch.setattr(compiled, "available", lambda available=available: available)
         monkeypatch.setattr(compiled, "kernel", getattr(compiled.kernel, "__wrapped__", compiled.kernel))
         monkeypatch.setattr(compiled, "_compiled", lambda: [functions.measure, functions.respond, None])
-        made = settings_under(latch, config, lambda *given, **details: events.append((given, details)))
-        assert made.kernel.name == name
+        result = settings_under(latch, config, lambda *arguments, **details: events.append((arguments, details)))
+        assert result.kernel.name == name
         assert events[-1][0] == (event,)
     assert "numba" in events[-1][1]["advice"]
 
 
-def test_threads_share_a_large_frame_and_give_the_same_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_several_threads_give_the_same_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
     size = Size(side=100, modes=13, mirror_side=8)
     calibration, frames = made_up(size, configuration(size, RATE_HZ))
     reference, pixels = calibration.reconstructor @ calibration.reference, frames[0].ravel()
-    alone = Tables.of(compiled.kernel(FUSED), calibration, reference)
-    assert alone is not None
-    expected = alone.estimate(pixels, 0.0)
+    reference_loop = Tables.of(compiled.kernel(FUSED), calibration, reference)
+    assert reference_loop is not None
+    expected = reference_loop.estimate(pixels, 0.0)
     assert expected is not None
     for threads in (2, 3):
         shared = Tables.of(compiled.kernel(FUSED, threads), calibration, reference)
@@ -238,23 +236,23 @@ def test_threads_share_a_large_frame_and_give_the_same_bytes(monkeypatch: pytest
         shared.sums_nm[:] = np.nan
         for at_least in (shared.tiles.nbytes, shared.tiles.nbytes + 1):  # by all threads, and by one
             monkeypatch.setattr(compiled, "SHARED_BYTES", at_least)
-            found = shared.estimate(pixels, 0.0)
-            assert found is not None
-            assert (found[0].tobytes(), found[1]) == (expected[0].tobytes(), expected[1])
+            counts = shared.estimate(pixels, 0.0)
+            assert counts is not None
+            assert (counts[0].tobytes(), counts[1]) == (expected[0].tobytes(), expected[1])
 
 
-def test_random_frames_and_states(monkeypatch: pytest.MonkeyPatch) -> None:
-    found, _ = compared(6_000, 500, monkeypatch)
-    assert found["fused"] > 1000
-    assert found["limits that only one saw"] <= 2
+def test_the_fused_step_agrees_on_random_frames_and_states(monkeypatch: pytest.MonkeyPatch) -> None:
+    counts, _ = compared(6_000, 500, monkeypatch)
+    assert counts["fused"] > 1000
+    assert counts["limits that only one saw"] <= 2
     for reason in (Rejection.SATURATED, Rejection.DARK, Rejection.STUCK, Limit.SLEW, Limit.MODAL_LIMIT, Limit.STROKE):
-        assert found[reason.name], reason.name
+        assert counts[reason.name], reason.name
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
-def test_a_million_random_frames_and_states(monkeypatch: pytest.MonkeyPatch) -> None:
-    found, largest_nm = compared(1_000_000, 1000, monkeypatch)
-    print(dict(found), f"largest difference {largest_nm:.3g} nm")
-    assert found["fused"] > 200_000
-    assert found["limits that only one saw"] < 200
+def test_the_fused_step_agrees_on_a_million_random_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    counts, largest_nm = compared(1_000_000, 1000, monkeypatch)
+    print(dict(counts), f"largest difference {largest_nm:.3g} nm")
+    assert counts["fused"] > 200_000
+    assert counts["limits that only one saw"] < 200

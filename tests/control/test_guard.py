@@ -1,4 +1,4 @@
-"""The guard of a law: when the integrator takes over, when the law drives again, and what it is not misled by."""
+"""The guard of a law: when the integrator takes over, when the law returns, and what must not mislead it."""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -11,7 +11,7 @@ from lowfc.arrays import Array
 from lowfc.contract.codecs.state_codec import controller_state, decode_state
 from lowfc.control.laws.linear_law import LinearLaw, integrator
 from lowfc.control.loop.advance import advance
-from lowfc.control.loop.guard import AGAIN, BETTER_S, MOST_TAKEOVERS, WORSE_BLOCKS, Group, Spans
+from lowfc.control.loop.guard import BETTER_S, LAW_RETURNS, MOST_TAKEOVERS, WORSE_BLOCKS, Group, Spans
 from lowfc.control.loop.inputs import Request
 from lowfc.control.loop.safety import Limit
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES, Settings, State
@@ -23,9 +23,9 @@ from tools.law_bench import Bench, calibrated, configured
 from tools.modal_bench import ModalBench
 
 RATE_HZ = 1000.0
-WHAT = settings(guard=True, gain=(0.5, 0.3), rate_hz=RATE_HZ)
+SETUP = settings(guard=True, gain=(0.5, 0.3), rate_hz=RATE_HZ)
 BEFORE = SETTLING_FRAMES + FADING_FRAMES - 1
-"""Frames before the first that is judged."""
+"""Frames before the first compared one."""
 SPANS = Spans.at(RATE_HZ)
 RNG = np.random.default_rng(1)
 NOISE_NM = 2 * RNG.standard_normal((30_000, len(NOLL)))
@@ -40,61 +40,63 @@ def gains(*gain: float, leak: tuple[float, ...] = (0.0, 0.0, 0.0)) -> LinearLaw:
 GOOD, BAD_TILT, BAD_FOCUS = gains(0.6, 0.6, 0.4), gains(0.05, 0.05, 0.3), gains(0.5, 0.5, 0.05)
 
 
-def with_law(law: LinearLaw, what: Settings = WHAT) -> State:
-    state, _ = advance(what, loaded(what), Request(0, "law", law=law))
+def with_law(law: LinearLaw, setup: Settings = SETUP) -> State:
+    state, _ = advance(setup, loaded(setup), Request(0, "law", law=law))
     return state
 
 
-def run(state: State, frames: int, first: int = 1, what: Settings = WHAT, **changes: object) -> tuple[list[str], State]:
-    """Reasons of the last step, as names, and the state after some frames of a slow wave."""
+def run(
+    state: State, frames: int, first: int = 1, setup: Settings = SETUP, **changes: object
+) -> tuple[list[str], State]:
+    """Names of the reasons of the last step, and the state, after some frames of a slow wave."""
     rows = slice(first, first + frames)
-    steps, _, state = live(what, SWAY_NM[rows], state=state, first=first, **changes)
+    steps, _, state = live(setup, SWAY_NM[rows], state=state, first=first, **changes)
     return [reason.name for reason in steps[-1].reasons], state
 
 
 def overruled(state: State) -> list[bool]:
-    return [group.overruled for group in state.drive.following.guard.groups]
+    return [group.overruled for group in state.loop.law_runner.guard.groups]
 
 
 @pytest.mark.parametrize(
-    ("law", "who"), [(GOOD, [False, False]), (BAD_TILT, [True, False]), (BAD_FOCUS, [False, True])]
+    ("law", "expected"), [(GOOD, [False, False]), (BAD_TILT, [True, False]), (BAD_FOCUS, [False, True])]
 )
-def test_the_integrator_takes_over_the_group_for_which_the_law_is_worse(law: LinearLaw, who: list[bool]) -> None:
+def test_the_integrator_takes_over_the_group_with_a_worse_law(law: LinearLaw, expected: list[bool]) -> None:
     reasons, state = run(with_law(law), BEFORE + (WORSE_BLOCKS + 1) * SPANS.block)
-    assert overruled(state) == who
-    assert reasons == (["LAW_OVERRULED"] if any(who) else [])
-    assert state.counts.get(Limit.LAW_OVERRULED, 0) == (SPANS.block + 1 if any(who) else 0)
+    assert overruled(state) == expected
+    assert reasons == (["LAW_OVERRULED"] if any(expected) else [])
+    assert state.counts.get(Limit.LAW_OVERRULED, 0) == (SPANS.block + 1 if any(expected) else 0)
     assert Limit.LAW_OVERRULED not in state.limits_hit
 
 
-def test_nothing_is_guarded_where_that_is_switched_off_or_the_integrator_drives() -> None:
-    what = replace(WHAT, guard=False)
-    reasons, state = run(with_law(BAD_TILT, what), 1000, what=what)
-    assert (reasons, state.drive.following.guard) == ([], None)
-    assert run(loaded(WHAT), 5)[1].drive.following is None
+def test_without_a_law_or_with_guard_off_nothing_is_guarded() -> None:
+    setup = replace(SETUP, guard=False)
+    reasons, state = run(with_law(BAD_TILT, setup), 1000, setup=setup)
+    assert (reasons, state.loop.law_runner.guard) == ([], None)
+    assert run(loaded(SETUP), 5)[1].loop.law_runner is None
 
 
-def test_the_integrator_takes_over_without_a_jump_and_it_is_told() -> None:
+def test_the_takeover_has_an_event_and_no_jump() -> None:
     state = with_law(BAD_TILT)
     _, state = run(state, BEFORE + WORSE_BLOCKS * SPANS.block - 1)
     assert not any(overruled(state))
     first = BEFORE + WORSE_BLOCKS * SPANS.block
-    before = state.drive.history_nm[0]
-    state, every = feed(WHAT, state, frame(first, SWAY_NM[first] + before))
+    before = state.loop.history_nm[0]
+    state, every = feed(SETUP, state, frame(first, SWAY_NM[first] + before))
     assert names(every) == ["LAW_OVERRULED"]
     event = every[0].events[0].details
     assert event["modes"] == "tip and tilt"
     assert event["until"] == f"until the law would be far better for {BETTER_S:g} s"
-    assert np.abs(state.drive.history_nm[0] - before).max() < 2  # a hundredth of the way to the integrator's command
+    assert np.abs(state.loop.history_nm[0] - before).max() < 2  # one hundredth of the cross-fade
     _, state = run(state, SPANS.faded, first + 1)
-    known = status.figures(controller_state(state, WHAT, 1))
+    known = status.figures(controller_state(state, SETUP, 1))
     assert known["law"]["overruled"] == ["tip and tilt"]
     assert "overruled: the integrator drives tip and tilt" in status.text(known)
-    weight = state.drive.following.weight
+    weight = state.loop.law_runner.weight
     np.testing.assert_array_equal(weight, [0, 0, 1])
 
 
-def test_waiting_doubles_and_ends_with_the_operator() -> None:
+def test_the_waiting_time_doubles_until_a_takeover_is_final() -> None:
     group, waited = Group(usual_nm2=100.0), []
     for _ in range(MOST_TAKEOVERS):
         for _ in range(WORSE_BLOCKS):
@@ -103,7 +105,7 @@ def test_waiting_doubles_and_ends_with_the_operator() -> None:
         assert "leaves 3.16 nm rms, the integrator would leave 2.24" in why
         for blocks in range(1, 10 * SPANS.better):
             group, why = group.judged((10.0, 2.0, 100.0), SPANS, void=False)
-            if why == AGAIN:
+            if why == LAW_RETURNS:
                 waited.append(blocks)
                 break
     assert waited == [SPANS.better, 2 * SPANS.better, 4 * SPANS.better]
@@ -111,7 +113,7 @@ def test_waiting_doubles_and_ends_with_the_operator() -> None:
 
 
 @pytest.mark.parametrize(("pol_nm2", "final"), [(39.0, True), (41.0, False)], ids=["amplified", "grown"])
-def test_a_loop_amplifies_where_its_error_is_unusual_and_not_a_small_part_of_what_there_is(
+def test_a_loop_amplifies_if_its_error_is_large_and_not_due_to_a_larger_disturbance(
     pol_nm2: float, final: bool
 ) -> None:
     group = Group(usual_nm2=1.0, blocks=WORSE_BLOCKS - 1)
@@ -120,89 +122,89 @@ def test_a_loop_amplifies_where_its_error_is_unusual_and_not_a_small_part_of_wha
 
 
 @pytest.mark.parametrize("between", [(10.0, 3.0, 100.0), (10.0, 2.0, 100.0)], ids=["not better", "void"])
-def test_a_block_between_makes_the_wait_begin_anew(between: tuple[float, ...]) -> None:
+def test_one_bad_block_restarts_the_wait(between: tuple[float, ...]) -> None:
     group = Group(overruled=True, takeovers=1, blocks=SPANS.better - 1, usual_nm2=100.0)
     group, _ = group.judged(between, SPANS, void=between[1] == 2.0)
     assert (group.overruled, group.blocks) == (True, 0)
 
 
-def test_the_law_drives_again_once_it_would_be_far_better() -> None:
-    """A law that does next to nothing is bad at first, and good where there is nothing but noise to correct."""
+def test_the_law_returns_once_it_would_be_far_better() -> None:
+    """A law that hardly corrects is worse for a slow wave and better for white noise."""
     state = with_law(gains(0.01, 0.01, 0.3, leak=(0.05, 0.05, 0.0)))
     frames = BEFORE + WORSE_BLOCKS * SPANS.block + SPANS.faded
     _, state = run(state, frames)
     assert overruled(state) == [True, False]
-    noisy = replace(state.drive.law, gain=np.array([1.9, 1.9, 0.3], np.float32))
-    state = state._replace(drive=state.drive._replace(law=noisy))
+    noisy = replace(state.loop.law, gain=np.array([1.9, 1.9, 0.3], np.float32))
+    state = state._replace(loop=state.loop._replace(law=noisy))
     quiet = np.zeros(((SPANS.better + 3) * SPANS.block, len(NOLL)))
-    steps, _, state = live(WHAT, quiet, NOISE_NM[: len(quiet)], state, frames + 1)
-    assert [group.takeovers for group in state.drive.following.guard.groups] == [1, 0]
-    assert state.drive.following.alone()
+    steps, _, state = live(SETUP, quiet, NOISE_NM[: len(quiet)], state, frames + 1)
+    assert [group.takeovers for group in state.loop.law_runner.guard.groups] == [1, 0]
+    assert state.loop.law_runner.alone()
     by_the_integrator = [step.reasons for step in steps].count((Limit.LAW_OVERRULED,))
     assert SPANS.better * SPANS.block <= by_the_integrator < len(steps)
 
 
-def test_closing_and_loading_begin_anew() -> None:
+def test_closing_and_loading_reset_the_guard() -> None:
     _, state = run(with_law(BAD_TILT), BEFORE + (WORSE_BLOCKS + 2) * SPANS.block)
     assert overruled(state)[0]
     for requests in ([Request(0, "open"), Request(0, "close")], [Request(0, "law", law=BAD_TILT)]):
-        anew, _ = feed(WHAT, state, *requests)
-        assert [group.takeovers for group in anew.drive.following.guard.groups] == [0, 0]
+        reset, _ = feed(SETUP, state, *requests)
+        assert [group.takeovers for group in reset.loop.law_runner.guard.groups] == [0, 0]
 
 
-def test_missing_and_refused_frames_hold_the_virtual_loop_as_the_real_one() -> None:
+def test_missing_and_refused_frames_hold_the_virtual_command() -> None:
     frames, lost = BEFORE + 90, {"missing": {250, 251, 260}, "dark": {270}}
-    what = replace(WHAT, delay_frames=1.5)
+    setup = replace(SETUP, delay_frames=1.5)
     law = replace(gains(0.2, 0.2, 0.2), delay_frames=1.5)
-    _, guarded = run(with_law(law, what), frames, what=what, **lost)
-    _, alone = run(loaded(what), frames, what=what, **lost)
-    virtual_nm = guarded.drive.following.guard.virtual_nm
-    np.testing.assert_allclose(virtual_nm, alone.drive.history_nm, atol=0.3)  # rounding to DN
-    assert np.abs(guarded.drive.history_nm[0] - alone.drive.history_nm[0]).max() > 1
+    _, guarded = run(with_law(law, setup), frames, setup=setup, **lost)
+    _, unguarded = run(loaded(setup), frames, setup=setup, **lost)
+    virtual_nm = guarded.loop.law_runner.guard.virtual_nm
+    np.testing.assert_allclose(virtual_nm, unguarded.loop.history_nm, atol=0.3)  # rounding to DN
+    assert np.abs(guarded.loop.history_nm[0] - unguarded.loop.history_nm[0]).max() > 1
 
 
-def test_a_virtual_law_is_what_it_would_be_if_it_drove() -> None:
+def test_a_virtual_law_has_the_command_of_a_real_one() -> None:
     frames = BEFORE + (WORSE_BLOCKS + 3) * SPANS.block
     _, state = run(with_law(BAD_TILT), frames)
-    what = replace(WHAT, guard=False)
-    _, alone = run(with_law(BAD_TILT, what), frames, what=what)
-    virtual_nm = state.drive.following.guard.virtual_nm[0]
-    np.testing.assert_allclose(virtual_nm[:2], alone.drive.history_nm[0][:2], atol=0.3)
+    setup = replace(SETUP, guard=False)
+    _, unguarded = run(with_law(BAD_TILT, setup), frames, setup=setup)
+    virtual_nm = state.loop.law_runner.guard.virtual_nm[0]
+    np.testing.assert_allclose(virtual_nm[:2], unguarded.loop.history_nm[0][:2], atol=0.3)
 
 
-def test_there_is_no_verdict_while_something_is_played_a_limit_acts_or_the_command_goes_to_zero() -> None:
+def test_probe_sequences_resets_and_limits_suspend_the_comparison() -> None:
     _, state = run(with_law(BAD_TILT), BEFORE + SPANS.block + 50)
-    guard, first = state.drive.following.guard, BEFORE + SPANS.block + 51
+    guard, first = state.loop.law_runner.guard, BEFORE + SPANS.block + 51
     assert (guard.frames, guard.groups[0].blocks) == (50, 1)
     play = Request(0, "play", text="offset", table=np.zeros((5, len(NOLL)), np.float32))
     for request in (play, Request(0, "reset")):
-        asked, _ = advance(WHAT, state, request)
-        after = run(asked, 1, first)[1].drive.following.guard
+        asked, _ = advance(SETUP, state, request)
+        after = run(asked, 1, first)[1].loop.law_runner.guard
         assert (after.frames, after.virtual_nm, after.groups[0].blocks) == (0, (), 0)
     limited = state._replace(limits_hit=(Limit.SLEW,))
-    after = run(limited, 1, first)[1].drive.following.guard
+    after = run(limited, 1, first)[1].loop.law_runner.guard
     assert (after.frames, after.void, after.virtual_nm) == (51, True, ())
     bounded = state._replace(limits_hit=(Limit.MODAL_LIMIT,))
-    assert run(bounded, 1, first)[1].drive.following.guard.void is False
+    assert run(bounded, 1, first)[1].loop.law_runner.guard.void is False
 
 
-def test_a_state_from_the_wire_goes_on_to_the_bit() -> None:
-    """In every phase: judged, in the cross-fade, overruled with a virtual law."""
-    state, done = with_law(BAD_TILT), 0
+def test_a_decoded_guard_continues_identically() -> None:
+    """In every phase: compared, in the cross-fade, overruled with a virtual law."""
+    state, frames_done = with_law(BAD_TILT), 0
     for until in (
         BEFORE + 150,
         BEFORE + WORSE_BLOCKS * SPANS.block + 50,
         BEFORE + (WORSE_BLOCKS + 3) * SPANS.block + 7,
     ):
-        _, state = run(state, until - done, done + 1)
-        done = until
-        message = controller_state(state, WHAT, 1)
-        again, resumed = decode_state(message, calibration(), {BAD_TILT.id: BAD_TILT})
-        assert again == WHAT
+        _, state = run(state, until - frames_done, frames_done + 1)
+        frames_done = until
+        message = controller_state(state, SETUP, 1)
+        decoded, resumed = decode_state(message, calibration(), {BAD_TILT.id: BAD_TILT})
+        assert decoded == SETUP
         message.guard.groups[0].overruled, message.guard.groups[0].takeovers = True, 0
         with pytest.raises(ValueError, match="the guard of the controller's state does not fit"):
             decode_state(message, calibration(), {BAD_TILT.id: BAD_TILT})
-        ends = [controller_state(run(one, 130, done + 1)[1], WHAT, 1) for one in (state, resumed)]
+        ends = [controller_state(run(one, 130, frames_done + 1)[1], SETUP, 1) for one in (state, resumed)]
         assert ends[0] == ends[1]
 
 
@@ -212,42 +214,42 @@ def case(preset: str, magnitude: float = 0.0, *, known: bool = False) -> Case:
 
 
 @pytest.fixture
-def brief(monkeypatch: pytest.MonkeyPatch) -> None:
+def short_settling(monkeypatch: pytest.MonkeyPatch) -> None:
     """A loop that is closed after 2 s."""
     monkeypatch.setattr("tools.guard._SETTLE", 2_000)
 
 
-def test_noise_without_images_is_that_of_the_images() -> None:
-    """Modes of an open loop that nothing disturbs, and tilt that a law leaves of the wheel."""
+def test_modal_noise_agrees_with_images() -> None:
+    """Modes of an open loop without a disturbance, and the residual tilt of a law on the reaction wheel."""
     config = configured(**{"disturbance.preset": "quiet"}, **SMALL_MIRROR)
     found = calibrated(config)
     bench = Bench(config, found)
     bench.run(600)
     expected = frame_noise_nm2(config, found)
-    got = np.cov(np.array([step.error_nm for step in bench.steps]).T)
-    assert np.linalg.norm(got - expected) < 0.2 * np.linalg.norm(expected)
+    measured = np.cov(np.array([step.error_nm for step in bench.steps]).T)
+    assert np.linalg.norm(measured - expected) < 0.2 * np.linalg.norm(expected)
     wheel = configured(**SMALL_MIRROR)
-    left: list[float] = []
+    tilt_mas: list[float] = []
     for one in (Bench(wheel, found), ModalBench(wheel, expected)):
         one.ask("close")
         one.run(500)
-        left.append(one.tilt_mas(350))
-    assert left[1] == pytest.approx(left[0], rel=0.03)
+        tilt_mas.append(one.tilt_mas(350))
+    assert tilt_mas[1] == pytest.approx(tilt_mas[0], rel=0.03)
 
 
-def test_lines_that_move_leave_no_more_than_the_integrator(brief: None) -> None:
+def test_with_shifted_lines_the_residual_is_at_most_the_integrators(short_settling: None) -> None:
     preset, factor = MOVED[0]
     got_mas, overruled_s = moved(case(preset, known=True), factor, 1)
     assert len(overruled_s) == 1
     assert got_mas < 1.1 * moved(case(preset, known=True), factor, 1, law=False)[0]
 
 
-def test_steps_are_no_failure_of_the_law(brief: None) -> None:
+def test_steps_of_the_disturbance_do_not_overrule_the_law(short_settling: None) -> None:
     assert undisturbed(case("reaction-wheel", known=True), 1, minutes=0.07) == 0
 
 
-def test_a_wrong_delay_is_noticed_though_it_spoils_what_is_compared() -> None:
-    """The law and the pseudo-open-loop modes reckon with one frame, the mirror acts after two."""
+def test_a_wrong_delay_is_detected_as_amplification() -> None:
+    """The law and the pseudo-open-loop modes assume one frame of delay; the true delay is two."""
     one = case("reaction-wheel", known=True)
     config = one.configured(1, **{"control.delay_frames": 1.0, "camera.delay_frames": 2.0})
     bench = ModalBench(config, one.covariance_nm2)
@@ -262,7 +264,7 @@ def test_a_wrong_delay_is_noticed_though_it_spoils_what_is_compared() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("preset", "factor"), MOVED)
-def test_lines_that_move_leave_no_more_than_the_integrator_whatever_the_seed(preset: str, factor: float) -> None:
+def test_with_shifted_lines_the_residual_is_at_most_the_integrators_for_all_seeds(preset: str, factor: float) -> None:
     ratios: Array = np.array(
         [moved(case(preset), factor, seed)[0] / moved(case(preset), factor, seed, law=False)[0] for seed in SEEDS]
     )
@@ -272,5 +274,5 @@ def test_lines_that_move_leave_no_more_than_the_integrator_whatever_the_seed(pre
 @pytest.mark.slow
 @pytest.mark.parametrize("magnitude", [0.0, 2.0, 5.0])
 def test_a_good_law_is_never_overruled(magnitude: float) -> None:
-    """Ten minutes of it; `python -m tools.measure guard` measures as many for each of twenty seeds, for some hours."""
+    """For ten minutes; `python -m tools.measure guard` measures ten minutes for each of twenty seeds in some hours."""
     assert undisturbed(case("reaction-wheel", magnitude), 21) == 0

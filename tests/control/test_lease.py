@@ -1,4 +1,4 @@
-"""Reservations of the loop, remarks on foolish values, and the sentences of replies and events."""
+"""Reservations of the loop, remarks on unwise values, and the texts of replies and events."""
 
 from dataclasses import replace
 
@@ -16,14 +16,14 @@ from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import State
 from tests.support.toy import GRID, NOLL, SOME, answered, feed, frame, frame_sequence, loaded, names, settings
 
-USUAL = settings(rate_hz=1000.0)
+DEFAULTS = settings(rate_hz=1000.0)
 HOLDER = "lowfc calibrate (anna, pid 7)"
 MINE, S = 11, 1_000_000_000
 
 
 def held(seconds: float = 10.0, frames: int = 3) -> State:
-    """A closed loop that is reserved from time 0 on."""
-    state, _ = feed(USUAL, loaded(USUAL), *(frame(count, SOME) for count in range(1, frames + 1)))
+    """A closed loop that is reserved from time 0."""
+    state, _ = feed(DEFAULTS, loaded(DEFAULTS), *(frame(count, SOME) for count in range(1, frames + 1)))
     state, reply = asked(state, Request(0, "lease", values=(seconds,), text=HOLDER, lease_id=MINE))
     assert reply.reply.accepted
     assert names([reply]) == ["LEASE_TAKEN"]
@@ -31,11 +31,11 @@ def held(seconds: float = 10.0, frames: int = 3) -> State:
 
 
 def asked(state: State, request: Request) -> tuple[State, Outputs]:
-    return advance(USUAL, state, request)
+    return advance(DEFAULTS, state, request)
 
 
 def played(state: State, frames: int = 500, lease_id: int = MINE) -> State:
-    """The same while a probe sequence is played."""
+    """The state with a probe sequence in progress."""
     shape = np.full(GRID, 3, np.float32).reshape(-1)
     table = np.ones((frames, 1), np.float32)
     request = Request(0, "play", text=MIRROR, actuators_nm=shape, table=table, lease_id=lease_id)
@@ -44,23 +44,23 @@ def played(state: State, frames: int = 500, lease_id: int = MINE) -> State:
     return state
 
 
-def left(state: State) -> int:
-    added = state.drive.command_channels
-    return 0 if added is None or added.play is None else added.play.left(state.frame_sequence + 1)
+def remaining_rows(state: State) -> int:
+    additions = state.loop.command_channels
+    return 0 if additions is None or additions.play is None else additions.play.remaining(state.frame_sequence + 1)
 
 
 GRANTED = {"safe", "open", "pause", "stop", "status", "note", "lease", "renew", "release", "permit", "configuration"}
 
 
 @pytest.mark.parametrize("name", sorted({*REQUESTS} - GRANTED))
-def test_requests_of_others_are_refused_and_name_the_holder(name: str) -> None:
+def test_requests_of_other_clients_are_refused_with_the_holders_name(name: str) -> None:
     state = held()
     after, outputs = asked(state, Request(4 * S, name))
     answered(outputs, False, HOLDER, "6 s", "lowfc ctl open")
     assert all(now is was for now, was in zip(after[:-1], state[:-1], strict=True))
 
 
-def test_the_holder_is_not_hindered() -> None:
+def test_the_holders_requests_are_granted() -> None:
     state, outputs = asked(held(), Request(S, "gain", values=(0.3,), lease_id=MINE))
     answered(outputs, True)
     state, outputs = asked(state, Request(S, "open", lease_id=MINE))
@@ -70,25 +70,25 @@ def test_the_holder_is_not_hindered() -> None:
 
 
 @pytest.mark.parametrize("name", ["safe", "open", "pause", "stop"])
-def test_these_are_granted_to_anybody_and_end_the_lease_and_what_it_plays(name: str) -> None:
+def test_safe_open_pause_and_stop_end_any_lease_and_its_probe_sequence(name: str) -> None:
     state, outputs = asked(played(held()), Request(S, name))
     answered(outputs, True)
     assert "LEASE_ENDED" in names([outputs])
-    assert not left(state)
+    assert not remaining_rows(state)
     state, outputs = asked(state, Request(2 * S, "renew", values=(10.0,), text=HOLDER, lease_id=MINE))
     assert outputs.reply.text == f"the lease ended: operator asked to {name}"
 
 
-def test_what_ends_a_lease_names_its_holder_without_how_long_it_was_going_to_take() -> None:
+def test_the_end_of_a_lease_names_its_holder_without_the_remaining_time() -> None:
     request = Request(0, "lease", values=(10.0,), text=f"{HOLDER}, about 33 s to go", lease_id=MINE)
-    state, _ = asked(loaded(USUAL), request)
+    state, _ = asked(loaded(DEFAULTS), request)
     _, outputs = asked(state, Request(S, "stop"))
     assert [event.details["holder"] for event in outputs.events if event.name == "LEASE_ENDED"] == [HOLDER]
     assert outputs.reply.text.endswith(f"; this ended the reservation for {HOLDER}")
 
 
-def test_a_closed_loop_is_not_said_to_be_closed_from_now_on() -> None:
-    state, outputs = asked(loaded(USUAL), Request(0, "close"))
+def test_close_reports_whether_the_loop_was_closed_already() -> None:
+    state, outputs = asked(loaded(DEFAULTS), Request(0, "close"))
     assert outputs.reply.text == "the loop stays closed"
     state, _ = asked(state, Request(1, "step", values=(5.0,)))
     assert asked(state, Request(2, "close"))[1].reply.text == "loop closed"
@@ -96,13 +96,13 @@ def test_a_closed_loop_is_not_said_to_be_closed_from_now_on() -> None:
 
 @pytest.mark.parametrize("name", ["close", "gain", "play", "load"])
 @pytest.mark.parametrize("ended", [True, False])
-def test_a_former_holder_is_refused_and_told_why(name: str, ended: bool) -> None:
-    state = asked(held(), Request(S, "pause"))[0] if ended else loaded(USUAL)
+def test_a_former_holder_is_refused_with_the_reason(name: str, ended: bool) -> None:
+    state = asked(held(), Request(S, "pause"))[0] if ended else loaded(DEFAULTS)
     _, outputs = asked(state, Request(2 * S, name, values=(0.1,), lease_id=MINE))
     answered(outputs, False, ("operator asked to pause" if ended else "did the controller restart"))
 
 
-def test_in_safe_mode_nothing_is_reserved_and_its_holders_safe_ends_it() -> None:
+def test_safe_mode_ends_and_refuses_a_lease() -> None:
     state, outputs = asked(held(), Request(S, "safe", lease_id=MINE))
     assert outputs.reply.text == f"loop in safe mode; this ended the reservation for {HOLDER}"
     _, outputs = asked(state, Request(S, "lease", values=(5.0,), text=HOLDER, lease_id=12))
@@ -112,13 +112,13 @@ def test_in_safe_mode_nothing_is_reserved_and_its_holders_safe_ends_it() -> None
 
 
 @pytest.mark.parametrize("name", ["status", "note"])
-def test_these_disturb_nobody(name: str) -> None:
+def test_status_and_note_do_not_end_a_lease(name: str) -> None:
     state, outputs = asked(held(), Request(S, name, text="cloud"))
     answered(outputs, True)
     assert not state.conditions.lease.ended
 
 
-def test_it_is_granted_to_one_at_a_time_and_released_by_its_holder_only() -> None:
+def test_a_lease_has_one_holder_who_alone_can_release_it() -> None:
     state = held()
     after, outputs = asked(state, Request(S, "lease", values=(5.0,), text="somebody", lease_id=12))
     answered(outputs, False)
@@ -143,37 +143,37 @@ def test_it_is_granted_to_one_at_a_time_and_released_by_its_holder_only() -> Non
         ({"lease_id": 0}, "identity"),
     ],
 )
-def test_a_lease_that_is_not_whole_is_refused(fields: dict[str, object], why: str) -> None:
+def test_an_incomplete_lease_is_refused(fields: dict[str, object], why: str) -> None:
     request = Request(0, "lease", values=(5.0,), text=HOLDER, lease_id=MINE)
-    _, outputs = asked(loaded(USUAL), replace(request, **fields))  # type: ignore[arg-type]  # each of its own type
+    _, outputs = asked(loaded(DEFAULTS), replace(request, **fields))  # type: ignore[arg-type]  # each of its own type
     answered(outputs, False, why)
 
 
-def test_it_ends_with_its_holder_by_the_frames() -> None:
-    """1000 frames of a second, and one more."""
+def test_a_lease_ends_after_its_number_of_frames() -> None:
+    """A lease of 1 s is in force for 1000 frames at 1 kHz."""
     state = played(held(1.0), 5000)
-    state, every = feed(USUAL, state, *(frame(count) for count in range(4, 1004)))
+    state, every = feed(DEFAULTS, state, *(frame(count) for count in range(4, 1004)))
     assert names(every) == []
-    assert left(state) == 4000
-    state, every = feed(USUAL, state, frame(1004))
+    assert remaining_rows(state) == 4000
+    state, every = feed(DEFAULTS, state, frame(1004))
     assert names(every) == ["LEASE_ENDED"]
-    assert not left(state)
+    assert not remaining_rows(state)
 
 
-def test_it_ends_with_its_holder_by_the_clock_where_no_frames_come() -> None:
-    state, every = feed(USUAL, played(held(1.0)), Tick(S, 0), Tick(S + 1, 0))
+def test_without_frames_a_lease_ends_by_the_clock() -> None:
+    state, every = feed(DEFAULTS, played(held(1.0)), Tick(S, 0), Tick(S + 1, 0))
     assert names(every) == ["LEASE_ENDED"]
-    assert not left(state)
+    assert not remaining_rows(state)
 
 
-def test_it_is_gone_by_the_time_of_the_next_request() -> None:
+def test_an_expired_lease_ends_before_the_next_request() -> None:
     _state, outputs = asked(held(1.0), Request(S + 1, "gain", values=(0.3,)))
     answered(outputs, True)
     assert names([outputs]) == ["LEASE_ENDED"]
 
 
-def test_it_outlives_a_camera_that_restarts() -> None:
-    state, _ = feed(USUAL, held(1.0), frame(1, SOME, sequence=frame_sequence(1, start=1_800_000_000)))
+def test_a_lease_outlives_a_camera_restart() -> None:
+    state, _ = feed(DEFAULTS, held(1.0), frame(1, SOME, sequence=frame_sequence(1, start=1_800_000_000)))
     assert not state.conditions.lease.ended
 
 
@@ -185,7 +185,7 @@ def replied(
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "said"),
+    ("name", "value", "remark"),
     [
         ("gain", 0.5, ""),
         ("gain", 1.2, "margins are below the 1.8 in gain and 45 degrees in phase that `lowfc tune` keeps"),
@@ -198,49 +198,49 @@ def replied(
         ("leak", 0.0, ""),
     ],
 )
-def test_a_foolish_value_is_granted_and_said_so(name: str, value: float, said: str) -> None:
-    after, reply = replied(loaded(USUAL), name, value, modes=(3,))
+def test_an_unwise_value_is_granted_with_a_remark(name: str, value: float, remark: str) -> None:
+    after, reply = replied(loaded(DEFAULTS), name, value, modes=(3,))
     assert reply.accepted
     attribute = {"gain": "gain", "limit": "limit_nm", "leak": "leak"}[name]
-    assert getattr(after.drive.law, attribute)[NOLL.index(3)] == np.float32(value)
+    assert getattr(after.loop.law, attribute)[NOLL.index(3)] == np.float32(value)
     assert reply.text.startswith(f"{name} is now ")
-    assert said in reply.text
-    assert (":" in reply.text) == bool(said)
+    assert remark in reply.text
+    assert (":" in reply.text) == bool(remark)
 
 
-def test_an_offset_that_would_not_be_followed_is_said_so() -> None:
-    state, _ = replied(loaded(USUAL), "gain", 0.0, modes=(3,))
-    for mode, said in ((3, "Z3 would not follow at a gain of 0"), (4, "")):
+def test_an_offset_of_a_mode_without_gain_has_a_remark() -> None:
+    state, _ = replied(loaded(DEFAULTS), "gain", 0.0, modes=(3,))
+    for mode, remark in ((3, "Z3 would not follow at a gain of 0"), (4, "")):
         _, reply = replied(state, "offset", 5.0, modes=(mode,))
         assert reply.accepted
-        assert said in reply.text
-        assert (":" in reply.text) == bool(said)
+        assert remark in reply.text
+        assert (":" in reply.text) == bool(remark)
 
 
-def test_the_remark_begins_where_tune_ends() -> None:
-    highest = highest_gain(USUAL.delay_frames)
-    texts = [replied(loaded(USUAL), "gain", factor * highest)[1].text for factor in (0.999, 1.001)]
+def test_the_remark_on_gains_begins_above_the_highest_gain() -> None:
+    highest = highest_gain(DEFAULTS.delay_frames)
+    texts = [replied(loaded(DEFAULTS), "gain", factor * highest)[1].text for factor in (0.999, 1.001)]
     assert ["lowfc tune" in text for text in texts] == [False, True]
 
 
-def test_a_channel_that_is_not_there_is_said_so_and_one_that_is_there_is_removed() -> None:
-    state = loaded(USUAL)
+def test_removing_a_channel_and_a_missing_one() -> None:
+    state = loaded(DEFAULTS)
     after, reply = replied(state, "channel", text="dark-hole")
     assert (reply.accepted, reply.text) == (True, "there is no channel 'dark-hole' to remove; there are none")
-    assert after.drive.command_channels is None
+    assert after.loop.command_channels is None
     shape = Request(1, "channel", text="dark-hole", actuators_nm=np.full(GRID, 2.0, np.float32).reshape(-1))
-    state, _ = advance(USUAL, state, shape)
+    state, _ = advance(DEFAULTS, state, shape)
     assert replied(state, "channel", text="hole")[1].text == "there is no channel 'hole' to remove; there are dark-hole"
     assert replied(state, "channel", text="dark-hole")[1].text == "channel dark-hole: 0 nm rms of surface"
     assert "letter first" in replied(state, "channel", text="Dark Hole")[1].text
 
 
-def test_an_offset_beyond_its_limit_names_its_mode() -> None:
-    _, reply = replied(loaded(USUAL), "offset", 80.0, modes=(4,))
+def test_the_refusal_of_an_offset_names_its_mode() -> None:
+    _, reply = replied(loaded(DEFAULTS), "offset", 80.0, modes=(4,))
     assert (reply.accepted, reply.text) == (False, "offset of mode 4: at most its limit, 50 nm; asked for 80 nm")
 
 
-def test_events_keep_singular_and_plural() -> None:
+def test_events_use_singular_and_plural() -> None:
     event = EVENTS["FRAMES_MISSING"]
     assert "1 frame missing" in event.log("controller", 0, count=1, number=7).message
     assert "2 frames missing" in event.log("controller", 0, count=np.int64(2), number=7).message

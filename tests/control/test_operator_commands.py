@@ -1,4 +1,4 @@
-"""Whatever comes, and whenever: requests are answered, nothing jumps, no limit is crossed, and the log says it all."""
+"""Random inputs: requests are answered, nothing jumps, the limits hold, and the log is sufficient for a replay."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import Phase, given
-from hypothesis import settings as effort
+from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from lowfc.arrays import Single
@@ -57,13 +57,13 @@ CALIBRATION = identified(calibration())
 OTHERS = tuple(identified(calibration(noll, scale)) for noll, scale in ((NOLL, 1.1), ((2, 3), 1.0), ((2,), 0.9)))
 ELSEWHERE = identified(replace(CALIBRATION, grid=(5, 4)))
 KNOWN = {each.id: each for each in (CALIBRATION, *OTHERS, ELSEWHERE)}
-LOUD = 3e38
+HUGE = 3e38
 STATIC_NM = (12.0, -8.0, 5.0)
-"""Of each mode, on which the rest of the disturbance rides."""
+"""Static part of the disturbance of each mode."""
 
 
 def laws(delay_frames: float, noll: tuple[int, ...]) -> tuple[LinearLaw, ...]:
-    """A stable one, one of the pseudo-open-loop modes, one that is not stable, one of other modes."""
+    """A stable law, a law of pseudo-open-loop modes, an unstable law, and a law of other modes."""
 
     def one(gain: float, modes: tuple[int, ...] = noll) -> LinearLaw:
         return linear(law_of(gain, modes=len(modes)), modes, delay_frames)
@@ -73,16 +73,16 @@ def laws(delay_frames: float, noll: tuple[int, ...]) -> tuple[LinearLaw, ...]:
 
 
 class Script:
-    """Requests as they come from the bus, and frames of a sensor that sees what the mirror does."""
+    """Random requests as from the bus, and frames of a sensor that sees the mirror."""
 
-    def __init__(self, what: Settings, seed: int) -> None:
+    def __init__(self, setup: Settings, seed: int) -> None:
         self.rng = np.random.default_rng(seed)
-        self.what = what
+        self.setup = setup
         self.count, self.start = 0, START
 
     def number(self) -> float:
-        """Mostly sensible; otherwise what a slip of the finger, or a broken program, may send."""
-        odd = (np.nan, np.inf, -np.inf, LOUD, -LOUD, 1e-42, -1.0, 1e6)
+        """A number, mostly sensible; otherwise as after a typing error or from a faulty program."""
+        odd = (np.nan, np.inf, -np.inf, HUGE, -HUGE, 1e-42, -1.0, 1e6)
         return float(self.rng.choice(odd)) if self.rng.random() < 0.15 else float(self.rng.uniform(0, 1.2))
 
     def modes(self) -> list[int]:
@@ -90,14 +90,14 @@ class Script:
         return some[self.rng.integers(len(some))]
 
     def shape(self) -> Single:
-        """A shape of the mirror that is smooth, rough, too large, not finite, or of another mirror."""
+        """A mirror shape that is smooth, rough, too large, not finite, or for another mirror."""
         rows, columns = CALIBRATION.grid
         smooth = np.add.outer(np.linspace(-1, 1, rows), np.linspace(-1, 1, columns))
         match self.rng.integers(8):
             case 0:
                 return np.zeros(CALIBRATION.grid, np.float32)
             case 1:
-                return np.full(CALIBRATION.grid, self.rng.choice([np.nan, np.inf, LOUD]), np.float32)
+                return np.full(CALIBRATION.grid, self.rng.choice([np.nan, np.inf, HUGE]), np.float32)
             case 2:
                 return np.ones(int(self.rng.integers(40)), np.float32)
             case 3:
@@ -108,11 +108,11 @@ class Script:
     def table(self, columns: int, amplitude: float) -> Single:
         table = self.rng.normal(0, amplitude, (int(self.rng.integers(1, 12)), columns)).astype(np.float32)
         if self.rng.random() < 0.1:
-            table.flat[0] = self.rng.choice([np.nan, LOUD, -1e6])
+            table.flat[0] = self.rng.choice([np.nan, HUGE, -1e6])
         return table
 
     def message(self, name: str) -> wire.Request:
-        """A request of that name, with what belongs to it, or something else."""
+        """A request of this name, with valid or invalid fields."""
         message = wire.Request(name=name, lease_id=int(self.rng.choice([0, 1, 1])))
         match name:
             case "gain" | "leak" | "limit":
@@ -134,9 +134,9 @@ class Script:
                 message.table = table.tobytes()
                 message.columns = table.shape[1]
             case "law":
-                of = laws(self.what.delay_frames, NOLL)
-                if (place := int(self.rng.integers(len(of) + 1))) < len(of):
-                    message.law.CopyFrom(wire_law(of[place]))
+                candidates = laws(self.setup.delay_frames, NOLL)
+                if (place := int(self.rng.integers(len(candidates) + 1))) < len(candidates):
+                    message.law.CopyFrom(wire_law(candidates[place]))
             case "load":
                 one = (CALIBRATION, *OTHERS, ELSEWHERE, None)[self.rng.integers(6)]
                 if one is not None:
@@ -151,19 +151,19 @@ class Script:
         return message
 
     def frame(self, state: State) -> Frame:
-        """What the sensor sees: a disturbance, and the mirror as the last command left it."""
+        """A frame with a random disturbance and the shape of the last command."""
         self.count += 1 + int(self.rng.random() < 0.03) * 3
         disturbance = self.rng.normal(STATIC_NM, 3)
-        if state.drive is not None:
+        if state.loop is not None:
             mirror = CALIBRATION.modes_to_actuators
-            disturbance = disturbance + np.linalg.lstsq(mirror, state.drive.actuators_nm.ravel(), rcond=None)[0]
+            disturbance = disturbance + np.linalg.lstsq(mirror, state.loop.actuators_nm.ravel(), rcond=None)[0]
         return frame(self.count, disturbance, sequence=frame_sequence(self.count, self.start))
 
-    def happening(self) -> Input:
-        """What may come beside good frames and requests."""
-        rng, still = self.rng, np.zeros(SHAPE, np.uint16)
+    def disruption(self) -> Input:
+        """A random input other than a good frame or a request."""
+        rng, black = self.rng, np.zeros(SHAPE, np.uint16)
         newest = frame_sequence(self.count, self.start)
-        pixels = (None, still, still + 65535, rng.integers(0, 65536, SHAPE).astype(np.uint16), still[:3])
+        pixels = (None, black, black + 65535, rng.integers(0, 65536, SHAPE).astype(np.uint16), black[:3])
         match rng.integers(9):
             case 0:
                 return frame(0, sequence=newest - int(rng.integers(3)))
@@ -191,72 +191,74 @@ class Script:
 
 @dataclass
 class Run:
-    """What was taken, and what was said: as bytes."""
+    """Inputs and outputs of a run; the outputs as bytes."""
 
     state: State
-    taken: list[Input]
-    said: list[bytes]
+    inputs: list[Input]
+    outputs: list[bytes]
     counts: Counter[tuple[str, bool]]
 
 
-def said(taken: Input, outputs: Outputs, state: State, what: Settings) -> bytes:
-    """Everything that an input gave rise to, as it goes to the bus."""
+def serialised(input_: Input, outputs: Outputs, state: State, setup: Settings) -> bytes:
+    """All outputs of an input, as on the bus."""
     step = codec.encode_step(outputs.step, state.input_number) if outputs.step else b""
     command = codec.encode_command(outputs.command, 1, "c", state.input_number) if outputs.command else b""
     reply = b""
-    if isinstance(taken, Request):
+    if isinstance(input_, Request):
         assert outputs.reply is not None
-        reply = codec.encode_request(taken, outputs.reply, state.input_number, None)
+        reply = codec.encode_request(input_, outputs.reply, state.input_number, None)
     events = [EVENTS[one.name].log("controller", 0, **one.details).SerializeToString() for one in outputs.events]
     return b"|".join((step, command, reply, *events))
 
 
-def taken_one(what: Settings, state: State, taken: Input) -> tuple[State, Outputs]:
-    """Take an input, whose arrays are read-only: it is pure, nothing that comes out jumps, refused is as not asked."""
-    if isinstance(taken, Frame) and taken.pixels is not None:
-        taken.pixels.flags.writeable = False
-    before = controller_state(state, what, 0)
-    after, outputs = advance(what, state, taken)
-    again, repeated = advance(what, state, taken)
-    assert said(taken, repeated, again, what) == said(taken, outputs, after, what)
-    assert controller_state(again, what, 0) == controller_state(after, what, 0)
-    assert controller_state(state, what, 0) == before
-    if isinstance(taken, Frame):
+def checked_advance(setup: Settings, state: State, input_: Input) -> tuple[State, Outputs]:
+    """Process an input with read-only arrays; check purity, limits, and that a refused request changes nothing."""
+    if isinstance(input_, Frame) and input_.pixels is not None:
+        input_.pixels.flags.writeable = False
+    before = controller_state(state, setup, 0)
+    after, outputs = advance(setup, state, input_)
+    again, repeated = advance(setup, state, input_)
+    assert serialised(input_, repeated, again, setup) == serialised(input_, outputs, after, setup)
+    assert controller_state(again, setup, 0) == controller_state(after, setup, 0)
+    assert controller_state(state, setup, 0) == before
+    if isinstance(input_, Frame):
         assert outputs.step is not None
-        assert (outputs.command is None) == (after.drive is None)
-    if isinstance(taken, Request):
+        assert (outputs.command is None) == (after.loop is None)
+    if isinstance(input_, Request):
         assert outputs.reply.text
         assert outputs.reply.frame_sequence == state.frame_sequence + 1
         assert outputs.command is None, "the next frame moves the mirror, not a request"
         if not outputs.reply.accepted:
-            assert all(now is was for now, was in zip(after[:-1], state[:-1], strict=True)), "but `taken`, the last"
-        if state.drive is not None and after.drive is not None and after.drive.actuators_nm.size:
-            assert np.array_equal(after.drive.actuators_nm, state.drive.actuators_nm)
-    if outputs.command is not None and state.drive is not None:
+            assert all(now is was for now, was in zip(after[:-1], state[:-1], strict=True)), (
+                "all but `input_number`, the last"
+            )
+        if state.loop is not None and after.loop is not None and after.loop.actuators_nm.size:
+            assert np.array_equal(after.loop.actuators_nm, state.loop.actuators_nm)
+    if outputs.command is not None and state.loop is not None:
         now = outputs.command.actuators_nm
-        assert violations(what.limits, state.drive.actuators_nm, now) == []
+        assert violations(setup.limits, state.loop.actuators_nm, now) == []
         assert np.isfinite(outputs.command.command_nm).all()
     if outputs.step is not None:
         assert np.isfinite(outputs.step.command_nm).all()
-    if after.drive is not None and after.drive.following is not None:
-        assert np.isfinite(after.drive.following.x).all()
+    if after.loop is not None and after.loop.law_runner is not None:
+        assert np.isfinite(after.loop.law_runner.x).all()
     if state.mode is LoopMode.SAFE and after.mode is not LoopMode.SAFE:
-        assert isinstance(taken, Request)
-        assert taken.name == "clear"
+        assert isinstance(input_, Request)
+        assert input_.name == "clear"
         assert after.mode is not LoopMode.CLOSED
     return after, outputs
 
 
-def operated(what: Settings, names: list[str], pauses: list[int], seed: int) -> Run:
-    """The run of a loop to which these requests come, each after so many frames."""
-    script = Script(what, seed)
-    state, _ = advance(what, State(), Load(0, CALIBRATION, "a test"))
+def random_run(setup: Settings, names: list[str], pauses: list[int], seed: int) -> Run:
+    """Run of a loop with these requests, each after a number of frames."""
+    script = Script(setup, seed)
+    state, _ = advance(setup, State(), Load(0, CALIBRATION, "a test"))
     run = Run(state, [], [], Counter())
     for name, pause in zip(names, pauses, strict=True):
-        for taken in between(script, name, pause, run):
-            run.state, outputs = taken_one(what, run.state, taken)
-            run.taken.append(taken)
-            run.said.append(said(taken, outputs, run.state, what))
+        for input_ in between(script, name, pause, run):
+            run.state, outputs = checked_advance(setup, run.state, input_)
+            run.inputs.append(input_)
+            run.outputs.append(serialised(input_, outputs, run.state, setup))
             if outputs.reply is not None:
                 run.counts[name, outputs.reply.accepted] += 1
     return run
@@ -266,49 +268,51 @@ def between(script: Script, name: str, pause: int, run: Run) -> Iterator[Input]:
     for _ in range(pause):
         yield script.frame(run.state)
     if script.rng.random() < 0.2:
-        yield script.happening()
+        yield script.disruption()
     try:
         yield codec.decode_request(script.message(name).SerializeToString(), name, 7)
-    except ValueError:  # the process answers it, before the loop hears of it
+    except ValueError:  # the process refuses it before it reaches the loop
         run.counts[name, False] += 1
 
 
-def replayed(what: Settings, state: State, run: Run, begin: int) -> tuple[State, list[bytes]]:
-    """The rest of a run from its log: requests as they were published."""
-    heard = []
-    for taken in run.taken[begin:]:
-        again = taken
-        if isinstance(taken, Request):
-            logged = wire.Request.FromString(codec.encode_request(taken, Reply(True, "", 0), 1, None))
-            again = codec.request(logged, logged.name, 7, KNOWN)
-        state, outputs = advance(what, state, again)
-        heard.append(said(again, outputs, state, what))
-    return state, heard
+def replayed(setup: Settings, state: State, run: Run, begin: int) -> tuple[State, list[bytes]]:
+    """Replay the rest of a run, with requests as published in the log."""
+    sent = []
+    for input_ in run.inputs[begin:]:
+        resent = input_
+        if isinstance(input_, Request):
+            logged = wire.Request.FromString(codec.encode_request(input_, Reply(True, "", 0), 1, None))
+            resent = codec.request(logged, logged.name, 7, KNOWN)
+        state, outputs = advance(setup, state, resent)
+        sent.append(serialised(resent, outputs, state, setup))
+    return state, sent
 
 
-def check(names: list[str], pauses: list[int], seed: int, delay_frames: float, tight: bool, silence: str) -> Run:
-    """Run, and replay: from the beginning, and from a state on the wire in the middle."""
-    what = settings(delay_frames=delay_frames, on_frame_timeout=silence, **(TIGHT if tight else {}))
-    run = operated(what, names, pauses, seed)
+def check(
+    names: list[str], pauses: list[int], seed: int, delay_frames: float, tight: bool, on_frame_timeout: str
+) -> Run:
+    """Run, and replay: from the beginning, and from a decoded state in the middle."""
+    setup = settings(delay_frames=delay_frames, on_frame_timeout=on_frame_timeout, **(TIGHT if tight else {}))
+    run = random_run(setup, names, pauses, seed)
     assert sum(run.counts.values()) == len(names), "every request is answered"
-    begun, _ = advance(what, State(), Load(0, CALIBRATION, "a test"))
-    end, heard = replayed(what, begun, run, 0)
-    assert heard == run.said
-    last = controller_state(run.state, what, 9).SerializeToString()
-    assert controller_state(end, what, 9).SerializeToString() == last
-    middle = len(run.taken) // 2
-    state, _ = replayed(what, begun, Run(begun, run.taken[:middle], run.said[:middle], Counter()), 0)
-    sent = controller_state(state, what, 8).SerializeToString()
-    asked = [prepared(what, one) for one in run.taken[:middle] if isinstance(one, Request)]
-    again, resumed = decode_state(
-        wire.ControllerState.FromString(sent),
-        KNOWN[state.drive.calibration.id],
-        {one.law.id: one.law for one in asked if one.law is not None},
-        {one.played.id: one.played for one in asked if one.played is not None},
+    start_state, _ = advance(setup, State(), Load(0, CALIBRATION, "a test"))
+    end, sent = replayed(setup, start_state, run, 0)
+    assert sent == run.outputs
+    last = controller_state(run.state, setup, 9).SerializeToString()
+    assert controller_state(end, setup, 9).SerializeToString() == last
+    middle = len(run.inputs) // 2
+    state, _ = replayed(setup, start_state, Run(start_state, run.inputs[:middle], run.outputs[:middle], Counter()), 0)
+    message = controller_state(state, setup, 8).SerializeToString()
+    requests = [prepared(setup, one) for one in run.inputs[:middle] if isinstance(one, Request)]
+    decoded, resumed = decode_state(
+        wire.ControllerState.FromString(message),
+        KNOWN[state.loop.calibration.id],
+        {one.law.id: one.law for one in requests if one.law is not None},
+        {one.played.id: one.played for one in requests if one.played is not None},
     )
-    end, heard = replayed(again, resumed, run, middle)
-    assert heard == run.said[middle:]
-    assert controller_state(end, again, 9).SerializeToString() == last
+    end, sent = replayed(decoded, resumed, run, middle)
+    assert sent == run.outputs[middle:]
+    assert controller_state(end, decoded, 9).SerializeToString() == last
     return run
 
 
@@ -322,15 +326,15 @@ NAMES = [
 ]
 
 
-def test_whatever_comes_in_it_is_pure_finite_and_within_the_limits() -> None:
-    """Of every kind of request some are accepted and some are refused: otherwise it would show little."""
+def test_random_inputs_are_handled_purely_and_within_the_limits() -> None:
+    """Each kind of request is both accepted and refused in these runs, so that both cases are covered."""
     rng = np.random.default_rng(6)
     counts: Counter[tuple[str, bool]] = Counter()
     for seed in range(24):
         some: list[str] = rng.choice([*NAMES, *NAMES, "safe"], COMMANDS).tolist()
         pauses: list[int] = rng.choice([0, 1, 2, 5, 12], COMMANDS).tolist()
-        delay_frames, silence = float(rng.choice([1.0, 1.5, 3.0])), str(rng.choice(["hold", "flat"]))
-        counts += check(some, pauses, seed, delay_frames, bool(seed % 2), silence).counts
+        delay_frames, on_frame_timeout = float(rng.choice([1.0, 1.5, 3.0])), str(rng.choice(["hold", "flat"]))
+        counts += check(some, pauses, seed, delay_frames, bool(seed % 2), on_frame_timeout).counts
     accepted = {name for name, good in counts if good}
     refused = {name for name, good in counts if not good}
     assert accepted == set(REQUESTS) - {"configuration"}
@@ -338,14 +342,14 @@ def test_whatever_comes_in_it_is_pure_finite_and_within_the_limits() -> None:
 
 
 @pytest.mark.slow
-@effort(max_examples=1000, deadline=None, phases=[Phase.explicit, Phase.generate, Phase.shrink])
+@hypothesis_settings(max_examples=1000, deadline=None, phases=[Phase.explicit, Phase.generate, Phase.shrink])
 @given(
     names=st.lists(st.sampled_from([*NAMES, *NAMES, "safe"]), min_size=COMMANDS, max_size=COMMANDS),
     pauses=st.lists(st.sampled_from([0, 1, 1, 2, 5, 12]), min_size=COMMANDS, max_size=COMMANDS),
     seed=st.integers(0, 2**32 - 1),
     delay_frames=st.sampled_from([1.0, 1.5, 3.0]),
     tight=st.booleans(),
-    silence=st.sampled_from(["hold", "flat"]),
+    on_frame_timeout=st.sampled_from(["hold", "flat"]),
 )
-def test_whatever_comes_in_for_long(**commands: Any) -> None:
+def test_many_random_inputs_are_handled(**commands: Any) -> None:
     check(**commands)

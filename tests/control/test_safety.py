@@ -1,4 +1,4 @@
-"""The limits of the mirror hold for any wanted shape, exactly, in float64; each mutation of their source is caught."""
+"""The limits of the mirror hold exactly, in float64, for any request; tests catch each mutation of their source."""
 
 import importlib.util
 import pkgutil
@@ -23,7 +23,7 @@ GRID = (4, 5)
 
 
 def boundary_values(bounds: tuple[float, ...]) -> list[float]:
-    """Dense around each limit: at it, and one and two roundings to either side, with both signs."""
+    """Values at each limit and one and two roundings to either side, with both signs."""
     found = [0.0, 1e-40, -1e-45, 1e-3]
     for bound in bounds:
         for value in (np.float32(bound), np.float32(bound - 1e-3), np.float32(bound / 2)):
@@ -44,7 +44,7 @@ def within(limits: Limits, actuators_nm: Single) -> bool:
 
 
 def allowed_shapes(limits: Limits = LIMITS) -> st.SearchStrategy[Single]:
-    """Shapes within the limits, many of them exactly at one."""
+    """Shapes within the limits, many of them exactly at a limit."""
 
     def bring_in(shape: Single) -> Single:
         shape = np.clip(shape, -np.float32(limits.stroke_nm), np.float32(limits.stroke_nm))
@@ -73,7 +73,7 @@ def test_whatever_is_wanted_the_limits_hold(previous: Single, wanted: Single) ->
 @given(stroke=st.floats(5, 2e5), slew=st.floats(0.05, 1), neighbour=st.floats(0.05, 1), seed=st.integers(0, 2**32 - 1))
 @example(stroke=2e5, slew=0.05, neighbour=0.05, seed=1)
 def test_the_limits_hold_for_any_limits(stroke: float, slew: float, neighbour: float, seed: int) -> None:
-    """Also for strokes so long that float32 rounds coarser than the usual margin, over many steps."""
+    """Over many steps, also for strokes at which float32 rounding exceeds the default margin."""
     limits = Limits(stroke, slew * stroke, neighbour * stroke)
     rng = np.random.default_rng(seed)
     shape = np.zeros(GRID, np.float32)
@@ -92,7 +92,7 @@ def test_cases_by_hand(case: Case) -> None:
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(previous=allowed_shapes(), fraction=st.floats(0, 1))
 def test_what_is_allowed_goes_through_unchanged(previous: Single, fraction: float) -> None:
-    """A move well within every limit is carried out as it was wanted, and nothing is said about it."""
+    """A move well within all limits is not changed, and no reason is reported."""
     wanted = (previous * np.float32(fraction)).astype(np.float32)
     assume(np.abs(wanted.astype(np.float64) - previous).max() < LIMITS.slew_nm - 0.01)
     assume(np.abs(wanted).max() < LIMITS.stroke_nm - 0.01)
@@ -148,7 +148,7 @@ def test_nothing_given_is_changed() -> None:
     wanted=hnp.arrays(np.float32, GRID, elements=finite.map(np.float32)),
 )
 def test_a_shape_outside_the_limits_comes_back(previous: Single, wanted: Single) -> None:
-    """What is outside never goes further out, comes in at no more than the slew limit, and gets there."""
+    """A shape outside the limits never moves further out, and returns at no more than the slew limit."""
     shape, steps = previous, 0
     while not within(LIMITS, shape):
         after = limit(LIMITS, shape, wanted).actuators_nm
@@ -180,7 +180,7 @@ def test_relaxing_reaches_flat(previous: Single) -> None:
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(shape=allowed_shapes(), seed=st.integers(0, 2**32 - 1))
 def test_a_mirror_pressed_against_the_neighbour_limit_stays_there(shape: Single, seed: int) -> None:
-    """It does not fall back towards flat and it does not shake: repeated wishes for too much change nothing much."""
+    """Repeated requests beyond the limit neither move it back towards flat nor make it oscillate."""
     rng = np.random.default_rng(seed)
     wanted = (5000 * rng.standard_normal(GRID)).astype(np.float32)
     for _ in range(30):
@@ -246,21 +246,21 @@ def test_the_document_on_safety_names_tests_that_exist() -> None:
 SOURCE = Path(safety.__file__).read_text(encoding="utf-8")
 
 MUTATIONS = {
-    "stroke never looked at": ("if max(highest_nm, -lowest_nm) > stroke:", "if False:"),
-    "stroke cut on one side": ("np.clip(kept, -stroke, stroke)", "np.clip(kept, None, stroke)"),
-    "stroke cut on the other side": ("np.clip(kept, -stroke, stroke)", "np.clip(kept, -stroke, None)"),
+    "stroke not checked": ("if max(highest_nm, -lowest_nm) > stroke:", "if False:"),
+    "stroke clipped on one side": ("np.clip(kept, -stroke, stroke)", "np.clip(kept, None, stroke)"),
+    "stroke clipped on the other side": ("np.clip(kept, -stroke, stroke)", "np.clip(kept, -stroke, None)"),
     "stroke without a sign": ("if max(highest_nm, -lowest_nm) > stroke:", "if highest_nm > stroke:"),
     "stroke without a margin": ("np.float32(self.stroke_nm - margin_nm)", "np.float32(self.stroke_nm + margin_nm)"),
-    "slew never looked at": ("if max(highest_move, -lowest_move) > slew:", "if False:"),
+    "slew not checked": ("if max(highest_move, -lowest_move) > slew:", "if False:"),
     "slew without a sign": ("if max(highest_move, -lowest_move) > slew:", "if highest_move > slew:"),
-    "slew cut on one side": ("np.clip(move, -slew, slew)", "np.clip(move, None, slew)"),
-    "slew cut on the other side": ("np.clip(move, -slew, slew)", "np.clip(move, -slew, None)"),
+    "slew clipped on one side": ("np.clip(move, -slew, slew)", "np.clip(move, None, slew)"),
+    "slew clipped on the other side": ("np.clip(move, -slew, slew)", "np.clip(move, -slew, None)"),
     "slew from flat": ("kept = previous_nm + move", "kept = move"),
-    "slew the wrong way": ("kept = previous_nm + move", "kept = previous_nm - move"),
+    "slew in the wrong direction": ("kept = previous_nm + move", "kept = previous_nm - move"),
     "slew without a margin": ("np.float32(self.slew_nm - margin_nm)", "np.float32(self.slew_nm + margin_nm)"),
     "stroke limit for slew": ("np.float32(self.slew_nm - margin_nm)", "np.float32(self.stroke_nm - margin_nm)"),
-    "neighbours never looked at": ("if highest_nm - lowest_nm > apart_nm and", "if False and"),
-    "neighbours looked at where twice as far apart": (
+    "neighbours not checked": ("if highest_nm - lowest_nm > apart_nm and", "if False and"),
+    "neighbours checked at twice the limit": (
         "if highest_nm - lowest_nm > apart_nm and",
         "if highest_nm - lowest_nm > 2 * apart_nm and",
     ),
@@ -279,37 +279,40 @@ MUTATIONS = {
     "shortened too little": ("fraction = min(fraction, float(", "fraction = max(fraction, float("),
     "shortened without a sign": ("np.sign(after[over]) * before[over]", "before[over]"),
     "not shortened": ("kept = _shorten(limits, previous_nm, kept)", "pass"),
-    "apart, shrunk at once": ("max(enough, slowest)", "enough"),
-    "apart, never shrunk": ("max(enough, slowest)", "1"),
-    "apart, not noticed": ("if apart_nm > neighbour_nm or largest_nm > limits.stroke_nm:", "if False:"),
-    "not finite let through": ("if not (isfinite(lowest_nm) and isfinite(highest_nm)):", "if False:"),
-    "only one value finite": (
+    "shape outside the limits shrunk at once": ("max(enough, slowest)", "enough"),
+    "shape outside the limits not shrunk": ("max(enough, slowest)", "1"),
+    "shape outside the limits not detected": (
+        "if apart_nm > neighbour_nm or largest_nm > limits.stroke_nm:",
+        "if False:",
+    ),
+    "non-finite values accepted": ("if not (isfinite(lowest_nm) and isfinite(highest_nm)):", "if False:"),
+    "one finite value suffices": (
         "if not (isfinite(lowest_nm) and isfinite(highest_nm)):",
         "if not (isfinite(lowest_nm) or isfinite(highest_nm)):",
     ),
-    "not finite becomes flat": (
+    "non-finite values become flat": (
         "Limited(previous_nm, (Limit.NOT_FINITE,))",
         "Limited(0 * previous_nm, (Limit.NOT_FINITE,))",
     ),
-    "another grid let through": ("if wanted_nm.shape != previous_nm.shape:", "if False:"),
-    "not said: stroke": ("reasons.append(Limit.STROKE)", "pass"),
-    "not said: slew": ("reasons.append(Limit.SLEW)", "pass"),
-    "not said: neighbours": ("reasons.append(Limit.NEIGHBOUR)", "pass"),
-    "limits of nothing": ("if not 2 * self.margin_nm < value < np.inf:", "if False:"),
+    "another grid accepted": ("if requested_nm.shape != previous_nm.shape:", "if False:"),
+    "stroke not reported": ("reasons.append(Limit.STROKE)", "pass"),
+    "slew not reported": ("reasons.append(Limit.SLEW)", "pass"),
+    "neighbours not reported": ("reasons.append(Limit.NEIGHBOUR)", "pass"),
+    "invalid limits accepted": ("if not 2 * self.margin_nm < value < np.inf:", "if False:"),
     "margin for short strokes only": ("max(MARGIN_NM, ldexp", "min(MARGIN_NM, ldexp"),
-    "dead-man one early": ("not 0 <= age_ns <= valid_for_ns", "not 0 <= age_ns < valid_for_ns"),
-    "dead-man asleep": ("not 0 <= age_ns <= valid_for_ns", "False"),
-    "dead-man trusts the clock": ("not 0 <= age_ns <= valid_for_ns", "age_ns > valid_for_ns"),
+    "command timeout one nanosecond early": ("not 0 <= age_ns <= valid_for_ns", "not 0 <= age_ns < valid_for_ns"),
+    "no command timeout": ("not 0 <= age_ns <= valid_for_ns", "False"),
+    "command timeout without a check of the clock": ("not 0 <= age_ns <= valid_for_ns", "age_ns > valid_for_ns"),
     "clear closes": ("(LoopMode.OPEN if calibrated", "(LoopMode.CLOSED if calibrated"),
     "clear in any mode": ('case "clear" if mode is LoopMode.SAFE:', 'case "clear" if True:'),
-    "safed is not latched": ('case "open" | "close" if mode is LoopMode.SAFE:', 'case "open" | "close" if False:'),
+    "safe mode is not latched": ('case "open" | "close" if mode is LoopMode.SAFE:', 'case "open" | "close" if False:'),
     "close without calibration": ('case "close" if not calibrated:', 'case "close" if False:'),
     "safe can be refused": ('return LoopMode.SAFE, ""', 'return (LoopMode.SAFE if calibrated else mode), ""'),
 }
 
 
 def module_of(source: str) -> ModuleType:
-    """The safety module from this source, beside the real one."""
+    """The safety module made from this source."""
     spec = importlib.util.spec_from_loader("mutated_safety", loader=None)
     module = importlib.util.module_from_spec(spec)
     sys.modules[module.__name__] = module  # dataclasses look their module up
@@ -321,7 +324,7 @@ def module_of(source: str) -> ModuleType:
 
 
 def check(module: Any) -> None:
-    """AssertionError, or whatever the mutation raises, where the module does not do what it must."""
+    """Raise AssertionError, or an error of the mutation, if the module does not work."""
     for case in CASES:
         check_kept(module.limit, case)
     _check_random_walks(module)
@@ -331,7 +334,7 @@ def check(module: Any) -> None:
                 module.Limits(*limits)
             except ValueError:
                 continue
-            raise AssertionError(f"{limits} taken")
+            raise AssertionError(f"{limits} accepted")
     assert not module.expired(0, 0)
     assert not module.expired(200, 200)
     assert module.expired(201, 200)
@@ -340,10 +343,10 @@ def check(module: Any) -> None:
 
 
 def _check_random_walks(module: Any) -> None:
-    """Towards random shapes at the edge of what is allowed, step after step; far strokes need a wider margin."""
+    """Random walks at the limits; long strokes need a wider margin."""
     rng = np.random.default_rng(7)
     usual, far, free = (LIMITS.stroke_nm, LIMITS.slew_nm, LIMITS.neighbour_nm), (2e5, 1.5e5, 1.5e5), (700.0, 500.0, 2e3)
-    for bounds in (usual, far, free):  # in the last, neighbours may be anywhere
+    for bounds in (usual, far, free):  # the last has no effective neighbour limit
         limits, shape = module.Limits(*bounds), np.zeros((3, 4), np.float32)
         for _ in range(60):
             wanted = (rng.choice([0.3, 1, 3]) * limits.stroke_nm * rng.standard_normal((3, 4))).astype(np.float32)

@@ -152,7 +152,7 @@ def test_added_contrast_is_shown_for_a_flat_mirror_and_the_present_one() -> None
 def test_figures_of_the_last_second_exclude_older_and_refused_frames() -> None:
     state, last = loaded(USUAL), LastSecond(SECOND // 4)
     assert last.figures(state, SECOND) == wire.LoopFigures()
-    flux_dn = state.drive.calibration.flux_dn
+    flux_dn = state.loop.calibration.flux_dn
 
     def step(error_nm: float | None) -> Step:
         errors = None if error_nm is None else np.full(4, error_nm, np.float32)

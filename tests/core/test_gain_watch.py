@@ -12,7 +12,7 @@ from lowfc.arrays import Array, Single
 from lowfc.contract.codecs.state_codec import controller_state, decode_state
 from lowfc.contract.configuration import FIXED_GAINS, load
 from lowfc.control.calibration.calibration import Calibration
-from lowfc.control.calibration.granted import noise_covariance_nm2
+from lowfc.control.calibration.map_reconstructor import noise_covariance_nm2
 from lowfc.control.laws.automatic_gain import GainBank, TiltCrossTalk
 from lowfc.control.laws.law import RELAXING
 from lowfc.control.loop.safety import LoopMode
@@ -50,7 +50,7 @@ def rms_nm(loop: Bench, frames: int) -> tuple[float, float]:
 
 
 def gains(loop: Bench) -> Single:
-    return loop.state.drive.law.gain
+    return loop.state.loop.law.gain
 
 
 @pytest.fixture(scope="module")
@@ -61,14 +61,14 @@ def gain_bank_responses() -> list[Array | Single]:
 
 @pytest.fixture(scope="module")
 def faint(gain_bank_responses: list[Array | Single]) -> Bench:
-    remade = GainBank.remade
+    use_reconstructor = GainBank.use_reconstructor
 
     def spied(self: GainBank, response: Array | Single) -> None:
         gain_bank_responses.append(response)
-        remade(self, response)
+        use_reconstructor(self, response)
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(GainBank, "remade", spied)
+        patched.setattr(GainBank, "use_reconstructor", spied)
         loop = bench(6.5)
         loop.run(1200)
     return loop
@@ -103,15 +103,17 @@ def test_automatic_gains_leave_at_most_ten_percent_more_residual_than_fixed_gain
 
 
 def test_modes_not_corrected_reduce_the_noise_of_the_others(faint: Bench) -> None:
-    drive = faint.state.drive
-    uncorrected = drive.weighting.prior_nm2 > 0
+    active_loop = faint.state.loop
+    uncorrected = active_loop.weighting.prior_nm2 > 0
     assert 0 < uncorrected.sum() < uncorrected.size
-    np.testing.assert_array_equal(uncorrected, drive.law.gain == 0)
+    np.testing.assert_array_equal(uncorrected, active_loop.law.gain == 0)
     original, reweighted = (
         np.diag(
-            noise_covariance_nm2(replace(drive.calibration, reconstructor=rows), faint.steps[-1].flux_dn, drive.camera)
+            noise_covariance_nm2(
+                replace(active_loop.calibration, reconstructor=rows), faint.steps[-1].flux_dn, active_loop.camera
+            )
         )
-        for rows in (drive.calibration.reconstructor, drive.estimator.rows[:-1])
+        for rows in (active_loop.calibration.reconstructor, active_loop.estimator.rows[:-1])
     )
     np.testing.assert_array_equal(reweighted[uncorrected], original[uncorrected])
     assert (reweighted[~uncorrected] < 1.0001 * original[~uncorrected]).all()
@@ -121,8 +123,8 @@ def test_modes_not_corrected_reduce_the_noise_of_the_others(faint: Bench) -> Non
 def test_the_gain_bank_receives_the_response_of_the_reweighted_reconstructor(
     faint: Bench, gain_bank_responses: list[Array | Single]
 ) -> None:
-    drive = faint.state.drive
-    response = drive.estimator.rows[:-1] @ drive.calibration.response
+    active_loop = faint.state.loop
+    response = active_loop.estimator.rows[:-1] @ active_loop.calibration.response
     np.testing.assert_array_equal(gain_bank_responses[-1], response[2:, 2:])
     assert np.abs(response - np.eye(len(response))).max() > 0.1
 
@@ -168,34 +170,34 @@ def test_closing_seldom_adds_contrast_on_a_faint_star_with_a_zernike_sensor() ->
 
 
 def test_a_decoded_state_has_the_same_reconstructor(faint: Bench) -> None:
-    drive = faint.state.drive
+    active_loop = faint.state.loop
     message = controller_state(faint.state, faint.settings, 1)
-    settings, again = decode_state(message, drive.calibration)
+    settings, again = decode_state(message, active_loop.calibration)
     assert settings == faint.settings
-    np.testing.assert_array_equal(again.drive.estimator.rows, drive.estimator.rows)
-    np.testing.assert_array_equal(again.drive.automatic, drive.automatic)
-    np.testing.assert_array_equal(again.drive.law.kept, drive.law.kept)
+    np.testing.assert_array_equal(again.loop.estimator.rows, active_loop.estimator.rows)
+    np.testing.assert_array_equal(again.loop.automatic, active_loop.automatic)
+    np.testing.assert_array_equal(again.loop.law.kept, active_loop.law.kept)
     assert controller_state(again, settings, 1) == message
 
 
 def test_a_state_decoded_before_gains_are_measured_has_the_same_law() -> None:
     """An operator may close the loop before: the replay must continue with the same command."""
     loop = bench(2.0)
-    drive, message = loop.state.drive, controller_state(loop.state, loop.settings, 1)
-    again = decode_state(message, drive.calibration)[1].drive
-    np.testing.assert_array_equal(again.law.rows, drive.law.rows)
+    active_loop, message = loop.state.loop, controller_state(loop.state, loop.settings, 1)
+    again = decode_state(message, active_loop.calibration)[1].loop
+    np.testing.assert_array_equal(again.law.rows, active_loop.law.rows)
 
 
 def test_tilt_cross_talk_uses_the_tilt_on_the_sensor_including_the_offset(monkeypatch: pytest.MonkeyPatch) -> None:
     """The square of a tilt offset is in the image, but the loop's error excludes the offset."""
     tilts_nm: list[Single] = []
-    followed = TiltCrossTalk.followed
+    add_frame = TiltCrossTalk.add_frame
 
     def spied(self: TiltCrossTalk, tilt_nm: Single, open_nm: Array | Single) -> Array:
         tilts_nm.append(tilt_nm)
-        return followed(self, tilt_nm, open_nm)
+        return add_frame(self, tilt_nm, open_nm)
 
-    monkeypatch.setattr(TiltCrossTalk, "followed", spied)
+    monkeypatch.setattr(TiltCrossTalk, "add_frame", spied)
     loop = bench(2.0)
     loop.ask("offset", modes=(2,), values=(40.0,))
     loop.run(20)
@@ -230,8 +232,8 @@ def test_manual_gains_are_kept_and_harm_is_reported_before_and_after_closing() -
     loop.run(850)
     assert named(loop, "CLOSING_HARMS")[0]["harm"].startswith("closing adds")
     assert named(loop, "LOOP_HARMS")[0]["action"] == "nothing is done"
-    drive = loop.state.drive
-    assert set(drive.law.gain.tolist()) == {np.float32(0.5), np.float32(0.05)}
+    active_loop = loop.state.loop
+    assert set(active_loop.law.gain.tolist()) == {np.float32(0.5), np.float32(0.05)}
     assert not named(loop, "GAINS_CHANGED")
     residual_nm, open_nm = rms_nm(loop, 600)
     assert residual_nm > open_nm
@@ -259,11 +261,11 @@ def test_a_mode_can_have_a_manual_gain_and_return_to_automatic() -> None:
     loop.run(510)
     loop.ask("gain", values=(0.3,), modes=(4,))
     loop.run(300)
-    drive = loop.state.drive
-    assert drive.law.gain[2] == np.float32(0.3)
-    assert not drive.automatic[2]
+    active_loop = loop.state.loop
+    assert active_loop.law.gain[2] == np.float32(0.3)
+    assert not active_loop.automatic[2]
     loop.ask("gain", text="auto", modes=(4,))
-    assert loop.state.drive.automatic.all()
+    assert loop.state.loop.automatic.all()
 
 
 def test_another_star_lowers_the_gains_and_restarts_their_measurement() -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lowfc.control.laws.continuous import Timing, left_power
+from lowfc.control.laws.continuous import Timing, residual_power
 from lowfc.control.laws.linear_law import integrator
 from lowfc.control.laws.margins import noise_gain
 from lowfc.control.laws.vibration import Line
@@ -24,7 +24,7 @@ EXPOSURE = 0.5
 @pytest.mark.parametrize("gain", [0.05, 0.4, 1.0])
 def test_what_is_left_of_a_drift_is_that_of_the_continuous_theory(gain):
     law, omega = integrator([gain], [0.0], (2,), 1.0, 250.0), np.geomspace(1e-6, 300 * np.pi, 200_000)
-    left = left_power(law, omega, Timing.of(1.0, EXPOSURE))[:, 0]
+    left = residual_power(law, omega, Timing.of(1.0, EXPOSURE))[:, 0]
     expected = 0.3 * np.trapezoid(left / omega**2, omega) / np.pi + 2.0 * noise_gain(law)[0]
     assert left_of_drift_nm2(0.3, 2.0, EXPOSURE, gain) == pytest.approx(expected, rel=1e-3)
 

@@ -187,7 +187,7 @@ def test_an_overruled_law_is_replayed_bit_by_bit_even_from_the_middle() -> None:
     made.take(Request(made.now_ns, "law", law=integrator((0.05,) * len(NOLL), (0.0,) * len(NOLL), NOLL, 1.0, 1000.0)))
     for count in range(860):
         wave_nm = 20 * np.sin(0.04 * count + np.arange(len(NOLL)))
-        made.take(frame(count, wave_nm + made.state.drive.history_nm[0]))
+        made.take(frame(count, wave_nm + made.state.loop.history_nm[0]))
     steps = [message for message in made.messages if message.key == STEP.key]
     overruled = [Limit.LAW_OVERRULED in wire.ControlStep.FromString(message.payload).reasons for message in steps]
     assert overruled == [False] * 598 + [True] * 262

@@ -166,7 +166,7 @@ class FoldedLoop(Client):
                 raise CalibrationError(str(fault)) from None
 
     def calibration(self) -> Calibration:
-        return self._bench.state.drive.calibration
+        return self._bench.state.loop.calibration
 
     def configuration(self) -> str:
         return self.config.to_toml()
@@ -179,8 +179,8 @@ class FoldedLoop(Client):
         return driver.camera_state(driver.CameraSettings.configured(self.config, side, side), 1)
 
     def laws(self) -> dict[str, LinearLaw]:
-        following = self._bench.state.drive.following
-        return {} if following is None else {following.law.id: following.law}
+        law_runner = self._bench.state.loop.law_runner
+        return {} if law_runner is None else {law_runner.law.id: law_runner.law}
 
     def frames(self, count: int | None = None) -> Iterator[Image]:
         return self._listen("frames", count)

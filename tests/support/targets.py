@@ -92,7 +92,7 @@ class Loop:
         self.count = 0
 
     def take(self, taken: Input) -> None:
-        before = self.state.drive.actuators_nm if self.state.drive is not None else np.zeros(GRID, np.float32)
+        before = self.state.loop.actuators_nm if self.state.loop is not None else np.zeros(GRID, np.float32)
         self.state, outputs = advance(USUAL, self.state, taken)
         if outputs.step is not None:
             codec.encode_step(outputs.step, self.state.input_number)

@@ -11,10 +11,10 @@ from lowfc.control.laws.linear_law import (
     LinearLaw,
     Signal,
     at_rest,
-    follow,
     integrator,
     integrator_block,
     of_blocks,
+    predict_and_update,
     respond,
 )
 from lowfc.control.laws.pi_notch import Notch, pi_notch
@@ -65,7 +65,7 @@ def run(law: LinearLaw, disturbance_nm: Array, delay_frames: float, limit_nm: fl
     for disturbance in disturbance_nm.astype(np.float32):
         error = disturbance + sum(weight * past for weight, past in zip(weights, history, strict=False))
         pol = error - sum(weight * past for weight, past in zip(believed, history, strict=False))
-        x = follow(law, x, error if law.signal == "error" else pol, history[0])
+        x = predict_and_update(law, x, error if law.signal == "error" else pol, history[0])
         history = [np.clip(respond(law, x), -limit_nm, limit_nm, dtype=np.float32), *history[:-1]]
         errors.append(error)
         commands.append(history[0])

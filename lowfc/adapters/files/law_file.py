@@ -15,10 +15,10 @@ FORMER_KIND = "lowfc law 1"
 
 # Extension, attribute of LinearLaw, sentence.
 _EXTENSIONS = (
-    ("TRANSITION", "transition", "F of x[k] = F x[k-1] + G y[k] + H c[k-1]"),
-    ("MEASUREMENT_GAIN", "measurement_gain", "G, of the modes measured"),
-    ("COMMAND_GAIN", "command_gain", "H, of the modal command before"),
-    ("PREDICT_ONLY", "predict_only", "A of x[k] = A x[k-1] + H c[k-1], without a frame"),
+    ("TRANSITION", "transition", "F of x[k] = F x[k-1] + G y[k] + U c[k-1]"),
+    ("MEASUREMENT_GAIN", "measurement_gain", "G, gain of the measured modes"),
+    ("COMMAND_GAIN", "command_gain", "U, gain of the last modal command"),
+    ("PREDICT_ONLY", "predict_only", "A of x[k] = A x[k-1] + U c[k-1], without a frame"),
     ("OUTPUT", "output", "K, the modal command is K x[k]"),
 )
 

@@ -85,8 +85,8 @@ def put_command_channels(message: wire.ControllerState, command_channels: Comman
     message.offset_nm.extend(command_channels.offset_nm.tolist())
     message.shift_history_nm.extend(np.concatenate(command_channels.shifts_nm).tolist())
     for one in command_channels.channels:
-        wanted, reached = one.wanted_nm.tobytes(), one.reached_nm.tobytes()
-        message.channels.add(name=one.name, actuators=wanted, shifts=one.shifts, reached=reached)
+        shape, reached = one.shape_nm.tobytes(), one.reached_nm.tobytes()
+        message.channels.add(name=one.name, actuators=shape, shifts=one.shifts, reached=reached)
     play = command_channels.play
     if play is not None:
         message.play.target = play.target

@@ -39,7 +39,7 @@ _LEASE = ("id", "holder", "last_sequence", "ended", "holds")
 
 def controller_state(state: State, settings: Settings, time_ns: int) -> wire.ControllerState:
     """Message of everything the next command depends on, besides the calibration."""
-    conditions, drive, estimate, lease = state.conditions, state.drive, state.estimate, state.conditions.lease
+    conditions, loop, estimate, lease = state.conditions, state.loop, state.estimate, state.conditions.lease
     message = wire.ControllerState(
         timestamp=timestamp(time_ns),
         frame_timestamp=timestamp(state.frame_time_ns),
@@ -58,32 +58,32 @@ def controller_state(state: State, settings: Settings, time_ns: int) -> wire.Con
         **fields_of(state, _STATE),
         **fields_of(conditions, _CONDITIONS),
     )
-    if drive is not None:
-        if drive.command_channels is not None:
-            put_command_channels(message, drive.command_channels)
-        if drive.camera is not None:
-            message.camera_expected.CopyFrom(wire_camera(drive.camera))
-        following = drive.following
-        if following is not None:
-            message.law.CopyFrom(law_header(following.law))
-            message.law_state.extend(following.x.tolist())
-            message.law_frames = following.frames
-            if following.guard is not None:
-                _put_guard(message.guard, following.guard)
-        message.calibration_id = drive.calibration.id
-        message.calibration_provisional = drive.calibration.provisional
+    if loop is not None:
+        if loop.command_channels is not None:
+            put_command_channels(message, loop.command_channels)
+        if loop.camera is not None:
+            message.camera_expected.CopyFrom(wire_camera(loop.camera))
+        law_runner = loop.law_runner
+        if law_runner is not None:
+            message.law.CopyFrom(law_header(law_runner.law))
+            message.law_state.extend(law_runner.x.tolist())
+            message.law_frames = law_runner.frames
+            if law_runner.guard is not None:
+                _put_guard(message.guard, law_runner.guard)
+        message.calibration_id = loop.calibration.id
+        message.calibration_provisional = loop.calibration.provisional
         if not message.calibration_id:
-            message.mirror_rows, message.mirror_columns = drive.calibration.grid
-        if drive.automatic.any():
-            message.automatic.extend(drive.automatic.tolist())
-        if drive.weighting is not None:
-            message.prior_nm2.extend(drive.weighting.prior_nm2.tolist())
-            message.weighting_flux_dn = drive.weighting.flux_dn
-        message.gain.extend(drive.law.gain.tolist())
-        message.leak.extend(drive.law.leak.tolist())
-        message.limit_nm.extend(drive.law.limit_nm.tolist())
-        message.command_history_nm.extend(np.concatenate(drive.history_nm).tolist())
-        message.actuators = drive.actuators_nm.tobytes()
+            message.mirror_rows, message.mirror_columns = loop.calibration.grid
+        if loop.automatic.any():
+            message.automatic.extend(loop.automatic.tolist())
+        if loop.weighting is not None:
+            message.prior_nm2.extend(loop.weighting.prior_nm2.tolist())
+            message.weighting_flux_dn = loop.weighting.flux_dn
+        message.gain.extend(loop.law.gain.tolist())
+        message.leak.extend(loop.law.leak.tolist())
+        message.limit_nm.extend(loop.law.limit_nm.tolist())
+        message.command_history_nm.extend(np.concatenate(loop.history_nm).tolist())
+        message.actuators = loop.actuators_nm.tobytes()
     return message
 
 
@@ -102,40 +102,40 @@ def decode_state(
         ValueError: the message is incomplete, the calibration is another one, or its law or table is missing.
     """
     settings = _decode_settings(message.settings, kernel)
-    drive = None
+    loop = None
     if message.mirror_rows:
         calibration = Calibration.none((message.mirror_rows, message.mirror_columns))
     if message.calibration_id or message.mirror_rows:
         if calibration is None or calibration.id != message.calibration_id:
             raise ValueError(f"calibration {message.calibration_id[:12]} of the controller's state is missing")
-        drive = ActiveLoop.at_rest(settings, calibration)
+        loop = ActiveLoop.at_rest(settings, calibration)
         law = gains_of(message)
-        history = np.array(message.command_history_nm, np.float32).reshape(len(drive.history_nm), -1)
+        history = np.array(message.command_history_nm, np.float32).reshape(len(loop.history_nm), -1)
         actuators = floats(message.actuators, *calibration.grid)
-        if law.gain.shape != drive.law.gain.shape or history.shape[1] != len(calibration.noll):
+        if law.gain.shape != loop.law.gain.shape or history.shape[1] != len(calibration.noll):
             raise ValueError(f"the controller's state does not have {len(calibration.noll)} modes")
-        following = None
+        law_runner = None
         if message.HasField("law"):
             x = np.array(message.law_state, np.float32)
             found = law_of(message.law, laws)
             guard = _decode_guard(message.guard, found, len(history)) if message.HasField("guard") else None
-            following = LawRunner(found, x, message.law_frames, guard)
-            if x.shape != linear_law.at_rest(following.law).shape or following.law.noll != calibration.noll:
+            law_runner = LawRunner(found, x, message.law_frames, guard)
+            if x.shape != linear_law.at_rest(law_runner.law).shape or law_runner.law.noll != calibration.noll:
                 raise ValueError("the law of the controller's state does not fit")
-        drive = drive._replace(
-            camera=camera_settings(message.camera_expected) if message.HasField("camera_expected") else drive.camera,
-            following=following,
-            command_channels=command_channels_of(message, drive.added(), drive.to_modes, plays),
+        loop = loop._replace(
+            camera=camera_settings(message.camera_expected) if message.HasField("camera_expected") else loop.camera,
+            law_runner=law_runner,
+            command_channels=command_channels_of(message, loop.additions(), loop.to_modes, plays),
             history_nm=tuple(history),
             actuators_nm=actuators,
             automatic=np.array(message.automatic or [False] * len(calibration.noll), bool),
-        ).under(law)
+        ).with_gains(law)
         if message.prior_nm2:
             prior_nm2 = np.array(message.prior_nm2, np.float32)
-            drive = drive.weighted(Weighting(prior_nm2, message.weighting_flux_dn))
+            loop = loop.with_weighting(Weighting(prior_nm2, message.weighting_flux_dn))
     state = State(
         mode=LoopMode(message.mode),
-        drive=drive,
+        loop=loop,
         frame_time_ns=from_timestamp(message.frame_timestamp),
         refused=Rejection(message.refused) if message.refused else None,
         limits_hit=tuple(reason_of(reason) for reason in message.limits_hit),

@@ -1,1 +1,1 @@
-"""Calibrations, and the measurements that they are made from."""
+"""Calibrations, and the measurements from which they are made."""

@@ -1,4 +1,4 @@
-"""What the sensor sees of each actuator, in modes: Z = R H_actuators."""
+"""Response of the sensor to each actuator, in modes: Z = R H_actuators."""
 
 from collections.abc import Callable
 
@@ -9,7 +9,7 @@ from lowfc.arrays import Array
 from lowfc.control.calibration.calibration import normalise_flux
 
 CHUNK = 128
-"""Shapes whose responses are held at a time: 128 of 6400 pixels are 6.6 MB."""
+"""Number of shapes whose responses are in memory at a time: 128 of 6400 pixels are 6.6 MB."""
 
 
 def actuators_to_modes(
@@ -21,15 +21,15 @@ def actuators_to_modes(
 ) -> Array:
     """Z (modes, actuators): nm of wavefront that R measures per nm of surface of each actuator.
 
-    The image's slope is linear in the wavefront, so that it is computed for each node of the pupil where these are
-    fewer than the actuators.
+    The slope of the image is linear in the wavefront: it is computed for each node of the pupil if there are fewer
+    nodes than actuators.
 
     Args:
         reconstructor: (modes, pixels) R, nm per flux fraction.
-        reference: (pixels,) I0, in whatever unit `response` has.
-        good: (pixels,) 1 where a pixel is used, else 0.
-        response: Slopes (pixels, shapes) of the image per unit of each of some wavefronts (shapes, nodes), as
-            `optics.twin.response` of a twin.
+        reference: (pixels,) I0, in the unit of `response`.
+        good: (pixels,) 1 for a used pixel, else 0.
+        response: Function from wavefronts (shapes, nodes) to the slopes (pixels, shapes) of the image per unit of each,
+            such as `optics.twin.response` of a twin.
         wavefronts: (actuators, nodes) wavefront in nm per nm of surface of each actuator; it contains the factor 2.
     """
     actuators, nodes = wavefronts.shape

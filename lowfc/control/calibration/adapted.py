@@ -1,4 +1,4 @@
-"""A calibration with another dark, mask or reference image: everything that hangs on them made anew."""
+"""Change the dark, pixel mask or reference image of a calibration, and recompute what depends on them."""
 
 from dataclasses import replace
 
@@ -9,19 +9,19 @@ from lowfc.control.calibration.calibration import Calibration, normalise_flux
 from lowfc.control.calibration.regularised import reconstruct
 
 MEASURED = frozenset(("poke", "hadamard", "in-loop"))
-"""Names in `Calibration.estimator` of ways to measure H."""
-_LEAST_LEFT = 1e-3
-"""Part of an answer to the modes below which it counts as none."""
+"""Parts of `Calibration.estimator` that name a method to measure H."""
+_SMALLEST_RESPONSE = 1e-3
+"""Singular value of R H, relative to the largest, below which a combination of modes counts as not measured."""
 
 
 def with_dark(calibration: Calibration, dark_dn: Array, good: Array, read_noise_e: float, gain_e: float) -> Calibration:
     """The calibration with another dark (pixels,), DN, and only the pixels (pixels,) that are 1 in `good`.
 
-    Pixels that were bad stay bad. I0 and H pass through the flux normalisation of the pixels that are left, and R is
-    made anew from them, for this read noise of a pixel and electrons per DN.
+    Pixels that were bad stay bad. I0 and H are normalised to the flux on the remaining pixels, and R is recomputed from
+    them, for this read noise of a pixel and electrons per DN.
 
     Raises:
-        ValueError: too little is left to tell the modes apart.
+        ValueError: the remaining pixels do not tell the modes apart.
     """
     kept = good * calibration.good
     I0, H = calibration.reference.astype(np.float64), calibration.response.astype(np.float64)
@@ -36,7 +36,7 @@ def with_dark(calibration: Calibration, dark_dn: Array, good: Array, read_noise_
         flux_dn=calibration.flux_dn * share,
     )
     if is_measured(calibration):
-        return replace(changed, reconstructor=single(_same_answers(calibration, changed)), operator_hash="", id="")
+        return replace(changed, reconstructor=single(_same_response(calibration, changed)), operator_hash="", id="")
     return _reconstructed(changed, read_noise_e, gain_e)
 
 
@@ -56,26 +56,26 @@ def with_reference(
 
 
 def is_measured(calibration: Calibration) -> bool:
-    """Whether H was measured: it has noise, of which no R is made (see `regularised`)."""
+    """Whether H was measured: its noise must not enter R (see `regularised`)."""
     return not MEASURED.isdisjoint(calibration.estimator.split("+"))
 
 
-def _same_answers(before: Calibration, changed: Calibration) -> Array:
-    """(modes, pixels): on the pixels that are left, R answers to the modes as it did on all.
+def _same_response(before: Calibration, changed: Calibration) -> Array:
+    """R (modes, pixels) on the remaining pixels, with the same response R H to the modes as on all pixels.
 
     Raises:
-        ValueError: too little is left to tell the modes apart.
+        ValueError: the remaining pixels do not tell the modes apart.
     """
-    answers = before.reconstructor.astype(np.float64) @ before.response
+    response = before.reconstructor.astype(np.float64) @ before.response
     rows = before.reconstructor.astype(np.float64) * changed.good
-    left = rows @ changed.response
-    if np.linalg.matrix_rank(left, _LEAST_LEFT) < np.linalg.matrix_rank(answers, _LEAST_LEFT):
-        raise ValueError("the good pixels that are left do not tell the modes apart")
-    return np.asarray(answers @ np.linalg.pinv(left, _LEAST_LEFT) @ rows)
+    remaining = rows @ changed.response
+    if np.linalg.matrix_rank(remaining, _SMALLEST_RESPONSE) < np.linalg.matrix_rank(response, _SMALLEST_RESPONSE):
+        raise ValueError("the remaining good pixels do not tell the modes apart")
+    return np.asarray(response @ np.linalg.pinv(remaining, _SMALLEST_RESPONSE) @ rows)
 
 
 def _reconstructed(calibration: Calibration, read_noise_e: float, gain_e: float) -> Calibration:
-    """R anew from I0 and H, by the weights that its name says."""
+    """Recompute R from I0 and H, with the weights of its estimator."""
     estimator = calibration.estimator.partition("+")[0]
     made = reconstruct(
         calibration.reference.astype(np.float64),

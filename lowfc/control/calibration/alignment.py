@@ -1,8 +1,7 @@
-"""How a real sensor's image is placed relative to the computed one: scale, centre, rotation, parity.
+"""Placement of a real sensor's image relative to the computed one: scale, centre, rotation, parity.
 
-The image of a flat wavefront through a pupil without phase is the same turned by half a turn, so that the reference
-image alone cannot tell a rotation from one by 180 degrees more; there every mode answers with the opposite sign. One
-poke tells.
+The image of a flat wavefront through a pupil without phase is unchanged by a rotation of 180 degrees, so the reference
+image alone leaves this ambiguity. In the wrong orientation every mode has the opposite sign: one poke resolves it.
 """
 
 from dataclasses import dataclass, replace
@@ -15,7 +14,7 @@ from scipy.optimize import least_squares
 from lowfc.arrays import Array
 
 _ANGLES = 72
-"""First guesses of the rotation over half a turn."""
+"""Number of initial rotations, spread over 180 degrees."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,11 +22,11 @@ class Geometry:
     """Position of a point of the computed image on the real sensor.
 
     Attributes:
-        scale: Real pixels per pixel of the computed image.
+        scale: Real pixels per computed pixel.
         row: Real row of the computed image's centre.
-        column: Real column of it.
+        column: Real column of the computed image's centre.
         rotation_deg: Counter-clockwise, from the column axis towards the row axis, after the reflection.
-        parity: 1, or -1 where the real image is reflected (columns reversed).
+        parity: 1, or -1 if the real image is reflected (columns reversed).
     """
 
     scale: float
@@ -36,21 +35,21 @@ class Geometry:
     rotation_deg: float
     parity: int
 
-    def turned(self) -> "Geometry":
-        """The other one of the two that the reference image cannot tell apart."""
+    def rotated_180(self) -> "Geometry":
+        """The geometry rotated by 180 degrees, which the reference image cannot distinguish."""
         return replace(self, rotation_deg=self.rotation_deg - 180 if self.rotation_deg > 0 else self.rotation_deg + 180)
 
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """A fit: the geometry, the light and the uniform background of the real image, and the residual.
+    """Result of a fit: geometry, flux and uniform background of the real image, and the residual.
 
     Attributes:
-        geometry: The better one of both parities; its rotation may be half a turn off.
-        flux: Light of the real image, in its unit.
-        background: In each real pixel.
-        residual: Rms of real less fitted over the rms of the real image.
-        other_parity: The same residual with the other parity.
+        geometry: Geometry of the better parity; its rotation may be off by 180 degrees.
+        flux: Flux of the real image, in its unit.
+        background: Background of each real pixel, in the same unit.
+        residual: Rms of real minus fitted image, relative to the rms of the real image.
+        other_parity: The same residual for the other parity.
     """
 
     geometry: Geometry
@@ -61,13 +60,13 @@ class Alignment:
 
 
 def onto(image: Array, geometry: Geometry, shape: tuple[int, int]) -> Array:
-    """A computed image (rows, columns), or images (rows, columns, many), as the real sensor's pixels see it.
+    """Resample a computed image (rows, columns), or images (rows, columns, many), onto the real sensor's pixels.
 
-    Light is kept: a value is per pixel. Between pixels it is a cubic spline; outside it is zero.
+    Flux is conserved. Between pixels the image is a cubic spline; outside it is zero.
 
     Args:
-        image: On the computed sensor.
-        geometry: Of the real one.
+        image: Image on the computed sensor.
+        geometry: Geometry of the real sensor.
         shape: Real rows and columns.
     """
     if image.ndim == 3:
@@ -79,11 +78,11 @@ def align(real: Array, computed: Array) -> Alignment:
     """Fit the geometry of a real reference image to the computed one.
 
     Args:
-        real: (rows, columns) dark subtracted, any unit.
+        real: (rows, columns) real image, dark subtracted, any unit.
         computed: (rows, columns) I0.
 
     Raises:
-        ValueError: there is no light in the image, or nothing in it is like the computed one.
+        ValueError: the image has no light, or does not resemble the computed one.
     """
     real = np.asarray(real, np.float64)
     spline = spline_filter(np.asarray(computed, np.float64))
@@ -91,34 +90,37 @@ def align(real: Array, computed: Array) -> Alignment:
     light = real - background
     if not light.sum() > 0:
         raise ValueError("the reference image has no light above its edge")
-    scales = {_size(light) / _size(np.asarray(computed, np.float64)), 1.0}  # a region may cut the image's wings off
+    scales = {
+        _size(light) / _size(np.asarray(computed, np.float64)),
+        1.0,
+    }  # a detector region may cut off the image's wings
     fits = []
     for parity in (1, -1):
         guesses = []
         for scale, angle in product(scales, np.arange(_ANGLES) * 180.0 / _ANGLES):
             guess = _placed(spline, Geometry(scale, 0.0, 0.0, float(angle), parity), light)
-            guesses.append((_left(_sample(spline, guess, real.shape), real)[0], guess))
+            guesses.append((_residual(_sample(spline, guess, real.shape), real)[0], guess))
         guesses.sort(key=lambda each: each[0])
         fits.append(min((_refine(spline, guess, real) for _, guess in guesses[:3]), key=lambda each: each[0]))
     fits.sort(key=lambda each: each[0])
-    (left, best), (other, _) = fits
-    if left > 0.5:
+    (residual, best), (other, _) = fits
+    if residual > 0.5:
         raise ValueError(
-            f"nothing in the image is like the computed reference: {left:.0%} of it is left after the best fit; is "
+            f"the image does not resemble the computed reference: {residual:.0%} of it remains after the best fit; is "
             "this the sensor and the mask of the configuration?"
         )
-    _, flux, background = _left(_sample(spline, best, real.shape), real)
+    _, flux, background = _residual(_sample(spline, best, real.shape), real)
     rotation = (best.rotation_deg + 90) % 180 - 90
-    return Alignment(replace(best, rotation_deg=rotation), flux, background, left, other)
+    return Alignment(replace(best, rotation_deg=rotation), flux, background, residual, other)
 
 
 def _placed(spline: Array, geometry: Geometry, light: Array) -> Geometry:
-    """The geometry centred where the model best matches the light, to a pixel."""
+    """The geometry with the centre at which the model best matches the light, to a pixel."""
     rows, columns = light.shape
     middle = replace(geometry, row=rows // 2, column=columns // 2)
-    model = _sample(spline, middle, (2 * rows, 2 * columns))  # so that it is not cut off on the other side
-    likeness = np.fft.irfft2(np.fft.rfft2(light, model.shape) * np.fft.rfft2(model).conj(), model.shape)
-    row, column = np.unravel_index(int(likeness.argmax()), model.shape)
+    model = _sample(spline, middle, (2 * rows, 2 * columns))  # large enough for any offset
+    correlation = np.fft.irfft2(np.fft.rfft2(light, model.shape) * np.fft.rfft2(model).conj(), model.shape)
+    row, column = np.unravel_index(int(correlation.argmax()), model.shape)
     down, across = (int(row) + rows) % (2 * rows) - rows, (int(column) + columns) % (2 * columns) - columns
     return replace(middle, row=float(middle.row + down), column=float(middle.column + across))
 
@@ -134,8 +136,8 @@ def _sample(spline: Array, geometry: Geometry, shape: tuple[int, ...]) -> Array:
     return np.asarray(sampled / geometry.scale**2)
 
 
-def _left(model: Array, real: Array) -> tuple[float, float, float]:
-    """Relative residual after the best light and background, and these two."""
+def _residual(model: Array, real: Array) -> tuple[float, float, float]:
+    """Relative residual after a fit of flux and background, and these two."""
     columns = np.stack([model.ravel(), np.ones(model.size)], axis=1)
     (flux, background), *_ = np.linalg.lstsq(columns, real.ravel(), rcond=None)
     rest = real.ravel() - columns @ (flux, background)
@@ -150,7 +152,7 @@ def _refine(spline: Array, guess: Geometry, real: Array) -> tuple[float, Geometr
 
     def rest(values: Array) -> Array:
         model = _sample(spline, geometry(values), real.shape)
-        _, flux, background = _left(model, real)
+        _, flux, background = _residual(model, real)
         return np.asarray(((real - flux * model - background) / real.std()).ravel())
 
     start = np.array([1.0, guess.row, guess.column, guess.rotation_deg])
@@ -160,7 +162,7 @@ def _refine(spline: Array, guess: Geometry, real: Array) -> tuple[float, Geometr
 
 
 def _size(light: Array) -> float:
-    """Rms size of an image in pixels; faint pixels, mostly noise, are left out."""
+    """Rms size of an image in pixels; faint pixels, which are mostly noise, are ignored."""
     bright = np.where(light > 0.05 * light.max(), light, 0.0)
     rows, columns = np.indices(light.shape, dtype=np.float64)
     total = bright.sum()

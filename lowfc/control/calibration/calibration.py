@@ -12,10 +12,10 @@ from lowfc.control.loop.camera import CameraSettings
 ESTIMATORS = ("weighted", "pinv")
 
 SINGULAR = 1e8
-"""Condition number above which modes count as the same."""
+"""Condition number of H above which the sensor cannot tell the modes apart."""
 
 FIRST = "+first"
-"""Of an estimator: the first calibration of a commissioning."""
+"""Suffix of `Calibration.estimator` for the first calibration of a commissioning."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,20 +27,19 @@ class Calibration:
         reference: (pixels,) I0 in flux fractions; sums to 1 over the good pixels.
         response: (pixels, modes) H in flux fractions per nm of wavefront rms.
         reconstructor: (modes, pixels) R in nm per flux fraction; zero at bad pixels.
-        good: (pixels,) 1 where a pixel is used, 0 where not.
+        good: (pixels,) 1 for a used pixel, else 0.
         dark: (pixels,) DN.
-        modes_to_actuators: (actuators, modes) nm of surface per nm of wavefront rms; it contains the 1/2.
-        actuators_to_modes: (modes, actuators) nm of wavefront rms that R makes of a nm of surface; empty where it is
-            not known.
+        modes_to_actuators: (actuators, modes) nm of surface per nm of wavefront rms; includes the 1/2 of reflection.
+        actuators_to_modes: (modes, actuators) nm of wavefront rms that R measures per nm of surface; empty if unknown.
         shape: rows and columns of the frame.
         grid: rows and columns of the mirror.
         flux_dn: expected sum of the good pixels, dark subtracted.
         saturation_dn: highest value a pixel can have.
-        estimator: how R was made: weighted or pinv, and what was fitted along, as in weighted+shear.
-        wavelength_nm: at which H was made.
-        operator_hash: of the optical model behind it; empty for a measured calibration.
-        id: identity of the whole.
-        camera: settings at which it was made; None where they are not known.
+        estimator: how R was computed: weighted or pinv, and fitted nuisance parameters, as in weighted+shear.
+        wavelength_nm: wavelength of H.
+        operator_hash: hash of its optical model; empty for a measured calibration.
+        id: identity of the calibration.
+        camera: camera settings with which it was made; None if unknown.
     """
 
     noll: tuple[int, ...]
@@ -73,7 +72,7 @@ class Calibration:
 
     @property
     def provisional(self) -> bool:
-        """Whether it is the first one of a commissioning, which nobody has judged."""
+        """Whether it is the first one of a commissioning, without a verdict."""
         return self.estimator.endswith(FIRST)
 
     @classmethod
@@ -85,7 +84,7 @@ class Calibration:
         return cls((), shape=(0, 0), grid=grid, flux_dn=1.0, saturation_dn=np.inf, **arrays, **rest)
 
     def identity(self) -> str:
-        """The correct `id`: a hash of everything else in it."""
+        """The correct `id`: a hash of all other content."""
         camera = self.camera
         settings = camera and (
             *(camera.shape, camera.region, camera.bias_dn, camera.saturation_dn),
@@ -102,7 +101,7 @@ _IDENTITY = (
 
 
 def array_shapes(modes: int, shape: tuple[int, int], grid: tuple[int, int]) -> dict[str, tuple[int, ...]]:
-    """Shape of each array of a calibration, by its name; `actuators_to_modes` may be empty."""
+    """Shapes of the arrays of a calibration, by name; `actuators_to_modes` may be empty."""
     pixels, actuators = shape[0] * shape[1], grid[0] * grid[1]
     return {
         **dict.fromkeys(("reference", "good", "dark"), (pixels,)),
@@ -114,12 +113,12 @@ def array_shapes(modes: int, shape: tuple[int, int], grid: tuple[int, int]) -> d
 
 
 def comparable(one: Calibration, other: Calibration) -> bool:
-    """Whether two calibrations are of the same pixels and modes."""
+    """Whether two calibrations have the same pixels and modes."""
     return one.shape == other.shape and one.noll == other.noll
 
 
 def normalise_flux(reference: Array, response: Array, good: Array) -> tuple[Array, Array]:
-    """Pass I0 (pixels,) and H (pixels, modes) through the normalisation that frames get: divided by their own flux.
+    """Normalise I0 (pixels,) and H (pixels, modes) like frames, which are divided by their own flux.
 
     Returns I0 in flux fractions and the derivative of I/sum(I) with respect to each mode, in flux fractions per nm.
     """
@@ -142,18 +141,18 @@ def reconstructor(
 ) -> Array:
     """R (modes, pixels) from normalised I0 and H: error = R (I - I0), the least-squares solution of eq. (11).
 
-    `weighted` is (H' W H)^-1 H' W with W = 1 / (I0 + read_noise^2) in electrons, the least noise that an unbiased
-    linear estimate can have; `pinv` weighs all pixels alike. Bad pixels get zero.
+    `weighted` is (H' W H)^-1 H' W with W = 1 / (I0 + read_noise^2) in electrons, the unbiased linear estimate with the
+    least noise; `pinv` weights all pixels equally. Bad pixels have zero weight.
 
     Args:
         reference: (pixels,) I0, normalised.
         response: (pixels, modes) H, normalised.
-        good: (pixels,) 1 where a pixel is used, else 0.
+        good: (pixels,) 1 for a used pixel, else 0.
         flux_e: Electrons on the good pixels.
-        read_noise_e: Of a pixel.
+        read_noise_e: Read noise of a pixel.
         estimator: One of `ESTIMATORS`.
-        nuisance: (pixels, any) what else changes an image, normalised like H, in any unit: fitted along, so that it
-            does not pass for modes, and not returned. Of the flux itself, normalisation leaves nothing to fit.
+        nuisance: (pixels, any) responses to other changes of the image, normalised like H, in any unit. They are fitted
+            with the modes, so that they are not measured as modes, and not returned. Flux changes need none.
 
     Raises:
         ValueError: unknown estimator, or modes that this sensor cannot tell apart.
@@ -189,12 +188,12 @@ def condition_number(response: Array) -> float:
 
 
 def noise_nm(matrix: Array, reference: Array, flux_e: float, read_noise_e: float) -> Array:
-    """Standard deviation (modes,) of the modes of one frame, in nm; as `noise_nm2`."""
+    """Standard deviation (modes,) of the modes of one frame, in nm; see `noise_nm2`."""
     return np.asarray(np.sqrt(np.diag(noise_nm2(matrix, reference, flux_e, read_noise_e))))
 
 
 def noise_nm2(matrix: Array, reference: Array, flux_e: float, read_noise_e: float) -> Array:
-    """Covariance (modes, modes) of the modes of one frame: photon and read noise through R (modes, pixels).
+    """Covariance (modes, modes) of the modes of one frame, from photon and read noise through R (modes, pixels).
 
     The normalisation divides by the frame's own noisy flux, so that each pixel's noise n acts as n - I0 sum(n).
     """

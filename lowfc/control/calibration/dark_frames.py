@@ -8,22 +8,22 @@ import numpy.typing as npt
 from lowfc.arrays import Array, Mask
 
 _SIGMAS = 8.0
-"""Robust standard deviations from the median beyond which a pixel is bad: of 6400 good ones none is."""
+"""Robust standard deviations from the median beyond which a pixel is bad; none of 6400 good pixels is that far."""
 _MOST_LIGHT = 0.02
-"""Part of the star's light that may be in dark frames."""
+"""Largest fraction of the star's light in dark frames."""
 _TO_SIGMA = 1.4826
-"""From a median absolute deviation to the standard deviation of a normal law."""
+"""Standard deviation of a normal distribution over its median absolute deviation."""
 
 
 class Dark(NamedTuple):
-    """What a camera says without light.
+    """Statistics of a camera's pixels without light.
 
     Attributes:
-        dark_dn: (pixels,) mean.
-        noise_dn: (pixels,) standard deviation of one frame.
-        hot: (pixels,) brighter than the others.
-        noisy: (pixels,) noisier than the others.
-        dead: (pixels,) stuck: they do not change at all where the others do.
+        dark_dn: (pixels,) mean, DN.
+        noise_dn: (pixels,) standard deviation of one frame, DN.
+        hot: (pixels,) whether a pixel is brighter than the others.
+        noisy: (pixels,) whether it is noisier than the others.
+        dead: (pixels,) whether it is stuck: without noise, unlike the others.
     """
 
     dark_dn: Array
@@ -41,39 +41,39 @@ class Dark(NamedTuple):
 
     @property
     def good(self) -> Array:
-        """(pixels,) 1 where a pixel is used, else 0."""
+        """(pixels,) 1 for a used pixel, else 0."""
         return np.where(self.hot | self.noisy | self.dead, 0.0, 1.0)
 
 
-def dark_of(frames: npt.NDArray[np.number]) -> Dark:
-    """Dark and bad pixels of frames (frames, pixels) taken without light, DN.
+def measure_dark(frames: npt.NDArray[np.number]) -> Dark:
+    """Dark and bad pixels from frames (frames, pixels) without light, DN.
 
     Raises:
-        ValueError: there are too few, or they are not dark.
+        ValueError: there are too few frames, or they are not dark.
     """
     count = len(frames)
     if count < 16:
         raise ValueError(f"a dark takes at least 16 frames, got {count}")
     values = frames.astype(np.float64)
     mean, noise = values.mean(axis=0), values.std(axis=0, ddof=1)
-    level, usual = float(np.median(mean)), float(np.median(noise))
-    of_mean = max(_spread(mean), usual / np.sqrt(count), 1e-3)
-    of_noise = max(_spread(noise), usual / np.sqrt(2 * count), 1e-3)
-    hot = mean > level + _SIGMAS * max(of_mean, usual / 4)
+    level, typical = float(np.median(mean)), float(np.median(noise))
+    mean_spread = max(_spread(mean), typical / np.sqrt(count), 1e-3)
+    noise_spread = max(_spread(noise), typical / np.sqrt(2 * count), 1e-3)
+    hot = mean > level + _SIGMAS * max(mean_spread, typical / 4)
     if hot.mean() > 0.05:
         raise ValueError(
             f"{hot.mean():.0%} of the pixels are much brighter than the median of {level:.1f} DN: these frames are not "
             "dark; block the star, or switch it off"
         )
-    dead = noise < 0.05 * usual
-    return Dark(mean, noise, hot, noise > usual + _SIGMAS * of_noise, dead)
+    dead = noise < 0.05 * typical
+    return Dark(mean, noise, hot, noise > typical + _SIGMAS * noise_spread, dead)
 
 
 def check_dark(dark_dn: Array, reference: Array, flux_dn: float) -> None:
-    """Refuse a dark (pixels,) with a part of the star's light, whose image (pixels,) is in flux fractions.
+    """Refuse a dark (pixels,) that contains light of the star; the reference (pixels,) is in flux fractions.
 
     Raises:
-        ValueError: the star is in it.
+        ValueError: the dark contains too much light.
     """
     light = light_in(dark_dn, reference)
     if light > _MOST_LIGHT * flux_dn:
@@ -83,9 +83,9 @@ def check_dark(dark_dn: Array, reference: Array, flux_dn: float) -> None:
 
 
 def light_in(dark_dn: Array, reference: Array) -> float:
-    """Flux in DN of a reference image (pixels,), in flux fractions, that is in frames said to be dark.
+    """Flux of the star in supposedly dark frames (pixels,), DN, from its reference image (pixels,) in flux fractions.
 
-    Of all pixels: those that light falls on pass for hot and noisy.
+    It uses all pixels, since those with light appear to be hot and noisy.
     """
     shape = reference - reference.mean()
     return float(shape @ dark_dn / (shape @ shape))

@@ -1,8 +1,8 @@
-"""From poke to image: after how many frames, and whether at all.
+"""Detect pokes in the images, and measure the delay from poke to image in frames.
 
-The answer to a pseudo-random poke is one picture, seen after each lag with a weight of its own. The picture is taken
-from one half of the frames and looked for in the other, so that noise does not find itself; the weights follow the
-loop's model of a delay, in which two neighbouring lags share the whole answer.
+The response to a pseudo-random poke is one image, which appears at each lag with its own weight. The image is estimated
+from one half of the frames and detected in the other, so that its noise does not correlate with itself. The weights
+follow the loop's model of a delay, in which two neighbouring lags share the whole response.
 """
 
 from typing import NamedTuple
@@ -12,88 +12,90 @@ import numpy as np
 from lowfc.arrays import Array
 
 LAGS = 6
-"""Frames after its own in which a poke is looked for, its own included."""
+"""Number of frames in which a poke is searched for, from its own frame on."""
 LEAST_FRAMES = 40 * LAGS
 LEAST_SNR = 10.0
-"""Below which no poke was seen; noise alone exceeds it less than once in 1e13 times."""
+"""Least signal-to-noise ratio of a detected poke; noise alone exceeds it with a probability below 1e-13."""
 
 
 class Delay(NamedTuple):
-    """What a poke's answer shows.
+    """Response to a poke.
 
     Attributes:
-        delay_frames: from the frame a command was made from to the first exposure that sees it wholly.
-        error_frames: its standard error.
-        weights: (lags,) part of the answer that comes so many frames after the poke's own.
-        picture: (pixels,) the answer to one unit of the poke, flux fractions.
-        snr: of the answer.
+        delay_frames: frames from the frame that a command is computed from to the first frame exposed wholly with it.
+        error_frames: standard error of the delay.
+        weights: (lags,) fraction of the response at each lag, in frames after the poke's own.
+        response: (pixels,) image of the response to one unit of the poke, flux fractions.
+        snr: signal-to-noise ratio of the response.
     """
 
     delay_frames: float
     error_frames: float
     weights: Array
-    picture: Array
+    response: Array
     snr: float
 
 
 class NotSeenError(ValueError):
-    """A poke has no answer in the frames."""
+    """A poke was not detected in the frames."""
 
 
 def measure_delay(fractions: Array, reference: Array, poke: Array, command: Array | None = None) -> Delay:
-    """The delay from frames under a pseudo-random poke.
+    """Measure the delay from frames with a pseudo-random poke.
 
     Args:
         fractions: (frames, pixels) consecutive frames in flux fractions.
-        reference: (pixels,) about the same without a poke: for the weights of the pixels.
-        poke: (frames,) amplitude in the command that was made from each frame.
-        command: (frames,) the loop's own command of that mode beside it; None where the loop is open.
+        reference: (pixels,) approximate image without a poke, for the weights of the pixels.
+        poke: (frames,) amplitude of the poke in the command computed from each frame.
+        command: (frames,) the loop's own command of the same mode; None if the loop is open.
 
     Raises:
-        ValueError: there are too few frames, or the answer comes later than is looked for.
-        NotSeenError: no poke is seen.
+        ValueError: there are too few frames, or the response is later than the longest lag.
+        NotSeenError: the poke is not detected.
     """
     if len(fractions) < LEAST_FRAMES:
         raise ValueError(f"the delay needs at least {LEAST_FRAMES} frames without a gap, got {len(fractions)}")
-    light = np.sqrt(np.maximum(reference, 0) + 1e-3 * reference.max())  # photon noise goes as the root of the light
+    light = np.sqrt(
+        np.maximum(reference, 0) + 1e-3 * reference.max()
+    )  # photon noise is proportional to the square root of the light
     first = LAGS - 1
     instruments = _lagged(poke)
     moved = instruments if command is None else _lagged(poke + command)
     rows = fractions[first:] / light
     halves = np.array_split(np.arange(len(rows)), 2)
     factors, variances = np.zeros(LAGS), np.zeros(LAGS)
-    picture = np.zeros(len(reference))
+    response = np.zeros(len(reference))
     power = 0.0
     for one, other in (halves, halves[::-1]):
-        pictures, _ = _regressed(rows[one], moved[one], instruments[one])
-        left, values, right = np.linalg.svd(pictures, full_matrices=False)
+        responses, _ = _regressed(rows[one], moved[one], instruments[one])
+        left, values, right = np.linalg.svd(responses, full_matrices=False)
         direction = right[0] * np.sign(left[:, 0].sum())
         found, noise = _regressed((rows[other] @ direction)[:, None], moved[other], instruments[other])
         factors += found[:, 0] / 2
         variances += noise[:, 0] ** 2 / 4
-        picture += direction * light * abs(left[:, 0].sum()) * values[0] / 2
+        response += direction * light * abs(left[:, 0].sum()) * values[0] / 2
         power += float(((found[:, 0] / noise[:, 0]) ** 2).sum())
     snr = float(np.sqrt(power))
     total = factors.sum()
     if snr < LEAST_SNR:
         raise NotSeenError(
             "the pokes are not seen in the frames: is the light on the sensor, does the mirror follow the commands, is "
-            "the amplitude too small for what shakes the wavefront?"
+            "the amplitude too small for the disturbance?"
         )
     pairs = factors[:-1] + factors[1:]
     whole = int(pairs.argmax())
     if pairs[whole] < 0.5 * np.abs(factors).sum() or factors[-1] > 0.5 * total:
         raise ValueError(
-            f"the answer to a poke is not over after {LAGS - 1} frames, or does not come at once: the delay cannot be "
-            "told; are frames lost, or commands late?"
+            f"the response to a poke is spread over several frames, or later than {LAGS - 1} frames: the delay "
+            "cannot be measured; are frames lost, or commands late?"
         )
     fraction = float(np.clip(factors[whole + 1] / pairs[whole], 0, 1))
     error = np.hypot(fraction * np.sqrt(variances[whole]), (1 - fraction) * np.sqrt(variances[whole + 1]))
-    return Delay(whole + fraction, float(error / pairs[whole]), factors / total, picture, snr)
+    return Delay(whole + fraction, float(error / pairs[whole]), factors / total, response, snr)
 
 
 def _lagged(row: Array) -> Array:
-    """(frames, lags): each frame's value and those before it, from the first frame that has all."""
+    """(frames, lags): the value of each frame and of those before it, from the first frame that has all lags."""
     first = LAGS - 1
     return np.stack([row[first - lag : len(row) - lag] for lag in range(LAGS)], axis=1)
 
@@ -101,7 +103,7 @@ def _lagged(row: Array) -> Array:
 def _regressed(rows: Array, moved: Array, instruments: Array) -> tuple[Array, Array]:
     """Factors (lags, columns) of each lag in rows (frames, columns), and their standard errors.
 
-    With instruments of their own, what moved because of the rows' noise does not count (see `response_fit`).
+    With separate instruments, motion caused by the rows' own noise does not bias the factors (see `response_fit`).
     """
     rows, moved, z = (each - each.mean(axis=0) for each in (rows, moved, instruments))
     inverse = np.linalg.inv(z.T @ moved)

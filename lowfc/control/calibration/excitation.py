@@ -1,7 +1,7 @@
-"""What is played to measure a loop: multisines, whose lines belong to one mode each, and staircases of one mode.
+"""Probe signals to measure a loop: multisines, whose lines belong to one mode each, and staircases of one mode.
 
-All lines of a multisine are odd multiples of one over its period, so that what a second-order nonlinearity makes of
-them falls between them, and no two are neighbours: Hann's window keeps them apart.
+All lines of a multisine are odd multiples of one over its period, so that products of a second-order nonlinearity fall
+between them. No two lines are neighbours, so that Hann's window separates them.
 """
 
 import numpy as np
@@ -10,23 +10,23 @@ import numpy.typing as npt
 from lowfc.arrays import Array, Single, Whole
 
 FEWEST_CYCLES = 3
-"""Of the lowest line in a period; below, the drift of the mean passes for it."""
-_APART = 3  # odd bins from one line of a mode to its next, at the least: the noise is measured between them
-_DRAWS = 32  # of the phases, of which the one with the lowest crest is kept
+"""Least cycles of the lowest line in a period; with fewer, it cannot be told from a drift of the mean."""
+_APART = 3  # least number of odd bins between lines of a mode: the noise is measured between them
+_DRAWS = 32  # random sets of phases; the one with the lowest crest is used
 
 
 def lines(period_frames: int, modes: int, lines_per_mode: int, lowest: float, highest: float) -> list[Whole]:
-    """Choose the lines of each mode, evenly in the logarithm of frequency as far as there are enough of them.
+    """Choose the lines of each mode, evenly in the logarithm of frequency as far as possible.
 
     Args:
         period_frames: Frames in a period.
-        modes: Modes that are excited at once.
-        lines_per_mode: Lines of each.
+        modes: Number of modes that are excited at once.
+        lines_per_mode: Number of lines of each mode.
         lowest: Frequency of the first line, cycles per frame.
-        highest: Frequency above which there is none, cycles per frame.
+        highest: Highest frequency of a line, cycles per frame.
 
     Returns:
-        For each mode (lines,), cycles per period: odd, ascending, and of no other mode.
+        For each mode (lines,), cycles per period: odd, ascending, and used by no other mode.
 
     Raises:
         ValueError: the period is too short for the lowest frequency, or for so many lines.
@@ -48,20 +48,20 @@ def lines(period_frames: int, modes: int, lines_per_mode: int, lowest: float, hi
     if places[-1] > highest * period_frames:
         room = int((highest * period_frames - first) // step) + 1
         raise ValueError(
-            f"a period of {period_frames} frames has room for {room} lines, {count} are wanted: take a longer one, or "
-            "fewer lines or modes"
+            f"a period of {period_frames} frames has room for {room} lines, {count} are requested: use a longer one "
+            "or fewer lines or modes"
         )
     return [places[mode::modes] for mode in range(modes)]
 
 
 def multisine(period_frames: int, bins: list[Whole], rms_nm: float, seed: int) -> Single:
-    """One period (period_frames, modes) of sines of even height, with random phases of a low crest.
+    """One period (period_frames, modes) of sines of equal amplitude, with random phases of a low crest.
 
     Args:
         period_frames: Frames in the period.
-        bins: Lines of each mode, indices as `lines` gives them.
-        rms_nm: Of each mode.
-        seed: Of the phases.
+        bins: Lines of each mode, as returned by `lines`.
+        rms_nm: Rms of each mode.
+        seed: Seed of the phases.
     """
     rng = np.random.default_rng([seed, 7])
     columns = []
@@ -76,18 +76,18 @@ def multisine(period_frames: int, bins: list[Whole], rms_nm: float, seed: int) -
     return np.stack(columns, axis=1).astype(np.float32)
 
 
-def led_in(period: Single, lead_frames: int) -> Single:
-    """A period (frames, modes) with what came before it, so that the loop has settled when it begins."""
+def with_lead_in(period: Single, lead_frames: int) -> Single:
+    """A period (frames, modes) with its preceding frames as a lead-in, in which the loop settles."""
     return np.concatenate([period[np.arange(-lead_frames, 0) % len(period)], period])
 
 
-def climb(levels_nm: npt.ArrayLike, hold_frames: int, largest_step_nm: float) -> tuple[Array, Whole]:
-    """A staircase from zero over all levels and back to zero, as quickly as a step may be.
+def build_staircase(levels_nm: npt.ArrayLike, hold_frames: int, largest_step_nm: float) -> tuple[Array, Whole]:
+    """A staircase from zero over all levels and back to zero, with the fewest frames between levels.
 
     Args:
-        levels_nm: (levels,) in their order.
+        levels_nm: (levels,) in order.
         hold_frames: Frames at each level.
-        largest_step_nm: From one frame to the next.
+        largest_step_nm: Largest change from one frame to the next.
 
     Returns:
         The staircase (frames,), and the first frame (levels,) at each level.

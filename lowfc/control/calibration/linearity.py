@@ -1,4 +1,4 @@
-"""How far a sensor is linear, and from how far a loop closes, as measured with shapes of one mode on the mirror."""
+"""Linear range of a sensor and capture range of a loop, measured with shapes of one mode on the mirror."""
 
 from dataclasses import dataclass
 
@@ -8,27 +8,27 @@ import numpy.typing as npt
 from lowfc.arrays import Array, Whole
 
 SURE = 3.0
-"""Standard errors beyond the limit at which a value counts as beyond it."""
+"""Standard errors by which a value must exceed a limit to count as beyond it."""
 MISSED = 0.3
-"""Part of a shape that may be left over, in its mode or another, when a loop has taken it away."""
+"""Largest residual of a captured shape, in any mode, as a fraction of its amplitude."""
 
-_SIGNS = np.array([1.0, -1.0, -1.0, 1.0])  # so that what drifts evenly has no part in the difference
+_SIGNS = np.array([1.0, -1.0, -1.0, 1.0])  # so that a linear drift cancels
 
 
 def levels(amplitudes_nm: npt.ArrayLike, cycles: int) -> Array:
-    """The levels of a staircase that pushes and pulls `cycles` times at each amplitude (amplitudes,) in turn."""
+    """Levels of a staircase that pushes and pulls `cycles` times at each amplitude (amplitudes,) in turn."""
     return np.concatenate([np.tile(amplitude * _SIGNS, cycles) for amplitude in np.asarray(amplitudes_nm, float)])
 
 
 @dataclass(frozen=True, slots=True)
 class Gains:
-    """What the sensor makes of one mode, at each amplitude.
+    """Gains of the sensor for one mode, at each amplitude.
 
     Attributes:
-        amplitude_nm: (amplitudes,).
-        gain: (amplitudes, modes) measured of each mode, beside the one that was there.
-        error: (amplitudes, modes) its standard error, from cycle to cycle.
-        mode: the place of the one that was there.
+        amplitude_nm: (amplitudes,) amplitude of the mode.
+        gain: (amplitudes, modes) measured amplitude of each mode over the true amplitude of `mode`.
+        error: (amplitudes, modes) standard error of the gain, from the scatter of the cycles.
+        mode: index of the mode.
     """
 
     amplitude_nm: Array
@@ -38,13 +38,13 @@ class Gains:
 
     @property
     def crosstalk(self) -> Array:
-        """The same (amplitudes, modes) with nothing at the mode itself."""
+        """The gains (amplitudes, modes) with 0 for the mode itself."""
         others = self.gain.copy()
         others[:, self.mode] = 0.0
         return others
 
     def within(self, gain_error: float, crosstalk: float) -> list[bool | None]:
-        """Whether gain and cross-talk at each amplitude are within these; None where the noise is too high to say."""
+        """Whether gain and cross-talk at each amplitude are within these limits; None if too noisy to tell."""
         limit = np.full(self.gain.shape[1], crosstalk)
         limit[self.mode] = gain_error
         departure = self.crosstalk
@@ -57,7 +57,7 @@ class Gains:
 
 
 def gains(error_nm: Array, mode: int, levels_nm: Array, starts: Whole, frames: int) -> Gains:
-    """Gain and cross-talk of a mode that went through the levels (levels,) of `levels`, from open-loop errors.
+    """Gain and cross-talk of a mode that followed the levels (levels,) of `levels`, from open-loop errors.
 
     Errors are (frames, modes); `starts` (levels,) are the first of the `frames` frames that saw each level.
     """
@@ -72,13 +72,13 @@ def gains(error_nm: Array, mode: int, levels_nm: Array, starts: Whole, frames: i
 
 
 def captured(error_nm: Array, command_nm: Array, mode: int, level_nm: float, before: slice, after: slice) -> bool:
-    """Whether a closed loop took a shape of one mode away that came at once.
+    """Whether a closed loop corrected a step of one mode.
 
-    The command of that mode must have moved against the shape, and no error be left in any: a loop that settled
-    elsewhere measures none either. Commands of other modes follow what drifts meanwhile. Errors and commands are
-    (frames, modes); `before` are frames before the shape came, `after` those in which the loop must have settled again.
+    The command of that mode must have moved against the step, and no mode may have an error left: a loop that settled
+    at another point has no error either. Commands of other modes may follow a drift. Errors and commands are (frames,
+    modes); `before` are frames before the step, `after` those in which the loop must have settled again.
     """
     moved_nm = command_nm[after, mode].mean() - command_nm[before, mode].mean()
-    left = error_nm[after].mean(axis=0)
+    residual_nm = error_nm[after].mean(axis=0)
     allowed = MISSED * abs(level_nm)
-    return bool(abs(moved_nm + level_nm) <= allowed and (np.abs(left) <= allowed).all())
+    return bool(abs(moved_nm + level_nm) <= allowed and (np.abs(residual_nm) <= allowed).all())

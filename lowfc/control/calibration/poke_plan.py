@@ -1,7 +1,7 @@
-"""What to play on the mirror so that the sensor's response can be measured: shapes, their order, frames to leave out.
+"""Probe sequences to measure the sensor's response: shapes, their order, and the frames to ignore.
 
-Every pattern is pushed and pulled in the order + - - + - + + -, the signs of the Thue-Morse sequence, whose eight are
-orthogonal to a drift that is constant, linear or quadratic in time.
+Every pattern is pushed and pulled in the order + - - + - + + -, the first eight signs of the Thue-Morse sequence, which
+are orthogonal to a drift that is constant, linear or quadratic in time.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from scipy.linalg import hadamard
 from lowfc.arrays import Array, Mask
 
 SIGNS = np.array([1, -1, -1, 1, -1, 1, 1, -1], dtype=np.float64)
-"""Of the pushes and pulls of one pattern."""
+"""Signs of the pushes and pulls of one pattern."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,8 +23,8 @@ class Plan:
     Attributes:
         table: (frames, columns) amplitudes of each frame's command, in the unit of its shapes: nm rms of wavefront for
             modes, nm of surface for single actuators.
-        used: (frames,) whether the exposure that sees this row, and nothing else, may be used.
-        per_column: frames of the cycle that measure each column.
+        used: (frames,) whether the exposure that sees only this row may be used.
+        per_column: number of frames of the cycle that measure each column.
     """
 
     table: Array
@@ -36,32 +36,31 @@ class Plan:
 
 
 def poke_patterns(columns: int, amplitude: float) -> Array:
-    """(columns, columns): one mode, or one actuator, after the other."""
+    """Patterns (columns, columns): one mode, or one actuator, after the other."""
     return amplitude * np.eye(columns)
 
 
 def hadamard_patterns(columns: int, amplitude: float) -> Array:
-    """(patterns, columns): all modes at once, each with signs that are orthogonal to those of all others."""
+    """Patterns (patterns, columns) of all modes at once, each with signs that are orthogonal to those of the others."""
     order = 1 << max(columns - 1, 0).bit_length()
     return amplitude * np.asarray(hadamard(order), dtype=np.float64)[:, :columns]
 
 
 def cycle(patterns: Array, hold: int, settle: int, rest: int, *, backwards: bool = False) -> Plan:
-    """Rest, then every pattern pushed and pulled.
+    """Rest frames, then every pattern pushed and pulled.
 
     Args:
         patterns: (patterns, columns), from `poke_patterns` or `hadamard_patterns`.
-        hold: Frames of each push or pull that are used.
-        settle: Frames after each change that are left out: where the delay is a fraction, and the mirror is moving.
-        rest: Frames without a poke that are used, for the reference image.
-        backwards: Take the patterns in the opposite order; every other cycle, so that what wanders more slowly than a
-            pattern averages out between them, too.
+        hold: Used frames of each push or pull.
+        settle: Ignored frames after each change, in which the mirror moves or a fractional delay mixes two rows.
+        rest: Used frames without a poke, for the reference image.
+        backwards: Reverse the order of the patterns; with every other cycle backwards, slow drifts average out.
 
     Raises:
         ValueError: no frame would be used.
     """
     if hold < 1 or settle < 0 or rest < 0:
-        raise ValueError(f"a poke is held for 1 frame or more, after none or more; got {hold}, {settle} and {rest}")
+        raise ValueError(f"hold must be 1 frame or more, settle and rest 0 or more; got {hold}, {settle} and {rest}")
     order = np.arange(len(patterns))[:: -1 if backwards else 1]
     states = (patterns[order, None, :] * SIGNS[:, None]).reshape(-1, patterns.shape[1])
     resting = rest + settle if rest else 0
@@ -73,10 +72,10 @@ def cycle(patterns: Array, hold: int, settle: int, rest: int, *, backwards: bool
 
 
 def dither(columns: int, amplitude: float, frames: int, hold: int, seed: int) -> Plan:
-    """Pseudo-random pushes and pulls of all modes at once, to be played with the loop closed.
+    """Pseudo-random pushes and pulls of all modes at once, to be played in a closed loop.
 
-    Columns are modes, the amplitude is in nm rms of wavefront, and signs change every `hold` frames: 1 is quickest, and
-    least answered by the loop. Each piece has a seed of its own.
+    Columns are modes, the amplitude is in nm rms of wavefront, and signs may change every `hold` frames: the loop
+    corrects 1 least. Each piece has its own seed.
     """
     rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence([seed, 7])))
     states = rng.integers(0, 2, (-(-frames // hold), columns)) * 2.0 - 1.0
@@ -85,19 +84,19 @@ def dither(columns: int, amplitude: float, frames: int, hold: int, seed: int) ->
 
 
 def frames_for(snr: float, noise_nm: float, amplitude_nm: float) -> int:
-    """Frames of pokes of this amplitude after which R knows a mode of this noise in one frame to 1 / snr."""
+    """Number of frames with pokes of this amplitude that determine R to 1 / snr, for this noise per frame."""
     return int(np.ceil((snr * noise_nm / amplitude_nm) ** 2))
 
 
 def seen(table: Array, weights: Array, sequence: npt.NDArray[np.integer], commanded: Mask) -> Array:
-    """What of a table (frames, columns) each exposure saw.
+    """Rows of a table (frames, columns) that exposures saw.
 
     Args:
-        table: A row for each frame from the play's first on; before and after it, zeros.
-        weights: (lags,) part of the row of `lag` frames before that an exposure sees; sums to 1.
-        sequence: (exposures,) rising, counted from the frame whose command was the first to have a row.
-        commanded: (exposures,) whether a command was made of the frame; where not, or where the frame is missing, the
-            mirror kept the row before.
+        table: A row for each frame from the first frame of the play; before and after it, zeros.
+        weights: (lags,) fraction of the row of `lag` frames before that an exposure sees; sums to 1.
+        sequence: (exposures,) ascending, counted from the frame whose command had the first row.
+        commanded: (exposures,) whether the frame led to a command; if not, or if the frame is missing, the mirror kept
+            the previous row.
 
     Returns:
         (exposures, columns).
@@ -108,7 +107,7 @@ def seen(table: Array, weights: Array, sequence: npt.NDArray[np.integer], comman
     row = np.full(last - first + 1, -1)  # place in the padded table, whose last row is zeros
     obeyed = np.zeros(row.size, np.bool_)
     obeyed[sequence[commanded] - first] = True
-    obeyed[: max(int(sequence[0]) - first, 0)] = True  # what was before is not known to have gone wrong
+    obeyed[: max(int(sequence[0]) - first, 0)] = True  # earlier commands are assumed to have been applied
     places = np.arange(first, last + 1)
     row = np.where((places >= 0) & (places < len(table)), places, len(table))
     newest = np.maximum.accumulate(np.where(obeyed, np.arange(row.size), 0))
@@ -119,12 +118,12 @@ def seen(table: Array, weights: Array, sequence: npt.NDArray[np.integer], comman
 
 
 def usable(plan: Plan, sequence: npt.NDArray[np.integer], commanded: Mask, lag: int) -> Mask:
-    """(exposures,) whether an exposure sees a row that may be used, and every command that it sees was made.
+    """Whether exposures (exposures,) see a row that may be used, and all commands that they see were sent.
 
     Args:
-        plan: What was played.
-        sequence: (exposures,) rising, counted from the first frame whose command had a row.
-        commanded: (exposures,) whether a command was made of the frame.
+        plan: The plan that was played.
+        sequence: (exposures,) ascending, counted from the frame whose command had the first row.
+        commanded: (exposures,) whether the frame led to a command.
         lag: Whole frames from a row's frame to the exposure that sees it.
     """
     place = sequence - lag

@@ -1,8 +1,8 @@
-"""The reconstructor of a response matrix, measured or computed; truncated or damped where asked.
+"""Reconstructor of a measured or computed response matrix, with optional truncation or damping.
 
-A measured H has the noise of thousands of pixels in it. Its own (H'WH)^-1 H'W has that noise twice: it measures every
-mode too small, and adds noise to every frame. R = (R_a H)^-1 R_a, with any R_a of full rank that does not know that
-noise, is unbiased and has the noise of R_a.
+A measured H contains the noise of thousands of pixels. Its own (H'WH)^-1 H'W contains that noise twice: it measures
+every mode too small, and adds noise to every frame. R = (R_a H)^-1 R_a, with any R_a of full rank that does not depend
+on that noise, is unbiased and has the noise of R_a.
 """
 
 from typing import NamedTuple
@@ -11,24 +11,24 @@ import numpy as np
 
 from lowfc.arrays import Array
 from lowfc.control.calibration.calibration import ESTIMATORS
-from lowfc.control.calibration.response_fit import WORST_ANSWER
+from lowfc.control.calibration.response_fit import WORST_CONDITION
 
 _NOISE = (
-    "the response does not tell the modes apart: take more cycles, a larger amplitude or a brighter star; or leave "
-    "combinations of modes out with --truncate"
+    "the response does not tell the modes apart: use more cycles, a larger amplitude or a brighter star; or drop "
+    "combinations of modes with --truncate"
 )
 
 
 class Reconstruction(NamedTuple):
-    """R and what it is worth.
+    """R and the singular values of its response matrix.
 
     Attributes:
         matrix: (modes, pixels) R, nm per flux fraction; zero at bad pixels.
-        singular_values: (modes,) of the weighted H, falling. Of the weighted estimator, 1 / value is the noise in nm
-            with which one frame measures that combination of modes.
-        kept: (modes,) part of each combination that is kept: 0 truncated, 1 not touched.
-        condition_number: largest over smallest singular value of what was measured.
-        combinations: (modes, modes) a column for each singular value.
+        singular_values: (modes,) singular values of the weighted H, descending. For the weighted estimator, 1 / value
+            is the noise in nm with which one frame measures that combination of modes.
+        kept: (modes,) fraction of each combination that is kept: 0 if truncated, 1 if unchanged.
+        condition_number: largest over smallest singular value.
+        combinations: (modes, modes) combination of modes of each singular value, in columns.
     """
 
     matrix: Array
@@ -49,19 +49,18 @@ def reconstruct(
     truncate: float = 0.0,
     tikhonov: float = 0.0,
 ) -> Reconstruction:
-    """R of a computed H, (H'WH)^-1 H'W, or of a measured one, (R_a H)^-1 R_a.
+    """R from a computed H, (H'WH)^-1 H'W, or from a measured one, (R_a H)^-1 R_a.
 
     Args:
         reference: (pixels,) I0, normalised.
         response: (pixels, modes) H, normalised.
-        initial: (modes, pixels) R_a for a measured H; what it leaves out of an image is left out by R, too. None for a
-            computed H.
-        good: (pixels,) 1 where a pixel is used, else 0.
+        initial: (modes, pixels) R_a for a measured H; R ignores what R_a ignores in an image. None for a computed H.
+        good: (pixels,) 1 for a used pixel, else 0.
         flux_e: Electrons on the good pixels.
-        read_noise_e: Of a pixel.
-        estimator: weighted or pinv, as for `control.calibration.reconstructor`; of a computed H.
-        truncate: Combinations of modes with a singular value below this part of the largest are left out.
-        tikhonov: Combinations are damped as s^2 / (s^2 + (tikhonov s_largest)^2).
+        read_noise_e: Read noise of a pixel.
+        estimator: For a computed H: weighted or pinv, as for `control.calibration.reconstructor`.
+        truncate: Combinations of modes with a singular value below this fraction of the largest are dropped.
+        tikhonov: Combinations are damped by s^2 / (s^2 + (tikhonov s_largest)^2).
 
     Raises:
         ValueError: an argument is out of range, or H does not tell the modes apart.
@@ -69,7 +68,7 @@ def reconstruct(
     if estimator not in ESTIMATORS:
         raise ValueError(f"estimator must be one of {', '.join(ESTIMATORS)}, got {estimator!r}")
     if not (0 <= truncate < 1 and 0 <= tikhonov < 1):
-        raise ValueError(f"truncation and damping are 0 or more and below 1, got {truncate} and {tikhonov}")
+        raise ValueError(f"truncation and damping must be at least 0 and below 1, got {truncate} and {tikhonov}")
     variance = pixel_variance(reference, flux_e, read_noise_e)
     if initial is None:
         weights = good / variance if estimator == "weighted" else good / variance.mean()
@@ -77,10 +76,10 @@ def reconstruct(
         power = signal @ response
     else:
         rows = initial * good
-        answers = rows @ response
-        if not np.linalg.cond(answers) < WORST_ANSWER:
+        product = rows @ response
+        if not np.linalg.cond(product) < WORST_CONDITION:
             raise ValueError(_NOISE)
-        unbiased = np.linalg.solve(answers, rows)
+        unbiased = np.linalg.solve(product, rows)
         power = np.linalg.inv((unbiased * variance) @ unbiased.T)  # H'WH for the weighted estimator
         signal = power @ unbiased
     squares, combinations = np.linalg.eigh(power)
@@ -97,25 +96,25 @@ def reconstruct(
 
 
 def pixel_variance(reference: Array, flux_e: float, read_noise_e: float) -> Array:
-    """Variance (pixels,) of a frame's flux fractions: photons of I0 (pixels,) and read-out."""
+    """Variance (pixels,) of a frame's flux fractions, from the photon noise of I0 (pixels,) and read noise."""
     variance = (np.maximum(reference, 0) * flux_e + read_noise_e**2) / flux_e**2
     return np.asarray(np.maximum(variance, 1e-12 * variance.max()))
 
 
 def advice(made: Reconstruction, noll: tuple[int, ...], limit_nm: float) -> str:
-    """What to do about the combinations of modes that are hardly measured, in one sentence.
+    """Advice on poorly measured combinations of modes, in one sentence.
 
     Args:
         made: A reconstruction with the weighted estimator.
         noll: Noll index of each mode.
-        limit_nm: Largest command of a mode: what one frame measures with more noise than this, the loop cannot follow.
+        limit_nm: Largest command of a mode; the loop cannot follow a combination with more noise than this in a frame.
     """
     noise_nm = 1 / np.maximum(made.singular_values, 1e-300)
     if not (made.kept > 0.999).all():
-        left = int(np.count_nonzero(made.kept < 0.5))
+        suppressed = int(np.count_nonzero(made.kept < 0.5))
         return (
-            f"{left} of {len(noll)} combinations of modes are suppressed: they are not controlled, and what disturbs "
-            "them stays; the modes that make them up answer by less than they should"
+            f"{suppressed} of {len(noll)} combinations of modes are suppressed: they are not controlled, and their "
+            "disturbance remains; the modes in them are measured too small"
         )
     bad = np.flatnonzero(noise_nm > limit_nm)
     if bad.size == 0:
@@ -128,5 +127,5 @@ def advice(made: Reconstruction, noll: tuple[int, ...], limit_nm: float) -> str:
     cut = made.singular_values[bad[0]] / made.singular_values[0]
     return (
         f"{bad.size} combinations of modes (mostly {names}) are measured with more noise than the {limit_nm:g} nm of "
-        f"their limit: take fewer modes, lower their gains, or leave them out with --truncate {1.01 * cut:.2g}"
+        f"their limit: use fewer modes, lower their gains, or drop them with --truncate {1.01 * cut:.2g}"
     )

@@ -1,11 +1,11 @@
-"""Reference image and response matrix from frames under known pokes, and what they are worth.
+"""Reference image and response matrix from frames with known pokes, and their errors.
 
-Each cycle of pokes, or piece of a dither, gives a response of its own: H = cov(frames, z) cov(seen, z)^-1, where `seen`
-is what the mirror did in each exposure and z the instrument. Open loop both are the poke. With the loop closed, `seen`
-is the poke and the loop's own command, which follows noise and disturbance; z is the poke alone, which does not, so
-that the loop's reaction does not bias the response. The scatter of the cycles is the standard error.
+Each cycle of pokes, or piece of a dither, yields one response: H = cov(frames, z) cov(seen, z)^-1, where `seen` is the
+mirror's shape in each exposure and z the instrument. In open loop both are the poke. In closed loop, `seen` is the sum
+of the poke and the loop's command, which follows noise and disturbance; z is the poke alone, which does not, so that
+the loop's reaction does not bias the response. The standard error comes from the scatter of the cycles.
 
-R is built from a reconstructor R_a that does not know these frames: R = (R_a H)^-1 R_a, see `regularised`.
+R is built from a reconstructor R_a that is independent of these frames: R = (R_a H)^-1 R_a, see `regularised`.
 """
 
 from typing import NamedTuple
@@ -16,34 +16,34 @@ import numpy.typing as npt
 from lowfc.arrays import Array, Whole
 
 LEAST_CYCLES = 4
-"""So that their scatter says something."""
+"""Least number of cycles for a useful scatter."""
 MOST_RMS = 1.2
-"""Rms of the elements of R H - I, in units of 1 / snr, that a calibration promises."""
+"""Largest rms of the elements of R H - I of a good calibration, in units of 1 / snr."""
 MOST_LARGEST = 4.0
-"""The largest of them."""
-WORST_ANSWER = 1e3
+"""Largest element of R H - I of a good calibration, in the same units."""
+WORST_CONDITION = 1e3
 """Condition number of R H above which a reconstructor does not tell the modes apart."""
 _WORST_INSTRUMENT = 1e6
 """Condition number of cov(seen, z) above which the pokes do not tell the modes apart."""
 _OUTLIER = 4.0
-"""Standard deviations from the median within which a cycle counts as it is."""
-_OF_A_MEDIAN = 1.2
-"""Noise of the median of a few values over that of their mean."""
+"""Standard deviations from the median to which outlying cycles are clipped."""
+_MEDIAN_NOISE = 1.2
+"""Ratio of the noise of the median of a few values to that of their mean."""
 _BETTER = 0.95
-"""Times the noise of an earlier candidate below which a later one is taken."""
-_SURE = 3.0
-"""Standard errors that the square of their rms may be off by."""
-_FAR = 5.0
-"""Standard errors that the largest of some hundred elements may be off by."""
+"""Ratio of noise to that of an earlier candidate below which a later one is chosen."""
+_MEAN_SQUARE_ERRORS = 3.0
+"""Allowed standard errors of the mean square of the elements."""
+_LARGEST_ERRORS = 5.0
+"""Allowed standard errors of the largest of some hundred elements."""
 
 
 class Cycle(NamedTuple):
-    """What one cycle shows.
+    """Result of one cycle.
 
     Attributes:
         response: (pixels, modes) flux fractions per nm of wavefront.
-        reference: (pixels,) flux fractions; None where no frame was without a poke.
-        flux_dn: mean of the frames.
+        reference: (pixels,) flux fractions; None if all frames had a poke.
+        flux_dn: mean flux of the frames, DN.
     """
 
     response: Array
@@ -52,11 +52,11 @@ class Cycle(NamedTuple):
 
 
 class Initial(NamedTuple):
-    """A reconstructor made without the frames of the calibration: the measured one is built from its rows.
+    """A reconstructor R_a that is independent of the calibration's frames: R is built from its rows.
 
     Attributes:
         matrix: (modes, pixels) nm per flux fraction; zero at bad pixels.
-        estimator: how it was made, as in `Calibration.estimator`.
+        estimator: how it was computed, as in `Calibration.estimator`.
     """
 
     matrix: Array
@@ -64,15 +64,15 @@ class Initial(NamedTuple):
 
 
 class Sums(NamedTuple):
-    """Of the cycles so far; another program may go on from them.
+    """Sums over the cycles so far, from which another program may continue.
 
     Attributes:
-        initial: the reconstructor that the answers are of.
-        answers: (cycles, modes, modes) what it makes of the response of each cycle.
-        response: (pixels, modes) sum.
-        reference: (pixels,) sum over `references` cycles.
-        references: cycles with frames without a poke.
-        flux_dn: sum.
+        initial: R_a.
+        answers: (cycles, modes, modes) R_a H of each cycle, without unit.
+        response: (pixels, modes) sum of H.
+        reference: (pixels,) sum of I0 over `references` cycles.
+        references: number of cycles with frames without a poke.
+        flux_dn: sum of the mean fluxes, DN.
     """
 
     initial: Initial
@@ -84,17 +84,17 @@ class Sums(NamedTuple):
 
     @classmethod
     def none(cls, initial: Initial) -> "Sums":
-        """Of no cycle."""
+        """Sums before the first cycle."""
         modes, pixels = initial.matrix.shape
         return cls(initial, np.zeros((0, modes, modes)), np.zeros((pixels, modes)), np.zeros(pixels), 0, 0.0)
 
     @property
     def cycles(self) -> int:
-        """How many."""
+        """Number of cycles."""
         return len(self.answers)
 
     def plus(self, cycle: Cycle) -> "Sums":
-        """With one cycle more."""
+        """Sums with one more cycle."""
         rested = cycle.reference is not None
         return Sums(
             self.initial,
@@ -107,15 +107,15 @@ class Sums(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """What the cycles say.
+    """Result of all cycles.
 
     Attributes:
         response: (pixels, modes) H, flux fractions per nm of wavefront rms.
-        initial: the reconstructor that R is built from.
-        error: (modes,) standard error of the elements of each row of R H; infinite where it is not known.
-        reference: (pixels,) I0 in flux fractions; None where it was not measured.
-        flux_dn: mean sum of the good pixels.
-        cycles: how many.
+        initial: R_a, from which R is built.
+        error: (modes,) standard error of the elements of each row of R H; infinite if unknown.
+        reference: (pixels,) I0 in flux fractions; None if it was not measured.
+        flux_dn: mean sum of the good pixels, DN.
+        cycles: number of cycles.
     """
 
     response: Array
@@ -127,7 +127,7 @@ class Measured(NamedTuple):
 
 
 def normalised(frames: npt.NDArray[np.number], dark: Array, good: Array) -> tuple[Array, Array]:
-    """Frames (frames, pixels) less the dark, each over its own flux, and the fluxes (frames,) in DN.
+    """Frames (frames, pixels) minus the dark, each divided by its flux, and the fluxes (frames,) in DN.
 
     Raises:
         ValueError: a frame has no light.
@@ -143,33 +143,32 @@ def normalised(frames: npt.NDArray[np.number], dark: Array, good: Array) -> tupl
 def cycle_response(
     fractions: Array, flux_dn: Array, seen: Array, instruments: Array, used: Array, slowest: float = 0.0
 ) -> Cycle:
-    """The response that one cycle shows.
+    """Response from one cycle.
 
     Args:
         fractions: (frames, pixels), from `normalised`.
-        flux_dn: (frames,).
-        seen: (frames, modes) what the mirror did in each exposure, nm of wavefront.
-        instruments: (frames, modes) the poke alone in each exposure; `seen` itself where the loop is open.
-        used: (frames,) 1 where a frame may be used, else 0.
-        slowest: What the pokes have below this frequency, in cycles per frame, is not used: there the wavefront moves
-            most.
+        flux_dn: (frames,) flux of each frame.
+        seen: (frames, modes) modes of the mirror in each exposure, nm of wavefront.
+        instruments: (frames, modes) the poke alone in each exposure; `seen` itself in open loop.
+        used: (frames,) 1 for a usable frame, else 0.
+        slowest: Frequency in cycles per frame below which the pokes are not used, since most of the disturbance is
+            there.
 
     Raises:
-        ValueError: the pokes in the frames that may be used do not tell the modes apart.
+        ValueError: the pokes in the usable frames do not tell the modes apart.
     """
     kept = used > 0
     x, z = seen[kept], instruments[kept]
     poked = z.any(axis=1)
     if not poked.any():
-        raise ValueError("no frame with a poke may be used: frames were lost or refused throughout")
+        raise ValueError("no frame with a poke is usable: all were lost or refused")
     y, x, z = fractions[kept][poked], x[poked], z[poked]
     slow = _slow(np.flatnonzero(kept)[poked], len(used), slowest)
     z = z - slow @ (slow.T @ z)
     together = (x - x.mean(axis=0)).T @ z
     if not np.linalg.cond(together) < _WORST_INSTRUMENT:
         raise ValueError(
-            f"the {len(z)} frames that may be used do not tell the {x.shape[1]} modes apart: too many frames were "
-            "lost or refused"
+            f"the {len(z)} usable frames do not tell the {x.shape[1]} modes apart: too many frames were lost or refused"
         )
     response = np.linalg.solve(together.T, z.T @ y).T
     at_rest = fractions[kept][~poked]
@@ -178,13 +177,13 @@ def cycle_response(
 
 
 def _slow(times: Whole, frames: int, slowest: float) -> Array:
-    """Orthonormal (times, any): the mean, and all cosines of a piece of so many frames below a frequency."""
+    """Orthonormal basis (times, any) of slow changes in a piece: the mean, and all cosines below a frequency."""
     orders = np.arange(1 + int(2 * frames * slowest))
     return np.linalg.qr(np.cos(np.pi * np.outer((times + 0.5) / frames, orders)))[0]
 
 
 def measured(sums: Sums) -> Measured:
-    """Response, standard error and reference of all cycles.
+    """Response, standard error and reference from all cycles.
 
     Raises:
         ValueError: there is no cycle.
@@ -194,19 +193,19 @@ def measured(sums: Sums) -> Measured:
         raise ValueError("no cycle was measured")
     response, kept = sums.response / n, without_outliers(sums.answers)
     mean = sums.answers.mean(axis=0)
-    if np.linalg.cond(mean) < WORST_ANSWER:
+    if np.linalg.cond(mean) < WORST_CONDITION:
         response = response @ np.linalg.solve(mean, kept.mean(axis=0))
     reference = sums.reference / sums.references if sums.references else None
     return Measured(response, sums.initial, row_error(kept), reference, sums.flux_dn / n, n)
 
 
 def without_outliers(answers: Array) -> Array:
-    """Answers (cycles, modes, modes), without unit, kept near their median.
+    """Products R_a H (cycles, modes, modes) with outliers clipped near the median.
 
-    A jolt of the wavefront spoils one cycle, not the mean.
+    A transient of the wavefront then affects one cycle, not the mean.
     """
     median = np.median(answers, axis=0)
-    # 1.48: from the median deviation to the standard deviation; of a row, for all its elements have the same noise
+    # 1.48: standard deviation over median deviation; per row, since all its elements have the same noise
     scale = 1.48 * np.median(np.abs(answers - median), axis=(0, 2))[:, None]
     return np.clip(answers, median - _OUTLIER * scale, median + _OUTLIER * scale)
 
@@ -214,31 +213,31 @@ def without_outliers(answers: Array) -> Array:
 def row_error(answers: Array) -> Array:
     """Standard error (modes,) of the elements of each row of R H, for the R built from all cycles.
 
-    It comes from the scatter of the cycles, so that whatever disturbed them is in it: photons, read-out, vibration.
+    It comes from the scatter of the cycles and so includes all disturbances: photon noise, read noise, vibration.
 
     Args:
-        answers: (cycles, modes, modes) what a reconstructor makes of the response of each cycle, without unit.
+        answers: (cycles, modes, modes) R_a H of each cycle, without unit.
 
     Returns:
-        Infinite from a single cycle, or where the pokes do not tell the modes apart.
+        Infinite for a single cycle, or if the pokes do not tell the modes apart.
     """
     n, modes, _ = answers.shape
     mean = answers.mean(axis=0)
-    if n < 2 or not np.linalg.cond(mean) < WORST_ANSWER:
+    if n < 2 or not np.linalg.cond(mean) < WORST_CONDITION:
         return np.full(modes, np.inf)
     scatter = np.linalg.solve(mean, answers - mean)
     return np.asarray(np.sqrt((scatter**2).sum(axis=0).mean(axis=1) / (n - 1) / n))
 
 
-def initial_of(candidates: list[Initial], picture: Array, mode: int, variance: Array) -> Initial:
-    """The reconstructor that sees a poke best; an earlier one unless a later is better by more than `_BETTER`.
+def best_initial(candidates: list[Initial], response: Array, mode: int, variance: Array) -> Initial:
+    """The candidate with the least noise for a mode; a later one must be better than an earlier one by `_BETTER`.
 
-    The picture (pixels,) is the answer to a poke of the mode, in flux fractions; the variance (pixels,) a frame's.
+    The response (pixels,) to a poke of the mode is in flux fractions; the variance (pixels,) is that of a frame.
     """
 
     def noise(initial: Initial) -> float:
         row = initial.matrix[mode]
-        seen = abs(float(row @ picture))
+        seen = abs(float(row @ response))
         return float(np.sqrt(row**2 @ variance)) / seen if seen > 0 else np.inf
 
     best, *later = candidates
@@ -249,25 +248,25 @@ def initial_of(candidates: list[Initial], picture: Array, mode: int, variance: A
 
 
 def cross_talk(reconstructor: npt.NDArray[np.floating], response: npt.NDArray[np.floating]) -> Array:
-    """R H - I (modes, modes): how a reconstructor answers to another's response matrix."""
+    """Cross-talk R H - I (modes, modes) of a reconstructor for a response matrix."""
     product = np.asarray(reconstructor, np.float64) @ np.asarray(response, np.float64)
     return np.asarray(product - np.eye(len(product)))
 
 
-def likeness(picture: npt.NDArray[np.floating], other: npt.NDArray[np.floating]) -> float:
-    """Correlation of the images of two pokes (pixels,): negative where their signs are opposite."""
-    norms = float(np.linalg.norm(picture) * np.linalg.norm(other))
-    return float(picture @ other) / max(norms, 1e-300)
+def correlation(response: npt.NDArray[np.floating], other: npt.NDArray[np.floating]) -> float:
+    """Correlation of the responses (pixels,) to two pokes: negative if their signs are opposite."""
+    norms = float(np.linalg.norm(response) * np.linalg.norm(other))
+    return float(response @ other) / max(norms, 1e-300)
 
 
 class Check(NamedTuple):
-    """R against frames that were not used for it.
+    """Check of R with frames that were not used for it.
 
     Attributes:
-        rms: of the elements of R H - I, less what the noise of these frames adds.
-        largest: of the elements of R H - I, with that noise.
-        error: (modes,) standard error that the noise of these frames gives the elements of each row.
-        cycles: how many.
+        rms: rms of the elements of R H - I, with the noise of these frames subtracted.
+        largest: largest element of R H - I, with that noise.
+        error: (modes,) standard error of the elements of each row, from the noise of these frames.
+        cycles: number of cycles.
     """
 
     rms: float
@@ -276,25 +275,25 @@ class Check(NamedTuple):
     cycles: int
 
     def within(self, rms: float, largest: float) -> bool:
-        """Whether the cross-talk is below this, as far as the noise of these frames lets them tell."""
+        """Whether the cross-talk is below these limits, within the noise of these frames."""
         modes = len(self.error)
-        unsure = _SURE * float(np.sqrt(2 * (self.error**4).sum() / modes**3))  # of the square of the rms
+        unsure = _MEAN_SQUARE_ERRORS * float(np.sqrt(2 * (self.error**4).sum() / modes**3))  # error of the mean square
         return bool(self.rms**2 <= rms**2 + unsure and self.largest <= self.bound(largest))
 
     def bound(self, largest: float) -> float:
-        """Largest element that these frames may show where none is above `largest`: their noise comes on top."""
-        return largest + _FAR * float(self.error.max())
+        """Largest element that these frames may show if none is above `largest`, with their noise."""
+        return largest + _LARGEST_ERRORS * float(self.error.max())
 
 
-def check(answers: Array, wanted: Array, error: Array) -> Check:
+def check(answers: Array, expected: Array, error: Array) -> Check:
     """Cross-talk of a reconstructor, from cycles that were not used for it.
 
     Args:
-        answers: (cycles, modes, modes) what it makes of the response of each, without unit.
-        wanted: (modes, modes) what it shall make of a response: one, unless combinations of modes are suppressed.
+        answers: (cycles, modes, modes) R H of each cycle, without unit.
+        expected: (modes, modes) R H without errors: the identity, unless combinations of modes are suppressed.
         error: (modes,) standard error of the elements of each row in one cycle.
     """
-    talk = np.median(answers, axis=0) - wanted  # as a jolt of the wavefront spoils one cycle only
-    noise = _OF_A_MEDIAN * error / np.sqrt(len(answers))
+    talk = np.median(answers, axis=0) - expected  # a transient of the wavefront affects only one cycle
+    noise = _MEDIAN_NOISE * error / np.sqrt(len(answers))
     power = float((talk**2).mean() - (noise**2).mean())
     return Check(float(np.sqrt(max(power, 0.0))), float(np.abs(talk).max()), noise, len(answers))

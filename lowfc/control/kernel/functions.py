@@ -1,8 +1,8 @@
-"""The fused step: the arithmetic of the usual frame in plain functions, to be compiled.
+"""The fused step: the arithmetic of a normal frame in plain functions, to be compiled.
 
-They are written for a compiler: loops over arrays that were made before, nothing allocated, nothing called but numpy's
-types and each other. Rows of R are taken ten at a time, and what is left five at a time, so that a frame is read once
-for all of them and several sums go on at once. `lowfc.adapters` compiles them.
+They are written for a compiler: loops over existing arrays, without allocations, that call only numpy's types and each
+other. Rows of R are processed ten at a time and the rest five at a time, so that each frame is read once for many rows
+and several sums run in parallel. `lowfc.adapters` compiles them.
 """
 
 import numpy as np
@@ -21,19 +21,19 @@ def scan(
 ) -> tuple[np.uint64, np.uint16]:
     """Products of one block of a frame with R, in one pass over its counts.
 
-    Counts, used, dark and scratch are of the block (block,), as in `measure`; its tiles begin at `row`. The result,
-    not normalised, is in `sums_nm` (modes rounded up to five,).
+    Counts, used, dark and scratch are (block,), as in `measure`; the block's tiles begin at `row`. The result, not yet
+    normalised, is in `sums_nm` (modes rounded up to five,).
 
     Returns:
-        Sum of the used counts, and the highest.
+        Sum of the used counts, and the highest used count.
     """
     total, highest, zero = np.uint64(0), np.uint16(0), np.float32(0)
     for i in range(counts.size):
         count = counts[i]
         scratch[i] = np.float32(count) - dark[i]
-        kept = count & used[i]
-        total += np.uint64(kept)
-        highest = max(highest, kept)
+        used_count = count & used[i]
+        total += np.uint64(used_count)
+        highest = max(highest, used_count)
     mode, rows = 0, sums_nm.size
     while mode + 5 < rows:
         r0, r1, r2, r3, r4 = tiles[row], tiles[row + 1], tiles[row + 2], tiles[row + 3], tiles[row + 4]
@@ -81,10 +81,10 @@ def measure_blocks(
     sums_nm: Single,
     totals: Sequences,
 ) -> None:
-    """`scan` of the blocks from `first` up to, but not, `last`, so that several threads share a frame.
+    """`scan` the blocks from `first` to `last`, exclusive, so that several threads can share a frame.
 
     The results are in `sums_nm` (blocks, modes rounded up to five) and `totals` (blocks, 2): sum of the used counts,
-    and the highest. Each thread has its own scratch; all else is as in `measure`.
+    and the highest used count. Each thread has its own scratch; the rest is as in `measure`.
     """
     block = scratch.size
     for number in range(first, last):
@@ -111,22 +111,22 @@ def measure(
     """Modal errors of a frame in one pass over its counts.
 
     Args:
-        pixels: (pixels,) counts, DN; empty where `measure_blocks` has filled the sums and totals.
-        good: (pixels,) all bits set where a pixel is used, else 0.
+        pixels: (pixels,) counts, DN; empty if `measure_blocks` has filled the sums and totals.
+        good: (pixels,) all bits set for a used pixel, else 0.
         dark: (pixels,) DN.
-        tiles: (blocks x modes rounded up to five, block) R, block of pixels after block; zero where it was filled up.
+        tiles: (blocks x modes rounded up to five, block) R, one block of pixels after the other, padded with zeros.
         scratch: (block,) overwritten.
         sums_nm: (blocks, modes rounded up to five) overwritten, or filled.
         totals: (blocks, 2) overwritten, or filled.
         reference_nm: (modes,) R I0.
-        full_well: counts from which on a pixel is saturated.
+        full_well: lowest count of a saturated pixel.
         dark_sum_dn: sum of the dark over the good pixels.
-        least_dn: flux up to which the frame is not usual.
+        least_dn: flux that a normal frame exceeds.
         error_nm: (modes,) the result, nm of wavefront rms.
 
     Returns:
-        The flux, DN, rounded as float32: the exact sum of the good pixels less `dark_sum_dn`. 0 where the frame is not
-        usual: a good pixel is saturated, or there is little light.
+        The flux, DN, rounded to float32: the exact sum of the good pixels minus `dark_sum_dn`. 0 if the frame is not
+        normal: a good pixel is saturated, or the flux is low.
     """
     modes, blocks = error_nm.size, totals.shape[0]
     if pixels.size:
@@ -153,64 +153,64 @@ def respond(
     seen_nm: Single,
     shift_nm: Single,
     target_nm: Single,
-    held_nm: Single,
+    previous_command_nm: Single,
     integrator: Single,
     x: Single,
     transition: Single,
     output: Single,
-    of_error: bool,
+    from_error: bool,
     shapes: Single,
     added_nm: Single,
     previous_nm: Single,
     stroke_nm: float,
     slew_nm: float,
-    apart_nm: float,
-    made: Single,
+    neighbour_nm: float,
+    results: Single,
     actuators_nm: Single,
 ) -> bool:
-    """From modal errors to the command of a closed loop, as long as no limit acts.
+    """From modal errors to the command of a closed loop, provided that no limit acts.
 
     Args:
-        measured_nm: (modes,) of `measure`.
-        seen_nm: (modes,) the command in the exposure.
-        shift_nm: (modes,) the shift by channels in it.
-        target_nm: (modes,) the loop's target.
-        held_nm: (modes,) the last command.
-        integrator: (3, modes) gain, what is kept of the last command, limit, as in `lowfc.control.laws.law`.
-        x: (states,) of a linear law; empty for the integrator, as are the next two.
-        transition: (states, states + 2 modes) F, G and H side by side.
+        measured_nm: (modes,) result of `measure`.
+        seen_nm: (modes,) command seen in the exposure.
+        shift_nm: (modes,) shift by the channels seen in the exposure.
+        target_nm: (modes,) target of the loop.
+        previous_command_nm: (modes,) last command.
+        integrator: (3, modes) gain, fraction of the command that is kept, and limit, as in `lowfc.control.laws.law`.
+        x: (states,) state of a linear law; empty for the integrator, like the next two.
+        transition: (states, states + 2 modes) F, G and U of a linear law, side by side.
         output: (modes, states) K.
-        of_error: the law's signal is the error, not the pseudo-open-loop modes.
+        from_error: whether the law's signal is the error, not the pseudo-open-loop modes.
         shapes: (modes, actuators) nm of surface per nm of wavefront.
         added_nm: (rows, columns) channels, nm of surface.
-        previous_nm: (rows, columns) the last command.
+        previous_nm: (rows, columns) last command, nm of surface.
         stroke_nm: largest deviation of an actuator from flat.
         slew_nm: largest move of an actuator.
-        apart_nm: largest difference of neighbours.
-        made: (3 modes + states,) the results: error, without shift and target; pseudo-open-loop modes, without the
-            shift; command; x.
-        actuators_nm: (rows, columns) the result, nm of surface.
+        neighbour_nm: largest difference between neighbours.
+        results: (3 modes + states,) output: error without shift and target, pseudo-open-loop modes without shift,
+            command, x.
+        actuators_nm: (rows, columns) output, nm of surface.
 
     Returns:
-        Whether the results count: every number is finite, and no limit would change the command.
+        Whether the results are valid: all numbers are finite, and no limit would change the command.
     """
     modes, states = measured_nm.size, x.size
-    stroke, slew, apart = np.float32(stroke_nm), np.float32(slew_nm), np.float32(apart_nm)
-    error_nm, pol_nm = made[:modes], made[modes : 2 * modes]
-    command_nm, after = made[2 * modes : 3 * modes], made[3 * modes :]
-    over = 0
+    stroke, slew, neighbour = np.float32(stroke_nm), np.float32(slew_nm), np.float32(neighbour_nm)
+    error_nm, pol_nm = results[:modes], results[modes : 2 * modes]
+    command_nm, after = results[2 * modes : 3 * modes], results[3 * modes :]
+    violations = 0
     for mode in range(modes):
         free_nm = measured_nm[mode] - shift_nm[mode]
         pol_nm[mode] = free_nm - seen_nm[mode]
         error_nm[mode] = free_nm - target_nm[mode]
-        command_nm[mode] = integrator[1, mode] * held_nm[mode] - integrator[0, mode] * error_nm[mode]
+        command_nm[mode] = integrator[1, mode] * previous_command_nm[mode] - integrator[0, mode] * error_nm[mode]
     for state in range(states):
         row, total = transition[state], np.float32(0)
         for i in range(states):
             total += row[i] * x[i]
         for mode in range(modes):
-            signal = error_nm[mode] if of_error else pol_nm[mode] - target_nm[mode]
-            total += row[states + mode] * signal + row[states + modes + mode] * held_nm[mode]
+            signal = error_nm[mode] if from_error else pol_nm[mode] - target_nm[mode]
+            total += row[states + mode] * signal + row[states + modes + mode] * previous_command_nm[mode]
         after[state] = total
     for mode in range(modes):
         if states:
@@ -218,11 +218,11 @@ def respond(
             for i in range(states):
                 total += row[i] * after[i]
             command_nm[mode] = total
-        over += not abs(command_nm[mode]) <= integrator[2, mode]
-    if over:
+        violations += not abs(command_nm[mode]) <= integrator[2, mode]
+    if violations:
         return False
     rows, columns = previous_nm.shape
-    flat, before, added = actuators_nm.ravel(), previous_nm.ravel(), added_nm.ravel()
+    flat, previous, added = actuators_nm.ravel(), previous_nm.ravel(), added_nm.ravel()
     for i in range(flat.size):
         flat[i] = added[i]
     for mode in range(modes):
@@ -230,12 +230,12 @@ def respond(
         for i in range(flat.size):
             flat[i] += shape[i] * value
     for i in range(flat.size):
-        over += not abs(flat[i]) <= stroke
-        over += not abs(flat[i] - before[i]) <= slew
+        violations += not abs(flat[i]) <= stroke
+        violations += not abs(flat[i] - previous[i]) <= slew
     for i in range(columns, flat.size):
-        over += not abs(flat[i] - flat[i - columns]) <= apart
+        violations += not abs(flat[i] - flat[i - columns]) <= neighbour
     for r in range(rows):
         line = actuators_nm[r]
         for i in range(1, columns):
-            over += not abs(line[i] - line[i - 1]) <= apart
-    return not over
+            violations += not abs(line[i] - line[i - 1]) <= neighbour
+    return not violations

@@ -1,4 +1,4 @@
-"""From modal errors to the next command: the reference in numpy, and the fused step where it is the usual frame."""
+"""From modal errors to the next command: the reference in numpy, and the fused step for normal frames."""
 
 from typing import NamedTuple
 
@@ -15,190 +15,193 @@ from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES, ActiveLoop,
 
 
 class Response(NamedTuple):
-    """What a frame's modal errors made; (modes,) nm of wavefront rms.
+    """Result of a frame; errors (modes,) are nm of wavefront rms.
 
     Attributes:
-        drive: after the frame.
+        loop: the loop after the frame.
         reasons: limits that acted on the command.
-        homing: the modal command is still on its way to zero.
+        returning_to_zero: whether the modal command is still returning to zero.
     """
 
     error_nm: Single
     pol_nm: Single
-    drive: ActiveLoop
+    loop: ActiveLoop
     reasons: tuple[Reason, ...]
-    homing: bool
+    returning_to_zero: bool
 
 
 def respond(
     settings: Settings,
     state: State,
-    drive: ActiveLoop,
+    loop: ActiveLoop,
     measured_nm: Single,
     sequence: int,
     events: list[PendingEvent],
     *,
-    usual: bool,
+    fused: bool,
 ) -> Response:
-    """What a frame's modal errors (modes,) make; `usual` where they are the fused step's."""
-    tables = drive.estimator.tables
-    made = _fused(settings, state, drive, tables, measured_nm) if usual and tables is not None else None
-    if made is None:
-        error_nm, pol_nm, drive = _pseudo_open_loop(state, drive, measured_nm, sequence, events)
-        return Response(error_nm, pol_nm, *next_command(settings, state, drive, error_nm, sequence))
-    error_nm, pol_nm, command_nm, x, actuators_nm = made
-    law = drive.following
+    """Respond to the modal errors (modes,) of a frame; `fused` if the fused step computed them."""
+    tables = loop.estimator.tables
+    results = _fused(settings, state, loop, tables, measured_nm) if fused and tables is not None else None
+    if results is None:
+        error_nm, pol_nm, loop = _pseudo_open_loop(state, loop, measured_nm, sequence, events)
+        return Response(error_nm, pol_nm, *next_command(settings, state, loop, error_nm, sequence))
+    error_nm, pol_nm, command_nm, x, actuators_nm = results
+    law = loop.law_runner
     if law is not None:
-        followed = LawRunner(law.law, x, law.frames + 1, law.guard)
-        target_nm = None if drive.command_channels is None else drive.command_channels.target_nm(sequence)
-        to_undo_nm = pol_nm if target_nm is None else pol_nm - target_nm
-        drive = _follow(state, drive, followed, error_nm, to_undo_nm, events)
-        if drive.following is not None and not drive.following.alone():  # its guard has changed its mind
-            return Response(error_nm, pol_nm, *next_command(settings, state, drive, error_nm, sequence))
-    return Response(error_nm, pol_nm, drive.pushed(command_nm, actuators_nm), (), False)
+        advanced = LawRunner(law.law, x, law.frames + 1, law.guard)
+        target_nm = None if loop.command_channels is None else loop.command_channels.target_nm(sequence)
+        pol_from_target_nm = pol_nm if target_nm is None else pol_nm - target_nm
+        loop = _update_guard(state, loop, advanced, error_nm, pol_from_target_nm, events)
+        if loop.law_runner is not None and not loop.law_runner.alone():  # its guard switched controllers in this frame
+            return Response(error_nm, pol_nm, *next_command(settings, state, loop, error_nm, sequence))
+    return Response(error_nm, pol_nm, loop.with_command(command_nm, actuators_nm), (), False)
 
 
 def _fused(
-    settings: Settings, state: State, drive: ActiveLoop, tables: Tables, measured_nm: Single
+    settings: Settings, state: State, loop: ActiveLoop, tables: Tables, measured_nm: Single
 ) -> tuple[Single, Single, Single, Single, Single] | None:
-    """Error, pseudo-open-loop modes, command (modes,), x (states,) and actuators (rows, columns) of the usual frame.
+    """Error, pseudo-open-loop modes, command (modes,), x (states,) and actuators (rows, columns) of a normal frame.
 
-    None where it is not usual: the loop is not closed, something moves beside it, a law has a part of the command, or a
-    limit acts.
+    None if the frame is not normal: the loop is not closed, its additions change, a law shares the command with the
+    integrator, or a limit acts.
     """
-    added, following = drive.command_channels, drive.following
-    if state.mode is not LoopMode.CLOSED or state.returning_to_zero or (added is not None and added.moving):
+    additions, law_runner = loop.command_channels, loop.law_runner
+    if state.mode is not LoopMode.CLOSED or state.returning_to_zero or (additions is not None and additions.moving):
         return None
-    x, law, of_error = tables.no_states, (tables.no_law, tables.no_law), True
-    if following is not None:
-        if not following.alone(1):
+    x, law, from_error = tables.no_states, (tables.no_law, tables.no_law), True
+    if law_runner is not None:
+        if not law_runner.alone(1):
             return None
-        x, law = following.x, (following.law.joined, following.law.output)
-        of_error = following.law.signal == "error"
+        x, law = law_runner.x, (law_runner.law.joined, law_runner.law.output)
+        from_error = law_runner.law.signal == "error"
     shift_nm = target_nm = tables.no_modes
     channels_nm = tables.no_channels
-    if added is not None:
-        shift_nm, target_nm, channels_nm = added.seen_nm(drive.weights), added.offset_nm, added.sum_nm
+    if additions is not None:
+        shift_nm, target_nm, channels_nm = additions.seen_nm(loop.weights), additions.offset_nm, additions.sum_nm
     modes, limits = measured_nm.size, settings.limits
-    made = np.empty(3 * modes + x.size, np.float32)
-    actuators_nm = np.empty_like(drive.actuators_nm)
-    signals = measured_nm, drive.seen_nm(), shift_nm, target_nm, drive.history_nm[0]
-    mirror = tables.shapes, channels_nm, drive.actuators_nm
-    most_nm = limits.kept_stroke_nm, limits.kept_slew_nm, limits.neighbour_nm - limits.margin_nm / 2
-    if not tables.respond(*signals, drive.law.rows, x, *law, of_error, *mirror, *most_nm, made, actuators_nm):
+    results = np.empty(3 * modes + x.size, np.float32)
+    actuators_nm = np.empty_like(loop.actuators_nm)
+    signals = measured_nm, loop.seen_nm(), shift_nm, target_nm, loop.history_nm[0]
+    mirror = tables.shapes, channels_nm, loop.actuators_nm
+    limits_nm = limits.kept_stroke_nm, limits.kept_slew_nm, limits.neighbour_nm - limits.margin_nm / 2
+    if not tables.respond(*signals, loop.law.rows, x, *law, from_error, *mirror, *limits_nm, results, actuators_nm):
         return None
-    error_nm, pol_nm, command_nm = made[:modes], made[modes : 2 * modes], made[2 * modes : 3 * modes]
-    return error_nm, pol_nm, command_nm, made[3 * modes :], actuators_nm
+    error_nm, pol_nm, command_nm = results[:modes], results[modes : 2 * modes], results[2 * modes : 3 * modes]
+    return error_nm, pol_nm, command_nm, results[3 * modes :], actuators_nm
 
 
 def _pseudo_open_loop(
-    state: State, drive: ActiveLoop, measured_nm: Single, sequence: int, events: list[PendingEvent]
+    state: State, loop: ActiveLoop, measured_nm: Single, sequence: int, events: list[PendingEvent]
 ) -> tuple[Single, Single, ActiveLoop]:
-    """Error and pseudo-open-loop modes (modes,) of what the sensor measured, and the drive whose law has seen them.
+    """Error and pseudo-open-loop modes (modes,) from the measured modes, and the loop with its law advanced.
 
-    Channels are taken out of both, as far as the exposure saw them; what the loop is to aim at is taken out of the
-    error.
+    The channels seen in the exposure are subtracted from both, the loop's target only from the error.
     """
-    added, error_nm = drive.command_channels, measured_nm
-    if added is not None:
-        error_nm = measured_nm - added.seen_nm(drive.weights)
-    pol_nm = to_undo_nm = error_nm - drive.seen_nm()
-    if added is not None:
-        target_nm = added.target_nm(sequence)
-        error_nm, to_undo_nm = error_nm - target_nm, pol_nm - target_nm
-    if drive.following is not None:
-        followed = drive.following.followed(error_nm, to_undo_nm, drive.history_nm[0])
-        drive = _follow(state, drive, followed, error_nm, to_undo_nm, events)
-    return error_nm, pol_nm, drive
+    additions, error_nm = loop.command_channels, measured_nm
+    if additions is not None:
+        error_nm = measured_nm - additions.seen_nm(loop.weights)
+    pol_nm = pol_from_target_nm = error_nm - loop.seen_nm()
+    if additions is not None:
+        target_nm = additions.target_nm(sequence)
+        error_nm, pol_from_target_nm = error_nm - target_nm, pol_nm - target_nm
+    if loop.law_runner is not None:
+        advanced = loop.law_runner.advanced(error_nm, pol_from_target_nm, loop.history_nm[0])
+        loop = _update_guard(state, loop, advanced, error_nm, pol_from_target_nm, events)
+    return error_nm, pol_nm, loop
 
 
-def _follow(
+def _update_guard(
     state: State,
-    drive: ActiveLoop,
-    followed: LawRunner,
+    loop: ActiveLoop,
+    advanced: LawRunner,
     error_nm: Single,
-    to_undo_nm: Single,
+    pol_from_target_nm: Single,
     events: list[PendingEvent],
 ) -> ActiveLoop:
-    """The drive whose law has followed a frame, and its guard after it; both (modes,) without the loop's target."""
-    if followed.guard is not None:
-        guard, more = _guarded(state, drive, followed, followed.guard, error_nm, to_undo_nm)
-        followed = followed._replace(guard=guard)
+    """The loop with its advanced law and guard; error and POL (modes,) are relative to the loop's target."""
+    if advanced.guard is not None:
+        guard, more = _guarded(state, loop, advanced, advanced.guard, error_nm, pol_from_target_nm)
+        advanced = advanced._replace(guard=guard)
         events += more
-    return drive._replace(following=followed)
+    return loop._replace(law_runner=advanced)
 
 
 def _guarded(
-    state: State, drive: ActiveLoop, law: LawRunner, guard: Guard, error_nm: Single, to_undo_nm: Single
+    state: State, loop: ActiveLoop, law: LawRunner, guard: Guard, error_nm: Single, pol_from_target_nm: Single
 ) -> tuple[Guard, list[PendingEvent]]:
-    """The guard of a law after a frame, and its events; both (modes,) without the loop's target."""
-    closed, added = state.mode is LoopMode.CLOSED, drive.command_channels
-    probed = state.returning_to_zero or (added is not None and added.play is not None)
+    """The guard of a law after a frame, and its events; error and POL (modes,) are relative to the loop's target."""
+    closed, additions = state.mode is LoopMode.CLOSED, loop.command_channels
+    probed = state.returning_to_zero or (additions is not None and additions.play is not None)
     if probed or not (closed or state.mode is LoopMode.OPEN):
         return guard.at_rest(), []
     if law.frames <= SETTLING_FRAMES or not closed:
-        return guard.observed(to_undo_nm, law.frames), []
+        return guard.observed(pol_from_target_nm, law.frames), []
     if law.frames < SETTLING_FRAMES + FADING_FRAMES:
         return guard.at_rest(), []
-    limited = any(reason is not Limit.MODAL_LIMIT for reason in state.limits_hit)  # virtual commands have that one, too
-    loop = drive.law, drive.weights, drive.history_nm
-    return guard.judged(law.law, law.x, *loop, error_nm, to_undo_nm, limited=limited)
+    limited = any(
+        reason is not Limit.MODAL_LIMIT for reason in state.limits_hit
+    )  # virtual commands have the modal limit, too
+    integrator = loop.law, loop.weights, loop.history_nm
+    return guard.judged(law.law, law.x, *integrator, error_nm, pol_from_target_nm, limited=limited)
 
 
 def next_command(
-    settings: Settings, state: State, drive: ActiveLoop, error_nm: Single, sequence: int
+    settings: Settings, state: State, loop: ActiveLoop, error_nm: Single, sequence: int
 ) -> tuple[ActiveLoop, tuple[Reason, ...], bool]:
-    """The command after an error (modes,), the limits that acted, and whether it is still on its way to zero."""
+    """The loop with the command after an error (modes,), the limits that acted, and `returning_to_zero` afterwards."""
     if state.mode is LoopMode.SAFE:
-        return step_to_flat(settings, drive), (), False
-    added, homing = drive.command_channels, state.returning_to_zero
+        return step_to_flat(settings, loop), (), False
+    additions, returning_to_zero = loop.command_channels, state.returning_to_zero
     closed = state.mode is LoopMode.CLOSED
-    # A limit that acted on the last command has kept the mirror from where it was to go.
-    if not closed and not homing and (added is None or not (added.moving or state.limits_hit)):
-        return drive.stayed(1), (), False
-    command_nm, cut = drive.history_nm[0], False
-    if homing:
+    # After a limit acted, the mirror has not reached its target.
+    if not closed and not returning_to_zero and (additions is None or not (additions.moving or state.limits_hit)):
+        return loop.holding_command(1), (), False
+    command_nm, clipped = loop.history_nm[0], False
+    if returning_to_zero:
         command_nm = np.zeros_like(command_nm)
     elif closed:
-        command_nm, cut = _law_output(drive, error_nm)
-    wanted_nm = drive.to_actuators.dot(command_nm).reshape(drive.calibration.grid)
+        command_nm, clipped = _law_output(loop, error_nm)
+    requested_nm = loop.to_actuators.dot(command_nm).reshape(loop.calibration.grid)
     extra_nm: Single | None = None
-    if added is not None:
-        added = added.moved(sequence, settings.limits.kept_slew_nm / 2, drive.to_modes)
-        drive = drive._replace(command_channels=added)
-        played_nm = added.played_nm(sequence)
-        extra_nm = added.sum_nm if played_nm is None else added.sum_nm + played_nm
-        wanted_nm += extra_nm
-    limited = limit(settings.limits, drive.actuators_nm, wanted_nm)
-    if limited.reasons and (closed or homing):  # the modal command becomes what was kept, against wind-up
-        kept_nm = limited.actuators_nm
+    if additions is not None:
+        additions = additions.moved(sequence, settings.limits.kept_slew_nm / 2, loop.to_modes)
+        loop = loop._replace(command_channels=additions)
+        played_nm = additions.played_nm(sequence)
+        extra_nm = additions.sum_nm if played_nm is None else additions.sum_nm + played_nm
+        requested_nm += extra_nm
+    limited = limit(settings.limits, loop.actuators_nm, requested_nm)
+    if limited.reasons and (closed or returning_to_zero):  # against wind-up, the modal command becomes the limited one
+        limited_nm = limited.actuators_nm
         if extra_nm is not None:
-            kept_nm = np.subtract(kept_nm, extra_nm)
-        command_nm = drive.inverse @ kept_nm.reshape(-1)
-    reasons = (Limit.MODAL_LIMIT, *limited.reasons) if cut else limited.reasons
-    homing = homing and bool(limited.reasons) and not np.array_equal(limited.actuators_nm, drive.actuators_nm)
-    return drive.pushed(command_nm, limited.actuators_nm), reasons, homing
+            limited_nm = np.subtract(limited_nm, extra_nm)
+        command_nm = loop.inverse @ limited_nm.reshape(-1)
+    reasons = (Limit.MODAL_LIMIT, *limited.reasons) if clipped else limited.reasons
+    returning_to_zero = (
+        returning_to_zero and bool(limited.reasons) and not np.array_equal(limited.actuators_nm, loop.actuators_nm)
+    )
+    return loop.with_command(command_nm, limited.actuators_nm), reasons, returning_to_zero
 
 
-def _law_output(drive: ActiveLoop, error_nm: Single) -> tuple[Single, bool]:
-    """The law's modal command (modes,) in its limits, and whether one was cut."""
-    following, held_nm = drive.following, drive.history_nm[0]
-    alone = following is not None and following.alone()
-    if following is None or not alone:
-        integrated_nm, cut = integrate(drive.law, held_nm, error_nm)
-        if following is None or following.frames <= SETTLING_FRAMES:
-            return integrated_nm, cut
-    wanted_nm = linear_law.respond(following.law, following.x)
+def _law_output(loop: ActiveLoop, error_nm: Single) -> tuple[Single, bool]:
+    """The law's modal command (modes,) within its limits, and whether a limit acted."""
+    law_runner, held_nm = loop.law_runner, loop.history_nm[0]
+    alone = law_runner is not None and law_runner.alone()
+    if law_runner is None or not alone:
+        integrated_nm, clipped = integrate(loop.law, held_nm, error_nm)
+        if law_runner is None or law_runner.frames <= SETTLING_FRAMES:
+            return integrated_nm, clipped
+    requested_nm = linear_law.respond(law_runner.law, law_runner.x)
     if not alone:
-        weight = following.weight
-        wanted_nm = wanted_nm * weight + integrated_nm * (1 - weight)
-    kept_nm = np.clip(wanted_nm, -drive.law.limit_nm, drive.law.limit_nm)
-    return kept_nm, not np.array_equal(kept_nm, wanted_nm)
+        weight = law_runner.weight
+        requested_nm = requested_nm * weight + integrated_nm * (1 - weight)
+    limited_nm = np.clip(requested_nm, -loop.law.limit_nm, loop.law.limit_nm)
+    return limited_nm, not np.array_equal(limited_nm, requested_nm)
 
 
-def step_to_flat(settings: Settings, drive: ActiveLoop) -> ActiveLoop:
-    """One frame towards flat, within the slew limit."""
-    flat = limit(settings.limits, drive.actuators_nm, np.zeros_like(drive.actuators_nm)).actuators_nm
-    if drive.command_channels is not None:
-        drive = drive._replace(command_channels=drive.command_channels.lowered(drive.to_modes))
-    return drive.pushed(drive.inverse @ flat.reshape(-1), flat)
+def step_to_flat(settings: Settings, loop: ActiveLoop) -> ActiveLoop:
+    """Move the mirror towards flat by one frame, within the slew limit."""
+    flat = limit(settings.limits, loop.actuators_nm, np.zeros_like(loop.actuators_nm)).actuators_nm
+    if loop.command_channels is not None:
+        loop = loop._replace(command_channels=loop.command_channels.restarted_from_flat(loop.to_modes))
+    return loop.with_command(loop.inverse @ flat.reshape(-1), flat)

@@ -1,4 +1,4 @@
-"""Which arithmetic the step uses, and the arrays of a calibration as its compiled functions read them."""
+"""Implementations of the control step, and the arrays of a calibration in the layout of its compiled functions."""
 
 from collections.abc import Callable
 from typing import Final, Literal, NamedTuple, get_args
@@ -9,19 +9,19 @@ from lowfc.arrays import Pixels, Sequences, Single, single
 from lowfc.control.calibration.calibration import Calibration
 
 KernelName = Literal["numpy", "fused"]
-"""Arithmetic of the usual frame."""
+"""Implementation of the control step for normal frames."""
 KERNELS: tuple[KernelName, ...] = get_args(KernelName)
 FUSED: Final = "fused"
 BLOCK = 6400
-"""Pixels at a time, at most: as float32 they fill half of a processor's first cache."""
+"""Most pixels per block: 25.6 kB as float32, which fits into an L1 data cache of 32 to 48 kB."""
 DARK_MARGIN = 1e-3
-"""Part of the expected flux by which a usual frame has more than a dark one, so that rounding decides nothing."""
+"""Margin of a normal frame over the lowest flux, as a fraction of the expected flux, against rounding."""
 
 
 class Kernel(NamedTuple):
-    """The arithmetic of the usual frame: `measure` and `respond` of `lowfc.control.kernel.functions`, compiled.
+    """Implementation for normal frames: `measure` and `respond` of `lowfc.control.kernel.functions`, compiled.
 
-    Without them, everything goes the reference's way, whatever the name.
+    Without them, the reference implementation is used, regardless of the name.
     """
 
     name: str
@@ -33,13 +33,13 @@ NUMPY = Kernel("numpy")
 
 
 class Tables(NamedTuple):
-    """What the compiled functions need of a calibration; most as in `lowfc.control.kernel.functions`.
+    """Arrays of a calibration for the compiled functions; most are as in `lowfc.control.kernel.functions`.
 
     Attributes:
-        full_well: counts from which on a pixel is saturated; above all counts where none is.
-        margin_dn: flux that a usual frame has beyond that of a dark one.
+        full_well: lowest count of a saturated pixel; above all counts if no pixel can be saturated.
+        margin_dn: flux by which a normal frame exceeds the lowest flux.
         shapes: (modes, actuators) nm of surface per nm of wavefront.
-        no_modes: (modes,) zeros, and `no_states` (0,), `no_law` (0, 0), `no_channels` (rows, columns).
+        no_modes: (modes,) zeros, like `no_states` (0,), `no_law` (0, 0) and `no_channels` (rows, columns).
     """
 
     measure: Callable[..., float]
@@ -62,7 +62,7 @@ class Tables(NamedTuple):
 
     @classmethod
     def of(cls, kernel: Kernel, calibration: Calibration, reference_nm: Single) -> "Tables | None":
-        """The tables of a calibration; None where the kernel has no functions, or the calibration no pixels."""
+        """Tables of a calibration; None if the kernel has no compiled functions or the calibration no pixels."""
         modes, pixels = calibration.reconstructor.shape
         if kernel.measure is None or kernel.respond is None or not modes * pixels:
             return None
@@ -91,7 +91,7 @@ class Tables(NamedTuple):
         )
 
     def estimate(self, pixels: Pixels, min_flux_dn: float) -> tuple[Single, float] | None:
-        """Modal errors (modes,) and flux of a usual frame (pixels,); None where it is not usual."""
+        """Modal errors (modes,) and flux of a frame (pixels,); None if the frame is not normal."""
         error_nm = np.empty_like(self.reference_nm)
         least_dn = min_flux_dn + self.margin_dn
         scanned = pixels, self.good, self.dark, self.tiles, self.scratch, self.sums_nm, self.totals

@@ -96,7 +96,7 @@ class GainBank:
         self._at_rest = VirtualIntegrators.at_rest(gain, kept, limit_nm, weights)
         self._windows = windows
         self._closed = self._throughout = False
-        self.remade(np.eye(kept.size))
+        self.use_reconstructor(np.eye(kept.size))
         self.restart()
 
     def restart(self) -> None:
@@ -104,28 +104,28 @@ class GainBank:
         self._loops = self._at_rest
         self._cross_talk = TiltCrossTalk(self._at_rest.kept.size)
         self._before_nm = np.zeros_like(self._at_rest.kept)
-        self.begin_again()
+        self.begin_first_window()
 
-    def remade(self, of_own: Array | Single) -> None:
+    def use_reconstructor(self, of_own: Array | Single) -> None:
         """Use modes of another R from now on: (modes, modes), its response to the modes of the calibration's own R.
 
         The cross-talk of tilt is fitted in the latter, which do not change: an R for fewer modes mixes it into them.
         """
         self._of_own, self._to_own = of_own, np.linalg.inv(of_own)
 
-    def begin_again(self) -> None:
+    def begin_first_window(self) -> None:
         """Make the next window a first one."""
         self.first = True
         self._clear(self._windows[0])
 
-    def followed(self, open_nm: Single, error_nm: Single, tilt_nm: Single | None = None, *, closed: bool) -> bool:
+    def add_frame(self, open_nm: Single, error_nm: Single, tilt_nm: Single | None = None, *, closed: bool) -> bool:
         """Add the modes (modes,) of one frame, of the open loop and of the loop; return whether a block is complete.
 
         A bank of other modes also needs tip and tilt (2,), as the sensor saw them.
         """
         if tilt_nm is not None:
-            self._tilt += self._cross_talk.followed(tilt_nm, self._to_own @ open_nm)
-        self._loops, errors_nm = self._loops.followed(open_nm)
+            self._tilt += self._cross_talk.add_frame(tilt_nm, self._to_own @ open_nm)
+        self._loops, errors_nm = self._loops.advanced(open_nm)
         squares = np.square(errors_nm)
         self._power += squares[0]
         self._changes += np.square(errors_nm[0] - self._before_nm) / 2
@@ -218,8 +218,8 @@ class GainBank:
     def _cross_talk_nm(self, tilts: list[Array]) -> list[Array]:
         """Cross-talk (modes,) of tip and tilt over these blocks: the certain part, and the possible."""
         found, error = self._cross_talk.mean_nm(np.mean(tilts, axis=0))
-        taken: list[Array] = [np.where(np.abs(found) > errors * error, found, 0) for errors in (SURE, SUSPECTED)]
-        return [self._of_own @ one for one in taken]
+        accepted: list[Array] = [np.where(np.abs(found) > errors * error, found, 0) for errors in (SURE, SUSPECTED)]
+        return [self._of_own @ one for one in accepted]
 
     def _without(self, cross_talk_nm: Array) -> Array:
         """Mean squares (blocks, rows and the loop itself, modes) less the open loop's, nm^2, of the true modes.
@@ -321,7 +321,7 @@ class TiltCrossTalk:
         self._changes = 0
         self._before: Array | None = None
 
-    def followed(self, tilt_nm: Single, open_nm: Array | Single) -> Array:
+    def add_frame(self, tilt_nm: Single, open_nm: Array | Single) -> Array:
         """Add tip and tilt (2,), as the sensor saw them in one frame, and the open loop of the others (modes,), nm.
 
         Returns:
@@ -370,8 +370,8 @@ def injected(gain: Single) -> Single:
     return gain / (2 - gain)
 
 
-def left_alone_nm2(verdict: Verdict, left: Mask, noise_nm2: Array) -> Single:
-    """Mean square (modes,) of the uncorrected modes `left`, nm^2, as `Weighting.prior_nm2`: 0 for the others.
+def uncorrected_prior_nm2(verdict: Verdict, uncorrected: Mask, noise_nm2: Array) -> Single:
+    """Mean square (modes,) of the uncorrected modes (modes,), nm^2, as `Weighting.prior_nm2`: 0 for the others.
 
     The measured power less the noise and two standard errors of that noise.
     """
@@ -379,4 +379,4 @@ def left_alone_nm2(verdict: Verdict, left: Mask, noise_nm2: Array) -> Single:
         noise_nm2 = np.maximum(noise_nm2, verdict.noise_nm2)
     uncertain = CONFIDENCE * noise_nm2 * np.sqrt(2 / verdict.frames)
     prior = np.maximum(verdict.power_nm2 - noise_nm2, 0) + uncertain
-    return np.where(left, prior, 0).astype(np.float32)
+    return np.where(uncorrected, prior, 0).astype(np.float32)

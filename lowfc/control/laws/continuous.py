@@ -29,8 +29,8 @@ class Timing(NamedTuple):
     """When a loop exposes and moves its mirror, in frame periods.
 
     Attributes:
-        delay: from the frame a command is made from to the first exposed wholly under it.
-        applied: from the start of an exposure until the command made from it is in force.
+        delay: from the frame that a command is computed from to the first frame exposed wholly with it.
+        applied: from the start of an exposure until the command computed from it is in force.
         exposure: its length; 0 for an instant.
         held: time over which the residual counts: a period, or 0 for the instant of the command alone.
     """
@@ -42,12 +42,12 @@ class Timing(NamedTuple):
 
     @classmethod
     def of(cls, delay: float, exposure: float) -> "Timing":
-        """A command is in force when the first exposure wholly under it begins."""
+        """Timing in which a command is in force when the first exposure wholly with it begins."""
         return cls(delay, delay, exposure)
 
     @classmethod
     def measured(cls, delay: float, exposure: float, waited: float) -> "Timing":
-        """A command is in force `waited` after its exposure's end; impossible or simulated times are ignored."""
+        """Timing in which a command is in force `waited` after its exposure's end; implausible times are ignored."""
         after = exposure + waited
         if delay != round(delay) or not exposure < after <= _LONGEST:
             return cls.of(delay, exposure)
@@ -71,24 +71,26 @@ def hold_floor(omega: Array, held: float = 1.0) -> Array:
     return np.asarray(1 - np.abs(mean_over(omega, held)) ** 2)
 
 
-def left_power(law: LinearLaw, omega: Array, timing: Timing) -> Array:
+def residual_power(law: LinearLaw, omega: Array, timing: Timing) -> Array:
     """Mean residual power over time (frequencies, modes) of a wave of power 1; rad per frame."""
-    return _left(sensitivity(law, omega, timing.delay), omega, timing)
+    return _residual(sensitivity(law, omega, timing.delay), omega, timing)
 
 
-def _left(S: Complex, omega: Array, timing: Timing) -> Array:
+def _residual(S: Complex, omega: Array, timing: Timing) -> Array:
     if not timing.held:  # at an instant: the part of a command that an exposure sees
         return np.asarray(np.abs(S) ** 2)
     command = _commanded(S, omega, timing.delay) * mean_over(omega, timing.exposure)[:, None]
-    return np.asarray(hold_floor(omega, timing.held)[:, None] + np.abs(_ahead(omega, timing)[:, None] + command) ** 2)
+    return np.asarray(
+        hold_floor(omega, timing.held)[:, None] + np.abs(_mean_while_applied(omega, timing)[:, None] + command) ** 2
+    )
 
 
-def _ahead(omega: Array, timing: Timing) -> Complex:
+def _mean_while_applied(omega: Array, timing: Timing) -> Complex:
     """Mean (frequencies,) of a wave over the time for which a command counts, relative to the wave at t_k."""
     return np.asarray(mean_over(omega, timing.held) * np.exp(1j * timing.applied * omega))
 
 
-def spectrum_left(law: LinearLaw, omega: Array, measured: Array, noise_nm2: Array, timing: Timing) -> Array:
+def residual_spectrum(law: LinearLaw, omega: Array, measured: Array, noise_nm2: Array, timing: Timing) -> Array:
     """Spectrum (frequencies, modes) of the residual, from the spectrum of the measurements.
 
     Args:
@@ -99,7 +101,7 @@ def spectrum_left(law: LinearLaw, omega: Array, measured: Array, noise_nm2: Arra
         timing: of the loop.
     """
     S = sensitivity(law, omega, timing.delay)
-    of_wave = _left(S, omega, timing) / np.abs(mean_over(omega, timing.exposure))[:, None] ** 2
+    of_wave = _residual(S, omega, timing) / np.abs(mean_over(omega, timing.exposure))[:, None] ** 2
     of_noise = np.abs(_commanded(S, omega, timing.delay)) ** 2
     return np.asarray((measured - noise_nm2) * of_wave + noise_nm2 * of_noise)
 
@@ -114,7 +116,7 @@ def _commanded(S: Complex, omega: Array, delay: float) -> Complex:
     return np.asarray((S - 1) / seen[:, None])
 
 
-def ahead_of(measured_nm: Array, timing: Timing) -> tuple[Array, Array]:
+def means_while_applied(measured_nm: Array, timing: Timing) -> tuple[Array, Array]:
     """Mean of each mode over the period in which a command is in force, from the measurements before and after.
 
     Args:
@@ -125,8 +127,8 @@ def ahead_of(measured_nm: Array, timing: Timing) -> tuple[Array, Array]:
         (frames, modes), NaN where there are too few neighbours; and the filter's response (frequencies,) at
         `_FILTER_OMEGA`, for the noise.
     """
-    answer = _ahead(_FILTER_OMEGA, timing) / mean_over(_FILTER_OMEGA, timing.exposure)
-    full = np.fft.irfft(answer, _FILTER_POINTS)
+    response = _mean_while_applied(_FILTER_OMEGA, timing) / mean_over(_FILTER_OMEGA, timing.exposure)
+    full = np.fft.irfft(response, _FILTER_POINTS)
     centre = round(timing.applied + (timing.held - timing.exposure) / 2)
     lags = np.arange(-_FILTER_REACH, _FILTER_REACH + 1) + centre  # in frames ahead
     taps = full[-lags % _FILTER_POINTS] * np.hanning(lags.size + 2)[1:-1]
@@ -138,28 +140,28 @@ def ahead_of(measured_nm: Array, timing: Timing) -> tuple[Array, Array]:
     return found, np.asarray(np.exp(1j * np.outer(_FILTER_OMEGA, lags)) @ taps)
 
 
-def held_left_nm2(
+def held_residual_nm2(
     law: LinearLaw, measured_nm: Array, command_nm: Array, noise_nm2: Array, timing: Timing
 ) -> tuple[Array, int]:
     """Sum of squares (modes,) of the residuals of the means that commands were to null, and the number of frames.
 
     The means are those of `ahead_of`; the contribution of the measurements' noise (modes,) is subtracted.
     """
-    ahead_nm, answer = ahead_of(measured_nm, timing)
+    ahead_nm, response = means_while_applied(measured_nm, timing)
     rows = np.isfinite(ahead_nm).all(axis=1)
     own = commanded(law, np.maximum(_FILTER_OMEGA, 1e-6), timing.delay)
-    passed = np.abs(answer)[:, None] ** 2 + 2 * np.real(answer[:, None] * own.conj())
+    passed = np.abs(response)[:, None] ** 2 + 2 * np.real(response[:, None] * own.conj())
     by_noise_nm2 = noise_nm2 * np.trapezoid(passed, _FILTER_OMEGA, axis=0) / np.pi
     squares = np.sum((ahead_nm[rows] + command_nm[rows]) ** 2, axis=0)
     return squares - rows.sum() * by_noise_nm2, int(rows.sum())
 
 
-def left_all_the_time_nm2(disturbance_nm: Array, mirror_nm: Array) -> Array:
+def continuous_residual_nm2(disturbance_nm: Array, mirror_nm: Array) -> Array:
     """Mean square residual over each period (frames, modes), from the states at the start of each exposure.
 
     The disturbance (frames, modes) is interpolated between those instants, and the mirror (frames, modes) holds for
     the period; NaN where there are too few neighbours.
     """
     moments = (np.arange(_MOMENTS) + 0.5) / _MOMENTS
-    between = (ahead_of(disturbance_nm, Timing(1.0, moment, 0.0, 0.0))[0] for moment in moments.tolist())
+    between = (means_while_applied(disturbance_nm, Timing(1.0, moment, 0.0, 0.0))[0] for moment in moments.tolist())
     return np.asarray(sum((one_nm + mirror_nm) ** 2 for one_nm in between) / _MOMENTS)

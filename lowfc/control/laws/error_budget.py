@@ -11,7 +11,7 @@ import numpy as np
 
 from lowfc.arrays import Array, Mask
 from lowfc.control.calibration.calibration import noise_nm
-from lowfc.control.laws.continuous import Timing, left_power, mean_over
+from lowfc.control.laws.continuous import Timing, mean_over, residual_power
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.margins import noise_gain, noise_transfer, rejection
 from lowfc.control.laws.spectra import Pieces, Spectrum, floor_nm2_hz, spectrum
@@ -21,7 +21,7 @@ ROWS_PER_REGRESSOR = 10
 CERTAIN = 2.0
 """Standard errors above which a difference of two variances counts as detected."""
 
-_ALIKE = 1e-7  # beside the largest singular value of the regressors
+_DEGENERATE = 1e-7  # relative to the largest singular value of the regressors
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +98,7 @@ def _omega(law: LinearLaw, found: Spectrum) -> Array:
 
 def _passed(law: LinearLaw, found: Spectrum, timing: Timing) -> Array:
     """Residual spectrum (frequencies, modes)."""
-    return left_power(law, _omega(law, found), timing)
+    return residual_power(law, _omega(law, found), timing)
 
 
 def _steady_nm2(law: LinearLaw, mean_nm: Array) -> Array:
@@ -138,16 +138,16 @@ def measurement_error(
         return None
     regressors = np.hstack([np.ones((rows, 1)), residual.joined(), seen.joined()])
     basis, sizes, _ = np.linalg.svd(regressors / np.maximum(np.linalg.norm(regressors, axis=0), 1e-30), False)
-    basis = basis[:, sizes > _ALIKE * sizes[0]]
+    basis = basis[:, sizes > _DEGENERATE * sizes[0]]
     added = error.joined() - residual.joined()
     linear = basis @ (basis.T @ added)
     rest = added - linear
 
-    def cut(column: Array) -> Spectrum | None:
+    def spectrum_of(column: Array) -> Spectrum | None:
         ends = np.cumsum([len(piece) for piece in error.values])[:-1]
         return spectrum(Pieces(tuple(np.split(column, ends)), error.bridged), law.rate_hz)
 
-    smooth, rough, each = cut(linear), cut(rest), cut(basis)
+    smooth, rough, each = spectrum_of(linear), spectrum_of(rest), spectrum_of(basis)
     if smooth is None or rough is None or each is None:
         return None
     passed, at_rest = noise_transfer(law, rough.frequency_hz) ** 2, noise_transfer(law, np.zeros(1))[0] ** 2
@@ -156,11 +156,11 @@ def measurement_error(
     # Residual from one unit of noise in each direction of the basis, (modes, directions).
     by_chance = passed.T @ each.power_nm2_hz * each.spacing_hz + np.outer(at_rest, basis.mean(axis=0) ** 2)
     noise_nm2 = np.sum(rest**2, axis=0) / freedom
-    left = rough.variance_nm2(passed) * rows / freedom - noise_nm**2 * noise_gain(law)
+    nonlinear_nm2 = rough.variance_nm2(passed) * rows / freedom - noise_nm**2 * noise_gain(law)
     return MeasurementError(
         Term(
             smooth.variance_nm2(passed) + steady - noise_nm2 * by_chance.sum(axis=1),
             noise_nm2 * np.sqrt(2 * np.sum(by_chance**2, axis=1)),
         ),
-        Term(left, rough.error_nm2(passed)),
+        Term(nonlinear_nm2, rough.error_nm2(passed)),
     )

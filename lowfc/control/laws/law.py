@@ -18,7 +18,7 @@ class Law:
     """Gain, leak and limit of each mode, each (modes,) float32; the limit is nm of wavefront rms.
 
     Attributes:
-        left: (modes,) whether a mode is uncorrected because its automatic gain is 0.
+        uncorrected: (modes,) whether a mode is uncorrected because its automatic gain is 0.
         kept: (modes,) fraction of the command that is kept: 1 - leak, or `RELAXING` for an uncorrected mode.
         rows: (3, modes) gain, kept and limit.
     """
@@ -26,7 +26,7 @@ class Law:
     gain: Single
     leak: Single
     limit_nm: Single
-    left: Mask | bool = False
+    uncorrected: Mask | bool = False
     kept: Single = field(init=False)
     rows: Single = field(init=False)
 
@@ -43,16 +43,16 @@ class Law:
         ):
             if not (np.isfinite(array).all() and (array >= low).all() and (array <= high).all()):
                 raise ValueError(f"every {name} must be between {low} and {high}, got {array.tolist()}")
-        object.__setattr__(self, "kept", np.where(self.left, np.minimum(1 - self.leak, RELAXING), 1 - self.leak))
+        object.__setattr__(self, "kept", np.where(self.uncorrected, np.minimum(1 - self.leak, RELAXING), 1 - self.leak))
         object.__setattr__(self, "rows", single([self.gain, self.kept, self.limit_nm]))
 
 
 def integrate(law: Law, command_nm: Single, error_nm: Single) -> tuple[Single, bool]:
-    """Compute command[k+1] = kept command[k] - gain error[k], cut to each mode's limit; and whether any was cut.
+    """Compute command[k+1] = kept command[k] - gain error[k], clipped to each mode's limit; and whether any was.
 
     All (modes,) float32, nm of wavefront rms.
     """
-    wanted = law.kept * command_nm - law.gain * error_nm
-    if np.count_nonzero(np.abs(wanted) > law.limit_nm):
-        return np.clip(wanted, -law.limit_nm, law.limit_nm), True
-    return wanted, False
+    next_nm = law.kept * command_nm - law.gain * error_nm
+    if np.count_nonzero(np.abs(next_nm) > law.limit_nm):
+        return np.clip(next_nm, -law.limit_nm, law.limit_nm), True
+    return next_nm, False

@@ -19,24 +19,24 @@ SIGNALS: tuple[Signal, ...] = ("error", "pol")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearLaw:
-    """x[k] = F x[k-1] + G y[k] + H c[k-1], wanted[k] = K x[k]; single precision, as in the loop.
+    """x[k] = F x[k-1] + G y[k] + U c[k-1], command[k] = K x[k]; single precision, as in the loop.
 
     y is the measured error or the pseudo-open-loop modes of frame k, c the modal command after all limits. For a
-    missing or refused frame, x[k] = A x[k-1] + H c[k-1].
+    missing or refused frame, x[k] = A x[k-1] + U c[k-1].
 
     Attributes:
-        signal: what y is.
+        signal: kind of y: error or pol.
         transition: (states, states) F.
         measurement_gain: (states, modes) G.
-        command_gain: (states, modes) H.
+        command_gain: (states, modes) U.
         predict_only: (states, states) A.
         output: (modes, states) K.
-        name: kind of law, for people.
+        name: kind of the law, for people.
         noll: Noll index of each mode.
-        delay_frames: the delay it was made for, as in `lowfc.control.laws.stability.delay_weights`.
-        rate_hz: the frame rate it was made for.
+        delay_frames: delay for which it was made, as in `lowfc.control.laws.stability.delay_weights`.
+        rate_hz: frame rate for which it was made.
         id: identity of the law.
-        joined: (states, states + 2 modes) F, G and H side by side.
+        joined: (states, states + 2 modes) F, G and U side by side.
     """
 
     signal: Signal
@@ -100,34 +100,34 @@ def at_rest(law: LinearLaw) -> Single:
     return np.zeros(len(law.transition), np.float32)
 
 
-def follow(law: LinearLaw, x: Single, y: Single, kept: Single) -> Single:
-    """The state (states,) after a frame, from its y (modes,), nm, and the command (modes,), nm, kept before it."""
+def predict_and_update(law: LinearLaw, x: Single, y: Single, command_nm: Single) -> Single:
+    """The state (states,) after a frame, from its y (modes,), nm, and the last command after limits (modes,)."""
     after: Single = law.transition @ x
     after += law.measurement_gain @ y
-    after += law.command_gain @ kept
+    after += law.command_gain @ command_nm
     return after
 
 
-def coast(law: LinearLaw, x: Single, kept: Single) -> Single:
-    """The state (states,) after a missing or refused frame; the command (modes,) in nm."""
+def predict(law: LinearLaw, x: Single, command_nm: Single) -> Single:
+    """The state (states,) after a missing or refused frame, from the last command after limits (modes,)."""
     after: Single = law.predict_only @ x
-    after += law.command_gain @ kept
+    after += law.command_gain @ command_nm
     return after
 
 
 def respond(law: LinearLaw, x: Single) -> Single:
-    """The command (modes,) that the law wants, nm of wavefront rms, before any limit."""
-    wanted: Single = law.output @ x
-    return wanted
+    """The command of the law (modes,), nm of wavefront rms, before any limit."""
+    command_nm: Single = law.output @ x
+    return command_nm
 
 
 class Block(NamedTuple):
-    """The part of a law that belongs to one mode: F (s, s), G (s,), H (s,), A (s, s), K (s,)."""
+    """The part of a law for one mode of s states: F (s, s), G (s,), U (s,), A (s, s), K (s,)."""
 
-    follow: Array
-    gain: Array
-    kept: Array
-    coast: Array
+    transition: Array
+    measurement_gain: Array
+    command_gain: Array
+    predict_only: Array
     output: Array
 
 
@@ -141,16 +141,16 @@ def of_blocks(
     """
     if len(blocks) != len(noll):
         raise ValueError(f"a law of {len(noll)} modes needs as many blocks, got {len(blocks)}")
-    ends = np.cumsum([len(block.gain) for block in blocks])
+    ends = np.cumsum([len(block.output) for block in blocks])
     states = int(ends[-1])
     F, A = np.zeros((states, states)), np.zeros((states, states))
-    G, H = np.zeros((states, len(noll))), np.zeros((states, len(noll)))
+    G, U = np.zeros((states, len(noll))), np.zeros((states, len(noll)))
     K = np.zeros((len(noll), states))
     for mode, (block, end) in enumerate(zip(blocks, ends.tolist(), strict=True)):
-        here = slice(end - len(block.gain), end)
-        F[here, here], A[here, here] = block.follow, block.coast
-        G[here, mode], H[here, mode], K[mode, here] = block.gain, block.kept, block.output
-    return LinearLaw(signal, single(F), single(G), single(H), single(A), single(K), name, noll, delay_frames, rate_hz)
+        here = slice(end - len(block.output), end)
+        F[here, here], A[here, here] = block.transition, block.predict_only
+        G[here, mode], U[here, mode], K[mode, here] = block.measurement_gain, block.command_gain, block.output
+    return LinearLaw(signal, single(F), single(G), single(U), single(A), single(K), name, noll, delay_frames, rate_hz)
 
 
 def integrator_block(gain: float, leak: float, signal: Signal, delay_frames: float) -> Block:
@@ -167,11 +167,11 @@ def integrator_block(gain: float, leak: float, signal: Signal, delay_frames: flo
     F[1, 0] = 0.0
     A = F.copy()
     A[0, 1:] = -weights
-    G, H = np.zeros(1 + registers), np.zeros(1 + registers)
-    G[0] = H[1] = 1.0
+    G, U = np.zeros(1 + registers), np.zeros(1 + registers)
+    G[0] = U[1] = 1.0
     K = np.concatenate([[-gain], -gain * weights])
     K[1] += 1 - leak
-    return Block(F, G, H, A, K)
+    return Block(F, G, U, A, K)
 
 
 def integrator(

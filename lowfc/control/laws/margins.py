@@ -12,6 +12,7 @@ import numpy as np
 from lowfc.arrays import Array, Complex, Mask, Whole
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.stability import delay_weights
+from lowfc.control.loop.wording import counted
 
 SAME_RATE = 0.01
 """Relative difference allowed between a law's frame rate and the camera's."""
@@ -58,7 +59,7 @@ def margins(law: LinearLaw, delay_frames: float) -> Margins:
         found.radius[part.modes] = radius if part.driven or radius > 1 + _STILL else min(radius, 1 - _STILL)
         if not part.driven:
             continue
-        omega = _frequencies(np.concatenate([poles, _poles(part.F + part.H @ part.K)]))
+        omega = _frequencies(np.concatenate([poles, _poles(part.F + part.U @ part.K)]))
         S = part.sensitivity(omega, delay_weights(delay_frames))
         for place, mode in enumerate(part.modes.tolist()):
             own = S[:, place, place]
@@ -77,7 +78,7 @@ def check_law(law: LinearLaw, delay_frames: float, rate_hz: float) -> None:
     """
     if law.signal == "pol" and abs(law.delay_frames - delay_frames) > 1e-3:
         raise ValueError(
-            f"the law is made for a delay of {law.delay_frames:g} frames, the loop has {delay_frames:g}: "
+            f"the law was made for a delay of {counted(law.delay_frames, 'frame')}, the loop has {delay_frames:g}: "
             "set control.delay_frames, or make a law for that delay"
         )
     if rate_hz and abs(law.rate_hz - rate_hz) > SAME_RATE * rate_hz:
@@ -107,17 +108,17 @@ def check_stable(law: LinearLaw, delay_frames: float) -> None:
             ("closed", part.closed(weights)),
             ("open", part.F),
             ("without frames", part.A),
-            ("without frames", part.A + part.H @ part.K),
+            ("without frames", part.A + part.U @ part.K),
         )
         for state, matrix in matrices:
             radius = float(np.abs(_poles(matrix)).max())
             at_most = 1 + _STILL if state != "closed" or not part.driven else 1.0
             if radius > at_most or (radius == 1 and at_most == 1):
                 modes = ", ".join(f"Z{law.noll[mode]}" for mode in part.modes)
+                true, own = (counted(float(delay), "frame") for delay in (delay_frames, law.delay_frames))
                 raise ValueError(
-                    f"the law {law.name!r} is unstable with a delay of {delay_frames:g} frames: {state}, {modes} has "
-                    f"a pole at {radius:.4f}, it must be below 1 (it was made for {law.delay_frames:g} frames at "
-                    f"{law.rate_hz:g} Hz)"
+                    f"the law {law.name!r} is unstable with a delay of {true}: {state}, {modes} has a pole at "
+                    f"{radius:.4f}, it must be below 1 (it was made for {own} at {law.rate_hz:g} Hz)"
                 )
 
 
@@ -176,7 +177,7 @@ class _Part:
     modes: Whole
     F: Array
     G: Array
-    H: Array
+    U: Array
     A: Array
     K: Array
     own_weights: Array
@@ -187,22 +188,22 @@ class _Part:
         """Whether the measurement affects the command."""
         return bool(self.G.any() and self.K.any())
 
-    def answer(self, z: Complex) -> Complex:
+    def response(self, z: Complex) -> Complex:
         """Response of the command to an error, (frequencies, modes, modes)."""
         identity = np.eye(len(self.F))
-        inside = identity - (self.F + self.H @ self.K) / z[:, None, None]
-        answer = self.K @ _solved(inside, np.broadcast_to(self.G.astype(complex), (z.size, *self.G.shape)))
+        inside = identity - (self.F + self.U @ self.K) / z[:, None, None]
+        response = self.K @ _solved(inside, np.broadcast_to(self.G.astype(complex), (z.size, *self.G.shape)))
         if not self.own_weights.size:
-            return np.asarray(answer)
+            return np.asarray(response)
         believed = np.polynomial.polynomial.polyval(1 / z, self.own_weights) / z
-        return _solved(np.eye(len(self.modes)) + answer * believed[:, None, None], answer)
+        return _solved(np.eye(len(self.modes)) + response * believed[:, None, None], response)
 
     def sensitivity(self, omega: Array, weights: Array) -> Complex:
         """S (frequencies, modes, modes), frequencies in rad per frame."""
         z = np.exp(1j * omega)
         seen = np.polynomial.polynomial.polyval(1 / z, weights) / z
         identity = np.eye(len(self.modes), dtype=complex)
-        return _solved(identity - seen[:, None, None] * self.answer(z), identity)
+        return _solved(identity - seen[:, None, None] * self.response(z), identity)
 
     def closed(self, weights: Array) -> Array:
         """Transition matrix of the closed loop for x[k-1], c[k-1], c[k-2], ..."""
@@ -212,7 +213,7 @@ class _Part:
         sees[: weights.size] += weights
         sees[: self.own_weights.size] -= self.own_weights
         history = np.kron(sees, self.G)  # y[k] = sum_j sees_j c[k-1-j]
-        history[:, :modes] += self.H
+        history[:, :modes] += self.U
         state = np.hstack([self.F, history])
         command = self.K @ state
         older = np.eye(modes * (lags - 1), states + modes * lags, states)
@@ -222,9 +223,9 @@ class _Part:
 def _parts(law: LinearLaw) -> list[_Part]:
     """Split the law into independent parts."""
     matrices = (law.transition, law.measurement_gain, law.command_gain, law.predict_only, law.output)
-    F, G, H, A, K = (matrix.astype(np.float64) for matrix in matrices)
+    F, G, U, A, K = (matrix.astype(np.float64) for matrix in matrices)
     states, modes = len(F), len(law.noll)
-    linked = np.block([[np.abs(F) + np.abs(A), np.abs(G) + np.abs(H)], [np.abs(K), np.zeros((modes, modes))]])
+    linked = np.block([[np.abs(F) + np.abs(A), np.abs(G) + np.abs(U)], [np.abs(K), np.zeros((modes, modes))]])
     label = _first_linked(linked + linked.T + np.eye(len(linked)) > 0)
     own = delay_weights(law.delay_frames) if law.signal == "pol" else np.zeros(0)
     found = []
@@ -232,7 +233,7 @@ def _parts(law: LinearLaw) -> list[_Part]:
         x, m = np.flatnonzero(label[:states] == number), np.flatnonzero(label[states:] == number)
         if m.size and x.size:
             own_states, driving = np.ix_(x, x), np.ix_(x, m)
-            found.append(_Part(m, F[own_states], G[driving], H[driving], A[own_states], K[np.ix_(m, x)], own))
+            found.append(_Part(m, F[own_states], G[driving], U[driving], A[own_states], K[np.ix_(m, x)], own))
     return found
 
 

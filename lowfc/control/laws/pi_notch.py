@@ -10,7 +10,7 @@ from lowfc.arrays import Array
 from lowfc.control.laws.linear_law import Block, LinearLaw, of_blocks
 from lowfc.control.laws.stability import delay_weights
 
-_EXACT = 1e-6  # variance of kept commands relative to the states'; the Riccati equation needs one above 0
+_EXACT = 1e-6  # variance of limited commands relative to the states'; the Riccati equation needs one above 0
 _UNKNOWN = 1e-3  # a larger one delays the return from a limit, a smaller one makes the states forget more slowly
 
 
@@ -102,10 +102,10 @@ def _block(
 
 
 def _correction(P: Array, B: Array, C: Array) -> Array:
-    """M (states,): share of kept - wanted for each state, so that C (s + M (kept - C s)) = kept.
+    """M (states,): share of each state in the correction by a limit.
 
-    Without notches the integral has all of it. Otherwise it is the steady Kalman gain of a law's states from its kept
-    commands, for errors of variance 1 and a small unknown part.
+    C (s + M (c - C s)) = c for the limited command c. Without notches the integral takes all of it. Otherwise M is the
+    steady Kalman gain of a law's states from its limited commands, for errors of variance 1 and a small unknown part.
     """
     if len(C) == 2:
         return np.array([1.0, 0.0])

@@ -78,7 +78,7 @@ def pieces(sequence: Sequences, values: npt.NDArray[np.floating]) -> Pieces:
     """Cut a run into evenly sampled pieces.
 
     Args:
-        sequence: (rows,) of each row's frame, consecutive without gaps; rows that do not increase are left out.
+        sequence: (rows,) sequence of each row's frame; rows that do not increase it are ignored.
         values: (rows, columns); a row with a NaN is a missing frame.
     """
     there = np.isfinite(values).all(axis=1)

@@ -30,8 +30,8 @@ def settling_frames(gain: Array | Single, leak: Array | Single, least: float = 0
 def delay_weights(delay_frames: float) -> Array:
     """Return w: the fraction of command[k - j], j = 0, 1, ..., seen in exposure k; sums to 1.
 
-    A delay of d frames (d >= 1) is counted from the frame a command was made from to the first exposed wholly under it;
-    a fraction f of a frame sees (1 - f) of the newer and f of the older command.
+    A delay of d frames (d >= 1) is counted from the frame that a command is computed from to the first frame exposed
+    wholly with it; a fraction f of a frame sees (1 - f) of the newer and f of the older command.
 
     Raises:
         ValueError: the delay is below 1 frame or not finite.

@@ -12,7 +12,7 @@ import numpy as np
 from lowfc.arrays import Array, Complex, Mask, Whole
 
 _FAINTEST = 1e-3  # relative to the mode's highest line; below is rounding to single precision
-_BESIDE = np.array([*range(-16, -1), *range(2, 17)])  # bins from which a line's noise is measured
+_ADJACENT = np.array([*range(-16, -1), *range(2, 17)])  # bins from which a line's noise is measured
 _OF_FLANKS = 12 / 7  # white noise of a bin under Hann's window, relative to that of a flank less the line
 _DB = 20 / np.log(10)
 
@@ -76,7 +76,7 @@ def measured(error_nm: Array, added_nm: Array) -> Lines:
     if error_nm.shape != added_nm.shape:
         raise ValueError(f"errors {error_nm.shape} and added signal {added_nm.shape} must have the same frames")
     frames = len(error_nm)
-    answer, added = _hann(error_nm), _hann(added_nm)
+    response, added = _hann(error_nm), _hann(added_nm)
     found: list[tuple[Whole, Whole, Complex, Array]] = []
     for mode in range(error_nm.shape[1]):
         plain = np.abs(np.fft.rfft(added_nm[:, mode])) / frames
@@ -87,13 +87,13 @@ def measured(error_nm: Array, added_nm: Array) -> Lines:
         own[:2] = own[-2:] = True
         for near in (-1, 0, 1):
             own[np.clip(places + near, 0, len(plain) - 1)] = True
-        beside = np.clip(places[:, None] + _BESIDE, 0, len(plain) - 1)
-        power = np.where(own[beside], np.nan, np.abs(answer[beside, mode]) ** 2)
+        adjacent = np.clip(places[:, None] + _ADJACENT, 0, len(plain) - 1)
+        power = np.where(own[adjacent], np.nan, np.abs(response[adjacent, mode]) ** 2)
         # A vibration on the line itself shows only in the adjacent bins, after subtraction of the line.
-        flanks = answer[places[:, None] + np.array([-1, 1]), mode] + answer[places, mode][:, None] / 2
+        flanks = response[places[:, None] + np.array([-1, 1]), mode] + response[places, mode][:, None] / 2
         nearest = _OF_FLANKS * np.mean(np.abs(flanks) ** 2, axis=1)
         noise = np.sqrt(np.maximum(np.nanmean(power, axis=1), nearest) / 2)
-        S = answer[places, mode] / added[places, mode]
+        S = response[places, mode] / added[places, mode]
         found.append((np.full(places.size, mode), places, S, noise / np.abs(added[places, mode])))
     if not found:
         raise ValueError("nothing was added to the loop's input: there is nothing to measure")

@@ -11,7 +11,7 @@ import numpy as np
 
 from lowfc.arrays import Array
 from lowfc.control.laws import margins
-from lowfc.control.laws.continuous import Timing, commanded, held_left_nm2, spectrum_left
+from lowfc.control.laws.continuous import Timing, commanded, held_residual_nm2, residual_spectrum
 from lowfc.control.laws.kalman import lqg_block
 from lowfc.control.laws.linear_law import Block, LinearLaw, integrator, integrator_block, of_blocks
 from lowfc.control.laws.margins import sensitivity
@@ -91,7 +91,7 @@ def best_gains(run: Pieces, rate_hz: float, timing: Timing, leak: Array) -> Gain
         raise ValueError(f"a law is tuned from at least {FEWEST} frames in a row, the longest run has {longest}")
     noise_nm2 = floor_nm2_hz(coarse) * rate_hz / 2
     omega = 2 * np.pi * fine.frequency_hz[1:] / rate_hz  # an integrator without leak has no value at 0 Hz
-    gains, left_nm2, sensed_nm2 = np.zeros(len(leak)), np.zeros(len(leak)), np.zeros(len(leak))
+    gains, residual_nm2, sensed_nm2 = np.zeros(len(leak)), np.zeros(len(leak)), np.zeros(len(leak))
     longest_nm = max(run.values, key=len)
     for mode, lost in enumerate(leak.tolist()):
         steady_nm2 = float(longest_nm[:, mode].mean()) ** 2  # a leak leaves a fraction of it: |S| at 0 Hz
@@ -100,19 +100,19 @@ def best_gains(run: Pieces, rate_hz: float, timing: Timing, leak: Array) -> Gain
         def of(gain: float, lost: float = lost) -> LinearLaw:
             return integrator([gain], [lost], (2,), timing.delay, rate_hz)  # or any other mode
 
-        def steady_left(gain: float, lost: float = lost, steady_nm2: float = steady_nm2) -> float:
+        def steady_residual_nm2(gain: float, lost: float = lost, steady_nm2: float = steady_nm2) -> float:
             return steady_nm2 * (lost / (lost + gain)) ** 2
 
-        def left(gain: float, measured: Array = measured, mode: int = mode, lost: float = lost) -> float:
-            power = spectrum_left(of(gain, lost), omega, measured, noise_nm2[mode : mode + 1], timing)
-            return float(power.sum()) * fine.spacing_hz * 2 / rate_hz + steady_left(gain)
+        def residual(gain: float, measured: Array = measured, mode: int = mode, lost: float = lost) -> float:
+            power = residual_spectrum(of(gain, lost), omega, measured, noise_nm2[mode : mode + 1], timing)
+            return float(power.sum()) * fine.spacing_hz * 2 / rate_hz + steady_residual_nm2(gain)
 
         bounds = (LOWEST_GAIN, highest_gain(timing.delay, lost))
-        found = minimize_scalar(left, bounds=bounds, method="bounded", options={"xatol": 1e-3})
-        gains[mode], left_nm2[mode] = found.x, found.fun
+        found = minimize_scalar(residual, bounds=bounds, method="bounded", options={"xatol": 1e-3})
+        gains[mode], residual_nm2[mode] = found.x, found.fun
         error = np.abs(sensitivity(of(found.x), omega, timing.delay)) ** 2 * measured
-        sensed_nm2[mode] = error.sum() * fine.spacing_hz * 2 / rate_hz + steady_left(found.x) - noise_nm2[mode]
-    rms = (np.sqrt(np.maximum(each, 0.0)) for each in (left_nm2, sensed_nm2, noise_nm2))
+        sensed_nm2[mode] = error.sum() * fine.spacing_hz * 2 / rate_hz + steady_residual_nm2(found.x) - noise_nm2[mode]
+    rms = (np.sqrt(np.maximum(each, 0.0)) for each in (residual_nm2, sensed_nm2, noise_nm2))
     return Gains(gains, *rms)
 
 
@@ -153,18 +153,18 @@ def tune_lqg(
     def law_of(blocks: Sequence[Block]) -> LinearLaw:
         return of_blocks(blocks, "pol", "lqg", noll, timing.delay, rate_hz)
 
-    def left(blocks: Sequence[Block]) -> Array:
-        return left_of(law_of(blocks), run, noise_nm2, timing)
+    def residual(blocks: Sequence[Block]) -> Array:
+        return simulated_residual_nm2(law_of(blocks), run, noise_nm2, timing)
 
     scaled = ([_scaled(model, factor, finest_hz) for model in models] for factor in (*_NARROWER, *_FASTER))
     tried = [models, *scaled]
     steady = [integrator_block(g, lost, "pol", timing.delay) for g, lost in zip(gains.gain, leak, strict=True)]
     held = [[within_margins(model, timing) for model in candidates] for candidates in tried]
     robust = [[block or rest for block, rest in zip(blocks, steady, strict=True)] for blocks in held]
-    left_nm2 = np.nan_to_num([left(blocks) for blocks in robust], nan=np.inf)
-    best = left_nm2.argmin(axis=0)
+    residual_nm2 = np.nan_to_num([residual(blocks) for blocks in robust], nan=np.inf)
+    best = residual_nm2.argmin(axis=0)
     modes = range(len(noll))
-    wins = left_nm2.min(axis=0) < left(steady)  # integrators do not beat themselves
+    wins = residual_nm2.min(axis=0) < residual(steady)  # integrators do not beat themselves
     chosen = [tried[best[mode]][mode] for mode in modes]
     law = law_of([robust[best[mode]][mode] if wins[mode] else steady[mode] for mode in modes])
     return _tuned(law, timing, ["lqg" if better else "integrator" for better in wins], chosen)
@@ -197,9 +197,9 @@ def _notched(model: Model, gain: float, leak: float, timing: Timing) -> tuple[fl
             for depth in (30.0, 10.0, 4.0):
                 more = (*notches, Notch(line.frequency_hz, width_hz, depth))
                 law = made(more, g)
-                left = float(predicted_nm(law, [model], timing)[0])
-                if left < least and _holds(margins.margins(law, timing.delay)):
-                    notches, least = more, left
+                residual = float(predicted_nm(law, [model], timing)[0])
+                if residual < least and _holds(margins.margins(law, timing.delay)):
+                    notches, least = more, residual
                     break
         tried.append((least, g, notches))
     _, g, notches = min(tried, key=lambda one: one[0])
@@ -219,7 +219,7 @@ def predicted_nm(law: LinearLaw, models: Sequence[Model], timing: Timing) -> Arr
         omega = _fine_frequencies(model)
         measured = model.spectrum_nm2(omega)[:, None] + model.noise_nm2
         noise_nm2 = np.full(len(models), model.noise_nm2)
-        power = spectrum_left(law, omega, measured, noise_nm2, timing)[:, mode]
+        power = residual_spectrum(law, omega, measured, noise_nm2, timing)[:, mode]
         found[mode] = np.trapezoid(power, omega) / np.pi
     return np.sqrt(found)
 
@@ -242,7 +242,7 @@ def frame_noise_nm2(models: Sequence[Model], noise_nm2: Array) -> Array:
     return np.asarray(noise_nm2 * np.outer(scale, scale))
 
 
-def left_of(law: LinearLaw, run: Pieces, noise_nm2: Array, timing: Timing) -> Array:
+def simulated_residual_nm2(law: LinearLaw, run: Pieces, noise_nm2: Array, timing: Timing) -> Array:
     """Mean square (modes,) residual of the means that a law's commands are to null.
 
     Changes within a command's period, which no law can remove, are not included. Each piece of the run, (frames, modes)
@@ -256,7 +256,7 @@ def left_of(law: LinearLaw, run: Pieces, noise_nm2: Array, timing: Timing) -> Ar
         every = np.zeros(len(piece), np.int64)
         command_nm = counterfactual(driven_by(law), weights, piece.astype(np.float32), every)[1]
         measured_nm, commanded_nm = piece[skipped:].astype(np.float64), command_nm[skipped:].astype(np.float64)
-        more, counted = held_left_nm2(law, measured_nm, commanded_nm, noise_nm2, timing)
+        more, counted = held_residual_nm2(law, measured_nm, commanded_nm, noise_nm2, timing)
         squares, frames = squares + more, frames + counted
     return np.asarray(squares / max(frames, 1))
 

@@ -77,8 +77,8 @@ class Model:
             step, seen = [1.0, 1 - _kept(self.cutoff_hz / self.rate_hz)], [0.0, 1.0]
         parts = [self.drift_nm2 * np.outer(step, step)]
         for line in self.lines:
-            _, left, variance = _per_frame(line, self.rate_hz)
-            parts.append(variance * (1 - left**2) * np.eye(2))
+            _, decay, variance = _per_frame(line, self.rate_hz)
+            parts.append(variance * (1 - decay**2) * np.eye(2))
             seen += [1.0, 0.0]
         return self.mean_over(1.0, 0.0), block_diag(*parts), np.array(seen)
 
@@ -95,8 +95,8 @@ class Model:
             kept = mean_of(-2 * np.pi * self.cutoff_hz / self.rate_hz).real
             blocks = [np.array([[1.0, 0.0], [1 - kept, kept]])]
         for line in self.lines:
-            omega, left, _ = _per_frame(line, self.rate_hz)
-            mean = mean_of(complex(np.log(left), omega))
+            omega, decay, _ = _per_frame(line, self.rate_hz)
+            mean = mean_of(complex(np.log(decay), omega))
             blocks.append(np.array([[mean.real, -mean.imag], [mean.imag, mean.real]]))
         return np.asarray(block_diag(*blocks))
 
@@ -343,8 +343,8 @@ def _per_frame(line: Line, rate_hz: float) -> tuple[float, float, float]:
     return 2 * np.pi * line.frequency_hz / rate_hz, float(np.exp(-np.pi * line.width_hz / rate_hz)), line.variance_nm2
 
 
-def _line(omega: Array, centre: float, left: float, variance_nm2: float) -> Array:
-    """Spectrum of a process with the covariance variance left^k cos(centre k)."""
-    lost = (1 - left) ** 2  # |1 - left e^(i x)|^2 = (1 - left)^2 + 4 left sin^2(x/2), without cancellation
-    near, far = (lost + 4 * left * np.sin((omega + sign * centre) / 2) ** 2 for sign in (-1, 1))
-    return np.asarray(variance_nm2 * (1 - left**2) / 2 * (1 / near + 1 / far))
+def _line(omega: Array, centre: float, decay: float, variance_nm2: float) -> Array:
+    """Spectrum of a process with the covariance variance decay^k cos(centre k)."""
+    lost = (1 - decay) ** 2  # |1 - decay e^(i x)|^2 = (1 - decay)^2 + 4 decay sin^2(x/2), without cancellation
+    near, far = (lost + 4 * decay * np.sin((omega + sign * centre) / 2) ** 2 for sign in (-1, 1))
+    return np.asarray(variance_nm2 * (1 - decay**2) / 2 * (1 / near + 1 / far))

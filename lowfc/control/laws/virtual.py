@@ -36,15 +36,15 @@ class VirtualIntegrators(NamedTuple):
         lags = 1 + max(lag for lag, _ in weights)
         return cls(gain, kept, limit_nm, weights, (np.zeros_like(gain),) * lags)
 
-    def followed(self, pol_nm: Single) -> tuple["VirtualIntegrators", Single]:
+    def advanced(self, pol_nm: Single) -> tuple["VirtualIntegrators", Single]:
         """One frame later, and the errors (rows, modes) that would have been measured, nm of wavefront rms."""
         error_nm = pol_nm
         for lag, weight in self.weights:
             error_nm = error_nm + (self.history_nm[lag] if weight == 1 else weight * self.history_nm[lag])
-        wanted_nm = self.kept * self.history_nm[0] - self.gain * error_nm
-        np.maximum(wanted_nm, -self.limit_nm, out=wanted_nm)
-        np.minimum(wanted_nm, self.limit_nm, out=wanted_nm)
-        return self._replace(history_nm=(wanted_nm, *self.history_nm[:-1])), error_nm
+        command_nm = self.kept * self.history_nm[0] - self.gain * error_nm
+        np.maximum(command_nm, -self.limit_nm, out=command_nm)
+        np.minimum(command_nm, self.limit_nm, out=command_nm)
+        return self._replace(history_nm=(command_nm, *self.history_nm[:-1])), error_nm
 
     def held(self, frames: int = 1) -> "VirtualIntegrators":
         """Some frames later, without measurements: commands are held, as in the loop."""

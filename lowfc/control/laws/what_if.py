@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from lowfc.arrays import Array, Mask, Sequences, Single, Whole
 from lowfc.control.laws.law import Law
-from lowfc.control.laws.linear_law import LinearLaw, at_rest, follow, integrator, respond
+from lowfc.control.laws.linear_law import LinearLaw, at_rest, integrator, predict_and_update, respond
 from lowfc.control.laws.stability import delay_weights
 from lowfc.control.loop.inputs import COUNT_BITS
 
@@ -30,7 +30,7 @@ def driven_by(law: LinearLaw, limit_nm: Single | None = None) -> Controller:
 
     def step(before: tuple[Single, Single] | None, error_nm: Single, pol_nm: Single) -> tuple[Any, Single]:
         x, held_nm = before or (at_rest(law), np.zeros_like(error_nm))
-        x = follow(law, x, pol_nm if law.signal == "pol" else error_nm, held_nm)
+        x = predict_and_update(law, x, pol_nm if law.signal == "pol" else error_nm, held_nm)
         command_nm = respond(law, x)
         if limit_nm is not None:
             command_nm = np.clip(command_nm, -limit_nm, limit_nm)
@@ -121,11 +121,11 @@ def delay_from_truth(true_nm: Single, command_nm: Single, missing: Whole) -> flo
             seen_nm(delay_weights(delay).astype(np.float32), command_nm, missing, first_nm)[rows].astype(np.float64)
             for delay in (lag, lag + 1)
         )
-        move, left = older - newer, true_nm[rows] - newer
+        move, difference = older - newer, true_nm[rows] - newer
         if np.sqrt(np.mean(move**2)) < _STILL_NM:
             return None
-        fraction = float(np.clip(np.sum(left * move) / np.sum(move**2), 0, 1))
-        best = min(best, (float(np.sum((left - fraction * move) ** 2)), lag + fraction))
+        fraction = float(np.clip(np.sum(difference * move) / np.sum(move**2), 0, 1))
+        best = min(best, (float(np.sum((difference - fraction * move) ** 2)), lag + fraction))
     return best[1]
 
 

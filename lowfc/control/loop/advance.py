@@ -45,18 +45,18 @@ from lowfc.control.loop.safety import Limit, LoopMode, Reason, Rejection
 from lowfc.control.loop.state import ActiveLoop, Settings, State
 
 UNMEASURED = frozenset({Rejection.NO_CALIBRATION, Rejection.WRONG_SIZE})
-"""Probe sequences continue with frames that do not match a calibration: each is still an exposure."""
+"""Rejections of frames that advance a probe sequence nevertheless: each is an exposure."""
 STEPPED = "its last step is done"
 
 
-def advance(settings: Settings, state: State, taken: Input) -> tuple[State, Outputs]:
+def advance(settings: Settings, state: State, input_: Input) -> tuple[State, Outputs]:
     """Process one input; return the next state and the messages to send.
 
     An input that changes nothing and produces no output returns the same state object and is not counted.
     """
-    if isinstance(taken, Frame):
-        return _frame(settings, state, taken)
-    after, outputs = _HANDLERS[type(taken)](settings, state, taken)
+    if isinstance(input_, Frame):
+        return _frame(settings, state, input_)
+    after, outputs = _HANDLERS[type(input_)](settings, state, input_)
     if after is not state or outputs.events:
         after = after._replace(input_number=state.input_number + 1)
     return after, outputs
@@ -69,39 +69,39 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
     if frame.sequence <= state.frame_sequence:
         stale = Rejection.REPEATED if frame.sequence == state.frame_sequence else Rejection.OUT_OF_ORDER
         return _refuse(settings, state, frame, stale, events)
-    state, drive = _arrive(state, frame, events)
-    freed = False
+    state, loop = _arrive(state, frame, events)
+    lease_ended = False
     if state.conditions.lease is not None:
-        state, ended = lease_checked(state._replace(drive=drive), 0, frame.sequence)
-        events, drive, freed = [*events, *ended], state.drive, bool(ended)
-    if drive is None:
-        return _refuse(settings, _newest(state, drive, frame), frame, Rejection.NO_CALIBRATION, events)
-    measured = _measure(settings, state, drive, frame)
+        state, ended = lease_checked(state._replace(loop=loop), 0, frame.sequence)
+        events, loop, lease_ended = [*events, *ended], state.loop, bool(ended)
+    if loop is None:
+        return _refuse(settings, _newest(state, loop, frame), frame, Rejection.NO_CALIBRATION, events)
+    measured = _measure(settings, state, loop, frame)
     if isinstance(measured, Rejection):
-        return _refuse(settings, _newest(state, drive, frame), frame, measured, events)
-    estimate, saturated, usual = measured
-    alike = state.identical_frames + 1 if estimate.same(state.estimate) else 0
-    if 0 < settings.max_identical_frames < alike:
-        stuck = _newest(state, drive, frame)._replace(identical_frames=alike)
+        return _refuse(settings, _newest(state, loop, frame), frame, measured, events)
+    estimate, saturated, fused = measured
+    identical = state.identical_frames + 1 if estimate.same(state.estimate) else 0
+    if 0 < settings.max_identical_frames < identical:
+        stuck = _newest(state, loop, frame)._replace(identical_frames=identical)
         return _refuse(settings, stuck, frame, Rejection.STUCK, events)
-    error_nm, pol_nm, drive, reasons, homing = respond(
-        settings, state, drive, estimate.error_nm, frame.sequence, events, usual=usual
+    error_nm, pol_nm, loop, reasons, returning_to_zero = respond(
+        settings, state, loop, estimate.error_nm, frame.sequence, events, fused=fused
     )
     if reasons:
-        drive = end_probe(drive, frame.sequence, _acted(reasons), events)
+        loop = end_probe(loop, frame.sequence, _acted(reasons), events)
     if state.refused is not None:
         details: dict[str, object] = {"refused": state.refused_count, "reason": state.refused.name}
         events.append(PendingEvent("FRAMES_ACCEPTED", details))
     if reasons != state.limits_hit:
         _limit_events(state.limits_hit, reasons, events)
-    shown = (*reasons, Limit.LAW_OVERRULED) if _overruled(state, drive) else reasons
-    mode, command_nm, commanded = state.mode, drive.history_nm[0], _commands(state)
+    shown = (*reasons, Limit.LAW_OVERRULED) if _overruled(state, loop) else reasons
+    mode, command_nm, commanded = state.mode, loop.history_nm[0], _may_command(state)
     steps_left, stepped = max(state.steps_left - 1, 0), state.steps_left == 1
     if stepped:
         events += [PendingEvent("LOOP_STEPPED", {}), mode_event(mode, LoopMode.OPEN, STEPPED)]
     state = State(  # constructed: `_replace` takes four times as long
         mode,
-        drive,
+        loop,
         frame.sequence,
         frame.time_ns,
         state.frames_used + 1,
@@ -109,28 +109,28 @@ def _frame(settings: Settings, state: State, frame: Frame) -> tuple[State, Outpu
         commanded=commanded,
         counts=_counted(state.counts, shown),
         steps_left=steps_left,
-        returning_to_zero=homing,
+        returning_to_zero=returning_to_zero,
         input_number=state.input_number + 1,
         estimate=estimate,
-        identical_frames=alike,
+        identical_frames=identical,
         conditions=state.conditions,
     )
     if stepped:
         state = in_mode(state, LoopMode.OPEN, frame.time_ns, STEPPED)
     step = Step(frame.sequence, frame.time_ns, mode, command_nm, shown, error_nm, pol_nm, estimate.flux_dn, saturated)
-    command = _command(state, drive, command_nm) if commanded else None
-    return state, Outputs(step, command, None, events, changed=stepped or freed)
+    command = _command_message(state, loop, command_nm) if commanded else None
+    return state, Outputs(step, command, None, events, changed=stepped or lease_ended)
 
 
-def _command(state: State, drive: ActiveLoop, command_nm: Single) -> Command:
+def _command_message(state: State, loop: ActiveLoop, command_nm: Single) -> Command:
     """The command of the newest frame."""
     safe = state.mode is LoopMode.SAFE
     newest = state.frame_sequence, state.frame_time_ns
-    return Command(*newest, drive.actuators_nm, command_nm, safe, state.conditions.clear_id)
+    return Command(*newest, loop.actuators_nm, command_nm, safe, state.conditions.clear_id)
 
 
-def _commands(state: State) -> bool:
-    """Whether commands are sent: a mirror that has not reported its shape would jump, unless in safe mode."""
+def _may_command(state: State) -> bool:
+    """Whether commands may be sent: before the mirror reports its shape it would jump, so only in safe mode."""
     return state.commanded or not state.conditions.mirror_fault or state.mode is LoopMode.SAFE
 
 
@@ -138,22 +138,22 @@ def _arrive(state: State, frame: Frame, events: list[PendingEvent]) -> tuple[Sta
     """The state, and the active loop advanced by the frames missing before this one."""
     if state.frame_timeout and state.frame_time_ns:
         events.append(PendingEvent("FRAMES_BACK", {"silent_ms": (frame.time_ns - state.frame_time_ns) / 1e6}))
-    drive = state.drive
+    loop = state.loop
     if frame.sequence >> COUNT_BITS == state.frame_sequence >> COUNT_BITS:
         missing = frame.sequence - state.frame_sequence - 1
         if missing:
             number = frame.sequence & ((1 << COUNT_BITS) - 1)
             events.append(PendingEvent("FRAMES_MISSING", {"count": missing, "number": number}))
-            drive = drive.missed(missing) if drive is not None else None
+            loop = loop.missed(missing) if loop is not None else None
     elif state.frame_sequence:
         events.append(PendingEvent("CAMERA_RESTARTED", {}))
         state = _awaiting_camera(state, frame)
-        if drive is not None and drive.play is not None:
-            drive = drive.stopped(0)  # its frames were counted by the previous start of the camera
+        if loop is not None and loop.play is not None:
+            loop = loop.stopped(0)  # its frames were counted by the previous start of the camera
             events.append(PendingEvent("PLAY_ENDED", {"why": "the camera restarted"}))
     else:  # after a clear, this may be another start of the camera
         state = _awaiting_camera(state, frame)
-    return state, drive
+    return state, loop
 
 
 def _awaiting_camera(state: State, frame: Frame) -> State:
@@ -164,15 +164,15 @@ def _awaiting_camera(state: State, frame: Frame) -> State:
     return state._replace(conditions=state.conditions._replace(camera_awaited=True))
 
 
-def _newest(state: State, drive: ActiveLoop | None, frame: Frame) -> State:
-    return state._replace(drive=drive, frame_timeout=False, frame_sequence=frame.sequence, frame_time_ns=frame.time_ns)
+def _newest(state: State, loop: ActiveLoop | None, frame: Frame) -> State:
+    return state._replace(loop=loop, frame_timeout=False, frame_sequence=frame.sequence, frame_time_ns=frame.time_ns)
 
 
 def _measure(
-    settings: Settings, state: State, drive: ActiveLoop, frame: Frame
+    settings: Settings, state: State, loop: ActiveLoop, frame: Frame
 ) -> tuple[Estimate, int, bool] | Rejection:
-    """Modal errors of a frame, its saturated pixels, and whether the fused step made them; or why it is refused."""
-    calibration = drive.calibration
+    """Estimate of a frame, its saturated pixels, and whether the fused step was used; or why the frame is refused."""
+    calibration = loop.calibration
     if not calibration.noll:
         return Rejection.NO_CALIBRATION
     if state.conditions.camera_awaited:
@@ -186,21 +186,21 @@ def _measure(
     if frame.age_ns > settings.max_frame_age_ns:
         return Rejection.LATE
     pixels, min_flux_dn = frame.pixels.ravel(), settings.min_flux_fraction * calibration.flux_dn
-    usual = drive.estimator.usual(pixels, min_flux_dn)
-    if usual is not None:
-        return usual, 0, True
+    fused = loop.estimator.estimate_fused(pixels, min_flux_dn)
+    if fused is not None:
+        return fused, 0, True
     saturated = saturated_pixels(calibration, pixels)
     if saturated > settings.max_saturated_pixels:
         return Rejection.SATURATED
     if saturated:
         pixels = filled(calibration, pixels)
-    estimate = drive.estimator.estimate(pixels, min_flux_dn)
+    estimate = loop.estimator.estimate(pixels, min_flux_dn)
     return Rejection.DARK if estimate is None else (estimate, saturated, False)
 
 
-def _overruled(state: State, drive: ActiveLoop) -> bool:
+def _overruled(state: State, loop: ActiveLoop) -> bool:
     """Whether the integrator has taken over part of the command from a law that did worse."""
-    guard = drive.following.guard if drive.following is not None else None
+    guard = loop.law_runner.guard if loop.law_runner is not None else None
     return guard is not None and state.mode is LoopMode.CLOSED and guard.overruled
 
 
@@ -215,60 +215,62 @@ def _refuse(
     """Hold the command: a refused frame still yields a step and a command."""
     if reason is not state.refused:
         events.append(PendingEvent("FRAMES_REFUSED", {"reason": reason.name}))
-    drive, homing, hit = state.drive, state.returning_to_zero, state.limits_hit
+    loop, returning_to_zero, hit = state.loop, state.returning_to_zero, state.limits_hit
     held = np.zeros(0, np.float32)
     reasons: tuple[Reason, ...] = (reason,)
-    if drive is not None:
+    if loop is not None:
         if state.mode is LoopMode.SAFE:
-            drive = step_to_flat(settings, drive)
+            loop = step_to_flat(settings, loop)
         elif reason in UNMEASURED and state.mode is not LoopMode.CLOSED:
-            drive, hit, homing = next_command(settings, state, drive.coasted(1), drive.history_nm[0], frame.sequence)
+            loop, hit, returning_to_zero = next_command(
+                settings, state, loop.predicted(1), loop.history_nm[0], frame.sequence
+            )
             if hit:
-                drive = end_probe(drive, frame.sequence, _acted(hit), events)
+                loop = end_probe(loop, frame.sequence, _acted(hit), events)
             _limit_events(state.limits_hit, hit, events)
             reasons = (reason, *hit)
         elif reason not in (Rejection.REPEATED, Rejection.OUT_OF_ORDER, Rejection.AHEAD):  # these are not new exposures
-            drive = drive.missed(1)
-        held = drive.history_nm[0]
+            loop = loop.missed(1)
+        held = loop.history_nm[0]
     state = state._replace(
-        drive=drive,
+        loop=loop,
         refused=reason,
         refused_count=state.refused_count + 1,
         limits_hit=hit,
-        returning_to_zero=homing,
-        commanded=drive is not None and _commands(state),
+        returning_to_zero=returning_to_zero,
+        commanded=loop is not None and _may_command(state),
         counts=_counted(state.counts, reasons),
         input_number=state.input_number + 1,
     )
     step = Step(frame.sequence, frame.time_ns, state.mode, held, reasons)
-    if drive is None or not state.commanded:
+    if loop is None or not state.commanded:
         return state, Outputs(step=step, events=events)
     # With the newest frame's sequence even if this frame is older: the mirror refuses older commands.
-    return state, Outputs(step=step, command=_command(state, drive, held), events=events)
+    return state, Outputs(step=step, command=_command_message(state, loop, held), events=events)
 
 
 def _tick(settings: Settings, state: State, tick: Tick) -> tuple[State, Outputs]:
     """Without frames: repeat the held command, so that it expires only if the controller dies."""
     state, events = lease_checked(state, tick.time_ns, 0)
-    freed = bool(events)
-    drive = state.drive
+    lease_ended = bool(events)
+    loop = state.loop
     safe = state.mode is LoopMode.SAFE
     silent = state.frame_timeout or tick.silent_ns > settings.frame_timeout_ns  # until a newer frame comes
-    if drive is None or not (state.commanded or safe):
+    if loop is None or not (state.commanded or safe):
         if silent is not state.frame_timeout:
             state = state._replace(frame_timeout=silent)
-        return state, Outputs(events=tuple(events), changed=freed)
+        return state, Outputs(events=tuple(events), changed=lease_ended)
     flatten = silent and settings.on_frame_timeout == "flat"
     counts = state.counts
     if silent and not state.frame_timeout:
         action = "relaxing the mirror to flat" if flatten else "holding the command"
         events.append(PendingEvent("NO_FRAMES", {"silent_ms": tick.silent_ns / 1e6, "action": action}))
         counts = _counted(counts, (Rejection.NO_FRAME,))
-        drive = end_probe(drive, state.frame_sequence, f"no frame for {tick.silent_ns / 1e6:.0f} ms", events)
+        loop = end_probe(loop, state.frame_sequence, f"no frame for {tick.silent_ns / 1e6:.0f} ms", events)
     if flatten or safe:
-        drive = step_to_flat(settings, drive)
-    state = state._replace(drive=drive, frame_timeout=silent, commanded=True, counts=counts)
-    return state, Outputs(command=_command(state, drive, drive.history_nm[0]), events=events, changed=freed)
+        loop = step_to_flat(settings, loop)
+    state = state._replace(loop=loop, frame_timeout=silent, commanded=True, counts=counts)
+    return state, Outputs(command=_command_message(state, loop, loop.history_nm[0]), events=events, changed=lease_ended)
 
 
 def _load(settings: Settings, state: State, load: Load) -> tuple[State, Outputs]:

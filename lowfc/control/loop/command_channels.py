@@ -1,8 +1,8 @@
 """Additions to the loop's command: static channels, an offset of its target, a table played frame by frame.
 
 A channel is a mirror shape set by another user, such as a dark hole. The sensor sees it, so its zero point shifts
-with it (Sect. 1 and 4), after the delay of a command, and the loop does not undo it. A play is for calibration and
-tests and shifts nothing.
+with it (Subedi et al. 2015, Sect. 1 and 4), after the delay of a command, and the loop does not remove it. A probe
+sequence ("play") is for calibration and tests and shifts nothing.
 """
 
 from typing import NamedTuple
@@ -17,28 +17,28 @@ FLAT = "flat"
 ADOPTED = "adopted"
 """Channel of the mirror's shape at the controller's start, beyond the modes."""
 EXTERNAL = "external"
-"""Channel of shapes that other programs put on the mirror: already applied, so it is not commanded."""
+"""Channel of shapes that other programs apply to the mirror: the loop does not command it."""
 MOST_CHANNELS = 16
 MOST_PLAYED = 1 << 24
-"""Largest count of numbers in the table of a play, and in its basis."""
+"""Most numbers in the table of a play, and in its basis."""
 MIRROR, OFFSET = "mirror", "offset"
 LONGEST_NAME = 32
 
 
 class Channel(NamedTuple):
-    """A shape added to the command, (rows, columns), nm of surface: the wanted shape and the part reached so far.
+    """A shape added to the command, (rows, columns), nm of surface, and the part of it reached so far.
 
-    `of` makes both the same array once the mirror has reached the shape.
+    With `of`, both are the same array once the mirror has reached the shape.
     """
 
     name: str
-    wanted_nm: Single
+    shape_nm: Single
     reached_nm: Single
 
     @classmethod
-    def of(cls, name: str, wanted_nm: Single, reached_nm: Single) -> "Channel":
+    def of(cls, name: str, shape_nm: Single, reached_nm: Single) -> "Channel":
         """A channel that is moving to its shape or has reached it."""
-        return cls(name, wanted_nm, wanted_nm if np.array_equal(wanted_nm, reached_nm) else reached_nm)
+        return cls(name, shape_nm, shape_nm if np.array_equal(shape_nm, reached_nm) else reached_nm)
 
     @property
     def shifts(self) -> bool:
@@ -53,7 +53,7 @@ class Channel(NamedTuple):
     @property
     def moving(self) -> bool:
         """Whether the mirror is still moving to it."""
-        return self.reached_nm is not self.wanted_nm
+        return self.reached_nm is not self.shape_nm
 
 
 class PlayTable(NamedTuple):
@@ -92,13 +92,13 @@ class Play(NamedTuple):
         place = sequence - self.first_sequence
         return self.table.rows[place] if 0 <= place < self.frames else None
 
-    def left(self, sequence: int) -> int:
-        """Rows left for this and later frames."""
+    def remaining(self, sequence: int) -> int:
+        """Number of rows for this and later frames."""
         return min(max(self.first_sequence + self.frames - sequence, 0), self.frames)
 
     def over(self, sequence: int) -> bool:
-        """Whether no row is left for this and later frames."""
-        return not self.left(sequence)
+        """Whether there is no row for this and later frames."""
+        return not self.remaining(sequence)
 
 
 class CommandChannels(NamedTuple):
@@ -108,7 +108,7 @@ class CommandChannels(NamedTuple):
         channels: sorted by name.
         sum_nm: (rows, columns) sum of the channels as far as reached.
         shift_nm: (modes,) shift of the sensor's zero point by the channels.
-        shifts_nm: `shift_nm` under the last frames, newest first, one for each weight of the delay.
+        shifts_nm: `shift_nm` of the last frames, newest first, one for each weight of the delay.
         offset_nm: (modes,) the loop's target.
         play: the current play.
     """
@@ -148,7 +148,7 @@ class CommandChannels(NamedTuple):
         return (row @ self.play.table.basis).reshape(self.sum_nm.shape)
 
     def moved(self, sequence: int, step_nm: float, to_modes: Single) -> "CommandChannels":
-        """For the next command: move every channel towards its shape, all together by at most `step_nm`."""
+        """A copy for the next command: every channel moves towards its shape, all together by at most `step_nm`."""
         play = None if self.play is not None and self.play.over(sequence) else self.play
         moving = sum(channel.moving for channel in self.channels)
         if not moving:
@@ -157,8 +157,8 @@ class CommandChannels(NamedTuple):
         return self._replace(play=play).at(tuple(_nearer(channel, step) for channel in self.channels), to_modes)
 
     def at(self, channels: tuple[Channel, ...], to_modes: Single) -> "CommandChannels":
-        """With these channels, without those that have become flat as wanted."""
-        kept = tuple(one for one in channels if one.wanted_nm.any() or one.reached_nm.any())
+        """A copy with these channels, without those that have reached flat."""
+        kept = tuple(one for one in channels if one.shape_nm.any() or one.reached_nm.any())
         sums = [
             sum((one.reached_nm for one in kept if one.commanded and one.shifts is shifts), np.zeros_like(self.sum_nm))
             for shifts in (True, False)
@@ -166,8 +166,8 @@ class CommandChannels(NamedTuple):
         seen_nm = sum((one.reached_nm for one in kept if not one.commanded), sums[0])
         return self._replace(channels=kept, sum_nm=sums[0] + sums[1], shift_nm=to_modes @ seen_nm.reshape(-1))
 
-    def with_channel(self, name: str, wanted_nm: Single, to_modes: Single) -> "CommandChannels":
-        """With a new shape for a channel, approached from its current one; `EXTERNAL` is reached at once.
+    def with_channel(self, name: str, shape_nm: Single, to_modes: Single) -> "CommandChannels":
+        """A copy with a new shape for a channel, approached from its current one; `EXTERNAL` is reached at once.
 
         Raises:
             ValueError: the name is invalid, or there are too many channels.
@@ -179,42 +179,42 @@ class CommandChannels(NamedTuple):
         if before is None and len(self.channels) >= MOST_CHANNELS:
             raise ValueError(f"there are {MOST_CHANNELS} channels already, which is the most: remove one")
         if name == EXTERNAL:
-            after = self.having(Channel(name, wanted_nm, wanted_nm), to_modes)
+            after = self.having(Channel(name, shape_nm, shape_nm), to_modes)
             more_nm = after.shift_nm - self.shift_nm
             return after._replace(shifts_nm=tuple(one + more_nm for one in self.shifts_nm))
-        reached_nm = np.zeros_like(wanted_nm) if before is None else before.reached_nm
-        return self.having(Channel.of(name, wanted_nm, reached_nm), to_modes)
+        reached_nm = np.zeros_like(shape_nm) if before is None else before.reached_nm
+        return self.having(Channel.of(name, shape_nm, reached_nm), to_modes)
 
     def channel(self, name: str) -> Channel | None:
         """The channel of that name."""
         return next((one for one in self.channels if one.name == name), None)
 
     def having(self, channel: Channel, to_modes: Single) -> "CommandChannels":
-        """With this channel added, or replacing the one of its name."""
+        """A copy with this channel added, or replaced if there is one of its name."""
         channels = {one.name: one for one in (*self.channels, channel)}
         return self.at(tuple(channels[name] for name in sorted(channels)), to_modes)
 
     def stopped(self, sequence: int) -> "CommandChannels":
-        """With the play ended after this frame; its shape is removed with the next command."""
+        """A copy whose play ends after this frame; its shape is removed with the next command."""
         if self.play is None:
             return self
-        left = min(max(sequence + 1 - self.play.first_sequence, 0), self.play.frames)
-        return self._replace(play=self.play._replace(frames=left))
+        remaining = min(max(sequence + 1 - self.play.first_sequence, 0), self.play.frames)
+        return self._replace(play=self.play._replace(frames=remaining))
 
     def passed(self, frames: int = 1) -> "CommandChannels":
-        """Some frames later."""
+        """A copy advanced by some frames."""
         newest = (self.shift_nm,) * min(frames, len(self.shifts_nm))
         return self._replace(shifts_nm=(*newest, *self.shifts_nm)[: len(self.shifts_nm)])
 
     def settled(self) -> "CommandChannels":
-        """As if the channels had always had their current shapes."""
+        """A copy as if the channels had always had their current shapes."""
         return self.passed(len(self.shifts_nm))
 
-    def lowered(self, to_modes: Single, *, only_flat: bool = False) -> "CommandChannels":
-        """For a loop command that goes to zero: its channels start from flat, and no play runs."""
+    def restarted_from_flat(self, to_modes: Single, *, only_flat: bool = False) -> "CommandChannels":
+        """A copy for a command that relaxes to zero: the channels restart from flat, and the play ends."""
         flat = np.zeros_like(self.sum_nm)
         kept = (
-            Channel.of(one.name, one.wanted_nm, flat if one.commanded else one.wanted_nm)
+            Channel.of(one.name, one.shape_nm, flat if one.commanded else one.shape_nm)
             for one in self.channels
             if one.name in (FLAT, EXTERNAL) or not only_flat
         )
@@ -231,10 +231,10 @@ def seen_nm(weights: tuple[tuple[int, np.float32], ...], newest_first: tuple[Sin
 
 
 def play_table(target: str, rows: Single, basis: Single) -> PlayTable:
-    """Make a table to play, after all checks that do not need the loop; shapes as in `PlayTable`, nm.
+    """Check and make a table to play, as far as possible without the loop; shapes as in `PlayTable`, nm.
 
     Raises:
-        ValueError: its parts do not match, it is too long, or a number in it is not finite.
+        ValueError: its parts do not match, it is too large, or a number in it is not finite.
     """
     if target not in (MIRROR, OFFSET):
         raise ValueError(f"a play's target is {MIRROR} or {OFFSET}, got {target!r}")
@@ -260,7 +260,7 @@ def play_table(target: str, rows: Single, basis: Single) -> PlayTable:
 
 
 def _nearer(channel: Channel, step_nm: np.float32) -> Channel:
-    rest = channel.wanted_nm - channel.reached_nm
+    rest = channel.shape_nm - channel.reached_nm
     if np.abs(rest).max() <= step_nm:
-        return channel._replace(reached_nm=channel.wanted_nm)
+        return channel._replace(reached_nm=channel.shape_nm)
     return channel._replace(reached_nm=channel.reached_nm + np.clip(rest, -step_nm, step_nm))

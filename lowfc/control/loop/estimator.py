@@ -31,7 +31,7 @@ class Estimator(NamedTuple):
         dark: (pixels,) DN.
         scratch: (pixels,) overwritten by every frame, so that no array of a frame's size is allocated; it carries no
             data from one call to the next.
-        kernel: fused step for usual frames, with its `tables`; None for the reference implementation alone.
+        kernel: implementation for normal frames, with its `tables`; None for the reference implementation alone.
     """
 
     rows: Single
@@ -50,8 +50,8 @@ class Estimator(NamedTuple):
         rows, scratch = np.vstack([R, calibration.good]), np.empty_like(calibration.dark)
         return cls(rows, reference_nm, calibration.dark, scratch, kernel, tables)
 
-    def usual(self, pixels: Pixels, min_flux_dn: float) -> Estimate | None:
-        """Modal error of a usual frame (pixels,) by the fused step; None if the reference step is needed."""
+    def estimate_fused(self, pixels: Pixels, min_flux_dn: float) -> Estimate | None:
+        """Modal error of a frame (pixels,) by the fused step; None if the frame needs the reference step."""
         found = None if self.tables is None else self.tables.estimate(pixels, min_flux_dn)
         return None if found is None else Estimate(*found)
 
@@ -67,7 +67,7 @@ class Estimator(NamedTuple):
 
 
 def difference(calibration: Calibration, pixels: Pixels, min_flux_dn: float, out: Single) -> float | None:
-    """Put (I - dark) / flux - I0 of a frame (pixels,) into `out` (pixels,), float32.
+    """Write (I - dark) / flux - I0 of a frame (pixels,) into `out` (pixels,), float32.
 
     Returns:
         The flux: the sum of the good pixels, dark subtracted, DN. None if it is at most `min_flux_dn`; `out` then

@@ -1,4 +1,4 @@
-"""Requests for gains, leaks and limits of the integrator, and for offsets, by a person or by measurement."""
+"""Requests for gains, leaks and limits of the integrator, and for offsets, from people or automatic gains."""
 
 from dataclasses import replace
 from typing import Any
@@ -22,56 +22,56 @@ from lowfc.control.loop.wording import AUTO, counted
 Changed = tuple[ActiveLoop, str, *tuple[PendingEvent, ...]]
 
 
-def changed_law(settings: Settings, drive: ActiveLoop, request: Request) -> Changed:
+def changed_law(settings: Settings, loop: ActiveLoop, request: Request) -> Changed:
     """The loop after a request for gain, leak or limit, and the reply; ValueError with the reason if refused."""
     if request.name == "gain" and request.text == AUTO:
-        return _automatic_gain(settings, drive, request)
-    if drive.following is not None and request.name != "limit":
+        return _automatic_gain(settings, loop, request)
+    if loop.law_runner is not None and request.name != "limit":
         raise ValueError(
-            f"the law {drive.following.law.name!r} drives the mirror, and has no {request.name}: "
+            f"the law {loop.law_runner.law.name!r} drives the mirror, and has no {request.name}: "
             "`lowfc ctl law integrator` returns to the integrator"
         )
-    law = _changed(drive.law, drive.calibration.noll, settings.delay_frames, request)
-    if request.name == "gain":  # a gain set by a person is not automatic, and its mode is measured as a corrected one
-        given = _chosen(drive, request)
-        weighting = drive.weighting
-        drive = drive._replace(automatic=drive.automatic & ~given)
+    law = _changed(loop.law, loop.calibration.noll, settings.delay_frames, request)
+    if request.name == "gain":  # a gain set by a person is not automatic, and R treats its mode as corrected
+        given = _chosen(loop, request)
+        weighting = loop.weighting
+        loop = loop._replace(automatic=loop.automatic & ~given)
         if weighting is not None and (weighting.prior_nm2[given] > 0).any():
             prior_nm2 = np.where(given, np.float32(0), weighting.prior_nm2)
-            drive = drive.weighted(weighting._replace(prior_nm2=prior_nm2))
-    drive = drive.under(law)
+            loop = loop.with_weighting(weighting._replace(prior_nm2=prior_nm2))
+    loop = loop.with_gains(law)
     text = f"{request.name} is now {_listed(getattr(law, _ATTRIBUTES[request.name]))}"
-    return drive, text + remark(settings, drive, request)
+    return loop, text + remark(settings, loop, request)
 
 
-def _automatic_gain(settings: Settings, drive: ActiveLoop, request: Request) -> Changed:
+def _automatic_gain(settings: Settings, loop: ActiveLoop, request: Request) -> Changed:
     """Automatic gains: switched on by a request without values, changed by one with measured values."""
-    chosen, noll = _chosen(drive, request), drive.calibration.noll
+    chosen, noll = _chosen(loop, request), loop.calibration.noll
     if not request.values:
-        drive = drive._replace(automatic=drive.automatic | chosen).under(drive.law)
+        loop = loop._replace(automatic=loop.automatic | chosen).with_gains(loop.law)
         names = ", ".join(f"Z{index}" for index, one in zip(noll, chosen, strict=True) if one)
-        return drive, f"the gain of {names} is automatic"
-    changed = _changed(drive.law, noll, settings.delay_frames, request)
+        return loop, f"the gain of {names} is automatic"
+    changed = _changed(loop.law, noll, settings.delay_frames, request)
     prior_nm2 = np.array(request.prior_nm2, np.float32)
     if prior_nm2.size and not (
         prior_nm2.shape == chosen.shape and np.isfinite(prior_nm2).all() and (prior_nm2 >= 0).all()
     ):
         raise ValueError(f"the mean squares of the modes must be {chosen.size}, finite and at least 0 nm^2")
-    mine = chosen & drive.automatic
-    gain = np.where(mine, changed.gain, drive.law.gain)
+    mine = chosen & loop.automatic
+    gain = np.where(mine, changed.gain, loop.law.gain)
     weighting = Weighting(prior_nm2, request.flux_dn) if prior_nm2.any() else None
-    drive = drive.under(replace(drive.law, gain=gain)).weighted(weighting)
+    loop = loop.with_gains(replace(loop.law, gain=gain)).with_weighting(weighting)
     text = _listed(gain)
-    return drive, f"gain is now {text}", PendingEvent("GAINS_CHANGED", {"gains": text})
+    return loop, f"gain is now {text}", PendingEvent("GAINS_CHANGED", {"gains": text})
 
 
 def _listed(values: Single) -> str:
     return " ".join(f"{value:.3g}" for value in values.tolist())
 
 
-def _chosen(drive: ActiveLoop, request: Request) -> Mask:
+def _chosen(loop: ActiveLoop, request: Request) -> Mask:
     """The modes (modes,) of a request."""
-    noll = drive.calibration.noll
+    noll = loop.calibration.noll
     return np.isin(noll, request.modes or noll)
 
 
@@ -114,7 +114,7 @@ def _changed(law: Law, noll: tuple[int, ...], delay_frames: float, request: Requ
     return replace(law, **changed)
 
 
-def remark(settings: Settings, drive: ActiveLoop, request: Request) -> str:
+def remark(settings: Settings, loop: ActiveLoop, request: Request) -> str:
     """Remark on the values of a request for gains or limits; usually empty."""
     lowest, highest = min(request.values), max(request.values)
     if request.name == "gain":
@@ -130,8 +130,8 @@ def remark(settings: Settings, drive: ActiveLoop, request: Request) -> str:
         unit = " nm" if request.name == "limit" else ""
         return f": a mode with a {request.name} of 0{unit} is not corrected"
     if request.name == "limit":
-        noll = request.modes or drive.calibration.noll
-        columns = drive.to_actuators[:, [drive.calibration.noll.index(mode) for mode in noll]]
+        noll = request.modes or loop.calibration.noll
+        columns = loop.to_actuators[:, [loop.calibration.noll.index(mode) for mode in noll]]
         stroke_nm = settings.limits.stroke_nm
         reach_nm = stroke_nm / np.maximum(np.abs(columns).max(axis=0), np.finfo(np.float32).tiny)
         beyond = np.flatnonzero(np.asarray(request.values) > reach_nm)
@@ -141,20 +141,20 @@ def remark(settings: Settings, drive: ActiveLoop, request: Request) -> str:
     return ""
 
 
-def offset_remark(drive: ActiveLoop, offset_nm: Single) -> str:
+def offset_remark(loop: ActiveLoop, offset_nm: Single) -> str:
     """Remark on offsets (modes,) of modes that cannot follow at a gain of 0; empty if there are none."""
-    fixed = (offset_nm != 0) & (drive.law.gain == 0) & ~drive.automatic & (drive.following is None)
-    names = ", ".join(f"Z{mode}" for mode, one in zip(drive.calibration.noll, fixed, strict=True) if one)
+    fixed = (offset_nm != 0) & (loop.law.gain == 0) & ~loop.automatic & (loop.law_runner is None)
+    names = ", ".join(f"Z{mode}" for mode, one in zip(loop.calibration.noll, fixed, strict=True) if one)
     return f": {names} would not follow at a gain of 0" if names else ""
 
 
-def check_offset(drive: ActiveLoop, largest_nm: npt.NDArray[np.floating[Any]]) -> None:
+def check_offset(loop: ActiveLoop, largest_nm: npt.NDArray[np.floating[Any]]) -> None:
     """Refuse offsets (modes,), nm rms of wavefront, beyond the limits of their modes.
 
     Raises:
         ValueError: an offset is too large; the text names its mode.
     """
-    for mode, limit_nm, asked_nm in zip(drive.calibration.noll, drive.law.limit_nm, largest_nm, strict=True):
+    for mode, limit_nm, asked_nm in zip(loop.calibration.noll, loop.law.limit_nm, largest_nm, strict=True):
         if asked_nm > limit_nm:
             raise ValueError(f"offset of mode {mode}: at most its limit, {limit_nm:g} nm; asked for {asked_nm:g} nm")
 

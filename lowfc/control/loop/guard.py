@@ -4,7 +4,7 @@ Tip and tilt are judged apart from the other modes, as the larger group would hi
 group, the integrator is virtual there, and vice versa.
 
 Squared errors are compared in blocks of frames, and several blocks in a row decide: a step of the disturbance, from
-which a law may recover more slowly than the integrator, spoils one or two blocks; vibration lines that moved spoil all.
+which a law may recover more slowly than the integrator, affects one or two blocks; shifted vibration lines affect all.
 """
 
 from collections.abc import Sequence
@@ -25,19 +25,19 @@ WORSE_BLOCKS = 4
 FADED_S = 0.1
 """Duration of the cross-fade."""
 BETTER_S = 10.0
-"""Time for which the law must be better in every block before it drives again; doubled each time."""
+"""Time for which the law must be better in every block before it drives again; doubles with each takeover."""
 MOST_TAKEOVERS = 4
-"""Takeover after which only an operator can let the law drive again."""
+"""Number of takeovers after which only an operator can let the law drive again."""
 WORSE, BETTER = 1.2, 0.25
 """Ratio of the law's mean squared error to the integrator's above which it is worse, and below which it is better."""
-USUAL_S = 10.0
-"""Time constant of the usual mean square of the pseudo-open-loop modes."""
+LONG_TERM_S = 10.0
+"""Time constant of the long-term mean square of the pseudo-open-loop modes."""
 AMPLIFIED = 2.5
-"""Ratio of mean squared error to the usual mean square of the pseudo-open-loop modes above which the loop amplifies;
-below `BETTER` of the present mean square the disturbance has grown, and the loop corrects it."""
+"""Ratio of mean squared error to the long-term mean square of the pseudo-open-loop modes above which it amplifies;
+below `BETTER` of the current mean square, the disturbance has grown and the loop corrects it."""
 
 NAMES = ("tip and tilt", "the other modes")
-AGAIN = "again"
+LAW_RETURNS = "law returns"
 
 
 class Spans(NamedTuple):
@@ -46,21 +46,21 @@ class Spans(NamedTuple):
     block: int
     faded: int
     better: int
-    usual: int
+    long_term: int
 
     @classmethod
     def at(cls, rate_hz: float) -> "Spans":
         """At this rate."""
         block = max(FEWEST, round(BLOCK_S * rate_hz))
-        better, usual = (max(1, round(seconds * rate_hz / block)) for seconds in (BETTER_S, USUAL_S))
-        return cls(block, max(1, round(FADED_S * rate_hz)), better, usual)
+        better, long_term = (max(1, round(seconds * rate_hz / block)) for seconds in (BETTER_S, LONG_TERM_S))
+        return cls(block, max(1, round(FADED_S * rate_hz)), better, long_term)
 
 
 class Group(NamedTuple):
     """The guard's state for a group of modes.
 
     Attributes:
-        overruled: the integrator drives it.
+        overruled: whether the integrator drives it.
         faded: frames of the cross-fade to the integrator so far.
         takeovers: number of takeovers by the integrator.
         blocks: blocks in a row in favour of a change.
@@ -79,22 +79,22 @@ class Group(NamedTuple):
         return self.takeovers >= MOST_TAKEOVERS
 
     def judged(self, means_nm2: Sequence[float], spans: Spans, *, void: bool) -> tuple["Group", str]:
-        """The group after a block, and why the law is overruled, or `AGAIN`; usually empty.
+        """The group after a block, and why the law is overruled, or `LAW_RETURNS`; empty if nothing changes.
 
         Args:
             means_nm2: means over the block of the squares of errors, virtual errors and pseudo-open-loop modes.
             spans: durations.
-            void: the comparison is not valid. An amplifying loop is detected nevertheless; a wrong delay, for example,
-                spoils pseudo-open-loop modes, and with them the comparison.
+            void: whether the comparison is invalid. An amplifying loop is detected nevertheless: a wrong delay, for
+                example, falsifies the pseudo-open-loop modes, and with them the comparison.
         """
         error_nm2, virtual_nm2, pol_nm2 = means_nm2
-        after = self._replace(usual_nm2=self.usual_nm2 + (pol_nm2 - self.usual_nm2) / spans.usual)
+        after = self._replace(usual_nm2=self.usual_nm2 + (pol_nm2 - self.usual_nm2) / spans.long_term)
         if self.overruled:
             better = not void and virtual_nm2 < BETTER * error_nm2
             after = after._replace(blocks=self.blocks + 1 if better else 0)
             if self.final or after.blocks < spans.better << (self.takeovers - 1):
                 return after, ""
-            return after._replace(overruled=False, blocks=0), AGAIN
+            return after._replace(overruled=False, blocks=0), LAW_RETURNS
         worse = not void and error_nm2 > WORSE * virtual_nm2
         amplified = error_nm2 > max(AMPLIFIED * self.usual_nm2, BETTER * pol_nm2)
         after = after._replace(blocks=self.blocks + 1 if worse or amplified else 0)
@@ -117,7 +117,7 @@ class Guard(NamedTuple):
         groups: in the order of `members`.
         frames: frames of the current block.
         sums_nm2: (3, groups) sums of squares: errors, virtual errors, pseudo-open-loop modes.
-        void: the virtual loop has not run for the whole block.
+        void: whether the virtual loop has not run for the whole block.
         virtual_nm: commands (modes,) of the controller that does not drive a mode, newest first; empty until it
             starts from the loop's command.
         x: (states,) of the law as if it drove all modes; None while it does.
@@ -147,24 +147,24 @@ class Guard(NamedTuple):
     @property
     def weight(self) -> Single:
         """The law's share (modes,) of the command."""
-        left = np.array([1 - group.faded / self.spans.faded for group in self.groups], np.float32)
-        return self.members @ left
+        shares = np.array([1 - group.faded / self.spans.faded for group in self.groups], np.float32)
+        return self.members @ shares
 
     def with_groups(self, groups: Sequence[Group]) -> "Guard":
-        """At rest, as at the beginning of a block, with these groups."""
+        """A copy at rest, as at the beginning of a block, with these groups."""
         return Guard(self.spans, self.members, tuple(groups), 0, np.zeros_like(self.sums_nm2))
 
-    def anew(self) -> "Guard":
-        """For a law that takes over from the integrator again; the usual mean squares are kept."""
+    def reset(self) -> "Guard":
+        """Reset for a law that takes over from the integrator; the long-term mean squares are kept."""
         return self.with_groups([Group(usual_nm2=group.usual_nm2) for group in self.groups])
 
     def at_rest(self) -> "Guard":
-        """Reset the block while there is nothing to judge."""
+        """A copy with a new block, while there is nothing to judge."""
         return self.with_groups([group._replace(blocks=0) for group in self.groups])
 
     def observed(self, pol_nm: Single, frames: int) -> "Guard":
-        """At rest, one frame later, as one of `frames` in which the law did not drive."""
-        part = 1 / min(frames, self.spans.usual * self.spans.block)
+        """A copy at rest, advanced by one frame, the last of `frames` in which the law did not drive."""
+        part = 1 / min(frames, self.spans.long_term * self.spans.block)
         squares = np.square(pol_nm).dot(self.members).tolist()
         return self.with_groups(
             [
@@ -174,13 +174,13 @@ class Guard(NamedTuple):
         )
 
     def held(self, frames: int, law: LinearLaw) -> "Guard":
-        """Some frames later, without measurements: commands are held, as in the loop."""
+        """A copy advanced by frames without measurements: commands are held, as in the loop."""
         if not self.virtual_nm:
             return self
         x = self.x
         if x is not None:
             for _ in range(frames):
-                x = linear_law.coast(law, x, self.virtual_nm[0])
+                x = linear_law.predict(law, x, self.virtual_nm[0])
         held = self.virtual_nm[:1] * min(frames, len(self.virtual_nm))
         return self._replace(virtual_nm=(held + self.virtual_nm)[: len(self.virtual_nm)], x=x)
 
@@ -196,7 +196,7 @@ class Guard(NamedTuple):
         *,
         limited: bool,
     ) -> tuple["Guard", list[PendingEvent]]:
-        """One frame later, in a closed loop, and the resulting events.
+        """A copy advanced by one frame of a closed loop, and the resulting events.
 
         Args:
             law: the guarded law.
@@ -204,9 +204,9 @@ class Guard(NamedTuple):
             integrator: the integrator that it is compared with.
             weights: which commands an exposure sees.
             history_nm: the loop's commands (modes,) before this frame's, newest first.
-            error_nm: (modes,) of this frame.
-            pol_nm: (modes,) pseudo-open-loop; both without the loop's target.
-            limited: a limit of the mirror acted on the last command; virtual commands do not keep it.
+            error_nm: (modes,) error of this frame.
+            pol_nm: (modes,) pseudo-open-loop modes; both relative to the loop's target.
+            limited: whether a limit of the mirror acted on the last command; virtual commands ignore these limits.
         """
         spans, groups = self.spans, self.groups
         overruled = self.overruled
@@ -227,7 +227,9 @@ class Guard(NamedTuple):
                 virtual_x = x
                 if self.x is not None:
                     y = pol_nm if law.signal == "pol" else np.where(out, other_nm, error_nm)
-                    virtual_x = linear_law.follow(law, self.x, y, np.where(out, virtual_nm[0], history_nm[0]))
+                    virtual_x = linear_law.predict_and_update(
+                        law, self.x, y, np.where(out, virtual_nm[0], history_nm[0])
+                    )
                 wanted_nm = np.clip(linear_law.respond(law, virtual_x), -integrator.limit_nm, integrator.limit_nm)
                 command_nm = np.where(out, wanted_nm, command_nm)
             virtual_nm, squares[1] = (command_nm, *virtual_nm[:-1]), other_nm
@@ -238,13 +240,13 @@ class Guard(NamedTuple):
         means_nm2 = (sums_nm2 / frames).T.tolist()
         judged = [group.judged(means, spans, void=void) for group, means in zip(groups, means_nm2, strict=True)]
         after, events = self.with_groups([group for group, _ in judged]), _events(law.name, judged)
-        if events:  # the new driver is compared once it drives alone
+        if events:  # the comparison restarts once the new controller drives alone
             return after.at_rest(), events
         return after._replace(virtual_nm=virtual_nm, x=virtual_x), []
 
 
 def _faded(group: Group, spans: Spans) -> Group:
-    """One frame further in the cross-fade to the controller that drives it."""
+    """Advance the cross-fade to the controller that drives the group by one frame."""
     faded = min(group.faded + 1, spans.faded) if group.overruled else max(group.faded - 1, 0)
     return group._replace(faded=faded, blocks=0)
 
@@ -252,7 +254,7 @@ def _faded(group: Group, spans: Spans) -> Group:
 def _events(law: str, judged: Sequence[tuple[Group, str]]) -> list[PendingEvent]:
     events = []
     for modes, (group, why) in zip(NAMES, judged, strict=True):
-        if why == AGAIN:
+        if why == LAW_RETURNS:
             events.append(PendingEvent("LAW_BACK", {"law": law, "modes": modes}))
         elif why:
             wait_s = BETTER_S * 2 ** (group.takeovers - 1)

@@ -23,7 +23,8 @@ class Frame(NamedTuple):
 
     Attributes:
         pixels: (rows, columns) uint16, DN, or None if the message held no valid image.
-        ahead: its sequence starts further ahead of the host's clock than allowed (a clock's verdict, as its age is).
+        ahead: whether its sequence starts further ahead of the host's clock than allowed; like its age, determined from
+            the clock before the step.
     """
 
     sequence: int
@@ -42,15 +43,15 @@ class Request:
         values: one for all modes, or one for each.
         text: name of a channel, target of a play, a note.
         actuators_nm: one or more shapes of the mirror, one after the other, nm of surface.
-        table: table of a play, (frames, columns).
+        table: (frames, columns), for a play.
         law: the law to drive the mirror; None for the integrator.
         calibration: the calibration to use.
-        played: the play made of `table` and shapes, once checked.
+        played: the checked table and shapes of a play.
         refusal: reason to refuse it in any state of the loop.
-        prepared: the checks that need no state are done; see `lowfc.control.loop.requests.prepared`.
-        lease_id: identity of the lease that it is sent under, or that it requests; 0 for none.
+        prepared: whether the checks that need no state are done; see `lowfc.control.loop.requests.prepared`.
+        lease_id: identity of the sender's lease, or of the requested one; 0 for none.
         requester: user and program that sent it, for people.
-        prior_nm2: of automatic gains, as in `lowfc.control.loop.state.Weighting`; with the light `flux_dn`.
+        prior_nm2: for automatic gains, as in `lowfc.control.loop.state.Weighting`, with the flux `flux_dn`.
     """
 
     time_ns: int
@@ -76,7 +77,7 @@ class MirrorShape:
     """The mirror's shape: actuators (rows, columns) nm of surface, and their modal command.
 
     Attributes:
-        safe: its last command was sent in safe mode.
+        safe: whether its last command was sent in safe mode.
     """
 
     time_ns: int
@@ -87,7 +88,7 @@ class MirrorShape:
 
 @dataclass(frozen=True, slots=True)
 class MirrorReport:
-    """Whether the mirror follows commands (a clock's verdict).
+    """Whether the mirror follows commands, determined from the clock before the step.
 
     Attributes:
         fault: the fault, a phrase that continues "the mirror ..."; empty if there is none.
@@ -110,7 +111,7 @@ class Load:
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """No frame arrived; `silent_ns` is the time since the last (a clock's verdict)."""
+    """No frame arrived; `silent_ns` is the time since the last, determined from the clock before the step."""
 
     time_ns: int
     silent_ns: int
@@ -172,7 +173,7 @@ class Reply(NamedTuple):
 
 
 class Outputs(NamedTuple):
-    """Outputs of one input; `changed`: the state changed by more than the next frame will show."""
+    """Outputs of one input; `changed`: whether the state changed in ways that the next step does not show."""
 
     step: Step | None = None
     command: Command | None = None

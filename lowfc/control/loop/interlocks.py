@@ -59,7 +59,7 @@ class Interlock(NamedTuple):
         if age_ns > self.max_age_ns:
             return f"no value of {self.name} for more than {age_s:g} s" if self.acts_when_old else ""
         if type(value) is not type(self.value):
-            return f"{self.name} is {shown(value)}, no {_KINDS[type(self.value)]}" if self.acts_when_old else ""
+            return f"{self.name} is {shown(value)}, not {_KINDS[type(self.value)]}" if self.acts_when_old else ""
         return f"{self.name} is {shown(value)}{self._compared()}" if self._holds(value) else ""
 
     def _holds(self, value: Value) -> bool:
@@ -87,7 +87,7 @@ class Acting(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class BenchReport:
-    """The newest value of a name, None if none was received; its age is a clock's verdict."""
+    """The newest value of a name, None if none was received; its age is determined from the clock before the step."""
 
     time_ns: int
     name: str
@@ -129,4 +129,4 @@ def _by_value(why: str, report: BenchReport) -> bool:
 
 _AGAINST_CLOSING = (Action.REFUSE_CLOSE, Action.HOLD, Action.OPEN, Action.SAFE)
 _BOUNDS = ("above", "below")
-_KINDS = {bool: "truth", float: "number", str: "text"}
+_KINDS = {bool: "true or false", float: "a number", str: "a text"}

@@ -22,7 +22,7 @@ UNRELATED = frozenset({"status", "note", "lease", "renew", "release", "permit"})
 """Requests that do not change the loop, and the requests for leases themselves."""
 LEASE_OVER = "the lease ended: "
 """Beginning of the refusal of a renewal, before the cause."""
-OUTLOOK = ", about "
+REMAINING_TIME_SEPARATOR = ", about "
 """Separator in a holder's description before its remaining time."""
 
 
@@ -30,7 +30,7 @@ class Lease(NamedTuple):
     """A reservation of the loop.
 
     Attributes:
-        id: carried by the holder's requests; above 0.
+        id: identity in the holder's requests; above 0.
         holder: the holder and its purpose, for people.
         until_ns: end by the controller's clock, unless it is renewed.
         last_sequence: last frame for which it is in force; 0 if the frame rate is unknown.
@@ -46,9 +46,9 @@ class Lease(NamedTuple):
     holds: bool = False
 
     @property
-    def without_outlook(self) -> str:
+    def holder_name(self) -> str:
         """The holder, without its remaining time."""
-        return self.holder.rpartition(OUTLOOK)[0] or self.holder
+        return self.holder.rpartition(REMAINING_TIME_SEPARATOR)[0] or self.holder
 
     def over(self, time_ns: int, frame_sequence: int) -> bool:
         """Whether it was not renewed in time, by the clock or by frames."""
@@ -57,8 +57,8 @@ class Lease(NamedTuple):
 
     def reserved(self, time_ns: int) -> str:
         """Message that the loop is reserved."""
-        left_s = ceil(max(0, self.until_ns - time_ns) * 1e-9)
-        return f"the loop is reserved for {self.holder} (while that runs, and for at most {left_s} s after it)"
+        remaining_s = ceil(max(0, self.until_ns - time_ns) * 1e-9)
+        return f"the loop is reserved for {self.holder} (while that runs, and for at most {remaining_s} s after it)"
 
 
 def refusal(lease: Lease | None, name: str, lease_id: int, time_ns: int) -> str:

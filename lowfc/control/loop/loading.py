@@ -19,7 +19,7 @@ ADOPTED_NM = 1.0
 REFUSED_IN_A_ROW = 3
 """Frames refused in a row from which on the loop counts as holding; fewer are ignored."""
 LATCHED = "it was in safe mode before the controller started"
-WITNESSED = "the mirror's last command was sent in safe mode"
+MIRROR_WAS_SAFE = "the mirror's last command was sent in safe mode"
 
 
 def loaded(
@@ -28,9 +28,9 @@ def loaded(
     """The state with another calibration, and the events.
 
     If the mirror has the same grid, it keeps its shape: the channels stay, the rest becomes a command of the new modes,
-    and what these cannot make becomes a channel of its own. Offset, play and a law of other modes are dropped.
+    and the part outside the modes becomes a channel. Offset, play and a law of other modes are dropped.
     """
-    drive, before = ActiveLoop.at_rest(settings, calibration), state.drive
+    loop, before = ActiveLoop.at_rest(settings, calibration), state.loop
     details: dict[str, object] = {
         "id": calibration.id[:12],
         "modes": len(calibration.noll),
@@ -43,27 +43,27 @@ def loaded(
         same = before.calibration.noll == calibration.noll
         if before.command_channels is not None:
             shape_nm = shape_nm - before.command_channels.sum_nm
-            command_channels = drive.added().at(before.command_channels.channels, drive.to_modes)
+            command_channels = loop.additions().at(before.command_channels.channels, loop.to_modes)
             if same:
                 command_channels = command_channels._replace(offset_nm=before.command_channels.offset_nm)
-            drive = drive._replace(command_channels=command_channels.settled())
-        command_nm = drive.inverse @ shape_nm.reshape(-1)
-        drive = drive._replace(
-            law=before.law if same else drive.law,
-            automatic=before.automatic if same else drive.automatic,
-            following=before.following if same else None,
+            loop = loop._replace(command_channels=command_channels.settled())
+        command_nm = loop.inverse @ shape_nm.reshape(-1)
+        loop = loop._replace(
+            law=before.law if same else loop.law,
+            automatic=before.automatic if same else loop.automatic,
+            law_runner=before.law_runner if same else None,
             actuators_nm=before.actuators_nm,
-            history_nm=(command_nm,) * len(drive.history_nm),
+            history_nm=(command_nm,) * len(loop.history_nm),
         )
-        drive, rest = adopted(drive, shape_nm)
+        loop, rest = adopted(loop, shape_nm)
         events += rest
     before_mode, cause = state.mode, "a calibration was loaded"
     mode = settings.start_mode if before_mode is LoopMode.IDLE else before_mode
     if mode is LoopMode.SAFE:
         cause = LATCHED
-    elif before_mode is LoopMode.IDLE and mode is LoopMode.CLOSED and drive.automatic.any():
+    elif before_mode is LoopMode.IDLE and mode is LoopMode.CLOSED and loop.automatic.any():
         mode, cause = LoopMode.OPEN, MEASURED_FIRST
-    state = state._replace(drive=drive)
+    state = state._replace(loop=loop)
     if mode is not LoopMode.SAFE and (wrong := uncalibrated(state)):
         mode, cause = LoopMode.IDLE, wrong
     elif mode is LoopMode.CLOSED and (wrong := misfit(state)):
@@ -78,20 +78,20 @@ def loaded(
 
 def misfit(state: State) -> str:
     """Why the camera's last received settings do not fit the calibration; empty if they do."""
-    camera, drive = state.conditions.camera, state.drive
-    if camera is None or drive is None or not drive.calibration.noll:
+    camera, loop = state.conditions.camera, state.loop
+    if camera is None or loop is None or not loop.calibration.noll:
         return ""
-    return "; ".join(changes(camera, _expected(drive, camera)))
+    return "; ".join(changes(camera, _expected(loop, camera)))
 
 
 def uncalibrated(state: State) -> str:
     """Why no mode can be measured: no calibration, or a computed one for another frame size; empty if they can."""
-    drive, camera = state.drive, state.conditions.camera
+    loop, camera = state.loop, state.conditions.camera
     hint = ": `lowfc commission` measures one"
-    if drive is None or not drive.calibration.noll:
+    if loop is None or not loop.calibration.noll:
         return f"no calibration is loaded{hint}"
-    rows, columns = drive.calibration.shape
-    if camera is None or camera.shape == (rows, columns) or not drive.calibration.operator_hash:
+    rows, columns = loop.calibration.shape
+    if camera is None or camera.shape == (rows, columns) or not loop.calibration.operator_hash:
         return ""
     frames = "{} x {}".format(*camera.shape)
     return f"the computed calibration is for frames of {rows} x {columns} pixels, the camera's are {frames}{hint}"
@@ -148,71 +148,71 @@ def mirror_reported(settings: Settings, state: State, shape: MirrorShape) -> tup
     if state.commanded:
         return state, Outputs()
     events: list[PendingEvent] = []
-    drive, safe = state.drive, WITNESSED if shape.safe else ""
-    if drive is None:  # probe sequences and channels need no calibration
-        drive = ActiveLoop.at_rest(settings, Calibration.none(shape.actuators_nm.shape))
+    loop, safe = state.loop, MIRROR_WAS_SAFE if shape.safe else ""
+    if loop is None:  # probe sequences and channels need no calibration
+        loop = ActiveLoop.at_rest(settings, Calibration.none(shape.actuators_nm.shape))
         events.append(PendingEvent("NOT_CALIBRATED", {"why": uncalibrated(state)}))
         safe = safe or (LATCHED if settings.start_mode is LoopMode.SAFE else "")
     if safe:
         state = _changed(state, LoopMode.SAFE, shape.time_ns, safe, events)
-    if shape.actuators_nm.shape != drive.calibration.grid or not np.isfinite(shape.actuators_nm).all():
-        why = f"the mirror has a grid of {shape.actuators_nm.shape}, the calibration {drive.calibration.grid}"
+    if shape.actuators_nm.shape != loop.calibration.grid or not np.isfinite(shape.actuators_nm).all():
+        why = f"the mirror has a grid of {shape.actuators_nm.shape}, the calibration {loop.calibration.grid}"
         events.append(PendingEvent("MIRROR_REFUSED", {"why": why}))
         return state, Outputs(events=events, changed=bool(safe))
-    limit_nm = drive.law.limit_nm
-    believed = shape.command_nm.shape == limit_nm.shape and (np.abs(shape.command_nm) <= limit_nm).all()
-    command_nm = shape.command_nm if believed else drive.inverse @ shape.actuators_nm.reshape(-1)
-    drive = drive._replace(actuators_nm=shape.actuators_nm, history_nm=(command_nm,) * len(drive.history_nm))
+    limit_nm = loop.law.limit_nm
+    plausible = shape.command_nm.shape == limit_nm.shape and (np.abs(shape.command_nm) <= limit_nm).all()
+    command_nm = shape.command_nm if plausible else loop.inverse @ shape.actuators_nm.reshape(-1)
+    loop = loop._replace(actuators_nm=shape.actuators_nm, history_nm=(command_nm,) * len(loop.history_nm))
     if command_nm.any():
         events.append(PendingEvent("MIRROR_ADOPTED", {"rms_nm": float(np.sqrt(command_nm @ command_nm))}))
     if state.mode is not LoopMode.SAFE:  # in safe mode it relaxes to flat and stays there
-        added = drive.command_channels  # of a mirror that reported late
-        drive, rest = adopted(drive, shape.actuators_nm if added is None else shape.actuators_nm - added.sum_nm)
+        additions = loop.command_channels  # a mirror that reported late has channels already
+        loop, rest = adopted(loop, shape.actuators_nm if additions is None else shape.actuators_nm - additions.sum_nm)
         events += rest
-    return state._replace(drive=drive), Outputs(events=events, changed=True)
+    return state._replace(loop=loop), Outputs(events=events, changed=True)
 
 
 def mirror_judged(settings: Settings, state: State, report: MirrorReport) -> tuple[State, Outputs]:
     """Hold while the mirror does not follow; a closed loop steps back to the mirror's last shape, against wind-up.
 
-    A long way back takes several reports: each step keeps the slew limit.
+    A large step back takes several reports, within the slew limit.
     """
-    fault, drive = report.fault, state.drive
-    news = fault != state.conditions.mirror_fault
+    fault, loop = report.fault, state.loop
+    changed = fault != state.conditions.mirror_fault
     events: list[PendingEvent] = []
-    if news:
+    if changed:
         events.append(PendingEvent("MIRROR_LOST", {"fault": fault}) if fault else PendingEvent("MIRROR_BACK", {}))
-    if drive is not None and fault:
-        if news:
-            drive = end_probe(drive, state.frame_sequence, f"the mirror {fault}", events)
-        if news and drive.following is not None:
-            drive = drive._replace(following=drive.following.again())
+    if loop is not None and fault:
+        if changed:
+            loop = end_probe(loop, state.frame_sequence, f"the mirror {fault}", events)
+        if changed and loop.law_runner is not None:
+            loop = loop._replace(law_runner=loop.law_runner.restarted())
         if state.mode is LoopMode.CLOSED and report.shape is not None:
-            drive = _gone_back(settings, drive, report.shape.actuators_nm)
-    if not news and drive is state.drive:
+            loop = _step_back(settings, loop, report.shape.actuators_nm)
+    if not changed and loop is state.loop:
         return state, Outputs()
     conditions = state.conditions._replace(mirror_fault=fault)
-    return state._replace(drive=drive, conditions=conditions), Outputs(events=events, changed=True)
+    return state._replace(loop=loop, conditions=conditions), Outputs(events=events, changed=True)
 
 
-def _gone_back(settings: Settings, drive: ActiveLoop, shape_nm: Single) -> ActiveLoop:
+def _step_back(settings: Settings, loop: ActiveLoop, shape_nm: Single) -> ActiveLoop:
     """Move the command towards a shape (rows, columns) of the mirror."""
-    if shape_nm.shape != drive.calibration.grid:
-        return drive
-    kept_nm = limit(settings.limits, drive.actuators_nm, shape_nm).actuators_nm
-    if np.array_equal(kept_nm, drive.actuators_nm):
-        return drive
-    modal_nm: Single = kept_nm if drive.command_channels is None else kept_nm - drive.command_channels.sum_nm
-    command_nm = drive.inverse @ modal_nm.reshape(-1)
-    return drive._replace(actuators_nm=kept_nm, history_nm=(command_nm,) * len(drive.history_nm))
+    if shape_nm.shape != loop.calibration.grid:
+        return loop
+    limited_nm = limit(settings.limits, loop.actuators_nm, shape_nm).actuators_nm
+    if np.array_equal(limited_nm, loop.actuators_nm):
+        return loop
+    modal_nm: Single = limited_nm if loop.command_channels is None else limited_nm - loop.command_channels.sum_nm
+    command_nm = loop.inverse @ modal_nm.reshape(-1)
+    return loop._replace(actuators_nm=limited_nm, history_nm=(command_nm,) * len(loop.history_nm))
 
 
-def end_probe(drive: ActiveLoop, sequence: int, why: str, events: list[PendingEvent]) -> ActiveLoop:
-    """End the play after this frame."""
-    if drive.play is None or drive.play.over(sequence):
-        return drive
+def end_probe(loop: ActiveLoop, sequence: int, why: str, events: list[PendingEvent]) -> ActiveLoop:
+    """End the probe sequence after this frame."""
+    if loop.play is None or loop.play.over(sequence):
+        return loop
     events.append(PendingEvent("PLAY_ENDED", {"why": why}))
-    return drive.stopped(sequence)
+    return loop.stopped(sequence)
 
 
 def camera_reported(settings: Settings, state: State, camera: CameraSettings) -> tuple[State, Outputs]:
@@ -236,24 +236,24 @@ def camera_reported(settings: Settings, state: State, camera: CameraSettings) ->
 
 def _with_camera(state: State, camera: CameraSettings) -> State:
     """The state with newly received camera settings; the same object if they are unchanged."""
-    drive, known = state.drive, state.conditions
+    loop, known = state.loop, state.conditions
     if (
-        drive is not None
-        and drive.calibration.noll
-        and drive.camera is None
-        and not changes(camera, _expected(drive, camera))
+        loop is not None
+        and loop.calibration.noll
+        and loop.camera is None
+        and not changes(camera, _expected(loop, camera))
     ):
-        state = state._replace(drive=drive._replace(camera=camera))
+        state = state._replace(loop=loop._replace(camera=camera))
     if camera != known.camera or known.camera_awaited:
         state = state._replace(conditions=known._replace(camera=camera, camera_awaited=False))
     return state
 
 
-def _expected(drive: ActiveLoop, camera: CameraSettings) -> CameraSettings:
+def _expected(loop: ActiveLoop, camera: CameraSettings) -> CameraSettings:
     """Settings of the calibration; if it has none yet, the camera's as far as the calibration allows."""
-    if drive.camera is not None:
-        return drive.camera
-    calibration = drive.calibration
+    if loop.camera is not None:
+        return loop.camera
+    calibration = loop.calibration
     return replace(camera, shape=calibration.shape, saturation_dn=calibration.saturation_dn)
 
 
@@ -261,35 +261,35 @@ def _since(state: State, time_ns: int, cause: str) -> Conditions:
     return state.conditions._replace(mode_since_ns=time_ns, mode_cause=cause)
 
 
-def adopted(drive: ActiveLoop, shape_nm: Single) -> tuple[ActiveLoop, list[PendingEvent]]:
-    """Keep a shape's deviation (rows, columns) from the modal command as a channel, except the driver's rounding."""
+def adopted(loop: ActiveLoop, shape_nm: Single) -> tuple[ActiveLoop, list[PendingEvent]]:
+    """Make a shape's deviation (rows, columns) from the modal command a channel, unless it is the driver's rounding."""
     rest_nm = shape_nm.copy()
-    rest_nm -= (drive.to_actuators @ drive.history_nm[0]).reshape(rest_nm.shape)
+    rest_nm -= (loop.to_actuators @ loop.history_nm[0]).reshape(rest_nm.shape)
     if not np.abs(rest_nm).max() > ADOPTED_NM:
-        return drive, []
-    added = drive.added()
-    before = added.channel(ADOPTED)
-    there_nm = rest_nm if before is None else before.wanted_nm + rest_nm
-    added = added.having(Channel(ADOPTED, there_nm, there_nm), drive.to_modes).settled()
+        return loop, []
+    additions = loop.additions()
+    before = additions.channel(ADOPTED)
+    channel_nm = rest_nm if before is None else before.shape_nm + rest_nm
+    additions = additions.having(Channel(ADOPTED, channel_nm, channel_nm), loop.to_modes).settled()
     rms_nm = float(np.sqrt(np.mean(np.square(rest_nm))))
-    drive = drive._replace(command_channels=added)
-    return drive, [PendingEvent("SHAPE_ADOPTED", {"rms_nm": rms_nm})]
+    loop = loop._replace(command_channels=additions)
+    return loop, [PendingEvent("SHAPE_ADOPTED", {"rms_nm": rms_nm})]
 
 
 def in_mode(state: State, mode: LoopMode, time_ns: int, cause: str) -> State:
     """Change the loop mode; the play, steps and return to zero of the previous mode end."""
-    drive = state.drive
-    if drive is not None and mode is not state.mode:
-        drive = drive.stopped(state.frame_sequence)
-        if drive.command_channels is not None and mode is LoopMode.SAFE:
-            lowered = drive.command_channels.lowered(drive.to_modes, only_flat=True)
-            drive = drive._replace(command_channels=lowered)
-        if drive.following is not None and mode is LoopMode.CLOSED:
-            drive = drive._replace(following=drive.following.taking_over())
+    loop = state.loop
+    if loop is not None and mode is not state.mode:
+        loop = loop.stopped(state.frame_sequence)
+        if loop.command_channels is not None and mode is LoopMode.SAFE:
+            restarted_from_flat = loop.command_channels.restarted_from_flat(loop.to_modes, only_flat=True)
+            loop = loop._replace(command_channels=restarted_from_flat)
+        if loop.law_runner is not None and mode is LoopMode.CLOSED:
+            loop = loop._replace(law_runner=loop.law_runner.taking_over())
     same = mode is state.mode
     conditions = state.conditions if same else _since(state, time_ns, cause)
     return state._replace(
-        mode=mode, drive=drive, steps_left=0, returning_to_zero=state.returning_to_zero and same, conditions=conditions
+        mode=mode, loop=loop, steps_left=0, returning_to_zero=state.returning_to_zero and same, conditions=conditions
     )
 
 

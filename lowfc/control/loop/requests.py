@@ -95,7 +95,7 @@ def _mode(settings: Settings, state: State, request: Request) -> Handled:
     """open, close, safe, clear, pause; a paused loop is open and holds its command until it is closed again."""
     asked = "open" if request.name == "pause" else request.name
     after = _granted(state, asked)
-    if request.name == "clear":  # the camera's and the mirror's numbers may restart, too
+    if request.name == "clear":  # the sequences of the camera and the mirror may restart, too
         conditions = state.conditions._replace(clear_id=request.time_ns)
         state = state._replace(frame_sequence=0, conditions=conditions)
     reply, paused = _REPLIES[request.name], state.conditions.mode_cause == PAUSED
@@ -107,7 +107,7 @@ def _mode(settings: Settings, state: State, request: Request) -> Handled:
     waits = state.mode is LoopMode.OPEN and state.conditions.mode_cause == MEASURED_FIRST
     if (request.name == "open" and paused) or (after is LoopMode.OPEN and waits):  # it stays open
         state = state._replace(conditions=state.conditions._replace(mode_cause=cause))
-    if after is LoopMode.CLOSED and state.drive is not None and state.drive.calibration.provisional:
+    if after is LoopMode.CLOSED and state.loop is not None and state.loop.calibration.provisional:
         reply += (
             "; its calibration is the first one of a commissioning and has no verdict: `lowfc commission --resume` "
             "makes the next, `lowfc ctl load FILE` puts another one in use"
@@ -167,66 +167,66 @@ def _step(settings: Settings, state: State, request: Request) -> Handled:
 
 
 def _reset(settings: Settings, state: State, request: Request) -> Handled:
-    drive = _drive(state)
+    loop = _calibrated_loop(state)
     if state.mode is LoopMode.SAFE:
         raise ValueError("the loop is in safe mode: the mirror relaxes to flat anyway")
-    if drive.following is not None:
-        drive = drive._replace(following=drive.following.again())
-    return state._replace(drive=drive, returning_to_zero=True), "the modal command goes to zero"
+    if loop.law_runner is not None:
+        loop = loop._replace(law_runner=loop.law_runner.restarted())
+    return state._replace(loop=loop, returning_to_zero=True), "the modal command goes to zero"
 
 
 def _law_of_modes(settings: Settings, state: State, request: Request) -> Handled:
     """gain, leak and limit of the integrator."""
-    drive, text, *events = changed_law(settings, _drive(state), request)
-    return state._replace(drive=drive), text, *events
+    loop, text, *events = changed_law(settings, _calibrated_loop(state), request)
+    return state._replace(loop=loop), text, *events
 
 
 def _offset(settings: Settings, state: State, request: Request) -> Handled:
-    added = (drive := _drive(state)).added()
+    additions = (loop := _calibrated_loop(state)).additions()
     asked = request if request.values else replace(request, values=(0.0,))
-    values = per_mode(drive.calibration.noll, asked, added.offset_nm)
-    check_offset(drive, np.abs(values))
+    values = per_mode(loop.calibration.noll, asked, additions.offset_nm)
+    check_offset(loop, np.abs(values))
     text = " ".join(f"{value:g}" for value in values.tolist())
-    after = _with(state, drive, added._replace(offset_nm=values))
-    return after, f"offset is now {text} nm{offset_remark(drive, values)}"
+    after = _with(state, loop, additions._replace(offset_nm=values))
+    return after, f"offset is now {text} nm{offset_remark(loop, values)}"
 
 
 def _channel(settings: Settings, state: State, request: Request) -> Handled:
-    drive = _mirror(state)
+    loop = _active_loop(state)
     if state.mode is LoopMode.SAFE and request.text not in (FLAT, EXTERNAL):
         raise ValueError("the loop is in safe mode: `lowfc ctl clear` first, when it is safe")
-    grid = drive.calibration.grid
-    wanted_nm = np.zeros(grid, np.float32)
+    grid = loop.calibration.grid
+    shape_nm = np.zeros(grid, np.float32)
     if request.actuators_nm.size:
-        if request.actuators_nm.size != wanted_nm.size:
+        if request.actuators_nm.size != shape_nm.size:
             raise ValueError(f"a channel has {grid[0]} x {grid[1]} actuators, got {request.actuators_nm.size}")
-        wanted_nm = request.actuators_nm.reshape(grid)
-    _check_shape(None if request.text == EXTERNAL else settings.limits, wanted_nm)
-    added = drive.added().with_channel(request.text, wanted_nm, drive.to_modes)
-    if not request.actuators_nm.size and drive.added().channel(request.text) is None:
-        names = ", ".join(one.name for one in drive.added().channels)
+        shape_nm = request.actuators_nm.reshape(grid)
+    _check_shape(None if request.text == EXTERNAL else settings.limits, shape_nm)
+    additions = loop.additions().with_channel(request.text, shape_nm, loop.to_modes)
+    if not request.actuators_nm.size and loop.additions().channel(request.text) is None:
+        names = ", ".join(one.name for one in loop.additions().channels)
         return state, f"there is no channel {request.text!r} to remove; there are {names or 'none'}"
-    commanded = (one.wanted_nm for one in added.channels if one.commanded)
+    commanded = (one.shape_nm for one in additions.channels if one.commanded)
     _check_shape(settings.limits, sum(commanded, np.zeros(grid, np.float32)))
-    rms_nm = float(np.sqrt(np.mean(np.square(wanted_nm, dtype=np.float64))))
-    return _with(state, drive, added), f"channel {request.text}: {rms_nm:.3g} nm rms of surface"
+    rms_nm = float(np.sqrt(np.mean(np.square(shape_nm, dtype=np.float64))))
+    return _with(state, loop, additions), f"channel {request.text}: {rms_nm:.3g} nm rms of surface"
 
 
 def _play(settings: Settings, state: State, request: Request) -> Handled:
-    drive = _mirror(state)
+    loop = _active_loop(state)
     if state.mode is LoopMode.SAFE:
         raise ValueError("the loop is in safe mode: `lowfc ctl clear` first, when it is safe")
     if not state.frame_sequence:
         raise ValueError("a play starts at a frame, and no frame has arrived yet")
     if state.conditions.mirror_fault:
         raise ValueError(f"the mirror {state.conditions.mirror_fault}: it would not follow a play")
-    added = drive.added()
-    if added.play is not None and not added.play.over(state.frame_sequence + 1):
-        raise ValueError("something is being played already: `lowfc ctl stop` ends it")
+    additions = loop.additions()
+    if additions.play is not None and not additions.play.over(state.frame_sequence + 1):
+        raise ValueError("a probe sequence is being played already: `lowfc ctl stop` ends it")
     table = request.played
     assert table is not None  # noqa: S101  # prepared
     if table.target == MIRROR:
-        grid = drive.calibration.grid
+        grid = loop.calibration.grid
         if table.basis.shape[1] != grid[0] * grid[1]:
             raise ValueError(
                 f"a play needs a shape of {grid[0]} x {grid[1]} actuators for each of {len(table.largest)} columns, "
@@ -235,34 +235,36 @@ def _play(settings: Settings, state: State, request: Request) -> Handled:
         if table.reach_nm > settings.limits.stroke_nm:
             raise ValueError(f"the shapes of the play may go beyond the stroke of {settings.limits.stroke_nm:g} nm")
     else:
-        modes = len(drive.calibration.noll)
+        modes = len(loop.calibration.noll)
         if len(table.largest) != modes:
             raise ValueError(f"a play on the offset has {modes} columns, one for each mode; got {len(table.largest)}")
-        check_offset(drive, table.largest)
+        check_offset(loop, table.largest)
     frames = len(table.rows)
-    made = Play(table, state.frame_sequence + 1, frames)
-    return _with(state, drive, added._replace(play=made)), f"playing {counted(frames, 'frame')} on the {table.target}"
+    play = Play(table, state.frame_sequence + 1, frames)
+    return _with(
+        state, loop, additions._replace(play=play)
+    ), f"playing {counted(frames, 'frame')} on the {table.target}"
 
 
 def _stop(settings: Settings, state: State, request: Request) -> Handled:
-    drive = state.drive
-    if drive is None or drive.play is None or drive.play.over(state.frame_sequence + 1):
+    loop = state.loop
+    if loop is None or loop.play is None or loop.play.over(state.frame_sequence + 1):
         return state, "nothing is being played"
-    left = drive.play.left(state.frame_sequence + 1)
-    text = f"stopped on the {drive.play.target}: {left} of {drive.play.frames} frames were left"
-    return state._replace(drive=drive.stopped(state.frame_sequence)), text
+    remaining = loop.play.remaining(state.frame_sequence + 1)
+    text = f"stopped on the {loop.play.target}: {remaining} of {loop.play.frames} frames were left"
+    return state._replace(loop=loop.stopped(state.frame_sequence)), text
 
 
 def _law(settings: Settings, state: State, request: Request) -> Handled:
-    drive = _drive(state)
+    loop = _calibrated_loop(state)
     if request.law is None:
-        return state._replace(drive=drive._replace(following=None)), "the integrator drives the mirror"
+        return state._replace(loop=loop._replace(law_runner=None)), "the integrator drives the mirror"
     _check_camera(state)
     law = request.law
-    if law.noll != drive.calibration.noll:
-        raise ValueError(f"the law is for modes {list(law.noll)}, the loop has {list(drive.calibration.noll)}")
-    drive = drive._replace(following=LawRunner.at_rest(law, guarded=settings.guard))
-    return state._replace(drive=drive), f"the law {law.name!r} takes over from the integrator"
+    if law.noll != loop.calibration.noll:
+        raise ValueError(f"the law is for modes {list(law.noll)}, the loop has {list(loop.calibration.noll)}")
+    loop = loop._replace(law_runner=LawRunner.at_rest(law, guarded=settings.guard))
+    return state._replace(loop=loop), f"the law {law.name!r} takes over from the integrator"
 
 
 def _load(settings: Settings, state: State, request: Request) -> Handled:
@@ -270,7 +272,7 @@ def _load(settings: Settings, state: State, request: Request) -> Handled:
         raise ValueError("the request has no calibration")
     if state.mode is LoopMode.CLOSED:
         raise ValueError("the loop is closed: open it before loading another calibration")
-    before = state.drive
+    before = state.loop
     if before is not None and before.calibration.grid != request.calibration.grid:
         raise ValueError(
             f"the calibration is for a mirror of {request.calibration.grid} actuators, this one has "
@@ -278,7 +280,7 @@ def _load(settings: Settings, state: State, request: Request) -> Handled:
         )
     settings = replace(settings, start_mode=LoopMode.OPEN)  # an idle loop stays open
     after, events = loaded(settings, state, request.calibration, "operator", request.time_ns)
-    others = (event for event in events if event.name != "MODE_CHANGED")  # every request adds its own
+    others = (event for event in events if event.name != "MODE_CHANGED")  # `answer` adds it
     return after, f"calibration {request.calibration.id[:12]}", *others
 
 
@@ -288,30 +290,30 @@ def _note(settings: Settings, state: State, request: Request) -> Handled:
     return state, "noted", PendingEvent("NOTE", {"text": request.text.strip()})
 
 
-def _mirror(state: State) -> ActiveLoop:
-    """The drive, with or without a calibration."""
-    if state.drive is None:
+def _active_loop(state: State) -> ActiveLoop:
+    """The active loop, with or without a calibration."""
+    if state.loop is None:
         raise ValueError("no mirror has reported its shape yet, and no calibration is loaded")
-    return state.drive
+    return state.loop
 
 
-def _drive(state: State) -> ActiveLoop:
-    if state.drive is None or not state.drive.calibration.noll:
+def _calibrated_loop(state: State) -> ActiveLoop:
+    if state.loop is None or not state.loop.calibration.noll:
         raise ValueError("no calibration is loaded, so there are no modes yet")
-    return state.drive
+    return state.loop
 
 
-def _with(state: State, drive: ActiveLoop, command_channels: CommandChannels) -> State:
-    return state._replace(drive=drive._replace(command_channels=command_channels))
+def _with(state: State, loop: ActiveLoop, command_channels: CommandChannels) -> State:
+    return state._replace(loop=loop._replace(command_channels=command_channels))
 
 
-def _check_shape(limits: Limits | None, wanted_nm: Single) -> None:
-    """Refuse a channel that exceeds the mirror's limits by itself, while an operator can still read why."""
-    if not np.isfinite(wanted_nm).all():
+def _check_shape(limits: Limits | None, shape_nm: Single) -> None:
+    """Refuse a channel that alone exceeds the mirror's limits, so that the operator reads why."""
+    if not np.isfinite(shape_nm).all():
         raise ValueError("every actuator of a channel must be finite")
     if limits is None:  # already on the mirror
         return
-    largest, apart = float(np.abs(wanted_nm).max()), neighbour_difference_nm(wanted_nm)
+    largest, apart = float(np.abs(shape_nm).max()), neighbour_difference_nm(shape_nm)
     if largest > limits.kept_stroke_nm:
         raise ValueError(f"an actuator is {largest:.4g} nm from flat, the limit is {limits.stroke_nm:g} nm")
     if apart > limits.neighbour_nm - limits.margin_nm:
@@ -344,5 +346,5 @@ _HANDLERS: dict[str, Handler] = {
 }
 
 CONFIGURATION = "configuration"
-"""The one request answered by the process, which has the configuration."""
+"""The only request that the process answers, because it has the configuration."""
 REQUESTS = (*_HANDLERS, CONFIGURATION)

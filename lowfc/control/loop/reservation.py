@@ -44,7 +44,7 @@ def release(settings: Settings, state: State, request: Request) -> tuple[State, 
     if held is None or held.ended or held.id != request.lease_id:
         return state, "nothing was reserved"
     after = _with(state, held._replace(ended="its holder released it"))
-    return after, "released", PendingEvent("LEASE_RELEASED", {"holder": held.without_outlook})
+    return after, "released", PendingEvent("LEASE_RELEASED", {"holder": held.holder_name})
 
 
 def lease_checked(state: State, time_ns: int, frame_sequence: int) -> tuple[State, list[PendingEvent]]:
@@ -60,9 +60,9 @@ def lease_ended(state: State, why: str) -> tuple[State, list[PendingEvent]]:
     held = state.conditions.lease
     if held is None or held.ended:
         return state, []
-    drive = None if state.drive is None else state.drive.stopped(state.frame_sequence)
-    after = _with(state, held._replace(ended=why))._replace(drive=drive)
-    return after, [PendingEvent("LEASE_ENDED", {"holder": held.without_outlook, "why": why})]
+    loop = None if state.loop is None else state.loop.stopped(state.frame_sequence)
+    after = _with(state, held._replace(ended=why))._replace(loop=loop)
+    return after, [PendingEvent("LEASE_ENDED", {"holder": held.holder_name, "why": why})]
 
 
 def permit(settings: Settings, state: State, request: Request) -> tuple[State, str, *tuple[PendingEvent, ...]]:
@@ -71,10 +71,10 @@ def permit(settings: Settings, state: State, request: Request) -> tuple[State, s
     Raises:
         ValueError: the move is refused, with the reason; or the request is incomplete.
     """
-    before, drive, closed = state.conditions.lease, state.drive, state.mode is LoopMode.CLOSED
+    before, loop, closed = state.conditions.lease, state.loop, state.mode is LoopMode.CLOSED
     if before is not None and not before.ended and before.id != request.lease_id:
         raise ValueError(before.reserved(request.time_ns))
-    play = None if drive is None else drive.play
+    play = None if loop is None else loop.play
     if play is not None and not play.over(state.frame_sequence + 1):
         raise ValueError("a probe sequence is being played, and the move would disturb its measurement")
     if not request.values:

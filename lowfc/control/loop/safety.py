@@ -87,8 +87,8 @@ class Limits:
         slew_nm: largest change of an actuator from one command to the next.
         neighbour_nm: largest difference between actuators side by side.
         margin_nm: distance kept from each limit: 1e-3 nm, or sixteen roundings of float32 for a long stroke.
-        kept_stroke_nm: stroke less the margin, a float32, so that a command cut to it is not cut again.
-        kept_slew_nm: slew less the margin, likewise.
+        kept_stroke_nm: stroke minus the margin, a float32, so that a command clipped to it is not clipped again.
+        kept_slew_nm: slew minus the margin, likewise.
     """
 
     stroke_nm: float
@@ -110,28 +110,28 @@ class Limits:
 
 
 class Limited(NamedTuple):
-    """A command that may be sent: (rows, columns) float32, nm of surface, and the limits that changed it."""
+    """A limited command: (rows, columns) float32, nm of surface, and the limits that changed it."""
 
     actuators_nm: Actuators
     reasons: tuple[Reason, ...]
 
 
-def limit(limits: Limits, previous_nm: Actuators, wanted_nm: Actuators) -> Limited:
-    """Return the command nearest to `wanted_nm` that may follow `previous_nm`.
+def limit(limits: Limits, previous_nm: Actuators, requested_nm: Actuators) -> Limited:
+    """Return the command nearest to `requested_nm` that may follow `previous_nm`.
 
     Both are (rows, columns) float32, nm of surface; the previous one is finite, as a result of this function. Stroke,
-    then slew, cut each actuator by itself; the neighbour limit shortens the whole move. For any `wanted_nm`, the result
-    is finite, no actuator moves further than the slew limit, and if `previous_nm` keeps the stroke and neighbour
-    limits, so does the result; otherwise it returns to them at the slew limit.
+    then slew, clip each actuator separately; the neighbour limit shortens the whole move. For any `requested_nm`, the
+    result is finite, no actuator moves further than the slew limit, and if `previous_nm` is within the stroke and
+    neighbour limits, so is the result; otherwise it returns to them at the slew limit.
     """
-    if wanted_nm.shape != previous_nm.shape:
+    if requested_nm.shape != previous_nm.shape:
         return Limited(previous_nm, (Limit.WRONG_GRID,))
-    lowest_nm, highest_nm = _range_nm(wanted_nm)
+    lowest_nm, highest_nm = _range_nm(requested_nm)
     if not (isfinite(lowest_nm) and isfinite(highest_nm)):
         return Limited(previous_nm, (Limit.NOT_FINITE,))
     reasons: list[Reason] = []
     stroke, slew = limits.kept_stroke_nm, limits.kept_slew_nm
-    kept = wanted_nm
+    kept = requested_nm
     if max(highest_nm, -lowest_nm) > stroke:
         reasons.append(Limit.STROKE)
         kept = np.clip(kept, -stroke, stroke)

@@ -9,7 +9,7 @@ import numpy as np
 
 from lowfc.arrays import Mask, Single
 from lowfc.control.calibration.calibration import Calibration
-from lowfc.control.calibration.granted import granted_rows
+from lowfc.control.calibration.map_reconstructor import map_reconstructor
 from lowfc.control.kernel.tables import NUMPY, Kernel
 from lowfc.control.laws import linear_law
 from lowfc.control.laws.law import TIP_TILT, Law
@@ -37,20 +37,20 @@ class Settings:
 
     Attributes:
         limits: limits of the mirror, applied here and again by the mirror.
-        delay_frames: frames from the one a command is made from to the first exposed wholly under it.
+        delay_frames: frames from the frame that a command is computed from to the first frame exposed wholly with it.
         start_mode: mode once a calibration is loaded: open or closed.
         max_frame_age_ns: age above which a frame is refused.
         frame_timeout_ns: time without frames after which an event is raised and `on_frame_timeout` applies.
         on_frame_timeout: hold the command, or relax the mirror to flat.
-        min_flux_fraction: fraction of the expected flux below which a frame is dark.
+        min_flux_fraction: fraction of the expected flux below which a frame is refused.
         max_saturated_pixels: good pixels at full well above which a frame is refused.
-        max_identical_frames: frames in a row that may give exactly the previous measurement; 0 for any number.
+        max_identical_frames: consecutive frames that may give the same measurement as the one before; 0 for no limit.
         gain: gain, leak and limit (nm) of tip and tilt, then of the other modes.
         rate_hz: frame rate; 0 if unknown.
         guard: whether laws are guarded.
         auto_gain: whether the gains of tip and tilt, and of the other modes, are automatic.
         interlocks: conditions on bench values.
-        kernel: fused step for usual frames.
+        kernel: implementation of the control step for normal frames.
     """
 
     limits: Limits
@@ -85,7 +85,7 @@ class Settings:
 
 
 class LawRunner(NamedTuple):
-    """A running linear law: its state x (states,), and the number of frames that it has followed.
+    """A running linear law: its state x (states,), and the number of frames that it has processed.
 
     It observes for `SETTLING_FRAMES`; over the next `FADING_FRAMES` it takes over from the integrator in a cross-fade,
     so that the mirror does not jump. A `guard` compares it with the integrator throughout.
@@ -98,42 +98,42 @@ class LawRunner(NamedTuple):
 
     @classmethod
     def at_rest(cls, law: LinearLaw, *, guarded: bool) -> "LawRunner":
-        """A law that has not followed any frame."""
+        """A law before its first frame."""
         return cls(law, linear_law.at_rest(law), 0, Guard.of(law) if guarded else None)
 
-    def again(self) -> "LawRunner":
-        """The same law at rest."""
+    def restarted(self) -> "LawRunner":
+        """The same law, at rest."""
         return self.at_rest(self.law, guarded=self.guard is not None)
 
-    def followed(self, error_nm: Single, pol_nm: Single, kept_nm: Single) -> "LawRunner":
-        """One frame later; all (modes,): error and POL without the loop's target, and the last frame's kept command."""
+    def advanced(self, error_nm: Single, pol_nm: Single, command_nm: Single) -> "LawRunner":
+        """A copy advanced by one frame, from error and POL (modes,) relative to the target, and the last command."""
         signal = error_nm if self.law.signal == "error" else pol_nm
-        x = linear_law.follow(self.law, self.x, signal, kept_nm)
+        x = linear_law.predict_and_update(self.law, self.x, signal, command_nm)
         return LawRunner(self.law, x, self.frames + 1, self.guard)
 
-    def coasted(self, frames: int, kept_nm: Single) -> "LawRunner":
-        """Some frames later that were missing or refused."""
+    def predicted(self, frames: int, command_nm: Single) -> "LawRunner":
+        """A copy advanced by some missing or refused frames."""
         x = self.x
         for _ in range(min(frames, MOST_COASTED)):
-            x = linear_law.coast(self.law, x, kept_nm)
+            x = linear_law.predict(self.law, x, command_nm)
         if frames > MOST_COASTED:
             return LawRunner(self.law, x, 0, self.guard)
         return LawRunner(self.law, x, self.frames, None if self.guard is None else self.guard.held(frames, self.law))
 
     @property
     def weight(self) -> np.float32 | Single:
-        """Its share of the command, or of each mode's (modes,); the integrator has the rest."""
+        """Its share of the command, for all modes or (modes,); the integrator has the rest."""
         weight = np.float32(min(max(self.frames - SETTLING_FRAMES, 0) / FADING_FRAMES, 1))
         return weight if self.guard is None or not self.guard.overruled else weight * self.guard.weight
 
     def alone(self, more: int = 0) -> bool:
-        """Whether the law makes the whole command, now or `more` frames later."""
+        """Whether the law determines the whole command, now or `more` frames later."""
         frames = self.frames + more
         return frames >= SETTLING_FRAMES + FADING_FRAMES and (self.guard is None or not self.guard.overruled)
 
     def taking_over(self) -> "LawRunner":
-        """The same law just after the loop was closed: it fades in."""
-        guard = None if self.guard is None else self.guard.anew()
+        """A copy for a loop that has just been closed: the law fades in."""
+        guard = None if self.guard is None else self.guard.reset()
         return self._replace(frames=min(self.frames, SETTLING_FRAMES), guard=guard)
 
 
@@ -160,9 +160,9 @@ class ActiveLoop(NamedTuple):
         camera: camera settings of the calibration: its own, or the first received after it was loaded; None until then.
         automatic: (modes,) whether the gain of a mode is automatic.
         weighting: weighting of R; None for the calibration's own R.
-        following: a law in place of the integrator's.
+        law_runner: linear law in use instead of the integrator; None for the integrator.
         command_channels: additions to the law's command; None for none.
-        history_nm: modal commands, newest first.
+        history_nm: modal commands (modes,), newest first.
         actuators_nm: (rows, columns), the last command.
     """
 
@@ -176,7 +176,7 @@ class ActiveLoop(NamedTuple):
     camera: CameraSettings | None
     automatic: Mask
     weighting: Weighting | None
-    following: LawRunner | None
+    law_runner: LawRunner | None
     command_channels: CommandChannels | None
     history_nm: tuple[Single, ...]
     actuators_nm: Single
@@ -188,7 +188,7 @@ class ActiveLoop(NamedTuple):
         weights = delay_weights(settings.delay_frames).astype(np.float32)
         inverse = np.linalg.pinv(calibration.modes_to_actuators.astype(np.float64)).astype(np.float32)
         law = settings.law(calibration.noll)
-        drive = cls(
+        loop = cls(
             calibration,
             Estimator.of(calibration, settings.kernel),
             law,
@@ -204,49 +204,49 @@ class ActiveLoop(NamedTuple):
             (np.zeros(modes, np.float32),) * len(weights),
             np.zeros(calibration.grid, np.float32),
         )
-        return drive.under(law)
+        return loop.with_gains(law)
 
     def seen_nm(self) -> Single:
         """The modal command (modes,) that the last exposure saw."""
         return seen_nm(self.weights, self.history_nm)
 
-    def under(self, law: Law) -> "ActiveLoop":
-        """With these gains; the command of a mode whose automatic gain is 0 relaxes to zero."""
-        return self._replace(law=replace(law, left=self.automatic & (law.gain == 0)))
+    def with_gains(self, law: Law) -> "ActiveLoop":
+        """A copy with these gains; the command of a mode whose automatic gain is 0 relaxes to zero."""
+        return self._replace(law=replace(law, uncorrected=self.automatic & (law.gain == 0)))
 
-    def weighted(self, weighting: Weighting | None) -> "ActiveLoop":
-        """With R computed for other uncorrected modes or another flux."""
+    def with_weighting(self, weighting: Weighting | None) -> "ActiveLoop":
+        """A copy with R computed for other uncorrected modes or another flux."""
         calibration = self.calibration
         if weighting is not None:
-            rows = granted_rows(calibration, weighting.prior_nm2, weighting.flux_dn, self.camera)
+            rows = map_reconstructor(calibration, weighting.prior_nm2, weighting.flux_dn, self.camera)
             calibration = replace(calibration, reconstructor=rows)
         return self._replace(weighting=weighting, estimator=Estimator.of(calibration, self.estimator.kernel))
 
-    def added(self) -> CommandChannels:
-        """Additions to the command, empty ones if there are none."""
+    def additions(self) -> CommandChannels:
+        """Additions to the command; an empty object if there are none."""
         if self.command_channels is not None:
             return self.command_channels
         return CommandChannels.none(self.calibration.grid, len(self.calibration.noll), len(self.history_nm))
 
     @property
     def play(self) -> Play | None:
-        """The current play."""
+        """The current probe sequence."""
         return None if self.command_channels is None else self.command_channels.play
 
     def stopped(self, sequence: int) -> "ActiveLoop":
-        """With the play ended after this frame."""
+        """A copy whose probe sequence ends after this frame."""
         if self.play is None or self.command_channels is None:
             return self
         return self._replace(command_channels=self.command_channels.stopped(sequence))
 
-    def pushed(self, command_nm: Single, actuators_nm: Single) -> "ActiveLoop":
-        """One frame later, with this command."""
-        fixed = self[:-3]  # `_replace` takes four times as long
+    def with_command(self, command_nm: Single, actuators_nm: Single) -> "ActiveLoop":
+        """A copy advanced by one frame, with this command."""
+        fixed = self[:-3]  # `_replace` would take four times as long
         command_channels = None if self.command_channels is None else self.command_channels.passed()
         return ActiveLoop(*fixed, command_channels, (command_nm, *self.history_nm[:-1]), actuators_nm)
 
-    def stayed(self, frames: int) -> "ActiveLoop":
-        """Some frames later, with the command held for each."""
+    def holding_command(self, frames: int) -> "ActiveLoop":
+        """A copy advanced by some frames in which the command is held."""
         held = min(frames, len(self.history_nm))
         history_nm = (self.history_nm[:1] * held + self.history_nm)[: len(self.history_nm)]
         if self.command_channels is None:
@@ -254,14 +254,14 @@ class ActiveLoop(NamedTuple):
         return self._replace(history_nm=history_nm, command_channels=self.command_channels.passed(frames))
 
     def missed(self, frames: int) -> "ActiveLoop":
-        """Some frames later, without measurements."""
-        return self.coasted(frames).stayed(frames)
+        """A copy advanced by some frames without measurements."""
+        return self.predicted(frames).holding_command(frames)
 
-    def coasted(self, frames: int) -> "ActiveLoop":
-        """With the law advanced by some frames without measurements."""
-        if self.following is None:
+    def predicted(self, frames: int) -> "ActiveLoop":
+        """A copy whose law is advanced by some frames without measurements."""
+        if self.law_runner is None:
             return self
-        return self._replace(following=self.following.coasted(frames, self.history_nm[0]))
+        return self._replace(law_runner=self.law_runner.predicted(frames, self.history_nm[0]))
 
 
 class Conditions(NamedTuple):
@@ -269,11 +269,11 @@ class Conditions(NamedTuple):
 
     Attributes:
         camera: settings of the camera as last received; None before the first.
-        camera_awaited: the camera restarted and its settings have not been received since.
+        camera_awaited: whether the camera restarted and its settings have not been received since.
         clear_id: identity of the operator's last clear; 0 without one.
         mode_since_ns: time of the change to this loop mode, and `mode_cause` its cause.
         lease: the reservation of the loop, or the last one that ended; None before the first.
-        mirror_fault: why the mirror does not follow commands; empty where it does.
+        mirror_fault: why the mirror does not follow commands; empty if it does.
         acting: the acting interlocks.
     """
 
@@ -297,13 +297,13 @@ class State(NamedTuple):
         frame_timeout: whether the frame timeout has been reported.
         commanded: whether a command has been sent, so that the mirror's shape is no longer adopted.
         steps_left: frames until the loop opens automatically; 0 for never.
-        returning_to_zero: the modal command is on its way to zero.
-        estimate: the last measurement, and `identical_frames`, the number in a row equal to the previous one.
+        returning_to_zero: whether the modal command is returning to zero.
+        estimate: the last measurement, and `identical_frames`, the number of consecutive equal ones before.
         input_number: count of the inputs that changed the state or produced output; the order of replay.
     """
 
     mode: LoopMode = LoopMode.IDLE
-    drive: ActiveLoop | None = None
+    loop: ActiveLoop | None = None
     frame_sequence: int = 0
     frame_time_ns: int = 0
     frames_used: int = 0

@@ -314,15 +314,15 @@ class Controller:
     def _adopt_mirror(self) -> None:
         """Read the mirror's shape before the first command, so that it does not jump."""
         lockstep = self._service.clock.lockstep
-        if lockstep and self._state.drive is not None:  # every lockstep run starts from flat
+        if lockstep and self._state.loop is not None:  # every lockstep run starts from flat
             self._mirror.close()
             return
         shape = self._mirror.first(MIRROR_PATIENCE_S)
         if shape is not None:
-            drive, grid = self._state.drive, shape.actuators_nm.shape
-            if drive is not None and grid != drive.calibration.grid:
+            loop, grid = self._state.loop, shape.actuators_nm.shape
+            if loop is not None and grid != loop.calibration.grid:
                 raise CalibrationError(
-                    f"the mirror has {grid} actuators, the calibration is for {drive.calibration.grid}; use the "
+                    f"the mirror has {grid} actuators, the calibration is for {loop.calibration.grid}; use the "
                     "mirror's own calibration"
                 )
             self._apply_report(shape)
@@ -378,8 +378,8 @@ class Controller:
         if outputs.step is not None:
             self._steps.put(codec.encode_step(outputs.step, self._state.input_number))
             self._last_second.add(outputs.step, self._service.clock.host_ns())
-            if self._state.drive is not None and self._state.drive.calibration.noll:
-                self._offload.add(outputs.step, self._state.drive.calibration.noll)
+            if self._state.loop is not None and self._state.loop.calibration.noll:
+                self._offload.add(outputs.step, self._state.loop.calibration.noll)
         for event in outputs.events:
             self._service.event(event.name, **event.details)
         if outputs.changed:

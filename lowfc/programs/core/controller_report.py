@@ -98,10 +98,10 @@ class LastSecond:
         """Figures of the last second; all zero without a frame."""
         rows = self._rows[: self._count]
         rows = rows[rows[:, 0] > now_ns - SECOND_NS]
-        if state.drive is None or not len(rows):
+        if state.loop is None or not len(rows):
             return wire.LoopFigures()
         _, square_nm2, flux_dn = rows.mean(axis=0).tolist()
-        fraction = flux_dn / state.drive.calibration.flux_dn
+        fraction = flux_dn / state.loop.calibration.flux_dn
         return wire.LoopFigures(frames=len(rows), residual_rms_nm=square_nm2**0.5, flux_fraction=fraction)
 
 
@@ -109,10 +109,10 @@ def fill_benefit(health: wire.Health, watch: GainWatch, state: State) -> None:
     """Add the harm that closing would do, and the measured added contrast, to a Health."""
     health.closing_harm = watch.closing_harm
     measured = watch.added_contrast()
-    if measured is None or state.drive is None or not measured[0]:
+    if measured is None or state.loop is None or not measured[0]:
         return
     uncorrected, by_mode = measured
-    name, share = costliest(by_group(state.drive.calibration.noll, by_mode))
+    name, share = costliest(by_group(state.loop.calibration.noll, by_mode))
     recent = health.recent_wavefront
     recent.added_contrast_flat, recent.added_contrast = uncorrected, float(by_mode.sum())
     recent.costliest_modes, recent.costliest_share = name, share
@@ -135,15 +135,15 @@ class Arrays:
 
     def publish_in_use(self, refused: Request, state: State) -> None:
         """Publish again the arrays in use after a refused request, so that the last published ones are in use."""
-        drive = state.drive
-        if drive is None:
+        loop = state.loop
+        if loop is None:
             return
-        play = drive.play
+        play = loop.play
         in_use = Request(
             refused.time_ns,
             refused.name,
-            calibration=drive.calibration if refused.calibration is not None else None,
-            law=drive.following.law if refused.law is not None and drive.following is not None else None,
+            calibration=loop.calibration if refused.calibration is not None else None,
+            law=loop.law_runner.law if refused.law is not None and loop.law_runner is not None else None,
             played=play.table if refused.played is not None and play is not None else None,
         )
         self.publish(in_use)

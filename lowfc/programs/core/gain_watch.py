@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from lowfc.arrays import Array, Mask, Single, single
-from lowfc.control.calibration.granted import noise_covariance_nm2
-from lowfc.control.laws.automatic_gain import CONFIDENCE, GainBank, Verdict, injected, left_alone_nm2
+from lowfc.control.calibration.map_reconstructor import noise_covariance_nm2
+from lowfc.control.laws.automatic_gain import CONFIDENCE, GainBank, Verdict, injected, uncorrected_prior_nm2
 from lowfc.control.laws.law import TIP_TILT
 from lowfc.control.loop.inputs import COUNT_BITS, PendingEvent, Request, Step
 from lowfc.control.loop.safety import LoopMode
@@ -44,20 +44,20 @@ NOTHING = Actions()
 class _Group:
     """Modes that are evaluated together: tip and tilt, or the others."""
 
-    def __init__(self, mask: Mask, tilt: Mask | None, settings: Settings, drive: ActiveLoop, window_s: float) -> None:
+    def __init__(self, mask: Mask, tilt: Mask | None, settings: Settings, loop: ActiveLoop, window_s: float) -> None:
         """Evaluate the modes in `mask` (modes,); `tilt` (modes,) selects tip and tilt, both in the other group."""
         rate_hz = settings.rate_hz or 1.0
         frames = [max(round(seconds * rate_hz), LEAST_FRAMES) for seconds in (FIRST_S, window_s)]
         self.mask, self.tilt = mask, tilt
         self.bank = GainBank(
-            1 - drive.law.leak[mask],
-            drive.law.limit_nm[mask],
-            drive.weights,
+            1 - loop.law.leak[mask],
+            loop.law.limit_nm[mask],
+            loop.weights,
             settings.delay_frames,
             (frames[0], frames[1]),
         )
         self.verdict: Verdict | None = None
-        self.gain = drive.law.gain[mask]
+        self.gain = loop.law.gain[mask]
         self.harmful = 0
         self.unrestricted = window_s == TILT_S
 
@@ -83,22 +83,22 @@ class GainWatch:
 
     def observe(self, step: Step, state: State) -> Actions:
         """Process a step and the state after it."""
-        drive = state.drive
-        if drive is None or not drive.calibration.noll:
+        loop = state.loop
+        if loop is None or not loop.calibration.noll:
             return NOTHING
-        self._begin(drive)
-        if drive.weighting is not self._weighting:
-            self._weighting = drive.weighting
-            response = single(drive.estimator.rows[:-1] @ drive.calibration.response)
+        self._begin(loop)
+        if loop.weighting is not self._weighting:
+            self._weighting = loop.weighting
+            response = single(loop.estimator.rows[:-1] @ loop.calibration.response)
             for group in self._groups:
-                group.bank.remade(response[np.ix_(group.mask, group.mask)])
+                group.bank.use_reconstructor(response[np.ix_(group.mask, group.mask)])
         missing = step.frame_sequence - self._newest - 1
         if missing < 0:  # an old frame
             return NOTHING
         same_camera = step.frame_sequence >> COUNT_BITS == self._newest >> COUNT_BITS
         self._newest = step.frame_sequence
         held = missing if same_camera else 0
-        added = drive.command_channels
+        added = loop.command_channels
         playing = added is not None and added.play is not None
         if step.error_nm is None or playing:
             held += 1
@@ -117,7 +117,7 @@ class GainWatch:
         closed = step.mode is LoopMode.CLOSED and not state.returning_to_zero
         star = self._star(step.flux_dn)
         if star:
-            return self._another_star(step, drive, star)
+            return self._another_star(step, loop, star)
         closing = step.mode is LoopMode.CLOSED and self._mode is LoopMode.OPEN and self.closing_harm
         events = (PendingEvent("CLOSING_HARMS", {"harm": self.closing_harm}),) if closing else ()
         self._mode = step.mode
@@ -126,7 +126,7 @@ class GainWatch:
         judged = [
             group
             for group in self._groups
-            if group.bank.followed(
+            if group.bank.add_frame(
                 open_nm[group.mask],
                 step.error_nm[group.mask],
                 None if group.tilt is None else state.estimate.error_nm[group.tilt],
@@ -135,7 +135,7 @@ class GainWatch:
         ]
         if not judged:
             return Actions(events=events) if events else NOTHING
-        found = self._judge(judged, step, state, drive)
+        found = self._judge(judged, step, state, loop)
         return found._replace(events=(*events, *found.events))
 
     def added_contrast(self) -> tuple[float, Array] | None:
@@ -153,15 +153,15 @@ class GainWatch:
         per_nm2 = np.diag(self._contrast)
         return float(per_nm2 @ open_nm2), per_nm2 * now_nm2
 
-    def _begin(self, drive: ActiveLoop) -> None:
-        identity = drive.calibration.id, drive.law.leak.tobytes(), drive.law.limit_nm.tobytes()
+    def _begin(self, loop: ActiveLoop) -> None:
+        identity = loop.calibration.id, loop.law.leak.tobytes(), loop.law.limit_nm.tobytes()
         if identity == self._identity:
             return
         self._identity, self._weighting = identity, None
-        tilt = np.isin(drive.calibration.noll, TIP_TILT)
+        tilt = np.isin(loop.calibration.noll, TIP_TILT)
         both = tilt if tilt.sum() == len(TIP_TILT) else None
         self._groups = [
-            _Group(mask, cross_talk, self._settings, drive, window_s)
+            _Group(mask, cross_talk, self._settings, loop, window_s)
             for mask, cross_talk, window_s in ((tilt, None, TILT_S), (~tilt, both, OTHERS_S))
             if mask.any()
         ]
@@ -183,38 +183,38 @@ class GainWatch:
         self._changed_in_a_row, self._former_flux_dn = 0, mean
         return ratio
 
-    def _another_star(self, step: Step, drive: ActiveLoop, ratio: float) -> Actions:
+    def _another_star(self, step: Step, loop: ActiveLoop, ratio: float) -> Actions:
         """Halve the automatic gains until they are measured again; lower them further if the flux fell by more."""
         for group in self._groups:
             group.bank.restart()
         events = (PendingEvent("STAR_CHANGED", {"ratio": ratio}),)
-        if not drive.automatic.any():
+        if not loop.automatic.any():
             return Actions(events=events)
-        lowered = drive.law.gain * np.float32(min(ratio, 0.5))
-        return Actions((self._gains(step, drive, np.where(drive.automatic, lowered, drive.law.gain)),), events)
+        lowered = loop.law.gain * np.float32(min(ratio, 0.5))
+        return Actions((self._gains(step, loop, np.where(loop.automatic, lowered, loop.law.gain)),), events)
 
-    def _judge(self, judged: list[_Group], step: Step, state: State, drive: ActiveLoop) -> Actions:
-        noise_nm2 = self._noise_nm2(drive) if any(group.bank.complete for group in judged) else None
-        gain, initial, events = drive.law.gain.copy(), False, []
+    def _judge(self, judged: list[_Group], step: Step, state: State, loop: ActiveLoop) -> Actions:
+        noise_nm2 = self._noise_nm2(loop) if any(group.bank.complete for group in judged) else None
+        gain, initial, events = loop.law.gain.copy(), False, []
         for group in judged:
             if not group.bank.complete:
-                early = group.bank.early(drive.law.gain[group.mask])
-                gain[group.mask] = np.where(drive.automatic[group.mask], early, gain[group.mask])
+                early = group.bank.early(loop.law.gain[group.mask])
+                gain[group.mask] = np.where(loop.automatic[group.mask], early, gain[group.mask])
                 continue
             initial |= group.bank.first
             noise = None if noise_nm2 is None else noise_nm2[group.mask]
-            group.gain = drive.law.gain[group.mask]
-            group.verdict = verdict = group.bank.verdict(drive.law.gain[group.mask], noise)
+            group.gain = loop.law.gain[group.mask]
+            group.verdict = verdict = group.bank.verdict(loop.law.gain[group.mask], noise)
             best = verdict.gain if group.unrestricted else np.minimum(verdict.gain, CAUTIOUS_GAIN)
-            gain[group.mask] = np.where(drive.automatic[group.mask], best, gain[group.mask])
+            gain[group.mask] = np.where(loop.automatic[group.mask], best, gain[group.mask])
             if not group.unrestricted:
                 group.unrestricted = True
-                group.bank.begin_again()
-            events += self._harm(group, verdict, drive)
+                group.bank.begin_first_window()
+            events += self._harm(group, verdict, loop)
         requests = []
-        if drive.automatic.any() and (initial or not np.array_equal(gain, drive.law.gain)):
-            requests.append(self._gains(step, drive, gain))
-        self.closing_harm = "" if state.mode is LoopMode.CLOSED else self._closing_harm(gain, drive)
+        if loop.automatic.any() and (initial or not np.array_equal(gain, loop.law.gain)):
+            requests.append(self._gains(step, loop, gain))
+        self.closing_harm = "" if state.mode is LoopMode.CLOSED else self._closing_harm(gain, loop)
         close_pending = state.mode is LoopMode.OPEN and state.conditions.mode_cause == MEASURED_FIRST
         if close_pending and all(group.verdict is not None for group in self._groups):
             requests.append(
@@ -223,12 +223,12 @@ class GainWatch:
         requests += [request for event in events for request in self._reaction(event, step, state)]
         return Actions(tuple(requests), tuple(events))
 
-    def _closing_harm(self, gain: Single, drive: ActiveLoop) -> str:
+    def _closing_harm(self, gain: Single, loop: ActiveLoop) -> str:
         """Sentence on the wavefront that closing would add, from modes evaluated at their present gains."""
-        noll, added, harm_nm2 = np.array(drive.calibration.noll), "", np.zeros(len(drive.calibration.noll))
+        noll, added, harm_nm2 = np.array(loop.calibration.noll), "", np.zeros(len(loop.calibration.noll))
         for group in self._groups:
             one = group.verdict
-            if one is None or not np.array_equal(gain[group.mask], drive.law.gain[group.mask]):
+            if one is None or not np.array_equal(gain[group.mask], loop.law.gain[group.mask]):
                 continue
             harmful = one.change_nm2 > CONFIDENCE * one.change_error_nm2
             harm_nm2[group.mask] = np.where(harmful, one.change_nm2, 0)
@@ -244,22 +244,22 @@ class GainWatch:
             "does not correct them"
         )
 
-    def _noise_nm2(self, drive: ActiveLoop) -> Array | None:
+    def _noise_nm2(self, loop: ActiveLoop) -> Array | None:
         """Noise of one frame (modes,), nm^2; None if the camera's gain is unknown."""
         covariance = noise_covariance_nm2(
-            drive.calibration, self._former_flux_dn or drive.calibration.flux_dn, drive.camera
+            loop.calibration, self._former_flux_dn or loop.calibration.flux_dn, loop.camera
         )
         return None if covariance is None else np.diag(covariance)
 
-    def _gains(self, step: Step, drive: ActiveLoop, gain: Single) -> Request:
+    def _gains(self, step: Step, loop: ActiveLoop, gain: Single) -> Request:
         """The request for gains (modes,), with the prior of the uncorrected modes for R."""
-        noise_nm2, uncorrected = self._noise_nm2(drive), drive.automatic & (gain == 0)
+        noise_nm2, uncorrected = self._noise_nm2(loop), loop.automatic & (gain == 0)
         prior_nm2: tuple[float, ...] = ()
         if noise_nm2 is not None and all(group.verdict is not None for group in self._groups):
             prior = np.zeros(gain.size, np.float32)
             for group in self._groups:
                 assert group.verdict is not None  # noqa: S101  # checked above
-                prior[group.mask] = left_alone_nm2(group.verdict, uncorrected[group.mask], noise_nm2[group.mask])
+                prior[group.mask] = uncorrected_prior_nm2(group.verdict, uncorrected[group.mask], noise_nm2[group.mask])
             prior_nm2 = tuple(prior.tolist())
         flux_dn = float(np.float32(self._former_flux_dn))
         values = tuple(gain.astype(np.float32).tolist())
@@ -267,7 +267,7 @@ class GainWatch:
             step.time_ns, "gain", (), values, AUTO, requester=REQUESTER, prior_nm2=prior_nm2, flux_dn=flux_dn
         )
 
-    def _harm(self, group: _Group, verdict: Verdict, drive: ActiveLoop) -> list[PendingEvent]:
+    def _harm(self, group: _Group, verdict: Verdict, loop: ActiveLoop) -> list[PendingEvent]:
         """The event if an open loop would have had a smaller residual for `HARMFUL_WINDOWS` consecutive windows."""
         if verdict.loop_nm2 is None:
             group.harmful = 0
@@ -276,11 +276,11 @@ class GainWatch:
         group.harmful = group.harmful + 1 if worse > 3 * error else 0
         if group.harmful != HARMFUL_WINDOWS:
             return []
-        noise_nm2 = self._noise_nm2(drive)
+        noise_nm2 = self._noise_nm2(loop)
         noise = 0.0 if noise_nm2 is None else float(noise_nm2[group.mask].sum())
         open_nm2 = max(float(verdict.power_nm2.sum()) - noise, 0.0)
         culprits = verdict.loop_nm2 > 2 * verdict.loop_error_nm2
-        noll = np.array(drive.calibration.noll)[group.mask]
+        noll = np.array(loop.calibration.noll)[group.mask]
         details: dict[str, object] = {
             "modes": ", ".join(f"Z{index}" for index in noll[culprits]),
             "closed_nm": float(np.sqrt(open_nm2 + worse)),
@@ -294,6 +294,6 @@ class GainWatch:
     def _reaction(self, event: PendingEvent, step: Step, state: State) -> list[Request]:
         if event.name != "LOOP_HARMS" or self._on_harm == "warn":
             return []
-        law = state.drive is not None and state.drive.following is not None
+        law = state.loop is not None and state.loop.law_runner is not None
         asked = Request(step.time_ns, "open", text=f"{AUTO}: the loop made it worse", requester=REQUESTER)
         return [replace(asked, name="law")] if law and self._on_harm == "integrator" else [asked]

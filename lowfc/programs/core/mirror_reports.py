@@ -69,8 +69,8 @@ class MirrorReports:
             )
             if self._health_fault == before or not self._health_fault:
                 self._fault = self._health_fault
-            if not self._fault and state.drive is not None:
-                shape = MirrorShape(now_ns, state.drive.actuators_nm, state.drive.history_nm[0])
+            if not self._fault and state.loop is not None:
+                shape = MirrorShape(now_ns, state.loop.actuators_nm, state.loop.history_nm[0])
                 self._commanded.append(shape)
         elif self._received_ns and now_ns - self._received_ns > SILENT_NS:
             self._fault = "does not answer"

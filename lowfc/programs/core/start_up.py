@@ -118,14 +118,14 @@ class StartUp:
 
 def _adopted_nm(state: State, flat_nm: Single) -> Single | None:
     """The shape (rows, columns) adopted from the mirror if it contains the flat map; controlled modes are ignored."""
-    drive = state.drive
-    if drive is None or drive.command_channels is None:
+    loop = state.loop
+    if loop is None or loop.command_channels is None:
         return None
-    shapes = [one.wanted_nm for one in drive.command_channels.channels if one.name == ADOPTED]
+    shapes = [one.shape_nm for one in loop.command_channels.channels if one.name == ADOPTED]
     if not shapes:
         return None
     without_modes = [
-        shape - drive.to_actuators @ (drive.inverse @ shape) for shape in (shapes[0].reshape(-1), flat_nm.reshape(-1))
+        shape - loop.to_actuators @ (loop.inverse @ shape) for shape in (shapes[0].reshape(-1), flat_nm.reshape(-1))
     ]
     adopted, flat = without_modes
     return shapes[0] if float(adopted @ flat) > LIKENESS * float(flat @ flat) else None

@@ -1,4 +1,4 @@
-"""From I0 and H to R: normalisation, unbiasedness, the least noise; a sensor's geometry from its image."""
+"""From I0 and H to R: normalisation, unbiasedness, least noise; a sensor's geometry from its image."""
 
 from dataclasses import replace
 
@@ -48,7 +48,7 @@ def test_modes_are_recovered_exactly_without_noise(estimator: str, good: np.ndar
     assert not R[:, good == 0].any()
 
 
-def test_plain_is_numpys_pseudo_inverse_and_weighted_is_not() -> None:
+def test_pinv_is_numpys_pseudo_inverse_and_weighted_is_not() -> None:
     assert np.allclose(reconstructor(I0, H, GOOD, 1e5, 2.0, "pinv"), np.linalg.pinv(H), rtol=1e-9)
     assert not np.allclose(reconstructor(I0, H, GOOD, 1e5, 2.0), np.linalg.pinv(H), rtol=1e-3)
 
@@ -63,7 +63,7 @@ def cramer_rao(flux_e: float, read_noise_e: float) -> np.ndarray:
 
 
 def covariance(estimator: str, flux_e: float, read_noise_e: float) -> np.ndarray:
-    """Covariance (modes, modes) of R on frames that are divided by their own noisy flux."""
+    """Covariance (modes, modes) of R for frames divided by their own noisy flux."""
     R = reconstructor(I0, H, GOOD, flux_e, read_noise_e, estimator)
     each = R - np.outer(R @ I0, GOOD)
     result: np.ndarray = each @ np.diag((I0 * flux_e + read_noise_e**2) / flux_e**2) @ each.T
@@ -72,14 +72,14 @@ def covariance(estimator: str, flux_e: float, read_noise_e: float) -> np.ndarray
 
 @pytest.mark.parametrize(("flux_e", "read_noise_e", "above"), [(1e5, 0.0, 1e-9), (1e4, 5.0, 0.01)])
 def test_the_weighted_estimator_reaches_the_cramer_rao_bound(flux_e: float, read_noise_e: float, above: float) -> None:
-    """Of photon noise; with read noise it stays within a percent of it."""
+    """For photon noise; with read noise it is within one percent."""
     ratio = np.diag(covariance("weighted", flux_e, read_noise_e)) / np.diag(cramer_rao(flux_e, read_noise_e))
     assert (ratio >= 1 - 1e-9).all()
     assert (ratio <= 1 + above).all()
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_the_predicted_noise_is_that_of_a_monte_carlo(estimator: str) -> None:
+def test_the_predicted_noise_agrees_with_a_monte_carlo(estimator: str) -> None:
     flux_e, read_noise_e, trials = 50_000.0, 3.0, 4000
     I0, H = normalise_flux(TOY.reference, RESPONSE, SOME_BAD)
     R = reconstructor(I0, H, SOME_BAD, flux_e, read_noise_e, estimator)
@@ -108,25 +108,25 @@ def test_a_sensor_that_cannot_tell_modes_apart_is_refused(response: np.ndarray, 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 @pytest.mark.parametrize("unit", [1.0, 1e-9, 1e12])
-def test_a_nuisance_mode_is_not_seen_whatever_its_unit(estimator: str, unit: float) -> None:
+def test_a_nuisance_mode_is_not_measured_whatever_its_unit(estimator: str, unit: float) -> None:
     ramp = np.linspace(-1, 1, PIXELS)
     background = np.column_stack([np.ones(PIXELS), TOY.reference * ramp])
-    beside = normalise_flux(TOY.reference, background, GOOD)[1]
-    R = reconstructor(I0, H, GOOD, 1e5, 2.0, estimator, unit * beside)
+    nuisance_response = normalise_flux(TOY.reference, background, GOOD)[1]
+    R = reconstructor(I0, H, GOOD, 1e5, 2.0, estimator, unit * nuisance_response)
     assert R.shape == (3, PIXELS)
     assert np.abs(R @ H - np.eye(3)).max() < 1e-9
-    assert np.abs(R @ beside).max() < 1e-9 * np.abs(R).max()
+    assert np.abs(R @ nuisance_response).max() < 1e-9 * np.abs(R).max()
     plain = reconstructor(I0, H, GOOD, 1e5, 2.0, estimator)
-    assert np.abs(plain @ beside).max() > 1e-3 * np.abs(plain).max()
-    if estimator == "weighted":  # of the estimates that do not see it, this one costs the least noise, but some
+    assert np.abs(plain @ nuisance_response).max() > 1e-3 * np.abs(plain).max()
+    if estimator == "weighted":  # ignoring the nuisance costs some noise
         assert (noise_nm(R, I0, 1e5, 2.0) > noise_nm(plain, I0, 1e5, 2.0)).all()
 
 
 @pytest.mark.parametrize("nuisance", [RESPONSE[:, :1], np.zeros((PIXELS, 1))])
-def test_a_nuisance_that_is_a_mode_or_nothing_is_refused(nuisance: np.ndarray) -> None:
-    beside = normalise_flux(TOY.reference, nuisance, GOOD)[1]
+def test_a_nuisance_equal_to_a_mode_or_zero_is_refused(nuisance: np.ndarray) -> None:
+    nuisance_response = normalise_flux(TOY.reference, nuisance, GOOD)[1]
     with pytest.raises(ValueError, match="nuisance modes"):
-        reconstructor(I0, H, GOOD, 1e5, 1.0, nuisance=beside)
+        reconstructor(I0, H, GOOD, 1e5, 1.0, nuisance=nuisance_response)
 
 
 def test_an_unknown_estimator_is_refused() -> None:
@@ -139,25 +139,25 @@ def test_condition_number_of_a_missing_mode_is_infinite() -> None:
     assert condition_number(np.column_stack([np.ones(4), np.zeros(4)])) == np.inf
 
 
-def test_an_estimate_is_the_reconstructor_times_the_difference_from_the_reference() -> None:
+def test_an_estimate_is_r_times_the_normalised_difference() -> None:
     rng = np.random.default_rng(3)
     shifted = rng.uniform(0.5, 1.5, PIXELS) * calibration().reference  # so that R I0 is not zero
-    known = replace(calibration(), reference=(shifted / shifted.sum()).astype(np.float32))
+    calibration_ = replace(calibration(), reference=(shifted / shifted.sum()).astype(np.float32))
     out = np.empty(PIXELS, np.float32)
     for flux_dn in (30_000.0, 300_000.0):
         pixels = rng.poisson(TOY.pixels((3, -4, 5), flux_dn).reshape(-1)).astype(np.uint16)
         before = pixels.copy()
-        found = Estimator.of(known).estimate(pixels, 0.0)
+        found = Estimator.of(calibration_).estimate(pixels, 0.0)
         assert (found.error_nm.dtype, pixels.tolist()) == (np.float32, before.tolist())
-        assert found.flux_dn == pytest.approx(difference(known, pixels, 0.0, out), rel=1e-6)
-        expected_nm = known.reconstructor.astype(np.float64) @ out
+        assert found.flux_dn == pytest.approx(difference(calibration_, pixels, 0.0, out), rel=1e-6)
+        expected_nm = calibration_.reconstructor.astype(np.float64) @ out
         assert np.abs(expected_nm).max() > 1
         assert found.error_nm == pytest.approx(expected_nm, rel=1e-4, abs=1e-4)
 
 
-def test_a_frame_at_or_below_the_least_flux_is_dark() -> None:
-    known = calibration()
-    estimator = Estimator.of(known)
+def test_a_frame_at_or_below_the_least_flux_has_no_estimate() -> None:
+    calibration_ = calibration()
+    estimator = Estimator.of(calibration_)
     pixels = np.full(PIXELS, 101, np.uint16)  # one DN above the dark in every pixel
     assert estimator.estimate(pixels, float(PIXELS)) is None
     assert estimator.estimate(pixels, PIXELS - 1.0) is not None
@@ -165,13 +165,13 @@ def test_a_frame_at_or_below_the_least_flux_is_dark() -> None:
 
 
 def test_only_good_pixels_count_as_saturated() -> None:
-    known = replace(calibration(), good=SOME_BAD.astype(np.float32))
+    calibration_ = replace(calibration(), good=SOME_BAD.astype(np.float32))
     pixels = np.full(PIXELS, 1000, np.uint16)
-    assert saturated_pixels(known, pixels) == 0
+    assert saturated_pixels(calibration_, pixels) == 0
     pixels[[3, 4]] = 60_000
-    assert saturated_pixels(known, pixels) == 1
+    assert saturated_pixels(calibration_, pixels) == 1
     pixels[5] = 65_535
-    assert saturated_pixels(known, pixels) == 2
+    assert saturated_pixels(calibration_, pixels) == 2
 
 
 @pytest.mark.parametrize(
@@ -184,13 +184,13 @@ def test_only_good_pixels_count_as_saturated() -> None:
         ({"flux_dn": np.nan}, "flux_dn"),
     ],
 )
-def test_a_calibration_that_does_not_fit_together_is_refused(change: dict[str, object], message: str) -> None:
+def test_an_inconsistent_calibration_is_refused(change: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         replace(calibration(), **change)
 
 
 def computed() -> np.ndarray:
-    """An image that is the same after half a turn, as that of a flat wavefront is, and not its mirror image."""
+    """An image that is unchanged by 180 degrees, like that of a flat wavefront, but not by a reflection."""
     rng = np.random.default_rng(4)
     y, x = np.indices((64, 64)) - 31.5
     speckles = gaussian_filter(rng.standard_normal((64, 64)), 2.5)
@@ -205,33 +205,33 @@ def computed() -> np.ndarray:
         Geometry(1.05, 35.0, 37.0, 89.0, -1),
     ],
 )
-def test_the_geometry_is_found(geometry: Geometry) -> None:
+def test_the_geometry_is_recovered(geometry: Geometry) -> None:
     rng = np.random.default_rng(1)
     real = rng.poisson(2e6 * onto(computed(), geometry, (70, 80)) + 5).astype(float)
     found = align(real, computed())
     assert found.geometry.parity == geometry.parity
     assert found.geometry.scale == pytest.approx(geometry.scale, abs=0.003)
     assert (found.geometry.row, found.geometry.column) == pytest.approx((geometry.row, geometry.column), abs=0.05)
-    turned = (found.geometry.rotation_deg - geometry.rotation_deg + 90) % 180 - 90  # half a turn it cannot tell
-    assert abs(turned) < 0.2
+    difference_deg = (found.geometry.rotation_deg - geometry.rotation_deg + 90) % 180 - 90  # modulo 180 degrees
+    assert abs(difference_deg) < 0.2
     assert found.flux == pytest.approx(2e6, rel=0.02)
     assert found.background == pytest.approx(5, abs=0.5)
     assert found.residual < 0.1
     assert found.other_parity > 2 * found.residual
 
 
-def test_half_a_turn_leaves_the_image_and_turns_the_response_round() -> None:
+def test_a_rotation_by_180_degrees_keeps_the_image_and_inverts_the_response() -> None:
     geometry = Geometry(1.1, 30.0, 40.0, 20.0, -1)
     image = computed()
-    other = geometry.turned()
-    assert other.turned() == geometry
+    other = geometry.rotated_180()
+    assert other.rotated_180() == geometry
     assert np.allclose(onto(image, geometry, (70, 80)), onto(image, other, (70, 80)), atol=1e-9)
     slope = image - np.roll(image, 1, axis=0)
     slope = slope - slope[::-1, ::-1]
     assert np.allclose(onto(slope, geometry, (70, 80)), -onto(slope, other, (70, 80)), atol=1e-9)
 
 
-def test_light_is_kept_and_many_images_are_as_one() -> None:
+def test_resampling_conserves_flux_for_one_or_many_images() -> None:
     image = computed()
     geometry = Geometry(1.3, 50.0, 50.0, 33.0, 1)
     assert onto(image, geometry, (100, 100)).sum() == pytest.approx(1.0, abs=0.01)
@@ -240,9 +240,9 @@ def test_light_is_kept_and_many_images_are_as_one() -> None:
     assert np.allclose(both[..., 1], 2 * both[..., 0])
 
 
-def test_another_image_is_refused() -> None:
+def test_an_unrelated_image_is_refused() -> None:
     rng = np.random.default_rng(3)
-    with pytest.raises(ValueError, match="nothing in the image is like"):
+    with pytest.raises(ValueError, match="the image does not resemble"):
         align(np.pad(rng.exponential(100.0, (30, 35)), 5), computed())
     with pytest.raises(ValueError, match="no light"):
         align(np.zeros((70, 80)), computed())

@@ -1,4 +1,4 @@
-"""H, I0, delay, dark and R from made-up frames of which everything is known, and what is played to measure them."""
+"""H, I0, delay, dark and R on synthetic frames, and the probe sequences that measure them."""
 
 from dataclasses import replace
 
@@ -7,7 +7,7 @@ import pytest
 
 from lowfc.control.calibration.adapted import with_dark, with_reference
 from lowfc.control.calibration.calibration import normalise_flux, reconstructor
-from lowfc.control.calibration.dark_frames import dark_of, light_in
+from lowfc.control.calibration.dark_frames import light_in, measure_dark
 from lowfc.control.calibration.delay_fit import measure_delay
 from lowfc.control.calibration.poke_plan import (
     SIGNS,
@@ -24,10 +24,10 @@ from lowfc.control.calibration.response_fit import (
     Initial,
     Measured,
     Sums,
+    best_initial,
     check,
     cross_talk,
     cycle_response,
-    initial_of,
     measured,
     normalised,
     row_error,
@@ -41,9 +41,7 @@ COLUMNS = 5
 
 @pytest.mark.parametrize("patterns", [poke_patterns(COLUMNS, 8.0), hadamard_patterns(COLUMNS, 3.0)])
 @pytest.mark.parametrize("backwards", [False, True])
-def test_a_cycle_tells_the_modes_apart_and_drift_up_to_the_second_order_cancels(
-    patterns: np.ndarray, backwards: bool
-) -> None:
+def test_a_cycle_separates_the_modes_and_cancels_quadratic_drift(patterns: np.ndarray, backwards: bool) -> None:
     plan = cycle(patterns, hold=3, settle=2, rest=4, backwards=backwards)
     used = plan.table[plan.used]
     normal = used.T @ used
@@ -52,10 +50,10 @@ def test_a_cycle_tells_the_modes_apart_and_drift_up_to_the_second_order_cancels(
     time = np.flatnonzero(plan.used) / len(plan)
     for power in (0, 1, 2):
         assert np.abs(used.T @ time**power).max() < 1e-9
-    assert np.abs(used.T @ time**3).max() > 1e-6  # or nothing above would mean anything
+    assert np.abs(used.T @ time**3).max() > 1e-6  # a cubic drift does not cancel
 
 
-def test_a_cycle_has_rest_pushes_and_pulls_with_their_settling() -> None:
+def test_a_cycle_has_rest_frames_and_settling_after_each_change() -> None:
     plan = cycle(poke_patterns(2, 8.0), hold=3, settle=2, rest=4)
     assert len(plan) == 4 + 2 + 2 * SIGNS.size * 5
     assert np.count_nonzero(plan.used[:6]) == 4
@@ -63,17 +61,17 @@ def test_a_cycle_has_rest_pushes_and_pulls_with_their_settling() -> None:
     changed = np.flatnonzero(np.diff(plan.table, axis=0).any(axis=1)) + 1
     for late in (0, 1):
         assert not plan.used[changed + late].any()
-    with pytest.raises(ValueError, match="held for 1 frame or more"):
+    with pytest.raises(ValueError, match="hold must be 1 frame or more"):
         cycle(poke_patterns(2, 8.0), hold=0, settle=2, rest=4)
 
 
-def test_hadamard_pokes_every_mode_in_every_pattern() -> None:
+def test_hadamard_patterns_poke_every_mode() -> None:
     assert np.all(np.abs(hadamard_patterns(14, 3.0)) == 3.0)
     assert hadamard_patterns(14, 3.0).shape == (16, 14)
     assert hadamard_patterns(16, 3.0).shape == (16, 16)
 
 
-def test_a_dither_is_another_one_with_another_seed() -> None:
+def test_a_dither_depends_on_its_seed() -> None:
     one, other = dither(3, 2.0, 100, 4, 1), dither(3, 2.0, 100, 4, 2)
     assert np.array_equal(one.table, dither(3, 2.0, 100, 4, 1).table)
     assert not np.array_equal(one.table, other.table)
@@ -81,12 +79,12 @@ def test_a_dither_is_another_one_with_another_seed() -> None:
     assert one.per_column == 100
 
 
-def test_the_frames_for_a_signal_to_noise_grow_with_its_square() -> None:
+def test_frames_grow_with_the_square_of_the_signal_to_noise() -> None:
     assert frames_for(100, 2.0, 4.0) == 2500
     assert frames_for(200, 2.0, 4.0) == 10_000
 
 
-def test_an_exposure_sees_the_rows_that_its_delay_says() -> None:
+def test_an_exposure_sees_the_rows_of_its_delay() -> None:
     table = np.arange(1.0, 6.0)[:, None]
     every = np.ones(8, np.bool_)
     whole = seen(table, np.array([0.0, 1.0]), np.arange(8), every)
@@ -95,7 +93,7 @@ def test_an_exposure_sees_the_rows_that_its_delay_says() -> None:
     assert half[:, 0].tolist() == [0, 0.5, 1.5, 2.5, 3.5, 4.5, 2.5, 0]
 
 
-def test_where_no_command_was_made_the_mirror_kept_the_row_before() -> None:
+def test_without_a_command_the_mirror_keeps_the_previous_row() -> None:
     table = np.arange(1.0, 6.0)[:, None]
     weights = np.array([0.0, 1.0])
     refused = np.array([True, True, False, True, True, True, True])
@@ -104,7 +102,7 @@ def test_where_no_command_was_made_the_mirror_kept_the_row_before() -> None:
     assert seen(table, weights, missing, np.ones(6, np.bool_))[:, 0].tolist() == [0, 1, 2, 4, 5, 0]
 
 
-def test_what_a_missing_frame_spoils_is_left_out_and_no_more() -> None:
+def test_only_exposures_affected_by_a_missing_frame_are_unusable() -> None:
     plan = cycle(poke_patterns(2, 8.0), hold=3, settle=0, rest=0)
     every = np.arange(len(plan) + 3)
     whole = usable(plan, every, np.ones(every.size, np.bool_), 1)
@@ -119,7 +117,7 @@ FLUX_E = 1e5
 
 
 def truth(seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """I0 and H, normalised."""
+    """Normalised I0 and H of a random sensor."""
     rng = np.random.default_rng(seed)
     light = rng.gamma(1.0, 1.0, PIXELS)
     slopes = light[:, None] * rng.standard_normal((PIXELS, MODES)) * 0.01
@@ -140,12 +138,12 @@ def fractions_of(frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return normalised(frames, np.zeros(PIXELS), GOOD)
 
 
-def known(seed: int = 1) -> Initial:
+def initial_of_sensor(seed: int = 1) -> Initial:
     return Initial(reconstructor(*truth(seed), GOOD, FLUX_E, 0.0), "weighted")
 
 
 def calibrated(patterns: np.ndarray, cycles: int, drift: float = 0.0) -> Measured:
-    sums = Sums.none(known())
+    sums = Sums.none(initial_of_sensor())
     for number in range(cycles):
         plan = cycle(patterns, hold=4, settle=1, rest=16, backwards=number % 2 == 1)
         time = np.arange(len(plan))[:, None] / len(plan)
@@ -157,7 +155,7 @@ def calibrated(patterns: np.ndarray, cycles: int, drift: float = 0.0) -> Measure
 
 
 @pytest.mark.parametrize("patterns", [poke_patterns(MODES, 8.0), hadamard_patterns(MODES, 3.0)])
-def test_r_is_found_within_its_standard_error(patterns: np.ndarray) -> None:
+def test_r_is_correct_within_its_standard_error(patterns: np.ndarray) -> None:
     found = calibrated(patterns, 20)
     assert found.reference is not None
     assert found.flux_dn == pytest.approx(FLUX_E, rel=1e-3)
@@ -168,23 +166,23 @@ def test_r_is_found_within_its_standard_error(patterns: np.ndarray) -> None:
     assert np.abs(made.matrix @ (found.reference - I0)).max() < 0.5
 
 
-def test_the_noise_of_h_neither_makes_modes_small_nor_gets_into_r() -> None:
-    """H is measured so shortly that its pixels' noise is as strong as the modes."""
+def test_the_noise_of_h_neither_biases_r_nor_adds_noise() -> None:
+    """H is measured so briefly that the noise of its pixels is as strong as the modes."""
     found = calibrated(poke_patterns(MODES, 0.3), 10)
     variance = I0 / FLUX_E
-    plain = reconstruct(I0, found.response, None, GOOD, FLUX_E, 0.0)
+    without_outlier = reconstruct(I0, found.response, None, GOOD, FLUX_E, 0.0)
     made = reconstruct(I0, found.response, found.initial.matrix, GOOD, FLUX_E, 0.0)
     least = np.sqrt(found.initial.matrix**2 @ variance)
-    assert np.diag(cross_talk(plain.matrix, H)).mean() < -0.3
+    assert np.diag(cross_talk(without_outlier.matrix, H)).mean() < -0.3
     assert abs(np.diag(cross_talk(made.matrix, H)).mean()) < 3 * found.error.max() / np.sqrt(MODES)
     assert (np.sqrt(made.matrix**2 @ variance) / least).max() < 1 + 3 * found.error.max()
-    # one whose weights are wrong, with other modes mixed in, does as well but for its own noise
+    # an initial reconstructor with wrong weights and mixed modes is unbiased too, with its own noise
     mixed = np.random.default_rng(0).standard_normal((MODES, MODES)) @ reconstructor(I0, H, GOOD, FLUX_E, 0.0, "pinv")
     other = reconstruct(I0, found.response, mixed, GOOD, FLUX_E, 0.0)
     assert np.abs(cross_talk(other.matrix, H)).max() < 6 * found.error.max()
 
 
-def test_r_answers_to_the_measured_h_and_a_single_cycle_has_no_standard_error() -> None:
+def test_r_inverts_the_measured_h_and_one_cycle_has_no_standard_error() -> None:
     assert calibrated(hadamard_patterns(MODES, 3.0), 1).error.tolist() == [np.inf] * MODES
     found = calibrated(hadamard_patterns(MODES, 3.0), 4)
     made = reconstruct(I0, found.response, found.initial.matrix, GOOD, FLUX_E, 0.0)
@@ -193,41 +191,41 @@ def test_r_answers_to_the_measured_h_and_a_single_cycle_has_no_standard_error() 
         reconstruct(I0, found.response, np.zeros((MODES, PIXELS)), GOOD, FLUX_E, 0.0)
 
 
-def test_what_a_reconstructor_leaves_out_the_measured_one_leaves_out() -> None:
+def test_r_ignores_what_the_initial_reconstructor_ignores() -> None:
     background = normalise_flux(I0, np.ones((PIXELS, 1)), GOOD)[1]
     blind = reconstructor(I0, H, GOOD, FLUX_E, 2.0, "weighted", background)
     found = calibrated(hadamard_patterns(MODES, 3.0), 4)
     assert np.abs(reconstruct(I0, found.response, blind, GOOD, FLUX_E, 2.0).matrix @ background).max() < 1e-9
 
 
-def test_the_reconstructor_that_sees_a_poke_best_is_taken() -> None:
-    one = known()
+def test_the_initial_reconstructor_with_the_least_noise_is_chosen() -> None:
+    one = initial_of_sensor()
     blind = Initial(np.zeros_like(one.matrix), "blind")
-    turned = Initial(known(2).matrix, "of another sensor")
-    again = Initial(one.matrix * 3.0, "again")
+    other = Initial(initial_of_sensor(2).matrix, "of another sensor")
+    scaled = Initial(one.matrix * 3.0, "again")
     for candidates, best in (
         ([one, blind], one),
-        ([turned, one], one),
-        ([blind, one, again], one),
-        ([again, one], again),
+        ([other, one], one),
+        ([blind, one, scaled], one),
+        ([scaled, one], scaled),
     ):
-        assert initial_of(candidates, -0.8 * H[:, 1], 1, I0 / FLUX_E) is best
+        assert best_initial(candidates, -0.8 * H[:, 1], 1, I0 / FLUX_E) is best
 
 
-def test_a_jolt_in_one_cycle_does_not_spoil_the_mean() -> None:
+def test_an_outlying_cycle_hardly_affects_the_mean() -> None:
     rng = np.random.default_rng(9)
     error = np.linspace(0.01, 0.04, 8)
     answers = np.eye(8) + rng.standard_normal((400, 8, 8, 8)) * error[:, None]
-    plain = [without_outliers(each).mean(axis=0) - np.eye(8) for each in answers]
-    assert np.std(plain) / np.sqrt((error**2).mean() / 8) < 1.03
+    without_outlier = [without_outliers(each).mean(axis=0) - np.eye(8) for each in answers]
+    assert np.std(without_outlier) / np.sqrt((error**2).mean() / 8) < 1.03
     answers[:, 3, 1, 5] += 2.0
-    jolted = [without_outliers(each).mean(axis=0) - np.eye(8) for each in answers]
-    assert np.sqrt(np.mean([each[1, 5] ** 2 for each in jolted])) < 2.5 * error[1] / np.sqrt(8)
+    with_outlier = [without_outliers(each).mean(axis=0) - np.eye(8) for each in answers]
+    assert np.sqrt(np.mean([each[1, 5] ** 2 for each in with_outlier])) < 2.5 * error[1] / np.sqrt(8)
     found = np.mean([row_error(without_outliers(each)) for each in answers], axis=0)
     assert found == pytest.approx(error / np.sqrt(8), rel=0.25)
 
 
-def test_frames_of_their_own_show_a_wrong_reconstructor() -> None:
+def test_independent_frames_reveal_a_wrong_reconstructor() -> None:
     rng = np.random.default_rng(4)
     error = np.linspace(0.01, 0.04, 8)
     answers = np.eye(8) + rng.standard_normal((400, 4, 8, 8)) * error[:, None]
@@ -235,7 +233,7 @@ def test_frames_of_their_own_show_a_wrong_reconstructor() -> None:
     assert np.mean([each.within(0.012, 0.04) for each in right]) > 0.99
     assert np.sqrt(np.mean([each.rms**2 for each in right])) < 0.01
     largest = max(right, key=lambda each: each.largest)
-    assert largest.bound(0.04) > largest.largest > 0.04, "with the noise of these frames it is good"
+    assert largest.bound(0.04) > largest.largest > 0.04, "the noise of these frames is allowed for"
     wrong = np.eye(8)
     wrong[2, 5] = 0.3
     assert not any(check(each, wrong, error).within(0.012, 0.04) for each in answers)
@@ -244,7 +242,7 @@ def test_frames_of_their_own_show_a_wrong_reconstructor() -> None:
 
 
 @pytest.mark.parametrize("delay", [1.0, 1.3, 1.5, 2.0, 2.75])
-def test_the_delay_is_found(delay: float) -> None:
+def test_the_delay_is_measured(delay: float) -> None:
     poke = dither(1, 8.0, 600, 1, 3).table[:, 0]
     weights = np.concatenate([[0.0], delay_weights(delay)])
     seen = np.convolve(poke, weights)[: len(poke)]
@@ -252,15 +250,15 @@ def test_the_delay_is_found(delay: float) -> None:
     fractions, _ = fractions_of(frames)
     found = measure_delay(fractions, I0, poke)
     assert abs(found.delay_frames - delay) < min(0.05, 5 * found.error_frames + 1e-3)
-    assert found.picture @ H[:, 1] > 0.9 * np.linalg.norm(found.picture) * np.linalg.norm(H[:, 1])
-    assert np.linalg.norm(found.picture) == pytest.approx(np.linalg.norm(H[:, 1]), rel=0.2)
+    assert found.response @ H[:, 1] > 0.9 * np.linalg.norm(found.response) * np.linalg.norm(H[:, 1])
+    assert np.linalg.norm(found.response) == pytest.approx(np.linalg.norm(H[:, 1]), rel=0.2)
     backwards = measure_delay(fractions, I0, -poke)
     assert backwards.delay_frames == pytest.approx(found.delay_frames)
-    assert backwards.picture @ H[:, 1] < 0
+    assert backwards.response @ H[:, 1] < 0
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_pokes_that_are_not_there_are_not_seen(seed: int) -> None:
+def test_absent_pokes_are_not_detected(seed: int) -> None:
     poke = dither(1, 8.0, 600, 1, seed).table[:, 0]
     fractions, _ = fractions_of(exposed(np.zeros((600, MODES)), seed))
     with pytest.raises(ValueError, match="pokes are not seen"):
@@ -269,20 +267,20 @@ def test_pokes_that_are_not_there_are_not_seen(seed: int) -> None:
         measure_delay(fractions[:100], I0, poke[:100])
 
 
-def test_an_answer_that_comes_too_late_is_said() -> None:
+def test_a_response_later_than_the_longest_lag_is_an_error() -> None:
     poke = dither(1, 8.0, 600, 1, 3).table[:, 0]
     fractions, _ = fractions_of(exposed(np.outer(np.roll(poke, 5), [0, 1, 0, 0]), 5))
-    with pytest.raises(ValueError, match="not over after"):
+    with pytest.raises(ValueError, match="spread over several frames"):
         measure_delay(fractions, I0, poke)
 
 
-def test_bad_pixels_are_found_and_good_ones_are_not() -> None:
+def test_bad_pixels_are_found() -> None:
     rng = np.random.default_rng(2)
     frames = np.rint(100 + 2 * rng.standard_normal((200, 6400)))
     frames[:, 10] += 40
     frames[:, 20] += np.rint(20 * rng.standard_normal(200))
     frames[:, 30] = 97
-    found = dark_of(frames)
+    found = measure_dark(frames)
     assert np.flatnonzero(found.hot).tolist() == [10]
     assert np.flatnonzero(found.noisy).tolist() == [20]
     assert np.flatnonzero(found.dead).tolist() == [30]
@@ -291,42 +289,42 @@ def test_bad_pixels_are_found_and_good_ones_are_not() -> None:
     light = np.zeros(6400)
     light[1000:1200] = 1 / 200
     assert light_in(found.dark_dn, light) == pytest.approx(0, abs=30)
-    lit = dark_of(frames + 5e3 * light)
+    lit = measure_dark(frames + 5e3 * light)
     assert light_in(lit.dark_dn, light) == pytest.approx(5e3, abs=100)
     with pytest.raises(ValueError, match="at least 16 frames"):
-        dark_of(frames[:5])
+        measure_dark(frames[:5])
     frames[:, 2000:3000] += 50
     with pytest.raises(ValueError, match="not dark"):
-        dark_of(frames)
+        measure_dark(frames)
 
 
-def test_a_computed_h_gives_the_reconstructor_that_it_always_gave() -> None:
+def test_r_of_a_computed_h_is_the_reconstructor() -> None:
     for estimator in ("weighted", "pinv"):
         made = reconstruct(I0, H, None, GOOD, FLUX_E, 2.0, estimator)
         assert np.allclose(made.matrix, reconstructor(I0, H, GOOD, FLUX_E, 2.0, estimator), rtol=1e-6, atol=1e-9)
 
 
-def test_combinations_that_are_hardly_measured_can_be_left_out_or_damped() -> None:
+def test_poorly_measured_combinations_can_be_truncated_or_damped() -> None:
     faint = np.column_stack([H[:, :3], H[:, 2] + 0.01 * H[:, 3]])
     whole = reconstruct(I0, faint, None, GOOD, FLUX_E, 0.0)
     assert whole.condition_number > 50
     assert "Z4 and Z5" in advice(whole, (2, 3, 4, 5), 1.0) or "Z5 and Z4" in advice(whole, (2, 3, 4, 5), 1.0)
     assert "no regularisation" in advice(whole, (2, 3, 4, 5), 1e6)
-    cut = reconstruct(I0, faint, None, GOOD, FLUX_E, 0.0, truncate=0.05)
-    assert np.count_nonzero(cut.kept) == 3
-    assert np.linalg.matrix_rank(cut.matrix) == 3
-    assert "1 of 4 combinations" in advice(cut, (2, 3, 4, 5), 1.0)
+    truncated = reconstruct(I0, faint, None, GOOD, FLUX_E, 0.0, truncate=0.05)
+    assert np.count_nonzero(truncated.kept) == 3
+    assert np.linalg.matrix_rank(truncated.matrix) == 3
+    assert "1 of 4 combinations" in advice(truncated, (2, 3, 4, 5), 1.0)
     damped = reconstruct(I0, faint, None, GOOD, FLUX_E, 0.0, tikhonov=0.05)
-    assert np.linalg.norm(cut.matrix) < np.linalg.norm(damped.matrix) < np.linalg.norm(whole.matrix)
-    with pytest.raises(ValueError, match="0 or more and below 1"):
+    assert np.linalg.norm(truncated.matrix) < np.linalg.norm(damped.matrix) < np.linalg.norm(whole.matrix)
+    with pytest.raises(ValueError, match="at least 0 and below 1"):
         reconstruct(I0, faint, None, GOOD, FLUX_E, 0.0, truncate=1.0)
     with pytest.raises(ValueError, match="weighted"):
         reconstruct(I0, faint, None, GOOD, FLUX_E, 0.0, "best")
     of_measured = reconstruct(I0, faint, whole.matrix, GOOD, FLUX_E, 0.0, truncate=0.05)
-    assert np.allclose(of_measured.matrix, cut.matrix, rtol=1e-6, atol=1e-6)
+    assert np.allclose(of_measured.matrix, truncated.matrix, rtol=1e-6, atol=1e-6)
 
 
-def test_too_few_usable_frames_are_said() -> None:
+def test_too_few_usable_frames_are_an_error() -> None:
     plan = cycle(poke_patterns(MODES, 8.0), hold=1, settle=0, rest=0)
     frames = exposed(plan.table, 1)
     fractions, flux = fractions_of(frames)
@@ -338,7 +336,7 @@ def test_too_few_usable_frames_are_said() -> None:
         fractions_of(np.zeros((3, PIXELS)))
 
 
-def test_another_dark_mask_or_reference_gives_a_calibration_that_reads_the_same_modes() -> None:
+def test_a_new_dark_mask_or_reference_keeps_the_response_to_the_modes() -> None:
     before = calibration()
     good = np.ones(before.good.size)
     good[3] = 0
@@ -354,7 +352,7 @@ def test_another_dark_mask_or_reference_gives_a_calibration_that_reads_the_same_
     assert moved.response is before.response
 
 
-def test_of_a_measured_calibration_r_is_not_made_again_of_a_noisy_h() -> None:
+def test_r_of_a_measured_calibration_is_not_recomputed_from_noisy_h() -> None:
     before = calibration()
     noise = 0.2 * np.abs(before.response).max() * np.random.default_rng(3).standard_normal(before.response.shape)
     response = (before.response + noise * before.good[:, None]).astype(np.float32)
@@ -369,7 +367,7 @@ def test_of_a_measured_calibration_r_is_not_made_again_of_a_noisy_h() -> None:
     assert not masked.reconstructor[:, 3].any()
     _, H_masked = normalise_flux(I0, H, good)
     there, here = (cross_talk(made, of) for made, of in ((matrix, H), (masked.reconstructor, H_masked)))
-    assert np.abs(there - here).max() < np.abs(there).max()  # a pixel is 2 % of this sensor
+    assert np.abs(there - here).max() < np.abs(there).max()  # one pixel holds 2 % of this sensor's flux
     power = [(each.reconstructor.astype(float) ** 2 @ (I0 + 1e-6)) for each in (masked, best)]
     assert (power[0] / power[1]).max() < 1.5
     with pytest.raises(ValueError, match="do not tell the modes apart"):

@@ -1,4 +1,4 @@
-"""What a loop leaves between the instants at which it looks: theory against loops in fine steps of time."""
+"""Continuous-time residual of a loop: theory against simulations with fine time steps."""
 
 import numpy as np
 import pytest
@@ -6,21 +6,21 @@ import pytest
 from lowfc.arrays import Array
 from lowfc.control.laws.continuous import (
     Timing,
-    ahead_of,
     commanded,
-    held_left_nm2,
+    continuous_residual_nm2,
+    held_residual_nm2,
     hold_floor,
-    left_all_the_time_nm2,
-    left_power,
     mean_over,
+    means_while_applied,
+    residual_power,
 )
 from lowfc.control.laws.kalman import lqg
-from lowfc.control.laws.linear_law import LinearLaw, at_rest, follow, integrator, respond
+from lowfc.control.laws.linear_law import LinearLaw, at_rest, integrator, predict_and_update, respond
 from lowfc.control.laws.stability import delay_weights
 from lowfc.control.laws.vibration import Line, Model
 
 FINE = 200
-"""Instants of a period."""
+"""Time steps of a period."""
 RATE_HZ = 1000.0
 LINES_HZ, LINES_MAS = (6.0, 18.0, 37.0, 71.0, 117.0), (9.0, 8.3, 5.0, 3.0, 2.0)
 OMEGA = 2 * np.pi * np.array(LINES_HZ) / RATE_HZ
@@ -35,8 +35,8 @@ def wheel(noise_nm2: float = 1e-6) -> Model:
     return Model(1e-9, np.inf, lines, noise_nm2, RATE_HZ)
 
 
-def left_of_wave(law: LinearLaw, omega: float, timing: Timing, frames: int = 4000) -> float:
-    """Mean square over time that a loop leaves of sqrt(2) cos(omega t + 1), by instants of each period."""
+def simulated_residual(law: LinearLaw, omega: float, timing: Timing, frames: int = 4000) -> float:
+    """Mean square residual over time of sqrt(2) cos(omega t + 1), simulated in fine steps."""
     fine = (np.arange(FINE) + 0.5) / FINE
     weights = delay_weights(timing.delay)
     x, c = at_rest(law).astype(float), np.zeros(frames + 8)
@@ -47,7 +47,7 @@ def left_of_wave(law: LinearLaw, omega: float, timing: Timing, frames: int = 400
         measured = at[k, exposure].mean() if exposure.any() else np.sqrt(2) * np.cos(omega * k + 1)
         seen = sum(weight * c[k - 1 - lag] for lag, weight in enumerate(weights))
         y = measured if law.signal == "pol" else measured + seen
-        x = follow(law, x, np.array([y]), c[k - 1 : k] if k else np.zeros(1))  # type: ignore[arg-type]
+        x = predict_and_update(law, x, np.array([y]), c[k - 1 : k] if k else np.zeros(1))  # type: ignore[arg-type]
         c[k] = respond(law, x)[0]  # type: ignore[arg-type]
         if k > frames // 2:
             whole = int(timing.applied)
@@ -59,47 +59,47 @@ def left_of_wave(law: LinearLaw, omega: float, timing: Timing, frames: int = 400
 
 @pytest.mark.parametrize("timing", [Timing(1, 1, 0.5), Timing(2, 2, 0.9), Timing(1, 0.75, 0.5), Timing(1.4, 1.4, 0.5)])
 @pytest.mark.parametrize("omega", [0.05, 0.7, 2.0, 2 * np.pi - 0.7])
-def test_what_is_left_of_a_wave(timing: Timing, omega: float) -> None:
+def test_the_residual_power_of_a_wave_agrees_with_a_fine_simulation(timing: Timing, omega: float) -> None:
     law = steady(0.4, timing.delay)
-    found = left_power(law, np.array([omega]), timing)[0, 0]
-    assert found == pytest.approx(left_of_wave(law, omega, timing), rel=0.01)
+    found = residual_power(law, np.array([omega]), timing)[0, 0]
+    assert found == pytest.approx(simulated_residual(law, omega, timing), rel=0.01)
 
 
-def test_the_floor_is_what_the_best_held_value_leaves() -> None:
+def test_the_floor_is_the_residual_of_the_best_held_value() -> None:
     t = np.linspace(0, 1, 20_001)
     for omega in (0.1, 1.0, 4.0):
         wave = np.exp(1j * omega * t)
-        left = np.trapezoid(np.abs(wave - np.trapezoid(wave, t)) ** 2, t)
-        assert hold_floor(np.array([omega]))[0] == pytest.approx(left, rel=1e-4)
+        residual = np.trapezoid(np.abs(wave - np.trapezoid(wave, t)) ** 2, t)
+        assert hold_floor(np.array([omega]))[0] == pytest.approx(residual, rel=1e-4)
     assert mean_over(np.zeros(1), 1.0)[0] == 1
 
 
-def of_wheel(law: LinearLaw, timing: Timing) -> float:
-    return float(np.sqrt(np.square(LINES_MAS) @ left_power(law, OMEGA, timing)[:, 0]))
+def wheel_residual_mas(law: LinearLaw, timing: Timing) -> float:
+    return float(np.sqrt(np.square(LINES_MAS) @ residual_power(law, OMEGA, timing)[:, 0]))
 
 
-def test_the_ideal_wheel() -> None:
-    """Per axis, mas, without noise; at one instant of a frame the integrator leaves 2.26 and the best law nothing."""
+def test_residuals_on_the_ideal_wheel() -> None:
+    """Mas per axis, without noise; at one instant of each frame the integrator leaves 2.26 and the best law nothing."""
     now, blurred = Timing(1, 1, 0), Timing(1, 1, 0.5)
-    assert of_wheel(steady(1.11, 1), now) == pytest.approx(3.528, abs=0.002)
-    assert of_wheel(steady(1.11, 1), blurred) == pytest.approx(2.944, abs=0.002)
-    assert of_wheel(steady(0.518, 2), Timing(2, 2, 0.5)) == pytest.approx(6.547, abs=0.002)
+    assert wheel_residual_mas(steady(1.11, 1), now) == pytest.approx(3.528, abs=0.002)
+    assert wheel_residual_mas(steady(1.11, 1), blurred) == pytest.approx(2.944, abs=0.002)
+    assert wheel_residual_mas(steady(0.518, 2), Timing(2, 2, 0.5)) == pytest.approx(6.547, abs=0.002)
     floor = float(np.sqrt(np.square(LINES_MAS) @ hold_floor(OMEGA)))
     assert floor == pytest.approx(0.7215, abs=1e-4)
     for timing in (now, blurred, Timing(1, 1, 0.9), Timing(2, 2, 0.5), Timing(1, 0.8, 0.5), Timing(1.5, 1.5, 0.5)):
-        assert of_wheel(lqg([wheel()], (2,), timing), timing) == pytest.approx(floor, rel=0.02), timing
+        assert wheel_residual_mas(lqg([wheel()], (2,), timing), timing) == pytest.approx(floor, rel=0.02), timing
 
 
-def test_a_law_that_nulls_something_else_leaves_more() -> None:
+def test_a_law_that_nulls_another_mean_has_a_larger_residual() -> None:
     instant, blurred = Timing(1, 1, 0), Timing(1, 1, 0.5)
-    at_instant = left_at(lambda model: model.mean_over(1.0, 0.0))
-    exposure = left_at(lambda model: model.mean_over(1.0, 0.5) @ np.linalg.inv(model.mean_over(0.0, 0.5)))
-    assert of_wheel(at_instant, instant) == pytest.approx(1.44, abs=0.01)
-    assert of_wheel(exposure, blurred) == pytest.approx(0.954, abs=0.01)
+    at_instant = law_nulling(lambda model: model.mean_over(1.0, 0.0))
+    exposure = law_nulling(lambda model: model.mean_over(1.0, 0.5) @ np.linalg.inv(model.mean_over(0.0, 0.5)))
+    assert wheel_residual_mas(at_instant, instant) == pytest.approx(1.44, abs=0.01)
+    assert wheel_residual_mas(exposure, blurred) == pytest.approx(0.954, abs=0.01)
 
 
-def left_at(foreseen) -> LinearLaw:  # type: ignore[no-untyped-def]
-    """The law whose command nulls another mean than that over the period in which it is in force."""
+def law_nulling(foreseen) -> LinearLaw:  # type: ignore[no-untyped-def]
+    """A law whose command nulls another mean than that over the period in which it is in force."""
     from dataclasses import replace
 
     law, model = lqg([wheel()], (2,), Timing(1, 1, 0.5)), wheel()
@@ -107,43 +107,43 @@ def left_at(foreseen) -> LinearLaw:  # type: ignore[no-untyped-def]
     return replace(law, output=(-C @ foreseen(model))[None].astype(np.float32))
 
 
-def test_noise_of_the_command_is_that_of_the_loop() -> None:
+def test_the_noise_of_the_command_has_a_closed_form() -> None:
     law, omega = steady(0.4, 1), np.linspace(1e-6, np.pi, 4000)
     power = np.abs(commanded(law, omega, 1))[:, 0] ** 2
     assert np.trapezoid(power, omega) / np.pi == pytest.approx(0.4 / (2 - 0.4), rel=1e-3)
 
 
 @pytest.mark.parametrize("timing", [Timing(1, 1, 0), Timing(1, 1, 0.5), Timing(2, 2, 0.9), Timing(1.3, 1.3, 0.5)])
-def test_means_between_measurements(timing: Timing) -> None:
-    """Of waves up to a quarter of the frame rate."""
+def test_means_are_interpolated_from_measurements(timing: Timing) -> None:
+    """For waves up to a quarter of the frame rate."""
     k = np.arange(400)
     for omega in (0.0, 0.04, 0.5, 1.5):
         wave = np.exp(1j * (omega * k + 0.3))
         measured = wave * mean_over(np.array([omega]), timing.exposure)
         ahead = wave * mean_over(np.array([omega]), 1.0) * np.exp(1j * omega * timing.applied)
-        found, answer = ahead_of(measured.real[:, None], timing)
-        there = np.isfinite(found[:, 0])
-        assert there.sum() > 290
-        np.testing.assert_allclose(found[there, 0], ahead.real[there], atol=2e-3)
-        assert answer[0] == pytest.approx(1)
+        found, response = means_while_applied(measured.real[:, None], timing)
+        valid = np.isfinite(found[:, 0])
+        assert valid.sum() > 290
+        np.testing.assert_allclose(found[valid, 0], ahead.real[valid], atol=2e-3)
+        assert response[0] == pytest.approx(1)
 
 
-def test_what_is_left_all_the_time_is_told_from_instants() -> None:
-    """Of a wave under a mirror that holds; what it leaves of the instants alone is much less."""
+def test_the_continuous_residual_is_recovered_from_instants() -> None:
+    """For a wave and a mirror that holds; the residual at the instants alone is much smaller."""
     timing, law, k, omega = Timing.of(1, 0.0), steady(0.5, 1), np.arange(3000), 0.3
     wave = np.sqrt(2) * np.cos(omega * k + 1)
     mirror, c = np.zeros_like(wave), 0.0
     for frame in range(len(k)):
         mirror[frame] = c
         c -= 0.5 * (wave[frame] + c)
-    found = left_all_the_time_nm2(wave[:, None], mirror[:, None])[500:-100]
+    found = continuous_residual_nm2(wave[:, None], mirror[:, None])[500:-100]
     assert np.isfinite(found).all()
-    assert found.mean() == pytest.approx(left_power(law, np.array([omega]), timing)[0, 0], rel=0.01)
+    assert found.mean() == pytest.approx(residual_power(law, np.array([omega]), timing)[0, 0], rel=0.01)
     assert np.mean((wave + mirror)[500:-100] ** 2) < 0.8 * found.mean()
 
 
-def test_what_commands_left_is_told_from_noisy_measurements() -> None:
-    """White noise of 1 nm beside a wave: what the loop leaves of the means, as theory has it."""
+def test_the_held_residual_is_recovered_from_noisy_measurements() -> None:
+    """A wave with 1 nm of white noise: the residual of the means agrees with theory."""
     timing, law, rng = Timing(1, 1, 0.5), steady(0.3, 1), np.random.default_rng(3)
     k, omega, frames = np.arange(20_000), 0.2, 20_000
     wave = 2 * np.sqrt(2) * np.exp(1j * (omega * k + 1))
@@ -151,8 +151,8 @@ def test_what_commands_left_is_told_from_noisy_measurements() -> None:
     c, x = np.zeros(frames), 0.0
     for frame in range(frames):
         c[frame] = x = x - 0.3 * (measured[frame] + x)
-    squares, counted = held_left_nm2(law, measured[:, None], c[:, None], np.ones(1), timing)
-    theory = 4 * (left_power(law, np.array([omega]), timing)[0, 0] - hold_floor(np.array([omega]))[0]) + 0.3 / 1.7
+    squares, counted = held_residual_nm2(law, measured[:, None], c[:, None], np.ones(1), timing)
+    theory = 4 * (residual_power(law, np.array([omega]), timing)[0, 0] - hold_floor(np.array([omega]))[0]) + 0.3 / 1.7
     assert squares[0] / counted == pytest.approx(theory, rel=0.03)
 
 
@@ -164,7 +164,7 @@ def states_over(model: Model, start: float, length: float) -> Array:
     return np.real(vectors @ np.diag(means) @ np.linalg.inv(vectors))
 
 
-def test_means_of_the_states_ahead() -> None:
+def test_predicted_means_of_the_states() -> None:
     model = Model(1e-3, 40.0, (Line(37.0, 2.0, 9.0), Line(120.0, 1.0, 1.0)), 1.0, RATE_HZ)
     for start, length in ((1.0, 1.0), (0.0, 0.5), (2.4, 1.0)):
         np.testing.assert_allclose(model.mean_over(start, length), states_over(model, start, length), atol=1e-6)

@@ -1,4 +1,4 @@
-"""What-ifs against the live loop's own `advance`, and against figures that can be checked by hand."""
+"""What-ifs against the live loop's `advance`, and against hand calculations."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ HALF = as_logged(law_of(modes=1))
 
 
 def single(*values: float) -> np.ndarray:
-    """One mode at several steps."""
+    """Values (steps, 1) of one mode."""
     return np.array(values, np.float32)[:, None]
 
 
@@ -35,13 +35,13 @@ def weights(delay_frames: float) -> np.ndarray:
     return delay_weights(delay_frames).astype(np.float32)
 
 
-def used(what: Settings, disturbance_nm: np.ndarray) -> list[Step]:
-    """Steps of the live loop with frames missing, and dark ones."""
-    return live(what, disturbance_nm, missing=MISSING, dark=DARK)[0]
+def used(setup: Settings, disturbance_nm: np.ndarray) -> list[Step]:
+    """Steps of the live loop with missing and dark frames."""
+    return live(setup, disturbance_nm, missing=MISSING, dark=DARK)[0]
 
 
 def columns(steps: list[Step]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Errors, pseudo-open-loop and commands (steps, modes), and exposures missing."""
+    """Errors, pseudo-open-loop modes and commands (steps, modes), and missing exposures."""
     nothing = np.full(3, np.nan, np.float32)
     error = np.array([nothing if step.error_nm is None else step.error_nm for step in steps])
     pol = np.array([nothing if step.pol_nm is None else step.pol_nm for step in steps])
@@ -58,21 +58,21 @@ DARK = (45, 46, 100, 101, 102, 103)
 
 
 @pytest.mark.parametrize("delay", DELAYS)
-def test_with_the_gains_that_were_used_it_is_the_logged_run(delay: float) -> None:
-    """To the rounding of float32 in pol = error - seen, with missing and refused frames and modal limits that act."""
-    what = settings(delay_frames=delay, gain=(0.3, 0.2), leak=(0.01, 0.0), limit_nm=(12.0, 50.0))
-    error, pol, command, missing = columns(used(what, walk(160)))
+def test_the_logged_gains_reproduce_the_logged_run(delay: float) -> None:
+    """Up to float32 rounding in pol = error - seen, with missing and refused frames and acting modal limits."""
+    setup = settings(delay_frames=delay, gain=(0.3, 0.2), leak=(0.01, 0.0), limit_nm=(12.0, 50.0))
+    error, pol, command, missing = columns(used(setup, walk(160)))
     assert missing.sum() == 9
     assert np.isnan(error).any(axis=1).sum() == len(DARK)
     assert (np.abs(command[:, 0]) == 12.0).any()
-    again_error, again_command = counterfactual(as_logged(what.law((2, 3, 4))), weights(delay), pol, missing)
-    np.testing.assert_allclose(again_error, error, atol=2e-5, rtol=0)
-    np.testing.assert_allclose(again_command, command, atol=2e-5, rtol=0)
+    replayed_error, replayed_command = counterfactual(as_logged(setup.law((2, 3, 4))), weights(delay), pol, missing)
+    np.testing.assert_allclose(replayed_error, error, atol=2e-5, rtol=0)
+    np.testing.assert_allclose(replayed_command, command, atol=2e-5, rtol=0)
 
 
 @pytest.mark.parametrize("delay", DELAYS)
-def test_with_other_gains_it_is_the_run_with_those(delay: float) -> None:
-    """On a sensor that is linear up to the rounding to DN, a hundredth of a nanometre here."""
+def test_other_gains_reproduce_a_run_with_these_gains(delay: float) -> None:
+    """For a sensor that is linear up to the rounding to DN, here 0.01 nm."""
     before = settings(delay_frames=delay, gain=(0.3, 0.1), **WIDE)
     after = settings(delay_frames=delay, gain=(0.1, 0.25), leak=(0.02, 0.01), **WIDE)
     disturbance = walk(160)
@@ -87,7 +87,7 @@ def test_with_other_gains_it_is_the_run_with_those(delay: float) -> None:
 @pytest.mark.parametrize(
     ("delay", "errors"), [(1.0, [8, 4, 2, 1]), (2.0, [8, 8, 4, 0]), (3.0, [8, 8, 8, 4]), (1.5, [8, 6, 2.5, 0.375])]
 )
-def test_an_integrator_of_half_on_a_step_by_hand(delay: float, errors: list[float]) -> None:
+def test_an_integrator_with_gain_one_half_on_a_step(delay: float, errors: list[float]) -> None:
     pol = single(8, 8, 8, 8)
     error, command = counterfactual(HALF, weights(delay), pol, NOTHING_MISSING[:4])
     assert error[:, 0].tolist() == errors
@@ -103,14 +103,14 @@ def test_any_function_of_state_and_error_is_a_controller() -> None:
     assert command[:, 0].tolist() == [0, -8, -8, 0, -8]
 
 
-def test_what_is_seen_of_commands_by_hand() -> None:
+def test_commands_seen_by_exposures() -> None:
     command, first, missing = single(1, 2, 4, 8), np.array([-1], np.float32), np.array([0, 0, 3, 0])
     assert seen_nm(weights(1.0), command, missing, first)[:, 0].tolist() == [-1, 1, 2, 4]
     assert seen_nm(weights(2.0), command, missing, first)[:, 0].tolist() == [-1, -1, 2, 2]
     assert seen_nm(weights(1.5), command, missing, first)[:, 0].tolist() == [-1, 0, 2, 3]
 
 
-def test_frames_that_came_again_or_late_are_no_exposures() -> None:
+def test_repeated_and_late_frames_are_not_exposures() -> None:
     counts = [5, 6, 6, 4, 9, 8]
     sequence = np.array([*map(frame_sequence, counts), frame_sequence(1, 1_800_000_000)], np.uint64)
     rows = exposed(sequence)
@@ -119,33 +119,33 @@ def test_frames_that_came_again_or_late_are_no_exposures() -> None:
 
 
 @pytest.mark.parametrize("delay", [1.0, 1.4, 2.0, 2.7, 3.0])
-def test_the_delay_is_found_from_what_the_mirror_truly_did(delay: float) -> None:
+def test_the_delay_is_recovered_from_the_true_mirror_motion(delay: float) -> None:
     rng = np.random.default_rng(3)
     command = np.cumsum(rng.normal(size=(400, 3)), axis=0).astype(np.float32)
     missing = (rng.random(400) < 0.02).astype(np.int64)
-    true = seen_nm(weights(delay), command, missing, command[0]) * np.float32(1.03)  # not quite what was commanded
+    true = seen_nm(weights(delay), command, missing, command[0]) * np.float32(1.03)  # 3 % more than commanded
     true[50:60] = np.nan
     assert delay_from_truth(true, command, missing) == pytest.approx(delay, abs=0.05)
 
 
-def test_a_mirror_that_stands_still_says_nothing_of_the_delay() -> None:
-    still = np.full((400, 3), 7, np.float32)
-    assert delay_from_truth(still, still, np.zeros(400, np.int64)) is None
+def test_a_motionless_mirror_gives_no_delay() -> None:
+    motionless = np.full((400, 3), 7, np.float32)
+    assert delay_from_truth(motionless, motionless, np.zeros(400, np.int64)) is None
 
 
-def test_the_delay_is_found_from_the_times_of_messages() -> None:
-    """40 exposures from 1000 ns on, every 1000 ns; every fourth command comes 100 ns after a start, and is late."""
+def test_the_delay_is_recovered_from_message_times() -> None:
+    """40 exposures from 1000 ns on, every 1000 ns; every fourth command is late, 100 ns after a start."""
     sequence = np.array([frame_sequence(count) for count in range(40)], np.uint64)
     start_ns = 1000 + 1000 * np.arange(40)
     applied_ns = start_ns + 900
     applied_ns[::4] += 200
-    again = slice(0, 40, 3)  # the mirror says some of them again, much later
-    told, times = np.append(sequence, sequence[again]), np.append(applied_ns, applied_ns[again] + 3000)
-    assert delay_from_times(sequence, start_ns, told, times) == pytest.approx(1.25, abs=0.02)
-    assert delay_from_times(sequence, start_ns, told[:5], times[:5]) is None
+    repeated = slice(0, 40, 3)  # the mirror reports some of them again, much later
+    reported, times = np.append(sequence, sequence[repeated]), np.append(applied_ns, applied_ns[repeated] + 3000)
+    assert delay_from_times(sequence, start_ns, reported, times) == pytest.approx(1.25, abs=0.02)
+    assert delay_from_times(sequence, start_ns, reported[:5], times[:5]) is None
 
 
-def test_times_beside_a_missing_frame_do_not_count() -> None:
+def test_times_next_to_a_missing_frame_are_ignored() -> None:
     counts = [count for count in range(90) if count % 3 != 2]
     sequence = np.array([frame_sequence(count) for count in counts], np.uint64)
     start_ns = 1000 * np.array(counts)
@@ -160,7 +160,7 @@ def test_settling_takes_five_time_constants_and_at_least_a_second(gain: object, 
     assert settling_frames(law.gain, law.leak, 250.0) == frames
 
 
-def test_frames_are_counted_from_where_the_loop_begins_to_run() -> None:
+def test_frames_are_counted_from_the_start_of_the_loop() -> None:
     running = np.array([0, 1, 1, 1, 0, 1, 1, 1], bool)
     begins = np.array([0, 0, 0, 0, 0, 0, 1, 0], bool)
     missing = np.array([0, 0, 3, 0, 0, 0, 0, 0])

@@ -1,4 +1,4 @@
-"""Terms of the error budget: against what can be worked out by hand, and their sum against a loop that ran."""
+"""Terms of the error budget against hand calculations, and their sum against a simulated loop."""
 
 from collections.abc import Callable
 
@@ -8,7 +8,7 @@ import pytest
 from lowfc.adapters.files import factory
 from lowfc.contract.configuration import FIXED_GAINS, load
 from lowfc.control.calibration.calibration import noise_nm
-from lowfc.control.laws.continuous import Timing, left_power
+from lowfc.control.laws.continuous import Timing, residual_power
 from lowfc.control.laws.error_budget import Term, lag, lag_under_noise, measurement_error, sensor_noise, white_noise
 from lowfc.control.laws.linear_law import LinearLaw, integrator
 from lowfc.control.laws.spectra import Pieces, spectrum
@@ -25,23 +25,23 @@ def loop(gain: tuple[float, ...] = (0.5, 0.1), leak: tuple[float, ...] = (0.0, 0
     return integrator(gain, leak, (2, 3), 1.0, RATE_HZ)
 
 
-def whole(values: np.ndarray) -> Pieces:
+def one_piece(values: np.ndarray) -> Pieces:
     return Pieces((values,), 0)
 
 
-def test_white_noise_through_the_shortest_loop_is_known_in_closed_form() -> None:
+def test_noise_gain_of_a_one_frame_loop_has_a_closed_form() -> None:
     found = white_noise(loop((0.5, 0.1)), np.array([4.0, 2.0]))
     assert found.variance_nm2 == pytest.approx([16 * 0.5 / 1.5, 4 * 0.1 / 1.9], rel=1e-3)
 
 
-def test_a_mode_without_gain_has_all_of_the_lag_and_no_noise() -> None:
-    made = loop((0.5, 0.0))
-    assert white_noise(made, np.ones(2)).variance_nm2[1] == 0
-    drift = spectrum(whole(np.random.default_rng(1).standard_normal((4000, 2))), RATE_HZ)
-    assert lag(made, drift, np.array([0.0, 3.0]), SAMPLED).variance_nm2[1] == pytest.approx(9 + drift.variance_nm2()[1])
+def test_a_mode_without_gain_keeps_its_disturbance_and_adds_no_noise() -> None:
+    law = loop((0.5, 0.0))
+    assert white_noise(law, np.ones(2)).variance_nm2[1] == 0
+    drift = spectrum(one_piece(np.random.default_rng(1).standard_normal((4000, 2))), RATE_HZ)
+    assert lag(law, drift, np.array([0.0, 3.0]), SAMPLED).variance_nm2[1] == pytest.approx(9 + drift.variance_nm2()[1])
 
 
-def test_sensor_noise_is_split_in_squares() -> None:
+def test_photon_and_read_noise_add_in_quadrature() -> None:
     rng = np.random.default_rng(2)
     matrix, reference = rng.standard_normal((2, 30)), rng.uniform(0.5, 1.5, 30)
     reference /= reference.sum()
@@ -53,32 +53,32 @@ def test_sensor_noise_is_split_in_squares() -> None:
     assert multiplied.read_nm == pytest.approx(found.read_nm)
 
 
-def test_the_lag_of_a_sine_is_its_rejected_amplitude() -> None:
+def test_the_lag_term_of_a_sine_is_its_rejected_power() -> None:
     time_s = np.arange(16_384) / RATE_HZ
     waves = np.stack([6 * np.sin(2 * np.pi * 31 * time_s), 2 * np.sin(2 * np.pi * 7 * time_s)], axis=1)
-    made = loop((0.5, 0.1), (0.0, 0.02))
-    found = spectrum(whole(waves), RATE_HZ)
+    law = loop((0.5, 0.1), (0.0, 0.02))
+    found = spectrum(one_piece(waves), RATE_HZ)
     passed = [rejection(np.array([f]), RATE_HZ, *law, 1.0)[0] for f, law in ((31.0, (0.5, 0.0)), (7.0, (0.1, 0.02)))]
     expected = np.array([18, 2]) * np.square(passed)
-    assert lag(made, found, np.zeros(2), SAMPLED).variance_nm2 == pytest.approx(expected, rel=0.02)
-    whole_time = lag(made, found, np.zeros(2), Timing.of(1.0, 0.0)).variance_nm2
+    assert lag(law, found, np.zeros(2), SAMPLED).variance_nm2 == pytest.approx(expected, rel=0.02)
+    whole_time = lag(law, found, np.zeros(2), Timing.of(1.0, 0.0)).variance_nm2
     omega = 2 * np.pi * np.array([31.0, 7.0]) / RATE_HZ
     assert whole_time == pytest.approx(
-        np.array([18, 2]) * left_power(made, omega, Timing.of(1.0, 0.0)).diagonal(), rel=0.02
+        np.array([18, 2]) * residual_power(law, omega, Timing.of(1.0, 0.0)).diagonal(), rel=0.02
     )
     steady = (
-        lag(made, found, np.array([30.0, 30.0]), SAMPLED).variance_nm2
-        - lag(made, found, np.zeros(2), SAMPLED).variance_nm2
+        lag(law, found, np.array([30.0, 30.0]), SAMPLED).variance_nm2
+        - lag(law, found, np.zeros(2), SAMPLED).variance_nm2
     )
-    assert steady == pytest.approx([0, (30 * 0.02 / 0.12) ** 2], abs=1e-3)  # an integrator leaves nothing of a mean
+    assert steady == pytest.approx([0, (30 * 0.02 / 0.12) ** 2], abs=1e-3)  # an integrator without leak removes a mean
 
 
 @pytest.mark.parametrize("timing", [SAMPLED, Timing.of(1.0, 0.0)])
-def test_the_lag_is_found_under_noise(timing: Timing) -> None:
+def test_the_lag_term_is_recovered_under_noise(timing: Timing) -> None:
     time_s = np.arange(20_000) / RATE_HZ
     waves = 6 * np.sin(2 * np.pi * 31 * time_s)[:, None].repeat(2, axis=1)
     noisy = waves + 4 * np.random.default_rng(3).standard_normal(waves.shape)
-    clear, measured = spectrum(whole(waves), RATE_HZ), spectrum(whole(noisy), RATE_HZ)
+    clear, measured = spectrum(one_piece(waves), RATE_HZ), spectrum(one_piece(noisy), RATE_HZ)
     expected, found = (
         lag(loop(), clear, np.zeros(2), timing),
         lag_under_noise(loop(), measured, np.zeros(2), timing),
@@ -88,7 +88,7 @@ def test_the_lag_is_found_under_noise(timing: Timing) -> None:
 
 
 @pytest.mark.parametrize(
-    ("variance", "error", "expected", "seen"),
+    ("variance", "error", "expected", "detected"),
     [
         ([9.0, 16.0], 0.0, 5.0, True),
         ([9.0, 16.0], [3.0, 4.0], 5.0, True),
@@ -97,15 +97,15 @@ def test_the_lag_is_found_under_noise(timing: Timing) -> None:
         ([0.0, 0.0], 0.0, 0.0, True),
     ],
 )
-def test_a_difference_that_is_not_seen_is_an_upper_limit(
-    variance: list[float], error: object, expected: float, seen: bool
+def test_an_undetected_difference_is_an_upper_limit(
+    variance: list[float], error: object, expected: float, detected: bool
 ) -> None:
     term = Term(np.array(variance), np.array(error) if error else 0.0)
-    assert term.total(BOTH) == (pytest.approx(expected), seen)
+    assert term.total(BOTH) == (pytest.approx(expected), detected)
 
 
 def run(measure: Callable[[np.ndarray, int], np.ndarray], frames: int = 8000) -> tuple[Pieces, Pieces, Pieces]:
-    """Error, residual and command seen of `loop()` with a sensor `measure(residual, frame)`."""
+    """Error, residual and seen command of `loop()` with a sensor `measure(residual, frame)`."""
     time_s = np.arange(frames) / RATE_HZ
     waves = np.stack([9 * np.sin(2 * np.pi * 11 * time_s), 4 * np.sin(2 * np.pi * 3 * time_s)], axis=1)
     command = np.zeros(2)
@@ -116,22 +116,22 @@ def run(measure: Callable[[np.ndarray, int], np.ndarray], frames: int = 8000) ->
         for row, value in zip(rows, (error, residual, command), strict=True):
             row.append(value)
         command = command - (0.5, 0.1) * error
-    error, residual, seen = (whole(np.array(row)[500:]) for row in rows)
+    error, residual, seen = (one_piece(np.array(row)[500:]) for row in rows)
     return error, residual, seen
 
 
 NOISE = np.random.default_rng(4).standard_normal((8000, 2))
 
 
-def test_a_sensor_with_noise_alone_has_no_other_term() -> None:
+def test_a_linear_sensor_with_noise_has_no_other_term() -> None:
     found = measurement_error(loop(), *run(lambda residual, index: residual + NOISE[index]), np.ones(2))
     for term in (found.crosstalk, found.nonlinearity):
-        rms_nm, seen = term.total(BOTH)
-        assert not seen
+        rms_nm, detected = term.total(BOTH)
+        assert not detected
         assert rms_nm < 0.25  # the noise itself leaves 0.6 nm
 
 
-def test_an_offset_and_a_mixture_of_modes_are_crosstalk() -> None:
+def test_an_offset_and_linear_mixing_are_cross_talk() -> None:
     offset, mixture = np.array([3.0, -4.0]), np.array([[0.0, 0.1], [0.2, 0.0]])
 
     def mixed(residual: np.ndarray, index: int) -> np.ndarray:
@@ -139,17 +139,17 @@ def test_an_offset_and_a_mixture_of_modes_are_crosstalk() -> None:
 
     error, residual, seen = run(mixed)
     found = measurement_error(loop(), error, residual, seen, np.full(2, 0.2))
-    steady = np.linalg.solve(np.eye(2) + mixture, -offset)  # what the loop settles at: an error of 0
+    steady = np.linalg.solve(np.eye(2) + mixture, -offset)  # the loop settles at a measured error of 0
     assert found.crosstalk.total(BOTH)[0] == pytest.approx(np.linalg.norm(steady), rel=0.03)
     assert found.crosstalk.total(BOTH)[1]
     assert not found.nonlinearity.total(BOTH)[1]
 
 
-def test_what_is_not_linear_is_nonlinearity() -> None:
-    def bent(residual: np.ndarray, index: int) -> np.ndarray:
+def test_a_quadratic_response_is_nonlinearity() -> None:
+    def quadratic(residual: np.ndarray, index: int) -> np.ndarray:
         return residual + 0.3 * residual[::-1] ** 2 + 0.2 * NOISE[index]
 
-    error, residual, seen = run(bent)
+    error, residual, seen = run(quadratic)
     found = measurement_error(loop(), error, residual, seen, np.full(2, 0.2))
     straight = run(lambda residual, index: residual + 0.2 * NOISE[index])[1].joined()
     added = residual.joined() - straight
@@ -157,15 +157,15 @@ def test_what_is_not_linear_is_nonlinearity() -> None:
     assert found.nonlinearity.total(BOTH) == (pytest.approx(expected, rel=0.3), True)
 
 
-def test_too_few_frames_for_a_fit_give_none() -> None:
-    few = [whole(part.joined()[:45]) for part in run(lambda residual, index: residual + NOISE[index], 600)]
+def test_too_few_frames_give_no_measurement_error() -> None:
+    few = [one_piece(part.joined()[:45]) for part in run(lambda residual, index: residual + NOISE[index], 600)]
     assert measurement_error(loop(), *few, np.ones(2)) is None
     nothing = Pieces((), 0)
     assert measurement_error(loop(), nothing, nothing, nothing, np.ones(2)) is None
 
 
-def test_the_terms_add_up_to_the_residual_of_a_loop_that_ran() -> None:
-    """Within 6 % of the rms in all, 12 % of tip and tilt: there are 1.5 s, so that noise alone scatters by 3 to 5 %."""
+def test_the_terms_add_up_to_the_residual_of_a_simulated_loop() -> None:
+    """Within 6 % of the total rms and 12 % for tip and tilt; in 1.5 s noise alone scatters by 3 to 5 %."""
     keys = {"control.start_mode": "closed", "camera.rate_hz": RATE_HZ, "disturbance.scale": 2.0}
     config = load(None, keys | FIXED_GAINS | SMALL_MIRROR)
     calibration = calibrated(config)
@@ -173,28 +173,28 @@ def test_the_terms_add_up_to_the_residual_of_a_loop_that_ran() -> None:
     signals = {name: getattr(ran, name)[100:] for name in ("error_nm", "pol_nm", "disturbance_nm", "residual_nm")}
     settings = factory.settings(config)
     law = settings.law(calibration.noll)
-    made = integrator(law.gain, law.leak, calibration.noll, settings.delay_frames, RATE_HZ)
+    law = integrator(law.gain, law.leak, calibration.noll, settings.delay_frames, RATE_HZ)
     noise = sensor_noise(
         calibration.reconstructor.astype(float), calibration.reference.astype(float), calibration.flux_dn, 1.0
     )
-    shaken = spectrum(whole(signals["disturbance_nm"]), RATE_HZ)
+    disturbance = spectrum(one_piece(signals["disturbance_nm"]), RATE_HZ)
     split = measurement_error(
-        made,
-        whole(signals["error_nm"]),
-        whole(signals["residual_nm"]),
-        whole(signals["error_nm"] - signals["pol_nm"]),
+        law,
+        one_piece(signals["error_nm"]),
+        one_piece(signals["residual_nm"]),
+        one_piece(signals["error_nm"] - signals["pol_nm"]),
         noise.total_nm,
     )
     terms = [
-        white_noise(made, noise.photon_nm),
-        white_noise(made, noise.read_nm),
-        lag(made, shaken, signals["disturbance_nm"].mean(axis=0), SAMPLED),
+        white_noise(law, noise.photon_nm),
+        white_noise(law, noise.read_nm),
+        lag(law, disturbance, signals["disturbance_nm"].mean(axis=0), SAMPLED),
         split.crosstalk,
         split.nonlinearity,
     ]
-    left = np.mean(signals["residual_nm"] ** 2, axis=0)
+    residual_nm2 = np.mean(signals["residual_nm"] ** 2, axis=0)
     summed = np.sum([np.maximum(term.variance_nm2, 0) for term in terms], axis=0)
     tilts = np.array([index in (2, 3) for index in calibration.noll])
-    assert np.sqrt(summed.sum() / left.sum()) == pytest.approx(1, abs=0.06)
-    assert np.sqrt(summed[tilts].sum() / left[tilts].sum()) == pytest.approx(1, abs=0.12)
+    assert np.sqrt(summed.sum() / residual_nm2.sum()) == pytest.approx(1, abs=0.06)
+    assert np.sqrt(summed[tilts].sum() / residual_nm2[tilts].sum()) == pytest.approx(1, abs=0.12)
     assert summed.sum() < 0.05 * np.mean(signals["disturbance_nm"] ** 2, axis=0).sum()

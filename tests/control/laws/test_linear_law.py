@@ -1,4 +1,4 @@
-"""Laws, their margins and their stability: against figures by hand, theory, and loops that are run."""
+"""Laws, their margins and their stability, against hand calculations, theory and simulated loops."""
 
 from dataclasses import replace
 
@@ -7,7 +7,7 @@ import pytest
 
 from lowfc.arrays import Array
 from lowfc.control.laws.law import integrate
-from lowfc.control.laws.linear_law import LinearLaw, Signal, at_rest, coast, follow, respond
+from lowfc.control.laws.linear_law import LinearLaw, Signal, at_rest, predict, predict_and_update, respond
 from lowfc.control.laws.margins import (
     MOST_COUPLED,
     check_stable,
@@ -26,19 +26,19 @@ from tests.support.toy import live, settings
 RATE_HZ = 1000.0
 
 
-def test_the_integrator_is_what_the_design_says() -> None:
+def test_the_integrator_step() -> None:
     command, error = np.array([10, -20, 0], np.float32), np.array([4, 4, -8], np.float32)
-    after, cut = integrate(law_of(leak=0.1), command, error)
+    after, clipped = integrate(law_of(leak=0.1), command, error)
     assert after.tolist() == pytest.approx([7, -20, 4], abs=1e-5)
-    assert cut is False
+    assert clipped is False
     assert after.dtype == np.float32
 
 
-def test_each_mode_is_cut_at_its_own_limit() -> None:
+def test_each_mode_is_clipped_at_its_own_limit() -> None:
     uneven = law_of(1.0, 0.0, [5, 50, 500])
-    after, cut = integrate(uneven, np.zeros(3, np.float32), np.array([-60, 60, -60], np.float32))
+    after, clipped = integrate(uneven, np.zeros(3, np.float32), np.array([-60, 60, -60], np.float32))
     assert after.tolist() == [5, -50, 60]
-    assert cut is True
+    assert clipped is True
 
 
 @pytest.mark.parametrize(
@@ -70,13 +70,13 @@ def test_a_delay_below_one_frame_is_refused(delay: float) -> None:
 
 
 @pytest.mark.parametrize("delay", [1.0, 1.5, 2.0, 3.0])
-def test_pseudo_open_loop_is_the_disturbance_while_the_loop_settles(delay: float) -> None:
-    what = settings(delay_frames=delay, gain=(0.3, 0.2), leak=(0.01, 0.0))
-    still = np.array([12.0, -7.0, 5.0])
-    steps, _, _ = live(what, np.tile(still, (60, 1)))
+def test_pseudo_open_loop_modes_equal_the_disturbance(delay: float) -> None:
+    setup = settings(delay_frames=delay, gain=(0.3, 0.2), leak=(0.01, 0.0))
+    constant = np.array([12.0, -7.0, 5.0])
+    steps, _, _ = live(setup, np.tile(constant, (60, 1)))
     for step in steps:
-        assert np.abs(step.pol_nm - still).max() < 0.05
-    assert np.abs(steps[-1].command_nm + still * [0.3 / 0.31, 0.3 / 0.31, 1]).max() < 0.05
+        assert np.abs(step.pol_nm - constant).max() < 0.05
+    assert np.abs(steps[-1].command_nm + constant * [0.3 / 0.31, 0.3 / 0.31, 1]).max() < 0.05
 
 
 NOLL = (2, 3, 4)
@@ -89,17 +89,17 @@ def pi(gain: Array, proportional: Array, leak: Array) -> LinearLaw:
     return pi_notch(NOLL, gain, proportional, leak, [()] * len(NOLL), 1.0, RATE_HZ)
 
 
-def test_the_integrator_as_a_linear_law_is_the_integrator_to_the_bit() -> None:
+def test_the_integrator_as_a_linear_law_agrees_to_single_precision() -> None:
     law, rng = linear(PLAIN), np.random.default_rng(1)
     x, command = at_rest(law), np.zeros(3, np.float32)
     for error in rng.standard_normal((100, 3)).astype(np.float32):
-        x = follow(law, x, error, command)
+        x = predict_and_update(law, x, error, command)
         command, _ = integrate(PLAIN, command, error)
         np.testing.assert_allclose(respond(law, x), command, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("delay_frames", [1.0, 1.4, 2.0, 3.0])
-def test_an_integrator_of_pseudo_open_loop_modes_is_the_same_loop(delay_frames: float) -> None:
+def test_an_integrator_of_pseudo_open_loop_modes_equals_one_of_the_error(delay_frames: float) -> None:
     disturbance = np.random.default_rng(2).standard_normal((300, 3))
     modes = list(zip(GAIN / 2, LEAK, strict=True))
     pol, error = integrators(modes, "pol", delay_frames), integrators(modes, "error", delay_frames)
@@ -110,28 +110,28 @@ def test_an_integrator_of_pseudo_open_loop_modes_is_the_same_loop(delay_frames: 
 def test_a_pi_law_follows_its_difference_equation() -> None:
     proportional = np.array([0.2, 0.1, 0.0])
     law, rng = pi(GAIN, proportional, LEAK), np.random.default_rng(3)
-    x, kept, before = at_rest(law), np.zeros(3), np.zeros(3)
+    x, command, before = at_rest(law), np.zeros(3), np.zeros(3)
     for error in rng.standard_normal((50, 3)):
-        x = follow(law, x, error.astype(np.float32), kept.astype(np.float32))
-        wanted = (1 - LEAK) * (kept + proportional * before) - (GAIN + proportional) * error
-        np.testing.assert_allclose(respond(law, x), wanted, atol=1e-5)
-        kept, before = np.clip(wanted, -1, 1), error
+        x = predict_and_update(law, x, error.astype(np.float32), command.astype(np.float32))
+        expected = (1 - LEAK) * (command + proportional * before) - (GAIN + proportional) * error
+        np.testing.assert_allclose(respond(law, x), expected, atol=1e-5)
+        command, before = np.clip(expected, -1, 1), error
 
 
 @pytest.mark.parametrize("name", LAWS)
 def test_closing_starts_from_the_held_command(name: str) -> None:
-    """A quiet sensor for long, then closed: the first command is the held one, whatever was measured before."""
+    """After a long time without errors, the first command is the held one, whatever was measured before."""
     law = LAWS[name]
     held = np.array([30, -20, 10], np.float32)
     x = at_rest(law)
     for error in [5.0] * 300 + [0.0] * 2000:
-        x = follow(law, x, np.full(3, error, np.float32), held)
+        x = predict_and_update(law, x, np.full(3, error, np.float32), held)
     np.testing.assert_allclose(respond(law, x), held, rtol=1e-3)
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_a_limit_does_not_wind_a_law_up(name: str) -> None:
-    """After seconds against a limit the command turns back as soon as the error does."""
+def test_a_limit_causes_no_wind_up(name: str) -> None:
+    """After seconds at a limit, the command returns as soon as the error changes sign."""
     disturbance = np.concatenate([np.full((3000, 3), 50.0), np.full((200, 3), 5.0)])
     errors, commands = run(LAWS[name], disturbance, 1.0, limit_nm=10.0)
     np.testing.assert_allclose(commands[2900:3000], -10, rtol=1e-6)
@@ -140,11 +140,11 @@ def test_a_limit_does_not_wind_a_law_up(name: str) -> None:
     assert free < max(3 * fresh, 0.5)
 
 
-def test_coasting_holds_an_integrator_and_lets_a_resonator_ring() -> None:
+def test_a_pi_law_holds_its_command_while_frames_are_missing() -> None:
     law = LAWS["pi"]
     x, held = at_rest(law), np.array([3, 2, 1], np.float32)
     for _ in range(5):
-        x = coast(law, x, held)
+        x = predict(law, x, held)
     np.testing.assert_allclose(respond(law, x), held, rtol=1e-6)
 
 
@@ -160,15 +160,17 @@ def test_coasting_holds_an_integrator_and_lets_a_resonator_ring() -> None:
         ({"noll": (2, 3)}, "gain must have shape"),
     ],
 )
-def test_a_law_that_does_not_fit_itself_is_refused(change: dict[str, object], sentence: str) -> None:
+def test_a_law_with_inconsistent_fields_is_refused(change: dict[str, object], sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
         replace(linear(PLAIN), **change)
 
 
-def test_a_law_is_in_single_precision() -> None:
+def test_a_law_computes_in_single_precision() -> None:
     law = LAWS["notch"]
-    x = follow(law, at_rest(law), np.ones(3, np.float32), np.zeros(3, np.float32))
-    assert {law.transition.dtype, x.dtype, respond(law, x).dtype, coast(law, x, x[:3]).dtype} == {np.dtype(np.float32)}
+    x = predict_and_update(law, at_rest(law), np.ones(3, np.float32), np.zeros(3, np.float32))
+    assert {law.transition.dtype, x.dtype, respond(law, x).dtype, predict(law, x, x[:3]).dtype} == {
+        np.dtype(np.float32)
+    }
 
 
 @pytest.mark.parametrize("notch", [Notch(0, 1, 5), Notch(600, 1, 5), Notch(20, 0, 5), Notch(20, 1, 1)])
@@ -177,7 +179,7 @@ def test_an_impossible_notch_is_refused(notch: Notch) -> None:
         pi_notch(NOLL, GAIN, 0 * GAIN, LEAK, [(notch,), (), ()], 1.0, RATE_HZ)
 
 
-def test_gains_of_another_number_of_modes_are_refused() -> None:
+def test_gains_for_the_wrong_number_of_modes_are_refused() -> None:
     with pytest.raises(ValueError, match="proportional must be given for each of 3 modes, got 2"):
         pi(GAIN, GAIN[:2], LEAK)
 
@@ -191,7 +193,7 @@ def one(gain: float, delay_frames: float, leak: float = 0.0) -> LinearLaw:
 
 @pytest.mark.parametrize("delay_frames", [1.0, 1.5, 2.0, 3.0])
 @pytest.mark.parametrize("leak", [0.0, 0.05])
-def test_the_integrator_has_the_transfer_functions_of_stability(delay_frames: float, leak: float) -> None:
+def test_the_transfer_functions_of_the_integrator_agree_with_theory(delay_frames: float, leak: float) -> None:
     law, gain = one(0.3, delay_frames, leak), float(np.float32(0.3))
     expected = theory.rejection(FREQUENCY_HZ, RATE_HZ, gain, leak, delay_frames)
     np.testing.assert_allclose(rejection(law, FREQUENCY_HZ, delay_frames)[:, 0], expected, rtol=1e-5)
@@ -202,7 +204,7 @@ def test_the_integrator_has_the_transfer_functions_of_stability(delay_frames: fl
 
 @pytest.mark.parametrize("delay_frames", [1.0, 1.3, 1.5, 2.0, 3.0])
 @pytest.mark.parametrize("leak", [0.0, 0.01, 0.3])
-def test_the_gain_margin_leads_to_the_limiting_gain(delay_frames: float, leak: float) -> None:
+def test_the_gain_margin_ends_at_the_limiting_gain(delay_frames: float, leak: float) -> None:
     found, highest = margins(one(0.2, delay_frames, leak), delay_frames), limiting_gain(delay_frames, leak)
     assert 0.2 * found.gain_margin[0] == pytest.approx(highest, rel=1e-4)
     assert found.gain_reduction[0] == 0
@@ -210,8 +212,8 @@ def test_the_gain_margin_leads_to_the_limiting_gain(delay_frames: float, leak: f
     assert not margins(one(1.0001 * highest, delay_frames, leak), delay_frames).stable
 
 
-def test_margins_of_half_a_gain_and_one_frame() -> None:
-    """By hand: L = g / (z - 1), |L| = 1 at 2 sin(w/2) = g; L is never nearer to -1 than at pi, 1 - g/2."""
+def test_margins_for_gain_one_half_and_one_frame_of_delay() -> None:
+    """By hand: L = g / (z - 1), |L| = 1 at 2 sin(w/2) = g; L is nearest to -1 at pi, at a distance of 1 - g/2."""
     found = margins(one(0.5, 1.0), 1.0)
     omega = 2 * np.arcsin(0.25)
     assert found.phase_margin_deg[0] == pytest.approx(np.degrees(np.pi / 2 - omega / 2), abs=0.05)
@@ -220,8 +222,8 @@ def test_margins_of_half_a_gain_and_one_frame() -> None:
     assert sentence(found) == "gain margin 4, phase margin 76 deg, max |S| 1.33"
 
 
-def test_the_true_delay_may_differ_from_the_law_s() -> None:
-    """A law of pseudo-open-loop modes reckons with its own delay; the loop it closes has the true one."""
+def test_margins_for_a_true_delay_other_than_the_laws() -> None:
+    """A law of pseudo-open-loop modes uses its own delay; the loop has the true delay."""
     law = integrators([(0.6, 0.0)], "pol", 1.0)
     assert margins(law, 1.0).gain_margin[0] == pytest.approx(2 / 0.6, rel=1e-3)
     # y[k] = c[k-2] - c[k-1], so that c[k] = 0.4 c[k-1] - 0.6 (c[k-2] - c[k-1]) = c[k-1] - 0.6 c[k-2]
@@ -231,25 +233,27 @@ def test_the_true_delay_may_differ_from_the_law_s() -> None:
 @pytest.mark.parametrize("gain", [0.3, 0.6, 0.9, 1.2])
 @pytest.mark.parametrize("true_frames", [1.0, 1.5, 2.0, 3.0])
 @pytest.mark.parametrize("signal", ["error", "pol"])
-def test_stable_is_what_settles(gain: float, true_frames: float, signal: Signal) -> None:
-    """Of a step, where the loop sees another delay than the law reckons with."""
+def test_a_stable_loop_settles(gain: float, true_frames: float, signal: Signal) -> None:
+    """After a step, with a true delay other than the law's."""
     law = integrators([(gain, 0.0)], signal, 1.0)
     found = margins(law, true_frames)
     if abs(found.radius[0] - 1) > 0.03:
-        left = run(law, np.ones((400, 1)), true_frames, limit_nm=1e6)[0][-1, 0]
-        assert found.stable == (abs(left) < 0.01)
+        residual = run(law, np.ones((400, 1)), true_frames, limit_nm=1e6)[0][-1, 0]
+        assert found.stable == (abs(residual) < 0.01)
 
 
-def test_rejection_is_what_a_loop_leaves_of_a_line() -> None:
+def test_rejection_equals_the_residual_of_a_line() -> None:
     law = LAWS["notch"]
     for frequency_hz in (30.0, 71.0, 150.0):
         line = np.repeat(np.sin(2 * np.pi * frequency_hz * np.arange(8000) / RATE_HZ)[:, None], 3, axis=1)
-        left = run(law, line, 1.0)[0][4000:].std(axis=0) / line.std(axis=0)
-        np.testing.assert_allclose(left, rejection(law, np.array([frequency_hz]), 1.0)[0], rtol=0.02)
+        residual = run(law, line, 1.0)[0][4000:].std(axis=0) / line.std(axis=0)
+        np.testing.assert_allclose(residual, rejection(law, np.array([frequency_hz]), 1.0)[0], rtol=0.02)
 
 
-def test_a_notch_is_as_deep_and_as_wide_as_it_says() -> None:
-    made = pi_notch((4,), np.array([0.3]), np.zeros(1), np.zeros(1), [(Notch(60, 6, 10),)], 1.0, RATE_HZ)
+def test_a_notch_has_the_requested_depth_and_width() -> None:
+    made = pi_notch(
+        (4,), np.array([0.3]), np.zeros(1), np.zeros(1), [(Notch(frequency_hz=60, width_hz=6, depth=10),)], 1.0, RATE_HZ
+    )
     bare = pi_notch((4,), np.array([0.3]), np.zeros(1), np.zeros(1), [()], 1.0, RATE_HZ)
     at = np.array([57.0, 60.0, 63.0])
     ratio = (rejection(made, at, 1.0) / rejection(bare, at, 1.0))[:, 0]
@@ -257,7 +261,7 @@ def test_a_notch_is_as_deep_and_as_wide_as_it_says() -> None:
     np.testing.assert_allclose(ratio[[0, 2]], np.sqrt(0.5), rtol=0.25)
 
 
-def test_modes_of_which_none_moves_count_as_stable() -> None:
+def test_modes_without_gain_count_as_stable() -> None:
     law = one(0.0, 1.0)
     check_stable(law, 1.0)
     found = margins(law, 1.0)
@@ -266,14 +270,14 @@ def test_modes_of_which_none_moves_count_as_stable() -> None:
     assert found.phase_margin_deg[0] == 180
 
 
-def test_an_unstable_law_is_refused_in_a_sentence() -> None:
+def test_the_refusal_of_an_unstable_law_names_the_pole() -> None:
     with pytest.raises(
-        ValueError, match=r"unstable with a delay of 2 frames: closed, Z4 has a pole at 1\.\d+.*made for 1 frames"
+        ValueError, match=r"unstable with a delay of 2 frames: closed, Z4 has a pole at 1\.\d+.*made for 1 frame"
     ):
         check_stable(one(1.2, 1.0), 2.0)
 
 
-def test_a_law_that_runs_away_while_open_is_refused() -> None:
+def test_a_law_unstable_without_frames_or_in_open_loop_is_refused() -> None:
     law = one(0.5, 1.0)
     with pytest.raises(ValueError, match=r"without frames, Z4 has a pole at 1.0100"):
         check_stable(replace(law, predict_only=np.full((1, 1), 1.01)), 1.0)
@@ -282,20 +286,22 @@ def test_a_law_that_runs_away_while_open_is_refused() -> None:
         check_stable(growing, 1.0)
 
 
-def test_modes_that_a_law_couples_are_taken_with_the_others_closed() -> None:
-    """Turning the modes into each other and back is the same loop: poles and |S| of a turned law are known."""
+def test_margins_of_coupled_modes_are_those_of_the_rotated_loop() -> None:
+    """Rotating the modes and back leaves the loop unchanged: poles and |S| of a rotated law are known."""
     law = linear(law_of(modes=2), (4, 5))
-    turn = np.array([[0.8, -0.6], [0.6, 0.8]], np.float32)
-    turned = replace(
-        law, measurement_gain=turn @ law.measurement_gain @ turn.T, command_gain=turn @ law.command_gain @ turn.T
+    rotation = np.array([[0.8, -0.6], [0.6, 0.8]], np.float32)
+    rotated = replace(
+        law,
+        measurement_gain=rotation @ law.measurement_gain @ rotation.T,
+        command_gain=rotation @ law.command_gain @ rotation.T,
     )
-    found = margins(turned, 1.0)
+    found = margins(rotated, 1.0)
     np.testing.assert_allclose(found.radius, 0.5, rtol=1e-5)
     np.testing.assert_allclose(found.gain_margin, 4, rtol=1e-3)
-    np.testing.assert_allclose(rejection(turned, FREQUENCY_HZ, 1.0), rejection(law, FREQUENCY_HZ, 1.0), rtol=1e-4)
+    np.testing.assert_allclose(rejection(rotated, FREQUENCY_HZ, 1.0), rejection(law, FREQUENCY_HZ, 1.0), rtol=1e-4)
 
 
-def test_a_law_that_is_one_large_system_is_refused_at_once() -> None:
+def test_a_law_with_too_many_coupled_states_is_refused() -> None:
     states, ones = MOST_COUPLED + 1, np.ones((MOST_COUPLED + 1, 1), np.float32)
     dense = np.full((states, states), 1e-3, np.float32)
     law = LinearLaw("error", dense, ones, 0 * ones, dense, -ones.T, "dense", (4,), 1.0, RATE_HZ)

@@ -1,4 +1,4 @@
-"""LQG for damped lines: how near the best law that keeps the margins, and the margins themselves."""
+"""LQG for damped lines: comparison with the best law within the margins, and the margins themselves."""
 
 import numpy as np
 import pytest
@@ -19,8 +19,8 @@ from tools.law_bench import RATE_HZ, Bench, calibrated, configured, tuned
 
 
 @pytest.mark.slow
-def test_an_identified_law_is_near_the_best() -> None:
-    """At a noise at which the margins cost nothing."""
+def test_an_identified_law_is_nearly_optimal() -> None:
+    """At a noise level at which the margins are no constraint."""
     config = configured()
     calibration = calibrated(config)
     law = tuned(lines.tilts_of(config, frame_noise_nm(config, calibration)[:2], 8000), config)["lqg"].law
@@ -31,7 +31,7 @@ def test_an_identified_law_is_near_the_best() -> None:
 @pytest.mark.parametrize("delay", lines.DELAYS)
 @pytest.mark.parametrize("magnitude", lines.MAGNITUDES)
 @pytest.mark.parametrize("width", lines.WIDTHS)
-def test_laws_are_near_the_best_that_keeps_the_margins(width: float, magnitude: float, delay: float) -> None:
+def test_laws_are_nearly_optimal_within_the_margins(width: float, magnitude: float, delay: float) -> None:
     found = lines.case(width, magnitude, delay)
     assert max(found["identified_mas"]) < 1.05 * found["best_within_margins_mas"]
     assert found["optimum_mas"] <= 1.001 * found["best_within_margins_mas"]
@@ -40,8 +40,8 @@ def test_laws_are_near_the_best_that_keeps_the_margins(width: float, magnitude: 
 @pytest.mark.parametrize("noise_nm", [0.05, 2.0])
 @pytest.mark.parametrize("width", lines.WIDTHS)
 @pytest.mark.parametrize("delay", lines.DELAYS)
-def test_however_little_noise_there_is_a_filter_keeps_the_margins(noise_nm: float, width: float, delay: float) -> None:
-    """The less noise, the more a filter trusts and the smaller its margins: noise is taken for as high as needed."""
+def test_a_filter_keeps_the_margins_at_any_noise(noise_nm: float, width: float, delay: float) -> None:
+    """With less noise a filter has more gain and smaller margins: the noise is overestimated as far as needed."""
     timing = Timing.of(delay, 0.5)
     known = tuple(Line(hz, width * hz, (2.4 * mas) ** 2) for hz, mas in zip(LINES_HZ, LINES_MAS, strict=True))
     model = Model(0.02, 2.0, known, noise_nm**2, RATE_HZ)
@@ -50,7 +50,7 @@ def test_however_little_noise_there_is_a_filter_keeps_the_margins(noise_nm: floa
     law, free = (of_blocks([one], "pol", "lqg", (2,), delay, RATE_HZ) for one in (block, lqg_block(model, timing)))
 
     def over(one: object) -> float:
-        """The margin that is nearest to its limit, of that limit."""
+        """Smallest ratio of a margin to its limit."""
         found = margins(one, delay)
         gain = min(found.gain_margin[0], 1 / max(found.gain_reduction[0], 1e-9)) / LEAST_GAIN_MARGIN
         return float(min(gain, found.phase_margin_deg[0] / (0.7 * LEAST_PHASE_MARGIN_DEG)))
@@ -60,11 +60,11 @@ def test_however_little_noise_there_is_a_filter_keeps_the_margins(noise_nm: floa
 
 
 @pytest.mark.slow
-def test_frames_without_images_are_as_those_with_them() -> None:
-    """Noise of the twin's images through the live loop, where nothing else is, and the law that is identified.
+def test_modal_simulation_agrees_with_images() -> None:
+    """Noise level above the lines, with images of the twin and without, and the identified laws.
 
-    The noise that is identified is lower than a frame's: a line's model has wings up to half the rate, those of the
-    simulated lines end sooner.
+    The identified noise is lower than a frame's: the model of a line has wings up to half the rate, while those of the
+    simulated lines end earlier.
     """
     config = configured()
     calibration = calibrated(config)
@@ -80,5 +80,5 @@ def test_frames_without_images_are_as_those_with_them() -> None:
         found.append(tuned(pol, config)["lqg"])
     identified_nm = [np.sqrt([model.noise_nm2 for model in one.models]) for one in found]
     np.testing.assert_allclose(*identified_nm, rtol=0.1)
-    left_mas = [float(np.hypot(*laws.theory_mas(config, calibration, one.law))) for one in found]
-    assert left_mas[0] == pytest.approx(left_mas[1], rel=0.03)
+    residual_mas = [float(np.hypot(*laws.theory_mas(config, calibration, one.law))) for one in found]
+    assert residual_mas[0] == pytest.approx(residual_mas[1], rel=0.03)

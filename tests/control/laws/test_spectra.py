@@ -1,4 +1,4 @@
-"""Spectra and measured transfer functions of what is known: noise, sines, gaps, and loops that theory describes."""
+"""Spectra and measured transfer functions of known signals: noise, sines, gaps, and loops with known theory."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lowfc.arrays import Array
-from lowfc.control.calibration.excitation import FEWEST_CYCLES, climb, led_in, lines, multisine
+from lowfc.control.calibration.excitation import FEWEST_CYCLES, build_staircase, lines, multisine, with_lead_in
 from lowfc.control.calibration.linearity import captured, gains, levels
 from lowfc.control.laws import margins
 from lowfc.control.laws.law import Law
@@ -25,7 +25,7 @@ from tests.support.toy import NOLL, calibration, frame, live, loaded, settings
 RATE_HZ = 500.0
 
 
-def whole(values: np.ndarray) -> Pieces:
+def one_piece(values: np.ndarray) -> Pieces:
     return Pieces((values,), 0)
 
 
@@ -33,74 +33,74 @@ def numbers(count: int, start: int = 1_700_000_000) -> np.ndarray:
     return (np.uint64(start) << np.uint64(32)) + np.arange(count, dtype=np.uint64)
 
 
-def test_the_power_of_white_noise_is_its_variance() -> None:
+def test_the_power_of_white_noise_equals_its_variance() -> None:
     noise = np.random.default_rng(1).standard_normal((40_000, 3)) * [1.0, 2.0, 5.0]
-    found = spectrum(whole(noise), RATE_HZ)
+    found = spectrum(one_piece(noise), RATE_HZ)
     assert found.frequency_hz[0] == 0
     assert found.frequency_hz[-1] == RATE_HZ / 2
     assert found.variance_nm2() == pytest.approx([1, 4, 25], rel=0.03)
-    level = 2 * np.array([1, 4, 25]) / RATE_HZ  # one-sided: all of it between 0 and half of the rate
+    level = 2 * np.array([1, 4, 25]) / RATE_HZ  # one-sided, from 0 to half the rate
     assert found.power_nm2_hz[10:-10].mean(axis=0) == pytest.approx(level, rel=0.03)
     assert floor_nm2_hz(found) == pytest.approx(level, rel=0.05)
 
 
 def test_a_sine_keeps_its_power_and_its_frequency() -> None:
     time_s = np.arange(8192) / RATE_HZ
-    found = spectrum(whole(3.0 * np.sin(2 * np.pi * 40.3 * time_s)[:, None]), RATE_HZ)
+    found = spectrum(one_piece(3.0 * np.sin(2 * np.pi * 40.3 * time_s)[:, None]), RATE_HZ)
     assert found.frequency_hz[np.argmax(found.power_nm2_hz)] == pytest.approx(40.3, abs=found.spacing_hz / 2)
     near = (np.abs(found.frequency_hz - 40.3) < 3 * found.spacing_hz)[:, None]
     assert found.variance_nm2(near) == pytest.approx(4.5, rel=0.01)
     assert found.variance_nm2() == pytest.approx(4.5, rel=0.01)
 
 
-def test_the_standard_error_is_the_scatter() -> None:
+def test_the_standard_error_equals_the_scatter() -> None:
     rng = np.random.default_rng(2)
-    trials = [spectrum(whole(rng.standard_normal((2000, 1))), RATE_HZ) for _ in range(300)]
+    trials = [spectrum(one_piece(rng.standard_normal((2000, 1))), RATE_HZ) for _ in range(300)]
     band = (trials[0].frequency_hz < 50)[:, None]
     variances = [float(one.variance_nm2(band)[0]) for one in trials if one is not None]
     errors = [float(one.error_nm2(band)[0]) for one in trials if one is not None]
     assert np.mean(errors) == pytest.approx(np.std(variances), rel=0.2)
 
 
-def test_short_gaps_are_bridged_and_long_ones_cut() -> None:
+def test_short_gaps_are_interpolated_and_long_gaps_split_the_run() -> None:
     values = np.arange(20.0)[:, None] * [1.0, -2.0]
-    kept = np.ones(20, bool)
-    kept[5 : 5 + MOST_BRIDGED] = False
-    kept[12 : 13 + MOST_BRIDGED] = False
-    found = pieces(numbers(20)[kept], values[kept])
+    present = np.ones(20, bool)
+    present[5 : 5 + MOST_BRIDGED] = False
+    present[12 : 13 + MOST_BRIDGED] = False
+    found = pieces(numbers(20)[present], values[present])
     assert [len(piece) for piece in found.values] == [12, 20 - 13 - MOST_BRIDGED]
     assert found.bridged == MOST_BRIDGED
-    assert np.array_equal(found.values[0], values[:12])  # a straight line is bridged exactly
+    assert np.array_equal(found.values[0], values[:12])  # interpolation of a straight line is exact
     assert np.array_equal(found.values[1], values[13 + MOST_BRIDGED :])
     assert found.frames == 20 - 1 - MOST_BRIDGED
 
 
-def test_repeated_and_older_frames_are_left_out() -> None:
+def test_repeated_and_older_frames_are_ignored() -> None:
     order = [0, 1, 2, 2, 1, 3, 4]
     found = pieces(numbers(5)[order], np.array(order, float)[:, None])
     assert found.joined().ravel().tolist() == [0, 1, 2, 3, 4]
 
 
-def test_a_restart_of_the_camera_begins_a_piece() -> None:
+def test_a_camera_restart_starts_a_new_piece() -> None:
     sequence = np.concatenate([numbers(10), numbers(10, 1_700_000_001)])
     assert [len(piece) for piece in pieces(sequence, np.ones((20, 1))).values] == [10, 10]
 
 
-def test_nothing_gives_no_pieces() -> None:
+def test_empty_and_short_runs_have_no_spectrum() -> None:
     assert pieces(numbers(0), np.zeros((0, 2))) == Pieces((), 0)
     assert pieces(numbers(3), np.full((3, 2), np.nan)) == Pieces((), 0)
     noise = np.random.default_rng(1).standard_normal((SHORTEST, 1))
-    found = [spectrum(one, RATE_HZ) for one in (Pieces((), 0), whole(noise[1:]), whole(noise))]
+    found = [spectrum(one, RATE_HZ) for one in (Pieces((), 0), one_piece(noise[1:]), one_piece(noise))]
     assert [one is not None for one in found] == [False, False, True]
 
 
-def test_a_long_run_has_finer_and_more_segments() -> None:
+def test_a_longer_run_has_a_finer_spectrum() -> None:
     rng = np.random.default_rng(3)
-    spacings = [spectrum(whole(rng.standard_normal((n, 1))), RATE_HZ).spacing_hz for n in (100, 1000, 100_000)]
+    spacings = [spectrum(one_piece(rng.standard_normal((n, 1))), RATE_HZ).spacing_hz for n in (100, 1000, 100_000)]
     assert spacings == [RATE_HZ / SHORTEST, RATE_HZ / 128, RATE_HZ / LONGEST]
 
 
-def test_bins_are_even_in_the_logarithm_and_keep_a_straight_line() -> None:
+def test_bins_are_logarithmic_and_preserve_a_straight_line() -> None:
     frequency_hz = np.linspace(0, 250, 1025)
     centres_hz, (same,) = in_bins(frequency_hz, [frequency_hz], per_decade=10)
     assert centres_hz[0] == frequency_hz[1]
@@ -123,18 +123,18 @@ def theory_of(one: Law, delay_frames: float) -> LinearLaw:
     return linear(one, NOLL, delay_frames, 1.0)
 
 
-def through(what: Settings, requests: Iterable[Request], frames: int) -> tuple[Array, Array, State]:
-    """Errors and commands (frames, modes) of the toy's loop, after what was asked; and the state after them.
+def through(setup: Settings, requests: Iterable[Request], frames: int) -> tuple[Array, Array, State]:
+    """Errors and commands (frames, modes) of the toy's loop after requests, and its state afterwards.
 
-    Beside white noise there is a slow sine that is no line of the multisine.
+    The disturbance is white noise and a slow sine that is not a line of the multisine.
     """
-    state, _ = advance(what, loaded(what), frame(1))
+    state, _ = advance(setup, loaded(setup), frame(1))
     for request in requests:
-        state, outputs = advance(what, state, request)
+        state, outputs = advance(setup, state, request)
         assert outputs.reply.accepted, outputs.reply.text
     slow = 3 * np.sin(2e-4 * np.arange(frames))[:, None]
     noise = 0.3 * np.random.default_rng(3).standard_normal((frames, len(NOLL)))
-    steps, _, state = live(what, slow + noise, state=state, first=2)
+    steps, _, state = live(setup, slow + noise, state=state, first=2)
     error_nm, command_nm = (
         np.array([getattr(step, name) for step in steps], float) for name in ("error_nm", "command_nm")
     )
@@ -144,15 +144,15 @@ def through(what: Settings, requests: Iterable[Request], frames: int) -> tuple[A
 @pytest.mark.parametrize(
     ("target", "delay_frames"), [("offset", 1.0), ("offset", 1.5), ("mirror", 1.5), ("mirror", 2.0)]
 )
-def test_the_measured_rejection_is_the_theorys(target: str, delay_frames: float) -> None:
-    what = settings(delay_frames=delay_frames, gain=GAIN)
+def test_the_measured_rejection_agrees_with_theory(target: str, delay_frames: float) -> None:
+    setup = settings(delay_frames=delay_frames, gain=GAIN)
     places = lines(PERIOD, len(NOLL), 12, FEWEST_CYCLES / PERIOD, 0.3)
     period = multisine(PERIOD, places, 3.0, 1)
     lead = settling_frames(law().gain, law().leak)
-    table = led_in(period, lead)
+    table = with_lead_in(period, lead)
     shapes = np.zeros(0) if target == "offset" else calibration().modes_to_actuators.T.reshape(-1)
     request = Request(0, "play", text=target, table=table, actuators_nm=shapes.astype(np.float32))
-    error_nm, _, _ = through(what, [request], len(table))
+    error_nm, _, _ = through(setup, [request], len(table))
     weights = delay_weights(delay_frames)
     added = -period.astype(float) if target == "offset" else seen_of_mirror(period.astype(float), weights)
     found = measured(error_nm[lead:], added)
@@ -176,7 +176,7 @@ def test_the_measured_rejection_is_the_theorys(target: str, delay_frames: float)
     assert not other.within[other.judged].all()
 
 
-def test_lines_are_odd_ascending_and_of_one_mode_each() -> None:
+def test_lines_are_odd_ascending_and_not_shared_by_modes() -> None:
     for modes in (1, 2, 3, 14):
         places = lines(15_000, modes, 12, 0.1 / 250, 0.3)
         every = np.sort(np.concatenate(places))
@@ -198,12 +198,12 @@ def test_lines_are_odd_ascending_and_of_one_mode_each() -> None:
         ((1000, 3, 12, 0.1, 0.6), "ascend"),
     ],
 )
-def test_a_multisine_that_cannot_be_is_refused(arguments: tuple[int, int, int, float, float], why: str) -> None:
+def test_an_impossible_multisine_is_refused(arguments: tuple[int, int, int, float, float], why: str) -> None:
     with pytest.raises(ValueError, match=why):
         lines(*arguments)
 
 
-def test_a_multisine_has_its_rms_its_lines_and_a_low_crest() -> None:
+def test_a_multisine_has_the_requested_rms_and_lines_and_a_low_crest() -> None:
     places = lines(4000, 4, 15, 0.001, 0.3)
     table = multisine(4000, places, 2.0, 5)
     assert np.std(table, axis=0) == pytest.approx(2.0, rel=1e-5)
@@ -211,68 +211,70 @@ def test_a_multisine_has_its_rms_its_lines_and_a_low_crest() -> None:
     spectrum = np.abs(np.fft.rfft(table, axis=0))
     for mode, one in enumerate(places):
         assert np.array_equal(np.flatnonzero(spectrum[:, mode] > 1e-3 * spectrum[:, mode].max()), one)
-    led = led_in(table, 4500)
-    assert np.array_equal(led[500:4500], table)
-    assert np.array_equal(led[4500:], table)
+    with_lead = with_lead_in(table, 4500)
+    assert np.array_equal(with_lead[500:4500], table)
+    assert np.array_equal(with_lead[4500:], table)
 
 
-def test_a_vibration_on_a_line_makes_it_uncertain() -> None:
+def test_a_vibration_near_a_line_raises_its_error() -> None:
     rng = np.random.default_rng(2)
     period = multisine(PERIOD, lines(PERIOD, 1, 10, 0.005, 0.3), 2.0, 1).astype(float)
     place = int(lines(PERIOD, 1, 10, 0.005, 0.3)[0][4])
     time = np.arange(PERIOD)
     error = 0.5 * period + 0.01 * rng.standard_normal(period.shape)
     quiet = measured(error, period)
-    shaken = measured(error + np.sin(2 * np.pi * (place + 0.4) / PERIOD * time)[:, None], period)
+    vibrating = measured(error + np.sin(2 * np.pi * (place + 0.4) / PERIOD * time)[:, None], period)
     assert np.abs(quiet.rejection - 0.5).max() < 0.02
-    assert shaken.error[4] > 10 * quiet.error[4]
-    assert abs(shaken.rejection[4] - 0.5) < 5 * shaken.error[4]
+    assert vibrating.error[4] > 10 * quiet.error[4]
+    assert abs(vibrating.rejection[4] - 0.5) < 5 * vibrating.error[4]
 
 
-def test_nothing_played_is_nothing_measured() -> None:
+def test_a_measurement_without_a_signal_is_refused() -> None:
     with pytest.raises(ValueError, match="nothing was added"):
         measured(np.zeros((100, 3)), np.zeros((100, 3)))
     with pytest.raises(ValueError, match="same frames"):
         measured(np.zeros((100, 3)), np.zeros((99, 3)))
 
 
-def test_a_staircase_keeps_its_step_and_holds_its_levels() -> None:
-    wanted = levels([2.0, 5.0], 2)
-    assert wanted.tolist() == [2, -2, -2, 2] * 2 + [5, -5, -5, 5] * 2
-    stairs, starts = climb(wanted, 6, 3.0)
+def test_a_staircase_limits_its_steps_and_holds_its_levels() -> None:
+    levels_nm = levels([2.0, 5.0], 2)
+    assert levels_nm.tolist() == [2, -2, -2, 2] * 2 + [5, -5, -5, 5] * 2
+    stairs, starts = build_staircase(levels_nm, 6, 3.0)
     assert np.abs(np.diff(stairs, prepend=0.0)).max() <= 3.0
     assert stairs[-1] == 0
-    for start, level in zip(starts, wanted, strict=True):
+    for start, level in zip(starts, levels_nm, strict=True):
         assert (stairs[start : start + 6] == level).all()
         assert (
-            start == 0 or stairs[start - 1] != level or level == wanted[max(np.flatnonzero(starts == start)[0] - 1, 0)]
+            start == 0
+            or stairs[start - 1] != level
+            or level == levels_nm[max(np.flatnonzero(starts == start)[0] - 1, 0)]
         )
 
 
-def test_gain_and_crosstalk_are_what_was_put_in() -> None:
+def test_known_gain_and_crosstalk_are_recovered() -> None:
     rng = np.random.default_rng(8)
-    wanted = levels([4.0, 8.0, 16.0], 8)
-    stairs, starts = climb(wanted, 8, 10.0)
+    levels_nm = levels([4.0, 8.0, 16.0], 8)
+    stairs, starts = build_staircase(levels_nm, 8, 10.0)
     true = np.stack([0.1 * stairs, stairs * (1 - (stairs / 50) ** 2), np.zeros_like(stairs)], axis=1)
     drift = np.linspace(0, 20, len(stairs))[:, None]
-    found = gains(true + drift + 0.2 * rng.standard_normal(true.shape), 1, wanted, starts + 2, 6)
+    found = gains(true + drift + 0.2 * rng.standard_normal(true.shape), 1, levels_nm, starts + 2, 6)
     assert found.amplitude_nm.tolist() == [4, 8, 16]
     truth = np.stack([np.full(3, 0.1), 1 - (found.amplitude_nm / 50) ** 2, np.zeros(3)], axis=1)
     assert (np.abs(found.gain - truth) < 4 * found.error).all()
     assert found.error.max() < 0.02
     assert found.within(0.05, 0.2) == [True, True, False]
     assert found.within(0.5, 0.05) == [False] * 3
-    assert gains(true + 30 * rng.standard_normal(true.shape), 1, wanted, starts + 2, 6).within(0.05, 0.2)[0] is None
+    assert gains(true + 30 * rng.standard_normal(true.shape), 1, levels_nm, starts + 2, 6).within(0.05, 0.2)[0] is None
 
 
 @pytest.mark.parametrize(("gain", "expected"), [((0.4, 0.3), True), ((0.0, 0.0), False)])
-def test_a_shape_is_captured_where_the_loop_takes_it_away(gain: tuple[float, float], expected: bool) -> None:
-    what = replace(settings(gain=gain), start_mode=LoopMode.CLOSED)
+def test_a_step_is_captured_if_the_loop_corrects_it(gain: tuple[float, float], expected: bool) -> None:
+    setup = replace(settings(gain=gain), start_mode=LoopMode.CLOSED)
     shape = calibration().modes_to_actuators[:, 1][None]
-    stairs, starts = climb([0.0, 30.0], 40, 20.0)
+    stairs, starts = build_staircase([0.0, 30.0], 40, 20.0)
     table = stairs.astype(np.float32)[:, None]
     request = Request(0, "play", text="mirror", table=table, actuators_nm=shape.reshape(-1))
-    error_nm, command_nm, state = through(what, [request], len(table))
+    error_nm, command_nm, state = through(setup, [request], len(table))
     assert state.mode is LoopMode.CLOSED
     before, after = slice(20, 40), slice(int(starts[1]) + 30, int(starts[1]) + 40)
     assert captured(error_nm, command_nm, 1, 30.0, before, after) is expected

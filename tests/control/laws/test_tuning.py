@@ -1,4 +1,4 @@
-"""Tuned laws: Gendron and Lena against theory, LQG and notches on the reaction wheel, in images and without."""
+"""Tuned laws: Gendron and Lena against theory, LQG and notches on the reaction wheel, with images and without."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,14 @@ from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.margins import margins
 from lowfc.control.laws.spectra import Pieces
 from lowfc.control.laws.stability import LEAST_GAIN_MARGIN, LEAST_PHASE_MARGIN_DEG, highest_gain
-from lowfc.control.laws.tuning import best_gains, identified, left_of, tune_integrator, tune_lqg, tune_pi_notch
+from lowfc.control.laws.tuning import (
+    best_gains,
+    identified,
+    simulated_residual_nm2,
+    tune_integrator,
+    tune_lqg,
+    tune_pi_notch,
+)
 from lowfc.control.laws.vibration import Model
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from sim_camera.disturbance import disturbance, modes_nm
@@ -23,7 +30,7 @@ NONE = np.zeros(2)
 
 
 def wheel(frames: int, seed: int = 1, noise_nm: float = 0.8) -> tuple[Pieces, np.ndarray]:
-    """Pseudo-open-loop tilts of the reaction wheel, and the truth."""
+    """Pseudo-open-loop tilts of the reaction wheel, and the true tilts."""
     truth = modes_nm(disturbance("reaction-wheel", NOLL, seed, NM_PER_MAS, 550.0), 0, frames, RATE_HZ)
     noise = noise_nm * np.random.default_rng(seed).standard_normal(truth.shape)
     return Pieces((truth + noise,), 0), truth
@@ -36,7 +43,7 @@ def true_mas(law: LinearLaw, pol: Pieces, truth: np.ndarray, delay_frames: float
 
 
 @pytest.mark.parametrize("delay_frames", [1.0, 1.5, 2.0, 3.0])
-def test_the_highest_gain_has_the_least_margins(delay_frames: float) -> None:
+def test_the_highest_gain_has_exactly_the_least_allowed_margins(delay_frames: float) -> None:
     found = margins(integrators([(highest_gain(delay_frames), 0.0)], "error", delay_frames), delay_frames)
     assert found.gain_margin[0] >= LEAST_GAIN_MARGIN * 0.999
     assert found.phase_margin_deg[0] >= LEAST_PHASE_MARGIN_DEG * 0.999
@@ -44,35 +51,35 @@ def test_the_highest_gain_has_the_least_margins(delay_frames: float) -> None:
     assert min(at_a_limit) == pytest.approx(1, rel=0.01)
 
 
-def test_the_best_gain_is_that_of_theory() -> None:
-    """A random walk under noise: the least of drift |S|^2 + noise |T|^2 over the gains, by a search in theory."""
+def test_the_best_gain_agrees_with_theory() -> None:
+    """A random walk with noise: the minimum of drift |S|^2 + noise |T|^2 over the gains, by a search."""
     model = Model(0.02, np.inf, (), 1.0, RATE_HZ)
     pol = Pieces((np.hstack([realised(model, 40_000, seed) for seed in (1, 2)]),), 0)
     found = best_gains(pol, RATE_HZ, Timing.sampled(1.0), NONE)
     omega = np.geomspace(1e-4, np.pi, 20_000)
     hz = omega * RATE_HZ / (2 * np.pi)
 
-    def left(gain: float) -> float:
+    def residual(gain: float) -> float:
         S, T = (of(hz, RATE_HZ, gain, 0.0, 1.0) ** 2 for of in (rejection, noise_transfer))
         return float(np.trapezoid(S * model.spectrum_nm2(omega) + T, omega) / np.pi)
 
     gains = np.linspace(0.02, 0.6, 59)
-    values = [left(gain) for gain in gains]
-    assert left(float(found.gain[0])) < 1.03 * min(values)
+    values = [residual(gain) for gain in gains]
+    assert residual(float(found.gain[0])) < 1.03 * min(values)
     np.testing.assert_allclose(found.predicted_nm**2, min(values), rtol=0.25)
     np.testing.assert_allclose(found.noise_nm, 1, rtol=0.05)
 
 
 @pytest.mark.parametrize("leak", [0.001, 0.01])
-def test_what_a_leaky_integrator_leaves_is_of_what_the_log_shows(leak: float) -> None:
-    """A leak leaves a part of what is slow; a random walk extrapolated to days would be all of it."""
+def test_the_residual_of_a_leaky_integrator_follows_from_the_log(leak: float) -> None:
+    """A leak leaves a part of slow disturbances; those below the log's lowest frequency must not be extrapolated."""
     pol = Pieces((10 + np.hstack([realised(Model(1e-3, np.inf, (), 0.5, RATE_HZ), 6000, seed) for seed in (1, 2)]),), 0)
     leaks = np.full(2, leak)
     gains = best_gains(pol, RATE_HZ, Timing.sampled(1.0), leaks)
     best = tune_integrator(identified(pol, RATE_HZ), gains, NOLL, leaks, Timing.sampled(1.0))
-    left_nm = np.sqrt(left_of(best.law, pol, gains.noise_nm**2, Timing.sampled(1.0)))
-    np.testing.assert_allclose(best.predicted_nm, left_nm, rtol=0.5)
-    np.testing.assert_allclose(gains.predicted_nm, left_nm, rtol=0.5)
+    residual_nm = np.sqrt(simulated_residual_nm2(best.law, pol, gains.noise_nm**2, Timing.sampled(1.0)))
+    np.testing.assert_allclose(best.predicted_nm, residual_nm, rtol=0.5)
+    np.testing.assert_allclose(gains.predicted_nm, residual_nm, rtol=0.5)
 
 
 @pytest.mark.parametrize(
@@ -82,39 +89,41 @@ def test_what_a_leaky_integrator_leaves_is_of_what_the_log_shows(leak: float) ->
         pytest.param(2.0, {"integrator": 5.0}, {}, 0.8, marks=pytest.mark.slow),
     ],
 )
-def test_the_reaction_wheel_without_images(
+def test_laws_on_the_reaction_wheel_leave_the_predicted_residual(
     delay: float, at_least_mas: dict[str, float], at_most_mas: dict[str, float], of_notch: float
 ) -> None:
-    """Each law leaves what it predicts; LQG less than a notch filter, a notch filter less than the integrator."""
+    """LQG leaves less than a notch filter, which leaves less than the integrator."""
     pol, truth = wheel(10_000)
     later = Pieces((truth + 0.8 * np.random.default_rng(99).standard_normal(truth.shape),), 0)
     models = identified(pol, RATE_HZ)
     timing = Timing.sampled(delay)
     gains = best_gains(pol, RATE_HZ, timing, NONE)
-    left_mas: dict[str, float] = {}
+    residual_mas: dict[str, float] = {}
     for one in (
         tune_integrator(models, gains, NOLL, NONE, timing),
         tune_pi_notch(models, gains, NOLL, NONE, timing),
         tune_lqg(pol, models, gains, NOLL, NONE, timing),
     ):
-        left_mas[one.law.name] = true_mas(one.law, later, truth, delay)
+        residual_mas[one.law.name] = true_mas(one.law, later, truth, delay)
         predicted_mas = float(np.sqrt(np.mean(one.predicted_nm**2)) / NM_PER_MAS)
-        assert left_mas[one.law.name] == pytest.approx(predicted_mas, rel=0.05), one.law.name
+        assert residual_mas[one.law.name] == pytest.approx(predicted_mas, rel=0.05), one.law.name
         assert one.margins.stable
         assert one.margins.gain_margin.min() >= LEAST_GAIN_MARGIN * 0.999
-    assert left_mas["lqg"] < of_notch * left_mas["pi-notch"] < left_mas["integrator"]
-    assert all(left_mas[name] > least for name, least in at_least_mas.items())
-    assert all(left_mas[name] < most for name, most in at_most_mas.items())
+    assert residual_mas["lqg"] < of_notch * residual_mas["pi-notch"] < residual_mas["integrator"]
+    assert all(residual_mas[name] > least for name, least in at_least_mas.items())
+    assert all(residual_mas[name] < most for name, most in at_most_mas.items())
 
 
-def test_a_mode_that_no_model_helps_keeps_its_integrator() -> None:
-    """Of white noise nothing can be foreseen: what is left is decided by this very run, and small either way."""
+def test_white_noise_gets_a_law_with_a_small_residual() -> None:
+    """White noise cannot be predicted: any choice between LQG and integrator leaves a small residual."""
     noise = np.random.default_rng(5).standard_normal((4096, 2))
     pol = Pieces((noise,), 0)
     gains = best_gains(pol, RATE_HZ, Timing.sampled(1.0), NONE)
     best = tune_lqg(pol, identified(pol, RATE_HZ), gains, NOLL, NONE, Timing.sampled(1.0))
     assert set(best.kinds) <= {"integrator", "lqg"}
-    assert (left_of(best.law, pol, noise.var(axis=0), Timing.sampled(1.0)) < 0.05 * noise.var(axis=0)).all()
+    assert (
+        simulated_residual_nm2(best.law, pol, noise.var(axis=0), Timing.sampled(1.0)) < 0.05 * noise.var(axis=0)
+    ).all()
     assert best.law.signal == "pol"
 
 
@@ -128,8 +137,8 @@ def test_too_few_frames_are_refused() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("delay", [1.0, 2.0])
-def test_lqg_is_near_its_theory_and_follows_lines_that_moved(delay: float) -> None:
-    """Within 15 % of this very law's theory and of the best LQG law's; the same again after lines moved by 2 %."""
+def test_lqg_agrees_with_theory_and_adapts_to_shifted_lines(delay: float) -> None:
+    """Within 15 % of the law's theory and of the best LQG law; the same again with lines shifted by 2 %."""
     config = configured(delay_frames=delay)
     calibration = calibrated(config)
     bench = Bench(config, calibration)
@@ -140,9 +149,9 @@ def test_lqg_is_near_its_theory_and_follows_lines_that_moved(delay: float) -> No
     law = tuned(bench.pol(), config)["lqg"].law
     bench.load(law)
     bench.run(10_000)
-    got = bench.tilt_mas(5000)
-    assert got < 1.15 * float(np.hypot(*laws.theory_mas(config, calibration, law)))
-    assert got < 1.15 * laws.optimum_mas(config, calibration)
+    measured_mas = bench.tilt_mas(5000)
+    assert measured_mas < 1.15 * float(np.hypot(*laws.theory_mas(config, calibration, law)))
+    assert measured_mas < 1.15 * laws.optimum_mas(config, calibration)
 
     moved = Bench(config, calibration, with_lines_moved(disturbance_of(config), 1.02))
     moved.load(law)
@@ -150,7 +159,7 @@ def test_lqg_is_near_its_theory_and_follows_lines_that_moved(delay: float) -> No
     moved.run(20_000)
     moved.load(tuned(moved.pol(), config)["lqg"].law)
     moved.run(10_000)
-    assert moved.tilt_mas(5000) < 1.15 * got
+    assert moved.tilt_mas(5000) < 1.15 * measured_mas
 
 
 @pytest.mark.slow
@@ -161,12 +170,12 @@ def test_capture_from_14_mas_on_20_seeds() -> None:
     bench.settle(600)
     bench.run(8192)
     law = tuned(bench.pol(), config)["lqg"].law
-    left = {}
+    residual = {}
     for seed in range(20):
         fresh = Bench(configured(seed=seed + 100), calibration)
         fresh.load(law)
         fresh.run(300)
         fresh.ask("close")
         fresh.run(3500)
-        left[seed] = fresh.tilt_mas(500)
-    assert {seed: mas for seed, mas in left.items() if mas >= 1.3} == {}
+        residual[seed] = fresh.tilt_mas(500)
+    assert {seed: mas for seed, mas in residual.items() if mas >= 1.3} == {}

@@ -1,4 +1,4 @@
-"""Models of drift, lines and noise identified from known processes, and what LQG leaves of them."""
+"""Models of drift, lines and noise identified from known processes, and their LQG residuals."""
 
 from dataclasses import replace
 
@@ -22,13 +22,13 @@ NM_PER_MAS = tilt_nm_per_mas(2.0)
 
 
 def preset(name: str, frames: int, seed: int = 1, noise_nm: float = 0.8) -> Pieces:
-    """Tip of a preset as a sensor with white noise sees it."""
-    shaken = disturbance(name, (2, 3, 4), seed, NM_PER_MAS, 550.0)
+    """Tip of a preset, measured with white noise."""
+    simulated = disturbance(name, (2, 3, 4), seed, NM_PER_MAS, 550.0)
     noise = noise_nm * np.random.default_rng(seed).standard_normal((frames, 1))
-    return Pieces((modes_nm(shaken, 0, frames, RATE_HZ)[:, :1] + noise,), 0)
+    return Pieces((modes_nm(simulated, 0, frames, RATE_HZ)[:, :1] + noise,), 0)
 
 
-def test_the_lines_of_the_reaction_wheel_are_found() -> None:
+def test_the_lines_of_the_reaction_wheel_are_identified() -> None:
     model = identify(preset("reaction-wheel-ideal", 12_000), RATE_HZ)
     assert [line.frequency_hz for line in model.lines] == pytest.approx(LINES_HZ, abs=0.02)
     rms_mas = [np.sqrt(line.variance_nm2) / NM_PER_MAS for line in model.lines]
@@ -37,7 +37,7 @@ def test_the_lines_of_the_reaction_wheel_are_found() -> None:
     assert all(line.width_hz < RATE_HZ / 12_000 for line in model.lines)
 
 
-def test_damped_lines_have_their_width_and_power() -> None:
+def test_width_and_power_of_damped_lines_are_identified() -> None:
     truth = Model(1e-4, np.inf, (Line(20, 0.8, 25.0), Line(60, 2.5, 9.0)), 0.5, RATE_HZ)
     model = identify(Pieces((realised(truth, 40_000),), 0), RATE_HZ)
     assert [line.frequency_hz for line in model.lines] == pytest.approx([20, 60], rel=0.01)
@@ -46,8 +46,8 @@ def test_damped_lines_have_their_width_and_power() -> None:
     assert model.noise_nm2 == pytest.approx(0.5, rel=0.05)
 
 
-def test_nothing_is_made_of_noise() -> None:
-    """Runs of noise alone: not one line."""
+def test_no_line_is_identified_in_noise() -> None:
+    """For runs of white noise."""
     for seed in range(5):
         noise = np.random.default_rng(seed).standard_normal((4096, 1))
         model = identify(Pieces((noise,), 0), RATE_HZ)
@@ -55,8 +55,8 @@ def test_nothing_is_made_of_noise() -> None:
         assert model.noise_nm2 == pytest.approx(1, rel=0.1)
 
 
-def test_a_spectrum_is_that_of_the_states() -> None:
-    """By the states' own transfer function, which shares no code with the spectrum."""
+def test_the_spectrum_of_a_model_agrees_with_its_states() -> None:
+    """Computed from the states' transfer function, which shares no code with the spectrum."""
     model = Model(0.01, 5.0, (Line(20, 0.8, 25.0), Line(60, 2.5, 9.0)), 0.5, RATE_HZ)
     F, Q, C = model.states()
     omega = np.array([0.01, 0.1257, 0.3, 0.377, 2.0])
@@ -67,7 +67,7 @@ def test_a_spectrum_is_that_of_the_states() -> None:
     np.testing.assert_allclose(model.spectrum_nm2(omega), found, rtol=1e-6)
 
 
-def test_pieces_count_like_one_run_and_too_short_ones_give_nothing() -> None:
+def test_pieces_are_identified_like_one_run_and_short_ones_are_not() -> None:
     whole = preset("reaction-wheel-ideal", 12_000).values[0]
     model = identify(Pieces((whole[:6000], whole[6000:]), 0), RATE_HZ)
     assert [round(line.frequency_hz) for line in model.lines] == [6, 18, 37, 71, 117]
@@ -76,9 +76,9 @@ def test_pieces_count_like_one_run_and_too_short_ones_give_nothing() -> None:
     assert resolution_hz(Pieces((), 0), RATE_HZ) == 0
 
 
-def test_a_slow_mode_is_drift() -> None:
-    shaken = disturbance("thermal", (4,), 3, NM_PER_MAS, 550.0)
-    run = modes_nm(shaken, 0, 20_000, RATE_HZ) + 0.5 * np.random.default_rng(3).standard_normal((20_000, 1))
+def test_a_slow_mode_is_identified_as_drift() -> None:
+    simulated = disturbance("thermal", (4,), 3, NM_PER_MAS, 550.0)
+    run = modes_nm(simulated, 0, 20_000, RATE_HZ) + 0.5 * np.random.default_rng(3).standard_normal((20_000, 1))
     model = identify(Pieces((run,), 0), RATE_HZ)
     assert all(line.frequency_hz < 1 for line in model.lines)
     assert model.drift_nm2 > 0
@@ -86,7 +86,7 @@ def test_a_slow_mode_is_drift() -> None:
 
 
 @pytest.mark.parametrize(("lines", "seed"), [((), 1), (LINES_HZ, 3)])
-def test_where_drift_explains_all_there_is_some_noise_and_a_filter(lines: tuple[float, ...], seed: int) -> None:
+def test_a_model_without_noise_still_gives_a_stable_filter(lines: tuple[float, ...], seed: int) -> None:
     truth = Model(1.0, 50.0, tuple(Line(hz, 1e-3, 100.0) for hz in lines), 1e-12, RATE_HZ)
     model = identify(Pieces((realised(truth, 4096, seed),), 0), RATE_HZ)
     assert model.noise_nm2 > 1e-8
@@ -98,7 +98,7 @@ MODEL = Model(0.02, 5.0, (Line(18, 0.3, 60.0), Line(71, 0.5, 20.0)), 0.7, RATE_H
 
 
 def residual_nm2(model: Model, whole_frames: int) -> float:
-    """Variance that the law leaves, if the model is true, for a delay of whole frames: Riccati's, that far ahead."""
+    """Residual variance of LQG for a true model and a delay of whole frames, from the Riccati equation."""
     A, Q, C = model.states()
     covariance = covariance_nm2(model)
     L = covariance @ C / (C @ covariance @ C + model.noise_nm2)
@@ -109,10 +109,10 @@ def residual_nm2(model: Model, whole_frames: int) -> float:
 
 
 def minimum_variance_nm2(spectrum_nm2: Array, noise_nm2: float, whole_frames: int) -> float:
-    """Least variance that any linear law can leave of a disturbance of known spectrum, for a delay of whole frames.
+    """Least residual variance of any linear law, for a known spectrum of the disturbance and a delay of whole frames.
 
-    Kolmogorov's: the spectrum of what is measured is factored into white innovations, of variance
-    exp(mean(log(spectrum + noise))), and a filter 1 + h1/z + ...; those that come after the command was made are lost.
+    By Kolmogorov: the spectrum of the measurements is factored into white innovations, of variance
+    exp(mean(log(spectrum + noise))), and a filter 1 + h1/z + ...; innovations after the command are lost.
     The spectrum (frequencies,) is at even steps from 0 to pi rad per frame, both included.
     """
     cepstrum = irfft(np.log(spectrum_nm2 + noise_nm2))
@@ -124,7 +124,7 @@ def minimum_variance_nm2(spectrum_nm2: Array, noise_nm2: float, whole_frames: in
 
 
 @pytest.mark.parametrize("delay", [1, 2, 3])
-def test_what_is_predicted_is_the_same_by_three_roads(delay: int) -> None:
+def test_three_predictions_of_the_residual_agree(delay: int) -> None:
     """Riccati's covariance, the law's own transfer functions, and the factor of the spectrum."""
     riccati = residual_nm2(MODEL, delay)
     assert predicted_nm(lqg([MODEL], (2,), Timing.sampled(delay)), [MODEL], Timing.sampled(delay))[
@@ -137,28 +137,28 @@ def test_what_is_predicted_is_the_same_by_three_roads(delay: int) -> None:
 
 @pytest.fixture(scope="module")
 def noisy_nm() -> Array:
-    """What `MODEL` describes, (frames, 1)."""
+    """Measurements (frames, 1) of a process with `MODEL`."""
     return realised(MODEL, 16_000, seed=4)
 
 
 @pytest.mark.parametrize("delay_frames", [1.0, 1.5, 1.8])
-def test_a_loop_leaves_what_is_predicted(noisy_nm: Array, delay_frames: float) -> None:
+def test_a_loop_leaves_the_predicted_residual(noisy_nm: Array, delay_frames: float) -> None:
     law = lqg([MODEL], (2,), Timing.sampled(delay_frames))
     check_stable(law, delay_frames)
     errors, _ = run(law, noisy_nm, delay_frames)
-    left = np.mean(errors[2000:] ** 2) - MODEL.noise_nm2
-    assert np.sqrt(left) == pytest.approx(predicted_nm(law, [MODEL], Timing.sampled(delay_frames))[0], rel=0.1)
+    residual_nm2 = np.mean(errors[2000:] ** 2) - MODEL.noise_nm2
+    assert np.sqrt(residual_nm2) == pytest.approx(predicted_nm(law, [MODEL], Timing.sampled(delay_frames))[0], rel=0.1)
 
 
-def test_a_constant_is_taken_out_whatever_the_noise() -> None:
+def test_a_constant_is_rejected() -> None:
     law = lqg([replace(MODEL, drift_nm2=1e-6)], (2,), SAMPLED)
     assert rejection(law, np.array([1e-4]), 1.0)[0, 0] < 0.01
 
 
 @pytest.mark.parametrize("noise_nm2", [1e-4, 0.7, 100.0])
 @pytest.mark.parametrize("width_hz", [1e-9, 1e-6, 1e-2, 3.0])
-def test_the_covariance_solves_riccatis_equation(width_hz: float, noise_nm2: float) -> None:
-    """With poles at any distance from the unit circle; where scipy finds a solution, it is the same."""
+def test_the_covariance_solves_the_riccati_equation(width_hz: float, noise_nm2: float) -> None:
+    """With poles at any distance from the unit circle."""
     lines = tuple(Line(frequency, width_hz, 1e-3 * frequency) for frequency in (0.3, 6, 6.5, 18, 117))
     model = Model(1e-8, 0.2, lines, noise_nm2, RATE_HZ)
     A, Q, C = model.states()

@@ -1,4 +1,4 @@
-"""Virtual integrators against the loop that they stand for."""
+"""Virtual integrators against real loops with their gains."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from lowfc.control.laws.stability import delay_weights
 from lowfc.control.laws.virtual import VirtualIntegrators
 
 
-def test_each_row_is_the_loop_of_its_gain() -> None:
+def test_each_row_equals_a_loop_with_its_gain() -> None:
     rng = np.random.default_rng(1)
     weights = tuple((lag, weight) for lag, weight in enumerate(delay_weights(1.5).astype(np.float32)) if weight)
     gain = np.array([[0, 0], [0.1, 0.4], [0.3, 0.2]], np.float32)
@@ -20,7 +20,7 @@ def test_each_row_is_the_loop_of_its_gain() -> None:
             commands = [[newest, newest] for newest, _ in commands]
             continue
         pol = rng.normal(0, 3, 2).astype(np.float32)
-        rows, errors = rows.followed(pol)
+        rows, errors = rows.advanced(pol)
         for row, law in enumerate(laws):
             newest, older = commands[row]
             error = pol + np.float32(0.5) * newest + np.float32(0.5) * older
@@ -29,8 +29,8 @@ def test_each_row_is_the_loop_of_its_gain() -> None:
         np.testing.assert_allclose(rows.history_nm[0], [newest for newest, _ in commands], atol=1e-4)
 
 
-def test_the_difference_of_squares_is_that_of_the_true_residuals_whatever_the_noise() -> None:
-    """Of 20,000 frames of a slow drift under noise ten times its size."""
+def test_differences_of_squared_errors_equal_those_of_true_residuals() -> None:
+    """For 20,000 frames of a slow drift with ten times stronger noise."""
     rng = np.random.default_rng(2)
     gain = np.array([0, 0.02, 0.5], np.float32)[:, None] * np.ones((1, 40), np.float32)
     ones = np.ones(40, np.float32)
@@ -41,7 +41,7 @@ def test_the_difference_of_squares_is_that_of_the_true_residuals_whatever_the_no
     for disturbance in drift:
         noise = rng.normal(0, 30, 40).astype(np.float32)
         residual = disturbance + rows.history_nm[0]
-        rows, errors = rows.followed(disturbance + noise)
+        rows, errors = rows.advanced(disturbance + noise)
         measured += errors**2 - errors[0] ** 2
         true += residual**2 - residual[0] ** 2
     difference = (measured - true)[1:].mean(axis=1) / len(drift)

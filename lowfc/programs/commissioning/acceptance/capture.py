@@ -7,7 +7,7 @@ import numpy as np
 
 from lowfc.arrays import Single
 from lowfc.contract.configuration import Acceptance
-from lowfc.control.calibration.excitation import climb
+from lowfc.control.calibration.excitation import build_staircase
 from lowfc.control.calibration.linearity import captured
 from lowfc.control.laws.law import TIP_TILT, Law
 from lowfc.control.loop.safety import LoopMode
@@ -79,7 +79,7 @@ def _trials(live: Live, noll: int, required: Acceptance) -> list[tuple[dict[str,
     step_nm = live.configuration.safety.slew_nm / 2 / float(np.abs(shape).max())
     trials = []
     for level_nm in (np.outer(SIZES, (1.0, -1.0)).ravel() * _required_nm(required, noll)).tolist():
-        stairs, starts = climb([0.0, level_nm], hold, step_nm)
+        stairs, starts = build_staircase([0.0, level_nm], hold, step_nm)
         zero_start, level_start = starts.tolist()
         what = {
             "noll": noll,

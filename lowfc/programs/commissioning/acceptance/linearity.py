@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from lowfc.contract.configuration import Acceptance
-from lowfc.control.calibration.excitation import climb
+from lowfc.control.calibration.excitation import build_staircase
 from lowfc.control.calibration.linearity import SURE, gains, levels
 from lowfc.control.loop.safety import LoopMode
 from lowfc.optics.chain.zernike import mode_name
@@ -93,7 +93,7 @@ def play(live: Live, staircase: Staircase, required: Acceptance) -> list[Played]
         shape = live.calibration.modes_to_actuators[:, live.loop.noll.index(noll)][None]
         step_nm = live.configuration.safety.slew_nm / 2 / float(np.abs(shape).max())
         levels_nm = levels(np.array(AMPLITUDES) * required.linear_nm, staircase.cycles)
-        stairs, starts = climb(levels_nm, staircase.hold_frames, step_nm)
+        stairs, starts = build_staircase(levels_nm, staircase.hold_frames, step_nm)
         what = {
             "noll": noll,
             "levels_nm": levels_nm.tolist(),

@@ -8,7 +8,7 @@ import numpy as np
 
 from lowfc.arrays import Array, Whole
 from lowfc.contract.configuration import Acceptance
-from lowfc.control.calibration.excitation import led_in, lines, multisine
+from lowfc.control.calibration.excitation import lines, multisine, with_lead_in
 from lowfc.control.laws import margins
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.stability import delay_weights
@@ -124,7 +124,7 @@ def play(live: Live, excitation: Excitation, required: Acceptance) -> list[Playe
     period = np.zeros((frames, len(noll)), np.float32)
     period[:, [noll.index(mode) for mode in tested]] = multisine(frames, bins, excitation.rms_nm, excitation.seed)
     live.set_mode(LoopMode.CLOSED)
-    table = led_in(period, live.loop.settling_frames() + _LEAD_FRAMES)
+    table = with_lead_in(period, live.loop.settling_frames() + _LEAD_FRAMES)
     basis = None
     if isinstance(live.loop.law, LinearLaw) and live.loop.law.signal == "pol":
         basis = np.ascontiguousarray(live.calibration.modes_to_actuators.T)

@@ -61,8 +61,8 @@ def aligned(out: Path, run: str | None, frames: int, *, load: bool) -> AlignResu
         calibration = on_sensor(config, computed, found.geometry, found.flux, before)
         mode = int(np.argmax(np.linalg.norm(calibration.response, axis=0)))
         poke = Player(loop, calibration, reporter(console)).first_poke(mode, sequence(AMPLITUDE_NM["poke"]))
-        if poke.picture @ calibration.response[:, mode] < 0:
-            found = replace(found, geometry=found.geometry.turned())
+        if poke.response @ calibration.response[:, mode] < 0:
+            found = replace(found, geometry=found.geometry.rotated_180())
             calibration = on_sensor(config, computed, found.geometry, found.flux, before)
         write(calibration, out, loop if load else None)
     return AlignResult(

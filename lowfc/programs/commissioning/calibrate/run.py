@@ -29,9 +29,9 @@ from lowfc.control.calibration.response_fit import (
     Initial,
     Measured,
     Sums,
+    best_initial,
     check,
-    initial_of,
-    likeness,
+    correlation,
     measured,
 )
 from lowfc.control.laws.law import TIP_TILT
@@ -155,7 +155,7 @@ class Calibrator:
         plan = self.pokes.delay(mode)
         self._show("detecting pokes", max(self.pokes.cycles(), self.completed), self.completed)
         found = self._player.first_poke(mode, plan)
-        self._compare_picture(found.picture, mode)
+        self._compare_response(found.response, mode)
         self._report(
             f"pokes of Z{self.before.noll[mode]} are detected after {found.delay_frames:.3f} +- "
             f"{found.error_frames:.3f} frames, {found.delay_frames * self.config.period_ns * 1e-6:.3g} ms (from the "
@@ -163,9 +163,9 @@ class Calibrator:
         )
         return found
 
-    def _compare_picture(self, picture: Array, mode: int) -> None:
+    def _compare_response(self, response: Array, mode: int) -> None:
         known = self.before.response[:, mode].astype(np.float64)
-        like = likeness(picture, known)
+        like = correlation(response, known)
         if abs(like) < _LIKE:
             self._report(
                 f"warning: the image of Z{self.before.noll[mode]} differs from that of the calibration in use "
@@ -231,7 +231,7 @@ class Calibrator:
             before.flux_dn * camera.gain_e_per_dn / camera.em_gain,
             factory.equivalent_read_noise_e(camera),
         )
-        return initial_of(full_rank, delay.picture, self._best, variance)
+        return best_initial(full_rank, delay.response, self._best, variance)
 
 
 def partial_of(out: Path) -> Path:

@@ -22,7 +22,7 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError, ConfigurationError, DataFileError
 from lowfc.control.calibration.adapted import with_dark, with_reference
 from lowfc.control.calibration.calibration import Calibration
-from lowfc.control.calibration.dark_frames import check_dark, dark_of
+from lowfc.control.calibration.dark_frames import check_dark, measure_dark
 from lowfc.control.calibration.response_fit import normalised
 from lowfc.control.loop.wording import counted
 from lowfc.optics.chain.zernike import zernikes
@@ -175,7 +175,7 @@ def darkened(out: Path, run: str | None, frames: int, file: Path | None, *, load
             check_size(cube.shape[1:], before)
         elif cube.shape[1:] != before.shape:
             raise DataFileError(f"{file}: its frames have {cube.shape[1:]} pixels, the calibration {before.shape}")
-        found = dark_of(cube.reshape(len(cube), -1))
+        found = measure_dark(cube.reshape(len(cube), -1))
         if file is None:
             check_dark(found.dark_dn, before.reference.astype(np.float64), before.flux_dn)
         write(with_dark(before, found.dark_dn, found.good, *noise), out, loop if load else None)

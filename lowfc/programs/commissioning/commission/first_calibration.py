@@ -13,7 +13,7 @@ from lowfc.control.calibration import poke_plan
 from lowfc.control.calibration.alignment import align
 from lowfc.control.calibration.calibration import FIRST, Calibration
 from lowfc.control.calibration.delay_fit import Delay
-from lowfc.control.calibration.response_fit import likeness
+from lowfc.control.calibration.response_fit import correlation
 from lowfc.programs.commissioning.calibrate.align import computed_scale, in_words, on_sensor
 from lowfc.programs.commissioning.calibrate.pokes import AMPLITUDE_NM, HOLD, SETTLE, largest_nm, sequence
 from lowfc.programs.commissioning.calibrate.recording import AFTERWARDS, Player, PokesNotSeenError, Report
@@ -73,11 +73,11 @@ def aligned(
     except (ValueError, CalibrationError) as error:
         report(f"the image cannot be compared with the computed one: {error}")
         return None
-    like = likeness(poke.picture, calibration.response[:, 0])
+    like = correlation(poke.response, calibration.response[:, 0])
     if like < 0:
-        found = replace(found, geometry=found.geometry.turned())
+        found = replace(found, geometry=found.geometry.rotated_180())
         calibration = on_sensor(config, computed, found.geometry, before.flux_dn, before)
-        like = likeness(poke.picture, calibration.response[:, 0])
+        like = correlation(poke.response, calibration.response[:, 0])
     scale = found.geometry.scale * computed_scale(config)
     report(f"{in_words(found, scale)}; the poke's image correlates by {like:.2f} with the computed one")
     if found.residual > MAX_MISFIT or like < MIN_LIKENESS:

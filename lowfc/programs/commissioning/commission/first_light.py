@@ -14,7 +14,7 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError
 from lowfc.contract.messages import wire
 from lowfc.control.calibration.calibration import Calibration
-from lowfc.control.calibration.dark_frames import check_dark, dark_of
+from lowfc.control.calibration.dark_frames import check_dark, measure_dark
 from lowfc.control.loop.camera import CameraSettings
 from lowfc.programs.commissioning.calibrate.recording import Report
 from lowfc.programs.commissioning.checks import Status
@@ -92,7 +92,7 @@ def darkened(camera: CameraSettings, frames: npt.NDArray[np.number], report: Rep
     if frames.shape[1:] != camera.shape:
         raise CalibrationError(f"the dark frames have {frames.shape[1:]} pixels, the camera {camera.shape}")
     try:
-        found = dark_of(frames.reshape(len(frames), -1))
+        found = measure_dark(frames.reshape(len(frames), -1))
     except ValueError as error:
         raise CalibrationError(str(error)) from None
     report(str(found))

@@ -7,7 +7,7 @@ import numpy as np
 
 from lowfc.arrays import Array
 from lowfc.control.laws import margins
-from lowfc.control.laws.continuous import Timing, spectrum_left
+from lowfc.control.laws.continuous import Timing, residual_spectrum
 from lowfc.control.laws.law import TIP_TILT
 from lowfc.control.laws.linear_law import LinearLaw, integrator
 from lowfc.control.laws.spectra import in_bins, spectrum
@@ -195,7 +195,7 @@ def picture(run: Telemetry, best: Tuned) -> bytes:
         modelled = one_sided * (model.spectrum_nm2(omega) + model.noise_nm2)
         noise_nm2 = np.array([one.noise_nm2 for one in best.models])
         measured = np.repeat((model.spectrum_nm2(omega) + model.noise_nm2)[:, None], len(noise_nm2), axis=1)
-        residual = one_sided * spectrum_left(best.law, omega, measured, noise_nm2, run.timing)[:, place]
+        residual = one_sided * residual_spectrum(best.law, omega, measured, noise_nm2, run.timing)[:, place]
         axes.loglog(found.frequency_hz[1:], found.power_nm2_hz[1:, place], color="0.6", label="pseudo-open-loop")
         closed = spectrum(run.error, run.rate_hz) if run.closed else None
         if closed is not None:

@@ -170,7 +170,7 @@ class ControllerReplay:
                 self._lose(_BEFORE if before_log else "after an input that the log does not have")
                 continue
             late = ended or now_ns - entry.receive_time_ns > PATIENCE_NS
-            if not late and entry.command is None and entry.leads_to_command and self._state.drive is not None:
+            if not late and entry.command is None and entry.leads_to_command and self._state.loop is not None:
                 return
             rule = changed_rule(entry.logged) if self._context.former is not None else ""
             if rule and number not in self._states and not late:

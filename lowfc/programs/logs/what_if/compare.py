@@ -13,7 +13,7 @@ from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.errors import CalibrationError, ConfigurationError
 from lowfc.contract.messages import MIRROR_STATE
 from lowfc.control.calibration.calibration import ESTIMATORS, Calibration, reconstructor
-from lowfc.control.laws.continuous import left_all_the_time_nm2
+from lowfc.control.laws.continuous import continuous_residual_nm2
 from lowfc.control.laws.law import TIP_TILT, Law
 from lowfc.control.laws.stability import limiting_gain
 from lowfc.control.laws.what_if import as_logged, counterfactual, rms
@@ -120,7 +120,7 @@ def _true(run: LoggedRun, rows: Mask, moved_nm: Single) -> tuple[dict[str, Array
             found[f"true_{name}"] = rms(after_nm, known)
         squares = np.full(after_nm.shape, np.nan)
         for piece in np.split(np.arange(len(rows)), np.flatnonzero(run.missing)):
-            squares[piece] = left_all_the_time_nm2(disturbance_nm[piece], (after_nm - disturbance_nm)[piece])
+            squares[piece] = continuous_residual_nm2(disturbance_nm[piece], (after_nm - disturbance_nm)[piece])
         with_squares = rows & np.isfinite(squares).all(axis=1)
         if with_squares.any():
             found[f"continuous_{name}"] = np.sqrt(squares[with_squares].mean(axis=0))

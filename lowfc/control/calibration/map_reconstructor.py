@@ -1,4 +1,4 @@
-"""R for the modes that the loop corrects: what the others measure is used as far as they are known to be small."""
+"""MAP reconstructor of the corrected modes: the uncorrected modes have a prior, their mean square."""
 
 import numpy as np
 
@@ -8,9 +8,9 @@ from lowfc.control.loop.camera import CameraSettings
 
 
 def noise_covariance_nm2(calibration: Calibration, flux_dn: float, camera: CameraSettings | None) -> Array | None:
-    """Covariance (modes, modes) of one frame's noise, nm^2 of wavefront rms, flux normalisation included.
+    """Covariance (modes, modes) of one frame's noise, nm^2 of wavefront rms, with the flux normalisation.
 
-    Photons of I0 and read-out; None where the camera's gain is not known.
+    It includes photon noise of I0 and read noise; None if the camera's gain is unknown.
     """
     if camera is None or not camera.gain_e_per_dn > 0 or not flux_dn > 0:
         return None
@@ -22,27 +22,27 @@ def noise_covariance_nm2(calibration: Calibration, flux_dn: float, camera: Camer
     return excess * noise_nm2(R, I0, flux_e, read_noise_e)
 
 
-def granted_rows(
+def map_reconstructor(
     calibration: Calibration, prior_nm2: Array | Single, flux_dn: float, camera: CameraSettings | None
 ) -> Single:
-    """R (modes, pixels) where some modes are left alone; the rows of (H'WH + P^-1)^-1 H'W for those that are not.
+    """R (modes, pixels) with the rows of (H'WH + P^-1)^-1 H'W for the corrected modes, P the prior of the others.
 
-    R_g - C_gl (C_ll + P_l)^-1 R_l, with C the noise of the calibration's own R, which is unbiased, measured H or
-    computed one. The rows of modes that are left stay as they are, so that what they measure stays unbiased.
+    For corrected modes c and uncorrected modes u it is R_c - C_cu (C_uu + P_u)^-1 R_u, with C the noise covariance of
+    the calibration's own R, which is unbiased for a measured or computed H. The rows R_u stay as they are, unbiased.
 
     Args:
-        calibration: In use.
-        prior_nm2: (modes,) mean square of a mode that is left alone; 0 for one that the loop corrects.
+        calibration: The calibration in use.
+        prior_nm2: (modes,) mean square of an uncorrected mode; 0 for a corrected mode.
         flux_dn: Sum of the good pixels, for the weights.
-        camera: Its settings.
+        camera: Camera settings.
     """
     R, prior_nm2 = calibration.reconstructor, np.asarray(prior_nm2, np.float64)
-    left = prior_nm2 > 0
+    uncorrected = prior_nm2 > 0
     covariance = noise_covariance_nm2(calibration, flux_dn, camera)
-    if covariance is None or not left.any() or left.all():
+    if covariance is None or not uncorrected.any() or uncorrected.all():
         return R
-    among = covariance[np.ix_(left, left)] + np.diag(prior_nm2[left])
-    mixed = np.linalg.solve(among, covariance[np.ix_(left, ~left)]).T
+    among = covariance[np.ix_(uncorrected, uncorrected)] + np.diag(prior_nm2[uncorrected])
+    mixed = np.linalg.solve(among, covariance[np.ix_(uncorrected, ~uncorrected)]).T
     rows = R.astype(np.float64)
-    rows[~left] -= mixed @ rows[left]
+    rows[~uncorrected] -= mixed @ rows[uncorrected]
     return single(rows)
