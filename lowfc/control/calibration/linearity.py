@@ -75,8 +75,8 @@ def captured(error_nm: Array, command_nm: Array, mode: int, level_nm: float, bef
     """Whether a closed loop corrected a step of one mode.
 
     The command of that mode must have moved against the step, and no mode may have an error left: a loop that settled
-    at another point has no error either. Commands of other modes may follow a drift. Errors and commands are (frames,
-    modes); `before` are frames before the step, `after` those in which the loop must have settled again.
+    at another point has no error either. Commands of other modes may follow a drift. Errors and commands are
+    (frames, modes), nm rms; `before` are frames before the step, `after` those in which the loop has settled again.
     """
     moved_nm = command_nm[after, mode].mean() - command_nm[before, mode].mean()
     residual_nm = error_nm[after].mean(axis=0)

@@ -200,7 +200,7 @@ def measured(sums: Sums) -> Measured:
 
 
 def without_outliers(answers: Array) -> Array:
-    """Products R_a H (cycles, modes, modes) with outliers clipped near the median.
+    """Products R_a H (cycles, modes, modes), without unit, with outliers clipped near the median.
 
     A transient of the wavefront then affects one cycle, not the mean.
     """
