@@ -14,10 +14,10 @@ from lowfc.control.laws.linear_law import integrator_block, of_blocks
 from lowfc.control.loop.safety import Limit, LoopMode
 from lowfc.programs.commissioning.acceptance import capture, linearity, noise, rejection
 from lowfc.programs.commissioning.acceptance.live import Live
-from lowfc.programs.commissioning.acceptance.played import (
+from lowfc.programs.commissioning.acceptance.probe import (
     AcceptanceError,
     AcceptanceResult,
-    Played,
+    ProbeResponse,
     _announced,
     chosen,
 )
@@ -35,15 +35,15 @@ def configured(**changes: object) -> Configuration:
     )
 
 
-def played(loop: FoldedLoop, test: Any, *how: Any) -> list[Played]:
+def responses_of(loop: FoldedLoop, test: Any, *arguments: Any) -> list[ProbeResponse]:
     """Run a test on a loop, check that the loop mode is restored, and return the responses to its probe sequences."""
     loop.run(5)
     live = Live(loop, lambda *_: None)
     found = loop.status().state.mode
     with loop.reserved("a test"), live.restored():
-        sequences = test.play(live, *how)
+        responses = test.play(live, *arguments)
     assert loop.status().state.mode == found
-    return sequences
+    return responses
 
 
 def drawn(module: Any, result: AcceptanceResult) -> bytes:
@@ -53,13 +53,13 @@ def drawn(module: Any, result: AcceptanceResult) -> bytes:
 
 
 @pytest.fixture(scope="module", params=[1.0, 1.5])
-def multisine(request: pytest.FixtureRequest) -> tuple[FoldedLoop, Played]:
+def multisine(request: pytest.FixtureRequest) -> tuple[FoldedLoop, ProbeResponse]:
     loop = FoldedLoop(configured(camera__delay_frames=request.param))
-    (one,) = played(loop, rejection, MULTISINE, REQUIRED)
+    (one,) = responses_of(loop, rejection, MULTISINE, REQUIRED)
     return loop, one
 
 
-def test_the_rejection_of_the_simulated_bench_matches_theory(multisine: tuple[FoldedLoop, Played]) -> None:
+def test_the_rejection_of_the_simulated_bench_matches_theory(multisine: tuple[FoldedLoop, ProbeResponse]) -> None:
     one = multisine[1]
     found = rejection.judge([one], REQUIRED)
     assert found.passed, found.text()
@@ -81,17 +81,17 @@ def test_the_rejection_of_the_simulated_bench_matches_theory(multisine: tuple[Fo
 def test_with_a_pseudo_open_loop_law_the_multisine_is_added_to_the_mirror() -> None:
     loop = FoldedLoop(configured())
     loop.law(of_blocks([integrator_block(0.3, 0.001, "pol", 1.0)] * 3, "pol", "leaky", (2, 3, 4), 1.0, 250.0))
-    found = rejection.judge(played(loop, rejection, MULTISINE, REQUIRED), REQUIRED)
+    found = rejection.judge(responses_of(loop, rejection, MULTISINE, REQUIRED), REQUIRED)
     assert (found.injected, found.law) == ("mirror", "leaky")
     assert found.passed, found.text()
     assert drawn(rejection, found).startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize("multisine", [1.0], indirect=True)
-def test_a_disturbed_measurement_is_refused(multisine: tuple[FoldedLoop, Played]) -> None:
+def test_a_disturbed_measurement_is_refused(multisine: tuple[FoldedLoop, ProbeResponse]) -> None:
     loop, one = multisine
     with pytest.raises(AcceptanceError, match=r"2 modes|3 modes"):
-        played(loop, rejection, replace(MULTISINE, duration_s=0.1), REQUIRED)
+        responses_of(loop, rejection, replace(MULTISINE, duration_s=0.1), REQUIRED)
     other = one.mode.copy()
     other[50] = LoopMode.OPEN
     limited = one.reasons.copy()
@@ -118,8 +118,8 @@ def test_a_disturbed_measurement_is_refused(multisine: tuple[FoldedLoop, Played]
 def test_linearity_passes_the_simulated_sensor_and_fails_noise_or_a_halved_gain() -> None:
     loop = FoldedLoop(configured())
     with pytest.raises(AcceptanceError, match="2 frames at each level are too few: the first 3"):
-        played(loop, linearity, linearity.Staircase(2, 3, (2,)), REQUIRED)
-    (one,) = played(loop, linearity, linearity.Staircase(7, 3, (2,)), REQUIRED)
+        responses_of(loop, linearity, linearity.Staircase(2, 3, (2,)), REQUIRED)
+    (one,) = responses_of(loop, linearity, linearity.Staircase(7, 3, (2,)), REQUIRED)
     found = linearity.judge([one], REQUIRED)
     assert found.passed, found.text()
     (mode,) = found.modes
@@ -146,7 +146,7 @@ def test_the_capture_range_ends_at_the_modal_limit_or_the_sensor_range(
     changes: dict[str, Any], tilt_nm: float, captured_nm: float, lost_nm: float | None, limits: list[str]
 ) -> None:
     required = Acceptance(capture_tilt_nm=tilt_nm)
-    trials = played(FoldedLoop(configured(**changes)), capture, (2,), required)  # Z2, tip
+    trials = responses_of(FoldedLoop(configured(**changes)), capture, (2,), required)  # Z2, tip
     found = capture.judge(trials, required)
     (mode,) = found.modes
     assert (mode.captured_nm, mode.lost_nm, mode.limits) == (captured_nm, lost_nm, limits)
@@ -158,26 +158,26 @@ def test_the_capture_range_ends_at_the_modal_limit_or_the_sensor_range(
 
 def test_a_capture_range_needs_a_gain() -> None:
     with pytest.raises(AcceptanceError, match="gain"):
-        capture.judge(played(FoldedLoop(configured(control__gain=0.0)), capture, (4,), REQUIRED), REQUIRED)
+        capture.judge(responses_of(FoldedLoop(configured(control__gain=0.0)), capture, (4,), REQUIRED), REQUIRED)
 
 
 def test_the_noise_floor_matches_photon_and_read_noise() -> None:
     config = configured(disturbance__preset="bench")
     loop = FoldedLoop(config)
-    sequences, calibration = played(loop, noise, 3.0), loop.calibration()
-    found = noise.judge(sequences, REQUIRED, config, calibration)
+    responses, calibration = responses_of(loop, noise, 3.0), loop.calibration()
+    found = noise.judge(responses, REQUIRED, config, calibration)
     assert found.passed, found.text()
     for mode in found.modes:
         assert mode.open_nm == pytest.approx(mode.expected_nm, rel=0.2)
         assert mode.closed_nm == pytest.approx(mode.expected_nm, rel=0.2)
         assert 0 < mode.residual_floor_nm < mode.closed_nm
     brighter = configured(star__magnitude=-2.0)
-    failed = noise.judge(sequences, REQUIRED, brighter, replace(calibration, flux_dn=4 * calibration.flux_dn))
+    failed = noise.judge(responses, REQUIRED, brighter, replace(calibration, flux_dn=4 * calibration.flux_dn))
     assert not failed.passed
     assert "FAILED" in failed.text()
     assert drawn(noise, found).startswith(b"\x89PNG")
     with pytest.raises(AcceptanceError, match="closed-loop recording"):
-        noise.judge(sequences[:1], REQUIRED, config, calibration)
+        noise.judge(responses[:1], REQUIRED, config, calibration)
 
 
 def test_a_note_announces_the_probe_sequences_of_a_test_in_a_log() -> None:

@@ -11,7 +11,7 @@ from lowfc.adapters.logs.reader import LogReader
 from lowfc.contract.configuration import MOST_FAULTS, Configuration, load
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.recorded_configuration import recorded
-from lowfc.programs.commissioning.acceptance.played import ANNOUNCEMENT
+from lowfc.programs.commissioning.acceptance.probe import ANNOUNCEMENT
 from lowfc.programs.view.recorded import draw_logs
 from lowfc.programs.view.renderer import Renderer
 from tests.support.loops import lowfc

@@ -14,12 +14,12 @@ from lowfc.control.loop.safety import LoopMode
 from lowfc.optics.chain.zernike import mode_name
 from lowfc.programs.cli.result import figure
 from lowfc.programs.commissioning.acceptance.live import Live
-from lowfc.programs.commissioning.acceptance.played import (
+from lowfc.programs.commissioning.acceptance.probe import (
     AcceptanceError,
     AcceptanceResult,
     Kind,
     ModeResult,
-    Played,
+    ProbeResponse,
     chosen,
 )
 
@@ -46,7 +46,7 @@ class CaptureResult(AcceptanceResult):
     modes: list[CaptureMode] = figure("modes")
 
 
-def play(live: Live, modes: Sequence[int], required: Acceptance) -> list[Played]:
+def play(live: Live, modes: Sequence[int], required: Acceptance) -> list[ProbeResponse]:
     """Add shapes of each mode to the mirror in closed loop, in steps of growing amplitude, until one is not corrected.
 
     Each shape is ramped up and down at the slew limit, in a frame or two: for the loop this equals closing on a static
@@ -92,7 +92,7 @@ def _trials(live: Live, noll: int, required: Acceptance) -> list[tuple[dict[str,
     return trials
 
 
-def closed(trial: Played) -> bool:
+def closed(trial: ProbeResponse) -> bool:
     """Whether the loop removed the shape of a trial."""
     if trial.limits_hit:
         return False
@@ -103,7 +103,7 @@ def closed(trial: Played) -> bool:
     return captured(trial.filled(trial.error_nm), commands, row, trial.what["level_nm"], before, after)
 
 
-def judge(trials: Sequence[Played], required: Acceptance) -> CaptureResult:
+def judge(trials: Sequence[ProbeResponse], required: Acceptance) -> CaptureResult:
     """Evaluate the capture range of each tested mode."""
     if not trials:
         raise AcceptanceError("all gains are zero: no mode has a capture range")

@@ -16,7 +16,7 @@ from lowfc.programs.cli.result import print_result
 if TYPE_CHECKING:
     from lowfc.contract.configuration import Acceptance
     from lowfc.programs.commissioning.acceptance.live import Live
-    from lowfc.programs.commissioning.acceptance.played import Played
+    from lowfc.programs.commissioning.acceptance.probe import ProbeResponse
 
 acceptance_app = new_app(
     "Test a loop against its requirements, live or from its log.\n\n"
@@ -118,7 +118,7 @@ def _carry_out(
     config: Path | None,
     plot: Path | None,
     as_json: bool,
-    play: "Callable[[Live, Acceptance], list[Played]]",
+    play: "Callable[[Live, Acceptance], list[ProbeResponse]]",
     *,
     by_instrument: bool = False,
 ) -> None:
@@ -133,7 +133,7 @@ def _carry_out(
     from lowfc.adapters.process.progress import counting_bar
     from lowfc.client import Client
     from lowfc.programs.commissioning.acceptance.live import Live
-    from lowfc.programs.commissioning.acceptance.played import logged
+    from lowfc.programs.commissioning.acceptance.probe import logged_responses
     from lowfc.programs.logs.guard import refuse_log
 
     required = configuration(config).acceptance if config is not None else None
@@ -149,7 +149,7 @@ def _carry_out(
         history = read_history(log)
         for remark in history.remarks:
             sys.stderr.write(f"warning: {remark}\n")
-        sequences = logged(history, test.KIND)
+        responses = logged_responses(history, test.KIND)
         if history.configuration is None or history.calibration is None:
             raise DataFileError(f"{log.path}: contains no configuration, which has the requirements")
         config_in_use, calibration = history.configuration, history.calibration
@@ -158,9 +158,9 @@ def _carry_out(
             live = Live(client, partial(count, test.KIND))
             config_in_use, calibration = live.configuration, live.calibration
             with client.reserved("lowfc acceptance"), live.restored():
-                sequences = play(live, required or config_in_use.acceptance)
+                responses = play(live, required or config_in_use.acceptance)
     instrument = (config_in_use, calibration) if by_instrument else ()
-    result = test.judge(sequences, required or config_in_use.acceptance, *instrument)
+    result = test.judge(responses, required or config_in_use.acceptance, *instrument)
     if plot is not None and figure is not None:
         test.draw(result.figures(), figure)
         figure.suptitle(result.verdict)

@@ -13,12 +13,12 @@ from lowfc.control.loop.safety import LoopMode
 from lowfc.optics.chain.zernike import mode_name
 from lowfc.programs.cli.result import Result, figure
 from lowfc.programs.commissioning.acceptance.live import Live
-from lowfc.programs.commissioning.acceptance.played import (
+from lowfc.programs.commissioning.acceptance.probe import (
     AcceptanceError,
     AcceptanceResult,
     Kind,
     ModeResult,
-    Played,
+    ProbeResponse,
     chosen,
 )
 
@@ -81,7 +81,7 @@ class LinearityResult(AcceptanceResult):
         return [key, *noisy, *super().remarks()]
 
 
-def play(live: Live, staircase: Staircase, required: Acceptance) -> list[Played]:
+def play(live: Live, staircase: Staircase, required: Acceptance) -> list[ProbeResponse]:
     """Play a staircase of each mode on the mirror, with the loop open."""
     skipped = int(np.ceil(live.loop.delay_frames)) + _SPARE_FRAMES
     if staircase.hold_frames <= skipped:
@@ -105,14 +105,14 @@ def play(live: Live, staircase: Staircase, required: Acceptance) -> list[Played]
     return [live.play(KIND, what, LoopMode.OPEN, table, shape) for what, table, shape in plan]
 
 
-def judge(sequences: Sequence[Played], required: Acceptance) -> LinearityResult:
+def judge(responses: Sequence[ProbeResponse], required: Acceptance) -> LinearityResult:
     """Evaluate gain and cross-talk from the probe sequences; AcceptanceError if the loop was disturbed meanwhile."""
     modes = []
-    for played in sequences:
-        played.check(LoopMode.OPEN)
-        what, noll = played.what, played.loop.noll
+    for response in responses:
+        response.check(LoopMode.OPEN)
+        what, noll = response.what, response.loop.noll
         levels_nm, starts = np.array(what["levels_nm"]), np.array(what["starts"], np.intp)
-        found = gains(played.filled(played.error_nm), noll.index(what["noll"]), levels_nm, starts, what["averaged"])
+        found = gains(response.filled(response.error_nm), noll.index(what["noll"]), levels_nm, starts, what["averaged"])
         within = found.within(required.gain_error, required.crosstalk)
         rows = []
         for row, amplitude_nm in enumerate(found.amplitude_nm.tolist()):

@@ -15,14 +15,14 @@ from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.loop.command_channels import MIRROR, OFFSET
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
-from lowfc.programs.commissioning.acceptance.played import (
+from lowfc.programs.commissioning.acceptance.probe import (
     ANNOUNCEMENT,
     LIMITS,
     AcceptanceError,
     Kind,
-    Played,
+    ProbeResponse,
     loop_of,
-    played,
+    probe_response,
 )
 
 _LAW = ("gain", "leak", "limit_nm", "law", "calibration_id")
@@ -92,10 +92,10 @@ class Live:
 
     def play(
         self, kind: Kind, what: dict[str, Any], mode: LoopMode, table: Single, basis: Single | None = None
-    ) -> Played:
+    ) -> ProbeResponse:
         """Play a table and return the steps meanwhile; without shapes in `basis` it is added to the offset.
 
-        With a table without columns nothing is played: only the steps are recorded.
+        With a table without columns no probe is added: only the steps are recorded.
         """
         modes = len(self.calibration.noll)
         basis = np.zeros((modes, 0), np.float32) if basis is None else basis
@@ -124,7 +124,7 @@ class Live:
             raise AcceptanceError("gains or control law changed during the measurement: measure again")
         loop = loop_of(before, self.calibration, self.loop.rate_hz, self.client.laws())
         target = "" if not table.shape[1] else MIRROR if basis.size else OFFSET
-        return played(what, loop, target, table, basis, first, of_steps(recorded, modes))
+        return probe_response(what, loop, target, table, basis, first, of_steps(recorded, modes))
 
     def _state(self) -> wire.ControllerState:
         state = self.client.status().state

@@ -16,7 +16,13 @@ from lowfc.optics.chain.zernike import mode_name
 from lowfc.programs.cli.contrast import added_contrast, sentence_of
 from lowfc.programs.cli.result import figure
 from lowfc.programs.commissioning.acceptance.live import Live
-from lowfc.programs.commissioning.acceptance.played import AcceptanceError, AcceptanceResult, Kind, ModeResult, Played
+from lowfc.programs.commissioning.acceptance.probe import (
+    AcceptanceError,
+    AcceptanceResult,
+    Kind,
+    ModeResult,
+    ProbeResponse,
+)
 
 KIND: Kind = "noise-floor"
 _LOOPS = {"open": LoopMode.OPEN, "closed": LoopMode.CLOSED}
@@ -48,7 +54,7 @@ class NoiseResult(AcceptanceResult):
         return [*contrast, *super().remarks()]
 
 
-def play(live: Live, duration_s: float) -> list[Played]:
+def play(live: Live, duration_s: float) -> list[ProbeResponse]:
     """Record the loop without a probe: open, then closed, each for `duration_s`."""
     frames = max(round(duration_s * live.loop.rate_hz), SHORTEST)
     live.expect(frames * len(_LOOPS))
@@ -57,10 +63,10 @@ def play(live: Live, duration_s: float) -> list[Played]:
 
 
 def judge(
-    sequences: Sequence[Played], required: Acceptance, configuration: Configuration, calibration: Calibration
+    responses: Sequence[ProbeResponse], required: Acceptance, configuration: Configuration, calibration: Calibration
 ) -> NoiseResult:
     """Evaluate the noise of the open-loop and of the closed-loop recording."""
-    by_loop = {played.what["loop"]: played for played in sequences}
+    by_loop = {response.what["loop"]: response for response in responses}
     if set(by_loop) != set(_LOOPS):
         raise AcceptanceError(
             f"an open-loop and a closed-loop recording are needed, found {', '.join(by_loop) or 'none'}"
@@ -68,12 +74,12 @@ def judge(
     noise_nm2 = frame_noise_nm2(configuration, calibration)
     floors, rms = {}, {}
     residual_nm2: dict[str, Array | None] = {}
-    for name, played in by_loop.items():
-        played.check(_LOOPS[name])
-        error_nm = played.filled(played.error_nm)
+    for name, response in by_loop.items():
+        response.check(_LOOPS[name])
+        error_nm = response.filled(response.error_nm)
         residual_nm2[name] = error_nm.T @ error_nm / len(error_nm) - noise_nm2
-        floors[name] = _floor_nm(played)
-        rms[name] = np.nanstd(played.error_nm, axis=0)
+        floors[name] = _floor_nm(response)
+        rms[name] = np.nanstd(response.error_nm, axis=0)
     loop = by_loop["closed"].loop
     expected = np.sqrt(np.diag(noise_nm2))
     gain = np.sqrt(margins.noise_gain(loop.linear, loop.delay_frames))
@@ -96,7 +102,7 @@ def judge(
         passed=all(mode.passed for mode in modes),
         noise_ratio=required.noise_ratio,
         law=loop.name,
-        frames={name: len(played.error_nm) for name, played in by_loop.items()},
+        frames={name: len(response.error_nm) for name, response in by_loop.items()},
         added_contrast=added_contrast(contrast_of(configuration), residual_nm2),
         modes=modes,
     )
@@ -115,9 +121,9 @@ def draw(found: dict[str, Any], figure: Any) -> None:
     ax.legend()
 
 
-def _floor_nm(played: Played) -> Array:
+def _floor_nm(response: ProbeResponse) -> Array:
     """White noise (modes,) per frame, nm, from the pseudo-open-loop modes, which the loop does not filter."""
-    power = spectrum(Pieces((played.filled(played.pol_nm),), 0), played.loop.rate_hz)
+    power = spectrum(Pieces((response.filled(response.pol_nm),), 0), response.loop.rate_hz)
     if power is None:
-        raise AcceptanceError(f"{len(played.pol_nm)} frames are too few for a spectrum, {SHORTEST} are needed")
-    return np.asarray(np.sqrt(floor_nm2_hz(power) * played.loop.rate_hz / 2))
+        raise AcceptanceError(f"{len(response.pol_nm)} frames are too few for a spectrum, {SHORTEST} are needed")
+    return np.asarray(np.sqrt(floor_nm2_hz(power) * response.loop.rate_hz / 2))

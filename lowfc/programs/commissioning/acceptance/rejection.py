@@ -19,12 +19,12 @@ from lowfc.control.loop.wording import counted
 from lowfc.optics.chain.zernike import mode_name
 from lowfc.programs.cli.result import Result, figure
 from lowfc.programs.commissioning.acceptance.live import Live
-from lowfc.programs.commissioning.acceptance.played import (
+from lowfc.programs.commissioning.acceptance.probe import (
     AcceptanceError,
     AcceptanceResult,
     Kind,
     ModeResult,
-    Played,
+    ProbeResponse,
     chosen,
 )
 
@@ -103,7 +103,7 @@ class RejectionResult(AcceptanceResult):
         return [*lines, *super().remarks()]
 
 
-def play(live: Live, excitation: Excitation, required: Acceptance) -> list[Played]:
+def play(live: Live, excitation: Excitation, required: Acceptance) -> list[ProbeResponse]:
     """Play a multisine in closed loop.
 
     It is added to the loop's offset. With a law on pseudo-open-loop modes it is added to the mirror, because such a law
@@ -131,28 +131,28 @@ def play(live: Live, excitation: Excitation, required: Acceptance) -> list[Playe
     return [live.play(KIND, {"period_frames": frames}, LoopMode.CLOSED, table, basis)]
 
 
-def transfer_function(played: Played) -> Lines:
+def transfer_function(response: ProbeResponse) -> Lines:
     """Measured transfer functions on the lines of the multisine; AcceptanceError if the loop was disturbed."""
-    played.check(LoopMode.CLOSED)
-    period = played.table[-played.what["period_frames"] :].astype(float)
-    added = -period if played.target == OFFSET else seen_of_mirror(period, delay_weights(played.loop.delay_frames))
-    return measured(played.filled(played.error_nm)[-len(period) :], added)
+    response.check(LoopMode.CLOSED)
+    period = response.table[-response.what["period_frames"] :].astype(float)
+    added = -period if response.target == OFFSET else seen_of_mirror(period, delay_weights(response.loop.delay_frames))
+    return measured(response.filled(response.error_nm)[-len(period) :], added)
 
 
-def judge(sequences: Sequence[Played], required: Acceptance) -> RejectionResult:
+def judge(responses: Sequence[ProbeResponse], required: Acceptance) -> RejectionResult:
     """Compare the last multisine with theory; AcceptanceError if the loop was disturbed meanwhile."""
-    played = sequences[-1]
-    found, rate_hz = transfer_function(played), played.loop.rate_hz
+    response = responses[-1]
+    found, rate_hz = transfer_function(response), response.loop.rate_hz
     tolerance_db = required.rejection_db
     frequency_hz = found.frequency * rate_hz
     line_rows = np.arange(found.mode.size)
-    law, delay_frames = played.loop.linear, played.loop.delay_frames
+    law, delay_frames = response.loop.linear, response.loop.delay_frames
     theory_s = margins.rejection(law, frequency_hz, delay_frames)[line_rows, found.mode]
     theory_t = margins.noise_transfer(law, frequency_hz, delay_frames)[line_rows, found.mode]
     of_s = departure(found.rejection, theory_s, found.error, tolerance_db)
     of_t = departure(found.noise_transfer, theory_t, found.error, tolerance_db)
     modes = []
-    for mode, noll in enumerate(played.loop.noll):
+    for mode, noll in enumerate(response.loop.noll):
         rows = np.flatnonzero(found.mode == mode)
         if rows.size:
             rejection, noise = _comparison(of_s, rows, frequency_hz), _comparison(of_t, rows, frequency_hz)
@@ -171,12 +171,12 @@ def judge(sequences: Sequence[Played], required: Acceptance) -> RejectionResult:
     return RejectionResult(
         test=KIND,
         passed=bool(modes) and all(mode.passed for mode in modes),
-        law=played.loop.name,
+        law=response.loop.name,
         rate_hz=rate_hz,
         delay_frames=delay_frames,
-        injected=MIRROR if played.target == MIRROR else OFFSET,
-        frames=len(played.table),
-        frames_missing=played.missing,
+        injected=MIRROR if response.target == MIRROR else OFFSET,
+        frames=len(response.table),
+        frames_missing=response.missing,
         tolerance_db=tolerance_db,
         lowest_hz=float(frequency_hz.min()),
         highest_hz=float(frequency_hz.max()),
@@ -187,7 +187,7 @@ def judge(sequences: Sequence[Played], required: Acceptance) -> RejectionResult:
         modes=modes,
         points=[
             {
-                "noll": played.loop.noll[found.mode[row]],
+                "noll": response.loop.noll[found.mode[row]],
                 "frequency_hz": float(frequency_hz[row]),
                 "rejection": float(np.abs(found.rejection[row])),
                 "rejection_theory": float(theory_s[row]),

@@ -102,7 +102,7 @@ class Loop:
 
 
 @dataclass(frozen=True, slots=True)
-class Played:
+class ProbeResponse:
     """Response of the loop to one probe sequence, or a recording without a probe, frame by frame.
 
     Attributes:
@@ -173,7 +173,7 @@ def chosen(requested: Sequence[int], noll: Sequence[int]) -> tuple[int, ...]:
     return tuple(requested or noll)
 
 
-def logged(history: History, kind: Kind) -> list[Played]:
+def logged_responses(history: History, kind: Kind) -> list[ProbeResponse]:
     """The probe sequences of a test in a log; DataFileError if there are none or the loop was changed meanwhile."""
     path, calibration = history.log.path, history.calibration
     announced = _announced(history.requests, kind)
@@ -193,7 +193,7 @@ def logged(history: History, kind: Kind) -> list[Played]:
         basis = decoded.actuators_nm.reshape(-1, calibration.grid[0] * calibration.grid[1])
         loop = loop_of(before[-1], calibration, history.rate_hz, history.published.laws)
         table = decoded.table if play else np.zeros((frames, 0), np.float32)
-        found.append(played(what, loop, request.text if play else "", table, basis, first, history.steps))
+        found.append(probe_response(what, loop, request.text if play else "", table, basis, first, history.steps))
     return found
 
 
@@ -218,7 +218,7 @@ def _announced(requests: Sequence[wire.Request], kind: Kind) -> list[tuple[dict[
     return found
 
 
-def played(
+def probe_response(
     what: dict[str, Any],
     loop: Loop,
     target: str,
@@ -226,7 +226,7 @@ def played(
     basis: Single,
     first: int,
     steps: Steps,
-) -> Played:
+) -> ProbeResponse:
     """The steps of a probe sequence from frame `first` on, one row per frame; the rate is measured from these steps."""
     frames = len(table)
     new = (steps.reasons & (1 << Rejection.REPEATED | 1 << Rejection.OUT_OF_ORDER)) == 0
@@ -239,7 +239,7 @@ def played(
     mode, reasons = np.zeros(frames, np.uint8), np.zeros(frames, np.int64)
     error_nm[rows], pol_nm[rows], command_nm[rows] = steps.error_nm, steps.pol_nm, steps.command_nm
     mode[rows], reasons[rows] = steps.mode, steps.reasons
-    return Played(what, loop, target, table, basis, error_nm, pol_nm, command_nm, mode, reasons)
+    return ProbeResponse(what, loop, target, table, basis, error_nm, pol_nm, command_nm, mode, reasons)
 
 
 def loop_of(
