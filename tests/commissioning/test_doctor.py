@@ -29,7 +29,7 @@ from lowfc.programs.core.recording.volume import bytes_per_s
 from tests.support.loops import lowfc, until
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "howto" / "doctor.md"
-LOOKS = {**timing.CHECKS.looks, **room.CHECKS.looks}
+CHECKS = {**timing.CHECKS.functions, **room.CHECKS.functions}
 NO_RIGHTS = [
     *(["setpriv", "--inh-caps=-all", "--bounding-set=-sys_nice,-ipc_lock,-sys_resource"] if os.geteuid() == 0 else []),
     *("prlimit", "--rtprio=0", "--memlock=65536", sys.executable, "-P", "-c"),
@@ -344,7 +344,7 @@ def test_doctor_checks_this_host(briefly: None) -> None:
     assert done.exit_code == 0, done.output
     (line,) = done.stdout.splitlines()
     found = json.loads(line)
-    assert [check["name"] for check in found["checks"]] == list(LOOKS)
+    assert [check["name"] for check in found["checks"]] == list(CHECKS)
     assert all(set(check) == {"name", "status", "detail", "advice", "cost"} for check in found["checks"])
     assert not [check for check in found["checks"] if check["status"] == "warning" and not check["advice"]]
     assert sum(found["counts"].values()) == len(found["checks"])
@@ -370,8 +370,8 @@ def test_strict_fails_on_warnings_but_not_on_notes(
 
 def test_the_document_describes_every_check_by_its_docstring() -> None:
     rows = [line.split(" | ") for line in DOCUMENT.read_text().splitlines() if line.startswith("| ")]
-    assert [(name.removeprefix("| "), looks_at) for name, looks_at, _ in rows[1:]] == [
-        (name, look.__doc__) for name, (_, look) in LOOKS.items()
+    assert [(name.removeprefix("| "), description) for name, description, _ in rows[1:]] == [
+        (name, function.__doc__) for name, (_, function) in CHECKS.items()
     ]
 
 

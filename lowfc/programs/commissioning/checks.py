@@ -82,7 +82,7 @@ class Table(Generic[S]):
     """Checks by name, in the order of the report; all examine the same subject."""
 
     def __init__(self) -> None:
-        self.looks: dict[str, tuple[Check, Callable[[S], Check | None]]] = {}
+        self.functions: dict[str, tuple[Check, Callable[[S], Check | None]]] = {}
 
     def check(
         self, name: str, expected: str = "", advice: str = "", cost: str = ""
@@ -96,23 +96,23 @@ class Table(Generic[S]):
             cost: Consequence of ignoring the advice.
         """
 
-        def enter(look: Callable[[S], Check | None]) -> Callable[[S], object]:
-            self.looks[name] = Check(Status.WARNING, "", advice, cost, name, expected), look
-            return look
+        def enter(function: Callable[[S], Check | None]) -> Callable[[S], object]:
+            self.functions[name] = Check(Status.WARNING, "", advice, cost, name, expected), function
+            return function
 
         return enter
 
     def of(self, subject: S, unknown: tuple[type[Exception], ...] = ()) -> Iterator[Check]:
         """Run every check on `subject`; a check that raises one of the `unknown` exceptions gives a note."""
-        for usual, look in self.looks.values():
+        for template, function in self.functions.values():
             try:
-                found = look(subject)
+                found = function(subject)
             except unknown as fault:
                 found = note(f"not known: {fault}")
             if found is not None and found.status is Status.WARNING and not found.advice:
-                yield usual._replace(got=found.got)
+                yield template._replace(got=found.got)
             elif found is not None:
-                yield found._replace(name=usual.name, expected=usual.expected)
+                yield found._replace(name=template.name, expected=template.expected)
 
 
 def put(

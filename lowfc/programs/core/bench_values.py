@@ -17,29 +17,31 @@ ANSWER_S = 0.2
 class BenchValues:
     """One slot per name: even a flood of values costs the loop only one check of each slot per frame."""
 
-    def __init__(self, service: Service, interlocks: Iterable[Interlock], take: Callable[[BenchReport], None]) -> None:
+    def __init__(
+        self, service: Service, interlocks: Iterable[Interlock], report: Callable[[BenchReport], None]
+    ) -> None:
         self._service = service
-        self._take = take
+        self._report = report
         ages_ns: dict[str, set[int]] = {}
         for interlock in interlocks:
             ages_ns.setdefault(interlock.name, set()).add(interlock.max_age_ns)
         self._slots = [_Slot(service, name, sorted(ages)) for name, ages in ages_ns.items()]
 
-    def ask(self) -> None:
+    def query(self) -> None:
         """Query the publisher of each value, so that every interlock is evaluated before the first frame."""
         for slot in self._slots:
             for sample in self._service.bus.get(BENCH.at(slot.name), timeout_s=ANSWER_S):
                 slot.mailbox.put(sample)
             now_ns = self._service.clock.now_ns()
-            self._take(slot.report(now_ns) or BenchReport(now_ns, slot.name, None))
+            self._report(slot.report(now_ns) or BenchReport(now_ns, slot.name, None))
 
-    def look(self) -> None:
+    def update(self) -> None:
         """Report new values, and values that have become too old for an interlock."""
         if self._slots:
             now_ns = self._service.clock.now_ns()
             for slot in self._slots:
                 if (slot.mailbox.waiting or now_ns > slot.due_ns) and (report := slot.report(now_ns)) is not None:
-                    self._take(report)
+                    self._report(report)
 
 
 class _Slot:

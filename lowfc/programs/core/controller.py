@@ -126,7 +126,7 @@ class Controller:
         """Do everything except frames, which the receiving thread processes; `_lock` serialises both."""
         self._camera.await_first()
         self._adopt_mirror()
-        self._bench.ask()
+        self._bench.query()
         self._service.state = "running"
         with self._lock:
             self._send_start_requests()
@@ -198,7 +198,7 @@ class Controller:
         except BadMessageError as fault:
             self._service.unreadable(sample.key, fault)
             return
-        self._bench.look()
+        self._bench.update()
         if isinstance(clock, SimulatedClock):
             clock.set_ns(frame.time_ns)
         outputs = self._advance(frame)
@@ -239,7 +239,7 @@ class Controller:
         if camera is not None:
             self._camera.take(camera)
         if not self._service.clock.lockstep:
-            self._bench.look()
+            self._bench.update()
             if self._mirror.due:
                 self._report_mirror()
         silent_ns = self._service.clock.host_ns() - self._last_frame_ns

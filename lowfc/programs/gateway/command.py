@@ -64,9 +64,9 @@ def epics(run: AnyRun = None, config: ConfigFile = None) -> None:
                     loop.bench(name, value)
             if now_s >= due_s:
                 due_s = now_s + PERIOD_S
-                seen = watch.look()
-                status = status_of(seen, links.run_id)
-                values = {one.name: one.read(seen, status) for one in offered if one.read is not None}
-                gateway.update(values, "" if seen.connected else "the controller does not answer")
+                view = watch.update()
+                status = status_of(view, links.run_id)
+                values = {one.name: one.read(view, status) for one in offered if one.read is not None}
+                gateway.update(values, "" if view.connected else "the controller does not answer")
             changed.wait(max(0.0, min(due_s, bench_s) - time.monotonic()))
             stop.wait(SHORTEST_PERIOD_S)

@@ -13,7 +13,7 @@ from lowfc.client import Answer, Client
 from lowfc.client.requests import DECLARED, Declaration
 from lowfc.contract.messages import Role, wire
 from lowfc.programs.cli.status import figures, interlocks
-from lowfc.programs.gateway.watch import Seen
+from lowfc.programs.gateway.watch import RunView
 
 
 class Kind(Enum):
@@ -39,30 +39,30 @@ class Variable(NamedTuple):
     kind: Kind
     unit: str
     sentence: str
-    read: Callable[[Seen, dict[str, Any]], Any] | None
+    read: Callable[[RunView, dict[str, Any]], Any] | None
     put: Put | None = None
 
 
-def _status(key: str, empty: Any) -> Callable[[Seen, dict[str, Any]], Any]:
-    return lambda seen, status: empty if status[key] is None else status[key]
+def _status(key: str, empty: Any) -> Callable[[RunView, dict[str, Any]], Any]:
+    return lambda view, status: empty if status[key] is None else status[key]
 
 
-def _latency(percentile: str) -> Callable[[Seen, dict[str, Any]], Any]:
-    def read(seen: Seen, status: dict[str, Any]) -> float:
-        controller = seen.processes.get(Role.CONTROLLER, wire.Health())
+def _latency(percentile: str) -> Callable[[RunView, dict[str, Any]], Any]:
+    def read(view: RunView, status: dict[str, Any]) -> float:
+        controller = view.processes.get(Role.CONTROLLER, wire.Health())
         return float(getattr(controller.frame_to_command, f"{percentile}_ns") * 1e-3)
 
     return read
 
 
-def _step(field: str) -> Callable[[Seen, dict[str, Any]], Any]:
-    return lambda seen, status: np.zeros(0) if seen.step is None else np.array(getattr(seen.step, field), float)
+def _step(field: str) -> Callable[[RunView, dict[str, Any]], Any]:
+    return lambda view, status: np.zeros(0) if view.step is None else np.array(getattr(view.step, field), float)
 
 
 READINGS = (
     Variable("mode", Kind.TEXT, "", "Loop mode: idle, open, closed, safe.", _status("mode", "")),
-    Variable("verdict", Kind.TEXT, "", "State of the loop in a sentence.", lambda seen, _: seen.verdict.headline),
-    Variable("verdict_level", Kind.TEXT, "", "Level of the verdict.", lambda seen, _: seen.verdict.level.name.lower()),
+    Variable("verdict", Kind.TEXT, "", "State of the loop in a sentence.", lambda view, _: view.verdict.headline),
+    Variable("verdict_level", Kind.TEXT, "", "Level of the verdict.", lambda view, _: view.verdict.level.name.lower()),
     Variable("holding", Kind.TEXT, "", "Why a closed loop holds its command.", _status("holding", "")),
     Variable("interlocks", Kind.TEXT, "", "Interlocks that are tripped.", lambda _, status: interlocks(status)),
     Variable("reserved_for", Kind.TEXT, "", "Holder of the loop's reservation.", _status("reserved_for", "")),
@@ -82,7 +82,7 @@ READINGS = (
     Variable("leak", Kind.NUMBERS, "", "Integrator leak of each mode.", _status("leak", [])),
     Variable("limit", Kind.NUMBERS, "nm", "Largest modal command of each mode.", _status("limit_nm", [])),
     Variable("offset", Kind.NUMBERS, "nm", "Target of each mode.", _status("offset_nm", [])),
-    Variable("frame", Kind.IMAGE, "DN", "The newest frame.", lambda seen, _: seen.frame),
+    Variable("frame", Kind.IMAGE, "DN", "The newest frame.", lambda view, _: view.frame),
 )
 
 
@@ -112,6 +112,6 @@ def variables() -> Iterator[Variable]:
     yield from puts.values()
 
 
-def status_of(seen: Seen, run: str) -> dict[str, Any]:
+def status_of(view: RunView, run: str) -> dict[str, Any]:
     """The figures of `lowfc ctl status`, from which most variables are read."""
-    return figures(seen.state, seen.processes, run)
+    return figures(view.state, view.processes, run)

@@ -17,7 +17,7 @@ _WAITING = 2000
 _PATIENCE_S = 0.2
 
 
-class Seen(NamedTuple):
+class RunView(NamedTuple):
     """Present state of the run; `connected` if the controller has sent Health recently; `frame` only if it is new."""
 
     connected: bool
@@ -38,7 +38,7 @@ class Watch:
         self._known: set[tuple[str, int]] = set()
         self._step: wire.ControlStep | None = None
 
-    def look(self) -> Seen:
+    def update(self) -> RunView:
         """Process the messages since the last call."""
         add, now_ns = self._accumulator.add, self._clock.host_ns()
         for topic, ring in self._rings.items():
@@ -56,7 +56,7 @@ class Watch:
         self._watcher.feed(snapshot)
         controller = snapshot.health.get(Role.CONTROLLER)
         connected = controller is not None and now_ns - controller.time_ns < SILENT_NS
-        return Seen(
+        return RunView(
             connected,
             snapshot.controller or wire.ControllerState(),
             {name: one.health for name, one in snapshot.health.items()},
