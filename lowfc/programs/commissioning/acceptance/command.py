@@ -151,7 +151,7 @@ def _carry_out(
             sys.stderr.write(f"warning: {remark}\n")
         responses = logged_responses(history, test.KIND)
         if history.configuration is None or history.calibration is None:
-            raise DataFileError(f"{log.path}: contains no configuration, which has the requirements")
+            raise DataFileError(f"{log.path}: has no configuration, so the requirements are unknown")
         config_in_use, calibration = history.configuration, history.calibration
     else:
         with Client(run) as client, counting_bar(Console(stderr=True), TimeRemainingColumn()) as count:
