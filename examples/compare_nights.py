@@ -24,8 +24,8 @@ def rows(nights: list[dict[str, Any]]) -> dict[str, list[str]]:
         texts = {"verdict": night["verdict"]["heading"]}
         texts |= {check["name"]: check["text"] for check in night["verdict"]["checks"]}
         for mode in night["residual"]["modes"]:
-            left_nm = mode["residual_rms_nm"] if mode["residual_rms_nm"] is not None else mode["error_rms_nm"]
-            texts[f"Z{mode['noll']} {mode['name']}, nm"] = "-" if left_nm is None else f"{left_nm:.2f}"
+            residual_nm = mode["residual_rms_nm"] if mode["residual_rms_nm"] is not None else mode["error_rms_nm"]
+            texts[f"Z{mode['noll']} {mode['name']}, nm"] = "-" if residual_nm is None else f"{residual_nm:.2f}"
         for name, text in texts.items():
             found.setdefault(name, ["-"] * len(nights))[place] = text
     return found

@@ -12,7 +12,7 @@ from lowfc import LogReader, read_history
 
 
 def table(path: Path) -> pd.DataFrame:
-    """Modal error, pseudo-open-loop modes and command of every step, nm rms of wavefront, and the light in DN."""
+    """Modal error, pseudo-open-loop modes and command of every step, nm rms of wavefront, and the flux in DN."""
     history = read_history(LogReader(path))
     steps, calibration = history.steps, history.calibration
     if calibration is None:

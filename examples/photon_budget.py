@@ -1,4 +1,4 @@
-"""Light and noise of one frame in tilt and in the other modes against V magnitude: how faint may the star be?
+"""Flux, and noise of one frame in tilt and in the other modes, against V magnitude.
 
 Example: python examples/photon_budget.py 2 5
 """

@@ -1,6 +1,6 @@
-"""A camera with only zenoh, protobuf and the compiled messages, as it would be written in another language.
+"""A camera that uses only zenoh, protobuf and the compiled messages, as in another language.
 
-It plays a numpy file of frames (frames, rows, columns) uint16 in a loop.
+It publishes a numpy file of frames (frames, rows, columns) uint16 in a loop.
 
 Example: python examples/plain_camera.py camera.json5 frames.npy
 """
@@ -35,13 +35,13 @@ START_S = now_ns() // 1_000_000_000
 
 
 class Publisher:
-    """Publish messages with an envelope of 16 bytes: start << 32 | count, and the time of the put, little-endian."""
+    """Publish messages with an envelope of 16 bytes: start << 32 | count, and the publication time, little-endian."""
 
-    def __init__(self, session: zenoh.Session, key: str, *, answers: bool = False) -> None:
-        """Publish on a key, and answer queries for the last message."""
+    def __init__(self, session: zenoh.Session, key: str, *, queryable: bool = False) -> None:
+        """Publish on a key; if queryable, also reply to queries with the last message."""
         self.key, self.count, self.last = key, 0, (b"", b"")
         self._publisher = session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP)
-        if answers:
+        if queryable:
             session.declare_queryable(key, lambda query: query.reply(key, self.last[0], attachment=self.last[1]))
 
     def put(self, payload: bytes) -> None:
@@ -52,13 +52,13 @@ class Publisher:
 
 
 session = zenoh.open(zenoh.Config.from_file(str(SESSION)))
-frames, states = Publisher(session, "lowfc/camera/frame"), Publisher(session, "lowfc/camera/state", answers=True)
-health = Publisher(session, "lowfc/health/camera", answers=True)
+frames, states = Publisher(session, "lowfc/camera/frame"), Publisher(session, "lowfc/camera/state", queryable=True)
+health = Publisher(session, "lowfc/health/camera", queryable=True)
 _, rows, columns = FRAMES.shape
 picture = RawImage(encoding="mono16", height=rows, width=columns, step=2 * columns, frame_id="my_camera")
 settings = CameraState(rows=rows, columns=columns, exposure_ns=EXPOSURE_NS, period_ns=PERIOD_NS, bit_depth=16)
 settings.gain_e_per_dn, settings.bias_dn, settings.saturation_dn, settings.em_gain = 1.0, 100.0, 40_100.0, 1.0
-how = Health(process="camera", state="running")
+report = Health(process="camera", state="running")
 end_ns, due_ns = now_ns(), 0
 while True:
     end_ns = max(end_ns + PERIOD_NS, now_ns())
@@ -69,8 +69,8 @@ while True:
     if end_ns >= due_ns:
         settings.timestamp.FromNanoseconds(end_ns)
         states.put(settings.SerializeToString())
-        how.timestamp.FromNanoseconds(now_ns())
-        del how.topics[:]
-        how.topics.add(topic=frames.key, published=frames.count)
-        health.put(how.SerializeToString())
+        report.timestamp.FromNanoseconds(now_ns())
+        del report.topics[:]
+        report.topics.add(topic=frames.key, published=frames.count)
+        health.put(report.SerializeToString())
         due_ns = end_ns + SETTINGS_PERIOD_NS

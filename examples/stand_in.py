@@ -23,22 +23,22 @@ class Optics:
 
     def join(self, service: Service) -> None:
         """Subscribe to the shape of the mirror."""
-        service.bus.subscribe(MIRROR_STATE, self._hear, self._config.mirror.name)
+        service.bus.subscribe(MIRROR_STATE, self._on_mirror_state, self._config.mirror.name)
 
     def expose(self) -> tuple[Pixels, int]:
         """Wait for the next frame; return it and the end of its exposure by CLOCK_MONOTONIC."""
         self._start_ns = max(self._start_ns + self._config.period_ns, time.monotonic_ns())
         _sleep_until_ns(self._start_ns)
-        there, expected = self._surface_nm.shape, (self._config.mirror.rows, self._config.mirror.columns)
-        if there != expected:
-            raise ConfigurationError(f"the mirror has {there} actuators, mirror.rows and mirror.columns say {expected}")
+        found, expected = self._surface_nm.shape, (self._config.mirror.rows, self._config.mirror.columns)
+        if found != expected:
+            raise ConfigurationError(f"the mirror has {found} actuators, mirror.rows and mirror.columns say {expected}")
         frame = self._scene.expose(self._index, self._surface_nm)
         self._index += 1
         end_ns = self._start_ns + self._config.exposure_ns
         _sleep_until_ns(end_ns)
         return frame, end_ns
 
-    def _hear(self, sample: Sample) -> None:
+    def _on_mirror_state(self, sample: Sample) -> None:
         shape = decode_mirror(sample.payload)
         if shape is not None:
             self._surface_nm = shape.actuators_nm

@@ -2,7 +2,7 @@
 
 Every preset is a sum of sine waves with seeded phases (a spectral model of drift and jitter), damped lines, a square
 wave and a static screen, and its spectrum is known exactly. A damped line is a rotating vector whose length and phase
-wander (an Ornstein-Uhlenbeck process): it is drawn frame by frame, so that a late frame costs all before it.
+wander (an Ornstein-Uhlenbeck process). It is drawn frame by frame: a frame requires all frames before it.
 """
 
 from dataclasses import dataclass, replace
@@ -14,12 +14,12 @@ from lowfc.control.laws.law import TIP_TILT
 from sim_camera.wheel import Wheel, walk
 
 BLOCK = 8
-"""Frames computed at once: cheap, and short enough not to delay a frame."""
+"""Frames computed at once: enough to be efficient, few enough not to delay a frame."""
 LINE_WIDTH = 0.005
-"""Of a damped line, between its half-power points, as a fraction of its frequency."""
+"""Width of a damped line between its half-power points, as a fraction of its frequency."""
 
-# The reaction wheel: rms of each line per axis, mas. Falling with frequency as a telescope's structure damps it;
-# with the drift they add up to 14 mas.
+# The reaction wheel: rms of each line per axis, mas. It falls with frequency as a telescope's structure damps it;
+# with the drift the total is 14 mas.
 LINES_HZ = (6.0, 18.0, 37.0, 71.0, 117.0)
 LINES_MAS = (9.0, 8.3, 5.0, 3.0, 2.0)
 _DRIFT_MAS = 3.0
@@ -37,7 +37,7 @@ _FRAMES_AT_ONCE = 1 << 14
 
 @dataclass(frozen=True, eq=False)
 class DampedLine:
-    """A vibration of this rms (modes,), nm of wavefront, and this width between half-power points."""
+    """A vibration: frequency, width between half-power points, and rms of each mode (modes,), nm of wavefront."""
 
     frequency_hz: float
     width_hz: float
@@ -50,15 +50,15 @@ class Disturbance:
 
     Attributes:
         noll: Noll index of each mode.
-        frequency_hz: (waves,) of each sine wave.
+        frequency_hz: (waves,) frequency of each sine wave.
         amplitude_nm: (waves, modes) complex: amplitude and phase, nm of wavefront rms.
-        step_nm: (modes,) half of the height of a square wave.
-        static_nm: (modes,) constant.
+        step_nm: (modes,) amplitude of a square wave, half of its height.
+        static_nm: (modes,) constant wavefront.
         screen_nm: rms of a static Kolmogorov screen, 0 for none.
-        lines: damped ones.
-        seed: of the lines' course.
-        wheels: whose speeds may change.
-        shear: of the beam on the sensor's masks, sine waves: Hz (waves,) and pupil diameters (waves, 2).
+        lines: damped lines.
+        seed: seed of the damped lines.
+        wheels: reaction wheels, whose speeds may change.
+        shear: shear of the beam on the sensor's masks as sine waves: Hz (waves,) and pupil diameters (waves, 2).
     """
 
     noll: tuple[int, ...]
@@ -73,7 +73,7 @@ class Disturbance:
     shear: tuple[Array, Complex] | None = None
 
 
-def disturbance(
+def preset_disturbance(
     preset: str,
     noll: tuple[int, ...],
     seed: int,
@@ -86,14 +86,14 @@ def disturbance(
     """The disturbance of a preset for these modes.
 
     Args:
-        preset: its name.
+        preset: name of the preset.
         noll: Noll index of each mode.
-        seed: of all phases.
+        seed: seed of all phases.
         nm_per_mas: wavefront rms of a milliarcsecond of tilt.
-        wavelength_nm: of the light.
-        scale: multiplies the amplitude.
+        wavelength_nm: central wavelength.
+        scale: factor on the amplitude.
         static_nm: constant wavefront, nm rms by Noll index.
-        line_width: of the reaction wheel's lines, between half-power points, as a fraction of their frequency.
+        line_width: width of the reaction wheel's lines between half-power points, as a fraction of their frequency.
 
     Raises:
         ValueError: unknown preset, or a static mode that is not among the modes.
@@ -143,106 +143,108 @@ def disturbance(
     return Disturbance(noll, frequencies, amplitudes, step, static, screen, lines, seed)
 
 
-def with_more(
-    shaken: Disturbance,
+def with_sources(
+    disturbance: Disturbance,
     rate_hz: float,
     drift_nm: dict[int, float],
     drift_slope: float,
     jitter_nm: float,
     shear: float,
 ) -> Disturbance:
-    """The disturbance with more sources, each from a seed of its own.
+    """The disturbance with drift, jitter and shear added, each with its own random stream.
 
     Args:
-        shaken: without them.
+        disturbance: the disturbance without them.
         rate_hz: frame rate.
-        drift_nm: nm per root second by Noll index, of a random walk.
-        drift_slope: of its spectrum, where it is another than a walk's 2.
-        jitter_nm: rms of tip and of tilt, white from half the frame rate to one and a half.
+        drift_nm: random walk of modes, nm per root second by Noll index.
+        drift_slope: slope of the drift's spectrum; 2 for a random walk.
+        jitter_nm: rms of tip and of tilt, white from 0.5 to 1.5 times the frame rate.
         shear: rms of the beam's slow wander on the sensor's masks along each axis, pupil diameters.
 
     Raises:
         ValueError: a mode of the drift is not among the modes.
     """
-    if unknown := set(drift_nm) - set(shaken.noll):
-        raise ValueError(f"the drifting mode Z{min(unknown)} is not one of Z{shaken.noll[0]} to Z{shaken.noll[-1]}")
-    waves = [(shaken.frequency_hz, shaken.amplitude_nm)]
+    if unknown := set(drift_nm) - set(disturbance.noll):
+        first, last = disturbance.noll[0], disturbance.noll[-1]
+        raise ValueError(f"the drifting mode Z{min(unknown)} is not one of Z{first} to Z{last}")
+    waves = [(disturbance.frequency_hz, disturbance.amplitude_nm)]
     if drift_nm:
-        per_root_s = np.array([drift_nm.get(index, 0.0) for index in shaken.noll])
-        waves.append(walk(np.random.default_rng([shaken.seed, 8]), per_root_s, drift_slope))
+        per_root_s = np.array([drift_nm.get(index, 0.0) for index in disturbance.noll])
+        waves.append(walk(np.random.default_rng([disturbance.seed, 8]), per_root_s, drift_slope))
     if jitter_nm:
-        rng = np.random.default_rng([shaken.seed, 9])
+        rng = np.random.default_rng([disturbance.seed, 9])
         frequency_hz = rate_hz * (0.5 + (np.arange(_WAVES_PER_BAND) + rng.random(_WAVES_PER_BAND)) / _WAVES_PER_BAND)
-        tilt_nm = jitter_nm * np.isin(shaken.noll, TIP_TILT) * np.sqrt(2 / _WAVES_PER_BAND)
-        waves.append((frequency_hz, tilt_nm * _phases(rng, (_WAVES_PER_BAND, len(shaken.noll)))))
-    wander = _drift(np.random.default_rng([shaken.seed, 10]), np.full(2, shear), _DRIFT_HZ) if shear else None
+        tilt_nm = jitter_nm * np.isin(disturbance.noll, TIP_TILT) * np.sqrt(2 / _WAVES_PER_BAND)
+        waves.append((frequency_hz, tilt_nm * _phases(rng, (_WAVES_PER_BAND, len(disturbance.noll)))))
+    wander = _drift(np.random.default_rng([disturbance.seed, 10]), np.full(2, shear), _DRIFT_HZ) if shear else None
     frequencies, amplitudes = zip(*waves, strict=True)
     return replace(
-        shaken, frequency_hz=np.concatenate(frequencies), amplitude_nm=np.concatenate(amplitudes), shear=wander
+        disturbance, frequency_hz=np.concatenate(frequencies), amplitude_nm=np.concatenate(amplitudes), shear=wander
     )
 
 
-def shear_at(shaken: Disturbance, time_s: float) -> Array:
-    """Shear of the beam (2,) along x and y, pupil diameters; empty where there is none."""
-    if shaken.shear is None:
+def shear_at(disturbance: Disturbance, time_s: float) -> Array:
+    """Shear of the beam (2,) along x and y, pupil diameters; empty without shear."""
+    if disturbance.shear is None:
         return np.zeros(0)
-    frequency_hz, amplitude = shaken.shear
+    frequency_hz, amplitude = disturbance.shear
     return np.asarray((np.exp(2j * np.pi * frequency_hz * time_s) @ amplitude).real)
 
 
-def speeds_hz(shaken: Disturbance, time_s: float) -> Array:
-    """Speed of each wheel, turns per second."""
-    return np.array([wheel.speed_hz(np.array([time_s]))[0] for wheel in shaken.wheels])
+def speeds_hz(disturbance: Disturbance, time_s: float) -> Array:
+    """Speed of each wheel, revolutions per second."""
+    return np.array([wheel.speed_hz(np.array([time_s]))[0] for wheel in disturbance.wheels])
 
 
-def modes_nm(shaken: Disturbance, first: int, count: int, rate_hz: float) -> Array:
+def modes_nm(disturbance: Disturbance, first: int, count: int, rate_hz: float) -> Array:
     """Modes (count, modes) at the starts of the exposures of the frames from `first` on, nm of wavefront rms."""
-    found = _sum_of_waves(shaken, (first + np.arange(count)) / rate_hz)
-    if shaken.lines:
-        lines = _Lines(shaken, rate_hz)
+    found = _sum_of_waves(disturbance, (first + np.arange(count)) / rate_hz)
+    if disturbance.lines:
+        lines = _Lines(disturbance, rate_hz)
         found[:, lines.modes] += lines.at(first, count)[:count].real.sum(axis=1)
     return found
 
 
-def _sum_of_waves(shaken: Disturbance, time_s: Array) -> Array:
-    """Modes (instants, modes) at these times without the damped lines."""
-    waves = np.exp(2j * np.pi * np.outer(time_s - time_s[0], shaken.frequency_hz)) @ _turned(shaken, time_s[0])
-    found = waves.real + _square(time_s)[:, None] * shaken.step_nm + shaken.static_nm
-    for wheel in shaken.wheels:
+def _sum_of_waves(disturbance: Disturbance, time_s: Array) -> Array:
+    """Modes (instants, modes) at these times, without the damped lines."""
+    rotations = np.exp(2j * np.pi * np.outer(time_s - time_s[0], disturbance.frequency_hz))
+    waves = (rotations @ _turned(disturbance, time_s[0])).real
+    found = waves + _square(time_s)[:, None] * disturbance.step_nm + disturbance.static_nm
+    for wheel in disturbance.wheels:
         found += wheel.modes_nm(time_s)
     return np.asarray(found)
 
 
-def variances_nm2(shaken: Disturbance, per_line: int = 401) -> tuple[Array, Array]:
+def variances_nm2(disturbance: Disturbance, per_line: int = 401) -> tuple[Array, Array]:
     """Frequencies (n,) in Hz and the variance at each (n, modes), nm^2.
 
-    A damped line is at the quantiles of its power, a wheel's harmonics are where they are at time 0.
+    A damped line is represented by quantiles of its power, a wheel by its harmonics at time 0.
     """
-    frequency_hz, variance_nm2 = [shaken.frequency_hz], [np.abs(shaken.amplitude_nm) ** 2 / 2]
+    frequency_hz, variance_nm2 = [disturbance.frequency_hz], [np.abs(disturbance.amplitude_nm) ** 2 / 2]
     quantiles = (np.arange(per_line) + 0.5) / per_line
-    for line in shaken.lines:
+    for line in disturbance.lines:
         frequency_hz.append(np.abs(line.frequency_hz + line.width_hz / 2 * np.tan(np.pi * (quantiles - 0.5))))
         variance_nm2.append(np.tile(line.rms_nm**2 / per_line, (per_line, 1)))
-    for wheel in shaken.wheels:
+    for wheel in disturbance.wheels:
         for found, of_wheel in zip((frequency_hz, variance_nm2), wheel.lines(), strict=True):
             found.append(of_wheel)
     return np.concatenate(frequency_hz), np.concatenate(variance_nm2)
 
 
 class _Lines:
-    """The course of damped lines at the starts of exposures, as complex vectors; drawn in the order of the frames.
+    """Damped lines at the starts of exposures as rotating complex vectors, drawn in the order of the frames.
 
     Attributes:
-        modes: (moved,) those that the lines move.
+        modes: (moved,) indices of the modes that the lines move.
     """
 
-    def __init__(self, shaken: Disturbance, rate_hz: float) -> None:
-        self._seed = shaken.seed
-        rms_nm = np.array([line.rms_nm for line in shaken.lines])
+    def __init__(self, disturbance: Disturbance, rate_hz: float) -> None:
+        self._seed = disturbance.seed
+        rms_nm = np.array([line.rms_nm for line in disturbance.lines])
         self.modes = np.flatnonzero(rms_nm.any(axis=0))
         self._rms_nm = rms_nm[:, self.modes]
-        omega = 2 * np.pi * np.array([line.frequency_hz for line in shaken.lines]) / rate_hz
-        damping = np.pi * np.array([line.width_hz for line in shaken.lines]) / rate_hz
+        omega = 2 * np.pi * np.array([line.frequency_hz for line in disturbance.lines]) / rate_hz
+        damping = np.pi * np.array([line.width_hz for line in disturbance.lines]) / rate_hz
         self._step = np.exp(1j * omega - damping)
         self._restart()
 
@@ -251,12 +253,12 @@ class _Lines:
         self._next, self._vector = 0, self._draw(1)[0]
 
     def _draw(self, count: int) -> Complex:
-        """(count, lines, moved) of the variance that a line has, both parts alike."""
+        """Random vectors (count, lines, moved) with the variance of each line, real and imaginary parts alike."""
         parts = self._rng.standard_normal((count, *self._rms_nm.shape, 2))
         return np.asarray((parts[..., 0] + 1j * parts[..., 1]) * self._rms_nm)
 
     def at(self, first: int, count: int) -> Complex:
-        """Vectors (count + 1, lines, moved) at the frames from `first` on."""
+        """Vectors (count + 1, lines, moved) at frames `first` to `first + count`."""
         if first < self._next:
             self._restart()
         while self._next < first:
@@ -264,7 +266,7 @@ class _Lines:
         return np.asarray(np.concatenate([self._advance(count), self._vector[None]]))
 
     def _advance(self, count: int) -> Complex:
-        """Vectors (count, lines, moved) from the next frame on."""
+        """Vectors (count, lines, moved) of the next `count` frames."""
         drawn = self._draw(count) * np.sqrt(1 - np.abs(self._step) ** 2)[:, None]
         found: Complex = np.empty_like(drawn)
         vector, step = self._vector, self._step[:, None]
@@ -276,38 +278,38 @@ class _Lines:
 
 
 class Sampler:
-    """The disturbance at the same instants of every period, in single precision, some frames at once."""
+    """The disturbance at fixed instants of every period, in single precision, computed in blocks of frames."""
 
-    def __init__(self, shaken: Disturbance, instants: Array, rate_hz: float) -> None:
+    def __init__(self, disturbance: Disturbance, instants: Array, rate_hz: float) -> None:
         """Prepare the waves; `instants` (instants,) are in periods after the start of an exposure."""
-        self._shaken = shaken
+        self._disturbance = disturbance
         self._rate_hz = rate_hz
         self._time_s = ((np.arange(BLOCK)[:, None] + instants) / rate_hz).ravel()
-        waves = np.exp(2j * np.pi * np.outer(self._time_s, shaken.frequency_hz))
+        waves = np.exp(2j * np.pi * np.outer(self._time_s, disturbance.frequency_hz))
         self._waves = np.hstack([waves.real, -waves.imag]).astype(np.float32)
-        self._lines = _Lines(shaken, rate_hz) if shaken.lines else None
-        self._between = _between(shaken.lines, instants / rate_hz, 1 / rate_hz)
-        self._shape = (BLOCK, len(instants), len(shaken.noll))
+        self._lines = _Lines(disturbance, rate_hz) if disturbance.lines else None
+        self._between = _between(disturbance.lines, instants / rate_hz, 1 / rate_hz)
+        self._shape = (BLOCK, len(instants), len(disturbance.noll))
         self._blocks: dict[int, Single] = {}
 
     def at(self, index: int) -> Single:
         """Modes (instants, modes) in the period of a frame, nm of wavefront rms."""
-        first = index - index % BLOCK  # a frame is the same in whatever order
+        first = index - index % BLOCK  # so that a frame does not depend on the order of the calls
         if first not in self._blocks:
-            # The block before is kept: a frame's truth is computed when the next one has been exposed.
+            # Keep the block before: a frame's truth is computed after the next frame's exposure.
             self._blocks = {before: block for before, block in self._blocks.items() if before == first - BLOCK}
             self._blocks[first] = self._block(first)
         row: Single = self._blocks[first][index - first]
         return row
 
     def _block(self, first: int) -> Single:
-        """Modes (frames, instants, modes) in the periods of the frames from `first` on."""
+        """Modes (frames, instants, modes) of the block that begins with frame `first`."""
         start_s = first / self._rate_hz
-        turned = _turned(self._shaken, start_s)
+        turned = _turned(self._disturbance, start_s)
         found = self._waves @ np.vstack([turned.real, turned.imag]).astype(np.float32)
-        square = _square(start_s + self._time_s)[:, None] * self._shaken.step_nm
-        found += (square + self._shaken.static_nm).astype(np.float32)
-        for wheel in self._shaken.wheels:
+        square = _square(start_s + self._time_s)[:, None] * self._disturbance.step_nm
+        found += (square + self._disturbance.static_nm).astype(np.float32)
+        for wheel in self._disturbance.wheels:
             found += wheel.modes_nm(start_s + self._time_s).astype(np.float32)
         block = found.reshape(self._shape)
         if self._lines is not None:
@@ -318,7 +320,7 @@ class Sampler:
 
 
 def _between(lines: tuple[DampedLine, ...], time_s: Array, period_s: float) -> Complex:
-    """How much (2, instants, lines) of a line's vectors at the starts of a period and of the next one is expected."""
+    """Weights (2, instants, lines) of a line's vectors at both ends of a period, for its conditional mean within."""
     omega = 2j * np.pi * np.array([line.frequency_hz for line in lines])
     damping = np.pi * np.array([line.width_hz for line in lines])
     whole = np.sinh(damping * period_s)
@@ -328,9 +330,9 @@ def _between(lines: tuple[DampedLine, ...], time_s: Array, period_s: float) -> C
     return np.array([before, after])
 
 
-def _turned(shaken: Disturbance, time_s: float) -> Complex:
-    """Amplitudes (waves, modes) with the phases of a time."""
-    return np.asarray(shaken.amplitude_nm * np.exp(2j * np.pi * shaken.frequency_hz * time_s)[:, None])
+def _turned(disturbance: Disturbance, time_s: float) -> Complex:
+    """Complex amplitudes (waves, modes) rotated to the phases at a time."""
+    return np.asarray(disturbance.amplitude_nm * np.exp(2j * np.pi * disturbance.frequency_hz * time_s)[:, None])
 
 
 def _square(time_s: Array) -> Array:
@@ -338,10 +340,10 @@ def _square(time_s: Array) -> Array:
 
 
 def screen(seed: int, samples: int, spacing: float) -> Array:
-    """Kolmogorov screen (samples, samples), of power law -11/3, at a spacing in pupil diameters; of any scale.
+    """Kolmogorov screen (samples, samples) with spectrum f^-11/3, sampled at a spacing in pupil diameters; not scaled.
 
-    It is made on a square of four pupil diameters and holds nothing finer than 12 cycles per diameter, which is far
-    beyond what the sensor's focal-plane mask passes, so that coarse nodes do not fold fine structure back.
+    It has a period of four pupil diameters, and is cut off at 12 cycles per diameter, far beyond what the sensor's
+    focal-plane mask passes, so that coarse nodes do not alias fine structure.
     """
     rng = np.random.default_rng([seed, 2])
     side, finest = 4.0, 12.0
@@ -357,7 +359,7 @@ def screen(seed: int, samples: int, spacing: float) -> Array:
 
 
 def _thermal_nm(noll: tuple[int, ...]) -> Array:
-    """Rms of the slow drift of each mode, by radial degree."""
+    """Rms of the thermal drift of each mode, by radial degree."""
     return np.array([_THERMAL_NM.get(_radial_degree(index), 1.0) for index in noll])
 
 
@@ -366,7 +368,7 @@ def _radial_degree(noll: int) -> int:
 
 
 def _drift(rng: np.random.Generator, rms_nm: Array, band_hz: tuple[float, float]) -> tuple[Array, Complex]:
-    """Sine waves, evenly spread in the logarithm of frequency, with a power that falls as 1/f^2 per hertz."""
+    """Sine waves, evenly spaced in log frequency, whose power per hertz falls as 1/f^2."""
     frequencies = np.geomspace(*band_hz, _WAVES_PER_BAND) * rng.uniform(0.95, 1.05, _WAVES_PER_BAND)
     weights = frequencies**-0.5
     weights *= np.sqrt(2 / np.sum(weights**2))

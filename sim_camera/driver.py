@@ -1,4 +1,4 @@
-"""The simulated camera as a driver: mirror states from the bus, frames to its loop, the truth to the bus."""
+"""The simulated camera as a driver: receives mirror states; publishes frames and the true wavefront."""
 
 import threading
 from collections import deque
@@ -26,7 +26,7 @@ from lowfc.device import CameraSettings, DriverOptions, Exposure, Puts
 from lowfc.optics.detector.detector import saturation_dn
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from sim_camera.contrast import AddedContrast, Contrast
-from sim_camera.disturbance import Disturbance, disturbance, with_more
+from sim_camera.disturbance import Disturbance, preset_disturbance, with_sources
 from sim_camera.faulty import FaultyFrames, read_fault
 from sim_camera.figures import Figures
 from sim_camera.lateness import Lateness
@@ -36,17 +36,17 @@ from sim_camera.scene import Scene
 from sim_camera.wheel import wheels
 
 PATIENCE_S = 5.0
-"""In lockstep, real time without progress after which the run is ended."""
+"""In lockstep, the run ends after this much real time without progress."""
 RECENT_S = 2.0
-"""Over which the wavefront is reported while the loop runs."""
-_REMEMBERED = 256
+"""Averaging time of the wavefront figures reported while the loop runs."""
+_REMEMBERED = 256  # mirror states, and publication times of frames
 
 
 def disturbance_of(config: Configuration) -> Disturbance:
     """The disturbance of a configuration."""
     section, nm_per_mas = config.disturbance, tilt_nm_per_mas(config.star.diameter_m)
     try:
-        shaken = disturbance(
+        found = preset_disturbance(
             section.preset,
             config.noll,
             config.seed,
@@ -56,8 +56,8 @@ def disturbance_of(config: Configuration) -> Disturbance:
             {int(index): amplitude for index, amplitude in section.static_nm.items()},
             section.line_width,
         )
-        shaken = with_more(
-            shaken,
+        found = with_sources(
+            found,
             config.camera.rate_hz,
             {int(index): per_root_s for index, per_root_s in section.drift_nm.items()},
             section.drift_slope,
@@ -67,23 +67,23 @@ def disturbance_of(config: Configuration) -> Disturbance:
     except ValueError as error:
         raise ConfigurationError(f"disturbance: {error}") from None
     if not section.wheel_hz:
-        return shaken
+        return found
     speeds_hz = (section.wheel_hz, section.wheel_hz + section.second_wheel_hz)[: 2 if section.second_wheel_hz else 1]
     rms_nm = np.where(np.isin(config.noll, TIP_TILT), section.wheel_mas * nm_per_mas, 0.0)
     spinning = wheels(config.seed, speeds_hz, rms_nm, section.wheel_course, section.wheel_change)
-    return replace(shaken, wheels=spinning)
+    return replace(found, wheels=spinning)
 
 
-def scene(config: Configuration, shaken: Disturbance | None = None) -> Scene:
-    """The optics of a configuration, its twin from the cache; `shaken` in place of the configured disturbance."""
+def scene(config: Configuration, disturbance: Disturbance | None = None) -> Scene:
+    """The scene of a configuration, its twin from the cache; `disturbance` replaces the configured one if given."""
     optics, detector, camera = factory.twin(config, None, ignore), factory.detector(config), config.camera
-    shaken = disturbance_of(config) if shaken is None else shaken
+    disturbance = disturbance_of(config) if disturbance is None else disturbance
     return Scene(
         optics,
         factory.true_mirror_on_twin(config, optics, ignore),
         detector,
         factory.electrons_per_exposure(config),
-        shaken,
+        disturbance,
         camera.rate_hz,
         config.seed,
         camera.noise,
@@ -98,23 +98,23 @@ def scene(config: Configuration, shaken: Disturbance | None = None) -> Scene:
             camera.hot_pixels,
             camera.hot_pixel_e_s * config.exposure_ns * 1e-9,
         ),
-        factory.shear_slopes(config) if shaken.shear is not None else None,
+        factory.shear_slopes(config) if disturbance.shear is not None else None,
     )
 
 
 def ignore(warning: str) -> None:
-    """The launcher has told the user."""
+    """Drop a warning that the launcher has already printed."""
 
 
 def _middle(name: str, size: int, of: int) -> tuple[int, int]:
-    """First and number of the rows or columns that are read."""
+    """First and number of the rows or columns of the readout region, centred."""
     if size > of:
         raise ConfigurationError(f"options of the simulated camera: {name} is {size}, the sensor has {of}")
     return ((of - size) // 2, size) if size else (0, of)
 
 
 class _Exposed(NamedTuple):
-    """A frame: its number, -1 before the first, its sequence, and the mirror at the exposure's start."""
+    """A frame: its index (-1 before the first), exposure times, sequence, and the mirror at the exposure's start."""
 
     frame: int
     start_ns: int
@@ -124,20 +124,20 @@ class _Exposed(NamedTuple):
 
 
 class SimulatedCamera:
-    """The optics, the star and the detector of a configuration, exposed frame after frame."""
+    """Camera that exposes the optics, star and detector of a configuration frame by frame."""
 
     class Options(DriverOptions):
-        """Region that is read, and what tests need."""
+        """Readout region, and a fault for tests."""
 
         rows: int = Field(0, ge=0)
-        """Rows of the region in the middle that is read; 0 for all."""
+        """Rows of the centred readout region; 0 for all."""
         columns: int = Field(0, ge=0)
-        """Columns of the region in the middle that is read; 0 for all."""
+        """Columns of the centred readout region; 0 for all."""
         fault: str = ""
-        """File (JSON) of a fault that befalls the frames; empty for none."""
+        """File (JSON) of a fault to inject into the frames; empty for none."""
 
     def __init__(self, options: Options, config: Configuration, optics: Scene | None = None) -> None:
-        """Build the optics, or take those that are given.
+        """Build the optics, unless `optics` is given.
 
         Raises:
             ConfigurationError: the region is larger than the sensor.
@@ -157,13 +157,13 @@ class SimulatedCamera:
         self._states: deque[Sample] = deque(maxlen=_REMEMBERED)
         self._arrived = threading.Event()
         self._latched = flat
-        # In lockstep a shape is in force from the start of an exposure on, and its settling is in the mirror's state.
+        # In lockstep a shape applies from the start of an exposure, and the mirror's state already includes settling.
         settling = 0.0 if config.lockstep else config.mirror.settling_us * 1e3 / config.period_ns
         self._path = MirrorPath(flat, config.camera.delay_frames - 1, settling)
         self._index, self._origin_ns = 0, 0
         self._exposing = self._exposed = _Exposed(-1, 0, 0, 0, flat)
         self._newest_state = 0
-        self._put_ns = [(0, 0)] * _REMEMBERED
+        self._published_ns = [(0, 0)] * _REMEMBERED  # (sequence, time) of the last frames
         self._last_frame = 0
         self._lateness = Lateness()
         self._frame_to_mirror = Durations()
@@ -173,65 +173,65 @@ class SimulatedCamera:
         self._measured: AddedContrast | None = None
 
     def join(self, service: Service) -> None:
-        """Declare the truth, and listen to the mirror."""
+        """Declare the publisher of the truth and subscribe to the mirror."""
         self._service = service
-        modal = factory.contrast_of(self._config)  # in the one BLAS thread that a process of the loop has
+        modal = factory.contrast_of(self._config)  # here, where the process is already limited to one BLAS thread
         self._contrast = Contrast(modal)
         self._truths = service.publisher(TRUTH)
-        service.bus.subscribe(MIRROR_STATE, self._hear, self._config.mirror.name)
+        service.bus.subscribe(MIRROR_STATE, self._on_mirror_state, self._config.mirror.name)
         service.on_stop(self._arrived.set)
 
     def through(self, publisher: Publisher) -> Puts:
-        """The publisher, or one with the fault of the options."""
+        """The publisher itself, or wrapped by the fault of the options."""
         if self._fault is None:
             return publisher
         highest = saturation_dn(factory.detector(self._config))
         return FaultyFrames(self._fault, publisher, self._config.camera.bias_dn, highest, self._service.clock.host_ns)
 
     def start(self) -> None:
-        """The time of the first exposure."""
+        """Set the time of the first exposure."""
         clock = self._service.clock
         self._origin_ns = clock.now_ns() + (0 if clock.lockstep else 10 * self._config.period_ns)
 
     def settings(self) -> CameraSettings:
-        """Those of the next exposure."""
+        """Camera settings of the next exposure."""
         time_ns = self._origin_ns and self._start_ns() + self._config.exposure_ns
         return replace(self._settings, time_ns=time_ns or None)
 
     def expose(self) -> Exposure | None:
-        """Latch the mirror as the next exposure starts, and make its frame before it ends."""
+        """Latch the mirror's shape at the start of the next exposure, and compute its frame before the end."""
         clock, period_ns = self._service.clock, self._config.period_ns
         start_ns = self._start_ns()
         clock.sleep_until_ns(start_ns)
         behind_ns = clock.now_ns() - start_ns
-        if behind_ns > period_ns:  # the host stood still: go on from here rather than catch up in a burst
+        if behind_ns > period_ns:  # the host stalled: continue from now rather than catch up in a burst
             self._origin_ns += behind_ns
             start_ns += behind_ns
         if not self._service.running:
             return None
         self._drain()
         self._shapes.appendleft(self._latched)
-        seen = self._latched
+        actuators_nm = self._latched
         if len(self._weights) > 1:
-            seen = np.tensordot(self._weights, np.array(self._shapes), 1)
-        frame = np.ascontiguousarray(self._scene.expose(self._index, seen)[self._region])
+            actuators_nm = np.tensordot(self._weights, np.array(self._shapes), 1)
+        frame = np.ascontiguousarray(self._scene.expose(self._index, actuators_nm)[self._region])
         end_ns = start_ns + self._config.exposure_ns
-        self._exposing = _Exposed(self._index, start_ns, end_ns, 0, seen)
+        self._exposing = _Exposed(self._index, start_ns, end_ns, 0, actuators_nm)
         self._index += 1
         return Exposure(frame, end_ns)
 
     def sent(self, envelope: Envelope) -> None:
-        """Remember when the frame was put, and publish the truth of the last one."""
-        self._put_ns[envelope.sequence % _REMEMBERED] = (envelope.sequence, envelope.publish_time_ns)
+        """Store the frame's publication time, and publish the truth of the frame before."""
+        self._published_ns[envelope.sequence % _REMEMBERED] = (envelope.sequence, envelope.publish_time_ns)
         self._last_frame = envelope.sequence
         self._publish_truth()
         self._exposed = self._exposing._replace(sequence=envelope.sequence)
 
     def step(self) -> None:
-        """Until the mirror has applied the command made from the last frame.
+        """Wait until the mirror has applied the command computed from the last frame.
 
         Raises:
-            BusError: it did not for so long.
+            BusError: not applied within PATIENCE_S.
         """
         while self._newest_state < self._last_frame and self._service.running:
             self._arrived.clear()
@@ -240,7 +240,7 @@ class SimulatedCamera:
             self._drain()
 
     def close(self) -> None:
-        """Publish the last truth, and compute the contrast of the run."""
+        """Publish the last truth and compute the contrast of the run."""
         self._drain()
         self._publish_truth()
         self._measured = self._contrast.measure() if self._contrast is not None else None
@@ -261,16 +261,18 @@ class SimulatedCamera:
         return self._origin_ns + self._index * self._config.period_ns
 
     def _publish_truth(self) -> None:
-        """Truth of the last exposed frame, once its period is over and the mirror's motion in it is known."""
-        index, _, end_ns, sequence, seen = self._exposed
+        """Publish the truth of the last exposed frame; its period is over, so the mirror's motion in it is known."""
+        index, _, end_ns, sequence, actuators_nm = self._exposed
         if index < 0:
             return
-        truth = self._scene.truth(index, seen, self._path.over(index, self._scene.instants))
+        truth = self._scene.truth(index, actuators_nm, self._path.over(index, self._scene.instants))
         added_flat, added = 0.0, None
         if self._contrast is not None:
-            flat, left = truth.instants_nm
-            self._contrast.add(flat[len(flat) // 2], left[len(left) // 2])
-            added_flat, added = float(self._contrast.quadratic(flat).sum()), self._contrast.quadratic(left)
+            disturbance_nm, residual_nm = truth.instants_nm
+            middle = len(residual_nm) // 2
+            self._contrast.add(disturbance_nm[middle], residual_nm[middle])
+            added_flat = float(self._contrast.quadratic(disturbance_nm).sum())
+            added = self._contrast.quadratic(residual_nm)
         self._figures.add(truth, added_flat, added)
         sampled, continuous = truth.sampled, truth.continuous
         message = wire.Truth(
@@ -294,12 +296,12 @@ class SimulatedCamera:
             message.sensed_residual_nm.extend(truth.sensed_nm.tolist())
         self._truths.put(message.SerializeToString())
 
-    def _hear(self, sample: Sample) -> None:
+    def _on_mirror_state(self, sample: Sample) -> None:
         self._states.append(sample)
         self._arrived.set()
 
     def _drain(self) -> None:
-        """Take the mirror's states that have come: the newest is the shape of the next exposure."""
+        """Process the received mirror states; the newest shape is that of the next exposure."""
         while self._states:
             sample = self._states.popleft()
             try:
@@ -313,24 +315,24 @@ class SimulatedCamera:
                 self._service.unreadable(sample.key, why)
                 continue
             self._latched = shape
-            latest = self._exposed.frame + 1  # though the host stood still: that exposure begins with it
+            latest = self._exposed.frame + 1  # after a stall of the host too, the next exposure starts with this shape
             self._path.applied(self._moment(sample.publish_time_ns), shape, latest)
             if state.frame_sequence > self._newest_state:
                 self._newest_state = state.frame_sequence
-                sequence, put_ns = self._put_ns[state.frame_sequence % _REMEMBERED]
-                if sequence == state.frame_sequence:  # else no controller made it of a frame: somebody tries the mirror
+                sequence, published_ns = self._published_ns[state.frame_sequence % _REMEMBERED]
+                if sequence == state.frame_sequence:  # otherwise the command is not from a frame, as in a mirror test
                     self._count_late(state.frame_sequence < self._last_frame)
-                    self._frame_to_mirror.add(sample.publish_time_ns - put_ns)
+                    self._frame_to_mirror.add(sample.publish_time_ns - published_ns)
 
     def _moment(self, publish_time_ns: int) -> float:
-        """When the mirror reached a shape, in periods: in lockstep, as the next exposure starts."""
+        """Time at which the mirror reached a shape, in periods; in lockstep, the start of the next exposure."""
         index, start_ns = self._exposed.frame, self._exposed.start_ns
         if self._service.clock.lockstep or index < 0:
             return index + 1
         return index + (publish_time_ns - start_ns) / self._config.period_ns
 
     def _count_late(self, late: bool) -> None:
-        """Report when commands become late habitually, and when they no longer are."""
+        """Count a command; report when commands become habitually late, and when they no longer are."""
         if self._lateness.add(late):
             event = "COMMANDS_LATE" if self._lateness.habitual else "COMMANDS_IN_TIME"
             self._service.event(event, percent=self._lateness.percent)
@@ -342,5 +344,5 @@ class SimulatedCamera:
             for name, health in sorted(self._service.last_health.items())
             if name != self._service.name and now_ns - health.timestamp.ToNanoseconds() > PATIENCE_S * 0.4e9
         ]
-        who = f"nothing was heard of {', '.join(silent)}" if silent else "all processes are alive"
+        who = f"no Health from {', '.join(silent)}" if silent else "all processes are alive"
         return f"the mirror did not apply a command for frame {self._index - 1} within {PATIENCE_S:g} s: {who}"

@@ -1,4 +1,4 @@
-"""A seeded camera fault: the data published in place of frames, as a function of the frame index."""
+"""A seeded camera fault: the data published in place of each frame, as a function of the frame index."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -13,7 +13,7 @@ LOST_SHARE = 0.1
 HOT_SHARE = 0.1
 COSMIC_SHARE = 0.2
 TRACK_PIXELS = 6
-"""Of a cosmic ray: fewer than make a frame saturated, so that it is used."""
+"""Length of a cosmic-ray track: fewer saturated pixels than the limit, so that the frame is used."""
 
 
 class Kind(StrEnum):
@@ -36,7 +36,7 @@ class Kind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One fault: `kind`, of `frames` frames from index `first` on; the first frame of a camera is always good."""
+    """A fault of this kind in `frames` frames from index `first` on; the first frame of a camera is always good."""
 
     kind: Kind
     first: int
@@ -47,12 +47,12 @@ class Fault:
         if self.first < 1 or self.frames < 1:
             raise ValueError(f"a fault begins at frame 1 or later and has frames, got {self.first} and {self.frames}")
 
-    def befalling(self, index: int) -> Kind | None:
-        """The fault of the frame with this index."""
+    def kind_at(self, index: int) -> Kind | None:
+        """Kind of the fault in the frame with this index; None if it is good."""
         return self.kind if self.first <= index < self.first + self.frames else None
 
     def random(self, index: int) -> np.random.Generator:
-        """Random numbers of this frame."""
+        """Random generator of this frame."""
         return np.random.default_rng([self.seed, index])
 
     def sent(self, index: int) -> tuple[int, ...]:
@@ -66,7 +66,7 @@ class Fault:
 
     def _due(self, frame: int) -> tuple[int, ...]:
         """Indices of the exposures at whose end a frame is published."""
-        match self.befalling(frame):
+        match self.kind_at(frame):
             case Kind.LOST if self.random(frame).random() < LOST_SHARE:
                 return ()
             case Kind.DUPLICATED:
@@ -78,17 +78,17 @@ class Fault:
         return (frame,)
 
     def pixels(self, index: int, frame: Frame, before: Frame, dark: int, highest: int) -> Frame:
-        """The detector's output in place of a frame (rows, columns).
+        """Detector output (rows, columns) in place of a frame.
 
         Args:
-            index: of the frame.
-            frame: as it would be.
-            before: what the detector gave last.
+            index: index of the frame.
+            frame: the frame without a fault.
+            before: the detector's output before it.
             dark: value without light, DN.
             highest: value of a pixel at full well, DN.
         """
         rng = self.random(index)
-        match self.befalling(index):
+        match self.kind_at(index):
             case Kind.SATURATED:
                 return np.full_like(frame, highest)
             case Kind.DARK:
@@ -99,14 +99,14 @@ class Fault:
                 return _with_track(frame, rng, highest)
             case Kind.STUCK:
                 return before
-            case Kind.WRONG_SIZE:  # as a camera with another region sends it
+            case Kind.WRONG_SIZE:  # as from a camera with another readout region
                 return np.ascontiguousarray(frame[1:, :-1])
         return frame
 
     def payload(self, index: int, message: bytes, image_end: int) -> bytes:
-        """The bytes of a frame's message, whose image ends at `image_end`, as they come."""
+        """The bytes published in place of a frame's message, whose image ends at `image_end`."""
         rng = self.random(index)
-        match self.befalling(index):
+        match self.kind_at(index):
             case Kind.TRUNCATED:
                 return message[: int(rng.integers(0, image_end))]
             case Kind.RANDOM:
@@ -115,11 +115,11 @@ class Fault:
 
 
 def _with_track(frame: Frame, rng: np.random.Generator, highest: int) -> Frame:
-    """A straight track of pixels at full well."""
+    """The frame with a straight track of pixels at full well."""
     start, angle = rng.uniform(0, frame.shape), rng.uniform(0, 2 * np.pi)
     along = start + np.arange(TRACK_PIXELS)[:, None] * (np.cos(angle), np.sin(angle))
     rows, columns = along.astype(int).T
     inside = (rows >= 0) & (rows < frame.shape[0]) & (columns >= 0) & (columns < frame.shape[1])
-    struck = frame.copy()
-    struck[rows[inside], columns[inside]] = highest
-    return struck
+    found = frame.copy()
+    found[rows[inside], columns[inside]] = highest
+    return found

@@ -14,14 +14,14 @@ from lowfc.contract.messages import RawImage, from_timestamp, image
 from sim_camera.faults import MOST_FRAMES_LATE, Fault, Frame, Kind
 
 EARLIER_S = 3600
-"""By how much a clock was set back."""
+"""Time by which the clock is set back in the fault "old-sequence"."""
 
 
 def read_fault(file: Path) -> Fault:
-    """Fault of a JSON file: an object with kind, first, frames and seed.
+    """Read a fault from a JSON file: an object with kind, first, frames and seed.
 
     Raises:
-        ConfigurationError: it is none.
+        ConfigurationError: the file does not contain a fault.
     """
     try:
         found = json.loads(file.read_text())
@@ -31,12 +31,12 @@ def read_fault(file: Path) -> Fault:
 
 
 class FaultyFrames:
-    """A publisher of frames to which a fault happens; see `Publisher`."""
+    """A publisher of frames that injects a fault; see `Publisher`."""
 
     def __init__(
         self, fault: Fault, publisher: Publisher, dark: float, highest: int, now_ns: Callable[[], int]
     ) -> None:
-        """Take the publisher of the frames, the detector's least and largest values in DN, and the host's clock."""
+        """Wrap the publisher of frames, with the detector's lowest and highest values in DN and the host's clock."""
         self._fault = fault
         self._publisher = publisher
         self._dark, self._highest = round(dark), highest
@@ -51,7 +51,7 @@ class FaultyFrames:
         self._index += 1
         message = self._message(index, RawImage.FromString(payload))
         if not self._start_s:
-            envelope = self._publisher.put(message)  # of frame 0, which is always good
+            envelope = self._publisher.put(message)  # frame 0, which is always good
             self._start_s = start_of(envelope.sequence)
             self._made.append((index, message, envelope.publish_time_ns))
             return envelope
@@ -59,15 +59,15 @@ class FaultyFrames:
         made = {number: (body, time_ns) for number, body, time_ns in self._made}
         for number in self._fault.sent(index):
             if number in made:
-                earlier = EARLIER_S if self._fault.befalling(number) is Kind.OLD_SEQUENCE else 0  # a clock set back
+                earlier = EARLIER_S if self._fault.kind_at(number) is Kind.OLD_SEQUENCE else 0
                 self._publisher.put(*made[number], sequence_of(self._start_s - earlier, number))
         return Envelope(sequence_of(self._start_s, index), now_ns)
 
-    def _message(self, index: int, sound: RawImage) -> bytes:
-        """Apply the fault to a frame's message."""
-        frame = np.frombuffer(sound.data, "<u2").reshape(sound.height, sound.width)
+    def _message(self, index: int, good: RawImage) -> bytes:
+        """A frame's message with the fault."""
+        frame = np.frombuffer(good.data, "<u2").reshape(good.height, good.width)
         before = frame if self._before is None else self._before
         self._before = self._fault.pixels(index, frame, before, self._dark, self._highest)
-        struck = image(self._before, from_timestamp(sound.timestamp), sound.frame_id)
-        message = struck.SerializeToString()
-        return self._fault.payload(index, message, message.index(struck.data) + len(struck.data))
+        faulty = image(self._before, from_timestamp(good.timestamp), good.frame_id)
+        message = faulty.SerializeToString()
+        return self._fault.payload(index, message, message.index(faulty.data) + len(faulty.data))

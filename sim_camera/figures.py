@@ -1,4 +1,4 @@
-"""The true wavefront's figures over the second half of a run of unknown length, and over its last frames."""
+"""Rms of the true wavefront over the second half of a run of unknown length, and over its most recent frames."""
 
 from dataclasses import dataclass
 
@@ -11,17 +11,17 @@ from lowfc.optics.chain.added_contrast import by_group, costliest
 from sim_camera.scene import Truth, Wavefront
 
 BLOCK = 500
-"""Frames summed together: the second half is right to this many frames."""
+"""Frames summed together: the second half is correct to this many frames."""
 MOST_BLOCKS = 256
-"""Blocks that are kept; then two become one, so that a long run takes no more memory than a short one."""
+"""Blocks stored; then pairs are merged, so that memory does not grow with the length of the run."""
 
 
 @dataclass(frozen=True, slots=True)
 class WavefrontFigures:
     """Root mean squares over frames: nm over the open pupil, mas per axis.
 
-    The first four are at the instants at which exposures start, the continuous ones over all time, of so many instants
-    of each period; zero where these are not computed.
+    The first four are taken at the starts of exposures; the continuous ones over all time, from `instants` samples
+    of each period; zero if not computed.
     """
 
     disturbance_rms_nm: float
@@ -40,20 +40,20 @@ class WavefrontFigures:
 
 
 class Figures:
-    """Sums over frames, block by block: contrast added by each mode, and squares of the wavefront."""
+    """Block sums over frames of the contrast added by each mode, and of the squared wavefront."""
 
     def __init__(self, noll: tuple[int, ...], nm_per_mas: float, recent: int = 1, instants: int = 0) -> None:
-        """Begin without a frame.
+        """Start without frames.
 
         Args:
-            noll: modes of the truths to come.
+            noll: Noll index of each mode of the truths.
             nm_per_mas: wavefront rms of a milliarcsecond of tilt.
-            recent: frames of the recent figures.
-            instants: of each period over which continuous truths are means; 0 where there are none.
+            recent: number of frames in the recent figures.
+            instants: samples of each period in the continuous truth; 0 if it is not computed.
         """
         self._noll, self._instants = noll, instants
         self._values = 1 + len(noll) + (8 if instants else 4)
-        self._tilts = slice(0, sum(index in TIP_TILT for index in noll))  # they come first
+        self._tilts = slice(0, sum(index in TIP_TILT for index in noll))  # tip and tilt are the first modes
         self._nm_per_mas = nm_per_mas
         self._blocks: list[list[float]] = []
         self._sums = [0.0] * self._values
@@ -63,7 +63,7 @@ class Figures:
         self._frames = 0
 
     def add(self, truth: Truth, added_flat: float = 0.0, added: Single | None = None) -> None:
-        """Count the truth of one frame, the contrast that its disturbance adds, and that of its residual by mode."""
+        """Add a frame's truth, the contrast added by its disturbance, and by each mode (modes,) of its residual."""
         contrasts = [added_flat, *([0.0] * len(self._noll) if added is None else added.tolist())]
         values = (*contrasts, *self._squares(truth.sampled))
         if truth.continuous is not None:
@@ -81,7 +81,11 @@ class Figures:
             self._block *= 2
 
     def wavefront(self) -> WavefrontFigures | None:
-        """Figures over the second half of the whole blocks, or of what there is; None before the first frame."""
+        """Figures over the second half of the complete blocks, or over all frames before the first is complete.
+
+        Returns:
+            None before the first frame.
+        """
         if self._blocks:
             half = self._blocks[len(self._blocks) // 2 :]
             mean = np.sum(half, axis=0) / (self._block * len(half))
@@ -97,14 +101,15 @@ class Figures:
         return self._figures(found.mean(axis=0)) if len(found) else None
 
     def _squares(self, wavefront: Wavefront) -> tuple[float, ...]:
-        tilt, left = wavefront.disturbance_nm[self._tilts], wavefront.residual_nm[self._tilts]
+        disturbance_nm, residual_nm = wavefront.disturbance_nm[self._tilts], wavefront.residual_nm[self._tilts]
         pupil_nm2 = wavefront.disturbance_rms_nm**2, wavefront.residual_rms_nm**2
-        return (*pupil_nm2, float(tilt @ tilt), float(left @ left))
+        return (*pupil_nm2, float(disturbance_nm @ disturbance_nm), float(residual_nm @ residual_nm))
 
     def _figures(self, mean: npt.NDArray[np.float64]) -> WavefrontFigures:
         flat, added, squares = mean[0], mean[1 : 1 + len(self._noll)], mean[1 + len(self._noll) :]
         per = np.array([1, 1, *[2 * self._nm_per_mas**2] * 2])
         rms = np.sqrt(squares.reshape(-1, 4) / per).ravel().tolist()
-        most = costliest(by_group(self._noll, added)) if flat else ("", 0.0)
-        figures = [*rms[:4], self._instants, *(rms[4:] or [0.0] * 4), float(flat), float(added.sum()), *most]
+        costliest_modes = costliest(by_group(self._noll, added)) if flat else ("", 0.0)
+        contrast = float(flat), float(added.sum()), *costliest_modes
+        figures = [*rms[:4], self._instants, *(rms[4:] or [0.0] * 4), *contrast]
         return WavefrontFigures(**dict(zip(WavefrontFigures.__annotations__, figures, strict=True)))

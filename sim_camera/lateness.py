@@ -1,9 +1,9 @@
-"""Commands that came after the next exposure had begun: whether that is the habit of the last ones."""
+"""Detection of habitually late commands: those applied after the next exposure has begun."""
 
 from collections import deque
 
 WINDOW = 500
-"""Commands that are looked at: the last ones."""
+"""Number of most recent commands in the statistics."""
 _ON = 0.25
 _OFF = 0.125
 
@@ -12,8 +12,8 @@ class Lateness:
     """Counts late commands.
 
     Attributes:
-        total: late ones since the start.
-        habitual: more than a quarter of a window was late, and since then never less than an eighth.
+        total: late commands since the start.
+        habitual: set when more than a quarter of the window was late, until an eighth or less is.
     """
 
     def __init__(self) -> None:
@@ -24,7 +24,7 @@ class Lateness:
 
     @property
     def percent(self) -> float:
-        """Late ones among the last."""
+        """Percentage of late commands among the most recent."""
         return 100 * self._late / len(self._last) if self._last else 0.0
 
     def add(self, late: bool) -> bool:

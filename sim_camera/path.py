@@ -8,28 +8,28 @@ from lowfc.arrays import Array, Single
 
 
 class MirrorPath:
-    """Shapes of the mirror in the order in which they came into force; times are in frame periods."""
+    """Shapes of the mirror in the order of their application; times are in frame periods."""
 
     def __init__(self, flat_nm: Single, delay: float = 0.0, settling: float = 0.0) -> None:
-        """Begin with a shape (rows, columns), nm of surface.
+        """Start with a shape (rows, columns), nm of surface.
 
         Args:
-            flat_nm: the first shape, in force since ever.
-            delay: by which each shape comes into force later than it was applied.
-            settling: time constant of the mirror's first-order response; 0 where a shape is reached at once.
+            flat_nm: the first shape, in effect since the infinite past.
+            delay: time from the application of a shape to its effect.
+            settling: time constant of the mirror's first-order response; 0 for an instantaneous mirror.
         """
         self._moves: deque[tuple[float, Single]] = deque([(-np.inf, flat_nm)])
         self._delay = delay
         self._settling = settling
 
     def applied(self, moment: float, shape_nm: Single, latest: float = np.inf) -> None:
-        """A shape (rows, columns) was applied, by the `latest` moment; not before the last one."""
+        """Add a shape (rows, columns) applied at `moment`, but at most `latest` and not before the previous shape."""
         self._moves.append((max(min(moment, latest) + self._delay, self._moves[-1][0]), shape_nm))
 
     def over(self, start: float, instants: Array) -> tuple[list[Single], Single]:
-        """Shapes (rows, columns) in force from `start` on, and how much of each (instants, shapes) is there.
+        """Shapes (rows, columns) in effect from `start` on, and the weight of each (instants, shapes).
 
-        `instants` (instants,) are after the start. What came into force before is forgotten, but for the last.
+        `instants` (instants,) are relative to `start`. Earlier shapes are dropped once the mirror has settled.
         """
         while len(self._moves) > 1 and self._moves[1][0] + 20 * self._settling <= start:
             self._moves.popleft()
@@ -39,8 +39,8 @@ class MirrorPath:
         ends = [moment for moment, _ in moves[2:]] + [np.inf]
         for row, ((moment, _), end) in enumerate(zip(moves[1:], ends, strict=False), 1):
             since = np.minimum(start + instants, end) - moment
-            left = np.exp(-since / self._settling) if self._settling else np.zeros(len(instants))
-            left = np.where(start + instants < moment, 1.0, left)
-            weights *= left[:, None].astype(np.float32)
-            weights[:, row] = 1 - left
+            remaining = np.exp(-since / self._settling) if self._settling else np.zeros(len(instants))
+            remaining = np.where(start + instants < moment, 1.0, remaining)
+            weights *= remaining[:, None].astype(np.float32)
+            weights[:, row] = 1 - remaining
         return [shape for _, shape in moves], weights

@@ -1,4 +1,4 @@
-"""Pixel errors of the simulated detector beyond photon and read noise: gain, hot, nonlinear; from the seed."""
+"""Pixel errors of the simulated detector, drawn from the seed: gain variation, hot pixels and nonlinearity."""
 
 from dataclasses import dataclass
 
@@ -14,8 +14,8 @@ class PixelErrors:
 
     Attributes:
         gain: response to light, 1 on average.
-        hot_e: electrons of the hot ones' dark current in an exposure.
-        response_dn: (65536,) digital number in place of each that a linear detector gives.
+        hot_e: dark-current electrons of hot pixels in an exposure, 0 elsewhere.
+        response_dn: (65536,) output for each digital number of a linear detector.
     """
 
     gain: Single
@@ -35,26 +35,26 @@ def pixel_errors(
     """Errors drawn from the seed; None if there are none.
 
     Args:
-        detector: without errors.
+        detector: the detector without errors.
         shape: rows and columns.
-        seed: of gains and hot pixels.
+        seed: seed of gains and hot pixels.
         nonuniformity: rms of the gains.
-        nonlinearity: by which the gain of a faint pixel exceeds that of one at full well.
-        hot_pixels: fraction of the pixels.
-        hot_pixel_e: mean electrons of a hot one's dark current in an exposure.
+        nonlinearity: fraction by which the response to faint light exceeds that at full well.
+        hot_pixels: fraction of pixels that are hot.
+        hot_pixel_e: mean dark-current electrons of a hot pixel in an exposure.
     """
     if not (hot_pixels or nonlinearity or nonuniformity):
         return None
-    rng = np.random.default_rng([seed, 6])
+    rng = np.random.default_rng([seed, 6])  # stream 6: pixel errors
     gain = np.maximum(1 + nonuniformity * rng.standard_normal(shape), 0)
     hot_e = (rng.random(shape) < hot_pixels) * rng.exponential(hot_pixel_e, shape)
     return PixelErrors(gain.astype(np.float32), hot_e.astype(np.float32), response(detector, nonlinearity))
 
 
 def response(detector: Detector, nonlinearity: float) -> Pixels:
-    """Digital number (65536,) in place of each linear one: the signal s becomes s (1 + nonlinearity (1 - s / full))."""
+    """Output (65536,) for each linear digital number: the signal s becomes s (1 + nonlinearity (1 - s / full))."""
     linear = np.arange(1 << 16)
     full = saturation_dn(detector) - detector.bias_dn
     signal = linear - detector.bias_dn
-    bent = signal * (1 + nonlinearity * (1 - signal / full))
-    return np.where(signal > 0, np.rint(detector.bias_dn + bent), linear).astype(np.uint16)
+    nonlinear = signal * (1 + nonlinearity * (1 - signal / full))
+    return np.where(signal > 0, np.rint(detector.bias_dn + nonlinear), linear).astype(np.uint16)

@@ -1,4 +1,4 @@
-"""Residual over all time predicted by control theory for a simulated run, from its disturbance and noise."""
+"""Prediction of a simulated run's continuous-time tilt residual, from its disturbance and noise spectra."""
 
 import numpy as np
 
@@ -14,19 +14,20 @@ from sim_camera.driver import disturbance_of, ignore
 
 
 def tilt_residual_mas(config: Configuration, delay_frames: float) -> float:
-    """Rms of tip and tilt per axis, for a loop closed with a delay; linear, so for residuals of a few mas only.
+    """Rms tilt residual per axis with this loop delay; from a linear model, valid for residuals of a few mas.
 
-    The disturbance's sine waves are known exactly; photon and read noise come through R. An automatic gain is taken to
-    be the highest.
+    The disturbance's sine waves are known exactly; photon and read noise propagate through R. For an automatic gain,
+    the highest gain within the margins is used.
     """
-    control, shaken = config.control, disturbance_of(config)
+    control, disturbance = config.control, disturbance_of(config)
     gain = highest_gain(delay_frames) if control.tilt_gain == "auto" else control.tilt_gain
     law = integrator([gain], [control.tilt_leak], (2,), delay_frames, config.camera.rate_hz)
     timing = Timing.of(delay_frames, config.camera.exposure_fraction)
-    frequency_hz, variance_nm2 = variances_nm2(shaken)
-    left = residual_power(law, 2 * np.pi * frequency_hz / config.camera.rate_hz, timing)
-    waves = np.sum(variance_nm2[:, :2] * left, axis=0)
+    frequency_hz, variance_nm2 = variances_nm2(disturbance)
+    transmitted = residual_power(law, 2 * np.pi * frequency_hz / config.camera.rate_hz, timing)
+    residual_nm2 = np.sum(variance_nm2[:, :2] * transmitted, axis=0)
     optics = factory.twin(config, None, ignore)
     calibration = factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, ignore))
-    noise = factory.frame_noise_nm(config, calibration)[:2] ** 2
-    return float(np.sqrt(np.mean(waves + noise * noise_gain(law))) / tilt_nm_per_mas(config.star.diameter_m))
+    noise_nm2 = factory.frame_noise_nm(config, calibration)[:2] ** 2
+    total_nm2 = residual_nm2 + noise_nm2 * noise_gain(law)
+    return float(np.sqrt(np.mean(total_nm2)) / tilt_nm_per_mas(config.star.diameter_m))

@@ -1,7 +1,7 @@
 """The simulated optics in front of the detector: mirror and disturbance in, frame and true wavefront out.
 
-Time is continuous: the star moves while the mirror holds. An image is the mean over its exposure; the truth is that of
-the instant at which the exposure starts, and the root mean square over the whole period.
+Time is continuous: the star moves while the mirror holds. An image is the mean over its exposure. The true wavefront
+is given at the start of the exposure, and as the root mean square over the whole period.
 """
 
 from dataclasses import dataclass
@@ -11,20 +11,20 @@ import numpy.typing as npt
 
 from lowfc.arrays import Array, Single
 from lowfc.optics.chain.zernike import zernikes
-from lowfc.optics.detector.detector import Detector, expose, laws_of, saturation_dn
+from lowfc.optics.detector.detector import Detector, expose, noise_table_of, saturation_dn
 from lowfc.optics.twin.twin import Evaluator, Twin, node_radii, wavefront_rms_nm
 from lowfc.optics.twin.twin_mirror import TwinMirror, wavefront_nm
 from sim_camera.disturbance import Disturbance, Sampler, screen, shear_at, speeds_hz
 from sim_camera.pixels import PixelErrors
 
 GAUSS_LEGENDRE = (1 + np.array([-1, 1]) / np.sqrt(3)) / 2
-"""Instants of an exposure whose mean is that over it, to third order in time."""
-_FOUR, _WEIGHTS_OF_FOUR = np.polynomial.legendre.leggauss(4)
+"""The two Gauss-Legendre nodes in [0, 1], in exposure times: their mean is exact to third order in time."""
+_FOUR_NODES, _FOUR_WEIGHTS = np.polynomial.legendre.leggauss(4)  # in [-1, 1]
 
 
 @dataclass(frozen=True, slots=True)
 class Wavefront:
-    """Modes (modes,) over the circle and rms over the open pupil, nm of wavefront."""
+    """Modes (modes,) over the circular aperture, and rms over the open part of the pupil mask; nm of wavefront."""
 
     disturbance_nm: Single
     residual_nm: Single
@@ -34,15 +34,15 @@ class Wavefront:
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """What no sensor knows.
+    """True wavefront of one frame, from the simulation.
 
     Attributes:
-        sampled: the wavefront at the instant at which the exposure starts.
-        continuous: root mean squares over the period, modes included; None where they are not computed.
-        sensed_nm: (modes,) of the residual's mean over the exposure, which is what the sensor sees.
+        sampled: wavefront at the start of the exposure.
+        continuous: root mean squares over the period, modes included; None if not computed.
+        sensed_nm: (modes,) mean of the residual over the exposure, as the sensor sees it.
         instants_nm: (2, instants, modes) disturbance and residual at each instant.
-        wheel_speed_hz: of each wheel as the exposure starts.
-        shear: of the beam along x and y in the middle of the exposure, pupil diameters; empty where it has none.
+        wheel_speed_hz: (wheels,) speed of each wheel at the start of the exposure.
+        shear: (2,) shear of the beam along x and y at mid-exposure, pupil diameters; empty without shear.
     """
 
     sampled: Wavefront
@@ -57,7 +57,7 @@ class Scene:
     """Optics, star, detector and disturbance of one run, with its own noise generator.
 
     Attributes:
-        instants: (instants,) of each period over which the continuous truth is the mean, in periods after its start.
+        instants: (instants,) times at which the continuous truth is sampled, in periods after the period's start.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class Scene:
         mirror: TwinMirror,
         detector: Detector,
         electrons: float,
-        shaken: Disturbance,
+        disturbance: Disturbance,
         rate_hz: float,
         seed: int,
         noise: bool = True,
@@ -79,44 +79,44 @@ class Scene:
 
         Args:
             optics: the twin.
-            mirror: on its nodes.
-            detector: of the sensor.
-            electrons: of one exposure, through the open circle.
-            shaken: the disturbance.
+            mirror: the mirror on the twin's nodes.
+            detector: the sensor's detector.
+            electrons: electrons of one exposure through the circular aperture, without any mask.
+            disturbance: the disturbance.
             rate_hz: frame rate.
-            seed: of noise and screen.
-            noise: photon and read noise.
-            exposure: its length, in periods.
-            instants: of each period at which the truth is computed; 1 for the start of the exposure alone, of which
-                the image is then one, too.
-            pixels: their errors; None for none.
-            shear_slopes: (pixels, 2) change of the image per pupil diameter of shear; where the disturbance has shear.
+            seed: seed of noise and screen.
+            noise: whether to add photon and read noise.
+            exposure: exposure time, in periods.
+            instants: number of times in each period at which the truth is computed; with 1, truth and image are
+                those at the start of the exposure, without blur.
+            pixels: pixel errors; None for none.
+            shear_slopes: (pixels, 2) change of the image per pupil diameter of shear; None without shear.
         """
         self._optics = optics
         self._mirror = mirror
         self._evaluator = Evaluator(optics)
         self._detector = detector
         self._electrons = np.float32(electrons)
-        self._rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence([seed, 3])))
+        self._rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence([seed, 3])))  # stream 3: noise
         self._noise = noise
         self._pixels = pixels
         self._area = optics.area_weights.astype(np.float32)
-        self._basis = zernikes(shaken.noll, *node_radii(optics)).astype(np.float32)
-        self._screen = self._static_screen(shaken.screen_nm, seed)
+        self._basis = zernikes(disturbance.noll, *node_radii(optics)).astype(np.float32)
+        self._screen = self._static_screen(disturbance.screen_nm, seed)
         self._screen_modes = np.asarray(self._project(self._screen), dtype=np.float32)
         self._mirror_to_modes = self._mirror_projection()
         self.instants = (np.arange(instants) + 0.5) / instants if instants > 1 else np.zeros(0)
-        seen, weights = GAUSS_LEGENDRE, np.full(2, 0.5)
+        nodes, weights = GAUSS_LEGENDRE, np.full(2, 0.5)
         if instants == 1:
-            seen, weights = np.zeros(0), np.ones(1)
-        elif shaken.frequency_hz.max(initial=0) > rate_hz / 2:
-            seen, weights = (1 + _FOUR) / 2, _WEIGHTS_OF_FOUR / 2
+            nodes, weights = np.zeros(0), np.ones(1)
+        elif disturbance.frequency_hz.max(initial=0) > rate_hz / 2:
+            nodes, weights = (1 + _FOUR_NODES) / 2, _FOUR_WEIGHTS / 2
         self._image_weights = weights.astype(np.float32)
         self._wavefronts: list[tuple[Single, Single]] = []
-        self._sampler = Sampler(shaken, np.concatenate([[0.0], exposure * seen, self.instants]), rate_hz)
-        self._shaken, self._rate_hz, self._exposure = shaken, rate_hz, exposure
+        self._sampler = Sampler(disturbance, np.concatenate([[0.0], exposure * nodes, self.instants]), rate_hz)
+        self._disturbance, self._rate_hz, self._exposure = disturbance, rate_hz, exposure
         self._shear_slopes = None if shear_slopes is None else shear_slopes.astype(np.float32)
-        laws_of(detector)  # the first frame has no time for it
+        noise_table_of(detector)  # built here so that the first frame is not late
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -125,11 +125,11 @@ class Scene:
         return pixels, pixels
 
     def expose(self, index: int, actuators_nm: Single) -> npt.NDArray[np.uint16]:
-        """Frame (rows, columns) with the mirror's actuators (rows, columns) during the exposure."""
+        """Expose a frame (rows, columns) with the mirror's actuators (rows, columns) at this shape."""
         modes = self._sampler.at(index)
         static_nm = self._screen + self._mirror_nm(actuators_nm)
-        last = len(modes) - len(self.instants)
-        opds_nm = modes[last - self._image_weights.size : last] @ self._basis
+        end = len(modes) - len(self.instants)
+        opds_nm = modes[end - self._image_weights.size : end] @ self._basis
         opds_nm += static_nm
         shares = self._electrons * self._image_weights
         electrons = self._evaluator.image(opds_nm[0]) * shares[0]
@@ -144,13 +144,13 @@ class Scene:
         return frame if self._pixels is None else self._pixels.response_dn[frame]
 
     def truth(self, index: int, actuators_nm: Single, path: tuple[list[Single], Single] | None = None) -> Truth:
-        """The truth of a frame and of its period.
+        """The true wavefront of a frame and of its period.
 
         Args:
-            index: of the frame.
-            actuators_nm: (rows, columns) at the start of its exposure.
-            path: shapes (rows, columns) that the mirror has in the period, and how much of each it has at each of the
-                instants (instants, shapes); as at the start all the time when None.
+            index: index of the frame.
+            actuators_nm: (rows, columns) shape of the mirror at the start of its exposure.
+            path: shapes (rows, columns) of the mirror in the period, and the weight of each at each of the
+                instants (instants, shapes); the mirror does not move if None.
         """
         modes = self._sampler.at(index)
         shapes_nm, weights = [actuators_nm], np.ones((len(self.instants), 1), np.float32)
@@ -163,21 +163,23 @@ class Scene:
         moved_nm = of_shapes @ np.array([self._mirror_nm(shape) for shape in shapes_nm])
         rows = rows + self._screen_modes
         residual = rows + of_shapes @ (np.array(shapes_nm).reshape(len(shapes_nm), -1) @ self._mirror_to_modes.T)
-        flat, left = self._mean_squares_nm2(opd_nm), self._mean_squares_nm2(opd_nm + moved_nm)
-        sampled = Wavefront(rows[0], residual[0], float(np.sqrt(flat[0])), float(np.sqrt(left[0])))
-        others = speeds_hz(self._shaken, index / self._rate_hz), self._shear(index)
+        mean_squares_nm2 = self._mean_squares_nm2(opd_nm), self._mean_squares_nm2(opd_nm + moved_nm)
+        disturbance_rms_nm, residual_rms_nm = (float(np.sqrt(each[0])) for each in mean_squares_nm2)
+        sampled = Wavefront(rows[0], residual[0], disturbance_rms_nm, residual_rms_nm)
+        speeds_and_shear = speeds_hz(self._disturbance, index / self._rate_hz), self._shear(index)
         if not len(self.instants):
-            return Truth(sampled, None, sampled.residual_nm, np.array([rows, residual]), *others)
+            return Truth(sampled, None, sampled.residual_nm, np.array([rows, residual]), *speeds_and_shear)
         sensed_nm = self._image_weights @ modes[1 : 1 + self._image_weights.size] - modes[0] + residual[0]
-        over = (np.sqrt(np.square(of[1:]).mean(axis=0)) for of in (rows, residual))
-        pupil = (float(np.sqrt(of[1:].mean())) for of in (flat, left))
-        return Truth(sampled, Wavefront(*over, *pupil), sensed_nm, np.array([rows[1:], residual[1:]]), *others)
+        modes_rms = (np.sqrt(np.square(each[1:]).mean(axis=0)) for each in (rows, residual))
+        pupil_rms = (float(np.sqrt(each[1:].mean())) for each in mean_squares_nm2)
+        continuous = Wavefront(*modes_rms, *pupil_rms)
+        return Truth(sampled, continuous, sensed_nm, np.array([rows[1:], residual[1:]]), *speeds_and_shear)
 
     def _shear(self, index: int) -> Array:
-        return shear_at(self._shaken, (index + self._exposure / 2) / self._rate_hz)
+        return shear_at(self._disturbance, (index + self._exposure / 2) / self._rate_hz)
 
     def _mirror_nm(self, actuators_nm: Single) -> Single:
-        """Wavefront (used,) of a shape, remembered for the last few."""
+        """Wavefront (used,) of a shape; the last three are cached."""
         for shape_nm, opd_nm in self._wavefronts:
             if shape_nm is actuators_nm:
                 return opd_nm
@@ -188,14 +190,14 @@ class Scene:
     def _mean_squares_nm2(self, opd_nm: Single) -> Single:
         """Mean square over the open pupil, piston removed, of wavefronts (many, used)."""
         from_mean = opd_nm - (opd_nm @ self._area)[:, None]
-        return np.maximum(np.square(from_mean) @ self._area, 0)  # a few weights are negative
+        return np.maximum(np.square(from_mean) @ self._area, 0)  # guard nodes of the interpolation have weights < 0
 
     def _noiseless(self, electrons: Single) -> npt.NDArray[np.uint16]:
         values = electrons / self._detector.gain_e_per_dn + self._detector.bias_dn
         return np.asarray(np.rint(np.clip(values, 0, saturation_dn(self._detector))), dtype=np.uint16)
 
     def _static_screen(self, rms_nm: float, seed: int) -> Single:
-        """The preset's screen at the nodes, of this rms over the open pupil, piston removed."""
+        """The preset's screen at the nodes, scaled to this rms over the open pupil, piston removed."""
         axis = self._optics.axis
         if not rms_nm:
             return np.zeros(self._optics.used.size, np.float32)
@@ -204,7 +206,7 @@ class Scene:
         return (opd * (rms_nm / wavefront_rms_nm(self._optics, opd))).astype(np.float32)
 
     def _project(self, opd_nm: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
-        """Modes over the circle, least squares with piston, of wavefronts (used,) or (used, many)."""
+        """Least-squares fit of modes and piston over the circular aperture to wavefronts (used,) or (used, many)."""
         x, y = node_radii(self._optics)
         inside = np.hypot(x, y) <= 1
         basis = np.vstack([np.ones(inside.sum()), self._basis[:, inside]]).astype(np.float64)

@@ -1,4 +1,4 @@
-"""Reaction wheels: harmonics of one speed, which ramps, wanders or runs down; pure functions of seed and time."""
+"""Reaction wheels: harmonics of a speed that ramps, wanders or runs down; pure functions of seed and time."""
 
 from dataclasses import dataclass
 
@@ -7,20 +7,20 @@ import numpy as np
 from lowfc.arrays import Array, Complex
 
 ORDERS = (1.0, 2.0, 2.9, 4.4, 5.4)
-"""Frequencies of the harmonics, in turns of the wheel; those of its bearings are no whole numbers."""
+"""Frequencies of the harmonics, as multiples of the wheel's speed; bearing harmonics are not integers."""
 HEIGHTS = (1.0, 0.5, 0.3, 0.2, 0.15)
-"""Amplitudes of the harmonics, of the first one's."""
+"""Amplitudes of the harmonics, relative to the first."""
 SOFT_HZ = 5.0
-"""First resonance of the structure: below it a harmonic falls with the square of its frequency, as the force does."""
+"""First resonance of the structure: below it a harmonic's amplitude is proportional to the frequency squared."""
 _WALK_HZ = (1e-4, 10.0)
 _WALK_WAVES = 64
 
 
 def walk(rng: np.random.Generator, per_root_s: Array, slope: float = 2.0) -> tuple[Array, Complex]:
-    """Sine waves (waves,) and (waves, any), evenly spread in the logarithm of frequency from 1e-4 to 10 Hz.
+    """Sine waves, frequencies (waves,) and amplitudes (waves, any), evenly spaced in log frequency from 1e-4 to 10 Hz.
 
-    Their density is per_root_s^2 / (2 pi^2 f^slope) per Hz; a random walk's with slope 2, which then moves by
-    per_root_s in a second and by the root of a longer time.
+    Their power density is per_root_s^2 / (2 pi^2 f^slope) per Hz. Slope 2 is a random walk: its rms displacement after
+    t seconds is per_root_s sqrt(t).
     """
     low, high = _WALK_HZ
     spacing = np.log(high / low) / _WALK_WAVES
@@ -32,14 +32,14 @@ def walk(rng: np.random.Generator, per_root_s: Array, slope: float = 2.0) -> tup
 
 @dataclass(frozen=True, eq=False)
 class Wheel:
-    """A wheel that shakes the modes.
+    """A reaction wheel that disturbs the modes.
 
     Attributes:
-        start_hz: its speed at time 0, turns per second.
-        course: ramp, walk or run-down (by friction in proportion to the speed).
-        change: of the speed: Hz per second, of a walk Hz per root second; 0 for a steady one.
+        start_hz: speed at time 0, revolutions per second.
+        course: ramp, walk or run-down (friction proportional to the speed).
+        change: rate of change of the speed: Hz per second, for a walk Hz per root second; 0 for a constant speed.
         amplitude_nm: (harmonics, modes) complex: amplitude and phase at high speed, nm of wavefront rms.
-        wander: (waves,) and (waves, 1) of a walk's speed in Hz.
+        wander: frequencies (waves,) and amplitudes (waves, 1) in Hz of a random walk of the speed.
     """
 
     start_hz: float
@@ -49,7 +49,7 @@ class Wheel:
     wander: tuple[Array, Complex]
 
     def speed_hz(self, time_s: Array) -> Array:
-        """Turns per second (instants,)."""
+        """Speed (instants,), revolutions per second."""
         if self.course == "walk":
             frequency_hz, height_hz = self.wander
             moved = (np.exp(2j * np.pi * np.outer(time_s, frequency_hz)) - 1) @ height_hz[:, 0]
@@ -59,7 +59,7 @@ class Wheel:
         return self.start_hz + self.change * time_s
 
     def turns(self, time_s: Array) -> Array:
-        """Turns since time 0 (instants,): the integral of the speed."""
+        """Revolutions since time 0 (instants,): the integral of the speed."""
         if self.course == "walk":
             frequency_hz, height_hz = self.wander
             omega = 2j * np.pi * frequency_hz
@@ -71,7 +71,7 @@ class Wheel:
         return self.start_hz * time_s + self.change / 2 * time_s**2
 
     def modes_nm(self, time_s: Array) -> Array:
-        """What it adds to the modes (instants, modes), nm of wavefront rms."""
+        """Contribution to the modes (instants, modes), nm of wavefront rms."""
         return np.asarray((self._heights(time_s) * self._phases(time_s) @ self.amplitude_nm).real)
 
     def lines(self) -> tuple[Array, Array]:
@@ -83,7 +83,7 @@ class Wheel:
         return np.asarray(np.exp(2j * np.pi * np.outer(self.turns(time_s), ORDERS)))
 
     def _heights(self, time_s: Array) -> Array:
-        """(instants, harmonics), of those at high speed."""
+        """Amplitudes (instants, harmonics), relative to those at high speed."""
         squared = np.outer(self.speed_hz(time_s), ORDERS) ** 2
         return np.asarray(squared / (squared + SOFT_HZ**2))
 
@@ -91,7 +91,7 @@ class Wheel:
 def wheels(
     seed: int, speeds_hz: tuple[float, ...], rms_nm: Array, course: str = "ramp", change: float = 0.0
 ) -> tuple[Wheel, ...]:
-    """A wheel for each speed at time 0, all of one kind; `rms_nm` (modes,) of the first harmonic at high speed."""
+    """Equal wheels, one for each speed at time 0; `rms_nm` (modes,) is that of the first harmonic at high speed."""
     found = []
     for number, start_hz in enumerate(speeds_hz):
         rng = np.random.default_rng([seed, 7, number])

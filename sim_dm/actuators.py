@@ -1,20 +1,20 @@
-"""Response of actuators to a command: gain errors, hysteresis, creep; the part of the mirror with memory."""
+"""Response of actuators to a command: gain errors, hysteresis and creep, which have memory."""
 
 import numpy as np
 
 from lowfc.arrays import Array, Single
 
 PLAY_NM = (1.0, 4.0, 16.0, 64.0, 256.0)
-"""Half widths of the plays, surface: hysteresis at moves of every size."""
+"""Half widths of the play operators, surface: hysteresis for moves of any size."""
 CREEP_S = (0.1, 1.0, 10.0, 100.0)
-"""Time constants of the creep, a decade apart, so that it grows with the logarithm of time."""
+"""Time constants of the creep, a decade apart, so that creep grows with the logarithm of time."""
 
 
 class Actuators:
-    """Actuators of one mirror, flat to begin with.
+    """Actuators of one mirror, initially flat.
 
-    Hysteresis is Prandtl's and Ishlinskii's: a share of the command passes through plays of several widths. Creep is
-    added by first-order responses with time constants a decade apart.
+    Hysteresis is a Prandtl-Ishlinskii model: a fraction of the command passes through play operators of several widths.
+    Creep is a sum of first-order responses with time constants a decade apart.
     """
 
     def __init__(self, grid: tuple[int, int], gain_error: float, hysteresis: float, creep: float, seed: int) -> None:
@@ -22,10 +22,10 @@ class Actuators:
 
         Args:
             grid: rows and columns.
-            gain_error: rms, a fraction.
-            hysteresis: share of the command that passes through the plays.
-            creep: share of a move that follows in each decade of time.
-            seed: of the gains.
+            gain_error: rms of the gain errors, a fraction.
+            hysteresis: fraction of the command that passes through the play operators.
+            creep: fraction of a move that is added in each decade of time.
+            seed: seed of the gains.
         """
         self._gain = 1 + gain_error * np.random.default_rng([seed, 5]).standard_normal(grid)
         self._hysteresis, self._creep = hysteresis, creep
@@ -33,14 +33,14 @@ class Actuators:
         self._crept_nm = np.zeros((len(CREEP_S), *grid))
 
     def reach(self, driven_nm: Single, elapsed_ns: float) -> Single:
-        """Positions reached (rows, columns) after this drive for `elapsed_ns`."""
+        """Positions reached (rows, columns) after this command has been applied for `elapsed_ns`."""
         wanted_nm: Array = driven_nm * self._gain
         if self._hysteresis:
             width_nm = np.array(PLAY_NM)[:, None, None]
             self._plays_nm = np.clip(self._plays_nm, wanted_nm - width_nm, wanted_nm + width_nm)
             wanted_nm = wanted_nm + self._hysteresis * (self._plays_nm.mean(axis=0) - wanted_nm)
         if self._creep:
-            left = np.exp(-max(elapsed_ns, 0) / (1e9 * np.array(CREEP_S)))[:, None, None]
-            self._crept_nm = wanted_nm + left * (self._crept_nm - wanted_nm)
+            remaining = np.exp(-max(elapsed_ns, 0) / (1e9 * np.array(CREEP_S)))[:, None, None]
+            self._crept_nm = wanted_nm + remaining * (self._crept_nm - wanted_nm)
             wanted_nm = wanted_nm + self._creep * self._crept_nm.sum(axis=0)
         return wanted_nm.astype(np.float32)

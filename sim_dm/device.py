@@ -1,4 +1,4 @@
-"""The simulated mirror: its actuators round, settle and stick; pure functions of values."""
+"""The simulated mirror: rounding to driver steps, settling, dead and stuck actuators; pure functions."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,11 +12,11 @@ from lowfc.device.guard import Guard, Status
 
 @dataclass(frozen=True)
 class Device(Guard):
-    """Properties of the mirror, apart from its protection.
+    """Properties of the mirror in addition to those of its protection.
 
     Attributes:
         settling_ns: time constant of the actuators.
-        fixed_nm: (rows, columns) height of dead and stuck actuators, NaN for those that move.
+        fixed_nm: (rows, columns) height of dead and stuck actuators, NaN for working ones.
     """
 
     settling_ns: float
@@ -24,19 +24,19 @@ class Device(Guard):
 
     @cached_property
     def fixed(self) -> Whole | None:
-        """Which of the flattened actuators are dead or stuck; None where all move."""
+        """Flat indices of dead and stuck actuators; None if all work."""
         found = np.flatnonzero(np.isfinite(self.fixed_nm))
         return found if found.size else None
 
 
 def initial(device: Device) -> Status:
-    """Flat, and waiting for the first command."""
+    """Initial status: flat, waiting for the first command."""
     flat = np.zeros(device.grid, np.float32)
     return Status(flat, _at_rest(device, flat))
 
 
 def rounded(device: Device, driven_nm: Single) -> Single:
-    """To the driver's steps."""
+    """Round a command to the driver's steps."""
     step = np.float32(device.step_nm)
     found = driven_nm / step
     np.rint(found, out=found)
@@ -45,7 +45,7 @@ def rounded(device: Device, driven_nm: Single) -> Single:
 
 
 def responded(device: Device, reached_nm: Single, surface_nm: Single, elapsed_ns: float) -> Single:
-    """First-order response of the actuators, on their way to `reached_nm` from a surface of `elapsed_ns` ago."""
+    """First-order response of the actuators, from `surface_nm`, `elapsed_ns` ago, towards `reached_nm`."""
     found = reached_nm
     if device.settling_ns > 0 and elapsed_ns <= 20 * device.settling_ns:
         found = found - surface_nm

@@ -31,7 +31,7 @@ class SimulatedMirror:
     """The mirror that the section [mirror] of a configuration describes."""
 
     def __init__(self, options: DriverOptions, config: Configuration) -> None:
-        """Flat, but for actuators that are stuck."""
+        """Start flat except for stuck actuators."""
         self.geometry = geometry(config)
         self._device = device(config)
         self._surface_nm = initial(self._device).surface_nm
@@ -39,7 +39,7 @@ class SimulatedMirror:
         self._actuators = Actuators(self._surface_nm.shape, *errors, config.seed) if any(errors) else None
 
     def apply(self, actuators_nm: Single) -> Single:
-        """Move, and wait until it has settled."""
+        """Move, and return the settled surface."""
         return self.settle(actuators_nm, np.inf)
 
     def settle(self, actuators_nm: Single, elapsed_ns: float) -> Single:

@@ -84,7 +84,7 @@ def test_a_process_that_stands_still_is_named(tmp_path: Path) -> None:
     os.kill(children(process.pid)["controller"], signal.SIGSTOP)
     _, complaints = process.communicate(timeout=40)
     assert process.returncode == 1
-    assert "nothing was heard of controller" in complaints
+    assert "no Health from controller" in complaints
     assert "Traceback" not in complaints
 
 

@@ -111,7 +111,7 @@ def test_the_camera_reports_the_habit_each_time() -> None:
         for _ in range(2 * WINDOW):
             sequence += 1
             camera._last_frame = sequence + late
-            camera._put_ns[sequence % len(camera._put_ns)] = sequence, 0
+            camera._published_ns[sequence % len(camera._published_ns)] = sequence, 0
             put(sequence)
     said = [event.split()[0] for event in events if event.startswith("COMMANDS_")]
     assert said == ["COMMANDS_LATE", "COMMANDS_IN_TIME", "COMMANDS_LATE"]

@@ -1,9 +1,9 @@
 """Contrast that a small wavefront adds to a coronagraph's dark zone: a quadratic form of its modes.
 
 With the field E = E0 + i k sum a_j E_j - k^2 / 2 sum a_j a_l E_jl, the intensity's second order in a has two terms:
-that of the first-order field, and that of the second-order field with E0. The second is as large as the first for a
-shaped pupil: without it tilt would cost 58 times too much. The first order has no mean over a dark zone on both sides
-of the star.
+the squared first-order field, and the product of the second-order field with E0. For a shaped pupil the second is as
+large as the first: without it, tilt would add 58 times too much. The first order averages to zero over a dark zone on
+both sides of the star.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,9 +18,9 @@ from lowfc.optics.chain.science_camera import ScienceCamera
 from lowfc.optics.chain.zernike import mode_group, zernikes
 
 BEYOND_QUADRATIC = 0.1
-"""Relative difference between form and image above which it is reported."""
-_SAMPLES_PER = 2  # in each lambda / D: the intensity's band is 1 D to either side
-_DRAWS = 24
+"""Relative difference between quadratic form and full images above which it is reported."""
+_SAMPLES_PER = 2  # samples per lambda / D: the intensity's band is 1 D to either side
+_DRAWS = 24  # random wavefronts compared
 
 
 class ModalContrast:
@@ -28,26 +28,26 @@ class ModalContrast:
 
     Attributes:
         noll: Noll index of each mode.
-        form: (modes, modes), see `contrast_form`.
+        form: (modes, modes) quadratic form, see `contrast_form`.
     """
 
     def __init__(self, coronagraph: Coronagraph, noll: tuple[int, ...], wavelength_nm: float) -> None:
-        """Prepare form and images."""
+        """Compute the form and prepare the images."""
         pupil, self._zone, lyot = coronagraph.pupil, coronagraph.dark_zone, coronagraph.lyot
         self.noll, self.form = noll, contrast_form(pupil, noll, wavelength_nm, self._zone, lyot)
         half_width = int(np.ceil(self._zone.outer))
         self._camera = ScienceCamera(pupil, noll, wavelength_nm, half_width, _SAMPLES_PER, lyot)
 
     def by_image(self, modes_nm: Array | Single) -> float:
-        """Contrast of the dark zone with a wavefront (modes,), the coronagraph's own included."""
+        """Mean contrast of the dark zone with a wavefront (modes,), including that of the coronagraph itself."""
         return self._camera.mean_contrast(self._camera.image(modes_nm), self._zone)
 
     def by_mode(self, covariance_nm2: Array) -> Array:
-        """Contrast added per mode (modes,) for wavefronts with a covariance (modes, modes), summing to the total."""
+        """Contrast added by each mode (modes,) for wavefronts with a covariance (modes, modes); sums to the total."""
         return np.asarray(np.sum(self.form * covariance_nm2, axis=1))
 
     def is_beyond_quadratic(self, covariance_nm2: Array) -> bool:
-        """Whether full images of wavefronts with this covariance (modes, modes) differ too much from the form."""
+        """Whether full images of wavefronts with this covariance (modes, modes) differ from the form by over 10 %."""
         values, vectors = np.linalg.eigh(covariance_nm2)
         drawn = np.random.default_rng(1).standard_normal((_DRAWS, len(values)))
         some_nm = drawn * np.sqrt(np.maximum(values, 0)) @ vectors.T
@@ -58,10 +58,7 @@ class ModalContrast:
 
 
 def by_group(noll: Sequence[int], each: Array) -> dict[str, float]:
-    """Sums of the added contrast of each mode (modes,) over modes of one kind, such as both comas.
-
-    The largest first.
-    """
+    """Added contrast of each mode (modes,) summed over modes of one kind, such as both comas; largest first."""
     found: dict[str, float] = {}
     for index, one in zip(noll, each.tolist(), strict=True):
         found[mode_group(index)] = found.get(mode_group(index), 0.0) + one
@@ -69,7 +66,7 @@ def by_group(noll: Sequence[int], each: Array) -> dict[str, float]:
 
 
 def costliest(groups: Mapping[str, float]) -> tuple[str, float]:
-    """The kind of modes that adds most, and its share of the total; groups as sorted by `by_group`."""
+    """The kind of modes that adds most contrast, and its share of the total; groups as sorted by `by_group`."""
     name, most = next(iter(groups.items()))
     return name, most / (sum(groups.values()) or 1.0)
 
@@ -81,7 +78,7 @@ def contrast_form(
     wedge: Wedge = DARK_ZONE,
     lyot: LyotStop | None = None,
 ) -> Array:
-    """Q (modes, modes) of the contrast a' Q a that a wavefront a (modes,) adds on average in a wedge, per nm^2.
+    """Quadratic form Q (modes, modes), per nm^2: a wavefront a (modes,) adds the mean contrast a' Q a in a wedge.
 
     Args:
         pupil: (n, n) amplitude transmission.
@@ -115,6 +112,6 @@ def contrast_form(
 
 
 def without_negative(form: Array) -> Array:
-    """The form (modes, modes), contrast per nm^2, without negative eigenvalues: a loss must not reward a wavefront."""
+    """The form (modes, modes), contrast per nm^2, with negative eigenvalues set to 0 for use as a loss function."""
     values, vectors = np.linalg.eigh(form)
     return np.asarray((vectors * np.maximum(values, 0)) @ vectors.T)

@@ -7,11 +7,11 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Band:
-    """Quadrature over a passband: an image is the sum of weight times image at each wavelength.
+    """Quadrature over a passband: an image is the weighted sum of the images at each wavelength.
 
     Attributes:
         wavelengths_nm: The wavelengths.
-        weights: One for each, positive, of sum 1.
+        weights: Weight of each wavelength, positive; the sum is 1.
     """
 
     wavelengths_nm: tuple[float, ...]
@@ -38,15 +38,15 @@ def monochromatic(wavelength_nm: float) -> Band:
 def gauss_legendre(centre_nm: float, fraction: float = 0.2, count: int = 3) -> Band:
     """Gauss-Legendre quadrature of a band of relative width `fraction`.
 
-    Three points are right to 2e-3 of the image over 20 %, four to 2e-4 (`sam27d07_bal14`; five times better for the
-    other masks that are shipped).
+    Over 20 %, three points are accurate to 2e-3 of the image, four to 2e-4 (`sam27d07_bal14`; the error is five times
+    smaller for the other masks in the package).
     """
     points, weights = np.polynomial.legendre.leggauss(count)
     return _band(centre_nm * (1.0 + 0.5 * fraction * points), weights / weights.sum())
 
 
 def uniform(centre_nm: float, fraction: float = 0.2, count: int = 5) -> Band:
-    """Evenly spaced wavelengths with both ends, equally weighted, as in Sect. 3.3: 25 to 50 times less accurate."""
+    """Evenly spaced wavelengths including both ends, equal weights, as in Sect. 3.3: 25 to 50 times less accurate."""
     wavelengths = centre_nm * (1.0 + 0.5 * fraction * np.linspace(-1.0, 1.0, count))
     return _band(wavelengths, np.full(count, 1.0 / count))
 

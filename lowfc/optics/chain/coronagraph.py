@@ -1,7 +1,7 @@
 """The science image of a coronagraph: contrast for a given wavefront (Fig. 1).
 
-Behind a shaped pupil it is the pupil's image; a Lyot coronagraph has an opaque mask and a stop in between. Contrast is
-intensity over the peak of the star off the mask with a flat wavefront; angles are in lambda / D (see `grid`).
+A shaped pupil is imaged directly; a Lyot coronagraph has an opaque mask and a stop in between. Contrast is intensity
+over the peak intensity of the star off the mask with a flat wavefront; angles are in lambda / D (see `grid`).
 """
 
 from dataclasses import dataclass
@@ -15,12 +15,12 @@ from lowfc.optics.chain.grid import image_axis
 
 @dataclass(frozen=True)
 class Wedge:
-    """Part of the focal plane on both sides of the star; the default is the dark zone of the shipped pupil.
+    """Part of the focal plane on both sides of the star; the default is the dark zone of the package's shaped pupil.
 
     Attributes:
-        inner: Radius, in lambda / D.
-        outer: Radius, in lambda / D.
-        half_opening_deg: Angle between its edges and the x axis.
+        inner: Inner radius, in lambda / D.
+        outer: Outer radius, in lambda / D.
+        half_opening_deg: Angle between the edges and the x axis.
     """
 
     inner: float = 4.0
@@ -39,11 +39,11 @@ DARK_ZONE = Wedge()
 
 @dataclass(frozen=True, eq=False)
 class LyotStop:
-    """The elements of a Lyot coronagraph behind its pupil: opaque mask and stop.
+    """The elements of a Lyot coronagraph after its pupil: opaque mask and stop.
 
     Attributes:
-        opaque: (k, k) part of the focal plane that the mask blocks, 0 to 1; it goes to the sensor.
-        stop: (n, n) transmission in the pupil behind it.
+        opaque: (k, k) fraction that the focal-plane mask blocks, 0 to 1; this light goes to the sensor.
+        stop: (n, n) transmission of the Lyot stop in the pupil after the mask.
         samples_per: Samples of the opaque part per lambda / D.
     """
 
@@ -52,15 +52,15 @@ class LyotStop:
     samples_per: int = 8
 
     def behind(self, field: Complex) -> Complex:
-        """Field (n, n) behind the stop for one in front of the mask: that field less the blocked part (Babinet)."""
-        return np.asarray(self.stop * (field - self._taken_out(field)))
+        """Field (n, n) after the stop for a pupil field before the mask: the field minus the blocked part (Babinet)."""
+        return np.asarray(self.stop * (field - self._blocked(field)))
 
     def transposed(self, field: Complex) -> Complex:
-        """The transpose of `behind`: from behind the stop to in front of the mask."""
+        """The transpose of `behind`: from after the stop to before the mask."""
         stopped = self.stop * field
-        return np.asarray(stopped - self._taken_out(stopped.conj()).conj())
+        return np.asarray(stopped - self._blocked(stopped.conj()).conj())
 
-    def _taken_out(self, field: Complex) -> Complex:
+    def _blocked(self, field: Complex) -> Complex:
         focal = to_image(np.asarray(field, np.complex128), len(self.opaque), self.samples_per, 1.0)
         return to_pupil(focal * self.opaque, len(field), self.samples_per, 1.0)
 
@@ -70,7 +70,7 @@ class Coronagraph:
     """The optics of the science image.
 
     Attributes:
-        pupil: (n, n) amplitude transmission in front.
+        pupil: (n, n) amplitude transmission.
         dark_zone: Region in which contrast is evaluated.
         lyot: Mask and stop of a Lyot coronagraph; None for a shaped pupil alone.
     """
@@ -89,7 +89,7 @@ def contrast(
     samples_per: int = 4,
     lyot: LyotStop | None = None,
 ) -> Array:
-    """Contrast (rows, columns) in the middle of the science focal plane, on `image_axis` in either direction.
+    """Contrast (rows, columns) at the centre of the science focal plane, sampled on `image_axis` in both directions.
 
     Args:
         pupil: (n, n) amplitude transmission.
@@ -97,7 +97,7 @@ def contrast(
         wavelength_nm: The wavelength.
         columns: Samples along x.
         rows: Samples along y; as many as columns when None.
-        samples_per: Samples per lambda / D; two are enough for means, since the intensity's band is 1 D to either side.
+        samples_per: Samples per lambda / D; two suffice for means, since the intensity's band is 1 D to either side.
         lyot: Mask and stop of a Lyot coronagraph; None for a shaped pupil alone.
 
     Raises:
@@ -129,7 +129,7 @@ def mean_contrast(
     samples_per: int = 4,
     lyot: LyotStop | None = None,
 ) -> float:
-    """Mean contrast in a wedge, from the samples around it alone; arguments and shapes as for `contrast`."""
+    """Mean contrast in a wedge; arguments and shapes as for `contrast`."""
     columns, rows = _extent(wedge, samples_per)
     image = contrast(pupil, opd_nm, wavelength_nm, columns, rows, samples_per, lyot)
     return float(image[wedge_samples(wedge, columns, rows, samples_per)].mean())
@@ -144,8 +144,8 @@ def contrast_curve(
         pupil: The shaped pupil.
         opd_nm: Wavefront.
         wavelength_nm: The wavelength.
-        edges: (rings + 1,) radii between the rings, in lambda / D, each at least a sample's distance from the next.
-        wedge: Its opening alone counts.
+        edges: (rings + 1,) radii between the rings, in lambda / D, spaced by at least one sample.
+        wedge: Only its opening is used.
         samples_per: Samples per lambda / D.
     """
     whole = Wedge(0.0, float(edges[-1]), wedge.half_opening_deg)
@@ -159,6 +159,6 @@ def contrast_curve(
 
 
 def _extent(wedge: Wedge, samples_per: int) -> tuple[int, int]:
-    """Columns and rows of the smallest image about the star that holds the wedge."""
+    """Columns and rows of the smallest image centred on the star that contains the wedge."""
     height = wedge.outer * np.sin(np.deg2rad(wedge.half_opening_deg))
     return 2 * int(np.ceil(wedge.outer * samples_per)), 2 * int(np.ceil(height * samples_per))

@@ -1,4 +1,4 @@
-"""The coronagraph's focal-plane mask: the part that reflects star light to the sensor."""
+"""The coronagraph's focal-plane mask: the part that reflects starlight to the sensor."""
 
 import numpy as np
 
@@ -9,27 +9,27 @@ _FINE = 16  # subsamples of a sample, for the fraction covered by the phase spot
 
 
 def disk(samples_per: int = 8, radius: float = 4.0, inner_radius: float = 0.0) -> Array:
-    """Reflecting disk of a radius in lambda0 / D (Sect. 2.1), on the smallest square grid that holds it.
+    """Reflecting disk (Sect. 2.1) or annulus (Sect. 2.4), on the smallest square grid that contains it.
 
     Args:
         samples_per: Samples per lambda0 / D.
-        radius: In lambda0 / D.
-        inner_radius: Of the hole in its middle; the annulus of Sect. 2.4 where it is not zero.
+        radius: Radius, in lambda0 / D.
+        inner_radius: Radius of a central hole, in lambda0 / D; 0 for a disk.
     """
     r, _ = _polar(samples_per, radius)
     return np.asarray((r <= radius) & (r >= inner_radius), dtype=np.float64)
 
 
 def phase_spot(samples_per: int = 8, radius: float = 4.0, spot_diameter: float = 1.06) -> Complex:
-    """The disk with a spot in its middle that delays by a quarter of a wave: the Zernike sensor's two masks as one.
+    """The disk with a central spot that delays by a quarter of a wave: both masks of the Zernike sensor in one.
 
-    Samples on the spot's edge have the mean of both sides, as the spot is only eight samples wide. The delay is assumed
-    equal at all wavelengths, and the spot's physical size fixed.
+    Samples on the spot's edge are area-weighted means of both sides, as the spot is only eight samples wide. The phase
+    is assumed equal at all wavelengths, and the spot's physical size fixed.
 
     Args:
         samples_per: Samples per lambda0 / D.
-        radius: Of the disk, in lambda0 / D.
-        spot_diameter: In lambda0 / D.
+        radius: Radius of the disk, in lambda0 / D.
+        spot_diameter: Diameter of the spot, in lambda0 / D.
     """
     mask = disk(samples_per, radius)
     size = len(mask)
@@ -40,7 +40,7 @@ def phase_spot(samples_per: int = 8, radius: float = 4.0, spot_diameter: float =
 
 
 def bowtie(samples_per: int = 8, radius: float = 4.0, outer_radius: float = 10.0, opening_deg: float = 95.0) -> Array:
-    """The disk and a wedge above and below it out to the outer radius (Fig. 3); radii in lambda0 / D."""
+    """The disk, and wedges above and below it out to the outer radius (Fig. 3); radii in lambda0 / D."""
     r, from_vertical = _polar(samples_per, outer_radius)
     wedge = (r <= outer_radius) & (from_vertical <= np.deg2rad(opening_deg) / 2.0)
     return np.asarray((r <= radius) | wedge, dtype=np.float64)

@@ -25,9 +25,9 @@ def to_image(pupil: Complex, image_samples: int, samples_per: int, scale: float)
 
 
 def to_pupil(image: Complex, pupil_samples: int, samples_per: int, scale: float) -> Complex:
-    """Complex (pupil_samples, pupil_samples) amplitude in the pupil that follows a square focal-plane field.
+    """Complex (pupil_samples, pupil_samples) amplitude in the pupil after a square focal-plane field.
 
-    The inverse.
+    The inverse of `to_image`.
     """
     matrix = kernel(image.shape[0], samples_per, pupil_samples, scale).conj()
     return (scale / samples_per**2) * (matrix.T @ image @ matrix)

@@ -1,4 +1,4 @@
-"""Where the samples are, and the conventions that every other optics module keeps to.
+"""Sample grids, and the conventions of all optics modules.
 
 The conventions::
 
@@ -8,10 +8,10 @@ The conventions::
     kernels     pupil to focal plane exp(-2 pi i x u lambda0 / lambda), focal plane to relay pupil the conjugate (so the
                 relay pupil is upright), relay pupil to sensor the first again
     phase       2 pi OPD / lambda; wavefronts are optical path differences in nm
-    intensity   the fraction, per pixel, of the light that enters the open circular pupil, before any mask
+    intensity   the light on a pixel divided by the light that enters the open circular pupil, before any mask
 
-All samples lie at half-integer offsets, symmetric about the axis: no sample is at zero. The focal-plane mask and the
-pixels are hardware: their size in lambda0 / D does not change with the wavelength.
+All samples lie at half-integer offsets from the optical axis, symmetric about it: no sample is at zero. The focal-plane
+mask and the pixels are hardware: their size in lambda0 / D does not change with the wavelength.
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ import numpy as np
 from lowfc.arrays import Array
 
 SAMPLES = 512
-"""Across a pupil, Table 1."""
+"""Samples across a pupil, Table 1."""
 
 OPEN_AREA = np.pi / 4.0
 """Area of the open circular pupil, in squared pupil diameters."""
@@ -31,5 +31,5 @@ def pupil_axis(samples: int) -> Array:
 
 
 def image_axis(samples: int, samples_per: float) -> Array:
-    """Coordinates (samples,) across a focal plane, in lambda0 / D, with `samples_per` samples in each."""
+    """Coordinates (samples,) across a focal plane, in lambda0 / D, with `samples_per` samples per lambda0 / D."""
     return np.asarray((np.arange(samples) - (samples - 1) / 2.0) / samples_per)

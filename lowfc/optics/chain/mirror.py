@@ -1,4 +1,4 @@
-"""A deformable mirror with separable Gaussian influence functions, and how modes become its commands."""
+"""A deformable mirror with separable Gaussian influence functions, and its modes-to-actuators matrix."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,8 +11,8 @@ from lowfc.optics.chain.grid import pupil_axis
 from lowfc.optics.chain.zernike import zernikes
 
 _TIKHONOV = 1e-4
-"""Regularisation relative to the mean influence: the fit's error stays 1.2 %, and no edge actuator needs three times
-the stroke of the others, as some do at 1e-6."""
+"""Regularisation relative to the mean influence: the fit's error stays at 1.2 %; at 1e-6 some edge actuators would need
+three times the stroke of the others."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Mirror:
         rows: Actuators along y.
         columns: Actuators along x.
         pitches_per_pupil: Actuator pitches across the pupil's diameter.
-        coupling: Surface at the next actuator over that at the poked one.
+        coupling: Surface at the next actuator divided by that at the poked one.
         shift_pitches: Offset of the actuators from the centre, equal along x and y.
     """
 
@@ -51,8 +51,8 @@ def actuator_axis(mirror: Mirror, actuators: int) -> Array:
 def influence_factors(mirror: Mirror, coordinates: Array, actuators: int) -> Array:
     """One axis of the influence functions, (points, actuators); surface = y_factors actuators x_factors'.
 
-    Points must be closer than half a pitch, or the print-through of the actuators folds to low frequencies; on the
-    nodes of a twin `twin_mirror` makes up for it.
+    Points must be closer than half a pitch, or the print-through of the actuators aliases to low frequencies;
+    `twin_mirror` corrects this on the nodes of a twin.
 
     Args:
         mirror: The mirror.
@@ -72,29 +72,29 @@ def surface_nm(
 
 
 def active_actuators(mirror: Mirror) -> Mask:
-    """Which actuators (rows, columns) are driven: those in the pupil and one ring round it."""
+    """Mask (rows, columns) of the actuators that are driven: those in the pupil and one ring around it."""
     y = actuator_axis(mirror, mirror.rows)
     x = actuator_axis(mirror, mirror.columns)
     return np.asarray(np.hypot(y[:, None], x) <= 0.5 + 1.5 / mirror.pitches_per_pupil)
 
 
 def modes_to_actuators(mirror: Mirror, nolls: Sequence[int], usable: Mask | None = None) -> Array:
-    """Commands that make Zernike wavefronts: nm of surface at the actuators per nm rms of wavefront.
+    """Modes-to-actuators matrix (M2C) of Zernike modes: nm of surface at the actuators per nm rms of wavefront.
 
-    A regularised least-squares fit over the circle. It contains the 1/2 of reflection: the wavefront is twice
+    A regularised least-squares fit over the circle. It includes the 1/2 of reflection: the wavefront is twice
     the surface.
 
     Args:
         mirror: The mirror.
         nolls: Noll indices.
-        usable: (rows, columns) actuators that may be commanded; all when None. The others stay at zero, and their
-            neighbours compensate as far as possible.
+        usable: (rows, columns) mask of actuators that may be commanded; all when None. The others stay at zero, and
+            their neighbours compensate as far as possible.
 
     Returns:
         (rows times columns, modes); inactive actuators are exactly zero.
 
     Raises:
-        ValueError: too few actuators are left for so many modes.
+        ValueError: Fewer usable actuators than modes.
     """
     import scipy.linalg  # slow to import, and most processes load a stored result
 
@@ -121,5 +121,5 @@ def modes_to_actuators(mirror: Mirror, nolls: Sequence[int], usable: Mask | None
 
 
 def _products(factors: Array) -> Array:
-    """Products (points, actuators squared) of every two factors at each point."""
+    """Products (points, actuators squared) of every pair of factors at each point."""
     return np.asarray((factors[:, :, None] * factors[:, None, :]).reshape(len(factors), -1))

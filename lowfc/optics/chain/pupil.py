@@ -1,4 +1,4 @@
-"""Pupils: the open circle, the masks that apodise it for a coronagraph, and a circle with a bar for the relay."""
+"""Pupils: the open circle, apodised pupils for coronagraphs, and a circle with a bar for the relay."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,8 +18,8 @@ def with_bar(samples: int, width: float, angle_deg: float) -> Array:
 
     Args:
         samples: Points across the diameter.
-        width: Of the bar, in pupil diameters.
-        angle_deg: Of the bar, from the x axis towards y.
+        width: Width of the bar, in pupil diameters.
+        angle_deg: Angle of the bar, from the x axis towards y.
     """
     u, angle = pupil_axis(samples), np.deg2rad(angle_deg)
     along = u * np.cos(angle) + u[:, None] * np.sin(angle)
@@ -30,14 +30,14 @@ def with_bar(samples: int, width: float, angle_deg: float) -> Array:
 def prolate(samples: int, mask_radius: float) -> Array:
     """Apodised pupil (samples, samples) of an apodised-pupil Lyot coronagraph, 1 at its centre.
 
-    The circular prolate function: of all pupils it puts the most of its light within the focal-plane mask.
+    The circular prolate function: of all pupils it concentrates the most light within the focal-plane mask.
 
     Args:
         samples: Points across the diameter.
-        mask_radius: Of the focal-plane mask, in lambda0 / D.
+        mask_radius: Radius of the focal-plane mask, in lambda0 / D.
 
     Raises:
-        ValueError: The mask has no size.
+        ValueError: The radius is not positive.
     """
     if not mask_radius > 0:
         raise ValueError(f"the focal-plane mask must have a radius, got {mask_radius} lambda0 / D")
@@ -58,8 +58,8 @@ def prolate(samples: int, mask_radius: float) -> Array:
 
 
 def _within(r: Array, rho: Array, radius: float) -> Array:
-    """Integral of x J0(2 pi r x) J0(2 pi rho x) from 0 to the radius, for all pairs: through the mask and back."""
-    from scipy.special import j0, j1  # takes a quarter of a second, and most processes load what was built
+    """Kernel pupil to mask to pupil: integral of x J0(2 pi r x) J0(2 pi rho x) from 0 to the radius, for all pairs."""
+    from scipy.special import j0, j1  # its import takes a quarter of a second; most processes load a stored result
 
     a, b = 2.0 * np.pi * r[:, None], 2.0 * np.pi * rho[None, :]
     gap = a**2 - b**2
@@ -77,8 +77,8 @@ def from_quarter(quarter: ArrayLike, samples: int) -> Array:
         samples: Points across the diameter, a multiple of twice the number of cells.
 
     Raises:
-        ValueError: The quadrant is not real and square, is outside 0..1, lets nothing through, or does not divide
-            `samples`.
+        ValueError: The quadrant is not real and square, has values outside 0..1 or no light, or `samples` is not a
+            multiple of twice its cells.
     """
     given = np.asarray(quarter)
     if given.dtype.kind not in "buif":

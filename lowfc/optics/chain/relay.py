@@ -1,4 +1,4 @@
-"""The optics between the focal-plane mask and the detector, in which the sensors differ."""
+"""The optics between the focal-plane mask and the detector, which distinguish the sensors."""
 
 from dataclasses import dataclass
 
@@ -11,10 +11,10 @@ from lowfc.optics.chain.grid import image_axis
 
 @dataclass(frozen=True, eq=False)
 class ApertureMask:
-    """A mask in the relay pupil and a focus behind it: sparse (Sect. 2.2), with a radial bar, or open (Sect. 4).
+    """A mask in the relay pupil, then a focus: sparse aperture (Sect. 2.2), radial bar, or open (Sect. 4).
 
     Attributes:
-        transmission: (n, n), sampled like the pupil.
+        transmission: (n, n) amplitude transmission, sampled like the pupil.
     """
 
     transmission: Array
@@ -25,7 +25,7 @@ class Defocus:
     """No relay pupil, and the detector out of focus: the coronagraphic low-order wavefront sensor (Sect. 2.4).
 
     Attributes:
-        distance: From the image of the focal-plane mask, in (lambda0/D)^2: see `fresnel_distance`.
+        distance: Distance from the image of the focal-plane mask, in (lambda0/D)^2; see `fresnel_distance`.
     """
 
     distance: float
@@ -37,10 +37,10 @@ class Defocus:
 
 @dataclass(frozen=True)
 class PupilImage:
-    """The relay pupil itself on the detector: the Zernike wavefront sensor, whose phase spot is in the focal mask.
+    """The relay pupil imaged on the detector: the Zernike wavefront sensor, whose phase spot is in the focal mask.
 
     Attributes:
-        width: Of the square image, in pupil diameters.
+        width: Width of the square image, in pupil diameters.
     """
 
     width: float = 1.1
@@ -61,18 +61,18 @@ def fresnel_distance(defocus_mm: float, focal_ratio: float, wavelength_nm: float
 def least_distance(reach: float, samples_per: int) -> float:
     """Shortest distance of a `Defocus` whose chirp the samples resolve, in (lambda0/D)^2.
 
-    The sum over the focal plane repeats itself where chirp and field together turn by a wave from sample to sample.
+    The sum over the focal plane aliases where the phase of chirp times field advances by a wave per sample.
 
     Args:
-        reach: From the edge of the detector to the far edge of the focal-plane mask, in lambda0 / D.
+        reach: Distance from the edge of the detector to the far edge of the focal-plane mask, in lambda0 / D.
         samples_per: Samples per lambda0 / D.
     """
-    spare = 2.0  # half a cycle for the pupil's light, the rest for the short end of a wide band
+    spare = 2.0  # margin, cycles: half for the bandwidth of the pupil's light, the rest for short wavelengths
     return reach / (samples_per - spare)
 
 
 def pitch(relay: Relay, samples: int, samples_per: int) -> float:
-    """Distance between the samples on the detector, in lambda0 / D; in D where it sees the pupil."""
+    """Spacing of the samples on the detector, in lambda0 / D; in D for a `PupilImage`."""
     return relay.width / samples if isinstance(relay, PupilImage) else 1.0 / samples_per
 
 
@@ -81,18 +81,18 @@ def direct_kernel(
 ) -> Complex:
     """Kernel (samples, focal_samples) of one axis from the focal-plane mask to the detector; conserves energy.
 
-    Eq. (13)'s Fresnel integral, exp(i pi (x' - x)^2 scale / distance), sampled exactly as long as the chirp is
-    resolved; or the transform to the relay pupil.
+    For a `Defocus`, the Fresnel integral of eq. (13), exp(i pi (x' - x)^2 scale / distance), exact as long as the chirp
+    is resolved; for a `PupilImage`, the transform to the relay pupil.
 
     Args:
-        relay: The optics between them.
-        samples: Across the detector.
-        focal_samples: Across the focal-plane mask.
+        relay: The optics between mask and detector.
+        samples: Samples across the detector.
+        focal_samples: Samples across the focal-plane mask.
         samples_per: Samples per lambda0 / D in the focal plane.
         scale: lambda0 / lambda.
     """
     if isinstance(relay, PupilImage):
-        # The pupil's samples are spaced by the width over their number, not by 1 / samples as `kernel` has them.
+        # The pupil's samples are spaced by width / samples, not by 1 / samples as in `kernel`.
         stretch = scale * relay.width
         return np.asarray(np.sqrt(scale) / samples_per * kernel(focal_samples, samples_per, samples, stretch).conj().T)
     x = image_axis(focal_samples, samples_per)
@@ -101,12 +101,12 @@ def direct_kernel(
 
 
 def half_band(relay: Relay, width: float, mask_radius: float, scale: float) -> float:
-    """Half of the band of the field on the detector, in cycles per unit of its axis.
+    """Half of the bandwidth of the field on the detector, in cycles per unit of its axis.
 
     Args:
         relay: The optics before the detector.
-        width: Of the detector, in its unit.
-        mask_radius: Of the focal-plane mask, in lambda0 / D.
+        width: Width of the detector, in the unit of its axis.
+        mask_radius: Radius of the focal-plane mask, in lambda0 / D.
         scale: lambda0 / lambda.
     """
     match relay:
@@ -115,6 +115,6 @@ def half_band(relay: Relay, width: float, mask_radius: float, scale: float) -> f
         case PupilImage():
             return scale * mask_radius
         case Defocus():
-            # A frequency moves light by distance times frequency; more than this leaves the detector.
+            # A spatial frequency displaces light by distance times frequency; beyond this it misses the detector.
             distance = relay.distance / scale
             return (width / 2.0 + mask_radius + float(np.sqrt(distance))) / distance

@@ -16,7 +16,7 @@ class Layout:
     Attributes:
         name: Name of the layout.
         purpose: What it was designed for, in one line.
-        holes: Each (x, y, diameter): the centre from the pupil's centre, all in pupil diameters.
+        holes: Centre relative to the pupil's centre and diameter (x, y, diameter) of each hole, in pupil diameters.
     """
 
     name: str
@@ -30,7 +30,7 @@ def equal_holes(centres: Sequence[Sequence[float]], diameter: float) -> tuple[tu
 
 
 def check(layout: Layout) -> None:
-    """Raise ValueError unless every hole lies inside the pupil and none overlaps another."""
+    """Raise ValueError if a hole reaches outside the pupil or overlaps another."""
     if not layout.holes:
         raise ValueError(f"{layout.name}: a sparse aperture mask needs at least one hole")
     holes = np.array(layout.holes, dtype=np.float64)
@@ -68,7 +68,7 @@ def separations(centres: Array) -> Array:
 
 
 def is_even_symmetric(layout: Layout) -> bool:
-    """Whether every hole has its mirror image through the centre; such a mask cannot sense focus or astigmatism."""
+    """Whether every hole has a counterpart opposite the centre; such a mask cannot sense focus or astigmatism."""
     holes = np.array(layout.holes, dtype=np.float64)
     mirrored = holes * np.array([-1.0, -1.0, 1.0])
     distances = np.linalg.norm(holes[:, None] - mirrored, axis=2)
@@ -80,8 +80,8 @@ def transmission(layout: Layout, samples: int, points: int = 1) -> Array:
 
     Args:
         layout: The holes.
-        samples: Across the pupil.
-        points: Points evaluated across a sample, in either direction; 1 is its centre alone.
+        samples: Samples across the pupil.
+        points: Points evaluated across a sample in each direction; 1 for its centre only.
     """
     u = pupil_axis(samples * points)
     mask = np.zeros((samples * points, samples * points), np.bool_)

@@ -1,4 +1,4 @@
-"""The science image of a wavefront known by its modes, fast enough for a live view: `coronagraph.contrast` prepared."""
+"""Science images of modal wavefronts, fast enough for a live view: `coronagraph.contrast` with prepared kernels."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,20 +13,20 @@ from lowfc.optics.chain.grid import pupil_axis
 from lowfc.optics.chain.zernike import zernikes
 
 SingleComplex = npt.NDArray[np.complex64]
-_LYOT_SQUARE = 4
+_LYOT_SQUARE = 4  # pupil samples across a cell
 
 
 class ScienceCamera:
     """Contrast of a coronagraph, in single precision, from modal wavefronts.
 
-    The field is summed over the open samples of the pupil alone. Where the pupil's samples come in equal squares of two
-    by two, as those of the shipped one do, a square has the wavefront of its middle; its kernel stays exact. Those of a
-    Lyot coronagraph are averaged in squares of four by four.
+    The field is summed over the open samples of the pupil only. If the pupil consists of equal 2 x 2 squares of
+    samples, as the package's shaped pupil does, the wavefront is evaluated at the centre of each square; the kernel
+    stays exact. The pupil of a Lyot coronagraph is averaged over squares of 4 x 4.
 
     Attributes:
-        samples: across the square image.
-        samples_per: of them in each lambda / D; where they are says `grid.image_axis`.
-        wavelength_nm: of the light.
+        samples: Samples across the square image, at the positions of `grid.image_axis`.
+        samples_per: Samples per lambda / D.
+        wavelength_nm: The wavelength.
     """
 
     def __init__(
@@ -44,12 +44,12 @@ class ScienceCamera:
             pupil: (n, n) amplitude transmission.
             noll: Noll index of each mode.
             wavelength_nm: The wavelength.
-            half_width: Of the image, in lambda / D.
+            half_width: Half of the image's width, in lambda / D.
             samples_per: Samples per lambda / D.
             lyot: Mask and stop of a Lyot coronagraph; None for a shaped pupil alone.
 
         Raises:
-            ValueError: The pupil is not square or lets no light through, or there are no modes.
+            ValueError: The pupil is not square or transmits no light, or there are no modes.
         """
         if pupil.ndim != 2 or pupil.shape[0] != pupil.shape[1] or not pupil.any():
             raise ValueError(f"a pupil must be square and let light through, got shape {pupil.shape}")
@@ -80,7 +80,7 @@ class ScienceCamera:
         """Contrast (samples, samples) with a wavefront (modes,) in nm rms of each mode.
 
         Raises:
-            ValueError: The wavefront has another number of modes.
+            ValueError: The wavefront has the wrong number of modes.
         """
         modes = len(self._phase_per_nm)
         if modes_nm.shape != (modes,):
@@ -93,7 +93,7 @@ class ScienceCamera:
         return np.asarray(field.real**2 + field.imag**2)
 
     def mean_contrast(self, image: Single, wedge: Wedge) -> float:
-        """Mean of an image's samples (rows, columns) in a wedge, those of `coronagraph.mean_contrast`.
+        """Mean of an image (rows, columns) over the samples in a wedge, as in `coronagraph.mean_contrast`.
 
         Raises:
             ValueError: The wedge reaches beyond the image.
@@ -111,10 +111,10 @@ class _Lyot:
     """A `LyotStop` for cells (rows, columns) of several samples, in single precision.
 
     Attributes:
-        to_y, to_x: (k, rows) and (columns, k) from the cells to the opaque part.
-        back_y, back_x: (rows, k) and (k, columns) from there.
-        opaque: (k, k).
-        stop: (rows, columns).
+        to_y, to_x: (k, rows) and (columns, k) kernels from the cells to the opaque part.
+        back_y, back_x: (rows, k) and (k, columns) kernels from the opaque part to the stop.
+        opaque: (k, k) fraction that the mask blocks.
+        stop: (rows, columns) transmission.
     """
 
     to_y: SingleComplex
@@ -134,8 +134,8 @@ class _Lyot:
         return cls(y, x.T, back_y.T, back_x, lyot.opaque.astype(np.float32), stop)
 
     def behind(self, field: SingleComplex) -> SingleComplex:
-        taken_out = self.back_y @ (self.opaque * (self.to_y @ field @ self.to_x)) @ self.back_x
-        return np.asarray(self.stop * (field - taken_out))
+        blocked = self.back_y @ (self.opaque * (self.to_y @ field @ self.to_x)) @ self.back_x
+        return np.asarray(self.stop * (field - blocked))
 
 
 def _averaged(pupil: Array, square: int) -> Array:
@@ -145,7 +145,7 @@ def _averaged(pupil: Array, square: int) -> Array:
 
 
 def _in_squares(pupil: Array) -> bool:
-    """Whether the samples are the same in every square of two by two."""
+    """Whether the samples within every 2 x 2 square are equal."""
     if len(pupil) % 2:
         return False
     squares = pupil.reshape(len(pupil) // 2, 2, len(pupil) // 2, 2)

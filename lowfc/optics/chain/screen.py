@@ -1,24 +1,24 @@
-"""Phase screens with the power spectrum of Kolmogorov's turbulence (Sect. 3.2)."""
+"""Phase screens with the power spectrum of Kolmogorov turbulence (Sect. 3.2)."""
 
 import numpy as np
 import scipy.fft
 
 from lowfc.arrays import Array
 
-_SPECTRUM = 0.0229  # of the phase, rad^2 per (cycle per D)^2 at one cycle per D, where Fried's length is D
+_SPECTRUM = 0.0229  # power spectrum of the phase at one cycle per D for r0 = D, rad^2 per (cycle per D)^2
 
 
 def kolmogorov(rng: np.random.Generator, samples: int, width: int = 4) -> Array:
-    """Screen (samples, samples) of power law -11/3, at the samples of a pupil, in radians for a Fried length of D.
+    """Screen (samples, samples) with spectrum f^-11/3, at the samples of a pupil, in radians for r0 = D.
 
-    It is cut out of a periodic one, which holds no wave longer than itself. What it lacks is tilt: over a circle that
-    has 0.90 rad^2 of the 1.03 rad^2 of an endless screen (Noll 1976), but about 0.3 rad^2 here at a width of 4 and 0.04
-    at a width of 1. The orders above tilt are nearly whole at a width of 4.
+    It is cut out of a periodic screen, which contains no wave longer than its width, so that it lacks tilt: over a
+    circle, tilt has 0.90 rad^2 of the 1.03 rad^2 of an infinite screen (Noll 1976), but about 0.3 rad^2 here at a width
+    of 4 and 0.04 at a width of 1. At a width of 4 the orders above tilt are nearly complete.
 
     Args:
-        rng: Source of all randomness.
+        rng: Generator of all random numbers.
         samples: Points across the pupil.
-        width: Of the periodic screen, in pupil diameters.
+        width: Width of the periodic screen, in pupil diameters.
 
     Raises:
         ValueError: The periodic screen would be narrower than the pupil.

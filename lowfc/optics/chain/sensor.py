@@ -18,7 +18,7 @@ class Sensor:
 
     Attributes:
         pupil: (n, n) amplitude transmission of the coronagraph's pupil.
-        focal_mask: (k, k) the part of the focal plane that goes to the sensor, k even, centred; complex where it
+        focal_mask: (k, k) amplitude reflectivity of the focal-plane mask to the sensor, k even, centred; complex if it
             delays light, as the spot of a Zernike sensor does.
         relay: The optics between the focal-plane mask and the detector.
         wavelength_nm: The central wavelength, lambda0.
@@ -63,18 +63,18 @@ class Sensor:
 
     @property
     def pitch(self) -> float:
-        """Distance between them, in lambda0 / D; in D where the detector sees the pupil."""
+        """Spacing of the detector samples, in lambda0 / D; in D for a `PupilImage`."""
         return pitch(self.relay, self.samples, self.samples_per)
 
 
 @dataclass(frozen=True)
 class LightBudget:
-    """Throughput of each element, as a fraction of the light that reached it, and `total` and `peak`.
+    """Throughput of each element, as a fraction of the light that reaches it, and `total` and `peak`.
 
     Attributes:
-        pupil: Fraction of the open circle's light that the shaped pupil transmits.
-        focal_mask: Fraction of that which the focal-plane mask sends to the sensor.
-        relay_mask: Fraction of that which passes a mask in the relay pupil.
+        pupil: Fraction of the open circle's light that the pupil mask transmits.
+        focal_mask: Fraction of the light after the pupil that the focal-plane mask reflects to the sensor.
+        relay_mask: Fraction of the light on a relay-pupil mask that it transmits; 1 without such a mask.
         sensor: Fraction of the light on the relay mask that falls on the pixels.
         total: Fraction of the open circle's light that falls on the pixels.
         peak: Fraction of the light on the pixels that falls on the brightest.
@@ -100,13 +100,13 @@ def propagate(
     wavelength_nm: float,
     focal_mask: NDArray[np.inexact] | None = None,
 ) -> Complex:
-    """Field at the sensor's samples, eqs. (4) to (6) or (13), of a field (n, n) that has passed the pupil's mask.
+    """Field at the sensor's samples, eqs. (4) to (6) or (13), for a field (n, n) after the pupil mask.
 
     Args:
         sensor: The optics.
-        pupil_field: The field.
-        wavelength_nm: Its wavelength.
-        focal_mask: Instead of the sensor's own.
+        pupil_field: The field after the pupil mask.
+        wavelength_nm: The wavelength.
+        focal_mask: Replaces the sensor's focal-plane mask if given.
     """
     mask = sensor.focal_mask if focal_mask is None else focal_mask
     scale = sensor.wavelength_nm / wavelength_nm
@@ -115,7 +115,7 @@ def propagate(
 
 
 def from_focus(sensor: Sensor, focal: Complex, wavelength_nm: float) -> Complex:
-    """Field at the sensor's samples of a field (k, k) that has passed the focal-plane mask."""
+    """Field at the sensor's samples for a field (k, k) after the focal-plane mask."""
     size, relay, scale = focal.shape[0], sensor.relay, sensor.wavelength_nm / wavelength_nm
     if isinstance(relay, ApertureMask):
         in_relay = to_pupil(focal, sensor.pupil.shape[0], sensor.samples_per, scale)
@@ -125,7 +125,7 @@ def from_focus(sensor: Sensor, focal: Complex, wavelength_nm: float) -> Complex:
 
 
 def field(sensor: Sensor, opd_nm: NDArray[np.floating], wavelength_nm: float | None = None) -> Complex:
-    """Field at the sensor's samples for a wavefront (n, n) in nm, with exp(i phi) and not its expansion.
+    """Field at the sensor's samples for a wavefront (n, n) in nm, from the full exp(i phi), not its expansion.
 
     Args:
         sensor: The optics.
@@ -142,7 +142,7 @@ def field(sensor: Sensor, opd_nm: NDArray[np.floating], wavelength_nm: float | N
 
 
 def image(sensor: Sensor, opd_nm: NDArray[np.floating], band: Band | None = None) -> Array:
-    """Image (pixels, pixels), fraction per pixel of the light entering the open circular pupil.
+    """Image (pixels, pixels): the light on each pixel divided by the light entering the open circular pupil.
 
     Args:
         sensor: The optics.
@@ -169,7 +169,7 @@ def response(sensor: Sensor, basis: NDArray[np.floating], band: Band | None = No
 
     Args:
         sensor: The optics.
-        basis: Modes (modes, n, n), unit rms where a is to be nm rms.
+        basis: Modes (modes, n, n), with unit rms for a in nm rms.
         band: The central wavelength alone when None.
     """
     band = monochromatic(sensor.wavelength_nm) if band is None else band
@@ -186,8 +186,8 @@ def response(sensor: Sensor, basis: NDArray[np.floating], band: Band | None = No
 def shear_response(sensor: Sensor, band: Band | None = None) -> Array:
     """dI/ds (pixels squared, 2), in the units of `image` per pupil diameter of shear of the beam along x and y.
 
-    A shift of the beam in the pupil is a ramp of phase on the focal plane, where -2 pi i x of the field is its slope.
-    It is a nuisance parameter: beam wander on the relay mask mimics a wavefront error.
+    A shift of the beam in the pupil is a phase ramp in the focal plane: the derivative of the field is -2 pi i x times
+    the field. Shear is a nuisance parameter: beam wander on the relay mask mimics a wavefront error.
 
     Args:
         sensor: The optics.
@@ -228,6 +228,6 @@ def light_budget(sensor: Sensor) -> LightBudget:
 
 
 def pixel_sums(sensor: Sensor, intensity: Array) -> Array:
-    """Pixels (pixels, pixels) of an intensity (samples, samples), as a fraction of the light in the open circle."""
+    """Sums (pixels, pixels) of an intensity (samples, samples), as fractions of the light in the open circle."""
     shape = (sensor.pixels, sensor.binning, sensor.pixels, sensor.binning)
     return np.asarray(intensity.reshape(shape).sum(axis=(1, 3))) * (sensor.pitch**2 / OPEN_AREA)

@@ -1,4 +1,4 @@
-"""Zernike polynomials in Noll's order, of unit rms over the unit circle."""
+"""Zernike polynomials in Noll order, with unit rms over the unit circle."""
 
 from collections.abc import Sequence
 from math import factorial, sqrt
@@ -46,7 +46,7 @@ def mode_name(noll: int) -> str:
 
 
 def mode_group(noll: int) -> str:
-    """The name without the mode's direction: "coma" of both."""
+    """The name without the mode's direction: "coma" for both comas."""
     name = mode_name(noll)
     return name.rsplit(" ", 1)[0] if name.endswith((" x", " y", " 0", " 45")) and noll <= len(_NAMES) else name
 
@@ -66,7 +66,7 @@ def noll_to_nm(noll: int) -> tuple[int, int]:
 
 
 def zernike(noll: int, x: ArrayLike, y: ArrayLike) -> Array:
-    """One polynomial at (x, y) in pupil radii; outside the circle the polynomial simply continues."""
+    """One polynomial at (x, y) in pupil radii, not cut off outside the circle."""
     x = np.asarray(x, dtype=np.float64)
     y = np.asarray(y, dtype=np.float64)
     n, signed_m = noll_to_nm(noll)

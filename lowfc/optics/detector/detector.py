@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lowfc.arrays import Pixels, Single
-from lowfc.optics.detector.detector_noise_table import FAINT_E, PixelLaws, draw, pixel_laws
+from lowfc.optics.detector.detector_noise_table import FAINT_E, NoiseTable, draw, noise_table
 
 
 @dataclass(frozen=True)
@@ -16,14 +16,14 @@ class Detector:
 
     Attributes:
         gain_e_per_dn: Electrons per digital number.
-        read_noise_e: Rms of the output amplifier, in electrons; behind the multiplication register if there is one.
-        bias_dn: Digital number of no electrons.
-        full_well_e: Charge at which the output stops growing, behind the multiplication register if there is one.
-        bit_depth: Of the converter, at most 16.
-        em_gain: Mean gain of the multiplication register; 1 is a detector without one.
-        clock_induced_charge_e: Mean spurious electrons per pixel and frame, ahead of the register.
-        exact: Draw every pixel's electrons from the Poisson law itself; else faint ones come from a table of what
-            they end as, in a third of the time: see `expose`.
+        read_noise_e: Rms noise of the output amplifier, electrons; after the multiplication register if there is one.
+        bias_dn: Digital number of zero electrons.
+        full_well_e: Charge at which the output saturates; after the multiplication register if there is one.
+        bit_depth: Bits of the converter, at most 16.
+        em_gain: Mean gain of the multiplication register; 1 for a detector without one.
+        clock_induced_charge_e: Mean spurious electrons per pixel and frame, before the register.
+        exact: Draw the electrons of every pixel from the Poisson distribution. If False, faint pixels are drawn from
+            a precomputed table, in a third of the time; see `expose`.
     """
 
     gain_e_per_dn: float = 1.0
@@ -53,7 +53,7 @@ class Detector:
 
 
 def saturation_dn(detector: Detector) -> int:
-    """The largest value a pixel can have: full well or the converter's range, whichever comes first."""
+    """Largest value of a pixel: full well or the end of the converter's range, whichever is lower."""
     full_well_dn = detector.bias_dn + detector.full_well_e / detector.gain_e_per_dn
     return int(min(np.rint(full_well_dn), 2**detector.bit_depth - 1))
 
@@ -61,20 +61,20 @@ def saturation_dn(detector: Detector) -> int:
 def expose(detector: Detector, electrons: NDArray[np.floating], rng: np.random.Generator) -> Pixels:
     """One frame (rows, columns) in DN.
 
-    Electrons are drawn from the Poisson law. Multiplication draws from the gamma law of a long register, whose
-    excess noise doubles the variance of the photons.
+    Electrons are drawn from the Poisson distribution. Multiplication draws from the gamma distribution of a long
+    register, whose excess noise doubles the variance of the photons.
 
-    Unless the detector is `exact`, pixels below `FAINT_E` electrons are drawn from the law of their digital number. It
-    is exact at multiples of 1/64 electron; between these the mean is exact and the variance too large by at most
-    6e-5 electrons squared, which the chi-square test of a million draws does not see.
+    Unless the detector is `exact`, pixels below `FAINT_E` electrons are drawn from a table of the distribution of their
+    digital number. It is exact at multiples of 1/64 electron; between these the mean is exact and the variance too
+    large by at most 6e-5 electrons squared, which a chi-square test of a million draws does not detect.
 
     Args:
-        detector: The camera.
-        electrons: (rows, columns) mean photo-electrons in the exposure; rounding below zero counts as none.
-        rng: Source of all randomness, with words of 64 random bits, as all of numpy's but MT19937 have.
+        detector: The detector.
+        electrons: (rows, columns) mean photo-electrons in the exposure; negative values count as zero.
+        rng: Generator of all random numbers; its raw words must have 64 random bits, as all of numpy's but MT19937.
 
     Raises:
-        ValueError: An expected number of electrons is not a finite number.
+        ValueError: A mean number of electrons is not finite.
     """
     mean = np.asarray(electrons, np.float32).ravel()
     if detector.clock_induced_charge_e:
@@ -82,26 +82,26 @@ def expose(detector: Detector, electrons: NDArray[np.floating], rng: np.random.G
     brightest_e = float(mean.max(initial=0))
     if not brightest_e < np.inf:
         raise ValueError(f"the electrons expected in a pixel must be a finite number, got {brightest_e}")
-    laws = laws_of(detector)
-    if laws is None:
-        return _expose_one_by_one(detector, mean, rng).reshape(electrons.shape)
-    frame = draw(laws, mean, rng)
+    table = noise_table_of(detector)
+    if table is None:
+        return _expose_exactly(detector, mean, rng).reshape(electrons.shape)
+    frame = draw(table, mean, rng)
     if brightest_e >= FAINT_E:
         bright = np.flatnonzero(mean >= FAINT_E)
-        frame[bright] = _expose_one_by_one(detector, mean[bright], rng)
+        frame[bright] = _expose_exactly(detector, mean[bright], rng)
     return frame.reshape(electrons.shape)
 
 
 @lru_cache(maxsize=4)
-def laws_of(detector: Detector) -> PixelLaws | None:
-    """The table that `expose` draws from, made once; None where it draws every electron."""
+def noise_table_of(detector: Detector) -> NoiseTable | None:
+    """The table from which `expose` draws faint pixels, cached; None if all are drawn step by step."""
     if detector.exact or detector.em_gain > 1.0:
         return None
-    return pixel_laws(detector.gain_e_per_dn, detector.read_noise_e, detector.bias_dn, saturation_dn(detector))
+    return noise_table(detector.gain_e_per_dn, detector.read_noise_e, detector.bias_dn, saturation_dn(detector))
 
 
-def _expose_one_by_one(detector: Detector, mean_e: Single, rng: np.random.Generator) -> Pixels:
-    """Pixels (pixels,) in DN: electrons, multiplication, read noise and rounding after each other."""
+def _expose_exactly(detector: Detector, mean_e: Single, rng: np.random.Generator) -> Pixels:
+    """Pixels (pixels,) in DN, step by step: electrons, multiplication, read noise, rounding."""
     charge = rng.poisson(np.maximum(mean_e, 0)).astype(np.float32)
     if detector.em_gain > 1.0:
         charge = rng.standard_gamma(charge, dtype=np.float32)

@@ -1,9 +1,9 @@
-"""What a faint pixel says, as a table: digital numbers drawn with a few passes over the image, photon and read noise.
+"""Fast draws of a faint pixel's digital number (photon noise, read noise, rounding) from a precomputed table.
 
-For a pixel that expects m electrons, the law of its digital number is known: Poisson, then Gaussian, then rounded. The
-table has this law for a grid of m, each as a row of equally likely numbers (Marsaglia, Tsang and Wang 2004); what of a
-probability is left over beyond whole places is drawn apart, from a place that says so. A pixel between two levels takes
-one of them by chance, so that its mean is right.
+The distribution of the digital number for a mean of m electrons is known: Poisson, plus Gaussian, rounded. The table
+has a row for each m of a grid, with 1024 equally likely entries (Marsaglia, Tsang and Wang 2004). Probability that is
+not a multiple of 1/1024 is drawn separately: entries marked `_APART` select it. A mean between two grid values is
+rounded at random to one of them, so that the mean of the draws is exact.
 """
 
 from dataclasses import dataclass
@@ -13,38 +13,43 @@ import numpy as np
 from lowfc.arrays import Pixels, Single
 
 FAINT_E = 24.0
-"""Only pixels that expect less are drawn from the table."""
+"""Pixels with a mean below this, electrons, are drawn from the table."""
 STEP_E = 1 / 64
-"""Between levels. By chance between two, the variance is too large by at most STEP_E^2 / 4 = 6e-5 e-^2."""
+"""Spacing of the tabulated means, electrons; random rounding to a neighbour adds a variance of at most STEP_E^2 / 4."""
 
-_PLACES_BITS = 10
-_PLACES = 1 << _PLACES_BITS
-_CHANCE_BITS = 16  # of taking the upper level
-_MOST_E = 64  # below 24 e-, more come once in 1e11 frames of a pixel
-_TAIL = 8.0  # standard deviations of read noise
-_WIDEST = 256
-_LEAST_NOISE_DN = 0.05
-_APART = 65535  # not a digital number of a law: those below saturation only
+_ENTRIES_BITS = 10
+_ENTRIES = 1 << _ENTRIES_BITS
+_CHANCE_BITS = 16  # resolution of the probability of rounding up
+_MOST_E = 64  # tabulated electrons; at a mean of 24 e- a pixel exceeds it once in 1e11 frames
+_TAIL = 8.0  # tabulated range of the read noise, standard deviations
+_WIDEST = 256  # largest range of digital numbers that is tabulated
+_LEAST_NOISE_DN = 0.05  # with less read noise the table does not resolve the rounding
+_APART = 65535  # never a tabulated digital number, since those are below saturation
 
 
 @dataclass(frozen=True, eq=False)
-class PixelLaws:
-    """Laws of the digital number at the means 0, STEP_E, ... FAINT_E.
+class NoiseTable:
+    """Distributions of the digital number at the means 0, STEP_E, ... FAINT_E (levels).
 
     Attributes:
-        places: (levels, places) digital numbers, all equally likely; `_APART` where `rest` decides.
-        rest: (levels, numbers) cumulative probability of what is left over.
-        first_dn: The number that the first column of `rest` stands for.
+        entries: (levels, entries) digital numbers, all equally likely; `_APART` where `rest` decides.
+        rest: (levels, numbers) cumulative distribution of the probability that is not a multiple of 1/1024.
+        first_dn: Digital number of the first column of `rest`.
     """
 
-    places: Pixels
+    entries: Pixels
     rest: Single
     first_dn: int
 
 
-def pixel_laws(gain_e_per_dn: float, read_noise_e: float, bias_dn: float, saturation_dn: int) -> PixelLaws | None:
-    """Laws for a detector without multiplication; None where rounding or saturation calls for more than a table."""
-    from scipy.special import ndtr  # takes a quarter of a second; of the processes only the camera needs it
+def noise_table(gain_e_per_dn: float, read_noise_e: float, bias_dn: float, saturation_dn: int) -> NoiseTable | None:
+    """Table for a detector without multiplication.
+
+    Returns:
+        None if the read noise is below 0.05 DN, or the range of digital numbers reaches below zero or up to saturation
+        or has more than 256 numbers.
+    """
+    from scipy.special import ndtr  # its import takes a quarter of a second; only the camera process needs it
 
     noise_dn = read_noise_e / gain_e_per_dn
     first = int(np.floor(bias_dn - _TAIL * noise_dn))
@@ -55,24 +60,24 @@ def pixel_laws(gain_e_per_dn: float, read_noise_e: float, bias_dn: float, satura
     electrons = np.arange(_MOST_E)
     poisson = np.cumprod(np.hstack([np.exp(-mean), mean / electrons[1:]]), axis=1)  # P(k) = P(k - 1) mean / k
     edges = np.arange(first, last + 2) - 0.5 - bias_dn
-    law = poisson @ np.diff(ndtr((edges - electrons[:, None] / gain_e_per_dn) / noise_dn), axis=1)
-    law *= _PLACES / law.sum(axis=1, keepdims=True)
-    whole = np.floor(law).astype(np.intp)
+    probability = poisson @ np.diff(ndtr((edges - electrons[:, None] / gain_e_per_dn) / noise_dn), axis=1)
+    probability *= _ENTRIES / probability.sum(axis=1, keepdims=True)  # in units of one entry
+    whole = np.floor(probability).astype(np.intp)
     numbers = np.arange(first, last + 1, dtype=np.uint16)
-    places = np.full((len(law), _PLACES), _APART, np.uint16)
-    for row, counts in zip(places, whole, strict=True):
+    entries = np.full((len(probability), _ENTRIES), _APART, np.uint16)
+    for row, counts in zip(entries, whole, strict=True):
         row[: counts.sum()] = np.repeat(numbers, counts)
-    left = np.cumsum(law - whole, axis=1)
-    return PixelLaws(places, (left / left[:, -1:]).astype(np.float32), first)
+    rest = np.cumsum(probability - whole, axis=1)
+    return NoiseTable(entries, (rest / rest[:, -1:]).astype(np.float32), first)
 
 
-def draw(laws: PixelLaws, mean_e: Single, rng: np.random.Generator) -> Pixels:
-    """Digital numbers (pixels,) of pixels that expect so many electrons each; of one above FAINT_E, as if of FAINT_E.
+def draw(table: NoiseTable, mean_e: Single, rng: np.random.Generator) -> Pixels:
+    """Digital numbers (pixels,) of pixels with these mean electrons.
 
     Args:
-        laws: Of the detector.
-        mean_e: (pixels,); below zero counts as none.
-        rng: Source of all randomness, with words of 64 random bits, as all of numpy's but MT19937 have.
+        table: The detector's table.
+        mean_e: (pixels,) mean electrons, clipped to 0 ... FAINT_E.
+        rng: Generator of all random numbers; its raw words must have 64 random bits, as all of numpy's but MT19937.
     """
     words = rng.bit_generator.random_raw((mean_e.size + 1) // 2).view(np.uint32)[: mean_e.size]
     level = mean_e * np.float32((1 << _CHANCE_BITS) / STEP_E)
@@ -80,11 +85,11 @@ def draw(laws: PixelLaws, mean_e: Single, rng: np.random.Generator) -> Pixels:
     np.minimum(level, np.float32((1 << _CHANCE_BITS) * FAINT_E / STEP_E), out=level)
     place = level.astype(np.int32)
     place += words.view(np.int32) & ((1 << _CHANCE_BITS) - 1)
-    place >>= _CHANCE_BITS - _PLACES_BITS
-    words >>= 32 - _PLACES_BITS
-    place ^= words.view(np.int32)  # what is left of the chance is made independent of it
-    drawn = laws.places.ravel().take(place)
+    place >>= _CHANCE_BITS - _ENTRIES_BITS
+    words >>= 32 - _ENTRIES_BITS
+    place ^= words.view(np.int32)  # the low bits depend on the rounding above: XOR with fresh bits
+    drawn = table.entries.ravel().take(place)
     apart = np.flatnonzero(drawn == _APART)
-    rest = laws.rest.take(place.take(apart) >> _PLACES_BITS, axis=0)
-    drawn[apart] = laws.first_dn + (rest > rng.random((apart.size, 1), np.float32)).argmax(axis=1)
+    rest = table.rest.take(place.take(apart) >> _ENTRIES_BITS, axis=0)
+    drawn[apart] = table.first_dn + (rest > rng.random((apart.size, 1), np.float32)).argmax(axis=1)
     return drawn

@@ -15,10 +15,10 @@ class Photometry:
     """A star, a telescope and the losses before the first mask; the defaults are those of Sect. 3.3.
 
     Attributes:
-        magnitude: Of the star, in V.
-        diameter_m: Of the open circular pupil.
+        magnitude: V magnitude of the star.
+        diameter_m: Diameter of the open circular pupil.
         bandwidth_nm: Width of the passband.
-        throughput: Of all optics before the shaped pupil.
+        throughput: Throughput of all optics before the shaped pupil.
         quantum_efficiency: Electrons per photon.
     """
 
@@ -41,7 +41,7 @@ class Photometry:
 
 
 def electrons(photometry: Photometry, exposure_s: float) -> float:
-    """Electrons per exposure of all light through the open circle: an image times this is in electrons."""
+    """Electrons per exposure of all light through the open circle: the factor from an image to electrons."""
     area_m2 = np.pi / 4.0 * photometry.diameter_m**2
     flux = PHOTONS_PER_S_M2_NM * 10.0 ** (-0.4 * photometry.magnitude)
     collected = flux * area_m2 * photometry.bandwidth_nm * exposure_s
@@ -49,5 +49,5 @@ def electrons(photometry: Photometry, exposure_s: float) -> float:
 
 
 def tilt_nm_per_mas(diameter_m: float) -> float:
-    """Wavefront tilt in nm rms over the circle for 1 mas on the sky: 2.424 nm for 2 m (a quarter of peak to valley)."""
+    """Tilt of 1 mas on the sky in nm rms of wavefront over the circle (1/4 of peak to valley): 2.424 nm for 2 m."""
     return float(_RADIANS_PER_MAS * diameter_m * 1e9 / 4.0)

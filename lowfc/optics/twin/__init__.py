@@ -1,1 +1,1 @@
-"""The compressed optical model: as exact as the full chain, and fast enough for the loop."""
+"""The digital twin: a compressed optical model, as accurate as the full chain and fast enough for the loop."""

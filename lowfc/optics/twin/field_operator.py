@@ -1,10 +1,10 @@
-"""The optics at one wavelength as a real matrix, from products of functions on the pupil to where modes are chosen.
+"""The optics at one wavelength as a real matrix, from separable functions in the pupil to the plane of the modes.
 
-The focal-plane mask is symmetric about both axes, so that focal samples may be paired into cosines and sines. With an
-aperture mask in the relay pupil, the operator from pupil to relay pupil is then real; on the sensor the prolate
-functions of either parity turn the last kernel into a real matrix times 1 (even) or -i (odd), so that the whole
-operator is a real matrix with known phases. Without one, the relay loses nothing and is a product of two axes: the real
-operator ends at the focal plane, and what is left of the way is applied to the few modes that are kept.
+The focal-plane mask is symmetric about both axes, so that pairs of focal samples become cosines and sines. With an
+aperture mask in the relay pupil, the operator from pupil to relay pupil is then real; on the sensor, prolate functions
+of even or odd parity turn the last kernel into a real matrix times 1 (even) or -i (odd), so that the whole operator is
+a real matrix with known phases. Without an aperture mask, the relay is lossless and separable: the real operator ends
+at the focal plane, and the rest of the path is applied only to the retained modes.
 """
 
 from collections.abc import Callable, Iterator
@@ -18,52 +18,52 @@ from lowfc.optics.chain.sensor import Sensor
 
 Matrix = Array | Complex
 
-_WIDEST = 0.49  # cycles per sample: the samples hold no more than half
+_WIDEST = 0.49  # half bandwidth, cycles per sample; Nyquist is 0.5
 
 
 def prolates(samples: int, half_band: float, count: int) -> Array:
     """Discrete prolate sequences (samples, count), even and odd in turn, orthonormal.
 
     Args:
-        samples: Of the axis.
-        half_band: Half of the band, in cycles per sample.
-        count: How many, the best concentrated first.
+        samples: Samples of the axis.
+        half_band: Half of the bandwidth, in cycles per sample.
+        count: Number of functions, the best concentrated first.
     """
-    import scipy.linalg  # takes its time, and most processes load what was built
+    import scipy.linalg  # slow to import, and most processes load a stored result
 
     index = np.arange(samples)
     diagonal = ((samples - 1) / 2.0 - index) ** 2 * np.cos(2.0 * np.pi * half_band)
     off_diagonal = index[1:] * (samples - index[1:]) / 2.0
     if count > samples:
-        raise ValueError(f"{count} prolate functions were asked for, the sensor has {samples} samples")
+        raise ValueError(f"{count} prolate functions need as many sensor samples, got {samples}")
     _, vectors = scipy.linalg.eigh_tridiagonal(
         diagonal, off_diagonal, select="i", select_range=(samples - count, samples - 1)
     )
-    signs = np.sign(vectors[samples // 2])  # LAPACK leaves the sign open; the same functions must come from each
+    signs = np.sign(vectors[samples // 2])  # LAPACK does not define the sign; fix it for reproducible functions
     return np.ascontiguousarray((vectors * signs)[:, ::-1])
 
 
 def sensor_functions(sensor: Sensor, scale: float, guards: int) -> Array:
-    """Prolate functions (sensor samples, functions) that hold the field at a wavelength.
+    """Prolate functions (sensor samples, functions) that represent the field at a wavelength.
 
     Args:
         sensor: The optics.
         scale: lambda0 / lambda.
-        guards: Functions beyond the number that the field's band and the sensor's width call for.
+        guards: Number of functions in addition to the bandwidth times the width of the sensor.
     """
     band = _half_band(sensor, scale)
     return prolates(sensor.samples, band, min(int(np.ceil(2.0 * band * sensor.samples)) + guards, sensor.samples))
 
 
 def intensity_functions(sensor: Sensor, scale: float, guards: int) -> Array:
-    """Prolate functions (sensor samples, functions) that hold the intensity, whose band is twice the field's."""
+    """Prolate functions (sensor samples, functions) that represent the intensity, whose band is twice the field's."""
     band = min(2.0 * _half_band(sensor, scale), _WIDEST)
     count = 2 * (int(np.ceil(band * sensor.samples)) + guards)
     return prolates(sensor.samples, band, min(count, sensor.samples))
 
 
 def phases(sensor: Sensor, count: int) -> Complex:
-    """Factor of each of the functions on the sensor: an aperture mask multiplies the odd ones by -i."""
+    """Phase factor of each function on the sensor: -i for odd functions behind an aperture mask, otherwise 1."""
     odd = -1j if isinstance(sensor.relay, ApertureMask) else 1.0
     return np.resize(np.array([1.0, odd], dtype=np.complex128), count)
 
@@ -79,17 +79,17 @@ def field_operator(
 ) -> Array:
     """Real matrix (rows, wanted) from amplitudes of separable functions in the pupil.
 
-    Its rows are coefficients of the functions on the sensor where there is an aperture mask, and samples of the focal
-    plane within its mask, in cosines and sines, where there is none; `on_sensor` takes either to the sensor.
+    With an aperture mask, its rows are coefficients of the functions on the sensor. Without, they are the cosine and
+    sine amplitudes of the focal plane within its mask. `on_sensor` propagates either to the sensor.
 
     Args:
         sensor: The optics.
         scale: lambda0 / lambda.
         functions: (sensor samples, functions) from `sensor_functions`.
-        y_factors: (n, p) the functions' factors along y at the pupil's samples.
-        x_factors: (n, q) along x.
-        wanted: Indices of the wanted products in the flattened (p, q).
-        advance: Called after each of the k / 2 steps, k the samples across the focal-plane mask.
+        y_factors: (n, p) factors of the functions along y at the pupil's samples.
+        x_factors: (n, q) factors along x.
+        wanted: Flat indices (p, q) of the products to compute.
+        advance: Called after each of k / 2 steps, where k is the number of samples across the focal-plane mask.
     """
     samples = sensor.pupil.shape[0]
     unit = scale * sensor.pitch / (samples**2 * np.sqrt(OPEN_AREA))
@@ -117,11 +117,11 @@ def _focal_rows(
     wanted: Whole,
     advance: Callable[[], None],
 ) -> Iterator[tuple[int, int, Whole, Array]]:
-    """Amplitudes on the focal plane row by row, from amplitudes in the pupil; arguments as for `field_operator`.
+    """Focal-plane amplitudes row by row, for amplitudes in the pupil; arguments as for `field_operator`.
 
     Yields:
-        Parity and index of the row, the columns within the mask, and the amplitudes (2 columns, wanted) there, of
-        either parity along x.
+        Parity and index of the row, the columns within the mask, and the amplitudes (2 columns, wanted) there, even
+        and odd along x.
     """
     samples, half = sensor.pupil.shape[0], waves.shape[1]
     entering = (x_factors.T[:, None, None] * waves).transpose(3, 1, 2, 0).reshape(samples, -1)
@@ -136,10 +136,10 @@ def _focal_rows(
 
 
 def on_sensor(sensor: Sensor, scale: float, functions: Array, modes: Array) -> Matrix:
-    """Coefficients (functions squared, modes) on the sensor of modes (rows, modes), rows as `field_operator` has them.
+    """Coefficients (functions squared, modes) on the sensor of modes (rows, modes), with the rows of `field_operator`.
 
-    The field at the sensor is F Y F', F the functions times `phases` and Y these coefficients, in the units of an
-    image's square root.
+    The field at the sensor is F Y F', where F is the functions times `phases` and Y these coefficients, in units of
+    the square root of an image.
     """
     if isinstance(sensor.relay, ApertureMask):
         return modes
@@ -164,7 +164,7 @@ def on_sensor(sensor: Sensor, scale: float, functions: Array, modes: Array) -> M
 def _waves(sensor: Sensor, scale: float) -> Array:
     """Cosines and sines (parity, k / 2, n) of the focal samples on the positive half axis.
 
-    The root of 2 makes each stand for the pair of samples that it replaces.
+    Each is scaled by sqrt(2), as it replaces a pair of samples.
     """
     half = sensor.focal_mask.shape[0] // 2
     x = image_axis(2 * half, sensor.samples_per)[half:]
@@ -173,7 +173,7 @@ def _waves(sensor: Sensor, scale: float) -> Array:
 
 
 def _kernels(sensor: Sensor, scale: float, functions: Array) -> Array:
-    """From the relay pupil to the functions on the sensor (functions, n), with half of both transforms' factors."""
+    """Kernel (functions, n) from the relay pupil to the functions on the sensor, with the factors of one axis."""
     samples = sensor.pupil.shape[0]
     angles = 2.0 * np.pi * scale * np.outer(image_axis(sensor.samples, sensor.samples_per), pupil_axis(samples))
     kernels = functions.T @ np.cos(angles)
@@ -182,7 +182,7 @@ def _kernels(sensor: Sensor, scale: float, functions: Array) -> Array:
 
 
 def _half_band(sensor: Sensor, scale: float) -> float:
-    """Half of the band of the field, in cycles per sample of the sensor."""
+    """Half of the bandwidth of the field, in cycles per sample of the sensor."""
     radius = sensor.focal_mask.shape[0] / (2.0 * sensor.samples_per)
     band = half_band(sensor.relay, sensor.samples * sensor.pitch, radius, scale)
     return min(band * sensor.pitch, _WIDEST)

@@ -1,4 +1,4 @@
-"""The regular grid of pupil nodes on which the twin knows a wavefront, and interpolation from it."""
+"""The regular grid of pupil nodes on which the twin represents a wavefront, and interpolation from it."""
 
 import numpy as np
 
@@ -7,11 +7,11 @@ from lowfc.optics.chain.grid import pupil_axis
 
 
 def node_axis(nodes: int, order: int) -> Array:
-    """Coordinates of the nodes along one axis, in pupil diameters: `nodes` across the pupil and order/2 guards outside.
+    """Coordinates of the nodes along one axis, in pupil diameters: `nodes` across the pupil, order/2 guards each side.
 
     Args:
-        nodes: Across the diameter; the spacing is 1 / nodes.
-        order: Points of the interpolation, even, so that every stencil is centred.
+        nodes: Number of nodes across the diameter; the spacing is 1 / nodes.
+        order: Points of the interpolation stencil, even, so that every stencil is centred.
 
     Raises:
         ValueError: The order is odd or below 2.

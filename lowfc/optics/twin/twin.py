@@ -1,11 +1,11 @@
-"""The real-time twin: the optics compressed to a few small matrices, and their evaluation.
+"""The digital twin: the optics compressed to a few small matrices, and their evaluation.
 
 At each wavelength the field at the sensor is linear in exp(i phi) at the pupil nodes, and both ends are band-limited:
 
     exp(i phi) --to_modes--> modes --to_coefficients--> coefficients of prolate functions --basis--> field at points
 
-The intensity is band-limited to twice the field's band, so it is evaluated at few points of each axis, and the pixels
-are two small products: `image = to_pixels |E|^2 to_pixels'`. `twin_build` makes the matrices from a `Sensor`.
+The intensity is band-limited to twice the field's band, so it is evaluated at few points of each axis. Two small
+products give the pixels: `image = to_pixels |E|^2 to_pixels'`. `twin_build` computes the matrices from a `Sensor`.
 """
 
 from dataclasses import dataclass
@@ -19,16 +19,16 @@ from lowfc.arrays import Array, Complex, Single, Whole
 
 @dataclass(frozen=True)
 class TwinSpec:
-    """How far the optics are compressed; the default is right to 1e-4 of the image for every sensor that has a name.
+    """Degree of compression; the default is accurate to 1e-4 of the image for every named sensor.
 
-    Other combinations of pupil, focal-plane mask and relay have been seen at up to 5e-4.
+    For other combinations of pupil, focal-plane mask and relay, errors of up to 5e-4 were found.
 
     Attributes:
         nodes: Pupil nodes across the diameter.
         order: Points of the interpolation from the nodes, even.
-        rank: Modes of the operator that are kept for a focal-plane mask as large as the disk of 4 lambda0 / D and an
-            aperture mask behind it; it grows with another mask's area, and is a third more without an aperture mask.
-        guards: Prolate functions along each axis of the sensor beyond what its width and the field's band call for.
+        rank: Retained modes of the operator for a focal-plane mask with the area of a disk of radius 4 lambda0 / D and
+            an aperture mask. It increases with the area of the mask, and by a third without an aperture mask.
+        guards: Prolate functions along each axis in addition to the field's bandwidth times the sensor's width.
     """
 
     nodes: int = 32
@@ -47,12 +47,12 @@ class Operator:
 
     Attributes:
         wavelength_nm: The wavelength.
-        weight: Of this wavelength's image in the band's.
-        modes: (rows, rank) orthonormal; what `field_operator` ends at, from which the modes were chosen.
-        to_modes: (rank, used) real; amplitudes of the modes from exp(i phi) at the used nodes. The units of the image
-            are in it.
-        to_coefficients: (functions squared, rank) real with an aperture mask, else complex.
-        basis: (points, functions) complex: prolate functions at the points, each with its phase, a power of i.
+        weight: Weight of this wavelength in the image of the band.
+        modes: (rows, rank) orthonormal modes, in the rows of `field_operator`.
+        to_modes: (rank, used) real matrix from exp(i phi) at the used nodes to amplitudes of the modes. It includes the
+            units of the image.
+        to_coefficients: (functions squared, rank) matrix to coefficients; real with an aperture mask, else complex.
+        basis: (points, functions) complex: prolate functions at the points, each times its phase, a power of i.
     """
 
     wavelength_nm: float
@@ -68,13 +68,13 @@ class Twin:
     """A compressed sensor.
 
     Attributes:
-        spec: How far.
+        spec: Degree of compression.
         axis: Coordinates of the nodes along one axis, with guards, in pupil diameters.
-        used: Indices of the nodes that matter in the flattened square grid of the axis (rows = y, columns = x).
+        used: Flat indices of the used nodes in the square grid of the axis (rows = y, columns = x).
         area_weights: (used,) weights of sum 1 for means over the open pupil (transmission above 0.5, unweighted).
-        operators: One for each wavelength.
-        to_pixels: (pixels, points) from intensities at the points of an axis to pixels.
-        operator_hash: Hexadecimal digest of everything the twin was made from.
+        operators: One operator for each wavelength.
+        to_pixels: (pixels, points) matrix from intensities at the points of an axis to pixels.
+        operator_hash: Hexadecimal digest of all inputs of the build.
     """
 
     spec: TwinSpec
@@ -96,15 +96,15 @@ def wavefront_rms_nm(twin: Twin, opd_nm: NDArray[np.floating]) -> float:
     """Rms of a wavefront (used,) over the open pupil, piston removed."""
     mean = float(twin.area_weights @ opd_nm)
     variance = float(twin.area_weights @ (opd_nm * opd_nm)) - mean**2
-    return sqrt(max(variance, 0.0))  # a few weights are negative: those of the interpolation's guard nodes
+    return sqrt(max(variance, 0.0))  # guard nodes of the interpolation have weights below zero
 
 
 def reference(twin: Twin, opd_nm: Array | None = None) -> Array:
-    """I0 (pixels, pixels) in float64: fraction per pixel of the light entering the open circle.
+    """I0 (pixels, pixels) in float64: the light on each pixel divided by the light entering the open circle.
 
     Args:
         twin: The twin.
-        opd_nm: The wavefront (used,) that is the zero point; flat when None.
+        opd_nm: Reference wavefront (used,); flat when None.
     """
     images = [each.weight * np.abs(_field(each, _phasor(twin, each, opd_nm))) ** 2 for each in twin.operators]
     return np.asarray(twin.to_pixels @ np.sum(images, axis=0) @ twin.to_pixels.T)
@@ -113,12 +113,12 @@ def reference(twin: Twin, opd_nm: Array | None = None) -> Array:
 def response(twin: Twin, basis: NDArray[np.floating], opd_nm: Array | None = None) -> Array:
     """H = dI/da (pixels squared, modes) in float64, per nm: 2 (2 pi / lambda) Re{E0 conj(i E_k)}, eq. (12) times 2.
 
-    At a wavefront phi that is not flat, both E0 and E_k are fields of exp(i phi) times what they are of at a flat one.
+    For a reference wavefront phi that is not flat, the pupil fields of E0 and E_k are multiplied by exp(i phi).
 
     Args:
         twin: The twin.
-        basis: Modes (modes, used) at the used nodes, of unit rms where a is to be nm rms.
-        opd_nm: The wavefront (used,) that is the zero point; flat when None.
+        basis: Modes (modes, used) at the used nodes, with unit rms for a in nm rms.
+        opd_nm: Reference wavefront (used,); flat when None.
 
     Raises:
         ValueError: The modes are not at the used nodes.
@@ -127,36 +127,36 @@ def response(twin: Twin, basis: NDArray[np.floating], opd_nm: Array | None = Non
         raise ValueError(f"modes must be (modes, {twin.used.size}) values at the used nodes, got {basis.shape}")
     H = np.zeros((twin.to_pixels.shape[0] ** 2, len(basis)))
     for operator in twin.operators:
-        at = _phasor(twin, operator, opd_nm)
-        E0 = _field(operator, at)
+        phasor = _phasor(twin, operator, opd_nm)
+        E0 = _field(operator, phasor)
         for k, mode in enumerate(basis):
             slope = (
                 operator.weight
                 * (4.0 * np.pi / operator.wavelength_nm)
-                * (E0 * np.conj(1j * _field(operator, at * mode))).real
+                * (E0 * np.conj(1j * _field(operator, phasor * mode))).real
             )
             H[:, k] += (twin.to_pixels @ slope @ twin.to_pixels.T).ravel()
     return H
 
 
 def _phasor(twin: Twin, operator: Operator, opd_nm: Array | None) -> Array | Complex:
-    """exp(i phi) (used,) of a wavefront in nm; real where that is flat."""
+    """exp(i phi) (used,) of a wavefront in nm; real ones for None."""
     if opd_nm is None:
         return np.ones(twin.used.size)
     return np.asarray(np.exp((2j * np.pi / operator.wavelength_nm) * opd_nm))
 
 
 def _field(operator: Operator, nodes: Array | Complex) -> Complex:
-    """Field (points, points) of values (used,) at the nodes."""
+    """Field (points, points) for values (used,) at the nodes."""
     functions = operator.basis.shape[1]
     coefficients = (operator.to_coefficients @ (operator.to_modes @ nodes)).reshape(functions, functions)
     return np.asarray(operator.basis @ coefficients @ operator.basis.T)
 
 
 class Evaluator:
-    """Makes images with a twin in float32, in buffers of its own: use one for each thread.
+    """Computes images with a twin in float32, in its own buffers: use one for each thread.
 
-    Rounding leaves values down to about -1e-7 of the brightest pixel where there is no light.
+    Rounding leaves values down to about -1e-7 of the brightest pixel in dark pixels.
     """
 
     def __init__(self, twin: Twin) -> None:
@@ -172,7 +172,7 @@ class Evaluator:
         self._image = np.empty((pixels, pixels), np.float32)
 
     def image(self, opd_nm: Single) -> Single:
-        """Image (pixels, pixels) of a wavefront (used,) in nm, fraction per pixel of the open circle's light.
+        """Image (pixels, pixels) for a wavefront (used,) in nm, as fractions of the open circle's light.
 
         The array is overwritten by the next call.
 
@@ -184,7 +184,7 @@ class Evaluator:
         self._intensity.fill(0.0)
         for stage in self._stages:
             np.multiply(opd_nm, stage.wavenumber, out=self._phase)
-            # The flat wavefront's field is added later, from float64: less is lost in the sums over the nodes.
+            # The flat wavefront's field is added later, computed in float64: smaller rounding errors in the sums.
             np.cos(self._phase, out=self._phasor[:, 0])
             np.subtract(self._phasor[:, 0], 1.0, out=self._phasor[:, 0])
             np.sin(self._phase, out=self._phasor[:, 1])
@@ -202,17 +202,17 @@ class _Stage:
         to_modes = np.sqrt(operator.weight) * operator.to_modes
         self._to_modes = to_modes.astype(np.float32)
         self._flat_modes = to_modes.sum(axis=1).astype(np.float32)
-        # A real matrix takes the two columns of real and imaginary parts, a complex one the numbers that they make.
+        # A real matrix multiplies the columns of real and imaginary parts, a complex one the complex numbers.
         self._unit = np.dtype(np.complex64 if np.iscomplexobj(operator.to_coefficients) else np.float32)
         self._to_coefficients = np.ascontiguousarray(operator.to_coefficients, self._unit)
         self._modes = np.empty((len(self._to_modes), 2), np.float32)
         self._pairs = np.empty((functions**2, 2), np.float32)
         basis, phases = _real_basis(operator.basis)
-        turned = np.outer(phases, phases).ravel()
-        # Times a power of i, the parts of a coefficient change places, signs or both.
+        factors = np.outer(phases, phases).ravel()
+        # Multiplication by a power of i swaps the parts of a coefficient, changes their signs, or both.
         places = np.arange(2 * functions**2).reshape(-1, 2)
-        self._places = np.where(np.abs(turned.imag) > 0.5, places.T[::-1], places.T)
-        signs = np.where(np.abs(turned.imag) > 0.5, (-turned.imag, turned.imag), turned.real)
+        self._places = np.where(np.abs(factors.imag) > 0.5, places.T[::-1], places.T)
+        signs = np.where(np.abs(factors.imag) > 0.5, (-factors.imag, factors.imag), factors.real)
         self._signs = signs.astype(np.float32)
         self._coefficients = np.empty(self._signs.shape, np.float32)
         self._basis = basis.astype(np.float32)
@@ -227,7 +227,7 @@ class _Stage:
         np.matmul(self._to_coefficients, self._modes.view(self._unit), out=self._pairs.view(self._unit))
         np.take(self._pairs, self._places, out=self._coefficients, mode="clip")
         self._coefficients *= self._signs
-        # Real and imaginary parts side by side: the functions are real.
+        # The functions are real: multiply real and imaginary parts side by side.
         functions, points = self._basis_transposed.shape
         np.matmul(self._coefficients.reshape(-1, functions), self._basis_transposed, out=self._half)
         np.matmul(self._basis, self._half.reshape(2, functions, points), out=self._field)
@@ -237,7 +237,7 @@ class _Stage:
 
 
 def _real_basis(basis: Complex) -> tuple[Array, Complex]:
-    """A basis (points, functions) without its phases, and these (functions,): powers of i."""
+    """Split a basis (points, functions) into real functions and their phases (functions,), powers of i."""
     largest = basis[np.abs(basis).argmax(axis=0), np.arange(basis.shape[1])]
     phases = np.where(np.abs(largest.imag) > np.abs(largest.real), 1j, 1.0 + 0j)
     return np.asarray((basis / phases).real), phases

@@ -1,4 +1,4 @@
-"""Compression of a sensor's optics to a twin: all in float64, as products of matrices."""
+"""Compression of a sensor's optics to a twin, in float64."""
 
 import itertools
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from lowfc.optics.twin.field_operator import field_operator, intensity_functions
 from lowfc.optics.twin.nodes import interpolation, node_axis
 from lowfc.optics.twin.twin import Operator, Twin, TwinSpec
 
-_DISK_AREA = np.pi * 4.0**2  # of the focal-plane mask that `TwinSpec.rank` is given for
+_DISK_AREA = np.pi * 4.0**2  # area of the focal-plane mask to which `TwinSpec.rank` refers, (lambda0 / D)^2
 
 
 def build(
@@ -27,10 +27,10 @@ def build(
 
     Args:
         sensor: The optics; the focal-plane mask must be symmetric about both axes.
-        spec: How far.
-        band: The central wavelength alone when None.
-        operator_hash: Digest of the three above, see `twin_store`.
-        progress: Called with the steps done and the steps in all.
+        spec: Degree of compression.
+        band: The passband; the central wavelength alone when None.
+        operator_hash: Digest of sensor, spec and band, see `twin_store`.
+        progress: Called with the number of steps done and the total.
 
     Raises:
         ValueError: The mask is not symmetric, or the specification cannot be met.
@@ -48,9 +48,9 @@ def build(
     area_weights = _adjoint(to_samples, sensor.pupil > 0.5).ravel()[used]
     points, to_pixels = _intensity_sampling(sensor, spec, max(scales))
     area = np.count_nonzero(mask) / sensor.samples_per**2
-    # Two thirds of the modes are the light's freedom, which goes by the mask's area; the others are for its edge.
-    # An aperture mask blurs what the faintest modes add; without one it takes a third more of them.
-    # A pupil that is bright up to its edge fills the faintest of them, a tenth more.
+    # Two thirds of the modes are degrees of freedom of the light, proportional to the mask's area; a third is for its
+    # edge. An aperture mask blurs the contribution of the faintest modes; without one, a third more modes are needed.
+    # A pupil that is bright up to its edge excites the faintest modes: a tenth more.
     needed = spec.rank if isinstance(sensor.relay, ApertureMask) else 4 * spec.rank / 3
     if sensor.pupil.mean() > 0.5:
         needed *= 1.1
@@ -66,14 +66,14 @@ def build(
     for scale, weight in zip(scales, band.weights, strict=True):
         functions = sensor_functions(sensor, scale, spec.guards)
         matrix = field_operator(sensor, scale, functions, to_samples, to_samples, used, advance)
-        kept = _leading_modes(matrix, rank)
+        modes = _leading_modes(matrix, rank)
         operators.append(
             Operator(
                 wavelength_nm=sensor.wavelength_nm / scale,
                 weight=weight,
-                modes=kept,
-                to_modes=kept.T @ matrix,
-                to_coefficients=on_sensor(sensor, scale, functions, kept),
+                modes=modes,
+                to_modes=modes.T @ matrix,
+                to_coefficients=on_sensor(sensor, scale, functions, modes),
                 basis=functions[points] * phases(sensor, functions.shape[1]),
             )
         )
@@ -81,16 +81,16 @@ def build(
 
 
 def _adjoint(to_samples: Array, weights: Mask) -> Array:
-    """Weights on the square grid of nodes that do what weights on the pupil's samples do to interpolated values."""
+    """Weights on the square grid of nodes equivalent to weights on interpolated values at the pupil's samples."""
     return np.asarray(to_samples.T @ weights.astype(np.float64) @ to_samples)
 
 
 def _intensity_sampling(sensor: Sensor, spec: TwinSpec, scale: float) -> tuple[Whole, Array]:
-    """Choose the sensor samples at which intensities are evaluated, and the matrix from them to pixels.
+    """Choose the sensor samples at which intensities are evaluated, and compute the matrix from them to pixels.
 
-    Intensities fill twice the field's band; the samples are picked by pivoted QR of that band's prolate functions.
+    Intensities have twice the field's bandwidth; a pivoted QR of that band's prolate functions selects the samples.
     """
-    import scipy.linalg  # takes its time, and most processes load what was built
+    import scipy.linalg  # slow to import, and most processes load a stored result
 
     functions = intensity_functions(sensor, scale, spec.guards)
     _, _, pivots = scipy.linalg.qr(functions.T, mode="economic", pivoting=True)
@@ -100,9 +100,9 @@ def _intensity_sampling(sensor: Sensor, spec: TwinSpec, scale: float) -> tuple[W
 
 
 def _leading_modes(matrix: Array, rank: int) -> Array:
-    """Orthonormal (rows, rank): the left singular vectors of the largest singular values.
+    """Left singular vectors (rows, rank) of the largest singular values.
 
-    They come from the smaller of the matrix's two squares, which costs precision only below 1e-8 of the largest value.
+    They are eigenvectors of the smaller of M M' and M' M, which loses precision only below 1e-8 of the largest value.
     """
     import scipy.linalg
 

@@ -1,8 +1,9 @@
 """A deformable mirror on the twin's nodes: its wavefront in microseconds.
 
-Nodes are too coarse for the print-through of the actuators: sampled there, it would fold to low orders, and in truth
-the shaped pupil's fine structure mixes some of it back into them. The nodes therefore carry the surface's least-squares
-fit, and a small correction makes the field at the sensor, to first order, the one that the full surface gives.
+The nodes are too coarse for the print-through of the actuators: sampled there, it would alias to low orders, while in
+the full optics the shaped pupil's fine structure mixes some of it into them. The nodes therefore carry a least-squares
+fit of the surface, and a small correction makes the field at the sensor equal to that of the full surface, to first
+order.
 """
 
 from dataclasses import dataclass
@@ -18,8 +19,8 @@ from lowfc.optics.twin.field_operator import field_operator, sensor_functions
 from lowfc.optics.twin.nodes import interpolation
 from lowfc.optics.twin.twin import Twin
 
-_LEAST_WEIGHT = 0.01  # of the largest; leaves alone the guard nodes that hardly any of the pupil depends on
-_SMALLEST_SINGULAR_VALUE = 0.01  # of the largest; the correction's error stops falling there
+_LEAST_WEIGHT = 0.01  # of the largest; excludes guard nodes that hardly affect the pupil
+_SMALLEST_SINGULAR_VALUE = 0.01  # of the largest; smaller ones do not reduce the correction's error
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,10 +29,10 @@ class TwinMirror:
 
     Attributes:
         used: The twin's used nodes.
-        y_factors: (axis, rows) influence functions along y, fitted by values at the nodes.
-        x_factors: (axis, columns) along x.
-        reduce: (few, rows times columns) what that leaves out, seen through the sensor.
-        expand: (used, few) the smooth surface that gives the same.
+        y_factors: (axis, rows) influence functions along y, fitted at the nodes.
+        x_factors: (axis, columns) influence functions along x, fitted at the nodes.
+        reduce: (few, rows times columns) effect at the sensor of the surface that the fit omits.
+        expand: (used, few) smooth surface with the same effect at the sensor.
     """
 
     used: Whole
@@ -42,7 +43,7 @@ class TwinMirror:
 
 
 def twin_mirror(sensor: Sensor, twin: Twin, mirror: Mirror) -> TwinMirror:
-    """Fit a mirror to a twin; the correction is exact at the wavelength in the middle of the band.
+    """Fit a mirror to a twin; the correction is computed at the middle wavelength of the band.
 
     Args:
         sensor: The optics that the twin was built from.
@@ -69,7 +70,7 @@ def twin_mirror(sensor: Sensor, twin: Twin, mirror: Mirror) -> TwinMirror:
         y_factors=y_factors.astype(np.float32),
         x_factors=x_factors.astype(np.float32),
         reduce=missing.astype(np.float32),
-        expand=right[kept].astype(np.float32).T,  # so ordered, its product takes half the time
+        expand=right[kept].astype(np.float32).T,  # column-major: its product takes half the time
     )
 
 
@@ -77,7 +78,7 @@ def wavefront_nm(mirror: TwinMirror, actuators_nm: NDArray[np.floating]) -> Sing
     """Wavefront (used,) at the twin's nodes: twice the surface.
 
     Args:
-        mirror: From `twin_mirror`.
+        mirror: Matrices of `twin_mirror`.
         actuators_nm: (rows, columns) nm of surface.
     """
     twice = np.multiply(actuators_nm, np.float32(2.0), dtype=np.float32)

@@ -18,7 +18,7 @@ from lowfc.control.laws.tuning import (
 )
 from lowfc.control.laws.vibration import Model
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
-from sim_camera.disturbance import disturbance, modes_nm
+from sim_camera.disturbance import modes_nm, preset_disturbance
 from sim_camera.driver import disturbance_of
 from tests.support.theory import integrators, noise_transfer, realised, rejection, run
 from tools import laws
@@ -31,7 +31,7 @@ NONE = np.zeros(2)
 
 def wheel(frames: int, seed: int = 1, noise_nm: float = 0.8) -> tuple[Pieces, np.ndarray]:
     """Pseudo-open-loop tilts of the reaction wheel, and the true tilts."""
-    truth = modes_nm(disturbance("reaction-wheel", NOLL, seed, NM_PER_MAS, 550.0), 0, frames, RATE_HZ)
+    truth = modes_nm(preset_disturbance("reaction-wheel", NOLL, seed, NM_PER_MAS, 550.0), 0, frames, RATE_HZ)
     noise = noise_nm * np.random.default_rng(seed).standard_normal(truth.shape)
     return Pieces((truth + noise,), 0), truth
 

@@ -14,7 +14,7 @@ from lowfc.control.laws.spectra import Pieces
 from lowfc.control.laws.tuning import predicted_nm
 from lowfc.control.laws.vibration import FEWEST, Line, Model, identify, resolution_hz
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
-from sim_camera.disturbance import LINES_HZ, disturbance, modes_nm
+from sim_camera.disturbance import LINES_HZ, modes_nm, preset_disturbance
 from tests.support.theory import realised, run
 
 RATE_HZ = 1000.0
@@ -23,7 +23,7 @@ NM_PER_MAS = tilt_nm_per_mas(2.0)
 
 def preset(name: str, frames: int, seed: int = 1, noise_nm: float = 0.8) -> Pieces:
     """Tip of a preset, measured with white noise."""
-    simulated = disturbance(name, (2, 3, 4), seed, NM_PER_MAS, 550.0)
+    simulated = preset_disturbance(name, (2, 3, 4), seed, NM_PER_MAS, 550.0)
     noise = noise_nm * np.random.default_rng(seed).standard_normal((frames, 1))
     return Pieces((modes_nm(simulated, 0, frames, RATE_HZ)[:, :1] + noise,), 0)
 
@@ -77,7 +77,7 @@ def test_pieces_are_identified_like_one_run_and_short_ones_are_not() -> None:
 
 
 def test_a_slow_mode_is_identified_as_drift() -> None:
-    simulated = disturbance("thermal", (4,), 3, NM_PER_MAS, 550.0)
+    simulated = preset_disturbance("thermal", (4,), 3, NM_PER_MAS, 550.0)
     run = modes_nm(simulated, 0, 20_000, RATE_HZ) + 0.5 * np.random.default_rng(3).standard_normal((20_000, 1))
     model = identify(Pieces((run,), 0), RATE_HZ)
     assert all(line.frequency_hz < 1 for line in model.lines)
