@@ -1,4 +1,4 @@
-"""Interlocks on the real processes: at the next frame after the value, the same in a replay; a flood costs nothing."""
+"""Interlocks with the real processes: a value acts at the next frame, replay is identical, a flood loses no frame."""
 
 import json
 import random
@@ -41,8 +41,8 @@ OPTIONS = ("--config", "night.toml", "--run", "flipped", "--duration", "600")
 
 
 @pytest.mark.exclusive
-def test_flipped_flooded_and_silent_interlocks(tmp_path: Path) -> None:
-    """At 500 Hz: the first frame after a value obeys it; a flood loses no frame; silence counts from the age on."""
+def test_interlocks_with_changing_flooding_and_missing_values(tmp_path: Path) -> None:
+    """At 500 Hz: the first frame after a value obeys it; a flood loses no frame; old values count as missing."""
     (tmp_path / "night.toml").write_text(CONFIG)
     process = start(tmp_path, "sim-loop", "--json", *OPTIONS)
     try:
@@ -55,21 +55,21 @@ def test_flipped_flooded_and_silent_interlocks(tmp_path: Path) -> None:
     assert process.returncode == 0, complaints
     figures = json.loads(out)
     assert figures["frames_missing"] == figures["messages_lost"] == 0
-    assert figures["frames_skipped"] <= 3, "the host stands still now and then, a flood would cost hundreds"
+    assert figures["frames_skipped"] <= 3, "a stall of the host skips a few, a flood would skip hundreds"
     log = tmp_path / figures["log"]
     replayed = json.loads(told(tmp_path, f"lowfc replay --json {log}"))
     assert replayed["identical"]
     assert replayed["unchecked"] == 0
-    _steps_follow_what_was_taken(log)
+    _steps_follow_the_inputs(log)
     _values_act_at_the_next_frame(log)
 
 
 def _publish(name: str) -> None:
-    """Values at random moments, then a flood of them, then none any more."""
+    """Publish values at random times, then a flood of them, then none."""
     until(lambda: name in running(), 60)
     rng = random.Random(3)  # noqa: S311
     with Client(name) as loop:
-        until(lambda: _took_frames(loop), 60)
+        until(lambda: _has_frames(loop), 60)
         loop.bench("shutter", "open")
         for number in range(FLIPS):  # some fall between the same two frames
             for acts in (True, False):
@@ -89,8 +89,8 @@ def _publish(name: str) -> None:
         until(lambda: [one.why[:8] for one in loop.status().state.interlocks_acting] == ["no value"])
 
 
-def _took_frames(loop: Client) -> bool:
-    """Whether the loop has begun; before, its controller may not answer yet."""
+def _has_frames(loop: Client) -> bool:
+    """Whether the loop has received frames; before that the controller may not reply."""
     try:
         return bool(loop.status().state.frame_sequence)
     except BusError:
@@ -98,7 +98,7 @@ def _took_frames(loop: Client) -> bool:
 
 
 def _closed(loop: Client) -> bool:
-    """Whether the loop was closed; it is refused until the values have been received."""
+    """Try to close the loop; the request is refused until the values have been received."""
     loop.bench("mask", False)
     try:
         return loop.close_loop().accepted
@@ -106,13 +106,13 @@ def _closed(loop: Client) -> bool:
         return False
 
 
-def _steps_follow_what_was_taken(log: Path) -> None:
-    """Every step is as the interlocks were judged before it; a value that came no more counts from its age on."""
+def _steps_follow_the_inputs(log: Path) -> None:
+    """Every step agrees with the interlock inputs before it; a missing value acts from its maximum age on."""
     types = {STEP.key: wire.ControlStep, CONTROL_INPUT.key: wire.ControlInput}
-    taken = [types[one.key].FromString(one.payload) for one in LogReader(log, topics=[STEP, CONTROL_INPUT])]
+    inputs = [types[one.key].FromString(one.payload) for one in LogReader(log, topics=[STEP, CONTROL_INPUT])]
     changes = held = opened = age_ns = 0
     mask = shut = False
-    for message in sorted(taken, key=lambda message: message.input_number):
+    for message in sorted(inputs, key=lambda message: message.input_number):
         if isinstance(message, wire.ControlStep):
             assert (wire.REASON_HELD in message.reasons) is (mask and message.mode == wire.LOOP_MODE_CLOSED)
             assert not (shut and message.mode == wire.LOOP_MODE_CLOSED)
@@ -132,7 +132,7 @@ def _steps_follow_what_was_taken(log: Path) -> None:
 
 
 def _values_act_at_the_next_frame(log: Path) -> None:
-    """The first frame that is published a period after a value obeys it; a few values may be longer on their way."""
+    """The first frame published at least a period after a value obeys it; a few values may arrive later."""
     messages = list(LogReader(log, topics=[BENCH, STEP, FRAME]))
     values = [one for one in messages if one.key == BENCH.at("mask")]
     frames_ns = {one.sequence: one.publish_time_ns for one in messages if one.key == FRAME.key}
@@ -146,4 +146,4 @@ def _values_act_at_the_next_frame(log: Path) -> None:
             (wire.REASON_HELD in step.reasons) is (acts and step.mode == wire.LOOP_MODE_CLOSED) for step in made[:1]
         ]
     assert len(obeyed) > FLIPS // 2
-    assert obeyed.count(False) <= len(obeyed) // 10, f"{obeyed.count(False)} of {len(obeyed)} values came later"
+    assert obeyed.count(False) <= len(obeyed) // 10, f"{obeyed.count(False)} of {len(obeyed)} values arrived later"

@@ -1,4 +1,4 @@
-"""The optics under test, built once: the real masks at the paper's sampling."""
+"""Fixtures of the optics under test, built once: the real masks at the paper's sampling."""
 
 import importlib
 import importlib.metadata
@@ -30,7 +30,7 @@ def modes(sensor):
 
 @pytest.fixture(scope="session")
 def coefficients_nm():
-    """20 wavefronts (20, 20): the paper's literal bounds, 0.04 waves rms for n = 1, 2 and 0.016 above."""
+    """20 wavefronts (20, 20) within the paper's bounds: 0.04 waves rms for radial degrees 1 and 2, 0.016 above."""
     bounds_nm = 550.0 * np.where(np.array(NOLLS_20) <= 6, 0.04, 0.016)
     return np.random.default_rng(20).uniform(-1, 1, (20, 20)) * bounds_nm
 
@@ -57,7 +57,7 @@ def broadband(sensor, cache_dir):
 
 @pytest.fixture(scope="session")
 def hcipy():
-    """An independent model; its import warns of things that are not ours."""
+    """An independent model; warnings of its import are suppressed."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return importlib.import_module("hcipy")
@@ -65,7 +65,7 @@ def hcipy():
 
 @pytest.fixture(scope="session")
 def prysm():
-    """Another independent model; prysm 0.21 asks pkg_resources, which setuptools no longer has, for its version."""
+    """Another independent model; prysm 0.21 imports pkg_resources, which setuptools no longer has."""
     with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         stand_in = SimpleNamespace(get_distribution=importlib.metadata.distribution)

@@ -1,4 +1,4 @@
-"""The science image of Lyot coronagraphs, classical and apodised, against hcipy and in its fast forms."""
+"""Science images of classical and apodised Lyot coronagraphs, against hcipy; the fast image against the exact one."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def waves_nm():
     return np.random.default_rng(4).normal(0, 3.0, (2, 14))
 
 
-def test_its_image_is_that_of_hcipy(hcipy, coronagraph, modes, waves_nm):
+def test_lyot_image_agrees_with_hcipy(hcipy, coronagraph, modes, waves_nm):
     opd_nm, lyot, samples = np.tensordot(waves_nm[0], modes, 1), coronagraph.lyot, 96
     found = contrast(coronagraph.pupil, opd_nm, NM, samples, samples_per=4, lyot=lyot)
 
@@ -49,7 +49,7 @@ def test_its_image_is_that_of_hcipy(hcipy, coronagraph, modes, waves_nm):
     assert np.linalg.norm(found - expected) < 1e-6 * np.linalg.norm(expected)
 
 
-def test_the_fast_image_and_the_form_are_those_of_the_exact_one(coronagraph, modes, waves_nm):
+def test_fast_image_and_quadratic_form_agree_with_the_exact_image(coronagraph, modes, waves_nm):
     modal = ModalContrast(coronagraph, NOLLS_14, NM)
     small_nm = [0.3 * np.random.default_rng(seed).choice([-1.0, 1.0], 14) for seed in range(6)]
     own, large, *small = (
@@ -60,8 +60,8 @@ def test_the_fast_image_and_the_form_are_those_of_the_exact_one(coronagraph, mod
     assert [one @ modal.form @ one for one in small_nm] == pytest.approx(np.array(small) - own, rel=0.01)
 
 
-def test_tilt_matters_at_small_angles(coronagraph):
-    """Of APLC it costs 1800 times what it costs a shaped pupil; a classical mask's own light is 1e-5, and changes."""
+def test_lyot_coronagraphs_are_far_more_sensitive_to_tilt_than_a_shaped_pupil(coronagraph):
+    """Tilt adds 1800 times more contrast with the APLC; with the classical mask it changes that mask's own 1e-5."""
     shaped = coronagraph_from(SensorSection())
     each, of_shaped = (
         contrast_form(one.pupil, (2,), NM, one.dark_zone, one.lyot).item() for one in (coronagraph, shaped)

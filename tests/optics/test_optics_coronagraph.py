@@ -1,4 +1,4 @@
-"""The science image: contrast, wavefront screens, and the fast image against the exact one."""
+"""The science image: contrast, phase screens, and the fast image against the exact one."""
 
 import numpy as np
 import pytest
@@ -26,14 +26,14 @@ def flat(shaped):
     return np.zeros(shaped.shape)
 
 
-def test_the_open_circle_makes_an_airy_pattern():
+def test_open_circle_gives_an_airy_pattern():
     x = image_axis(64, 8)
     r = np.pi * np.hypot(x[:, None], x)
     found = contrast(circle(512), np.zeros((512, 512)), NM, 64, samples_per=8)
-    np.testing.assert_allclose(found, (2 * j1(r) / r) ** 2, atol=2e-4)  # the circle has a staircase for an edge
+    np.testing.assert_allclose(found, (2 * j1(r) / r) ** 2, atol=2e-4)  # the sampled circle has a staircase edge
 
 
-def test_the_flat_shaped_pupil_is_dark_everywhere_in_its_zone(shaped, flat):
+def test_shaped_pupil_contrast_is_below_1e_9_in_its_dark_zone(shaped, flat):
     dark = wedge_samples(DARK_ZONE, 160, 160)
     image = contrast(shaped, flat, NM, 160)
     assert image[dark].max() < 1e-9
@@ -53,7 +53,7 @@ def test_a_tilt_moves_the_star(shaped):
     assert abs(x[row] - 0.5) <= 0.125
 
 
-def test_means_and_curves_take_their_samples_from_the_whole_image(shaped, flat):
+def test_mean_contrast_and_curve_agree_with_the_full_image(shaped, flat):
     ring = Wedge(4.5, 5.5)
     radii = 2 * pupil_axis(512)
     opd_nm = NM / 30 * zernikes((4, 7), radii, radii[:, None]).sum(axis=0)
@@ -67,7 +67,7 @@ def test_means_and_curves_take_their_samples_from_the_whole_image(shaped, flat):
     assert mean_contrast(shaped, opd_nm, NM, ring, samples_per=2) == pytest.approx(mean, rel=0.05)
 
 
-def test_a_wedge_is_as_large_as_its_formula():
+def test_wedge_has_the_area_of_its_formula():
     wedge = Wedge(4, 20, 42.5)
     inside = wedge_samples(wedge, 200, 200, 4)
     assert inside.sum() / 16 == pytest.approx((20**2 - 4**2) * np.deg2rad(2 * 42.5), rel=5e-3)
@@ -77,12 +77,12 @@ def test_a_wedge_is_as_large_as_its_formula():
             Wedge(**wrong)
 
 
-def test_a_wavefront_of_another_sampling_is_refused(shaped):
+def test_wavefront_with_other_sampling_than_the_pupil_is_refused(shaped):
     with pytest.raises(ValueError, match=r"\(512, 512\), got \(64, 64\)"):
         contrast(shaped, np.zeros((64, 64)), NM, 8)
 
 
-def test_screens_have_the_structure_function_of_kolmogorov():
+def test_screens_have_the_structure_function_of_a_periodic_kolmogorov_screen():
     samples, width, separations = 128, 4, np.array([2, 4, 8, 16])
     found = np.zeros(separations.size)
     for i in range(24):
@@ -91,7 +91,7 @@ def test_screens_have_the_structure_function_of_kolmogorov():
             steps = [screen[shift:] - screen[:-shift], screen[:, shift:] - screen[:, :-shift]]
             found[k] += np.mean([np.mean(step**2) for step in steps]) / 24
     r = separations / samples
-    # What is expected without the waves longer than the periodic screen: its zero frequency holds a disk this large.
+    # Without waves longer than the periodic screen: its zero-frequency cell is replaced by a disk of equal area.
     f = np.geomspace(1.0 / (width * np.sqrt(np.pi)), samples / 2, 4000)
     density = 0.0229 * f ** (-11 / 3) * 2 * np.pi * f
     expected = 2 * np.trapezoid(density * (1 - j0(2 * np.pi * r[:, None] * f)), f, axis=1)
@@ -120,7 +120,7 @@ def camera(shaped):
 
 
 def wavefront(**nm):
-    """Modes (14,) by their names, Z<Noll index>."""
+    """Modes (14,) from keywords Z<Noll index>, nm."""
     return np.array([nm.get(f"Z{index}", 0.0) for index in NOLLS_14])
 
 
@@ -136,7 +136,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_it_agrees_with_the_exact_image_to_a_hundredth(shaped, modes, camera, name):
+def test_fast_science_image_agrees_with_the_exact_image_to_one_percent(shaped, modes, camera, name):
     """Each sample to 1 % of itself and 1 % of the flat wavefront's contrast, the mean to 0.2 %."""
     opd_nm = np.tensordot(CASES[name], modes, 1)
     exact = contrast(shaped, opd_nm, NM, camera.samples, samples_per=SAMPLES_PER)
@@ -145,10 +145,10 @@ def test_it_agrees_with_the_exact_image_to_a_hundredth(shaped, modes, camera, na
     np.testing.assert_allclose(found[dark], exact[dark], rtol=1e-2, atol=4e-12 + 1e-3 * exact[dark].mean())
     mean = mean_contrast(shaped, opd_nm, NM, RING, SAMPLES_PER)
     assert camera.mean_contrast(found, RING) == pytest.approx(mean, rel=2e-3)
-    assert np.abs(found - exact).max() < 1e-3  # the star itself, too
+    assert np.abs(found - exact).max() < 1e-3  # including the star's core
 
 
-def test_a_pupil_without_equal_squares_is_taken_as_it_is():
+def test_pupil_without_equal_squares_is_not_averaged():
     pupil = circle(64)
     modes_nm = np.array([20.0, -35.0, 12.0])
     radii = 2 * pupil_axis(64)
@@ -157,7 +157,7 @@ def test_a_pupil_without_equal_squares_is_taken_as_it_is():
     np.testing.assert_allclose(camera.image(modes_nm), contrast(pupil, opd_nm, NM, 48), rtol=1e-4, atol=1e-7)
 
 
-def test_what_does_not_fit_is_refused(shaped, camera):
+def test_science_camera_refuses_inconsistent_inputs(shaped, camera):
     with pytest.raises(ValueError, match=r"14 modes, got shape \(3,\)"):
         camera.image(np.zeros(3))
     with pytest.raises(ValueError, match=r"ends 12 lambda/D"):

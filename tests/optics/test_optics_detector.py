@@ -1,8 +1,10 @@
+"""The detector's noise against its probability distributions, its saturation, and the photometry of the paper."""
+
 import numpy as np
 import pytest
 from scipy import stats
 
-from lowfc.optics.detector.detector import Detector, expose, laws_of, saturation_dn
+from lowfc.optics.detector.detector import Detector, expose, noise_table_of, saturation_dn
 from lowfc.optics.detector.detector_noise_table import FAINT_E, STEP_E
 from lowfc.optics.detector.photometry import Photometry, electrons, tilt_nm_per_mas
 
@@ -17,8 +19,8 @@ def rng():
     return np.random.default_rng(5)
 
 
-def law_of(camera, mean_e, numbers):
-    """Probability of each digital number, from the laws' definitions."""
+def probabilities(camera, mean_e, numbers):
+    """Probability of each digital number, from the Poisson and normal distributions."""
     electrons_e = np.arange(400)
     edges = (np.append(numbers, numbers[-1] + 1) - 0.5 - camera.bias_dn) * camera.gain_e_per_dn
     read = np.diff(stats.norm.cdf((edges - electrons_e[:, None]) / camera.read_noise_e), axis=1)
@@ -29,26 +31,26 @@ CAMERAS = [Detector(), Detector(gain_e_per_dn=0.7, read_noise_e=0.4, bias_dn=90.
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
-def test_the_table_has_the_law_of_every_level(camera):
-    """Places and what is left over of them add up to Poisson, read noise and rounding."""
-    laws = laws_of(camera)
-    numbers = np.arange(laws.first_dn, laws.first_dn + laws.rest.shape[1])
-    for level in (0, 1, 2, 17, 64, 500, len(laws.places) - 1):
-        places = laws.places[level].astype(int)
-        apart = (places > numbers[-1]).sum()
-        found = np.bincount(places[places <= numbers[-1]] - numbers[0], minlength=len(numbers)).astype(float)
-        found += apart * np.diff(laws.rest[level].astype(float), prepend=0.0)
-        assert 0.5 * np.abs(found / len(places) - law_of(camera, level * STEP_E, numbers)).sum() < 1e-7
+def test_noise_table_has_the_exact_distribution_at_its_levels(camera):
+    """Entries and rest together have the distribution of Poisson noise, read noise and rounding."""
+    table = noise_table_of(camera)
+    numbers = np.arange(table.first_dn, table.first_dn + table.rest.shape[1])
+    for level in (0, 1, 2, 17, 64, 500, len(table.entries) - 1):
+        entries = table.entries[level].astype(int)
+        apart = (entries > numbers[-1]).sum()
+        found = np.bincount(entries[entries <= numbers[-1]] - numbers[0], minlength=len(numbers)).astype(float)
+        found += apart * np.diff(table.rest[level].astype(float), prepend=0.0)
+        assert 0.5 * np.abs(found / len(entries) - probabilities(camera, level * STEP_E, numbers)).sum() < 1e-7
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
 @pytest.mark.parametrize("mean_e", [0.0, 0.5 * STEP_E, 0.05, 1.3, 5.03, 13.0, FAINT_E - 0.01, FAINT_E, 60.0])
 def test_a_million_pixels_pass_the_chi_square_test(camera, mean_e):
-    """Between two levels, on them, and above, where every electron is drawn."""
+    """On levels of the table, between them, and above the table."""
     count, least = 1_000_000, 10
     frame = expose(camera, flat(mean_e, 1000), rng())
     numbers = np.arange(400)
-    expected = count * law_of(camera, float(np.float32(mean_e)), numbers)
+    expected = count * probabilities(camera, float(np.float32(mean_e)), numbers)
     found = np.bincount(frame.ravel(), minlength=400)
     often = expected > least
     expected = np.append(expected[often], max(count - expected[often].sum(), least))
@@ -59,13 +61,13 @@ def test_a_million_pixels_pass_the_chi_square_test(camera, mean_e):
 
 def test_an_exact_camera_has_no_table_and_the_same_mean_and_variance():
     camera = Detector(exact=True)
-    assert laws_of(camera) is None
+    assert noise_table_of(camera) is None
     exact, drawn = (expose(one, flat(2.3), rng()).astype(float) for one in (camera, Detector()))
     assert exact.mean() == pytest.approx(drawn.mean(), abs=0.03)
     assert exact.var() == pytest.approx(drawn.var(), rel=0.03)
 
 
-def test_faint_and_bright_pixels_of_one_frame_keep_their_places():
+def test_faint_and_bright_pixels_of_one_frame_are_independent():
     mean_e = np.tile(np.array([0.0, 5.0, 23.0, 25.0, 900.0], np.float32), (10_000, 1))
     frame = expose(Detector(), mean_e, rng()).astype(float)
     assert frame.mean(axis=0) - 100 == pytest.approx(mean_e[0], abs=1.5)
@@ -102,16 +104,16 @@ def test_saturation_is_full_well_or_the_converter(camera, limit):
     assert frame.min() >= limit - 5 * max(1.0, camera.read_noise_e)
 
 
-def test_the_same_seed_gives_the_same_frame_and_the_input_is_kept():
+def test_same_seed_gives_the_same_frame_and_input_is_unchanged():
     mean_e = np.linspace(0, 50, 6400, dtype=np.float32).reshape(80, 80)
-    kept = mean_e.copy()
+    before = mean_e.copy()
     first, second = (expose(Detector(), mean_e, np.random.default_rng(7)) for _ in range(2))
     np.testing.assert_array_equal(first, second)
-    np.testing.assert_array_equal(mean_e, kept)
+    np.testing.assert_array_equal(mean_e, before)
     assert (expose(Detector(), mean_e, np.random.default_rng(8)) != first).any()
 
 
-def test_rounding_below_zero_is_no_light_but_nan_is_an_error():
+def test_negative_electrons_count_as_zero_and_nan_is_an_error():
     assert expose(QUIET, flat(-1e-9, 4), rng()).max() == 0
     with pytest.raises(ValueError, match="finite number, got nan"):
         expose(QUIET, flat(np.nan, 4), rng())

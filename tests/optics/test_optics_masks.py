@@ -1,3 +1,5 @@
+"""Layouts of sparse aperture masks and pupils: the packaged ones, and files of users."""
+
 import json
 from dataclasses import replace
 
@@ -19,17 +21,17 @@ def written(tmp_path, content, name="mask.json"):
     return path
 
 
-SHIPPED = {
+PACKAGED = {
     **dict.fromkeys(("sam27d07", "sam27d07_bowtie", "sam27d07_bal14", "sam27_crb20"), 0.07),
     "sam27d10_bal14": 0.1,
     "sam18_sized": None,
 }
-"""Diameter of all holes."""
+"""Diameter of the holes, in pupil diameters; None if they differ."""
 
 
-def test_shipped_layouts_are_sound():
-    assert set(layout_names()) == set(SHIPPED)
-    for name, diameter in SHIPPED.items():
+def test_packaged_layouts_are_valid():
+    assert set(layout_names()) == set(PACKAGED)
+    for name, diameter in PACKAGED.items():
         layout = load_layout(name)
         assert layout_warnings(layout) == []
         if diameter is not None:
@@ -38,7 +40,7 @@ def test_shipped_layouts_are_sound():
         assert open_area == pytest.approx(np.pi / 4 * sum(hole[2] ** 2 for hole in layout.holes), rel=0.01)
 
 
-def test_holes_are_where_x_and_y_say():
+def test_hole_positions_follow_x_and_y():
     mask = transmission(Layout("one", "", ((0.3, -0.2, 0.1),)), 100)
     rows, columns = np.nonzero(mask)
     assert (rows.mean() + 0.5) / 100 - 0.5 == pytest.approx(-0.2)
@@ -65,19 +67,19 @@ def test_holes_may_touch():
     check(Layout("touching", "", ((0.0, 0.0, 0.1), (0.1, 0.0, 0.1), (0.45, 0.0, 0.1))))
 
 
-def test_even_symmetry_is_warned_about(tmp_path):
+def test_even_symmetric_mask_gives_a_warning(tmp_path):
     even = Layout("even", "", equal_holes(((0.2, 0.1), (-0.2, -0.1), (0.0, 0.0)), 0.1))
     assert is_even_symmetric(even)
     assert not is_even_symmetric(replace(even, holes=(*even.holes, (0.3, 0.2, 0.1))))
     assert not is_even_symmetric(replace(even, holes=((0.2, 0.1, 0.05), *even.holes[1:])))
     path = written(tmp_path, {"holes": even.holes})
-    said = []
-    sensor_from(SensorSection(sam=str(path)), warn=said.append)
-    assert len(said) == 1
-    assert "cannot sense even modes" in said[0]
-    said.clear()
-    sensor_from(warn=said.append)
-    assert said == []
+    warnings = []
+    sensor_from(SensorSection(sam=str(path)), warn=warnings.append)
+    assert len(warnings) == 1
+    assert "cannot sense even modes" in warnings[0]
+    warnings.clear()
+    sensor_from(warn=warnings.append)
+    assert warnings == []
 
 
 def test_layouts_from_files(tmp_path):

@@ -1,3 +1,5 @@
+"""Influence functions and the modes-to-actuators matrix of the mirror."""
+
 import numpy as np
 import pytest
 
@@ -15,7 +17,7 @@ from lowfc.optics.chain.zernike import NOLLS_20, zernikes
 MIRROR = Mirror()
 
 
-def test_one_poke_is_one_nm_there_and_the_coupling_next_door():
+def test_poke_has_unit_height_and_neighbours_have_the_coupling():
     axis = actuator_axis(MIRROR, 34)
     assert axis[1] - axis[0] == pytest.approx(1 / 31)
     poke = np.zeros((34, 34))
@@ -46,7 +48,7 @@ def test_the_driven_actuators_are_the_pupil_and_one_ring():
     np.testing.assert_array_equal(active, active[::-1])
 
 
-def test_commands_make_the_modes_with_half_the_surface():
+def test_modes_to_actuators_gives_the_modes_with_half_the_surface():
     commands = modes_to_actuators(MIRROR, NOLLS_20)
     assert commands.shape == (34 * 34, 20)
     assert not commands[~active_actuators(MIRROR).ravel()].any()
@@ -62,31 +64,31 @@ def test_commands_make_the_modes_with_half_the_surface():
         )
 
 
-def test_neighbours_make_up_for_actuators_that_may_not_be_used():
-    """The modes are better than those of a mirror that does not know which of its actuators are dead."""
+def test_neighbours_compensate_for_unusable_actuators():
+    """The modes are more accurate than with the unusable actuators of a full fit set to zero."""
     usable = np.ones((34, 34), bool)
     usable[10, 12] = usable[16, 17] = usable[17, 17] = usable[22, 9] = usable[25, 24] = False
     commands = modes_to_actuators(MIRROR, NOLLS_20, usable)
     assert not commands[~usable.ravel()].any()
-    ignorant = modes_to_actuators(MIRROR, NOLLS_20) * usable.ravel()[:, None]
+    uncompensated = modes_to_actuators(MIRROR, NOLLS_20) * usable.ravel()[:, None]
     u = pupil_axis(256)
     inside = np.hypot(u[:, None], u) <= 0.5
     factors = influence_factors(MIRROR, u, 34)
     targets = zernikes(NOLLS_20, 2 * u, 2 * u[:, None])
 
-    def faults(of):
-        made = [2.0 * surface_nm(factors, of[:, k].reshape(34, 34), factors) for k in range(20)]
+    def errors(matrix):
+        made = [2.0 * surface_nm(factors, matrix[:, k].reshape(34, 34), factors) for k in range(20)]
         return np.array([(one - target)[inside].std() for one, target in zip(made, targets, strict=True)])
 
-    assert (faults(commands) < 0.95 * faults(ignorant)).all()
-    assert np.median(faults(commands) / faults(ignorant)) < 0.8
+    assert (errors(commands) < 0.95 * errors(uncompensated)).all()
+    assert np.median(errors(commands) / errors(uncompensated)) < 0.8
     few = np.zeros((34, 34), bool)
     few[16:18, 16:18] = True
     with pytest.raises(ValueError, match="4 active actuators in the pupil cannot make 20 modes"):
         modes_to_actuators(MIRROR, NOLLS_20, few)
 
 
-def test_a_mirror_may_lie_beside_the_pupil():
+def test_mirror_may_be_shifted_relative_to_the_pupil():
     moved = actuator_axis(Mirror(shift_pitches=0.5), 34) - actuator_axis(MIRROR, 34)
     np.testing.assert_allclose(moved, 0.5 / 31)
 

@@ -1,4 +1,4 @@
-"""Conventions of the grids, Zernike modes, pupils and focal-plane masks against their closed forms."""
+"""Grid conventions, Zernike modes, pupils and focal-plane masks against closed forms."""
 
 import numpy as np
 import pytest
@@ -28,10 +28,10 @@ def test_the_relay_pupil_is_upright_and_energy_is_kept(scale):
     assert np.sum(np.abs(focal) ** 2) / 8**2 == pytest.approx(np.sum(np.abs(pupil) ** 2) / 128**2, rel=1e-9)
 
 
-def test_an_image_is_the_fraction_of_the_light_in_the_open_circle():
+def test_image_is_normalised_to_the_light_in_the_open_circle():
     open_circle = Sensor(circle(512), np.ones((480, 480)), ApertureMask(np.ones((512, 512))))
     total = image(open_circle, np.zeros((512, 512))).sum()
-    assert 0.97 < total < 1.0  # what diffraction throws beyond the pixels is missing
+    assert 0.97 < total < 1.0  # diffraction puts the rest outside the detector
     half = Sensor(0.5 * circle(512), np.ones((480, 480)), ApertureMask(np.ones((512, 512))))
     assert image(half, np.zeros((512, 512))).sum() == pytest.approx(0.25 * total)
     assert circle(512).mean() == pytest.approx(OPEN_AREA, rel=1e-3)
@@ -76,7 +76,7 @@ def test_polynomials_continue_outside_the_circle():
     assert zernike(11, 0.0, 2.0) == pytest.approx(np.sqrt(5) * (6 * 16 - 6 * 4 + 1))
 
 
-def test_names_say_which_axis_a_mode_follows():
+def test_mode_names_give_the_axis():
     names = {noll: mode_name(noll) for noll in range(1, 30)}
     assert len(set(names.values())) == 29
     assert [names[noll] for noll in (2, 3, 4, 7, 8, 11)] == [
@@ -87,7 +87,7 @@ def test_names_say_which_axis_a_mode_follows():
         "coma x",
         "spherical",
     ]
-    for noll in (noll for noll, name in names.items() if name.endswith(" x")):  # they change sign with x and not with y
+    for noll in (noll for noll, name in names.items() if name.endswith(" x")):  # odd in x and even in y
         assert zernike(noll, -0.3, 0.2) == pytest.approx(-zernike(noll, 0.3, 0.2))
         assert zernike(noll, 0.3, -0.2) == pytest.approx(zernike(noll, 0.3, 0.2))
 
@@ -98,7 +98,7 @@ def test_indices_below_one_are_refused():
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 20.0, 135.0, 300.0])
-def test_the_bar_goes_from_the_centre_to_the_edge_on_one_side(angle_deg):
+def test_bar_reaches_from_the_centre_to_the_edge_on_one_side(angle_deg):
     barred, angle = with_bar(512, 0.1, angle_deg), np.deg2rad(angle_deg)
 
     def at(radius, across):
@@ -122,28 +122,28 @@ def apodised():
 
 
 def encircled(pupil, radius):
-    """Share of a pupil's light within a radius of its image, by a sum over fine samples."""
+    """Fraction of a pupil's light within a radius in the image plane, and the field there, from fine samples."""
     samples_per = 32
     x = image_axis(2 * int(np.ceil(radius * samples_per)), samples_per)
     image = to_image(pupil.astype(complex), x.size, samples_per, 1.0) * (np.hypot(x[:, None], x) <= radius)
     return np.sum(np.abs(image) ** 2) / samples_per**2 / (np.sum(pupil**2) / pupil.size), image
 
 
-def test_through_the_mask_and_back_it_is_itself(apodised):
-    """The circular prolate function is an eigenfunction, and its eigenvalue is the share on the mask."""
+def test_prolate_pupil_is_an_eigenfunction_of_the_mask(apodised):
+    """The eigenvalue of the circular prolate function is the fraction of light on the mask."""
     share, image = encircled(apodised, 2.5)
     back = to_pupil(image, 256, 32, 1.0)
     inside = circle(256) > 0
     assert np.abs(back[inside] - share * apodised[inside]).max() < 1e-3
 
 
-def test_its_throughput_and_its_shape(apodised):
+def test_prolate_pupil_throughput_and_symmetry(apodised):
     assert apodised.max() <= 1
     assert apodised[127:129, 127:129] == pytest.approx(1, abs=1e-3)
     assert not apodised[circle(256) == 0].any()
     np.testing.assert_allclose(apodised, apodised.T, atol=1e-12)
     np.testing.assert_allclose(apodised, apodised[::-1], atol=1e-12)
-    # For a large c, pi times the mask's radius, it is exp(-c r^2 / 2) with r in pupil radii: throughput 1 / c.
+    # For large c = pi times the mask's radius, the pupil tends to exp(-c r^2 / 2), r in pupil radii: throughput 1 / c.
     assert np.sum(apodised**2) / np.sum(circle(256)) == pytest.approx(1 / (np.pi * 2.5), rel=0.1)
     with pytest.raises(ValueError, match="must have a radius"):
         prolate(256, 0.0)
@@ -162,7 +162,7 @@ def test_the_phase_spot_has_the_area_of_its_circle_and_a_soft_edge(radius, spot)
     np.testing.assert_array_equal(mask, mask.T)
 
 
-def test_a_pupil_of_ones_own_comes_from_its_file(tmp_path):
+def test_custom_pupil_is_read_from_a_file(tmp_path):
     quarter = np.linspace(1.0, 0.5, 64 * 64).reshape(64, 64)
     np.savez(tmp_path / "mine.npz", quarter=quarter)
     pupil = sensor_from(SensorSection(pupil=str(tmp_path / "mine.npz"))).pupil
@@ -172,7 +172,7 @@ def test_a_pupil_of_ones_own_comes_from_its_file(tmp_path):
     assert not np.array_equal(pupil, load_pupil())
 
 
-def test_a_slip_in_the_name_of_a_sensor_is_named():
+def test_misspelt_sensor_name_gets_a_suggestion():
     with pytest.raises(ConfigurationError, match=r"layout is called 'clofws'.* nor is it a sensor.* mean 'clowfs'"):
         sensor_named("clofws")
     with pytest.raises(ConfigurationError, match=r"'mask': there are .*sam27d07.* nor is it a sensor: sam, bow.*"):
@@ -188,6 +188,6 @@ def test_a_slip_in_the_name_of_a_sensor_is_named():
         ({"kind": "zwfs", "focal_mask": "bowtie"}, "bowtie has neither"),
     ],
 )
-def test_keys_that_do_not_go_together_are_refused(keys, complaint):
+def test_inconsistent_sensor_keys_are_refused(keys, complaint):
     with pytest.raises(ConfigurationError, match=complaint):
         sensor_from(SensorSection.model_validate(keys))

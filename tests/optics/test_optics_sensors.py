@@ -50,7 +50,7 @@ def test_the_chain_agrees_with_hcipy(hcipy, sensor, opd_nm, wavelength_nm):
 
 
 def test_the_chain_agrees_with_prysm(prysm, sensor, opd_nm):
-    # Table 1 in prysm's units (mm and um); its grids have a sample on the axis, the ramps move that by half a sample.
+    # Table 1 in prysm's units (mm and um). Its grids have a sample on the axis; the ramp shifts by half a sample.
     u = (np.arange(512) - 256) / 512
     ramp = np.exp(-2j * np.pi * (u + u[:, None]) / 16)
     pupil_mm, focal_mm, wavelength_um = 10.0, 200.0, 0.55
@@ -105,7 +105,7 @@ def test_bands_have_the_wavelengths_of_section_3_3():
         ("sam27_crb20", 0.152, 0.00446, 57.2),
     ],
 )
-def test_shipped_masks_pass_the_light_they_were_designed_for(sam, sensor_fraction, peak, condition, modes):
+def test_packaged_masks_have_their_design_throughput(sam, sensor_fraction, peak, condition, modes):
     sensor = sensor_named(sam)
     budget = light_budget(sensor)
     assert budget.pupil == pytest.approx(0.2625, abs=1e-3)
@@ -128,12 +128,12 @@ def test_the_bowtie_adds_light_above_and_below(sensor):
     assert bowtie.sum() / 64 == pytest.approx(area, rel=0.01)
 
 
-def test_kernels_are_shared_and_cannot_be_written():
+def test_cached_kernels_are_read_only():
     with pytest.raises(ValueError, match="read-only"):
         kernel(64, 8, 512, 1.0)[0, 0] = 0
 
 
-def test_shapes_that_do_not_fit_are_refused(sensor):
+def test_sensor_refuses_inconsistent_shapes(sensor):
     with pytest.raises(ValueError, match=r"\(512, 512\), got \(256, 256\)"):
         field(sensor, np.zeros((256, 256)))
     with pytest.raises(ValueError, match="sampled like the pupil"):
@@ -145,19 +145,19 @@ def test_shapes_that_do_not_fit_are_refused(sensor):
 
 
 def at_the_mask(optics, opd_nm, wavelength_nm):
-    """Field behind the focal-plane mask."""
+    """Field after the focal-plane mask."""
     start = optics.pupil * np.exp(2j * np.pi / wavelength_nm * opd_nm)
     return to_image(start, len(optics.focal_mask), 8, 550.0 / wavelength_nm) * optics.focal_mask
 
 
-def test_six_millimetres_are_three_and_a_half_waves_of_defocus():
+def test_six_millimetres_are_3_4_waves_of_defocus():
     assert fresnel_distance(6.0, 20.0, 550.0) == pytest.approx(27.27, abs=0.01)
     assert fresnel_distance(6.0, 20.0, 550.0) / 8 == pytest.approx(3.41, abs=0.01)  # z / (8 lambda F^2), peak to valley
 
 
 @pytest.mark.parametrize("wavelength_nm", [550.0, 500.0])
 def test_the_defocused_image_agrees_with_hcipy(hcipy, opd_nm, wavelength_nm):
-    """Its window is periodic, which costs a scale factor of 1e-3; lengths in lambda0/D, the wavelength paraxial."""
+    """hcipy's window is periodic, which changes the scale by up to 1e-3; lengths in lambda0/D, small wavelength."""
     optics = sensor_named("clowfs")
     samples, paraxial = 512, 1e-3
     grid = hcipy.make_uniform_grid([samples] * 2, [samples / 8] * 2)
@@ -173,11 +173,11 @@ def test_the_defocused_image_agrees_with_hcipy(hcipy, opd_nm, wavelength_nm):
 
 
 @pytest.mark.parametrize("defocus_mm", [1.5, 6.0])
-def test_the_defocused_image_is_that_of_a_quadratic_phase_in_the_relay_pupil(opd_nm, defocus_mm):
-    """Fresnel's integral by way of the angular spectrum, over all frequencies that the samples hold."""
+def test_defocused_image_agrees_with_a_quadratic_phase_in_the_relay_pupil(opd_nm, defocus_mm):
+    """The Fresnel integral by the angular spectrum, over all frequencies that the samples resolve."""
     optics = sensor_from(SensorSection(kind="clowfs", defocus_mm=defocus_mm))
     x, u = image_axis(64, 8), image_axis(4096, 512)  # 8 D of relay pupil
-    window = np.cos(np.clip((np.abs(u) - 3.0) * np.pi / 2, 0, np.pi / 2)) ** 2  # its rim sends nothing to the detector
+    window = np.cos(np.clip((np.abs(u) - 3.0) * np.pi / 2, 0, np.pi / 2)) ** 2  # its rim sends no light to the detector
     transfer = window * np.exp(-1j * np.pi * optics.relay.distance * u**2)
     there = np.exp(2j * np.pi * np.outer(image_axis(160, 8), u)) * transfer @ np.exp(-2j * np.pi * np.outer(u, x))
     there /= 8 * 512
@@ -186,7 +186,7 @@ def test_the_defocused_image_is_that_of_a_quadratic_phase_in_the_relay_pupil(opd
 
 
 @pytest.mark.parametrize("wavelength_nm", [550.0, 500.0])
-def test_the_image_of_the_pupil_agrees_with_hcipy(hcipy, opd_nm, wavelength_nm):
+def test_pupil_image_agrees_with_hcipy(hcipy, opd_nm, wavelength_nm):
     optics = sensor_named("zwfs")
     focal_grid = hcipy.CartesianGrid(hcipy.RegularCoords([1 / 8] * 2, [64] * 2, [-63 / 16] * 2))
     pitch = 1.1 / 80
@@ -202,19 +202,19 @@ def test_the_image_of_the_pupil_agrees_with_hcipy(hcipy, opd_nm, wavelength_nm):
     assert relative_l2(ours, theirs.reshape(40, 2, 40, 2).sum(axis=(1, 3))) < 1e-12
 
 
-def test_the_kernels_conserve_energy():
-    """Over the whole period of the sampled focal plane the columns of each are orthonormal."""
-    distance = 27.25  # of which the period, 8 distances, is a whole number of samples
+def test_direct_kernels_conserve_energy():
+    """Over the full period of the sampled focal plane the columns of each kernel are orthonormal."""
+    distance = 27.25  # its period, 8 distances, is an integer number of samples
     matrix = direct_kernel(Defocus(distance), 1744, 64, 8, 1.0)
     np.testing.assert_allclose(matrix.conj().T @ matrix, np.eye(64), atol=1e-12)
     for scale in (1.0, 1.1):
         matrix = direct_kernel(PupilImage(8.0 / scale), 512, 64, 8, scale)
-        unitary = matrix.conj().T @ matrix * (8.0 / scale / 512) * 8  # to the density of the focal plane's samples
+        unitary = matrix.conj().T @ matrix * (8.0 / scale / 512) * 8  # times the sample density of the focal plane
         np.testing.assert_allclose(unitary, np.eye(64), atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["clowfs", "zwfs"])
-def test_without_a_relay_mask_only_the_detectors_edge_loses_light(name):
+def test_without_relay_mask_light_is_lost_only_at_the_detector_edge(name):
     optics = sensor_named(name)
     budget = light_budget(optics)
     assert budget.relay_mask == 1
@@ -224,9 +224,9 @@ def test_without_a_relay_mask_only_the_detectors_edge_loses_light(name):
 
 
 @pytest.mark.parametrize("name", SENSORS)
-def test_the_response_of_every_sensor_is_the_slope_of_its_image(name, modes):
+def test_response_of_every_sensor_is_the_derivative_of_its_image(name, modes):
     optics, step_nm = sensor_named(name), 0.02
-    chosen = modes[[0, 5]] if name == "open" else modes[[0, 2, 9]]  # it has no slope along even modes
+    chosen = modes[[0, 5]] if name == "open" else modes[[0, 2, 9]]  # the open relay has no response to even modes
     H = response(optics, chosen)
     assert H.shape == (optics.pixels**2, len(chosen))
     for k, mode in enumerate(chosen):
@@ -238,12 +238,12 @@ EIGHTH_ORDER = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
 
 
 def slope_along(shifted, step):
-    """Central difference of eighth order of what a function gives for 1 to 4 steps either way."""
+    """Derivative by an eighth-order central difference of `shifted` at -4 to 4 steps."""
     return sum(weight * (shifted(k) - shifted(-k)) for k, weight in EIGHTH_ORDER.items()) / step
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-def test_a_sheared_beam_is_a_relay_mask_moved_the_other_way(axis, sensor):
+def test_shear_is_equivalent_to_moving_the_relay_mask_the_other_way(axis, sensor):
     def moved(samples):
         transmission = np.roll(sensor.relay.transmission, -samples, axis=1 - axis)
         return reference(replace(sensor, relay=ApertureMask(transmission))).ravel()
@@ -253,14 +253,14 @@ def test_a_sheared_beam_is_a_relay_mask_moved_the_other_way(axis, sensor):
 
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize("name", ["clowfs", "zwfs"])
-def test_a_sheared_beam_moves_the_image(name, axis):
-    """By as much where the detector sees the pupil; behind a focus, where left and right are swapped, by -z shear."""
+def test_shear_moves_the_image(name, axis):
+    """By the shear itself where the detector sees the pupil; behind focus, where the image is inverted, by -z shear."""
     fine = replace(sensor_named(name), pixels=160 if name == "clowfs" else 640, binning=1)
     moves_by = -fine.relay.distance if name == "clowfs" else 1.0
-    still = reference(fine)
-    slope = slope_along(lambda samples: np.roll(still, samples, axis=1 - axis), fine.pitch / moves_by)
+    I0 = reference(fine)
+    slope = slope_along(lambda samples: np.roll(I0, samples, axis=1 - axis), fine.pitch / moves_by)
     inner = np.s_[8:-8, 8:-8]
-    ours = shear_response(fine)[:, axis].reshape(still.shape)
+    ours = shear_response(fine)[:, axis].reshape(I0.shape)
     assert relative_l2(ours[inner], slope[inner]) < 1e-4
 
 
@@ -272,8 +272,8 @@ def test_broadband_shear_is_a_weighted_sum(name):
 
 
 @pytest.mark.parametrize("name", ["clowfs", "zwfs", "bar"])
-def test_at_another_wavelength_it_is_the_sensor_with_its_hardware_scaled(name):
-    """At 1.25 lambda0 a sample of lambda0/8D is one of lambda/10D, and the same millimetres are less defocus."""
+def test_another_wavelength_is_equivalent_to_scaled_hardware(name):
+    """At lambda = 1.25 lambda0 a sample of lambda0/8D is lambda/10D, and the same millimetres are less defocus."""
     optics, longer_nm = sensor_named(name), 687.5
     ours = reference(optics, monochromatic(longer_nm))
     relay = optics.relay
@@ -283,7 +283,7 @@ def test_at_another_wavelength_it_is_the_sensor_with_its_hardware_scaled(name):
     np.testing.assert_allclose(ours, reference(scaled), rtol=1e-9, atol=1e-15)
 
 
-def test_the_papers_defocus_tells_the_modes_apart_best(modes):
+def test_the_papers_defocus_gives_the_best_condition_number(modes):
     def condition(defocus_mm):
         optics = sensor_from(SensorSection(kind="clowfs", defocus_mm=defocus_mm))
         return np.linalg.cond(response(optics, modes[:14]))
@@ -291,7 +291,7 @@ def test_the_papers_defocus_tells_the_modes_apart_best(modes):
     assert condition(6.0) < 0.7 * min(condition(2.0), condition(12.0))
 
 
-def test_a_defocus_that_the_samples_do_not_resolve_is_refused():
+def test_unresolved_defocus_is_refused():
     optics = sensor_named("clowfs")
     with pytest.raises(ValueError, match=r"of at least 2.33 \(lambda/D\)\^2, got 2.3"):
         replace(optics, relay=Defocus(2.3))
@@ -304,11 +304,11 @@ def test_a_defocus_that_the_samples_do_not_resolve_is_refused():
 
 
 @pytest.mark.parametrize("name", ["sam", "bar", "lyot"])
-def test_behind_an_aperture_mask_shear_flux_and_background_do_not_look_like_a_wavefront(name, modes):
-    """With symmetric real masks before it, phases change the image by odd functions, amplitudes by even ones."""
+def test_behind_an_aperture_mask_modes_are_odd_and_shear_and_flux_even(name, modes):
+    """With symmetric real masks, phases change the image by odd functions, and amplitudes by even ones."""
     optics = sensor_named(name)
     H, slopes = response(optics, modes[:14]), shear_response(optics)
-    # The last pixel is the first one's mirror image through the centre.
+    # Reversing the order of pixels is a point reflection through the centre.
     assert np.abs(H + H[::-1]).max() < 1e-9 * np.abs(H).max()
     assert np.abs(slopes - slopes[::-1]).max() < 1e-9 * np.abs(slopes).max()
     I0 = reference(optics).ravel()
@@ -317,7 +317,7 @@ def test_behind_an_aperture_mask_shear_flux_and_background_do_not_look_like_a_wa
 
 @pytest.fixture
 def calibrated(cache_dir, monkeypatch):
-    """Makes calibrations and their noise from keys of the configuration, with a small mirror and a cache of its own."""
+    """Return a function from configuration keys to a calibration and its noise, with a small mirror, own cache."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(cache_dir))
 
     def make(**changed):
@@ -330,13 +330,13 @@ def calibrated(cache_dir, monkeypatch):
     return make
 
 
-@pytest.mark.parametrize(("name", "price"), [("clowfs", (3, 8)), ("zwfs", (1.2, 2))])
-def test_shear_and_background_fitted_along_do_not_pass_for_modes(name, price, calibrated):
-    """A beam sheared by 0.002 D on 10 % of uniform light; the price is the noise of tip, the mode most like a shear."""
+@pytest.mark.parametrize(("name", "noise_factor"), [("clowfs", (3, 8)), ("zwfs", (1.2, 2))])
+def test_fitting_shear_and_background_removes_their_bias(name, noise_factor, calibrated):
+    """Beam sheared by 0.002 D plus 10 % uniform light; the noise of tip, the mode most like shear, increases."""
     optics = sensor_named(name)
     ramp = np.exp(-2j * np.pi * 0.002 * image_axis(64, 8))
     sheared = reference(replace(optics, focal_mask=optics.focal_mask * ramp)).ravel()
-    veiled = sheared + 0.1 * sheared.mean()
+    with_background = sheared + 0.1 * sheared.mean()
 
     def bias_nm(calibration, light):
         return np.linalg.norm(calibration.reconstructor @ (light / light.sum() - calibration.reference))
@@ -347,11 +347,11 @@ def test_shear_and_background_fitted_along_do_not_pass_for_modes(name, price, ca
     assert (plain.estimator, both.estimator) == ("weighted", "weighted+background+shear")
     assert bias_nm(plain, sheared) > 4.0
     assert bias_nm(shear, sheared) < 0.15
-    assert bias_nm(shear, veiled) > 20 * bias_nm(both, veiled)
-    assert bias_nm(both, veiled) < 0.15
-    assert price[0] < shear_noise_nm[0] / noise_nm[0] < price[1]
+    assert bias_nm(shear, with_background) > 20 * bias_nm(both, with_background)
+    assert bias_nm(both, with_background) < 0.15
+    assert noise_factor[0] < shear_noise_nm[0] / noise_nm[0] < noise_factor[1]
 
 
-def test_a_star_that_fills_the_pixels_is_refused(calibrated):
+def test_saturating_star_is_refused(calibrated):
     with pytest.raises(CalibrationError, match=r"the star saturates the sensor: \d+ e- in the brightest pixel"):
         calibrated(sensor__kind="zwfs", star__magnitude=-1.0)

@@ -1,4 +1,4 @@
-"""The twin against the full chain that it was made from, and what its benchmark reports."""
+"""The twin against the full optical chain from which it is built, and the report of its benchmark."""
 
 import json
 from dataclasses import replace
@@ -31,7 +31,7 @@ def fast_twin(name):
 
 @pytest.fixture(scope="module")
 def tilts_nm():
-    """Shapes of the mirror that are tilts of 34 nm rms of wavefront, and their surfaces at the pupil's samples."""
+    """Mirror commands for tilts of 34 nm rms of wavefront, and their surfaces at the pupil's samples."""
     factors = influence_factors(Mirror(), pupil_axis(512), 34)
     shapes = [34.0 * tilt.reshape(34, 34) for tilt in modes_to_actuators(Mirror(), [2, 3]).T]
     return [(shape, surface_nm(factors, shape, factors)) for shape in shapes]
@@ -55,7 +55,9 @@ def worst_error(sensor, twin, modes, coefficients_nm, band=None):
 @pytest.mark.parametrize(
     ("name", "wavefronts", "limit"), [("fast", 8, 1e-4), ("accurate", 5, 2e-6), ("broadband", 3, 1e-4)]
 )
-def test_the_twin_of_the_default_sensor(name, wavefronts, limit, request, sensor, modes, coefficients_nm):
+def test_twin_of_the_default_sensor_agrees_with_the_full_chain(
+    name, wavefronts, limit, request, sensor, modes, coefficients_nm
+):
     twin, band = request.getfixturevalue(name), gauss_legendre(550.0) if name == "broadband" else None
     assert worst_error(sensor, twin, modes, coefficients_nm[:wavefronts], band) < limit
 
@@ -85,24 +87,24 @@ ACCURATE_LIMITS = {"clowfs": 1e-6, "zwfs": 2e-6, "bar": 1e-6, "lyot": 2e-6, "apl
         *(pytest.param(ACCURATE, *item, marks=pytest.mark.slow) for item in ACCURATE_LIMITS.items()),
     ],
 )
-def test_the_twin_of_every_sensor(spec, name, limit, modes, coefficients_nm):
+def test_twin_of_every_sensor_agrees_with_the_full_chain(spec, name, limit, modes, coefficients_nm):
     sensor, twin = fast_twin(name) if spec is FAST else (sensor_named(name), build(sensor_named(name), spec))
     assert worst_error(sensor, twin, modes, coefficients_nm[:3]) < limit
     if (spec, name) == (FAST, "bowtie"):
-        assert len(twin.operators[0].to_modes) == 171  # as many as its area needs
+        assert len(twin.operators[0].to_modes) == 171  # the rank increases with the area of the mask
 
 
 @pytest.mark.parametrize(
     ("defocus_mm", "limit"),
     [(3.0, 5e-5), *(pytest.param(*far, marks=pytest.mark.slow) for far in ((1.5, 2e-4), (12.0, 5e-5)))],
 )
-def test_the_defocused_twin_is_right_at_any_distance(defocus_mm, limit, modes, coefficients_nm):
+def test_defocused_twin_is_accurate_at_any_distance(defocus_mm, limit, modes, coefficients_nm):
     sensor = sensor_from(SensorSection(kind="clowfs", defocus_mm=defocus_mm))
     assert worst_error(sensor, build(sensor, FAST), modes, coefficients_nm[:1]) < limit
 
 
 @pytest.mark.parametrize(("name", "limit"), [("fast", 3e-4), ("accurate", 1e-5)])
-def test_reference_and_response_are_those_of_the_full_chain(name, limit, request, sensor, modes):
+def test_twin_reference_and_response_agree_with_the_full_chain(name, limit, request, sensor, modes):
     twin = request.getfixturevalue(name)
     chosen = [0, 1, 2, 5, 9, 19]
     ours = twin_response(twin, zernikes([NOLLS_20[k] for k in chosen], *node_radii(twin)))
@@ -113,7 +115,7 @@ def test_reference_and_response_are_those_of_the_full_chain(name, limit, request
 
 
 @pytest.mark.parametrize("name", ["fast", "broadband"])
-def test_response_is_the_slope_of_the_evaluator(name, request):
+def test_twin_response_is_the_derivative_of_the_evaluator(name, request):
     twin = request.getfixturevalue(name)
     mode = zernikes([4], *node_radii(twin))
     evaluator = Evaluator(twin)
@@ -123,7 +125,7 @@ def test_response_is_the_slope_of_the_evaluator(name, request):
 
 
 @pytest.mark.parametrize("name", ["accurate", "broadband", "clowfs", "zwfs"])
-def test_a_tilt_made_by_the_mirror_is_right_to_1e_4(name, request, sensor, tilts_nm):
+def test_tilt_of_the_mirror_is_accurate_to_1e_4(name, request, sensor, tilts_nm):
     band = gauss_legendre(550.0) if name == "broadband" else None
     sensor, twin = fast_twin(name) if name in FAST_LIMITS else (sensor, request.getfixturevalue(name))
     on_nodes = twin_mirror(sensor, twin, Mirror())
@@ -132,12 +134,12 @@ def test_a_tilt_made_by_the_mirror_is_right_to_1e_4(name, request, sensor, tilts
         assert relative_l2(Evaluator(twin).image(wavefront_nm(on_nodes, actuators_nm)), full) < 1e-4
 
 
-def test_the_mirror_on_the_nodes_makes_the_commanded_wavefront(sensor, fast):
+def test_mirror_on_the_nodes_gives_the_commanded_wavefront(sensor, fast):
     on_nodes = twin_mirror(sensor, fast, Mirror())
     commands = modes_to_actuators(Mirror(), NOLLS_20)
-    for command, wanted in zip(commands.T, zernikes(NOLLS_20, *node_radii(fast)), strict=True):
-        error = wavefront_nm(on_nodes, 10.0 * command.reshape(34, 34)) - 10.0 * wanted
-        assert wavefront_rms_nm(fast, error) < 0.35  # the full surface's own fit errors reach 0.15 nm
+    for command, mode in zip(commands.T, zernikes(NOLLS_20, *node_radii(fast)), strict=True):
+        error = wavefront_nm(on_nodes, 10.0 * command.reshape(34, 34)) - 10.0 * mode
+        assert wavefront_rms_nm(fast, error) < 0.35  # fit errors of the full surface reach 0.15 nm
 
 
 def test_rms_is_taken_over_the_open_pupil_without_piston(sensor, modes, fast):
@@ -158,13 +160,13 @@ def test_interpolation_is_exact_for_polynomials_of_its_order():
             np.testing.assert_allclose(weights @ axis**power, u**power, atol=1e-12)
 
 
-def test_progress_counts_up_to_the_end(sensor):
-    seen = []
-    build(sensor, replace(FAST, nodes=16, order=4), progress=lambda done, total: seen.append((done, total)))
-    assert seen == [(i, 32) for i in range(1, 33)]
+def test_build_reports_progress(sensor):
+    calls = []
+    build(sensor, replace(FAST, nodes=16, order=4), progress=lambda done, total: calls.append((done, total)))
+    assert calls == [(i, 32) for i in range(1, 33)]
 
 
-def test_what_cannot_be_compressed_is_refused(sensor):
+def test_unsupported_optics_and_specifications_are_refused(sensor):
     lopsided = sensor.focal_mask.copy()
     lopsided[:, :20] = 0
     with pytest.raises(ValueError, match="symmetric about both axes"):

@@ -1,3 +1,5 @@
+"""The cache of twins and fitted mirrors."""
+
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -18,7 +20,7 @@ from lowfc.optics.chain.mirror import Mirror
 from lowfc.optics.chain.relay import ApertureMask
 from lowfc.optics.twin.twin import Evaluator, TwinSpec
 
-SMALL = TwinSpec(nodes=16, order=4, rank=40, guards=4)  # the real optics, coarser, for tests of the file
+SMALL = TwinSpec(nodes=16, order=4, rank=40, guards=4)  # coarse, for tests of the cache file
 HASH_OF_ONES = "a4449a9f81f26403e8a1f5dda2c0cbe7385184dc0b31b34b2b78eb5a92ba3eec"
 
 
@@ -84,8 +86,8 @@ def test_the_hash_depends_on_everything(sensor):
     assert operator_hash(replace(sensor), SMALL, band) == hashes[0]
 
 
-def test_the_operator_hash_is_that_of_the_first_release(sensor):
-    """It is part of the identity of computed calibrations, which must not change; arrays that round alike anywhere."""
+def test_operator_hash_has_not_changed_since_the_first_release(sensor):
+    """It is part of the identity of computed calibrations, which must not change; ones round the same on all hosts."""
     plain = replace(
         sensor,
         pupil=np.ones_like(sensor.pupil),
@@ -95,7 +97,7 @@ def test_the_operator_hash_is_that_of_the_first_release(sensor):
     assert operator_hash(plain, SMALL, monochromatic(550.0)) == HASH_OF_ONES
 
 
-def test_a_changed_source_builds_again(sensor, stored, tmp_path, monkeypatch):
+def test_changed_source_code_rebuilds_the_cache(sensor, stored, tmp_path, monkeypatch):
     twin, mirror = stored[0], Mirror(rows=6, columns=5, pitches_per_pupil=4.0)
     load_or_fit_mirror(sensor, twin, mirror, tmp_path)
     before = set(tmp_path.iterdir())
@@ -105,11 +107,11 @@ def test_a_changed_source_builds_again(sensor, stored, tmp_path, monkeypatch):
     assert sorted(path.name.partition("-")[0] for path in set(tmp_path.iterdir()) - before) == ["mirror", "twin"]
 
 
-def test_the_tests_have_a_cache_of_their_own():
+def test_tests_use_their_own_cache():
     assert default_cache_dir().is_relative_to(Path(__file__).parents[2] / ".pytest_cache")
 
 
-def test_a_damaged_file_is_noticed_and_built_again(sensor, stored, tmp_path):
+def test_damaged_file_is_reported_and_rebuilt(sensor, stored, tmp_path):
     twin, path = stored
     content = path.read_bytes()
     middle = len(content) // 3
@@ -122,31 +124,31 @@ def test_a_damaged_file_is_noticed_and_built_again(sensor, stored, tmp_path):
         other.read_bytes(),
     ):
         path.write_bytes(damaged)
-        said, steps = [], []
+        notices, steps = [], []
         again = load_or_build(
             sensor,
             SMALL,
             cache_dir=tmp_path,
-            notice=said.append,
+            notice=notices.append,
             progress=lambda *step, steps=steps: steps.append(step),
         )
-        assert len(said) == 1
-        assert str(path) in said[0]
+        assert len(notices) == 1
+        assert str(path) in notices[0]
         assert steps[-1] == (32, 32)
         same(twin, again)
         same(twin, load_or_build(sensor, SMALL, cache_dir=tmp_path, progress=forbidden, notice=forbidden))
 
 
 def test_a_directory_that_cannot_be_written_is_not_fatal(sensor, stored, tmp_path):
-    in_the_way = tmp_path / "file"
-    in_the_way.write_text("not a directory")
-    said = []
-    twin = load_or_build(sensor, SMALL, cache_dir=in_the_way / "cache", notice=said.append)
+    file = tmp_path / "file"
+    file.write_text("not a directory")
+    notices = []
+    twin = load_or_build(sensor, SMALL, cache_dir=file / "cache", notice=notices.append)
     same(stored[0], twin)
-    assert any("cannot be written" in text for text in said)
+    assert any("cannot be written" in text for text in notices)
 
 
-def test_two_builders_at_once_do_no_harm(sensor, tmp_path):
+def test_concurrent_builds_give_one_valid_file(sensor, tmp_path):
     with ThreadPoolExecutor(2) as pool:
         twins = list(pool.map(lambda _: load_or_build(sensor, SMALL, cache_dir=tmp_path), range(2)))
     same(*twins)
@@ -162,17 +164,17 @@ def test_the_cache_follows_xdg(monkeypatch, tmp_path):
     assert default_cache_dir() == tmp_path / ".cache" / "lowfc"
 
 
-def test_a_mirror_is_kept_too_and_a_damaged_one_is_fitted_again(stored, sensor, tmp_path):
-    twin, mirror, said = stored[0], Mirror(rows=6, columns=5, pitches_per_pupil=4.0), []
-    first = load_or_fit_mirror(sensor, twin, mirror, tmp_path, said.append)
+def test_mirror_is_cached_and_a_damaged_file_is_refitted(stored, sensor, tmp_path):
+    twin, mirror, notices = stored[0], Mirror(rows=6, columns=5, pitches_per_pupil=4.0), []
+    first = load_or_fit_mirror(sensor, twin, mirror, tmp_path, notices.append)
     file = next(tmp_path.glob("mirror-*.npz"))
     written = file.stat().st_mtime_ns
-    again = load_or_fit_mirror(sensor, twin, mirror, tmp_path, said.append)
+    again = load_or_fit_mirror(sensor, twin, mirror, tmp_path, notices.append)
     assert file.stat().st_mtime_ns == written
-    assert not said
+    assert not notices
     file.write_bytes(file.read_bytes()[:-100])
-    rebuilt = load_or_fit_mirror(sensor, twin, mirror, tmp_path, said.append)
-    assert "cannot be used" in said[0]
+    rebuilt = load_or_fit_mirror(sensor, twin, mirror, tmp_path, notices.append)
+    assert "cannot be used" in notices[0]
     for other in (again, rebuilt):
         for part in ("used", "y_factors", "x_factors", "reduce", "expand"):
             np.testing.assert_array_equal(getattr(first, part), getattr(other, part))

@@ -1,4 +1,4 @@
-"""Errors of the simulated mirror's actuators, against models of a few lines."""
+"""Errors of the simulated mirror's actuators, against simple models."""
 
 import numpy as np
 import pytest
@@ -9,23 +9,23 @@ from sim_dm.actuators import PLAY_NM, Actuators
 from sim_dm.driver import SimulatedMirror
 
 GRID = (2, 3)
-NEVER, AT_ONCE = np.inf, 0.0
+SETTLED, AT_ONCE = np.inf, 0.0  # elapsed time, ns
 
 
 def even(height_nm: float) -> np.ndarray:
     return np.full(GRID, height_nm, np.float32)
 
 
-def test_gains_differ_from_actuator_to_actuator_and_come_from_the_seed() -> None:
+def test_gain_errors_differ_between_actuators_and_depend_on_the_seed() -> None:
     one, same, other = (Actuators((40, 50), 0.05, 0, 0, seed) for seed in (1, 1, 2))
-    gains = [each.reach(np.full((40, 50), 100, np.float32), NEVER) / 100 for each in (one, same, other)]
+    gains = [each.reach(np.full((40, 50), 100, np.float32), SETTLED) / 100 for each in (one, same, other)]
     assert gains[0].std() == pytest.approx(0.05, rel=0.05)
     np.testing.assert_array_equal(gains[0], gains[1])
     assert np.abs(gains[0] - gains[2]).max() > 0.05
 
 
 def play(width_nm: float, heights_nm: list[float]) -> list[float]:
-    """A block in a slot: it moves only where an end of the slot pushes it."""
+    """Play operator: a block in a slot, which moves only when an end of the slot pushes it."""
     found, at_nm = [], 0.0
     for height_nm in heights_nm:
         if height_nm - at_nm > width_nm:
@@ -36,8 +36,8 @@ def play(width_nm: float, heights_nm: list[float]) -> list[float]:
     return found
 
 
-def test_a_hysteresis_loop_is_that_of_blocks_in_slots_and_encloses_their_area() -> None:
-    """The loop of a play of half width r under a swing of +-A has the area 4 r (A - r)."""
+def test_hysteresis_agrees_with_play_operators_and_encloses_their_area() -> None:
+    """The hysteresis loop of a play of half width r for a swing of +-A has the area 4 r (A - r)."""
     swing_nm, share = 80.0, 0.1
     cycle = swing_nm * np.sin(np.linspace(0, 2 * np.pi, 4001))
     heights = [*cycle, *cycle[1:]]
@@ -53,7 +53,7 @@ def test_a_hysteresis_loop_is_that_of_blocks_in_slots_and_encloses_their_area() 
 
 def test_creep_grows_with_the_logarithm_of_time() -> None:
     actuators = Actuators(GRID, 0, 0, 0.01, 1)
-    actuators.reach(even(0), NEVER)
+    actuators.reach(even(0), SETTLED)
     times_s = np.geomspace(1e-3, 1000, 600)
     reached = [float(actuators.reach(even(100), 1e9 * step_s)[1, 2]) for step_s in np.diff(times_s, prepend=0.0)]
     for decade_s in (0.3, 1.0, 3.0):
@@ -63,12 +63,12 @@ def test_creep_grows_with_the_logarithm_of_time() -> None:
     assert reached[-1] == pytest.approx(104, abs=0.05)
 
 
-def test_a_configuration_has_none_of_them_unless_it_says_so() -> None:
+def test_actuator_errors_are_off_by_default() -> None:
     ideal, real = ({f"mirror.{key}": value for key in ("gain_error", "hysteresis", "creep")} for value in (0.0, 0.05))
     shapes = np.random.default_rng(1).normal(0, 20, (20, 34, 34)).astype(np.float32)
     plain, zero, one, same = (SimulatedMirror(DriverOptions(), load(None, keys)) for keys in ({}, ideal, real, real))
     for shape in shapes:
-        ways = [mirror.settle(shape, 1e6) for mirror in (plain, zero, one, same)]
-        np.testing.assert_array_equal(ways[0], ways[1])
-        np.testing.assert_array_equal(ways[2], ways[3])
-    assert np.abs(ways[0] - ways[2]).max() > 1
+        surfaces = [mirror.settle(shape, 1e6) for mirror in (plain, zero, one, same)]
+        np.testing.assert_array_equal(surfaces[0], surfaces[1])
+        np.testing.assert_array_equal(surfaces[2], surfaces[3])
+    assert np.abs(surfaces[0] - surfaces[2]).max() > 1

@@ -1,4 +1,4 @@
-"""Disturbances and faults of the simulated camera: what they are, and that a seed gives them again."""
+"""Disturbances and faults of the simulated camera: their statistics, and reproducibility from the seed."""
 
 import json
 from collections import Counter
@@ -25,8 +25,8 @@ from sim_camera.disturbance import (
     Disturbance,
     Sampler,
     _Lines,
-    disturbance,
     modes_nm,
+    preset_disturbance,
     screen,
     variances_nm2,
 )
@@ -40,90 +40,90 @@ RATE_HZ = 1000.0
 
 
 def preset(name: str, seed: int = 1, **more: object) -> Disturbance:
-    return disturbance(name, NOLL, seed, NM_PER_MAS, 550.0, **more)
+    return preset_disturbance(name, NOLL, seed, NM_PER_MAS, 550.0, **more)
 
 
-def rms_nm(shaken: Disturbance) -> np.ndarray:
-    """Rms of each mode over all time, from its exact spectrum."""
-    result: np.ndarray = np.sqrt(np.sum(np.abs(shaken.amplitude_nm) ** 2, axis=0) / 2)
+def rms_nm(disturbance: Disturbance) -> np.ndarray:
+    """Rms of each mode over all time, from the amplitudes of its sine waves."""
+    result: np.ndarray = np.sqrt(np.sum(np.abs(disturbance.amplitude_nm) ** 2, axis=0) / 2)
     return result
 
 
 @pytest.mark.parametrize("name", PRESETS)
 @settings(max_examples=6, deadline=None, derandomize=True)
 @given(first=st.integers(0, 10**9), count=st.integers(1, 80), cut=st.integers(0, 80))
-def test_a_frame_is_the_same_in_any_order_and_any_block(name: str, first: int, count: int, cut: int) -> None:
-    shaken = preset(name, static_nm={4: 3.0})
-    whole = modes_nm(shaken, first, count, RATE_HZ)
+def test_modes_do_not_depend_on_order_or_block(name: str, first: int, count: int, cut: int) -> None:
+    disturbance = preset(name, static_nm={4: 3.0})
+    whole = modes_nm(disturbance, first, count, RATE_HZ)
     cut = min(cut, count - 1)
     assert whole.shape == (count, len(NOLL))
-    assert np.abs(modes_nm(shaken, first + cut, count - cut, RATE_HZ) - whole[cut:]).max() < 1e-5
-    assert np.abs(modes_nm(shaken, first + cut, 1, RATE_HZ)[0] - whole[cut]).max() < 1e-5
+    assert np.abs(modes_nm(disturbance, first + cut, count - cut, RATE_HZ) - whole[cut:]).max() < 1e-5
+    assert np.abs(modes_nm(disturbance, first + cut, 1, RATE_HZ)[0] - whole[cut]).max() < 1e-5
     assert np.array_equal(modes_nm(preset(name, static_nm={4: 3.0}), first, count, RATE_HZ), whole)
 
 
 @pytest.mark.parametrize("name", ["bench", "thermal", "reaction-wheel"])
-def test_another_seed_is_another_disturbance_of_the_same_rms(name: str) -> None:
+def test_another_seed_gives_another_disturbance_with_the_same_rms(name: str) -> None:
     one, other = preset(name, 1), preset(name, 2)
     assert np.abs(modes_nm(one, 0, 50, RATE_HZ) - modes_nm(other, 0, 50, RATE_HZ)).max() > 0.5
     assert rms_nm(one) == pytest.approx(rms_nm(other), rel=1e-9)
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_the_scale_multiplies_it(name: str) -> None:
+def test_scale_multiplies_the_disturbance(name: str) -> None:
     one, thrice = preset(name), preset(name, scale=3.0)
     assert np.allclose(modes_nm(thrice, 5, 7, RATE_HZ), 3 * modes_nm(one, 5, 7, RATE_HZ))
     assert thrice.screen_nm == pytest.approx(3 * one.screen_nm)
 
 
-def test_the_ideal_reaction_wheel_is_14_mas_per_axis_with_its_five_lines() -> None:
-    shaken = preset(IDEAL)
-    per_axis_mas = rms_nm(shaken)[:2] / NM_PER_MAS
+def test_ideal_reaction_wheel_has_14_mas_per_axis_in_five_lines() -> None:
+    disturbance = preset(IDEAL)
+    per_axis_mas = rms_nm(disturbance)[:2] / NM_PER_MAS
     assert np.abs(per_axis_mas / 14 - 1).max() < 0.05
     assert LINES_HZ == (6.0, 18.0, 37.0, 71.0, 117.0)
     for axis in (0, 1):
-        power = np.abs(shaken.amplitude_nm[:, axis]) ** 2
-        lines = np.isin(shaken.frequency_hz, LINES_HZ)
+        power = np.abs(disturbance.amplitude_nm[:, axis]) ** 2
+        lines = np.isin(disturbance.frequency_hz, LINES_HZ)
         assert lines.sum() == 5
         assert power[lines].sum() > 0.9 * power.sum()
-        assert shaken.frequency_hz[~lines].max() < 6
+        assert disturbance.frequency_hz[~lines].max() < 6
         assert (np.diff(power[lines]) < 0).all()
 
 
 @pytest.mark.parametrize("width", [0.005, 0.02])
-def test_damped_lines_have_their_power_and_lose_their_phase(width: float) -> None:
-    """Variance, and the correlation at two times of exp(-pi width t), over 400 seeds of one line on two axes."""
+def test_damped_lines_have_the_configured_power_and_coherence(width: float) -> None:
+    """Variance, and autocorrelation exp(-pi width t), over 400 seeds of one line on two axes."""
     line = DampedLine(37.0, 37.0 * width, np.array([2.0, 3.0]))
     lag = round(RATE_HZ / (np.pi * line.width_hz))
-    still = preset("quiet")
-    several = [replace(still, noll=(2, 3), lines=(line,), seed=seed) for seed in range(400)]
-    found = np.array([_Lines(one, RATE_HZ).at(0, lag + 1)[[0, lag]] for one in several])[:, :, 0]
+    quiet = preset("quiet")
+    realisations = [replace(quiet, noll=(2, 3), lines=(line,), seed=seed) for seed in range(400)]
+    found = np.array([_Lines(one, RATE_HZ).at(0, lag + 1)[[0, lag]] for one in realisations])[:, :, 0]
     assert found.real.std(axis=(0, 1)) == pytest.approx(line.rms_nm, rel=0.1)
-    kept = np.mean(found[:, 1] * found[:, 0].conj(), axis=0) / np.mean(np.abs(found[:, 0]) ** 2, axis=0)
+    correlation = np.mean(found[:, 1] * found[:, 0].conj(), axis=0) / np.mean(np.abs(found[:, 0]) ** 2, axis=0)
     phase = np.exp(2j * np.pi * line.frequency_hz * lag / RATE_HZ)
-    assert np.abs(kept / phase - np.exp(-1)).max() < 0.15
+    assert np.abs(correlation / phase - np.exp(-1)).max() < 0.15
 
 
-def test_the_wheel_and_the_ideal_wheel_have_the_same_power() -> None:
+def test_reaction_wheel_and_ideal_preset_have_the_same_power() -> None:
     for per_line in (1, 401):
         both = [variances_nm2(preset(name), per_line)[1].sum(axis=0) for name in ("reaction-wheel", IDEAL)]
         np.testing.assert_allclose(*both)
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_instants_of_a_period_are_those_of_continuous_time(name: str) -> None:
-    """The same disturbance at twice the rate, between whose frames lie those of the slower one; a block's end too."""
-    shaken = replace(preset(name, static_nm={4: 3.0}), lines=())
-    sampler = Sampler(shaken, np.array([0.0, 0.5]), RATE_HZ)
+def test_sampler_instants_agree_with_a_higher_frame_rate(name: str) -> None:
+    """Two instants per period agree with frames at twice the rate, also at the end of a block."""
+    disturbance = replace(preset(name, static_nm={4: 3.0}), lines=())
+    sampler = Sampler(disturbance, np.array([0.0, 0.5]), RATE_HZ)
     for index in (0, BLOCK - 1, 5, 12_345 * BLOCK + 1):
-        np.testing.assert_allclose(sampler.at(index), modes_nm(shaken, 2 * index, 2, 2 * RATE_HZ), atol=2e-4)
+        np.testing.assert_allclose(sampler.at(index), modes_nm(disturbance, 2 * index, 2, 2 * RATE_HZ), atol=2e-4)
 
 
-def test_between_two_frames_a_damped_line_goes_on_turning() -> None:
-    shaken = replace(preset("quiet"), noll=(2, 3), step_nm=np.zeros(2), static_nm=np.zeros(2))
-    shaken = replace(shaken, amplitude_nm=np.zeros((0, 2)), lines=(DampedLine(71.0, 0.1, np.ones(2)),))
+def test_damped_line_rotates_between_frames() -> None:
+    disturbance = replace(preset("quiet"), noll=(2, 3), step_nm=np.zeros(2), static_nm=np.zeros(2))
+    disturbance = replace(disturbance, amplitude_nm=np.zeros((0, 2)), lines=(DampedLine(71.0, 0.1, np.ones(2)),))
     instants = np.array([0.0, 0.25, 0.75])
-    sampler, vectors = Sampler(shaken, instants, RATE_HZ), _Lines(shaken, RATE_HZ).at(0, 40)[:, 0]
+    sampler, vectors = Sampler(disturbance, instants, RATE_HZ), _Lines(disturbance, RATE_HZ).at(0, 40)[:, 0]
     for index in (0, 1, BLOCK - 1, BLOCK, 30):
         turned = np.exp(2j * np.pi * 0.071 * instants)[:, None]
         ends = vectors[index], vectors[index + 1] * np.exp(-2j * np.pi * 0.071)
@@ -131,8 +131,8 @@ def test_between_two_frames_a_damped_line_goes_on_turning() -> None:
         np.testing.assert_allclose(sampler.at(index), expected.real, atol=1e-4)
 
 
-def test_the_truth_of_a_frame_is_there_when_the_next_block_has_begun(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is computed after the next exposure: damped lines must not be drawn again from the first frame on."""
+def test_previous_frame_is_available_after_a_new_block(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The truth is computed after the next exposure: damped lines must not be drawn again from the first frame on."""
     sampler = Sampler(preset("reaction-wheel"), np.zeros(1), RATE_HZ)
     monkeypatch.delattr(_Lines, "_restart")
     for index in range(1, 4 * BLOCK):
@@ -142,24 +142,26 @@ def test_the_truth_of_a_frame_is_there_when_the_next_block_has_begun(monkeypatch
 
 
 def test_the_lines_phases_of_the_two_axes_differ() -> None:
-    shaken = preset(IDEAL)
-    tilts = shaken.amplitude_nm[np.isin(shaken.frequency_hz, LINES_HZ), :2]
+    disturbance = preset(IDEAL)
+    tilts = disturbance.amplitude_nm[np.isin(disturbance.frequency_hz, LINES_HZ), :2]
     assert np.abs(np.angle(tilts[:, 0] / tilts[:, 1])).max() > 0.5
 
 
-def test_the_bench_drifts_and_jitters_a_little() -> None:
-    shaken = preset("bench")
-    jitter = np.isin(shaken.frequency_hz, (0.7, 1.9, 4.3, 9.1))
+def test_bench_preset_has_slow_drift_and_tilt_jitter() -> None:
+    disturbance = preset("bench")
+    jitter = np.isin(disturbance.frequency_hz, (0.7, 1.9, 4.3, 9.1))
     assert jitter.sum() == 4
-    assert np.sqrt(np.sum(np.abs(shaken.amplitude_nm[jitter]) ** 2, axis=0) / 2)[:2] == pytest.approx(1.5 * NM_PER_MAS)
-    assert not shaken.amplitude_nm[jitter, 2:].any()
-    assert shaken.frequency_hz[~jitter].max() <= 0.53
+    assert np.sqrt(np.sum(np.abs(disturbance.amplitude_nm[jitter]) ** 2, axis=0) / 2)[:2] == pytest.approx(
+        1.5 * NM_PER_MAS
+    )
+    assert not disturbance.amplitude_nm[jitter, 2:].any()
+    assert disturbance.frequency_hz[~jitter].max() <= 0.53
 
 
 def test_the_thermal_drift_is_slow_and_falls_with_radial_degree() -> None:
-    shaken = preset("thermal")
-    assert shaken.frequency_hz.max() <= 0.53
-    assert rms_nm(shaken) == pytest.approx([4, 4, 5, 5, 5, 2.5, 2.5, 2.5, 2.5, 1.5, 1.5, 1.5, 1.5, 1.5])
+    disturbance = preset("thermal")
+    assert disturbance.frequency_hz.max() <= 0.53
+    assert rms_nm(disturbance) == pytest.approx([4, 4, 5, 5, 5, 2.5, 2.5, 2.5, 2.5, 1.5, 1.5, 1.5, 1.5, 1.5])
 
 
 def test_the_step_is_a_square_wave_of_5_mas() -> None:
@@ -169,18 +171,18 @@ def test_the_step_is_a_square_wave_of_5_mas() -> None:
     assert not tilt[:, 2:].any()
 
 
-def test_quiet_is_nothing_but_what_is_asked() -> None:
-    still = modes_nm(preset("quiet", static_nm={2: 4.0, 11: -7.0}), 10**6, 3, RATE_HZ)
-    assert (still == still[0]).all()
-    assert still[0][[0, 9]].tolist() == [4, -7]
-    assert np.count_nonzero(still[0]) == 2
+def test_quiet_preset_contains_only_the_static_modes() -> None:
+    modes = modes_nm(preset("quiet", static_nm={2: 4.0, 11: -7.0}), 10**6, 3, RATE_HZ)
+    assert (modes == modes[0]).all()
+    assert modes[0][[NOLL.index(2), NOLL.index(11)]].tolist() == [4, -7]
+    assert np.count_nonzero(modes[0]) == 2
 
 
-def test_the_screen_has_kolmogorovs_spectrum_and_comes_from_the_seed() -> None:
-    """Power summed over many seeds falls as the -11/3 power of frequency, between 1 and 12 cycles per diameter."""
+def test_screen_has_a_kolmogorov_spectrum_and_depends_on_the_seed() -> None:
+    """Power averaged over seeds falls as frequency to the power -11/3 between 1 and 5 cycles per diameter."""
     power = np.zeros((64, 64))
     for seed in range(30):
-        power += np.abs(np.fft.fft2(screen(seed, 64, 4 / 64))) ** 2  # the whole periodic square
+        power += np.abs(np.fft.fft2(screen(seed, 64, 4 / 64))) ** 2  # one full period
     radius = np.hypot(*np.meshgrid(np.fft.fftfreq(64, 4 / 64), np.fft.fftfreq(64, 4 / 64)))
     bands = [(radius > low) & (radius <= 1.3 * low) for low in (1.0, 2.0, 4.0)]
     slope = np.polyfit(np.log([radius[b].mean() for b in bands]), np.log([power[b].mean() for b in bands]), 1)[0]
@@ -206,88 +208,88 @@ def fault(kind: Kind, seed: int = 5) -> Fault:
     return Fault(kind, FIRST, FRAMES, seed)
 
 
-def order(kind: Kind, seed: int = 5) -> list[int]:
+def published(kind: Kind, seed: int = 5) -> list[int]:
     return [frame for index in range(LAST) for frame in fault(kind, seed).sent(index)]
 
 
-def spoilt(kind: Kind, index: int) -> np.ndarray:
+def faulty_frame(kind: Kind, index: int) -> np.ndarray:
     return fault(kind).pixels(index, IMAGE, IMAGE[::-1], DARK, HIGHEST)
 
 
 @pytest.mark.parametrize("kind", Kind)
-def test_outside_its_time_a_fault_changes_nothing(kind: Kind) -> None:
+def test_fault_changes_no_frame_outside_its_range(kind: Kind) -> None:
     for index in (1, FIRST - 1, FIRST + FRAMES + MOST_FRAMES_LATE + 1):
         assert fault(kind).sent(index) == (index,)
-        assert spoilt(kind, index) is IMAGE
+        assert faulty_frame(kind, index) is IMAGE
         assert fault(kind).payload(index, b"whole", 5) == b"whole"
 
 
-def test_a_tenth_of_the_frames_is_lost_as_the_seed_says() -> None:
-    lost = set(range(LAST)) - set(order(Kind.LOST))
+def test_lost_frames_are_a_tenth_chosen_by_the_seed() -> None:
+    lost = set(range(LAST)) - set(published(Kind.LOST))
     assert lost <= set(range(FIRST, FIRST + FRAMES))
     assert len(lost) == pytest.approx(LOST_SHARE * FRAMES, rel=0.5)
-    assert order(Kind.LOST) == order(Kind.LOST) != order(Kind.LOST, seed=6)
+    assert published(Kind.LOST) == published(Kind.LOST) != published(Kind.LOST, seed=6)
 
 
-def test_reordered_frames_come_in_pairs_the_second_one_first() -> None:
-    found = order(Kind.REORDERED)
+def test_reordered_frames_are_swapped_in_pairs() -> None:
+    found = published(Kind.REORDERED)
     assert sorted(found) == list(range(LAST))
     assert found[FIRST : FIRST + 4] == [FIRST + 1, FIRST, FIRST + 3, FIRST + 2]
 
 
-def test_late_frames_all_come_by_up_to_fifty_frames_late() -> None:
+def test_late_frames_are_all_published_within_fifty_frames() -> None:
     when = {frame: index for index in range(LAST) for frame in fault(Kind.LATE).sent(index)}
     assert set(when) == set(range(LAST))
     late = [when[frame] - frame for frame in range(FIRST, FIRST + FRAMES)]
     assert (min(late), max(late)) == (1, MOST_FRAMES_LATE)
 
 
-def test_what_the_detector_gives() -> None:
-    assert (spoilt(Kind.SATURATED, FIRST) == HIGHEST).all()
-    dark = spoilt(Kind.DARK, FIRST)
+def test_detector_faults_change_the_pixels() -> None:
+    assert (faulty_frame(Kind.SATURATED, FIRST) == HIGHEST).all()
+    dark = faulty_frame(Kind.DARK, FIRST)
     assert abs(dark.astype(int) - DARK).max() <= 2
-    np.testing.assert_array_equal(spoilt(Kind.STUCK, FIRST), IMAGE[::-1])
-    assert 0 < (spoilt(Kind.HOT_PIXELS, FIRST) == HIGHEST).sum() < IMAGE.size / 4
-    struck = [(spoilt(Kind.COSMIC_RAYS, index) == HIGHEST).sum() for index in range(FIRST, FIRST + FRAMES)]
-    assert 0 < np.count_nonzero(struck) < FRAMES / 2
-    assert max(struck) <= TRACK_PIXELS
-    assert IMAGE.max() == 399, "what was given is left alone"
+    np.testing.assert_array_equal(faulty_frame(Kind.STUCK, FIRST), IMAGE[::-1])
+    assert 0 < (faulty_frame(Kind.HOT_PIXELS, FIRST) == HIGHEST).sum() < IMAGE.size / 4
+    tracks = [(faulty_frame(Kind.COSMIC_RAYS, index) == HIGHEST).sum() for index in range(FIRST, FIRST + FRAMES)]
+    assert 0 < np.count_nonzero(tracks) < FRAMES / 2
+    assert max(tracks) <= TRACK_PIXELS
+    assert IMAGE.max() == 399, "the input is not modified"
 
 
-def test_what_is_on_the_wire() -> None:
-    sound = image(IMAGE, 0, "sensor")
-    message = sound.SerializeToString()
-    end = message.index(sound.data) + len(sound.data)
-    assert spoilt(Kind.WRONG_SIZE, FIRST).shape == (19, 19)
-    cutting = Fault(Kind.TRUNCATED, FIRST, 5000, 5)
-    short = [cutting.payload(index, message, end) for index in range(FIRST, FIRST + 5000)]
-    assert all(message.startswith(one) and decode_frame(one, 1, 0).pixels is None for one in short)
+def test_message_faults_change_the_payload() -> None:
+    good = image(IMAGE, 0, "sensor")
+    message = good.SerializeToString()
+    end = message.index(good.data) + len(good.data)
+    assert faulty_frame(Kind.WRONG_SIZE, FIRST).shape == (19, 19)
+    truncating = Fault(Kind.TRUNCATED, FIRST, 5000, 5)
+    truncated = [truncating.payload(index, message, end) for index in range(FIRST, FIRST + 5000)]
+    assert all(message.startswith(one) and decode_frame(one, 1, 0).pixels is None for one in truncated)
     assert len({fault(Kind.RANDOM).payload(index, message, end) for index in range(FIRST, FIRST + 50)}) == 50
 
 
 @pytest.mark.parametrize("kind", [Kind.DUPLICATED, Kind.REORDERED, Kind.LATE, Kind.OLD_SEQUENCE, Kind.TRUNCATED])
-def test_what_is_published(kind: Kind) -> None:
+def test_faulty_publisher_sends_the_configured_frames(kind: Kind) -> None:
     hub, clock = MemoryHub(), FakeClock(EARLIER_S * 10**10)
     camera, reader = MemoryBus(hub, "camera", clock), MemoryBus(hub, "controller", clock)
-    got: list[Sample] = []
-    reader.subscribe(FRAME, got.append)
+    received: list[Sample] = []
+    reader.subscribe(FRAME, received.append)
     faulty = FaultyFrames(Fault(kind, 10, 10), camera.publisher(FRAME), DARK, HIGHEST, clock.host_ns)
     for index in range(90):
         envelope = faulty.put(image(IMAGE + np.uint16(index), index, "camera").SerializeToString())
         assert count_of(envelope.sequence) == index
-    start_s = start_of(got[0].sequence)
-    for sample in got:
+    start_s = start_of(received[0].sequence)
+    for sample in received:
         index = count_of(sample.sequence)
-        struck = 10 <= index < 20
-        earlier_s = EARLIER_S if kind is Kind.OLD_SEQUENCE and struck else 0
+        faulty_range = 10 <= index < 20
+        earlier_s = EARLIER_S if kind is Kind.OLD_SEQUENCE and faulty_range else 0
         assert start_of(sample.sequence) == start_s - earlier_s
         frame = decode_frame(sample.payload, sample.sequence, 0)
-        if kind is Kind.TRUNCATED and struck:
+        if kind is Kind.TRUNCATED and faulty_range:
             assert frame.pixels is None
         else:
             assert frame.pixels is not None
             np.testing.assert_array_equal(frame.pixels, IMAGE + np.uint16(index))
-    counts = Counter(count_of(sample.sequence) for sample in got)
+    counts = Counter(count_of(sample.sequence) for sample in received)
     assert set(counts) == set(range(90))
     assert sum(counts.values()) == (100 if kind is Kind.DUPLICATED else 90)
 
@@ -302,12 +304,12 @@ def test_what_is_published(kind: Kind) -> None:
         '{"kind": "lost", "first": 0, "frames": 1}',
     ],
 )
-def test_a_file_of_a_fault_that_is_none(tmp_path: Path, content: str) -> None:
+def test_invalid_fault_file_is_refused(tmp_path: Path, content: str) -> None:
     (tmp_path / "fault.json").write_text(content)
     with pytest.raises(ConfigurationError, match="not a fault"):
         read_fault(tmp_path / "fault.json")
 
 
-def test_a_file_of_a_fault(tmp_path: Path) -> None:
+def test_fault_file_is_read(tmp_path: Path) -> None:
     (tmp_path / "fault.json").write_text(json.dumps({"kind": "dark", "first": 3, "frames": 4, "seed": 5}))
     assert read_fault(tmp_path / "fault.json") == Fault(Kind.DARK, 3, 4, 5)

@@ -1,4 +1,4 @@
-"""What a camera reports of a run of unknown length: figures of the wavefront, and late commands."""
+"""Reports of the simulated camera: figures of the wavefront, habitually late commands, and the readout region."""
 
 from types import SimpleNamespace
 from typing import cast
@@ -21,7 +21,7 @@ NOLL = (2, 3, 4)
 
 
 def figures(*residuals_nm: float, nm_per_mas: float = 1.0, recent: int = 1) -> Figures:
-    """Of frames with this residual in every mode and over the pupil, and twice the disturbance."""
+    """Figures of frames with this residual in every mode and over the pupil, and a disturbance twice as large."""
     found = Figures(NOLL, nm_per_mas, recent)
     for residual_nm in residuals_nm:
         modes = np.full(len(NOLL), residual_nm, np.float32)
@@ -39,7 +39,7 @@ def figures(*residuals_nm: float, nm_per_mas: float = 1.0, recent: int = 1) -> F
 
 
 @pytest.mark.parametrize("blocks", [2, MOST_BLOCKS - 1, MOST_BLOCKS, MOST_BLOCKS + 2, 2 * MOST_BLOCKS + 4])
-def test_they_are_those_of_the_second_half_however_long_it_was(monkeypatch: pytest.MonkeyPatch, blocks: int) -> None:
+def test_figures_cover_the_second_half_of_a_run_of_any_length(monkeypatch: pytest.MonkeyPatch, blocks: int) -> None:
     monkeypatch.setattr("sim_camera.figures.BLOCK", 2)
     half = blocks // 2 * 2
     run = figures(*[5.0] * half, *[3.0] * (2 * blocks - half))
@@ -48,24 +48,24 @@ def test_they_are_those_of_the_second_half_however_long_it_was(monkeypatch: pyte
     assert len(run._blocks) < MOST_BLOCKS
 
 
-def test_before_the_first_block_they_are_those_of_what_there_is() -> None:
+def test_figures_before_the_first_block_cover_all_frames() -> None:
     assert figures().wavefront() is None
     found = figures(*[3.0, 5.0] * (BLOCK // 4), nm_per_mas=2.0).wavefront()
     assert found is not None
-    rms_nm = np.sqrt(17)
+    rms_nm = np.sqrt((3**2 + 5**2) / 2)
     assert found == WavefrontFigures(*(pytest.approx(value * rms_nm) for value in (2, 1, 1, 0.5))), "tilts per axis"
 
 
-def test_the_recent_ones_forget_what_was_before() -> None:
+def test_recent_figures_cover_only_recent_frames() -> None:
     assert figures(recent=100).recent() is None
     run = figures(*[50.0] * BLOCK, *[2.0] * 100, recent=100)
     found, whole = run.recent(), run.wavefront()
     assert (found.residual_rms_nm, found.tilt_disturbance_mas) == pytest.approx((2.0, 4.0))
-    assert whole.residual_rms_nm > 40.0, "of the whole run's second half"
+    assert whole.residual_rms_nm > 40.0, "includes the frames before"
 
 
 @pytest.mark.parametrize("before", [0, 1, WINDOW, 3 * WINDOW + 7])
-def test_a_quarter_of_a_window_is_a_habit_and_an_eighth_is_none(before: int) -> None:
+def test_late_commands_are_habitual_from_a_quarter_to_an_eighth_of_the_window(before: int) -> None:
     lateness = Lateness()
     assert not any(lateness.add(False) for _ in range(before))
     changes = [lateness.add(True) for _ in range(WINDOW)]
@@ -77,13 +77,13 @@ def test_a_quarter_of_a_window_is_a_habit_and_an_eighth_is_none(before: int) -> 
     assert (sum(changes), lateness.habitual, lateness.percent, lateness.total) == (1, False, 0, WINDOW)
 
 
-def test_a_few_late_commands_are_no_habit() -> None:
+def test_occasional_late_commands_are_not_habitual() -> None:
     lateness = Lateness()
     assert not any(lateness.add(number % 5 == 0) for number in range(10 * WINDOW))
     assert lateness.percent == 20
 
 
-def test_the_camera_reports_the_habit_each_time() -> None:
+def test_camera_reports_each_change_of_habitual_lateness() -> None:
     hub, clock, config = MemoryHub(), FakeClock(), Configuration()
     events: list[str] = []
     MemoryBus(hub, "operator", clock).subscribe(
@@ -104,7 +104,7 @@ def test_the_camera_reports_the_habit_each_time() -> None:
 
     camera._last_frame = 1 << 32
     for sequence in range(1, 2 * WINDOW):
-        put(sequence)  # as conformance commands a mirror, where there is no controller
+        put(sequence)  # without frames of these sequences, as in the conformance test of a mirror
     assert (camera._lateness.total, events[1:]) == (0, [])
     camera._newest_state = sequence = 0
     for late in (False, True, False, True):
@@ -113,12 +113,12 @@ def test_the_camera_reports_the_habit_each_time() -> None:
             camera._last_frame = sequence + late
             camera._published_ns[sequence % len(camera._published_ns)] = sequence, 0
             put(sequence)
-    said = [event.split()[0] for event in events if event.startswith("COMMANDS_")]
-    assert said == ["COMMANDS_LATE", "COMMANDS_IN_TIME", "COMMANDS_LATE"]
+    names = [event.split()[0] for event in events if event.startswith("COMMANDS_")]
+    assert names == ["COMMANDS_LATE", "COMMANDS_IN_TIME", "COMMANDS_LATE"]
     assert camera._lateness.total == 4 * WINDOW
 
 
-def test_the_middle_of_the_sensor_is_read() -> None:
+def test_region_is_read_at_the_centre_of_the_sensor() -> None:
     pixels = np.arange(80 * 80, dtype=np.uint16).reshape(80, 80)
     optics = cast("Scene", SimpleNamespace(shape=(80, 80), instants=(), expose=lambda index, shape: pixels))
     options = SimulatedCamera.Options(rows=64, columns=50)

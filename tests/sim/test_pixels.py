@@ -1,4 +1,4 @@
-"""Errors of the simulated detector's pixels, against models of a few lines."""
+"""Pixel errors of the simulated detector, against simple models."""
 
 from typing import Any
 
@@ -21,25 +21,24 @@ def quiet(**changed: Any) -> Configuration:
 
 
 def test_dark_current_is_poisson_of_the_exposure_time() -> None:
-    """400 electrons per second in 2 ms: the histogram of digital numbers is that of electrons drawn at 0.8 each."""
+    """400 electrons per second in 2 ms: digital numbers have a Poisson distribution with mean 0.8."""
     config = quiet(**{"camera.dark_current_e_s": 400.0, "camera.read_noise_e": 0.0})
     assert config.dark_e == pytest.approx(0.8)
     frame = expose(detector(config), np.zeros((400, 500)), np.random.default_rng(1))
     counted = np.bincount((frame - 100).ravel(), minlength=8)
     expected = stats.poisson.pmf(np.arange(8), 0.8) * frame.size
-    kept = expected > 5
-    assert (
-        stats.chisquare([*counted[kept], counted[~kept].sum()], [*expected[kept], frame.size - expected[kept].sum()])[1]
-        > 1e-3
-    )
+    often = expected > 5
+    observed = [*counted[often], counted[~often].sum()]
+    p_value = stats.chisquare(observed, [*expected[often], frame.size - expected[often].sum()])[1]
+    assert p_value > 1e-3
 
 
-def test_dark_current_is_in_the_frames_and_in_the_calibrations_dark() -> None:
+def test_dark_current_raises_the_mean_of_frames() -> None:
     frames = [scene(quiet(**{"camera.dark_current_e_s": rate})).expose(0, FLAT) for rate in (0.0, 5000.0)]
     assert frames[1].mean() - frames[0].mean() == pytest.approx(10, abs=0.2)
 
 
-def test_hot_pixels_and_gains_are_as_many_and_as_wide_as_said() -> None:
+def test_hot_pixels_and_gains_have_the_configured_statistics() -> None:
     found = pixel_errors(FULL, (300, 400), 1, 0.02, 0.0, 0.01, 50.0)
     assert found is not None
     assert found.gain.std() == pytest.approx(0.02, rel=0.02)
@@ -52,16 +51,16 @@ def test_hot_pixels_and_gains_are_as_many_and_as_wide_as_said() -> None:
     assert pixel_errors(FULL, (300, 400), 1, 0, 0, 0, 50.0) is None
 
 
-def test_a_response_that_is_bent_has_its_gain_at_zero_and_its_end_at_full_well() -> None:
-    bent, full = response(FULL, 0.05), saturation_dn(FULL)
-    assert bent[[0, 50, 100, full]].tolist() == [0, 50, 100, full]
+def test_nonlinear_response_is_exact_at_zero_and_full_well() -> None:
+    found, full = response(FULL, 0.05), saturation_dn(FULL)
+    assert found[[0, 50, 100, full]].tolist() == [0, 50, 100, full]
     for signal in (200, 20_000, 35_000):
-        assert bent[100 + signal] - 100 == pytest.approx(signal * 1.05 - 0.05 * signal**2 / 40_000, abs=0.5)
-    assert (np.diff(bent[: full + 1].astype(int)) >= 0).all()
+        assert found[100 + signal] - 100 == pytest.approx(signal * 1.05 - 0.05 * signal**2 / 40_000, abs=0.5)
+    assert (np.diff(found[: full + 1].astype(int)) >= 0).all()
     np.testing.assert_array_equal(response(FULL, 0.0), np.arange(1 << 16))
 
 
-def test_the_scene_applies_them_to_a_frame_and_a_seed_gives_it_again() -> None:
+def test_scene_applies_pixel_errors_reproducibly() -> None:
     keys = {"camera.hot_pixels": 0.01, "camera.nonlinearity": 0.05, "camera.nonuniformity": 0.02, "camera.noise": False}
     bright = {"star.magnitude": 0.0, "disturbance.preset": "quiet"}
     plain, one, same = (scene(load(None, bright | more)) for more in ({"camera.noise": False}, keys, keys))

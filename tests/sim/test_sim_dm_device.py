@@ -1,4 +1,4 @@
-"""The simulated mirror trusts nobody: its limits, its dead-man and its checks hold whatever it is told."""
+"""The simulated mirror enforces its own limits, command timeout and checks for any commands."""
 
 from dataclasses import replace
 
@@ -24,13 +24,13 @@ MS = 1_000_000
 
 
 def mirror(**changes: object) -> Device:
-    free = np.full(GRID, np.nan, np.float32)
-    return replace(Device(GRID, LIMITS, STEP_NM, True, 0.0, free), **changes)
+    none_fixed = np.full(GRID, np.nan, np.float32)
+    return replace(Device(GRID, LIMITS, STEP_NM, True, 0.0, none_fixed), **changes)
 
 
-def told(actuators_nm: Single | None, index: int = 1, **changes: object) -> Command:
-    usual = Command("lowfc", index, START_NS + index * MS, 200 * MS, actuators_nm, np.array([1, 2], np.float32))
-    return replace(usual, **changes)
+def command(actuators_nm: Single | None, index: int = 1, **changes: object) -> Command:
+    valid = Command("lowfc", index, START_NS + index * MS, 200 * MS, actuators_nm, np.array([1, 2], np.float32))
+    return replace(valid, **changes)
 
 
 def even(height_nm: float) -> Single:
@@ -40,49 +40,49 @@ def even(height_nm: float) -> Single:
 def follow(device: Device, status: Status, *heights_nm: float) -> Status:
     for height_nm in heights_nm:
         index = status.frame_sequence + 1
-        status, refused = apply_command(device, status, told(even(height_nm), index), START_NS + index * MS)
+        status, refused = apply_command(device, status, command(even(height_nm), index), START_NS + index * MS)
         assert refused is None
     return status
 
 
-def test_clear_makes_the_mirror_forget_the_newest_command() -> None:
+def test_clear_id_resets_the_newest_sequence_of_the_mirror() -> None:
     device = mirror()
-    status, _ = apply_command(device, initial(device), told(even(5.0), (1 << 63)), START_NS)
-    late, refused = apply_command(device, status, told(even(9.0), 3), START_NS)
+    status, _ = apply_command(device, initial(device), command(even(5.0), (1 << 63)), START_NS)
+    late, refused = apply_command(device, status, command(even(9.0), 3), START_NS)
     assert (refused, late) == (Rejection.OUT_OF_ORDER, status)
-    status, refused = apply_command(device, status, told(even(9.0), 3, clear_id=77), START_NS)
+    status, refused = apply_command(device, status, command(even(9.0), 3, clear_id=77), START_NS)
     assert (refused, status.frame_sequence) == (None, 3)
-    assert apply_command(device, status, told(even(9.0), 2, clear_id=77), START_NS)[1] is Rejection.OUT_OF_ORDER, (
+    assert apply_command(device, status, command(even(9.0), 2, clear_id=77), START_NS)[1] is Rejection.OUT_OF_ORDER, (
         "once for each clear"
     )
-    assert apply_command(device, status, told(even(9.0), 2, clear_id=78), START_NS)[1] is None
+    assert apply_command(device, status, command(even(9.0), 2, clear_id=78), START_NS)[1] is None
 
 
-def test_the_mirror_has_room_for_sixteen_channels() -> None:
+def test_mirror_accepts_sixteen_channels() -> None:
     device, status = mirror(), initial(mirror())
     for number in range(16):
-        status, refused = apply_command(device, status, told(even(1.0), channel=f"c{number}"), START_NS)
+        status, refused = apply_command(device, status, command(even(1.0), channel=f"c{number}"), START_NS)
         assert refused is None
-    assert apply_command(device, status, told(even(1.0), channel="another"), START_NS) == (status, Limit.CHANNEL)
-    assert apply_command(device, status, told(even(1.0), channel="c3"), START_NS)[1] is None
-    assert apply_command(device, initial(device), told(even(1.0), channel="x" * 33), START_NS)[1] is Limit.CHANNEL
+    assert apply_command(device, status, command(even(1.0), channel="another"), START_NS) == (status, Limit.CHANNEL)
+    assert apply_command(device, status, command(even(1.0), channel="c3"), START_NS)[1] is None
+    assert apply_command(device, initial(device), command(even(1.0), channel="x" * 33), START_NS)[1] is Limit.CHANNEL
 
 
-def test_a_command_of_safe_mode_is_remembered_by_its_channel() -> None:
+def test_safe_mode_is_stored_by_channel() -> None:
     device = mirror()
-    status, _ = apply_command(device, initial(device), told(even(1.0), safe=True), START_NS)
-    status, _ = apply_command(device, status, told(even(1.0), channel="other"), START_NS)
+    status, _ = apply_command(device, initial(device), command(even(1.0), safe=True), START_NS)
+    status, _ = apply_command(device, status, command(even(1.0), channel="other"), START_NS)
     assert status.safe == {"lowfc"}
     assert tick(device, status, START_NS + 10 * LONGEST_VALID_NS).safe == {"lowfc"}
-    assert apply_command(device, status, told(even(1.0), 2), START_NS)[0].safe == frozenset()
+    assert apply_command(device, status, command(even(1.0), 2), START_NS)[0].safe == frozenset()
 
 
-def test_a_command_from_the_far_future_does_not_stop_the_way_to_flat() -> None:
+def test_command_with_a_time_in_the_far_future_still_times_out_to_flat() -> None:
     device = mirror(settling_ns=50_000.0)
-    ahead = replace(told(even(100.0)), time_ns=1 << 62)
+    ahead = replace(command(even(100.0)), time_ns=1 << 62)
     status, _ = apply_command(device, initial(device), ahead, START_NS)
-    for turn in range(1, 5):
-        status = tick(device, status, START_NS + LONGEST_VALID_NS + turn * 10 * MS)
+    for number in range(1, 5):
+        status = tick(device, status, START_NS + LONGEST_VALID_NS + number * 10 * MS)
     assert not status.following
     assert not status.surface_nm.any()
 
@@ -96,7 +96,7 @@ commands = st.lists(
         hnp.arrays(np.float32, GRID, elements=values.map(np.float32)),
         hnp.arrays(np.float32, st.sampled_from([(5, 4), (1, 1), (20,)]), elements=values.map(np.float32)),
         st.none(),
-        st.integers(1, 3_000).map(lambda ms: ms * MS),  # silence
+        st.integers(1, 3_000).map(lambda ms: ms * MS),  # time without commands
     ),
     max_size=12,
 )
@@ -104,17 +104,17 @@ commands = st.lists(
 
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(script=commands, bits=st.sampled_from([8, 10, 16, 24]))
-def test_whatever_it_is_told_the_surface_keeps_the_limits(script: list[object], bits: int) -> None:
-    """After rounding to the driver's steps, and when it relaxes by itself."""
+def test_surface_stays_within_the_limits_for_any_commands(script: list[object], bits: int) -> None:
+    """Also after rounding to the driver's steps, and when the command has expired."""
     device = mirror(step_nm=1500 / 2**bits)
     status, now_ns = initial(device), START_NS
-    for index, what in enumerate(script):
+    for index, entry in enumerate(script):
         now_ns += MS
-        if isinstance(what, int):
-            now_ns += what
+        if isinstance(entry, int):
+            now_ns += entry
             after = tick(device, status, now_ns)
         else:
-            after, _ = apply_command(device, status, told(what, index + 1), now_ns)
+            after, _ = apply_command(device, status, command(entry, index + 1), now_ns)
         assert violations(LIMITS, status.surface_nm, after.surface_nm) == []
         status = after
 
@@ -123,63 +123,63 @@ def test_whatever_it_is_told_the_surface_keeps_the_limits(script: list[object], 
 def test_a_command_is_rounded_to_the_drivers_steps(bits: int) -> None:
     device = mirror(step_nm=1500 / 2**bits)
     wanted = np.linspace(-100, 100, 20, dtype=np.float32).reshape(GRID)
-    status, _ = apply_command(device, initial(device), told(wanted), START_NS)
+    status, _ = apply_command(device, initial(device), command(wanted), START_NS)
     steps = status.surface_nm / device.step_nm
     assert np.abs(steps - np.round(steps)).max() < 1e-3
     assert np.abs(status.surface_nm - wanted).max() <= device.step_nm * 0.501
     assert len(np.unique(status.surface_nm)) > 10
 
 
-def test_a_mirror_pressed_against_its_neighbour_limit_stays_there() -> None:
-    """Rounding must not make it think that it is beyond the limit and fall back towards flat."""
+def test_mirror_at_the_neighbour_limit_does_not_oscillate() -> None:
+    """Rounding must not exceed the limit by itself, which would make the mirror fall back towards flat."""
     device = mirror(step_nm=1500 / 2**8)
     wanted = even(0)
     wanted[:2] = 740
     wanted[2:] = -740
     status = initial(device)
     for index in range(1, 60):
-        status, _ = apply_command(device, status, told(wanted, index), START_NS + index * MS)
+        status, _ = apply_command(device, status, command(wanted, index), START_NS + index * MS)
         if index == 30:
             settled = status.surface_nm
     assert neighbour_difference_nm(status.surface_nm) > LIMITS.neighbour_nm - 3 * device.step_nm
     assert np.array_equal(status.surface_nm, settled)
 
 
-def test_its_own_limits_are_named_and_the_modal_command_is_forgotten() -> None:
+def test_limits_of_the_mirror_are_reported_and_drop_the_modal_command() -> None:
     device = mirror()
-    status, _ = apply_command(device, initial(device), told(even(100)), START_NS)
+    status, _ = apply_command(device, initial(device), command(even(100)), START_NS)
     assert status.limits_hit == ()
     assert status.command_nm.tolist() == [1, 2]
-    status, _ = apply_command(device, status, told(even(900), 2), START_NS + MS)
+    status, _ = apply_command(device, status, command(even(900), 2), START_NS + MS)
     assert status.limits_hit == (Limit.STROKE, Limit.SLEW)
     assert status.command_nm.size == 0
-    status, _ = apply_command(device, status, told(even(300), 3), START_NS + 2 * MS)
+    status, _ = apply_command(device, status, command(even(300), 3), START_NS + 2 * MS)
     assert status.limits_hit == ()
 
 
 @pytest.mark.parametrize(
-    ("what", "reason"),
+    ("invalid", "reason"),
     [
-        (told(None, 6), Limit.WRONG_GRID),
-        (told(np.zeros((5, 4), np.float32), 6), Limit.WRONG_GRID),
-        (told(even(np.nan), 6), Limit.NOT_FINITE),
-        (told(even(-np.inf), 6), Limit.NOT_FINITE),
-        (told(even(5), 6, command_nm=np.array([np.nan], np.float32)), Limit.NOT_FINITE),
-        (told(even(5), 4), Rejection.OUT_OF_ORDER),
+        (command(None, 6), Limit.WRONG_GRID),
+        (command(np.zeros((5, 4), np.float32), 6), Limit.WRONG_GRID),
+        (command(even(np.nan), 6), Limit.NOT_FINITE),
+        (command(even(-np.inf), 6), Limit.NOT_FINITE),
+        (command(even(5), 6, command_nm=np.array([np.nan], np.float32)), Limit.NOT_FINITE),
+        (command(even(5), 4), Rejection.OUT_OF_ORDER),
     ],
 )
-def test_a_bad_command_changes_nothing_and_does_not_feed_the_dead_man(what: Command, reason: Reason) -> None:
+def test_invalid_command_changes_nothing_and_does_not_restart_the_timeout(invalid: Command, reason: Reason) -> None:
     device = mirror()
     before = follow(device, initial(device), 10, 20, 30, 40, 50)
-    after, refused = apply_command(device, before, what, START_NS + 100 * MS)
+    after, refused = apply_command(device, before, invalid, START_NS + 100 * MS)
     assert refused is reason
     assert after is before
 
 
-def test_a_repeated_command_is_taken_so_that_a_held_one_can_be_renewed() -> None:
+def test_repeated_command_renews_the_timeout() -> None:
     device = mirror()
     status = follow(device, initial(device), 10)
-    after, refused = apply_command(device, status, told(even(10), 1), START_NS + 150 * MS)
+    after, refused = apply_command(device, status, command(even(10), 1), START_NS + 150 * MS)
     assert refused is None
     assert after.received_ns == START_NS + 150 * MS
     assert np.array_equal(after.surface_nm, status.surface_nm)
@@ -188,11 +188,11 @@ def test_a_repeated_command_is_taken_so_that_a_held_one_can_be_renewed() -> None
 @pytest.mark.parametrize(
     ("valid_ns", "held_ns"),
     [(200 * MS, 200 * MS), (2**64 - 1, LONGEST_VALID_NS), (0, 0)],
-    ids=["valid", "most", "none"],
+    ids=["200 ms", "longest", "zero"],
 )
-def test_the_dead_man_acts_just_after_what_the_command_promised(valid_ns: int, held_ns: int) -> None:
+def test_command_expires_just_after_its_validity(valid_ns: int, held_ns: int) -> None:
     device = mirror()
-    status, _ = apply_command(device, initial(device), told(even(50), valid_for_ns=valid_ns), START_NS)
+    status, _ = apply_command(device, initial(device), command(even(50), valid_for_ns=valid_ns), START_NS)
     held = tick(device, status, START_NS + held_ns)
     assert held.following
     assert np.array_equal(held.surface_nm, status.surface_nm)
@@ -201,15 +201,15 @@ def test_the_dead_man_acts_just_after_what_the_command_promised(valid_ns: int, h
     assert not expired.surface_nm.any()
 
 
-def test_a_clock_that_goes_back_does_not_keep_a_command_alive() -> None:
+def test_command_expires_if_the_clock_goes_back() -> None:
     device = mirror()
-    status, _ = apply_command(device, initial(device), told(even(50)), START_NS)
+    status, _ = apply_command(device, initial(device), command(even(50)), START_NS)
     gone_back = tick(device, status, START_NS - 1)
     assert not gone_back.following
     assert gone_back.time_ns >= status.time_ns
 
 
-def test_once_expired_it_relaxes_to_flat_within_the_slew_limit_and_follows_again() -> None:
+def test_expired_mirror_relaxes_to_flat_within_the_slew_limit_and_follows_again() -> None:
     device = mirror()
     status = follow(device, initial(device), 100, 200, 300, 400, 500)
     now_ns = START_NS + 1_000 * MS
@@ -221,13 +221,13 @@ def test_once_expired_it_relaxes_to_flat_within_the_slew_limit_and_follows_again
     assert heights[0] == pytest.approx(350, abs=0.1)
     assert heights[3:] == [0, 0, 0]
     assert status.channels == {}
-    status, refused = apply_command(device, status, told(even(100), 700), now_ns)
+    status, refused = apply_command(device, status, command(even(100), 700), now_ns)
     assert refused is None
     assert status.following
     assert status.surface_nm.max() == pytest.approx(100, abs=STEP_NM)
 
 
-def test_once_expired_it_holds_its_shape_where_that_is_configured() -> None:
+def test_expired_mirror_holds_its_shape_if_configured() -> None:
     device = mirror(flatten=False)
     status = follow(device, initial(device), 50)
     expired = tick(device, status, START_NS + 1_000 * MS)
@@ -235,7 +235,7 @@ def test_once_expired_it_holds_its_shape_where_that_is_configured() -> None:
     assert np.array_equal(expired.surface_nm, status.surface_nm)
 
 
-def test_before_the_first_command_it_is_flat_and_waits() -> None:
+def test_mirror_is_flat_before_the_first_command() -> None:
     status = tick(mirror(), initial(mirror()), START_NS)
     assert (status.following, status.surface_nm.any()) == (False, False)
 
@@ -244,11 +244,13 @@ def test_channels_are_summed_and_the_sum_is_limited() -> None:
     device = mirror()
     status = initial(device)
     for index, (channel, height_nm) in enumerate((("lowfc", 60), ("offset", -20), ("lowfc", 80)), start=1):
-        status, _ = apply_command(device, status, told(even(height_nm), index, channel=channel), START_NS + index * MS)
+        status, _ = apply_command(
+            device, status, command(even(height_nm), index, channel=channel), START_NS + index * MS
+        )
     assert status.surface_nm.max() == pytest.approx(60, abs=STEP_NM)
     assert sorted(status.channels) == ["lowfc", "offset"]
-    status, _ = apply_command(device, status, told(even(3e38), 4, channel="lowfc"), START_NS + 4 * MS)
-    status, _ = apply_command(device, status, told(even(3e38), 5, channel="offset"), START_NS + 5 * MS)
+    status, _ = apply_command(device, status, command(even(3e38), 4, channel="lowfc"), START_NS + 4 * MS)
+    status, _ = apply_command(device, status, command(even(3e38), 5, channel="offset"), START_NS + 5 * MS)
     assert status.limits_hit == (Limit.NOT_FINITE,)
     assert np.abs(status.surface_nm).max() <= LIMITS.stroke_nm
 
@@ -270,10 +272,10 @@ def test_dead_and_stuck_actuators_stay_where_they_are() -> None:
 
 
 def test_settling_is_a_first_order_response() -> None:
-    """A third command, one time constant after the second: the surface is 1 - 1/e of the way."""
+    """One time constant after a command the surface has moved by 1 - 1/e."""
     device = mirror(settling_ns=1e6)
-    status, _ = apply_command(device, initial(device), told(even(0), 1), START_NS)
-    status, _ = apply_command(device, status, told(even(100), 2), START_NS)
+    status, _ = apply_command(device, initial(device), command(even(0), 1), START_NS)
+    status, _ = apply_command(device, status, command(even(100), 2), START_NS)
     assert status.surface_nm.max() == pytest.approx(100 * (1 - np.exp(-1)), abs=STEP_NM)
     status = tick(device, status, status.time_ns + 2 * MS)
     assert status.surface_nm.max() == pytest.approx(100 * (1 - np.exp(-3)), abs=STEP_NM)
@@ -281,39 +283,39 @@ def test_settling_is_a_first_order_response() -> None:
     assert status.surface_nm.max() == pytest.approx(100, abs=STEP_NM)
 
 
-def test_an_older_time_does_not_move_the_surface_back() -> None:
+def test_command_with_an_older_time_does_not_move_the_surface_back() -> None:
     device = mirror(settling_ns=1e6)
     status = follow(device, initial(device), 0, 100)
-    again, _ = apply_command(device, status, told(even(100), 2, time_ns=0), START_NS)
+    again, _ = apply_command(device, status, command(even(100), 2, time_ns=0), START_NS)
     assert np.array_equal(again.surface_nm, status.surface_nm)
 
 
 def test_commands_of_the_same_frame_move_the_surface_within_the_slew() -> None:
-    """A silent camera: the controller relaxes the mirror, and no frame's time goes on."""
+    """Frame timeout: the controller relaxes the mirror with commands that all have the last frame's time."""
     device = mirror(settling_ns=1e6)
     status = follow(device, initial(device), 100, 200, 300)
     for number, height_nm in enumerate((200, 100, 0), start=1):
         before = status.surface_nm
         now_ns = status.received_ns + 10 * MS
-        status, _ = apply_command(device, status, told(even(height_nm), 3, time_ns=status.commanded_ns), now_ns)
+        status, _ = apply_command(device, status, command(even(height_nm), 3, time_ns=status.commanded_ns), now_ns)
         assert status.surface_nm.max() == pytest.approx(height_nm, abs=1), number
         assert np.abs(status.surface_nm - before).max() <= LIMITS.slew_nm
 
 
-def test_obeying_changes_nothing_that_it_was_given() -> None:
+def test_apply_command_does_not_modify_its_arguments() -> None:
     device = mirror()
     status = follow(device, initial(device), 10)
     driven, surface, channels = status.driven_nm.copy(), status.surface_nm.copy(), dict(status.channels)
-    what = told(even(700), 2, channel="other")
-    apply_command(device, status, what, START_NS)
+    given = command(even(700), 2, channel="other")
+    apply_command(device, status, given, START_NS)
     tick(device, status, START_NS + 10_000 * MS)
     assert np.array_equal(status.driven_nm, driven)
     assert np.array_equal(status.surface_nm, surface)
     assert status.channels == channels
-    assert np.array_equal(what.actuators_nm, even(700))
+    assert np.array_equal(given.actuators_nm, even(700))
 
 
-def test_a_driver_too_coarse_for_the_limits_is_refused() -> None:
+def test_driver_step_too_coarse_for_the_slew_limit_is_refused() -> None:
     with pytest.raises(ValueError, match="slew_nm"):
         _ = mirror(limits=Limits(750.0, 5.0, 500.0), step_nm=1500 / 2**8).tighter
 

@@ -1,4 +1,4 @@
-"""Wheels, drift, jitter and shear of the simulated world, against models of a few lines."""
+"""Reaction wheels, drift, jitter and shear of the simulated camera, against simple models."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -38,8 +38,8 @@ def wheel(course: str, change: float, start_hz: float = 30.0) -> Wheel:
         ("run-down", 0.0, lambda t: 30.0 + 0 * t),
     ],
 )
-def test_a_wheels_harmonics_turn_with_the_integral_of_its_speed(course: str, change: float, speed_hz: Any) -> None:
-    """The phase is summed up step by step; ramps go through standstill, where nothing is left."""
+def test_phase_of_wheel_harmonics_is_the_integral_of_the_speed(course: str, change: float, speed_hz: Any) -> None:
+    """Against a numerically integrated phase; a ramp passes through zero speed, where the amplitude vanishes."""
     made, speed = wheel(course, change), speed_hz(TIME_S)
     phase = 2 * np.pi * cumulative_trapezoid(speed, TIME_S, initial=0)
     expected = np.zeros((TIME_S.size, 2))
@@ -54,7 +54,7 @@ def test_a_wheels_harmonics_turn_with_the_integral_of_its_speed(course: str, cha
     assert np.abs(made.amplitude_nm[:, 0] / made.amplitude_nm[0, 0]) == pytest.approx(HEIGHTS)
 
 
-def test_a_walking_speed_has_the_phase_that_is_its_integral() -> None:
+def test_phase_of_a_random_walk_speed_is_its_integral() -> None:
     made, time_s = wheel("walk", 0.5), TIME_S[::10]
     speed = made.speed_hz(time_s)
     assert speed[0] == pytest.approx(30)
@@ -62,7 +62,7 @@ def test_a_walking_speed_has_the_phase_that_is_its_integral() -> None:
     np.testing.assert_allclose(made.turns(time_s), cumulative_trapezoid(speed, time_s, initial=0), atol=1e-3)
 
 
-def test_a_walk_moves_by_the_root_of_time() -> None:
+def test_random_walk_grows_with_the_square_root_of_time() -> None:
     times_s, moved = np.array([0.3, 3.0, 30.0, 300.0]), []
     for seed in range(300):
         frequency_hz, amplitude = walk(np.random.default_rng(seed), np.array([0.2, 0.4]))
@@ -73,9 +73,9 @@ def test_a_walk_moves_by_the_root_of_time() -> None:
 
 
 @pytest.mark.parametrize("slope", [1.0, 2.0, 3.0])
-def test_a_drift_has_the_spectrum_that_is_asked_for(slope: float) -> None:
-    shaken = disturbance_of(quiet(disturbance__drift_nm={"4": 0.3}, disturbance__drift_slope=slope))
-    frequency_hz, variance_nm2 = variances_nm2(shaken)
+def test_drift_has_the_configured_spectrum(slope: float) -> None:
+    disturbance = disturbance_of(quiet(disturbance__drift_nm={"4": 0.3}, disturbance__drift_slope=slope))
+    frequency_hz, variance_nm2 = variances_nm2(disturbance)
     assert not np.delete(variance_nm2, 2, axis=1).any()
     edges = np.geomspace(1e-3, 1, 4)
     for low, high in pairwise(edges):
@@ -88,7 +88,7 @@ def test_a_drift_has_the_spectrum_that_is_asked_for(slope: float) -> None:
 
 
 def test_two_wheels_beat() -> None:
-    """Where both are as high, their sum goes from twice the one to nothing and back with the difference of speeds."""
+    """The sum of two equal harmonics goes from twice one to zero and back at the difference of the speeds."""
     one, other = wheels(1, (30.0, 30.5), np.array([2.0]))
     time_s = np.arange(0, 4, 1e-3)
     both = [replace(each, amplitude_nm=np.array([[2.0], *[[0]] * 4]) + 0j) for each in (one, other)]
@@ -101,27 +101,27 @@ def test_two_wheels_beat() -> None:
 
 
 @pytest.mark.parametrize("exposure", [0.5, 1.0])
-def test_jitter_is_faster_than_the_frames_and_the_sensor_sees_its_mean_over_the_exposure(exposure: float) -> None:
+def test_sensor_sees_the_mean_of_fast_jitter_over_the_exposure(exposure: float) -> None:
     config = quiet(disturbance__jitter_mas=2.0, camera__exposure_fraction=exposure)
-    shaken = disturbance_of(config)
-    assert 500 < shaken.frequency_hz.min() < shaken.frequency_hz.max() < 1500
-    np.testing.assert_allclose(np.sqrt(variances_nm2(shaken)[1].sum(axis=0))[:3] / 2.424, [2, 2, 0], rtol=1e-3)
+    disturbance = disturbance_of(config)
+    assert 500 < disturbance.frequency_hz.min() < disturbance.frequency_hz.max() < 1500
+    np.testing.assert_allclose(np.sqrt(variances_nm2(disturbance)[1].sum(axis=0))[:3] / 2.424, [2, 2, 0], rtol=1e-3)
     made, fine = scene(config), 2000
     for index in (0, 7, 8, 30):
-        within = modes_nm(shaken, index * fine, round(exposure * fine) + 1, 1000.0 * fine)
+        within = modes_nm(disturbance, index * fine, round(exposure * fine) + 1, 1000.0 * fine)
         mean = (within[1:] + within[:-1]).mean(axis=0) / 2
         assert np.abs(made.truth(index, FLAT).sensed_nm - mean)[:2].max() < 0.1
 
 
-def test_shear_of_the_beam_changes_the_image_and_not_the_wavefront() -> None:
+def test_shear_changes_the_image_but_not_the_wavefront() -> None:
     keys = {"camera__noise": False, "camera__gain_e_per_dn": 0.01, "camera__full_well_e": 600.0}
     config = quiet(disturbance__shear=0.002, **keys)
-    made, shaken = scene(config), disturbance_of(config)
-    course = np.array([shear_at(shaken, time_s) for time_s in np.arange(0, 100, 0.01)])
-    assert course.std(axis=0) == pytest.approx([0.002, 0.002], rel=0.2)
-    index = 1000 * int(np.abs(course[::100]).max(axis=1).argmax())
+    made, disturbance = scene(config), disturbance_of(config)
+    series = np.array([shear_at(disturbance, time_s) for time_s in np.arange(0, 100, 0.01)])
+    assert series.std(axis=0) == pytest.approx([0.002, 0.002], rel=0.2)
+    index = 1000 * int(np.abs(series[::100]).max(axis=1).argmax())  # a frame with large shear
     truth = made.truth(index, FLAT)
-    np.testing.assert_allclose(truth.shear, shear_at(shaken, (index + 0.25) / 1000))
+    np.testing.assert_allclose(truth.shear, shear_at(disturbance, (index + 0.25) / 1000))
     assert truth.sampled.residual_rms_nm == pytest.approx(0, abs=1e-4)
     changed = made.expose(index, FLAT).astype(float) - scene(quiet(**keys)).expose(index, FLAT)
     slopes = shear_slopes(config) @ truth.shear
@@ -130,7 +130,7 @@ def test_shear_of_the_beam_changes_the_image_and_not_the_wavefront() -> None:
     assert np.abs(changed).max() > 25
 
 
-def test_one_seed_gives_the_same_frames_and_truths_in_any_order() -> None:
+def test_frames_and_truths_depend_on_the_seed_only() -> None:
     keys = {
         "disturbance__wheel_hz": 40.0,
         "disturbance__second_wheel_hz": 0.7,
