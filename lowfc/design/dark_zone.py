@@ -1,4 +1,4 @@
-"""The dark zone of a shaped pupil's image: one quadrant of it, for the rest are mirror images; all in lambda / D."""
+"""The dark zone of a shaped pupil's image: one quadrant, since the others are mirror images; lengths in lambda / D."""
 
 from dataclasses import dataclass
 
@@ -7,17 +7,17 @@ import numpy as np
 from lowfc.arrays import Array, Mask
 
 FINE_STEP = 0.1
-"""Between the points where a mask must keep its promise."""
+"""Spacing of the points at which the contrast of a mask is checked."""
 
 
 @dataclass(frozen=True)
 class DarkZone:
-    """Part of a ring.
+    """A sector of a ring.
 
     Attributes:
-        inner: Where it begins.
-        outer: Where it ends.
-        half_angle_deg: It lies within this angle of the x axis.
+        inner: Inner radius.
+        outer: Outer radius.
+        half_angle_deg: Largest angle from the x axis.
     """
 
     inner: float
@@ -26,13 +26,13 @@ class DarkZone:
 
 
 def fine_grid(zone: DarkZone) -> tuple[Array, Mask]:
-    """Coordinates (n,) from the star outward, and where (n, n), [row = y, column = x], they are in the zone."""
+    """Coordinates (n,) from the star outward, and a mask (n, n), [row = y, column = x], of the points in the zone."""
     axis = _axis(FINE_STEP, zone.outer)
     return axis, _inside(zone, axis)
 
 
 def first_points(zone: DarkZone, step: float) -> Array:
-    """Points (n, 2), x and y, of a square grid in the zone and along its edges, where the field is worst."""
+    """Points (n, 2), x and y, of a square grid in the zone, and along its edges, where the field is largest."""
     axis = _axis(step, zone.outer)
     y, x = np.nonzero(_inside(zone, axis))
     found = np.concatenate([np.column_stack([axis[x], axis[y]]), edge_points(zone, step)])

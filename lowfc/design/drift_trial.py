@@ -1,4 +1,4 @@
-"""A loop on simulated images whose modes drift: what it leaves, to check `lowfc.design.tolerance` by."""
+"""Simulation of a loop on images with drifting modes: its residual, to check `lowfc.design.tolerance`."""
 
 from dataclasses import dataclass
 
@@ -10,9 +10,9 @@ from lowfc.design.trials import noisy_e
 from lowfc.optics.chain.zernike import zernikes
 from lowfc.optics.twin.twin import Evaluator, Twin, node_radii, reference, response
 
-_SEEN = np.array([0.5 - 0.5 / np.sqrt(3.0), 0.5 + 0.5 / np.sqrt(3.0)])  # instants of an exposure
-_INSTANTS = (np.arange(8) + 0.5) / 8  # of a period
-_SETTLED = 8.0  # time constants of the slowest mode that do not count
+_NODES = np.array([0.5 - 0.5 / np.sqrt(3.0), 0.5 + 0.5 / np.sqrt(3.0)])  # Gauss-Legendre, in exposure times
+_INSTANTS = (np.arange(8) + 0.5) / 8  # times at which the residual is sampled, in periods
+_SETTLED = 8.0  # time constants of the slowest mode that are discarded
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,11 +20,11 @@ class DriftTrial:
     """A sensor, a star and a loop.
 
     Attributes:
-        twin: of the sensor.
-        noll: of the modes that are fitted.
+        twin: twin of the sensor.
+        noll: Noll indices of the fitted modes.
         light_e: electrons of the open circle's light in an exposure.
-        read_noise_e: of a pixel.
-        exposure: of the period.
+        read_noise_e: read noise of a pixel, electrons.
+        exposure: exposure time, in periods.
     """
 
     twin: Twin
@@ -34,21 +34,23 @@ class DriftTrial:
     exposure: float
 
     def left_nm2(self, step_nm2: Array, gain: Array, frames: int, rng: np.random.Generator) -> Array:
-        """Mean square (modes,) over all time of what integrators leave.
+        """Mean square (modes,) of the residual of integrators, in continuous time.
 
         Args:
             step_nm2: (modes,) variance of each mode's step in a frame, nm^2.
-            gain: (modes,) of the integrators; 0 for a mode that stays.
-            frames: That count.
-            rng: Source of all randomness.
+            gain: (modes,) gains of the integrators; 0 for a mode that is not controlled.
+            frames: Number of frames averaged.
+            rng: Generator of all random numbers.
         """
         basis = zernikes(self.noll, *node_radii(self.twin))
         I0, H = reference(self.twin).ravel(), response(self.twin, basis)
         good = np.ones(I0.size)
-        seen, slopes = normalise_flux(I0, H, good)
-        R = reconstructor(seen, slopes, good, self.light_e * float(I0.sum()), self.read_noise_e, "weighted")
+        normalised_I0, normalised_H = normalise_flux(I0, H, good)
+        R = reconstructor(
+            normalised_I0, normalised_H, good, self.light_e * float(I0.sum()), self.read_noise_e, "weighted"
+        )
         evaluator, on_nodes = Evaluator(self.twin), basis.astype(np.float32)
-        times = np.concatenate([self.exposure * _SEEN, _INSTANTS, [1.0]])
+        times = np.concatenate([self.exposure * _NODES, _INSTANTS, [1.0]])
         order = np.argsort(times, kind="stable")
         lengths = np.diff(times[order], prepend=0.0)
         first = int(np.ceil(_SETTLED / gain[gain > 0].min()))
@@ -57,12 +59,12 @@ class DriftTrial:
         for frame in range(first + frames):
             path = np.empty((len(times), len(gain)))
             path[order] = start + np.cumsum(moves * rng.standard_normal(path.shape), axis=0)
-            left = path + command
-            opds = left[: len(_SEEN)].astype(np.float32) @ on_nodes
-            mean = np.mean([evaluator.image(opd).copy() for opd in opds], axis=0).ravel()  # it overwrites its image
+            residual = path + command
+            opds = residual[: len(_NODES)].astype(np.float32) @ on_nodes
+            mean = np.mean([evaluator.image(opd).copy() for opd in opds], axis=0).ravel()  # the buffer is reused
             image = noisy_e(rng, mean * self.light_e, self.read_noise_e)
             if frame >= first:
-                squares += np.square(left[len(_SEEN) : -1]).mean(axis=0)
-            command = command - gain * (R @ (image / image.sum() - seen))
+                squares += np.square(residual[len(_NODES) : -1]).mean(axis=0)
+            command = command - gain * (R @ (image / image.sum() - normalised_I0))
             start = path[-1]
         return squares / frames

@@ -1,4 +1,4 @@
-"""From an image to modes: plain and noise-weighted pseudo-inverse (Sect. 2.3), and iterations with the full model."""
+"""Estimators of modes from an image: plain and noise-weighted pseudo-inverse (Sect. 2.3), iterated full model."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -9,22 +9,22 @@ from lowfc.arrays import Array
 from lowfc.control.calibration.calibration import ESTIMATORS, reconstructor
 
 Model = Callable[[Array], Array]
-"""Image (pixels,), fractions of the open circle's light, of modes in nm: with exp(i phi) and not its expansion."""
+"""Function from modes in nm to the image (pixels,), fractions of the open circle's light, with the full exp(i phi)."""
 
 KINDS = ESTIMATORS[::-1]
-"""The plain one first, as in the paper."""
+"""Kinds of linear estimator; the paper's plain pseudo-inverse first."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A linear estimator for one exposure of one sensor; the light's total is taken to be known.
+    """A linear estimator for one exposure of one sensor; the total flux is assumed to be known.
 
     Attributes:
         nolls: Noll index of each mode.
         reference_e: (pixels,) I0 in electrons.
         response_e: (pixels, modes) H in electrons per nm.
         R: (modes, pixels) nm per electron.
-        kind: One of `KINDS`.
+        kind: Kind of estimator, one of `KINDS`.
         scale_e: Electrons of the open circle's light in the exposure.
     """
 
@@ -49,36 +49,36 @@ def fit(
 
     Args:
         nolls: Noll index of each mode.
-        I0: (pixels,) flat wavefront's image, fractions of the open circle's light.
-        H: (pixels, modes) its derivative per nm of each mode.
-        scale_e: Electrons of the open circle's light in the exposure: fractions times this are electrons.
-        read_noise_e: Of each pixel.
-        kind: "pinv" weighs all pixels alike, "weighted" by the inverse variance of the flat image.
-        nuisance: (pixels, extra) changes of the image that are no wavefront, in fractions per unit of each: I0 for the
-            flux, `lowfc.optics.chain.sensor.shear_response` for the pupil's shear. They are fitted along and dropped.
+        I0: (pixels,) image of a flat wavefront, fractions of the open circle's light.
+        H: (pixels, modes) derivative of the image per nm of each mode.
+        scale_e: Electrons of the open circle's light in the exposure: the factor from fractions to electrons.
+        read_noise_e: Read noise of each pixel.
+        kind: "pinv" weights all pixels equally, "weighted" by the inverse variance of the flat image.
+        nuisance: (pixels, extra) changes of the image by nuisance parameters, in fractions per unit of each: I0 for the
+            flux, `lowfc.optics.chain.sensor.shear_response` for the pupil's shear. They are fitted and dropped.
 
     Raises:
-        ValueError: Unknown kind, or modes that this sensor cannot tell apart.
+        ValueError: Unknown kind, or modes that this sensor cannot distinguish.
     """
     R = reconstructor(I0, H, np.ones_like(I0), scale_e, read_noise_e, kind, nuisance)
     return Fit(tuple(nolls), I0 * scale_e, H * scale_e, R / scale_e, kind, scale_e)
 
 
 def estimate(fit: Fit, image_e: Array) -> Array:
-    """Modes in nm, (modes,) or (n, modes), of an image (pixels,) or images (n, pixels) in electrons."""
+    """Estimate modes in nm, (modes,) or (n, modes), from an image (pixels,) or images (n, pixels) in electrons."""
     return np.asarray((image_e - fit.reference_e) @ fit.R.T)
 
 
 def iterated(fit: Fit, image_e: Array, model: Model, iterations: int) -> list[Array]:
-    """Estimates (modes,) in nm after none, one, ... `iterations` with the full model: a <- a + R (I - I_model(a)).
+    """Estimates (modes,) in nm after 0, 1, ... `iterations` with the full model: a <- a + R (I - I_model(a)).
 
-    The gain stays, the model is not linear; two iterations are enough for the wavefronts of Sect. 3.1.
+    R is constant, the model is nonlinear; two iterations suffice for the wavefronts of Sect. 3.1.
 
     Args:
         fit: The linear estimator.
-        image_e: (pixels,) electrons.
+        image_e: (pixels,) image in electrons.
         model: The sensor's image for modes in nm.
-        iterations: How many.
+        iterations: Number of iterations.
     """
     found = [estimate(fit, image_e)]
     for _ in range(iterations):

@@ -1,6 +1,6 @@
-"""Error of an estimate by noise: covariance of a linear one, and the bound for any unbiased one.
+"""Noise of an estimate: covariance of a linear estimate, and bounds for any unbiased one.
 
-The Cramer-Rao bound is that of a sensor. The quantum limit is that of the light, whatever the sensor.
+The Cramer-Rao bound holds for a given sensor, the quantum limit for any measurement of the light.
 """
 
 import numpy as np
@@ -11,13 +11,13 @@ from lowfc.optics.chain.grid import OPEN_AREA
 
 
 def variance_e(reference_e: Array, read_noise_e: float) -> Array:
-    """Variance (pixels,) of the noise of the flat wavefront's image, photon and read noise (Sects. 3 and 3.3).
+    """Variance (pixels,) of photon and read noise in the image of a flat wavefront (Sects. 3 and 3.3).
 
-    Rounding to whole electrons is left out: its 1/12 e-^2 changes no scatter of Table 4 by more than 1 %.
+    Rounding to whole electrons is neglected: its 1/12 e-^2 changes no scatter of Table 4 by more than 1 %.
 
     Args:
         reference_e: I0 (pixels,) in electrons.
-        read_noise_e: Of each pixel.
+        read_noise_e: Read noise of each pixel.
     """
     return np.asarray(np.maximum(reference_e, 0.0) + read_noise_e**2)
 
@@ -27,7 +27,7 @@ def covariance(R: Array, variance: Array) -> Array:
 
     Args:
         R: (modes, pixels) nm per electron.
-        variance: (pixels,) of the image, in electrons squared.
+        variance: (pixels,) variance of the image, in electrons squared.
     """
     return np.asarray((R * variance) @ R.T)
 
@@ -35,14 +35,14 @@ def covariance(R: Array, variance: Array) -> Array:
 def cramer_rao(H: Array, variance: Array) -> Array:
     """Inverse Fisher information (modes, modes), nm^2: no unbiased linear estimate has a smaller covariance.
 
-    The information is that of the image's mean; the little that the photon noise's own variance adds is not counted.
+    It includes the information in the image's mean, not the small amount in the variance of the photon noise.
 
     Args:
         H: (pixels, modes) electrons per nm.
-        variance: (pixels,) of the image, in electrons squared; a pixel without any carries no information.
+        variance: (pixels,) variance of the image, in electrons squared; pixels with zero variance are ignored.
 
     Raises:
-        ValueError: The modes cannot be told apart.
+        ValueError: The sensor cannot distinguish the modes.
     """
     weights = np.divide(1.0, variance, out=np.zeros_like(variance), where=variance > 0)
     weighted = np.sqrt(weights)[:, None] * H
@@ -53,13 +53,13 @@ def cramer_rao(H: Array, variance: Array) -> Array:
 
 
 def quantum_information(pupil: Array, modes: Array, wavelength_nm: float, light_e: float = 1.0) -> Array:
-    """Quantum Fisher information (modes, modes), per nm^2: no measurement of the light tells more of its wavefront.
+    """Quantum Fisher information (modes, modes), per nm^2: the upper limit for any measurement of the light.
 
-    It is 4 N Cov: N photons behind the pupil's mask, and the covariance of the modes' phases over them.
+    It is 4 N Cov, with N photons after the pupil mask and Cov the intensity-weighted covariance of the modes' phases.
 
     Args:
         pupil: (n, n) amplitude transmission.
-        modes: (modes, n, n) of unit rms over the circle.
+        modes: (modes, n, n) modes with unit rms over the circle.
         wavelength_nm: The wavelength.
         light_e: Electrons of the open circle's light.
     """

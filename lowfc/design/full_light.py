@@ -1,7 +1,7 @@
-"""Sensors that use all of the light behind the focal-plane mask, Zernike's and CLOWFS, predicted for a search.
+"""Predicted performance of sensors that use all light from the focal-plane mask (Zernike, CLOWFS), for a search.
 
-The fields on the focal-plane mask depend on neither the spot nor the defocus: they are propagated once, and each
-candidate from there.
+The fields on the focal-plane mask depend on neither the spot nor the defocus: they are propagated once, and from there
+for each candidate.
 """
 
 from collections.abc import Callable
@@ -30,11 +30,11 @@ class Focus:
     """Light on a focal-plane mask.
 
     Attributes:
-        band: Of Table 4.
-        forms: Of the pupil.
-        fields: By wavelength, (1 + modes, k, k): the flat wavefront's, and the first-order ones of the 20 modes.
-        wavefronts_nm: By the number of modes, (wavefronts, modes) random ones matched to Table 3's input.
-        aberrated: By the number of modes, (wavefronts, k, k) their fields at the central wavelength.
+        band: Passband of Table 4.
+        forms: Quadratic forms of the pupil.
+        fields: By wavelength, (1 + modes, k, k) field of the flat wavefront and first-order fields of the 20 modes.
+        wavefronts_nm: By the number of modes, (wavefronts, modes) random wavefronts matched to Table 3's input.
+        aberrated: By the number of modes, (wavefronts, k, k) fields of these wavefronts at the central wavelength.
     """
 
     band: Band
@@ -45,7 +45,7 @@ class Focus:
 
     @classmethod
     def of(cls, sensor: Sensor) -> "Focus":
-        """Behind the pupil of a sensor, as large as its focal-plane mask."""
+        """Propagate from the pupil of a sensor to its focal-plane mask."""
         modes = zernikes(NOLLS_20, *pupil_radii(sensor))
         forms, band = PupilForms.of(sensor.pupil, modes), uniform(WAVELENGTH_NM)
 
@@ -54,8 +54,8 @@ class Focus:
             field = np.asarray(pupil_field, np.complex128)
             return to_image(field, size, sensor.samples_per, WAVELENGTH_NM / wavelength_nm)
 
-        wanted = {WAVELENGTH_NM, *band.wavelengths_nm}
-        fields = {nm: np.array([focal(sensor.pupil * shape, nm) for shape in (1.0, *modes)]) for nm in wanted}
+        all_nm = {WAVELENGTH_NM, *band.wavelengths_nm}
+        fields = {nm: np.array([focal(sensor.pupil * shape, nm) for shape in (1.0, *modes)]) for nm in all_nm}
         drawn, aberrated = {}, {}
         for count in MODES:
             nolls, (low, high) = NOLLS_20[:count], LITERAL_WAVES
@@ -69,13 +69,13 @@ class Focus:
 
 @dataclass(frozen=True, eq=False)
 class FullLight:
-    """A sensor without a relay mask that is judged: a `lowfc.design.merit.Candidate`.
+    """A sensor without a relay mask as a `lowfc.design.merit.Candidate`.
 
-    Its paper's rows are those of CLOWFS, the only sensor of this kind that the paper has figures of.
+    It is compared with the paper's rows of CLOWFS, the only sensor of this kind in the paper.
 
     Attributes:
         sensor: The optics.
-        focus: What falls on its focal-plane mask.
+        focus: Light on its focal-plane mask.
     """
 
     sensor: Sensor
@@ -85,15 +85,15 @@ class FullLight:
 
     @property
     def forms(self) -> PupilForms:
-        """Of the pupil."""
+        """Quadratic forms of the pupil."""
         return self.focus.forms
 
     def central(self, row: str = "clowfs") -> Signal:
-        """What it sees at the central wavelength."""
+        """I0 and H at the central wavelength."""
         return self._central
 
     def in_band(self) -> Signal:
-        """What it sees of the band of Table 4."""
+        """I0 and H in the band of Table 4."""
         return self._in_band
 
     @cached_property
@@ -106,10 +106,10 @@ class FullLight:
 
     def nonlinearity_waves(self, modes: int) -> float:
         """Mean residual rms over the open pupil of random wavefronts without noise, by the plain pseudo-inverse."""
-        seen, truth = self.central(), self.focus.wavefronts_nm[modes]
-        R = reconstructor(seen.I0, seen.H[:, :modes], np.ones_like(seen.I0), 1.0, 0.0, "pinv")
+        signal, truth = self.central(), self.focus.wavefronts_nm[modes]
+        R = reconstructor(signal.I0, signal.H[:, :modes], np.ones_like(signal.I0), 1.0, 0.0, "pinv")
         images = [self._intensity(self._on_sensor(field, WAVELENGTH_NM)) for field in self.focus.aberrated[modes]]
-        residuals = truth - (np.array(images) - seen.I0) @ R.T
+        residuals = truth - (np.array(images) - signal.I0) @ R.T
         return float(residual_rms(self.forms.gram[:modes, :modes], residuals).mean()) / WAVELENGTH_NM
 
     def _signal(self, band: Band) -> Signal:
@@ -130,13 +130,15 @@ class FullLight:
 
 
 def sweep(merit_of: Callable[[float], float], low: float, high: float, count: int) -> tuple[Array, float]:
-    """Values (count,) evenly over a range, and the one between their neighbours of the least merit where it is least.
+    """Minimise over a range: evenly spaced values (count,), and the refined value of least merit.
+
+    The refinement searches between the neighbours of the best evenly spaced value.
 
     Args:
-        merit_of: Of a value.
-        low: End of the range.
-        high: Other end; the same for one value.
-        count: How many, at least 3.
+        merit_of: Merit of a value.
+        low: Lower end of the range.
+        high: Upper end; equal to `low` for a single value.
+        count: Number of values, at least 3.
     """
     if low == high:
         return np.array([low]), low

@@ -26,17 +26,17 @@ WEIGHTED = ("paper", "pareto")
 
 @dataclass(frozen=True)
 class Goal:
-    """What is minimised.
+    """The figure of merit to minimise.
 
     Attributes:
-        merit: Of `MERITS`; "paper" is the largest ratio of a predicted figure to the paper's, over its rows of Table 3
-            and Table 4, those of Table 3 to the power of 2 weight, that of Table 4 to 2 (1 - weight); "pareto" is
-            table3^(1 - weight) table4^weight; "contrast" is what the noise of one exposure of Table 4's star, 14 modes,
-            adds to the contrast of the dark zone.
+        merit: One of `MERITS`. "paper": the largest ratio of a predicted figure to the paper's over the rows of Tables
+            3 and 4, those of Table 3 to the power 2 weight, that of Table 4 to the power 2 (1 - weight). "pareto":
+            table3^(1 - weight) table4^weight. "contrast": contrast added to the dark zone by the noise of 14 modes in
+            one exposure of Table 4's star.
         estimator: "pinv", or "weighted" for the Cramer-Rao bound.
         modes: Number of modes in Table 3 and in the condition number.
-        weight: Of Table 4 in "pareto" and "paper", 0 to 1; None for 1/2 in "paper", and for a weight of its own for
-            each chain in a "pareto" search.
+        weight: Weight of Table 4 in "pareto" and "paper", 0 to 1. None: 1/2 in "paper"; in a "pareto" search each chain
+            has its own weight.
     """
 
     merit: str = "paper"
@@ -59,7 +59,7 @@ class Goal:
 
 
 def merit(candidate: Candidate, goal: Goal) -> float:
-    """The figure to be made small, above 0; infinite where a mode has no signal."""
+    """The figure of merit to minimise, above 0; infinite if a mode has no signal."""
     try:
         value = _merit(candidate, goal)
     except np.linalg.LinAlgError:
@@ -68,7 +68,7 @@ def merit(candidate: Candidate, goal: Goal) -> float:
 
 
 def paper_ratios(candidate: Candidate, estimator: str = "pinv") -> dict[str, float]:
-    """Predicted over paper's figure, of each row of Tables 3 and 4: below 1 is better than the paper."""
+    """Ratio of the predicted figure to the paper's for each row of Tables 3 and 4; below 1 is better than the paper."""
     ratios = {}
     for name in candidate.paper_rows:
         for modes in MODES:
@@ -97,7 +97,7 @@ def _merit(candidate: Candidate, goal: Goal) -> float:
         case "table3":
             return table3_waves(candidate, first, goal.modes, goal.estimator)
     if goal.weight is None:
-        raise ValueError("a point of the front needs a weight")
+        raise ValueError("the merit pareto needs a weight")
     residual = table3_waves(candidate, first, goal.modes, goal.estimator)
     return float(residual ** (1.0 - goal.weight) * _tilt_mas(candidate, goal.estimator) ** goal.weight)
 
@@ -107,21 +107,21 @@ def _tilt_mas(candidate: Candidate, estimator: str) -> float:
 
 
 def figures(candidate: Candidate) -> dict[str, Any]:
-    """What the first row of Table 3, and Table 4, would show, as plain values for people and for JSON.
+    """Predicted figures of the first row of Table 3 and of Table 4, as plain values for output and JSON.
 
-    "bound" is the Cramer-Rao bound of Table 3, which knows no second order; in Table 4 "weighted" attains it.
+    "bound" is the Cramer-Rao bound of Table 3, without second-order errors; in Table 4 "weighted" attains the bound.
     """
     first, in_band = candidate.paper_rows[0], candidate.in_band()
-    seen, forms = candidate.central(first), candidate.forms
+    central, forms = candidate.central(first), candidate.forms
     table3 = {name: {str(m): table3_waves(candidate, first, m, name) for m in MODES} for name in ESTIMATORS}
-    table3["bound"] = {str(m): table3_noise_waves(forms, seen, m, "weighted") for m in MODES}
+    table3["bound"] = {str(m): table3_noise_waves(forms, central, m, "weighted") for m in MODES}
     fitted = (TABLE4_MODES, in_band.H.shape[1])
     return {
-        "throughput": throughput(seen),
-        "condition": {str(m): condition(seen, m) for m in MODES},
+        "throughput": throughput(central),
+        "condition": {str(m): condition(central, m) for m in MODES},
         "table3_waves": table3,
         "table4_mas": {name: {str(m): table4_mas(in_band, m, name) for m in fitted} for name in ESTIMATORS},
-        "noise_nm": float(np.sqrt(np.trace(exposure_nm2(seen, HELD, "weighted")))),
-        "contrast_noise": contrast_noise(forms, seen, "weighted"),
-        "quantum_share": quantum_share(forms, seen),
+        "noise_nm": float(np.sqrt(np.trace(exposure_nm2(central, HELD, "weighted")))),
+        "contrast_noise": contrast_noise(forms, central, "weighted"),
+        "quantum_share": quantum_share(forms, central),
     }

@@ -1,4 +1,4 @@
-"""Linear programs of the kind that a shaped pupil is, each begun where a similar one ended."""
+"""Linear programs of shaped pupils, warm-started from the multipliers of a similar program."""
 
 import numpy as np
 from scipy.optimize import linprog
@@ -7,26 +7,26 @@ from lowfc.arrays import Array
 
 
 class NotSolvedError(ValueError):
-    """The solver gave up."""
+    """The solver failed."""
 
 
 def maximise(rows: Array, weights: Array, multipliers: Array) -> tuple[Array, Array, float]:
-    """The x in [0, 1] of the largest weights @ x with rows @ x <= 0, by HiGHS' dual simplex.
+    """Maximise weights @ x over x in [0, 1] with rows @ x <= 0, by HiGHS' dual simplex.
 
-    scipy takes no starting basis. A row with a multiplier is therefore given a slack of its own, and is added to the
-    objective with its multiplier: at the optimum that belongs to the multipliers nothing is left to be gained, and the
-    simplex, which begins there, needs a sixth to two thirds of the steps. Presolving would undo it.
+    scipy accepts no starting basis. Therefore each row with a multiplier gets its own slack variable and is added to
+    the objective with its multiplier. The simplex then starts at the optimum that belongs to the multipliers, and needs
+    a sixth to two thirds of the steps. Presolving would undo this.
 
     Args:
-        rows: (m, n).
-        weights: (n,).
-        multipliers: (m,) of a similar program, zero where not known.
+        rows: (m, n) constraints.
+        weights: (n,) objective.
+        multipliers: (m,) multipliers of a similar program, zero if not known.
 
     Returns:
         x (n,), the multipliers (m,), and the dual bound on the objective, which proves the optimum.
 
     Raises:
-        NotSolvedError: HiGHS gave up.
+        NotSolvedError: HiGHS failed.
     """
     tight = multipliers > 0
     count = int(np.count_nonzero(tight))

@@ -1,27 +1,27 @@
-"""The paper's conditions and results that both the tables and the search for better masks need (Sects. 2 and 3)."""
+"""Conditions and results of the paper used by the tables and by the search for better masks (Sects. 2 and 3)."""
 
 from lowfc.optics.detector.photometry import Photometry
 
 MODES = (14, 20)
-"""Numbers of modes of the two columns of Table 3: radial degrees up to 4 and up to 5."""
+"""Numbers of modes in the two columns of Table 3: radial degrees up to 4 and up to 5."""
 
 PEAK_E = 40_000.0
 """Electrons in the brightest pixel of the flat wavefront's image (Sect. 3.1)."""
 TABLE3_READ_NOISE_E = 3.0
 TABLE3_INPUT_WAVES = {14: 0.015, 20: 0.018}
-"""Root mean square of its random wavefronts over the open pupil, by number of modes."""
+"""Rms of Table 3's random wavefronts over the open pupil, by number of modes."""
 
 STAR = Photometry()
 TABLE4_EXPOSURE_S = 0.05
 TABLE4_READ_NOISE_E = 1.0
 TABLE4_MODES = 2
-"""Tip and tilt: with more modes in the fit the paper's figure is out of reach of any of its sensors."""
+"""Tip and tilt: with more modes in the fit, none of the paper's sensors can reach its figure."""
 
 TABLE3_WAVES = {
     "disk": {14: (5.1e-4, 8.9e-3), 20: (8.0e-4, 0.021)},
     "bowtie": {14: (4.6e-4, 8.0e-3), 20: (6.8e-4, 0.017)},
     "clowfs": {14: (1.3e-3, 0.022), 20: (2.3e-3, 0.066)},
 }
-"""Mean RMS and P-V residuals by number of modes: the sparse aperture with either focal-plane mask, and CLOWFS."""
+"""Mean rms and P-V residuals by number of modes: sparse aperture with disk or bow-tie mask, and CLOWFS."""
 TABLE4_MAS = {"sam": {1: 0.36, 10: 0.37}, "clowfs": {1: 0.080, 10: 0.082}}
 """Standard deviation of the tilt estimate, by the tilt in mas."""

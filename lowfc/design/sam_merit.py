@@ -1,9 +1,9 @@
 """Performance of a sparse aperture mask, predicted fast enough to search for the best one.
 
-The fields in the relay pupil, behind the focal-plane mask, do not depend on the holes: that of the flat wavefront and
-the first-order one of each mode are propagated once (`build_optics`). Each hole adds a small product of matrices to
-every field at the sensor (`hole_fields`), so that a search which moves one hole recomputes that hole alone. I0 and H,
-eqs. (6) and (12), follow from the fields (`signal`, `band_signal`); how good they are says `lowfc.design.merit`.
+The fields in the relay pupil, after the focal-plane mask, do not depend on the holes: the field of the flat wavefront
+and the first-order field of each mode are propagated once (`build_optics`). Each hole adds a small product of matrices
+to every field at the sensor (`hole_fields`), so that a search that moves one hole recomputes only that hole. I0 and H,
+eqs. (6) and (12), follow from the fields (`signal`, `band_signal`); `lowfc.design.merit` computes their figures.
 """
 
 from collections.abc import Callable
@@ -28,32 +28,32 @@ FOCAL_MASKS: dict[str, Callable[[int], Array]] = {"disk": disk, "bowtie": bowtie
 IMAGE_WIDTH = 20
 """Width of the sensor's image, in lambda0 / D (Table 1)."""
 PIXELS_PER = 4
-"""Pixels in each lambda0 / D (Table 1)."""
+"""Pixels per lambda0 / D (Table 1)."""
 FOCAL_SAMPLES_PER = 8
 _PIXEL = 1.0 / (PIXELS_PER**2 * OPEN_AREA)
-"""Fraction of the open circle's light in a pixel where the field is 1."""
+"""Fraction of the open circle's light on a pixel at which the field is 1."""
 
 TABLE3_NONLINEARITY_WAVES = {14: 2.1e-4, 20: 3.1e-4}
-"""Residual without noise of the plain pseudo-inverse, by number of modes: the second order of wavefronts matched to the
-paper's input, as it adds to the noise in quadrature; a constant, so that a search need not compute it.
+"""Residual of the plain pseudo-inverse without noise, by number of modes: the second-order error for wavefronts matched
+to the paper's input, which adds to the noise in quadrature. A constant, so that a search does not compute it.
 
-Two draws, of 60 and 100 wavefronts, with each shipped layout behind the disk and two behind the bowtie gave means of
+Two sets of 60 and 100 wavefronts, with each packaged layout behind the disk and two behind the bowtie, gave means of
 1.9e-4 to 2.1e-4 with 14 modes and 3.0e-4 to 3.3e-4 with 20, root mean squares of 2.2e-4 to 2.6e-4 and 3.4e-4 to 3.9e-4,
-and up to 1.4e-3 for a single wavefront: the constants are within 12 % of the means, and up to a quarter below the root
+and up to 1.4e-3 for a single wavefront. The constants are within 12 % of the means, and up to a quarter below the root
 mean squares."""
 
 RELAY_SAMPLES = 128
 SAMPLES_PER = 2
-"""Samples at the sensor per lambda0 / D: half as many as pixels, yet enough for all that an image can hold."""
+"""Samples at the sensor per lambda0 / D: half as many as pixels, which still sample the image completely."""
 
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """What is propagated at one wavelength.
+    """Fields in the relay pupil at one wavelength.
 
     Attributes:
         relay: (fields, relay, relay) fields in the relay pupil.
-        kernel: (samples, relay) from the relay pupil to the sensor, along one axis; conserves energy.
+        kernel: (samples, relay) kernel from the relay pupil to the sensor, along one axis; conserves energy.
     """
 
     relay: Single
@@ -62,17 +62,17 @@ class Group:
 
 @dataclass(frozen=True, eq=False)
 class Optics:
-    """Everything before the sparse aperture mask.
+    """The optics before the sparse aperture mask.
 
     Attributes:
-        focal_masks: Names; those of Table 3. Table 4 is predicted for the first.
-        band: Of Table 4.
-        groups: The central wavelength (flat wavefront and 20 modes, for each focal-plane mask), then the others of the
-            band (flat wavefront and `band_modes` modes, for the first focal-plane mask).
-        band_modes: Modes, tilts first, that can be fitted in Table 4.
-        forms: Of the shaped pupil.
-        samples_per: Samples at the sensor per lambda0 / D; each stands for the mean over its surroundings.
-        at_pixels: (pixels, samples) from a field's samples to its values at the pixels' centres, along one axis.
+        focal_masks: Names of the focal-plane masks in Table 3. Table 4 is predicted for the first.
+        band: Passband of Table 4.
+        groups: Fields at the central wavelength (flat wavefront and 20 modes, for each focal-plane mask), then at the
+            other wavelengths of the band (flat wavefront and `band_modes` modes, for the first focal-plane mask).
+        band_modes: Number of modes, tilts first, that can be fitted in Table 4.
+        forms: Quadratic forms of the shaped pupil.
+        samples_per: Samples at the sensor per lambda0 / D.
+        at_pixels: (pixels, samples) interpolation of a field from its samples to the pixel centres, along one axis.
     """
 
     focal_masks: tuple[str, ...]
@@ -94,15 +94,15 @@ def build_optics(
 ) -> Optics:
     """Propagate the flat wavefront and the modes to the relay pupil, eqs. (4), (5) and (12).
 
-    With the default sampling every figure of a mask is within 2 % of that of the paper's sampling (Table 1).
+    With the default sampling every figure of a mask is within 2 % of that with the paper's sampling (Table 1).
 
     Args:
         pupil: (n, n) amplitude transmission of the shaped pupil.
-        focal_masks: Of `FOCAL_MASKS`.
-        band_modes: Modes, tilts first, that can be fitted in Table 4; a search needs the two tilts.
-        band: Of Table 4; the paper's five wavelengths when None.
-        relay_samples: Across the relay pupil.
-        samples_per: At the sensor, per lambda0 / D; at least 2.
+        focal_masks: Names in `FOCAL_MASKS`.
+        band_modes: Number of modes, tilts first, that can be fitted in Table 4; a search needs the two tilts.
+        band: Passband of Table 4; the paper's five wavelengths when None.
+        relay_samples: Samples across the relay pupil.
+        samples_per: Samples at the sensor per lambda0 / D; at least 2.
     """
     band = uniform(WAVELENGTH_NM) if band is None else band
     u = 2.0 * pupil_axis(len(pupil))
@@ -121,7 +121,7 @@ def build_optics(
     groups = [group(1.0, focal_masks, 1 + len(modes))]
     groups += [group(WAVELENGTH_NM / nm, focal_masks[:1], 1 + band_modes) for nm in others]
     at_samples = kernel(samples, samples_per, relay_samples, 1.0)
-    wanted = kernel(IMAGE_WIDTH * PIXELS_PER, PIXELS_PER, relay_samples, 1.0)
+    at_centres = kernel(IMAGE_WIDTH * PIXELS_PER, PIXELS_PER, relay_samples, 1.0)
     return Optics(
         focal_masks,
         band,
@@ -129,14 +129,14 @@ def build_optics(
         band_modes,
         PupilForms.of(pupil, modes),
         samples_per,
-        (wanted @ np.linalg.pinv(at_samples, rcond=1e-3)).astype(np.complex64),
+        (at_centres @ np.linalg.pinv(at_samples, rcond=1e-3)).astype(np.complex64),
     )
 
 
 def hole_fields(optics: Optics, hole: Hole) -> Single:
-    """What one hole (x, y, diameter) adds to the fields (fields, samples, samples) at the sensor, eqs. (2) and (6).
+    """Contribution of a hole (x, y, diameter) to the fields (fields, samples, samples) at the sensor, eqs. (2), (6).
 
-    Samples on the rim count by how much of them the hole covers.
+    Samples on the rim are weighted by the fraction that the hole covers.
     """
     x, y, diameter = hole
     n = optics.groups[0].relay.shape[1]
@@ -152,11 +152,11 @@ def hole_fields(optics: Optics, hole: Hole) -> Single:
 
 
 def signal(optics: Optics, fields: Single, focal_mask: str) -> Signal:
-    """What the sensor sees at the central wavelength, for Table 3.
+    """I0 and H at the central wavelength, for Table 3.
 
     Args:
-        optics: Everything before the mask.
-        fields: The sum of `hole_fields` over the mask, shapes as there; amplitude.
+        optics: The optics before the sparse aperture mask.
+        fields: Sum of `hole_fields` over the holes.
         focal_mask: One of `optics.focal_masks`.
     """
     count = 1 + len(NOLLS_20)
@@ -168,7 +168,7 @@ def signal(optics: Optics, fields: Single, focal_mask: str) -> Signal:
 
 
 def band_signal(optics: Optics, fields: Single) -> Signal:
-    """What the sensor sees of the whole band behind the first focal-plane mask: amplitude, shapes as in `signal`."""
+    """I0 and H in the band, for the first focal-plane mask; arguments as for `signal`."""
     count, first = 1 + optics.band_modes, (1 + len(NOLLS_20)) * len(optics.focal_masks)
     I0: Array = np.zeros(fields[0].size)
     H: Array = np.zeros((fields[0].size, optics.band_modes))
@@ -182,11 +182,11 @@ def band_signal(optics: Optics, fields: Single) -> Signal:
 
 @dataclass(frozen=True, eq=False)
 class Mask:
-    """A sparse aperture mask that is judged: a `Candidate`.
+    """A sparse aperture mask as a `Candidate`.
 
     Attributes:
-        optics: Everything before it.
-        fields: The sum of `hole_fields` over its holes.
+        optics: The optics before the mask.
+        fields: Sum of `hole_fields` over its holes.
     """
 
     optics: Optics
@@ -195,24 +195,24 @@ class Mask:
 
     @property
     def forms(self) -> PupilForms:
-        """Of the shaped pupil."""
+        """Quadratic forms of the shaped pupil."""
         return self.optics.forms
 
     @property
     def paper_rows(self) -> tuple[str, ...]:
-        """The focal-plane masks."""
+        """Names of the focal-plane masks."""
         return self.optics.focal_masks
 
     def central(self, row: str) -> Signal:
-        """Behind one focal-plane mask."""
+        """I0 and H at the central wavelength with one focal-plane mask."""
         return signal(self.optics, self.fields, row)
 
     def in_band(self) -> Signal:
-        """Behind the first focal-plane mask."""
+        """I0 and H in the band with the first focal-plane mask."""
         return band_signal(self.optics, self.fields)
 
     def nonlinearity_waves(self, modes: int) -> float:
-        """The same for all masks."""
+        """A constant, the same for all masks."""
         return TABLE3_NONLINEARITY_WAVES[modes]
 
 
@@ -223,7 +223,7 @@ def _relay(amplitude: Complex, focal_mask: str, samples: int, scale: float) -> C
 
 
 def _covered(samples: int, centre: float, diameter: float) -> slice:
-    """Indices of the samples that a hole may touch, along one axis."""
+    """Slice of the samples along one axis that a hole may cover."""
     first = int(np.floor((centre - diameter / 2.0 + 0.5) * samples)) - 1
     last = int(np.ceil((centre + diameter / 2.0 + 0.5) * samples)) + 1
     return slice(max(first, 0), min(last, samples))

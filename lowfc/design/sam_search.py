@@ -1,7 +1,7 @@
 """Simulated annealing of the holes of a sparse aperture mask, in blocks that can be stopped, stored and continued.
 
-Positions and diameters are whole thousandths of the pupil's diameter, so that a layout is written without loss. Under
-a mirror symmetry a chain moves orbits: a hole on the axis, or one hole that stands for itself and its mirror image.
+Positions and diameters are integer thousandths of the pupil's diameter, so that a layout is written without loss. With
+a mirror symmetry a chain moves orbits: a hole on the axis, or a hole together with its mirror image.
 """
 
 from dataclasses import dataclass, replace
@@ -20,10 +20,10 @@ SYMMETRIES = ("none", "x", "y")
 BLOCK = 200
 """Steps between two states of a chain that can be stored."""
 
-_ATTEMPTS = 60
-_PACKINGS = 200
-_WARM, _COLD = 0.01, 0.0003
-_FAR, _NEAR = 80.0, 1.5
+_ATTEMPTS = 60  # random placements of a hole
+_PACKINGS = 200  # random starting layouts
+_WARM, _COLD = 0.01, 0.0003  # temperature at the start and at the end, in relative change of the merit
+_FAR, _NEAR = 80.0, 1.5  # scale of the moves at the start and at the end, thousandths of the pupil's diameter
 
 
 @dataclass(frozen=True)
@@ -31,10 +31,10 @@ class Bounds:
     """Constraints on every layout of a search; lengths in thousandths of the pupil's diameter.
 
     Attributes:
-        count: Fewest and most holes.
-        diameter: Smallest and largest.
+        count: Smallest and largest number of holes.
+        diameter: Smallest and largest diameter.
         gap: Least distance between the rims of two holes.
-        edge: Least distance from a hole's rim to the pupil's.
+        edge: Least distance between a hole's rim and the pupil's edge.
         symmetry: "none", or the axis, "x" or "y", about which the mask is its own mirror image.
     """
 
@@ -60,16 +60,16 @@ class Bounds:
 
 @dataclass(frozen=True)
 class Chain:
-    """One search between two blocks.
+    """State of one annealing chain between two blocks.
 
     Attributes:
-        seed: Of the whole search.
-        index: Of this chain.
-        steps: How many it makes in all.
-        step: How many it has made.
-        orbits: Where it stands.
-        best: The best it has seen.
-        best_merit: Merit of that.
+        seed: Seed of the search.
+        index: Index of this chain.
+        steps: Total number of steps.
+        step: Number of steps made.
+        orbits: Current layout.
+        best: Best layout found.
+        best_merit: Merit of the best layout.
     """
 
     seed: int
@@ -82,10 +82,10 @@ class Chain:
 
 
 def start(bounds: Bounds, seed: int, index: int, steps: int) -> Chain:
-    """A chain at a random layout.
+    """Start a chain at a random layout.
 
     Raises:
-        ValueError: So many holes cannot be placed.
+        ValueError: The holes could not be placed.
     """
     rng = np.random.default_rng([seed, index])
     for _ in range(_PACKINGS):
@@ -99,7 +99,7 @@ def start(bounds: Bounds, seed: int, index: int, steps: int) -> Chain:
 
 
 def advance(optics: Optics, goal: Goal, bounds: Bounds, chain: Chain) -> Chain:
-    """Make the next block of steps, if any is left; the result depends on nothing but the arguments."""
+    """Make the next block of steps, if any remain; the result depends only on the arguments."""
     if chain.step >= chain.steps:
         return chain
     rng = np.random.default_rng([chain.seed, chain.index, 1 + chain.step])
@@ -121,7 +121,7 @@ def advance(optics: Optics, goal: Goal, bounds: Bounds, chain: Chain) -> Chain:
         changed = total if at is None else total - fields[at]
         changed = changed if field is None else changed + field
         value = merit(Mask(optics, changed), goal)
-        # a layout that is 1 % worse is as likely at any level of the merit
+        # on relative changes, so that a layout 1 % worse is accepted equally often at any merit
         accepted = value < current or (value < inf and rng.random() < exp(-log(value / current) / temperature))
         if not accepted:
             continue
@@ -137,7 +137,7 @@ def advance(optics: Optics, goal: Goal, bounds: Bounds, chain: Chain) -> Chain:
 
 
 def holes(orbits: tuple[Orbit, ...], symmetry: str) -> tuple[tuple[float, float, float], ...]:
-    """The holes (x, y, diameter) in pupil diameters that orbits stand for, in a fixed order."""
+    """The holes (x, y, diameter) of the orbits in pupil diameters, sorted."""
     expanded = sorted(hole for orbit in orbits for hole in images(orbit, symmetry))
     return tuple((x / UNIT, y / UNIT, diameter / UNIT) for x, y, diameter in expanded)
 
@@ -155,7 +155,7 @@ def orbit_fields(optics: Optics, orbit: Orbit, symmetry: str) -> Single:
 
 
 def _packed(rng: np.random.Generator, bounds: Bounds) -> tuple[Orbit, ...] | None:
-    """A random layout of the fewest holes and smallest diameters, or None when it got stuck."""
+    """A random layout with the fewest holes and smallest diameters; None if a hole could not be placed."""
     orbits: list[Orbit] = []
     missing = bounds.count[0]
     while missing:
@@ -171,13 +171,13 @@ def _packed(rng: np.random.Generator, bounds: Bounds) -> tuple[Orbit, ...] | Non
 def _move(
     rng: np.random.Generator, bounds: Bounds, orbits: list[Orbit], done: float
 ) -> tuple[int | None, Orbit | None] | None:
-    """A random change that keeps to the bounds: which orbit goes and which one comes; None when none was found."""
+    """A random change within the bounds: index of the removed orbit, and the added orbit; None if none was found."""
     at = int(rng.integers(len(orbits)))
     if bounds.count[0] < bounds.count[1] and rng.random() < 0.1:
         count = sum(len(images(orbit, bounds.symmetry)) for orbit in orbits)
         if rng.random() < 0.5:
-            left = count - len(images(orbits[at], bounds.symmetry))
-            return (at, None) if left >= bounds.count[0] else None
+            remaining = count - len(images(orbits[at], bounds.symmetry))
+            return (at, None) if remaining >= bounds.count[0] else None
         paired = bounds.symmetry != "none" and rng.random() < 0.8
         diameter = int(rng.integers(bounds.diameter[0], bounds.diameter[1] + 1))
         added = _placed(rng, bounds, orbits, paired, diameter) if count + 1 + paired <= bounds.count[1] else None
@@ -202,7 +202,7 @@ def _move(
 
 
 def _placed(rng: np.random.Generator, bounds: Bounds, others: list[Orbit], paired: bool, diameter: int) -> Orbit | None:
-    """A random orbit that fits beside others, or None when none was found."""
+    """A random orbit that does not collide with the others; None if none was found."""
     for _ in range(_ATTEMPTS):
         orbit = _anywhere(rng, bounds, paired, diameter)
         if _fits(bounds, orbit, others, paired):
@@ -216,7 +216,7 @@ def _anywhere(rng: np.random.Generator, bounds: Bounds, paired: bool, diameter: 
 
 
 def _on_axis(bounds: Bounds, orbit: Orbit, paired: bool) -> Orbit:
-    """The orbit itself, or moved onto the axis of the symmetry unless it is to be a pair."""
+    """The orbit, moved onto the symmetry axis if there is one, unless it is a pair."""
     x, y, diameter = orbit
     if bounds.symmetry == "none" or paired:
         return orbit
@@ -224,7 +224,7 @@ def _on_axis(bounds: Bounds, orbit: Orbit, paired: bool) -> Orbit:
 
 
 def _fits(bounds: Bounds, orbit: Orbit, others: list[Orbit], paired: bool) -> bool:
-    """Whether an orbit is one hole or a pair as wanted, inside the pupil, apart from its own image and from others."""
+    """Whether an orbit is a pair if required, inside the pupil, and clear of its own image and of the others."""
     own = images(orbit, bounds.symmetry)
     x, y, diameter = orbit
     if len(own) != 1 + paired or 2 * hypot(x, y) + diameter > UNIT - 2 * bounds.edge:

@@ -1,11 +1,11 @@
 """The shaped pupil by linear programming: the most open mask whose image has a dark zone.
 
-The transmissions of the cells of one quadrant are the variables. A mask that is symmetric about both axes has a real
+The variables are the transmissions of the cells of one quadrant. A mask that is symmetric about both axes has a real
 field, so that `|E| <= sqrt(contrast) E(0)` is two linear inequalities at every point. Less symmetry would gain nothing:
-the mean of any mask and its mirror images is as open, and as dark in a zone that has both mirror symmetries itself.
+the mean of any mask and its mirror images is as open, and as dark in a zone with the same symmetries.
 
-Between the points of a grid the light is tens of times brighter. Exchange: the maxima of the solution on a fine
-grid become points of the next program, until none is above what was promised.
+Between the points of a coarse grid the intensity is tens of times higher. Exchange: the maxima of the solution on a
+fine grid are added as points to the next program, until none exceeds the required contrast.
 """
 
 from bisect import bisect_left
@@ -25,15 +25,15 @@ from lowfc.optics.chain.grid import OPEN_AREA, SAMPLES, pupil_axis
 from lowfc.optics.chain.pupil import circle, from_quarter
 
 FOCAL_MASK_RADIUS = 4.0
-"""Radius of the disk whose share of the light is reported, in lambda / D (Sect. 2.1)."""
+"""Radius of the disk for which the fraction of the light is reported, in lambda / D (Sect. 2.1)."""
 
 LEAST_OPEN = 0.01
-"""A program whose best mask is less open than this part of the circle is called infeasible: a closed one is dark."""
+"""Smallest open fraction of the circle: below it a request counts as infeasible, since a closed mask is dark."""
 
 SYMMETRIES = ("quarter", "octant")
 
 COARSEST_CELLS = 32
-"""Cells in half the diameter, in the first programs: they find most of the points, and are soon solved."""
+"""Cells in half the diameter in the first programs, which find most of the points quickly."""
 
 
 @dataclass(frozen=True)
@@ -41,15 +41,15 @@ class Request:
     """Requirements on a shaped pupil: the options of `lowfc design spc`.
 
     Attributes:
-        inner: Where the dark zone begins, in lambda/D.
-        outer: Where it ends, in lambda/D.
-        half_angle_deg: Degrees from the x axis, on both sides, within which it lies; 90: all around.
-        contrast: Largest intensity in it, over the star's; kept every 0.1 lambda/D and on its edges.
-        limit: Contrast in the linear programs, over the one promised; below 1 they end sooner.
-        cells: In half the diameter: 8, 16, 32, 64, 128 or 256.
-        step: Of the first grid of points, in lambda/D.
-        symmetry: quarter: about both axes; octant: about the diagonals too, as the zone then is, four times as fast.
-        rounds: Programs at most, with each number of cells on the way.
+        inner: Inner radius of the dark zone, in lambda/D.
+        outer: Outer radius of the dark zone, in lambda/D.
+        half_angle_deg: Half-angle of the dark zone from the x axis, on both sides, in degrees; 90: all around.
+        contrast: Largest intensity in the dark zone, over the star's peak; checked every 0.1 lambda/D and on its edges.
+        limit: Contrast in the linear programs, over the required one; below 1 fewer rounds are needed.
+        cells: Cells in half the diameter: 8, 16, 32, 64, 128 or 256.
+        step: Spacing of the first grid of points, in lambda/D.
+        symmetry: quarter: about both axes; octant: also about the diagonals, for the zone too; four times faster.
+        rounds: Most programs for each number of cells.
     """
 
     inner: float = 4.0
@@ -86,7 +86,7 @@ class Request:
 
     @property
     def zone(self) -> DarkZone:
-        """The part of the dark zone that has no mirror image in itself."""
+        """The part of the dark zone without its mirror images."""
         most_deg = 45.0 if self.symmetry == "octant" else 90.0
         return DarkZone(self.inner, self.outer, min(self.half_angle_deg, most_deg))
 
@@ -96,13 +96,13 @@ class Round:
     """A solved program.
 
     Attributes:
-        number: Counted from 1 with each number of cells.
-        points: Of the program, each with one sign of the field.
-        quarter: (cells, cells) the mask, [0, 0] next to the pupil's centre.
-        open_area: Fraction of the circle.
-        bound: On `open_area`, from the dual: no mask that keeps to `limit` times the contrast in these points is more
-            open. One that keeps to the contrast alone, as promised, may be.
-        contrast: The largest in the zone on the fine grid; infinite for a closed mask.
+        number: Number of the round, from 1 for each number of cells.
+        points: Number of points in the program, each with one sign of the field.
+        quarter: (cells, cells) quadrant of the mask, [0, 0] next to the pupil's centre.
+        open_area: Open fraction of the circle.
+        bound: Dual bound on `open_area`: no mask with `limit` times the contrast at these points is more open. A mask
+            with the contrast itself may be.
+        contrast: Largest contrast in the zone on the fine grid; infinite for a closed mask.
     """
 
     number: int
@@ -115,15 +115,15 @@ class Round:
 
 @dataclass(frozen=True)
 class Figures:
-    """Figures of a mask: all are fractions; contrasts every `FINE_STEP` of the dark zone.
+    """Figures of a mask; contrasts are sampled every `FINE_STEP` in the dark zone.
 
     Attributes:
-        open_area_fraction: Sum of the transmission, of the open circle.
-        energy_fraction: Of the open circle's light, what passes.
-        focal_mask_fraction: Of that, what falls within `FOCAL_MASK_RADIUS`.
-        max_contrast: The largest, also on the zone's edges.
-        mean_contrast: The mean.
-        grey_cells_fraction: Of the circle's cells, those neither open nor closed to a thousandth.
+        open_area_fraction: Mean amplitude transmission over the circle.
+        energy_fraction: Fraction of the open circle's light that passes.
+        focal_mask_fraction: Fraction of the passing light that falls within `FOCAL_MASK_RADIUS`.
+        max_contrast: Largest contrast, including the zone's edges.
+        mean_contrast: Mean contrast.
+        grey_cells_fraction: Fraction of the circle's cells that are neither open nor closed to a thousandth.
     """
 
     open_area_fraction: float
@@ -135,13 +135,13 @@ class Figures:
 
 
 def exchange(request: Request) -> Iterator[Round]:
-    """Solve program after program, first with few cells; the last one keeps the promise unless the rounds ran out.
+    """Solve a series of programs, first with few cells; the last meets the contrast unless the rounds ran out.
 
-    Each program begins at the multipliers of the one before, and the points are those that few cells have found.
-    Where nothing but a closed mask is dark the last round's contrast is infinite.
+    Each program starts at the multipliers of the previous one, with the points found so far. If only a closed mask is
+    dark, the contrast of the last round is infinite.
 
     Raises:
-        NotSolvedError: The solver gave up.
+        NotSolvedError: The solver failed.
     """
     points = first_points(request.zone, request.step)
     points, signs = np.concatenate([points, points]), np.repeat([1.0, -1.0], len(points))
@@ -165,7 +165,7 @@ def exchange(request: Request) -> Iterator[Round]:
             found, found_signs = _maxima(quarter, request, level * (1 + 1e-6))
             points, signs = np.concatenate([points, found]), np.concatenate([signs, found_signs])
             multipliers = np.concatenate([multipliers, np.zeros(len(found))])
-        if is_open:  # the other sign of the field hardly ever matters in the same place with more cells
+        if is_open:  # with more cells the other sign of the field is hardly ever active at the same point
             kept = (signs * _field_at(quarter, points) > 0) | (multipliers > 0)
             points, signs, multipliers = points[kept], signs[kept], multipliers[kept]
 
@@ -174,7 +174,7 @@ def relative_field(quarter: Array, axis: Array) -> Array:
     """Field E / E(0) of a mask at all pairs of coordinates, [row = y, column = x].
 
     Args:
-        quarter: (cells, cells) of the mask.
+        quarter: (cells, cells) quadrant of the mask.
         axis: (n,) coordinates in lambda / D.
     """
     waves = _waves(axis, len(quarter))
@@ -190,7 +190,7 @@ def largest_contrast(quarter: Array, request: Request) -> float:
 
 
 def figures(quarter: Array, request: Request) -> Figures:
-    """What a mask does in the dark zone of a request: transmissions (cells, cells) of one quadrant."""
+    """Figures of a mask, transmissions (cells, cells) of one quadrant, for the dark zone of a request."""
     axis, zone = fine_grid(request.zone)
     contrast = relative_field(quarter, axis)[zone] ** 2
     pupil = from_quarter(quarter, SAMPLES)
@@ -209,7 +209,7 @@ def figures(quarter: Array, request: Request) -> Figures:
 
 
 def stored(quarter: Array, request: Request) -> NDArray[np.floating]:
-    """The mask, transmissions (cells, cells), in the shortest floating-point type in which it keeps the promise."""
+    """The mask, transmissions (cells, cells), in the shortest floating-point type that meets the contrast."""
     for kind in (np.float16, np.float32):
         short: NDArray[np.floating] = quarter.astype(kind)
         if largest_contrast(short.astype(np.float64), request) <= request.contrast:
@@ -218,13 +218,13 @@ def stored(quarter: Array, request: Request) -> NDArray[np.floating]:
 
 
 def nearest_feasible(request: Request) -> tuple[float | None, float | None]:
-    """For an infeasible request, what would do: the next inner angle in steps of 0.1, and contrast in steps of 26 %.
+    """For an infeasible request, the nearest feasible inner angle (steps of 0.1) and contrast (steps of 26 %).
 
-    Found with the fewest cells that resolve the zone.
+    They are found with the fewest cells that resolve the zone.
 
     Returns:
-        Inner angle (at most twice as large), and contrast (at most 1e5 times as large) with all else kept; None where
-        even the largest is infeasible.
+        Inner angle (at most twice as large) and contrast (at most 1e5 times as large), each with everything else
+        unchanged; None if even the largest is infeasible.
     """
     coarse = replace(request, cells=_levels(request)[0])
     inners = [round(v, 6) for v in request.inner + 0.1 * np.arange(1, round(10 * request.inner) + 1)]
@@ -236,25 +236,25 @@ def nearest_feasible(request: Request) -> tuple[float | None, float | None]:
 
 
 def is_feasible(request: Request) -> bool:
-    """Whether a mask that is not closed keeps the promise."""
+    """Whether a mask that is not closed meets the contrast."""
     return [found.contrast <= request.contrast for found in exchange(request)][-1]
 
 
 def _first(candidates: Sequence[float], feasible: Callable[[float], bool]) -> float | None:
-    """The first feasible one of candidates that grow easier, by bisection."""
+    """The first feasible candidate, by bisection; each must be easier than the one before."""
     place = bisect_left(candidates, True, key=feasible)
     return candidates[place] if place < len(candidates) else None
 
 
 def _levels(request: Request) -> list[int]:
-    """Numbers of cells, up to what is wanted."""
+    """Numbers of cells, up to the requested one."""
     finest = request.cells
     coarser = [cells for cells in (COARSEST_CELLS, 64, 128) if request.outer <= cells < finest]
     return [*coarser, finest]
 
 
 def _variables(cells: int, symmetry: str) -> tuple[Whole, Whole, Array]:
-    """Indices y and x (n,) of the cells that stand for themselves and their mirror images, and how many those are."""
+    """Indices y and x (n,) of the independent cells, and the number of cells that each represents by symmetry."""
     y, x = np.nonzero(_circle_quarter(cells))
     if symmetry == "quarter":
         return y, x, np.ones(y.size)
@@ -264,7 +264,7 @@ def _variables(cells: int, symmetry: str) -> tuple[Whole, Whole, Array]:
 
 
 def _rows(points: Array, signs: Array, cells: int, symmetry: str) -> Array:
-    """Field (points, n) at points, with a sign, of each variable; a cell adds 1 to E(0)."""
+    """Signed field (points, n) of each variable at the points; a cell adds 1 to E(0)."""
     y, x, weights = _variables(cells, symmetry)
     along_x, along_y = (_waves(points[:, k], cells) for k in (0, 1))
     rows = along_y[:, y] * along_x[:, x]
@@ -274,7 +274,7 @@ def _rows(points: Array, signs: Array, cells: int, symmetry: str) -> Array:
 
 
 def _waves(axis: Array, cells: int) -> Array:
-    """Kernel (n, cells) from a half-axis of cells, mirrored, to the image: the mean over each cell's samples."""
+    """Kernel (n, cells) from a mirrored half-axis of cells to the image, averaged over each cell's samples."""
     u = pupil_axis(SAMPLES)[SAMPLES // 2 :]
     return np.asarray(np.cos(2.0 * np.pi * np.outer(axis, u)).reshape(axis.size, cells, -1).mean(axis=2))
 
@@ -286,7 +286,7 @@ def _field_at(quarter: Array, points: Array) -> Array:
 
 
 def _maxima(quarter: Array, request: Request, level: float) -> tuple[Array, Array]:
-    """Where the field's absolute value has maxima above a level, points (n, 2), and its signs (n,) there."""
+    """Maxima of the field's absolute value above a level: points (n, 2), and signs (n,) of the field there."""
     axis, zone = fine_grid(request.zone)
     field = np.where(zone, relative_field(quarter, axis), 0.0)
     edge = edge_points(request.zone, FINE_STEP)

@@ -1,16 +1,16 @@
-"""Which drift and which line a loop may have to hold, by theory: from the contrast they may add back to their size.
+"""Tolerances of drift and vibration lines, from theory: the size that a loop can correct to an allowed contrast.
 
-A mode drifts as a random walk of variance D in a frame, and is measured with noise of variance n, averaged over an
-exposure of e frames; a command is in force from the next frame on. Of the state r at the start of a frame,
+A mode drifts as a random walk of variance D per frame, and is measured with noise of variance n, averaged over an
+exposure of e frames; a command takes effect at the next frame. For the state r at the start of a frame,
 
     r' = r + d - g (r + m + noise),    var d = D, var m = D e / 3, cov(d, m) = D e / 2
 
-with the gain g of an integrator. So the variance at all times is v = D / 2 + P, where
+with the gain g of an integrator. The variance in continuous time is therefore v = D / 2 + P, where
 
     P = (D (1 - g e + g^2 e / 3) + g^2 n) / (g (2 - g)),
 
 and at the best gain (P + D e / 2)^2 = D (P + D e / 3 + n), which is the Kalman filter's Riccati equation: for drift
-alone no linear law does better than that integrator.
+alone no linear law is better than that integrator.
 """
 
 from collections.abc import Callable
@@ -32,19 +32,19 @@ Kind = Literal["integrator", "lqg"]
 KINDS: tuple[Kind, ...] = ("integrator", "lqg")
 
 DELAY = 1.0
-_LEAST_DRIFT = 1e-12  # of a filter that knows a line alone
+_LEAST_DRIFT = 1e-12  # drift in the model of a filter for a line only, nm^2 per frame
 _GAINS = np.geomspace(0.01, 1.0, 30)
 _LINE_RATIOS = np.geomspace(1e-6, 1e10, 49)  # variance of a line over that of a frame's noise
 
 
 @dataclass(frozen=True)
 class Drift:
-    """A drift that is held.
+    """A drift corrected by an integrator.
 
     Attributes:
-        step_nm2: D, variance of its step in a frame.
-        gain: of the integrator.
-        left_nm2: v, variance of what is left, at all times.
+        step_nm2: D, variance of the drift per frame.
+        gain: gain of the integrator.
+        left_nm2: v, variance of the residual in continuous time.
     """
 
     step_nm2: float
@@ -53,67 +53,67 @@ class Drift:
 
 
 def left_of_drift_nm2(step_nm2: float, noise_nm2: float, exposure: float, gain: float) -> float:
-    """Variance of what an integrator leaves of a drift, at all times."""
-    seen = step_nm2 * (1.0 - gain * exposure + gain**2 * exposure / 3.0)
-    return step_nm2 / 2.0 + (seen + gain**2 * noise_nm2) / (gain * (2.0 - gain))
+    """Variance of the residual of an integrator under a drift, in continuous time."""
+    drift_nm2 = step_nm2 * (1.0 - gain * exposure + gain**2 * exposure / 3.0)
+    return step_nm2 / 2.0 + (drift_nm2 + gain**2 * noise_nm2) / (gain * (2.0 - gain))
 
 
 def best_gain(step_nm2: float, noise_nm2: float, exposure: float) -> float:
-    """The gain at which that is least; it is the Kalman filter's."""
-    seen = 2.0 * (step_nm2 * exposure / 3.0 + noise_nm2) - step_nm2 * exposure
-    root = np.sqrt(step_nm2**2 + 2.0 * step_nm2 * seen)
+    """Gain of the least residual, which is the Kalman gain."""
+    measurement_nm2 = 2.0 * (step_nm2 * exposure / 3.0 + noise_nm2) - step_nm2 * exposure
+    root = np.sqrt(step_nm2**2 + 2.0 * step_nm2 * measurement_nm2)
     return float(2.0 * step_nm2 / (step_nm2 + root))
 
 
 def tolerated_drift(left_nm2: float, noise_nm2: float, exposure: float, kind: Kind = "integrator") -> Drift:
-    """The fastest drift of which no more than a variance is left.
+    """The fastest drift whose residual does not exceed a variance.
 
     Args:
-        left_nm2: That variance.
-        noise_nm2: Of a frame.
-        exposure: Of the period.
-        kind: An integrator keeps the gain at which its margins hold, where the best one is higher.
+        left_nm2: Allowed variance of the residual.
+        noise_nm2: Variance of the noise of a frame.
+        exposure: Exposure time, in periods.
+        kind: The gain of an integrator is limited to the highest within its margins.
     """
     square = (exposure - 1.0) ** 2 / 4.0 - exposure / 3.0 + 0.5
     linear = (exposure - 2.0) * left_nm2 - noise_nm2
     step = 2.0 * left_nm2**2 / (-linear + np.sqrt(linear**2 - 4.0 * square * left_nm2**2))
     gain, most = best_gain(step, noise_nm2, exposure), highest_gain(DELAY)
     if kind == "integrator" and gain > most:
-        by_noise = left_of_drift_nm2(0.0, noise_nm2, exposure, most)
-        step, gain = (left_nm2 - by_noise) / left_of_drift_nm2(1.0, 0.0, exposure, most), most
+        from_noise_nm2 = left_of_drift_nm2(0.0, noise_nm2, exposure, most)
+        step, gain = (left_nm2 - from_noise_nm2) / left_of_drift_nm2(1.0, 0.0, exposure, most), most
     return Drift(float(step), gain, left_nm2)
 
 
 def tolerated_lines(kind: Kind, line: Line, rate_hz: float, exposure: float) -> Callable[[Array], Array]:
-    """What variance a line may have, over a frame's noise, by the variance that may be left of it, over the same.
+    """Function from the allowed residual variance of a line to its tolerated variance, both over the noise of a frame.
 
     Args:
-        kind: Integrator of the best gain, or the filter that knows the line.
-        line: Its frequency and width.
-        rate_hz: Of the frames.
-        exposure: Of the period.
+        kind: Integrator with the best gain, or LQG with the line in its model.
+        line: Frequency and width of the line.
+        rate_hz: Frame rate.
+        exposure: Exposure time, in periods.
     """
     timing = Timing.of(DELAY, exposure)
 
-    def left(law: LinearLaw, variance: float) -> float:
+    def residual(law: LinearLaw, variance: float) -> float:
         model = Model(_LEAST_DRIFT, np.inf, (replace(line, variance_nm2=variance),), 1.0, rate_hz)
         return float(predicted_nm(law, [model], timing)[0] ** 2)
 
     if kind == "integrator":  # v = A line + B noise at each gain
         laws = [integrator([gain], [0.0], (2,), DELAY, rate_hz) for gain in np.append(_GAINS, highest_gain(DELAY))]
-        of_noise = np.array([0.0, *(float(noise_gain(law)[0]) for law in laws)])  # without a loop the line stays
-        of_line = np.array([1.0, *(left(law, 1.0) for law in laws)]) - of_noise
+        of_noise = np.array([0.0, *(float(noise_gain(law)[0]) for law in laws)])  # first without a loop
+        of_line = np.array([1.0, *(residual(law, 1.0) for law in laws)]) - of_noise
         return lambda allowed: np.asarray(np.max((allowed[..., None] - of_noise) / of_line, axis=-1))
 
     def filtered(variance: float) -> float:
         model = Model(_LEAST_DRIFT, np.inf, (replace(line, variance_nm2=variance),), 1.0, rate_hz)
-        return min(left(lqg([model], (2,), timing), variance), variance)
+        return min(residual(lqg([model], (2,), timing), variance), variance)
 
     found = np.log([filtered(variance) for variance in _LINE_RATIOS.tolist()])
     return lambda allowed: np.asarray(np.exp(np.interp(np.log(allowed), found, np.log(_LINE_RATIOS))))
 
 
 def tolerated_variance(form: float, quartic: float, contrast: float) -> float:
-    """Variance of a Gaussian mode that adds a contrast, nm^2: form a^2 + quartic a^4 of an amplitude a."""
+    """Variance, nm^2, of a Gaussian mode that adds this mean contrast, if amplitude a adds form a^2 + quartic a^4."""
     root = np.sqrt(form**2 + 12.0 * max(quartic, 0.0) * contrast)
     return float(2.0 * contrast / (form + root))

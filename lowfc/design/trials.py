@@ -1,4 +1,4 @@
-"""Random wavefronts and noisy images (Sect. 3.1), and what is left of a wavefront after its estimate is taken off."""
+"""Random wavefronts and noisy images (Sect. 3.1), and statistics of the residuals of estimates."""
 
 from collections.abc import Sequence
 
@@ -9,9 +9,9 @@ from lowfc.arrays import Array
 from lowfc.optics.chain.zernike import noll_to_nm
 
 LITERAL_WAVES = (0.04, 0.016)
-"""Bounds of Sect. 3.1 for radial degrees 1 and 2, and above; read as uniform between minus and plus these."""
+"""Bounds of Sect. 3.1 for radial degrees 1 and 2, and above; interpreted as uniform between minus and plus these."""
 
-_BLOCK = 100  # wavefronts whose samples are in memory at once
+_BLOCK = 100  # wavefronts in memory at once
 
 
 def bounds_waves(nolls: Sequence[int], low: float, high: float) -> Array:
@@ -22,8 +22,8 @@ def bounds_waves(nolls: Sequence[int], low: float, high: float) -> Array:
 def random_wavefronts(rng: np.random.Generator, count: int, nolls: Sequence[int], low: float, high: float) -> Array:
     """Coefficients (count, modes) in waves rms, uniform between minus and plus `bounds_waves` (Sect. 3.1).
 
-    They are stratified: of `count` equal parts of its range each coefficient takes every one once, in random order, so
-    that the input's mean square, on which the second-order errors depend, hardly changes from seed to seed.
+    They are stratified: each coefficient has one value in each of `count` equal parts of its range, in random order.
+    The input's mean square, on which second-order errors depend, therefore hardly differs between seeds.
     """
     strata = rng.permuted(np.tile(np.arange(count), (len(nolls), 1)), axis=1).T
     unit = 2.0 * (strata + rng.uniform(size=strata.shape)) / count - 1.0
@@ -31,16 +31,13 @@ def random_wavefronts(rng: np.random.Generator, count: int, nolls: Sequence[int]
 
 
 def noisy_e(rng: np.random.Generator, mean_e: ArrayLike, read_noise_e: float) -> Array:
-    """An exposure (any shape) in electrons.
-
-    Photon noise, read noise, and whole numbers at one electron per digital number.
-    """
-    mean_e = np.maximum(mean_e, 0.0)  # a twin's rounding leaves values below zero where there is no light
+    """An exposure (any shape) in electrons, with photon noise, read noise and rounding to whole electrons."""
+    mean_e = np.maximum(mean_e, 0.0)  # rounding errors of a twin give values below zero in dark pixels
     return np.asarray(np.rint(rng.poisson(mean_e) + read_noise_e * rng.standard_normal(mean_e.shape)))
 
 
 def gram(basis: Array) -> Array:
-    """Mean products (modes, modes) of modes (modes, samples), in any unit, over the open pupil, piston removed."""
+    """Covariance (modes, modes) of modes (modes, samples), in any unit, over the open pupil."""
     centred = basis - basis.mean(axis=1, keepdims=True)
     return np.asarray(centred @ centred.T / basis.shape[1])
 
@@ -51,7 +48,7 @@ def input_rms(gram: Array, bounds: Array) -> float:
 
 
 def expected_rms(gram: Array, covariance: Array) -> float:
-    """Root mean square over the open pupil of residuals with this covariance (modes, modes), in their unit."""
+    """Expected rms over the open pupil of residuals with this covariance (modes, modes), in their unit."""
     return float(np.sqrt(np.sum(gram * covariance)))
 
 
@@ -65,24 +62,24 @@ def residual_pv(basis: Array, residuals: Array) -> Array:
 
     Args:
         basis: Modes (modes, samples) at the open samples.
-        residuals: Truth minus estimate.
+        residuals: (n, modes) truth minus estimate.
     """
     blocks = (residuals[i : i + _BLOCK] @ basis for i in range(0, len(residuals), _BLOCK))
     return np.concatenate([np.ptp(block, axis=1) for block in blocks])
 
 
 def expected_r_squared(variances: Array, bounds: Array) -> Array:
-    """What `r_squared` tends to (modes,), without unit, with many estimates, if errors do not depend on the truth.
+    """Limit of `r_squared` (modes,), without unit, for many estimates, if errors do not depend on the truth.
 
     Args:
-        variances: (modes,) of the errors.
-        bounds: (modes,) of the coefficients, uniform between minus and plus these.
+        variances: (modes,) variances of the errors.
+        bounds: (modes,) bounds of the coefficients, which are uniform between minus and plus these.
     """
     return np.asarray(1.0 - variances / (bounds**2 / 3.0 + variances))
 
 
 def r_squared(estimates: Array, truth: Array) -> Array:
-    """Coefficient of determination (modes,), without unit, of estimates (n, modes), as the text below eq. (15)."""
+    """Coefficient of determination (modes,), without unit, of estimates (n, modes), as defined below eq. (15)."""
     residual = np.sum((estimates - truth) ** 2, axis=0)
     total = np.sum((estimates - estimates.mean(axis=0)) ** 2, axis=0)
     return np.asarray(1.0 - residual / total)
