@@ -1,4 +1,4 @@
-"""What the tests of the search for a sparse aperture mask share."""
+"""Fixtures of the tests of the search for a sparse aperture mask."""
 
 import pytest
 
@@ -8,5 +8,5 @@ from lowfc.design.sam_merit import Optics, build_optics
 
 @pytest.fixture(scope="session")
 def optics() -> Optics:
-    """All that precedes the mask, as a search has it."""
+    """The optics before the mask, with the sampling of a search."""
     return build_optics(load_pupil(256))

@@ -1,4 +1,4 @@
-"""Estimators against closed forms, their covariance against the Cramer-Rao bound, and both against noise itself."""
+"""Estimators against closed forms, and their covariance against the Cramer-Rao bound and simulated noise."""
 
 from itertools import pairwise
 
@@ -27,7 +27,7 @@ NOLLS = (2, 3, 4)
 
 @pytest.fixture(scope="module")
 def optics():
-    """I0 (60,) and H (60, 3) of no sensor in particular."""
+    """I0 (60,) and H (60, 3) of an arbitrary sensor."""
     rng = np.random.default_rng(1)
     I0 = rng.exponential(size=60) / 60
     return I0, I0[:, None] ** 0.5 * rng.normal(size=(60, 3)) * 1e-3
@@ -38,12 +38,12 @@ def fits(optics):
     return {kind: fit(NOLLS, *optics, SCALE_E, READ_NOISE_E, kind) for kind in KINDS}
 
 
-def test_a_pixel_without_noise_or_light_tells_nothing():
+def test_pixel_without_variance_carries_no_information():
     H, variance = np.array([[3.0], [0.0]]), np.array([9.0, 0.0])
     np.testing.assert_allclose(cramer_rao(H, variance), [[1.0]])
 
 
-def test_modes_that_look_alike_have_no_bound_and_no_estimate():
+def test_indistinguishable_modes_are_refused():
     H = np.ones((5, 2))
     with pytest.raises(ValueError, match="cannot tell the modes apart"):
         cramer_rao(H, np.ones(5))
@@ -68,14 +68,14 @@ def test_a_linear_image_is_estimated_exactly(fits, optics, kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_is_fitted_along_does_not_pass_for_a_mode(fits, optics, kind):
+def test_fitted_nuisance_parameters_do_not_bias_the_modes(fits, optics, kind):
     I0, H = optics
     nuisance = np.column_stack([I0, H[:, 0] * 1e6 + np.gradient(I0)])  # flux, and a shear that looks like the tilt
     image_e = SCALE_E * (I0 + H @ [1.0, -2.0, 3.0] + nuisance @ [0.01, 2e-6])
-    careful = fit(NOLLS, I0, H, SCALE_E, READ_NOISE_E, kind, nuisance)
-    np.testing.assert_allclose(estimate(careful, image_e), [1.0, -2.0, 3.0], atol=1e-8)
+    with_nuisance = fit(NOLLS, I0, H, SCALE_E, READ_NOISE_E, kind, nuisance)
+    np.testing.assert_allclose(estimate(with_nuisance, image_e), [1.0, -2.0, 3.0], atol=1e-8)
     assert abs(estimate(fits[kind], image_e)[0] - 1.0) > 0.5
-    assert careful.R.shape == (3, 60)
+    assert with_nuisance.R.shape == (3, 60)
 
 
 def test_iterations_with_the_full_model_remove_the_second_order(fits, optics):
@@ -93,7 +93,7 @@ def test_iterations_with_the_full_model_remove_the_second_order(fits, optics):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_scatter_under_noise_is_the_predicted_one(fits, kind):
+def test_scatter_with_noise_agrees_with_the_prediction(fits, kind):
     rng, linear, count = np.random.default_rng(5), fits[kind], 20_000
     images_e = noisy_e(rng, np.tile(linear.reference_e, (count, 1)), READ_NOISE_E)
     predicted = np.sqrt(np.diag(covariance(linear.R, variance_e(linear.reference_e, READ_NOISE_E) + 1 / 12)))
@@ -106,7 +106,7 @@ def test_an_unknown_kind_is_refused(optics):
         fit(NOLLS, *optics, SCALE_E, READ_NOISE_E, "best")
 
 
-def test_noise_is_photons_read_noise_and_whole_numbers():
+def test_noise_is_photon_noise_read_noise_and_rounding():
     mean_e = np.repeat([0.0, 7.0, 400.0], 40_000)
     image_e = noisy_e(np.random.default_rng(3), mean_e, READ_NOISE_E)
     assert (image_e == np.rint(image_e)).all()
@@ -116,7 +116,7 @@ def test_noise_is_photons_read_noise_and_whole_numbers():
         assert part.var() == pytest.approx(variance, rel=0.04)
 
 
-def test_wavefronts_fill_their_bounds_evenly_and_come_from_the_seed():
+def test_random_wavefronts_are_stratified_and_depend_on_the_seed():
     drawn = random_wavefronts(np.random.default_rng(4), 50, NOLLS_20, 0.04, 0.016)
     bounds = bounds_waves(NOLLS_20, 0.04, 0.016)
     assert bounds.tolist() == [0.04] * 5 + [0.016] * 15
@@ -133,7 +133,7 @@ def circle_modes():
     return zernikes(NOLLS_14, u, u[:, None])[:, inside]
 
 
-def test_residuals_over_the_circle_are_those_of_zernike_polynomials(circle_modes):
+def test_residual_rms_and_pv_over_the_circle(circle_modes):
     residuals = np.zeros((2, 14))
     residuals[0, 0], residuals[1, :3] = 0.5, (3.0, 0.0, 4.0)
     products = gram(circle_modes)
@@ -144,7 +144,7 @@ def test_residuals_over_the_circle_are_those_of_zernike_polynomials(circle_modes
     assert pv[1] == pytest.approx(np.ptp(residuals[1] @ circle_modes))
 
 
-def test_the_expected_rms_is_that_of_many_draws(circle_modes):
+def test_expected_rms_agrees_with_many_draws(circle_modes):
     products, bounds = gram(circle_modes), bounds_waves(NOLLS_14, 0.04, 0.016)
     drawn = random_wavefronts(np.random.default_rng(6), 5000, NOLLS_14, 0.04, 0.016)
     measured = np.sqrt(np.mean(residual_rms(products, drawn) ** 2))

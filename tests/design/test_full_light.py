@@ -1,4 +1,4 @@
-"""Sensors that use all of the light, tuned alike; and what any sensor could get of the light."""
+"""Sensors that use all light from the focal-plane mask, their optimisation, and the quantum limit of all sensors."""
 
 import json
 import tomllib
@@ -25,7 +25,7 @@ from lowfc.optics.detector.photometry import electrons
 from lowfc.programs.design.command import design_app
 
 LIGHT_E = electrons(STAR, TABLE4_EXPOSURE_S)
-# Noise of 14 modes in nm, and the share of the quantum limit, as an independent calculation found them.
+# Noise of 14 modes in nm, and the share of the quantum limit, from an independent calculation.
 EXPECTED = {
     "sam": (None, 0.006),
     "sam18_sized": (None, 0.013),
@@ -56,7 +56,7 @@ def modes():
 
 
 @pytest.mark.parametrize("name", SENSORS)
-def test_no_sensor_uses_all_of_the_light(name, modes):
+def test_cramer_rao_bound_of_every_sensor_exceeds_the_quantum_limit(name, modes):
     sensor = sensor_named(name)
     I0, H = reference(sensor).ravel() * LIGHT_E, response(sensor, modes[:14]) * LIGHT_E
     bound = cramer_rao(H, variance_e(I0, 0.0))
@@ -70,7 +70,7 @@ def test_no_sensor_uses_all_of_the_light(name, modes):
 
 
 def test_an_interferometer_of_two_holes_reaches_the_quantum_limit():
-    """Two small holes whose phases differ by a: their fringe at quadrature tells as much as the light holds."""
+    """For two small holes whose phases differ by a, the fringe at quadrature attains the quantum limit."""
     n, pupil = 64, np.zeros((64, 64))
     pupil[32, 8], pupil[32, 56] = 1.0, 1.0
     mode = np.zeros((1, n, n))
@@ -80,23 +80,22 @@ def test_an_interferometer_of_two_holes_reaches_the_quantum_limit():
 
 
 @pytest.mark.parametrize("name", ["zwfs_tuned", "clowfs_tuned"])
-def test_a_candidate_is_predicted_as_the_full_chain_has_it(name, focus, modes):
+def test_prediction_of_a_candidate_agrees_with_the_full_chain(name, focus, modes):
     sensor = sensor_named(name)
     one = FullLight(sensor, focus)
-    seen = one.central()
-    assert np.allclose(seen.I0, reference(sensor).ravel(), rtol=1e-9, atol=1e-15)
-    assert np.allclose(seen.H[:, 7], response(sensor, modes[7:8])[:, 0], rtol=1e-9, atol=1e-15)
-    bound = cramer_rao(seen.H[:, :14] * LIGHT_E, variance_e(seen.I0 * LIGHT_E, 1.0))
+    central = one.central()
+    assert np.allclose(central.I0, reference(sensor).ravel(), rtol=1e-9, atol=1e-15)
+    assert np.allclose(central.H[:, 7], response(sensor, modes[7:8])[:, 0], rtol=1e-9, atol=1e-15)
+    bound = cramer_rao(central.H[:, :14] * LIGHT_E, variance_e(central.I0 * LIGHT_E, 1.0))
     expected = np.sum(contrast_form(sensor.pupil, NOLLS_14, 550.0) * bound)
-    assert contrast_noise(one.forms, seen, "weighted") == pytest.approx(expected, rel=0.01)
-    assert merit(one, Goal("contrast", "weighted")) == contrast_noise(one.forms, seen, "weighted")
-    shown = figures(one)
-    measured = {"zwfs_tuned": 9.0e-4, "clowfs_tuned": 1.4e-3}[name]  # second order alone, with the plain inverse
+    assert contrast_noise(one.forms, central, "weighted") == pytest.approx(expected, rel=0.01)
+    assert merit(one, Goal("contrast", "weighted")) == contrast_noise(one.forms, central, "weighted")
+    measured = {"zwfs_tuned": 9.0e-4, "clowfs_tuned": 1.4e-3}[name]  # second order alone, plain pseudo-inverse
     assert one.nonlinearity_waves(14) == pytest.approx(measured, rel=0.2)
-    assert shown["table3_waves"]["pinv"]["14"] > one.nonlinearity_waves(14)
+    assert figures(one)["table3_waves"]["pinv"]["14"] > one.nonlinearity_waves(14)
 
 
-def test_a_sweep_finds_the_least_between_its_values():
+def test_sweep_finds_the_minimum_between_its_values():
     values, best = sweep(lambda x: (x - 1.234) ** 2, 0.0, 4.0, 5)
     assert values.tolist() == [0, 1, 2, 3, 4]
     assert best == pytest.approx(1.234, abs=0.01)
@@ -120,7 +119,7 @@ def test_the_command_writes_the_keys_of_the_best(tmp_path, monkeypatch):
     assert "spot_diameter" in str(wrong.exception)
 
 
-def test_holes_of_a_mask_that_is_made_move_the_image_little():
+def test_sampling_of_the_holes_changes_the_image_by_under_1_percent():
     layout = load_layout(SensorSection().sam)
     fine, centres = transmission(layout, 512, 4), transmission(layout, 512)
     area = sum(np.pi / 4 * diameter**2 for _, _, diameter in layout.holes)
@@ -128,9 +127,9 @@ def test_holes_of_a_mask_that_is_made_move_the_image_little():
     assert set(np.unique(centres)) == {0.0, 1.0}
     sensors = [sensor_from(SensorSection(hole_samples=points)) for points in (1, 4)]
     tilt = zernikes(NOLLS_14, *pupil_radii(sensors[0]))
-    for of, expected in (
+    for quantity, expected in (
         (lambda sensor: reference(sensor), 0.0035),
         (lambda sensor: response(sensor, tilt), 0.0049),
     ):
-        one, other = map(of, sensors)
+        one, other = map(quantity, sensors)
         assert np.linalg.norm(one - other) / np.linalg.norm(other) == pytest.approx(expected, rel=0.2)

@@ -1,6 +1,6 @@
-"""The layouts that are shipped: every message path in them is a field of the message on that topic.
+"""The packaged viewer layouts: every message path in them is a field of the message on that topic.
 
-A field or a topic that is renamed fails here, and not before somebody at night.
+A renamed field or topic fails here rather than during operation.
 """
 
 import json
@@ -31,8 +31,7 @@ def field_of(topic: str, path: list[str]) -> FieldDescriptor:
     """The field at the end of a path such as ["error_nm[0]"].
 
     Raises:
-        KeyError: there is no such topic for a viewer, or no such field, or it is an array and has no index, or the
-            other way round.
+        KeyError: there is no such topic for a viewer, no such field, or an index is missing or superfluous.
     """
     declared = topic_of(topic.removeprefix("/"))
     if Role.VIEWER not in declared.subscribers:
@@ -54,7 +53,7 @@ def foxglove_field(path: str) -> FieldDescriptor:
 
 
 def plotjuggler_field(curve: str) -> FieldDescriptor:
-    """PlotJuggler joins topic and fields with slashes; no topic begins with another one."""
+    """The field of a PlotJuggler curve, which joins topic and fields with slashes; no topic is a prefix of another."""
     parts = curve.split("/")
     for length in range(2, len(parts)):
         try:
@@ -66,7 +65,7 @@ def plotjuggler_field(curve: str) -> FieldDescriptor:
 
 
 def leaves(node: Any) -> Iterator[str]:
-    """Panels of an arrangement, those in tabs too."""
+    """Panels of a layout tree, including those in tabs."""
     if isinstance(node, str):
         yield node
         for tab in PANELS[node].get("tabs", ()):
@@ -88,7 +87,7 @@ def test_every_panel_is_arranged_once() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(PLOTS))
-def test_the_plots_are_of_numbers(name: str) -> None:
+def test_plots_show_numeric_fields(name: str) -> None:
     paths = PANELS[name]["paths"]
     assert len({(path["color"], path["label"]) for path in paths}) == len(paths)
     for path in paths:
@@ -96,11 +95,11 @@ def test_the_plots_are_of_numbers(name: str) -> None:
         assert path["enabled"]
 
 
-def test_the_modes_are_all_there_under_their_names() -> None:
+def test_mode_plots_have_all_modes_with_their_names() -> None:
     names = [mode_name(noll) for noll in NOLLS_14]
-    of_modes = {name for name in PLOTS if [path["label"] for path in PANELS[name]["paths"]] == names}
-    assert of_modes == {"Plot!command", "Plot!error", "Plot!pol", "Plot!residual"}
-    for name in of_modes:
+    mode_plots = {name for name in PLOTS if [path["label"] for path in PANELS[name]["paths"]] == names}
+    assert mode_plots == {"Plot!command", "Plot!error", "Plot!pol", "Plot!residual"}
+    for name in mode_plots:
         indices = [re.findall(r"\[(\d+)\]", path["value"]) for path in PANELS[name]["paths"]]
         assert indices == [[str(index)] for index in range(len(names))]
 
@@ -129,37 +128,37 @@ def test_the_curves_of_plotjuggler_are_numbers() -> None:
         assert len(curves) > 10
         for curve in curves:
             assert plotjuggler_field(curve).cpp_type not in NOT_NUMBERS
-    for splitter in PLOTJUGGLER.iter("DockSplitter"):  # PlotJuggler trusts these
+    for splitter in PLOTJUGGLER.iter("DockSplitter"):  # PlotJuggler does not check these
         assert splitter.get("count") == str(len(splitter)) == str(len(splitter.get("sizes", "").split(";")))
 
 
-SHOWN = {"ViewBlueprint:display_name", "ViewBlueprint:space_origin", "SeriesLines:names"}
-MAPPED = "VisualizerInstruction:component_map"
+NAMES = {"ViewBlueprint:display_name", "ViewBlueprint:space_origin", "SeriesLines:names"}
+MAPPING = "VisualizerInstruction:component_map"
 
 
-def of_rerun(path: Path) -> tuple[str, Counter[str], set[tuple[str, str]]]:
+def rerun_layout(path: Path) -> tuple[str, Counter[str], set[tuple[str, str]]]:
     """Application id of a layout, its views and names, and the message and field of each mapping."""
     reader = RrdReader(path)
     (entry,) = reader.blueprints()
-    shown: Counter[str] = Counter()
-    mapped: set[tuple[str, str]] = set()
+    names: Counter[str] = Counter()
+    mappings: set[tuple[str, str]] = set()
     for chunk in reader.store(store=entry).stream():
         batch = chunk.to_record_batch()
-        for name in SHOWN & set(batch.schema.names):
-            shown.update(f"{name} {value}" for value in batch.column(name)[0].as_py())
-        if MAPPED in batch.schema.names:
-            mapped |= {(one["source_component"], one["selector"]) for one in batch.column(MAPPED)[0].as_py()}
-    return entry.application_id, shown, mapped
+        for name in NAMES & set(batch.schema.names):
+            names.update(f"{name} {value}" for value in batch.column(name)[0].as_py())
+        if MAPPING in batch.schema.names:
+            mappings |= {(one["source_component"], one["selector"]) for one in batch.column(MAPPING)[0].as_py()}
+    return entry.application_id, names, mappings
 
 
-def test_the_layouts_for_rerun_are_those_that_the_code_makes(tmp_path: Path) -> None:
+def test_rerun_layouts_are_up_to_date(tmp_path: Path) -> None:
     layouts.make(tmp_path)
     for name in ("lowfc.rbl", "log.rbl"):
-        assert of_rerun(LAYOUTS / name) == of_rerun(tmp_path / name), "python -m tools.measure layouts"
-    _, shown, mapped = of_rerun(LAYOUTS / "log.rbl")
-    assert shown[f"ViewBlueprint:space_origin /{TRUTH.key}"] == 2
-    assert len(mapped) == 15
-    for component, selector in mapped:
+        assert rerun_layout(LAYOUTS / name) == rerun_layout(tmp_path / name), "python -m tools.measure layouts"
+    _, names, mappings = rerun_layout(LAYOUTS / "log.rbl")
+    assert names[f"ViewBlueprint:space_origin /{TRUTH.key}"] == 2
+    assert len(mappings) == 15
+    for component, selector in mappings:
         message = getattr(wire, component.removeprefix("lowfc.v1.").removesuffix(":message"))
         first, *rest = selector.removeprefix(".").split(".")
         field = message.DESCRIPTOR.fields_by_name[first.partition("[")[0]]

@@ -1,3 +1,5 @@
+"""The command `lowfc design sam`: executors, interruption and resumption, files, and its errors."""
+
 import io
 import json
 import os
@@ -33,7 +35,7 @@ SMALL = {"merit": "table4", "holes": "4", "diameter": "0.1:0.2", "steps": BLOCK 
 
 
 class Interrupted(Executor):
-    """The user's Ctrl-C after a number of blocks."""
+    """Executor that raises the user's Ctrl-C after a number of blocks."""
 
     def __init__(self, blocks: int) -> None:
         self.blocks, self.inside = blocks, Here()
@@ -45,7 +47,7 @@ class Interrupted(Executor):
         return self.inside.submit(fn, *args, **kwargs)
 
 
-def searched(**options) -> Search:
+def search_with(**options) -> Search:
     return Search(**{"name": "small", **SMALL, **options})
 
 
@@ -58,16 +60,16 @@ def run(search, folder, executor, chains=None, console=None, **files):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """An uninterrupted search in this process: its result and what it wrote."""
+    """Result and layout file of an uninterrupted search in this process."""
     folder = tmp_path_factory.mktemp("whole")
-    result, out = run(searched(), folder, Here())
+    result, out = run(search_with(), folder, Here())
     assert [path.name for path in folder.iterdir()] == ["mask.json"]
     return result, out.read_text()
 
 
-def test_the_result_does_not_depend_on_where_the_chains_run(whole, tmp_path):
+def test_result_does_not_depend_on_the_executor(whole, tmp_path):
     with open_executor(2, None) as executor:
-        result, out = run(searched(), tmp_path, executor)
+        result, out = run(search_with(), tmp_path, executor)
     assert out.read_text() == whole[1]
     assert result["merits"] == whole[0]["merits"]
     assert len(set(result["merits"])) == 2
@@ -82,36 +84,36 @@ def scheduler() -> Iterator[str]:
         yield cluster.scheduler_address
 
 
-def test_a_dask_cluster_finds_the_same(scheduler, whole, tmp_path):
+def test_dask_cluster_gives_the_same_result(scheduler, whole, tmp_path):
     with open_executor(1, scheduler) as executor:
-        _, out = run(searched(), tmp_path, executor)
+        _, out = run(search_with(), tmp_path, executor)
     assert out.read_text() == whole[1]
 
 
-def test_an_interrupted_search_keeps_its_best_and_goes_on(whole, tmp_path):
-    result, out = run(searched(), tmp_path, Interrupted(3))
+def test_interrupted_search_writes_its_best_and_resumes(whole, tmp_path):
+    result, out = run(search_with(), tmp_path, Interrupted(3))
     assert result["interrupted"]
     assert result["steps"] < 2 * SMALL["steps"]
     load_layout(str(out))
     text = program.render(result)
     assert f"--resume {result['resume']}" in text
     search, chains = program.resumed(tmp_path / "state.json")
-    assert search == searched()
+    assert search == search_with()
     again, out = run(search, tmp_path, Here(), chains)
     assert (out.read_text(), again["merits"], again["interrupted"]) == (whole[1], whole[0]["merits"], False)
     assert not (tmp_path / "state.json").exists()
 
 
-def test_an_interrupt_before_the_first_block_says_that_nothing_was_found(tmp_path):
-    said = io.StringIO()
+def test_interrupt_before_the_first_block_reports_that_nothing_was_found(tmp_path):
+    output = io.StringIO()
     with pytest.raises(KeyboardInterrupt):
-        run(searched(), tmp_path, Interrupted(0), console=Console(file=said, width=200))
-    assert "nothing was found, nothing is written" in said.getvalue()
+        run(search_with(), tmp_path, Interrupted(0), console=Console(file=output, width=200))
+    assert "nothing was found, nothing is written" in output.getvalue()
     assert list(tmp_path.iterdir()) == []
 
 
 class Broken(Interrupted):
-    """Workers that die after a number of blocks."""
+    """Executor whose workers die after a number of blocks."""
 
     def submit(self, fn, /, *args, **kwargs):
         if self.blocks:
@@ -121,30 +123,30 @@ class Broken(Interrupted):
         return future
 
 
-def test_lost_workers_are_one_clear_error_and_the_search_goes_on(whole, tmp_path):
+def test_lost_workers_are_reported_and_the_search_resumes(whole, tmp_path):
     with pytest.raises(
         LowfcError, match=r"workers were lost .*abruptly.*\); no chain had finished .* nothing is written"
     ):
-        run(searched(), tmp_path, Broken(0))
+        run(search_with(), tmp_path, Broken(0))
     assert list(tmp_path.iterdir()) == []
-    with pytest.raises(LowfcError, match=r"workers were lost .*abruptly.*\); go on with --resume .*state\.json"):
-        run(searched(), tmp_path, Broken(2))
+    with pytest.raises(LowfcError, match=r"workers were lost .*abruptly.*\); continue with --resume .*state\.json"):
+        run(search_with(), tmp_path, Broken(2))
     search, chains = program.resumed(tmp_path / "state.json")
     _, out = run(search, tmp_path, Here(), chains)
     assert out.read_text() == whole[1]
 
 
-def test_processes_that_die_and_a_mistake_in_the_search_are_told_apart(tmp_path, monkeypatch):
+def test_dead_processes_are_distinguished_from_errors_in_the_search(tmp_path, monkeypatch):
     with open_executor(2, None) as executor:
         future = executor.submit(os._exit, 1)
         assert executors.is_lost(future.exception())
     monkeypatch.setattr(program, "advance", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        run(searched(), tmp_path, Here())
+        run(search_with(), tmp_path, Here())
 
 
-def test_a_worker_with_another_pupil_is_refused(tmp_path):
-    search = searched()
+def test_worker_with_another_pupil_is_refused(tmp_path):
+    search = search_with()
     with pytest.raises(ConfigurationError, match="another shaped pupil: install the same lowfc"):
         program.advance_block(search, program.begin(search)[0], "another")
 
@@ -152,11 +154,11 @@ def test_a_worker_with_another_pupil_is_refused(tmp_path):
 def test_the_command_does_not_overwrite_an_interrupted_search(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     state = tmp_path / "mask.json.state.json"
-    program.write_state(state, searched(), program.pupil_digest(), program.begin(searched()))
+    program.write_state(state, search_with(), program.pupil_digest(), program.begin(search_with()))
     before = state.read_bytes()
     ran = cli("--out", "mask.json")
     assert isinstance(ran.exception, ConfigurationError)
-    assert f"go on with --resume {state.name}, or delete it" in str(ran.exception)
+    assert f"continue with --resume {state.name}, or delete it" in str(ran.exception)
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == {state: before}
     assert isinstance(cli("--resume", state.name, "--out", state.name).exception, ConfigurationError)
     assert state.read_bytes() == before
@@ -165,17 +167,17 @@ def test_the_command_does_not_overwrite_an_interrupted_search(tmp_path, monkeypa
     assert [path.name for path in tmp_path.iterdir()] == ["mask.json"]
 
 
-def test_a_folder_may_be_called_like_a_layout_file(tmp_path):
+def test_folder_name_may_look_like_a_layout_file(tmp_path):
     folder = tmp_path / "a.json.d"
     folder.mkdir()
-    run(searched(steps=20), folder, Here())
+    run(search_with(steps=20), folder, Here())
     assert load_layout(f"{folder}/mask.json") == load_layout(f"{folder}/mask.json:small")
     with pytest.raises(ConfigurationError, match="no sparse-aperture layout is called"):
         load_layout(f"{folder}/mask")
 
 
 def test_states_are_read_back_or_refused(tmp_path):
-    search = searched()
+    search = search_with()
     state = tmp_path / "state.json"
     with pytest.raises(DataFileError, match="no search to resume"):
         read_state(state, "pupil")
@@ -188,8 +190,8 @@ def test_states_are_read_back_or_refused(tmp_path):
         read_state(state, "another")
 
 
-def test_a_front_is_written_and_drawn(tmp_path):
-    search = searched(merit="pareto", chains=3, steps=60, name="edge", estimator="pinv")
+def test_front_is_written_and_plotted(tmp_path):
+    search = search_with(merit="pareto", chains=3, steps=60, name="edge", estimator="pinv")
     table, picture = tmp_path / "front.csv", tmp_path / "front.png"
     result, out = run(search, tmp_path, Here(), front_file=table, plot_file=picture)
     head, *rows = [line.split(",") for line in table.read_text().splitlines()]
@@ -197,19 +199,19 @@ def test_a_front_is_written_and_drawn(tmp_path):
     assert [row[1] for row in rows] == ["4"] * 3
     on_front = [(float(row[2]), float(row[3])) for row in rows if row[-1] == "1"]
     assert all(b[0] > a[0] and b[1] < a[1] for a, b in pairwise(on_front))
-    assert {shown["name"] for shown in result["layouts"]} == {row[0] for row in rows if row[-1] == "1"}
+    assert {layout["name"] for layout in result["layouts"]} == {row[0] for row in rows if row[-1] == "1"}
     assert picture.read_bytes().startswith(b"\x89PNG")
-    for shown in result["layouts"]:
-        assert len(load_layout(f"{out}:{shown['name']}").holes) == 4
+    for layout in result["layouts"]:
+        assert len(load_layout(f"{out}:{layout['name']}").holes) == 4
 
 
 def cli(*words):
-    app = new_app("As the program has it.")
+    app = new_app("Test.")
     app.add_typer(design_app, name="design")
     return CliRunner().invoke(app, ["design", "sam", *map(str, words)])
 
 
-def test_the_command_records_itself_and_finds_the_same_again(tmp_path, monkeypatch):
+def test_command_is_recorded_and_reproduces_the_layout(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     ran = cli("--merit", "condition", "--holes", 5, "--steps", 30, "--symmetry", "x", "--jobs", 1, "--json")
     assert ran.exit_code == 0, ran.output
@@ -234,7 +236,7 @@ def test_the_command_records_itself_and_finds_the_same_again(tmp_path, monkeypat
         (("--merit", "table3", "--weight", "0.5"), "belongs to the merits paper and pareto"),
         (("--merit", "pareto", "--weight", "2"), "a weight, 0 to 1"),
         (("--merit", "pareto", "--chains", "1"), "at least 2 chains"),
-        (("--merit", "table3", "--focal-mask", "both"), "only 'paper' takes both"),
+        (("--merit", "table3", "--focal-mask", "both"), "only 'paper' uses both"),
         (("--focal-mask", "square"), "--focal-mask must be"),
         (("--holes", "many"), "--holes must be a number"),
         (("--holes", "9:4"), "number of holes"),
@@ -259,7 +261,7 @@ def test_the_command_records_itself_and_finds_the_same_again(tmp_path, monkeypat
         (("--out", "mask.json", "--front", "./mask.json"), "must be different files"),
     ],
 )
-def test_mistakes_are_one_clear_error(tmp_path, monkeypatch, words, message):
+def test_invalid_options_give_one_line_errors(tmp_path, monkeypatch, words, message):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(executors, "DASK_TIMEOUT_S", 0.2)
     ran = cli(*words)
@@ -271,20 +273,20 @@ def test_mistakes_are_one_clear_error(tmp_path, monkeypatch, words, message):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_missing_extras_are_named_before_the_work(tmp_path, monkeypatch):
+def test_missing_packages_are_reported_before_the_search(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(ConfigurationError, match=r"pip install .*'distributed"), open_executor(1, "x:1"):
         pass
     with pytest.raises(ConfigurationError, match=r"pip install .*'matplotlib"):
-        run(searched(), tmp_path, Interrupted(0), plot_file=tmp_path / "front.png")
+        run(search_with(), tmp_path, Interrupted(0), plot_file=tmp_path / "front.png")
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("name", RECORDED)
-def test_the_recorded_command_finds_a_layout_as_good_as_the_shipped_one(tmp_path, name):
-    """On the processor that found it the same; where sums round in another way the search goes another way."""
+def test_recorded_command_finds_a_layout_as_good_as_the_packaged_one(tmp_path, name):
+    """On the same kind of processor it is identical; with other rounding the search takes another path."""
     ran = cli(*shlex.split(RECORDED[name])[3:], "--jobs", 1, "--out", tmp_path / "mask.json")
     assert ran.exit_code == 0, ran.output
     focal_mask = RECORDED[name].partition("--focal-mask ")[2].split()[0]

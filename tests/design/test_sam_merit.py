@@ -1,4 +1,4 @@
-"""Merit of aperture masks, and the search for better ones."""
+"""Predicted figures of aperture masks, and the search for better ones."""
 
 import json
 from dataclasses import replace
@@ -59,8 +59,8 @@ def at_pixels(values):
     return values.reshape(80, 2, 80, 2).sum(axis=(1, 3)).ravel() / (64 * OPEN_AREA)
 
 
-def by_the_chain(pupil, modes, mask, wavelength_nm):
-    """I0 (pixels,) and H (pixels, modes) per nm, by the full chain of Table 1."""
+def full_chain(pupil, modes, mask, wavelength_nm):
+    """I0 (pixels,) and H (pixels, modes) per nm, by the full chain with the sampling of Table 1."""
     scale = 550.0 / wavelength_nm
     E0, *Ek = (to_image(relay_of(a, scale) * mask, 160, 8, scale) for a in (pupil, *(pupil * modes)))
     slopes = [at_pixels(4 * np.pi / wavelength_nm * (E0 * np.conj(1j * E)).real) for E in Ek]
@@ -75,22 +75,22 @@ def noise_nm2(I0, H, light_e, read_noise_e, estimator):
     return (R * variance) @ R.T
 
 
-def test_the_holes_add_up_to_the_field_of_the_full_chain(pupil, modes):
+def test_sum_over_holes_agrees_with_the_field_of_the_full_chain(pupil, modes):
     fine = build_optics(pupil, band=monochromatic(550.0), relay_samples=512, samples_per=8)
-    some = Layout("three", "", ((0.2, -0.3, 0.07), (-0.414, 0.102, 0.12), (0.0, 0.05, 0.2)))
-    found = np.sum([hole_fields(fine, hole) for hole in some.holes], axis=0)
+    three = Layout("three", "", ((0.2, -0.3, 0.07), (-0.414, 0.102, 0.12), (0.0, 0.05, 0.2)))
+    found = np.sum([hole_fields(fine, hole) for hole in three.holes], axis=0)
     u = pupil_axis(512)
-    covered = [np.clip((d / 2 - np.hypot(u[:, None] - y, u - x)) * 512 + 0.5, 0, 1) for x, y, d in some.holes]
-    for mask, allowed in ((sum(covered), 1e-6), (transmission(some, 512), 5e-3)):
+    covered = [np.clip((d / 2 - np.hypot(u[:, None] - y, u - x)) * 512 + 0.5, 0, 1) for x, y, d in three.holes]
+    for mask, allowed in ((sum(covered), 1e-6), (transmission(three, 512), 5e-3)):
         for k, amplitude in {0: pupil, 1: pupil * modes[0], 13: pupil * modes[12]}.items():
             truth = to_image(relay_of(amplitude) * mask, 160, 8, 1.0)
             assert np.linalg.norm(found[k] - truth) < allowed * np.linalg.norm(truth)
 
 
-def test_the_predictions_are_those_of_the_full_chain(pupil, modes, layout, fields, optics):
-    shown = figures(Mask(optics, fields))
+def test_predictions_agree_with_the_full_chain(pupil, modes, layout, fields, optics):
+    predicted = figures(Mask(optics, fields))
     mask = transmission(layout, 512)
-    I0, H = by_the_chain(pupil, modes, mask, 550.0)
+    I0, H = full_chain(pupil, modes, mask, 550.0)
     open_ = modes[:, pupil > 0.5]
     for estimator in ("pinv", "weighted"):
         for count in (14, 20):
@@ -98,30 +98,30 @@ def test_the_predictions_are_those_of_the_full_chain(pupil, modes, layout, field
             drawn = np.linalg.cholesky(C) @ np.random.default_rng(1).standard_normal((count, 20 * count))
             rms = np.sqrt(np.mean(np.var(drawn.T @ open_[:count], axis=1))) / 550.0
             expected = np.hypot(rms, TABLE3_NONLINEARITY_WAVES[count])
-            assert shown["table3_waves"][estimator][str(count)] == pytest.approx(expected, rel=0.05)
-    assert shown["throughput"] == pytest.approx(I0.sum(), rel=0.02)
+            assert predicted["table3_waves"][estimator][str(count)] == pytest.approx(expected, rel=0.05)
+    assert predicted["throughput"] == pytest.approx(I0.sum(), rel=0.02)
     for count in (14, 20):
-        assert shown["condition"][str(count)] == pytest.approx(np.linalg.cond(H[:, :count]), rel=0.02)
+        assert predicted["condition"][str(count)] == pytest.approx(np.linalg.cond(H[:, :count]), rel=0.02)
     band = uniform(550.0)
-    at = [by_the_chain(pupil, modes[:2], mask, nm) for nm in band.wavelengths_nm]
-    I0, H = np.mean([image for image, _ in at], axis=0), np.mean([response for _, response in at], axis=0)
+    each = [full_chain(pupil, modes[:2], mask, nm) for nm in band.wavelengths_nm]
+    I0, H = np.mean([image for image, _ in each], axis=0), np.mean([response for _, response in each], axis=0)
     for estimator in ("pinv", "weighted"):
         C = noise_nm2(I0, H, electrons(Photometry(), 0.05), 1.0, estimator)
         expected = np.sqrt(np.diag(C)) / tilt_nm_per_mas(2.0)
-        assert shown["table4_mas"][estimator]["2"] == pytest.approx(expected, rel=0.02)
+        assert predicted["table4_mas"][estimator]["2"] == pytest.approx(expected, rel=0.02)
 
 
-def test_merits_are_what_their_names_say(optics, fields):
+def test_merits_agree_with_their_definitions(optics, fields):
     mask = Mask(optics, fields)
-    shown = figures(mask)
-    tilt = max(shown["table4_mas"]["pinv"]["2"])
+    predicted = figures(mask)
+    tilt = max(predicted["table4_mas"]["pinv"]["2"])
     expected = {
         "paper": max(paper_ratios(mask).values()),
-        "table3": shown["table3_waves"]["pinv"]["20"],
+        "table3": predicted["table3_waves"]["pinv"]["20"],
         "table4": tilt,
-        "condition": shown["condition"]["20"],
-        "throughput": 1 / shown["throughput"],
-        "pareto": shown["table3_waves"]["pinv"]["20"] ** 0.75 * tilt**0.25,
+        "condition": predicted["condition"]["20"],
+        "throughput": 1 / predicted["throughput"],
+        "pareto": predicted["table3_waves"]["pinv"]["20"] ** 0.75 * tilt**0.25,
         "contrast": contrast_noise(optics.forms, signal(optics, fields, "disk"), "pinv"),
     }
     assert set(expected) == set(MERITS)
@@ -129,22 +129,22 @@ def test_merits_are_what_their_names_say(optics, fields):
         weight = 0.25 if name == "pareto" else None
         assert merit(mask, Goal(name, "pinv", 20, weight)) == pytest.approx(value, rel=1e-6)
     ratios = paper_ratios(mask)
-    assert ratios["table3 disk 14 modes"] == pytest.approx(shown["table3_waves"]["pinv"]["14"] / 5.1e-4)
+    assert ratios["table3 disk 14 modes"] == pytest.approx(predicted["table3_waves"]["pinv"]["14"] / 5.1e-4)
     assert ratios["table4"] == pytest.approx(tilt / 0.36)
     assert merit(Mask(optics, np.zeros_like(fields)), Goal("table4")) == np.inf
 
 
 def test_the_weighted_estimator_is_never_worse(optics, fields):
-    seen = signal(optics, fields, "disk")
+    disk_signal = signal(optics, fields, "disk")
     for count in (2, 14, 20):
-        plain, weighted = (covariance_nm2(seen, 1e6, 3.0, count, name) for name in ("pinv", "weighted"))
+        plain, weighted = (covariance_nm2(disk_signal, 1e6, 3.0, count, name) for name in ("pinv", "weighted"))
         assert np.linalg.eigvalsh(plain - weighted).min() > -1e-9 * np.trace(plain)
     with pytest.raises(ValueError, match="estimator must be one of"):
-        covariance_nm2(seen, 1e6, 3.0, 2, "best")
+        covariance_nm2(disk_signal, 1e6, 3.0, 2, "best")
 
 
 @pytest.mark.parametrize("modes", [14, 20])
-def test_table_3_is_predicted_as_it_was_measured(optics, modes):
+def test_prediction_of_table_3_agrees_with_the_measurement(optics, modes):
     (measured,) = (
         row["measured"]
         for table in json.loads(RECORDED_TABLES.read_text())["tables"]
@@ -172,7 +172,7 @@ def bounds(draw):
 
 @settings(max_examples=60, deadline=None)
 @given(bounds(), st.integers(0, 1000))
-def test_no_move_leaves_the_bounds(bounds, seed):
+def test_moves_stay_within_the_bounds(bounds, seed):
     rng = np.random.default_rng(seed)
     orbits = list(start(bounds, seed, 0, 1).orbits)
     for step in range(40):
@@ -194,24 +194,24 @@ def test_no_move_leaves_the_bounds(bounds, seed):
         assert {tuple(np.multiply(hole, flip)) for hole in found} == set(found)
 
 
-def test_every_kind_of_move_happens():
+def test_every_kind_of_move_occurs():
     bounds = Bounds((3, 9), (50, 100), symmetry="y")
-    orbits, seen = list(start(bounds, 1, 0, 1).orbits), set()
+    orbits, kinds = list(start(bounds, 1, 0, 1).orbits), set()
     rng = np.random.default_rng(1)
     for _ in range(300):
         move = sam_search._move(rng, bounds, orbits, 0.5)
         if move is not None:
             at, orbit = move
             kind = "add" if at is None else "remove" if orbit is None else "move"
-            sized = kind == "move" and orbit[2] != orbits[at][2]
+            resized = kind == "move" and orbit[2] != orbits[at][2]
             size = len(images(orbit, "y")) if orbit is not None else 0
-            seen.add((kind, size, sized))
+            kinds.add((kind, size, resized))
             orbits = [*(o for i, o in enumerate(orbits) if i != at), *([orbit] if orbit is not None else [])]
     expected = {("add", size, False) for size in (1, 2)} | {("remove", 0, False)}
-    assert seen == expected | {("move", size, sized) for size in (1, 2) for sized in (False, True)}
+    assert kinds == expected | {("move", size, resized) for size in (1, 2) for resized in (False, True)}
 
 
-def test_a_search_gets_better_and_repeats_itself(optics):
+def test_search_improves_and_is_reproducible(optics):
     goal, bounds = Goal("table4"), Bounds((5, 5), (60, 150))
     chain = start(bounds, 3, 1, 2 * BLOCK)
     first = advance(optics, goal, bounds, chain)

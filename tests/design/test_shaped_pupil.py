@@ -1,3 +1,5 @@
+"""The design of a shaped pupil: its linear programs, the command, and the mask of the package."""
+
 import json
 import re
 import signal
@@ -29,7 +31,7 @@ from lowfc.optics.chain.pupil import circle, from_quarter
 from tests.support.loops import lowfc
 
 SMALL = Request(outer=8.0, cells=16)
-SHIPPED = resources.files("lowfc") / "data" / "spc_quarter128.npz"
+PACKAGED = resources.files("lowfc") / "data" / "spc_quarter128.npz"
 
 
 def last(request):
@@ -37,7 +39,7 @@ def last(request):
 
 
 def image_of(quarter, samples_per, extent):
-    """Contrast by the sensor's own transform, at half-integer offsets: never on a point of the fine grid."""
+    """Field by the sensor's transform, sampled at half-integer offsets and so never at a point of the fine grid."""
     pupil = from_quarter(quarter, SAMPLES)
     axis = image_axis(2 * extent * samples_per, samples_per)
     return axis, to_image(pupil.astype(complex), axis.size, samples_per, 1.0) / pupil.mean()
@@ -52,7 +54,7 @@ def in_zone(request, axis, margin=0.0):
     )
 
 
-def test_the_field_is_the_sensors():
+def test_field_agrees_with_the_sensor_transform():
     quarter = np.random.default_rng(1).random((16, 16))
     axis, field = image_of(quarter, 7, 9)
     np.testing.assert_allclose(relative_field(quarter, axis), field, atol=1e-12)
@@ -63,12 +65,12 @@ def test_figures_of_the_open_circle():
     assert found.open_area_fraction == pytest.approx(1.0, abs=1e-3)
     assert found.energy_fraction == found.open_area_fraction
     encircled = 1.0 - j0(4 * np.pi) ** 2 - j1(4 * np.pi) ** 2
-    assert found.focal_mask_fraction == pytest.approx(encircled, abs=2e-3)  # the disk's rim is a staircase
+    assert found.focal_mask_fraction == pytest.approx(encircled, abs=2e-3)  # the sampled disk has a staircase rim
     assert found.grey_cells_fraction == 0.0
 
 
-def test_the_first_program_has_the_optimum_that_another_formulation_and_solver_find():
-    """The whole pupil without symmetry, its field as a plain sum, the whole wedge, an interior-point method."""
+def test_first_program_has_the_same_optimum_as_another_formulation_and_solver():
+    """Other formulation: full pupil without symmetry, field as a plain sum, full wedge, interior-point method."""
     request = replace(SMALL, limit=1.0)
     first = next(exchange(request))
     assert first.bound == pytest.approx(first.open_area, abs=1e-9)
@@ -93,13 +95,13 @@ def test_the_first_program_has_the_optimum_that_another_formulation_and_solver_f
     assert -other.fun / 32**2 / OPEN_AREA == pytest.approx(first.open_area, abs=1e-6)
 
 
-def test_the_command_writes_a_mask_that_keeps_its_promise_between_the_points(tmp_path):
+def test_command_writes_a_mask_that_meets_the_contrast_between_the_points(tmp_path):
     path, picture = tmp_path / "spc.npz", tmp_path / "spc.png"
     pytest.importorskip("matplotlib")
     arguments = ["spc", "--outer", "8", "--cells", "64", "--out", str(path), "--plot", str(picture), "--json"]
-    answer = lowfc("design", *arguments)
-    assert answer.exit_code == 0, answer.output
-    result = json.loads(answer.stdout)
+    ran = lowfc("design", *arguments)
+    assert ran.exit_code == 0, ran.output
+    result = json.loads(ran.stdout)
     assert result["open_area_fraction"] == pytest.approx(0.5317, abs=5e-4)
     assert abs(result["below_optimum_at_limit_fraction"]) < 1e-6
     assert picture.read_bytes().startswith(b"\x89PNG")
@@ -117,13 +119,13 @@ def test_the_command_writes_a_mask_that_keeps_its_promise_between_the_points(tmp
     assert (np.abs(field[zone]) ** 2).mean() == pytest.approx(result["mean_contrast"], rel=0.05)
 
 
-def test_the_same_request_gives_the_same_mask():
+def test_design_is_reproducible():
     first, again = last(SMALL), last(SMALL)
     assert first.contrast <= SMALL.contrast
     np.testing.assert_array_equal(first.quarter, again.quarter)
 
 
-def test_less_symmetry_gains_nothing():
+def test_octant_symmetry_is_as_open_as_quarter_symmetry():
     request = replace(SMALL, half_angle_deg=90.0, limit=0.98)
     octant = last(replace(request, symmetry="octant"))
     np.testing.assert_array_equal(octant.quarter, octant.quarter.T)
@@ -131,19 +133,19 @@ def test_less_symmetry_gains_nothing():
     assert octant.open_area == pytest.approx(last(request).open_area, abs=1e-4)
 
 
-def test_the_shortest_type_that_keeps_the_promise():
+def test_mask_is_stored_in_the_shortest_type_that_meets_the_contrast():
     found = last(SMALL)
     kinds = {stored(found.quarter, replace(SMALL, contrast=contrast)).dtype for contrast in (1e-9, 1e-7)}
     assert kinds == {np.dtype(np.float32), np.dtype(np.float16)}
 
 
-def test_an_infeasible_request_names_the_nearest_that_is_feasible(tmp_path):
+def test_infeasible_request_reports_the_nearest_feasible_one(tmp_path):
     path = tmp_path / "spc.npz"
     arguments = ["spc", "--inner", "2.5", "--outer", "8", "--cells", "16", "--out", str(path)]
     error = lowfc("design", *arguments).exception
     assert isinstance(error, ConfigurationError)
     assert "inner angle 2.5 lambda/D at 1e-09 is infeasible" in str(error)
-    nearest = r"nearest feasible inner angle is (\S+) \(contrast kept\), or contrast is (\S+) \(angle kept\)"
+    nearest = r"nearest feasible inner angle is (\S+) \(same contrast\), or contrast is (\S+) \(same angle\)"
     inner, contrast = map(float, re.search(nearest, str(error)).groups())
     request = replace(SMALL, inner=2.5)
     assert is_feasible(replace(request, inner=inner))
@@ -172,7 +174,7 @@ def test_impossible_requests_are_refused(values, message):
         Request(**values)
 
 
-def test_too_few_rounds_say_what_to_do(tmp_path):
+def test_too_few_rounds_give_advice(tmp_path):
     arguments = ["spc", "--outer", "8", "--cells", "16", "--rounds", "1", "--out", str(tmp_path / "spc.npz")]
     error = lowfc("design", *arguments).exception
     assert isinstance(error, ConfigurationError)
@@ -181,19 +183,20 @@ def test_too_few_rounds_say_what_to_do(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("failure", "seen"), [(NotSolvedError("the solver gave up"), ConfigurationError), (ValueError("a bug"), ValueError)]
+    ("failure", "reported"),
+    [(NotSolvedError("the solver failed"), ConfigurationError), (ValueError("a bug"), ValueError)],
 )
-def test_only_the_solver_that_gives_up_is_the_users_affair(tmp_path, monkeypatch, failure, seen):
+def test_only_solver_failures_become_configuration_errors(tmp_path, monkeypatch, failure, reported):
     def fail(*_):
         raise failure
 
     monkeypatch.setattr(shaped_pupil, "maximise", fail)
     error = lowfc("design", "spc", "--out", tmp_path / "spc.npz").exception
-    assert type(error) is seen
+    assert type(error) is reported
     assert str(error) == str(failure)
 
 
-def test_a_file_that_cannot_be_written_is_said_first(tmp_path):
+def test_unwritable_file_is_reported_before_the_design(tmp_path):
     error = lowfc("design", "spc", "--out", tmp_path / "nowhere" / "spc.npz").exception
     assert isinstance(error, DataFileError)
     assert "there is no directory" in str(error)
@@ -212,11 +215,11 @@ def test_ctrl_c_stops_within_a_program_and_leaves_no_file(tmp_path):
 
 
 def recorded():
-    with SHIPPED.open("rb") as stream, np.load(stream) as file:
+    with PACKAGED.open("rb") as stream, np.load(stream) as file:
         return file["quarter"].astype(float), Request(**json.loads(str(file["made_by"])))
 
 
-def test_the_shipped_mask_keeps_what_its_record_promises():
+def test_packaged_mask_meets_its_recorded_request():
     quarter, request = recorded()
     assert request == Request()
     found = figures(quarter, request)
@@ -226,7 +229,7 @@ def test_the_shipped_mask_keeps_what_its_record_promises():
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_the_recorded_command_makes_the_shipped_mask_again():
+def test_recorded_request_reproduces_the_packaged_mask():
     quarter, request = recorded()
     again = last(request)
     assert again.contrast <= request.contrast

@@ -22,15 +22,15 @@ EXPOSURE = 0.5
 
 
 @pytest.mark.parametrize("gain", [0.05, 0.4, 1.0])
-def test_what_is_left_of_a_drift_is_that_of_the_continuous_theory(gain):
+def test_residual_of_a_drift_agrees_with_the_continuous_theory(gain):
     law, omega = integrator([gain], [0.0], (2,), 1.0, 250.0), np.geomspace(1e-6, 300 * np.pi, 200_000)
-    left = residual_power(law, omega, Timing.of(1.0, EXPOSURE))[:, 0]
-    expected = 0.3 * np.trapezoid(left / omega**2, omega) / np.pi + 2.0 * noise_gain(law)[0]
+    transmitted = residual_power(law, omega, Timing.of(1.0, EXPOSURE))[:, 0]
+    expected = 0.3 * np.trapezoid(transmitted / omega**2, omega) / np.pi + 2.0 * noise_gain(law)[0]
     assert left_of_drift_nm2(0.3, 2.0, EXPOSURE, gain) == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize("noise", [1e-3, 0.3, 30.0])
-def test_a_tolerated_drift_leaves_what_is_allowed_and_no_gain_leaves_less(noise):
+def test_tolerated_drift_leaves_the_allowed_residual_at_the_best_gain(noise):
     for kind in ("integrator", "lqg"):
         found = tolerated_drift(0.5, noise, EXPOSURE, kind)
         assert left_of_drift_nm2(found.step_nm2, noise, EXPOSURE, found.gain) == pytest.approx(0.5)
@@ -39,29 +39,29 @@ def test_a_tolerated_drift_leaves_what_is_allowed_and_no_gain_leaves_less(noise)
     assert min(left_of_drift_nm2(found.step_nm2, noise, EXPOSURE, best * f) for f in (0.9, 1.1)) > 0.5
 
 
-def test_a_slow_loop_leaves_the_root_of_drift_times_noise():
-    """Kalman and Bucy: where a gain is low, sqrt(D n)."""
+def test_residual_of_a_slow_loop_is_the_root_of_drift_times_noise():
+    """Kalman and Bucy: at low gain the residual variance is sqrt(D n)."""
     found = tolerated_drift(1.0, 1e4, EXPOSURE)
     assert found.step_nm2 * 1e4 == pytest.approx(1.0, rel=1e-3)
 
 
-def test_a_filter_that_knows_a_line_tolerates_more_of_it_than_an_integrator():
+def test_lqg_with_the_line_tolerates_more_than_an_integrator():
     allowed, line = np.geomspace(1e-3, 1e4, 8), Line(10.0, 0.05, 1.0)
-    plain, knows = (tolerated_lines(kind, line, 250.0, EXPOSURE)(allowed) for kind in ("integrator", "lqg"))
-    assert (knows >= plain * 0.999).all()
-    assert (plain >= allowed * 0.999).all()  # without any loop the line itself may stay
-    assert knows[3] > 10 * plain[3]
-    assert (np.diff(knows) > 0).all()
+    plain, lqg = (tolerated_lines(kind, line, 250.0, EXPOSURE)(allowed) for kind in ("integrator", "lqg"))
+    assert (lqg >= plain * 0.999).all()
+    assert (plain >= allowed * 0.999).all()  # a line of the allowed variance needs no loop
+    assert lqg[3] > 10 * plain[3]
+    assert (np.diff(lqg) > 0).all()
 
 
-def test_the_fourth_order_bounds_a_mode_that_costs_little():
+def test_quartic_term_limits_a_mode_with_a_small_quadratic_term():
     assert tolerated_variance(2e-12, 0.0, 1e-10) == pytest.approx(50.0)
     variance = tolerated_variance(1e-15, 1e-14, 1e-10)
     assert 1e-15 * variance + 3e-14 * variance**2 == pytest.approx(1e-10)
 
 
 @pytest.mark.slow
-def test_colour_moves_no_zero_point_of_an_aperture_mask():
+def test_star_colour_does_not_shift_the_zero_point_of_an_aperture_mask():
     assert np.linalg.norm(zero_point_nm("sam")) < 1e-9
     assert np.linalg.norm(zero_point_nm("zwfs_tuned")) > 1.0
 

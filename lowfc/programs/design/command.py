@@ -16,7 +16,7 @@ from lowfc.programs.design.options import flag, with_options_of
 from lowfc.programs.design.sam_request import Search
 
 Keys = Annotated[Path, typer.Option(help="Configuration file.")]
-Drawn = Annotated[Path | None, typer.Option(help="Plot the figures of merit against size (PNG).")]
+Plot = Annotated[Path | None, typer.Option(help="Plot the figures of merit against size (PNG).")]
 
 design_app = new_app("Design masks and sensors.\n\nExample: lowfc design spc --help")
 
@@ -54,7 +54,7 @@ def sam(
     plot: Annotated[Path | None, typer.Option(help="Plot each chain's best layout (PNG).")] = None,
     as_json: Json = False,
 ) -> None:
-    """Search for a sparse aperture mask: position, size and number of holes. Ctrl-C keeps the best so far.
+    """Search for a sparse aperture mask: position, size and number of holes. Ctrl-C writes the best layout found.
 
     Example: lowfc design sam --diameter 0.05:0.2 --holes 8:30 --chains 4 --out mask.json
     """
@@ -82,8 +82,8 @@ def sam(
 
 @design_app.command()
 @with_options_of(Spot)
-def zwfs(request: Spot, out: Keys = Path("zwfs.toml"), plot: Drawn = None, as_json: Json = False) -> None:
-    """Find the phase spot of a Zernike sensor.
+def zwfs(request: Spot, out: Keys = Path("zwfs.toml"), plot: Plot = None, as_json: Json = False) -> None:
+    """Optimise the phase spot of a Zernike sensor.
 
     Example: lowfc design zwfs --merit contrast --out zwfs.toml
     """
@@ -92,8 +92,8 @@ def zwfs(request: Spot, out: Keys = Path("zwfs.toml"), plot: Drawn = None, as_js
 
 @design_app.command()
 @with_options_of(Defocus)
-def clowfs(request: Defocus, out: Keys = Path("clowfs.toml"), plot: Drawn = None, as_json: Json = False) -> None:
-    """Find the defocus of a coronagraphic low-order sensor.
+def clowfs(request: Defocus, out: Keys = Path("clowfs.toml"), plot: Plot = None, as_json: Json = False) -> None:
+    """Optimise the defocus of a coronagraphic low-order sensor.
 
     Example: lowfc design clowfs --merit contrast --out clowfs.toml
     """

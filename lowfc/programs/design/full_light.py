@@ -1,4 +1,4 @@
-"""`lowfc design zwfs` and `lowfc design clowfs`: a sensor without a relay mask, over one of its dimensions."""
+"""`lowfc design zwfs` and `lowfc design clowfs`: optimisation of one dimension of a sensor without a relay mask."""
 
 from collections.abc import Callable
 from functools import cache
@@ -23,21 +23,21 @@ _POINTS = 21
 
 
 class Point(Result):
-    """A sensor of one size."""
+    """Figures of a sensor of one size."""
 
     value: float = figure("size", form=".3f")
     merit: float = figure("merit", form=".4g")
-    throughput: float = figure("light", form=".1%")
+    throughput: float = figure("throughput", form=".1%")
     table3_waves: float = figure("Table 3, n<=4", "waves", ".2e")
     table4_mas: float = figure("Table 4, 2 modes", "mas", ".3f")
     condition: float = figure("cond14", form=".0f")
     noise_nm: float = figure("noise of 14 modes", "nm", ".3g")
-    contrast_noise: float = figure("contrast it adds", form=".2e")
-    quantum_share: float = figure("of the quantum limit", form=".1%")
+    contrast_noise: float = figure("contrast from noise", form=".2e")
+    quantum_share: float = figure("share of quantum limit", form=".1%")
 
 
-class Swept(Result):
-    """Every size that was looked at, and the best."""
+class Sweep(Result):
+    """Figures of every size, and the best size."""
 
     key: str = figure("key of [sensor]")
     merit: str = figure("merit")
@@ -48,8 +48,8 @@ class Swept(Result):
     figures_of_best: dict[str, Any] = figure()
 
 
-def design(sizes: Sizes, goal: Goal, out: Path, plot: Path | None) -> Swept:
-    """Look at sizes of a sensor, find the best between them, and write its keys as a configuration."""
+def design(sizes: Sizes, goal: Goal, out: Path, plot: Path | None) -> Sweep:
+    """Evaluate sizes of a sensor, optimise between them, and write the keys of the best as a configuration."""
     if plot is not None:
         figure_class()
     require_folder(out, plot)
@@ -71,7 +71,7 @@ def design(sizes: Sizes, goal: Goal, out: Path, plot: Path | None) -> Swept:
     write_whole(out, "".join(["[sensor]\n", *(f"{name} = {value}\n" for name, value in keys.items())]).encode())
     if plot is not None:
         write_whole(plot, _picture(points, key, goal))
-    return Swept(
+    return Sweep(
         key=key,
         merit=goal.merit,
         estimator=goal.estimator,
@@ -103,7 +103,7 @@ def _point(one: FullLight, value: float, merit_of: Callable[[float], float], goa
 
 
 def _picture(points: list[Point], key: str, goal: Goal) -> bytes:
-    """Every figure over the size, beside its least."""
+    """Figures against size, relative to their minima (PNG)."""
     drawing = figure_class()(figsize=(7.5, 5.0), layout="constrained")
     axes = drawing.subplots()
     values = [point.value for point in points]
@@ -111,11 +111,11 @@ def _picture(points: list[Point], key: str, goal: Goal) -> bytes:
         "merit": f"merit {goal.merit}",
         "table3_waves": "Table 3",
         "table4_mas": "Table 4",
-        "contrast_noise": "contrast of the noise",
+        "contrast_noise": "contrast from noise",
     }
     for name, label in labels.items():
         found = [getattr(point, name) for point in points]
         axes.semilogy(values, [one / min(found) for one in found], label=label)
-    axes.set(xlabel=key, ylabel="of the least")
+    axes.set(xlabel=key, ylabel="relative to minimum")
     axes.legend()
     return png(drawing)

@@ -1,4 +1,4 @@
-"""What a search for the size of a sensor without a relay mask is asked for."""
+"""Options of the searches for the size of a sensor without a relay mask."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ Kind = Literal["zwfs", "clowfs"]
 
 
 class Sizes(NamedTuple):
-    """What is looked at: a kind, one end and the other, and keys of [sensor] that stay."""
+    """Sizes to search: kind of sensor, lowest and highest size, and other keys of [sensor]."""
 
     kind: Kind
     low: float
@@ -21,14 +21,14 @@ class Sizes(NamedTuple):
 
 
 @dataclass(frozen=True)
-class _Wanted(ABC):
-    """What the searches have in common.
+class _Request(ABC):
+    """Options common to the searches.
 
     Attributes:
-        merit: What to minimise: paper, table3, table4, condition, throughput, pareto or contrast.
+        merit: Figure to optimise: paper, table3, table4, condition, throughput, pareto or contrast.
         estimator: pinv, or weighted for the Cramer-Rao bound.
         modes: Modes in Table 3 and the condition number: 14 or 20.
-        weight: Of Table 4 in paper and pareto, 0 to 1.
+        weight: Weight of Table 4 in paper and pareto, 0 to 1.
     """
 
     merit: str = "contrast"
@@ -37,21 +37,21 @@ class _Wanted(ABC):
     weight: float = 0.5
 
     def __post_init__(self) -> None:
-        _ = self.goal, self.sizes  # what is wrong with them is found now
+        _ = self.goal, self.sizes  # validated here
 
     @cached_property
     def goal(self) -> Goal:
-        """What is minimised."""
+        """The figure of merit to minimise."""
         return Goal(self.merit, self.estimator, self.modes, self.weight if self.merit in WEIGHTED else None)
 
     @property
     @abstractmethod
     def sizes(self) -> Sizes:
-        """What is looked at."""
+        """The sizes to search."""
 
 
 @dataclass(frozen=True)
-class Spot(_Wanted):
+class Spot(_Request):
     """The options of `lowfc design zwfs`.
 
     Attributes:
@@ -62,17 +62,17 @@ class Spot(_Wanted):
 
     @property
     def sizes(self) -> Sizes:
-        """What is looked at."""
+        """The spot diameters to search."""
         return Sizes("zwfs", *span("--spot", self.spot), {})
 
 
 @dataclass(frozen=True)
-class Defocus(_Wanted):
+class Defocus(_Request):
     """The options of `lowfc design clowfs`.
 
     Attributes:
         defocus: SMALLEST:LARGEST defocus, mm.
-        inner_radius: Of the reflecting annulus, lambda/D.
+        inner_radius: Inner radius of the reflecting annulus, lambda/D.
     """
 
     defocus: str = "1.5:8"
@@ -80,5 +80,5 @@ class Defocus(_Wanted):
 
     @property
     def sizes(self) -> Sizes:
-        """What is looked at."""
+        """The defocus distances to search."""
         return Sizes("clowfs", *span("--defocus", self.defocus), {"inner_radius": self.inner_radius})

@@ -1,4 +1,4 @@
-"""A dataclass as the options of a command: each is declared once, with its help in the docstring's attributes."""
+"""Command-line options from the fields of a dataclass, with their help from the attributes in its docstring."""
 
 import functools
 import inspect
@@ -15,18 +15,18 @@ from lowfc.contract.errors import ConfigurationError
 
 
 def flag(name: str) -> str:
-    """The option of a field, such as --half-angle of half_angle_deg."""
+    """The option of a field, such as --half-angle for half_angle_deg."""
     return f"--{name.removesuffix('_deg').replace('_', '-')}"
 
 
 def command_line(command: str, request: Any) -> str:
-    """The command that asks for the same again; what is None is left out."""
+    """The command line that repeats a request, without options that are None."""
     given = {flag(name): value for name, value in asdict(request).items() if value is not None}
     return shlex.join([*command.split(), *(str(word) for option in given.items() for word in option)])
 
 
 def span(option: str, text: str) -> tuple[float, float]:
-    """Ends of LOW:HIGH, or one value for both; ValueError where it is neither, or not finite."""
+    """Parse LOW:HIGH, or one value for both; ValueError if it is neither, or not finite."""
     low, _, high = text.partition(":")
     try:
         found = float(low), float(high or low)
@@ -38,9 +38,9 @@ def span(option: str, text: str) -> tuple[float, float]:
 
 
 def with_options_of(kind: type[Any]) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Let typer see the fields of a dataclass in place of a command's first parameter, which receives the instance.
+    """Replace a command's first parameter by options for the fields of a dataclass; the command receives the instance.
 
-    The command raises ConfigurationError where the dataclass refuses its values.
+    The command raises ConfigurationError if the dataclass refuses its values.
     """
     types, helps = get_type_hints(kind), _attributes(kind)
     options = [
@@ -71,7 +71,7 @@ def with_options_of(kind: type[Any]) -> Callable[[Callable[..., None]], Callable
 
 
 def _attributes(kind: type[Any]) -> dict[str, str]:
-    """The sentences of the attributes in the docstrings of a class and those it is made from, each on one line."""
+    """Descriptions of the attributes in the docstrings of a class and its bases, each on one line."""
     found: dict[str, str] = {}
     for one in kind.__mro__[-2::-1]:
         _, _, text = inspect.cleandoc(one.__doc__ or "").partition("Attributes:\n")

@@ -1,4 +1,4 @@
-"""The search for a sparse aperture mask: chains on all cores or on a Dask cluster, kept safe from interruption."""
+"""The search for a sparse aperture mask: chains on all cores or on a Dask cluster, resumable after interruption."""
 
 import hashlib
 import shlex
@@ -40,7 +40,7 @@ STATE_PERIOD_S = 10.0
 
 
 def begin(search: Search) -> list[Chain]:
-    """The chains of a new search, at random layouts; ConfigurationError where the holes cannot be placed."""
+    """Start the chains of a new search at random layouts; ConfigurationError if the holes cannot be placed."""
     try:
         return [start(search.bounds, search.seed, i, search.steps) for i in range(search.chains)]
     except ValueError as error:
@@ -48,7 +48,7 @@ def begin(search: Search) -> list[Chain]:
 
 
 def resumed(state: Path) -> tuple[Search, list[Chain]]:
-    """The search and the chains of a state file."""
+    """Read the search and its chains from a state file."""
     return read_state(state, pupil_digest())
 
 
@@ -62,16 +62,16 @@ def design_sam(
     plot_file: Path | None = None,
     console: Console | None = None,
 ) -> dict[str, Any]:
-    """Search, write the best layout or the front, and say what they would show; Ctrl-C writes the best so far.
+    """Search, write the best layout or the front, and return their predicted figures; Ctrl-C writes the best so far.
 
-    The chains are brought forward in place, and kept in the file `state` until the end.
+    The chains are advanced in place, and stored in the file `state` until the end.
     """
     console = Console(stderr=True) if console is None else console
     _one_thread()
     if plot_file is not None:
-        figure_class()  # missing, it must be found before the work, not after
+        figure_class()  # report a missing package before the work, not after
     pupil = pupil_digest()
-    write_state(state, search, pupil, chains)  # and so must a folder that cannot be written
+    write_state(state, search, pupil, chains)  # likewise a folder that cannot be written
     interrupted = False
     with counting_bar(console, TimeElapsedColumn(), TimeRemainingColumn()) as count:
         saved_s = time.monotonic()
@@ -89,12 +89,12 @@ def design_sam(
             run_chains(search, chains, executor, on_block)
         except (KeyboardInterrupt, Exception) as error:
             interrupted = isinstance(error, KeyboardInterrupt)
-            go_on = _kept(state, search, pupil, chains)
+            advice = _store_or_remove(state, search, pupil, chains)
             if is_lost(error):
-                raise LowfcError(f"the workers were lost ({error!r}); {go_on}") from error
-            if interrupted and go_on == _NOTHING:
+                raise LowfcError(f"the workers were lost ({error!r}); {advice}") from error
+            if interrupted and advice == _NOTHING:
                 console.print(_NOTHING, highlight=False)
-            if not interrupted or go_on == _NOTHING:
+            if not interrupted or advice == _NOTHING:
                 raise
     points = [point_of(search, chain) for chain in chains if chain.step]
     best = front(points) if search.sweeps else [min(points, key=lambda point: point.merit)]
@@ -122,17 +122,17 @@ def design_sam(
 _NOTHING = f"no chain had finished its first {BLOCK} steps: nothing was found, nothing is written"
 
 
-def _kept(state: Path, search: Search, pupil: str, chains: list[Chain]) -> str:
-    """Write the state if any chain has come forward, else remove it; what can be done now."""
+def _store_or_remove(state: Path, search: Search, pupil: str, chains: list[Chain]) -> str:
+    """Write the state if any chain has advanced, otherwise remove it; return what to do next."""
     if not any(chain.step for chain in chains):
         state.unlink()
         return _NOTHING
     write_state(state, search, pupil, chains)
-    return f"go on with --resume {state}"
+    return f"continue with --resume {state}"
 
 
 def run_chains(search: Search, chains: list[Chain], executor: Executor, on_block: Callable[[], None]) -> None:
-    """Bring every chain to its end, in place, block by block."""
+    """Advance every chain to its end, in place, block by block."""
     running: dict[Future[Chain], int] = {}
     pupil = pupil_digest()
     try:
@@ -153,7 +153,7 @@ def run_chains(search: Search, chains: list[Chain], executor: Executor, on_block
 
 
 def advance_block(search: Search, chain: Chain, pupil: str) -> Chain:
-    """One block of one chain, on whatever machine this runs."""
+    """Advance a chain by one block; runs in a worker, possibly on another machine."""
     if pupil != pupil_digest():
         raise ConfigurationError("a worker has another shaped pupil: install the same lowfc on all machines")
     _one_thread()
@@ -161,25 +161,25 @@ def advance_block(search: Search, chain: Chain, pupil: str) -> Chain:
 
 
 def point_of(search: Search, chain: Chain) -> Point:
-    """The best layout of a chain."""
+    """The best layout of a chain, with its figures."""
     found = holes(chain.best, search.bounds.symmetry)
     name = f"{search.name}_{chain.index}" if search.sweeps else search.name
     goal = search.goal_of(chain.index)
     weight = "" if goal.weight is None else f" with weight {goal.weight:g}"
     masks = " and ".join(search.focal_masks)
     purpose = f"{_described(found)}: merit {goal.merit}{weight}, focal-plane mask {masks}"
-    shown = _figures(search.focal_masks[0], found)
+    predicted = _figures(search.focal_masks[0], found)
     return Point(
         Layout(name, purpose, found),
         chain.best_merit,
-        shown["table3_waves"][goal.estimator][str(goal.modes)],
-        max(shown["table4_mas"][goal.estimator][str(TABLE4_MODES)]),
-        shown["throughput"],
+        predicted["table3_waves"][goal.estimator][str(goal.modes)],
+        max(predicted["table4_mas"][goal.estimator][str(TABLE4_MODES)]),
+        predicted["throughput"],
     )
 
 
 def summary(point: Point) -> dict[str, Any]:
-    """A layout and its predicted figures, as JSON has them."""
+    """A layout and its predicted figures, for JSON."""
     return {
         "name": point.layout.name,
         "purpose": point.layout.purpose,
@@ -194,39 +194,39 @@ def render(result: dict[str, Any]) -> str:
     lines = []
     for layout in result["layouts"]:
         lines.append(f"{layout['name']}: {layout['purpose']}, {result['merit']} {layout['merit']:.4g}")
-        for name, shown in layout["focal_masks"].items():
-            condition = "  ".join(f"{value:.0f} ({modes} modes)" for modes, value in shown["condition"].items())
-            lines.append(f"  {name}: throughput {shown['throughput']:.2%}, condition number {condition}")
-            for estimator, row in shown["table3_waves"].items():
+        for name, predicted in layout["focal_masks"].items():
+            condition = "  ".join(f"{value:.0f} ({modes} modes)" for modes, value in predicted["condition"].items())
+            lines.append(f"  {name}: throughput {predicted['throughput']:.2%}, condition number {condition}")
+            for estimator, row in predicted["table3_waves"].items():
                 lines.append(f"    Table 3  {estimator:<9} n<=4 {row['14']:.2e}  n<=5 {row['20']:.2e} waves rms")
-            for estimator, tilts in shown["table4_mas"].items():
+            for estimator, tilts in predicted["table4_mas"].items():
                 fits = "  ".join(f"{modes} modes x {x:.3f} y {y:.3f}" for modes, (x, y) in tilts.items())
                 lines.append(f"    Table 4  {estimator:<9} {fits} mas")
-            lines.append(f"    {noise_line(shown)}")
+            lines.append(f"    {noise_line(predicted)}")
     lines.append(
-        "predicted; the weighted estimator attains the Cramer-Rao bound of Table 4, 'bound' is that of Table 3"
+        "predicted; in Table 4 the weighted estimator attains the Cramer-Rao bound, 'bound' is that of Table 3"
     )
-    lines.append(f"written to {result['file']}; found again on a processor like this one by: {result['command']}")
+    lines.append(f"written to {result['file']}; reproduced on the same kind of processor by: {result['command']}")
     if result["interrupted"]:
-        go_on = shlex.join(["lowfc", "design", "sam", "--resume", result["resume"], "--out", result["file"]])
-        lines.append(f"interrupted after {result['steps']} steps; go on with: {go_on}")
+        resume = shlex.join(["lowfc", "design", "sam", "--resume", result["resume"], "--out", result["file"]])
+        lines.append(f"interrupted after {result['steps']} steps; continue with: {resume}")
     return "\n".join(lines)
 
 
 @cache
 def _one_thread() -> None:
-    """From now on one thread in this process, so that every run adds up alike; others may be at work, so for good."""
+    """Limit this process to one thread for good, so that sums round the same in every run."""
     threadpool_limits(1)
 
 
 @lru_cache(maxsize=1)
 def pupil_digest() -> str:
-    """Identity of the shaped pupil, on which every result depends."""
+    """Digest of the shaped pupil, on which every result depends."""
     return hashlib.sha256(load_pupil(_PUPIL_SAMPLES).tobytes()).hexdigest()
 
 
 _PUPIL_SAMPLES = 256
-"""One for each cell of the shipped shaped pupil; a mask's figures are those of 512 samples to 1e-3."""
+"""One sample for each cell of the package's shaped pupil; the figures of a mask agree with 512 samples to 1e-3."""
 
 
 @lru_cache(maxsize=4)
@@ -241,11 +241,11 @@ def _figures(focal_mask: str, holes_: tuple[Hole, ...]) -> dict[str, Any]:
     return figures(Mask(optics, fields))
 
 
-def noise_line(shown: Mapping[str, Any]) -> str:
-    """What one exposure of Table 4's star leaves, of the figures of a sensor."""
+def noise_line(predicted: Mapping[str, Any]) -> str:
+    """Text of the noise figures of a sensor for one exposure of Table 4's star."""
     return (
-        f"noise of 14 modes {shown['noise_nm']:.3g} nm, which adds {shown['contrast_noise']:.2e} to the contrast; "
-        f"{shown['quantum_share']:.1%} of the quantum limit"
+        f"noise of 14 modes {predicted['noise_nm']:.3g} nm, which adds {predicted['contrast_noise']:.2e} to the "
+        f"contrast; {predicted['quantum_share']:.1%} of the quantum limit"
     )
 
 

@@ -1,4 +1,4 @@
-"""Where the chains of a search run: this process, others of this machine, or the workers of a Dask cluster."""
+"""Executors for the chains of a search: this process, a pool of local processes, or the workers of a Dask cluster."""
 
 import logging
 import multiprocessing
@@ -16,10 +16,10 @@ DASK_TIMEOUT_S = 10.0
 
 
 class Here(Executor):
-    """Runs what is submitted at once, in this process."""
+    """Runs submitted calls immediately in this process."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Run it; an interrupt is the caller's."""
+        """Run the call; KeyboardInterrupt propagates to the caller."""
         future: Future[Any] = Future()
         try:
             future.set_result(fn(*args, **kwargs))
@@ -30,7 +30,7 @@ class Here(Executor):
 
 @contextmanager
 def open_executor(jobs: int, scheduler: str | None) -> Iterator[Executor]:
-    """Where the chains run."""
+    """Open the executor for this number of processes, or of the Dask scheduler if its address is given."""
     if scheduler is not None:
         with _dask(scheduler) as executor:
             yield executor
@@ -46,7 +46,7 @@ def open_executor(jobs: int, scheduler: str | None) -> Iterator[Executor]:
 
 
 def is_lost(error: BaseException) -> bool:
-    """Whether it says that the workers are gone, not that their work is wrong."""
+    """Whether the error means that the workers died, not that their work failed."""
     from_dask = type(error).__module__.partition(".")[0] == "distributed"
     return from_dask or isinstance(error, (BrokenExecutor, CancelledError, OSError))
 
@@ -59,7 +59,7 @@ def _dask(address: str) -> Iterator[Executor]:
         raise ConfigurationError(f"--scheduler needs Dask: {install_advice('cluster')}") from None
     except (OSError, ValueError) as error:
         raise ConfigurationError(f"no Dask scheduler answers at {address!r}: {error}") from error
-    for name in ("distributed", "distributed.client"):  # a lost scheduler is ours to tell, without their traceback
+    for name in ("distributed", "distributed.client"):  # a lost scheduler is reported by us, without a traceback
         logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
         yield client.get_executor(pure=False)

@@ -24,7 +24,7 @@ UNITS = "pupil diameters, origin at the pupil centre, x to the right (columns), 
 
 @dataclass(frozen=True)
 class Point:
-    """A layout and where it lies between Table 3 and Table 4."""
+    """A layout and its predicted figures in Tables 3 and 4."""
 
     layout: Layout
     merit: float
@@ -34,36 +34,36 @@ class Point:
 
 
 def check_files(out: Path, resume: Path | None, *others: Path | None) -> Path:
-    """Say before the search what would go wrong after it.
+    """Check before the search that its files can be written.
 
     Args:
         out: Layout file.
-        resume: State file to go on from.
-        others: More files to be written.
+        resume: State file of the search to continue.
+        others: Other files to be written.
 
     Returns:
         The state file.
     """
     if out.suffix != ".json":
-        raise ConfigurationError(f"--out must end in .json, as only that is read as a layout file; got {out}")
+        raise ConfigurationError(f"--out must end in .json, the only type read as a layout file; got {out}")
     state = resume if resume is not None else out.with_name(f"{out.name}.state.json")
     files = [file for file in (out, state, *others) if file is not None]
     require_folder(*files)
     if len({file.resolve() for file in files}) < len(files):
         raise ConfigurationError(f"these must be different files: {', '.join(map(str, files))}")
     if resume is None and state.exists():
-        raise ConfigurationError(f"{state} holds an interrupted search: go on with --resume {state}, or delete it")
+        raise ConfigurationError(f"{state} holds an interrupted search: continue with --resume {state}, or delete it")
     return state
 
 
 def write_state(path: Path, search: Search, pupil: str, chains: Sequence[Chain]) -> None:
-    """Write all that a search needs to go on."""
+    """Write the state from which a search can be resumed."""
     state = {"search": asdict(search), "pupil": pupil, "chains": [asdict(chain) for chain in chains]}
     write_whole(path, json.dumps(state).encode())
 
 
 def read_state(path: Path, pupil: str) -> tuple[Search, list[Chain]]:
-    """The search and its chains that `write_state` wrote."""
+    """Read the search and its chains from a file of `write_state`."""
     try:
         state = json.loads(input_file.read_whole(path, _LARGEST_BYTES))
         search = Search(**state["search"])
@@ -74,12 +74,12 @@ def read_state(path: Path, pupil: str) -> tuple[Search, list[Chain]]:
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise DataFileError(f"{path} is not the state of a search: {type(error).__name__}: {error}") from error
     if made_for != pupil:
-        raise DataFileError(f"{path} belongs to a search with another shaped pupil; start again without --resume")
+        raise DataFileError(f"{path} belongs to a search with another shaped pupil; start a new one without --resume")
     return search, chains
 
 
 def write_layouts(path: Path, points: Sequence[Point], search: Search, command: str) -> None:
-    """Write layouts as the loop reads them, each with how it was found."""
+    """Write layouts in the format that the loop reads, each with the command that found it."""
     entries = {point.layout.name: _entry(point, search, command) for point in points}
     content = json.dumps({"units": UNITS, "layouts": entries}, indent=1) + "\n"
     for name, entry in json.loads(content)["layouts"].items():
@@ -88,7 +88,7 @@ def write_layouts(path: Path, points: Sequence[Point], search: Search, command: 
 
 
 def write_front(path: Path, points: Sequence[Point]) -> None:
-    """Write a table of the points (CSV), those that no other beats in both Tables marked."""
+    """Write a table of the points (CSV); points on the front are marked."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(["layout", "holes", "table3_waves", "table4_mas", "throughput", "merit", "on_front"])
@@ -100,7 +100,7 @@ def write_front(path: Path, points: Sequence[Point]) -> None:
 
 
 def write_plot(path: Path, points: Sequence[Point], search: Search) -> None:
-    """Draw the points and the paper's (PNG)."""
+    """Plot the points and the paper's result (PNG)."""
     figure = figure_class()(figsize=(6.4, 4.8), layout="constrained")
     axes = figure.subplots()
     on_front = sorted(front(points), key=lambda point: point.table3_waves)
@@ -115,7 +115,7 @@ def write_plot(path: Path, points: Sequence[Point], search: Search) -> None:
 
 
 def front(points: Sequence[Point]) -> list[Point]:
-    """The points that no other one equals or beats in both Tables at once."""
+    """The Pareto front: points that no other point equals or beats in both tables."""
     return [
         point
         for point in points
@@ -129,7 +129,7 @@ def front(points: Sequence[Point]) -> list[Point]:
 
 
 def _as_tuple(value: Any) -> Any:
-    """What JSON made a list of, at any depth."""
+    """Convert JSON's lists to tuples, at any depth."""
     return tuple(map(_as_tuple, value)) if isinstance(value, list) else value
 
 

@@ -1,4 +1,4 @@
-"""What a search for a sparse aperture mask is asked for."""
+"""Options of the search for a sparse aperture mask."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -11,23 +11,23 @@ from lowfc.programs.design.options import span
 
 @dataclass(frozen=True)
 class Search:
-    """All that the result depends on, besides the shaped pupil: the options of `lowfc design sam`.
+    """The options of `lowfc design sam`, which with the shaped pupil determine the result.
 
     Attributes:
-        merit: What to minimise: paper, table3, table4, condition, throughput, pareto or contrast.
+        merit: Figure to optimise: paper, table3, table4, condition, throughput, pareto or contrast.
         estimator: pinv, or weighted for the Cramer-Rao bound. Default: weighted; pinv for the merit paper.
         modes: Modes in Table 3: 14 or 20.
-        weight: Of Table 4 in paper and pareto, 0 to 1. Default: 0.5; in pareto, a front.
+        weight: Weight of Table 4 in paper and pareto, 0 to 1. Default: 0.5; in pareto, a front.
         focal_mask: disk, bowtie or both. Default: disk; both for the merit paper.
         holes: Number of holes, or FEWEST:MOST.
-        diameter: Of the holes, or SMALLEST:LARGEST, in pupil diameters.
-        gap: Least distance between two holes' rims, in pupil diameters.
-        edge: Least distance from a hole to the pupil's edge.
+        diameter: Diameter of the holes, or SMALLEST:LARGEST, in pupil diameters.
+        gap: Least distance between the rims of two holes, in pupil diameters.
+        edge: Least distance from a hole to the pupil's edge, in pupil diameters.
         symmetry: none, or the axis of a mirror symmetry: x or y.
-        seed: Of all random numbers.
-        chains: Independent searches; the best one counts.
-        steps: Of each chain.
-        name: Of the layout.
+        seed: Seed of all random numbers.
+        chains: Independent searches, of which the best is used.
+        steps: Steps of each chain.
+        name: Name of the layout.
     """
 
     merit: str = "paper"
@@ -58,41 +58,41 @@ class Search:
                 raise ValueError(f"{what} must be at least 1, got {value}")
         if self.seed < 0:
             raise ValueError(f"the seed must not be negative, got {self.seed}")
-        _ = self.goal, self.bounds  # what is wrong with them is found now
+        _ = self.goal, self.bounds  # validated here
         if len(self.focal_masks) > 1 and not for_paper:
-            raise ValueError(f"the merit {self.merit!r} is of one focal-plane mask; only 'paper' takes both")
+            raise ValueError(f"the merit {self.merit!r} uses one focal-plane mask; only 'paper' uses both")
         if self.sweeps and self.chains < 2:
-            raise ValueError("a front needs at least 2 chains, one for each weight; or give one weight")
+            raise ValueError("a front needs at least 2 chains, one for each weight; or set --weight")
 
     @cached_property
     def goal(self) -> Goal:
-        """What is minimised."""
+        """The figure of merit to minimise."""
         return Goal(self.merit, str(self.estimator), self.modes, self.weight)
 
     @cached_property
     def focal_masks(self) -> tuple[str, ...]:
-        """Focal-plane masks of Table 3; the first one is also that of Table 4."""
+        """Focal-plane masks of Table 3; the first is also used for Table 4."""
         return tuple(FOCAL_MASKS) if self.focal_mask == "both" else (str(self.focal_mask),)
 
     @cached_property
     def bounds(self) -> Bounds:
-        """What every layout keeps to."""
+        """Constraints on every layout."""
         (gap, _), (edge, _) = _span("--gap", str(self.gap), UNIT), _span("--edge", str(self.edge), UNIT)
         holes, diameter = _span("--holes", self.holes, 1), _span("--diameter", self.diameter, UNIT)
         return Bounds(holes, diameter, gap, edge, self.symmetry)
 
     @property
     def sweeps(self) -> bool:
-        """Whether the chains go along a front."""
+        """Whether the chains have different weights, along a front."""
         return self.merit == "pareto" and self.weight is None
 
     def goal_of(self, index: int) -> Goal:
-        """What chain `index` minimises: along a front each has a weight of its own."""
+        """The goal of chain `index`; along a front each chain has its own weight."""
         return replace(self.goal, weight=index / (self.chains - 1)) if self.sweeps else self.goal
 
 
 def _span(option: str, text: str, scale: int) -> tuple[int, int]:
-    """LOW:HIGH, or one value for both, in units of 1 / scale."""
+    """Parse LOW:HIGH, or one value for both, in units of 1 / scale."""
     first, last = (value * scale for value in span(option, text))
     found = round(first), round(last)
     if abs(found[0] - first) > 1e-6 or abs(found[1] - last) > 1e-6:

@@ -1,4 +1,4 @@
-"""The design of a shaped pupil: progress, file, picture and text around `lowfc.design.shaped_pupil`."""
+"""The command `lowfc design spc`: progress, mask file and plot around `lowfc.design.shaped_pupil`."""
 
 import io
 import json
@@ -38,63 +38,63 @@ Value = TypeVar("Value")
 
 
 class ShapedPupil(Result):
-    """What was found.
+    """Figures of the mask found.
 
-    `below_optimum_at_limit_fraction` is how much more of the circle a mask could leave open that keeps to `limit` times
-    the contrast; with the contrast promised it may be more.
+    `below_optimum_at_limit_fraction` is the fraction of the circle by which the best mask with `limit` times the
+    contrast may be more open; with the contrast itself it may be more.
     """
 
     open_area_fraction: float = figure("open area", "of the circle", ".2%")
-    energy_fraction: float = figure("energy", "of the circle's light", ".2%")
-    focal_mask_fraction: float = figure("on the focal mask", "of that", ".2%")
-    focal_mask_radius_lambda_d: float = figure("its radius", "lambda/D", "g")
+    energy_fraction: float = figure("throughput", "of the circle's light", ".2%")
+    focal_mask_fraction: float = figure("on the focal mask", "of the light passed", ".2%")
+    focal_mask_radius_lambda_d: float = figure("focal mask radius", "lambda/D", "g")
     max_contrast: float = figure("largest contrast", form=".2e")
     mean_contrast: float = figure("mean contrast", form=".2e")
-    contrast_step_lambda_d: float = figure("looked at every", "lambda/D", "g")
+    contrast_step_lambda_d: float = figure("contrast step", "lambda/D", "g")
     grey_cells_fraction: float = figure("grey cells", form=".2%")
     below_optimum_at_limit_fraction: float
-    rounds: int = figure("solved", "linear programs")
-    points: int = figure("the last one with", "points")
+    rounds: int = figure("linear programs")
+    points: int = figure("points in the last")
     file: str = figure("written to")
     dtype: str = figure("stored as")
-    command: str = figure("found again by")
+    command: str = figure("reproduced by")
 
 
-def design_spc(wanted: Request, out: Path, plot: Path | None, console: Console) -> ShapedPupil:
+def design_spc(request: Request, out: Path, plot: Path | None, console: Console) -> ShapedPupil:
     """Design a mask and write it.
 
     Args:
-        wanted: The mask.
-        out: An npz file with `quarter`, which `load_pupil` reads, and `made_by`, the request as JSON.
-        plot: Picture to be drawn, or None.
-        console: Where progress goes.
+        request: Requirements on the mask.
+        out: npz file with `quarter`, which `load_pupil` reads, and `made_by`, the request as JSON.
+        plot: Plot file (PNG), or None.
+        console: Console for progress.
     """
     if plot is not None:
         figure_class()
     require_folder(out, plot)
     with console.status("solving linear programs"):
-        rounds = _interruptibly(lambda: _rounds(wanted, console))
+        rounds = _interruptibly(lambda: _rounds(request, console))
     last = rounds[-1]
     if last.open_area < LEAST_OPEN:
         with console.status("infeasible; looking for the nearest feasible request"):
-            raise ConfigurationError(_infeasible(wanted, *_interruptibly(lambda: nearest_feasible(wanted))))
-    if last.contrast > wanted.contrast:
+            raise ConfigurationError(_infeasible(request, *_interruptibly(lambda: nearest_feasible(request))))
+    if last.contrast > request.contrast:
         raise ConfigurationError(
-            f"after {last.number} programs with {wanted.cells} cells the contrast is {last.contrast:.2e}, not "
-            f"{wanted.contrast:g}: allow more --rounds, or a lower --limit than {wanted.limit:g}"
+            f"after {last.number} programs with {request.cells} cells the contrast is {last.contrast:.2e}, not "
+            f"{request.contrast:g}: allow more --rounds, or a lower --limit than {request.limit:g}"
         )
-    quarter = stored(last.quarter, wanted)
-    made_by = np.array(json.dumps(asdict(wanted)))
+    quarter = stored(last.quarter, request)
+    made_by = np.array(json.dumps(asdict(request)))
     content = io.BytesIO()
     np.savez_compressed(content, allow_pickle=False, quarter=quarter, made_by=made_by)
     write_whole(out, content.getvalue())
-    found = figures(quarter.astype(np.float64), wanted)
+    found = figures(quarter.astype(np.float64), request)
     if plot is not None:
-        write_whole(plot, _picture(quarter.astype(np.float64), wanted))
+        write_whole(plot, _picture(quarter.astype(np.float64), request))
     return ShapedPupil(
         file=str(out),
         dtype=str(quarter.dtype),
-        command=command_line("lowfc design spc", wanted),
+        command=command_line("lowfc design spc", request),
         **asdict(found),
         focal_mask_radius_lambda_d=FOCAL_MASK_RADIUS,
         contrast_step_lambda_d=FINE_STEP,
@@ -104,9 +104,9 @@ def design_spc(wanted: Request, out: Path, plot: Path | None, console: Console) 
     )
 
 
-def _rounds(wanted: Request, console: Console) -> list[Round]:
+def _rounds(request: Request, console: Console) -> list[Round]:
     rounds: list[Round] = []
-    for found in exchange(wanted):
+    for found in exchange(request):
         rounds.append(found)
         console.print(
             f"{len(found.quarter):>4} cells, program {found.number:>2}: {found.points:>5} points, open area "
@@ -116,21 +116,21 @@ def _rounds(wanted: Request, console: Console) -> list[Round]:
     return rounds
 
 
-def _infeasible(wanted: Request, inner: float | None, contrast: float | None) -> str:
+def _infeasible(request: Request, inner: float | None, contrast: float | None) -> str:
     ways = []
     if inner is not None:
-        ways.append(f"inner angle is {inner:g} (contrast kept)")
+        ways.append(f"inner angle is {inner:g} (same contrast)")
     if contrast is not None:
-        ways.append(f"contrast is {contrast:g} (angle kept)")
+        ways.append(f"contrast is {contrast:g} (same angle)")
     nearest = f"the nearest feasible {', or '.join(ways)}" if ways else "nothing near it is feasible"
     return (
-        f"inner angle {wanted.inner:g} lambda/D at {wanted.contrast:g} is infeasible (no mask is more open than "
+        f"inner angle {request.inner:g} lambda/D at {request.contrast:g} is infeasible (no mask is more open than "
         f"{LEAST_OPEN:.0%}); {nearest}"
     )
 
 
 def _interruptibly(work: Callable[[], Value]) -> Value:
-    """Do work in a thread, for Ctrl-C waits for the end of a program where the main thread solves it."""
+    """Run `work` in a thread: in the main thread Ctrl-C would wait for the end of a linear program."""
     future: Future[Value] = Future()
 
     def run() -> None:
@@ -147,38 +147,38 @@ def _interruptibly(work: Callable[[], Value]) -> Value:
         raise ConfigurationError(str(error)) from error
 
 
-def _picture(quarter: Array, wanted: Request) -> bytes:
+def _picture(quarter: Array, request: Request) -> bytes:
     """Mask, image on a log scale with the dark zone outlined, and contrast against angle (PNG)."""
     drawing = figure_class()(figsize=(15, 4.6), layout="constrained")
     mask, image, curve = drawing.subplots(1, 3)
     mask.imshow(from_quarter(quarter, 2 * len(quarter)), cmap="gray", extent=(-0.5, 0.5, -0.5, 0.5))
     mask.set(title="shaped pupil", xlabel="x (D)", ylabel="y (D)")
 
-    edge = min(wanted.outer + 4.0, float(wanted.cells))
+    edge = min(request.outer + 4.0, float(request.cells))
     axis = np.arange(-edge, edge + FINE_STEP / 2, FINE_STEP)
     decades = np.log10(np.maximum(relative_field(quarter, axis) ** 2, 1e-30))
-    floor = np.log10(wanted.contrast) - 2.0
+    floor = np.log10(request.contrast) - 2.0
     drawn = image.imshow(
         decades, vmin=floor, vmax=0.0, cmap="inferno", origin="lower", extent=(-edge, edge, -edge, edge)
     )
-    angles = np.deg2rad(np.linspace(-wanted.half_angle_deg, wanted.half_angle_deg, 91))
-    radii = np.concatenate([np.full(91, wanted.inner), np.full(91, wanted.outer), [wanted.inner]])
+    angles = np.deg2rad(np.linspace(-request.half_angle_deg, request.half_angle_deg, 91))
+    radii = np.concatenate([np.full(91, request.inner), np.full(91, request.outer), [request.inner]])
     outline = np.concatenate([angles, angles[::-1], angles[:1]])
     for side in (-1.0, 1.0):
         image.plot(side * radii * np.cos(outline), radii * np.sin(outline), "c-", linewidth=0.8)
     image.set(title="image, log10 of contrast", xlabel="x (lambda/D)", ylabel="y (lambda/D)")
     drawing.colorbar(drawn, ax=image)
 
-    axis, zone = fine_grid(wanted.zone)
+    axis, zone = fine_grid(request.zone)
     contrast = relative_field(quarter, axis) ** 2
     ring = np.round(np.hypot(axis, axis[:, None])[zone] / 0.5).astype(int)
     values = contrast[zone]
     rings = np.unique(ring)
     for name, reduce in (("max", np.max), ("mean", np.mean)):
         curve.semilogy(0.5 * rings, [reduce(values[ring == k]) for k in rings], label=f"{name} in the dark zone")
-    along_x = axis[axis <= wanted.outer]
+    along_x = axis[axis <= request.outer]
     curve.semilogy(along_x, contrast[0, : along_x.size], color="0.6", linewidth=0.8, label="on the x axis")
-    curve.axhline(wanted.contrast, color="k", linestyle=":", label="promised")
-    curve.set(title="contrast", xlabel="angle (lambda/D)", ylim=(10.0**floor, 1.0), xlim=(0.0, wanted.outer))
+    curve.axhline(request.contrast, color="k", linestyle=":", label="required")
+    curve.set(title="contrast", xlabel="angle (lambda/D)", ylim=(10.0**floor, 1.0), xlim=(0.0, request.outer))
     curve.legend()
     return png(drawing)
