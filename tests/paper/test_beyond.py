@@ -67,7 +67,7 @@ def test_docs_is_refused_for_parts_of_a_page(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_a_second_seed_changes_no_verdict():
+def test_another_seed_gives_the_same_verdicts():
     def verdicts(rows):
         return {
             (row["name"], row["quantity"]): row["measured"] for row in rows if row["quantity"].startswith("verdict")

@@ -157,7 +157,7 @@ def test_the_papers_inconsistencies_are_computed(few):
 
 
 @pytest.mark.slow
-def test_no_figure_depends_on_the_number_of_threads(few):
+def test_tables_do_not_depend_on_the_number_of_threads(few):
     names = ("table3", "table4")
     again = run(names, Context(FEW, jobs=1, sensors=(SAM,)))
     assert again == [few[name] for name in names]
@@ -246,7 +246,7 @@ def test_docs_writes_document_results_and_pictures(monkeypatch, tmp_path):
 
 def test_an_unwritable_folder_is_a_user_error(tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(DataFileError, match="cannot be made"):
+    with pytest.raises(DataFileError, match="cannot be created"):
         run(["table1"], Context(), tmp_path / "file" / "plots")
     with pytest.raises(DataFileError, match="cannot be written"):
         write_document(tmp_path / "nowhere", [])
@@ -268,20 +268,20 @@ def test_rows_are_formatted_as_text_markdown_and_json():
 
 
 @pytest.mark.slow
-def test_every_table_is_as_committed(committed):
+def test_every_table_agrees_with_the_committed_one(committed):
     for table in run(tuple(TABLES), Context(20, jobs=2)):
         assert not compare(table, committed[table["table"]])
 
 
 @pytest.mark.slow
-def test_every_figure_is_as_committed(committed):
+def test_every_figure_agrees_with_the_committed_one(committed):
     for table in run(tuple(FIGURES), Context(10, jobs=2)):
         name, reference_table = table["table"], committed[table["table"]]
         for row, reference in zip(table["rows"], reference_table["rows"], strict=True):
             assert key(row) == key(reference), name
-            by_chance = CHANCE.get((name, row["quantity"]))
-            if by_chance is not None:
-                assert abs(row["measured"] - reference["measured"]) < by_chance(reference["measured"]), (name, row)
+            tolerance = TOLERANCE.get((name, row["quantity"]))
+            if tolerance is not None:
+                assert abs(row["measured"] - reference["measured"]) < tolerance(reference["measured"]), (name, row)
                 row, reference = row | {"measured": None}, reference | {"measured": None}
             if name == "fig9" and row["limit"] is not None:  # the best fit is a mean over the screens too
                 assert row["limit"] == pytest.approx(reference["limit"], rel=0.2), row
@@ -302,7 +302,7 @@ def _a_fifth(value):
     return 0.2 * value
 
 
-CHANCE = {
+TOLERANCE = {
     ("fig5", "correlation"): _unexplained,
     **{("fig6", quantity): _unexplained for quantity in ("R^2", "least R^2", "mean R^2")},
     **{("fig9", quantity): _a_fifth for quantity in ("least residual rms", "largest residual rms")},

@@ -1,3 +1,5 @@
+"""The figures of `lowfc validate`: their rows and plots with few trials, and the paper's claims with many."""
+
 from dataclasses import replace
 from itertools import pairwise
 
@@ -50,7 +52,7 @@ def test_every_row_is_finite_and_states_its_assumptions(tables, figure):
 
 
 @pytest.mark.parametrize("figure", FIGURES)
-def test_every_figure_is_drawn(figure, tables, tmp_path):
+def test_every_figure_is_plotted(figure, tables, tmp_path):
     path = tmp_path / f"{figure}.png"
     FIGURES[figure].plot(FEW, path)
     picture = imread(path)
@@ -58,7 +60,7 @@ def test_every_figure_is_drawn(figure, tables, tmp_path):
     assert np.std(picture[..., :3]) > 0.05
 
 
-def test_the_estimate_restores_the_contrast(tables):
+def test_correction_restores_the_contrast(tables):
     rows = tables["fig1"]
     assert max(values(rows, "contrast, flat wavefront")) < 5e-10
     assert max(values(rows, "aberrated over flat", name="sam, coma Z8")) > 100
@@ -71,7 +73,9 @@ def test_masks_and_throughputs_are_those_of_the_sensors(tables):
     assert values(tables["fig3"], "outer radius") == [4.0]
     assert values(tables["fig3"], "reflecting area")[0] == pytest.approx(16 * np.pi, rel=0.01)
     light = {row.quantity: row.measured for row in tables["fig2"]}
-    assert light["focal-plane mask, of the light on it"] == values(tables["fig3"], "reflected, of the light on it")[0]
+    assert (
+        light["reflected by the focal-plane mask / light on it"] == values(tables["fig3"], "reflected / light on it")[0]
+    )
     assert all(0 < part < 1 for part in light.values())
 
 
@@ -130,10 +134,10 @@ def test_the_signal_to_noise_ratio_of_an_image_agrees_with_the_bound_of_tilt(tab
     light_e = electrons(STAR, TABLE4_EXPOSURE_S)
     slope_e, noise_e2 = light_e * NM_PER_MAS * ready.band_H[:, 1:2], variance_e(light_e * ready.band_I0, 1.0)
     least_mas = np.sqrt(cramer_rao(slope_e, noise_e2)[0, 0])
-    ratio = values(rows, "signal over noise of the image", name="sam, tilt y")[0]
+    ratio = values(rows, "signal-to-noise ratio of the image", name="sam, tilt y")[0]
     assert ratio == pytest.approx(1.0 / least_mas, rel=0.03)
     brightest = np.max(np.abs(slope_e[:, 0]) / np.sqrt(noise_e2))
-    assert values(rows, "largest signal over noise of a pixel", name="sam, tilt y")[0] == pytest.approx(
+    assert values(rows, "largest signal-to-noise ratio of a pixel", name="sam, tilt y")[0] == pytest.approx(
         brightest, rel=0.03
     )
     assert brightest < ratio
@@ -148,11 +152,11 @@ def test_rows_depend_on_the_seed_but_not_on_the_number_of_threads():
 
 def test_the_linear_range_ends_at_a_deviation_of_ten_per_cent():
     estimates = np.stack([AMPLITUDES * (1 - 2 * AMPLITUDES), AMPLITUDES * 1.05, AMPLITUDES * (1 - 50 * AMPLITUDES)])
-    off = deviations(estimates)
-    np.testing.assert_allclose(off[0], 2 * AMPLITUDES)
-    assert linear_range(off[0]) == pytest.approx(0.05)
-    assert linear_range(off[1]) == np.inf
-    assert linear_range(off[2]) == pytest.approx(0.002)
+    deviation = deviations(estimates)
+    np.testing.assert_allclose(deviation[0], 2 * AMPLITUDES)
+    assert linear_range(deviation[0]) == pytest.approx(0.05)
+    assert linear_range(deviation[1]) == np.inf
+    assert linear_range(deviation[2]) == pytest.approx(0.002)
 
 
 @pytest.mark.slow

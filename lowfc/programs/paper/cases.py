@@ -1,4 +1,4 @@
-"""What a table or figure is, what it is given to work with, and the sensors, each made ready once."""
+"""Tables and figures as cases, the context in which they run, and the prepared sensors."""
 
 import threading
 import zlib
@@ -32,11 +32,11 @@ Result = TypeVar("Result")
 
 
 def no_progress(what: str, done: int, total: int) -> None:
-    """Show nothing."""
+    """Report no progress."""
 
 
 class Prepared:
-    """A sensor at the paper's sampling with everything the tables ask of it, made when first asked for."""
+    """A sensor at the paper's sampling, with the quantities that the tables use, computed on first use."""
 
     def __init__(self, name: str, sensor: Sensor) -> None:
         self.name, self.sensor = name, sensor
@@ -59,17 +59,17 @@ class Prepared:
 
     @cached_property
     def gram(self) -> Array:
-        """Their mean products (20, 20), piston removed."""
+        """Covariance (20, 20) of the modes over the open part."""
         return gram(self.open_modes)
 
     @cached_property
     def I0(self) -> Array:
-        """Flat wavefront's image (pixels,) at the central wavelength, fractions of the open circle's light."""
+        """Image (pixels,) of a flat wavefront at the central wavelength, fractions of the open circle's light."""
         return reference(self.sensor).ravel()
 
     @cached_property
     def H(self) -> Array:
-        """Its derivative (pixels, 20) per nm of each mode."""
+        """Derivative (pixels, 20) of the image per nm of each mode."""
         return response(self.sensor, self.modes)
 
     @cached_property
@@ -89,17 +89,17 @@ class Prepared:
 
     @cached_property
     def nuisance(self) -> Array:
-        """Changes of the image (pixels, 3) that are no wavefront: flux (whole), pupil shear in x and y (diameters)."""
+        """Changes of the image (pixels, 3) by nuisance parameters: flux (relative), pupil shear x and y (diameters)."""
         return np.column_stack([self.I0, shear_response(self.sensor)])
 
     @cached_property
     def budget(self) -> LightBudget:
-        """Where the light goes."""
+        """Throughput of each element."""
         return light_budget(self.sensor)
 
     @cached_property
     def twin(self) -> Twin:
-        """The real-time twin that the full-model iterations run on: right to about 1e-5 of the image."""
+        """The twin used by the iterations with the full model, accurate to about 1e-5 of the image."""
         return load_or_build(self.sensor, ACCURATE)
 
     def opd_nm(self, modes_nm: Array) -> Array:
@@ -107,7 +107,7 @@ class Prepared:
         return np.asarray(np.tensordot(modes_nm, self.modes[: len(modes_nm)], 1))
 
     def image(self, modes_nm: Array, band: Band | None = None) -> Array:
-        """Image (pixels,) of the first modes (up to 20,) in nm by the full optical chain, the truth of every trial."""
+        """Image (pixels,) of the first modes (up to 20,) in nm by the full optical chain, the truth of the trials."""
         return image(self.sensor, self.opd_nm(modes_nm), band).ravel()
 
     def fit(
@@ -131,7 +131,7 @@ class Prepared:
         return zernikes(NOLLS_20, *node_radii(self.twin))
 
     def model(self, modes_nm: Array) -> Array:
-        """The same by the twin; any thread may call it."""
+        """The same as `image`, by the twin; thread-safe."""
         if not hasattr(self._own, "evaluator"):
             self._own.evaluator = Evaluator(self.twin)
         opd_nm = modes_nm @ self._node_modes[: len(modes_nm)]
@@ -146,16 +146,16 @@ def modes_at(samples: int) -> Array:
 
 
 def sparse_apertures() -> tuple[str, ...]:
-    """Names of the default sensor and of one with each of the other layouts that are shipped."""
+    """Names of the default sensor, and of the sensors with each other packaged layout."""
     return "sam", *(name for name in layout_names() if name != DEFAULT_SAM)
 
 
 @lru_cache(maxsize=64)
 def prepared(name: str) -> Prepared:
-    """A sensor by its name, made ready once in a process.
+    """A sensor by name, cached in the process.
 
     Args:
-        name: as of `lowfc.adapters.files.sensors.sensor_named`; clowfs:MM with its defocus; or bowtie:LAYOUT.
+        name: a name of `lowfc.adapters.files.sensors.sensor_named`; clowfs:MM with its defocus; or bowtie:LAYOUT.
     """
     kind, _, detail = name.partition(":")
     if kind == "clowfs" and detail:
@@ -171,20 +171,20 @@ def prepared(name: str) -> Prepared:
 
 @dataclass(frozen=True)
 class Row:
-    """One figure.
+    """One figure of a table.
 
     Attributes:
-        name: What was measured: a sensor, a mode, an element.
-        quantity: Which figure of it.
-        unit: Of all numbers; "" where they have none.
-        measured: Ours.
-        paper: The paper's; None where it has none.
-        error: Standard error of `measured`, a mean or a scatter over trials; None where no chance is involved.
-        predicted: What theory gives for `measured`; None where it was not asked.
-        limit: The Cramer-Rao bound, or another limit that the assumption names; None where there is none.
-        modes: Number of modes fitted; None where nothing is fitted.
-        estimator: How; None where nothing is estimated.
-        assumption: What the paper does not say, or contradicts; one to a line.
+        name: Object of the measurement: a sensor, a mode, an element.
+        quantity: Measured quantity.
+        unit: Unit of all numbers; "" if they have none.
+        measured: Our figure.
+        paper: The paper's figure; None if it has none.
+        error: Standard error of `measured` if it is a mean or scatter over trials; None if it is deterministic.
+        predicted: Theoretical prediction of `measured`; None if not computed.
+        limit: The Cramer-Rao bound, or another limit described in the assumption; None if there is none.
+        modes: Number of fitted modes; None if nothing is fitted.
+        estimator: Name of the estimator; None if nothing is estimated.
+        assumption: Assumptions where the paper is silent or contradicts itself, one per line.
     """
 
     name: str
@@ -201,7 +201,7 @@ class Row:
 
     @property
     def key(self) -> tuple[str, int | None, str | None, str]:
-        """What tells a row from the others of its table."""
+        """Key of the row, unique in its table."""
         return self.name, self.modes, self.estimator, self.quantity
 
 
@@ -212,7 +212,7 @@ ORDER = (
 
 
 def plain(row: Row) -> dict[str, Any]:
-    """The row as JSON has it; figures have six digits."""
+    """The row as a JSON object; numbers have six digits."""
     values = asdict(row)
     return {key: _plain(values[key]) for key in ORDER}
 
@@ -224,20 +224,20 @@ def _plain(value: float | str | None) -> float | str | None:
 
 
 def assuming(rows: Sequence[Row], assumption: str) -> list[Row]:
-    """The rows, each with an assumption more."""
+    """The rows with an additional assumption."""
     return [replace(each, assumption="\n".join(filter(None, (each.assumption, assumption)))) for each in rows]
 
 
 @dataclass(frozen=True)
 class Context:
-    """What a table is given to work with.
+    """Settings with which a table is computed.
 
     Attributes:
-        trials: Wavefronts, noise realisations.
-        seed: Of all random numbers.
-        jobs: Threads; no figure depends on them.
-        sensors: Instead of a table's own sensors, where it has a choice.
-        progress: Called with what is being done, how much of it is, and how much there is.
+        trials: Number of wavefronts and noise realisations.
+        seed: Seed of all random numbers.
+        jobs: Number of threads; the figures do not depend on it.
+        sensors: Sensors that replace the table's own, if it has a choice.
+        progress: Called with a description, the number of steps done, and the total.
     """
 
     trials: int = 100
@@ -247,16 +247,16 @@ class Context:
     progress: Callable[[str, int, int], None] = no_progress
 
     def names(self, *own: str) -> tuple[str, ...]:
-        """The sensors that are asked for, or else a table's own."""
+        """The requested sensors, or a table's own."""
         return self.sensors or own
 
     def rng(self, *key: str | int) -> np.random.Generator:
-        """A generator that depends on the seed and the key alone, so that no trial depends on another's."""
+        """A random generator that depends only on the seed and the key, so that trials are independent."""
         words = [part if isinstance(part, int) else zlib.crc32(part.encode()) for part in key]
         return np.random.default_rng([self.seed, *words])
 
     def map(self, what: str, function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-        """The function's values of all items, in their order, on `jobs` threads, with progress."""
+        """Apply the function to all items on `jobs` threads, with progress; results in the order of the items."""
         todo: Sequence[Item] = list(items)
         results: list[Result] = []
         with ThreadPoolExecutor(self.jobs) as pool:
@@ -268,10 +268,10 @@ class Context:
 
 @dataclass(frozen=True)
 class Case:
-    """A table or a figure of the paper: what it shows, its rows, and its drawing where there is one.
+    """A table or figure: title, function that computes its rows, and function that plots it if there is a plot.
 
-    `in_text` says which of the rows, as `plain` has them, stand in the text where they are too many; `about` is what
-    the page of a table that is not the paper's begins with.
+    `in_text` selects the rows in the text if there are too many; it receives rows of `plain`. `about` is the
+    introduction of the page of an additional table.
     """
 
     title: str

@@ -16,7 +16,7 @@ TABLES = (
 )
 
 BEYOND = ("anchors", "tolerance")
-"""Additional tables, not included in `all`, which are the paper's."""
+"""Additional tables that are not in the paper and not included in `all`."""
 OF_THE_PAPER = ("table1", "photometry")
 """Tables and figures for the paper's own sensors only."""
 
@@ -50,7 +50,7 @@ def validate(
     docs: Annotated[
         Path | None,
         typer.Option(
-            help="Folder to write the pages, their JSON and the drawings to; with all, or without any of the paper.",
+            help="Folder for the pages, their JSON and plots; with all, or with additional tables only.",
             show_default=False,
         ),
     ] = None,
@@ -64,10 +64,10 @@ def validate(
     for name in tables:
         if name not in known:
             raise ConfigurationError(f"there is no table {name!r}{nearest(name, known)}; {', '.join(known)}")
-    wanted = [name for name in TABLES if name in tables or "all" in tables]
-    wanted += [name for name in BEYOND if name in tables]
-    pages = all(name in BEYOND for name in wanted)
-    if docs is not None and (not (pages or tuple(wanted) == TABLES) or sensor or plots is not None):
+    chosen = [name for name in TABLES if name in tables or "all" in tables]
+    chosen += [name for name in BEYOND if name in tables]
+    pages = all(name in BEYOND for name in chosen)
+    if docs is not None and (not (pages or tuple(chosen) == TABLES) or sensor or plots is not None):
         raise ConfigurationError(
             f"--docs writes whole documents: use it with all, or with {' and '.join(BEYOND)}; without --sensor and "
             "--plots"
@@ -77,10 +77,10 @@ def validate(
     from lowfc.programs.paper.report import PICTURES, run, to_json, to_text, write_document, write_page
 
     context = Context(trials, seed, jobs or len(os.sched_getaffinity(0)), tuple(sensor) if sensor else None)
-    fixed = [name for name in wanted if name in OF_THE_PAPER]
+    fixed = [name for name in chosen if name in OF_THE_PAPER]
     if sensor and fixed:
         typer.echo(f"{', '.join(fixed)}: for the paper's own sensors only, --sensor has no effect there", err=True)
-    found = run(wanted, context, plots if docs is None else docs / PICTURES)
+    found = run(chosen, context, plots if docs is None else docs / PICTURES)
     if docs is not None and pages:
         for table in found:
             write_page(docs, table)

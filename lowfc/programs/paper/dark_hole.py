@@ -1,4 +1,4 @@
-"""How much of a dark hole's steps the loop undoes: the table of docs/howto/zero_point.md."""
+"""Fraction of dark-hole steps that the loop undoes: the table of docs/howto/zero_point.md."""
 
 import json
 import signal
@@ -21,13 +21,13 @@ from lowfc.control.loop.command_channels import FLAT
 STEPS = 20
 SEED = 5
 SETTLE, WINDOW = 100, 300
-"""Frames after each step, and after the last one and the one that takes it all back."""
+"""Frames after each step, and after the last step and after its removal."""
 AT_ONCE = 5
-"""Steps that are taken at once where the zero point is not shifted along: what is undone of those is no small thing."""
+"""Steps combined into one on the channel that does not shift the zero point, where the loop undoes a large fraction."""
 SHIFTED, PLAIN = "dark-hole", FLAT
-"""Channels with the sensor's zero point taken along, and without."""
+"""Channels that shift the sensor's zero point, and that do not."""
 GAINS = "[control]\ntilt_gain = 0.5\ngain = 0.05\n"
-"""What the loop would undo depends on its gains."""
+"""Gains of the loop, on which the fraction depends."""
 COMMAND = "lowfc sim-loop --lockstep --rate 1000 --disturbance bench --star-magnitude -2"
 RUN = "dark-hole"
 PATIENCE_S = 60.0
@@ -35,11 +35,11 @@ PATIENCE_S = 60.0
 
 @dataclass(frozen=True)
 class Channel:
-    """What became of a channel; arrays (1 + changes of it, modes), nm rms of wavefront, the first before all changes.
+    """Result of a channel; arrays (1 + changes, modes), nm rms of wavefront, the first row before all changes.
 
     Attributes:
-        seen_nm: what the sensor sees of the channel.
-        own_nm: the loop's own command beyond what cancels the disturbance, mean of the last frames of each step.
+        seen_nm: modes of the channel's shape as the sensor sees them.
+        own_nm: the loop's command minus the part that cancels the disturbance, mean of the last frames of each step.
         left_nm: (2,) rms of the true residual about its mean, before the steps and after them.
     """
 
@@ -48,7 +48,7 @@ class Channel:
     left_nm: Array
 
     def undone(self) -> tuple[float, float]:
-        """Fraction of the steps that the loop undoes, least squares over all of them, and its standard error."""
+        """Fraction of the steps that the loop undoes, least squares over all steps, and its standard error."""
         seen, own = self.seen_nm - self.seen_nm.mean(axis=0), self.own_nm - self.own_nm.mean(axis=0)
         power = float((seen * seen).sum())
         slope = float((seen * own).sum()) / power
@@ -58,14 +58,14 @@ class Channel:
 
 @dataclass(frozen=True)
 class Night:
-    """A run: its channels, and where its log is."""
+    """Results of a run: its channels, and the path of its log."""
 
     channels: dict[str, Channel]
     log: Path
 
 
 def shapes_nm(grid: tuple[int, int], each_nm: float, usable: Mask | None = None) -> Array:
-    """The channel (steps, rows, columns) after each step: every one adds a random shape, nm rms of surface."""
+    """The channel (steps, rows, columns) after each step, which adds a random shape, nm rms of surface."""
     steps = each_nm * np.random.default_rng(SEED).standard_normal((STEPS, *grid))
     return np.asarray(np.cumsum(steps if usable is None else steps * usable, axis=0))
 
@@ -73,14 +73,14 @@ def shapes_nm(grid: tuple[int, int], each_nm: float, usable: Mask | None = None)
 def dark_hole(
     folder: Path, each_nm: float, toml: str = "", base_nm: npt.ArrayLike = 0.0, seed: int | None = None
 ) -> Night:
-    """Take the steps on one channel, take them back, and take them on the other; all in one run of the processes.
+    """Apply the steps on one channel, remove them, and apply them on the other, in one run of the processes.
 
     Args:
-        folder: where the log goes.
+        folder: folder of the log.
         each_nm: rms of each step.
         toml: configuration.
-        base_nm: (rows, columns) nm that are on the channel without a zero-point shift all the time.
-        seed: of the simulation; the configuration's when None.
+        base_nm: (rows, columns) nm, constant shape on the channel without a zero-point shift.
+        seed: seed of the simulation; the configuration's if None.
     """
     (folder / "night.toml").write_text(f"{GAINS}{toml}")
     words = [sys.executable, "-m", *COMMAND.split(), "--run", RUN, "--config", "night.toml", "--json"]
@@ -91,10 +91,10 @@ def dark_hole(
             deadline_s = time.monotonic() + PATIENCE_S
             while RUN not in running() and time.monotonic() < deadline_s and process.poll() is None:
                 time.sleep(0.05)
-            marks, seen = _asked(each_nm, np.asarray(base_nm))
+            marks, seen = _apply_steps(each_nm, np.asarray(base_nm))
         except BusError as error:
             process.send_signal(signal.SIGINT)
-            raise RuntimeError(f"{error}; the loop said: {process.communicate(timeout=PATIENCE_S)}") from error
+            raise RuntimeError(f"{error}; output of the loop: {process.communicate(timeout=PATIENCE_S)}") from error
         process.send_signal(signal.SIGINT)
         out, complaints = process.communicate(timeout=PATIENCE_S)
     if process.returncode:
@@ -103,16 +103,16 @@ def dark_hole(
     return Night(_channels(log, marks, seen), log)
 
 
-def _asked(each_nm: float, base_nm: Array) -> tuple[dict[str, list[int]], Array]:
-    """First frames of each step of each channel and of its end, and what the sensor sees of the steps."""
+def _apply_steps(each_nm: float, base_nm: Array) -> tuple[dict[str, list[int]], Array]:
+    """First frame of each step and of the removal, by channel, and the modes of the steps as the sensor sees them."""
     marks: dict[str, list[int]] = {}
     with Client(RUN) as loop:
 
-        def pass_by(frames: int) -> None:
+        def wait(frames: int) -> None:
             for _ in loop.steps(frames, patience_s=PATIENCE_S):
                 pass
 
-        pass_by(2 * WINDOW)
+        wait(2 * WINDOW)
         calibration = loop.calibration()
         used = np.asarray(calibration.actuators_to_modes.any(axis=0)).reshape(calibration.grid)
         shapes = shapes_nm(calibration.grid, each_nm, used)
@@ -120,10 +120,10 @@ def _asked(each_nm: float, base_nm: Array) -> tuple[dict[str, list[int]], Array]
             marks[channel] = []
             for shape in shapes[every - 1 :: every]:
                 marks[channel].append(loop.channel(channel, shape + under_nm).frame_sequence)
-                pass_by(SETTLE)
-            pass_by(WINDOW)
+                wait(SETTLE)
+            wait(WINDOW)
             marks[channel].append(loop.channel(channel, np.zeros(calibration.grid) + under_nm).frame_sequence)
-            pass_by(WINDOW)
+            wait(WINDOW)
     seen = shapes.reshape(STEPS, -1) @ calibration.actuators_to_modes.T.astype(np.float64)
     return marks, np.vstack([np.zeros(seen.shape[1]), seen])
 
@@ -143,9 +143,9 @@ def _channels(log: Path, marks: dict[str, list[int]], seen_nm: Array) -> dict[st
     for name, changed_at in marks.items():
         ends = [until(end, 3 * SETTLE // 4) for end in changed_at]
         own = np.array([(command[end] + truths.disturbance_nm[end]).mean(axis=0, dtype=np.float64) for end in ends])
-        left = [
+        residual_nm = [
             np.sqrt(truths.residual_nm[until(end, WINDOW)].var(axis=0, dtype=np.float64).sum())
             for end in (changed_at[0], changed_at[-1])
         ]
-        found[name] = Channel(seen_nm[:: STEPS // (len(changed_at) - 1)], own, np.array(left))
+        found[name] = Channel(seen_nm[:: STEPS // (len(changed_at) - 1)], own, np.array(residual_nm))
     return found

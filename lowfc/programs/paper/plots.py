@@ -1,4 +1,4 @@
-"""Drawings of the figures as PNG files; matplotlib is loaded only here, and only when something is drawn."""
+"""Plots of the figures as PNG files; matplotlib is imported only here, and only when something is plotted."""
 
 from collections.abc import Callable, Sequence
 from importlib import import_module
@@ -23,7 +23,7 @@ SKY_UNIT = r"$\lambda$/D"
 SKY = (f"x, {SKY_UNIT}", f"y, {SKY_UNIT}")
 PUPIL = ("x, pupil diameters", "y, pupil diameters")
 
-# Okabe and Ito's colours, which the colour-blind can tell apart, black first; lines differ in style and marker, too.
+# Okabe and Ito's colours, safe for colour blindness, black first; lines also differ in style and marker.
 _COLOURS = ("#000000", "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#F0E442")
 _STYLES = ("-", "--", "-.", ":")
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X")
@@ -33,7 +33,7 @@ _DPI = 110
 
 
 class Line(NamedTuple):
-    """Points (n,) with a name, joined or single."""
+    """Points (n,) with a name, joined by a line or single."""
 
     name: str
     x: Array
@@ -42,11 +42,11 @@ class Line(NamedTuple):
 
 
 Panel = Callable[["Figure", "Axes"], None]
-"""Draws into its axes."""
+"""Function that draws a panel into its axes."""
 
 
 def draw(path: Path, panels: Sequence[Panel], caption: str, columns: int = 3, wide: bool = False) -> None:
-    """Draw panels in rows with a caption beneath, as a PNG file."""
+    """Draw panels in rows with a caption below, as a PNG file."""
     figure_type = figure_class()
     columns = min(columns, len(panels))
     rows = ceil(len(panels) / columns)
@@ -73,14 +73,14 @@ def picture(
     unit: str,
     scale: Scale = "linear",
 ) -> Panel:
-    """An image (rows, columns) with its colour bar; NaN is left grey. `half_width` is in the axes' unit."""
+    """An image (rows, columns) with a colour bar; NaN is grey. `half_width` is in the unit of the axes."""
 
     def panel(figure: "Figure", axes: "Axes") -> None:
         low, high, w = *bounds, half_width
         options: dict[str, Any] = {"vmin": low, "vmax": high}
         if scale == "log":
             options = {"norm": import_module("matplotlib.colors").LogNorm(low, high)}
-        shown = axes.imshow(
+        image = axes.imshow(
             np.maximum(values, low) if scale == "log" else values,
             cmap=_MAPS[scale],
             origin="lower",
@@ -90,7 +90,7 @@ def picture(
         )
         axes.set_facecolor("0.75")
         _label(axes, title, *labels)
-        bar = figure.colorbar(shown, ax=axes, shrink=0.85)
+        bar = figure.colorbar(image, ax=axes, shrink=0.85)
         bar.set_label(unit, fontsize=8)
         bar.ax.tick_params(labelsize=7)
 
@@ -108,7 +108,7 @@ def curves(
     diagonal: bool = False,
     legend: Literal["upper right", "upper left", "lower left"] = "upper right",
 ) -> Panel:
-    """Lines over one pair of axes; `ticks` name the whole numbers on an x axis that counts things."""
+    """Lines in one pair of axes; `ticks` are labels of the integers on the x axis."""
 
     def panel(_: "Figure", axes: "Axes") -> None:
         if diagonal:
@@ -137,7 +137,7 @@ def curves(
 
 
 def bars(heights: dict[str, Array], groups: Sequence[str], title: str, y_label: str) -> Panel:
-    """Groups of bars, side by side: the heights (groups,) of each name."""
+    """Groups of bars side by side: heights (groups,) by name."""
 
     def panel(_: "Figure", axes: "Axes") -> None:
         width = 0.8 / len(heights)

@@ -1,4 +1,4 @@
-"""Figures 1 and 7: a thirtieth of a wave of focus and of coma, its effect on the contrast, and its estimate."""
+"""Figures 1 and 7: lambda/30 of focus and of coma, its effect on the contrast, and its estimate."""
 
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -40,7 +40,7 @@ _PAPER_PV_WAVES = 6e-3
 
 @dataclass(frozen=True, eq=False)
 class _Aberrated:
-    """One aberration (modes,), and what each estimator leaves of it (realisations, modes)."""
+    """One aberration (modes,), and its residuals (realisations, modes) for each estimator."""
 
     ready: Prepared
     truth_nm: Array
@@ -53,7 +53,7 @@ def _aberrated(context: Context, name: str, coma: int) -> _Aberrated:
     truth_nm = np.zeros(MODES)
     truth_nm[[NOLLS_14.index(4), NOLLS_14.index(coma)]] = ready.sensor.wavelength_nm / 30.0
     image, linear = ready.image(truth_nm), fits(ready, MODES)
-    ready.model(truth_nm)  # the twin is built before the threads ask for it
+    ready.model(truth_nm)  # builds the twin before the threads use it
 
     def one(i: int) -> dict[str, Array]:
         return estimates_nm(ready, linear, exposed_e(ready, image, context.rng("focus and coma", name, coma, i)))
@@ -77,8 +77,8 @@ def fig1(context: Context) -> list[Row]:
                 Row(what, "aberrated over flat", "", aberrated / flat, _PAPER_WORSE),
             ]
             for key in _CORRECTED:
-                left = context.map(f"{what}, {key}", partial(_contrast, ready), case.residuals_nm[key])
-                mean, error = mean_and_error(np.array(left))
+                corrected = context.map(f"{what}, {key}", partial(_contrast, ready), case.residuals_nm[key])
+                mean, error = mean_and_error(np.array(corrected))
                 fitted = partial(Row, what, modes=MODES, estimator=key)
                 rows += [
                     fitted("contrast, corrected", "", mean, error=error, limit=flat),
@@ -86,14 +86,14 @@ def fig1(context: Context) -> list[Row]:
                 ]
     return assuming(
         rows,
-        "Mean from 4.5 to 5.5 lambda/D within 42.5 degrees of the x axis, over the flat star's peak. The paper's "
-        "figures are its goal, and 'over a factor of 100'; it does not name the coma. Corrected: mean of at most "
+        "Mean from 4.5 to 5.5 lambda/D within 42.5 degrees of the x axis, over the peak of the flat wavefront's star. "
+        "paper: its goal, and 'over a factor of 100'; it does not specify the coma. Corrected: mean of at most "
         f"{REALISATIONS} exposures; limit: the flat wavefront. {BRIGHT} {FULL_CHAIN}",
     )
 
 
 def _between_samples(ready: Prepared) -> list[Row]:
-    """The flat wavefront's contrast on a grid finer than the one on which the pupil was made."""
+    """Contrast with a flat wavefront on a finer grid than that of the pupil's design."""
     pupil, wavelength_nm = ready.sensor.pupil, ready.sensor.wavelength_nm
     columns = 2 * _VIEW * _FINE_SAMPLES_PER
     image = contrast(pupil, np.zeros_like(pupil), wavelength_nm, columns, samples_per=_FINE_SAMPLES_PER)
@@ -118,9 +118,9 @@ def plot_fig1(context: Context, path: Path) -> None:
             image = contrast(optics.pupil, opd_nm, optics.wavelength_nm, columns, samples_per=_VIEW_SAMPLES_PER)
             panels.append(plots.picture(image, title, plots.SKY, _VIEW, (1e-11, 1.0), "contrast", "log"))
         middles = (_CURVE_EDGES[1:] + _CURVE_EDGES[:-1]) / 2.0
-        shown = {"flat": flat_nm, "aberrated": case.truth_nm}
-        shown |= {key: case.residuals_nm[key][0] for key in _CORRECTED}
-        lines = [plots.Line(key, middles, _curve(case.ready, modes_nm)) for key, modes_nm in shown.items()]
+        wavefronts = {"flat": flat_nm, "aberrated": case.truth_nm}
+        wavefronts |= {key: case.residuals_nm[key][0] for key in _CORRECTED}
+        lines = [plots.Line(key, middles, _curve(case.ready, modes_nm)) for key, modes_nm in wavefronts.items()]
         panels.append(
             plots.curves(lines, f"Z{coma}, corrected by {name}", f"radius, {plots.SKY_UNIT}", "contrast", "log")
         )
@@ -149,7 +149,7 @@ def fig7(context: Context) -> list[Row]:
                 rows.append(fitted("P-V residual", "waves", mean, paper, error, limit=limit))
     return assuming(
         rows,
-        f"lambda/30 of Z4 and of one coma, which the paper does not name; mean of at most {REALISATIONS} exposures, "
+        f"lambda/30 of Z4 and of one coma, which the paper does not specify; mean of at most {REALISATIONS} exposures, "
         f"over the open pupil; limit: mean of {_LIMIT_DRAWS} residuals drawn from the Cramer-Rao bound. "
         f"{BRIGHT} {FULL_CHAIN}",
     )
@@ -161,11 +161,11 @@ def plot_fig7(context: Context, path: Path) -> None:
     panels: list[plots.Panel] = []
     for coma in COMAS:
         case = _aberrated(context, name, coma)
-        left = {key: case.residuals_nm[key][0] for key in (PINV, WEIGHTED_1)}
+        residuals = {key: case.residuals_nm[key][0] for key in (PINV, WEIGHTED_1)}
         for title, modes_nm, bound in (
             (f"input, $\\lambda$/30 of Z4 and of Z{coma}", case.truth_nm, 0.1),
-            (f"estimate, {WEIGHTED_1}", case.truth_nm - left[WEIGHTED_1], 0.1),
-            *((f"residual, {key}", modes_nm, 0.006) for key, modes_nm in left.items()),
+            (f"estimate, {WEIGHTED_1}", case.truth_nm - residuals[WEIGHTED_1], 0.1),
+            *((f"residual, {key}", modes_nm, 0.006) for key, modes_nm in residuals.items()),
         ):
             waves = case.ready.opd_nm(modes_nm) / case.ready.sensor.wavelength_nm
             inside = waves[case.ready.open]
@@ -185,5 +185,5 @@ def _curve(ready: Prepared, modes_nm: Array) -> Array:
 
 CASES = {
     "fig1": Case("Fig. 1: point spread function and contrast: flat, aberrated, corrected", fig1, plot_fig1),
-    "fig7": Case("Fig. 7: estimate of a thirtieth of a wave of focus and of coma", fig7, plot_fig7),
+    "fig7": Case("Fig. 7: estimate of lambda/30 of focus and of coma", fig7, plot_fig7),
 }

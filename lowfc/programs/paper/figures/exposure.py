@@ -1,4 +1,4 @@
-"""The bright exposure in which the figures measure one wavefront (Sect. 3.1), and all ways to estimate it."""
+"""The bright exposure of a single wavefront in the figures (Sect. 3.1), and its estimators."""
 
 import numpy as np
 
@@ -16,7 +16,7 @@ BRIGHT = (
     f"{PEAK_E:,.0f} e- in the brightest pixel of the flat image, {TABLE3_READ_NOISE_E:.0f} e- read noise, whole "
     "electrons, monochromatic."
 )
-FULL_CHAIN = "Images by the full optical chain; iterations with the twin, right to about 1e-5."
+FULL_CHAIN = "Images by the full optical chain; iterations with the twin, accurate to about 1e-5."
 
 
 ESTIMATORS = tuple(label(kind, iterations) for kind in KINDS for iterations in ITERATIONS)
@@ -25,12 +25,12 @@ WEIGHTED, WEIGHTED_1, WEIGHTED_2 = (label("weighted", iterations) for iterations
 
 
 def exposed_e(ready: Prepared, image: Array, rng: np.random.Generator) -> Array:
-    """A noisy image (pixels,) in electrons of one in fractions of the open circle's light."""
+    """A noisy image (pixels,) in electrons, from an image in fractions of the open circle's light."""
     return noisy_e(rng, scale_e(ready) * image, TABLE3_READ_NOISE_E)
 
 
 def estimates_nm(ready: Prepared, linear: dict[str, Fit], image_e: Array) -> dict[str, Array]:
-    """What each of `ESTIMATORS` makes (modes,) of an image (pixels,) in electrons; of the kinds in `linear` alone."""
+    """Estimates (modes,) from an image (pixels,) in electrons, by those of `ESTIMATORS` whose kind is in `linear`."""
     found: dict[str, Array] = {}
     for kind, fit in linear.items():
         steps_nm = iterated(fit, image_e, ready.model, ITERATIONS[-1])

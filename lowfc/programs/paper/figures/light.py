@@ -25,25 +25,26 @@ _FAINTEST = {"focal": 1e-8, "relay": 1e-4, "sensor": 1e-5}
 
 
 def fig2(context: Context) -> list[Row]:
-    """What part of the light passes each plane, Fig. 2 and Sect. 3.3."""
+    """Fraction of the light that passes each plane, Fig. 2 and Sect. 3.3."""
     rows = []
     for name in context.names("sam"):
         budget = prepared(name).budget
         relay = PAPER_RELAY_MASK if name.startswith("sam") else None
         rows += [
-            Row(name, "shaped pupil, of the open circle's light", "", budget.pupil, PAPER_PUPIL),
-            Row(name, "focal-plane mask, of the light on it", "", budget.focal_mask, PAPER_FOCAL_MASK),
-            Row(name, "sensor, of the light that the focal-plane mask reflects", "", budget.sensor, relay),
-            Row(name, "brightest pixel, of the light on the sensor", "", budget.peak, PAPER_PEAK.get(name)),
+            Row(name, "shaped pupil / open circle", "", budget.pupil, PAPER_PUPIL),
+            Row(name, "reflected by the focal-plane mask / light on it", "", budget.focal_mask, PAPER_FOCAL_MASK),
+            Row(name, "sensor / reflected by the focal-plane mask", "", budget.sensor, relay),
+            Row(name, "brightest pixel / light on the sensor", "", budget.peak, PAPER_PEAK.get(name)),
         ]
     return assuming(
         rows,
-        "Flat wavefront at the central wavelength. Our pupil and layout are not the paper's, which are not published.",
+        "Flat wavefront at the central wavelength. Our pupil and layout differ from the paper's, which are not "
+        "published.",
     )
 
 
 def plot_fig2(context: Context, path: Path) -> None:
-    """Draw Fig. 2: intensities in the focal plane, behind the aperture mask and on the sensor."""
+    """Draw Fig. 2: intensities in the focal plane, after the aperture mask and on the sensor."""
     ready = prepared(context.names("sam")[0])
     optics = ready.sensor
     pupil = optics.pupil.astype(np.complex128)
@@ -54,16 +55,16 @@ def plot_fig2(context: Context, path: Path) -> None:
     if isinstance(optics.relay, ApertureMask):
         focal = to_image(pupil, len(optics.focal_mask), optics.samples_per, 1.0) * optics.focal_mask
         relay = np.abs(to_pupil(focal, len(pupil), optics.samples_per, 1.0)) ** 2
-        shown = relay / relay.max() * optics.relay.transmission**2
+        transmitted = relay / relay.max() * optics.relay.transmission**2
         bounds = (_FAINTEST["relay"], 1.0)
-        panels.append(plots.picture(shown, "behind the aperture mask", plots.PUPIL, 0.5, bounds, "of peak", "log"))
+        panels.append(plots.picture(transmitted, "after the aperture mask", plots.PUPIL, 0.5, bounds, "of peak", "log"))
     image, bounds = ready.I0 / ready.I0.max(), (_FAINTEST["sensor"], 1.0)
     panels.append(_on_sensor(ready, image, "sensor, $I_0$", bounds, "of peak", "log"))
     plots.draw(path, panels, f"Fig. 2. {ready.name}: flat wavefront at {optics.wavelength_nm:.0f} nm.")
 
 
 def fig3(context: Context) -> list[Row]:
-    """The focal-plane masks, Fig. 3: how large they are, and what they reflect."""
+    """Sizes and reflected light of the focal-plane masks, Fig. 3."""
     rows = []
     for name in context.names("sam", "bowtie"):
         ready = prepared(name)
@@ -72,9 +73,11 @@ def fig3(context: Context) -> list[Row]:
         rows += [
             Row(name, "outer radius", "lambda/D", radius, {"sam": 4.0, "bowtie": 10.0}.get(name)),
             Row(name, "reflecting area", "(lambda/D)^2", float(mask.sum()) / ready.sensor.samples_per**2),
-            Row(name, "reflected, of the light on it", "", ready.budget.focal_mask, reflected),
+            Row(name, "reflected / light on it", "", ready.budget.focal_mask, reflected),
         ]
-    return assuming(rows, "The paper gives the light of its own pupil on the disk only; the wedges open to 95 degrees.")
+    return assuming(
+        rows, "The paper gives the light of its own pupil on the disk only; opening of the wedges 95 degrees."
+    )
 
 
 def plot_fig3(context: Context, path: Path) -> None:
@@ -87,11 +90,11 @@ def plot_fig3(context: Context, path: Path) -> None:
         whole = np.pad(mask, (widest - len(mask)) // 2)
         half_width = widest / (2.0 * ready.sensor.samples_per)
         panels.append(plots.picture(whole, ready.name, plots.SKY, half_width, (0.0, 1.0), "reflectivity"))
-    plots.draw(path, panels, "Fig. 3. Focal-plane masks: bright is what goes to the sensor.")
+    plots.draw(path, panels, "Fig. 3. Focal-plane masks: bright parts reflect to the sensor.")
 
 
 def fig4(context: Context) -> list[Row]:
-    """Largest change of the image by a thirtieth of a wave, Fig. 4 and Table 2."""
+    """Largest change of the image by lambda/30, Fig. 4 and Table 2."""
     rows = []
     for name in context.names("sam"):
         ready = prepared(name)
@@ -107,8 +110,8 @@ def fig4(context: Context) -> list[Row]:
         ]
     return assuming(
         rows,
-        "lambda/30 rms, full optical chain, no noise; 'normalised to unity' is read as I0's brightest pixel. "
-        "The layout is not the paper's.",
+        "lambda/30 rms, full optical chain, no noise; 'normalised to unity' is interpreted as I0's brightest pixel. "
+        "The layout differs from the paper's.",
     )
 
 
@@ -126,7 +129,7 @@ def plot_fig4(context: Context, path: Path) -> None:
 
 
 def _tilted_e(ready: Prepared, axis: int) -> tuple[Array, Array]:
-    """A short exposure, electrons (pixels,), and how a star that is off by 1 mas changes it."""
+    """A short exposure, electrons (pixels,), and its change by 1 mas of tilt."""
     light_e = electrons(STAR, TABLE4_EXPOSURE_S)
     return light_e * ready.band_I0, light_e * tilt_signal(ready, axis)
 
@@ -143,14 +146,14 @@ def fig10(context: Context) -> list[Row]:
             rows += [
                 Row(what, "P-V change over peak", "", signal_e / float(flat_e.max()), PAPER_SIGNAL.get(name)),
                 Row(what, "P-V change", "e-", signal_e),
-                Row(what, "largest signal over noise of a pixel", "", float(ratio.max())),
-                Row(what, "signal over noise of the image", "", float(np.sqrt(np.sum(ratio**2)))),
+                Row(what, "largest signal-to-noise ratio of a pixel", "", float(ratio.max())),
+                Row(what, "signal-to-noise ratio of the image", "", float(np.sqrt(np.sum(ratio**2)))),
             ]
     return assuming(
         rows,
-        f"1 mas, {TABLE4_EXPOSURE_S} s, V = {STAR.magnitude}, 20 % band in five wavelengths with both ends, "
+        f"1 mas, {TABLE4_EXPOSURE_S} s, V = {STAR.magnitude}, 20 % band in five wavelengths including both ends, "
         "1 e- read noise, our own photometry and masks, full optical chain. "
-        "The ratio of the image is that of the best filter for it.",
+        "The ratio of the image is that of the matched filter.",
     )
 
 

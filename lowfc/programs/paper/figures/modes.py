@@ -1,4 +1,4 @@
-"""Figures 5, 6 and 8: estimated against true coefficients, how well each mode is fitted, and the linear range."""
+"""Figures 5, 6 and 8: estimated against true coefficients, coefficient of determination, and linear range."""
 
 from collections.abc import Iterator
 from functools import lru_cache, partial
@@ -44,7 +44,7 @@ def _ensemble(context: Context, name: str) -> Ensemble:
 
 
 def fig5(context: Context) -> list[Row]:
-    """Line through estimated against true coefficients of each radial degree, Fig. 5."""
+    """Linear fit to estimated against true coefficients of each radial degree, Fig. 5."""
     rows = []
     for name in context.names("sam"):
         ready, found = prepared(name), _ensemble(context, name)
@@ -60,7 +60,7 @@ def fig5(context: Context) -> list[Row]:
             ]
     return assuming(
         rows,
-        "The wavefronts of Table 3, n = 1 to 4, input matched to its rms; the paper shows the points only, 'tight' "
+        "The wavefronts of Table 3, n = 1 to 4, input matched to its rms; the paper only shows the points, 'tight' "
         f"about y = x. {BRIGHT} Images by the full optical chain.",
     )
 
@@ -139,10 +139,10 @@ def _r_squared_limit(ready: Prepared) -> Array:
 
 @lru_cache(maxsize=8)
 def _pure_modes(context: Context, name: str) -> Array:
-    """Estimates (iterations, modes, amplitudes) in waves of a pure mode by itself, without noise."""
+    """Estimates (iterations, modes, amplitudes) in waves of each pure mode from its image, without noise."""
     ready = prepared(name)
     wavelength_nm, linear = ready.sensor.wavelength_nm, fits(ready, MODES)["pinv"]
-    ready.model(np.zeros(MODES))  # the twin is built before the threads ask for it
+    ready.model(np.zeros(MODES))  # builds the twin before the threads use it
 
     def one(k: int) -> Array:
         found = np.empty((len(ITERATIONS), AMPLITUDES.size))
@@ -158,12 +158,12 @@ def _pure_modes(context: Context, name: str) -> Array:
 
 
 def deviations(estimates: Array) -> Array:
-    """Part by which estimates (..., amplitudes) of a pure mode differ from its amplitude, linear being 0."""
+    """Relative deviation of estimates (..., amplitudes) of a pure mode from its amplitude; 0 if linear."""
     return np.asarray(np.abs(estimates / AMPLITUDES - 1.0))
 
 
 def linear_range(deviation: Array) -> float:
-    """Amplitude at which a deviation (amplitudes,) first passes 10 %; infinite where it never does."""
+    """Amplitude at which a deviation (amplitudes,) first exceeds 10 %; infinite if it never does."""
     above = np.flatnonzero(deviation > _DEVIATION)
     if not above.size:
         return float("inf")
@@ -184,7 +184,7 @@ def _one_wavefront(context: Context, name: str, literal: bool) -> tuple[Array, d
 
 
 def fig8(context: Context) -> list[Row]:
-    """Deviation from linear of pure modes, Fig. 8(a), and errors of one random wavefront, Fig. 8(b)."""
+    """Deviation of pure modes from linearity, Fig. 8(a), and errors of one random wavefront, Fig. 8(b)."""
     names = context.names("sam", "clowfs", "zwfs")
     rows = [row for name in names for row in _range_rows(context, name)]
     paper = _PAPER_ERROR_WAVES if names[0].startswith("sam") else None
@@ -206,13 +206,13 @@ def _range_rows(context: Context, name: str) -> Iterator[Row]:
     at = {"lambda/20": int(np.argmin(np.abs(AMPLITUDES - 0.05))), "lambda/10": int(np.argmin(np.abs(AMPLITUDES - 0.1)))}
     linear = dict(zip(at, _PAPER_LINEAR.get(name, (None, None)), strict=True))
     for iterations, estimates in zip(ITERATIONS, _pure_modes(context, name), strict=True):
-        off = deviations(estimates)
+        deviation = deviations(estimates)
         fitted = partial(Row, modes=MODES, estimator=label("pinv", iterations), assumption=assumption)
         for amplitude, j in at.items():
             paper = linear[amplitude] if iterations == 0 else None
-            yield fitted(name, f"mean deviation at {amplitude}", "", float(off[:, j].mean()), paper)
-            yield fitted(name, f"largest deviation at {amplitude}", "", float(off[:, j].max()))
-        ranges = np.array([linear_range(mode) for mode in off])
+            yield fitted(name, f"mean deviation at {amplitude}", "", float(deviation[:, j].mean()), paper)
+            yield fitted(name, f"largest deviation at {amplitude}", "", float(deviation[:, j].max()))
+        ranges = np.array([linear_range(mode) for mode in deviation])
         what = "amplitude of 10 % deviation"
         yield fitted(name, f"{what}, median mode", "waves", _amplitude(float(np.median(ranges))))
         yield fitted(name, f"{what}, worst mode", "waves", _amplitude(float(ranges.min())))
@@ -225,7 +225,7 @@ def _amplitude(waves: float) -> float | str:
 
 
 def plot_fig8(context: Context, path: Path) -> None:
-    """Draw Fig. 8: response to pure modes, mean deviation from linear, and one random wavefront."""
+    """Draw Fig. 8: response to pure modes, mean deviation from linearity, and one random wavefront."""
     names = context.names("sam", "clowfs", "zwfs")
     responses = _pure_modes(context, names[0])[0]
     truth, estimates = _one_wavefront(context, names[0], False)
@@ -243,7 +243,7 @@ def plot_fig8(context: Context, path: Path) -> None:
             modes, f"(a) {names[0]}, {PINV}", x_label, "estimate, waves rms", diagonal=True, legend="upper left"
         ),
         plots.curves(
-            means, "mean of 14 modes", x_label, "deviation from linear, %", y_bounds=(0.0, 40.0), legend="upper left"
+            means, "mean of 14 modes", x_label, "deviation from linearity, %", y_bounds=(0.0, 40.0), legend="upper left"
         ),
         plots.bars(fitted, _MODE_TICKS, f"(b) {names[0]}, {PINV}", "waves rms"),
         plots.bars(errors, _MODE_TICKS, f"{names[0]}, errors of (b)", "waves rms"),

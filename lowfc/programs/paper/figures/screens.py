@@ -25,7 +25,7 @@ from lowfc.programs.paper.tables.reconstruction import fits, mean_and_error
 
 SCREENS = 12
 WIDTHS = {4: "cut from four pupil diameters", 1: "periodic over one pupil diameter"}
-"""Widths of the screens that ours are cut from, in pupil diameters."""
+"""Width of the periodic screen, in pupil diameters, and its description."""
 _INPUT_WAVES = 0.05
 _PAPER_WAVES = {"reconstructed": 0.038, "residual": 0.030}
 _ESTIMATORS = (PINV, WEIGHTED, WEIGHTED_2)
@@ -33,11 +33,11 @@ _BEST = "best possible fit"
 
 
 _Screen = tuple[Array, dict[str, Array]]
-"""A screen (n, n) in nm, and the modes (modes,) in nm that each estimator, and the best fit, find in it."""
+"""A screen (n, n) in nm, and its estimates (modes,) in nm by each estimator and by the best fit."""
 
 
 def _screen_nm(context: Context, ready: Prepared, width: int, i: int) -> Array:
-    """Screen (n, n) of the paper's rms over the open pupil, piston removed."""
+    """Screen (n, n) with the paper's rms over the open pupil, piston removed."""
     screen = kolmogorov(context.rng("kolmogorov", width, i), len(ready.sensor.pupil), width)
     inside = screen[ready.open]
     return np.asarray((screen - inside.mean()) * (_INPUT_WAVES * ready.sensor.wavelength_nm / inside.std()))
@@ -48,7 +48,7 @@ def _screens(context: Context, name: str, width: int) -> list[_Screen]:
     ready = prepared(name)
     linear = fits(ready, MODES)
     centred = ready.open_modes[:MODES] - ready.open_modes[:MODES].mean(axis=1, keepdims=True)
-    ready.model(np.zeros(MODES))  # the twin is built before the threads ask for it
+    ready.model(np.zeros(MODES))  # builds the twin before the threads use it
 
     def one(i: int) -> _Screen:
         opd_nm = _screen_nm(context, ready, width, i)
@@ -94,13 +94,13 @@ def plot_fig9(context: Context, path: Path) -> None:
     name, width = context.names("sam")[0], next(iter(WIDTHS))
     ready = prepared(name)
     screen_nm, modes_nm = _screens(context, name, width)[0]
-    left_nm = {key: screen_nm - ready.opd_nm(modes_nm[key]) for key in (PINV, _BEST)}
+    residual_nm = {key: screen_nm - ready.opd_nm(modes_nm[key]) for key in (PINV, _BEST)}
     panels: list[plots.Panel] = []
     for title, opd_nm, bound in (
         ("(a) input", screen_nm, 1.0),
         (f"(b) estimate, {PINV}", ready.opd_nm(modes_nm[PINV]), 1.0),
-        ("(c) residual", left_nm[PINV], 0.4),
-        (f"residual, {_BEST}", left_nm[_BEST], 0.4),
+        ("(c) residual", residual_nm[PINV], 0.4),
+        (f"residual, {_BEST}", residual_nm[_BEST], 0.4),
     ):
         inside = opd_nm[ready.open]
         radians = (opd_nm - inside.mean()) * (2.0 * np.pi / ready.sensor.wavelength_nm)
@@ -110,8 +110,8 @@ def plot_fig9(context: Context, path: Path) -> None:
     plots.draw(
         path,
         panels,
-        f"Fig. 9. {name}: a Kolmogorov screen {WIDTHS[width]}; rms over the shaped pupil's open part, the "
-        f"whole circle is shown. {BRIGHT}",
+        f"Fig. 9. {name}: a Kolmogorov screen {WIDTHS[width]}; rms over the open part of the shaped pupil, plots over "
+        f"the full circle. {BRIGHT}",
         columns=4,
     )
 
@@ -120,8 +120,8 @@ def _rms_waves(ready: Prepared, screen: _Screen, key: str) -> tuple[float, float
     """Rms in waves over the open pupil of the estimate and of the residual."""
     opd_nm, modes_nm = screen
     fitted = modes_nm[key] @ ready.open_modes[:MODES]
-    left = opd_nm[ready.open] - fitted
-    return float(fitted.std()) / ready.sensor.wavelength_nm, float(left.std()) / ready.sensor.wavelength_nm
+    residual = opd_nm[ready.open] - fitted
+    return float(fitted.std()) / ready.sensor.wavelength_nm, float(residual.std()) / ready.sensor.wavelength_nm
 
 
 CASES = {"fig9": Case("Fig. 9: estimate of Kolmogorov screens", fig9, plot_fig9)}

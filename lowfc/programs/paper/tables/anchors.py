@@ -33,7 +33,7 @@ from lowfc.programs.paper.plots import curves, draw
 from lowfc.programs.paper.tables import pointing, tolerance
 
 DRIVEN = ("sam", "zwfs_tuned")
-"""Sensors whose loops are run."""
+"""Sensors for which loops are run."""
 RATE_HZ, MAGNITUDE, EXPOSURE = 1000.0, 2.0, 0.5
 OBSERVED_S, CLOSED_S, MEAN_S = 10.0, 24.0, 2.0
 """Durations: of the loop that a law is identified from, of the loop that is judged, of a mean as in SCExAO."""
@@ -74,8 +74,8 @@ HUNDRED = (
     "flat, all 14 modes fitted. predicted: from the noise of a frame."
 )
 AGAINST_V = (
-    f"Drift of {DRIFT_PM:g} pm/sqrt(s) in each of 14 modes, integrators of the best gains, {tolerance.RATE_HZ:g} Hz; "
-    "what they leave of drift and noise adds this contrast to the dark zone of the sensor's coronagraph."
+    f"Drift of {DRIFT_PM:g} pm/sqrt(s) in each of 14 modes, integrators with the best gains, {tolerance.RATE_HZ:g} Hz: "
+    "contrast that the residual of drift and noise adds to the dark zone of the sensor's coronagraph."
 )
 
 
@@ -147,7 +147,7 @@ def _pointing(context: Context, name: str) -> list[Row]:
 
 
 def _means(made: Callable[..., Row], history: History, where: str) -> Row:
-    """Standard deviation of means of the true tilt after the first four seconds."""
+    """Row with the standard deviation of means of the true tilt after the first four seconds."""
     truths = history.true
     assert truths is not None  # noqa: S101  # a simulated loop's
     frames = round(MEAN_S * RATE_HZ)
@@ -184,11 +184,11 @@ def _hicat(context: Context) -> list[Row]:
 
 
 def _table4(context: Context) -> list[Row]:
-    """The paper's Table 4 by its own definition: tip and tilt fitted, 1 mas, 0.05 s of V = 4.83."""
+    """Rows of the paper's Table 4 by its own definition: tip and tilt fitted, 1 mas, 0.05 s of V = 4.83."""
     names = ("sam", "sam18_sized", "clowfs_tuned", "zwfs_tuned")
     rows = pointing.table4(replace(context, sensors=names))
-    wanted = "std of x tilt, 1 mas, own photometry"
-    chosen = [row for row in rows if (row.quantity, row.modes, row.estimator) == (wanted, 2, "weighted")]
+    scatter = "std of x tilt, 1 mas, own photometry"
+    chosen = [row for row in rows if (row.quantity, row.modes, row.estimator) == (scatter, 2, "weighted")]
     papers = {"clowfs_tuned": TABLE4_MAS["clowfs"][1], "zwfs_tuned": TABLE4_MAS["clowfs"][1]}
     return [each for row in chosen for each in _judged(replace(row, paper=papers.get(row.name, row.paper)))]
 
@@ -198,13 +198,13 @@ def _hundred_seconds(context: Context, name: str) -> Iterator[Row]:
     frames = HELD_S * tolerance.RATE_HZ
     sensor, light_e = prepared(name), tolerance.light_e(MAGNITUDE)
     good, H = np.ones(sensor.I0.size), sensor.H[:, : len(NOLLS_14)]
-    seen, slopes = normalise_flux(sensor.I0, H, good)
-    R = reconstructor(seen, slopes, good, light_e * float(sensor.I0.sum()), tolerance.READ_NOISE_E)
+    normalised_I0, normalised_H = normalise_flux(sensor.I0, H, good)
+    R = reconstructor(normalised_I0, normalised_H, good, light_e * float(sensor.I0.sum()), tolerance.READ_NOISE_E)
 
     def trial(i: int) -> Array:
         rng = context.rng("anchors", name, i)
         image = noisy_e(rng, sensor.I0 * light_e * frames, tolerance.READ_NOISE_E * np.sqrt(frames))
-        return np.asarray(R @ (image / image.sum() - seen))
+        return np.asarray(R @ (image / image.sum() - normalised_I0))
 
     found = np.array(context.map(f"anchors {name}, 100 s", trial, range(context.trials))).std(axis=0, ddof=1)
     predicted = np.sqrt(np.diag(tolerance.frame_noise_nm2(name, MAGNITUDE)) / frames)
@@ -230,10 +230,10 @@ def added_contrast(name: str, magnitude: float, quantum: bool = False) -> float:
     noise = np.diag(tolerance.frame_noise_nm2(name, magnitude))
     noise = tolerance.quantum_noise_nm2(prepared(name), magnitude) if quantum else noise
     step = (DRIFT_PM / 1e3) ** 2 / tolerance.RATE_HZ
-    left = [
+    residual_nm2 = [
         left_of_drift_nm2(step, n, tolerance.EXPOSURE, best_gain(step, n, tolerance.EXPOSURE)) for n in noise.tolist()
     ]
-    return float(sum(tolerance.contrasts_of(name).added(mode, each) for mode, each in enumerate(left)))
+    return float(sum(tolerance.contrasts_of(name).added(mode, each) for mode, each in enumerate(residual_nm2)))
 
 
 def _against_magnitude(name: str) -> Iterator[Row]:

@@ -20,7 +20,7 @@ from lowfc.programs.paper.cases import Context, Prepared, Row, prepared, sparse_
 from lowfc.programs.paper.tables.pointing import NM_PER_MAS
 
 OTHERS = ("clowfs", "clowfs_tuned", "zwfs", "zwfs_tuned")
-"""Sensors besides the shipped sparse apertures."""
+"""Sensors in addition to the packaged sparse apertures."""
 BARS = ((0.05, 20.0), (0.1, 20.0), (0.2, 20.0), (0.1, 0.0), (0.1, 45.0), (0.1, 90.0))
 """Width in pupil diameters and angle in degrees."""
 HOLES = (0.09, 0.08, 0.07, 0.06, 0.05, 0.04, 0.03)
@@ -32,14 +32,14 @@ FIXED_STAR = (
 )
 NOISE = (
     f"Cramer-Rao bound, all 14 modes fitted, root of the sum of their variances, no read noise: V = {STAR.magnitude}, "
-    f"{TABLE4_EXPOSURE_S} s, our own masks. The same photons, at the central wavelength or over the band, in four "
-    "Gauss-Legendre wavelengths."
+    f"{TABLE4_EXPOSURE_S} s, our own masks. Same number of photons at the central wavelength and over the band, the "
+    "latter in four Gauss-Legendre wavelengths."
 )
 QUANTUM = (
     "limit: quantum Fisher information of the light behind the pupil's mask, 4 N Cov of the modes' phases: no sensor "
     "of this light has less noise."
 )
-SHARE = "Median over the modes of the quantum limit's variance over the Cramer-Rao bound's."
+SHARE = "Median over the modes of the ratio of variances, quantum limit over Cramer-Rao bound."
 CLAIMS = {
     "open": "Sect. 4: extremely high. limit: above 1e12 is singular in double precision.",
     "bar": "Sect. 4: below 1000 (the limit here), an order of magnitude above the sparse aperture mask's.",
@@ -50,7 +50,7 @@ LIMITS = {"open": 1e12, "bar": 1000.0, "holes": None, "sensor": 100.0}
 
 
 def conditioning(context: Context) -> list[Row]:
-    """Condition numbers, throughput and the tilt's Cramer-Rao bound of each mask in the relay pupil."""
+    """Condition number, throughput and Cramer-Rao bounds of each mask in the relay pupil."""
     masks = [("open", prepared("open"))]
     masks += [("bar", _bar(width, angle)) for width, angle in BARS]
     masks += [("sensor", prepared(name)) for name in context.names(*sparse_apertures(), *OTHERS)]
@@ -70,7 +70,7 @@ def _bar(width: float, angle_deg: float) -> Prepared:
 
 
 def _with_holes(diameter: float) -> Prepared | Row:
-    """The default layout with holes of another diameter; a row that says so where they would overlap."""
+    """The default layout with holes of another diameter, or a row that states that they would overlap."""
     layout = load_layout(SensorSection().sam)
     name = f"default layout with holes of {100 * diameter:g} %"
     shrunk = sams.Layout(name, layout.purpose, sams.equal_holes([hole[:2] for hole in layout.holes], diameter))
@@ -95,7 +95,7 @@ def _rows(kind: str, mask: Prepared) -> Iterator[Row]:
             modes=modes,
             assumption=f"{MONOCHROMATIC}\n{CLAIMS[kind]}",
         )
-    yield Row(mask.name, "open circle's light that falls on the sensor", "", float(mask.I0.sum()))
+    yield Row(mask.name, "fraction of the open circle's light on the sensor", "", float(mask.I0.sum()))
     scale_e = electrons(STAR, TABLE4_EXPOSURE_S)
     yield from _noise_rows(mask, scale_e)
     variance = variance_e(mask.I0 * scale_e, TABLE4_READ_NOISE_E)
@@ -109,7 +109,7 @@ def _rows(kind: str, mask: Prepared) -> Iterator[Row]:
 
 
 def _noise_rows(mask: Prepared, light_e: float) -> Iterator[Row]:
-    """The noise of 14 modes beside the least that the light allows."""
+    """The noise of 14 modes, and its quantum limit."""
     limit = np.diag(
         np.linalg.inv(quantum_information(mask.sensor.pupil, mask.modes[:14], mask.sensor.wavelength_nm, light_e))
     )
@@ -121,14 +121,14 @@ def _noise_rows(mask: Prepared, light_e: float) -> Iterator[Row]:
             bound = np.diag(cramer_rao(H * light_e, variance_e(I0 * light_e, 0.0)))
         except ValueError:
             return
-        of_light = float(np.sqrt(limit.sum())) if quantity == "noise" else None
+        quantum = float(np.sqrt(limit.sum())) if quantity == "noise" else None
         yield bounded(
             quantity=quantity,
             unit="nm",
             measured=float(np.sqrt(bound.sum())),
-            limit=of_light,
-            assumption=f"{NOISE}\n{QUANTUM}" if of_light else NOISE,
+            limit=quantum,
+            assumption=f"{NOISE}\n{QUANTUM}" if quantum else NOISE,
         )
-        if of_light:
+        if quantum:
             share = float(np.median(limit / bound))
             yield bounded(quantity="share of the quantum limit", unit="", measured=share, limit=1.0, assumption=SHARE)

@@ -46,7 +46,7 @@ PAPER_R2 = 0.97
 
 
 def photometry(context: Context) -> list[Row]:
-    """Throughputs, peaks, signals, ratios of the sensors, and the paper's inconsistencies."""
+    """Rows of throughputs, peaks, signals, ratios of the sensors, and the paper's inconsistencies."""
     sam, clowfs = prepared("sam"), prepared("clowfs")
     rows = [*_throughputs(sam, clowfs)]
     for sensor in (sam, clowfs, prepared("zwfs")):
@@ -59,7 +59,9 @@ def _throughputs(sam: Prepared, clowfs: Prepared) -> Iterator[Row]:
     yield Row("shaped pupil", "throughput", "", budget.pupil, PAPER_PUPIL, assumption=pupil)
     yield Row("focal-plane mask", "throughput", "", budget.focal_mask, PAPER_FOCAL_MASK, assumption=pupil)
     yield Row("sparse aperture mask", "throughput", "", budget.relay_mask, PAPER_RELAY_MASK)
-    yield Row("sam", "relay mask's light that falls on the sensor", "", budget.sensor, PAPER_RELAY_MASK)
+    yield Row(
+        "sam", "fraction of the light on the relay mask that reaches the sensor", "", budget.sensor, PAPER_RELAY_MASK
+    )
     for sensor in (sam, clowfs):
         own_e = electrons(STAR, TABLE4_EXPOSURE_S) * float(sensor.band_I0.sum())
         yield Row(
@@ -69,19 +71,19 @@ def _throughputs(sam: Prepared, clowfs: Prepared) -> Iterator[Row]:
             own_e,
             paper_count_e(sensor),
             assumption=f"V = {STAR.magnitude}, {STAR.diameter_m:g} m, {TABLE4_EXPOSURE_S} s, {STAR.bandwidth_nm:g} nm; "
-            "paper: the same light through the paper's throughputs.",
+            "paper: the same light with the paper's throughputs.",
         )
 
 
 def tilt_signal(sensor: Prepared, axis: int = 0) -> Array:
-    """Difference (pixels,) that 1 mas along x, or along y for axis 1, makes to the band's image."""
+    """Change (pixels,) of the image in the band by 1 mas of tilt along x, or along y for axis 1."""
     tilt_nm = np.zeros(2)
     tilt_nm[axis] = NM_PER_MAS
     return sensor.image(tilt_nm, sensor.band) - sensor.band_I0
 
 
 def differential(sensor: Prepared, noll: int) -> Array:
-    """(I - I0) / max(I0), (pixels,), for a thirtieth of a wave rms of one of the 14 modes, with the full exp(i phi)."""
+    """(I - I0) / max(I0), (pixels,), for lambda/30 rms of one of the 14 modes, with the full exp(i phi)."""
     modes_nm = np.zeros(len(NOLLS_14))
     modes_nm[NOLLS_14.index(noll)] = sensor.sensor.wavelength_nm / 30.0
     return np.asarray((sensor.image(modes_nm) - sensor.I0) / sensor.I0.max())
@@ -133,7 +135,7 @@ def _inconsistencies(sam: Prepared, clowfs: Prepared) -> Iterator[Row]:
 
 
 def _tilt_contradiction(sam: Prepared) -> Iterator[Row]:
-    """Table 2's tilt cannot go with the 2.5 % of Sect. 3.3: a P-V is at most twice the largest |dI|."""
+    """Table 2's tilt contradicts the 2.5 % of Sect. 3.3: a P-V is at most twice the largest |dI|."""
     name, tilt_nm = "inconsistency 1: Table 2 against 2.5 % for 1 mas", sam.sensor.wavelength_nm / 30.0
     yield Row(
         name,
@@ -167,20 +169,20 @@ def _defocus_contradiction(clowfs: Prepared) -> Iterator[Row]:
         I0 = reference(replace(clowfs.sensor, relay=relay))
         return float(I0.max() / I0.sum())
 
-    wanted, own = PAPER_PEAK["clowfs"], f"{section.defocus_mm:g} mm"
-    name = f"inconsistency 2: CLOWFS at {own} against {100 * wanted:.2f} % in its brightest pixel"
+    paper_peak, own = PAPER_PEAK["clowfs"], f"{section.defocus_mm:g} mm"
+    name = f"inconsistency 2: CLOWFS at {own} against {100 * paper_peak:.2f} % in its brightest pixel"
     yield Row(
         name,
         f"brightest pixel / image at {own}",
         "",
         peak(section.defocus_mm),
-        wanted,
+        paper_peak,
         assumption=f"{own} are {defocus_waves(section, clowfs.sensor.wavelength_nm):.2f} waves of defocus.",
     )
-    found = brentq(lambda mm: peak(mm) - wanted, 1.0, section.defocus_mm, xtol=1e-3)
+    found = brentq(lambda mm: peak(mm) - paper_peak, 1.0, section.defocus_mm, xtol=1e-3)
     yield Row(
         name,
-        f"defocus at which the brightest pixel has {100 * wanted:.2f} %",
+        f"defocus at which the brightest pixel has {100 * paper_peak:.2f} %",
         "mm",
         float(found),
         section.defocus_mm,
@@ -190,12 +192,12 @@ def _defocus_contradiction(clowfs: Prepared) -> Iterator[Row]:
 
 
 def _r2_contradiction(sam: Prepared) -> Iterator[Row]:
-    """A mean R2 of 0.97 and a residual 30 times below the input do not go together."""
+    """A mean R2 of 0.97 contradicts a residual 30 times below the input."""
     name = "inconsistency 3: R2 of 0.97 against a residual 30 times below the input"
     paper_in, paper_out = TABLE3_INPUT_WAVES[14], TABLE3_WAVES["disk"][14][0]
     yield Row(
         name,
-        "R2 if every mode's error were as far below its input as the wavefront's",
+        "R2 if the error of every mode were as far below its input as that of the wavefront",
         "",
         1.0 - (paper_out / paper_in) ** 2,
         PAPER_R2,

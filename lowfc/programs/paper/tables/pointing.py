@@ -1,4 +1,4 @@
-"""Table 4: the scatter of tilt estimates from short exposures of a star, at the paper's count and at our own."""
+"""Table 4: scatter of tilt estimates from short exposures of a star, with the paper's flux and with our own."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from lowfc.optics.detector.photometry import electrons, tilt_nm_per_mas
 from lowfc.programs.paper.cases import Context, Prepared, Row, prepared, sparse_apertures
 
 OTHERS = ("clowfs", "clowfs:1", "clowfs_tuned", "zwfs", "zwfs_tuned")
-"""Sensors besides the shipped sparse apertures."""
+"""Sensors in addition to the packaged sparse apertures."""
 FITTED = {1: (2, 14, 20), 10: (2, 14)}
 """Numbers of modes, tip and tilt first, by the tilt in mas."""
 NM_PER_MAS = tilt_nm_per_mas(STAR.diameter_m)
@@ -38,7 +38,7 @@ CENTRED = "paper: 'the estimate distribution is centered on the true value'; pre
 
 @dataclass(frozen=True)
 class Exposure:
-    """Electrons of the open circle's light that the sensor gets, whose figure it is, and where it comes from."""
+    """Flux in an exposure: its name, electrons of the open circle's light, and how they were determined."""
 
     name: str
     scale_e: float
@@ -46,17 +46,19 @@ class Exposure:
 
 
 def paper_count_e(sensor: Prepared) -> float:
-    """Electrons on the sensor by the paper's own throughputs."""
+    """Electrons on the sensor with the paper's throughputs."""
     relay = PAPER_RELAY_MASK if isinstance(sensor.sensor.relay, ApertureMask) else 1.0
     return electrons(STAR, TABLE4_EXPOSURE_S) * PAPER_PUPIL * PAPER_FOCAL_MASK * relay
 
 
 def exposures(sensor: Prepared) -> tuple[Exposure, Exposure]:
-    """The paper's electron count, and our own."""
+    """The exposures with the paper's electron count and with our own."""
     on_sensor, own = float(sensor.band_I0.sum()), electrons(STAR, TABLE4_EXPOSURE_S)
     count = paper_count_e(sensor)
     return (
-        Exposure("paper's electrons", count / on_sensor, f"{count:.3g} e- on the sensor, by the paper's throughputs."),
+        Exposure(
+            "paper's electrons", count / on_sensor, f"{count:.3g} e- on the sensor, with the paper's throughputs."
+        ),
         Exposure(
             "own photometry",
             own,
@@ -86,19 +88,19 @@ def fits(sensor: Prepared, exposure: Exposure, mas: int) -> dict[tuple[int, str]
 
 
 def bound_mas(linear: Fit) -> Array:
-    """Cramer-Rao bounds (2,) of the tilts in x and y near the flat wavefront."""
+    """Cramer-Rao bounds (2,) of the tilts in x and y at the flat wavefront."""
     bound = cramer_rao(linear.response_e, variance_e(linear.reference_e, TABLE4_READ_NOISE_E))
     return np.asarray(np.sqrt(np.diag(bound)[:2]) / NM_PER_MAS)
 
 
 def predicted_mas(linear: Fit, mean_e: Array) -> Array:
-    """Standard deviations (2,) of the tilts in x and y that an image of this mean (pixels,) gives."""
+    """Standard deviations (2,) of the tilts in x and y for an image with this mean (pixels,)."""
     spread = covariance(linear.R[:2], variance_e(mean_e, TABLE4_READ_NOISE_E))
     return np.asarray(np.sqrt(np.diag(spread)) / NM_PER_MAS)
 
 
 def table4(context: Context) -> list[Row]:
-    """Rows of Table 4: electrons, then scatter and mean error of the tilt by sensor, light, tilt, modes and kind."""
+    """Rows of Table 4: electrons, then scatter and mean error of the tilt by sensor, flux, tilt, modes and kind."""
     rows: list[Row] = []
     for name in context.names(*sparse_apertures(), *OTHERS):
         sensor = prepared(name)
@@ -118,7 +120,7 @@ def table4(context: Context) -> list[Row]:
 def _realisations(
     context: Context, sensor: Prepared, exposure: Exposure, linear: dict[tuple[int, str], Fit], mas: int, mean_e: Array
 ) -> dict[tuple[int, str], Array]:
-    """Tilts (trials, 2) in mas that each estimator finds in noisy images."""
+    """Tilts (trials, 2) in mas from noisy images, by estimator."""
 
     def trial(i: int) -> list[Array]:
         image_e = noisy_e(context.rng("table4", sensor.name, exposure.name, mas, i), mean_e, TABLE4_READ_NOISE_E)
@@ -167,7 +169,7 @@ def _rows(
 
 
 def _dimmed_rows(sensor: Prepared, exposure: Exposure, tilted: Array) -> Iterator[Row]:
-    """What the throughput of our pupil contributes, by prediction alone."""
+    """Predictions with the throughput of the paper's pupil."""
     linear = fits(sensor, exposure, 1)
     what, paper = f"predicted std of x tilt, 1 mas, {exposure.name}", _paper_mas(sensor.name, 2, 1)
     for kind in KINDS:

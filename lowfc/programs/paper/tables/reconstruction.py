@@ -15,7 +15,7 @@ from lowfc.optics.chain.zernike import NOLLS_20
 from lowfc.programs.paper.cases import DEFAULT_SAM, Context, Prepared, Row, prepared, sparse_apertures
 
 OTHERS = ("bowtie", f"bowtie:{DEFAULT_SAM}", "clowfs", "clowfs_tuned", "zwfs", "zwfs_tuned", "bar", "lyot", "aplc")
-"""Sensors besides the shipped sparse apertures."""
+"""Sensors in addition to the packaged sparse apertures."""
 ITERATIONS = (0, 1, 2)
 WITH_NUISANCES = "weighted, flux and shear fitted along"
 EVEN = (
@@ -33,14 +33,14 @@ PAPER_WAVES = {
 }
 
 NOISE = (
-    "40,000 e- in the brightest pixel of the sensor's own flat image (which rewards a mask that wastes light: read it "
-    "with Table 4), 3 e- read noise, whole electrons, total known, monochromatic; open area: transmission above 0.5, "
-    "piston removed. RMS and its limit, at the Cramer-Rao bound: root mean square over wavefronts; P-V: mean."
+    "40,000 e- in the brightest pixel of the sensor's own flat image (which favours masks with low throughput: compare "
+    "Table 4), 3 e- read noise, whole electrons, total flux known, monochromatic; open area: transmission above 0.5, "
+    "piston removed. RMS and its limit (Cramer-Rao bound): root mean square over wavefronts; P-V: mean."
 )
 
 
 def label(kind: str, iterations: int) -> str:
-    """An estimator's name: its kind, and how many iterations with the full model follow."""
+    """An estimator's name: its kind and the number of iterations with the full model."""
     return kind if iterations == 0 else f"{kind} + {iterations} iteration{'s' * (iterations > 1)}"
 
 
@@ -49,7 +49,7 @@ ESTIMATORS = ("pinv", *(label("weighted", iterations) for iterations in ITERATIO
 
 @dataclass(frozen=True)
 class Input:
-    """A reading of Sect. 3.1: bounds of random wavefronts for radial degrees 1 and 2, and above, in waves rms."""
+    """An interpretation of Sect. 3.1: bounds of random wavefronts for radial degrees 1 and 2, and above, waves rms."""
 
     name: str
     low: float
@@ -58,7 +58,7 @@ class Input:
 
 
 def inputs(sensor: Prepared, modes: int, literal: bool) -> Iterator[Input]:
-    """The readings of Sect. 3.1: the one that has the input of Table 3, and where asked for the text's own."""
+    """Interpretations of Sect. 3.1: the one that matches the input of Table 3, and if `literal` those of the text."""
     low, high = random.LITERAL_WAVES
     bounds = random.bounds_waves(NOLLS_20[:modes], low, high)
     literal_rms = random.input_rms(sensor.gram[:modes, :modes], bounds)
@@ -67,9 +67,9 @@ def inputs(sensor: Prepared, modes: int, literal: bool) -> Iterator[Input]:
         "matched",
         low * scale,
         high * scale,
-        f"Coefficients uniform within {low * scale:.4f} (n <= 2) and {high * scale:.4f} waves rms, for which the root "
-        f"mean square of the input is Table 3's {TABLE3_INPUT_WAVES[modes]}; with the text's {low} and {high} it would "
-        f"be {literal_rms:.3f}.",
+        f"Coefficients uniform within {low * scale:.4f} (n <= 2) and {high * scale:.4f} waves rms, which gives the "
+        f"input rms of Table 3, {TABLE3_INPUT_WAVES[modes]}; with {low} and {high} of the text it would be "
+        f"{literal_rms:.3f}.",
     )
     if literal:
         yield Input("literal", low, high, f"Coefficients uniform within {low} and {high} waves rms, as in the text.")
@@ -77,7 +77,8 @@ def inputs(sensor: Prepared, modes: int, literal: bool) -> Iterator[Input]:
             "quarter",
             low / 4,
             high / 4,
-            f"Coefficients uniform within {low / 4} and {high / 4} waves rms, as if the text's were peak to valley.",
+            f"Coefficients uniform within {low / 4} and {high / 4} waves rms, as if the bounds of the text were peak "
+            "to valley.",
         )
 
 
@@ -86,9 +87,9 @@ class Ensemble:
     """Random wavefronts and their estimates by one sensor.
 
     Attributes:
-        truth_nm: (trials, modes).
-        estimates_nm: Of each estimator, (trials, modes).
-        bound_nm: Root mean square over the open pupil at the Cramer-Rao bound.
+        truth_nm: (trials, modes) true coefficients.
+        estimates_nm: (trials, modes) estimates by each estimator.
+        bound_nm: Residual rms over the open pupil at the Cramer-Rao bound.
     """
 
     truth_nm: Array
@@ -111,13 +112,13 @@ def fits(sensor: Prepared, modes: int, nuisances: bool = False) -> dict[str, Fit
 
 
 def ensemble(context: Context, name: str, modes: int, wavefronts: Input, nuisances: bool = False) -> Ensemble:
-    """Draw the wavefronts, image them with the full chain and noise, and estimate them in every way."""
+    """Draw the wavefronts, image them with the full chain and noise, and estimate them with every estimator."""
     sensor = prepared(name)
     linear, light_e, wavelength_nm = fits(sensor, modes, nuisances), scale_e(sensor), sensor.sensor.wavelength_nm
     rng = context.rng("table3", modes, wavefronts.name)
     nolls = NOLLS_20[:modes]
     truth_nm = wavelength_nm * random.random_wavefronts(rng, context.trials, nolls, wavefronts.low, wavefronts.high)
-    sensor.model(np.zeros(modes))  # the twin is built before the threads ask for it
+    sensor.model(np.zeros(modes))  # builds the twin before the threads use it
 
     def trial(i: int) -> dict[str, Array]:
         noise = context.rng("table3", name, modes, wavefronts.name, i)
@@ -138,7 +139,7 @@ def mean_and_error(values: Array) -> tuple[float, float]:
 
 
 def table3(context: Context) -> list[Row]:
-    """Rows of Table 3: input, then RMS and P-V residual of each sensor, range, reading and estimator."""
+    """Rows of Table 3: input, then rms and P-V residual for each sensor, number of modes, input and estimator."""
     rows: list[Row] = []
     pupils: set[tuple[bytes, int, str]] = set()
     for name in context.names(*sparse_apertures(), *OTHERS):
@@ -180,7 +181,7 @@ def _residual_rows(sensor: Prepared, modes: int, wavefronts: Input, found: Ensem
 
 
 def _rms(sensor: Prepared, coefficients_nm: Array) -> tuple[float, float]:
-    """Root mean square over wavefronts and over the open pupil, and its standard error to first order, waves."""
+    """Rms over wavefronts and over the open pupil, and its standard error to first order, waves."""
     modes = coefficients_nm.shape[1]
     values = random.residual_rms(sensor.gram[:modes, :modes], coefficients_nm) / sensor.sensor.wavelength_nm
     mean, error = mean_and_error(values)

@@ -1,4 +1,4 @@
-"""A reference star and a target of another colour and roll: the change of the dark zone after subtraction."""
+"""Reference star and target of different colour and roll: change of the dark zone after subtraction."""
 
 from collections.abc import Iterator
 from functools import lru_cache, partial
@@ -41,7 +41,7 @@ def coloured(temperature_K: float) -> Band:
 
 @lru_cache(maxsize=1)
 def _maps() -> tuple[Array, Array, Mask]:
-    """Second-order maps (modes, samples, samples) of contrast per nm^2, the flat wavefront's, and the dark zone."""
+    """Second-order maps (modes, samples, samples) of contrast per nm^2, the map of a flat wavefront, the dark zone."""
     samples = 2 * int(np.ceil(DARK_ZONE.outer)) * _SAMPLES_PER
     flat = _image(np.zeros(len(NOLLS_14)), samples)
     waves = _SMALL_NM * np.eye(len(NOLLS_14))
@@ -62,11 +62,11 @@ def zero_point_nm(name: str) -> Array:
     reference_star, target = (coloured(kelvin) for _, kelvin in STARS.values())
     I0, H = reference(sensor.sensor, reference_star).ravel(), response(sensor.sensor, sensor.modes[:14], reference_star)
     good = np.ones(I0.size)
-    seen, slopes = normalise_flux(I0, H, good)
+    normalised_I0, normalised_H = normalise_flux(I0, H, good)
     flux_e = tolerance.light_e(STARS["reference"][0]) * float(I0.sum())
-    R = reconstructor(seen, slopes, good, flux_e, tolerance.READ_NOISE_E)
-    other = reference(sensor.sensor, target).ravel()
-    return np.asarray(-R @ (other / other.sum() - seen))
+    R = reconstructor(normalised_I0, normalised_H, good, flux_e, tolerance.READ_NOISE_E)
+    target_I0 = reference(sensor.sensor, target).ravel()
+    return np.asarray(-R @ (target_I0 / target_I0.sum() - normalised_I0))
 
 
 def pair_rows(name: str) -> Iterator[Row]:
@@ -74,17 +74,18 @@ def pair_rows(name: str) -> Iterator[Row]:
     maps, flat, zone = _maps()
     step = (DRIFT_PM / 1e3) ** 2 / tolerance.RATE_HZ
     made = partial(Row, name, unit="", assumption=ASSUMPTION)
-    left: dict[str, Array] = {}
+    residual_nm2: dict[str, Array] = {}
     for star, (magnitude, _) in STARS.items():
         noise = np.diag(tolerance.frame_noise_nm2(name, magnitude)).tolist()
         gains = np.array([best_gain(step, n, tolerance.EXPOSURE) for n in noise])
-        left[star] = np.array(
+        residual_nm2[star] = np.array(
             [left_of_drift_nm2(step, n, tolerance.EXPOSURE, g) for n, g in zip(noise, gains.tolist(), strict=True)]
         )
         yield made(
-            f"added contrast, {star}, V = {magnitude:g}", measured=float(tolerance.contrasts_of(name).form @ left[star])
+            f"added contrast, {star}, V = {magnitude:g}",
+            measured=float(tolerance.contrasts_of(name).form @ residual_nm2[star]),
         )
-    by_noise = np.tensordot(left["target"] - left["reference"], maps, 1)
+    by_noise = np.tensordot(residual_nm2["target"] - residual_nm2["reference"], maps, 1)
     shift = zero_point_nm(name)
     by_colour = _image(shift, len(flat)) - flat
     yield made("zero-point shift by colour", unit="nm", measured=float(np.linalg.norm(shift)))

@@ -29,7 +29,7 @@ TABLE2_SENSORS = ("sam", "sam27d07_bal14", "sam27d10_bal14", "bowtie", "clowfs",
 
 
 def table1(context: Context) -> list[Row]:
-    """Rows of Table 1, and of the parameters that Sects. 2 and 3 give in their text."""
+    """Rows of Table 1, and of parameters in the text of Sects. 2 and 3."""
     sensor, section, clowfs = prepared("sam").sensor, SensorSection(), SensorSection(kind="clowfs")
     layout = load_layout(section.sam)
     diameters = sorted({hole[2] for hole in layout.holes})
@@ -56,7 +56,7 @@ def table1(context: Context) -> list[Row]:
 
 
 def table2(context: Context) -> list[Row]:
-    """Rows of Table 2: how much lambda/30 of each mode changes the image."""
+    """Rows of Table 2: change of the image by lambda/30 of each mode."""
     names = context.names(*TABLE2_SENSORS)
     return [row for name in names for row in _peaks(context, name)]
 

@@ -34,7 +34,7 @@ ESTIMATORS: dict[Kind, str] = {"integrator": "integrator of the best gain", "lqg
 
 CHECKED_SENSORS, CHECKED_MODES, CHECKED_MAGNITUDES = ("clowfs_tuned", "zwfs_tuned"), (4, 8, 11), (2.0, 5.0)
 CHECKED_CONTRAST, SHOWN_CONTRAST = 1e-11, 1e-10
-_FRAMES_PER_TRIAL = 20  # over the lowest gain: 100 trials know a variance to 3 %
+_FRAMES_PER_TRIAL = 20  # divided by the gain: 100 trials determine a variance to 3 %
 _SHOWN, _MIDDLE = (2, 4, 8, 11), f"{SHOWN_CONTRAST:g}"
 _LARGEST = 6e-9  # contrast up to which the fourth order is fitted
 
@@ -47,9 +47,9 @@ colour changes the image by an even function of position, and the zero point of 
 of the Zernike sensor and of CLOWFS move, and I0 has to be measured again on the target.
 """
 LOOP = (
-    f"{RATE_HZ:g} Hz, exposure of half the period, delay of one frame, 1 e- read noise, all 14 modes fitted with "
-    "weights, monochromatic; 2 m, 110 nm, 50 % throughput, quantum efficiency 0.8. Each mode alone adds the contrast, "
-    "on average over the dark zone. limit: the same with the noise of the quantum limit."
+    f"{RATE_HZ:g} Hz, exposure of half the period, delay of one frame, 1 e- read noise, weighted fit of all 14 modes, "
+    "monochromatic; 2 m, 110 nm, 50 % throughput, quantum efficiency 0.8. Each mode alone adds the contrast, averaged "
+    "over the dark zone. limit: the same with noise at the quantum limit."
 )
 DRIFT = "A random walk. For drift alone LQG equals the integrator of the best gain, unless margins bound the latter."
 LINE = f"A line at {LINE_HZ:g} Hz, {100 * LINE_WIDTH:g} % wide between half-power points; LQG has it in its model."
@@ -83,7 +83,7 @@ def contrasts(pupil: str, focal_radius: float) -> Contrasts:
     own, form = modal.by_image(np.zeros(len(NOLLS_14))), np.diag(modal.form)
     if not (form > 0).all():
         raise ConfigurationError(
-            f"behind pupil = {pupil!r} some modes take light out of the dark zone, which is bright: no tolerance there"
+            f"with pupil = {pupil!r} some modes reduce the light in the dark zone, which is bright: no tolerance"
         )
     quartic = np.zeros(len(NOLLS_14))
     for mode, each in enumerate(form.tolist()):
@@ -115,32 +115,32 @@ def light_e(magnitude: float) -> float:
 
 @lru_cache(maxsize=256)
 def frame_noise_nm2(name: str, magnitude: float) -> Array:
-    """Covariance (14, 14) of a loop's modes in a frame, at the central wavelength."""
+    """Noise covariance (14, 14) of a loop's modes in a frame, at the central wavelength."""
     sensor = prepared(name)
     good = np.ones(sensor.I0.size)
-    seen, slopes = normalise_flux(sensor.I0, sensor.H[:, : len(NOLLS_14)], good)
+    I0, H = normalise_flux(sensor.I0, sensor.H[:, : len(NOLLS_14)], good)
     flux_e = light_e(magnitude) * float(sensor.I0.sum())
-    return noise_nm2(reconstructor(seen, slopes, good, flux_e, READ_NOISE_E), seen, flux_e, READ_NOISE_E)
+    return noise_nm2(reconstructor(I0, H, good, flux_e, READ_NOISE_E), I0, flux_e, READ_NOISE_E)
 
 
 def quantum_noise_nm2(sensor: Prepared, magnitude: float) -> Array:
-    """Variance (14,) of each mode at the quantum limit, all fitted."""
+    """Variance (14,) of each mode at the quantum limit, with all modes fitted."""
     modes = sensor.modes[: len(NOLLS_14)]
     information = quantum_information(sensor.sensor.pupil, modes, sensor.sensor.wavelength_nm, light_e(magnitude))
     return np.asarray(np.diag(np.linalg.inv(information)))
 
 
 def tolerance(context: Context) -> list[Row]:
-    """Rows of tolerated drift and lines, of their check by simulation, and of the pair of two stars."""
+    """Rows of tolerated drift and lines, of their check by simulation, and of the pair of stars."""
     from lowfc.programs.paper.tables.star_pair import pair_rows
 
     names = context.names(*HELD)
     lines = {kind: tolerated_lines(kind, Line(LINE_HZ, LINE_WIDTH * LINE_HZ, 1.0), RATE_HZ, EXPOSURE) for kind in KINDS}
 
-    def of(name: str) -> list[Row]:
+    def rows_of(name: str) -> list[Row]:
         return list(_tolerated(name, lines))
 
-    rows = [row for found in context.map("tolerance", of, names) for row in found]
+    rows = [row for found in context.map("tolerance", rows_of, names) for row in found]
     rows += _checked(context)
     return rows + [row for name in names if _section(name).pupil == "shaped" for row in pair_rows(name)]
 
@@ -148,14 +148,16 @@ def tolerance(context: Context) -> list[Row]:
 def _tolerated(name: str, lines: dict[Kind, Callable[[Array], Array]]) -> Iterator[Row]:
     of_contrast = contrasts_of(name)
     for magnitude in MAGNITUDES:
-        noise, least = np.diag(frame_noise_nm2(name, magnitude)), quantum_noise_nm2(prepared(name), magnitude)
+        noise, quantum = np.diag(frame_noise_nm2(name, magnitude)), quantum_noise_nm2(prepared(name), magnitude)
         for mode, noll in enumerate(NOLLS_14):
             for allowed in ALLOWED:
-                left = of_contrast.variance_nm2(mode, allowed)
+                residual_nm2 = of_contrast.variance_nm2(mode, allowed)
                 where = f"Z{noll} {mode_name(noll)}, V = {magnitude:g}, {allowed:g}"
                 made = partial(Row, name)
                 for kind in KINDS:
-                    step, limit = (tolerated_drift(left, n[mode], EXPOSURE, kind).step_nm2 for n in (noise, least))
+                    step, limit = (
+                        tolerated_drift(residual_nm2, n[mode], EXPOSURE, kind).step_nm2 for n in (noise, quantum)
+                    )
                     pm = [1e3 * float(np.sqrt(each * RATE_HZ)) for each in (step, limit)]
                     yield made(
                         f"drift of {where}",
@@ -165,8 +167,8 @@ def _tolerated(name: str, lines: dict[Kind, Callable[[Array], Array]]) -> Iterat
                         estimator=ESTIMATORS[kind],
                         assumption=f"{LOOP}\n{DRIFT}",
                     )
-                    over = np.array([left / noise[mode], left / least[mode]])
-                    rms = 1e3 * np.sqrt(lines[kind](over) * np.array([noise[mode], least[mode]]))
+                    each_noise = np.array([noise[mode], quantum[mode]])
+                    rms = 1e3 * np.sqrt(lines[kind](residual_nm2 / each_noise) * each_noise)
                     yield made(
                         f"line of {where}",
                         "pm",
@@ -190,12 +192,12 @@ def _checked(context: Context) -> list[Row]:
         trial = DriftTrial(prepared(name).twin, NOLLS_14, light_e(magnitude), READ_NOISE_E, EXPOSURE)
         only = np.eye(len(NOLLS_14))[mode]
         rng = context.rng("tolerance", name, round(magnitude), noll)
-        left = trial.left_nm2(drift.step_nm2 * only, drift.gain * only, frames, rng)
+        residual_nm2 = trial.left_nm2(drift.step_nm2 * only, drift.gain * only, frames, rng)
         return Row(
             name,
-            f"contrast that Z{noll} {mode_name(noll)} adds at its tolerance, V = {magnitude:g}",
+            f"contrast added by Z{noll} {mode_name(noll)} at its tolerance, V = {magnitude:g}",
             "",
-            of_contrast.added(mode, float(left[mode])),
+            of_contrast.added(mode, float(residual_nm2[mode])),
             error=CHECKED_CONTRAST * float(np.sqrt(2.0 / (frames * drift.gain))),
             predicted=CHECKED_CONTRAST,
             estimator=ESTIMATORS["integrator"],
@@ -220,12 +222,13 @@ def plot(context: Context, path: Path) -> None:
     names = context.names(*(name for name in HELD if name != "aplc"))
 
     def drifts(name: str, mode: int, quantum: bool = False) -> Array:
-        left = contrasts_of(name).variance_nm2(mode, SHOWN_CONTRAST)
+        residual_nm2 = contrasts_of(name).variance_nm2(mode, SHOWN_CONTRAST)
         found = []
         for magnitude in magnitudes.tolist():
             of_frame = np.diag(frame_noise_nm2(name, magnitude))
             noise = quantum_noise_nm2(prepared(name), magnitude) if quantum else of_frame
-            found.append(1e3 * np.sqrt(tolerated_drift(left, float(noise[mode]), EXPOSURE, "lqg").step_nm2 * RATE_HZ))
+            drift = tolerated_drift(residual_nm2, float(noise[mode]), EXPOSURE, "lqg")
+            found.append(1e3 * np.sqrt(drift.step_nm2 * RATE_HZ))
         return np.array(found)
 
     panels = []
