@@ -1,4 +1,4 @@
-"""Every reader of foreign bytes, fed with damage: it says what is wrong, and neither crashes, hangs nor swells."""
+"""Every reader of external bytes, with damaged inputs: it raises its errors, and does not crash, hang or use memory."""
 
 import pytest
 
@@ -13,30 +13,30 @@ def every(tmp_path_factory: pytest.TempPathFactory) -> list[Target]:
     return targets(tmp_path_factory.mktemp("fuzz"))
 
 
-def test_what_is_whole_is_read(every: list[Target]) -> None:
-    """Or all that follows would be refused at the door."""
+def test_undamaged_inputs_are_read(every: list[Target]) -> None:
+    """Otherwise all damaged inputs would be refused for the same trivial reason."""
     for target in every:
         for data in target.corpus:
             target.read(data)
 
 
-@pytest.mark.parametrize(("card", "instead"), [(b"KIND    = '", b"KIND    = &"), (b"XTENSION=", b"XTENSAON=")])
-def test_a_header_that_was_damaged_is_refused(every: list[Target], card: bytes, instead: bytes) -> None:
+@pytest.mark.parametrize(("card", "damage"), [(b"KIND    = '", b"KIND    = &"), (b"XTENSION=", b"XTENSAON=")])
+def test_damaged_header_is_refused(every: list[Target], card: bytes, damage: bytes) -> None:
     for target in every:
         for data in target.corpus if target.name in ("calibration file", "law file") else ():
-            damaged = data.replace(card, instead)
+            damaged = data.replace(card, damage)
             assert damaged != data
             with pytest.raises(target.errors, match="not a whole"):
                 target.read(damaged)
 
 
-def test_an_input_is_made_from_its_number_alone(every: list[Target]) -> None:
+def test_inputs_depend_only_on_their_number(every: list[Target]) -> None:
     for target in every:
         assert target.input(5) == target.input(5)
         assert len({target.input(number) for number in range(20)}) > 1
 
 
-def test_a_reader_that_crashes_or_hangs_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_crashes_and_hangs_of_a_reader_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tests.support.fuzzing.HANG_S", 0.05)
 
     def read(data: bytes) -> None:

@@ -1,7 +1,7 @@
-"""Make the golden files of the version at hand: `python -m tests.golden.make FOLDER`.
+"""Write the golden files of the current version: `python -m tests.golden.make FOLDER`.
 
-A short loop on the bus in memory, whose camera exposes frame by frame and whose clock is moved by hand, so that every
-kind of input of the controller is in its log. What a released version has written is never written again.
+A short loop on an in-memory bus, with a camera that exposes on request and a clock that is advanced explicitly, so that
+every kind of input of the controller is in its log. The files of a released version are never changed.
 """
 
 import shutil
@@ -61,17 +61,17 @@ CONFIGURATION = {
 
 
 class Night:
-    """A run in one process: camera by hand, controller, mirror and recorder on threads of their own."""
+    """A run in one process: a camera that exposes on request; controller, mirror and recorder in their own threads."""
 
     def __init__(self, config: Configuration, calibration: Calibration, folder: Path) -> None:
         self.config, self.calibration = config, calibration
         self.hub, self.clock = MemoryHub(), FakeClock(START_NS)
-        self.index = self.answered = 0
+        self.index = self.last_step = 0
         self.shape_nm = np.zeros((config.mirror.rows, config.mirror.columns), np.float32)
         self.scene = scene(config)
         operator = self.bus("operator")
-        operator.subscribe(STEP, self._take_step)
-        operator.subscribe(MIRROR_STATE, self._take_mirror)
+        operator.subscribe(STEP, self._on_step)
+        operator.subscribe(MIRROR_STATE, self._on_mirror_state)
         self.client = Client("golden", bus=operator)
         self.start_camera()
         (folder / "run").mkdir(parents=True)
@@ -99,7 +99,7 @@ class Night:
         return MemoryBus(self.hub, role, self.clock)
 
     def start_camera(self, **changes: float) -> None:
-        """Start the camera, or start it again with other settings."""
+        """Start the camera, or restart it with other settings."""
         bus = self.bus("camera")
         self.frames, self.truths = bus.publisher(FRAME), bus.publisher(TRUTH)
         self.settings = bus.publisher(CAMERA_STATE)
@@ -108,14 +108,14 @@ class Night:
             setattr(state, name, value)
         self.settings.put(state.SerializeToString())
 
-    def _take_step(self, sample: Sample) -> None:
-        self.answered = wire.ControlStep.FromString(sample.payload).frame_sequence
+    def _on_step(self, sample: Sample) -> None:
+        self.last_step = wire.ControlStep.FromString(sample.payload).frame_sequence
 
-    def _take_mirror(self, sample: Sample) -> None:
+    def _on_mirror_state(self, sample: Sample) -> None:
         self.shape_nm = actuators(wire.MirrorState.FromString(sample.payload))
 
     def expose(self, frames: int, change: Callable[[Any], Any] = lambda pixels: pixels, late_ns: int = 0) -> None:
-        """Some frames, each waiting for its step; `change` does something to their pixels."""
+        """Expose frames, each after the step of the one before; `change` modifies their pixels."""
         for _ in range(frames):
             pixels = self.scene.expose(self.index, self.shape_nm)
             truth = self.scene.truth(self.index, self.shape_nm).sampled
@@ -134,10 +134,10 @@ class Night:
                 residual_rms_nm=truth.residual_rms_nm,
             )
             self.truths.put(message.SerializeToString())
-            until(lambda: self.answered == sequence)  # noqa: B023  # called at once
+            until(lambda: self.last_step == sequence)  # noqa: B023  # called immediately
 
-    def silence(self) -> None:
-        """No frame for a while: the command is repeated, and NO_FRAMES."""
+    def frame_timeout(self) -> None:
+        """Expose no frame until the command is repeated and NO_FRAMES is raised."""
         for _ in range(3):
             self.clock.advance(20_000_000)
             time.sleep(0.05)
@@ -149,17 +149,17 @@ class Night:
             assert not thread.is_alive()
 
 
-def refused(ask: Callable[..., object], *words: object) -> None:
-    """A request that is refused."""
+def expect_refusal(request: Callable[..., object], *arguments: object) -> None:
+    """Make a request that must be refused."""
     try:
-        ask(*words)
+        request(*arguments)
     except RequestRefusedError:
         return
-    raise AssertionError("the request was granted")
+    raise AssertionError("the request was accepted")
 
 
 def law(config: Configuration) -> LinearLaw:
-    """An integrator of the pseudo-open-loop modes, which remembers commands."""
+    """An integrator on pseudo-open-loop modes, whose state includes past commands."""
     settings = factory.settings(config)
     delay, gains = settings.delay_frames, settings.law(config.noll).gain.astype(float).tolist()
     blocks = [integrator_block(gain, 0.01, "pol", delay) for gain in gains]
@@ -177,7 +177,7 @@ def main(folder: Path) -> None:
     law_file.save(made, folder / "law.fits")
     (folder / "lowfc.toml").write_text(config.to_toml())
     for path in (ROOT / "deploy/layouts").glob("*.*"):
-        if path.suffix != ".rbl":  # rerun's own form, of one of its versions
+        if path.suffix != ".rbl":  # binary format of one version of rerun
             shutil.copy(path, folder / path.name)
     shutil.copy(ROOT / "lowfc/contract/wire/lowfc.desc", folder / "lowfc.desc")
 
@@ -191,8 +191,8 @@ def main(folder: Path) -> None:
     loop.gain(0.4, (2, 3))
     loop.leak(0.01)
     loop.limit([120.0, 110.0], (2, 3))
-    refused(loop.gain, 3.0)
-    refused(loop.ask, "dance")
+    expect_refusal(loop.gain, 3.0)
+    expect_refusal(loop.ask, "dance")
     night.expose(3)
     loop.offset([2.0, -1.0], (2, 3))
     ramp_nm = np.linspace(-40, 40, 144, dtype=np.float32).reshape(12, 12)
@@ -203,7 +203,7 @@ def main(folder: Path) -> None:
     night.expose(4)
     loop.play(np.stack([ramp_nm / 20, ramp_nm.T / 20]), [[1.0, 0.0], [0.0, 1.0], [-1.0, 0.5], [0.0, 0.0]])
     night.expose(2)
-    refused(loop.play_offset, np.ones((2, 2)))
+    expect_refusal(loop.play_offset, np.ones((2, 2)))
     night.expose(3)
     part = next((work / "logs").glob("*.part"))
     before = part.stat().st_size
@@ -221,10 +221,10 @@ def main(folder: Path) -> None:
     night.expose(1, lambda pixels: np.full_like(pixels, 100))
     night.expose(1, lambda pixels: np.full_like(pixels, 65_535))
     night.expose(1, late_ns=25_000_000)
-    still: list[Any] = []
-    night.expose(6, lambda pixels: (still.append(pixels), still[0])[1])
-    night.silence()
-    night.expose(115)  # the law follows for a hundred frames, and has taken over some of the command by now
+    stuck: list[Any] = []
+    night.expose(6, lambda pixels: (stuck.append(pixels), stuck[0])[1])
+    night.frame_timeout()
+    night.expose(115)  # the law observes for a hundred frames, and is then in its cross-fade
     loop.law()
     loop.status()
     loop.pause()
@@ -240,7 +240,7 @@ def main(folder: Path) -> None:
     night.expose(3)
     loop.safe()
     night.expose(2)
-    refused(loop.close_loop)
+    expect_refusal(loop.close_loop)
     loop.clear()
     night.expose(1)
     night.finish()

@@ -1,4 +1,4 @@
-"""What must be documented: every public name, with shapes and unit of the arrays that it takes; every event."""
+"""Required documentation: every public name, with shapes and units of array arguments; advice on every event."""
 
 import ast
 import re
@@ -50,19 +50,19 @@ def test_every_public_name_has_a_docstring(package: str) -> None:
 
 
 @pytest.mark.parametrize("package", PACKAGES)
-def test_who_takes_arrays_says_their_shapes_and_units(package: str) -> None:
+def test_functions_of_arrays_document_shapes_and_units(package: str) -> None:
     lacking = []
     for name, one, text, above in names(package):
         if isinstance(one, ast.FunctionDef):
-            taken = [argument for argument in one.args.args if argument.annotation is not None]
-            arrays = [each for each in taken if ARRAYS.search(ast.unparse(each.annotation))]
+            annotated = [argument for argument in one.args.args if argument.annotation is not None]
+            arrays = [each for each in annotated if ARRAYS.search(ast.unparse(each.annotation))]
             words = f"{text} {above} {' '.join(each.arg.rpartition('_')[2] for each in arrays)}"
             if arrays and not (SHAPE.search(words) and UNIT.search(words)):
                 lacking.append((name, "shape" if not SHAPE.search(words) else "unit", [each.arg for each in arrays]))
     assert lacking == []
 
 
-def test_every_event_and_every_reason_has_advice() -> None:
+def test_every_event_and_reason_has_advice() -> None:
     assert [*ADVICE] == [*EVENTS]
     reasons = [value.name.removeprefix("REASON_") for value in lowfc_pb2.Reason.DESCRIPTOR.values]
     assert [*REASONS] == reasons[1:]

@@ -1,4 +1,4 @@
-"""Former names are in the table of former names, and nowhere else."""
+"""Former names occur only in the table of former names."""
 
 import ast
 from pathlib import Path
@@ -14,7 +14,7 @@ IDENTIFIERS = {
     *("Drive", "Following", "Additions", "Raised", "Lane", "hopeful", "Wanted", "Taken", "Told", "obey"),
     *("ShortcutReader", "SharedShortcutReader", "ShortcutWriter", "Ledger", "Rehearsal"),
     *("when_we_die", "last_words", "newest_only", "timeless", "stay_awake", "SAFED"),
-    *("late_ms", "hold_ms", "valid_ms", "most_alike", "most_saturated", "least_flux"),
+    *("late_ms", "hold_ms", "valid_ms", "most_alike", "most_saturated", "least_flux", "PixelLaws", "pixel_laws"),
 }
 FOLDERS = ("lowfc", "sim_camera", "sim_dm", "tests", "benchmarks", "tools", "examples")
 SOURCES = [path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py") if path != Path(__file__)]
@@ -30,13 +30,13 @@ def identifiers(source: str) -> set[str]:
     return found
 
 
-def test_no_source_has_a_former_identifier() -> None:
+def test_no_source_uses_a_former_identifier() -> None:
     found = {path: identifiers(path.read_text(encoding="utf-8")) & IDENTIFIERS for path in SOURCES}
     assert {str(path.relative_to(ROOT)): names for path, names in found.items() if names} == {}
     assert len(SOURCES) > 400
 
 
-def test_no_message_has_a_former_field() -> None:
+def test_no_message_uses_a_former_field() -> None:
     for former in former_names.FIELDS:
         message, _, field = former.partition(".")
         assert field not in getattr(wire, message).DESCRIPTOR.fields_by_name, former
@@ -44,7 +44,7 @@ def test_no_message_has_a_former_field() -> None:
     assert values & former_names.VALUES.keys() == set()
 
 
-def test_no_key_and_no_extension_has_a_former_name() -> None:
+def test_no_key_or_extension_uses_a_former_name() -> None:
     assert configuration.keys().keys() & former_names.KEYS.keys() == set()
     former = {old for new, old in former_names.LAW_EXTENSIONS.items() if old != new}
     assert {name for name, _, _ in law_file._EXTENSIONS} & former == set()
@@ -53,5 +53,5 @@ def test_no_key_and_no_extension_has_a_former_name() -> None:
 @pytest.mark.parametrize(
     "source", ["class Drive: ...", "x = state.hopeful", "def obey(): ...", "f(late_ms=1)", "from a import Lane"]
 )
-def test_a_former_identifier_is_found(source: str) -> None:
+def test_former_identifiers_are_found(source: str) -> None:
     assert identifiers(source) & IDENTIFIERS

@@ -1,4 +1,4 @@
-"""Imports point downward, the numerics are pure, no file and no folder is too large."""
+"""Imports point downward, numerical modules are pure, and no file or folder is too large."""
 
 import ast
 import tomllib
@@ -16,7 +16,7 @@ FILES = {
 }
 GENERATED = "lowfc.contract.wire"
 
-# What each layer may import of the project, besides itself.
+# Packages of the project that each layer may import in addition to itself.
 BELOW = {
     "lowfc.arrays": (),
     "lowfc.optics": (),
@@ -67,7 +67,7 @@ PURE_IMPORTS = (
     ),
     *("types", "typing"),
 )
-# A generator made from a seed is a value; everything else in numpy.random is state that all share.
+# A generator made from a seed is a value; everything else in numpy.random is global state.
 FROM_A_SEED = ("Generator", "default_rng", "SeedSequence", "SFC64", "PCG64")
 NUMPY_FILES = ("load", "loadtxt", "save", "savez", "savez_compressed", "savetxt", "fromfile", "memmap", "genfromtxt")
 FORBIDDEN_CALLS = ("open", "print", "input", "exec", "eval", "__import__", "breakpoint", "globals")
@@ -112,7 +112,7 @@ def layer_faults(module: str, source: str) -> list[str]:
 
 
 def purity_faults(module: str, source: str) -> list[str]:
-    """Imports and calls by which a module of the numerics would depend on more than its arguments."""
+    """Imports and calls that make a numerical module depend on more than its arguments."""
     tree, faults = ast.parse(source), []
     for name in imports_of(tree):
         if layer_of(name) or name == "lowfc":
@@ -144,7 +144,7 @@ def test_imports_point_downward() -> None:
     assert [fault for name, path in FILES.items() for fault in layer_faults(name, path.read_text("utf-8"))] == []
 
 
-def test_the_numerics_are_pure() -> None:
+def test_numerical_modules_are_pure() -> None:
     pure = {name: path.read_text("utf-8") for name, path in FILES.items() if is_pure(name)}
     assert [fault for name, source in pure.items() for fault in purity_faults(name, source)] == []
 
@@ -152,7 +152,7 @@ def test_the_numerics_are_pure() -> None:
 def test_every_module_is_in_a_layer() -> None:
     outside = [module for module in FILES if not layer_of(module) and module != "lowfc"]
     assert outside == []
-    assert sum(map(is_pure, FILES)) > 25  # the list above still finds the numerics
+    assert sum(map(is_pure, FILES)) > 25  # the lists above still match modules
 
 
 def test_every_source_but_the_tests_is_type_checked() -> None:
@@ -162,7 +162,7 @@ def test_every_source_but_the_tests_is_type_checked() -> None:
     assert mypy["strict"]
 
 
-def test_no_file_outgrows_its_noun() -> None:
+def test_no_file_is_too_long_or_vaguely_named() -> None:
     long = {module: len(path.read_text(encoding="utf-8").splitlines()) for module, path in FILES.items()}
     assert {module: lines for module, lines in long.items() if lines > LONGEST and not inside(module, GENERATED)} == {}
     vague = {"utils", "util", "helpers", "common", "misc"}
@@ -174,7 +174,7 @@ def packages() -> dict[str, Path]:
     return {name: path for name, path in FILES.items() if path.name == "__init__.py" and name != GENERATED}
 
 
-def test_every_folder_of_modules_is_a_package_of_at_most_sixteen() -> None:
+def test_every_folder_is_a_package_of_at_most_sixteen_modules() -> None:
     folders = {path.parent for path in FILES.values()}
     assert folders - {path.parent for path in packages().values()} - {FILES[GENERATED].parent} == set()
     folders |= {path.parent for path in (ROOT / "tests").rglob("*.py")}
@@ -183,7 +183,7 @@ def test_every_folder_of_modules_is_a_package_of_at_most_sixteen() -> None:
 
 
 @pytest.mark.parametrize(
-    ("module", "source", "fine"),
+    ("module", "source", "allowed"),
     [
         ("lowfc.control.laws.law", "from lowfc.contract import codec", False),
         ("lowfc.control.laws.law", "from lowfc.optics.twin.twin import Twin", False),
@@ -196,12 +196,12 @@ def test_every_folder_of_modules_is_a_package_of_at_most_sixteen() -> None:
         ("lowfc.programs.core.controller", "import lowfc.adapters.bus.bus\nfrom lowfc import __version__", True),
     ],
 )
-def test_an_import_upward_is_found(module: str, source: str, fine: bool) -> None:
-    assert (layer_faults(module, source) == []) is fine
+def test_upward_imports_are_found(module: str, source: str, allowed: bool) -> None:
+    assert (layer_faults(module, source) == []) is allowed
 
 
 @pytest.mark.parametrize(
-    ("source", "fine"),
+    ("source", "allowed"),
     [
         ("import time", False),
         ("from pathlib import Path", False),
@@ -220,5 +220,5 @@ def test_an_import_upward_is_found(module: str, source: str, fine: bool) -> None
         ("from lowfc.control.loop.safety import limit", True),
     ],
 )
-def test_an_impurity_is_found(source: str, fine: bool) -> None:
-    assert (purity_faults("lowfc.control.laws.law", source) == []) is fine
+def test_impure_code_is_found(source: str, allowed: bool) -> None:
+    assert (purity_faults("lowfc.control.laws.law", source) == []) is allowed

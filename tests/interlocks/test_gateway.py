@@ -1,4 +1,4 @@
-"""`lowfc gateway epics`: a real IOC drives an interlock, and a scan moves a gain and reads the residual."""
+"""`lowfc gateway epics`: a real IOC drives an interlock, and a scan changes a gain and reads the residual."""
 
 import json
 import os
@@ -55,12 +55,12 @@ def scan():
     yield from bps.close_run()
 
 
-def keep(kind, document):
+def store(kind, document):
     if kind == "event":
         rows.append([document["data"]["residual"], np.asarray(document["data"]["gain"]).tolist()])
 
 
-engine(scan(), keep)
+engine(scan(), store)
 print(json.dumps(rows))
 """
 CONFIG = """
@@ -78,17 +78,17 @@ max_age_s = 2.0
 """
 
 
-def test_every_request_of_numbers_or_a_text_is_offered_under_a_name_of_its_own() -> None:
+def test_requests_with_numbers_or_a_text_are_variables_with_unique_names() -> None:
     offered = {one.name: one for one in variables()}
     assert len(offered) == len(list(variables()))
     for one in DECLARED:
         fields = {field for field, _ in one.fields}
         name = one.name if "record" not in one.key else f"record_{one.name}"
         plain = fields <= {"modes", "values", "text", "lease_id"} and one.example
-        puts = bool(plain) and name not in ("status", "configuration")
-        assert (name in offered and offered[name].put is not None) is puts, name
+        writable = bool(plain) and name not in ("status", "configuration")
+        assert (name in offered and offered[name].put is not None) is writable, name
     loop = Mock()
-    for name, value, asked in (
+    for name, value, arguments in (
         ("gain", [0.2], {"values": [0.2]}),
         ("step", [7.0], {"values": [7.0]}),
         ("permit", "the mask", {"text": "the mask"}),
@@ -97,12 +97,12 @@ def test_every_request_of_numbers_or_a_text_is_offered_under_a_name_of_its_own()
         put = offered[name].put
         assert put is not None
         put(loop, value)
-        loop.ask.assert_called_with(name, **asked)
+        loop.ask.assert_called_with(name, **arguments)
     assert offered["gain"].kind is Kind.NUMBERS
     assert all(one.read is not None or one.put is not None for one in offered.values())
 
 
-def test_without_p4p_one_sentence_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_p4p_is_reported_with_install_advice(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "p4p", None)
     fault = lowfc("gateway", "epics").exception
     assert isinstance(fault, ConfigurationError)
@@ -126,7 +126,7 @@ def ioc() -> Iterator[tuple[Process, int]]:
 @pytest.mark.epics
 @pytest.mark.slow
 @pytest.mark.exclusive
-def test_an_ioc_drives_an_interlock_and_a_scan_moves_a_gain(tmp_path: Path, ioc: tuple[Process, int]) -> None:
+def test_ioc_drives_an_interlock_and_scan_changes_a_gain(tmp_path: Path, ioc: tuple[Process, int]) -> None:
     pytest.importorskip("ophyd_async", reason="needs ophyd-async")
     process, search = ioc
     (port,) = free_ports(1)
@@ -135,15 +135,15 @@ def test_an_ioc_drives_an_interlock_and_a_scan_moves_a_gain(tmp_path: Path, ioc:
     until(lambda: "epics" in running(), 60)
     gateway = start(tmp_path, "gateway", "epics", "--run", "epics", "--config", "bench.toml")
     try:
-        scanned(loop, gateway, process, f"127.0.0.1:{port + 1} 127.0.0.1:{search}")
+        run_scan(loop, gateway, process, f"127.0.0.1:{port + 1} 127.0.0.1:{search}")
     finally:
         for one in (loop, gateway):
             one.kill()
             one.communicate()
 
 
-def scanned(loop: Process, gateway: Process, ioc: Process, addresses: str) -> None:
-    """The whole story, with the processes that take part."""
+def run_scan(loop: Process, gateway: Process, ioc: Process, addresses: str) -> None:
+    """Drive the interlock, run the scan, then stop the IOC and the loop."""
     thread = pytest.importorskip("p4p.client.thread", reason="needs p4p")
     with thread.Context("pva", conf={"EPICS_PVA_ADDR_LIST": addresses, "EPICS_PVA_AUTO_ADDR_LIST": "NO"}) as pvs:
 
