@@ -156,7 +156,7 @@ def signal(optics: Optics, fields: Single, focal_mask: str) -> Signal:
 
     Args:
         optics: The optics before the sparse aperture mask.
-        fields: Sum of `hole_fields` over the holes.
+        fields: (fields, samples, samples) sum of `hole_fields` over the holes, amplitude.
         focal_mask: One of `optics.focal_masks`.
     """
     count = 1 + len(NOLLS_20)
@@ -168,7 +168,7 @@ def signal(optics: Optics, fields: Single, focal_mask: str) -> Signal:
 
 
 def band_signal(optics: Optics, fields: Single) -> Signal:
-    """I0 and H in the band, for the first focal-plane mask; arguments as for `signal`."""
+    """I0 and H in the band, for the first focal-plane mask; amplitude fields, shapes as in `signal`."""
     count, first = 1 + optics.band_modes, (1 + len(NOLLS_20)) * len(optics.focal_masks)
     I0: Array = np.zeros(fields[0].size)
     H: Array = np.zeros((fields[0].size, optics.band_modes))
