@@ -220,7 +220,7 @@ def test_the_operator_is_asked_to_block_and_unblock_the_star(tmp_path: Path) -> 
     bench = Bench(tmp_path)
     with pytest.raises(CalibrationError, match="was it not blocked for the dark"):
         bench.commission(no_dark=False)
-    assert bench.questions == ["block the star; is it dark?", "unblock the star; is it there?"]
+    assert bench.questions == ["block the star; is it dark?", "unblock the star; is it visible?"]
 
 
 def test_a_camera_that_differs_from_the_configuration_is_refused(tmp_path: Path) -> None:

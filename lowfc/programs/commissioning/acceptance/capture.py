@@ -58,7 +58,7 @@ def play(live: Live, modes: Sequence[int], required: Acceptance) -> list[ProbeRe
     for trials in plan:
         for number, (what, table, shape) in enumerate(trials):
             found.append(live.play(KIND, what, LoopMode.CLOSED, table, shape))
-            if not closed(found[-1]):
+            if not removed(found[-1]):
                 live.skip(sum(len(table) for _, table, _ in trials[number + 1 :]))
                 live.return_to_zero()
                 live.set_mode(LoopMode.CLOSED)
@@ -92,7 +92,7 @@ def _trials(live: Live, noll: int, required: Acceptance) -> list[tuple[dict[str,
     return trials
 
 
-def closed(trial: ProbeResponse) -> bool:
+def removed(trial: ProbeResponse) -> bool:
     """Whether the loop removed the shape of a trial."""
     if trial.limits_hit:
         return False
@@ -110,7 +110,7 @@ def judge(trials: Sequence[ProbeResponse], required: Acceptance) -> CaptureResul
     modes = []
     for noll in dict.fromkeys(trial.what["noll"] for trial in trials):
         of_mode = [trial for trial in trials if trial.what["noll"] == noll]
-        converged = {trial.what["level_nm"]: closed(trial) for trial in of_mode}
+        converged = {trial.what["level_nm"]: removed(trial) for trial in of_mode}
         sizes = sorted({abs(level_nm) for level_nm in converged})
         lost = [abs(level_nm) for level_nm, success in converged.items() if not success]
         good = [size for size in sizes if {size, -size} <= set(converged) and size < min([*lost, np.inf])]

@@ -208,7 +208,7 @@ class Commissioning:
         else:
             self._confirm("block the star; is it dark?")
             sensor = darkened(camera, watch(self._loop, options.frames), self._report)
-            self._confirm("unblock the star; is it there?")
+            self._confirm("unblock the star; is it visible?")
         self._step("reference image")
         before = referenced(sensor, watch(self._loop, options.frames), self._computed, self._report)
         self._step("delay")
