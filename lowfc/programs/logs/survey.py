@@ -114,7 +114,7 @@ class _Account:
     def __init__(self, selection: Selection = EVERYTHING) -> None:
         """Start the account of a log with this selection of topics."""
         self._selection = selection
-        self._ledger = LossAccount(selection)
+        self._losses = LossAccount(selection)
         self._lines: dict[str, _Line] = {}
         self._events: Counter[str] = Counter()
         self._modes: list[str] = []
@@ -133,11 +133,11 @@ class _Account:
         self._end_ns = max(self._end_ns, now_ns)
         if not topic.queryable and (self._begin_ns is None or now_ns < self._begin_ns):
             self._begin_ns = now_ns  # messages requested at the log's start may be hours old
-        self._ledger.enter(topic, message, recorded=True)
+        self._losses.enter(topic, message, recorded=True)
         author = ""
         with contextlib.suppress(BadMessageError, DecodeError):  # the log holds it as received
             if topic is HEALTH:
-                self._ledger.believe(message, wire.Health.FromString(message.payload))
+                self._losses.believe(message, wire.Health.FromString(message.payload))
             elif topic is CONTROLLER_STATE:
                 mode = mode_name(wire.ControllerState.FromString(message.payload).mode)
                 if self._modes[-1:] != [mode]:
@@ -151,7 +151,7 @@ class _Account:
 
     def figures(self) -> dict[str, Any]:
         """The account as a dictionary."""
-        missing = self._ledger.lost()
+        missing = self._losses.lost()
         begin = None if self._begin_ns is None else datetime.fromtimestamp(self._begin_ns / 1e9, UTC)
         topics = {}
         for key, line in sorted(self._lines.items()):

@@ -131,8 +131,8 @@ class Axes:
             for piece in np.ma.clump_unmasked(np.ma.masked_invalid(y)):  # type: ignore[no-untyped-call]
                 points = self.positions(x[piece], y[piece])
                 strips.append((points if len(points) > 1 else np.repeat(points, 2, axis=0), colour, width))
-        positions, shades, points_wide = zip(*strips, strict=True) if strips else ((), (), ())
-        radii = rr.Radius.ui_points(list(points_wide))
+        positions, shades, line_widths = zip(*strips, strict=True) if strips else ((), (), ())
+        radii = rr.Radius.ui_points(list(line_widths))
         stream.log(f"{self.path}/curves", rr.LineStrips2D(positions, colors=list(shades), radii=radii))
 
     def positions(self, x: npt.ArrayLike, y: npt.ArrayLike) -> Array:

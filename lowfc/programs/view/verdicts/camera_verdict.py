@@ -14,19 +14,16 @@ FEW = 0.005
 MANY_LOST = 0.1
 """Fraction of frames lost above which the loop no longer behaves as tuned."""
 DARK, DIM, BRIGHT = 0.2, 0.5, 2.0
-"""Fractions of the expected light. Below a fifth the controller refuses frames by default; half of it makes 1.4 times
-the noise; more than twice is not the star of the calibration."""
-SURELY_S = 4.0
+"""Fractions of the expected light. Below a fifth the controller refuses frames by default; at half the noise is 1.4
+times larger; more than twice is not the calibrated star."""
+HEALTH_OVERDUE_S = 4.0
 """Time after which a camera that has died sends no Health either."""
 LATELY = f"in the last {RECENT_S:g} s"
 
 REFUSED: dict[Reason, tuple[str, str]] = {
     Rejection.DARK: ("too dark", "the star is gone; check pointing, shutter and clouds"),
     Rejection.SATURATED: ("detector saturated", "too much light; shorten the exposure or dim the star"),
-    Rejection.WRONG_SIZE: (
-        "wrong size",
-        "they do not match the calibration; restore the camera's settings or calibrate again",
-    ),
+    Rejection.WRONG_SIZE: ("wrong size", "they do not match the calibration; reset the camera or calibrate again"),
     Rejection.LATE: ("too late", "host or link is too slow; check the latency, lower the rate"),
     Rejection.NO_CALIBRATION: ("no calibration", "load a calibration"),
     Rejection.STUCK: ("stuck", "the camera repeats one image; restart it"),
@@ -45,7 +42,7 @@ def frames(state: RunState) -> Tile:
     if camera.life is Liveness.STARTING:
         return tile("STARTING", "the camera")
     if silent_s is not None:
-        alive = camera.life is not Liveness.SILENT and silent_s > SURELY_S
+        alive = camera.life is not Liveness.SILENT and silent_s > HEALTH_OVERDUE_S
         who = "the camera runs, but sends none" if alive else "camera silent"
         since = duration(silent_s)
         advice = f"No frame for {since}, {who}: the loop holds. Check the camera's last output and restart it."

@@ -207,7 +207,9 @@ def _recorder(state: RunState) -> Tile:
     done = last.health.recording
     log = short(PurePath(done.file).stem)
     if done.failure:
-        advice = f"Recording failed, the loop goes on: {short(done.failure)}. Make room and start `lowfc record` again."
+        advice = (
+            f"Recording failed, the loop goes on: {short(done.failure)}. Free disk space, restart `lowfc record`."
+        )
         return tile("FAILED", short(done.failure), Level.BAD, advice)
     gone = absent("RECORDER", "recorder", recorder, state.running_s, "nothing is recorded, the loop goes on")
     if gone is not None and recorder.life is Liveness.SILENT:
@@ -215,7 +217,7 @@ def _recorder(state: RunState) -> Tile:
     if recorder.life is Liveness.STOPPED:
         if state.controller.life not in (Liveness.RUNNING, Liveness.STARTING):
             return tile("STOPPED", f"{log} is complete")
-        advice = "The recorder was stopped, the loop goes on: nothing is recorded. Start `lowfc record` again."
+        advice = "The recorder was stopped, the loop goes on: nothing is recorded. Restart `lowfc record`."
         return tile("STOPPED", f"{log} is complete; nothing is recorded now", Level.WARNING, advice)
     if done.stopped:
         advice = "Recording was stopped by an operator: nothing is recorded. `lowfc ctl record start` resumes."

@@ -28,15 +28,15 @@ def wavefront(state: RunState, nm_per_mas: float | None, loop: Tile) -> Tile:
     tile, found, attained = partial(Tile, "WAVEFRONT"), state.wavefront, state.attained
     if found is None:
         return tile("?", "not measured now")
-    left = figure(found.residual_nm)
-    value, flat, more = f"{left} nm rms", f"{figure(found.open_nm)} nm with a flat mirror", "true"
+    residual = figure(found.residual_nm)
+    value, flat, more = f"{residual} nm rms", f"{figure(found.open_nm)} nm with a flat mirror", "true"
     if not state.true:
         more = f"measured, {_without_noise(found.residual_nm, attained)}" if attained else "measured, with noise"
     if nm_per_mas and found.tilt_open_nm:
         tilt, before = (figure(one / nm_per_mas) for one in (found.tilt_residual_nm, found.tilt_open_nm))
         more = f"tilt {tilt} of {before} mas per axis; {more}"
     if loop.value == "ENDED":
-        return tile(f"last: {left} nm", f"of {flat}; {more}")
+        return tile(f"last: {residual} nm", f"of {flat}; {more}")
     if loop.level is not Level.GOOD:
         return tile(value, f"{'not corrected;' if loop.value in UNCORRECTED else 'of'} {flat}; {more}")
     if state.true and _shaped(state.snapshot.controller):
@@ -45,7 +45,7 @@ def wavefront(state: RunState, nm_per_mas: float | None, loop: Tile) -> Tile:
     raw, latest = found.open_nm / found.residual_nm if found.residual_nm else 1.0, state.latest
     if raw < 1 / WORSE and latest is not None and latest.residual_nm > WORSE * latest.open_nm:
         level = Level.BAD if raw < 1 / DIVERGING else Level.WARNING
-        advice = f"The loop does harm: {left} nm rms, {flat}. Lower the gain or open the loop."
+        advice = f"The loop does harm: {residual} nm rms, {flat}. Lower the gain or open the loop."
         return tile(value, f"worse than {flat}; {more}", level, advice)
     noise_nm = attained.noise_nm if attained is not None and not state.true else 0.0
     level, why = merit(factor(found.residual_nm, found.open_nm, noise_nm), attained)
@@ -69,14 +69,14 @@ def factor(residual_nm: float, open_nm: float, noise_nm: float) -> float:
     return open_nm / residual_nm
 
 
-def merit(better: float, attained: Attained | None) -> tuple[Level, str]:
+def merit(reduction: float, attained: Attained | None) -> tuple[Level, str]:
     """Level of a closed loop that does no harm, and the reason if it is not good."""
     if attained is None:
-        return (Level.GOOD, "") if better >= GOOD_FACTOR else (Level.NEUTRAL, ": little is corrected")
+        return (Level.GOOD, "") if reduction >= GOOD_FACTOR else (Level.NEUTRAL, ": little is corrected")
     if attained.residual_nm > hypot(NEAR_BEST * attained.best_nm, NOISE_FLOOR * attained.noise_nm):
         times = attained.residual_nm / max(attained.best_nm, 1e-9)
         return Level.NEUTRAL, f", {times:.1f} x the residual of the best gains: run `lowfc tune`"
-    if better >= GOOD_FACTOR:
+    if reduction >= GOOD_FACTOR:
         return Level.GOOD, ""
     best = attained.residual_nm <= NEAR_BEST * attained.best_nm
     return Level.NEUTRAL, ": little is corrected" + (", and other gains would not correct more" if best else "")
