@@ -18,8 +18,8 @@ from lowfc.programs.view.recorded import Drawn, draw_logs
 from lowfc.programs.view.renderer import Renderer
 from lowfc.programs.view.session import memory_remarks
 from lowfc.programs.view.target import Target
-from lowfc.programs.view.verdicts import course
-from lowfc.programs.view.verdicts.course import Course
+from lowfc.programs.view.verdicts import span_means
+from lowfc.programs.view.verdicts.span_means import SpanMeans
 from lowfc.programs.view.verdicts.tile import Level, Verdict
 from tests.support import report_log
 from tests.support.report_log import Night
@@ -96,14 +96,14 @@ def test_a_log_without_steps_has_no_verdict_on_the_loop(tmp_path: Path, shown: S
 
 
 def test_the_trend_of_a_night_has_a_limited_number_of_spans() -> None:
-    averages, snapshot = Course(), snapshot_of(night(200).samples)
+    averages, snapshot = SpanMeans(), snapshot_of(night(200).samples)
     averages.feed(snapshot)
     _, rms_nm = averages.wavefront()
     squares = np.stack([snapshot.truths.residual_rms_nm, snapshot.truths.disturbance_rms_nm], axis=1).astype(float) ** 2
     np.testing.assert_allclose(rms_nm[0], np.sqrt(squares.mean(axis=0)), rtol=1e-6)
     averages.add(np.array([snapshot.truths.time_ns[0] + 10 * 3600 * 10**9]), slice(0, 3), np.ones((1, 2)))
     after_ns, rms_nm = averages.wavefront()
-    assert course.MOST / 2 <= len(after_ns) <= course.MOST
+    assert span_means.MOST / 2 <= len(after_ns) <= span_means.MOST
     np.testing.assert_allclose(rms_nm[0], np.sqrt(squares.mean(axis=0)), rtol=1e-6)
     assert np.isnan(rms_nm[1:-1]).all()  # nothing in between: a gap
 

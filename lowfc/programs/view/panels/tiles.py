@@ -16,7 +16,7 @@ from lowfc.programs.view.draw.colours import Colour
 from lowfc.programs.view.draw.plots import at
 from lowfc.programs.view.panels.panel import Panel
 from lowfc.programs.view.snapshot import Snapshot
-from lowfc.programs.view.verdicts.night import Night
+from lowfc.programs.view.verdicts.log_verdict import LogVerdict
 from lowfc.programs.view.verdicts.tile import FILL, INK, WORD, Level, Tile, Verdict
 from lowfc.programs.view.verdicts.verdict import judge
 from lowfc.programs.view.verdicts.watcher import Watcher
@@ -29,10 +29,10 @@ SHORTEST_NS = 250_000_000
 """Shortest time between pictures with another word or colour. If only figures differ, there is one picture per second:
 more cannot be read, and each stays in the viewer's memory."""
 
-_GAP, _INSET, _BAND, _CLOCK = 6, 9, 46, 190
+_GAP, _INSET, _BAND, _CLOCK = 6, 9, 46, 190  # gap of boxes, inset of text, height of headline, width of clock, px
 _TILES_END = 196
 _FACTS = (3, 4, 4, 4)  # relative widths of the facts below the tiles
-_SMALLEST = 8
+_SMALLEST_FONT = 8
 _SHADES = 16
 _PITCH = 1.16  # of lines, in font sizes
 
@@ -50,16 +50,16 @@ class Tiles(Panel):
         """`nm_per_mas`: wavefront rms of a tilt of 1 mas, if the telescope is known."""
         self._nm_per_mas = nm_per_mas
         self._watcher = Watcher()
-        self._night = Night()
+        self._log_verdict = LogVerdict()
         self._drawn: object = None
         self._judged_ns = 0
 
     def draw(self, stream: rr.RecordingStream, snapshot: Snapshot) -> None:
         """Judge the run, and show the verdict if it or the clock has changed."""
         self._watcher.feed(snapshot)
-        self._night.feed(snapshot)
+        self._log_verdict.feed(snapshot)
         if snapshot.ended is not None:
-            self._show(stream, snapshot.time_ns, self._night.verdict(self._watcher.state(), snapshot.ended))
+            self._show(stream, snapshot.time_ns, self._log_verdict.verdict(self._watcher.state(), snapshot.ended))
         elif not 0 <= snapshot.host_ns - self._judged_ns < SHORTEST_NS:
             self._judged_ns = snapshot.host_ns
             verdict = judge(self._watcher.state(), self._nm_per_mas)
@@ -140,7 +140,7 @@ def _shades(width: int, height: int, texts: tuple[Text, ...]) -> Shades:
 def _write(pen: ImageDraw.ImageDraw, box: Box, text: str, largest: int) -> None:
     """Draw wrapped text in the largest size that fits: centred in a low box, from the top of a high one."""
     x0, y0, x1, y1 = box
-    for size in range(largest, _SMALLEST - 1, -1):
+    for size in range(largest, _SMALLEST_FONT - 1, -1):
         lines, pitch = _wrapped(text, size, x1 - x0), size * _PITCH
         if len(lines) * pitch <= y1 - y0 and all(_width(line, size) <= x1 - x0 for line in lines):
             break

@@ -14,7 +14,7 @@ from lowfc.programs.view.draw.colours import GREEN, GREY
 from lowfc.programs.view.draw.plots import Axes, Ticks, at
 from lowfc.programs.view.panels.panel import Panel
 from lowfc.programs.view.snapshot import Snapshot
-from lowfc.programs.view.verdicts.course import Course
+from lowfc.programs.view.verdicts.span_means import SpanMeans
 
 TREND = "residual/trend"
 WIDTH = 200.0
@@ -29,18 +29,18 @@ class Trend(Panel):
     """Rms of each span, drawn every two seconds and at the end of a log."""
 
     def __init__(self) -> None:
-        self._course = Course()
+        self._means = SpanMeans()
         self._axes = Axes(TREND, WIDTH)
 
     def draw(self, stream: rr.RecordingStream, snapshot: Snapshot) -> None:
         """Add the new data; draw when due."""
-        course = self._course
-        course.feed(snapshot)
+        means = self._means
+        means.feed(snapshot)
         if not self.due(snapshot) and snapshot.ended is None:
             return
-        after_ns, rms_nm = course.wavefront()
+        after_ns, rms_nm = means.wavefront()
         known = np.isfinite(rms_nm).all(axis=1) & (rms_nm > 0).all(axis=1)
-        if not known.any() or course.begin_ns is None:
+        if not known.any() or means.begin_ns is None:
             return
         at(stream, snapshot.time_ns)
         after_s, logarithms = after_ns * 1e-9, np.full(rms_nm.shape, np.nan)
@@ -52,9 +52,9 @@ class Trend(Panel):
         y = (y_ticks[0][0], y_ticks[-1][0])
         if len(y_ticks) > _MOST_TICKS:
             y_ticks = [tick for tick in y_ticks if tick[0] == round(tick[0])]
-        self._axes.fit(stream, (0.0, span_s), y, _clock_ticks(course.begin_ns, span_s), y_ticks)
-        kind = "true" if course.true else "measured"
-        names = ("flat mirror", "residual", f"{kind}, {course.span_ns / 1e9:g} s mean")
+        self._axes.fit(stream, (0.0, span_s), y, _clock_ticks(means.begin_ns, span_s), y_ticks)
+        kind = "true" if means.true else "measured"
+        names = ("flat mirror", "residual", f"{kind}, {means.span_ns / 1e9:g} s mean")
         self._axes.name(stream, names, (GREY, GREEN, GREY))
         self._axes.draw(stream, after_s, [*logarithms.T[::-1]], (GREY, GREEN), (1.2, 1.8))  # the residual on top
 

@@ -207,9 +207,7 @@ def _recorder(state: RunState) -> Tile:
     done = last.health.recording
     log = short(PurePath(done.file).stem)
     if done.failure:
-        advice = (
-            f"Recording failed, the loop goes on: {short(done.failure)}. Free disk space, restart `lowfc record`."
-        )
+        advice = f"Recording failed, the loop goes on: {short(done.failure)}. Free disk space, restart `lowfc record`."
         return tile("FAILED", short(done.failure), Level.BAD, advice)
     gone = absent("RECORDER", "recorder", recorder, state.running_s, "nothing is recorded, the loop goes on")
     if gone is not None and recorder.life is Liveness.SILENT:

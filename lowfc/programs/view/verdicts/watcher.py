@@ -42,7 +42,7 @@ ATTAINED_NS = 30_000_000_000
 """Time between two computations of the best gains, which take 0.3 s for 14 modes."""
 _SAMPLES = 1000
 _MODES: dict[int, LoopMode] = {mode.value: mode for mode in LoopMode}
-_COUNTED: dict[str, tuple[Role, Callable[[wire.Health], int]]] = {
+_COUNTERS: dict[str, tuple[Role, Callable[[wire.Health], int]]] = {
     "skipped": (Role.CONTROLLER, lambda health: topic_count(health, FRAME.key).skipped),
     "missing": (Role.CONTROLLER, lambda health: topic_count(health, FRAME.key).missing),
     "late": (Role.CAMERA, lambda health: health.commands_late),
@@ -78,7 +78,7 @@ class Watcher:
         self._steady, self._attained_ns = Steady(), 0
         self._attained: Attained | None = None
         self._samples: deque[_Sample] = deque(maxlen=_SAMPLES)
-        self._counted: dict[str, tuple[int, int]] = {}
+        self._last_counts: dict[str, tuple[int, int]] = {}
         self._last_active: list[_Sample] = []
 
     def feed(self, snapshot: Snapshot) -> None:
@@ -224,15 +224,15 @@ class Watcher:
     def _grown(self, snapshot: Snapshot) -> dict[str, int]:
         """Increase of the processes' counts since the last snapshot; none for a restarted process."""
         grown: dict[str, int] = {}
-        for name, (role, count_in) in _COUNTED.items():
+        for name, (role, count_in) in _COUNTERS.items():
             last = snapshot.health.get(role)
             if last is None:
                 continue
             count = count_in(last.health)
-            pid, before = self._counted.get(name, (last.health.pid, count))
+            pid, before = self._last_counts.get(name, (last.health.pid, count))
             if pid == last.health.pid and count > before:
                 grown[name] = count - before
-            self._counted[name] = (last.health.pid, count)
+            self._last_counts[name] = (last.health.pid, count)
         return grown
 
 

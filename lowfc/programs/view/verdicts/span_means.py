@@ -14,7 +14,7 @@ _TRUE, _MEASURED, _LIGHT = slice(0, 3), slice(3, 6), slice(6, 8)  # columns: a c
 _COLUMNS = 8
 
 
-class Course:
+class SpanMeans:
     """Means of each span of `span_ns`, one second long at first, from `begin_ns` on (None before the first row).
 
     The wavefront is the `true` one of a simulation, otherwise the measured one.

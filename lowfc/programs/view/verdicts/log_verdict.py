@@ -12,9 +12,9 @@ from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.wording import counted
 from lowfc.programs.view.snapshot import LogEnd, Snapshot
 from lowfc.programs.view.verdicts.camera_verdict import DIM, FEW, REFUSED
-from lowfc.programs.view.verdicts.course import Course
 from lowfc.programs.view.verdicts.facts import facts
 from lowfc.programs.view.verdicts.run_state import RunState
+from lowfc.programs.view.verdicts.span_means import SpanMeans
 from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict, duration, figure, worst_of
 from lowfc.programs.view.verdicts.verdict import LIMITS, stroke, stroke_used_nm
 from lowfc.programs.view.verdicts.wavefront_verdict import GOOD_FACTOR
@@ -25,11 +25,11 @@ _MODES = {mode.value: mode for mode in LoopMode}
 _NAMES = {LoopMode.OPEN: "open", LoopMode.SAFE: "safe", LoopMode.IDLE: "idle", None: "without frames"}
 
 
-class Night:
+class LogVerdict:
     """Sums over all snapshots of a log."""
 
     def __init__(self) -> None:
-        self._course = Course()
+        self._means = SpanMeans()
         self._closed = np.zeros(3)  # while closed: rows, sums of squares of residual and open
         self._mode_ns: Counter[LoopMode | None] = Counter()
         self._first_ns = self._last_ns = 0
@@ -39,8 +39,8 @@ class Night:
 
     def feed(self, snapshot: Snapshot) -> None:
         """Add a snapshot."""
-        self._course.feed(snapshot)
-        steps, waves = snapshot.steps, snapshot.waves(true=self._course.true)
+        self._means.feed(snapshot)
+        steps, waves = snapshot.steps, snapshot.waves(true=self._means.true)
         if steps.time_ns.size:
             self._add_modes(steps)
             closed = np.isin(waves.sequence, steps.sequence[steps.mode == LoopMode.CLOSED.value])
@@ -95,11 +95,11 @@ class Night:
         if not count:
             return Tile("WAVEFRONT", "?", "never measured with the loop closed")
         residual_nm, flat_nm = float(np.sqrt(residual_nm2 / count)), float(np.sqrt(flat_nm2 / count))
-        worst_nm = float(np.nanmax(self._course.wavefront()[1][:, 0], initial=0.0))
+        worst_nm = float(np.nanmax(self._means.wavefront()[1][:, 0], initial=0.0))
         factor = flat_nm / residual_nm if residual_nm else 1.0
         detail = (
             f"while closed, {factor:.1f} x better than {figure(flat_nm)} nm with a flat mirror; "
-            f"worst {self._span}: {figure(worst_nm)} nm; {'true' if self._course.true else 'measured, with noise'}"
+            f"worst {self._span}: {figure(worst_nm)} nm; {'true' if self._means.true else 'measured, with noise'}"
         )
         level = Level.GOOD if factor >= GOOD_FACTOR else Level.NEUTRAL
         value = f"{figure(residual_nm)} nm rms"
@@ -107,10 +107,10 @@ class Night:
 
     @property
     def _span(self) -> str:
-        return duration(self._course.span_ns * 1e-9)
+        return duration(self._means.span_ns * 1e-9)
 
     def _star(self) -> Tile:
-        light = 100 * self._course.light()
+        light = 100 * self._means.light()
         light = light[np.isfinite(light)]
         if not light.size:
             return Tile("STAR", "?", "no frame was used")
