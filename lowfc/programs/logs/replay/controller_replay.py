@@ -95,19 +95,19 @@ class ControllerReplay:
         self.done = begun_ns >= context.segment.until_ns
         self.retry_pending = False
         self._context, self._account = context, context.account
-        self._last: int | None = None
-        self._lost_at: int | None = None
-        self._forgotten = 0
-        self._began = 0
-        self._first: int | None = None  # lowest input number in the log
-        self._form: tuple[int, str] | None = None
+        self._end: int | None = None  # input number of the first state of the next segment
+        self._lost_number: int | None = None  # input number at which the state was lost
+        self._dropped = 0  # inputs since then
+        self._start_number = 0  # input number of the adopted state
+        self._first_number: int | None = None  # lowest input number in the log
+        self._command_form: tuple[int, str] | None = None  # validity, ns, and channel of the log's commands
         self._entries: dict[int, _Entry] = {}
         self._states: dict[int, wire.ControllerState] = {}
         self._settings: Settings | None = None
         self._state: State | None = None
-        self._past: deque[State] = deque(maxlen=_STATES_KEPT)
-        self._why = _BEFORE if begun_ns >= context.segment.from_ns else ""
-        self._counts = bool(self._why)
+        self._recent_states: deque[State] = deque(maxlen=_STATES_KEPT)
+        self._unchecked_because = _BEFORE if begun_ns >= context.segment.from_ns else ""
+        self._counts_earlier = bool(self._unchecked_because)
 
     def take(self, message: Sample, kind: type[Message]) -> None:
         """Add one of the controller's messages, and replay as far as possible."""
@@ -125,7 +125,7 @@ class ControllerReplay:
                         "another controller; use `lowfc what-if` or `lowfc report`"
                     )
                 return
-            self._first = number if self._first is None else min(number, self._first)
+            self._first_number = number if self._first_number is None else min(number, self._first_number)
             if self._state is not None and number <= self._state.input_number:
                 self._account_for_late(number, body)
                 return
@@ -138,12 +138,12 @@ class ControllerReplay:
             entry.logged, entry.logged_bytes = body, message.payload  # type: ignore[assignment]  # one of the three
             if isinstance(body, wire.ControlStep):
                 self._context.frames.note_step(body)
-        self.go_on(message.receive_time_ns)
+        self.proceed(message.receive_time_ns)
 
     def _account_for_late(self, number: int, body: Message) -> None:
         """Account for a message of a past input: from before the adopted state, or a duplicate."""
-        if number <= self._began:
-            if self._counts:
+        if number <= self._start_number:
+            if self._counts_earlier:
                 self._account.leave_out(_BEFORE, int(isinstance(body, wire.ControlStep)))
         elif not isinstance(body, wire.MirrorCommand) and self._state is not None:
             name = body.DESCRIPTOR.name
@@ -152,12 +152,12 @@ class ControllerReplay:
             self._account.enter(duplicate, self._context.tolerance_nm)
             self._account.frames += isinstance(body, wire.ControlStep)
 
-    def go_on(self, now_ns: int, *, ended: bool = False) -> None:
+    def proceed(self, now_ns: int, *, ended: bool = False) -> None:
         """Replay every input that is complete or overdue; all remaining ones once the log has `ended`."""
         while (self._entries or self._states) and not self.done:
             if self._state is None and not self._adopt():
                 if not self.done:
-                    self._forget(now_ns, ended=ended)
+                    self._drop_old(now_ns, ended=ended)
                 return
             assert self._state is not None  # noqa: S101  # adopted above
             number = self._state.input_number + 1
@@ -166,8 +166,8 @@ class ControllerReplay:
                 waiting = next(iter(self._entries.values()), None)
                 if waiting is None or not (ended or now_ns - waiting.receive_time_ns > PATIENCE_NS):
                     return
-                before_log = self._first is not None and number < self._first
-                self._lose(_BEFORE if before_log else "after an input that the log does not have")
+                before_log = self._first_number is not None and number < self._first_number
+                self._reset(_BEFORE if before_log else "after an input that the log does not have")
                 continue
             late = ended or now_ns - entry.receive_time_ns > PATIENCE_NS
             if not late and entry.command is None and entry.leads_to_command and self._state.loop is not None:
@@ -183,7 +183,7 @@ class ControllerReplay:
                 del self._entries[number]
                 self._check(entry, input_)
             elif late:
-                self._lose(f"after {'an input' if entry.logged is None else 'a frame'} that the log does not have")
+                self._reset(f"after {'an input' if entry.logged is None else 'a frame'} that the log does not have")
             else:
                 return
 
@@ -191,8 +191,8 @@ class ControllerReplay:
         if receive_time_ns < self._context.segment.from_ns:
             return
         if receive_time_ns >= self._context.segment.until_ns:
-            self._last = message.input_number if self._last is None else min(self._last, message.input_number)
-        past = next((state for state in self._past if state.input_number == message.input_number), None)
+            self._end = message.input_number if self._end is None else min(self._end, message.input_number)
+        past = next((state for state in self._recent_states if state.input_number == message.input_number), None)
         if past is not None:
             self._compare_state(past, message)
         elif self._state is None or message.input_number > self._state.input_number:
@@ -209,17 +209,17 @@ class ControllerReplay:
             try:
                 settings, state = self._decoded(message)
             except ValueError as error:
-                self._why = self._why and f"not replayed: {error}"
+                self._unchecked_because = self._unchecked_because and f"not replayed: {error}"
                 continue
             self._states = {later: state for later, state in self._states.items() if later > number}
-            self._settings, self._state, self._began = settings, state, number
-            self._past.append(state)
-            self._counts = bool(self._why)
+            self._settings, self._state, self._start_number = settings, state, number
+            self._recent_states.append(state)
+            self._counts_earlier = bool(self._unchecked_because)
             self._leave_out(number)
-            if self._lost_at is not None:
-                self._account.inputs_missing += number - self._lost_at - self._forgotten
-                self._lost_at = None
-            self.done = number == self._last
+            if self._lost_number is not None:
+                self._account.inputs_missing += number - self._lost_number - self._dropped
+                self._lost_number = None
+            self.done = number == self._end
             return not self.done
         return False
 
@@ -238,24 +238,25 @@ class ControllerReplay:
     def _leave_out(self, upto: int) -> None:
         for number in [number for number in self._entries if number <= upto]:
             logged = self._entries.pop(number).logged
-            self._forgotten += logged is not None
-            if self._why:  # otherwise they belong to another segment
-                self._account.leave_out(self._why, int(isinstance(logged, wire.ControlStep)))
+            self._dropped += logged is not None
+            if self._unchecked_because:  # otherwise they belong to another segment
+                self._account.leave_out(self._unchecked_because, int(isinstance(logged, wire.ControlStep)))
 
-    def _forget(self, now_ns: int, *, ended: bool) -> None:
+    def _drop_old(self, now_ns: int, *, ended: bool) -> None:
         """Without a state to continue from, drop inputs that the next state will not need, and surplus states."""
         old = [number for number, entry in self._entries.items() if now_ns - entry.receive_time_ns > 2 * PATIENCE_NS]
         self._leave_out(max(self._entries if ended else old, default=0))
         while len(self._states) > _STATES_KEPT:
             del self._states[min(self._states)]
 
-    def _lose(self, why: str) -> None:
-        self._why = why
-        self._lost_at = self._state.input_number if self._state is not None and why not in ("", _BEFORE) else None
-        self._forgotten = 0
+    def _reset(self, why: str) -> None:
+        """Drop the state; steps are unchecked because of `why` until the next state is adopted."""
+        self._unchecked_because = why
+        self._lost_number = self._state.input_number if self._state is not None and why not in ("", _BEFORE) else None
+        self._dropped = 0
         self._state = None
         self.retry_pending = True
-        self._past.clear()
+        self._recent_states.clear()
 
     def _input(self, entry: _Entry, *, late: bool) -> Input | None:
         """The controller's input; None if the log does not have it (yet). If `late`, nothing more will arrive."""
@@ -294,27 +295,27 @@ class ControllerReplay:
             try:
                 self._settings, state = self._decoded(logged)
             except ValueError as error:
-                self._lose(f"not replayed: {error}")
+                self._reset(f"not replayed: {error}")
                 return
         self._account.requests += isinstance(input_, Request)
         self._state = state
-        self._past.append(state)
-        self.done = state.input_number == self._last
+        self._recent_states.append(state)
+        self.done = state.input_number == self._end
 
     def _difference(self, state: State, logged: Message, replayed: Message | None) -> Difference | None:
         """Difference between the compared fields; None without any."""
         if self._context.former is not None and type(replayed) is type(logged):
             if isinstance(logged, wire.ControllerState):
-                logged = self._in_todays_form(logged)
+                logged = self._reencoded(logged)
             elif isinstance(logged, wire.Request) and logged.HasField("state"):
                 logged = deepcopy(logged)
-                logged.state.CopyFrom(self._in_todays_form(logged.state))
+                logged.state.CopyFrom(self._reencoded(logged.state))
             logged, replayed = self._context.former.compared(logged), self._context.former.compared(replayed)
         if replayed == logged and (self._context.former is not None or isinstance(logged, wire.ControllerState)):
             return None  # other messages are compared byte by byte
         return difference(state.input_number, state.frame_sequence, logged, replayed)
 
-    def _in_todays_form(self, logged: wire.ControllerState) -> wire.ControllerState:
+    def _reencoded(self, logged: wire.ControllerState) -> wire.ControllerState:
         """Re-encode a state in the form of this version; unchanged if it cannot be decoded."""
         with contextlib.suppress(ValueError):
             settings, state = self._decoded(logged)
@@ -326,7 +327,7 @@ class ControllerReplay:
         assert self._state is not None  # noqa: S101
         state, outputs = advance(self._settings, self._state, input_)
         self._state = state
-        self._past.append(state)
+        self._recent_states.append(state)
         account = self._account
         if outputs.step is not None and entry.logged is not None:
             account.frames += 1
@@ -335,8 +336,8 @@ class ControllerReplay:
             account.commands += 1
             replayed = None
             if outputs.command is not None:
-                self._form = self._form or (entry.command.valid_for_ns, entry.command.channel)
-                replayed = codec.encode_command(outputs.command, *self._form, state.input_number)
+                self._command_form = self._command_form or (entry.command.valid_for_ns, entry.command.channel)
+                replayed = codec.encode_command(outputs.command, *self._command_form, state.input_number)
             self._compare(entry.command, entry.command_bytes, replayed)
         elif outputs.command is not None:
             account.commands_missing += 1
@@ -358,7 +359,7 @@ class ControllerReplay:
     def _compare_state(self, state: State, logged: wire.ControllerState) -> None:
         assert self._settings is not None  # noqa: S101
         self._account.states += 1
-        self.done = state.input_number == self._last
+        self.done = state.input_number == self._end
         replayed = controller_state(state, self._settings, from_timestamp(logged.timestamp))
         found = self._difference(state, logged, replayed)
         if found is None:
@@ -366,7 +367,7 @@ class ControllerReplay:
         self._account.enter(found, self._context.tolerance_nm)
         if self._state is state and not self.done:  # otherwise the difference would persist for the rest of the log
             self._states[state.input_number] = logged
-            self._lose("")
+            self._reset("")
             self._adopt()
 
     def _compare(self, logged: Message, logged_bytes: bytes, replayed: bytes | None) -> None:

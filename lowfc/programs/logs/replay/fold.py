@@ -66,7 +66,7 @@ class Replay:
     def finish(self) -> Account:
         """Replay the rest at the end of the log or segment, and return the account."""
         for controller in self._controllers.values():
-            controller.go_on(self._last_ns, ended=True)
+            controller.proceed(self._last_ns, ended=True)
         return self.context.account
 
     def _controller(self, message: Sample) -> ControllerReplay:
