@@ -253,7 +253,7 @@ def request(
     table, basis = floats(message.table, -1, message.columns or 1), floats(message.actuators, -1)
     if message.play_id:
         if message.play_id not in plays:
-            raise ValueError(f"the table {message.play_id[:12]} of a play is missing")
+            raise ValueError(f"the table {message.play_id[:12]} of a probe sequence is missing")
         known_table = plays[message.play_id]
         table, basis = known_table.rows, known_table.basis.reshape(-1)
     calibration = None

@@ -92,7 +92,7 @@ def seen(table: Array, weights: Array, sequence: npt.NDArray[np.integer], comman
     """Rows of a table (frames, columns) that exposures saw.
 
     Args:
-        table: A row for each frame from the first frame of the play; before and after it, zeros.
+        table: A row for each frame from the first one of the sequence; before and after it, zeros.
         weights: (lags,) fraction of the row of `lag` frames before that an exposure sees; sums to 1.
         sequence: (exposures,) ascending, counted from the frame whose command had the first row.
         commanded: (exposures,) whether the frame led to a command; if not, or if the frame is missing, the mirror kept

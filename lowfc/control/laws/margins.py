@@ -266,7 +266,7 @@ def _frequencies(poles: Complex) -> Array:
 
 
 def _gain_margins(loop: Complex) -> tuple[float, float]:
-    """Growth and reduction at which L passes through -1: where it crosses the negative real axis."""
+    """Growth and reduction of the gain at which L passes through -1, from its crossings of the negative real axis."""
     before, after = loop[:-1], loop[1:]
     crosses = np.signbit(before.imag) != np.signbit(after.imag)
     a, b = before[crosses], after[crosses]

@@ -84,10 +84,10 @@ def _block(
         # of this depth and, between its -3 dB points, of width 2 a depth.
         pole = complex(np.exp(-np.pi * notch.width_hz / rate_hz / notch.depth) * z)
         seen = complex(np.polynomial.polynomial.polyval(1 / z, weights)) / z
-        wanted = (notch.depth - 1) * (1 / seen + law(z))
+        target = (notch.depth - 1) * (1 / seen + law(z))
         near, far = 1 / (1 - pole / z), 1 / (1 - pole.conjugate() / z)
         parts = np.array([[(near + far).real, (far - near).imag], [(near + far).imag, (near - far).real]])
-        real, imaginary = np.linalg.solve(parts, [wanted.real, wanted.imag])
+        real, imaginary = np.linalg.solve(parts, [target.real, target.imag])
         residues.append((pole, complex(real, imaginary)))
 
     rotations = [np.array([[pole.real, -pole.imag], [pole.imag, pole.real]]) for pole, _ in residues]

@@ -140,7 +140,7 @@ def tune_integrator(models: Sequence[Model], gains: Gains, noll: tuple[int, ...]
 def tune_lqg(
     run: Pieces, models: Sequence[Model], gains: Gains, noll: tuple[int, ...], leak: Array, timing: Timing
 ) -> Tuned:
-    """LQG where it beats the best integrator on this run, otherwise that integrator; leaks (modes,) without unit.
+    """LQG for modes in which it beats the best integrator, else that integrator; leaks (modes,) without unit.
 
     The run also decides the width of lines that the spectrum does not resolve, and how fast lines move.
 

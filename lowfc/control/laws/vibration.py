@@ -27,7 +27,7 @@ _LOBE = 12  # frequencies on either side of a line into which the window spreads
 _FULL = 40  # frequencies on either side of a line, and from 0 on, that are not averaged
 _PER_DECADE = 48
 _LEAST_DRIFT = 1e-8  # variance of its step per variance of noise: a constant is followed in 10^4 frames
-_LEAST_NOISE = 1e-3  # of the level of the upper frequencies, all of which drift may explain: a filter needs noise
+_LEAST_NOISE = 1e-3  # of the level of the upper frequencies; drift may explain all of it, but a filter needs noise
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ EXTERNAL = "external"
 """Channel of shapes that other programs apply to the mirror: the loop does not command it."""
 MOST_CHANNELS = 16
 MOST_PLAYED = 1 << 24
-"""Most numbers in the table of a play, and in its basis."""
+"""Most numbers in the table of a probe sequence, and in its basis."""
 MIRROR, OFFSET = "mirror", "offset"
 LONGEST_NAME = 32
 
@@ -211,7 +211,7 @@ class CommandChannels(NamedTuple):
         return self.passed(len(self.shifts_nm))
 
     def restarted_from_flat(self, to_modes: Single, *, only_flat: bool = False) -> "CommandChannels":
-        """A copy for a command that relaxes to zero: the channels restart from flat, and the play ends."""
+        """A copy for a command that relaxes to zero: the channels restart from flat, and the probe sequence ends."""
         flat = np.zeros_like(self.sum_nm)
         kept = (
             Channel.of(one.name, one.shape_nm, flat if one.commanded else one.shape_nm)
@@ -237,21 +237,21 @@ def play_table(target: str, rows: Single, basis: Single) -> PlayTable:
         ValueError: its parts do not match, it is too large, or a number in it is not finite.
     """
     if target not in (MIRROR, OFFSET):
-        raise ValueError(f"a play's target is {MIRROR} or {OFFSET}, got {target!r}")
+        raise ValueError(f"the target of a probe sequence is {MIRROR} or {OFFSET}, got {target!r}")
     if rows.ndim != 2 or not rows.size:
-        raise ValueError(f"a play's table has a row for each frame and a column for each shape, got {rows.shape}")
+        raise ValueError(f"the table of a probe sequence has a row per frame and a column per shape, got {rows.shape}")
     columns = rows.shape[1]
     if target == MIRROR and (not basis.size or basis.size % columns):
         raise ValueError(
-            f"a play on the mirror needs the actuators of a shape for each of {columns} columns, got {basis.size}"
+            f"a probe sequence on the mirror needs a shape for each of {columns} columns, got {basis.size} actuators"
         )
     if max(rows.size, basis.size) > MOST_PLAYED:
         raise ValueError(
-            f"a play holds at most {MOST_PLAYED} numbers, {MOST_PLAYED // columns} frames of {columns} columns; "
+            f"a probe sequence has at most {MOST_PLAYED} numbers, {MOST_PLAYED // columns} rows of {columns} columns; "
             f"got {max(rows.size, basis.size)}: play it in parts"
         )
     if not (np.isfinite(rows).all() and np.isfinite(basis).all()):
-        raise ValueError("every number of a play must be finite")
+        raise ValueError("every number of a probe sequence must be finite")
     basis = basis.reshape(columns, -1) if target == MIRROR else np.zeros((0, 0), np.float32)
     largest = np.abs(rows).max(axis=0).astype(np.float64)
     reach_nm = float(largest @ np.abs(basis).max(axis=1)) if basis.size else 0.0

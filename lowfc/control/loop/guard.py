@@ -230,8 +230,8 @@ class Guard(NamedTuple):
                     virtual_x = linear_law.predict_and_update(
                         law, self.x, y, np.where(out, virtual_nm[0], history_nm[0])
                     )
-                wanted_nm = np.clip(linear_law.respond(law, virtual_x), -integrator.limit_nm, integrator.limit_nm)
-                command_nm = np.where(out, wanted_nm, command_nm)
+                law_nm = np.clip(linear_law.respond(law, virtual_x), -integrator.limit_nm, integrator.limit_nm)
+                command_nm = np.where(out, law_nm, command_nm)
             virtual_nm, squares[1] = (command_nm, *virtual_nm[:-1]), other_nm
         np.square(squares, out=squares)
         frames, sums_nm2, void = self.frames + 1, self.sums_nm2 + squares.dot(self.members), self.void or limited

@@ -41,12 +41,12 @@ class Request:
     Attributes:
         modes: Noll indices that the values are for; empty for all.
         values: one for all modes, or one for each.
-        text: name of a channel, target of a play, a note.
+        text: name of a channel, target of a probe sequence, or a note.
         actuators_nm: one or more shapes of the mirror, one after the other, nm of surface.
-        table: (frames, columns), for a play.
+        table: (frames, columns) of a probe sequence.
         law: the law to drive the mirror; None for the integrator.
         calibration: the calibration to use.
-        played: the checked table and shapes of a play.
+        played: the checked table and shapes of a probe sequence.
         refusal: reason to refuse it in any state of the loop.
         prepared: whether the checks that need no state are done; see `lowfc.control.loop.requests.prepared`.
         lease_id: identity of the sender's lease, or of the requested one; 0 for none.

@@ -277,7 +277,7 @@ def adopted(loop: ActiveLoop, shape_nm: Single) -> tuple[ActiveLoop, list[Pendin
 
 
 def in_mode(state: State, mode: LoopMode, time_ns: int, cause: str) -> State:
-    """Change the loop mode; the play, steps and return to zero of the previous mode end."""
+    """Change the loop mode; probe sequence, steps and return to zero of the previous mode end."""
     loop = state.loop
     if loop is not None and mode is not state.mode:
         loop = loop.stopped(state.frame_sequence)

@@ -217,9 +217,9 @@ def _play(settings: Settings, state: State, request: Request) -> Handled:
     if state.mode is LoopMode.SAFE:
         raise ValueError("the loop is in safe mode: `lowfc ctl clear` first, when it is safe")
     if not state.frame_sequence:
-        raise ValueError("a play starts at a frame, and no frame has arrived yet")
+        raise ValueError("a probe sequence starts at a frame, and no frame has arrived yet")
     if state.conditions.mirror_fault:
-        raise ValueError(f"the mirror {state.conditions.mirror_fault}: it would not follow a play")
+        raise ValueError(f"the mirror {state.conditions.mirror_fault}: it would not follow a probe sequence")
     additions = loop.additions()
     if additions.play is not None and not additions.play.over(state.frame_sequence + 1):
         raise ValueError("a probe sequence is being played already: `lowfc ctl stop` ends it")
@@ -229,15 +229,17 @@ def _play(settings: Settings, state: State, request: Request) -> Handled:
         grid = loop.calibration.grid
         if table.basis.shape[1] != grid[0] * grid[1]:
             raise ValueError(
-                f"a play needs a shape of {grid[0]} x {grid[1]} actuators for each of {len(table.largest)} columns, "
+                f"a probe sequence needs {grid[0]} x {grid[1]} actuators for each of {len(table.largest)} columns, "
                 f"got {table.basis.shape[1]} actuators for each"
             )
         if table.reach_nm > settings.limits.stroke_nm:
-            raise ValueError(f"the shapes of the play may go beyond the stroke of {settings.limits.stroke_nm:g} nm")
+            raise ValueError(f"the probe sequence may exceed the stroke of {settings.limits.stroke_nm:g} nm")
     else:
         modes = len(loop.calibration.noll)
         if len(table.largest) != modes:
-            raise ValueError(f"a play on the offset has {modes} columns, one for each mode; got {len(table.largest)}")
+            raise ValueError(
+                f"a probe sequence on the offset has {modes} columns, one per mode; got {len(table.largest)}"
+            )
         check_offset(loop, table.largest)
     frames = len(table.rows)
     play = Play(table, state.frame_sequence + 1, frames)
@@ -313,11 +315,11 @@ def _check_shape(limits: Limits | None, shape_nm: Single) -> None:
         raise ValueError("every actuator of a channel must be finite")
     if limits is None:  # already on the mirror
         return
-    largest, apart = float(np.abs(shape_nm).max()), neighbour_difference_nm(shape_nm)
-    if largest > limits.kept_stroke_nm:
-        raise ValueError(f"an actuator is {largest:.4g} nm from flat, the limit is {limits.stroke_nm:g} nm")
-    if apart > limits.neighbour_nm - limits.margin_nm:
-        raise ValueError(f"neighbours differ by {apart:.4g} nm, the limit is {limits.neighbour_nm:g} nm")
+    largest_nm, difference_nm = float(np.abs(shape_nm).max()), neighbour_difference_nm(shape_nm)
+    if largest_nm > limits.kept_stroke_nm:
+        raise ValueError(f"an actuator is {largest_nm:.4g} nm from flat, the limit is {limits.stroke_nm:g} nm")
+    if difference_nm > limits.neighbour_nm - limits.margin_nm:
+        raise ValueError(f"neighbours differ by {difference_nm:.4g} nm, the limit is {limits.neighbour_nm:g} nm")
 
 
 _HANDLERS: dict[str, Handler] = {

@@ -86,30 +86,30 @@ def test_frames_grow_with_the_square_of_the_signal_to_noise() -> None:
 
 def test_an_exposure_sees_the_rows_of_its_delay() -> None:
     table = np.arange(1.0, 6.0)[:, None]
-    every = np.ones(8, np.bool_)
-    whole = seen(table, np.array([0.0, 1.0]), np.arange(8), every)
-    assert whole[:, 0].tolist() == [0, 1, 2, 3, 4, 5, 0, 0]
-    half = seen(table, np.array([0.0, 0.5, 0.5]), np.arange(8), every)
-    assert half[:, 0].tolist() == [0, 0.5, 1.5, 2.5, 3.5, 4.5, 2.5, 0]
+    commanded = np.ones(8, np.bool_)
+    one_frame = seen(table, np.array([0.0, 1.0]), np.arange(8), commanded)
+    assert one_frame[:, 0].tolist() == [0, 1, 2, 3, 4, 5, 0, 0]
+    one_and_a_half = seen(table, np.array([0.0, 0.5, 0.5]), np.arange(8), commanded)
+    assert one_and_a_half[:, 0].tolist() == [0, 0.5, 1.5, 2.5, 3.5, 4.5, 2.5, 0]
 
 
 def test_without_a_command_the_mirror_keeps_the_previous_row() -> None:
     table = np.arange(1.0, 6.0)[:, None]
     weights = np.array([0.0, 1.0])
-    refused = np.array([True, True, False, True, True, True, True])
-    assert seen(table, weights, np.arange(7), refused)[:, 0].tolist() == [0, 1, 2, 2, 4, 5, 0]
+    commanded = np.array([True, True, False, True, True, True, True])
+    assert seen(table, weights, np.arange(7), commanded)[:, 0].tolist() == [0, 1, 2, 2, 4, 5, 0]
     missing = np.array([0, 1, 3, 4, 5, 6])
     assert seen(table, weights, missing, np.ones(6, np.bool_))[:, 0].tolist() == [0, 1, 2, 4, 5, 0]
 
 
 def test_only_exposures_affected_by_a_missing_frame_are_unusable() -> None:
     plan = cycle(poke_patterns(2, 8.0), hold=3, settle=0, rest=0)
-    every = np.arange(len(plan) + 3)
-    whole = usable(plan, every, np.ones(every.size, np.bool_), 1)
-    assert np.flatnonzero(whole).tolist() == list(range(1, len(plan) + 1))
-    without = np.delete(every, 20)
-    kept = usable(plan, without, np.ones(without.size, np.bool_), 1)
-    assert sorted(set(np.flatnonzero(whole)) - set(without[kept])) == [20, 21, 22]
+    sequence = np.arange(len(plan) + 3)
+    with_all = usable(plan, sequence, np.ones(sequence.size, np.bool_), 1)
+    assert np.flatnonzero(with_all).tolist() == list(range(1, len(plan) + 1))
+    with_gap = np.delete(sequence, 20)
+    usable_with_gap = usable(plan, with_gap, np.ones(with_gap.size, np.bool_), 1)
+    assert sorted(set(np.flatnonzero(with_all)) - set(with_gap[usable_with_gap])) == [20, 21, 22]
 
 
 PIXELS, MODES = 300, 4
@@ -358,17 +358,17 @@ def test_r_of_a_measured_calibration_is_not_recomputed_from_noisy_h() -> None:
     response = (before.response + noise * before.good[:, None]).astype(np.float32)
     matrix = np.linalg.solve(before.reconstructor @ response, before.reconstructor).astype(np.float32)
     noisy = replace(before, response=response, reconstructor=matrix, estimator="weighted+hadamard")
-    I0, H = before.reference.astype(float), before.response.astype(float)
-    assert np.array_equal(with_reference(noisy, I0, before.flux_dn, 1.0, 1.0).reconstructor, matrix)
-    good = np.ones(I0.size)
+    reference, true_response = before.reference.astype(float), before.response.astype(float)
+    assert np.array_equal(with_reference(noisy, reference, before.flux_dn, 1.0, 1.0).reconstructor, matrix)
+    good = np.ones(reference.size)
     good[3] = 0
     masked = with_dark(noisy, np.zeros(good.size), good, 1.0, 1.0)
     best = with_dark(before, np.zeros(good.size), good, 1.0, 1.0)
     assert not masked.reconstructor[:, 3].any()
-    _, H_masked = normalise_flux(I0, H, good)
-    there, here = (cross_talk(made, of) for made, of in ((matrix, H), (masked.reconstructor, H_masked)))
+    _, H_masked = normalise_flux(reference, true_response, good)
+    there, here = (cross_talk(made, of) for made, of in ((matrix, true_response), (masked.reconstructor, H_masked)))
     assert np.abs(there - here).max() < np.abs(there).max()  # one pixel holds 2 % of this sensor's flux
-    power = [(each.reconstructor.astype(float) ** 2 @ (I0 + 1e-6)) for each in (masked, best)]
+    power = [(each.reconstructor.astype(float) ** 2 @ (reference + 1e-6)) for each in (masked, best)]
     assert (power[0] / power[1]).max() < 1.5
     with pytest.raises(ValueError, match="do not tell the modes apart"):
         with_dark(noisy, np.zeros(good.size), np.arange(good.size) < 1, 1.0, 1.0)
