@@ -323,10 +323,10 @@ def _between(lines: tuple[DampedLine, ...], time_s: Array, period_s: float) -> C
     """Weights (2, instants, lines) of a line's vectors at both ends of a period, for its conditional mean within."""
     omega = 2j * np.pi * np.array([line.frequency_hz for line in lines])
     damping = np.pi * np.array([line.width_hz for line in lines])
-    whole = np.sinh(damping * period_s)
+    full = np.sinh(damping * period_s)
     time_s = time_s[:, None]
-    before = np.sinh(damping * (period_s - time_s)) / whole * np.exp(omega * time_s)
-    after = np.sinh(damping * time_s) / whole * np.exp(omega * (time_s - period_s))
+    before = np.sinh(damping * (period_s - time_s)) / full * np.exp(omega * time_s)
+    after = np.sinh(damping * time_s) / full * np.exp(omega * (time_s - period_s))
     return np.array([before, after])
 
 

@@ -1,7 +1,7 @@
 """The simulated optics in front of the detector: mirror and disturbance in, frame and true wavefront out.
 
 Time is continuous: the star moves while the mirror holds. An image is the mean over its exposure. The true wavefront
-is given at the start of the exposure, and as the root mean square over the whole period.
+is given at the start of the exposure, and as the root mean square over the period.
 """
 
 from dataclasses import dataclass

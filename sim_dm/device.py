@@ -58,6 +58,6 @@ def _at_rest(device: Device, surface_nm: Single) -> Single:
     """Keep dead and stuck actuators in place."""
     if device.fixed is None:
         return surface_nm
-    kept = surface_nm.copy()
-    kept.flat[device.fixed] = device.fixed_nm.flat[device.fixed]
-    return kept
+    found = surface_nm.copy()
+    found.flat[device.fixed] = device.fixed_nm.flat[device.fixed]
+    return found

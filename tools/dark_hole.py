@@ -23,8 +23,8 @@ def measure() -> Figures:
         run: Figures = {"together_nm": each_nm * STEPS**0.5}
         for name, channel in night.channels.items():
             undone, error = channel.undone()
-            run[name] = {"undone": undone, "error": error, "left_nm": channel.left_nm.tolist()}
-            run["seen_nm"] = float(np.linalg.norm(channel.seen_nm[-1]))
+            run[name] = {"undone": undone, "error": error, "left_nm": channel.residual_nm.tolist()}
+            run["seen_nm"] = float(np.linalg.norm(channel.channel_nm[-1]))
         runs[f"{each_nm:g}"] = run
     return {"runs": runs}
 

@@ -166,8 +166,8 @@ def exchange(request: Request) -> Iterator[Round]:
             points, signs = np.concatenate([points, found]), np.concatenate([signs, found_signs])
             multipliers = np.concatenate([multipliers, np.zeros(len(found))])
         if is_open:  # with more cells the other sign of the field is hardly ever active at the same point
-            kept = (signs * _field_at(quarter, points) > 0) | (multipliers > 0)
-            points, signs, multipliers = points[kept], signs[kept], multipliers[kept]
+            relevant = (signs * _field_at(quarter, points) > 0) | (multipliers > 0)
+            points, signs, multipliers = points[relevant], signs[relevant], multipliers[relevant]
 
 
 def relative_field(quarter: Array, axis: Array) -> Array:

@@ -51,7 +51,7 @@ def test_indistinguishable_modes_are_refused():
         fit(NOLLS[:2], np.ones(5), H, SCALE_E, READ_NOISE_E, "pinv")
 
 
-def test_weighting_attains_the_bound_and_the_plain_inverse_does_not(fits):
+def test_weighted_estimator_attains_the_cramer_rao_bound(fits):
     variance = variance_e(fits["pinv"].reference_e, READ_NOISE_E)
     bound = cramer_rao(fits["pinv"].response_e, variance)
     np.testing.assert_allclose(covariance(fits["weighted"].R, variance), bound, rtol=1e-9)

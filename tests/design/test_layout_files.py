@@ -77,7 +77,7 @@ def leaves(node: Any) -> Iterator[str]:
         yield from leaves(node["second"])
 
 
-def test_every_panel_is_arranged_once() -> None:
+def test_every_panel_is_in_the_layout_once() -> None:
     assert FOXGLOVE.keys() == {"configById", "globalVariables", "userNodes", "playbackConfig", "layout"}
     assert Counter(leaves(FOXGLOVE["layout"])) == Counter(PANELS.keys())
     kinds = {name.partition("!")[0] for name in PANELS}

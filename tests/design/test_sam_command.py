@@ -59,19 +59,19 @@ def run(search, folder, executor, chains=None, console=None, **files):
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
+def uninterrupted(tmp_path_factory):
     """Result and layout file of an uninterrupted search in this process."""
-    folder = tmp_path_factory.mktemp("whole")
+    folder = tmp_path_factory.mktemp("uninterrupted")
     result, out = run(search_with(), folder, Here())
     assert [path.name for path in folder.iterdir()] == ["mask.json"]
     return result, out.read_text()
 
 
-def test_result_does_not_depend_on_the_executor(whole, tmp_path):
+def test_result_does_not_depend_on_the_executor(uninterrupted, tmp_path):
     with open_executor(2, None) as executor:
         result, out = run(search_with(), tmp_path, executor)
-    assert out.read_text() == whole[1]
-    assert result["merits"] == whole[0]["merits"]
+    assert out.read_text() == uninterrupted[1]
+    assert result["merits"] == uninterrupted[0]["merits"]
     assert len(set(result["merits"])) == 2
 
 
@@ -84,13 +84,13 @@ def scheduler() -> Iterator[str]:
         yield cluster.scheduler_address
 
 
-def test_dask_cluster_gives_the_same_result(scheduler, whole, tmp_path):
+def test_dask_cluster_gives_the_same_result(scheduler, uninterrupted, tmp_path):
     with open_executor(1, scheduler) as executor:
         _, out = run(search_with(), tmp_path, executor)
-    assert out.read_text() == whole[1]
+    assert out.read_text() == uninterrupted[1]
 
 
-def test_interrupted_search_writes_its_best_and_resumes(whole, tmp_path):
+def test_interrupted_search_writes_its_best_and_resumes(uninterrupted, tmp_path):
     result, out = run(search_with(), tmp_path, Interrupted(3))
     assert result["interrupted"]
     assert result["steps"] < 2 * SMALL["steps"]
@@ -100,7 +100,11 @@ def test_interrupted_search_writes_its_best_and_resumes(whole, tmp_path):
     search, chains = program.resumed(tmp_path / "state.json")
     assert search == search_with()
     again, out = run(search, tmp_path, Here(), chains)
-    assert (out.read_text(), again["merits"], again["interrupted"]) == (whole[1], whole[0]["merits"], False)
+    assert (out.read_text(), again["merits"], again["interrupted"]) == (
+        uninterrupted[1],
+        uninterrupted[0]["merits"],
+        False,
+    )
     assert not (tmp_path / "state.json").exists()
 
 
@@ -123,7 +127,7 @@ class Broken(Interrupted):
         return future
 
 
-def test_lost_workers_are_reported_and_the_search_resumes(whole, tmp_path):
+def test_lost_workers_are_reported_and_the_search_resumes(uninterrupted, tmp_path):
     with pytest.raises(
         LowfcError, match=r"workers were lost .*abruptly.*\); no chain had finished .* nothing is written"
     ):
@@ -133,7 +137,7 @@ def test_lost_workers_are_reported_and_the_search_resumes(whole, tmp_path):
         run(search_with(), tmp_path, Broken(2))
     search, chains = program.resumed(tmp_path / "state.json")
     _, out = run(search, tmp_path, Here(), chains)
-    assert out.read_text() == whole[1]
+    assert out.read_text() == uninterrupted[1]
 
 
 def test_dead_processes_are_distinguished_from_errors_in_the_search(tmp_path, monkeypatch):
@@ -176,7 +180,7 @@ def test_folder_name_may_look_like_a_layout_file(tmp_path):
         load_layout(f"{folder}/mask")
 
 
-def test_states_are_read_back_or_refused(tmp_path):
+def test_state_files_are_read_or_refused(tmp_path):
     search = search_with()
     state = tmp_path / "state.json"
     with pytest.raises(DataFileError, match="no search to resume"):

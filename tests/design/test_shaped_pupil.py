@@ -169,7 +169,7 @@ def test_infeasible_request_reports_the_nearest_feasible_one(tmp_path):
         ({"rounds": 0}, "one round"),
     ],
 )
-def test_impossible_requests_are_refused(values, message):
+def test_invalid_requests_are_refused(values, message):
     with pytest.raises(ValueError, match=message):
         Request(**values)
 

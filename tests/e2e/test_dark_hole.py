@@ -43,8 +43,8 @@ def said(night: Night) -> dict[str, list[bytes]]:
 
 def test_the_loop_does_not_undo_the_steps(night: Night) -> None:
     channel = night.channels[SHIFTED]
-    assert len(channel.seen_nm) == STEPS + 1
-    assert np.linalg.norm(channel.seen_nm[-1]) > 15, "nm of wavefront that a loop without the shift would take away"
+    assert len(channel.channel_nm) == STEPS + 1
+    assert np.linalg.norm(channel.channel_nm[-1]) > 15, "nm of wavefront that a loop without the shift would take away"
     undone, error = channel.undone()
     assert abs(undone) < 0.01
     assert error < 0.005
@@ -56,7 +56,7 @@ def test_without_the_shift_it_does_undo_them(night: Night) -> None:
 
 
 def test_the_residual_is_as_small_as_before(night: Night) -> None:
-    before_nm, after_nm = night.channels[SHIFTED].left_nm
+    before_nm, after_nm = night.channels[SHIFTED].residual_nm
     assert before_nm < 3
     assert after_nm < 1.2 * before_nm
 

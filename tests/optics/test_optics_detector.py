@@ -131,7 +131,7 @@ def test_negative_electrons_count_as_zero_and_nan_is_an_error():
         {"bias_dn": 300.0, "bit_depth": 8},
     ],
 )
-def test_impossible_detectors_are_refused(bad):
+def test_invalid_detectors_are_refused(bad):
     with pytest.raises(ValueError, match="got"):
         Detector(**bad)
 
@@ -142,7 +142,7 @@ def test_photometry_of_section_3_3():
     assert electrons(Photometry(), 0.1) == pytest.approx(2 * electrons(Photometry(), 0.05))
 
 
-def test_a_milliarcsecond_of_tilt():
+def test_tilt_of_a_milliarcsecond_in_nm():
     assert tilt_nm_per_mas(2.0) == pytest.approx(2.424, abs=1e-3)
     assert 4 * tilt_nm_per_mas(2.0) / 550 == pytest.approx(0.0176, abs=1e-4)  # waves peak to valley, Sect. 3.3
 
@@ -150,6 +150,6 @@ def test_a_milliarcsecond_of_tilt():
 @pytest.mark.parametrize(
     "bad", [{"diameter_m": 0.0}, {"bandwidth_nm": -1.0}, {"throughput": 1.5}, {"quantum_efficiency": 0.0}]
 )
-def test_impossible_photometry_is_refused(bad):
+def test_invalid_photometry_is_refused(bad):
     with pytest.raises(ValueError, match="got"):
         Photometry(**bad)

@@ -58,7 +58,7 @@ def test_hole_positions_follow_x_and_y():
         (((float("nan"), 0.0, 0.1),), "finite"),
     ],
 )
-def test_impossible_layouts_are_refused(holes, message):
+def test_invalid_layouts_are_refused(holes, message):
     with pytest.raises(ValueError, match=message):
         check(Layout("a", "", holes))
 
@@ -108,7 +108,7 @@ def test_layouts_from_files(tmp_path):
         ({"layouts": {"x": 3}}, "layout x"),
     ],
 )
-def test_damaged_layout_files_are_named(tmp_path, content, message):
+def test_errors_of_damaged_layout_files_have_their_path(tmp_path, content, message):
     path = written(tmp_path, content)
     with pytest.raises(DataFileError, match=message) as caught:
         load_layout(str(path))

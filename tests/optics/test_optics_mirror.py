@@ -94,6 +94,6 @@ def test_mirror_may_be_shifted_relative_to_the_pupil():
 
 
 @pytest.mark.parametrize("bad", [{"rows": 0}, {"pitches_per_pupil": 0.0}, {"coupling": 0.0}, {"coupling": 1.0}])
-def test_impossible_mirrors_are_refused(bad):
+def test_invalid_mirrors_are_refused(bad):
     with pytest.raises(ValueError, match="got"):
         Mirror(**bad)

@@ -21,7 +21,7 @@ def blob(samples, x0, y0, width=0.08):
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.9, 1.1])
-def test_the_relay_pupil_is_upright_and_energy_is_kept(scale):
+def test_relay_pupil_is_upright_and_energy_is_conserved(scale):
     pupil = blob(128, 0.2, -0.1)
     focal = to_image(pupil, 360, 8, scale)
     np.testing.assert_allclose(to_pupil(focal, 128, 8, scale), pupil, atol=1e-6)
@@ -92,7 +92,7 @@ def test_mode_names_give_the_axis():
         assert zernike(noll, 0.3, -0.2) == pytest.approx(zernike(noll, 0.3, 0.2))
 
 
-def test_indices_below_one_are_refused():
+def test_noll_indices_below_one_are_refused():
     with pytest.raises(ValueError, match="start at 1"):
         zernike(0, 0.0, 0.0)
 

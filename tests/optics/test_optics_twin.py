@@ -186,7 +186,7 @@ def test_wavefronts_that_are_not_at_the_used_nodes_are_refused(fast):
         twin_response(fast, np.zeros((2, 1444)))
 
 
-def test_the_bench_reports_all_three_twins(cache_dir, fast, accurate, broadband):
+def test_benchmark_reports_all_three_twins(cache_dir, fast, accurate, broadband):
     result = bench_twin(seconds=0.05, cache_dir=cache_dir)
     assert json.loads(json.dumps(result)) == result
     cases = result["cases"]

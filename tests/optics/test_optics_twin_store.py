@@ -63,7 +63,7 @@ def test_broadband_twins_survive_the_file(sensor, tmp_path):
     assert [each.weight for each in again.operators] == list(band.weights)
 
 
-def test_the_hash_depends_on_everything(sensor):
+def test_operator_hash_depends_on_every_input(sensor):
     band = monochromatic(550.0)
     changed_pupil = sensor.pupil.copy()
     changed_pupil[256, 256] += 1e-6

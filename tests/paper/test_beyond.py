@@ -62,7 +62,7 @@ def test_docs_is_refused_for_parts_of_a_page(tmp_path):
     for words in (["tolerance", "table1"], ["anchors", "--sensor", "sam"]):
         ran = CliRunner().invoke(app, ["validate", *words, "--docs", str(tmp_path)])
         assert ran.exit_code
-        assert "--docs writes whole documents" in str(ran.exception)
+        assert "--docs writes complete pages" in str(ran.exception)
 
 
 @pytest.mark.slow

@@ -141,7 +141,7 @@ def test_previous_frame_is_available_after_a_new_block(monkeypatch: pytest.Monke
         np.testing.assert_array_equal(sampler.at(index - 1), before)
 
 
-def test_the_lines_phases_of_the_two_axes_differ() -> None:
+def test_phases_of_the_lines_differ_between_the_axes() -> None:
     disturbance = preset(IDEAL)
     tilts = disturbance.amplitude_nm[np.isin(disturbance.frequency_hz, LINES_HZ), :2]
     assert np.abs(np.angle(tilts[:, 0] / tilts[:, 1])).max() > 0.5
@@ -191,7 +191,7 @@ def test_screen_has_a_kolmogorov_spectrum_and_depends_on_the_seed() -> None:
     assert not np.allclose(screen(3, 20, 0.05), screen(4, 20, 0.05))
 
 
-def test_mistakes_are_named() -> None:
+def test_unknown_presets_and_modes_are_refused() -> None:
     with pytest.raises(ValueError, match="'earthquake'"):
         preset("earthquake")
     with pytest.raises(ValueError, match="Z40"):

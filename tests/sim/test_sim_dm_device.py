@@ -122,23 +122,23 @@ def test_surface_stays_within_the_limits_for_any_commands(script: list[object], 
 @pytest.mark.parametrize("bits", [8, 16])
 def test_a_command_is_rounded_to_the_drivers_steps(bits: int) -> None:
     device = mirror(step_nm=1500 / 2**bits)
-    wanted = np.linspace(-100, 100, 20, dtype=np.float32).reshape(GRID)
-    status, _ = apply_command(device, initial(device), command(wanted), START_NS)
+    shape_nm = np.linspace(-100, 100, 20, dtype=np.float32).reshape(GRID)
+    status, _ = apply_command(device, initial(device), command(shape_nm), START_NS)
     steps = status.surface_nm / device.step_nm
     assert np.abs(steps - np.round(steps)).max() < 1e-3
-    assert np.abs(status.surface_nm - wanted).max() <= device.step_nm * 0.501
+    assert np.abs(status.surface_nm - shape_nm).max() <= device.step_nm * 0.501
     assert len(np.unique(status.surface_nm)) > 10
 
 
 def test_mirror_at_the_neighbour_limit_does_not_oscillate() -> None:
     """Rounding must not exceed the limit by itself, which would make the mirror fall back towards flat."""
     device = mirror(step_nm=1500 / 2**8)
-    wanted = even(0)
-    wanted[:2] = 740
-    wanted[2:] = -740
+    shape_nm = even(0)
+    shape_nm[:2] = 740
+    shape_nm[2:] = -740
     status = initial(device)
     for index in range(1, 60):
-        status, _ = apply_command(device, status, command(wanted, index), START_NS + index * MS)
+        status, _ = apply_command(device, status, command(shape_nm, index), START_NS + index * MS)
         if index == 30:
             settled = status.surface_nm
     assert neighbour_difference_nm(status.surface_nm) > LIMITS.neighbour_nm - 3 * device.step_nm

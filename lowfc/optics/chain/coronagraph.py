@@ -148,9 +148,9 @@ def contrast_curve(
         wedge: Only its opening is used.
         samples_per: Samples per lambda / D.
     """
-    whole = Wedge(0.0, float(edges[-1]), wedge.half_opening_deg)
-    columns, rows = _extent(whole, samples_per)
-    inside = wedge_samples(whole, columns, rows, samples_per)
+    sector = Wedge(0.0, float(edges[-1]), wedge.half_opening_deg)
+    columns, rows = _extent(sector, samples_per)
+    inside = wedge_samples(sector, columns, rows, samples_per)
     radius = np.hypot(image_axis(rows, samples_per)[:, None], image_axis(columns, samples_per))[inside]
     values = contrast(pupil, opd_nm, wavelength_nm, columns, rows, samples_per)[inside]
     count, _ = np.histogram(radius, edges)

@@ -107,8 +107,8 @@ def modes_to_actuators(mirror: Mirror, nolls: Sequence[int], usable: Mask | None
     sums = (_products(y_factors).T @ along_x).reshape(mirror.rows, mirror.rows, mirror.columns, mirror.columns)
     actuators = mirror.rows * mirror.columns
     normal = sums.transpose(0, 2, 1, 3).reshape(actuators, actuators)
-    wanted = 0.5 * inside * zernikes(nolls, 2.0 * u, 2.0 * u[:, None])
-    projected = (y_factors.T @ wanted @ x_factors).reshape(len(nolls), actuators)
+    surfaces = 0.5 * inside * zernikes(nolls, 2.0 * u, 2.0 * u[:, None])
+    projected = (y_factors.T @ surfaces @ x_factors).reshape(len(nolls), actuators)
     driven = active_actuators(mirror) if usable is None else active_actuators(mirror) & usable
     active = np.flatnonzero(driven)
     if active.size < len(nolls):

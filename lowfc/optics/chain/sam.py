@@ -15,7 +15,7 @@ class Layout:
 
     Attributes:
         name: Name of the layout.
-        purpose: What it was designed for, in one line.
+        purpose: Purpose of the design, in one line.
         holes: Centre relative to the pupil's centre and diameter (x, y, diameter) of each hole, in pupil diameters.
     """
 

@@ -32,5 +32,5 @@ def kolmogorov(rng: np.random.Generator, samples: int, width: int = 4) -> Array:
     amplitude = np.sqrt(_SPECTRUM) * f2 ** (-11.0 / 12.0)
     spectrum = scipy.fft.rfft2(rng.standard_normal((count, count))) * amplitude
     # White noise has a power of count^2 at each frequency; the inverse transform divides by it once more.
-    whole = (count / width) * scipy.fft.irfft2(spectrum, (count, count))
-    return np.ascontiguousarray(whole[:samples, :samples])
+    periodic = (count / width) * scipy.fft.irfft2(spectrum, (count, count))
+    return np.ascontiguousarray(periodic[:samples, :samples])

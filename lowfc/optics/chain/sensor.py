@@ -1,4 +1,4 @@
-"""The whole optical chain of a sensor, with full diffraction: star to binned sensor image (Sect. 2, Table 1)."""
+"""The full optical chain of a sensor, with diffraction: star to binned sensor image (Sect. 2, Table 1)."""
 
 from dataclasses import dataclass
 

@@ -63,14 +63,14 @@ def twin_mirror(sensor: Sensor, twin: Twin, mirror: Mirror) -> TwinMirror:
     rows, columns = np.divmod(twin.used, twin.axis.size)
     sampled = (y_factors[rows][:, :, None] * x_factors[columns][:, None, :]).reshape(twin.used.size, -1)
     left, values, right = np.linalg.svd(operator.to_modes, full_matrices=False)
-    kept = values > _SMALLEST_SINGULAR_VALUE * values[0]
-    missing = left[:, kept].T @ (to_field - operator.to_modes @ sampled) / values[kept, None]
+    significant = values > _SMALLEST_SINGULAR_VALUE * values[0]
+    missing = left[:, significant].T @ (to_field - operator.to_modes @ sampled) / values[significant, None]
     return TwinMirror(
         used=twin.used,
         y_factors=y_factors.astype(np.float32),
         x_factors=x_factors.astype(np.float32),
         reduce=missing.astype(np.float32),
-        expand=right[kept].astype(np.float32).T,  # column-major: its product takes half the time
+        expand=right[significant].astype(np.float32).T,  # column-major: its product takes half the time
     )
 
 

@@ -29,7 +29,7 @@ def spc(
     plot: Annotated[Path | None, typer.Option(help="Plot mask, image and contrast (PNG).")] = None,
     as_json: Json = False,
 ) -> None:
-    """Design a shaped pupil: the most open mask with a dark zone beside the star, by linear programs.
+    """Design a shaped pupil by linear programming: the most open mask with a dark zone near the star.
 
     Example: lowfc design spc --outer 12 --cells 64 --out spc.npz
     """

@@ -69,7 +69,7 @@ def validate(
     pages = all(name in BEYOND for name in chosen)
     if docs is not None and (not (pages or tuple(chosen) == TABLES) or sensor or plots is not None):
         raise ConfigurationError(
-            f"--docs writes whole documents: use it with all, or with {' and '.join(BEYOND)}; without --sensor and "
+            f"--docs writes complete pages: use it with all, or with {' and '.join(BEYOND)}; without --sensor and "
             "--plots"
         )
 

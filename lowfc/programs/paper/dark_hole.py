@@ -38,21 +38,21 @@ class Channel:
     """Result of a channel; arrays (1 + changes, modes), nm rms of wavefront, the first row before all changes.
 
     Attributes:
-        seen_nm: modes of the channel's shape as the sensor sees them.
-        own_nm: the loop's command minus the part that cancels the disturbance, mean of the last frames of each step.
-        left_nm: (2,) rms of the true residual about its mean, before the steps and after them.
+        channel_nm: modes of the channel's shape as the sensor sees them.
+        reaction_nm: the loop's command minus the part that cancels the disturbance, mean of each step's last frames.
+        residual_nm: (2,) rms of the true residual about its mean, before the steps and after them.
     """
 
-    seen_nm: Array
-    own_nm: Array
-    left_nm: Array
+    channel_nm: Array
+    reaction_nm: Array
+    residual_nm: Array
 
     def undone(self) -> tuple[float, float]:
         """Fraction of the steps that the loop undoes, least squares over all steps, and its standard error."""
-        seen, own = self.seen_nm - self.seen_nm.mean(axis=0), self.own_nm - self.own_nm.mean(axis=0)
-        power = float((seen * seen).sum())
-        slope = float((seen * own).sum()) / power
-        noise = float(np.square(own - slope * seen).mean())
+        steps, reaction = (each - each.mean(axis=0) for each in (self.channel_nm, self.reaction_nm))
+        power = float((steps * steps).sum())
+        slope = float((steps * reaction).sum()) / power
+        noise = float(np.square(reaction - slope * steps).mean())
         return -slope, float(np.sqrt(noise / power))
 
 
@@ -91,7 +91,7 @@ def dark_hole(
             deadline_s = time.monotonic() + PATIENCE_S
             while RUN not in running() and time.monotonic() < deadline_s and process.poll() is None:
                 time.sleep(0.05)
-            marks, seen = _apply_steps(each_nm, np.asarray(base_nm))
+            marks, steps_nm = _apply_steps(each_nm, np.asarray(base_nm))
         except BusError as error:
             process.send_signal(signal.SIGINT)
             raise RuntimeError(f"{error}; output of the loop: {process.communicate(timeout=PATIENCE_S)}") from error
@@ -100,7 +100,7 @@ def dark_hole(
     if process.returncode:
         raise RuntimeError(complaints)
     log = folder / json.loads(out)["log"]
-    return Night(_channels(log, marks, seen), log)
+    return Night(_channels(log, marks, steps_nm), log)
 
 
 def _apply_steps(each_nm: float, base_nm: Array) -> tuple[dict[str, list[int]], Array]:
@@ -124,11 +124,11 @@ def _apply_steps(each_nm: float, base_nm: Array) -> tuple[dict[str, list[int]], 
             wait(WINDOW)
             marks[channel].append(loop.channel(channel, np.zeros(calibration.grid) + under_nm).frame_sequence)
             wait(WINDOW)
-    seen = shapes.reshape(STEPS, -1) @ calibration.actuators_to_modes.T.astype(np.float64)
-    return marks, np.vstack([np.zeros(seen.shape[1]), seen])
+    steps_nm = shapes.reshape(STEPS, -1) @ calibration.actuators_to_modes.T.astype(np.float64)
+    return marks, np.vstack([np.zeros(steps_nm.shape[1]), steps_nm])
 
 
-def _channels(log: Path, marks: dict[str, list[int]], seen_nm: Array) -> dict[str, Channel]:
+def _channels(log: Path, marks: dict[str, list[int]], steps_nm: Array) -> dict[str, Channel]:
     history = read_history(LogReader(log))
     truths = history.true
     if truths is None:
@@ -142,10 +142,11 @@ def _channels(log: Path, marks: dict[str, list[int]], seen_nm: Array) -> dict[st
     found = {}
     for name, changed_at in marks.items():
         ends = [until(end, 3 * SETTLE // 4) for end in changed_at]
-        own = np.array([(command[end] + truths.disturbance_nm[end]).mean(axis=0, dtype=np.float64) for end in ends])
+        reaction_nm = command + truths.disturbance_nm
+        reaction = np.array([reaction_nm[end].mean(axis=0, dtype=np.float64) for end in ends])
         residual_nm = [
             np.sqrt(truths.residual_nm[until(end, WINDOW)].var(axis=0, dtype=np.float64).sum())
             for end in (changed_at[0], changed_at[-1])
         ]
-        found[name] = Channel(seen_nm[:: STEPS // (len(changed_at) - 1)], own, np.array(residual_nm))
+        found[name] = Channel(steps_nm[:: STEPS // (len(changed_at) - 1)], reaction, np.array(residual_nm))
     return found
