@@ -129,8 +129,8 @@ class Account(Result):
     def remarks(self) -> Sequence[str]:
         """Remarks on what could not be checked, what differs, and the speed."""
         missing = ((self.inputs_missing, "input"), (self.commands_missing, "command"))
-        changed = f"inputs since {self.version}"
-        lines = [f"rule changed       {n} {changed}: {rule}" for rule, n in self.rules_changed.items()]
+        since = f"since {self.version}"
+        lines = [f"rule changed       {counted(n, 'input')} {since}: {rule}" for rule, n in self.rules_changed.items()]
         lines += [f"unchecked          {counted(n, 'step')} {why}" for why, n in self.unchecked_because.items()]
         lines += [f"missing            the log lacks {counted(n, what)} of the controller" for n, what in missing if n]
         lines += faults(self.damaged, self.no_end)
