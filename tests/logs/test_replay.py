@@ -76,28 +76,30 @@ class Night:
         self.start_s += 1
         self._start()
 
-    def take(self, taken: Input) -> None:
+    def apply(self, input_: Input) -> None:
         self.now_ns += 1_000_000
-        if isinstance(taken, Frame):
-            self._frame(taken)
-        if isinstance(taken, Request):
-            taken = prepared(self.loop_settings, taken)
-            if taken.law is not None:
-                self._put(LAW, wire_law(taken.law, taken.time_ns).SerializeToString())
-            if taken.played is not None:
-                self._put(PLAY, wire_play(taken.played, taken.time_ns).SerializeToString())
-        self.state, outputs = advance(self.loop_settings, self.state, taken)
+        if isinstance(input_, Frame):
+            self._frame(input_)
+        if isinstance(input_, Request):
+            input_ = prepared(self.loop_settings, input_)
+            if input_.law is not None:
+                self._put(LAW, wire_law(input_.law, input_.time_ns).SerializeToString())
+            if input_.played is not None:
+                self._put(PLAY, wire_play(input_.played, input_.time_ns).SerializeToString())
+        self.state, outputs = advance(self.loop_settings, self.state, input_)
         number = self.state.input_number
         if outputs.command is not None:
             self._put(COMMAND, codec.encode_command(outputs.command, 200, "lowfc", number), "dm")
         if outputs.step is not None:
             self._put(STEP, codec.encode_step(outputs.step, number))
-        if isinstance(taken, Request):
+        if isinstance(input_, Request):
             assert outputs.reply is not None
-            shown = controller_state(self.state, self.loop_settings, taken.time_ns) if taken.name == "status" else None
-            self._put(REQUEST, codec.encode_request(taken, outputs.reply, number, shown))
-        elif not isinstance(taken, Frame) and number > self._last_number:
-            self._put(CONTROL_INPUT, codec.encode_input(taken, number))
+            shown = (
+                controller_state(self.state, self.loop_settings, input_.time_ns) if input_.name == "status" else None
+            )
+            self._put(REQUEST, codec.encode_request(input_, outputs.reply, number, shown))
+        elif not isinstance(input_, Frame) and number > self._last_number:
+            self._put(CONTROL_INPUT, codec.encode_input(input_, number))
         self._last_number = number
         if outputs.changed or number % STATE_EVERY == 0:
             self._put_state()
@@ -108,18 +110,18 @@ class Night:
     def _start(self) -> None:
         self.state, self._last_number = State(), 0
         self._put(CALIBRATION, encode_calibration(happenings.CALIBRATION, self.now_ns))
-        self.take(Load(self.now_ns, happenings.CALIBRATION, "a test"))
+        self.apply(Load(self.now_ns, happenings.CALIBRATION, "a test"))
 
     def _put_state(self) -> None:
         message = controller_state(self.state, self.loop_settings, self.now_ns)
         self._put(CONTROLLER_STATE, message.SerializeToString())
 
-    def _frame(self, taken: Frame) -> None:
-        message = RawImage(timestamp=timestamp(taken.time_ns))
-        if taken.pixels is not None:
-            message = image(taken.pixels, taken.time_ns, "sensor")
+    def _frame(self, input_: Frame) -> None:
+        message = RawImage(timestamp=timestamp(input_.time_ns))
+        if input_.pixels is not None:
+            message = image(input_.pixels, input_.time_ns, "sensor")
         payload = message.SerializeToString()
-        self.messages.append(Sample(FRAME.key, payload, taken.sequence, self.now_ns, self.now_ns))
+        self.messages.append(Sample(FRAME.key, payload, input_.sequence, self.now_ns, self.now_ns))
 
     def _put(self, topic: Topic, payload: bytes, name: str = "") -> None:
         key = topic.at(name)
@@ -129,10 +131,10 @@ class Night:
         self.messages.append(Sample(key, payload, sequence, self.now_ns, self.now_ns))
 
 
-def night(taken: list[Input], **changes: object) -> Night:
+def night(input_list: list[Input], **changes: object) -> Night:
     made = Night(settings(**(TIGHT | changes)))
-    for one in taken:
-        made.take(one)
+    for one in input_list:
+        made.apply(one)
     return made
 
 
@@ -140,8 +142,8 @@ def night(taken: list[Input], **changes: object) -> Night:
 def test_a_log_of_the_fused_kernel_is_replayed_bit_by_bit_with_it_and_with_a_difference_by_numpy() -> None:
     channel = Request(0, "channel", text="dark-hole", actuators_nm=np.full(20, 3, np.float32))
     law = Request(0, "law", law=integrator([0.3] * 3, [0.0] * 3, NOLL, 2.5, 1000.0))
-    taken = [*frames(60, 1), channel, *frames(100, 61), law, *frames(400, 161)]
-    made = night(taken, kernel=compiled.kernel("fused"), delay_frames=2.5, interlocks=())
+    input_list = [*frames(60, 1), channel, *frames(100, 61), law, *frames(400, 161)]
+    made = night(input_list, kernel=compiled.kernel("fused"), delay_frames=2.5, interlocks=())
     logged = [one.payload for one in made.messages if one.key == CONTROLLER_STATE.key][-1]
     assert wire.ControllerState.FromString(logged).settings.kernel == "fused"
     assert replay(made.messages).identical
@@ -152,11 +154,11 @@ def test_a_log_of_the_fused_kernel_is_replayed_bit_by_bit_with_it_and_with_a_dif
     assert (tolerant.frames, tolerant.different, tolerant.identical) == (560, 0, False)
 
 
-def after_camera_restart(taken: list[Input]) -> list[Input]:
+def after_camera_restart(input_list: list[Input]) -> list[Input]:
     """The same inputs after a restart of the camera, so that no two frames share sequence and time."""
     return [
         one._replace(sequence=one.sequence + (1 << 32), time_ns=one.time_ns + 10**9) if isinstance(one, Frame) else one
-        for one in taken
+        for one in input_list
     ]
 
 
@@ -173,7 +175,7 @@ def test_any_sequence_of_inputs_is_replayed_bit_by_bit(
     made = night(before, on_frame_timeout=silence, delay_frames=delay_frames, kernel=compiled.kernel(kernel))
     made.restart()
     for one in after_camera_restart(after):
-        made.take(one)
+        made.apply(one)
     account, sent = replay(made.messages), Counter(message.key for message in made.messages)
     assert (account.different, account.largest_difference_nm, account.unchecked_because) == (0, 0.0, {})
     assert account.frames == sent[STEP.key]
@@ -184,10 +186,10 @@ def test_any_sequence_of_inputs_is_replayed_bit_by_bit(
 
 def test_an_overruled_law_is_replayed_bit_by_bit_even_from_the_middle() -> None:
     made = night([], guard=True, rate_hz=1000.0, limit_nm=(150.0, 150.0))
-    made.take(Request(made.now_ns, "law", law=integrator((0.05,) * len(NOLL), (0.0,) * len(NOLL), NOLL, 1.0, 1000.0)))
+    made.apply(Request(made.now_ns, "law", law=integrator((0.05,) * len(NOLL), (0.0,) * len(NOLL), NOLL, 1.0, 1000.0)))
     for count in range(860):
         wave_nm = 20 * np.sin(0.04 * count + np.arange(len(NOLL)))
-        made.take(frame(count, wave_nm + made.state.loop.history_nm[0]))
+        made.apply(frame(count, wave_nm + made.state.loop.history_nm[0]))
     steps = [message for message in made.messages if message.key == STEP.key]
     overruled = [Limit.LAW_OVERRULED in wire.ControlStep.FromString(message.payload).reasons for message in steps]
     assert overruled == [False] * 598 + [True] * 262
@@ -204,21 +206,21 @@ def test_an_overruled_law_is_replayed_bit_by_bit_even_from_the_middle() -> None:
 @effort(deadline=None, max_examples=EXAMPLES)
 @given(inputs(), st.randoms(use_true_random=False), st.integers(1, 6))
 def test_lost_messages_are_never_a_difference_and_every_step_is_accounted_for(
-    taken: list[Input], random: st.DataObject, losses: int
+    input_list: list[Input], random: st.DataObject, losses: int
 ) -> None:
-    made = night([*frames(30, 9000), *after_camera_restart([*taken, *frames(30, 5000)])])
-    kept = list(made.messages)
+    made = night([*frames(30, 9000), *after_camera_restart([*input_list, *frames(30, 5000)])])
+    remaining = list(made.messages)
     for _ in range(losses):
-        kept.pop(random.randrange(len(kept)))  # type: ignore[attr-defined]
-    account = replay(kept)
+        remaining.pop(random.randrange(len(remaining)))  # type: ignore[attr-defined]
+    account = replay(remaining)
     assert (account.different, account.largest_difference_nm) == (0, 0.0)
-    assert account.frames + account.unchecked == sum(message.key == STEP.key for message in kept)
+    assert account.frames + account.unchecked == sum(message.key == STEP.key for message in remaining)
 
 
 @effort(deadline=None, max_examples=EXAMPLES)
 @given(inputs(), st.randoms(use_true_random=False))
-def test_the_order_between_publishers_does_not_matter(taken: list[Input], random: st.DataObject) -> None:
-    made = night([*taken, *frames(20, 5000)])
+def test_the_order_between_publishers_does_not_matter(input_list: list[Input], random: st.DataObject) -> None:
+    made = night([*input_list, *frames(20, 5000)])
     late_ns = {True: random.randrange(PATIENCE_NS // 2), False: random.randrange(PATIENCE_NS // 2)}  # type: ignore[attr-defined]
     late = [
         message._replace(receive_time_ns=message.receive_time_ns + late_ns[message.key == FRAME.key])
@@ -251,7 +253,7 @@ def test_segments_together_give_the_account_of_the_whole_log(
     made = night([*before, *frames(60, 9000)])
     made.restart()
     for one in after_camera_restart([*after, *frames(60, 9000)]):
-        made.take(one)
+        made.apply(one)
     begun_ns = made.messages[0].receive_time_ns
     messages = [
         message._replace(receive_time_ns=begun_ns + slowdown * (message.receive_time_ns - begun_ns))
@@ -304,24 +306,24 @@ def test_a_recording_that_begins_in_the_middle_of_a_run_lacks_no_input() -> None
     assert account.inputs_missing == 0
 
 
-def tampered(made: Night, topic: Topic, number: int, how: str) -> Account:
+def tampered(made: Night, topic: Topic, number: int, change: str) -> Account:
     """Change one message slightly, and replay."""
     messages = list(made.messages)
     places = [index for index, message in enumerate(messages) if topic.matches(message.key)]
     index = places[number]
     body = topic.message.FromString(messages[index].payload)
-    if how == "actuators":
+    if change == "actuators":
         surface = np.frombuffer(body.actuators, np.float32).copy()  # type: ignore[attr-defined]
         surface[7] = np.nextafter(surface[7], np.float32(np.inf))
         body.actuators = surface.tobytes()  # type: ignore[attr-defined]
     else:
-        exec(how, {"body": body})  # noqa: S102  # the test's own text
+        exec(change, {"body": body})  # noqa: S102  # the test's own text
     messages[index] = messages[index]._replace(payload=body.SerializeToString())
     return replay(messages)
 
 
 @pytest.mark.parametrize(
-    ("topic", "how", "expected"),
+    ("topic", "change", "expected"),
     [
         (COMMAND, "actuators", "actuators: [7] log"),
         (STEP, "body.error_nm[1] += 1e-6", "error_nm: [1] log"),
@@ -335,12 +337,12 @@ def tampered(made: Night, topic: Topic, number: int, how: str) -> Account:
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_the_smallest_difference_is_found_and_reported(topic: Topic, how: str, expected: str) -> None:
-    account = tampered(night(frames(60)), topic, 2, how)
+def test_the_smallest_difference_is_found_and_reported(topic: Topic, change: str, expected: str) -> None:
+    account = tampered(night(frames(60)), topic, 2, change)
     assert not account.identical
     assert account.first_difference.message == topic.message.DESCRIPTOR.name
     assert any(line.startswith(expected) for line in account.first_difference.fields), account.first_difference.fields
-    if how == "actuators":
+    if change == "actuators":
         assert 0 < account.largest_difference_nm < 1e-5
         assert (account.different, account.first_difference.taken, account.first_difference.frame_sequence & 0xFF) == (
             1,
@@ -384,16 +386,16 @@ def test_a_log_with_nothing_to_check_is_not_identical() -> None:
 
 def test_frames_are_kept_within_a_limit_of_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(frames_of_log, "FRAMES_BYTES", 1000)
-    kept = Frames()
+    store = Frames()
     pixels = np.arange(100, dtype=np.uint16).reshape(10, 10)
     for sequence in range(50):
-        kept.add(sequence, image(pixels + sequence, sequence, "sensor").SerializeToString())
-    found = [kept.frame(sequence, sequence, 0) for sequence in range(50)]
+        store.add(sequence, image(pixels + sequence, sequence, "sensor").SerializeToString())
+    found = [store.frame(sequence, sequence, 0) for sequence in range(50)]
     assert found[49].pixels is not None
     assert np.array_equal(found[49].pixels, pixels + 49)
     assert [one is not None for one in found].count(True) == 4
-    assert kept.frame(49, 48, 0) is None
-    assert kept.frame(49, 48, 0, last=True) is not None
+    assert store.frame(49, 48, 0) is None
+    assert store.frame(49, 48, 0, last=True) is not None
 
 
 @pytest.fixture(scope="module")
