@@ -239,7 +239,7 @@ def test_docs_writes_document_results_and_pictures(monkeypatch, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {DOCUMENT, RESULTS, PICTURES.partition("/")[0]}
     assert (
         {path.stem for path in (tmp_path / PICTURES).iterdir()}
-        == set(CASES) - set(commands.BEYOND)
+        == set(CASES) - set(commands.ADDITIONAL)
         == set(commands.TABLES)
     )
 

@@ -15,7 +15,7 @@ TABLES = (
     *("conditioning", "photometry"),
 )
 
-BEYOND = ("anchors", "tolerance")
+ADDITIONAL = ("anchors", "tolerance")
 """Additional tables that are not in the paper and not included in `all`."""
 OF_THE_PAPER = ("table1", "photometry")
 """Tables and figures for the paper's own sensors only."""
@@ -25,7 +25,7 @@ def validate(
     tables: Annotated[
         list[str],
         typer.Argument(
-            help=f"Any of {', '.join(TABLES)}; all of these; or {', '.join(BEYOND)}.",
+            help=f"Any of {', '.join(TABLES)}; all of these; or {', '.join(ADDITIONAL)}.",
             metavar="TABLE...",
             show_default=False,
         ),
@@ -60,16 +60,16 @@ def validate(
 
     Example: lowfc validate table3 table4 --trials 20
     """
-    known = (*TABLES, *BEYOND, "all")
+    known = (*TABLES, *ADDITIONAL, "all")
     for name in tables:
         if name not in known:
             raise ConfigurationError(f"there is no table {name!r}{nearest(name, known)}; {', '.join(known)}")
     chosen = [name for name in TABLES if name in tables or "all" in tables]
-    chosen += [name for name in BEYOND if name in tables]
-    pages = all(name in BEYOND for name in chosen)
+    chosen += [name for name in ADDITIONAL if name in tables]
+    pages = all(name in ADDITIONAL for name in chosen)
     if docs is not None and (not (pages or tuple(chosen) == TABLES) or sensor or plots is not None):
         raise ConfigurationError(
-            f"--docs writes complete pages: use it with all, or with {' and '.join(BEYOND)}; without --sensor and "
+            f"--docs writes complete pages: use it with all, or with {' and '.join(ADDITIONAL)}; without --sensor and "
             "--plots"
         )
 

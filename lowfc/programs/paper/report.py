@@ -17,12 +17,12 @@ from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.programs.cli.result import table as text_table
 from lowfc.programs.paper.cases import Case, Context, plain, prepared
 from lowfc.programs.paper.figures import aberration, light, modes, screens
-from lowfc.programs.paper.tables.tables import BEYOND, TABLES
+from lowfc.programs.paper.tables.tables import ADDITIONAL, TABLES
 
 _ALL = {**aberration.CASES, **light.CASES, **modes.CASES, **screens.CASES}
 
 FIGURES: dict[str, Case] = {f"fig{number}": _ALL[f"fig{number}"] for number in range(1, len(_ALL) + 1)}
-CASES: dict[str, Case] = {**TABLES, **FIGURES, **BEYOND}
+CASES: dict[str, Case] = {**TABLES, **FIGURES, **ADDITIONAL}
 
 DOCUMENT, RESULTS, PICTURES = "paper.md", "paper.json", "pictures/paper"
 COMMAND = "lowfc validate all --docs docs/measured"

@@ -32,16 +32,16 @@ from lowfc.programs.paper.plots import Line as Curve
 from lowfc.programs.paper.plots import curves, draw
 from lowfc.programs.paper.tables import pointing, tolerance
 
-DRIVEN = ("sam", "zwfs_tuned")
+LOOP_SENSORS = ("sam", "zwfs_tuned")
 """Sensors for which loops are run."""
 RATE_HZ, MAGNITUDE, EXPOSURE = 1000.0, 2.0, 0.5
 OBSERVED_S, CLOSED_S, MEAN_S = 10.0, 24.0, 2.0
 """Durations: of the loop that a law is identified from, of the loop that is judged, of a mean as in SCExAO."""
 GAINS = "[control]\ntilt_gain = 0.5\ngain = 0.05\n"
 ROMAN_MAS, SCEXAO_MAS = 0.4, {"laboratory": 0.02, "sky": 0.15}
-HELD_S = 100.0
+AVERAGED_S = 100.0
 DRIFT_PM = 20.0
-REACHED, SHORT = "reached", "not reached"
+REACHED, NOT_REACHED = "reached", "not reached"
 
 ABOUT = """An anchor is a published figure and lowfc's figure by the same definition. *paper* is the published figure,
 *limit* lowfc's with the noise of the quantum limit of the light. Loops are the real processes in lockstep, judged by
@@ -70,8 +70,8 @@ HICAT = (
     "HiCAT digs while its low-order loop runs (A&A 663, A49, 2022; arXiv 2301.03242); reached here: below 1 %."
 )
 HUNDRED = (
-    f"Standard deviation of a mode's mean over {HELD_S:g} s of frames at {tolerance.RATE_HZ:g} Hz, V = 2, wavefront "
-    "flat, all 14 modes fitted. predicted: from the noise of a frame."
+    f"Standard deviation of a mode's mean over {AVERAGED_S:g} s of frames at {tolerance.RATE_HZ:g} Hz, V = 2, "
+    "wavefront flat, all 14 modes fitted. predicted: from the noise of a frame."
 )
 AGAINST_V = (
     f"Drift of {DRIFT_PM:g} pm/sqrt(s) in each of 14 modes, integrators with the best gains, {tolerance.RATE_HZ:g} Hz: "
@@ -81,20 +81,20 @@ AGAINST_V = (
 
 def anchors(context: Context) -> list[Row]:
     """Rows of every anchor, with a verdict if there is a published figure."""
-    names = context.names(*DRIVEN)
+    names = context.names(*LOOP_SENSORS)
     rows = [row for found in map(partial(_pointing, context), names) for row in found]
     rows += _hicat(context)
     rows += _table4(context)
     rows += [row for name in names for row in _hundred_seconds(context, name)]
-    return rows + [row for name in context.names(*tolerance.HELD) for row in _against_magnitude(name)]
+    return rows + [row for name in context.names(*tolerance.SENSORS_COMPARED) for row in _against_magnitude(name)]
 
 
-def _judged(row: Row, allowed: float | None = None) -> list[Row]:
+def _with_verdict(row: Row, allowed: float | None = None) -> list[Row]:
     """A row and its verdict against the published or the allowed figure; by `predicted` if there is one."""
     best, ours = row.paper if allowed is None else allowed, row.measured if row.predicted is None else row.predicted
     assert isinstance(ours, float)  # noqa: S101  # these are
     assert isinstance(best, float)  # noqa: S101
-    verdict = REACHED if ours <= best else SHORT
+    verdict = REACHED if ours <= best else NOT_REACHED
     return [
         row,
         replace(
@@ -129,7 +129,7 @@ def _pointing(context: Context, name: str) -> list[Row]:
             limit = _quantum_pointing_nm(observed, name) / nm_per_mas
             driven = partial(made, estimator="LQG")
             rows.append(made(f"tilt, {preset}, open loop", measured=run["tilt_disturbance_mas"], assumption=LOOP))
-            rows += _judged(
+            rows += _with_verdict(
                 driven(
                     f"tilt, {preset}",
                     measured=run["tilt_residual_mas"],
@@ -139,10 +139,12 @@ def _pointing(context: Context, name: str) -> list[Row]:
                 )
             )
             if preset == "reaction-wheel":
-                rows += _judged(_means(driven, _history(folder / run["log"]), "sky"))
+                rows += _with_verdict(_means(driven, _history(folder / run["log"]), "sky"))
         context.progress(f"anchors {name}, bench", 9, 12)
         run = _sim_loop(name, "bench", folder, "gains.toml", CLOSED_S, context.seed)
-        rows += _judged(_means(partial(made, estimator="integrator"), _history(folder / run["log"]), "laboratory"))
+        rows += _with_verdict(
+            _means(partial(made, estimator="integrator"), _history(folder / run["log"]), "laboratory")
+        )
     return rows
 
 
@@ -180,7 +182,7 @@ def _hicat(context: Context) -> list[Row]:
     with tempfile.TemporaryDirectory() as folder:
         undone, error = dark_hole(Path(folder), 2.0, seed=context.seed).channels[SHIFTED].undone()
     row = Row("sam", "part of a dark hole's steps undone", "%", abs(100 * undone), error=100 * error, assumption=HICAT)
-    return _judged(row, allowed=1.0)
+    return _with_verdict(row, allowed=1.0)
 
 
 def _table4(context: Context) -> list[Row]:
@@ -190,12 +192,12 @@ def _table4(context: Context) -> list[Row]:
     scatter = "std of x tilt, 1 mas, own photometry"
     chosen = [row for row in rows if (row.quantity, row.modes, row.estimator) == (scatter, 2, "weighted")]
     papers = {"clowfs_tuned": TABLE4_MAS["clowfs"][1], "zwfs_tuned": TABLE4_MAS["clowfs"][1]}
-    return [each for row in chosen for each in _judged(replace(row, paper=papers.get(row.name, row.paper)))]
+    return [each for row in chosen for each in _with_verdict(replace(row, paper=papers.get(row.name, row.paper)))]
 
 
 def _hundred_seconds(context: Context, name: str) -> Iterator[Row]:
-    """Noise of each mode's mean over `HELD_S`, as one exposure of all the light with all the read noise."""
-    frames = HELD_S * tolerance.RATE_HZ
+    """Noise of each mode's mean over `AVERAGED_S`, as one exposure of all the light with all the read noise."""
+    frames = AVERAGED_S * tolerance.RATE_HZ
     sensor, light_e = prepared(name), tolerance.light_e(MAGNITUDE)
     good, H = np.ones(sensor.I0.size), sensor.H[:, : len(NOLLS_14)]
     normalised_I0, normalised_H = normalise_flux(sensor.I0, H, good)
@@ -213,7 +215,7 @@ def _hundred_seconds(context: Context, name: str) -> Iterator[Row]:
         pm = 1e3 * np.array([found[mode], predicted[mode], limit[mode]])
         yield Row(
             name,
-            f"Z{noll} {mode_name(noll)} over {HELD_S:g} s",
+            f"Z{noll} {mode_name(noll)} over {AVERAGED_S:g} s",
             "pm",
             float(pm[0]),
             error=float(pm[0] / np.sqrt(2 * (context.trials - 1))),
@@ -253,7 +255,7 @@ def _against_magnitude(name: str) -> Iterator[Row]:
 def plot(context: Context, path: Path) -> None:
     """Draw the added contrast against magnitude for every sensor and the quantum limit."""
     magnitudes = np.arange(0.0, 10.5, 0.5)
-    names = context.names(*(name for name in tolerance.HELD if name != "aplc"))
+    names = context.names(*(name for name in tolerance.SENSORS_COMPARED if name != "aplc"))
     lines = [
         Curve(name, magnitudes, np.array([added_contrast(name, V) for V in magnitudes.tolist()])) for name in names
     ]

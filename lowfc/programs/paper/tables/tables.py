@@ -86,7 +86,7 @@ TABLES: dict[str, Case] = {
     "photometry": Case("Sect. 3.3: photometry, and the paper's inconsistencies", photometry),
 }
 
-BEYOND: dict[str, Case] = {
+ADDITIONAL: dict[str, Case] = {
     "anchors": Case("Anchors: published figures and lowfc's", anchors.anchors, anchors.plot, None, anchors.ABOUT),
     "tolerance": Case(
         "Tolerated drift and lines", tolerance.tolerance, tolerance.plot, tolerance.in_text, tolerance.ABOUT

@@ -25,7 +25,7 @@ from lowfc.programs.paper.cases import Context, Prepared, Row, prepared
 from lowfc.programs.paper.plots import Line as Curve
 from lowfc.programs.paper.plots import curves, draw
 
-HELD = ("sam", "sam18_sized", "bar", "clowfs", "clowfs_tuned", "zwfs", "zwfs_tuned", "aplc")
+SENSORS_COMPARED = ("sam", "sam18_sized", "bar", "clowfs", "clowfs_tuned", "zwfs", "zwfs_tuned", "aplc")
 MAGNITUDES = (0.0, 2.0, 5.0, 8.0)
 ALLOWED = (1e-9, 1e-10, 1e-11)
 RATE_HZ, EXPOSURE, READ_NOISE_E = 250.0, 0.5, 1.0
@@ -134,7 +134,7 @@ def tolerance(context: Context) -> list[Row]:
     """Rows of tolerated drift and lines, of their check by simulation, and of the pair of stars."""
     from lowfc.programs.paper.tables.star_pair import pair_rows
 
-    names = context.names(*HELD)
+    names = context.names(*SENSORS_COMPARED)
     lines = {kind: tolerated_lines(kind, Line(LINE_HZ, LINE_WIDTH * LINE_HZ, 1.0), RATE_HZ, EXPOSURE) for kind in KINDS}
 
     def rows_of(name: str) -> list[Row]:
@@ -219,7 +219,7 @@ def in_text(row: Mapping[str, Any]) -> bool:
 def plot(context: Context, path: Path) -> None:
     """Draw the tolerated drift against magnitude for four modes."""
     magnitudes = np.arange(0.0, 10.5, 0.5)
-    names = context.names(*(name for name in HELD if name != "aplc"))
+    names = context.names(*(name for name in SENSORS_COMPARED if name != "aplc"))
 
     def drifts(name: str, mode: int, quantum: bool = False) -> Array:
         residual_nm2 = contrasts_of(name).variance_nm2(mode, SHOWN_CONTRAST)
