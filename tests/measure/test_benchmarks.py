@@ -1,4 +1,4 @@
-"""The benchmarks' own arithmetic, on made-up figures, and one small run of each for real."""
+"""Arithmetic of the benchmarks on synthetic figures, and one small real run of each."""
 
 import json
 import subprocess
@@ -34,20 +34,20 @@ def by_heading(lines: runner.Lines) -> list[dict[str, str]]:
 # The control step
 
 
-def test_a_step_keeps_nothing_and_takes_no_more_than_the_frame_and_the_shapes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_step_retains_no_memory_and_allocates_only_frame_and_actuators(monkeypatch: pytest.MonkeyPatch) -> None:
     config = configuration(SMALL, step.RATE_HZ)
     calibration, frames = made_up(SMALL, config)
     found = step.allocated(ControlStep(config, calibration, 0), Payloads(frames))
     assert abs(found["kept_bytes"]) < 1
     assert 2 * SMALL.pixels < found["peak_bytes"] < 2 * SMALL.pixels + 5 * 4 * SMALL.actuators + 4096
     kept, original = [], stepping.integrate
-    monkeypatch.setattr(stepping, "integrate", lambda *given: (kept.append(bytes(100)), original(*given))[1])
+    monkeypatch.setattr(stepping, "integrate", lambda *arguments: (kept.append(bytes(100)), original(*arguments))[1])
     assert step.allocated(ControlStep(config, calibration, 0), Payloads(frames))["kept_bytes"] > 100
 
 
 def test_the_stages_are_those_of_a_step_and_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     nothing = step.set_up(None, None, lock_memory=False, disable_cpu_idle=False)
-    monkeypatch.setattr(step, "set_up", lambda *_, **__: nothing)  # this process stays what it is
+    monkeypatch.setattr(step, "set_up", lambda *_, **__: nothing)  # do not change this process
     original = stepping.limit
     found = step.measure(Namespace(seconds=0.2), lambda _: None)
     assert stepping.limit is original
@@ -61,7 +61,7 @@ def test_the_stages_are_those_of_a_step_and_add_up(monkeypatch: pytest.MonkeyPat
 # Cost curves
 
 
-def test_a_made_up_calibration_sees_noise_and_has_the_bytes_that_are_counted() -> None:
+def test_a_random_calibration_has_the_stated_noise_and_number_of_bytes() -> None:
     size = Size(32, 7, 16)
     calibration, frames = made_up(size, configuration(SMALL, 100.0))
     pixels = frames.reshape(len(frames), -1).astype(float) - calibration.dark
@@ -71,16 +71,16 @@ def test_a_made_up_calibration_sees_noise_and_has_the_bytes_that_are_counted() -
     assert size.bytes == sum(getattr(calibration, name).nbytes for name in touched) + frames[0].nbytes
 
 
-def test_a_step_that_holds_its_command_is_no_measurement(monkeypatch: pytest.MonkeyPatch) -> None:
-    dazzled = configuration(SMALL, 100.0).model_copy(update={"camera": Camera(full_well_e=500.0)})
-    monkeypatch.setattr(curves, "configuration", lambda size, rate_hz: dazzled)
+def test_a_step_that_refuses_frames_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    saturated = configuration(SMALL, 100.0).model_copy(update={"camera": Camera(full_well_e=500.0)})
+    monkeypatch.setattr(curves, "configuration", lambda size, rate_hz: saturated)
     with pytest.raises(RuntimeError, match="SATURATED"):
         curves.step_figures(SMALL, 0.01)
 
 
 @pytest.mark.exclusive
 @pytest.mark.slow
-def test_a_loop_of_sizes_without_an_optical_model_is_run() -> None:
+def test_a_loop_of_any_size_runs_without_an_optical_model() -> None:
     found = curves.loop_figures(Size(side=32, modes=40, mirror_side=16), 500.0, 0.5)
     assert found["frames"] > 200
     assert found["echo_us"]["p50"] > 0
@@ -113,7 +113,7 @@ def curves_result() -> dict[str, Any]:
     }
 
 
-def test_a_point_is_the_median_of_its_repeats_and_says_what_the_limit_is() -> None:
+def test_a_point_has_the_median_of_its_repeats_and_the_memory_limit() -> None:
     result = json.loads(json.dumps(curves_result()))
     pixels, modes = curves.tables(result)
     first, second = by_heading(pixels)
@@ -158,7 +158,7 @@ def test_a_grid_is_geometric_and_has_both_ends() -> None:
 
 @pytest.mark.parametrize("edge", range(-1, 32, 3))
 @pytest.mark.parametrize("wrong", [None, 7, 15, 30])
-def test_the_search_finds_the_last_rate_that_holds_in_spite_of_one_wrong_verdict(edge: int, wrong: int | None) -> None:
+def test_the_search_finds_the_highest_sustained_rate_despite_one_wrong_result(edge: int, wrong: int | None) -> None:
     tried: list[int] = []
 
     def sustains(index: int) -> bool:
@@ -187,11 +187,11 @@ def good(**changed: Any) -> dict[str, Any]:
         ({"asked_hz": 1000.0, "failure": "it fell"}, ["it fell"]),
     ],
 )
-def test_a_rate_holds_where_nothing_is_to_be_complained_of(one: dict[str, Any], complaints: list[str]) -> None:
+def test_a_rate_is_sustained_if_there_is_no_complaint(one: dict[str, Any], complaints: list[str]) -> None:
     assert throughput.complaints(one) == complaints
 
 
-def test_a_way_has_its_highest_rate_and_why_it_goes_no_faster(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_loop_has_its_highest_rate_and_the_reason_for_its_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     shares = {"camera": (0.5, "0"), "controller": (0.6, "1"), "mirror": (0.3, "1"), "recorder": (0.2, "0,1")}
     usage = {role: {"share": share, "processors": where} for role, (share, where) in shares.items()}
 
@@ -201,22 +201,22 @@ def test_a_way_has_its_highest_rate_and_why_it_goes_no_faster(monkeypatch: pytes
 
     monkeypatch.setattr(throughput, "run_once", run_once)
     rates = throughput.grid(1000, 2000, 1.1)
-    way = throughput.find([], rates, 1.0, lambda _: None)
-    assert (way["highest_hz"], way["run"]["rate_hz"], way["above"]["asked_hz"]) == (1210, 1210, 1331)
+    loop = throughput.find([], rates, 1.0, lambda _: None)
+    assert (loop["highest_hz"], loop["run"]["rate_hz"], loop["above"]["asked_hz"]) == (1210, 1210, 1331)
     none = throughput.find([], [1400.0], 1.0, lambda _: None)
     assert none["highest_hz"] is None
-    result = {"loops": {"simulated": way, "none": none}, "seconds": 1.0, "rates_hz": rates}
+    result = {"loops": {"simulated": loop, "none": none}, "seconds": 1.0, "rates_hz": rates}
     speeds, use = throughput.tables(json.loads(json.dumps(result)))
     assert speeds[1] == ["simulated", "1210", "200", "400", "25 %", "1331 Hz: 7 messages lost"]
     assert speeds[2] == ["none", "none", "", "", "", "1400 Hz: 7 messages lost"]
     assert use[1] == ["simulated", "1210", "50 % (0)", "60 % (1)", "30 % (1)", "20 % (0,1)", "0: 50 %, 1: 90 %"]
     assert use[2][:2] == ["simulated", "1000"]
-    assert f"{len(way['runs']) + len(none['runs'])} runs on a grid of 8 rates" in throughput.about(result)
+    assert f"{len(loop['runs']) + len(none['runs'])} runs on a grid of 8 rates" in throughput.about(result)
 
 
 @pytest.mark.exclusive
 @pytest.mark.slow
-def test_a_loop_with_the_simulated_camera_is_measured_for_real() -> None:
+def test_a_real_loop_with_the_simulated_camera_is_measured() -> None:
     one = throughput.run_once(throughput.LOOPS["simulated camera, recorder"], 100.0, 1.5)
     assert 0 < one["frames"] <= 151
     assert one["messages_lost"] is not None
@@ -224,7 +224,7 @@ def test_a_loop_with_the_simulated_camera_is_measured_for_real() -> None:
     assert set(one["usage"]) == {*load.LOOP, "recorder"}
 
 
-def test_a_command_that_fails_says_why() -> None:
+def test_a_failed_command_gives_its_error() -> None:
     one = throughput.run_once(["--camera", "nonsense"], 100.0, 1.0)
     assert "nonsense" in throughput.complaints(one)[0]
 
@@ -236,7 +236,7 @@ def moment(at_s: float, **used_s: float) -> load.Moment:
     return load.Moment(at_s, {role: load.Used(one, "0", 2_000_000) for role, one in used_s.items()})
 
 
-def test_shares_are_of_the_time_in_which_all_were_there() -> None:
+def test_shares_are_over_the_time_in_which_all_processes_ran() -> None:
     moments = [moment(0.0, camera=5.0)]
     moments += [moment(1 + tenth / 10, camera=9 + tenth / 20, controller=1, mirror=tenth / 40) for tenth in range(12)]
     moments += [moment(3.0, camera=99.0)]
@@ -247,7 +247,7 @@ def test_shares_are_of_the_time_in_which_all_were_there() -> None:
     assert load.shares(moments[:3], 1.0) == load.shares([], 1.0) == {}
 
 
-def test_processes_are_known_by_what_python_was_told_to_run() -> None:
+def test_roles_of_processes_are_found_from_their_command_lines() -> None:
     assert load.role_of(["python", "-P", "-m", "sim_camera", "--run", "x"]) == "camera"
     assert load.role_of(["python", "-m", "lowfc", "record"]) == "recorder"
     assert load.role_of(["python", "-m", "lowfc", "latency"]) is None
@@ -269,7 +269,7 @@ def one(p50: float, p99: float, without: int = 0) -> dict[str, Any]:
     return counts | {"frame_to_command": span, "frame_to_mirror": None}
 
 
-def test_the_figures_of_a_run_are_those_of_its_times(tmp_path: Path) -> None:
+def test_the_figures_of_a_run_are_computed_from_its_times(tmp_path: Path) -> None:
     comparison.lay_out(tmp_path, 6)
     due = np.arange(7) * 1_000_000 + 50_000_000
     published = due + 10_000
@@ -286,10 +286,10 @@ def test_the_figures_of_a_run_are_those_of_its_times(tmp_path: Path) -> None:
     assert found["off"] is None
     commanded.fill(1)
     commanded.tofile(tmp_path / "commanded")
-    assert comparison.figures(tmp_path, 2)["off"] == 1  # no actuators have come
+    assert comparison.figures(tmp_path, 2)["off"] == 1  # no actuators were received
 
 
-def test_the_tables_have_ranges_and_differences_within_a_turn_and_who_is_not_there() -> None:
+def test_the_tables_have_ranges_differences_within_a_turn_and_missing_implementations() -> None:
     runs = {
         "C chain": [one(55, 440, 3), one(66, 110, 9), None],
         "pyrtcao, stock": [],
@@ -321,7 +321,7 @@ def test_the_tables_have_ranges_and_differences_within_a_turn_and_who_is_not_the
         assert words in about
 
 
-def test_who_cannot_take_part_is_said_and_how_it_can(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_implementation_is_reported_with_a_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     chain, *_, pyrtcao, _, _ = IMPLEMENTATIONS
     assert "pyrtcao is not installed in /no" in implementations.missing(pyrtcao, rules("--pyrtcao", "/no"))
     monkeypatch.setattr(implementations.shutil, "which", lambda _: "cc")
@@ -345,8 +345,8 @@ def test_the_step_is_an_integrator_with_a_leak(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "chosen", [pytest.param(one, id=one.name, marks=[pytest.mark.slow] * bool(one.kernel)) for one in IMPLEMENTATIONS]
 )
-def test_an_implementation_is_really_run(chosen: implementations.Implementation) -> None:
-    """The C chain where ISIO_DIR is a checkout of ImageStreamIO, pyrtcao where PYRTCAO_PYTHON has it."""
+def test_a_real_run_of_an_implementation(chosen: implementations.Implementation) -> None:
+    """The C chain if ISIO_DIR is a checkout of ImageStreamIO, pyrtcao if PYRTCAO_PYTHON has it."""
     seconds, rate_hz = 0.5, 200.0
     asked = rules("--seconds", str(seconds), "--rate", str(rate_hz), "--warm-up", "10")
     if why := implementations.missing(chosen, asked):
@@ -354,10 +354,10 @@ def test_an_implementation_is_really_run(chosen: implementations.Implementation)
     found = comparison.one_run(chosen, asked, 0)
     assert found["frames"] == pytest.approx(seconds * rate_hz, abs=10)  # lowfc warms up by time
     assert found["without_command"] < found["frames"]
-    there, back = found["frame_to_command"], found["frame_to_mirror"]
-    assert 0 < there["p50"] <= there["p99"] <= there["max"]
-    assert back["max"] > there["p50"]
-    assert (found["off"] or 0) < 1e-4  # of those whose every frame had a command
+    to_command, to_mirror = found["frame_to_command"], found["frame_to_mirror"]
+    assert 0 < to_command["p50"] <= to_command["p99"] <= to_command["max"]
+    assert to_mirror["max"] > to_command["p50"]
+    assert (found["off"] or 0) < 1e-4  # None if a frame has no command
 
 
 # Kernels
@@ -402,7 +402,7 @@ def test_streams_and_the_direct_link_are_compared_turn_by_turn(monkeypatch: pyte
 @pytest.mark.exclusive
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [streams.BETWEEN, streams.READ])
-def test_a_loop_by_streams_is_really_run(name: str) -> None:
+def test_a_real_loop_over_streams_is_measured(name: str) -> None:
     found = streams.one_run(200.0, 1.0, name)
     assert found["frames"] == pytest.approx(200, abs=10)
     assert found["without_command"] < found["frames"]

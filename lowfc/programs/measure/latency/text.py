@@ -91,12 +91,19 @@ def _row(name: str, values: Mapping[str, float]) -> str:
     return f"{name:<22}" + "".join(f"{values[at]:>9.1f}" for at in PERCENTILES)
 
 
+def _ratio(value: float) -> str:
+    return f"{value:.2f}" if value >= 0.01 else f"{value:.1g}"
+
+
 def _remarks(figures: Mapping[str, Any]) -> list[str]:
     lines = []
     for name, (_, words) in RATIOS.items():
         if figures[name]:
             spread = figures[f"{name}_spread"]
-            parts = [f"{at} {figures[name][at]:.2f} ({low:.2f} to {high:.2f})" for at, (low, high) in spread.items()]
+            parts = [
+                f"{at} {_ratio(figures[name][at])} ({_ratio(low)} to {_ratio(high)})"
+                for at, (low, high) in spread.items()
+            ]
             lines.append(f"frame to command over half a bare echo and one control step{words}: {', '.join(parts)}")
     if figures.get("kernel_ratio"):
         spread, numpy_us = figures["kernel_ratio_spread"], figures["numpy_us"]
