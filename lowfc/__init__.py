@@ -1,11 +1,11 @@
 """lowfc: a real-time low-order wavefront control daemon for coronagraphs.
 
-What programs of yours use, imported when it is first named:
+Names for your own programs, each imported on first use:
 
-- `Client`, `running`: a running loop, and the names of the runs on this host
-- `Configuration`, `load_configuration`: the configuration, and the one of a file
-- `Calibration`, `load_calibration`: a calibration, and the one of a file
-- `LogReader`, `read_history`: a log, and everything that it has of every step, as columns
+- `Client`, `running`: connection to a running loop; names of the runs on this host
+- `Configuration`, `load_configuration`: configuration; load it from a file
+- `Calibration`, `load_calibration`: calibration; load it from a file
+- `LogReader`, `read_history`: read a log; read all of its steps as columns
 """
 
 from importlib import import_module
@@ -32,7 +32,7 @@ __all__ = [
     "running",
 ]
 
-_WHERE = {
+_SOURCES = {
     "Calibration": "lowfc.control.calibration.calibration:Calibration",
     "Client": "lowfc.client:Client",
     "Configuration": "lowfc.contract.configuration:Configuration",
@@ -45,11 +45,11 @@ _WHERE = {
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _WHERE:
+    if name not in _SOURCES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module, _, attribute = _WHERE[name].partition(":")
+    module, _, attribute = _SOURCES[name].partition(":")
     return getattr(import_module(module), attribute)
 
 
 def __dir__() -> list[str]:
-    return [*globals(), *_WHERE]
+    return [*globals(), *_SOURCES]

@@ -4,7 +4,7 @@ import signal
 
 
 def main() -> None:
-    """Entry point; until everything is loaded, Ctrl-C ends it without a word."""
+    """Entry point; while modules load, Ctrl-C ends the process without a traceback."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     from lowfc.programs.cli.main import main as run
 

@@ -1,4 +1,4 @@
-"""Names of array types, once for the whole project."""
+"""Array types of the project."""
 
 import numpy as np
 import numpy.typing as npt
@@ -14,5 +14,5 @@ Sequences = npt.NDArray[np.uint64]
 
 
 def single(array: npt.ArrayLike) -> Single:
-    """In single precision and row after row, as the loop uses it."""
+    """Convert to single precision in row-major (C) order, as the loop uses it."""
     return np.ascontiguousarray(array, dtype=np.float32)

@@ -27,11 +27,11 @@ class Answer(NamedTuple):
 
     @property
     def frame(self) -> int:
-        """Number of that frame since its camera started."""
+        """Number of the first frame in force, counted from its camera's start."""
         return count_of(self.frame_sequence)
 
     @property
     def sentence(self) -> str:
-        """The answer as a readable sentence."""
+        """The answer as one sentence."""
         run = f" (run {self.run})" if self.run else ""
         return f"{self.reply}, from frame {self.frame} on{run}"

@@ -61,13 +61,13 @@ M = TypeVar("M", bound=Message)
 CONNECT_S = 1.0
 ANSWER_S = 2.0
 SLOW_ANSWER_S = 30.0
-"""Answer timeout for loading a calibration, a long play, or finishing a log."""
+"""Answer timeout for loading a calibration, a long probe sequence, or finishing a log."""
 LARGE_BYTES = 100_000
-"""Size of a request above which it has the longer timeout."""
+"""Size of a request above which the longer timeout applies."""
 
 
 def _plain(name: str) -> Callable[["Client"], Answer]:
-    """Make the method of a request that has no fields, with the declared docstring."""
+    """Make the method of a request without fields, with its declared description as docstring."""
 
     def ask(client: "Client") -> Answer:
         return client.ask(name)
@@ -77,12 +77,12 @@ def _plain(name: str) -> Callable[["Client"], Answer]:
 
 
 class Client:
-    """A connection to a loop, for use by one thread (another renews a reservation), until `disconnect`.
+    """A connection to a loop until `disconnect`, for use by one thread (a second thread renews a reservation).
 
     Only the process that answers a request has to be running.
 
-    Every request is carried out between two frames or refused, and answered with the first frame for which it is in
-    force. A refused request raises RequestRefusedError, an unanswered one BusError.
+    Every request is carried out between two frames or refused; the answer has the first frame for which it is in force.
+    A refused request raises RequestRefusedError, an unanswered one BusError.
     """
 
     def __init__(self, run: str | None = None, *, bus: Bus | None = None) -> None:
@@ -135,11 +135,11 @@ class Client:
         return self.ask("gain", modes, text=AUTO)
 
     def leak(self, values: npt.ArrayLike, modes: Modes = ()) -> Answer:
-        """Set integrator leaks: one for all modes or one for each, (modes,), as in `gain`."""
+        """Set integrator leaks: one value, or one for each of `modes`, as in `gain`."""
         return self.ask("leak", modes, values)
 
     def limit(self, values: npt.ArrayLike, modes: Modes = ()) -> Answer:
-        """Set the largest modal commands (modes,), nm rms of wavefront, as `gain`."""
+        """Set the modal limits (modes,), nm rms of wavefront, as in `gain`."""
         return self.ask("limit", modes, values)
 
     def step(self, frames: int) -> Answer:
@@ -147,7 +147,7 @@ class Client:
         return self.ask("step", values=frames)
 
     def offset(self, values: npt.ArrayLike = (), modes: Modes = ()) -> Answer:
-        """Set the loop's target (modes,), nm rms of wavefront, as `gain`; zero without values."""
+        """Set the loop's target (modes,), nm rms of wavefront, as in `gain`; zero without values."""
         return self.ask("offset", modes, values)
 
     def channel(self, name: str, actuators_nm: npt.ArrayLike | None = None) -> Answer:
@@ -164,11 +164,11 @@ class Client:
         return self.ask("channel", text=name, actuators_nm=shape)
 
     def play(self, basis_nm: npt.ArrayLike, table: npt.ArrayLike) -> Answer:
-        """Add shapes to the mirror frame by frame, unknown to the control law, until the table ends.
+        """Play a probe sequence: shapes added to the mirror frame by frame, unknown to the control law.
 
         Args:
             basis_nm: (shapes, actuators) or (shapes, rows, columns), nm of surface.
-            table: (frames, shapes), a row of factors for each frame, starting with the frame of the answer.
+            table: (frames, shapes), factors of the shapes in each frame, starting with the frame of the answer.
         """
         basis, factors = np.asarray(basis_nm, np.float32), np.asarray(table, np.float32)
         basis = basis.reshape(len(basis), -1) if basis.ndim == 3 else basis
@@ -180,7 +180,7 @@ class Client:
         return self.ask("play", text=MIRROR, actuators_nm=basis, table=factors)
 
     def play_offset(self, table_nm: npt.ArrayLike) -> Answer:
-        """Add a table to the loop's target frame by frame, (frames, modes), nm rms of wavefront, until it ends."""
+        """Play a probe sequence of the loop's target: (frames, modes), nm rms of wavefront, added frame by frame."""
         table = np.asarray(table_nm, np.float32)
         if table.ndim != 2:
             raise RequestRefusedError(f"play refused: it takes a table (frames, modes), got an array of {table.shape}")
@@ -198,8 +198,7 @@ class Client:
     def reserved(self, purpose: str, duration_s: float | None = None) -> Iterator[Lease]:
         """Reserve the loop: until the end of the block, other clients' requests that would change it are refused.
 
-        `safe`, `open`, `pause` and `stop` are always granted and end the reservation: see `check_lease`.
-        See `Lease`.
+        `safe`, `open`, `pause` and `stop` are always accepted and end the reservation: see `check_lease` and `Lease`.
         """
         lease = Lease(
             lambda name, lease_id, seconds, holder: self.ask(name, values=seconds, text=holder, lease_id=lease_id),
@@ -219,7 +218,7 @@ class Client:
             self._lease.check()
 
     def permit(self, purpose: str, hold_s: float | None = None, lease_id: int = 0) -> Answer:
-        """Ask permission to move something on the bench; with `hold_s`, the loop holds for that long: see `held`."""
+        """Ask permission to move something on the bench; with `hold_s`, the loop holds for that time: see `held`."""
         values = () if hold_s is None else hold_s
         return self.ask("permit", values=values, text=by_this_process(purpose), lease_id=lease_id or new_identity())
 
@@ -292,7 +291,7 @@ class Client:
         return found
 
     def laws(self) -> dict[str, LinearLaw]:
-        """The law loaded in place of the integrator, by its identity; empty if there has been none."""
+        """The control law loaded instead of the integrator, by its identity; empty if none has been loaded."""
         published = Published()
         for sample in self._bus.get(LAW.key, timeout_s=ANSWER_S):
             published.take(LAW, sample.payload)
@@ -354,8 +353,8 @@ class Client:
         patience_s = SLOW_ANSWER_S if len(payload) > LARGE_BYTES else ANSWER_S
         return self._answer(name, self._get(REQUEST_KEY.format(name=name), payload, patience_s))
 
-    def _get(self, key: str, payload: bytes, answer_s: float, who: Role = Role.CONTROLLER) -> Sample:
-        """Query one process; retry while a new link reports at once that nobody is there."""
+    def _get(self, key: str, payload: bytes, answer_s: float, role: Role = Role.CONTROLLER) -> Sample:
+        """Query one process; retry for a second while a new link has not found it yet."""
         deadline_s = time.monotonic() + CONNECT_S
         while True:
             begun_s = time.monotonic()
@@ -364,19 +363,19 @@ class Client:
             now_s = time.monotonic()
             if now_s - begun_s >= answer_s * 0.9:
                 raise BusError(
-                    f"the {who} of run {self.run_id!r} did not answer within {answer_s:g} s: it hangs or is too slow; "
+                    f"the {role} of run {self.run_id!r} did not answer within {answer_s:g} s: it hangs or is too slow; "
                     "the log and `lowfc ctl status` show whether the request was carried out"
                 )
             if now_s >= deadline_s:
-                if starting(self.run_id, who):
-                    raise BusError(f"run {self.run_id!r} is starting, and its {who} is not there yet: try again")
-                raise BusError(f"no {who} is there in run {self.run_id!r}: start one, as with `{_COMMANDS[who]}`")
+                if starting(self.run_id, role):
+                    raise BusError(f"run {self.run_id!r} is starting, and its {role} is not there yet: try again")
+                raise BusError(f"no {role} is there in run {self.run_id!r}: start one, as with `{_COMMANDS[role]}`")
             time.sleep(0.05)
 
-    def _get_message(self, topic: Topic, kind: type[M], who: Role) -> M:
-        """The state that a process last published."""
+    def _get_message(self, topic: Topic, kind: type[M], role: Role) -> M:
+        """The last message of a topic that a process published."""
         try:
-            return kind.FromString(self._get(topic.key, b"", ANSWER_S, who).payload)
+            return kind.FromString(self._get(topic.key, b"", ANSWER_S, role).payload)
         except DecodeError as fault:
             raise BusError(f"the answer to {topic.key} is not a {kind.DESCRIPTOR.full_name}: {fault}") from None
 
@@ -391,7 +390,7 @@ class Client:
         return Answer(True, message.reply, message.frame_sequence, message.text, state, self.run_id)
 
     def _mirror_grid(self) -> tuple[int, int]:
-        if self._grid is None:  # it does not change: another mirror is another run
+        if self._grid is None:  # the grid is fixed within a run
             self._grid = self.calibration().grid
         return self._grid
 

@@ -20,7 +20,7 @@ RENEWAL_S = 0.5
 """Time between renewals; in lockstep a loop may run twenty times faster than real time."""
 
 Ask = Callable[[str, int, float, str], object]
-"""Sends `lease`, `renew` or `release`: the request, the lease's identity, seconds, its holder."""
+"""Function that sends `lease`, `renew` or `release`: name of the request, lease id, seconds, holder."""
 
 
 def new_identity() -> int:
@@ -43,7 +43,7 @@ class Lease:
         self._purpose = by_this_process(purpose)
         self._end_s = None if duration_s is None else time.monotonic() + duration_s
         self._ended = ""
-        self._turn = threading.Lock()
+        self._lock = threading.Lock()
         self._done = threading.Event()
         self._ask("lease", self.id, DURATION_S, self._holder())
         self._thread = threading.Thread(target=self._renew, name="lease", daemon=True)
@@ -63,8 +63,8 @@ class Lease:
         return count
 
     def check(self) -> None:
-        """Renew it now; CalibrationError with the reason if it has ended."""
-        with self._turn:
+        """Renew the reservation now; CalibrationError with the reason if it has ended."""
+        with self._lock:
             if not self._ended:
                 try:
                     self._ask("renew", self.id, DURATION_S, self._holder())

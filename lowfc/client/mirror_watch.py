@@ -18,9 +18,9 @@ class MirrorWatch:
     """Reports of the mirrors of a run since construction, which returns once a first mirror has reported.
 
     Attributes:
-        frame_sequence: of the newest command that every known mirror follows.
-        applied: the last of these commands, each with the time of the mirror's report, ns of the host's clock.
-        interruption: subject and verb of what kept a mirror from following commands meanwhile; empty if nothing did.
+        frame_sequence: frame of the newest command that every known mirror has applied.
+        applied: frames of the last applied commands, each with the time of the mirror's report, ns of the host's clock.
+        interruption: clause that describes why a mirror did not follow commands meanwhile; empty if it always did.
     """
 
     def __init__(self, bus: Bus) -> None:

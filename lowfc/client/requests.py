@@ -26,12 +26,12 @@ class Declaration(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Last part of the key."""
+        """Name of the request: the last part of the key."""
         return self.key.rpartition("/")[2]
 
 
 _MODES = ("modes", "Noll indices, none for all")
-_ONE_OR_EACH = "one, or one for each mode"
+_ONE_OR_EACH = "one value, or one per mode"
 
 
 def _declared(name: str, sentence: str, example: str, *fields: tuple[str, str]) -> Declaration:
@@ -39,19 +39,19 @@ def _declared(name: str, sentence: str, example: str, *fields: tuple[str, str]) 
 
 
 DECLARED: tuple[Declaration, ...] = (
-    _declared("status", "Report what the controller is doing; the answer holds the whole state.", "status"),
-    _declared("open", "Stop driving the mirror, which holds its shape.", "open"),
-    _declared("close", "Let the control law drive the mirror.", "close"),
-    _declared("pause", "Hold the command; `close` goes on from it.", "pause"),
+    _declared("status", "Report the loop mode; the answer contains the controller's whole state.", "status"),
+    _declared("open", "Open the loop; the mirror holds its shape.", "open"),
+    _declared("close", "Close the loop: the control law drives the mirror.", "close"),
+    _declared("pause", "Open the loop, reported as paused; `close` resumes from the held command.", "pause"),
     _declared(
-        "step", "Close the loop for some frames, then open it again.", "step 100", ("values", "number of frames")
+        "step", "Close the loop for a number of frames, then open it again.", "step 100", ("values", "number of frames")
     ),
-    _declared("safe", "Relax the mirror to flat and latch it there, whatever else is requested.", "safe"),
-    _declared("clear", "Leave the latched safe state; the loop is open afterwards.", "clear"),
-    _declared("reset", "Take the modal command to zero within the slew limit, and clear the law's memory.", "reset"),
+    _declared("safe", "Relax the mirror to flat and latch it there until `clear`.", "safe"),
+    _declared("clear", "Leave safe mode; the loop is open afterwards.", "clear"),
+    _declared("reset", "Return the modal command to zero within the slew limit, and clear the law's memory.", "reset"),
     _declared(
         "gain",
-        "Set integrator gains, or let them be automatic; one at which the loop would be unstable is refused.",
+        "Set integrator gains, or have them chosen automatically; gains that make the loop unstable are refused.",
         "gain 0.4 --modes 2,3",
         _MODES,
         ("values", f"{_ONE_OR_EACH}; none for automatic gains"),
@@ -60,58 +60,60 @@ DECLARED: tuple[Declaration, ...] = (
     _declared("leak", "Set integrator leaks.", "leak 0.01", _MODES, ("values", _ONE_OR_EACH)),
     _declared(
         "limit",
-        "Set the largest modal commands.",
+        "Set the modal limits.",
         "limit 100 --modes 2,3",
         _MODES,
         ("values", f"{_ONE_OR_EACH}, nm rms of wavefront"),
     ),
     _declared(
         "offset",
-        "Set where the loop holds the wavefront; zero without values.",
+        "Set the loop's target wavefront; zero without values.",
         "offset 5 -3 --modes 4,11",
         _MODES,
         ("values", f"{_ONE_OR_EACH}, nm rms of wavefront"),
     ),
     _declared(
         "channel",
-        "Set a shape that is added to the mirror, and shift the sensor's zero point with it, so that the loop does not "
-        "undo it; `flat` shifts nothing.",
+        "Add a shape to the mirror, and shift the sensor's zero point with it so that the loop does not undo it; "
+        "`flat` shifts nothing.",
         "channel dark-hole shape.fits",
         ("text", "name: up to 32 of a-z, 0-9 and -, a letter first"),
         ("actuators", "float32, nm of surface, rows x columns; empty removes the channel"),
     ),
     _declared(
         "play",
-        "Add a row of a table for each frame, from the answered frame on, unknown to the control law; it ends by "
-        "itself.",
+        "Play a probe sequence, one row of a table per frame from the answered frame on, unknown to the control law; "
+        "it ends by itself.",
         "",
         ("text", "`mirror` or `offset`"),
         ("table", "float32, frames x columns: factors of the shapes, or nm rms of wavefront of each mode"),
-        ("columns", "of the table"),
-        ("actuators", "of `mirror`: one shape for each column, float32, nm of surface"),
+        ("columns", "number of columns of the table"),
+        ("actuators", "for `mirror`: one shape per column, float32, nm of surface"),
     ),
-    _declared("stop", "End the play.", "stop"),
+    _declared("stop", "End the probe sequence.", "stop"),
     _declared(
         "law",
-        "Let a linear law drive the mirror: it observes for a while, then takes over in a cross-fade; refused where it "
-        "is not stable.",
+        "Let a linear law drive the mirror: it first observes, then takes over in a cross-fade; an unstable law is "
+        "refused.",
         "law lqg.fits",
-        ("law", "none for the integrator"),
+        ("law", "the linear law; none for the integrator"),
     ),
-    _declared("load", "Use another calibration in an open loop.", "load calibration.fits", ("calibration", "all")),
+    _declared(
+        "load", "Use another calibration; the loop must be open.", "load calibration.fits", ("calibration", "all of it")
+    ),
     _declared("note", "Write a note to the log.", 'note "new star"', ("text", "the note")),
     _declared(
         "lease",
-        "Reserve the loop: until that ends, other clients' requests that would change it are refused; `safe`, `open`, "
-        "`pause` and `stop` are granted to everyone, and end it.",
+        "Reserve the loop: until the reservation ends, other clients' requests that would change the loop are refused; "
+        "`safe`, `open`, `pause` and `stop` are accepted from everyone, and end it.",
         "",
-        ("lease_id", "a random number, which all requests of the holder carry"),
-        ("values", "seconds for which it holds without being renewed, at most 60"),
-        ("text", "the holder and its purpose, for people"),
+        ("lease_id", "random number, sent with all requests of the holder"),
+        ("values", "seconds in force without renewal, at most 60"),
+        ("text", "holder and purpose, as text"),
     ),
     _declared(
         "renew",
-        "Extend a reservation that is in force; refused with the cause if it has ended.",
+        "Extend a reservation; if it has ended, refused with the cause.",
         "",
         ("lease_id", "as in `lease`"),
         ("values", "seconds"),
@@ -120,26 +122,26 @@ DECLARED: tuple[Declaration, ...] = (
     _declared("release", "End a reservation.", "", ("lease_id", "as in `lease`")),
     _declared(
         "permit",
-        "Ask permission to move something on the bench; with a time, a closed loop holds its command and the loop is "
-        "reserved for that long, or until it is released.",
+        "Ask permission to move something on the bench; with a time, the loop is reserved for that time, or until "
+        "released, and a closed loop holds its command.",
         'permit "moving the mask" --hold 5',
-        ("text", "what is moved, for people"),
-        ("values", "seconds for which the loop is held, at most 60; none only asks"),
-        ("lease_id", "of a hold: as in `lease`"),
+        ("text", "what is moved, as text"),
+        ("values", "seconds to hold the loop, at most 60; none: permission only"),
+        ("lease_id", "for a hold, as in `lease`"),
     ),
-    _declared("configuration", "Answer with the configuration that the controller was started with.", "configuration"),
+    _declared("configuration", "Report the configuration that the controller was started with.", "configuration"),
     Declaration(RECORD_KEY.format(name="start"), (), "Start the next log and print its path.", "record start"),
     Declaration(
         RECORD_KEY.format(name="stop"),
         (),
-        "Finish the log and print its path; the file is complete when the answer comes.",
+        "Finish the log and print its path; the file is complete when the answer arrives.",
         "record stop",
     ),
 )
 
 
 BY_NAME = {one.key.partition("/")[2].removeprefix("request/"): one for one in DECLARED}
-"""By name, as "gain" and "record/start"."""
+"""Declarations by name, such as "gain" and "record/start"."""
 
 
 def table() -> str:

@@ -7,12 +7,12 @@ from lowfc.contract.messages import Role
 
 
 def running() -> list[str]:
-    """Names of the runs on this host whose controller is listening; the directory of a killed run does not count."""
+    """Names of the runs on this host whose controller is listening; directories of killed runs do not count."""
     return [name for name, roles in living().items() if Role.CONTROLLER in roles]
 
 
 def the_run(name: str | None) -> str:
-    """The run with that name or unique beginning of a name, or the only run, whichever of its processes are running.
+    """Find the run with that name or unambiguous beginning of a name, or the only run; any running process suffices.
 
     Raises:
         BusError: there is no such run, none at all, or more than one to choose from.
@@ -35,12 +35,12 @@ def the_run(name: str | None) -> str:
 
 
 def the_known_run(name: str | None) -> str:
-    """The run of that name, even if none of its processes is running; otherwise as `the_run`."""
+    """Find the run of that name, even if none of its processes is running; otherwise as `the_run`."""
     return name if name is not None and (runtime_base() / name).is_dir() else the_run(name)
 
 
 def nobody_yet(name: str) -> str:
-    """Message while a process waits alone for its run on this host; empty once another process is running."""
+    """Message while a process is alone in its run on this host; empty once another process is running."""
     runs = living()
     if name in runs:
         return ""

@@ -21,8 +21,9 @@ from lowfc.control.loop.safety import LoopMode, reason_of
 T = TypeVar("T")
 
 WAITING = 1024
-"""Messages of a stream that its buffer holds: one second of a 1 kHz loop."""
+"""Messages that a stream buffers: one second of a 1 kHz loop."""
 SILENT_S = 5.0
+"""Default timeout for the next message."""
 _POLL_S = 0.002
 
 
@@ -52,7 +53,7 @@ class Stream(Generic[T]):
         self._ring = ring
         self._decode = decode
         self._what = what
-        self._left = -1 if count is None else count
+        self._remaining = -1 if count is None else count
         self._patience_s = patience_s
         self._gaps: dict[int, Gaps] = {}
         self._damaged = 0
@@ -61,7 +62,7 @@ class Stream(Generic[T]):
 
     @property
     def lost(self) -> int:
-        """Messages that were lost because the reader was too slow, or that were damaged."""
+        """Number of messages that were damaged, or lost because the reader was too slow."""
         return self._damaged + sum(gaps.missing for gaps in self._gaps.values())
 
     def __iter__(self) -> "Stream[T]":
@@ -69,14 +70,14 @@ class Stream(Generic[T]):
 
     def __next__(self) -> T:
         """The next message; BusError if none arrives in time."""
-        while self._left:
+        while self._remaining:
             self._fill()
             sample = self._waiting.popleft()
             count = count_of(sample.sequence)
             self._gaps.setdefault(start_of(sample.sequence), Gaps(count)).came(count)
             found = self._decode(sample)
             if found is not None:
-                self._left -= 1
+                self._remaining -= 1
                 return found
             self._damaged += 1
         self.close()
@@ -84,7 +85,7 @@ class Stream(Generic[T]):
 
     def close(self) -> None:
         """Stop receiving."""
-        self._left = 0
+        self._remaining = 0
         self._ring.close()
         self._waiting.clear()
 
@@ -95,18 +96,18 @@ class Stream(Generic[T]):
             if not self._waiting:
                 if time.monotonic() >= deadline_s:
                     self.close()
-                    raise BusError(f"no {self._what} came within {self._patience_s:g} s: `lowfc ctl status` says why")
+                    raise BusError(f"no {self._what} came within {self._patience_s:g} s: `lowfc ctl status` shows why")
                 time.sleep(_POLL_S)
 
 
 def frame_of(sample: Sample) -> Frame | None:
-    """Frame of a message; None if it holds no complete image."""
+    """Decode a frame; None if it holds no complete image."""
     frame = codec.decode_frame(sample.payload, sample.sequence, 0)
     return None if frame.pixels is None else Frame(frame.sequence, frame.time_ns, frame.pixels)
 
 
 def step_of(sample: Sample) -> Step | None:
-    """Step of a message; None if it is not valid."""
+    """Decode a step; None if it is not valid."""
     try:
         message = wire.ControlStep.FromString(sample.payload)
         return Step(

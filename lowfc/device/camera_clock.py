@@ -1,18 +1,18 @@
 """Conversion of a camera's own clock to the host's."""
 
 WINDOW_NS = 10_000_000_000
-"""Window of the offset estimate: a quartz off by 20 parts in a million drifts 0.2 ms in it."""
+"""Window of the offset estimate; a clock that is off by 20 ppm drifts 0.2 ms in it."""
 
 
 class CameraClock:
     """Converts times of a camera whose clock has its own epoch and rate to CLOCK_MONOTONIC.
 
-    No frame arrives before its time stamp, and some arrive almost at once. The offset is therefore the smallest
-    difference between reception and stamp in the last 10 s; times are late by the shortest transfer.
+    The offset is the smallest difference between reception and time stamp in the last 10 s. Converted times are
+    therefore late by the shortest transfer time.
 
     Example:
         self.clock = CameraClock()                                    # in __init__
-        end_ns = self.clock.monotonic_ns(stamp_ns, time.monotonic_ns())  # in expose, just after the frame has come
+        end_ns = self.clock.monotonic_ns(stamp_ns, time.monotonic_ns())  # in expose, on reception
     """
 
     def __init__(self) -> None:

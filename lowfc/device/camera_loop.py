@@ -11,18 +11,19 @@ from lowfc.device.driver import Camera, CameraExtras, CameraSettings, Exposure, 
 from lowfc.device.watch import DriverWatch
 
 WAIT_S = 30.0
-"""Time the first frame waits for the processes that need it."""
+"""Time that the first frame waits for the processes that need it."""
 SETTINGS_NS = round(1e9 / float(CAMERA_STATE.rate))
 PATIENCE_S = 1.0
 """Timeout of an exposure, or three periods if that is longer."""
 REST_NS = 100_000_000
+"""Longest sleep between beats while the driver must not be called."""
 AHEAD_NS = 5_000_000
 """Largest time by which the end of an exposure may be ahead of its clock."""
 MOST_LOST, MOST_FASTER = 100, 4
-"""Largest step of frame numbers: this many, plus this factor times the periods since the last frame; else a restart."""
+"""Largest plausible step of frame numbers: MOST_LOST + MOST_FASTER x periods since the last frame; else a restart."""
 FRAME_ID = "lowfc_camera"
 
-_IDLE = CameraExtras()
+_NO_EXTRAS = CameraExtras()
 
 
 class CameraLoop:
@@ -33,12 +34,12 @@ class CameraLoop:
         self._driver = driver
         self._service = service
         self._limit = frames
-        getattr(driver, "join", _IDLE.join)(service)
+        getattr(driver, "join", _NO_EXTRAS.join)(service)
         self._frames = service.publisher(FRAME)
-        self._puts = getattr(driver, "through", _IDLE.through)(self._frames)
+        self._puts = getattr(driver, "through", _NO_EXTRAS.through)(self._frames)
         self._states = service.publisher(CAMERA_STATE)
-        self._sent = getattr(driver, "sent", _IDLE.sent)
-        self._fill_extra = getattr(driver, "fill", _IDLE.fill)
+        self._sent = getattr(driver, "sent", _NO_EXTRAS.sent)
+        self._fill_extra = getattr(driver, "fill", _NO_EXTRAS.fill)
         self._first_put_ns = self._last_put_ns = 0
         self._number: int | None = None
         self._number_ns = self._lost = self._lost_due_ns = 0
@@ -61,8 +62,8 @@ class CameraLoop:
         service.require(wait_for, WAIT_S, "the camera will not start without")
         service.awaited = lambda: "" if service.work else "the camera's first frame"
         service.state = "running"
-        getattr(self._driver, "start", _IDLE.start)()
-        step = getattr(self._driver, "step", _IDLE.step) if service.clock.lockstep else _IDLE.step
+        getattr(self._driver, "start", _NO_EXTRAS.start)()
+        step = getattr(self._driver, "step", _NO_EXTRAS.step) if service.clock.lockstep else _NO_EXTRAS.step
         with self.watch.over(self._driver.close):
             while service.running and service.work != self._limit:
                 frame = self._next_frame()
@@ -88,7 +89,7 @@ class CameraLoop:
             if exposure is None:
                 return None
             if exposure.pixels.shape != (settings.rows, settings.columns):
-                settings = self._publish_settings()  # the region has changed since
+                settings = self._publish_settings()  # the region changed during the exposure
             pixels = _checked(exposure.pixels, settings)
             end_ns = self._end_ns(exposure, settings)
             self._follow_numbers(exposure, settings)
@@ -144,7 +145,7 @@ class CameraLoop:
             self._lost += lost
 
     def _restart(self) -> None:
-        """Restart the publishers of frames and of the settings, which the controller then waits for."""
+        """Restart the publishers of frames and settings; the controller then waits for the settings."""
         self._service.bus.restart()
         self._settings = None
         self._publish_settings()

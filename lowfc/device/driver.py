@@ -21,9 +21,9 @@ from lowfc.optics.detector.detector import saturation_dn
 
 
 class DriverOptions(Section):
-    """Options of a driver: derive from it and call it `Options` in the driver's class.
+    """Base class of a driver's options: derive from it in the driver's class, under the name `Options`.
 
-    A docstring below a field is its help. Unknown keys are refused, values are not converted and cannot change. They
+    A docstring below a field is its help. Unknown keys are refused; values are not converted and do not change. They
     come from `[drivers.NAME]` of the configuration and from the command line: `--frame-rate 100` sets `frame_rate`.
     """
 
@@ -114,11 +114,11 @@ def camera_state(settings: CameraSettings, time_ns: int) -> wire.CameraState:
 
 
 class Exposure(NamedTuple):
-    """One frame.
+    """A frame as returned by `Camera.expose`.
 
     Attributes:
-        pixels: (rows, columns) uint16 in DN as the converter gives them, the low bit at bit 0.
-        end_ns: end of the exposure, ns of the clock that the settings name; None for the moment of reception.
+        pixels: (rows, columns) uint16, DN of the converter, least significant bit at bit 0.
+        end_ns: end of the exposure, ns of the clock named in the settings; None for the time of reception.
         number: the hardware's frame number; the loop unwraps it and counts missing frames. None if there is none.
         lost: frames lost just before this one, if the hardware has no frame numbers.
     """
@@ -130,10 +130,10 @@ class Exposure(NamedTuple):
 
 
 class Puts(Protocol):
-    """Publishes messages of a topic."""
+    """Publisher of one topic, as far as the camera loop needs it."""
 
     def put(self, payload: bytes) -> Envelope:
-        """Send a message; return its envelope."""
+        """Publish a message and return its envelope."""
         ...
 
 
@@ -144,7 +144,7 @@ class Camera(Protocol):
     """
 
     def settings(self) -> CameraSettings:
-        """Settings in force. It is called before every exposure, so it must not wait for the hardware."""
+        """Return the settings in force. Called before every exposure, so it must not wait for the hardware."""
         ...
 
     def expose(self) -> Exposure | None:
@@ -152,7 +152,7 @@ class Camera(Protocol):
         ...
 
     def close(self) -> None:
-        """Release the hardware; the last call."""
+        """Release the hardware; no call follows."""
         ...
 
 
@@ -160,16 +160,16 @@ class CameraExtras:
     """Optional methods of a camera, independent of each other; the defaults do nothing."""
 
     def join(self, service: Service) -> None:
-        """The process has joined its run: `service` has its clock, publishers, bus and events."""
+        """Called when the process has joined its run; `service` has its clock, publishers, bus and events."""
 
     def start(self) -> None:
-        """All processes that the first frame waits for are running; the first exposure follows."""
+        """Called before the first exposure, when all processes that the first frame waits for are running."""
 
     def sent(self, envelope: Envelope) -> None:
-        """The last frame has been published, with this envelope."""
+        """Called when a frame has been published, with its envelope."""
 
     def step(self) -> None:
-        """In lockstep, after each frame: wait until the mirror has applied its command."""
+        """Called after each frame in lockstep: wait until the mirror has applied its command."""
 
     def through(self, publisher: Publisher) -> Puts:
         """Replace the publisher of frames, for example in fault tests."""
@@ -210,13 +210,13 @@ def geometry(config: Configuration) -> Geometry:
 class Mirror(Protocol):
     """A mirror: `MyMirror(options, config)` opens it.
 
-    It may have a class `Options`, derived from `DriverOptions`, and the methods of `MirrorExtras`. The actuators that
-    it receives keep the tighter of its geometry's limits and those of [mirror].
+    It may have a class `Options`, derived from `DriverOptions`, and the methods of `MirrorExtras`. The commands that it
+    receives are within the tighter of its geometry's limits and those of [mirror].
     """
 
     @property
     def geometry(self) -> Geometry:
-        """Its actuators and limits; they do not change."""
+        """Actuators and limits; they do not change."""
         ...
 
     def apply(self, actuators_nm: Single) -> Single | None:
@@ -227,7 +227,7 @@ class Mirror(Protocol):
         ...
 
     def close(self) -> None:
-        """Release the hardware; the last call. The mirror keeps its shape."""
+        """Release the hardware; no call follows. The mirror keeps its shape."""
         ...
 
 
@@ -235,21 +235,21 @@ class MirrorExtras:
     """Optional methods of a mirror, independent of each other."""
 
     def join(self, service: Service) -> None:
-        """The process has joined its run: `service` has its clock, publishers, bus and events."""
+        """Called when the process has joined its run; `service` has its clock, publishers, bus and events."""
 
     def position(self) -> Single:
-        """Read back the shape (rows, columns), nm; called at the start and after a fault.
+        """Read back the shape (rows, columns), nm of surface; called at the start and after a fault.
 
         Without this method the mirror is driven to flat at once.
         """
         raise NotImplementedError
 
     def beside(self) -> Single | None:
-        """Shape (rows, columns), nm, that other programs add to the commands; the stroke limit holds for the sum."""
+        """Shape (rows, columns), nm of surface, added by other programs; the stroke limit applies to the sum."""
         return None
 
     def settle(self, actuators_nm: Single, elapsed_ns: float) -> Single:
-        """Simulated mirrors: `apply` (rows, columns) with the run's time since the last call.
+        """Replace `apply` in simulated mirrors: (rows, columns), nm of surface, and the run's time since the last call.
 
         Also called without a new command.
         """

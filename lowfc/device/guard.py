@@ -1,6 +1,6 @@
-"""The mirror's own protection: limits, command timeout and check of commands, as pure functions.
+"""The mirror's own protection: limits, command timeout and validation of commands, as pure functions.
 
-It trusts no sender and is the same for every mirror, simulated or real. The mirror itself is a function `Move`.
+It trusts no sender and is the same for simulated and real mirrors. The mirror itself is a function `Move`.
 """
 
 from collections.abc import Callable, Mapping
@@ -18,21 +18,21 @@ from lowfc.control.loop.safety import Limit, Limited, Limits, Reason, Rejection,
 _NONE: Single = np.zeros(0, np.float32)
 
 LONGEST_VALID_NS = 2_000_000_000
-"""Longest validity of a command, whatever it requests."""
+"""Longest time for which a command may be held; longer requests are shortened to it."""
 AHEAD_NS = 1_000_000_000
-"""Largest time by which a frame may be ahead of the mirror's clock and still set the time of the surface."""
+"""Largest time by which a frame may be ahead of the mirror's clock; beyond it the surface is timed by that clock."""
 
 
 Move = Callable[[Single, float], Single]
-"""Drives the actuators (rows, columns), nm of surface, and returns their positions; the second argument is the run's
-time since the last call, ns."""
+"""Function that drives the actuators (rows, columns), nm of surface, and returns their positions; its second argument
+is the run's time since the last call, ns."""
 
 
 @dataclass(frozen=True)
 class Guard:
-    """Limits of a mirror, after its driver has rounded to `step_nm`, and its action on the command timeout.
+    """Limits of a mirror, and its action on the command timeout: flat if `flatten`, otherwise hold the shape.
 
-    `flatten`: relax to flat on the timeout; otherwise hold the shape.
+    The limits apply after the driver has rounded to `step_nm`.
     """
 
     grid: tuple[int, int]
@@ -42,7 +42,7 @@ class Guard:
 
     @cached_property
     def tighter(self) -> Limits:
-        """Limits before the driver rounds, one step tighter, so that rounding cannot cross the real ones."""
+        """Limits tightened by one driver step, so that rounding cannot exceed the real limits."""
         limits, step = self.limits, self.step_nm
         return Limits(limits.stroke_nm - step, limits.slew_nm - step, limits.neighbour_nm - step)
 
@@ -52,10 +52,10 @@ class Command:
     """A command as received.
 
     Attributes:
-        actuators_nm: (rows, columns) float32, nm of surface, or None if the bytes made no grid.
-        safe: it was sent in safe mode.
-        clear_id: identity of the operator's last clear; a new one makes the mirror forget the newest sequence.
-        ahead: its sequence starts further ahead of the mirror's clock than allowed (a clock's verdict).
+        actuators_nm: (rows, columns) float32, nm of surface; None if the bytes are not a grid.
+        safe: whether it was sent in safe mode.
+        clear_id: identity of the operator's last `clear`; a new one permits sequences below the newest received.
+        ahead: whether its sequence starts further ahead of the mirror's clock than allowed.
     """
 
     channel: str
@@ -73,18 +73,18 @@ class Status(NamedTuple):
     """State of the mirror.
 
     Attributes:
-        driven_nm: (rows, columns) sent to the driver, before it rounds: always within the limits.
-        surface_nm: (rows, columns) positions of the actuators.
-        channels: last actuators of each channel; the mirror follows their sum.
-        command_nm: its modal command; empty if the mirror's own limits changed it.
+        driven_nm: (rows, columns) as sent to the driver, before its rounding; always within the limits.
+        surface_nm: (rows, columns) positions of the actuators, nm of surface.
+        channels: last actuators of each channel; the mirror applies their sum.
+        command_nm: modal command of the last command; empty if the mirror's own limits changed it.
         limits_hit: the mirror's own limits that acted on the last command.
         frame_sequence: sequence of the frame of the last command; its time is `time_ns`.
         commanded_ns: `time_ns` at the last command; between commands `time_ns` advances by the mirror's clock.
-        received_ns: time of reception of the last command, by the mirror's clock.
-        valid_for_ns: time for which it may be held.
-        following: whether there is a command in force.
+        received_ns: reception of the last command, ns of the mirror's clock.
+        valid_for_ns: time for which the last command may be held.
+        following: whether a command is in force.
         safe: channels whose last command was sent in safe mode.
-        clear_id: identity of the newest clear carried by a command.
+        clear_id: identity of the newest `clear` received with a command.
     """
 
     driven_nm: Single
@@ -105,25 +105,25 @@ class Status(NamedTuple):
 def apply_command(
     guard: Guard, status: Status, command: Command, now_ns: int, move: Move, beside_nm: Single | None = None
 ) -> tuple[Status, Reason | None]:
-    """Apply a command received at `now_ns`; a refused one changes nothing, and the reason is returned.
+    """Apply a command received at `now_ns`; a refused command changes nothing, and its reason is returned.
 
-    A shape of other programs on the mirror, `beside_nm` (rows, columns), uses part of the stroke.
+    `beside_nm` (rows, columns) is the shape of other programs on the mirror; it uses part of the stroke.
     """
     reason = _refusal(guard, status, command)
     if reason is not None:
         return status, reason
     assert command.actuators_nm is not None  # noqa: S101  # _refusal
     channels = {**status.channels, command.channel: command.actuators_nm}
-    wanted = command.actuators_nm
+    target_nm = command.actuators_nm
     if len(channels) > 1:
         with np.errstate(over="ignore", invalid="ignore"):  # a sum that is not finite is refused by `limit`
-            wanted = sum(channels.values(), np.zeros(guard.grid, np.float32))
-    limited = _limited(guard, status.driven_nm, wanted, beside_nm)
+            target_nm = sum(channels.values(), np.zeros(guard.grid, np.float32))
+    limited = _limited(guard, status.driven_nm, target_nm, beside_nm)
     # From frame to frame, not from the last tick: ticks use the mirror's own clock, which is ahead of a frame's time.
     elapsed_ns = command.time_ns - status.commanded_ns if status.commanded_ns else np.inf
-    if elapsed_ns <= 0:  # the same frame again, while no frame arrives: only the mirror's own clock advances
+    if elapsed_ns <= 0:  # a command repeated for the same frame: only the mirror's own clock has advanced
         elapsed_ns = now_ns - status.received_ns
-    followed = Status(
+    applied = Status(
         driven_nm=limited.actuators_nm,
         surface_nm=move(limited.actuators_nm, elapsed_ns),
         channels=channels,
@@ -138,22 +138,22 @@ def apply_command(
         safe=status.safe | {command.channel} if command.safe else status.safe - {command.channel},
         clear_id=command.clear_id or status.clear_id,
     )
-    return followed, None
+    return applied, None
 
 
-def _limited(guard: Guard, previous_nm: Single, wanted_nm: Single, beside_nm: Single | None) -> Limited:
-    """Limit the command; its sum with other programs' shape keeps the stroke, or goes no further beyond it."""
-    if beside_nm is None or not beside_nm.any() or not np.isfinite(wanted_nm).all():
-        return limit(guard.tighter, previous_nm, wanted_nm)
+def _limited(guard: Guard, previous_nm: Single, target_nm: Single, beside_nm: Single | None) -> Limited:
+    """Limit the command so that its sum with other programs' shape is within the stroke, or exceeds it no further."""
+    if beside_nm is None or not beside_nm.any() or not np.isfinite(target_nm).all():
+        return limit(guard.tighter, previous_nm, target_nm)
     stroke_nm = np.float32(guard.tighter.kept_stroke_nm)
-    room_nm = np.clip(wanted_nm, np.minimum(-stroke_nm - beside_nm, 0), np.maximum(stroke_nm - beside_nm, 0))
+    room_nm = np.clip(target_nm, np.minimum(-stroke_nm - beside_nm, 0), np.maximum(stroke_nm - beside_nm, 0))
     limited = limit(guard.tighter, previous_nm, room_nm)
-    cut = Limit.STROKE not in limited.reasons and not np.array_equal(room_nm, wanted_nm)
-    return limited._replace(reasons=(Limit.STROKE, *limited.reasons)) if cut else limited
+    clipped = Limit.STROKE not in limited.reasons and not np.array_equal(room_nm, target_nm)
+    return limited._replace(reasons=(Limit.STROKE, *limited.reasons)) if clipped else limited
 
 
 def tick(guard: Guard, status: Status, now_ns: int, move: Move) -> Status:
-    """Advance without a new command: settle, and act on the command timeout."""
+    """Advance the mirror without a new command: let it settle, and apply the command timeout."""
     if status.following and expired(now_ns - status.received_ns, status.valid_for_ns):
         status = status._replace(following=False, channels={})
     if not status.following and guard.flatten and status.driven_nm.any():

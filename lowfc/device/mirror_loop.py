@@ -36,7 +36,7 @@ from lowfc.optics.chain.mirror import influence_factors
 
 TICK_NS = 10_000_000
 IDLE_STATE_NS = 100_000_000
-"""Period of the state without commands, from which a restarted controller starts."""
+"""Period of the published state without commands; a restarted controller starts from it."""
 PICTURE_PIXELS = 64
 PATIENCE_S = 0.5
 """Timeout of a move by the driver."""
@@ -46,7 +46,7 @@ class _LostError(Exception):
     """The driver failed or hung: the position of the mirror is unknown."""
 
 
-_IDLE = MirrorExtras()
+_NO_EXTRAS = MirrorExtras()
 _NONE: Single = np.zeros(0, np.float32)
 
 
@@ -79,12 +79,12 @@ class MirrorLoop:
         self._service = service
         self._guard = guard_of(driver, config)
         self._settle = getattr(driver, "settle", None)
-        self._beside = getattr(driver, "beside", _IDLE.beside)
-        getattr(driver, "join", _IDLE.join)(service)
-        self._fill_extra = getattr(driver, "fill", _IDLE.fill)
+        self._beside = getattr(driver, "beside", _NO_EXTRAS.beside)
+        getattr(driver, "join", _NO_EXTRAS.join)(service)
+        self._fill_extra = getattr(driver, "fill", _NO_EXTRAS.fill)
         self.watch = DriverWatch(service, PATIENCE_S, self._hang)
         self._turn = threading.Lock()
-        self._pause = Mailbox()  # never receives: waiting on it can be ended by a signal at any point
+        self._pause = Mailbox()  # never receives a message; a signal ends a wait on it at any time
         service.on_stop(self._pause.wake)
         self._applied_ns = 0
         self._states = service.publisher(MIRROR_STATE, name)
@@ -113,7 +113,7 @@ class MirrorLoop:
 
     def _start(self, flat_nm: Single) -> None:
         """Start from the mirror's position if its driver can read it; otherwise drive it to flat."""
-        held_nm = self._held()
+        held_nm = self._read_shape()
         if held_nm is None:
             self._status = Status(flat_nm, self._drive(flat_nm, np.inf))
         else:
@@ -121,7 +121,7 @@ class MirrorLoop:
         self._known = True
 
     def run(self) -> None:
-        """Run the command timeout and the recovery from faults; the receiving thread applies commands."""
+        """Run the command timeout and the recovery from faults; the receive thread applies commands."""
         service = self._service
         with self.watch.over(self._close):
             while service.running:
@@ -130,7 +130,7 @@ class MirrorLoop:
                 if free:
                     try:
                         if not service.clock.lockstep and service.clock.host_ns() - self._applied_ns >= TICK_NS:
-                            self._wait()
+                            self._idle()
                     finally:
                         self._turn.release()
                 service.beat(alive=free)
@@ -141,7 +141,7 @@ class MirrorLoop:
         self._driver.close()
 
     def _arrived(self, sample: Sample) -> None:
-        """Handle a command on the receiving thread; commands superseded while this process stood still are skipped."""
+        """Handle a command on the receive thread; superseded commands are skipped."""
         with self._turn:
             if self._service.running:
                 self._next_command(sample)
@@ -176,7 +176,7 @@ class MirrorLoop:
                 self._service.event("LIMIT_HIT", reason=reason.name)
 
     def _drive(self, actuators_nm: Single, elapsed_ns: float) -> Single:
-        """Call the driver to move; without a new command a real mirror is not called."""
+        """Call the driver to move; a real mirror is called only with a new command."""
         if self._settle is not None:
             reached_nm = self._call(self._settle, actuators_nm, elapsed_ns)
         elif actuators_nm is self._driven_nm:
@@ -186,7 +186,7 @@ class MirrorLoop:
         self._driven_nm = actuators_nm
         return actuators_nm if reached_nm is None else reached_nm
 
-    def _held(self) -> Single | None:
+    def _read_shape(self) -> Single | None:
         """Read the mirror's shape from its driver; None if it cannot be read."""
         position = getattr(self._driver, "position", None)
         return None if position is None else self._call(position)
@@ -194,7 +194,7 @@ class MirrorLoop:
     def _call(self, method: Callable[..., Single | None], *arguments: object) -> Single | None:
         """Call a method of the driver and return the mirror's positions.
 
-        _LostError if it failed or hung: the position is then unknown, and the mirror first goes to its idle state.
+        _LostError if it failed or hung: the position is then unknown until the mirror is in its idle state.
         """
         self.watch.begin()
         try:
@@ -213,15 +213,15 @@ class MirrorLoop:
         raise _LostError
 
     def _hang(self) -> None:
-        """Mark the position in the state as unknown; called on the watch's thread."""
+        """Publish the position as unknown; called on the watch's thread."""
         self._known, self._refused = False, Rejection.NO_MIRROR
         self._publish(self._service.clock.now_ns())
 
     def _return(self) -> None:
-        """After a fault, step towards the idle state: flat, or the shape that it holds or was last driven to."""
+        """After a fault, step towards the idle state: flat, or the shape read back or last commanded."""
         if self._service.clock.host_ns() < self.watch.retry_ns:
             return
-        if self._driven_nm is None and (held_nm := self._held()) is not None:
+        if self._driven_nm is None and (held_nm := self._read_shape()) is not None:
             self._status = self._status._replace(driven_nm=held_nm)
         self._status = tick(self._guard, self._status, self._service.clock.now_ns(), self._drive)
         self._known = True
@@ -229,7 +229,7 @@ class MirrorLoop:
         if not self._returning:
             self._refused = None
 
-    def _wait(self) -> None:
+    def _idle(self) -> None:
         now_ns = self._service.clock.now_ns()
         before = self._status
         with contextlib.suppress(_LostError):

@@ -1,4 +1,4 @@
-"""Find drivers by name: entry points of installed packages, "module:Class", or "folder/file.py:Class"."""
+"""Find drivers by name: an entry point of an installed package, "module:Class", or "folder/file.py:Class"."""
 
 import importlib.util
 import sys
@@ -31,7 +31,7 @@ def load(kind: Kind, name: str) -> Any:
     if colon:
         if module.endswith(".py") and not Path(module).is_file():
             raise ConfigurationError(f"the driver {name!r} cannot be loaded: there is no file {module}")
-        # `python -P` leaves out the current folder
+        # `python -P` excludes the current folder
         sys.path.insert(0, str(Path(module).resolve().parent if module.endswith(".py") else Path.cwd()))
         point = EntryPoint(name, f"{section(name)}:{attribute}", f"lowfc.{kind}s")
     elif name in (known := installed(kind)):
@@ -52,7 +52,7 @@ def load(kind: Kind, name: str) -> Any:
 
 
 def section(name: str) -> str:
-    """NAME of a driver's section [drivers.NAME]: its own or its module's name."""
+    """Return NAME of a driver's section [drivers.NAME]: the driver's own or its module's name."""
     module = name.partition(":")[0]
     return Path(module).stem if module.endswith(".py") else module
 
@@ -91,13 +91,13 @@ def faults(config: Configuration, folder: Path) -> list[str]:
 def table(config: Configuration, kind: Kind, name: str) -> dict[str, Any]:
     """Options of a driver in a configuration: [drivers.NAME], or its part for this kind.
 
-    ConfigurationError if they are under the name of its class.
+    ConfigurationError if the section is named after the driver's class.
     """
-    mine = section(name)
-    for other in {name, name.rpartition(":")[2]} - {mine}:
+    expected = section(name)
+    for other in {name, name.rpartition(":")[2]} - {expected}:
         if other in config.drivers:
-            raise ConfigurationError(f"the options of {name} are in [drivers.{mine}], got [drivers.{other}]")
-    found = config.drivers.get(mine, {})
+            raise ConfigurationError(f"the options of {name} are in [drivers.{expected}], got [drivers.{other}]")
+    found = config.drivers.get(expected, {})
     if found and set(found) <= set(KINDS):
         return dict(found.get(kind, {}))
     return found
@@ -111,17 +111,17 @@ def options(driver: Any, found: dict[str, Any], words: Sequence[str] = ()) -> Dr
     model: type[DriverOptions] = getattr(driver, "Options", DriverOptions)
     given, faults = _given(words), []
     try:
-        made = model.model_validate(found)
+        validated = model.model_validate(found)
     except ValidationError as error:  # options missing here may be among the words
         faults = [one for one in error.errors() if not (given and one["type"] == "missing")]
     if given and not faults:
         try:
-            made = model.model_validate({**found, **given}, strict=False)
+            validated = model.model_validate({**found, **given}, strict=False)
         except ValidationError as error:
             faults = error.errors()
     if faults:
         raise ConfigurationError("\n".join(f"options of {driver.__name__}: {_explained(one, model)}" for one in faults))
-    return made
+    return validated
 
 
 def options_help(driver: Any) -> list[tuple[str, str]]:
@@ -148,7 +148,7 @@ def _explained(fault: Any, model: type[DriverOptions]) -> str:
 
 
 def _given(words: Sequence[str]) -> dict[str, Any]:
-    """Values of a command line by field name; lists are written as in TOML."""
+    """Parse a command line into values by field name; lists are written as in TOML."""
     found: dict[str, Any] = {}
     rest = list(words)
     while rest:

@@ -45,7 +45,7 @@ PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
 """Settings of a command that passes unknown words to the driver as its options."""
 Frames = Annotated[int | None, typer.Option(min=1, help="Stop after so many frames; default: at Ctrl-C or SIGTERM.")]
 LEAVE_S = 2.0
-"""Time a camera in the controller's process has to end."""
+"""Time in which a camera in the controller's process has to end."""
 WaitFor = Annotated[list[str] | None, typer.Option(help="Process that the first frame waits for; repeat.")]
 
 
@@ -66,7 +66,7 @@ def run_camera(
     """
     service = join(config, run, Role.CAMERA, config.realtime.camera_cpus)
     with closing(service.bus):  # a callback on zenoh's threads must not outlive the interpreter
-        with opening("the camera does not say how it is set"):
+        with opening("the camera's settings cannot be read"):
             loop = CameraLoop(driver, service, config, frames)
         service.catch_signals()
         loop.run(wait_for)
@@ -74,7 +74,7 @@ def run_camera(
 
 @contextmanager
 def camera_beside(driver: Camera, config: Configuration, service: Service) -> Iterator[None]:
-    """Read a camera in the controller's process: the thread that reads a frame also handles it, without a link.
+    """Run a camera in the controller's process: the thread that reads a frame also handles it, without a link.
 
     Other processes see the same role, topics and Health as from a camera in its own process. When the camera or the
     controller ends, so does the other.
@@ -94,7 +94,7 @@ def camera_beside(driver: Camera, config: Configuration, service: Service) -> It
     camera = join_beside(config, service, Role.CAMERA)
     faults: list[Exception] = []
     with closing(camera.bus):
-        with opening("the camera does not say how it is set"):
+        with opening("the camera's settings cannot be read"):
             loop = CameraLoop(driver, camera, config)
 
         def read() -> None:
@@ -126,7 +126,7 @@ def run_mirror(driver: Mirror, config: Configuration, run: str) -> None:
     """
     service = join(config, run, mirror_role(config.mirror.name), config.realtime.mirror_cpus)
     with closing(service.bus):
-        with opening("the mirror does not say what it is"):
+        with opening("the mirror's geometry cannot be read"):
             loop = MirrorLoop(driver, service, config)
         service.catch_signals()
         loop.run()

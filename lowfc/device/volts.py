@@ -1,4 +1,4 @@
-"""Conversion from nm of surface to the drive value of each channel, clipped, in the vendor's order."""
+"""Conversion from nm of surface to clipped drive values in the vendor's order of channels."""
 
 import numpy as np
 
@@ -26,7 +26,7 @@ class VoltOptions(DriverOptions):
     highest: float = 1.0
     """Highest value sent."""
     order: str = ""
-    """File of each actuator's channel, from 0, or -1 for an actuator without channel; empty: row by row."""
+    """File of each actuator's channel number, from 0; -1 for an actuator without channel; empty: row by row."""
 
 
 class VoltMap:
@@ -40,33 +40,33 @@ class VoltMap:
         """
         grid = (config.mirror.rows, config.mirror.columns)
 
-        def read(key: str, file: str, otherwise: Array) -> Array:
-            return shape_of(config, f"option {key}", file).astype(float) if file else otherwise
+        def read(key: str, file: str, default: Array) -> Array:
+            return shape_of(config, f"option {key}", file).astype(float) if file else default
 
         zero = read("zero_map", options.zero_map, np.full(grid, options.zero))
         gain = read("gain_map", options.gain_map, np.ones(grid))
         order = read("order", options.order, np.arange(zero.size, dtype=float).reshape(grid)).ravel().astype(int)
-        self._used = np.flatnonzero(order >= 0)
-        self._channel = order[self._used]
+        self._wired = np.flatnonzero(order >= 0)
+        self._channel = order[self._wired]
         self.channels = int(self._channel.max(initial=-1)) + 1 if channels is None else channels
         if len(set(self._channel)) < len(self._channel) or self._channel.max(initial=-1) >= self.channels:
-            raise ConfigurationError(f"option order: each actuator has a channel of its own below {self.channels}")
+            raise ConfigurationError(f"option order: each actuator needs its own channel below {self.channels}")
         if not (gain > 0).all():
             raise ConfigurationError("option gain_map: every gain must be above 0")
-        self._zero, self._nm = zero.ravel()[self._used], (gain * config.mirror.nm_per_unit).ravel()[self._used]
+        self._zero, self._nm = zero.ravel()[self._wired], (gain * config.mirror.nm_per_unit).ravel()[self._wired]
         self._range = low, high = options.lowest, options.highest
         if not (low <= self._zero.min(initial=np.inf) <= self._zero.max(initial=-np.inf) <= high):
-            raise ConfigurationError(f"options zero, zero_map: a flat mirror has values within {low:g} to {high:g}")
+            raise ConfigurationError(f"options zero, zero_map: flat values must be within {low:g} to {high:g}")
         self._grid = grid
 
     def values(self, actuators_nm: Single) -> Array:
-        """Values (channels,) for actuators (rows, columns), nm of surface, within lowest to highest; 0 where unused."""
+        """Values (channels,), clipped, for actuators (rows, columns) in nm of surface; 0 for unused channels."""
         found = np.zeros(self.channels)
-        found[self._channel] = np.clip(self._zero + actuators_nm.ravel()[self._used] / self._nm, *self._range)
+        found[self._channel] = np.clip(self._zero + actuators_nm.ravel()[self._wired] / self._nm, *self._range)
         return found
 
     def surface_nm(self, values: Array) -> Single:
-        """Actuators (rows, columns), nm of surface, under values (channels,); 0 where an actuator has no channel."""
+        """Actuators (rows, columns) in nm of surface for values (channels,); 0 for actuators without a channel."""
         surface = np.zeros(self._grid)
-        surface.flat[self._used] = (values[self._channel] - self._zero) * self._nm
+        surface.flat[self._wired] = (values[self._channel] - self._zero) * self._nm
         return single(surface)

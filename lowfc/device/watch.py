@@ -1,4 +1,4 @@
-"""Faults of a driver: one that raises or does not return is counted, named in an event and tried again later."""
+"""Watch of a driver: calls that raise or do not return are counted, reported in an event, and retried later."""
 
 import re
 import threading
@@ -10,12 +10,12 @@ from pathlib import Path
 from lowfc.adapters.process.service import Service
 from lowfc.contract.errors import ConfigurationError, LowfcError
 
-LOOK_S = 0.1
+CHECK_S = 0.1
 PAUSES_NS = (0, 100_000_000, 200_000_000, 500_000_000, 1_000_000_000, 2_000_000_000, 4_000_000_000)
-"""Pause after the first failure, the second in a row, and so on."""
-STEADY_NS = 1_000_000_000
-"""A driver works again when it has not failed for this long."""
-AGAIN_NS = 10_000_000_000
+"""Pause before the retry after the first, second, ... consecutive failure."""
+RECOVERED_NS = 1_000_000_000
+"""A driver counts as recovered after this time without failure."""
+REPEAT_NS = 10_000_000_000
 """Period at which a persistent fault is reported again."""
 _HERE = Path(__file__).parent
 
@@ -43,10 +43,10 @@ class DriverWatch:
     """Watches the calls of one driver.
 
     Attributes:
-        failures: failures since the start, calls that did not return included.
-        hangs: the current call has exceeded its timeout.
-        failed_ns: host's time of the last failure.
-        retry_ns: host's time before which the driver is not called.
+        failures: number of failures since the start, including calls that did not return.
+        hangs: whether the current call has exceeded its timeout.
+        failed_ns: time of the last failure, ns of the host's clock.
+        retry_ns: time before which the driver is not called, ns of the host's clock.
     """
 
     def __init__(self, service: Service, patience_s: float, hanging: Callable[[], None] = lambda: None) -> None:
@@ -56,66 +56,66 @@ class DriverWatch:
         self.patience_s = patience_s
         self._service = service
         self._hanging = hanging
-        self._calls = self._looked_at = self._looks = self._row = self._series = 0
-        self._under_way = False
-        self._kind, self._said_ns = "", 0
-        self._ended = threading.Event()
+        self._calls = self._checked_call = self._checks = self._consecutive = self._series = 0
+        self._in_call = False
+        self._kind, self._reported_ns = "", 0
+        self._closed = threading.Event()
 
     @contextmanager
     def over(self, close: Callable[[], None]) -> Iterator[None]:
         """Watch on a separate thread; close the driver at the end of the block in any case."""
-        threading.Thread(target=self._look_on, name="driver's watch", daemon=True).start()
+        threading.Thread(target=self._run_checks, name="driver's watch", daemon=True).start()
         try:
             yield
         finally:
-            self._ended.set()
+            self._closed.set()
             try:
                 close()
             except Exception as fault:
                 self.failed(fault)
 
     def begin(self) -> None:
-        """A call begins."""
+        """Note that a call begins."""
         self._calls += 1
-        self._under_way = True
+        self._in_call = True
 
     def returned(self) -> bool:
         """Note that the call has returned; return whether it did so in time."""
-        self._under_way = False
+        self._in_call = False
         in_time, self.hangs = not self.hangs, False
         return in_time
 
     def worked(self) -> None:
-        """Note that a call returned a valid result."""
-        self._row = 0
-        if self._series and self._service.clock.host_ns() - self.failed_ns >= STEADY_NS:
+        """Note that a call has returned a valid result."""
+        self._consecutive = 0
+        if self._series and self._service.clock.host_ns() - self.failed_ns >= RECOVERED_NS:
             self._service.event("DRIVER_BACK", count=self._series)
             self._series, self._kind = 0, ""
 
     def failed(self, fault: Exception) -> None:
-        """Note that a call raised or returned nonsense; a `LowfcError`, for a user to correct, is raised again."""
-        self._under_way = self.hangs = False
+        """Note that a call raised or returned an invalid result; a `LowfcError`, for the user, is raised again."""
+        self._in_call = self.hangs = False
         if isinstance(fault, LowfcError):
             raise fault
-        self.retry_ns = self._service.clock.host_ns() + PAUSES_NS[min(self._row, len(PAUSES_NS) - 1)]
-        self._row += 1
+        self.retry_ns = self._service.clock.host_ns() + PAUSES_NS[min(self._consecutive, len(PAUSES_NS) - 1)]
+        self._consecutive += 1
         self._count()
         why = described(fault)
-        kind = re.sub(r"\d+", "", why)  # the same fault with other numbers counts as the same
-        if kind != self._kind or self.failed_ns >= self._said_ns + AGAIN_NS:
-            self._kind, self._said_ns = kind, self.failed_ns
+        kind = re.sub(r"\d+", "", why)  # a message that differs only in its numbers is the same fault
+        if kind != self._kind or self.failed_ns >= self._reported_ns + REPEAT_NS:
+            self._kind, self._reported_ns = kind, self.failed_ns
             self._service.event("DRIVER_FAILED", why=why)
 
-    def look(self) -> None:
-        """Report a call that lasts too many checks; checks are counted because the host may have stood still."""
-        if not self._under_way or self._calls != self._looked_at:
-            self._looked_at, self._looks = self._calls, 0
+    def check(self) -> None:
+        """Report a call that lasts too many checks; checks are counted, not time, as the host may have stopped."""
+        if not self._in_call or self._calls != self._checked_call:
+            self._checked_call, self._checks = self._calls, 0
             return
-        self._looks += 1
-        if self._looks * LOOK_S >= self.patience_s and not self.hangs:
+        self._checks += 1
+        if self._checks * CHECK_S >= self.patience_s and not self.hangs:
             self.hangs = True
             self._count()
-            self._service.event("DRIVER_HANGS", hangs_s=self._looks * LOOK_S)
+            self._service.event("DRIVER_HANGS", hangs_s=self._checks * CHECK_S)
             self._hanging()
 
     def _count(self) -> None:
@@ -123,6 +123,6 @@ class DriverWatch:
         self._series += 1
         self.failed_ns = self._service.clock.host_ns()
 
-    def _look_on(self) -> None:
-        while not self._ended.wait(LOOK_S):
-            self.look()
+    def _run_checks(self) -> None:
+        while not self._closed.wait(CHECK_S):
+            self.check()

@@ -1,1 +1,1 @@
-"""For tests of lowfc and of drivers: an in-memory bus, a clock that the test advances."""
+"""Test helpers for lowfc and for drivers: an in-memory bus and a clock that the test advances."""

@@ -1,4 +1,4 @@
-"""A clock that moves by hand only."""
+"""A clock that only the test advances."""
 
 from lowfc.adapters.process.clock import SIMULATED_START_NS
 
@@ -6,7 +6,7 @@ _NS = 1_000_000_000
 
 
 class FakeClock:
-    """A clock for tests: host and run have the same time, which moves by hand only."""
+    """Clock for tests: host and run have the same time, which only `advance` and `sleep_until_ns` change."""
 
     offset_ns = 0
 
@@ -16,19 +16,19 @@ class FakeClock:
         self.start_s = start_ns // _NS
 
     def now_ns(self) -> int:
-        """Its time."""
+        """Present time."""
         return self.time_ns
 
     host_ns = now_ns
 
     def ahead_ns(self) -> int:
-        """It is its own wall clock."""
+        """Return 0: there is no separate wall clock."""
         return 0
 
     def advance(self, duration_ns: int) -> None:
-        """Let time pass."""
+        """Advance the time."""
         self.time_ns += duration_ns
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
-        """Let time pass up to the deadline."""
+        """Advance the time to the deadline."""
         self.time_ns = max(self.time_ns, deadline_ns)

@@ -1,4 +1,4 @@
-"""What a test hears of a process: messages by topic, events by name."""
+"""Recorder of a process's messages and events, for tests."""
 
 from typing import Any
 
@@ -10,27 +10,27 @@ from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 
 
 class Listener:
-    """Keeps every message of some topics and of the events: `samples` has them with their envelopes, by topic."""
+    """Keeps all messages of some topics and all events: `samples` has them by topic, with their envelopes."""
 
     def __init__(self, hub: MemoryHub, clock: Clock, *topics: Topic) -> None:
         self.samples: dict[Topic, list[Sample]] = {topic: [] for topic in (*topics, EVENT)}
         self._hub, self._clock = hub, clock
         bus = MemoryBus(hub, "operator", clock)
-        for topic, kept in self.samples.items():
-            bus.subscribe(topic, kept.append)
+        for topic, received in self.samples.items():
+            bus.subscribe(topic, received.append)
 
     def service(self, role: str) -> Service:
-        """A process beside it, on the same bus and by the same clock."""
+        """Make a process on the same hub with the same clock."""
         return Service(role, "test", self._clock, MemoryBus(self._hub, role, self._clock))
 
     def messages(self, topic: Topic) -> list[Any]:
-        """Messages of a topic, in their order."""
+        """Messages of a topic, in order."""
         return [topic.message.FromString(sample.payload) for sample in self.samples[topic]]
 
     def events(self) -> list[str]:
-        """Names of the events, in their order."""
+        """Names of the events, in order."""
         return [message.message.split()[0] for message in self.messages(EVENT)]
 
-    def said(self, start: str) -> list[str]:
-        """Events that begin so, in full."""
+    def event_texts(self, start: str) -> list[str]:
+        """Texts of the events that begin with `start`."""
         return [log.message for log in self.messages(EVENT) if log.message.startswith(start)]

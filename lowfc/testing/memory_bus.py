@@ -1,4 +1,4 @@
-"""The bus within one process: a put calls the handlers before it returns. For unit and fault tests."""
+"""In-memory bus for unit and fault tests: a put calls the handlers before it returns."""
 
 import contextlib
 import threading
@@ -20,7 +20,7 @@ T = TypeVar("T")
 
 @dataclass(slots=True)
 class MemoryHub:
-    """What the buses of one test have in common; `lose` says whether to lose a message on its way to a role."""
+    """Connects the buses of one test; `lose` decides whether a message to a role is lost."""
 
     buses: "list[MemoryBus]" = field(default_factory=list)
     starts: dict[str, int] = field(default_factory=dict)
@@ -113,10 +113,10 @@ class MemoryBus:
         """See `Bus.get`; returns once every handler has replied or failed, or after `timeout_s`."""
         answers: list[Sample] = []
         replied = threading.Semaphore(0)
-        asked = 0
+        pending = 0
         for bus in list(self.hub.buses):
-            kept = [one for one in bus.publishers if key in (one.key, one.topic.at(ALL))]
-            answers.extend(_sample(one.key, *one.last, self.clock) for one in kept if one.last)
+            stored = [one for one in bus.publishers if key in (one.key, one.topic.at(ALL))]
+            answers.extend(_sample(one.key, *one.last, self.clock) for one in stored if one.last)
             start = Envelope(sequence_of(bus.start_s, 0), self.clock.host_ns())
 
             def reply(body: bytes, envelope: Envelope = start) -> None:
@@ -124,10 +124,10 @@ class MemoryBus:
                 replied.release()
 
             for handler in [one for expression, one in bus.queryables if _covers(expression, key)]:
-                asked += bus.call("queryable of", key, handler, Query(key, payload, reply))
+                pending += bus.call("queryable of", key, handler, Query(key, payload, reply))
         deadline_s = time.monotonic() + timeout_s
-        while asked and replied.acquire(timeout=max(0.0, deadline_s - time.monotonic())):
-            asked -= 1
+        while pending and replied.acquire(timeout=max(0.0, deadline_s - time.monotonic())):
+            pending -= 1
         return answers
 
     def peers(self) -> int:
@@ -147,15 +147,15 @@ class MemoryBus:
             self.hub.buses.remove(self)
 
     def deliver(self, key: str, payload: bytes, envelope: Envelope) -> None:
-        """Call the handlers for a message that somebody put."""
+        """Call the handlers for a published message."""
         if self.hub.lose(self.role, key, envelope):
             return
-        for topic, wanted, handler in list(self._subscriptions):
-            if key == wanted or (wanted == topic.at(ALL) and topic.matches(key)):
-                self.call("handler of", wanted, handler, _sample(key, payload, envelope, self.clock))
+        for topic, pattern, handler in list(self._subscriptions):
+            if key == pattern or (pattern == topic.at(ALL) and topic.matches(key)):
+                self.call("handler of", pattern, handler, _sample(key, payload, envelope, self.clock))
 
     def call(self, what: str, key: str, handler: Callable[[T], None], argument: T) -> bool:
-        """Call a handler, and say whether it raised nothing; its fault is its own process's, never the publisher's."""
+        """Call a handler; return False if it raised. A fault counts for its own process, not the publisher's."""
         try:
             handler(argument)
         except Exception as fault:

@@ -147,14 +147,14 @@ def forge(hub: MemoryHub) -> Callable[[], None]:
 
 
 def test_forged_names_fill_no_process_and_are_one_event(hub: MemoryHub, forge: Callable[[], None]) -> None:
-    heard = Listener(hub, FakeClock())
-    camera = heard.service("camera")
+    listener = Listener(hub, FakeClock())
+    camera = listener.service("camera")
     forge()
-    heard.service("controller").beat()
+    listener.service("controller").beat()
     camera.beat()
     assert len(camera.last_health) == MOST_NAMES + 1
     assert "controller" in camera.last_health
-    (event,) = heard.said("BAD_MESSAGE")
+    (event,) = listener.event_texts("BAD_MESSAGE")
     assert event.startswith(f"BAD_MESSAGE {FORGED - MOST_NAMES} messages on lowfc/health/* could not be read")
 
 

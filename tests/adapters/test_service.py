@@ -32,7 +32,7 @@ def service(hub: MemoryHub, clock: FakeClock, name: str, **more: object) -> Serv
 
 
 def test_health_is_sent_when_due_and_tells_everything(hub: MemoryHub, clock: FakeClock) -> None:
-    ear = Listener(hub, clock, HEALTH)
+    listener = Listener(hub, clock, HEALTH)
 
     def fill(health: wire.Health) -> None:
         health.commands_late = 3
@@ -41,13 +41,13 @@ def test_health_is_sent_when_due_and_tells_everything(hub: MemoryHub, clock: Fak
     frames = camera.publisher(FRAME)
     camera.beat()
     camera.beat()
-    assert len(ear.messages(HEALTH)) == 1
+    assert len(listener.messages(HEALTH)) == 1
     for _ in range(5):
         frames.put(b"")
         camera.work += 1
     clock.advance(HEALTH_PERIOD_NS)
     camera.beat()
-    first, second = ear.messages(HEALTH)
+    first, second = listener.messages(HEALTH)
     assert (first.state, first.rate_hz, second.rate_hz) == ("starting", 0.0, 10.0)
     assert (second.process, second.run_id, second.pid, second.version) == ("camera", "night", os.getpid(), __version__)
     assert (second.commands_late, second.uptime_ns, second.realtime_granted) == (
@@ -68,11 +68,11 @@ def test_health_is_sent_when_due_and_tells_everything(hub: MemoryHub, clock: Fak
 def test_a_clock_that_is_off_is_reported_at_the_start(
     hub: MemoryHub, clock: FakeClock, monkeypatch: pytest.MonkeyPatch, ahead_ms: int, said: bool
 ) -> None:
-    ear = Listener(hub, clock, HEALTH)
+    listener = Listener(hub, clock, HEALTH)
     monkeypatch.setattr(clock, "ahead_ns", lambda: ahead_ms * 1_000_000)
     service(hub, clock, "camera")
-    found = ear.said(f"CLOCK_OFF this boot's clock is {ahead_ms:+d} ms from the wall clock")
-    assert len(found) == len(ear.said("CLOCK_OFF")) == said
+    found = listener.event_texts(f"CLOCK_OFF this boot's clock is {ahead_ms:+d} ms from the wall clock")
+    assert len(found) == len(listener.event_texts("CLOCK_OFF")) == said
 
 
 def test_what_a_mailbox_got_is_in_health(hub: MemoryHub, clock: FakeClock) -> None:
@@ -90,16 +90,16 @@ def test_what_a_mailbox_got_is_in_health(hub: MemoryHub, clock: FakeClock) -> No
 def test_events_are_published_and_warnings_shown(
     hub: MemoryHub, clock: FakeClock, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    ear = Listener(hub, clock, HEALTH)
+    listener = Listener(hub, clock, HEALTH)
     controller = service(hub, clock, "controller", granted=Granted((), (("SCHED_FIFO", "a longer tail"),)))
     controller.event("FRAMES_BACK", silent_ms=12.4)
-    assert [(log.name, log.message.split()[0], log.level) for log in ear.messages(EVENT)] == [
+    assert [(log.name, log.message.split()[0], log.level) for log in listener.messages(EVENT)] == [
         ("controller", "STARTED", 2),
         ("controller", "REALTIME_REFUSED", 3),
         ("controller", "FRAMES_BACK", 2),
     ]
-    assert ear.messages(EVENT)[-1].message == "FRAMES_BACK frames are back after 12 ms"
-    assert from_timestamp(ear.messages(EVENT)[-1].timestamp) == clock.now_ns()
+    assert listener.messages(EVENT)[-1].message == "FRAMES_BACK frames are back after 12 ms"
+    assert from_timestamp(listener.messages(EVENT)[-1].timestamp) == clock.now_ns()
     shown = capsys.readouterr().err
     assert shown == "controller: REALTIME_REFUSED the host refused SCHED_FIFO: a longer tail\n"
 
@@ -121,24 +121,24 @@ def test_processes_meet_when_each_has_heard_the_other(hub: MemoryHub, clock: Fak
 def test_a_newcomer_is_answered_before_the_next_health_is_due(hub: MemoryHub, clock: FakeClock) -> None:
     camera = service(hub, clock, "camera")
     camera.beat()
-    ear = Listener(hub, clock, HEALTH)
+    listener = Listener(hub, clock, HEALTH)
     camera.beat()
-    assert ear.messages(HEALTH) == []
+    assert listener.messages(HEALTH) == []
     service(hub, clock, "controller").beat()
     camera.beat()
-    assert list(ear.messages(HEALTH)[-1].peers_alive) == ["controller"]
+    assert list(listener.messages(HEALTH)[-1].peers_alive) == ["controller"]
     again = service(hub, clock, "controller")
     camera.beat()
-    assert len(ear.messages(HEALTH)) == 2  # one of each process
+    assert len(listener.messages(HEALTH)) == 2  # one of each process
     again.beat()  # the same name and the same process: no news
     camera.beat()
-    assert [health.process for health in ear.messages(HEALTH)] == ["controller", "camera", "controller"]
+    assert [health.process for health in listener.messages(HEALTH)] == ["controller", "camera", "controller"]
 
 
 def test_a_flood_of_bad_messages_is_one_event_and_the_last_health_has_all_counts(
     hub: MemoryHub, clock: FakeClock
 ) -> None:
-    ear = Listener(hub, clock, HEALTH)
+    listener = Listener(hub, clock, HEALTH)
     mirror = service(hub, clock, "mirror-dm")
     for number in range(500):
         mirror.unreadable("lowfc/mirror/dm/command", f"reason {number}")
@@ -147,23 +147,23 @@ def test_a_flood_of_bad_messages_is_one_event_and_the_last_health_has_all_counts
     mirror.beat()  # no Health is due
     mirror.stop("enough")
     mirror.finish()
-    assert ear.said("BAD_MESSAGE") == [
+    assert listener.event_texts("BAD_MESSAGE") == [
         "BAD_MESSAGE 500 messages on lowfc/mirror/dm/command could not be read; the last: reason 499",
         "BAD_MESSAGE 1 message on lowfc/mirror/dm/command could not be read; the last: too short",
     ]
     assert not mirror.running
-    assert ear.messages(EVENT)[-1].message == "STOPPED mirror-dm stopped: enough"
-    assert ear.messages(HEALTH)[-1].state == "stopped"
-    assert {count.topic: count.published for count in ear.messages(HEALTH)[-1].topics} == {
-        "lowfc/event": len(ear.messages(EVENT)),
-        "lowfc/health/mirror-dm": len(ear.messages(HEALTH)),
+    assert listener.messages(EVENT)[-1].message == "STOPPED mirror-dm stopped: enough"
+    assert listener.messages(HEALTH)[-1].state == "stopped"
+    assert {count.topic: count.published for count in listener.messages(HEALTH)[-1].topics} == {
+        "lowfc/event": len(listener.messages(EVENT)),
+        "lowfc/health/mirror-dm": len(listener.messages(HEALTH)),
     }
 
 
 def test_a_message_that_cannot_be_read_is_an_event_and_neither_a_traceback_nor_the_end(
     hub: MemoryHub, clock: FakeClock, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    ear = Listener(hub, clock, HEALTH)
+    listener = Listener(hub, clock, HEALTH)
     mirror = service(hub, clock, "mirror-dm")
     read: list[int] = []
     mirror.dispatch(
@@ -178,8 +178,8 @@ def test_a_message_that_cannot_be_read_is_an_event_and_neither_a_traceback_nor_t
     commands.put(wire.MirrorCommand(actuators=b"1234").SerializeToString())
     mirror.beat()
     assert (mirror.running, read) == (True, [4])
-    assert ear.said("BAD_MESSAGE 1 message on lowfc/mirror/dm/command")
-    assert ear.said("BAD_MESSAGE 1 message on lowfc/health/*")
+    assert listener.event_texts("BAD_MESSAGE 1 message on lowfc/mirror/dm/command")
+    assert listener.event_texts("BAD_MESSAGE 1 message on lowfc/health/*")
     assert not mirror.bus.faults.counts
     assert "Traceback" not in capsys.readouterr().err
 

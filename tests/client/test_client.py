@@ -428,7 +428,7 @@ def test_what_did_not_get_here_is_counted_and_a_restart_or_a_repetition_is_no_lo
 def test_silence_is_an_error_and_so_is_a_stream_that_never_begins() -> None:
     frames = stream(frame_sample(1))
     next(frames)
-    with pytest.raises(BusError, match=r"no frame came within 0.02 s: `lowfc ctl status` says why"):
+    with pytest.raises(BusError, match=r"no frame came within 0.02 s: `lowfc ctl status` shows why"):
         next(frames)
     with pytest.raises(BusError, match="no frame came"):
         stream()

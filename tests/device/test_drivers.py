@@ -1,4 +1,4 @@
-"""A driver as its author writes it: found by name, its options checked, run by the loops."""
+"""Drivers as users write them: found by name, options validated, run by the camera and mirror loops."""
 
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -38,13 +38,13 @@ MS = 1_000_000
 
 
 class Ramp:
-    """A camera of 3 x 4 pixels that counts."""
+    """Camera of 3 x 4 pixels whose level increases by 1 DN per frame."""
 
     class Options(DriverOptions):
         level: int = 7
-        """Value of the first frame."""
+        """Level before the first frame, DN."""
         ports: tuple[int, ...] = ()
-        """Some list."""
+        """A list."""
 
     def __init__(self, options: Options, config: Configuration) -> None:
         self.level, self.closed = options.level, False
@@ -61,7 +61,7 @@ class Ramp:
 
 
 class Follower:
-    """A mirror that goes where it is told."""
+    """Mirror that records its commands."""
 
     def __init__(self, options: DriverOptions, config: Configuration) -> None:
         self.geometry = geometry(config)
@@ -76,53 +76,53 @@ class Follower:
 
 def test_a_camera_publishes_what_its_driver_returns() -> None:
     hub, clock = MemoryHub(), FakeClock()
-    heard = Listener(hub, clock, FRAME, CAMERA_STATE)
+    listener = Listener(hub, clock, FRAME, CAMERA_STATE)
     driver = Ramp(Ramp.Options(), CONFIG)
-    CameraLoop(driver, heard.service("camera"), CONFIG, frames=3).run()
-    frames = heard.messages(FRAME)
+    CameraLoop(driver, listener.service("camera"), CONFIG, frames=3).run()
+    frames = listener.messages(FRAME)
     assert [frame.data for frame in frames] == [np.full((3, 4), level, np.uint16).tobytes() for level in (8, 9, 10)]
     assert {frame.timestamp.ToNanoseconds() for frame in frames} == {clock.now_ns()}
-    state = heard.messages(CAMERA_STATE)[-1]
+    state = listener.messages(CAMERA_STATE)[-1]
     assert (state.rows, state.columns, state.saturation_dn, state.exposure_ns) == (3, 4, 4095, 2 * MS)
     assert driver.closed
-    assert heard.events() == ["STARTED", "STOPPED"]
+    assert listener.events() == ["STARTED", "STOPPED"]
 
 
-def test_a_mirror_is_driven_within_its_limits_and_to_flat_once_the_commands_end() -> None:
+def test_commands_are_limited_and_the_mirror_goes_flat_after_the_command_timeout() -> None:
     hub, clock = MemoryHub(), FakeClock()
-    heard = Listener(hub, clock, MIRROR_STATE)
+    listener = Listener(hub, clock, MIRROR_STATE)
     driver = Follower(DriverOptions(), CONFIG)
-    loop = MirrorLoop(driver, heard.service("mirror-dm"), CONFIG)
-    assert not driver.applied.pop().any(), "it begins flat, for nobody knows where it is"
+    loop = MirrorLoop(driver, listener.service("mirror-dm"), CONFIG)
+    assert not driver.applied.pop().any(), "driven to flat at the start: its position is unknown"
     commands = MemoryBus(hub, "controller", clock).publisher(COMMAND, "dm")
 
     def command(height_nm: float, grid: tuple[int, int] = GRID) -> None:
-        told = wire.MirrorCommand(frame_sequence=5, rows=grid[0], columns=grid[1], valid_for_ns=100 * MS)
-        told.actuators = np.full(grid, height_nm, np.float32).tobytes()
-        commands.put(told.SerializeToString())
+        message = wire.MirrorCommand(frame_sequence=5, rows=grid[0], columns=grid[1], valid_for_ns=100 * MS)
+        message.actuators = np.full(grid, height_nm, np.float32).tobytes()
+        commands.put(message.SerializeToString())
 
     command(200.0)
     assert driver.applied[-1].max() == pytest.approx(150.0, abs=0.1), "the slew limit of [mirror]"
     command(200.0, (5, 4))
     command(float("nan"))
     assert len(driver.applied) == 1
-    assert [state.refused for state in heard.messages(MIRROR_STATE)] == [0, Limit.WRONG_GRID, Limit.NOT_FINITE]
+    assert [state.refused for state in listener.messages(MIRROR_STATE)] == [0, Limit.WRONG_GRID, Limit.NOT_FINITE]
     clock.advance(101 * MS)
-    loop._wait()
+    loop._idle()
     assert not driver.applied[-1].any()
-    loop._wait()
-    assert len(driver.applied) == 2, "a mirror at rest is left alone"
-    assert heard.events()[-1] == "COMMAND_EXPIRED"
+    loop._idle()
+    assert len(driver.applied) == 2, "a mirror at rest gets no further call"
+    assert listener.events()[-1] == "COMMAND_EXPIRED"
 
 
-def test_the_tighter_of_the_drivers_limits_and_the_configured_ones_count() -> None:
+def test_the_tighter_of_driver_and_configured_limits_applies() -> None:
     driver = Follower(DriverOptions(), load(None, {"mirror.rows": 4, "mirror.columns": 5, "mirror.slew_nm": 30.0}))
     assert guard_of(driver, CONFIG).limits.slew_nm == 30.0
     with pytest.raises(ConfigurationError, match=r"4 x 5 actuators; .* say 34 x 34"):
         guard_of(driver, Configuration())
 
 
-def test_options_come_from_the_configuration_and_the_command_line() -> None:
+def test_options_come_from_configuration_and_command_line() -> None:
     config = load(None, {"drivers.ramp.level": 3, "drivers.both.camera": {"level": 4}, "drivers.both.mirror": {}})
     assert plugins.opened("camera", "ramp", config, (), Ramp).level == 3
     assert plugins.opened("camera", "both:Class", config, (), Ramp).level == 4
@@ -157,7 +157,7 @@ def test_a_driver_is_found_by_entry_point_or_by_module_and_class(
             plugins.load("camera", name)
 
 
-def test_a_configuration_is_checked_by_the_drivers_themselves(tmp_path: Path) -> None:
+def test_driver_sections_of_a_configuration_are_checked(tmp_path: Path) -> None:
     (tmp_path / "mine.py").touch()
     good = {"drivers.sim": {"camera": {"fault": ""}}, "drivers.json": {"any": 1}, "drivers.mine.level": 1}
     assert plugins.faults(load(None, good), tmp_path) == []
@@ -185,7 +185,7 @@ class Own:
 
 
 @pytest.mark.parametrize("kind", ["camera", "mirror"])
-def test_the_help_of_a_driver_lists_its_own_options(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_help_lists_the_drivers_options(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "path", [*sys.path])
     (tmp_path / "own_driver.py").write_text(OWN)
     words = [kind, "--run", "bench", f"{tmp_path}/own_driver.py:Own", "--help"]
@@ -198,7 +198,7 @@ def test_the_help_of_a_driver_lists_its_own_options(kind: str, tmp_path: Path, m
     assert "--rows <int>" in lowfc("camera", "sim", "-h").output
 
 
-def test_a_driver_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doctor_checks_the_requirements_of_a_driver(monkeypatch: pytest.MonkeyPatch) -> None:
     needs = [Need("a cable", "cable 7", ""), Need("a camera", "", "switch it on")]
     monkeypatch.setattr(Ramp, "needs", lambda options: needs, raising=False)
     monkeypatch.setattr(plugins, "load", lambda kind, name: Ramp)
@@ -220,14 +220,14 @@ class Unopened(Ramp):
 
 
 class Half:
-    """No camera yet."""
+    """A driver without the required methods."""
 
     def expose(self) -> None:
         """Nothing."""
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "message"),
     [
         ("nowhere/half.py:Half", "there is no file nowhere/half.py"),
         (f"{__name__}:Sized", "frame_rows is missing: --frame-rows VALUE, or frame_rows in"),
@@ -235,35 +235,37 @@ class Half:
         (f"{__name__}:Unopened", r"cannot be opened: ValueError: serial 7 is not there \(test_drivers.py, line \d+\)"),
     ],
 )
-def test_a_driver_that_cannot_be_opened_is_a_sentence(name: str, said: str) -> None:
-    with pytest.raises(ConfigurationError, match=said):
+def test_a_driver_that_cannot_be_opened_gives_one_sentence(name: str, message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message):
         plugins.opened("camera", name, CONFIG)
 
 
-def test_the_first_settings_that_raise_are_a_sentence() -> None:
+def test_a_fault_in_the_first_settings_gives_one_sentence() -> None:
     camera = Unset(Unset.Options(), CONFIG)
     with (
-        ThreadPoolExecutor(1) as own,  # its scheduling class ends with it
-        pytest.raises(ConfigurationError, match=r"how it is set: RuntimeError: no link \(test_drivers.py, line \d+\)"),
+        ThreadPoolExecutor(1) as thread,  # its scheduling class ends with it
+        pytest.raises(
+            ConfigurationError, match=r"settings cannot be read: RuntimeError: no link \(test_drivers.py, line \d+\)"
+        ),
     ):
-        own.submit(run_camera, camera, CONFIG, "unset").result()
+        thread.submit(run_camera, camera, CONFIG, "unset").result()
 
 
-def test_in_lockstep_the_camera_is_a_process_of_its_own() -> None:
+def test_lockstep_refuses_a_camera_in_the_controllers_process() -> None:
     controller = Listener(MemoryHub(), FakeClock()).service("controller")
     beside = camera_beside(Ramp(Ramp.Options(), CONFIG), load(None, {"lockstep": True}), controller)
     with pytest.raises(ConfigurationError, match="leave out --camera, or lockstep"), beside:
         pass
 
 
-def test_options_under_the_name_of_the_class_are_not_passed_over() -> None:
+def test_options_in_a_section_named_after_the_class_are_refused() -> None:
     config = load(None, {"drivers.Ramp.level": 3})
     with pytest.raises(ConfigurationError, match=rf"are in \[drivers.{__name__}\], got \[drivers.Ramp\]"):
         plugins.opened("camera", f"{__name__}:Ramp", config)
 
 
-def test_a_cameras_own_clock_is_followed_within_the_shortest_transfer() -> None:
-    """30 parts in a million slow, with transfers of 0.2 to 5 ms."""
+def test_camera_clock_is_converted_to_within_the_shortest_transfer_time() -> None:
+    """Clock slow by 30 ppm, transfers of 0.2 ms plus an exponential delay of mean 0.5 ms."""
     clock, rng = CameraClock(), np.random.default_rng(1)
     errors_ns = []
     for end_ns in range(10**15, 10**15 + 60 * 10**9, 10**7):

@@ -1,4 +1,4 @@
-"""Camera and mirror by ImageStreamIO streams, against the plain reader and writer."""
+"""Camera and mirror drivers for ImageStreamIO streams, against an independent reader and writer."""
 
 import os
 import threading
@@ -29,7 +29,7 @@ AT_NS = 1_700_000_000_000_000_000
 
 
 class Events(list[tuple[str, dict[str, object]]]):
-    """The service of a driver, as far as it uses it."""
+    """Stand-in for the driver's service: records its events."""
 
     def event(self, name: str, **details: object) -> None:
         self.append((name, details))
@@ -75,7 +75,7 @@ def channel(folder: Path, name: str = "dm00disp03", *, make: bool = False) -> Pl
         (FLOAT32, {"scale_dn": 0.1, "zero_dn": 1.0}, [np.inf, -np.inf, 94], [65535, 0, 10]),
     ],
 )
-def test_pixels_of_any_type_become_dn(
+def test_pixels_of_any_type_are_converted_to_dn(
     folder: Path, number: int, options: dict[str, float], pixels: list[float], expected: list[int]
 ) -> None:
     writer = PlainStream.make(folder / "camnsv.im.shm", 3, 1, number)
@@ -89,7 +89,7 @@ def test_pixels_of_any_type_become_dn(
 
 
 @pytest.mark.parametrize(("atime", "expected"), [("end", AT_NS), ("start", AT_NS + 2_000_000), ("none", None)])
-def test_the_time_of_a_frame_is_the_end_of_its_exposure(folder: Path, atime: str, expected: int | None) -> None:
+def test_frames_are_timed_at_the_end_of_the_exposure(folder: Path, atime: str, expected: int | None) -> None:
     writer = PlainStream.make(folder / "camnsv.im.shm", COLUMNS, ROWS, UINT16)
     driver, _ = camera(atime=atime, exposure_us=2000.0)
     writer.write(np.zeros((ROWS, COLUMNS)), AT_NS)
@@ -99,7 +99,7 @@ def test_the_time_of_a_frame_is_the_end_of_its_exposure(folder: Path, atime: str
     assert driver.settings().clock == "realtime"
 
 
-def test_the_stream_is_named_on_the_command_line_or_in_the_configuration() -> None:
+def test_the_stream_name_comes_from_command_line_or_configuration() -> None:
     assert options(IsioCamera, {}, ("--stream", "camnsv", "--exposure-us", "500")).exposure_us == 500  # type: ignore[attr-defined]
     assert options(IsioMirror, {"stream": "dm00disp03"}).stream == "dm00disp03"  # type: ignore[attr-defined]
     for table, words in (({}, ()), ({}, ("--atime", "end"))):
@@ -107,19 +107,21 @@ def test_the_stream_is_named_on_the_command_line_or_in_the_configuration() -> No
             options(IsioCamera, table, words)
 
 
-def test_settings_are_of_the_options_the_keywords_and_the_configuration(folder: Path) -> None:
+def test_settings_come_from_options_keywords_and_configuration(folder: Path) -> None:
     words: dict[str, float | str | int] = {"tint": 1.5e-3, "y0": 17, "name": "nsv"}
     PlainStream.make(folder / "camnsv.im.shm", COLUMNS, ROWS, UINT16, keywords=words)
     driver, _ = camera(gain_e_per_dn=2.5, keywords={"exposure_s": "tint", "region_row": "y0", "bias_dn": "absent"})
-    said = driver.settings()
-    assert (said.rows, said.columns, said.exposure_ns, said.region_row) == (ROWS, COLUMNS, 1_500_000, 17)
-    assert (said.gain_e_per_dn, said.bias_dn, said.period_ns) == (2.5, CONFIG.camera.bias_dn, CONFIG.period_ns)
+    settings = driver.settings()
+    expected = (ROWS, COLUMNS, 1_500_000, 17)
+    assert (settings.rows, settings.columns, settings.exposure_ns, settings.region_row) == expected
+    expected = (2.5, CONFIG.camera.bias_dn, CONFIG.period_ns)
+    assert (settings.gain_e_per_dn, settings.bias_dn, settings.period_ns) == expected
     driver, _ = camera(keywords={"gain_e_per_dn": "name"})
     with pytest.raises(StreamError, match="keyword 'name' of stream 'camnsv' is 'nsv'"):
         driver.settings()
 
 
-def test_silence_and_a_stream_made_anew_are_named_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_silent_or_recreated_stream_is_reported_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lowfc.device.drivers.isio.camera._WAIT_S", 0.01)
     with pytest.raises(StreamError, match="there is no stream 'camnsv'"):
         camera()
@@ -142,7 +144,7 @@ def test_silence_and_a_stream_made_anew_are_named_once(folder: Path, monkeypatch
     driver.close()
 
 
-def test_the_channel_is_made_or_adopted_with_its_shape(folder: Path) -> None:
+def test_the_channel_is_created_or_adopted_with_its_shape(folder: Path) -> None:
     driver, _ = mirror()
     assert not driver.position().any()
     assert not driver.beside().any()
@@ -157,7 +159,7 @@ def test_the_channel_is_made_or_adopted_with_its_shape(folder: Path) -> None:
         mirror()
 
 
-def test_it_writes_no_channel_that_another_process_writes(folder: Path) -> None:
+def test_a_channel_written_by_another_process_is_refused(folder: Path) -> None:
     other = channel(folder, make=True)
     driver, _ = mirror()
     driver.apply(shape_nm(1))
@@ -168,11 +170,11 @@ def test_it_writes_no_channel_that_another_process_writes(folder: Path) -> None:
     other.pack("<i", other.writers, os.getppid())
     with pytest.raises(RuntimeError, match=f"process {os.getppid()} writes stream 'dm00disp03'"):
         driver.apply(shape_nm(2))
-    driver.apply(shape_nm(2))  # nobody has written it since
+    driver.apply(shape_nm(2))  # no other write since
     assert np.allclose(other.pixels[0] * 1000, shape_nm(2), atol=1e-4)
 
 
-def test_a_channel_that_is_made_anew_is_adopted(folder: Path) -> None:
+def test_a_recreated_channel_is_adopted(folder: Path) -> None:
     driver, events = mirror()
     driver.apply(shape_nm(1))
     again = channel(folder, make=True)
@@ -182,7 +184,7 @@ def test_a_channel_that_is_made_anew_is_adopted(folder: Path) -> None:
 
 
 class Sum(threading.Thread):
-    """The process that sums the channels: it takes the mean away, and keeps to a limit."""
+    """Stand-in for the process that sums the channels: clips the sum, then subtracts its mean."""
 
     def __init__(self, folder: Path, limit: float) -> None:
         super().__init__(daemon=True)
@@ -199,14 +201,14 @@ class Sum(threading.Thread):
                 self.total.write(total - total.mean())
 
 
-def test_the_sum_of_all_channels_says_what_was_reached(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_reached_position_comes_from_the_sum_of_channels(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mirror_module, "SUM_WAIT_S", 2.0)
-    monkeypatch.setattr(mirror_module, "_LOOK_S", 0.0)
+    monkeypatch.setattr(mirror_module, "_SEARCH_S", 0.0)
     channel(folder, make=True)
     summing = Sum(folder, 0.5)
     driver, _ = mirror()
     summing.others.write(shape_nm(3) / 1000 + 0.1)
-    assert driver.apply(shape_nm(1)) is None  # as it was written, but for piston
+    assert driver.apply(shape_nm(1)) is None  # as written, except for piston
     assert np.allclose(driver.beside(), shape_nm(3) - shape_nm(3).mean(), atol=1e-3)
     too_far = shape_nm(2)
     too_far[5, 7] = 600
@@ -218,27 +220,27 @@ def test_the_sum_of_all_channels_says_what_was_reached(folder: Path, monkeypatch
     summing.join()
     monkeypatch.setattr(mirror_module, "SUM_WAIT_S", 0.001)
     monkeypatch.setattr(mirror_module, "SUM_SILENT_S", 0.01)
-    assert driver.apply(shape_nm(1)) is None  # for a while it may be late
+    assert driver.apply(shape_nm(1)) is None  # within SUM_SILENT_S a late sum is tolerated
     time.sleep(0.02)
     with pytest.raises(RuntimeError, match="'dm00disp' has not followed 'dm00disp03'"):
         driver.apply(shape_nm(1))
 
 
-def test_the_stroke_holds_for_the_sum_with_others() -> None:
+def test_the_stroke_limit_applies_to_the_sum_of_channels() -> None:
     guard = guard_of(mirror()[0], CONFIG)
-    flat, beside, wanted = (np.zeros(GRID, np.float32) for _ in range(3))
+    flat, beside, target = (np.zeros(GRID, np.float32) for _ in range(3))
     beside[2, 2], beside[4, 4], beside[6, 6], beside[8, 8] = 700, 900, -900, 700
-    wanted[2, 2], wanted[4, 4], wanted[6, 6], wanted[8, 8], wanted[9, 9] = 100, 100, 100, -100, 100
-    told = Command("lowfc", 1, AT_NS, 10**9, wanted, np.ones(2, np.float32))
-    status, reason = apply_command(guard, Status(flat, flat), told, AT_NS, lambda shape, _: shape, beside)
+    target[2, 2], target[4, 4], target[6, 6], target[8, 8], target[9, 9] = 100, 100, 100, -100, 100
+    command = Command("lowfc", 1, AT_NS, 10**9, target, np.ones(2, np.float32))
+    status, reason = apply_command(guard, Status(flat, flat), command, AT_NS, lambda shape, _: shape, beside)
     assert reason is None
     assert status.limits_hit == (Limit.STROKE,)
     assert not status.command_nm.size
     reached = status.surface_nm
     assert reached[2, 2] == pytest.approx(50, abs=0.1)
-    assert reached[4, 4] == 0  # beyond the stroke already, and not this loop's doing
+    assert reached[4, 4] == 0  # the other channels already exceed the stroke: no further
     assert (reached[6, 6], reached[8, 8], reached[9, 9]) == (100, -100, 100)
     assert np.abs(reached + beside)[2, 2] < CONFIG.mirror.stroke_nm / 2
-    status, _ = apply_command(guard, Status(flat, flat), told, AT_NS, lambda shape, _: shape, flat)
-    assert np.array_equal(status.surface_nm, wanted)
+    status, _ = apply_command(guard, Status(flat, flat), command, AT_NS, lambda shape, _: shape, flat)
+    assert np.array_equal(status.surface_nm, target)
     assert not status.limits_hit

@@ -1,4 +1,4 @@
-"""A loop whose camera and mirror are ImageStreamIO streams, beside a bench as CACAO has one."""
+"""A loop whose camera and mirror are ImageStreamIO streams, on an emulated CACAO bench."""
 
 import json
 import os
@@ -54,17 +54,17 @@ CONTROLLER = "lowfc controller --run bench --config bench.toml"
 BRIDGE = "lowfc bridge isio --run bench --beside dm00disp03"
 LOOP, LOOP_OF_ONE = (CAMERA_DRIVER, CONTROLLER), (f"{CONTROLLER} --camera isio",)
 DOCUMENTED = (MIRROR, CAMERA_DRIVER, CONTROLLER, BRIDGE, *LOOP_OF_ONE)
-"""Commands of docs/howto/cacao.md; all are run here."""
+"""Commands documented in docs/howto/cacao.md; all are run here."""
 
 
 def bench_of(rate_hz: float, preset: str, tilt_nm: float) -> str:
-    """Configuration of a bench; its processes are kept apart as `lowfc sim-loop` does it."""
+    """Configuration of a bench, with processes pinned to processors as by `lowfc sim-loop`."""
     cpus = "\n".join(f"{key} = {value}" for key, value in spread(os.sched_getaffinity(0)).items())
     return BENCH.format(cpus=cpus, rate_hz=rate_hz, preset=preset, tilt_nm=tilt_nm)
 
 
 class Bench:
-    """The bench in a folder, its streams, and what the run says."""
+    """The emulated bench in a folder, its streams, and the events and errors of the run."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -78,7 +78,7 @@ class Bench:
         self.process = subprocess.Popen(words, cwd=ROOT, stdin=pipe, stdout=pipe, text=True)
         until(lambda: file_of(self.folder, CAMERA).exists())
 
-    def tell(self, word: str) -> None:
+    def send(self, word: str) -> None:
         assert self.process.stdin is not None
         self.process.stdin.write(f"{word}\n")
         self.process.stdin.flush()
@@ -104,11 +104,11 @@ class Bench:
             bus.subscribe(STEP, step)
             yield
 
-    def said(self, *words: str) -> bool:
+    def has_event(self, *words: str) -> bool:
         return any(all(word in event for word in words) for event in list(self.events))
 
-    def held(self) -> bool:
-        """Whether the last steps say that the loop holds the wavefront."""
+    def converged(self) -> bool:
+        """Whether the mean error of the last 100 steps is below 2 nm rms."""
         newest = self.errors_nm[-100:]
         return len(newest) == 100 and all(newest) and float(np.linalg.norm(np.mean(newest, axis=0))) < 2.0
 
@@ -120,47 +120,51 @@ def folder(tmp_path: Path, own_runtime: Path, monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.parametrize("loop", [LOOP, LOOP_OF_ONE], ids=["two processes", "one process"])
-def test_a_loop_runs_by_streams_beside_others(folder: Path, loop: tuple[str, ...]) -> None:
+def test_a_loop_runs_on_streams_with_other_mirror_channels(folder: Path, loop: tuple[str, ...]) -> None:
     (folder / "bench.toml").write_text(bench_of(rate_hz=200, preset="quiet", tilt_nm=15))
     with closing(Bench(folder)) as bench, going_on(folder, MIRROR), bench.listening():
         with going_on(folder, *loop):
-            until(bench.held, 60)
+            until(bench.converged, 60)
             refused = run(folder, "mirror", "isio", "--run", "other", "--config", "bench.toml")
             assert refused.returncode == 2
             assert "writes stream 'dm00disp03'" in refused.stderr
-            _what_others_put_on_the_mirror_is_not_undone(bench)
-            theirs = bench.stream(f"{TOTAL}00")
-        until(lambda: bench.said("COMMAND_EXPIRED") and not bench.stream(CHANNEL).pixels.any())
-        assert theirs.pixels.any()
+            _other_channels_are_not_undone(bench)
+            other_channel = bench.stream(f"{TOTAL}00")
+        until(lambda: bench.has_event("COMMAND_EXPIRED") and not bench.stream(CHANNEL).pixels.any())
+        assert other_channel.pixels.any()
 
 
 @pytest.mark.parametrize("loop", [LOOP, LOOP_OF_ONE], ids=["two processes", "one process"])
-def test_each_fault_of_a_stream_is_named_and_recovered_from(folder: Path, loop: tuple[str, ...]) -> None:
+def test_stream_faults_are_reported_and_recovered_from(folder: Path, loop: tuple[str, ...]) -> None:
     (folder / "bench.toml").write_text(bench_of(rate_hz=200, preset="quiet", tilt_nm=15))
     with closing(Bench(folder)) as bench, going_on(folder, MIRROR, *loop), bench.listening():
-        until(bench.held, 60)
-        _a_reader_that_stands_still_goes_on_with_the_newest_image(bench)
-        bench.tell("renew")
-        until(lambda: bench.said("STREAM_RENEWED", CAMERA))
-        until(lambda: bench.said("CAMERA_RESTARTED"))
+        until(bench.converged, 60)
+        _a_stopped_reader_resumes_with_the_newest_image(bench)
+        bench.send("renew")
+        until(lambda: bench.has_event("STREAM_RENEWED", CAMERA))
+        until(lambda: bench.has_event("CAMERA_RESTARTED"))
         bench.errors_nm.clear()
-        until(bench.held)
-        bench.tell("region")
-        until(lambda: bench.said("CAMERA_CHANGED") and bench.said("closed -> open"))
-        bench.tell("die")
-        until(lambda: bench.said("STREAM_SILENT", "in the middle of an image"))
-        until(lambda: bench.said("DRIVER_FAILED", f"'{TOTAL}' has not followed") and bench.said("MIRROR_LOST"))
+        until(bench.converged)
+        bench.send("region")
+        until(lambda: bench.has_event("CAMERA_CHANGED") and bench.has_event("closed -> open"))
+        bench.send("die")
+        until(lambda: bench.has_event("STREAM_SILENT", "in the middle of an image"))
+        until(
+            lambda: bench.has_event("DRIVER_FAILED", f"'{TOTAL}' has not followed") and bench.has_event("MIRROR_LOST")
+        )
         bench.process.communicate()
         bench.start()
-        until(lambda: bench.said("FRAMES_BACK") and bench.said("DRIVER_BACK") and bench.said("MIRROR_BACK"))
+        until(
+            lambda: bench.has_event("FRAMES_BACK") and bench.has_event("DRIVER_BACK") and bench.has_event("MIRROR_BACK")
+        )
         with Client("bench") as client:
             until(lambda: not client.status().state.mirror_fault)
             client.close_loop()
         bench.errors_nm.clear()
-        until(bench.held)
+        until(bench.converged)
 
 
-def _a_reader_that_stands_still_goes_on_with_the_newest_image(bench: Bench) -> None:
+def _a_stopped_reader_resumes_with_the_newest_image(bench: Bench) -> None:
     stream = PlainStream(file_of(bench.folder, CAMERA), 80, 80, 3)
     with Client("bench") as client:
         pid = client.processes()["camera"].pid
@@ -171,12 +175,12 @@ def _a_reader_that_stands_still_goes_on_with_the_newest_image(bench: Bench) -> N
         until(lambda: stream.count > count + 5)
     finally:
         os.kill(pid, signal.SIGCONT)
-    until(lambda: bench.said("FRAMES_LOST") or bench.said("FRAMES_MISSING"))
+    until(lambda: bench.has_event("FRAMES_LOST") or bench.has_event("FRAMES_MISSING"))
     bench.errors_nm.clear()
-    until(bench.held)
+    until(bench.converged)
 
 
-def _what_others_put_on_the_mirror_is_not_undone(bench: Bench) -> None:
+def _other_channels_are_not_undone(bench: Bench) -> None:
     with going_on(bench.folder, BRIDGE), Client("bench") as client:
         calibration = client.calibration()
         until(lambda: file_of(bench.folder, "lowfc_flux").exists())
@@ -187,16 +191,16 @@ def _what_others_put_on_the_mirror_is_not_undone(bench: Bench) -> None:
         bench.stream(f"{TOTAL}00").write(dark_hole)
         until(lambda: any(one.name == "external" for one in client.status().state.channels))
         bench.errors_nm.clear()
-        until(bench.held)
-        undone = calibration.actuators_to_modes @ (bench.stream(CHANNEL).pixels[0] - before).reshape(-1)
-        seen = calibration.actuators_to_modes @ dark_hole.reshape(-1)
-        assert np.linalg.norm(undone) < 0.3 * np.linalg.norm(seen)  # noise; without the channel it would be all
+        until(bench.converged)
+        correction_nm = calibration.actuators_to_modes @ (bench.stream(CHANNEL).pixels[0] - before).reshape(-1)
+        external_nm = calibration.actuators_to_modes @ dark_hole.reshape(-1)
+        assert np.linalg.norm(correction_nm) < 0.3 * np.linalg.norm(external_nm)  # noise; uncompensated it would be 1
         state = client.status().state
         (external,) = (one for one in state.channels if one.name == "external")
         assert np.allclose(np.frombuffer(external.actuators, "f4"), dark_hole.reshape(-1) * 1000, atol=0.01)
 
 
-def test_a_minute_at_500_hz_loses_nothing_and_is_as_good_as_the_direct_loop(folder: Path) -> None:
+def test_a_minute_at_500_hz_loses_no_frame_and_matches_the_simulated_loop(folder: Path) -> None:
     (folder / "bench.toml").write_text(bench_of(rate_hz=500, preset="bench", tilt_nm=0))
     with going_on(folder, CONTROLLER), closing(Bench(folder)) as bench, going_on(folder, MIRROR, CAMERA_DRIVER):
         until(lambda: file_of(folder, CHANNEL).exists() and bench.stream(CHANNEL).count > 100, 60)
@@ -205,7 +209,7 @@ def test_a_minute_at_500_hz_loses_nothing_and_is_as_good_as_the_direct_loop(fold
             with Client("bench") as client:
                 state = client.status().state
         assert not [event for event in bench.events if "FRAMES" in event and "LATE" not in event]
-        assert sum(one.count for one in state.counts) < 0.01 * state.frames_used  # late, where the host stood still
+        assert sum(one.count for one in state.counts) < 0.01 * state.frames_used  # late frames
         figures = bench.stopped()
     config = '[disturbance]\npreset = "bench"\n[control]\ntilt_gain = 0.5\ngain = 0.2\n'
     direct = loop(folder, "--no-record", "--rate", "500", "--duration", "60", config=config)

@@ -1,4 +1,4 @@
-"""Drivers that die or hang for five seconds, each in its own process, restarted as a service manager does."""
+"""Driver processes that die or hang for 5 s, restarted as by a service manager."""
 
 import subprocess
 import time
@@ -44,11 +44,11 @@ class Dying:
 """
 
 
-def test_a_camera_whose_process_dies_is_a_new_start_once_it_is_started_again(tmp_path: Path) -> None:
+def test_a_restarted_camera_process_is_a_new_start(tmp_path: Path) -> None:
     (tmp_path / "dying.py").write_text(DYING)
     words = ("camera", "dying.py:Dying", "--run", "dying")
     starts: list[int] = []
-    with closing(ZenohBus(open_run("dying").links, Role.RECORDER, HostClock())) as bus:  # the camera connects to it
+    with closing(ZenohBus(open_run("dying").links, Role.RECORDER, HostClock())) as bus:  # a peer for the camera
         bus.subscribe(FRAME, lambda sample: starts.append(start_of(sample.sequence)))
         died = subprocess.run([*LOWFC, *words], cwd=tmp_path, timeout=60, check=False)
         assert died.returncode == 7, "a failure: the units in deploy restart it"
@@ -95,9 +95,9 @@ class Mirror:
         pass
 """
 )
-OF_BENCH = "--run bench --config bench.toml"
-CAMERA, MIRROR = (f"lowfc {kind} faulty.py:{kind.capitalize()} {OF_BENCH}" for kind in ("camera", "mirror"))
-CONTROLLER = f"lowfc controller {OF_BENCH}"
+ON_BENCH = "--run bench --config bench.toml"
+CAMERA, MIRROR = (f"lowfc {kind} faulty.py:{kind.capitalize()} {ON_BENCH}" for kind in ("camera", "mirror"))
+CONTROLLER = f"lowfc controller {ON_BENCH}"
 
 
 class Bench:
@@ -164,7 +164,7 @@ def bench(tmp_path: Path, own_runtime: Path) -> Iterator[Bench]:
 
 @pytest.mark.slow
 @pytest.mark.exclusive
-def test_a_camera_that_hangs_for_five_seconds_is_named_and_its_loop_holds_and_goes_on(bench: Bench) -> None:
+def test_a_camera_hang_of_five_seconds_is_reported_and_the_loop_holds_and_resumes(bench: Bench) -> None:
     with going_on(bench.folder, MIRROR):
         bench.settled()
         bench.inject("camera", "hang")
@@ -172,12 +172,12 @@ def test_a_camera_that_hangs_for_five_seconds_is_named_and_its_loop_holds_and_go
         until(lambda: bench.named("controller", "FRAMES_BACK") and bench.named("camera", "DRIVER_BACK"))
         assert bench.named("camera", "DRIVER_HANGS") == 1
         bench.settled()
-    assert len(bench.starts) == 1, "its process has not died"
+    assert len(bench.starts) == 1, "its process has not restarted"
 
 
 @pytest.mark.slow
 @pytest.mark.exclusive
-def test_a_mirror_that_hangs_for_five_seconds_gets_no_command_meanwhile_and_is_flat_before_the_next(
+def test_a_mirror_hang_of_five_seconds_blocks_commands_and_the_mirror_goes_flat_before_the_next(
     bench: Bench,
 ) -> None:
     with going_on(bench.folder, MIRROR):
@@ -198,7 +198,9 @@ def test_a_mirror_that_hangs_for_five_seconds_gets_no_command_meanwhile_and_is_f
 
 
 @pytest.mark.exclusive
-def test_a_camera_in_the_controllers_process_closes_the_loop_and_hangs_alone(tmp_path: Path, own_runtime: Path) -> None:
+def test_a_hanging_camera_in_the_controllers_process_does_not_block_the_controller(
+    tmp_path: Path, own_runtime: Path
+) -> None:
     (tmp_path / "faulty.py").write_text(FAULTY)
     (tmp_path / "bench.toml").write_text(STILL)
     bench = Bench(tmp_path)
@@ -213,10 +215,10 @@ def test_a_camera_in_the_controllers_process_closes_the_loop_and_hangs_alone(tmp
         client.safe()
         assert client.status().state.mode == wire.LOOP_MODE_SAFE
         ending_s = time.monotonic()
-    assert time.monotonic() - ending_s < HANGS_S - PATIENCE_S, "it did not wait for its camera"
+    assert time.monotonic() - ending_s < HANGS_S - PATIENCE_S, "the controller did not wait for its camera"
 
 
-def test_a_camera_that_the_controller_cannot_read_is_an_error_message(tmp_path: Path, own_runtime: Path) -> None:
+def test_a_fault_of_the_controllers_camera_gives_an_error_message(tmp_path: Path, own_runtime: Path) -> None:
     (tmp_path / "faulty.py").write_text(FAULTY)
     (tmp_path / "camera").write_text("refuse")
     (tmp_path / "bench.toml").write_text(STILL)
@@ -227,11 +229,11 @@ def test_a_camera_that_the_controller_cannot_read_is_an_error_message(tmp_path: 
 
 
 @pytest.mark.exclusive
-def test_a_mirror_whose_process_dies_is_named_and_the_loop_holds_until_it_is_started_again(bench: Bench) -> None:
+def test_a_dead_mirror_process_is_reported_and_the_loop_holds_until_its_restart(bench: Bench) -> None:
     with subprocess.Popen([*LOWFC, *MIRROR.split()[1:]], cwd=bench.folder) as process:
         try:
             bench.settled()
-            time.sleep(1.2)  # two Healths of the mirror: the controller goes back to the command of the last but one
+            time.sleep(1.2)  # two Health messages: the controller returns to the command of the last but one
             before_nm = list(bench.steps[-1].command_nm)
             bench.inject("mirror", "die")
             assert process.wait(10) == 7, "a failure: the units in deploy restart it"

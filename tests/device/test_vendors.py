@@ -1,4 +1,4 @@
-"""Cameras of vendors against the vendors' own emulators: whole, with losses, and where something is missing."""
+"""Drivers of vendors' cameras against the vendors' emulators: normal operation, lost frames, missing packages."""
 
 import json
 import shutil
@@ -38,18 +38,16 @@ OPTIONS = {"rows": 60, "columns": 80, "region_row": 16, "region_column": 32, "ra
 
 
 def run(driver: Any, frames: int) -> tuple[Listener, list[int]]:
-    """So many frames of a driver by its loop: what was heard, and the sequences of the frames."""
+    """Run a driver's loop for a number of frames; return the listener and the frame counts."""
     hub = MemoryHub()
-    heard = Listener(hub, HostClock(), FRAME, CAMERA_STATE)
-    CameraLoop(driver, heard.service("camera"), CONFIG, frames).run()
-    samples = [sample.sequence & 0xFFFFFFFF for sample in heard.samples[FRAME]]
-    return heard, samples
+    listener = Listener(hub, HostClock(), FRAME, CAMERA_STATE)
+    CameraLoop(driver, listener.service("camera"), CONFIG, frames).run()
+    samples = [sample.sequence & 0xFFFFFFFF for sample in listener.samples[FRAME]]
+    return listener, samples
 
 
 @pytest.mark.parametrize(("name", "package"), [("basler", "pypylon"), ("aravis", "gi")])
-def test_without_the_package_one_sentence_says_what_to_install(
-    monkeypatch: pytest.MonkeyPatch, name: str, package: str
-) -> None:
+def test_a_missing_package_gives_install_advice(monkeypatch: pytest.MonkeyPatch, name: str, package: str) -> None:
     for module in (package, f"{package}.pylon"):
         monkeypatch.setitem(sys.modules, module, None)
     driver = plugins.load("camera", name)
@@ -61,7 +59,7 @@ def test_without_the_package_one_sentence_says_what_to_install(
     assert "install " in need.advice
 
 
-def test_settings_are_the_options_or_else_the_configuration() -> None:
+def test_settings_default_to_the_configuration() -> None:
     settings = GenicamOptions(rows=8, columns=9, region_row=3, pixel_format="Mono10", rate_hz=500.0).settings(CONFIG)
     assert (settings.rows, settings.columns, settings.region_row, settings.region_column) == (8, 9, 3, 0)
     assert (settings.bit_depth, settings.saturation_dn, settings.period_ns) == (10, 1023, 2_000_000)
@@ -69,7 +67,7 @@ def test_settings_are_the_options_or_else_the_configuration() -> None:
 
 
 class Buffers:
-    """Stands in for a stream of aravis: buffers of 2 x 3 pixels with the frame numbers given, 0 for one that failed."""
+    """Stand-in for a stream of aravis: buffers of 2 x 3 pixels with the given frame numbers; 0 for a failed buffer."""
 
     def __init__(self, *numbers: int) -> None:
         self.numbers, self.pushed = list(numbers), 0
@@ -93,14 +91,14 @@ class Buffers:
         self.pushed += 1
 
 
-def test_numbers_of_gige_vision_wrap_without_a_zero_and_buffers_go_back() -> None:
+def test_gige_frame_numbers_wrap_to_one_and_buffers_are_returned() -> None:
     driver, stream = object.__new__(AravisCamera), Buffers(65534, 65535, 0, 2)
     driver._aravis = SimpleNamespace(BufferStatus=SimpleNamespace(SUCCESS="whole"))
     driver._settings, driver._stream = GenicamOptions(rows=2, columns=3).settings(CONFIG), stream
     driver._camera = SimpleNamespace(start_acquisition=lambda: None, stop_acquisition=lambda: None)
-    heard, sequences = run(driver, 3)
-    assert sequences == [0, 1, 3], "one was lost at the wrap: number 1"
-    assert heard.messages(FRAME)[0].data == np.arange(6, dtype="<u2").tobytes()
+    listener, sequences = run(driver, 3)
+    assert sequences == [0, 1, 3], "one lost at the wrap: number 1"
+    assert listener.messages(FRAME)[0].data == np.arange(6, dtype="<u2").tobytes()
     assert stream.pushed == 4
 
 
@@ -112,7 +110,7 @@ def emulated(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.basler
-def test_a_basler_camera_that_waits_for_its_trigger_is_silent_and_wrong_settings_are_refused(emulated: None) -> None:
+def test_an_untriggered_basler_camera_is_silent_and_invalid_settings_are_refused(emulated: None) -> None:
     driver = BaslerCamera(GenicamOptions(**OPTIONS, camera="0815-0001", trigger="Line1"), CONFIG)
     driver.start()
     assert driver.expose() is None
@@ -129,7 +127,7 @@ def test_a_basler_camera_that_waits_for_its_trigger_is_silent_and_wrong_settings
 
 
 @pytest.mark.basler
-def test_a_basler_camera_is_set_and_its_failed_buffers_are_lost_frames(emulated: None) -> None:
+def test_a_basler_camera_is_configured_and_failed_buffers_count_as_lost_frames(emulated: None) -> None:
     driver = BaslerCamera(GenicamOptions(**OPTIONS, gain=6.0, pixel_format="Mono12"), CONFIG)
     camera = driver._camera
     assert (camera.Width.Value, camera.Height.Value, camera.OffsetX.Value, camera.OffsetY.Value) == (80, 60, 32, 16)
@@ -137,26 +135,26 @@ def test_a_basler_camera_is_set_and_its_failed_buffers_are_lost_frames(emulated:
     assert (driver.settings().exposure_ns, driver.settings().period_ns) == (500_000, 5_000_000)
     camera.ForceFailedBufferCount.Value = 7
     camera.ForceFailedBuffer.Execute()
-    whole = driver.expose
+    expose = driver.expose
 
     def fail_later() -> Any:
-        exposure = whole()
+        exposure = expose()
         if exposure is not None and exposure.number == 20:
             camera.ForceFailedBuffer.Execute()
         return exposure
 
     driver.expose = fail_later  # type: ignore[method-assign]
-    heard, sequences = run(driver, 60)
-    assert sequences[-1] - 59 >= 7, "those that failed at the start are before the first number"
-    assert "FRAMES_LOST" in heard.events()
-    pixels = np.frombuffer(heard.messages(FRAME)[0].data, "<u2")
+    listener, sequences = run(driver, 60)
+    assert sequences[-1] - 59 >= 7, "those that failed at the start precede the first number"
+    assert "FRAMES_LOST" in listener.events()
+    pixels = np.frombuffer(listener.messages(FRAME)[0].data, "<u2")
     assert pixels.size == 60 * 80
     assert 255 < pixels.max() < 4096
 
 
 @pytest.fixture
 def fake_camera(request: pytest.FixtureRequest) -> Iterator[None]:
-    """The fake camera of aravis on loopback; it loses 5 of 1000 packets, or as many as the test says."""
+    """Aravis's fake camera on loopback; it loses 5 of 1000 packets, or the number given by the test."""
     program = shutil.which("arv-fake-gv-camera-0.8")
     if program is None:
         pytest.skip("needs arv-fake-gv-camera-0.8 (Debian: apt install aravis-tools)")
@@ -180,19 +178,19 @@ def fake_camera(request: pytest.FixtureRequest) -> Iterator[None]:
 
 @pytest.mark.aravis
 @pytest.mark.filterwarnings("ignore:DynamicImporter:ImportWarning")
-def test_a_camera_by_aravis_is_set_and_frames_without_all_packets_are_lost_frames(fake_camera: None) -> None:
+def test_an_aravis_camera_is_configured_and_incomplete_frames_count_as_lost(fake_camera: None) -> None:
     settings = {**OPTIONS, "rate_hz": 100.0, "camera": "127.0.0.1", "pixel_format": "Mono16"}
     driver = AravisCamera(GenicamOptions(**settings, gain=2.0), CONFIG)
     region = driver._camera.get_region()
     assert (region.x, region.y, region.width, region.height) == (32, 16, 80, 60)
     assert (driver.settings().exposure_ns, driver.settings().period_ns) == (500_000, 10_000_000)
     assert driver._camera.get_gain() == 2.0
-    heard, sequences = run(driver, 250)
-    assert sequences[-1] > 249, "packets are lost"
+    listener, sequences = run(driver, 250)
+    assert sequences[-1] > 249, "some frames are incomplete"
     assert sequences == sorted(set(sequences))
-    assert heard.events()[:1] == ["STARTED"]
-    assert "FRAMES_LOST" in heard.events()
-    assert not any(name.startswith("DRIVER") for name in heard.events())
+    assert listener.events()[:1] == ["STARTED"]
+    assert "FRAMES_LOST" in listener.events()
+    assert not any(name.startswith("DRIVER") for name in listener.events())
     assert all(need.found for need in AravisCamera.needs(GenicamOptions(**settings)))
     for wrong in ({"columns": 9999}, {"pixel_format": "Mono14"}, {"camera": "Nobody-7"}):
         with pytest.raises(ConfigurationError, match=r"^camera "):
@@ -201,15 +199,15 @@ def test_a_camera_by_aravis_is_set_and_frames_without_all_packets_are_lost_frame
 
 @contextmanager
 def _healths(run_id: str) -> Iterator[dict[str, wire.Health]]:
-    """The last Health of each process of a run."""
+    """Newest Health of each process of a run, by name."""
     found: dict[str, wire.Health] = {}
 
-    def heard(sample: Sample) -> None:
+    def received(sample: Sample) -> None:
         health = wire.Health.FromString(sample.payload)
         found[health.process] = health
 
     with closing(ZenohBus(open_run(run_id).links, Role.OPERATOR, HostClock())) as bus:
-        bus.subscribe(HEALTH, heard)
+        bus.subscribe(HEALTH, received)
         yield found
 
 
@@ -251,52 +249,52 @@ pixel_format = "Mono12"
 
 @pytest.mark.basler
 @pytest.mark.exclusive
-def test_a_closed_loop_counts_every_buffer_that_fails(emulated: None, tmp_path: Path, own_runtime: Path) -> None:
-    """One buffer of twenty, at 600 Hz; the frames are the emulation's own, and the loop refuses those it must."""
+def test_a_closed_loop_counts_every_failed_buffer(emulated: None, tmp_path: Path, own_runtime: Path) -> None:
+    """One failed buffer in twenty at 600 Hz; the emulation's images are no sensor frames, so the loop refuses some."""
     (tmp_path / "failing.py").write_text(FAILING)
     (tmp_path / "bench.toml").write_text(FAST)
-    of_bench = "--run failing --config bench.toml"
+    arguments = "--run failing --config bench.toml"
     with (
         _healths("failing") as health,
-        going_on(tmp_path, f"lowfc controller {of_bench}", f"lowfc mirror sim {of_bench}"),
+        going_on(tmp_path, f"lowfc controller {arguments}", f"lowfc mirror sim {arguments}"),
     ):
         until(lambda: {"controller", "mirror-dm"} <= set(health))
-        with going_on(tmp_path, f"lowfc camera failing.py:Failing {of_bench}"):
+        with going_on(tmp_path, f"lowfc camera failing.py:Failing {arguments}"):
             until(lambda: "camera" in health and health["camera"].state == "running")
             time.sleep(5)
         until(lambda: health["camera"].state == "stopped")
-        time.sleep(1.0)  # a Health of the controller after the last frame
+        time.sleep(1.0)  # wait for a Health of the controller after the last frame
         with Client("failing") as client:
             status = client.status().state
     (sent,) = (one for one in health["camera"].topics if one.topic == FRAME.key)
-    (got,) = (one for one in health["controller"].topics if one.topic == FRAME.key)
+    (received,) = (one for one in health["controller"].topics if one.topic == FRAME.key)
     refusals = (wire.REASON_LATE, wire.REASON_SATURATED, wire.REASON_DARK, wire.REASON_STUCK)
     refused = sum(one.count for one in status.counts if one.reason in refusals)
     failed = int((tmp_path / "failed").read_text())
     print(
         f"{health['camera'].mean_rate_hz:.0f} Hz: {sent.published} frames, {sent.missing} lost, {failed} buffers failed"
-        f"; the controller received {got.received}, missed {got.missing}, skipped {got.skipped}, used "
+        f"; the controller received {received.received}, missed {received.missing}, skipped {received.skipped}, used "
         f"{status.frames_used} and refused {refused}"
     )
-    assert sent.missing == got.missing >= failed - 1  # the last may fail after the last frame
+    assert sent.missing == received.missing >= failed - 1  # the last may fail after the last frame
     assert failed > sent.published // 25
-    assert sent.published - sent.missing == got.received + got.skipped
-    assert got.received == status.frames_used + refused
+    assert sent.published - sent.missing == received.received + received.skipped
+    assert received.received == status.frames_used + refused
 
 
 @pytest.mark.basler
-def test_a_camera_without_its_trigger_says_what_it_waits_for_and_ends_by_control_c(
+def test_an_untriggered_camera_reports_the_wait_and_ends_at_ctrl_c(
     emulated: None, tmp_path: Path, own_runtime: Path
 ) -> None:
     options = "--rows 60 --columns 80 --trigger Line1 --camera 0815-0001"
     process = start(tmp_path, "camera", "basler", "--run", "dark", *options.split())
     assert process.stderr is not None
     try:
-        said = [process.stderr.readline() for _ in range(2)]
+        lines = [process.stderr.readline() for _ in range(2)]
     finally:
-        _, complaints = interrupt(process)
-    assert said == ["camera: ready (run dark)\n", "camera: waiting for the camera's first frame (run dark)\n"]
-    assert "after 0 frames: SIGINT" in complaints
+        _, stderr = interrupt(process)
+    assert lines == ["camera: ready (run dark)\n", "camera: waiting for the camera's first frame (run dark)\n"]
+    assert "after 0 frames: SIGINT" in stderr
     assert process.returncode in (0, 130)
 
 
@@ -313,8 +311,8 @@ class Playing(BaslerCamera):
 
 @pytest.mark.basler
 @pytest.mark.exclusive
-def test_a_basler_camera_of_16_bits_keeps_the_contract(emulated: None, tmp_path: Path, own_runtime: Path) -> None:
-    """Pylon plays images of a spot; those of its own have eight bits, whatever the format."""
+def test_a_16_bit_basler_camera_passes_conformance(emulated: None, tmp_path: Path, own_runtime: Path) -> None:
+    """Pylon plays 16-bit images of a spot; its own test images have 8 bits in any format."""
     (tmp_path / "playing.py").write_text(PLAYING)
     (tmp_path / "images").mkdir()
     y, x = np.mgrid[:80, :80]
@@ -328,7 +326,7 @@ def test_a_basler_camera_of_16_bits_keeps_the_contract(emulated: None, tmp_path:
 @pytest.mark.aravis
 @pytest.mark.exclusive
 @pytest.mark.parametrize("fake_camera", [0], indirect=True)
-def test_a_camera_by_aravis_keeps_the_contract(fake_camera: None, tmp_path: Path, own_runtime: Path) -> None:
+def test_an_aravis_camera_passes_conformance(fake_camera: None, tmp_path: Path, own_runtime: Path) -> None:
     _conforms(tmp_path, "aravis", 'camera = "127.0.0.1"\npixel_format = "Mono16"\n', rate_hz=100)
 
 

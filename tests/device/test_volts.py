@@ -1,4 +1,4 @@
-"""Mirrors that are driven by volts: the map from surface to values, and a vendor's calls under it."""
+"""Mirrors driven by voltages: conversion from surface to values, and the example driver of a vendor's library."""
 
 import sys
 from pathlib import Path
@@ -22,7 +22,7 @@ def stored(path: Path, values: Any) -> str:
     return str(path)
 
 
-def test_a_surface_becomes_values_in_the_vendors_order_within_their_range(tmp_path: Path) -> None:
+def test_a_surface_is_converted_to_clipped_values_in_channel_order(tmp_path: Path) -> None:
     options = VoltOptions(
         zero_map=stored(tmp_path / "zero.npy", [[0.5, 0.4, 0.5], [0.3, 0.5, 0.5]]),
         gain_map=stored(tmp_path / "gain.npy", [[1, 2, 1], [1, 1, 1]]),
@@ -41,21 +41,21 @@ def test_a_surface_becomes_values_in_the_vendors_order_within_their_range(tmp_pa
 @pytest.mark.parametrize(
     ("name", "values", "why"),
     [
-        ("order", [[0, 0, 1], [2, 3, 4]], "channel of its own"),
+        ("order", [[0, 0, 1], [2, 3, 4]], "its own channel"),
         ("order", [[0, 9, 1], [2, 3, 4]], "below 8"),
         ("gain_map", [[0, 1, 1], [1, 1, 1]], "above 0"),
-        ("zero_map", [[2, 0, 0], [0, 0, 0]], "flat mirror"),
+        ("zero_map", [[2, 0, 0], [0, 0, 0]], "flat values"),
         ("zero_map", [[0, 0, 0]], "1 x 3 values"),
     ],
 )
-def test_a_map_that_cannot_be_is_refused(tmp_path: Path, name: str, values: Any, why: str) -> None:
+def test_invalid_maps_are_refused(tmp_path: Path, name: str, values: Any, why: str) -> None:
     options = VoltOptions(**{name: stored(tmp_path / "map.npy", values)})
     with pytest.raises(ConfigurationError, match=why):
         VoltMap(options, CONFIG, channels=8)
 
 
 class BmcDm:
-    """Stands in for the vendor's: it keeps what is sent, and refuses once it is broken."""
+    """Stand-in for the vendor's class: records the values, and fails once `broken` is set."""
 
     def open_dm(self, serial: str) -> int:
         return 0 if serial == "17CW000#001" else 5
@@ -75,7 +75,7 @@ class BmcDm:
         return 0
 
 
-def test_the_example_of_a_vendors_mirror(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_boston_mirror_example(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "bmc", SimpleNamespace(BmcDm=BmcDm, NO_ERR=0))
     monkeypatch.setattr(sys, "path", list(sys.path))
     name = f"{ROOT}/examples/boston_mirror.py:BostonMirror"

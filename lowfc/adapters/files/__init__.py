@@ -1,1 +1,1 @@
-"""Files other than logs: calibrations, laws, maps, layouts, sensors, the twin's cache."""
+"""Files other than logs: calibrations, control laws, maps, layouts, sensors, the cache of digital twins."""

@@ -1,4 +1,4 @@
-"""An array of numbers in a file: the first image of a FITS file, or a .npy file."""
+"""Read an array from a file: the first image of a FITS file, or a .npy file."""
 
 from pathlib import Path
 from tokenize import TokenError
@@ -13,12 +13,12 @@ from lowfc.contract.errors import DataFileError
 
 
 def read_array(path: Path, what: str, dimensions: tuple[int, ...]) -> npt.NDArray[np.generic]:
-    """The array of a file.
+    """Read the array of a file.
 
     Args:
-        path: of the file.
-        what: it should be, for people.
-        dimensions: which number of them it may have.
+        path: path of the file.
+        what: description of the expected content, for errors.
+        dimensions: permitted numbers of dimensions.
 
     Raises:
         DataFileError: the file is missing, damaged or holds something else.

@@ -1,4 +1,4 @@
-"""Calibrations as FITS: one named extension for each array, units in the headers."""
+"""Calibrations as FITS files: one named extension per array, with its unit in the header."""
 
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ _EXTENSIONS = (
     ("MODES2ACT", "modes_to_actuators", "", "nm of surface per nm rms of wavefront"),
     ("ACT2MODES", "actuators_to_modes", "", "nm rms of wavefront that R makes of a nm of surface"),
 )
-_MAY_LACK = "ACT2MODES"
+_OPTIONAL = "ACT2MODES"
 _CAMERA = (
     ("CAMBIAS", "bias_dn", "[adu] bias of the camera when this was made"),
     ("CAMFULL", "saturation_dn", "[adu] its highest value of a pixel"),
@@ -33,7 +33,7 @@ _CAMERA = (
 
 
 def to_bytes(calibration: Calibration) -> bytes:
-    """Calibration as a FITS file."""
+    """Encode a calibration as a FITS file."""
     primary = fits_file.header_of(KIND)
     header = primary.header
     header["CALID"] = calibration.id
@@ -58,7 +58,7 @@ def to_bytes(calibration: Calibration) -> bytes:
         [
             fits_file.extension(name, arrays[name], sentence, unit)
             for name, _, unit, sentence in _EXTENSIONS
-            if name != _MAY_LACK or arrays[name].size
+            if name != _OPTIONAL or arrays[name].size
         ],
     )
 
@@ -73,7 +73,7 @@ def save(calibration: Calibration, path: Path) -> None:
 
 
 def load(path: Path) -> Calibration:
-    """Read a FITS file and check that it is whole.
+    """Read a FITS file and check its identity.
 
     Raises:
         DataFileError: the file is missing, damaged or holds something else.
@@ -88,7 +88,7 @@ def _read(units: fits.HDUList) -> Calibration:
     arrays = {
         attribute: fits_file.single(units, name)
         for name, attribute, _, _ in _EXTENSIONS
-        if name != _MAY_LACK or name in units
+        if name != _OPTIONAL or name in units
     }
     return Calibration(
         noll=tuple(int(index) for index in str(header["NOLL"]).split()),

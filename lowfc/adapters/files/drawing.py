@@ -1,4 +1,4 @@
-"""Pictures as PNG files; matplotlib is loaded only where something is drawn."""
+"""Plots as PNG files; matplotlib is imported only when needed."""
 
 import io
 from typing import Any
@@ -8,7 +8,7 @@ from lowfc.contract.errors import ConfigurationError
 
 
 def figure_class() -> Any:
-    """Matplotlib's Figure, which draws without a screen.
+    """Return matplotlib's class Figure, which draws without a display.
 
     Raises:
         ConfigurationError: matplotlib is not installed.
@@ -17,13 +17,13 @@ def figure_class() -> Any:
         from matplotlib.figure import Figure
     except ImportError as error:
         raise ConfigurationError(
-            f"plots need matplotlib, which is not there ({error}); install it with: {install_advice('plots')}"
+            f"plots need matplotlib, which is not installed ({error}); install it with: {install_advice('plots')}"
         ) from None
     return Figure
 
 
 def png(figure: Any, dpi: int = 120) -> bytes:
-    """A figure as PNG, without the version of what drew it: the same figure is the same file."""
+    """Encode a figure as PNG without matplotlib's version, so that the same figure gives the same file."""
     content = io.BytesIO()
     figure.savefig(content, format="png", dpi=dpi, metadata={"Software": None})
     return content.getvalue()

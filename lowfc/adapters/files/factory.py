@@ -1,6 +1,6 @@
-"""The simulated instrument that a configuration describes: optics, star, detector, mirror, calibration.
+"""Factory of the instrument's parts from the configuration: optics, star, detector, mirror, calibration.
 
-The camera, the mirror and the launcher build the same parts from the same keys; nothing else interprets them.
+Camera, mirror and launcher all use it, so that they interpret the keys in the same way.
 """
 
 from collections.abc import Callable
@@ -35,7 +35,7 @@ from lowfc.optics.twin.twin_mirror import TwinMirror, wavefront_nm
 
 Progress = Callable[[int, int], None]
 
-_OF_CAMERA = ("bias_dn", "gain_e_per_dn", "em_gain", "read_noise_e")
+_SHARED = ("bias_dn", "gain_e_per_dn", "em_gain", "read_noise_e")
 _TWINS = {spec.nodes: spec for spec in (FAST, ACCURATE)}
 
 
@@ -45,7 +45,7 @@ def sensor(config: Configuration, warn: Callable[[str], None]) -> Sensor:
 
 
 def band(config: Configuration) -> Band:
-    """The wavelengths that stand for the star's band."""
+    """Sample wavelengths of the star's band, with weights."""
     if config.sensor.wavelengths == 1:
         return monochromatic(config.star.wavelength_nm)
     quadrature = gauss_legendre if config.sensor.quadrature == "gauss-legendre" else uniform
@@ -53,10 +53,10 @@ def band(config: Configuration) -> Band:
 
 
 def twin(config: Configuration, progress: Progress | None, warn: Callable[[str], None]) -> Twin:
-    """The real-time twin of the sensor, from the cache or built.
+    """Real-time digital twin of the sensor, from the cache or built.
 
     Raises:
-        ConfigurationError: the optics do not have as many modes as they ask for.
+        ConfigurationError: the optics have fewer modes than `sensor.rank`.
     """
     spec = replace(_TWINS[config.sensor.nodes], rank=config.sensor.rank)
     try:
@@ -66,12 +66,12 @@ def twin(config: Configuration, progress: Progress | None, warn: Callable[[str],
 
 
 def contrast_of(config: Configuration) -> ModalContrast:
-    """What the modes add to the dark zone's contrast. It takes a tenth of a second, behind a Lyot stop half of one."""
+    """Contrast that the modes add in the dark zone. Takes 0.1 s to compute, with a Lyot stop 0.5 s."""
     return ModalContrast(coronagraph_from(config.sensor), config.noll, config.star.wavelength_nm)
 
 
 def electrons_per_exposure(config: Configuration) -> float:
-    """Electrons in one exposure of all the light through the open circle; an image times this is in electrons."""
+    """Electrons per exposure of all light that enters the open circular pupil; an image times this is in electrons."""
     star = config.star
     photometry = Photometry(
         star.magnitude,
@@ -102,35 +102,35 @@ def detector(config: Configuration) -> Detector:
 
 
 def mirror(config: Configuration) -> Mirror:
-    """The mirror's geometry, as it is believed to be."""
+    """Nominal geometry of the mirror."""
     section = config.mirror
     return Mirror(section.rows, section.columns, section.pitches_per_pupil, section.coupling)
 
 
 def true_mirror(config: Configuration) -> Mirror:
-    """The simulated mirror's geometry, with its errors of registration."""
+    """Geometry of the simulated mirror, with its registration errors."""
     section = config.mirror
     pitches_per_pupil = section.pitches_per_pupil / section.magnification
     return replace(mirror(config), pitches_per_pupil=pitches_per_pupil, shift_pitches=section.shift_pitches)
 
 
 def mirror_on_twin(config: Configuration, optics: Twin, warn: Callable[[str], None]) -> TwinMirror:
-    """The mirror's wavefront at the twin's nodes as it is believed to be, from the cache or fitted."""
+    """Wavefront of the nominal mirror at the twin's nodes, from the cache or fitted."""
     return load_or_fit_mirror(sensor(config, warn), optics, mirror(config), notice=warn)
 
 
 def true_mirror_on_twin(config: Configuration, optics: Twin, warn: Callable[[str], None]) -> TwinMirror:
-    """The simulated mirror's wavefront at the twin's nodes, with its errors of registration."""
+    """Wavefront of the simulated mirror at the twin's nodes, with its registration errors."""
     return load_or_fit_mirror(sensor(config, warn), optics, true_mirror(config), notice=warn)
 
 
 def mirror_limits(config: Configuration) -> Limits:
-    """What the mirror itself allows."""
+    """The mirror's own limits, nm of surface."""
     return Limits(config.mirror.stroke_nm / 2, config.mirror.slew_nm, config.mirror.neighbour_nm)
 
 
 def settings(config: Configuration) -> Settings:
-    """What of the controller does not change during a run."""
+    """Settings of the controller, constant during a run."""
     control, safety = config.control, config.safety
     return Settings(
         limits=Limits(safety.stroke_nm, safety.slew_nm, safety.neighbour_nm),
@@ -150,7 +150,7 @@ def settings(config: Configuration) -> Settings:
         limit_nm=(control.tilt_limit_nm, control.limit_nm),
         max_identical_frames=control.max_identical_frames
         if config.camera.noise
-        else 0,  # without noise images are alike
+        else 0,  # images without noise are identical
         rate_hz=config.camera.rate_hz,
         guard=control.guard,
         interlocks=tuple(map(_interlock, config.interlocks)),
@@ -167,25 +167,25 @@ def analytic_calibration(
 ) -> Calibration:
     """I0 and H from the camera's own operator, eqs. (6) to (12), R from them, and the mirror's modes.
 
-    The modes are fitted to the influence functions, then mixed a little so that a modal command is what the sensor
-    measures of it: through the shaped pupil some of the mirror's print-through looks like low orders, by 2 to 6 %.
+    The modes are fitted to the influence functions, then mixed slightly so that the sensor measures each modal command
+    as itself: through the shaped pupil, 2 to 6 % of the mirror's print-through looks like low orders.
 
-    Actuators that are not active stay out of the modes, and the sensor sees nothing of them.
+    Inactive actuators are in no mode, and the sensor's response to them is set to 0.
 
     Args:
-        config: The instrument's.
-        optics: Its twin.
-        on_nodes: Its mirror.
-        opd_nm: Wavefront at the twin's used nodes at which I0 and H are wanted; flat when None.
+        config: Configuration of the instrument.
+        optics: Digital twin of its sensor.
+        on_nodes: Its mirror on the twin's nodes.
+        opd_nm: Wavefront at the twin's used nodes at which I0 and H are computed; flat when None.
 
     Raises:
-        CalibrationError: this sensor cannot tell the modes apart, the star saturates it, or shear is to be fitted
-            along at a wavefront that is not flat.
+        CalibrationError: the sensor cannot distinguish the modes, the star saturates it, or shear is a fitted
+            nuisance at a wavefront that is not flat.
         ConfigurationError: the map of active actuators cannot be used.
     """
     if opd_nm is not None and "shear" in config.control.nuisance:
         raise CalibrationError(
-            "what shear of the beam does is known at a flat wavefront only: leave it out of control.nuisance"
+            "the response to beam shear is known at a flat wavefront only: remove shear from control.nuisance"
         )
     camera = detector(config)
     highest_dn = float(saturation_dn(camera))
@@ -212,10 +212,10 @@ def analytic_calibration(
     actuators = config.mirror.rows * config.mirror.columns
     pokes = np.eye(actuators, dtype=np.float32).reshape(actuators, config.mirror.rows, config.mirror.columns)
     wavefronts = np.array([wavefront_nm(on_nodes, poke) for poke in pokes])
-    seen = actuators_to_modes(R, light, good, lambda shapes: response(optics, shapes, opd_nm), wavefronts)
+    sensed = actuators_to_modes(R, light, good, lambda shapes: response(optics, shapes, opd_nm), wavefronts)
     if active is not None:
-        seen[:, ~active.reshape(-1)] = 0
-    commands = commands @ np.linalg.inv(seen @ commands)
+        sensed[:, ~active.reshape(-1)] = 0
+    commands = commands @ np.linalg.inv(sensed @ commands)
 
     grid = (config.mirror.rows, config.mirror.columns)
     return identified(
@@ -235,14 +235,14 @@ def analytic_calibration(
             wavelength_nm=config.star.wavelength_nm,
             operator_hash=optics.operator_hash,
             id="",
-            actuators_to_modes=single(seen),
-            camera=CameraSettings(0, (shape[0], shape[1]), saturation_dn=highest_dn, **fields_of(camera, _OF_CAMERA)),
+            actuators_to_modes=single(sensed),
+            camera=CameraSettings(0, (shape[0], shape[1]), saturation_dn=highest_dn, **fields_of(camera, _SHARED)),
         )
     )
 
 
 def frame_noise_nm(config: Configuration, calibration: Calibration) -> Array:
-    """Standard deviation of each mode of one frame, nm of wavefront rms: photon and read noise through R."""
+    """Standard deviation of each mode's noise per frame, nm rms of wavefront: photon and read noise through R."""
     return np.asarray(np.sqrt(np.diag(frame_noise_nm2(config, calibration))))
 
 
@@ -256,7 +256,7 @@ def frame_noise_nm2(config: Configuration, calibration: Calibration) -> Array:
 
 
 def _check_exposure(config: Configuration, light: Array) -> None:
-    """Raise where a pixel is at full well in the reference image: what it then says is no longer linear."""
+    """Raise CalibrationError if a pixel of the reference image saturates: its response is then not linear."""
     camera = detector(config)
     charge_e = float(light.max()) * electrons_per_exposure(config) * camera.em_gain
     full_dn = float(saturation_dn(camera))
@@ -269,7 +269,7 @@ def _check_exposure(config: Configuration, light: Array) -> None:
 
 
 def _nuisance(config: Configuration, light: Array, good: Array) -> Array | None:
-    """Slopes (pixels, any) of the normalised image along what is fitted beside the modes; None without any."""
+    """Slopes (pixels, any) of the normalised image along the fitted nuisance parameters; None without any."""
     columns = []
     for name in config.control.nuisance:
         if name == "background":
@@ -289,7 +289,7 @@ def _dark_dn(camera: Detector) -> float:
 
 
 def equivalent_read_noise_e(camera: Detector) -> float:
-    """Read noise beside photon noise as the weights see it, in electrons before multiplication.
+    """Read noise equivalent to all noise except photon noise, in electrons before multiplication, for the weights.
 
     The register doubles the photons' variance, to 2 (I0 + read_noise^2 / (2 gain^2)); spurious charge counts as light.
     """

@@ -1,4 +1,4 @@
-"""FITS files of our own: named extensions written at once, and read only where they are whole."""
+"""lowfc's own FITS files: named extensions with checksums; damaged files are refused."""
 
 import contextlib
 import io
@@ -19,32 +19,32 @@ from lowfc.contract.errors import DataFileError
 T = TypeVar("T")
 
 LARGEST_BYTES = 1 << 33
-"""Size of a file of arrays, at most."""
+"""Largest size of a file of arrays."""
 DAMAGED = (
     *(OSError, KeyError, TypeError, ValueError, EOFError, MemoryError, RecursionError),
     *(AstropyWarning, fits.VerifyError),
 )
-"""What reading a file that is damaged, or something else, may raise."""
+"""Exceptions that reading a damaged or unrelated file may raise."""
 
 
 def header_of(kind: str) -> fits.PrimaryHDU:
-    """The head of a file; `kind` says what it is."""
+    """Make the primary HDU of a file of this kind."""
     primary = fits.PrimaryHDU()
     primary.header["KIND"] = (kind, "what this file is")
     return primary
 
 
 def extension(name: str, array: npt.NDArray[np.generic], sentence: str, unit: str | None = None) -> fits.ImageHDU:
-    """An array under its name, with what it is and its unit."""
-    made = fits.ImageHDU(array, name=name)
+    """Make a named extension from an array, with its description and unit."""
+    unit_hdu = fits.ImageHDU(array, name=name)
     if unit is not None:
-        made.header["BUNIT"] = unit
-    made.header["CONTENT"] = sentence
-    return made
+        unit_hdu.header["BUNIT"] = unit
+    unit_hdu.header["CONTENT"] = sentence
+    return unit_hdu
 
 
 def to_bytes(primary: fits.PrimaryHDU, extensions: list[fits.ImageHDU]) -> bytes:
-    """The whole file, with checksums."""
+    """Encode a file, with checksums."""
     stream = io.BytesIO()
     fits.HDUList([primary, *extensions]).writeto(stream, checksum=True)
     return stream.getvalue()
@@ -52,25 +52,25 @@ def to_bytes(primary: fits.PrimaryHDU, extensions: list[fits.ImageHDU]) -> bytes
 
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[fits.HDUList]:
-    """A file to read; raises some of `DAMAGED` where it is not whole."""
+    """Open a file for reading; raises one of `DAMAGED` if it is incomplete."""
     with (
         warnings.catch_warnings(),
         input_file.opened(path, LARGEST_BYTES) as stream,
-    ):  # which astropy leaves open where it raises
-        warnings.simplefilter("error", AstropyWarning)  # a shortened file is no more than a warning to astropy
+    ):  # closes it if astropy raises
+        warnings.simplefilter("error", AstropyWarning)  # astropy only warns of a truncated file
         with fits.open(stream, mode="readonly", memmap=False) as units:
             yield units
 
 
 def load(path: Path, kinds: tuple[str, ...], what: str, parse: Callable[[fits.HDUList], T], advice: str = "") -> T:
-    """What `parse` makes of a file of our own.
+    """Read one of lowfc's own files with `parse`.
 
     Args:
-        path: of the file.
-        kinds: one of which it must be, the present one first.
-        what: it is, for people.
-        parse: raises some of `DAMAGED` where something is wrong.
-        advice: how such a file is made.
+        path: path of the file.
+        kinds: permitted kinds, the present one first.
+        what: description of the file, for errors.
+        parse: decodes the open file; raises one of `DAMAGED` if its content is invalid.
+        advice: instruction to make such a file, for errors.
 
     Raises:
         DataFileError: the file is missing, damaged or holds something else.
@@ -88,20 +88,20 @@ def load(path: Path, kinds: tuple[str, ...], what: str, parse: Callable[[fits.HD
 
 
 def single(units: fits.HDUList, name: str) -> Single:
-    """An extension's array.
+    """Read an extension's array as float32.
 
     Raises:
         KeyError: there is no such extension.
         ValueError: it holds no array.
     """
-    data = getattr(units[name], "data", None)  # damaged, it may be an extension of no known kind
+    data = getattr(units[name], "data", None)  # a damaged extension may have an unknown type
     if data is None:
         raise ValueError(f"the extension {name} holds no array")
     return np.ascontiguousarray(data, dtype=np.float32)
 
 
 def first_image(units: fits.HDUList) -> npt.NDArray[np.generic]:
-    """The first image or cube that there is.
+    """Read the first image or cube.
 
     Raises:
         ValueError: there is none.
@@ -113,17 +113,17 @@ def first_image(units: fits.HDUList) -> npt.NDArray[np.generic]:
 
 
 def require_identity(path: Path, found: str, stated: str) -> None:
-    """Refuse a file whose content is not what it says.
+    """Check that the identity stated in a file is that of its content.
 
     Raises:
-        DataFileError: it is not.
+        DataFileError: the identities differ.
     """
     if found != stated:
         raise DataFileError(f"{path}: damaged: its content has identity {found[:12]}, it says {stated[:12]}")
 
 
 def in_a_line(error: BaseException) -> str:
-    """What an error says, whose text may have several lines, or more characters than a user reads."""
+    """Text of an error on one line, at most 300 characters."""
     if "SIMPLE card" in str(error):
         return "it is not a FITS file"
     text = error.strerror if isinstance(error, OSError) and error.strerror else str(error)

@@ -1,4 +1,4 @@
-"""Control laws as FITS: one named extension for each matrix."""
+"""Control laws as FITS files: one named extension per matrix."""
 
 from pathlib import Path
 from typing import cast
@@ -24,7 +24,7 @@ _EXTENSIONS = (
 
 
 def to_bytes(law: LinearLaw) -> bytes:
-    """Law as a FITS file."""
+    """Encode a law as a FITS file."""
     primary = fits_file.header_of(KIND)
     header = primary.header
     header["LAWID"] = law.id
@@ -49,7 +49,7 @@ def save(law: LinearLaw, path: Path) -> None:
 
 
 def load(path: Path) -> LinearLaw:
-    """Read a FITS file and check that it is whole.
+    """Read a FITS file and check its identity.
 
     Raises:
         DataFileError: the file is missing, damaged or holds something else.
@@ -65,7 +65,7 @@ def _read(units: fits.HDUList) -> tuple[LinearLaw, str]:
     header = units[0].header
     former = LAW_EXTENSIONS if header["KIND"] == FORMER_KIND else {}
     law = LinearLaw(
-        signal=cast("Signal", str(header["SIGNAL"])),  # a law refuses any other
+        signal=cast("Signal", str(header["SIGNAL"])),  # LinearLaw refuses any other
         name=str(header["NAME"]),
         noll=tuple(int(index) for index in str(header["NOLL"]).split()),
         delay_frames=float(header["DELAY"]),

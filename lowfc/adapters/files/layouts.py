@@ -1,4 +1,4 @@
-"""Sparse-aperture layouts: the shipped ones, and those of a user's own files."""
+"""Sparse-aperture layouts: those shipped with lowfc, and those in a user's files."""
 
 import json
 import re
@@ -17,12 +17,12 @@ _LARGEST_BYTES = 1 << 24
 
 
 def layout_names() -> list[str]:
-    """Names of the layouts that are shipped."""
+    """Names of the shipped layouts."""
     return sorted(_read_layouts(SHIPPED))
 
 
 def load_layout(name: str) -> sams.Layout:
-    """A layout by name, checked.
+    """Load a layout by name and check it.
 
     Args:
         name: A shipped layout, `file.json` with one layout, or `file.json:name` with several. A file has the shape of
@@ -36,29 +36,29 @@ def load_layout(name: str) -> sams.Layout:
     in_file = re.fullmatch(r"(.*\.json)(?::(.*))?", name)
     file: Traversable = Path(in_file[1]) if in_file else SHIPPED
     layouts = _read_layouts(file)
-    wanted = (in_file[2] or "") if in_file else name
-    if not wanted and len(layouts) == 1:
-        wanted = next(iter(layouts))
-    if wanted not in layouts:
+    chosen = (in_file[2] or "") if in_file else name
+    if not chosen and len(layouts) == 1:
+        chosen = next(iter(layouts))
+    if chosen not in layouts:
         known = ", ".join(sorted(layouts))
-        if not wanted:
-            raise ConfigurationError(f"{file} holds several layouts; say which as {file}:name, of {known}")
+        if not chosen:
+            raise ConfigurationError(f"{file} holds several layouts; choose one as {file}:name, of {known}")
         raise ConfigurationError(
-            f"no sparse-aperture layout is called {wanted!r}{nearest(wanted, layouts)}: there are {known}"
+            f"no sparse-aperture layout is called {chosen!r}{nearest(chosen, layouts)}: there are {known}"
         )
-    return parse_layout(file, wanted, layouts[wanted])
+    return parse_layout(file, chosen, layouts[chosen])
 
 
 def parse_layout(file: Traversable, name: str, entry: Any) -> sams.Layout:
-    """A layout from what a JSON file holds under its name, checked.
+    """Make a layout from its entry in a JSON file and check it.
 
     Args:
-        file: Named in errors.
-        name: Of the layout.
-        entry: "hole_diameter", "holes" and perhaps "purpose", as in `load_layout`.
+        file: File of the layout, for errors.
+        name: Name of the layout.
+        entry: "hole_diameter", "holes" and optionally "purpose", as in `load_layout`.
 
     Raises:
-        DataFileError: It is malformed, or its holes overlap or leave the pupil.
+        DataFileError: The entry is malformed, or its holes overlap or leave the pupil.
     """
     try:
         holes = tuple(_hole(hole, entry) for hole in entry["holes"])
@@ -76,7 +76,7 @@ def parse_layout(file: Traversable, name: str, entry: Any) -> sams.Layout:
 
 
 def layout_warnings(layout: sams.Layout) -> list[str]:
-    """What a user should know about a layout that is legal but of little use."""
+    """Warnings about a layout that is valid but of little use."""
     if sams.is_even_symmetric(layout):
         return [
             f"{layout.name} is symmetric about the pupil's centre: it cannot sense even modes such as focus and "

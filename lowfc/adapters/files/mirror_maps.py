@@ -1,4 +1,4 @@
-"""Maps of the mirror in files, FITS or numpy's: its shapes, and the actuators that may be commanded."""
+"""Maps of the mirror in FITS or .npy files: shapes, and the map of active actuators."""
 
 from pathlib import Path
 
@@ -10,19 +10,19 @@ from lowfc.contract.errors import ConfigurationError, DataFileError
 
 
 def read_shape(path: Path) -> Single:
-    """Shape of a mirror (rows, columns), nm of surface: the first image of a FITS file, or the array of a .npy file.
+    """Read the shape of a mirror (rows, columns), nm of surface: first image of a FITS file, or array of a .npy file.
 
     Raises:
         DataFileError: the file is missing, damaged or holds something else.
     """
-    from lowfc.adapters.files.array_file import read_array  # astropy takes its time
+    from lowfc.adapters.files.array_file import read_array  # astropy is slow to import
 
     shape = read_array(path, "a mirror's shape is an array (rows, columns)", (2,))
     return single(shape)
 
 
 def active_actuators(config: Configuration) -> Mask | None:
-    """Actuators (rows, columns) that may be commanded, of `mirror.active`; None where all may.
+    """Read the map of active actuators (rows, columns) of `mirror.active`; None if all are active.
 
     Raises:
         ConfigurationError: the file is missing, damaged or does not fit the mirror.
@@ -38,7 +38,7 @@ def active_actuators(config: Configuration) -> Mask | None:
 
 
 def flat_nm(config: Configuration) -> Single | None:
-    """The flat map (rows, columns) of `mirror.flat`, nm of surface, zero at inactive actuators; None without one.
+    """Read the flat map (rows, columns) of `mirror.flat`, nm of surface, 0 at inactive actuators; None without one.
 
     Raises:
         ConfigurationError: the file is missing, damaged or does not fit the mirror.
@@ -51,7 +51,7 @@ def flat_nm(config: Configuration) -> Single | None:
 
 
 def shape_of(config: Configuration, key: str, file: str) -> Single:
-    """A shape (rows, columns) of the configured mirror, nm of surface, from the file that `key` names.
+    """Read a shape (rows, columns) of the configured mirror, nm of surface; `key` is the file's key, for errors.
 
     Raises:
         ConfigurationError: the file is missing, damaged or does not fit the mirror.

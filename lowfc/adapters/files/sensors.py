@@ -1,4 +1,4 @@
-"""Pupils from files, and a sensor built from the names of its masks."""
+"""Load pupils from files, and build a sensor from the names of its masks."""
 
 import logging
 from collections.abc import Callable
@@ -26,15 +26,15 @@ _DATA = resources.files("lowfc") / "data"
 _LARGEST_BYTES = 1 << 30
 _WITH_LYOT_STOP = ("circle", "prolate")
 _LYOT_OUTER = 12.0
-"""Outer radius of their dark zone, lambda / D, which begins at the mask's edge and goes all round."""
+"""Outer radius of the annular dark zone with a Lyot stop, lambda / D; the inner radius is the mask's edge."""
 _log = logging.getLogger(__name__)
 
 
 def load_pupil(samples: int = SAMPLES, file: Traversable = _DATA / "spc_quarter128.npz") -> Array:
-    """The shaped pupil (samples, samples): 1e-9 between 4 and 20 lambda/D within 42.5 degrees of the x axis.
+    """Load the shaped pupil (samples, samples): 1e-9 between 4 and 20 lambda/D within 42.5 degrees of the x axis.
 
     Args:
-        samples: Across the diameter, a multiple of 256.
+        samples: Samples across the diameter, a multiple of 256.
         file: An npz file whose array `quarter` is the quadrant x >= 0, y >= 0.
 
     Raises:
@@ -62,15 +62,15 @@ def load_pupil(samples: int = SAMPLES, file: Traversable = _DATA / "spc_quarter1
 def sensor_from(
     section: SensorSection | None = None, wavelength_nm: float = 550.0, warn: Callable[[str], None] = _log.warning
 ) -> Sensor:
-    """The optics that [sensor] describes, at the sampling of Table 1.
+    """Build the optics described by [sensor], at the sampling of Table 1 of the paper.
 
     Args:
-        section: All defaults when None.
-        wavelength_nm: The central wavelength.
-        warn: Called with each of `layout_warnings`.
+        section: Section of the configuration; all defaults when None.
+        wavelength_nm: Central wavelength.
+        warn: Function called with each warning of `layout_warnings`.
 
     Raises:
-        ConfigurationError: A name is not known, or values do not go together.
+        ConfigurationError: A name is unknown, or values are inconsistent.
         DataFileError: A file is missing or damaged, or a layout is impossible.
     """
     section = SensorSection() if section is None else section
@@ -97,12 +97,12 @@ def sensor_from(
 
 
 def sensor_named(name: str) -> Sensor:
-    """One of `SENSORS`, or the sparse aperture mask with that layout."""
+    """Build one of `SENSORS`, or the sparse-aperture sensor with that layout."""
     return sensor_from(SensorSection.model_validate(sensor_keys(name)))
 
 
 def coronagraph_from(section: SensorSection) -> Coronagraph:
-    """What makes the science image: of a shaped pupil, or behind a Lyot stop.
+    """Build the coronagraph of the science image: with a shaped pupil, or with a Lyot stop.
 
     Raises:
         ConfigurationError: There is no such pupil.
@@ -145,7 +145,7 @@ def _pupil(section: SensorSection) -> Array:
 def _focal_mask(section: SensorSection) -> NDArray[np.inexact]:
     if section.focal_mask == "bowtie":
         if section.kind == "zwfs" or section.inner_radius:
-            raise ValueError("a bowtie has neither a phase spot nor an inner radius; take focal_mask = 'disk'")
+            raise ValueError("a bowtie has neither a phase spot nor an inner radius; set focal_mask = 'disk'")
         return bowtie(radius=section.focal_radius)
     if section.kind == "zwfs":
         return phase_spot(radius=section.focal_radius, spot_diameter=section.spot_diameter)

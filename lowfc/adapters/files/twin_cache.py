@@ -1,6 +1,6 @@
-"""The twin's cache: twin and mirror are built once, then read from files named by a hash of all they depend on.
+"""Cache of digital twins: twin and mirror are built once, then read from files named by a hash of all their inputs.
 
-That includes the source of the optics, so that no other version's file is ever read.
+The hash includes the source of the optics, so that files of other versions are never read.
 """
 
 import functools
@@ -28,12 +28,12 @@ from lowfc.optics.twin.twin_build import build
 from lowfc.optics.twin.twin_mirror import TwinMirror, twin_mirror
 
 _HASHED_AS = 3
-"""Part of every operator hash, and so of the identity of every computed calibration: it stays as it is."""
+"""Part of every operator hash, and so of the identity of every computed calibration: do not change it."""
 
-_OF_TWIN = ("operator_hash", "axis", "used", "area_weights", "to_pixels")
-_OF_OPERATOR = ("modes", "to_modes", "to_coefficients", "basis")
+_TWIN_ARRAYS = ("operator_hash", "axis", "used", "area_weights", "to_pixels")
+_OPERATOR_ARRAYS = ("modes", "to_modes", "to_coefficients", "basis")
 
-_Kept = TypeVar("_Kept", Twin, TwinMirror)
+_Cached = TypeVar("_Cached", Twin, TwinMirror)
 
 _log = logging.getLogger(__name__)
 
@@ -72,15 +72,15 @@ def load_or_build(
     cache_dir: Path | None = None,
     notice: Callable[[str], None] = _log.warning,
 ) -> Twin:
-    """The twin from the cache, or built and put there.
+    """Load the twin from the cache, or build and cache it.
 
     Args:
-        sensor: The optics.
-        spec: How far they are compressed.
-        band: The central wavelength alone when None.
-        progress: Called with the steps done and the steps in all, only while building.
-        cache_dir: `default_cache_dir()` when None.
-        notice: Called with a sentence about a damaged file or a directory that cannot be written; neither is fatal.
+        sensor: Optics of the sensor.
+        spec: Compression of the twin.
+        band: Wavelengths; the central wavelength alone when None.
+        progress: Function called with the completed and total steps, only while building.
+        cache_dir: Folder of the cache; `default_cache_dir()` when None.
+        notice: Function called with a sentence if a file is damaged or cannot be written; neither is fatal.
     """
     band = monochromatic(sensor.wavelength_nm) if band is None else band
     key = operator_hash(sensor, spec, band)
@@ -100,7 +100,7 @@ def load_or_fit_mirror(
     cache_dir: Path | None = None,
     notice: Callable[[str], None] = _log.warning,
 ) -> TwinMirror:
-    """A mirror on the twin's nodes from the cache, or fitted and put there; arguments as for `load_or_build`."""
+    """Load a mirror on the twin's nodes from the cache, or fit and cache it; arguments as for `load_or_build`."""
     return _cached(
         _file("mirror", repr((twin.operator_hash, astuple(mirror))), cache_dir),
         lambda content: TwinMirror(**_arrays(content)),
@@ -111,19 +111,19 @@ def load_or_fit_mirror(
 
 
 def _file(kind: str, key: str, cache_dir: Path | None) -> Path:
-    """Where what has this key is kept, if it was built by these sources."""
+    """File of this key for the present source code."""
     name = f"{kind}-{_digest({}, source_hash() + key)[:32]}.npz"
     return (default_cache_dir() if cache_dir is None else cache_dir) / name
 
 
 def _cached(
     path: Path,
-    unpack: Callable[[bytes], _Kept],
-    make: Callable[[], _Kept],
-    pack: Callable[[_Kept], bytes],
+    unpack: Callable[[bytes], _Cached],
+    make: Callable[[], _Cached],
+    pack: Callable[[_Cached], bytes],
     notice: Callable[[str], None],
-) -> _Kept:
-    """What the file holds; made and written there where the file is missing or damaged."""
+) -> _Cached:
+    """Read an object from a file; if it is missing or damaged, make and write the object."""
     try:
         return unpack(path.read_bytes())
     except FileNotFoundError:
@@ -135,7 +135,7 @@ def _cached(
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, pack(made))
     except (OSError, DataFileError) as error:
-        notice(f"{path} cannot be written, so that it will be built again next time: {error}")
+        notice(f"{path} cannot be written and will be built again next time: {error}")
     return made
 
 
@@ -149,10 +149,10 @@ def _digest(arrays: dict[str, NDArray[Any]], extra: str = "") -> str:
 
 
 def _pack(twin: Twin) -> bytes:
-    arrays: dict[str, NDArray[Any]] = {name: np.array(getattr(twin, name)) for name in _OF_TWIN}
+    arrays: dict[str, NDArray[Any]] = {name: np.array(getattr(twin, name)) for name in _TWIN_ARRAYS}
     arrays["band"] = np.array([(operator.wavelength_nm, operator.weight) for operator in twin.operators])
     for i, operator in enumerate(twin.operators):
-        arrays |= {f"{name}_{i}": getattr(operator, name) for name in _OF_OPERATOR}
+        arrays |= {f"{name}_{i}": getattr(operator, name) for name in _OPERATOR_ARRAYS}
     return _packed(arrays)
 
 
@@ -172,7 +172,7 @@ def _unpack(content: bytes, key: str, spec: TwinSpec) -> Twin:
     if str(arrays["operator_hash"]) != key:
         raise ValueError("it was made from other optics")
     operators = tuple(
-        Operator(nm, weight, *(arrays[f"{name}_{i}"] for name in _OF_OPERATOR))
+        Operator(nm, weight, *(arrays[f"{name}_{i}"] for name in _OPERATOR_ARRAYS))
         for i, (nm, weight) in enumerate(arrays["band"].tolist())
     )
     return Twin(spec, arrays["axis"], arrays["used"], arrays["area_weights"], operators, arrays["to_pixels"], key)

@@ -1,4 +1,4 @@
-"""Files that are whole or not there."""
+"""Atomic writing of files: complete or absent."""
 
 import contextlib
 import os
@@ -12,12 +12,12 @@ from lowfc.contract.errors import DataFileError
 
 @contextlib.contextmanager
 def being_written(path: Path, source: Path | None = None, mode: int = 0o666) -> Iterator[Path]:
-    """A file to write that gets the name `path` when all went well, and is gone when not.
+    """Yield a temporary file that is renamed to `path` on success and removed on failure.
 
-    Its permissions are those of `mode` that the umask leaves, and no more than those of `source`, its origin.
+    Its permissions are `mode` without the umask's bits, and at most those of `source`, its origin.
 
     Raises:
-        DataFileError: it cannot be written.
+        DataFileError: the file cannot be written.
     """
     try:
         most = source.stat().st_mode & mode if source is not None and source.exists() else mode
@@ -27,7 +27,7 @@ def being_written(path: Path, source: Path | None = None, mode: int = 0o666) -> 
         os.close(descriptor)
         try:
             yield part
-            part.chmod(mode)  # who writes it may have replaced it
+            part.chmod(mode)  # the writer may have replaced it
             part.replace(path)
         finally:
             part.unlink(missing_ok=True)
@@ -36,7 +36,7 @@ def being_written(path: Path, source: Path | None = None, mode: int = 0o666) -> 
 
 
 def write_whole(path: Path, content: bytes, source: Path | None = None, mode: int = 0o666) -> None:
-    """Write beside, then rename: neither a reader nor a second writer ever sees half a file; see `being_written`.
+    """Write a temporary file, then rename it, so that no process ever reads a partial file; see `being_written`.
 
     Raises:
         DataFileError: The file cannot be written.
@@ -46,10 +46,10 @@ def write_whole(path: Path, content: bytes, source: Path | None = None, mode: in
 
 
 def require_folder(*files: Path | None) -> None:
-    """Say before the work that a file could not be written after it; None is no file.
+    """Check that files can be written later; None is skipped.
 
     Raises:
-        DataFileError: A file's folder is not there.
+        DataFileError: A file's folder does not exist.
     """
     for file in files:
         if file is not None and not file.parent.is_dir():

@@ -1,1 +1,1 @@
-"""Drivers of the field's own interfaces, found by their entry points."""
+"""Drivers for common interfaces: GenICam cameras and ImageStreamIO streams, loaded through entry points."""

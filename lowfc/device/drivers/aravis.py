@@ -1,4 +1,4 @@
-"""A GigE Vision or USB3 Vision camera, by the system's library aravis."""
+"""Driver of GigE Vision and USB3 Vision cameras, through the system's library aravis."""
 
 import importlib
 from dataclasses import replace
@@ -10,9 +10,9 @@ from lowfc.device import CameraSettings, Configuration, ConfigurationError, Expo
 from lowfc.device.drivers.genicam import WAIT_MS, GenicamOptions
 
 ADVICE = (
-    "Debian: apt install gir1.2-aravis-0.8 python3-gi; then let this Python see the package gi, by an environment made "
-    "with `python3 -m venv --system-site-packages`, or, where the system's Python is of the same version, by a link to "
-    "/usr/lib/python3/dist-packages/gi in its site-packages"
+    "Debian: apt install gir1.2-aravis-0.8 python3-gi; then make the package gi visible to this Python, with an "
+    "environment made by `python3 -m venv --system-site-packages`, or, if the system's Python has the same version, "
+    "with a link to /usr/lib/python3/dist-packages/gi in its site-packages"
 )
 _BUFFERS = 32
 
@@ -26,19 +26,19 @@ def _aravis() -> Any:
 
 
 class AravisCamera:
-    """Frames as aravis receives them; those that lack packets are gaps in the camera's own numbers."""
+    """Camera driver; frames with missing packets are dropped and appear as gaps in the camera's frame numbers."""
 
     Options = GenicamOptions
 
     def __init__(self, options: GenicamOptions, config: Configuration) -> None:
-        """Open the camera and set it."""
+        """Open and configure the camera."""
         self._aravis = aravis = _aravis()
         self._settings = options.settings(config)
         try:
             self._camera = aravis.Camera.new(options.camera or None)
             self._set(options)
             self._stream = self._camera.create_stream(None, None)
-            if self._camera.is_gv_device():  # a packet that is sent again comes too late
+            if self._camera.is_gv_device():  # a resent packet would arrive too late
                 self._stream.set_property("packet-resend", aravis.GvStreamPacketResend.NEVER)
             for _ in range(_BUFFERS):
                 self._stream.push_buffer(aravis.Buffer.new_allocate(self._camera.get_payload()))
@@ -47,25 +47,26 @@ class AravisCamera:
 
     @classmethod
     def needs(cls, options: GenicamOptions) -> list[Need]:
-        """The library, and a camera that it sees."""
+        """Requirements: the library, and a camera that it detects."""
         try:
             aravis = _aravis()
         except ConfigurationError as fault:
             return [Need("aravis", "", str(fault))]
         aravis.update_device_list()
-        seen = [aravis.get_device_id(index) for index in range(aravis.get_n_devices())]
-        return [Need("aravis", "0.8", ""), Need("a camera", ", ".join(seen), "connect one; `arv-tool-0.8` lists them")]
+        detected = [aravis.get_device_id(index) for index in range(aravis.get_n_devices())]
+        advice = "connect one; `arv-tool-0.8` lists them"
+        return [Need("aravis", "0.8", ""), Need("a camera", ", ".join(detected), advice)]
 
     def start(self) -> None:
-        """Begin to receive."""
+        """Start the acquisition."""
         self._camera.start_acquisition()
 
     def settings(self) -> CameraSettings:
-        """As the camera took them."""
+        """Settings as the camera accepted them."""
         return self._settings
 
     def expose(self) -> Exposure | None:
-        """The next whole frame; its time is that at which its first packet came, just after the exposure."""
+        """Next complete frame; its time is the arrival of its first packet, just after the exposure."""
         buffer = self._stream.timeout_pop_buffer(WAIT_MS * 1000)
         if buffer is None:
             return None
@@ -80,7 +81,7 @@ class AravisCamera:
             self._stream.push_buffer(buffer)
 
     def close(self) -> None:
-        """Let go of the camera."""
+        """Stop the acquisition."""
         self._camera.stop_acquisition()
 
     def _set(self, options: GenicamOptions) -> None:

@@ -1,4 +1,4 @@
-"""A Basler camera, by the vendor's package pypylon."""
+"""Driver of Basler cameras, through the vendor's package pypylon."""
 
 import importlib
 from dataclasses import replace
@@ -11,12 +11,12 @@ from lowfc.device import CameraSettings, Configuration, ConfigurationError, Expo
 from lowfc.device.drivers.genicam import WAIT_MS, GenicamOptions
 
 _EXPOSURES = "ExposureTime", "ExposureTimeAbs"
-"""Names in newer and older cameras; the emulation has both, and the older ones take effect."""
+"""Node names of newer and older cameras; the emulation has both, and the older one takes effect."""
 _RATES = "AcquisitionFrameRate", "AcquisitionFrameRateAbs"
 _RESULTS = "ResultingFrameRate", "ResultingFrameRateAbs", "BslResultingAcquisitionFrameRate"
 _BUFFERS = 16
 _QUEUED = 2
-"""Frames buffered while the host stands still; older ones are dropped and counted, as their times would be wrong."""
+"""Frames buffered while the process is stopped; older ones are dropped and counted: their times would be wrong."""
 
 
 def _pylon() -> Any:
@@ -29,12 +29,12 @@ def _pylon() -> Any:
 
 
 class BaslerCamera:
-    """Frames as pylon grabs them; those that were lost or failed are gaps in the camera's own numbers."""
+    """Camera driver; lost and failed frames appear as gaps in the camera's frame numbers."""
 
     Options = GenicamOptions
 
     def __init__(self, options: GenicamOptions, config: Configuration) -> None:
-        """Open the camera and set it."""
+        """Open and configure the camera."""
         self._pylon = pylon = _pylon()
         self._settings = options.settings(config)
         try:
@@ -50,25 +50,25 @@ class BaslerCamera:
 
     @classmethod
     def needs(cls, options: GenicamOptions) -> list[Need]:
-        """The package, and a camera that it sees."""
+        """Requirements: the package, and a camera that it detects."""
         try:
             pylon = _pylon()
         except ConfigurationError:
             return [Need("pypylon", "", install_advice("basler"))]
-        seen = [one.GetFriendlyName() for one in pylon.TlFactory.GetInstance().EnumerateDevices()]
+        detected = [one.GetFriendlyName() for one in pylon.TlFactory.GetInstance().EnumerateDevices()]
         advice = "connect one and switch it on; PYLON_CAMEMU=1 in the environment emulates one"
-        return [Need("pypylon", pylon.GetPylonVersionString(), ""), Need("a camera", ", ".join(seen), advice)]
+        return [Need("pypylon", pylon.GetPylonVersionString(), ""), Need("a camera", ", ".join(detected), advice)]
 
     def start(self) -> None:
-        """Begin to grab."""
+        """Start grabbing."""
         self._camera.StartGrabbing(self._pylon.GrabStrategy_LatestImages)
 
     def settings(self) -> CameraSettings:
-        """As the camera took them."""
+        """Settings as the camera accepted them."""
         return self._settings
 
     def expose(self) -> Exposure | None:
-        """The next whole frame."""
+        """Next complete frame."""
         result = self._camera.RetrieveResult(WAIT_MS, self._pylon.TimeoutHandling_Return)
         if not result.IsValid():
             return None
@@ -78,16 +78,16 @@ class BaslerCamera:
             return Exposure(result.GetArray().astype(np.uint16), None, result.GetBlockID())
 
     def close(self) -> None:
-        """Let go of the camera."""
+        """Release the camera."""
         self._camera.Close()
 
     def _set(self, options: GenicamOptions) -> None:
         camera, settings = self._camera, self._settings
         camera.PixelFormat.Value = options.pixel_format
-        camera.OffsetX.Value = camera.OffsetY.Value = 0  # else the size may not fit
+        camera.OffsetX.Value = camera.OffsetY.Value = 0  # otherwise the size may not fit
         camera.Width.Value, camera.Height.Value = options.columns, options.rows
         camera.OffsetX.Value, camera.OffsetY.Value = options.region_column, options.region_row
-        self._put(_EXPOSURES, settings.exposure_ns * 1e-3)
+        self._write(_EXPOSURES, settings.exposure_ns * 1e-3)
         if options.gain is not None:
             camera.Gain.Value = options.gain
         camera.TriggerSelector.Value = "FrameStart"
@@ -97,13 +97,13 @@ class BaslerCamera:
             camera.TriggerSource.Value = options.trigger
         else:
             camera.AcquisitionFrameRateEnable.Value = True
-            self._put(_RATES, 1e9 / period_ns)
+            self._write(_RATES, 1e9 / period_ns)
             period_ns = round(1e9 / min(self._read(_RESULTS + _RATES)))
         camera.MaxNumBuffer.Value, camera.OutputQueueSize.Value = _BUFFERS, _QUEUED
         exposure_ns = round(self._read(_EXPOSURES)[0] * 1e3)
         self._settings = replace(settings, exposure_ns=exposure_ns, period_ns=period_ns)
 
-    def _put(self, names: tuple[str, ...], value: float) -> None:
+    def _write(self, names: tuple[str, ...], value: float) -> None:
         for node in (getattr(self._camera, name) for name in names):
             if node.IsWritable():
                 node.Value = value

@@ -1,4 +1,4 @@
-"""Options and camera settings that the drivers of GenICam cameras share."""
+"""Common options and camera settings of the drivers of GenICam cameras."""
 
 from dataclasses import replace
 from typing import Literal
@@ -11,6 +11,7 @@ from lowfc.device import CameraSettings, DriverOptions
 FRAME_ID_WRAP = 65535
 """GigE Vision counts frames from 1 to 65535, then from 1 again; 64-bit numbers are reduced modulo 65535."""
 WAIT_MS = 500
+"""Longest wait for a frame."""
 
 
 class GenicamOptions(DriverOptions):
@@ -27,26 +28,26 @@ class GenicamOptions(DriverOptions):
     region_column: int = Field(default=0, ge=0)
     """First column of the region read."""
     pixel_format: Literal["Mono8", "Mono10", "Mono12", "Mono14", "Mono16"] = "Mono12"
-    """Format of a pixel, each in bytes of its own."""
+    """Pixel format, unpacked."""
     exposure_us: float | None = Field(default=None, gt=0)
     """Exposure time."""
     rate_hz: float | None = Field(default=None, gt=0)
-    """Frames per second: of the camera, or of its trigger."""
+    """Frame rate of the camera, or of its trigger."""
     gain: float | None = None
-    """Gain, in the camera's unit, mostly dB; if not given, the camera keeps its gain."""
+    """Gain, in the camera's unit, mostly dB; by default the camera keeps its gain."""
     trigger: str = ""
-    """Line that triggers each frame, as the camera calls it (`Line1`); empty for a camera that runs freely."""
+    """Camera's name of the line that triggers each frame (`Line1`); empty: free-running."""
 
     def settings(self, config: Configuration) -> CameraSettings:
-        """Settings requested by the options; the bit depth is that of the pixel format."""
-        usual = CameraSettings.configured(config, self.rows, self.columns)
+        """Settings requested by the options; the bit depth follows from the pixel format."""
+        configured = CameraSettings.configured(config, self.rows, self.columns)
         bits = int(self.pixel_format.removeprefix("Mono"))
         full_dn = 2**bits - 1
         return replace(
-            usual,
-            exposure_ns=usual.exposure_ns if self.exposure_us is None else round(self.exposure_us * 1e3),
-            period_ns=usual.period_ns if self.rate_hz is None else round(1e9 / self.rate_hz),
-            saturation_dn=min(usual.saturation_dn or full_dn, full_dn),
+            configured,
+            exposure_ns=configured.exposure_ns if self.exposure_us is None else round(self.exposure_us * 1e3),
+            period_ns=configured.period_ns if self.rate_hz is None else round(1e9 / self.rate_hz),
+            saturation_dn=min(configured.saturation_dn or full_dn, full_dn),
             bit_depth=bits,
             region_row=self.region_row,
             region_column=self.region_column,

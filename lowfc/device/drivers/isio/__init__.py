@@ -1,1 +1,1 @@
-"""Camera and mirror by ImageStreamIO streams, as milk and CACAO use them."""
+"""Camera and mirror drivers for ImageStreamIO streams, as in milk and CACAO."""

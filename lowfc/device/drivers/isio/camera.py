@@ -1,4 +1,4 @@
-"""A camera whose images another program writes into an ImageStreamIO stream."""
+"""Driver of a camera whose images another program writes to an ImageStreamIO stream."""
 
 from dataclasses import fields, replace
 from typing import Any, Literal
@@ -17,25 +17,25 @@ from lowfc.device import CameraSettings, DriverOptions, Exposure
 Setting = Literal[
     "exposure_s", "gain_e_per_dn", "bias_dn", "read_noise_e", "saturation_dn", "em_gain", "region_row", "region_column"
 ]
-_WHOLE = ("region_row", "region_column")
+_INTEGERS = ("region_row", "region_column")
 _WAIT_S = 0.5
 _FULL_DN = 65535
 
 
 class IsioCamera:
-    """Reads the stream of another program's camera."""
+    """Camera driver that reads another program's stream."""
 
     class Options(DriverOptions):
-        """Where the images are and how they were made; what is left out is as in [camera]."""
+        """Stream and camera settings; those not given are taken from [camera]."""
 
         stream: str
         """Name of the stream."""
         atime: Literal["end", "start", "none"] = "end"
-        """What the stream's `atime` is of the exposure; none: a frame has the time at which it is read."""
+        """Meaning of the stream's `atime`: end or start of the exposure; none: frames are timed when read."""
         scale_dn: float = 1.0
-        """DN for each unit of a pixel."""
+        """DN per unit of a pixel."""
         zero_dn: float = 0.0
-        """DN of a pixel of zero."""
+        """DN of a pixel with value 0."""
         exposure_us: float | None = Field(default=None, gt=0)
         """Exposure time."""
         gain_e_per_dn: float | None = Field(default=None, gt=0)
@@ -55,7 +55,7 @@ class IsioCamera:
         region_column: int = Field(default=0, ge=0)
         """First column of the region read."""
         keywords: dict[Setting, str] = Field(default_factory=dict)
-        """Keywords of the stream that say a setting, in the setting's unit: `{exposure_s = "tint"}`."""
+        """Keywords of the stream that contain settings, in the setting's unit: `{exposure_s = "tint"}`."""
 
     def __init__(self, options: Options, config: Configuration) -> None:
         """Open the stream."""
@@ -75,20 +75,20 @@ class IsioCamera:
         self._silent = False
 
     def join(self, service: Service) -> None:
-        """Keep the process, for its events."""
+        """Keep the process's service for events."""
         self._service = service
 
     def settings(self) -> CameraSettings:
-        """As configured; the size, and what keywords say, as in the stream."""
+        """Settings as configured; the size and the settings in keywords come from the stream."""
         stream = self._reader.stream
         if stream is not None and stream.current():
             rows, columns = stream.layout.shape[1:]
-            said = self._from_keywords(stream) if self._options.keywords else {}
-            self._settings = replace(self._settings, rows=rows, columns=columns, **said)
+            in_stream = self._from_keywords(stream) if self._options.keywords else {}
+            self._settings = replace(self._settings, rows=rows, columns=columns, **in_stream)
         return self._settings
 
     def expose(self) -> Exposure | None:
-        """The next image of the stream."""
+        """Next image of the stream."""
         image = self._reader.next(_WAIT_S)
         if image is None:
             if not self._silent:
@@ -105,19 +105,19 @@ class IsioCamera:
         return Exposure(self._in_dn(image.pixels), None if self._options.atime == "none" else end_ns, image.number)
 
     def close(self) -> None:
-        """Give the semaphore back."""
+        """Release the semaphore."""
         self._reader.close()
 
     def _from_keywords(self, stream: Stream) -> dict[str, Any]:
-        found, said = stream.keywords(), dict[str, Any]()
+        keywords, settings = stream.keywords(), dict[str, Any]()
         for setting, word in self._options.keywords.items():
-            if isinstance(value := found.get(word), str):
+            if isinstance(value := keywords.get(word), str):
                 raise StreamError(f"keyword {word!r} of stream {stream.name!r} is {value!r}, expected a number")
             if value is not None:
-                said[setting] = value
-        if "exposure_s" in said:
-            said["exposure_ns"] = round(said.pop("exposure_s") * 1e9)
-        return {name: int(value) if name in _WHOLE else value for name, value in said.items()}
+                settings[setting] = value
+        if "exposure_s" in settings:
+            settings["exposure_ns"] = round(settings.pop("exposure_s") * 1e9)
+        return {name: int(value) if name in _INTEGERS else value for name, value in settings.items()}
 
     def _in_dn(self, pixels: npt.NDArray[np.generic]) -> Pixels:
         scale, zero = self._options.scale_dn, self._options.zero_dn

@@ -1,4 +1,4 @@
-"""A mirror behind an ImageStreamIO channel: CACAO sums the channels and drives the actuators."""
+"""Driver of a mirror behind an ImageStreamIO channel: CACAO sums the channels and drives the actuators."""
 
 import math
 import time
@@ -21,30 +21,30 @@ from lowfc.contract.configuration import Configuration
 from lowfc.device import DriverOptions, Geometry, geometry
 
 SUM_WAIT_S = 0.001
-"""How long a command waits for the sum to follow it."""
+"""Time that a command waits for the sum to be updated."""
 SUM_SILENT_S = 0.5
-"""After so long without a new sum the mirror counts as not following."""
+"""Time without an updated sum after which the mirror counts as not following commands."""
 SAME_NM = 0.05
-"""Difference between what is wanted and what the sum shows that is rounding, of float32 in micrometres."""
+"""Largest difference between commanded and reached shape, nm, that float32 rounding in micrometres explains."""
 _POLL_S = 50e-6
-_LOOK_S = 1.0
+_SEARCH_S = 1.0
 
 
 class IsioMirror:
-    """Writes one channel of the mirror, and reads the sum of all."""
+    """Mirror driver that writes one channel and reads the sum of all channels."""
 
     class Options(DriverOptions):
-        """Which channel it is."""
+        """The mirror's streams."""
 
         stream: str
         """Name of the channel's stream."""
         nm_per_unit: float = Field(default=1000.0, gt=0)
-        """Nanometres of surface that one unit of the stream makes; CACAO's is the micrometre."""
+        """Surface per unit of the stream, nm; CACAO's unit is the micrometre."""
         total: str | None = None
-        """Name of the stream with the sum of all channels, read where it is; by default dm00disp of dm00disp03."""
+        """Name of the stream with the sum of all channels, read if it exists; default: dm00disp for dm00disp03."""
 
     def __init__(self, options: Options, config: Configuration) -> None:
-        """Open the channel, or make it."""
+        """Open the channel, or create it."""
         self._options = options
         self.geometry: Geometry = geometry(config)
         self._grid = self.geometry.rows, self.geometry.columns
@@ -54,39 +54,39 @@ class IsioMirror:
         self._total_name = sum_name(options.stream) if options.total is None else options.total
         self._beside: tuple[Single | None, Single] = None, np.zeros(self._grid, np.float32)
         self._total: Stream | None = None
-        self._looked_s = -_LOOK_S
+        self._searched_s = -_SEARCH_S
         self._unanswered_s = math.inf
 
     def join(self, service: Service) -> None:
-        """Keep the process, for its events."""
+        """Keep the process's service for events."""
         self._service = service
 
     def position(self) -> Single:
-        """The channel's content."""
-        held = whole(self._channel)
-        return np.zeros(self._grid, np.float32) if held is None else held * np.float32(self._options.nm_per_unit)
+        """Present shape of the channel."""
+        shape = whole(self._channel)
+        return np.zeros(self._grid, np.float32) if shape is None else shape * np.float32(self._options.nm_per_unit)
 
     def beside(self) -> Single:
-        """The other channels' shape on the mirror, without piston, which only the sum has."""
+        """Sum of the other channels, without piston; the sum stream includes it."""
         shape = self._others.sum()
         if shape is not self._beside[0]:
             self._beside = shape, (shape - shape.mean()) * np.float32(self._options.nm_per_unit)
         return self._beside[1]
 
     def apply(self, actuators_nm: Single) -> Single | None:
-        """Write the channel (rows, columns); once the sum has followed, return this channel's part of it."""
+        """Write the channel (rows, columns); once the sum is updated, return this channel's part of it."""
         self._check_channel()
         total = self._current_total()
         before = 0 if total is None else total.count
         self._channel.put(actuators_nm / np.float32(self._options.nm_per_unit))
         self._count = self._channel.count
-        return None if total is None or not self._followed(total, before) else self._reached(total, actuators_nm)
+        return None if total is None or not self._updated(total, before) else self._reached(total, actuators_nm)
 
     def close(self) -> None:
         """Do nothing: the channel keeps its shape, and a writer holds no semaphore."""
 
     def _check_channel(self) -> None:
-        """Make sure that the channel is the one there is, and nobody else's."""
+        """Reopen the channel if it was recreated; RuntimeError if another process writes it."""
         if not self._channel.current():
             self._channel = channel_of(self._options.stream, self._grid)
             self._count = self._channel.count
@@ -98,19 +98,19 @@ class IsioMirror:
             raise RuntimeError(f"{f'process {pid}' if pid else 'another process'} writes stream {self._channel.name!r}")
 
     def _current_total(self) -> Stream | None:
-        """The stream of the sum, if there is one; searched for once a second."""
+        """Stream of the sum, if it exists; searched once a second."""
         if self._total is not None and self._total.current():
             return self._total
         self._total, now_s = None, time.monotonic()
-        if self._total_name and now_s - self._looked_s >= _LOOK_S:
-            self._looked_s = now_s
+        if self._total_name and now_s - self._searched_s >= _SEARCH_S:
+            self._searched_s = now_s
             self._total = opened(stream_path(self._total_name), self._grid)
         return self._total
 
-    def _followed(self, total: Stream, before: int) -> bool:
-        """Whether the sum was made anew after the channel, within what a command may wait.
+    def _updated(self, total: Stream, before: int) -> bool:
+        """Whether the sum was updated after the channel, within `SUM_WAIT_S`.
 
-        RuntimeError where it has not been for long, so that the mirror does not follow.
+        RuntimeError if it has not been for `SUM_SILENT_S`, so that the mirror counts as not following.
         """
         written_s = time.monotonic()
         while (now_s := time.monotonic()) - written_s < SUM_WAIT_S and total.count == before:
@@ -122,12 +122,12 @@ class IsioMirror:
         if now_s - self._unanswered_s > SUM_SILENT_S:
             raise RuntimeError(
                 f"stream {total.name!r} has not followed {self._channel.name!r} for {SUM_SILENT_S:g} s: the process "
-                "that sums the channels does not run"
+                "that sums the channels is not running"
             )
         return False
 
     def _reached(self, total: Stream, actuators_nm: Single) -> Single | None:
-        """This channel's part of the sum; None if it is as written. Piston belongs to the sum."""
+        """This channel's part of the sum, with its piston ignored; None if it is as written."""
         shape = whole(total)
         if shape is None:
             return None
