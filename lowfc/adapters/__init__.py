@@ -1,1 +1,1 @@
-"""Access to the host: bus, clock, files, scheduling."""
+"""Interfaces to the host: bus, clock, files, scheduling."""

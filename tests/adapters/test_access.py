@@ -214,7 +214,7 @@ def test_a_foreign_certificate_is_told_so(hosts: Hosts, monkeypatch: pytest.Monk
     monkeypatch.setattr(routed, "CONNECT_MS", 100)
     certificates.make_certificates(hosts.folder / "foreign", ("camera",), [])
     others = hosts.folder / "foreign"
-    with pytest.raises(BusError, match=r"do not take each other .CERTIFICATE_VERIFY_FAILED"):
+    with pytest.raises(BusError, match=r"do not accept each other .CERTIFICATE_VERIFY_FAILED"):
         hosts.join("camera", network=hosts.network("foreign"))
     (others / "ca.pem").write_bytes((hosts.folder / "certs" / "ca.pem").read_bytes())
     with pytest.raises(DataFileError, match=r"camera\.pem is not a valid certificate .* signed by .*lowfc certs"):
@@ -268,7 +268,7 @@ def test_a_router_is_not_waited_for_where_that_does_not_help(hosts: Hosts, monke
         patch.setattr("lowfc.adapters.bus.routed.socket.create_connection", unknown)
         with pytest.raises(BusError, match=r"nowhere\.invalid.*cannot be reached .*resolve it"):
             hosts.join("camera", network=hosts.network(host="nowhere.invalid"))
-    with pytest.raises(BusError, match="takes camera's certificate, and zenoh opens no session: this and that"):
+    with pytest.raises(BusError, match="accepts camera's certificate, but zenoh opens no session: this and that"):
         hosts.join("camera")
 
 
@@ -280,7 +280,7 @@ def test_a_role_does_not_pass_for_the_router(hosts: Hosts, monkeypatch: pytest.M
         (folder / name).write_bytes((hosts.folder / "certs" / source).read_bytes())
     hosts.join(ROUTER, network=hosts.network("false"))
     monkeypatch.setattr(routed, "CONNECT_MS", 100)
-    with pytest.raises(BusError, match="do not take each other"):
+    with pytest.raises(BusError, match="do not accept each other"):
         hosts.join("recorder")
 
 
@@ -291,7 +291,7 @@ def test_a_run_remembers_its_way(tmp_path: Path) -> None:
     for later in (None, Network(), way):
         assert open_run("hosts", base=tmp_path, network=later).links.network == way
     other = Network(router="tls/elsewhere:7447", certificates=str(tmp_path))
-    with pytest.raises(BusError, match=r"run 'hosts' is by tls/bench:7447 .* has tls/elsewhere:7447 .* remove its dir"):
+    with pytest.raises(BusError, match=r"run 'hosts' is on tls/bench:7447 .* has tls/elsewhere:7447 .* remove its dir"):
         open_run("hosts", base=tmp_path, network=other)
     assert open_run("alone", base=tmp_path).links.network == Network()
     with pytest.raises(BusError, match="run 'alone' is on this host alone"):

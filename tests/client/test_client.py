@@ -345,7 +345,7 @@ def test_a_loop_that_is_not_seen_from_here_is_named(own_runtime: Path, monkeypat
         where = f"`lowfc {program} --run {name}` (process {process.pid}){found}"
         assert ours == [f"you run {where}"] * bool(found)
         assert (f"user {own_runtime.owner()} runs {where}" in theirs) == bool(found)
-        assert sentence.endswith("starting or ending: ask again in a few seconds") == ("starting" in found)
+        assert sentence.endswith("starting or ending: try again in a few seconds") == ("starting" in found)
 
 
 # The mirror.

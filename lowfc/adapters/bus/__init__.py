@@ -1,4 +1,4 @@
-"""The message bus: zenoh, its configuration and access rules, and the runs that it connects."""
+"""The message bus: zenoh, its configuration and access rules, and the runs of processes that it connects."""
 
 DEFAULT_RUN = "default"
-"""Run of processes that are started by hand, without naming one."""
+"""Name of the run of processes started without `--run`."""

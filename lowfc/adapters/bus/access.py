@@ -1,4 +1,4 @@
-"""Access control at the router, made from the table of topics; all else is denied.
+"""Access control at the router, derived from the table of topics; everything else is denied.
 
 The common name of a process's certificate is its role: "camera", "mirror-dm". Directions are the router's: ingress is
 from a process, egress to it.
@@ -14,17 +14,17 @@ from lowfc.contract.messages import HEALTH, RECORD_KEY, REQUEST_KEY, TOPICS, Rol
 ROUTER = "router"
 """Role of the router itself: its common name, and its name in Health."""
 CLOCK_KEY = "lowfc/clock"
-"""Key of the router's queryable for its time, by which all processes set that of their envelopes."""
+"""Key of the router's queryable for its time, the time of all envelopes in a run on several hosts."""
 
-_LOCAL = frozenset({Role.LAUNCHER, Role.REPLAY})  # they are never part of a run on several hosts
+_LOCAL = frozenset({Role.LAUNCHER, Role.REPLAY})  # never part of a run on several hosts
 
 
 @dataclass(frozen=True, slots=True)
 class Grant:
-    """Rights of a process: the common name of its certificate, and keys.
+    """Rights of a role, the common name of a certificate, as lists of keys.
 
-    It publishes and answers under its own names only. The same keys, as others subscribe to them (`subscribed`) and
-    query them (`queried`), have "*" in place of a name, as have those that it receives and queries.
+    It publishes and answers under its own names only. The keys under which others subscribe to and query it
+    (`subscribed`, `queried`), and the keys that it receives and queries, have "*" in place of a name.
     """
 
     role: str
@@ -37,13 +37,13 @@ class Grant:
 
 
 def roles(mirrors: Iterable[str]) -> tuple[str, ...]:
-    """Every role that has a certificate, without the router, with those of `mirrors`, such as "mirror-dm"."""
+    """Every role with a certificate except the router, including `mirrors` such as "mirror-dm"."""
     alone = [role for role in Role if role is not Role.MIRROR and role not in _LOCAL]
     return tuple(sorted([*map(str, alone), *mirrors]))
 
 
 def grant(role: str) -> Grant:
-    """Rights of a role by the table of topics."""
+    """Rights of a role according to the table of topics."""
     part, _, name = role.partition("-")
     kind = Role(part)
     published = [topic for topic in TOPICS if kind in topic.publisher]
@@ -88,7 +88,7 @@ def access_control(mirrors: Iterable[str]) -> dict[str, Any]:
 
 
 def _rules(rights: Grant) -> list[dict[str, Any]]:
-    """The rules of one role: for each direction, which messages about which keys."""
+    """Rules of one role: permitted messages and keys in each direction."""
     lines = (
         ("publishes", "ingress", ["put"], rights.publishes),
         ("is subscribed to", "egress", ["declare_subscriber"], rights.subscribed),
@@ -113,10 +113,10 @@ def _rules(rights: Grant) -> list[dict[str, Any]]:
 
 
 def _receivers(topic: Topic) -> frozenset[Role]:
-    """Roles that may receive a topic: an operator's own programs see what a view sees."""
+    """Roles that may receive a topic; an operator's own programs receive what viewers receive."""
     return topic.subscribers | ({Role.OPERATOR} if Role.VIEWER in topic.subscribers else frozenset())
 
 
 def _own(topic: Topic, role: str, name: str) -> str:
-    """Key of a topic with the name that a role may use: its own, that of its mirror, or any mirror's."""
+    """Key of a topic with the name that a role may use: its own, its mirror's, or any mirror's."""
     return topic.at(role if topic is HEALTH else name or ALL)

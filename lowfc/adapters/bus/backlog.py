@@ -1,4 +1,4 @@
-"""Messages that wait for a slow reader, bounded by their number and by their bytes."""
+"""Queue for a slow reader, bounded in messages and in bytes."""
 
 import threading
 from collections import deque
@@ -8,10 +8,10 @@ from lowfc.contract.messages import Rate, Topic
 
 
 class Backlog:
-    """A queue from the bus's threads to one that writes.
+    """Queue from the bus's threads to a writing thread.
 
-    A message that does not fit is left out, and counted as lost by its sequence. States, requests and events are few
-    and needed to understand the rest: they always fit.
+    A message that does not fit is dropped, and its missing sequence counts as a loss. States, requests and events
+    always fit: they are few and needed to interpret the rest.
     """
 
     def __init__(self, most_messages: int, most_bytes: int) -> None:
@@ -25,7 +25,7 @@ class Backlog:
         return len(self._waiting)
 
     def put(self, topic: Topic, sample: Sample) -> None:
-        """Append a message, or leave it out where too many wait."""
+        """Append a message, or drop it if the queue is full."""
         size = len(sample.payload)
         with self._lock:
             fits = len(self._waiting) < self._most_messages and self._bytes + size <= self._most_bytes
@@ -34,7 +34,7 @@ class Backlog:
                 self._bytes += size
 
     def take(self) -> tuple[Topic, Sample]:
-        """Oldest message; IndexError where nothing waits."""
+        """Remove and return the oldest message; IndexError if there is none."""
         with self._lock:
             topic, sample = self._waiting.popleft()
             self._bytes -= len(sample.payload)

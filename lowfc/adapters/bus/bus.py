@@ -1,7 +1,7 @@
-"""The message bus as processes use it: publish, subscribe, answer, query.
+"""Interface of the message bus: publish, subscribe, answer, query.
 
-`ZenohBus` carries the messages between processes; `MemoryBus` does the same within one, for tests. Handlers run on
-the thread that receives, one message after the other: a slow handler delays the next message.
+`ZenohBus` carries messages between processes, `MemoryBus` within one process, for tests. Handlers run on the receive
+thread, one message at a time: a slow handler delays the next message.
 """
 
 import sys
@@ -23,14 +23,14 @@ ALL = "*"
 
 
 class Sample(NamedTuple):
-    """One message as it arrived.
+    """A received message.
 
     Attributes:
-        key: where it was published.
+        key: key under which it was published.
         payload: protobuf bytes.
-        sequence: see `Envelope`.
-        publish_time_ns: when the publisher sent it, host clock.
-        receive_time_ns: when the thread that received it had it here, host clock.
+        sequence: sequence as in `Envelope`.
+        publish_time_ns: time at which the publisher sent it, host clock.
+        receive_time_ns: time at which the receive thread had it, host clock.
     """
 
     key: str
@@ -42,7 +42,7 @@ class Sample(NamedTuple):
 
 @dataclass(slots=True)
 class Query:
-    """A query of a key that waits for its answer: `reply` sends it, later and from any thread, once."""
+    """A query; `reply` sends its answer, once, at any time and from any thread."""
 
     key: str
     payload: bytes
@@ -50,7 +50,7 @@ class Query:
 
     @property
     def name(self) -> str:
-        """Last part of the key."""
+        """Name of the request: the last part of the key."""
         return self.key.rpartition("/")[2]
 
 
@@ -58,10 +58,10 @@ class Publisher(Protocol):
     """Publishes one topic under one key.
 
     Attributes:
-        published: messages so far, with those skipped.
-        skipped: messages that never were: frames that a camera lost.
-        handed_ns: time at which the last one had been handed to its direct link, or else to the bus, host clock.
-        last: message and envelope, of a topic that can be queried.
+        published: number of messages so far, including `skipped`.
+        skipped: number of sequences without a message: frames that the camera lost.
+        handed_ns: time at which the last message was handed to the direct link, otherwise to the bus, host clock.
+        last: last message and envelope of a queryable topic.
     """
 
     topic: Topic
@@ -72,41 +72,41 @@ class Publisher(Protocol):
     last: tuple[bytes, Envelope] | None
 
     def put(self, payload: bytes, publish_time_ns: int | None = None, sequence: int | None = None) -> Envelope:
-        """Send `payload`, by default now and with the next sequence; never waits for a reader.
+        """Send `payload`, by default with the present time and the next sequence; never waits for a reader.
 
-        A publisher that sets sequences (a replay: those of the log) sets them with every put.
+        A caller that sets sequences (a replay sets those of the log) must set them in every call.
         """
         ...
 
 
 class Ring(Protocol):
-    """The newest messages of one topic, kept until they are drained."""
+    """Ring buffer of the newest messages of one topic."""
 
     def drain(self) -> list[Sample]:
-        """Messages since the last call, in their order; `receive_time_ns` is that of this call."""
+        """Return the messages since the last call, in order; their `receive_time_ns` is the time of this call."""
         ...
 
     def close(self) -> None:
-        """Undeclare the subscription, once or more often."""
+        """End the subscription; may be called repeatedly."""
         ...
 
 
 class Bus(Protocol):
-    """A connection of one process to all others of its run; `offset` is of the router's clock, across hosts."""
+    """A process's connection to all others of its run; `offset` is the router's clock offset, across hosts only."""
 
     faults: "Faults"
     offset: ClockOffset | None
 
     def publisher(self, topic: Topic, name: str = "") -> Publisher:
-        """Publisher of a topic; the last message of a queryable topic is what `get` on its key returns."""
+        """Make a publisher of a topic; `get` on the key of a queryable topic returns its last message."""
         ...
 
     def subscribe(self, topic: Topic, handler: Callable[[Sample], None], name: str = ALL) -> Callable[[], None]:
-        """Call `handler` with every message of a topic, of one mirror or process or of all; return what ends it."""
+        """Call `handler` with every message of a topic, from all or from `name`; the returned function unsubscribes."""
         ...
 
     def ring(self, topic: Topic, capacity: int) -> "Ring":
-        """Keep the newest `capacity` messages of a topic for a monitor, at no cost until it drains them."""
+        """Make a ring buffer of the newest `capacity` messages, for a monitor; it costs no processing until drained."""
         ...
 
     def queryable(self, key_expression: str, handler: Callable[[Query], None]) -> None:
@@ -114,15 +114,15 @@ class Bus(Protocol):
         ...
 
     def get(self, key: str, payload: bytes = b"", timeout_s: float = 1.0) -> list[Sample]:
-        """Query a key and return the answers; an empty list where no process answers."""
+        """Query a key and return the answers; an empty list if no process answers."""
         ...
 
     def peers(self) -> int:
-        """Number of other processes that this one is connected to."""
+        """Number of other processes connected to this one."""
         ...
 
     def restart(self) -> None:
-        """Begin a new start of this process, as where a camera's numbers begin again: publishers count from 0."""
+        """Begin a new start of this process: publishers count from 0, as when a camera restarts its frame numbers."""
         ...
 
     def close(self) -> None:
@@ -131,9 +131,9 @@ class Bus(Protocol):
 
 
 def states(bus: Bus, topics: Iterable[Topic], timeout_s: float = 1.0) -> Iterator[tuple[Topic, Sample]]:
-    """Query the states among `topics` from all of their publishers, for a process that joins late.
+    """Query the last messages of the queryable `topics` from all publishers, for a process that joins late.
 
-    Health is none of them: it is published twice a second.
+    Health is not queried: it is published twice a second.
     """
     for topic in topics:
         if topic.queryable and topic is not HEALTH:
@@ -142,18 +142,18 @@ def states(bus: Bus, topics: Iterable[Topic], timeout_s: float = 1.0) -> Iterato
 
 
 UNREADABLE = (BadMessageError, DecodeError)
-"""Exceptions that a bad message raises."""
+"""Exceptions raised by an unreadable message."""
 
 
 class Faults:
-    """Exceptions of handlers, and messages that cannot be read.
+    """Counts exceptions of handlers, and unreadable messages.
 
-    Of exceptions, the first of each place goes to standard error with its traceback. Messages that cannot be read are
-    counted without one, until `take_unreadable`.
+    The first exception at each place is printed on standard error with its traceback. Unreadable messages are only
+    counted, until `take_unreadable`.
 
     Attributes:
-        counts: of exceptions, by place.
-        unreadable: count and last reason of messages that could not be read, by key.
+        counts: number of exceptions, by place.
+        unreadable: number of unreadable messages and the last reason, by key.
     """
 
     def __init__(self) -> None:
@@ -172,16 +172,16 @@ class Faults:
             self.counts[where] = seen + 1
         if not seen:
             text = "".join(traceback.format_exception(fault))
-            sys.stderr.write(f"{where}: {text}(further ones here are only counted)\n")
+            sys.stderr.write(f"{where}: {text}(further ones at this place are only counted)\n")
 
     def add_unreadable(self, key: str, why: object) -> None:
-        """Count a message that could not be read, by its key or its key expression."""
+        """Count an unreadable message by its key or key expression."""
         with self._lock:
             count, _ = self.unreadable.get(key, (0, ""))
             self.unreadable[key] = count + 1, why
 
     def take_unreadable(self) -> dict[str, tuple[int, object]]:
-        """Messages that could not be read since the last call: count and last reason, by key."""
+        """Return and reset the number of unreadable messages and the last reason, by key."""
         with self._lock:
             taken, self.unreadable = self.unreadable, {}
         return taken

@@ -1,7 +1,7 @@
-"""Certificates: an authority of the bench's own, and one certificate per role, its common name, signed by it.
+"""Certificates: the bench's own authority, and one certificate per role, with the role as common name.
 
-The authority's folder has ca.key, which signs: it belongs on no machine of the loop. A machine gets ca.pem, and of each
-role that it has ROLE.pem and ROLE.key.
+The authority's folder holds the signing key ca.key, which must not be on any host of the loop. A host gets ca.pem, and
+ROLE.pem and ROLE.key of each of its roles.
 """
 
 import contextlib
@@ -28,38 +28,38 @@ from lowfc.contract.errors import ConfigurationError, DataFileError
 
 CA_DAYS = 3650
 DAYS = 825
-"""How long a role's certificate is valid, unless it is said."""
+"""Default validity of a role's certificate, days."""
 
-_EARLY = datetime.timedelta(hours=1)  # hosts' clocks differ
+_BACKDATED = datetime.timedelta(hours=1)  # hosts' clocks differ
 
 
 def make_certificates(
     folder: Path, roles: Iterable[str], addresses: Sequence[str], days: int = DAYS, *, renew: bool = False
 ) -> list[Path]:
-    """Make the authority, if there is none, and those certificates that are not there yet.
+    """Make the authority and the certificates that do not exist yet.
 
     Args:
-        folder: of the authority; it is made, closed to others.
-        roles: to make certificates for, the router's among them.
-        addresses: names and IP addresses by which the others reach the router.
-        days: that the certificates are valid.
-        renew: make those that are there anew, too, of the keys that they have; not the authority.
+        folder: folder of the authority; created with access for this user only.
+        roles: roles to make certificates for, including the router's.
+        addresses: names and IP addresses by which other hosts reach the router.
+        days: validity of the certificates, days.
+        renew: also renew existing certificates, with their present keys; the authority is never renewed.
 
     Returns:
-        The certificates that were made.
+        Files of the new certificates.
 
     Raises:
-        ConfigurationError: the router's certificate has no address, or one that is none.
-        DataFileError: the folder holds something else, or cannot be written.
+        ConfigurationError: there is no address for the router's certificate, or an invalid one.
+        DataFileError: the folder holds other files, or cannot be written.
     """
-    wanted = [role for role in roles if renew or not (folder / f"{role}.pem").exists()]
+    missing = [role for role in roles if renew or not (folder / f"{role}.pem").exists()]
     names = [_general_name(address) for address in addresses]
-    if ROUTER in wanted and not names:
-        raise ConfigurationError("the router's certificate is for its address: say by which name the others reach it")
+    if ROUTER in missing and not names:
+        raise ConfigurationError("the router's certificate needs its address: give the name by which others reach it")
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         key, authority = _authority(folder)
-        for role in wanted:
+        for role in missing:
             own = _own_key(folder, role)
             usage = ExtendedKeyUsageOID.SERVER_AUTH if role == ROUTER else ExtendedKeyUsageOID.CLIENT_AUTH
             builder = _builder(role, own, days).issuer_name(authority.subject)
@@ -69,7 +69,7 @@ def make_certificates(
             write_whole(folder / f"{role}.pem", builder.sign(key, SHA256()).public_bytes(Encoding.PEM))
     except OSError as fault:
         raise DataFileError(f"no certificates can be written in {folder}: {fault.strerror or fault}") from fault
-    return [folder / f"{role}.pem" for role in wanted]
+    return [folder / f"{role}.pem" for role in missing]
 
 
 def _authority(folder: Path) -> tuple[EllipticCurvePrivateKey, x509.Certificate]:
@@ -96,10 +96,10 @@ def _authority(folder: Path) -> tuple[EllipticCurvePrivateKey, x509.Certificate]
 
 
 def _own_key(folder: Path, role: str) -> EllipticCurvePrivateKey:
-    """A role's key, which it keeps for good: whatever is interrupted, a certificate that is there is of this key."""
+    """A role's key, made once, so that every existing certificate belongs to it even after an interruption."""
     file = folder / f"{role}.key"
     if not file.exists():
-        (folder / f"{role}.pem").unlink(missing_ok=True)  # of a key that is not here
+        (folder / f"{role}.pem").unlink(missing_ok=True)  # it belongs to a lost key
         own = generate_private_key(SECP256R1())
         write_whole(file, _pem(own), mode=0o600)
         return own
@@ -107,11 +107,11 @@ def _own_key(folder: Path, role: str) -> EllipticCurvePrivateKey:
         found = load_pem_private_key(file.read_bytes(), password=None)
         if isinstance(found, EllipticCurvePrivateKey):
             return found
-    raise DataFileError(f"{file} is not a key that was made here; remove it to have another one made")
+    raise DataFileError(f"{file} is not a key made by lowfc; remove it to have a new one made")
 
 
 def _builder(name: str, own: EllipticCurvePrivateKey, days: int, *, authority: bool = False) -> x509.CertificateBuilder:
-    """A certificate for a key, all but its issuer and what it is for."""
+    """Certificate builder for a key, without issuer and extended key usage."""
     now = datetime.datetime.now(datetime.UTC)
     usage = x509.KeyUsage(
         digital_signature=not authority,
@@ -129,7 +129,7 @@ def _builder(name: str, own: EllipticCurvePrivateKey, days: int, *, authority: b
         .subject_name(_name(name))
         .public_key(own.public_key())
         .serial_number(x509.random_serial_number())
-        .not_valid_before(now - _EARLY)
+        .not_valid_before(now - _BACKDATED)
         .not_valid_after(now + datetime.timedelta(days=days))
         .add_extension(x509.BasicConstraints(ca=authority, path_length=0 if authority else None), critical=True)
         .add_extension(usage, critical=True)

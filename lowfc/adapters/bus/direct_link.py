@@ -1,8 +1,8 @@
 """The direct link between two processes of the loop on one host: a Unix socket in parallel with the bus.
 
-The bus still carries every message to everybody. The one reader that a topic names (`Topic.direct_subscriber`) gets it
-first by a socket in the run's directory: no thread of the bus is between the put and the reader. Messages of a
-publisher on another host, or without this library, come by the bus as ever.
+The bus still carries every message to all subscribers. A topic's `Topic.direct_subscriber` also receives it through a
+socket in the run's directory, without a thread of the bus in between. Messages from another host, or from a program
+without this library, arrive over the bus only.
 """
 
 import contextlib
@@ -20,23 +20,23 @@ from lowfc.contract.envelope import Envelope
 
 Handler = Callable[[Sample], None]
 
-_BUFFER_BYTES = 4 << 20  # some hundred frames, where the host allows it; the kernel allows twice as much
+_BUFFER_BYTES = 4 << 20  # some hundred frames, if the host allows it; the kernel allows twice as much
 _RETRY_S = 0.1
-_LATELY = 1 << 13  # envelopes: more messages than wait in a socket while its reader stands still
+_RECENT = 1 << 13  # envelopes: more messages than a socket buffers while its reader is stopped
 _ENVELOPE_BYTES = len(Envelope(0, 0).encode())
 
 
 class DirectWriter:
-    """Sends to the reader, if there is one; never waits."""
+    """Sends to the reader, if connected; never waits."""
 
     def __init__(self, path: Path) -> None:
-        """Send to the process that listens at `path`, now or later."""
+        """Set the reader's socket `path`; the reader may start later."""
         self._path = os.fspath(path)
         self._socket: socket.socket | None = None
-        self._again_s = 0.0
+        self._retry_s = 0.0
 
     def send(self, envelope: bytes, payload: bytes) -> bool:
-        """Send a message, and say whether it went; a reader that is too far behind loses it, as it would on the bus."""
+        """Send a message and return whether it was sent; a reader too far behind loses it, as on the bus."""
         if self._socket is None:
             self._connect()
             if self._socket is None:
@@ -47,25 +47,25 @@ class DirectWriter:
             return False
         except OSError as fault:
             self.close()  # the reader has gone
-            if fault.errno == errno.EMSGSIZE:  # more than a socket takes on this host: it will be so with the next
-                self._again_s = math.inf
+            if fault.errno == errno.EMSGSIZE:  # larger than this host's socket limit, as the next one will be
+                self._retry_s = math.inf
             return False
         return True
 
     def close(self) -> None:
-        """Leave the reader to the bus."""
+        """Disconnect; the reader then receives over the bus only."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
 
     def _connect(self) -> None:
         now_s = time.monotonic()
-        if now_s < self._again_s:
+        if now_s < self._retry_s:
             return
-        self._again_s = now_s + _RETRY_S
+        self._retry_s = now_s + _RETRY_S
         made = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
         try:
-            made.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_BYTES)  # the kernel gives what it allows
+            made.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_BYTES)  # the kernel grants up to its limit
             made.connect(self._path)
         except OSError:  # no listener, or not yet
             made.close()
@@ -74,29 +74,29 @@ class DirectWriter:
 
 
 class DirectCall:
-    """Sends to a reader of the same process: by a call, which returns once the message is dealt with."""
+    """Sends to a reader in the same process by a function call that returns once the message is handled."""
 
     def __init__(self, reader: "DirectReader") -> None:
-        """Send to it."""
+        """Set the reader."""
         self._reader = reader
 
     def send(self, envelope: bytes, payload: bytes) -> bool:
-        """Hand a message on; it always goes."""
+        """Pass a message to the reader; always succeeds."""
         self._reader.take(envelope, payload)
         return True
 
     def close(self) -> None:
-        """Leave the reader to the bus."""
+        """Disconnect; the reader then receives over the bus only."""
         self._reader.writer_gone()
 
 
 class DirectReader:
-    """Forwards each message once, from the socket or the bus, whichever was faster.
+    """Forwards each message once, from the socket or the bus, whichever is first.
 
-    A copy is known by its envelope; numbers alone would not do, for two publishers may have started in the same second.
-    The bus is left while a publisher that is alone on its topic uses the socket; a message of it that is still on the
-    bus when a newer one has come by the socket is too late, and left out. Where others may publish too, by the bus
-    alone, it is never left, and a message that only the bus carried may come after a newer one.
+    A copy is recognised by its envelope; the sequence alone is not enough, as two publishers may have started in the
+    same second. The bus is unsubscribed while the only publisher of a topic uses the socket; its messages that arrive
+    over the bus after a newer one from the socket are dropped as late. On a topic with several publishers the bus stays
+    subscribed, and a message that only the bus carried may come after a newer one.
     """
 
     def __init__(
@@ -110,16 +110,16 @@ class DirectReader:
         *,
         shared: bool = False,
     ) -> None:
-        """Listen, at once.
+        """Start listening.
 
         Args:
-            path: where the writer sends to.
-            key: of the topic.
-            handler: gets each message, one at a time, on the bus's thread or on one of this reader's own.
-            subscribe: to the same topic on the bus; returns what ends that.
+            path: path of the socket.
+            key: key of the topic.
+            handler: called with each message, one at a time, on the bus's thread or on one of this reader's threads.
+            subscribe: subscribes a handler to the same topic on the bus; the function it returns unsubscribes.
             now_ns: the host's clock.
-            failed: told of what the handler raises.
-            shared: others may publish too.
+            failed: called with an exception of the handler.
+            shared: whether the topic has several publishers.
         """
         self._handler = handler
         self._subscribe = subscribe
@@ -129,11 +129,11 @@ class DirectReader:
         self._turn = threading.Lock()
         self._key = key
         self._closed = False
-        self._lately: dict[tuple[int, int], None] = {}
-        self._first = self._newest = -1  # sequences: the first by the socket, and the newest by either way
+        self._recent: dict[tuple[int, int], None] = {}
+        self._first = self._newest = -1  # sequences: first one from the socket, newest one from either path
         self._both = False
         self._leave_bus: Callable[[], None] | None = subscribe(self._by_bus)
-        path.unlink(missing_ok=True)  # of a process that was killed: there is one of each role
+        path.unlink(missing_ok=True)  # left by a killed process: each role runs only once
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._listener.bind(os.fspath(path))
         self._listener.listen(1)
@@ -141,7 +141,7 @@ class DirectReader:
         self._accepting.start()
 
     def take(self, envelope: bytes, payload: bytes) -> None:
-        """Hand on a message of a writer, on the thread that calls; of the socket's, or of one in this process."""
+        """Forward a message of a writer, on the calling thread: the socket's, or the writer's in this process."""
         now_ns = self._now_ns()
         try:
             self._by_socket(Sample(self._key, payload, *Envelope.decode_checked(envelope), now_ns))
@@ -150,49 +150,49 @@ class DirectReader:
         self._leave()
 
     def close(self) -> None:
-        """Hand on nothing more; for any thread but those that hand on."""
+        """Stop forwarding; not to be called on a forwarding thread."""
         with self._turn:
             if self._closed:
                 return
             self._closed = True
-        _end(self._listener)
+        _shut_down(self._listener)
         self._accepting.join()
         if self._leave_bus is not None:
             self._leave_bus()
 
     def _by_bus(self, sample: Sample) -> None:
         with self._turn:
-            handed = self._hand_on(sample)
-            if not handed and not self._shared and 0 <= self._first <= sample.sequence:
-                self._both = True  # it has come by both ways: the bus can be left
+            forwarded = self._forward(sample)
+            if not forwarded and not self._shared and 0 <= self._first <= sample.sequence:
+                self._both = True  # received over both paths: the bus can be unsubscribed
 
     def _by_socket(self, sample: Sample) -> None:
         with self._turn:
             if self._first < 0:
                 self._first = sample.sequence
-            self._hand_on(sample)
+            self._forward(sample)
 
-    def _hand_on(self, sample: Sample) -> bool:
-        """Hand a message on, unless it has come before or is too late."""
+    def _forward(self, sample: Sample) -> bool:
+        """Forward a message unless it is a copy or late."""
         envelope = sample.sequence, sample.publish_time_ns
         late = not self._shared and self._first >= 0 and sample.sequence <= self._newest
-        if self._closed or late or envelope in self._lately:
+        if self._closed or late or envelope in self._recent:
             return False
-        self._lately[envelope] = None
-        if len(self._lately) > _LATELY:
-            del self._lately[next(iter(self._lately))]
+        self._recent[envelope] = None
+        if len(self._recent) > _RECENT:
+            del self._recent[next(iter(self._recent))]
         self._newest = sample.sequence
         self._handler(sample)
         return True
 
     def _leave(self) -> None:
-        """After each message of the socket: leave the bus while messages arrive by both paths."""
+        """Unsubscribe from the bus once messages arrive over both paths; called after each message of the socket."""
         if self._both and self._leave_bus is not None:
             self._leave_bus()
             self._leave_bus, self._both = None, False
 
     def writer_gone(self) -> None:
-        """A writer has gone: its messages, or those of the next one, come by the bus."""
+        """Subscribe to the bus again after a writer has disconnected."""
         with self._turn:
             self._both, self._first, self._newest = False, -1, -1
         if self._leave_bus is None and not self._closed:
@@ -207,11 +207,11 @@ class DirectReader:
                 coming = None
                 with contextlib.suppress(OSError):
                     coming, _ = self._listener.accept()
-                if coming is None and not self._closed:  # out of descriptors, say
+                if coming is None and not self._closed:  # for example without free file descriptors
                     time.sleep(_RETRY_S)
                     continue
                 if served is not None and connection is not None:
-                    _end(connection)
+                    _shut_down(connection)
                     served.join()
                 if coming is None:
                     return
@@ -236,7 +236,7 @@ class DirectReader:
             self.take(bytes(buffer[: min(size, _ENVELOPE_BYTES)]), bytes(buffer[_ENVELOPE_BYTES:size]))
 
 
-def _end(one: socket.socket) -> None:
-    """Wake the thread that accepts or receives on the socket."""
+def _shut_down(one: socket.socket) -> None:
+    """Shut a socket down to wake the thread that accepts or receives on it."""
     with contextlib.suppress(OSError):
         one.shutdown(socket.SHUT_RDWR)

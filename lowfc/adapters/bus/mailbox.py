@@ -1,4 +1,4 @@
-"""A one-slot mailbox between the bus's thread and the loop: the loop gets the newest message, or a timeout."""
+"""One-slot mailbox from the bus's thread to the loop: the loop receives the newest message, or times out."""
 
 import threading
 import time
@@ -8,14 +8,14 @@ from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.logs.sequence_gaps import Arrivals
 
 LONGEST_WAIT_S = 0.5
-"""A signal that strikes after Python has looked for one and before it waits is handled only when the wait is over."""
+"""Bound of one wait: a signal that arrives just before the wait begins is handled only after the wait."""
 
 
 class Mailbox(Arrivals):
     """Holds the newest message of one publisher; a newer one replaces it.
 
-    One thread puts and one takes. A bare lock is the signal: releasing it is the cheapest way for CPython to wake a
-    thread that waits with a timeout.
+    One thread puts and one takes. A bare lock serves as the signal: in CPython it is the cheapest way to wake a thread
+    that waits with a timeout.
     """
 
     def __init__(self, key: str = "") -> None:
@@ -28,22 +28,22 @@ class Mailbox(Arrivals):
 
     @property
     def skipped(self) -> int:
-        """Messages that arrived and were replaced by a newer one before they were taken."""
+        """Number of messages that were replaced by a newer one before `take`."""
         return self.received - self._taken - len(self._slot)
 
     @property
     def waiting(self) -> bool:
-        """Whether there is a message to take."""
+        """Whether a message is waiting."""
         return bool(self._slot)
 
     def put(self, sample: Sample) -> None:
-        """Leave a message; called on the bus's thread."""
+        """Store a message; called on the bus's thread."""
         self.count(sample)
         self._slot.append(sample)
         self._raise_signal()
 
     def take(self, timeout_s: float) -> Sample | None:
-        """Newest message; None after `timeout_s` without one, or as soon as `wake` was called."""
+        """Remove and return the newest message; None after `timeout_s` without one, or after `wake`."""
         deadline_s = time.monotonic() + timeout_s
         while True:
             try:
@@ -59,12 +59,12 @@ class Mailbox(Arrivals):
                 return sample
 
     def wake(self) -> None:
-        """Make `take` return, now or the next time it would wait; callable from any thread and from a signal."""
+        """End the present or next wait of `take`; callable from any thread and from a signal handler."""
         self._woken = True
         self._raise_signal()
 
     def _raise_signal(self) -> None:
         try:
             self._signal.release()
-        except RuntimeError:  # it is raised already
+        except RuntimeError:  # already raised
             return

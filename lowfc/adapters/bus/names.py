@@ -1,14 +1,14 @@
-"""Names of processes and mirrors from the bus: bounded, for a program with the run's secret can invent any number."""
+"""Names of processes and mirrors on the bus; their number is bounded, as a faulty program could invent any number."""
 
 from lowfc.adapters.bus.bus import name_in
 from lowfc.contract.errors import BadMessageError
 from lowfc.contract.messages import HEALTH, Role, Topic, wire
 
 MOST_NAMES = 64
-"""Names on one topic, beside those of `Role`, which always have room."""
+"""Largest number of names on one topic, in addition to those of `Role`."""
 LONGEST_NAME = 128
 LARGEST_HEALTH_BYTES = 256_000
-"""That of a recorder names all of its logs, about 3000."""
+"""Enough for a recorder's Health with the names of about 3000 logs."""
 
 
 class Names:
@@ -20,7 +20,7 @@ class Names:
     def admit(self, topic: Topic, key: str) -> str:
         """Name of the mirror or process in a key of this topic; empty for a topic without one.
 
-        BadMessageError where it is too long, or new and there is no room for it.
+        BadMessageError if it is too long, or new when `MOST_NAMES` are known.
         """
         name = name_in(topic, key)
         known = self._known.setdefault(topic.key, set())
@@ -37,7 +37,7 @@ class Names:
     def health(self, key: str, payload: bytes) -> tuple[str, wire.Health]:
         """Name and Health of a process.
 
-        BadMessageError as for `admit`, or where the message is too large; DecodeError where it is no Health.
+        BadMessageError as for `admit`, or if the message is too large; DecodeError if it is not a Health.
         """
         if len(payload) > LARGEST_HEALTH_BYTES:
             raise BadMessageError(f"a Health has up to {LARGEST_HEALTH_BYTES} bytes, got {len(payload)}")

@@ -1,4 +1,4 @@
-"""Loops on this host whose runs are not in this user's runtime directory, found among its processes."""
+"""Find loops on this host whose runs are not in this user's runtime directory, by listing processes."""
 
 import contextlib
 import itertools
@@ -18,11 +18,11 @@ _STARTING = ", starting or ending"
 
 
 def none_here() -> str:
-    """Sentence for a user without a loop here: the folder that was searched, and other loops on this host."""
+    """Sentence for an error when no loop is found: the folder that was searched, and other loops on this host."""
     found = list(other_loops())
-    soon = [each.removesuffix(_STARTING) for each in found if each.endswith(_STARTING)]
-    if soon:
-        return f"{soon[0]}, which is starting or ending: ask again in a few seconds"
+    transient = [each.removesuffix(_STARTING) for each in found if each.endswith(_STARTING)]
+    if transient:
+        return f"{transient[0]}, which is starting or ending: try again in a few seconds"
     given = f"from {_FOLDER}" if os.environ.get(_FOLDER) else f"{_FOLDER} is not set"
     sentence = (
         f"no loop of user {_name(os.geteuid())} is running here: {runtime_path()} was searched ({given}); loops of "
@@ -33,9 +33,9 @@ def none_here() -> str:
 
 
 def other_loops() -> Iterator[str]:
-    """A sentence for each simulated loop, and each controller without one, on this host, whoever runs it."""
+    """Yield a sentence for each simulated loop and each separate controller on this host, of any user."""
     for process in psutil.process_iter():
-        with contextlib.suppress(psutil.Error):  # it has ended, or may not be read
+        with contextlib.suppress(psutil.Error):  # it has ended, or is not readable
             program = _program(process.cmdline())
             above = process.parent() if program else None
             if program and process.pid != os.getpid() and not (above and _program(above.cmdline())):
@@ -45,7 +45,7 @@ def other_loops() -> Iterator[str]:
 
 
 def _program(words: Sequence[str]) -> str:
-    """`lowfc controller --run NAME` of a command line that is one; empty for any other, also for that of sudo."""
+    """Short form `lowfc controller --run NAME` of a loop's command line; empty for others, including sudo's."""
     if not words or not words[0].rpartition("/")[2].startswith("python"):
         return ""
     for before, word in itertools.pairwise(words):
@@ -56,7 +56,7 @@ def _program(words: Sequence[str]) -> str:
 
 
 def _where(process: psutil.Process) -> str:
-    """The runtime directory of a process; nothing for that of another user, which may not be read."""
+    """Clause on the runtime directory of a process; empty for another user's process, which is not readable."""
     try:
         there = process.environ().get(_FOLDER, "")
     except psutil.Error:

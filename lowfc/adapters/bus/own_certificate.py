@@ -1,4 +1,4 @@
-"""A role's certificate as its peers will judge it: by a TLS handshake in memory, before a session is opened."""
+"""Check of a role's certificate as its peers will check it: by a TLS handshake in memory, before a session opens."""
 
 import contextlib
 import datetime
@@ -9,30 +9,30 @@ from typing import Any, NamedTuple
 from lowfc.contract.errors import DataFileError
 
 WARN_DAYS = 60
-"""Days before the end of a certificate from which it is warned about."""
+"""Remaining validity of a certificate, days, below which there is a warning."""
 
-_ROUNDS = 4  # of both ends; three are enough
+_ROUNDS = 4  # of the handshake; three are needed
 
 
 class OwnCertificate(NamedTuple):
-    """A certificate's common name, which is its role, and when it, or the authority's own, ceases to be valid."""
+    """A certificate's common name (its role), and the end of its validity or the authority's, whichever is first."""
 
     name: str
     ends: datetime.datetime
 
 
 def read_certificate(authority: Path, certificate: Path, key: Path, *, server: bool = False) -> OwnCertificate:
-    """Read a certificate and check it as a peer does: signed by `authority`, of this `key`, a router's where `server`.
+    """Read a certificate and check it as a peer does: signed by `authority`, matching `key`, a router's if `server`.
 
-    DataFileError where a file cannot be read, or the three do not fit, or it is not valid now.
+    DataFileError if a file cannot be read, the three do not match, or the certificate is not valid now.
     """
     try:
         listening, connecting = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
         connecting.check_hostname = False
         connecting.verify_mode = ssl.CERT_NONE
-        judge = connecting if server else listening
-        judge.load_verify_locations(authority)
-        judge.verify_mode = ssl.CERT_REQUIRED
+        verifier = connecting if server else listening
+        verifier.load_verify_locations(authority)
+        verifier.verify_mode = ssl.CERT_REQUIRED
         for context in (listening, connecting):
             context.load_cert_chain(certificate, key)
         to_server, to_client = ssl.MemoryBIO(), ssl.MemoryBIO()
@@ -42,7 +42,7 @@ def read_certificate(authority: Path, certificate: Path, key: Path, *, server: b
                 end.do_handshake()
         found: dict[str, Any] = {**(ends[server].getpeercert() or {})}
         name = dict(pair for part in found["subject"] for pair in part)["commonName"]
-        authorities: list[dict[str, Any]] = judge.get_ca_certs()
+        authorities: list[dict[str, Any]] = verifier.get_ca_certs()
         last_s = min(ssl.cert_time_to_seconds(one["notAfter"]) for one in (found, *authorities))
     except (OSError, KeyError, ValueError) as fault:  # ssl.SSLError is an OSError
         why = getattr(fault, "verify_message", "") or getattr(fault, "reason", "") or getattr(fault, "strerror", "")

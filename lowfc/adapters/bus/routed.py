@@ -1,4 +1,4 @@
-"""The bus across hosts: zenoh's configuration of the router and of its clients, by mutual TLS."""
+"""The bus across hosts: zenoh's configuration of the router and its clients, with mutual TLS."""
 
 import contextlib
 import datetime
@@ -19,23 +19,23 @@ from lowfc.contract.errors import BusError, DataFileError
 from lowfc.contract.network import Network
 
 CA = "ca.pem"
-"""File of a folder of certificates: the authority that signed all of them."""
+"""File name of the authority's certificate in a folder of certificates."""
 CA_KEY = "ca.key"
-"""The authority's key, which belongs on no machine of the loop."""
+"""File name of the authority's key, which must not be on any host of the loop."""
 
 CONNECT_MS = 1000
 _LEASE_MS = 2000
 _ALERT_S = 0.5
-_NOT_THERE = {
+_ABSENT = {
     *(errno.ECONNREFUSED, errno.ECONNRESET, errno.ETIMEDOUT),
     *(errno.EHOSTUNREACH, errno.EHOSTDOWN, errno.ENETUNREACH, errno.ENETDOWN),
     socket.EAI_AGAIN,
 }
-"""Faults of a router or a network that is not there yet; after any other, waiting is pointless."""
+"""Errors of a router or network that is not up yet; after any other error, waiting is pointless."""
 
 
 def client_session(network: Network, role: str, sending: dict[str, Any]) -> dict[str, Any]:
-    """Part of a role's session configuration across hosts that replaces its links on one.
+    """Session configuration of a role across hosts, in place of its links on one host.
 
     `sending` is zenoh's `transport/link/tx`, as on one host.
     """
@@ -45,7 +45,7 @@ def client_session(network: Network, role: str, sending: dict[str, Any]) -> dict
         "listen": {"endpoints": []},
         "connect": {
             "endpoints": [network.router],
-            # time that opening a session waits for a router; a session that has lost it tries again for ever
+            # timeout for opening a session; an open session that loses its router retries indefinitely
             "timeout_ms": CONNECT_MS,
             "exit_on_failure": True,
             "retry": {"period_init_ms": 50, "period_max_ms": 1000, "period_increase_factor": 2},
@@ -64,7 +64,7 @@ def client_session(network: Network, role: str, sending: dict[str, Any]) -> dict
 
 
 def router_session(network: Network, mirrors: Iterable[str], sending: dict[str, Any]) -> dict[str, Any]:
-    """Part of the router's session configuration: TLS only, and the access control of the table of topics.
+    """Session configuration of the router: TLS only, and access control from the table of topics.
 
     `mirrors` are roles such as "mirror-dm"; `sending` is zenoh's `transport/link/tx`, as on one host.
     """
@@ -87,35 +87,35 @@ def router_session(network: Network, mirrors: Iterable[str], sending: dict[str, 
 
 
 def open_by_router(config: zenoh.Config, network: Network, role: str) -> zenoh.Session:
-    """Open a session by the router, and wait for the router while nothing listens there.
+    """Open a session through the router, and wait for the router while it is not running.
 
     Raises:
-        BusError: router and process do not accept each other's certificates; the router cannot be reached for another
-            reason than that it is not there; or zenoh refuses the session though the router is there.
+        BusError: router and process do not accept each other's certificates; the router cannot be reached for a reason
+            other than its absence; or zenoh refuses the session although the router is running.
     """
-    said, refused = "", 0
+    reported, refused = "", 0
     while True:
         try:
             return zenoh.open(config)
         except zenoh.ZError as fault:
             trouble = router_trouble(network, role)
-            refused = 0 if trouble else refused + 1  # once it may have come just now
+            refused = 0 if trouble else refused + 1  # the first refusal may precede the router's start
             if refused > 1:
                 raise BusError(
-                    f"the router at {network.router} takes {role}'s certificate, and zenoh opens no session: "
+                    f"the router at {network.router} accepts {role}'s certificate, but zenoh opens no session: "
                     f"{plain(fault)}"
                 ) from fault
-            if trouble != said and trouble:
+            if trouble != reported and trouble:
                 sys.stderr.write(f"{role}: waiting for the router at {network.router}: {trouble}\n")
-                said = trouble
+                reported = trouble
 
 
 def router_trouble(network: Network, role: str) -> str:
-    """Reason for a missing link to the router: it is not there, or going down; empty where it is there.
+    """Reason for a missing link to the router: absent or shutting down; empty if it is running.
 
     Raises:
-        BusError: one of the two does not accept the other's certificate; or the router cannot be reached for another
-            reason, such as an unknown name.
+        BusError: router and process do not accept each other's certificates, or the router cannot be reached for
+            another reason, such as an unknown name.
     """
     ca, certificate, key = certificate_files(network, role)
     host, port = network.address
@@ -128,17 +128,17 @@ def router_trouble(network: Network, role: str) -> str:
         ):
             link.settimeout(_ALERT_S)
             with contextlib.suppress(TimeoutError):
-                link.recv(1)  # a refusal comes only now
+                link.recv(1)  # a refusal arrives only here
     except ssl.SSLEOFError:
-        return "the connection is ended in the midst of the handshake: the router is going down, or it is none"
+        return "the connection was closed during the handshake: the router is shutting down, or it is another program"
     except ssl.SSLError as fault:
         raise BusError(
-            f"the router at {network.router} and {certificate} do not take each other ({fault.reason or fault}): both "
-            f"must be signed by {ca}, valid today, and the router's made for the name {host!r}; see lowfc certs"
+            f"the router at {network.router} and {certificate} do not accept each other ({fault.reason or fault}): "
+            f"both must be signed by {ca}, valid today, and the router's made for the name {host!r}; see lowfc certs"
         ) from fault
     except OSError as fault:
         why = fault.strerror or str(fault)
-        if isinstance(fault, TimeoutError) or fault.errno in _NOT_THERE:
+        if isinstance(fault, TimeoutError) or fault.errno in _ABSENT:
             return why
         raise BusError(
             f"the router at {network.router} cannot be reached ({why}): is network.router its name and port, and can "
@@ -148,26 +148,26 @@ def router_trouble(network: Network, role: str) -> str:
 
 
 class RouterWatch:
-    """Reports why a process has lost its router, and when it is back."""
+    """Reports on standard error why a process has lost its router, and when it is back."""
 
     def __init__(self, network: Network, role: str) -> None:
         self._network = network
         self._role = role
-        self._said = ""
+        self._reported = ""
 
     def look(self, *, linked: bool) -> None:
-        """Report a change of the link; to be called periodically."""
+        """Report a change of the link; call it periodically."""
         if linked:
             why = ""
         else:
             try:
-                why = router_trouble(self._network, self._role) or "it is there, and the link is being made anew"
+                why = router_trouble(self._network, self._role) or "it is running, and the link is being restored"
             except BusError as fault:
                 why = str(fault)
-        if why != self._said:
+        if why != self._reported:
             text = f"no link to the router at {self._network.router}: {why}" if why else "the router is back"
             sys.stderr.write(f"{self._role}: {text}\n")
-            self._said = why
+            self._reported = why
 
 
 def certificate_files(network: Network, role: str) -> tuple[Path, Path, Path]:
@@ -177,9 +177,10 @@ def certificate_files(network: Network, role: str) -> tuple[Path, Path, Path]:
 
 
 def require_certificate(network: Network, role: str) -> None:
-    """Refuse, by a DataFileError, a certificate that would not be let in, or let in and sent nothing.
+    """Check this host's certificate of a role before connecting.
 
-    Its files are missing or cannot be read, or it is not valid, or another role's.
+    DataFileError if its files cannot be read, it is not valid, or it is another role's: the router would refuse it, or
+    accept it and forward nothing.
     """
     files = certificate_files(network, role)
     for file in files:
@@ -187,20 +188,20 @@ def require_certificate(network: Network, role: str) -> None:
             file.open("rb").close()
         except OSError as fault:
             raise DataFileError(
-                f"{file} cannot be read ({fault.strerror}): the router takes nobody without it; make it where the "
-                "authority's key is (lowfc certs) and copy it here"
+                f"{file} cannot be read ({fault.strerror}): the router accepts no process without it; make it where "
+                "the authority's key is (lowfc certs) and copy it here"
             ) from fault
     name = read_certificate(*files, server=role == ROUTER).name
     if name != role:
         raise DataFileError(
-            f"{files[1]} is the certificate of {name!r}, and this process is {role!r}: the router would let it in and "
-            f"pass on nothing; copy {role}.pem and {role}.key of that role here"
+            f"{files[1]} is the certificate of {name!r}, and this process is {role!r}: the router would accept it and "
+            f"forward nothing; copy {role}.pem and {role}.key of that role here"
         )
 
 
 def ending_certificates(network: Network, now: datetime.datetime) -> list[str]:
-    """A sentence for each certificate in this host's folder that is invalid, or ends within `WARN_DAYS`."""
-    said = []
+    """Warnings about certificates in this host's folder that are invalid or end within `WARN_DAYS`."""
+    warnings = []
     for key in sorted(Path(network.certificates).glob("*.key")):
         role = key.stem
         if key.name == CA_KEY:
@@ -208,21 +209,21 @@ def ending_certificates(network: Network, now: datetime.datetime) -> list[str]:
         try:
             found = read_certificate(*certificate_files(network, role), server=role == ROUTER)
         except DataFileError as fault:
-            said.append(str(fault))
+            warnings.append(str(fault))
             continue
         left = found.ends - now
         if left < datetime.timedelta(days=WARN_DAYS):
-            said.append(f"the certificate of {role} ends in {left.days} days, on {found.ends:%Y-%m-%d}")
-    return said
+            warnings.append(f"the certificate of {role} ends in {left.days} days, on {found.ends:%Y-%m-%d}")
+    return warnings
 
 
 def _transport(tls: dict[str, object], sending: dict[str, Any]) -> dict[str, Any]:
     return {
         "link": {
-            "protocols": ["tls"],  # nothing else is connected to or listened for
+            "protocols": ["tls"],  # the only permitted protocol
             "tls": tls,
-            # A link that is silent for so long is closed, and made anew as soon as possible. Messages sent until
-            # then wait in it, and arrive stale.
+            # A link that is silent for the lease is closed, and restored as soon as possible. Messages sent in the
+            # meantime wait in it and arrive stale.
             "tx": {**sending, "lease": _LEASE_MS, "keep_alive": 4},
         },
         "shared_memory": {"enabled": False},

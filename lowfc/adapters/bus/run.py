@@ -1,7 +1,7 @@
 """A run: one loop's runtime directory, ports and secret, so that two loops on one host never mix.
 
-The directory is made complete under another name and renamed, so that the first process makes it and all others
-read the same. It is the user's own (0700), under $XDG_RUNTIME_DIR, or /tmp where the host has none.
+The first process creates the directory complete under another name and renames it; all others read it. It belongs to
+the user (mode 0700), under $XDG_RUNTIME_DIR, or under /tmp if that is not set.
 """
 
 import contextlib
@@ -31,7 +31,7 @@ _RUN_ID = re.compile(r"[a-z0-9][a-z0-9._-]{0,47}")
 _LOWEST_PORT = 15000
 _CONNECT_S = 1.0
 _LONGEST_START = 20  # characters
-_LATEST_START_S = (1 << 32) - 3  # a sequence has no room for a later one
+_LATEST_START_S = (1 << 32) - 3  # latest start that fits a sequence
 _LONGEST_SOCKET = 107  # bytes of a Unix socket's address
 _PORT_RANGE = Path("/proc/sys/net/ipv4/ip_local_port_range")
 
@@ -41,11 +41,11 @@ class Links:
     """Endpoints of the processes of a run, and their shared secret.
 
     Attributes:
-        run_id: the run they belong to.
-        ports: loopback TCP port of each role that listens: "camera", "controller", "mirror-dm", "recorder".
-        user: name for zenoh's user/password authentication.
-        secret_file: zenoh's dictionary, one line "user:password".
-        network: the router, where the run is on several hosts; ports and secret are then not used.
+        run_id: name of the run.
+        ports: loopback TCP port of each listening role: "camera", "controller", "mirror-dm", "recorder".
+        user: user name of zenoh's user/password authentication.
+        secret_file: zenoh's dictionary file, one line "user:password".
+        network: the router of a run on several hosts; ports and secret are then not used.
     """
 
     run_id: str
@@ -72,7 +72,7 @@ class Links:
     def direct_link(self, role: str) -> Path | None:
         """Socket of a role's direct link; None if the directory's name is too long for one.
 
-        None by a router, whose access control applies to all messages.
+        None with a router, whose access control applies to all messages.
         """
         return None if self.network.router else self._beside(f"{role}.in")
 
@@ -81,9 +81,9 @@ class Links:
         return path if len(os.fsencode(path)) <= _LONGEST_SOCKET else None
 
     def live(self) -> set[str]:
-        """Roles whose processes listen now; a run that was killed leaves its directory behind.
+        """Roles whose processes listen now; a killed run leaves its directory behind.
 
-        By a router, only the router listens: while it does, any role may be there.
+        With a router, only the router listens: while it does, any role may be running.
         """
         if self.network.router:
             return set(self.ports) if _listens(*self.network.address) else set()
@@ -95,10 +95,10 @@ class Links:
         return tuple(role for role in self.ports if role.partition("-")[0] == Role.MIRROR)
 
     def claim_start(self, role: str, start_s: int) -> int:
-        """Start of a role's process for its sequences: `start_s`, or more where this run has had that one already.
+        """Claim the start of a role's process for its sequences: `start_s`, or later if this run has used it already.
 
-        A process that is killed and restarted within one second must not repeat its sequences. Where the run's
-        directory cannot be written it is `start_s`: an operator must be able to ask for `safe` there, too.
+        A process that is killed and restarted within one second must not repeat its sequences. If the run's directory
+        cannot be written, the start is `start_s`, so that an operator can still request `safe`.
         """
         path = self.secret_file.parent / f"start-{role}"
         with contextlib.suppress(OSError, ValueError), path.open("a+") as file:
@@ -108,7 +108,7 @@ class Links:
             claimed = max(start_s, int(last) + 1) if last.isdecimal() else start_s
             claimed = claimed if claimed <= _LATEST_START_S else start_s
             file.truncate(0)
-            file.write(str(claimed))  # at the end of the file, which is its beginning now
+            file.write(str(claimed))  # the file is empty now
             return claimed
         return start_s
 
@@ -122,7 +122,7 @@ class Run:
     links: Links
 
     def remove(self) -> None:
-        """Delete the directory; for the process that made the run, when all others have ended."""
+        """Delete the directory; for the process that created the run, when all others have ended."""
         shutil.rmtree(self.path, ignore_errors=True)
 
 
@@ -138,7 +138,7 @@ def _listens(host: str, port: int) -> bool:
 
 
 def new_run_id() -> str:
-    """Unused name for a run: UTC time and a random part."""
+    """Make an unused name for a run: UTC time and a random part."""
     return f"{time.strftime('%Y%m%d-%H%M%S', time.gmtime())}-{secrets.token_hex(3)}"
 
 
@@ -149,19 +149,19 @@ def open_run(
     listeners: tuple[str, ...] = (),
     network: Network | None = None,
 ) -> Run:
-    """Run of that name; the first to open it makes its directory, chooses its ports and its secret.
+    """Open the run of that name; the first call creates its directory, ports and secret.
 
     Args:
-        run_id: its name.
-        mirrors: that it has.
-        base: directory of its directory; the user's runtime directory when None.
-        listeners: roles that get a port of their own beside the usual ones, where this makes the run: a launcher
-            receives from a view, which only connects, if it listens.
-        network: the router, where this makes the run; without one, the run's applies. A launcher's run stays on its
-            host.
+        run_id: name of the run.
+        mirrors: names of its mirrors.
+        base: parent of its directory; the user's runtime directory when None.
+        listeners: additional roles with a port, if this call creates the run: a launcher must listen to receive from a
+            viewer, which only connects.
+        network: router of the run, if this call creates it; None: that of the existing run. A launcher's run stays on
+            its host.
 
     Raises:
-        BusError: the name is not usable, or the run was made without one of `mirrors`, or with another network.
+        BusError: the name is invalid, or the run exists without one of `mirrors`, or with another network.
         DataFileError: the run's directory is damaged.
     """
     if not _RUN_ID.fullmatch(run_id):
@@ -179,9 +179,9 @@ def open_run(
         and _absolute(network) != links.network
         and Role.LAUNCHER not in links.ports
     ):
-        there = f"by {links.network.router}" if links.network.router else "on this host alone"
+        existing = f"on {links.network.router}" if links.network.router else "on this host alone"
         raise BusError(
-            f"run {run_id!r} is {there} with certificates {links.network.certificates!r}, and the configuration has "
+            f"run {run_id!r} is {existing} with certificates {links.network.certificates!r}, and the configuration has "
             f"{network.router} with {_absolute(network).certificates!r}; {_ADVICE} ({path}), or start another run"
         )
     for role in map(mirror_role, mirrors):
@@ -199,15 +199,15 @@ def mirror_role(name: str) -> str:
 
 
 def runtime_path() -> Path:
-    """The user's runtime directory for lowfc, which may not exist."""
+    """Path of the user's runtime directory for lowfc, which may not exist."""
     given = os.environ.get("XDG_RUNTIME_DIR")
     return Path(given) / "lowfc" if given else Path("/tmp") / f"lowfc-{os.geteuid()}"  # noqa: S108  # own_directory() checks it
 
 
 def runtime_base() -> Path:
-    """The user's runtime directory for lowfc, made if there is none.
+    """The user's runtime directory for lowfc, created if it does not exist.
 
-    DataFileError where it belongs to somebody else, is open to others, or is not a directory.
+    DataFileError if it belongs to another user, is accessible to others, or is not a directory.
     """
     base = runtime_path()
     try:
@@ -222,7 +222,7 @@ def runtime_base() -> Path:
 
 
 def own_directory(path: Path) -> Path:
-    """Check that `path` is a directory of this user, closed to all others and no link; DataFileError where not."""
+    """Check that `path` is a directory of this user, closed to all others and not a link; otherwise DataFileError."""
     found = path.lstat()
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid() or found.st_mode & 0o077:
         raise DataFileError(
@@ -233,7 +233,7 @@ def own_directory(path: Path) -> Path:
 
 
 def write_once(path: Path, text: str) -> str:
-    """Write a file unless there is one; return what it holds. Two writers at once agree on one text."""
+    """Write a file unless it exists, and return its text; simultaneous writers get the same text."""
     with contextlib.suppress(FileNotFoundError):
         return path.read_text()
     with tempfile.NamedTemporaryFile("w", prefix=f".{path.name}-", dir=path.parent) as draft:  # mode 0600
@@ -245,15 +245,15 @@ def write_once(path: Path, text: str) -> str:
 
 
 def _absolute(network: Network) -> Network:
-    """The same for any current directory of a process."""
+    """Network with absolute paths, so that it is the same in any working directory."""
     if not network.router:
         return Network()
     return network.model_copy(update={"certificates": str(Path(network.certificates).expanduser().absolute())})
 
 
 def _make(path: Path, mirrors: tuple[str, ...], listeners: tuple[str, ...], network: Network) -> None:
-    """Make the directory under another name and rename it; a later process keeps the first one's directory."""
-    # Monitors connect and do not listen: there may be several, and no other process searches for one.
+    """Create the directory under another name and rename it; a later process uses the first one's directory."""
+    # Monitors connect and do not listen: there may be several, and no other process connects to them.
     roles = [Role.CAMERA, Role.CONTROLLER, *map(mirror_role, mirrors), Role.RECORDER, *listeners]
     draft = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))  # mode 0700
     links = {
@@ -279,7 +279,7 @@ def _read(path: Path) -> Links:
         found = json.loads(file.read_text())
         ports = {str(role): int(port) for role, port in found["ports"].items()}
         if found["run_id"] != path.name or not all(0 < port < 1 << 16 for port in ports.values()):
-            raise ValueError("another run's, or a port that is none")
+            raise ValueError("of another run, or an invalid port")
         network = Network.model_validate(found.get("network", {}))
         return Links(path.name, ports, str(found["user"]), path / _CREDENTIALS, network)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as fault:
@@ -289,10 +289,10 @@ def _read(path: Path) -> Links:
 
 
 def free_ports(count: int) -> list[int]:
-    """Return loopback TCP ports that nobody listens on, below those that the host gives to outgoing connections.
+    """Return unused loopback TCP ports below the host's ephemeral range.
 
-    A port of the ephemeral range may be taken by any outgoing connection before its role listens, and a connection
-    retried to one without a listener may even be given that port and reach itself.
+    An ephemeral port may be taken by any outgoing connection before its role listens; a connection retried to such a
+    port without a listener may even be assigned the port itself and connect to itself.
     """
     candidates = range(_LOWEST_PORT, int(_PORT_RANGE.read_text().split()[0]))
     chooser = random.SystemRandom()

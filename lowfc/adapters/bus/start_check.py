@@ -1,4 +1,4 @@
-"""Refusal of sequences that start too far in the future: after one, every true message would be out of order."""
+"""Refusal of sequences that start too far in the future: every valid message after one would be out of order."""
 
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -14,29 +14,29 @@ class StartCheck:
     """Compares the start in received sequences with this host's clock."""
 
     def __init__(self, clock: Clock, max_ahead_h: float, refused: Callable[[str, str], None]) -> None:
-        """Refuse starts more than `max_ahead_h` hours ahead of `clock`; none for 0, nor by a simulated clock.
+        """Refuse starts more than `max_ahead_h` hours ahead of `clock`; 0 or a simulated clock disables the check.
 
-        `refused` is called with the start and this host's time, in UTC, once for each start that is refused, at
-        most once a second.
+        `refused` is called with the start and this host's time, both UTC, once for each refused start, at most once a
+        second.
         """
         self._clock = clock
         self._ahead_s = round(max_ahead_h * _HOUR_S)
         self._refused = refused
-        self._named_s = self._at_s = 0
+        self._reported_s = self._reported_at_s = 0
         self._compares = max_ahead_h > 0 and not clock.lockstep
         self._allowed = 0
 
     def ahead(self, sequence: int) -> bool:
         """Whether this sequence starts too far ahead."""
-        if sequence < self._allowed or not self._compares:  # time only goes on: what was allowed stays so
+        if sequence < self._allowed or not self._compares:  # time only increases: an allowed sequence stays allowed
             return False
         now_s = self._clock.host_ns() // _NS
         self._allowed = sequence_of(now_s + self._ahead_s + 1, 0)
         if sequence < self._allowed:
             return False
         start_s = start_of(sequence)
-        if start_s != self._named_s and now_s != self._at_s:  # invented starts must not fill the log
-            self._named_s, self._at_s = start_s, now_s
+        if start_s != self._reported_s and now_s != self._reported_at_s:  # a faulty sender must not fill the log
+            self._reported_s, self._reported_at_s = start_s, now_s
             self._refused(_utc(start_s), _utc(now_s))
         return True
 

@@ -1,8 +1,6 @@
 """The bus between processes: zenoh peers over loopback TCP, each connected to all others of its run.
 
-Monitors connect by Unix socket instead, and are sent fewer pictures.
-
-Why each setting is what it is stands in `zenoh_session`; all of them were measured.
+Monitors connect by Unix socket instead and get images at a lower rate. `zenoh_session` explains each setting.
 """
 
 import contextlib
@@ -29,21 +27,21 @@ from lowfc.contract.envelope import Envelope, sequence_of
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import HEALTH, Role, Topic
 
-TAKEN_S = 0.5
-"""Timeout for an answer of the router, or of a process that already has this role."""
+ROLE_CHECK_S = 0.5
+"""Timeout for an answer of the router, or of another process with this role."""
 FLUSH_S = 2.0
-"""Time a closing session waits for peers that have not received everything yet."""
+"""Time that a closing session waits for peers that have not received everything yet."""
 
 
 def declare_publisher(session: zenoh.Session, topic: Topic, key: str, *, lockstep: bool = False) -> zenoh.Publisher:
-    """Return zenoh's own publisher of a topic, with the settings of the loop; in lockstep it waits for slow readers."""
+    """Make a zenoh publisher of a topic with the loop's settings; in lockstep it waits for slow readers."""
     return session.declare_publisher(
         key,
         encoding=f"application/protobuf;{topic.message.DESCRIPTOR.full_name}",
         congestion_control=zenoh.CongestionControl.BLOCK if lockstep else zenoh.CongestionControl.DROP,
         priority=zenoh.Priority.REAL_TIME if topic.in_loop else zenoh.Priority.DATA,
-        # Express gives every message a batch of its own, so that a burst of 16 fills the queue and the rest is lost;
-        # without it the latency is the same, for messages are batched under back-pressure only.
+        # With express every message is its own batch: a burst of 16 fills the queue and the rest is lost. Without it
+        # the latency is the same, as messages are batched only under back-pressure.
         express=False,
     )
 
@@ -75,7 +73,7 @@ class ZenohPublisher:
             session.declare_queryable(key, Callback(self._answer, indirect=False))
 
     def put(self, payload: bytes, publish_time_ns: int | None = None, sequence: int | None = None) -> Envelope:
-        """Send `payload`; a slow reader delays it by at most 1 ms and loses it, or in lockstep is waited for."""
+        """Send `payload`; a slow reader delays this by at most 1 ms and loses it; in lockstep put waits for it."""
         envelope = Envelope(
             sequence_of(self._bus.start_s, self.published) if sequence is None else sequence,
             self._host_ns() if publish_time_ns is None else publish_time_ns,
@@ -130,10 +128,10 @@ class ZenohRing:
 
 
 def receive_in_one_thread() -> None:
-    """Let zenoh's thread that waits for messages read them too, instead of waking another; before the first session.
+    """Make zenoh receive and decode messages in one thread; call it before the first session.
 
-    Right for a process that waits for what it receives; one that computes meanwhile would hold it up. Its children
-    inherit it.
+    It saves waking a second thread in a process that blocks on input; in one that computes meanwhile it would delay
+    messages. Child processes inherit it.
     """
     os.environ.setdefault("ZENOH_RUNTIME", "(rx: (handover: net))")
 
@@ -142,10 +140,10 @@ class ZenohBus:
     """One process's zenoh session; see `Bus`.
 
     Attributes:
-        offset: of the router's clock, where the run is on several hosts. Envelopes go by that clock; what is sent and
-            received here is by this host's.
-        read: what a message of zenoh's says.
-        direct_readers: of the topics that this process gets directly, by key.
+        offset: offset of the router's clock, in a run on several hosts. Envelopes on the network have the router's
+            time; messages sent and received here have this host's.
+        read: converts a message of zenoh to a `Sample`.
+        direct_readers: readers of the topics that this process receives over a direct link, by key.
     """
 
     def __init__(
@@ -154,18 +152,17 @@ class ZenohBus:
         """Join a run.
 
         Args:
-            links: of the run.
-            role: this process's.
-            clock: the run's.
-            monitor: this process takes no part in the loop: it looks at what it kept in a `Ring` now and then. It is
-                sent the topics of which only the newest matters no faster than it looks, receives into spare buffers,
-                and in one thread: half the cost. To be set in a process's first bus.
-            beside: bus of another role in this process, which has subscribed: what it gets directly, it gets by a call.
+            links: links of the run.
+            role: role of this process.
+            clock: clock of the run.
+            monitor: whether this process is a monitor, which polls `Ring`s. It gets `latest_only` topics at display
+                rate, spare receive buffers and a single receive thread: half the cost. Set it in a process's first bus.
+            beside: bus of another role in this process, which has subscribed: its direct link is then a function call.
 
         Raises:
-            BusError: the role's port is taken, or the role itself on another host; zenoh refuses the configuration, or
-                the router the certificate.
-            DataFileError: the role has no certificate, across hosts.
+            BusError: the role's port is in use, or the role runs on another host; zenoh refuses the configuration, or
+                the router refuses the certificate.
+            DataFileError: across hosts, the role has no certificate.
         """
         self.role = role
         self._links = links
@@ -194,26 +191,26 @@ class ZenohBus:
             listens = role in {*links.ports, ROUTER}
             where = f"cannot listen on {address}; is one running already?" if listens else "cannot join."
             raise BusError(
-                f"{role} of run {links.run_id!r} {where} Stop what is in the way, or start another run ({plain(fault)})"
+                f"{role} of run {links.run_id!r} {where} Stop that process, or start another run ({plain(fault)})"
             ) from None
         if role == ROUTER:
             self.queryable(CLOCK_KEY, lambda query: query.reply(b""))
 
     def _join_hosts(self) -> None:
-        """Refuse a role that is already in use (ports prevent it on one host); set envelopes by the router's clock."""
-        if self.role in self._links.ports and self.get(HEALTH.at(self.role), timeout_s=TAKEN_S):
+        """Refuse a role that is already in use (ports prevent it on one host); use the router's clock in envelopes."""
+        if self.role in self._links.ports and self.get(HEALTH.at(self.role), timeout_s=ROLE_CHECK_S):
             self._session.close()  # type: ignore[no-untyped-call]
             raise BusError(
                 f"run {self._links.run_id!r} has a {self.role} already, on this host or another; stop it first"
             )
         self.offset = ClockOffset()
-        self.read = partial(_sample_from_afar, self.offset)
+        self.read = partial(_sample_across_hosts, self.offset)
         self._router = RouterWatch(self._links.network, self.role)
-        self._closers.append(ClockAsker(self.offset, self._ask_the_time, self.clock.host_ns).close)
+        self._closers.append(ClockAsker(self.offset, self._query_time, self.clock.host_ns).close)
 
-    def _ask_the_time(self) -> list[tuple[int, int]]:
+    def _query_time(self) -> list[tuple[int, int]]:
         self._router.look(linked=bool(self._session.info.routers_zid()))
-        answers = self.get(CLOCK_KEY, timeout_s=TAKEN_S)
+        answers = self.get(CLOCK_KEY, timeout_s=ROLE_CHECK_S)
         return [(answer.publish_time_ns, answer.receive_time_ns) for answer in answers]
 
     def publisher(self, topic: Topic, name: str = "") -> ZenohPublisher:
@@ -225,7 +222,7 @@ class ZenohBus:
         return publisher
 
     def subscribe(self, topic: Topic, handler: Callable[[Sample], None], name: str = ALL) -> Callable[[], None]:
-        """See `Bus.subscribe`; `handler` runs on a thread that receives, on one at a time."""
+        """See `Bus.subscribe`; `handler` runs on a receive thread, one call at a time."""
         if _reader(topic, name) != self.role or (path := self._direct_link(topic, name)) is None:
             return self._subscribe(topic, handler, name)
         key = topic.at(name)
@@ -250,14 +247,14 @@ class ZenohBus:
             now_ns = host_ns()
             try:
                 handler(read(sample, now_ns, known_key))
-            except Exception as fault:  # zenoh would print it and go on; it is counted here
+            except Exception as fault:  # zenoh would only print it; count it here
                 faults.add(f"{self.role}: handler of", key, fault)
 
         subscriber = self._session.declare_subscriber(key, Callback(received, indirect=False))
         return subscriber.undeclare
 
     def ring(self, topic: Topic, capacity: int) -> "ZenohRing":
-        """See `Bus.ring`; zenoh's own threads keep the messages, and Python is not woken for any of them."""
+        """See `Bus.ring`; zenoh's threads keep the messages without waking Python."""
         return ZenohRing(self, self._session.declare_subscriber(topic.at(ALL), RingChannel(capacity)))
 
     def queryable(self, key_expression: str, handler: Callable[[Query], None]) -> None:
@@ -302,20 +299,20 @@ class ZenohBus:
             priority=priority,
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
-            # An operator's question waits for room, or a large one is lost; those of late joiners are empty.
+            # A request waits for room in the queue, or a large one would be lost; queries of late joiners are empty.
             congestion_control=zenoh.CongestionControl.BLOCK if payload else zenoh.CongestionControl.DROP,
         )
         done.wait(timeout_s + 1.0)
         return list(answers)
 
     def sent(self, envelope: Envelope) -> bytes:
-        """An envelope as it goes out: across hosts, by the router's clock."""
+        """Encode an outgoing envelope: across hosts, with the router's time."""
         if self.offset is None:
             return envelope.encode()
         return Envelope(envelope.sequence, envelope.publish_time_ns + self.offset.offset_ns).encode()
 
     def peers(self) -> int:
-        """See `Bus.peers`; across hosts, the router alone."""
+        """See `Bus.peers`; across hosts, the router only."""
         return len(self._session.info.peers_zid()) + len(self._session.info.routers_zid())
 
     def restart(self) -> None:
@@ -327,11 +324,11 @@ class ZenohBus:
     def close(self) -> None:
         """Leave the run once all published messages have been received or the peers have timed out.
 
-        Zenoh interrupts the write of a message when its session closes; to a slow reader that leaves half a message,
-        and the rest of the stream is lost. Messages of the lowest priority are sent last, and so is this question.
+        A closing zenoh session interrupts the write of a message; a slow reader then gets half a message and loses the
+        rest of the stream. A query of the lowest priority is sent last: its answer shows that all was sent.
         """
         if self.role in self._links.ports:
-            with contextlib.suppress(zenoh.ZError):  # it is closed already
+            with contextlib.suppress(zenoh.ZError):  # already closed
                 self.get(HEALTH.at(ALL), timeout_s=FLUSH_S, priority=zenoh.Priority.BACKGROUND)
         for close in self._closers:
             close()
@@ -350,7 +347,7 @@ class ZenohBus:
 
     @contextlib.contextmanager
     def replying(self, query: zenoh.Query) -> Iterator[None]:
-        """End a question, answered or not, so that its asker does not wait; a fault harms nobody here."""
+        """Finish a query, answered or not, so that its sender does not wait; a fault is only counted."""
         try:
             yield
         except Exception as fault:
@@ -368,12 +365,12 @@ class ZenohBus:
 
 
 def _reader(topic: Topic, name: str) -> str | None:
-    """Role of the process that waits for a topic."""
+    """Role of the direct subscriber of a topic."""
     return mirror_role(name) if topic.direct_subscriber is Role.MIRROR else topic.direct_subscriber
 
 
 def _known_key(expression: str) -> str | None:
-    """The key of every message, if there is only one."""
+    """Key of an expression without wildcard, otherwise None."""
     return None if ALL in expression else expression
 
 
@@ -389,9 +386,9 @@ def _sample(sample: zenoh.Sample, receive_time_ns: int, key: str | None = None) 
     )
 
 
-def _sample_from_afar(
+def _sample_across_hosts(
     offset: ClockOffset, sample: zenoh.Sample, receive_time_ns: int, key: str | None = None
 ) -> Sample:
-    """The same across hosts: when it was sent, by this host's clock."""
+    """As `_sample`, across hosts: the publish time converted to this host's clock."""
     found = _sample(sample, receive_time_ns, key)
     return found._replace(publish_time_ns=found.publish_time_ns - offset.offset_ns)

@@ -1,4 +1,4 @@
-"""Zenoh's errors, for people."""
+"""Readable text of zenoh's errors."""
 
 import re
 
@@ -9,7 +9,7 @@ _PLACE = re.compile(r"\s*\bat /?\S+\.rs:\d+\.?")
 
 
 def plain(fault: zenoh.ZError) -> str:
-    """The cause, without the places in zenoh's sources and the names of its parts."""
+    """Cause of an error, without zenoh's source locations and component names."""
     text = _PLACE.sub("", str(fault).splitlines()[0])
     cause = text.rpartition("[")[2].partition("]")[0] or text
     return cause.strip(" .[]")[:_LONGEST]

@@ -1,4 +1,4 @@
-"""Zenoh's configuration of each role: links on one host, or by a router across several. All settings were measured."""
+"""Zenoh's configuration for each role: direct links on one host, a router across hosts. All settings were measured."""
 
 from typing import Any
 
@@ -9,21 +9,21 @@ from lowfc.adapters.bus.run import Links
 from lowfc.contract.messages import TOPICS
 
 _SOCKET = "unixsock-stream"
-_GLANCES_HZ = 40.0  # a view draws 30 pictures a second; each finds a new one
-_BATCH_BYTES = 65535  # zenoh's own
-_SMALL_BATCH_BYTES = 16384  # of a monitor, which keeps messages: each holds the buffer that it came in
-_SPARE_BUFFERS = 1024  # without them it makes and clears one for every message
+_DISPLAY_HZ = 40.0  # a viewer draws 30 images a second, each from a new message
+_BATCH_BYTES = 65535  # zenoh's default
+_SMALL_BATCH_BYTES = 16384  # of a monitor, which keeps messages: each holds its receive buffer
+_SPARE_BUFFERS = 1024  # otherwise zenoh allocates and clears one for every message
 _PRIORITIES = ("real_time", "interactive_high", "interactive_low", "data_high", "data", "data_low", "background")
 
 
 def session_config(links: Links, role: str, *, monitor: bool = False) -> dict[str, Any]:
-    """Zenoh's configuration for a role of a run; a role without a port of its own only connects.
+    """Zenoh's configuration for a role of a run; a role without its own port only connects.
 
-    A run on several hosts goes by its router: see `routed`. For `monitor` see `ZenohBus`.
+    A run on several hosts uses its router: see `routed`. For `monitor` see `ZenohBus`.
     """
     batch_bytes = _SMALL_BATCH_BYTES if monitor else _BATCH_BYTES
     sending = {
-        "batch_size": batch_bytes,  # of both directions: the smaller one of both ends holds
+        "batch_size": batch_bytes,  # for both directions: the smaller of the two ends applies
         # A full queue delays a put by at most 1 ms, then the message is dropped; at 0 bursts are lost.
         "queue": {
             "size": dict.fromkeys(_PRIORITIES, 16),
@@ -39,7 +39,7 @@ def session_config(links: Links, role: str, *, monitor: bool = False) -> dict[st
         )
         return routed | {"scouting": scouting}
     listening = [_address(links, role), _socket(links, role)] if role in links.ports else []
-    glanced_at = [{"key_expr": topic.at(ALL), "freq": _GLANCES_HZ} for topic in TOPICS if topic.latest_only]
+    throttled = [{"key_expr": topic.at(ALL), "freq": _DISPLAY_HZ} for topic in TOPICS if topic.latest_only]
     return {
         "mode": "peer",
         # Peers do not forward, so each connects to all others; with a timeout of -1 any start order works.
@@ -52,11 +52,11 @@ def session_config(links: Links, role: str, *, monitor: bool = False) -> dict[st
             ],
             "timeout_ms": -1,
             "exit_on_failure": False,
-            # A newcomer connects to all others itself. Five attempts a second to reach an absent process (a recorder,
-            # say) made a frame late each time.
+            # A new process connects to all others itself. Attempts to reach an absent process (such as the recorder)
+            # five times a second each delayed a frame.
             "retry": {"period_init_ms": 50, "period_max_ms": 4000, "period_increase_factor": 2},
         },
-        # Opening waits `delay` ms for the links that are not there yet; running processes are connected within a few.
+        # Opening waits `delay` ms for missing links; running processes are connected within a few ms.
         "scouting": scouting,
         "transport": {
             "auth": {
@@ -70,17 +70,17 @@ def session_config(links: Links, role: str, *, monitor: bool = False) -> dict[st
                 "tx": sending,
                 "rx": {"buffer_size": _SPARE_BUFFERS * batch_bytes if monitor else batch_bytes},
             },
-            # Gains nothing at these sizes, and a receiver descheduled for 100 ms loses messages silently.
+            # No gain at these sizes, and a receiver descheduled for 100 ms loses messages silently.
             "shared_memory": {"enabled": False},
         },
-        # Monitors connect by socket, and are sent no more pictures than they draw: writing them costs the loop, too.
+        # Monitors connect by socket and get no more images than they display: sending them costs the loop time.
         "downsampling": [
             {
                 "id": "glances",
                 "flows": ["egress"],
                 "messages": ["put"],
                 "link_protocols": [_SOCKET],
-                "rules": glanced_at,
+                "rules": throttled,
             }
         ],
     }
