@@ -1,4 +1,4 @@
-"""A child process that dies with its parent, and the end of its standard error."""
+"""A child process that ends with its parent; keeps its standard error."""
 
 import contextlib
 import errno
@@ -17,18 +17,18 @@ _DIES_WITH = """
 import ctypes, os, sys
 number, parent = map(int, sys.argv[1:3])
 ctypes.CDLL(None).prctl(1, number)  # PR_SET_PDEATHSIG, which exec keeps
-if os.getppid() == parent:  # it lives still
+if os.getppid() == parent:  # the parent is still alive
     os.execvp(sys.argv[3], sys.argv[3:])
 """
-"""Becomes the program, with the signal set: between fork and exec no code may run where other threads hold locks."""
+"""Sets the signal, then becomes the program: a separate process, as no code may run between fork and exec."""
 
 
 @dataclass(slots=True)
 class Child:
-    """One process, its standard error going to a file; its name is as in its Health, or in messages about it.
+    """A child process whose standard error goes to a file; `name` is its name in Health or in messages.
 
-    Without an `environment` it has ours. It gets `death_signal` when its parent dies; only SIGKILL ends a process that
-    is stopped.
+    `environment` defaults to this process's. The child gets `death_signal` when its parent dies; only SIGKILL ends a
+    stopped process.
     """
 
     name: str
@@ -40,12 +40,12 @@ class Child:
     _stream: "IO[bytes] | None" = field(default=None, repr=False)
 
     def start(self) -> None:
-        """Start it in a session of its own, so that Ctrl-C reaches only us.
+        """Start the process in its own session, so that Ctrl-C reaches only the parent.
 
-        It dies with us; the kernel takes the end of the thread that starts it for ours.
+        It ends with the thread that calls this method: for the kernel that thread is the parent.
 
         Raises:
-            OSError: there is no such program.
+            OSError: the program does not exist.
         """
         if shutil.which(self.command[0], path=(self.environment or os.environ).get("PATH")) is None:
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), self.command[0])
@@ -62,11 +62,11 @@ class Child:
 
     @property
     def status(self) -> int | None:
-        """Exit status; None while it runs, negative where a signal ended it."""
+        """Exit status; None while it runs, negative if a signal ended it."""
         return self.process.poll() if self.process is not None else None
 
     def stop(self, patience_s: float) -> None:
-        """Send SIGTERM, wait, and kill it where it does not end."""
+        """Send SIGTERM, wait, then SIGKILL if it is still running."""
         if self.process is None:
             return
         if self.status is None:
@@ -80,12 +80,12 @@ class Child:
             self._stream.close()
 
     def stderr_tail(self) -> str:
-        """Last lines of its standard error."""
+        """Last lines of the child's standard error."""
         lines = self.stderr_path.read_text(errors="replace").strip().splitlines() if self.stderr_path.exists() else []
         return "\n".join(lines[-_TAIL_LINES:])
 
     def how_it_ended(self) -> str:
-        """One line about a process that ended by itself."""
+        """One line on how the process ended by itself."""
         status = self.status
         if status is not None and status < 0:
             return f"{self.name} was killed by {signal.Signals(-status).name}"

@@ -1,8 +1,8 @@
-"""Time: nanoseconds since the epoch that never step, shared by all processes of a host.
+"""Time: nanoseconds since the epoch, without steps, the same for all processes of a host.
 
-The host's clock is CLOCK_MONOTONIC plus an offset that is fixed once per boot by whichever process comes first, and
-kept in the per-user runtime directory in a file named after the boot. In lockstep the time of the messages is
-simulated; envelopes keep the host's time, so that latencies stay measurable.
+The host's clock is CLOCK_MONOTONIC plus an offset that the first process after a boot fixes and stores in the user's
+runtime directory, in a file named after the boot. In lockstep the time of messages is simulated; envelopes keep the
+host's time, so that latencies can be measured.
 """
 
 import time
@@ -13,22 +13,22 @@ from lowfc.adapters.bus.run import runtime_base, runtime_path, write_once
 from lowfc.contract.errors import DataFileError
 
 SIMULATED_START_NS = 1_767_225_600_000_000_000
-"""2026-01-01T00:00:00Z, where every lockstep run starts."""
+"""2026-01-01T00:00:00Z, the start of every lockstep run."""
 
 WALL_TOLERANCE_NS = 100_000_000
-"""Difference from the wall clock above which it is reported: it was wrong when the offset of this boot was fixed."""
+"""Difference from the wall clock that is reported: the wall clock was wrong when this boot's offset was fixed."""
 
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 _NS = 1_000_000_000
 
 
 class Clock(Protocol):
-    """Where a process takes its time from.
+    """Clock of a process.
 
     Attributes:
-        lockstep: the time is simulated and moved by hand.
-        start_s: unix seconds of the process's start, the upper half of its sequences.
-        offset_ns: what CLOCK_MONOTONIC is short of the epoch.
+        lockstep: whether the time is simulated and set explicitly.
+        start_s: Unix time of the process's start, s; the upper half of its sequences.
+        offset_ns: offset to add to CLOCK_MONOTONIC for time since the epoch.
     """
 
     lockstep: bool
@@ -44,7 +44,7 @@ class Clock(Protocol):
         ...
 
     def ahead_ns(self) -> int:
-        """By how much the host's time is ahead of its wall clock, now."""
+        """Present lead of the host's time over its wall clock."""
         ...
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
@@ -69,17 +69,17 @@ class HostClock:
     now_ns = host_ns
 
     def ahead_ns(self) -> int:
-        """By how much it is ahead of the wall clock, now."""
+        """Present lead over the wall clock."""
         return self.host_ns() - time.time_ns()
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
-        """Sleep until `deadline_ns`; returns at once when it has passed."""
+        """Sleep until `deadline_ns`; return at once if it has passed."""
         while (left_ns := deadline_ns - self.now_ns()) > 0:
             time.sleep(left_ns * 1e-9)
 
 
 class SimulatedClock(HostClock):
-    """The clock of a lockstep run: it stands still until it is set; the host's time stays available."""
+    """Clock of a lockstep run, constant until it is set; the host's time stays available."""
 
     lockstep = True
 
@@ -92,23 +92,23 @@ class SimulatedClock(HostClock):
         return self._now_ns
 
     def set_ns(self, now_ns: int) -> None:
-        """Move the clock."""
+        """Set the clock."""
         self._now_ns = now_ns
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
-        """Move the clock to the deadline, without waiting."""
+        """Advance the clock to the deadline, without waiting."""
         self._now_ns = max(self._now_ns, deadline_ns)
 
 
 def boot_file(base: Path | None = None) -> Path:
-    """File of this boot's offset, in the user's runtime directory where no other is given; it may not be there yet."""
+    """File of this boot's offset, by default in the user's runtime directory; it may not exist yet."""
     return (runtime_path() if base is None else base) / f"clock-{_BOOT_ID.read_text().strip()}"
 
 
 def boot_offset_ns(base: Path) -> int:
-    """Offset of CLOCK_MONOTONIC from the epoch, ns; the first to ask since the host was booted fixes it.
+    """Offset of CLOCK_MONOTONIC from the epoch, ns; the first call since the boot fixes it.
 
-    DataFileError where the file in `base` that keeps it is damaged.
+    DataFileError if its file in `base` is damaged.
     """
     path = boot_file(base)
     text = write_once(path, str(time.time_ns() - time.monotonic_ns()))

@@ -15,27 +15,27 @@ from lowfc.control.kernel import functions
 from lowfc.control.kernel.tables import FUSED, NUMPY, Kernel
 
 FASTMATH = frozenset({"reassoc", "contract"})
-"""What of fast-math is allowed: NaN and infinity stay visible, and the same binary gives the same bytes."""
+"""Permitted parts of fast-math: NaN and infinity are preserved, and the same binary gives the same bytes."""
 SHARED_BYTES = 8 << 20
-"""Size of R from which on threads share a frame: waking them takes longer than they save of a smaller one."""
+"""Size of R above which threads share a frame; below, waking them takes longer than they save."""
 
 
 def available() -> bool:
-    """Whether the fused step can be compiled here."""
+    """Whether the fused step can be compiled on this host."""
     return importlib.util.find_spec("numba") is not None
 
 
 def missing() -> str:
-    """What to do where it cannot."""
+    """Advice if the fused step cannot be compiled."""
     return f"the fused step needs numba: {install_advice('fast')}"
 
 
 @cache
 def kernel(name: str, threads: int = 1) -> Kernel:
-    """The kernel of that name, ready for use; without numba, numpy's.
+    """Return the kernel of that name, compiled; numpy's if numba is not installed.
 
-    The first use on a host compiles for some seconds; later ones load what was compiled, where that could be kept. The
-    threads share the pass over a large frame, and give the same bytes.
+    The first call on a host compiles for some seconds; later ones load the cached result. The threads share the pass
+    over a large frame; their number does not change the result.
     """
     if name != FUSED or not available():
         return NUMPY
@@ -44,10 +44,10 @@ def kernel(name: str, threads: int = 1) -> Kernel:
 
 
 class Pool:
-    """Threads that share the pass over large frames; they sleep in between, and start with this process's set-up."""
+    """Threads that share the pass over large frames and sleep in between; they inherit this process's scheduling."""
 
     def __init__(self, measure: Callable[..., float], measure_blocks: Callable[..., None], threads: int) -> None:
-        """Start them; this one counts as the first."""
+        """Start the threads; the calling thread is the first of `threads`."""
         self._measure = measure
         self._measure_blocks = measure_blocks
         self._work: tuple[Any, ...] = ()
@@ -86,7 +86,7 @@ class Pool:
         return self._measure(pixels[:0], *scanned[1:], *rest)
 
     def _divide(self, block: int, blocks: int) -> None:
-        """A share of the blocks for each thread, and arrays for those that help."""
+        """Divide the blocks among the threads, and allocate their arrays."""
         edges = [blocks * number // (len(self._turns) + 1) for number in range(len(self._turns) + 2)]
         self._shares = list(pairwise(edges))
         self._scratch = [np.empty(block, np.float32) for _ in self._turns]
@@ -127,6 +127,6 @@ def _compiled() -> list[Any]:
         shared = {"nogil": function is functions.measure_blocks}
         try:
             found.append(njit(signature, cache=True, **options, **shared)(function))
-        except RuntimeError:  # no folder in which it may be kept
+        except RuntimeError:  # no writable cache folder
             found.append(njit(signature, **options, **shared)(function))
     return found

@@ -1,6 +1,6 @@
-"""What the host is and what it allows, as its kernel reports it; others judge it.
+"""Properties and limits of the host as reported by its kernel.
 
-A reading raises OSError where there is nothing to read, and ValueError or LookupError where it makes no sense.
+A reading raises OSError if it is not available, and ValueError or LookupError if it cannot be interpreted.
 """
 
 import contextlib
@@ -21,7 +21,7 @@ _MOST = 1 << 14  # bytes; of /proc/stat, the lines of 200 processors
 
 
 class Synchronisation(NamedTuple):
-    """How well CLOCK_REALTIME is kept, by the kernel's account: by a daemon, what is left to correct, largest error."""
+    """State of CLOCK_REALTIME: kept by a daemon or not, remaining correction, and largest error."""
 
     synchronised: bool
     offset_s: float
@@ -29,25 +29,25 @@ class Synchronisation(NamedTuple):
 
 
 class Host:
-    """The kernel's account of this host; `root` is the folder with `proc` and `sys`."""
+    """Readings of this host's kernel; `root` is the folder with `proc` and `sys`."""
 
     def __init__(self, root: Path = Path("/")) -> None:
         self.root = root
 
     def text(self, path: str) -> str:
-        """A file below `proc` or `sys`."""
+        """Content of a file below `proc` or `sys`."""
         return (self.root / path).read_text(errors="replace").strip()
 
     def text_or_nothing(self, path: str) -> str:
-        """The same; empty where there is no such file."""
+        """As `text`; empty if the file does not exist."""
         try:
             return self.text(path)
         except OSError:
             return ""
 
     def cpus(self, which: str) -> set[int]:
-        """Processors of a list of the kernel: `online`, `isolated` (isolcpus), `nohz_full`."""
-        read = self.text_or_nothing if which == "nohz_full" else self.text  # not every kernel has that one
+        """Processors in a list of the kernel: `online`, `isolated` (isolcpus), `nohz_full`."""
+        read = self.text_or_nothing if which == "nohz_full" else self.text  # not every kernel has it
         found: set[int] = set()
         for part in filter(None, read(f"{CPUS}/{which}").replace("(null)", "").split(",")):
             first, _, last = part.partition("-")
@@ -59,7 +59,7 @@ class Host:
         return os.sched_getaffinity(0)
 
     def quota_cpus(self) -> float | None:
-        """Processors' worth of time that this process's control group and those above may use; None for all."""
+        """CPU quota of this process's control group and its parents, in processors; None without a quota."""
         lines = self.text("proc/self/cgroup").splitlines()
         (path,) = [line.removeprefix("0::/") for line in lines if line.startswith("0::")]
         groups = [Path(path), *Path(path).parents]
@@ -67,30 +67,32 @@ class Host:
         return min((int(limit[0]) / int(limit[1]) for limit in limits if limit and limit[0] != "max"), default=None)
 
     def clock_source(self) -> str:
-        """Hardware that the kernel reads the time from."""
+        """The kernel's clock source."""
         return self.text("sys/devices/system/clocksource/clocksource0/current_clocksource")
 
     def open_files(self) -> int | None:
-        """How many files and sockets this process may have open; None for no limit."""
+        """Limit on open files and sockets of this process; None without a limit."""
         limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
         return None if limit == resource.RLIM_INFINITY else limit
 
     def swap(self) -> tuple[int, int]:
-        """Bytes of swap space, and how many of them are in use."""
+        """Swap space in bytes: total and used."""
         found = psutil.swap_memory()
         return found.total, found.used
 
     def stolen_share(self) -> float:
-        """Part of all processor time since boot that a hypervisor gave to others."""
+        """Fraction of all processor time since boot that the hypervisor gave to other guests."""
         times = psutil.cpu_times()
-        return float(times.steal / (sum(times) - times.guest - times.guest_nice))  # which are in user and nice already
+        return float(
+            times.steal / (sum(times) - times.guest - times.guest_nice)
+        )  # guest time is included in user and nice
 
     def load(self) -> float:
-        """Processes that ran or waited to run, mean of a minute."""
+        """Load average of one minute."""
         return os.getloadavg()[0]
 
     def busy(self) -> list[tuple[str, float]]:
-        """Other processes, the busiest first: name with number, and share of one processor since the last call."""
+        """Other processes, busiest first: name (pid), and load in processors since the last call."""
         found = [process.info for process in psutil.process_iter(["pid", "name", "cpu_percent"])]
         shares = [
             (f"{one['name']} ({one['pid']})", (one["cpu_percent"] or 0.0) / 100)
@@ -100,34 +102,34 @@ class Host:
         return sorted(shares, key=lambda one: -one[1])
 
     def disk(self, folder: Path) -> tuple[int, bool]:
-        """Free bytes of the disk that a folder is on, or will be once it is made, and whether it can be written."""
+        """Free bytes on the disk of a folder, which may not exist yet, and whether it is writable."""
         there = self.root / folder.absolute().relative_to("/")
         while not there.exists():
             there = there.parent
         return psutil.disk_usage(str(there)).free, os.access(there, os.W_OK)
 
     def synchronisation(self) -> Synchronisation:
-        """How CLOCK_REALTIME is kept; of the kernel that runs, whatever `root` is."""
+        """State of CLOCK_REALTIME of the running kernel, independent of `root`."""
         libc = ctypes.CDLL(None, use_errno=True)
         timex = Timex(modes=0)  # change nothing
         state = libc.adjtimex(ctypes.byref(timex))
         if state < 0:
             raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()), "adjtimex")
         unit_s = 1e-9 if timex.status & _STA_NANO else 1e-6
-        kept = state != _TIME_ERROR and not timex.status & _STA_UNSYNC
-        return Synchronisation(kept, timex.offset * unit_s, timex.maxerror * 1e-6)
+        synchronised = state != _TIME_ERROR and not timex.status & _STA_UNSYNC
+        return Synchronisation(synchronised, timex.offset * unit_s, timex.maxerror * 1e-6)
 
 
 class Counts(NamedTuple):
-    """What the kernel counts that holds a process up, since boot or since its start.
+    """The kernel's counters of delays of a process, since boot or since the process's start.
 
     Attributes:
-        stolen_ns: time that the hypervisor gave to others, of the processor or of all; in steps of 10 ms.
-        throttled: periods in which the quota of the control group was used up.
-        waited_ns: time in which the thread could run and had no processor.
-        preempted: times that the thread had to leave its processor.
-        minor_faults: pages of the process that were in memory and not mapped yet.
-        major_faults: pages of the process that were read from a disk.
+        stolen_ns: time that the hypervisor gave to other guests, of one processor or of all, in steps of 10 ms.
+        throttled: number of periods in which the control group's quota was used up.
+        waited_ns: time for which the thread was runnable without a processor.
+        preempted: number of involuntary context switches of the thread.
+        minor_faults: number of the process's page faults without disk access.
+        major_faults: number of the process's page faults with disk access.
     """
 
     stolen_ns: int
@@ -139,10 +141,10 @@ class Counts(NamedTuple):
 
 
 class Counters:
-    """The `Counts` of one thread of a process; the files stay open, so that a reading takes some 20 us."""
+    """Reads the `Counts` of a thread; the files stay open, so that a reading takes about 20 us."""
 
     def __init__(self, process: int, thread: int, cpus: Collection[int]) -> None:
-        """Open the files of a thread that runs on these processors, on all when empty; OSError where there is none."""
+        """Open the files of a thread on these processors (all when empty); OSError if there is no such thread."""
         folder = f"/proc/{process}/task/{thread}"
         self._cpu = f"cpu{next(iter(cpus))} " if len(cpus) == 1 else "cpu "
         names = "/proc/stat", f"{folder}/schedstat", f"{folder}/status", f"/proc/{process}/stat"
@@ -152,7 +154,7 @@ class Counters:
         self._tick_ns = 1_000_000_000 // os.sysconf("SC_CLK_TCK")
 
     def read(self) -> Counts:
-        """The counts now; OSError where the process has ended."""
+        """Return the present counts; OSError if the process has ended."""
         stat = _content(self._stat)
         stolen = stat[stat.index(self._cpu) :].split(maxsplit=9)[8]
         waited_ns = _content(self._waits).split()[1]
@@ -164,7 +166,7 @@ class Counters:
 
 
 def busiest_thread(process: int, seconds: float) -> int:
-    """The thread of a process that runs most in the next seconds; OSError where there is no such process."""
+    """Return the thread of a process with the most processor time in the next seconds; OSError without a process."""
     before = _run_ns(process)
     time.sleep(seconds)
     return max((ran_ns - before.get(thread, 0), thread) for thread, ran_ns in _run_ns(process).items())[1]
@@ -179,7 +181,7 @@ def _run_ns(process: int) -> dict[int, int]:
 
 
 def _quota_file() -> Path | None:
-    """Where this process's control group counts the periods in which its quota was used up; None where it has none."""
+    """File with the throttling counter of this process's control group; None without a quota."""
     for line in Path("/proc/self/cgroup").read_text().splitlines():
         _, controllers, path = line.split(":", 2)
         if not controllers or "cpu" in controllers.split(","):
@@ -194,12 +196,12 @@ def _content(file: int) -> str:
 
 
 def resident_bytes(process: int | None = None) -> int:
-    """Resident memory of a process, of this one when None; psutil.NoSuchProcess where there is none."""
+    """Resident memory of a process (None: this one); psutil.NoSuchProcess if it does not exist."""
     return int(psutil.Process(process).memory_info().rss)
 
 
 class Timex(ctypes.Structure):
-    """The kernel's struct timex, up to what is read here."""
+    """The kernel's struct timex, first part."""
 
     _fields_ = (
         ("modes", ctypes.c_uint),
@@ -210,12 +212,12 @@ class Timex(ctypes.Structure):
 
 
 def program_name() -> str:
-    """The program of this process as people know it: `lowfc ctl`, or the name of a script."""
+    """Name of this process's program for users: `lowfc ctl`, or the name of a script."""
     program = Path(sys.argv[0])
     name = program.parent.name if program.stem == "__main__" else program.name
     return " ".join([name, *sys.argv[1:2]]) if name == "lowfc" else name or "python"
 
 
 def by_this_process(what: str) -> str:
-    """What is done, with the user and process that do it: `lowfc ctl by ann (process 12)`."""
+    """An action with this user and process: `lowfc ctl by ann (process 12)`."""
     return f"{what} by {psutil.Process().username()} (process {os.getpid()})"

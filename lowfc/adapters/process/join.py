@@ -1,4 +1,4 @@
-"""How a process of the loop joins a run: real-time set-up first, then clock, bus and service."""
+"""Set-up of a process of the loop: real-time measures, then clock, bus and service."""
 
 from lowfc.adapters.bus.run import open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus, receive_in_one_thread
@@ -11,15 +11,15 @@ from lowfc.contract.messages import Role
 
 
 def clock_of(config: Configuration) -> Clock:
-    """The run's clock: the host's, or a simulated one in lockstep."""
+    """Make the run's clock: the host's, or a simulated one in lockstep."""
     return SimulatedClock() if config.lockstep else HostClock()
 
 
 def prepare(config: Configuration, cpus: list[int]) -> Granted:
-    """Set this process up for the loop, before its first session, whose threads keep what they are born with.
+    """Set this process up for the loop, before its first zenoh session, whose threads inherit the scheduling.
 
-    All have the same priority: where the mirror shares a processor with the controller, which yields after its put, a
-    command is applied before the controller publishes its step.
+    All processes have the same priority: if mirror and controller share a processor, the controller yields after its
+    put, so that a command is applied before the controller publishes its step.
     """
     realtime = config.realtime
     return set_up(
@@ -33,7 +33,7 @@ def prepare(config: Configuration, cpus: list[int]) -> Granted:
 def join(config: Configuration, run_id: str, role: str, cpus: list[int]) -> Service:
     """Set this process up for the loop and join a run."""
     granted = prepare(config, cpus)
-    if role != Role.CAMERA:  # which computes while the mirror's states come
+    if role != Role.CAMERA:  # a simulated camera computes while messages arrive
         receive_in_one_thread()
     run = open_run(run_id, (config.mirror.name,), network=config.network)
     clock = clock_of(config)
@@ -41,9 +41,9 @@ def join(config: Configuration, run_id: str, role: str, cpus: list[int]) -> Serv
 
 
 def join_beside(config: Configuration, service: Service, role: str) -> Service:
-    """Join the run of a process once more, in another role: what is directly for the process, it gets by a call.
+    """Join the run of a process again in another role; direct links within the process are function calls.
 
-    The service manager hears of the process alone.
+    The service manager is notified by `service` only.
     """
     assert isinstance(service.bus, ZenohBus)  # noqa: S101  # as `join` made it
     links = open_run(service.run_id, (config.mirror.name,), network=config.network).links

@@ -1,7 +1,7 @@
-"""The latch of safe mode: it outlives the controller, in places that fail independently, and never delays the loop.
+"""The latch of safe mode: files that outlive the controller, in two places that fail independently.
 
-A file in any place means safe, and so does a place that cannot be read. A thread of its own writes the files, again and
-again until that works, so that neither a full disk nor a server that hangs delays the loop or an answer.
+A file in any place means safe, and so does a place that cannot be read. A separate thread writes the files and retries
+until it succeeds, so that neither a full disk nor a hanging file server delays the loop or an answer.
 """
 
 import contextlib
@@ -20,48 +20,48 @@ RETRY_S = 1.0
 
 
 def latch_files(run: Run) -> tuple[Path, ...]:
-    """Where the latch of a run is kept: in its directory, and outside of it by the run's name.
+    """Files of a run's latch: one in its directory, one outside that is named after the run.
 
-    The directory of a run is gone after a reboot or a logout, the other place is not. A run that a launcher started
-    ends with it and needs the first alone.
+    The second survives a reboot or logout, which remove the run's directory. A run started by a launcher ends with it
+    and needs the first only.
     """
     files = (run.path / NAME,)
     if Role.LAUNCHER in run.links.ports:
         return files
-    state = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]  # given by systemd
+    state = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]  # set by systemd
     if not state:
         state = str(Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local/state") / "lowfc")
-    with contextlib.suppress(OSError):  # the latch reports it when it needs the folder
+    with contextlib.suppress(OSError):  # the latch reports the fault when it writes
         Path(state).mkdir(mode=0o700, parents=True, exist_ok=True)
     return (*files, Path(state) / f"{run.run_id}.{NAME}")
 
 
 class Latch:
-    """Whether the loop is in safe mode, kept in files."""
+    """State of safe mode, stored in files."""
 
     def __init__(self, files: Sequence[Path], failed: Callable[[str], None] = lambda why: None) -> None:
-        """Read the files; `failed` gets the reason, once, whenever a file cannot be read or written.
+        """Read the files; `failed` is called once with the reason when a file cannot be read or written.
 
         Attributes:
-            safe: one of the files is there, or cannot be looked for.
-            kept: at least one of them can be written.
+            safe: whether a file exists or cannot be checked.
+            kept: whether at least one file can be written.
         """
         self._files = tuple(files)
         self._failed = failed
-        self._named: set[Path] = set()
-        self.safe = True in [self._there(file) for file in self._files]
+        self._reported: set[Path] = set()
+        self.safe = True in [self._exists(file) for file in self._files]
         self.kept = True in [self._try(_probe, file) for file in self._files]
-        self._wanted = self.safe
-        self._done: bool | None = None if self.safe else False  # where one place is safe, the others shall be, too
+        self._target = self.safe
+        self._done: bool | None = None if self.safe else False  # one file exists: write the others, too
         self._ended = False
         self._changed = threading.Condition()
         self._keeper = threading.Thread(target=self._keep, name="latch", daemon=True)
         self._keeper.start()
 
     def set(self, safe: bool) -> None:
-        """Keep this from now on; returns at once and raises nothing."""
+        """Set the state; returns at once and raises nothing."""
         with self._changed:
-            self._wanted = safe
+            self._target = safe
             self._changed.notify()
 
     def close(self) -> None:
@@ -71,27 +71,27 @@ class Latch:
             self._changed.notify()
         self._keeper.join(RETRY_S)
 
-    def _there(self, file: Path) -> bool:
+    def _exists(self, file: Path) -> bool:
         for one in (file, file.with_name(FORMER_NAME)) if file.name == NAME else (file,):
             try:
                 one.lstat()
             except (FileNotFoundError, NotADirectoryError):
                 continue
             except OSError as fault:
-                self._name(one, f"{one} cannot be read ({fault.strerror}), which counts as safe")
+                self._report(one, f"{one} cannot be read ({fault.strerror}), which counts as safe")
             return True
         return False
 
     def _keep(self) -> None:
-        """On a thread of its own: write or remove the files until all are as wanted."""
+        """Write or remove the files until all agree with the state; runs on its own thread."""
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._ended or self._wanted is not self._done)
-                ended, wanted = self._ended, self._wanted
-            if wanted is not self._done:
-                self._done = None  # some of the files may be written, and others not
-                if False not in [self._try(_write if wanted else _remove, file) for file in self._files]:
-                    self._done = wanted
+                self._changed.wait_for(lambda: self._ended or self._target is not self._done)
+                ended, target = self._ended, self._target
+            if target is not self._done:
+                self._done = None  # only some of the files may be written
+                if False not in [self._try(_write if target else _remove, file) for file in self._files]:
+                    self._done = target
                 elif not ended:
                     with self._changed:
                         self._changed.wait_for(lambda: self._ended, RETRY_S)
@@ -103,15 +103,15 @@ class Latch:
         try:
             act(file)
         except OSError as fault:
-            self._name(file, f"{file} cannot be written ({fault.strerror})")
+            self._report(file, f"{file} cannot be written ({fault.strerror})")
             return False
-        self._named.discard(file)
+        self._reported.discard(file)
         return True
 
-    def _name(self, file: Path, why: str) -> None:
-        """Report once that a file is wrong, until it is right again; a handler that fails does not end this thread."""
-        if file not in self._named:
-            self._named.add(file)
+    def _report(self, file: Path, why: str) -> None:
+        """Report a fault of a file once until it works again; a failing handler does not end this thread."""
+        if file not in self._reported:
+            self._reported.add(file)
             with contextlib.suppress(Exception):
                 self._failed(why)
 

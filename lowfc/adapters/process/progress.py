@@ -1,4 +1,4 @@
-"""Progress bars that leave nothing behind."""
+"""Progress bars that disappear at the end."""
 
 import contextlib
 import time
@@ -17,18 +17,18 @@ from rich.progress import (
 )
 
 Counted = Callable[[str, int, int], None]
-"""Gets what is being done, how much of it is done, and of how much."""
+"""Progress callback: description of the work, amount done, total amount."""
 _EVERY_S = 10.0
 
 
 def passing_bar(console: Console, *columns: ProgressColumn) -> Progress:
-    """A bar that vanishes at its end, and is not shown without a terminal, where it would leave an empty line."""
+    """Make a bar that disappears at its end; without a terminal it is not shown, as it would leave an empty line."""
     return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
 
 
 @contextlib.contextmanager
 def counting_bar(console: Console, *columns: ProgressColumn) -> Iterator[Counted]:
-    """One bar for several things in turn, with `columns` beside its description; it appears with the first step."""
+    """One bar for several tasks in turn, with `columns` beside its description; it appears with the first progress."""
     with passing_bar(console, TextColumn("{task.description}"), BarColumn(), *columns) as bar:
         tasks: list[TaskID] = []
 
@@ -41,12 +41,12 @@ def counting_bar(console: Console, *columns: ProgressColumn) -> Iterator[Counted
 
 
 def reading_bar(console: Console) -> contextlib.AbstractContextManager[Counted]:
-    """The same for a file: how many of its bytes have been read."""
+    """As `counting_bar`, for the bytes read from a file."""
     return counting_bar(console, DownloadColumn(), TimeRemainingColumn())
 
 
 def spoken(say: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> Counted:
-    """Progress without a terminal: a line every 10 s, with the time to go at the rate so far; `clock` is in seconds."""
+    """Progress without a terminal: a line every 10 s with the estimated remaining time; `clock` is in seconds."""
     before = -1
     begun = spoken_at = -inf
 
@@ -55,7 +55,7 @@ def spoken(say: Callable[[str], None], clock: Callable[[], float] = time.monoton
         now = clock()
         if before < 0:
             before, spoken_at = done, now
-        if done == before:  # the time until then is no measure of the rate
+        if done == before:  # exclude the time before the first progress from the rate
             begun = now
         elif now - spoken_at >= _EVERY_S:
             spoken_at = now

@@ -1,4 +1,4 @@
-"""Origin of figures: versions, host, processor and linear algebra, by which two runs can be told apart."""
+"""Provenance of results: versions, host, processor and linear algebra library."""
 
 import contextlib
 import importlib.metadata
@@ -20,11 +20,11 @@ _SIMD = ("sse", "ssse", "avx", "fma", "f16c", "amx", "neon", "asimd", "sve", "fp
 
 
 def provenance(run_id: str = "", seed: int | None = None) -> dict[str, str]:
-    """Versions and host of a run; they stay the same while host and installation do.
+    """Versions and host of a run; constant for the same host and installation.
 
     Args:
-        run_id: of the run; empty for none.
-        seed: of a simulated run.
+        run_id: name of the run; empty for none.
+        seed: seed of a simulated run.
 
     Returns:
         Versions by library, and lowfc, python, host, kernel, processor, processors, cpu_features (the processor's
@@ -36,10 +36,10 @@ def provenance(run_id: str = "", seed: int | None = None) -> dict[str, str]:
         "python": platform.python_version(),
         "host": platform.node(),
         "kernel": platform.release(),
-        "processor": _of_the_processor("model name", "Model") or platform.machine(),
+        "processor": _cpuinfo("model name", "Model") or platform.machine(),
         "processors": str(os.cpu_count()),
         "cpu_features": " ".join(
-            sorted({flag for flag in _of_the_processor("flags", "Features").split() if flag.startswith(_SIMD)})
+            sorted({flag for flag in _cpuinfo("flags", "Features").split() if flag.startswith(_SIMD)})
         ),
         "blas": _blas(),
         **{library: importlib.metadata.version(library) for library in LIBRARIES},
@@ -55,8 +55,8 @@ def provenance(run_id: str = "", seed: int | None = None) -> dict[str, str]:
     return found
 
 
-def _of_the_processor(*names: str) -> str:
-    """Value of the first line of /proc/cpuinfo with one of these names; empty without one."""
+def _cpuinfo(*names: str) -> str:
+    """First value in /proc/cpuinfo with one of these names; empty if there is none."""
     with Path("/proc/cpuinfo").open() as lines:
         for line in lines:
             name, _, value = line.partition(":")
@@ -66,7 +66,7 @@ def _of_the_processor(*names: str) -> str:
 
 
 def _blas() -> str:
-    """The linear algebra that numpy calls; scipy's own, where it is loaded too, is not in the loop."""
+    """BLAS library used by numpy; scipy's own, if loaded, is not used in the loop."""
     loaded = [library for library in threadpool_info() if library["user_api"] == "blas"]
     of_numpy = [library for library in loaded if Path(library["filepath"]).is_relative_to(_NUMPY / "numpy.libs")]
     names = {

@@ -1,6 +1,6 @@
-"""Real-time set-up of a process, in one place; call it before the first zenoh session.
+"""Real-time set-up of a process; call it before the first zenoh session.
 
-A session's threads keep the scheduling class and the processors they are born with.
+A session's threads inherit the scheduling class and the processors at its creation.
 """
 
 import ctypes
@@ -19,17 +19,17 @@ _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 _CAP_IPC_LOCK = 1 << 14
 _MONITOR_NICE = 5  # of 19
 _LATENCY_DEVICE = "/dev/cpu_dma_latency"
-_COMPILER = "llvmlite"  # its work is done before the first frame, and it is larger than all the rest
+_COMPILER = "llvmlite"  # not used after the first frame, and larger than everything else
 
 _Measure = tuple[str, Callable[[], object], str]
-"""Name of a measure, what asks the host for it, and the cost of its refusal."""
+"""Name of a measure, the function that requests it, and the cost of its refusal."""
 
-_held: list[int] = []
+_open_devices: list[int] = []
 
 
 @dataclass(frozen=True, slots=True)
 class Granted:
-    """Measures that are in force, and those that the host refused, each with what that costs."""
+    """Measures in force, and measures refused by the host, each with the cost of its refusal."""
 
     granted: tuple[str, ...]
     refused: tuple[tuple[str, str], ...]
@@ -46,13 +46,13 @@ def set_up(priority: int | None, cpus: set[int] | None, *, lock_memory: bool, di
     """Prepare this process for the loop.
 
     Args:
-        priority: of SCHED_FIFO, 1 to 99; None leaves the normal class.
-        cpus: processors to stay on; None leaves all.
-        lock_memory: keep every page in memory.
-        disable_cpu_idle: keep the host's idle processors awake as long as this process lives.
+        priority: priority of SCHED_FIFO, 1 to 99; None: normal scheduling class.
+        cpus: processors to run on; None: all.
+        lock_memory: whether to lock all pages in memory.
+        disable_cpu_idle: whether to disable CPU idle states of the host while this process lives.
 
     Returns:
-        What was granted; a refusal is no error, for the loop runs without, only less evenly.
+        Granted and refused measures; a refusal is not an error: the loop runs with more jitter.
     """
     threadpool_limits(limits=1)
     gc.collect()
@@ -67,7 +67,7 @@ def set_up(priority: int | None, cpus: set[int] | None, *, lock_memory: bool, di
             "a processor that sleeps between frames takes tens of microseconds longer to wake, several times a "
             f"frame; let this user write to {_LATENCY_DEVICE}"
         )
-        measures.append(("processors awake", _stay_awake, cost))
+        measures.append(("processors awake", _disable_cpu_idle, cost))
     cost = (
         "other programs may run first, and one frame in a thousand comes milliseconds late on a busy host; "
         "allow it with LimitRTPRIO= or CAP_SYS_NICE"
@@ -76,16 +76,15 @@ def set_up(priority: int | None, cpus: set[int] | None, *, lock_memory: bool, di
 
 
 def spread(cpus: Iterable[int], *, simulated: bool = True) -> dict[str, list[int]]:
-    """Configuration keys that keep the loop's processes apart on these processors; none where there is only one.
+    """Configuration keys that distribute the loop's processes over these processors; none for a single one.
 
-    The controller has one to itself where it can: whatever else runs there pushes its code and data out of the caches,
-    and the recorder, which is sent each frame together with it, would run first. Of two processors, though, a simulated
-    camera needs one, and the recorder whatever is left of either: a processor whose real-time share is used up stands
-    still for 50 ms.
+    The controller gets its own processor if possible: other processes would evict its code and data from the caches,
+    and the recorder, which receives each frame at the same time, would run first. With two processors, a simulated
+    camera needs one, and the recorder may use both: a processor whose real-time share is used up stops for 50 ms.
 
     Args:
-        cpus: to spread them on.
-        simulated: the camera computes its frames.
+        cpus: available processors.
+        simulated: whether the camera computes its frames.
     """
     camera, *others = cpus = sorted(cpus)
     if not others:
@@ -101,23 +100,23 @@ def spread(cpus: Iterable[int], *, simulated: bool = True) -> dict[str, list[int
 
 
 def step_back(priority: int | None, cpus: set[int] | None = None) -> Granted:
-    """Prepare a process that must keep up but never get in the loop's way, such as the recorder.
+    """Set up a process that must keep up with the loop but never delay it, such as the recorder.
 
-    Its SCHED_FIFO priority, where it may have one, is below the loop's and above all else on the host: in the normal
-    class, beside other work, a recorder loses messages of a 1 kHz loop.
+    Its SCHED_FIFO priority, if granted, is below the loop's and above everything else: in the normal class on a busy
+    host, a recorder loses messages of a 1 kHz loop.
     """
-    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # not the class of a parent that is in the loop
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # do not inherit the class of a parent in the loop
     measures = _processors(cpus, "the recorder may get in the loop's way")
     measures += _scheduling(priority, "on a busy host the recorder loses messages")
     return _ask([] if priority is not None else ["normal scheduling class"], measures)
 
 
 def let_send() -> None:
-    """Let the bus's thread send what was just put before this one goes on.
+    """Yield so that the bus's thread sends the last put before this thread continues.
 
-    Of equal SCHED_FIFO priority and on the same processor, it would wait until this one rests; so would the mirror that
-    got a command, and the bus's thread of the mirror, which is woken only then. In the normal class the kernel sees to
-    that, and yielding would give way to everybody.
+    With equal SCHED_FIFO priority on the same processor, that thread would wait until this one sleeps; so would the
+    mirror and its bus thread, hence the second yield. In the normal class the kernel schedules them, and yielding would
+    let any process run.
     """
     if os.sched_getscheduler(0) == os.SCHED_FIFO:
         os.sched_yield()
@@ -125,8 +124,8 @@ def let_send() -> None:
 
 
 def give_way() -> None:
-    """Let the loop and its recorder run first: for a monitor, which may be late and loses nothing."""
-    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # not the class of a parent that is in the loop
+    """Lower this process's priority below the loop and its recorder; for a monitor, which may be late."""
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # do not inherit the class of a parent in the loop
     os.nice(_MONITOR_NICE)
     threadpool_limits(limits=1)
 
@@ -154,23 +153,23 @@ def _scheduling(priority: int | None, cost: str) -> list[_Measure]:
     return [(f"SCHED_FIFO priority {priority}", first, cost)]
 
 
-def _stay_awake() -> None:
-    """Ask the kernel for processors that wake at once; it holds as long as the device is open."""
-    if not _held:
+def _disable_cpu_idle() -> None:
+    """Disable CPU idle states; in force while the device is open."""
+    if not _open_devices:
         device = os.open(_LATENCY_DEVICE, os.O_WRONLY)
         try:
             os.write(device, struct.pack("=i", 0))
         except OSError:
             os.close(device)
             raise
-        _held.append(device)
+        _open_devices.append(device)
 
 
 def _lock_memory() -> None:
-    """Lock what is there, and every other page once it is touched; of files all pages now, for reading one takes long.
+    """Lock present pages, other pages once touched, and all pages of mapped files now, as reading them is slow.
 
-    To lock all of what is only reserved would fill it: most of it are buffers and stacks of threads that BLAS does not
-    use. Under a limit, later allocations would fail instead of being slow, so nothing is locked then.
+    Locking all reserved memory would allocate it: most of it are buffers and thread stacks that BLAS does not use.
+    Under a memory-lock limit nothing is locked, as later allocations would fail.
     """
     limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[1]
     if limit != resource.RLIM_INFINITY and not _capabilities() & _CAP_IPC_LOCK:

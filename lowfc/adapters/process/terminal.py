@@ -1,4 +1,4 @@
-"""Command lines: how a user's mistake is shown, and the options that all processes of a run have."""
+"""Command lines: display of users' errors, and options common to all processes of a run."""
 
 import errno
 import os
@@ -34,7 +34,7 @@ ConfigFile = Annotated[Path | None, typer.Option("--config", help="Configuration
 
 
 class _Group(TyperGroup):
-    """Commands, each with its whole first sentence."""
+    """Command group that lists each command with its full first sentence."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         with formatter.section("Commands"):
@@ -42,7 +42,7 @@ class _Group(TyperGroup):
 
 
 def new_app(help_text: str) -> typer.Typer:
-    """A command line with plain errors."""
+    """Make a command line with plain error messages."""
     return typer.Typer(
         help=help_text,
         cls=_Group,
@@ -58,7 +58,7 @@ def _warn(text: str) -> None:
 
 
 def run_app(app: Callable[[], object]) -> NoReturn:
-    """Run a command line; a user's mistake is one clear message and exit status 2, never a traceback.
+    """Run a command line; a user's error gives one message and exit status 2, never a traceback.
 
     SIGTERM ends a command as Ctrl-C does; the processes of a loop catch both themselves.
     """
@@ -71,7 +71,7 @@ def run_app(app: Callable[[], object]) -> NoReturn:
         if fault.filename is not None or fault.errno not in (errno.ENOSPC, errno.EIO, errno.EPIPE):
             raise
         sys.stderr.write(f"error: standard output cannot be written: {fault.strerror}\n")
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the rest of it cannot be written
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # discard the rest
         sys.exit(2)
     except LowfcError as error:
         sys.stderr.write(f"error: {printable(str(error), keep=LINES)}\n")
@@ -86,8 +86,8 @@ def run_app(app: Callable[[], object]) -> NoReturn:
 def configuration(
     file: Path | None, overrides: dict[str, Any] | None = None, defaults: dict[str, Any] | None = None
 ) -> "Configuration":
-    """Configuration of a file, options given on the command line (not None) over it, a command's defaults under it."""
+    """Configuration from a file; command-line options that are not None override it, it overrides the defaults."""
     from lowfc.contract.configuration import load
 
-    given = {key: value for key, value in (overrides or {}).items() if value is not None}
-    return load(file, given, defaults, remark=_warn)
+    overriding = {key: value for key, value in (overrides or {}).items() if value is not None}
+    return load(file, overriding, defaults, remark=_warn)

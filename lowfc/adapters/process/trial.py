@@ -1,6 +1,6 @@
-"""What this host grants a process of the loop, and how late it wakes it: tried in a process of its own.
+"""Trial of this host's real-time measures and wake-up latency, in a separate process.
 
-That process ends, so nothing of what it was granted stays with the caller.
+The process ends afterwards, so that no measure stays in force for the caller.
 """
 
 import os
@@ -14,17 +14,17 @@ from lowfc.contract.configuration import Realtime
 
 RATE_HZ = 1000
 
-_CPUS = 8192  # as many as a kernel can have
+_CPUS = 8192  # the kernel's maximum
 
 
 class Trial(NamedTuple):
-    """What the host granted.
+    """Result of a trial.
 
     Attributes:
-        refused: of `priority`, `lock_memory` and `disable_cpu_idle` what the host refused, each with what that costs.
-        cpus: processors that the process could choose from.
-        normal_ns: how late each wake-up was in the normal class, ns.
-        first_ns: the same under SCHED_FIFO; empty where that is not asked for, or refused.
+        refused: refused ones among `priority`, `lock_memory` and `disable_cpu_idle`, each with its cost.
+        cpus: processors available to the process.
+        normal_ns: lateness of each wake-up in the normal scheduling class, ns.
+        first_ns: lateness of each wake-up under SCHED_FIFO, ns; empty if not requested or refused.
     """
 
     refused: dict[str, tuple[str, str]]
@@ -34,21 +34,21 @@ class Trial(NamedTuple):
 
 
 def try_out(asked: Realtime, cpus: set[int], seconds: float) -> Trial:
-    """Ask for what a process of the loop asks for, and sleep 1000 times a second in each scheduling class.
+    """Request the measures of a process of the loop, and time 1000 wake-ups per second in each scheduling class.
 
-    It sleeps on these processors, all when empty. OSError where the process that tries cannot be started, or fails.
+    It runs on these processors (all when empty). OSError if the trial's process cannot be started, or fails.
     """
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         try:
             return pool.submit(_try, asked, cpus, seconds).result()
         except BrokenExecutor as fault:
-            raise OSError(f"the process that tries it ended: {fault}") from fault
+            raise OSError(f"the trial's process ended: {fault}") from fault
 
 
 def lateness_ns(wake_ups: int, period_ns: int = 1_000_000_000 // RATE_HZ) -> list[int]:
-    """Sleep until instants a period apart; how late each wake-up was, ns.
+    """Sleep until times a period apart; return the lateness of each wake-up, ns.
 
-    The instants are fixed beforehand: one that passes while this process sleeps too long counts as late, too.
+    The times are fixed beforehand: one that passes during a late wake-up also counts as late.
     """
     late_ns = [0] * wake_ups
     due_ns = time.monotonic_ns()
@@ -61,7 +61,7 @@ def lateness_ns(wake_ups: int, period_ns: int = 1_000_000_000 // RATE_HZ) -> lis
 
 
 def _try(asked: Realtime, cpus: set[int], seconds: float) -> Trial:
-    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # not the class of a parent that has another
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # do not inherit the parent's class
     wake_ups = max(1, round(seconds * RATE_HZ))
     inherited = os.sched_getaffinity(0)
     os.sched_setaffinity(0, range(_CPUS))
@@ -70,8 +70,8 @@ def _try(asked: Realtime, cpus: set[int], seconds: float) -> Trial:
     refused: dict[str, tuple[str, str]] = {}
 
     def ask(name: str, priority: int | None = None, **measure: bool) -> None:
-        wanted = {"lock_memory": False, "disable_cpu_idle": False} | measure
-        if found := set_up(priority, None, **wanted).refused:
+        measures = {"lock_memory": False, "disable_cpu_idle": False} | measure
+        if found := set_up(priority, None, **measures).refused:
             refused[name] = found[0]
 
     ask("lock_memory", lock_memory=asked.lock_memory)

@@ -1,19 +1,18 @@
-"""The rerun viewer as a child process: a window, a picture without a screen, or a page for the browser.
+"""The rerun viewer as a child process: a window, headless, or a page for the browser.
 
-It listens on loopback only, asks nobody on the network, and dies with us. It is the binary itself: rerun's own servers
-inside of a Python process have no option for where to listen, and its `rerun` on the path is a script that leaves the
-binary behind when it is killed.
+It listens on loopback only, does not use the network, and ends with its parent. The binary is started directly: rerun's
+servers in a Python process cannot be bound to an address, and the script `rerun` leaves the binary behind when it is
+killed.
 
 Measured with rerun 0.41:
 
-- `RecordingStream.log` into a viewer that hangs goes on until about 100 MB are unsent (our memory grows by 150 MB), and
-  then blocks. Into one that is dead it does neither; a new stream with the same ids to a new viewer on the same port
-  goes on.
-- `disconnect`, `del`, and the end of the process block as long as the viewer hangs: stop() it first.
-- A browser's page whose server was restarted must be reloaded.
-- The memory limit is one for the data as rerun counts it: a viewer levelled off at 184 MB for "100MB", a headless one
+- `RecordingStream.log` to a hanging viewer continues until about 100 MB are unsent (this process grows by 150 MB), then
+  blocks. To a dead viewer it does neither; a new stream with the same ids to a new viewer on the same port continues.
+- `disconnect`, `del`, and the end of the process block while the viewer hangs: call stop() first.
+- A browser's page must be reloaded after its server has restarted.
+- The memory limit applies to the data as counted by rerun: a viewer levelled off at 184 MB for "100MB", a headless one
   at 545 MB for "200MB".
-- ViewerClient has no time limit: all calls here run in a thread that may be left.
+- ViewerClient has no timeout: all calls here run in a thread that may be abandoned.
 """
 
 import http.client
@@ -51,9 +50,9 @@ _START_S = 20.0
 _POLL_S = 0.05
 _CALL_S = 20.0
 _STOP_S = 1.0
-_REDRAW_S = 0.5  # longer than a notification stands still when nobody looks
+_REDRAW_S = 0.5  # longer than a pause in the animation of a notification
 _FAILURES = ("panicked at", "Error:", "ERROR")
-_HTTP2_HELLO = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes([0, 0, 0, 4, 0, 0, 0, 0, 0])  # and empty SETTINGS
+_HTTP2_HELLO = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes([0, 0, 0, 4, 0, 0, 0, 0, 0])  # with empty SETTINGS
 
 Answer = TypeVar("Answer")
 
@@ -63,7 +62,7 @@ class ViewerError(LowfcError):
 
 
 class Show(StrEnum):
-    """How the viewer is looked at."""
+    """Display mode of the viewer."""
 
     NATIVE = "native"
     HEADLESS = "headless"
@@ -85,12 +84,12 @@ class RerunViewer:
         port: int | None = None,
         web_port: int | None = None,
     ) -> None:
-        """Start it and wait until it answers; a port that is None is a free one.
+        """Start the viewer and wait until it answers; None selects a free port.
 
-        `memory_limit` bounds what it keeps of the stream, `size_px` (width, height) is for a headless one.
+        `memory_limit` bounds the data kept of the stream; `size_px` (width, height) is for headless mode.
 
         Raises:
-            ViewerError: the binary, a screen or a driver is missing, or it does not come up.
+            ViewerError: the binary, a screen or a driver is missing, or the viewer does not start.
         """
         free = free_ports(3)
         self.show = show
@@ -100,7 +99,7 @@ class RerunViewer:
         self.web_address = web_address(self.url, self.web_port) if self.web_port else None
         self._page: ViewerPage | None = None
         self._source_port = free[2]
-        self._stderr = tempfile.TemporaryFile()  # noqa: SIM115  # nameless: nothing is left if this process is killed
+        self._stderr = tempfile.TemporaryFile()  # noqa: SIM115  # unnamed: removed even if this process is killed
         self._output = ""
         stderr = Path(f"/proc/self/fd/{self._stderr.fileno()}")
         self._child = Child(f"the viewer on port {self.port}", [], stderr, death_signal=signal.SIGKILL)
@@ -126,17 +125,17 @@ class RerunViewer:
 
     @property
     def pid(self) -> int:
-        """Number of its process."""
+        """Process id of the viewer."""
         assert self._child.process is not None  # noqa: S101  # __init__ started it
         return self._child.process.pid
 
     @property
     def alive(self) -> bool:
-        """Whether its process is there; one that hangs is."""
+        """Whether its process exists; a hanging one does."""
         return self._child.process is not None and self._child.status is None
 
     def answers(self, patience_s: float = 1.0) -> bool:
-        """Whether its server greets a new connection; one that hangs does not, though the kernel accepts for it."""
+        """Whether its server answers a new connection; a hanging one does not, although the kernel accepts it."""
         try:
             with socket.create_connection((HOST, self.port), patience_s) as link:
                 link.settimeout(patience_s)
@@ -146,19 +145,19 @@ class RerunViewer:
             return False
 
     def resident_bytes(self) -> int:
-        """Memory of its process; 0 when it is gone."""
+        """Resident memory of its process; 0 if it has ended."""
         try:
             return resident_bytes(self.pid)
         except psutil.NoSuchProcess:
             return 0
 
     def how_it_ended(self) -> str:
-        """One line about a viewer that is no longer alive."""
+        """One line on how the viewer ended."""
         how = self._child.how_it_ended()
         return how if (self._child.status or 0) < 0 else f"{how} ({self._failure()})"
 
     def stop(self) -> None:
-        """End it, kindly for a second and then not; one that has ended stays so."""
+        """Stop the viewer: SIGTERM, then SIGKILL after a second; no effect if it has ended."""
         if self._page is not None:
             self._page.stop()
             self._page = None
@@ -167,10 +166,10 @@ class RerunViewer:
         self._stderr.close()
 
     def screenshot(self, path: Path | None = None, patience_s: float = 20.0) -> bytes:
-        """PNG of the whole viewer once it has loaded and stands still, or when the patience with either ends.
+        """PNG of the whole viewer once it has loaded and its image is constant, or after the timeout of either.
 
         Raises:
-            ViewerError: it does not answer, or nothing is loaded.
+            ViewerError: the viewer does not answer, or has loaded nothing.
             DataFileError: the file cannot be written.
         """
         deadline_s = time.monotonic() + patience_s
@@ -193,13 +192,13 @@ class RerunViewer:
         return picture
 
     def state(self) -> "ViewerState":
-        """Its recordings, its views, and what it is loading; ViewerError where it does not answer."""
+        """Recordings, views and pending loads of the viewer; ViewerError if it does not answer."""
         return self._ask(lambda client: client.get_state())
 
     def _start(self) -> None:
         self._child.start()
         deadline_s = time.monotonic() + _START_S
-        ready = self._page_is_there if self.show is Show.WEB else self._draws
+        ready = self._page_is_served if self.show is Show.WEB else self._draws
         while not (ready() and self.alive):
             if not self.alive:
                 raise ViewerError(f"{self.how_it_ended()}{_ADVICE[self.show]}")
@@ -211,7 +210,7 @@ class RerunViewer:
             time.sleep(_POLL_S)
 
     def _failure(self) -> str:
-        """The most useful line of its output: the failure before a stack trace, or the last."""
+        """Most useful line of its output: the failure before a stack trace, otherwise the last line."""
         if not self._stderr.closed:
             self._stderr.seek(0)
             self._output = self._stderr.read().decode(errors="replace")
@@ -219,7 +218,7 @@ class RerunViewer:
         failures = [line for line in lines if any(word in line for word in _FAILURES)]
         return next(iter(failures or lines[-1:]), "it wrote nothing")
 
-    def _page_is_there(self) -> bool:
+    def _page_is_served(self) -> bool:
         page = http.client.HTTPConnection(HOST, self._source_port, timeout=1.0)
         try:
             page.request("HEAD", "/")
@@ -230,7 +229,7 @@ class RerunViewer:
             page.close()
 
     def _draws(self) -> bool:
-        """Whether the viewer, not only its server, is up: without a driver the server is, for a moment."""
+        """Whether the viewer itself is up: without a graphics driver its server alone runs for a moment."""
         try:
             return self.answers() and bool(
                 self._ask(lambda client: client.take_screenshot(max_size=16))
@@ -241,7 +240,7 @@ class RerunViewer:
             return False
 
     def _ask(self, question: "Callable[[ViewerClient], Answer]") -> Answer:
-        """Ask the viewer; a call to one that hangs would not return, so it is made by a thread that may be left."""
+        """Query the viewer on a separate thread, which is abandoned if the viewer hangs."""
         answers: list[Answer] = []
         faults: list[Exception] = []
 
@@ -275,34 +274,34 @@ _ADVICE = {
 
 
 def stream_url(port: int) -> str:
-    """Where a RecordingStream connects to a viewer that listens on a port."""
+    """URL for a RecordingStream to a viewer that listens on a port."""
     return f"rerun+http://{HOST}:{port}/proxy"
 
 
 def web_address(url: str, web_port: int) -> str:
-    """Page that opens the stream, dark as the colours of our layout need it; it keeps nothing between two visits."""
+    """Address of the page that opens the stream, with the dark theme of our layout and no stored state."""
     return f"http://{HOST}:{web_port}/?url={quote(url, safe='')}&hide_welcome_screen&persist=0&theme=dark"
 
 
 def has_screen(environment: Mapping[str, str] = os.environ) -> bool:
-    """Whether there is a screen for a window to be on."""
+    """Whether there is a screen for a window."""
     return any(environment.get(name) for name in _SCREEN_VARIABLES)
 
 
 def require_screen(show: Show | None, environment: Mapping[str, str] = os.environ) -> None:
-    """Raise a ViewerError where something is to be shown in a window, and there is no screen for it."""
+    """Raise ViewerError if a window is requested and there is no screen."""
     if show is Show.NATIVE and not has_screen(environment):
         raise ViewerError(f"there is no screen for a window (neither DISPLAY nor WAYLAND_DISPLAY is set); {_NO_SCREEN}")
 
 
 def vulkan_drivers() -> list[Path]:
-    """Vulkan drivers that are installed, the one that draws without a graphics card first."""
+    """Installed Vulkan drivers, the software renderer first."""
     found = [path for folder in _DRIVER_FOLDERS for path in sorted(Path(folder).glob("*.json"))]
     return sorted(found, key=lambda path: not path.name.startswith("lvp"))
 
 
 def viewer_binary() -> Path:
-    """The viewer's program, as rerun-sdk installs it; ViewerError where it is not there."""
+    """The viewer's binary as installed by rerun-sdk; ViewerError if it is missing."""
     package = importlib.util.find_spec("rerun_cli")
     binary = Path(package.origin).parent / "rerun" if package is not None and package.origin is not None else None
     if binary is None or not binary.is_file():
@@ -319,7 +318,7 @@ def _words(show: Show, memory_limit: str, size_px: tuple[int, int], source_port:
 
 
 def _environment(show: Show) -> dict[str, str]:
-    """Environment of the viewer: no usage statistics, no question to the network, no chatter."""
+    """Environment of the viewer: no usage statistics, no network access, warnings only."""
     environment = {name: value for name, value in os.environ.items() if name.lower() != "no_proxy"}
     require_screen(show, environment)
     if show is Show.HEADLESS and not any(environment.get(name) for name in _DRIVER_VARIABLES):
@@ -328,8 +327,8 @@ def _environment(show: Show) -> dict[str, str]:
             raise ViewerError(f"there is no Vulkan driver to draw with; {_PACKAGES}")
         environment["VK_ICD_FILENAMES"] = str(drivers[0])
     environment.pop("FORCE_RERUN_ANALYTICS", None)
-    environment["CI"] = "1"  # rerun sends no usage statistics then, and the user's own settings stay as they are
-    environment["ALL_PROXY"] = f"http://{HOST}:9"  # nobody there: it asks api.github.com for a newer version otherwise
-    environment["NO_COLOR"] = "1"  # the end of its output goes into ours
+    environment["CI"] = "1"  # disables usage statistics without changing the user's settings
+    environment["ALL_PROXY"] = f"http://{HOST}:9"  # no proxy there: prevents the version check at api.github.com
+    environment["NO_COLOR"] = "1"  # the end of its output is printed in our errors
     environment["RUST_LOG"] = "warn,egui_wgpu=error,re_renderer=error,re_viewer::native=error"
     return environment

@@ -1,7 +1,7 @@
-"""The web viewer's page, served again with a rule that keeps it on this host.
+"""Proxy for the web viewer's page that adds a content security policy, so that the page contacts this host only.
 
-As rerun 0.41 serves it, the page sends usage statistics, asks for a newer version and fetches a font, each from
-somewhere on the network, and has no setting against it; but a browser obeys a content security policy.
+Served by rerun 0.41 itself, the page sends usage statistics, checks for a newer version and fetches a font over the
+network, without a setting to prevent it.
 """
 
 import http.client
@@ -11,16 +11,16 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 _PATIENCE_S = 10.0
 _CHUNK_BYTES = 1 << 20
-_PASSED_ON = ("Content-Type", "rerun-final-length")  # the second is for the page's progress bar
+_FORWARDED = ("Content-Type", "rerun-final-length")  # the second is used by the page's progress bar
 
 
 class ViewerPage:
-    """Serves what another server on this host serves, with the policy added, until stop()."""
+    """Serves the content of another server on this host with the policy added, until stop()."""
 
     def __init__(self, host: str, port: int, source_port: int, stream_port: int) -> None:
-        """Listen at `host` and `port`, and serve what is at `source_port`; OSError where the port is taken.
+        """Listen at `host` and `port`, and serve the content of `source_port`; OSError if the port is in use.
 
-        The page may ask nobody but this server and the stream.
+        The page may connect to this server and to the stream only.
         """
         own = "'self' 'unsafe-inline' 'wasm-unsafe-eval' data: blob:"
         policy = f"default-src {own}; connect-src {own} http://{host}:{stream_port}"
@@ -32,7 +32,7 @@ class ViewerPage:
                     source.request("GET", self.path)
                     answer = source.getresponse()
                     self.send_response(answer.status)
-                    for name in _PASSED_ON:
+                    for name in _FORWARDED:
                         if value := answer.getheader(name):
                             self.send_header(name, value)
                     self.send_header("Content-Security-Policy", policy)
