@@ -79,7 +79,7 @@ def test_one_that_is_made_here_is_read_by_others(path: Path) -> None:
     assert other.wait(3, 1)
     assert np.array_equal(other.pixels[0], image(1, FLOAT32))
     assert other.get("<q", 184) - 1_700_000_000 == round(time.clock_gettime(time.CLOCK_TAI) - time.time())
-    with pytest.raises(StreamError, match="is there already"):
+    with pytest.raises(StreamError, match="exists already"):
         Stream.create(path, (ROWS, COLUMNS), np.float32)
     assert [one.name for one in path.parent.iterdir()] == [path.name]
 

@@ -199,7 +199,7 @@ def test_messages_without_chunks_are_under_the_checksum_of_the_whole_and_read_up
     path.write_bytes(data)
     reader = LogReader(path, skip_damaged=True)
     assert len(list(reader)) == len(SENT)
-    assert [one.why.partition(",")[0] for one in reader.damage] == ["its parts are whole"]
+    assert [one.why.partition(",")[0] for one in reader.damage] == ["its parts are intact"]
     path.write_bytes(data[: len(data) // 2])
     reader = LogReader(path)
     read = identity(list(reader))
@@ -221,6 +221,6 @@ def test_an_unknown_compression_is_named_and_not_called_damage(
     with pytest.raises(DataFileError) as caught:
         list(LogReader(path, skip_damaged=skip_damaged))
     assert str(caught.value) == (
-        f"{path} is compressed with 'brotli', which is not read; lz4, zstd and none are: "
+        f"{path} is compressed with 'brotli'; lz4, zstd and none are supported: "
         "compress it again with `mcap compress --compression zstd`"
     )

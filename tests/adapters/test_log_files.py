@@ -237,7 +237,7 @@ def test_a_damaged_attachment_is_left_out_and_damaged_metadata_named(tmp_path: P
     assert (list(reader.attachments), len(reader.damage)) == (["h.fits"], 1)
     path.write_bytes(data)
     flipped(path, data.index(b"night"))  # which no checksum of its own covers
-    with pytest.raises(DataFileError, match="its parts are whole, but"):
+    with pytest.raises(DataFileError, match="its parts are intact, but"):
         list(LogReader(path))
 
 
@@ -270,7 +270,7 @@ NO_FIT = [
             for start in NO_TIMES
         ),
         ([DECLARED, message(1), chunk(message(2))], "outside of the chunks", [0, 2]),
-        ([chunk(STEPS, CHANNEL, message(0), message(1, channel=2))], "what declares its messages is not there", [0]),
+        ([chunk(STEPS, CHANNEL, message(0), message(1, channel=2))], "the declaration of its messages is missing", [0]),
         *(([DECLARED, packed(content), chunk(message(2))], "is damaged", [0, 2]) for content in NO_FIT),
     ],
 )

@@ -140,7 +140,7 @@ def test_every_lost_message_is_counted(bench: Bench) -> None:
 def test_a_folder_that_cannot_be_written_is_an_error(bench: Bench) -> None:
     bench.folder.write_text("a file")
     bus = MemoryBus(bench.hub, "recorder", bench.clock)
-    with pytest.raises(DataFileError, match="cannot be made"):
+    with pytest.raises(DataFileError, match="cannot be created"):
         Recorder(bus, bench.clock, "night", bench.folder, metadata={}).run()
 
 

@@ -97,7 +97,7 @@ def lose_the_terminal(bench: Bench) -> None:
     [
         (lose_the_terminal, "Input/output error"),
         (lambda bench: refuse(bench, os.open("/dev/full", os.O_WRONLY)), "No space left on device"),
-        (lambda bench: shutil.rmtree(bench.folder), "somebody removed it"),
+        (lambda bench: shutil.rmtree(bench.folder), "the file was removed"),
     ],
 )
 def test_a_disk_error_ends_the_recording_but_not_the_process(
@@ -125,7 +125,7 @@ def test_a_nearly_full_disk_leaves_a_complete_log(bench: Bench, small_disk: Path
     put_until(frames, lambda: event_published(bench, "RECORDING_FAILED"))
     assert bench.thread.is_alive()
     summary = bench.stop()
-    assert "make room" in summary.failure
+    assert "free some space" in summary.failure
     reader = LogReader(summary.files[0])
     list(reader)
     assert reader.complete

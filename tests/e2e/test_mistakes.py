@@ -158,7 +158,7 @@ def test_ctrl_c_while_it_loads_is_quiet(tmp_path: Path) -> None:
     ("words", "expected"),
     [
         (("info", "empty.mcap"), "empty.mcap is empty: nothing was recorded"),
-        (("recover", "header.mcap"), "nothing in it is whole, so there is nothing to recover"),
+        (("recover", "header.mcap"), "no part of it is intact, so there is nothing to recover"),
         (("replay", "night.mcap.part"), "it is finished now: night.mcap"),
         (("replay", "night.mcap", "night.mcap"), "are the same part of one log"),
         (("replay", "pipe"), "pipe cannot be read: not a regular file"),

@@ -135,11 +135,11 @@ def test_parts_left_out_are_reported(tmp_path: Path) -> None:
 def test_an_intact_log_is_not_recovered(tmp_path: Path) -> None:
     path = small_log(tmp_path / "night.mcap")
     done = lowfc("recover", path)
-    assert (done.exit_code, done.stdout) == (0, f"{path} is whole; there is nothing to recover\n")
+    assert (done.exit_code, done.stdout) == (0, f"{path} is intact; there is nothing to recover\n")
     assert json.loads(lowfc("recover", path, "--json").stdout)["recovered"] is None
     assert [path.name for path in tmp_path.iterdir()] == ["night.mcap"]
     part = path.rename(tmp_path / "night.mcap.part")  # its recorder died before renaming it
-    assert lowfc("recover", part).stdout == f"{part} is whole; only rename it to night.mcap\n"
+    assert lowfc("recover", part).stdout == f"{part} is intact; only rename it to night.mcap\n"
 
 
 def test_an_existing_file_is_not_overwritten(tmp_path: Path) -> None:

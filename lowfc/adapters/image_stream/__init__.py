@@ -1,1 +1,1 @@
-"""ImageStreamIO streams: images in shared memory, as milk and CACAO exchange them."""
+"""ImageStreamIO streams: images in shared memory, as used by milk and CACAO."""

@@ -1,4 +1,4 @@
-"""The channels of one mirror, as CACAO names them: dm00disp00 to dm00disp11, and dm00disp, which is their sum."""
+"""Channels of a mirror with CACAO's names: dm00disp00 to dm00disp11, and their sum dm00disp."""
 
 import re
 import time
@@ -11,13 +11,13 @@ from lowfc.adapters.image_stream.stream import Stream, StreamAbsentError, Stream
 from lowfc.arrays import Single
 
 CHANNELS = 12
-_LOOK_S = 1.0
-"""Between two looks for channels that came, went or were made anew."""
+_SEARCH_S = 1.0
+"""Period of the search for channels that appeared, disappeared or were recreated."""
 _ATTEMPTS = 3
 
 
 def sum_name(channel: str) -> str:
-    """Name of the sum that a channel is part of; empty where its name does not say."""
+    """Name of the sum that contains a channel; empty if its name is not CACAO's."""
     found = re.fullmatch(r"(dm\d\ddisp)\d\d", channel)
     return found[1] if found else ""
 
@@ -29,30 +29,30 @@ def channel_names(channel: str) -> tuple[str, ...]:
 
 
 class OtherChannels:
-    """What others have on the mirror beside one channel: the sum of theirs, in their unit.
+    """Sum of a mirror's channels except one, in the unit of the streams.
 
-    A channel that cannot be used is left out: another grid, another layout, a value that is not finite.
+    Unusable channels are left out: another grid, another layout, or a value that is not finite.
     """
 
     def __init__(self, names: Iterable[str], grid: tuple[int, int]) -> None:
-        """Read these channels, those that there are and those that come, of (rows, columns) actuators."""
+        """Read these channels of (rows, columns) actuators, including those that appear later."""
         self._paths = [stream_path(name) for name in names]
         self._grid = grid
         self._streams: dict[Path, Stream] = {}
-        self._looked_s = -_LOOK_S
+        self._searched_s = -_SEARCH_S
         self._counts: dict[Path, tuple[tuple[int, int, int], int]] = {}
         self._sum: Single = np.zeros(grid, np.float32)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the channels that there are."""
+        """Names of the existing channels."""
         return tuple(stream.name for stream in self._streams.values())
 
     def sum(self) -> Single:
-        """Their sum (rows, columns); the very same array until one of them is written."""
+        """Sum of the channels (rows, columns); the same array object until a channel is written."""
         now_s = time.monotonic()
-        if now_s - self._looked_s >= _LOOK_S:
-            self._looked_s = now_s
+        if now_s - self._searched_s >= _SEARCH_S:
+            self._searched_s = now_s
             self._streams = {path: stream for path, stream in self._streams.items() if stream.current()}
             for path in self._paths:
                 if path not in self._streams and (stream := opened(path, self._grid)) is not None:
@@ -65,7 +65,7 @@ class OtherChannels:
 
 
 def opened(path: Path, grid: tuple[int, int]) -> Stream | None:
-    """A stream of a mirror's shapes; None where there is none that can be used."""
+    """Open a stream of a mirror's shapes; None if there is no usable one."""
     try:
         stream = Stream(path)
     except StreamError:
@@ -74,12 +74,12 @@ def opened(path: Path, grid: tuple[int, int]) -> Stream | None:
 
 
 def fits(stream: Stream, grid: tuple[int, int]) -> bool:
-    """Whether it holds shapes (rows, columns) of a mirror in float32."""
+    """Whether a stream holds float32 shapes (rows, columns)."""
     return stream.layout.dtype == np.float32 and stream.layout.shape == (1, *grid)
 
 
 def whole(stream: Stream) -> Single | None:
-    """The shape in a stream, a copy; None while it is written, or where it is not finite."""
+    """Copy the shape in a stream; None while it is being written, or if it is not finite."""
     for _ in range(_ATTEMPTS):
         count, shape = stream.count, stream.data[0].astype(np.float32)
         if stream.count == count and not stream.writing:
@@ -88,9 +88,9 @@ def whole(stream: Stream) -> Single | None:
 
 
 def channel_of(name: str, grid: tuple[int, int]) -> Stream:
-    """A channel to be written: the one that there is, or a new one, at zero.
+    """Open a channel for writing, or create it with zeros.
 
-    StreamError where it is not of this grid, or another process writes it.
+    StreamError if it has another grid, or another process writes it.
     """
     path = stream_path(name)
     try:
@@ -102,7 +102,7 @@ def channel_of(name: str, grid: tuple[int, int]) -> Stream:
         depth = f" x {planes}" if planes > 1 else ""
         raise StreamError(
             f"stream {name!r} has {columns} x {rows}{depth} pixels of {stream.layout.dtype}, expected {grid[1]} x "
-            f"{grid[0]} of float32, for [mirror] has {grid[0]} rows and {grid[1]} columns"
+            f"{grid[0]} of float32, as [mirror] has {grid[0]} rows and {grid[1]} columns"
         )
     if pid := stream.other_writer():
         raise StreamError(f"process {pid} writes stream {name!r}: stop it first, or choose a channel of your own")

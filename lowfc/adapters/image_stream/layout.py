@@ -1,6 +1,6 @@
-"""Layout of an ImageStreamIO stream, version 2.00: what lies where in its file.
+"""Layout of an ImageStreamIO stream file, version 2.00, as in `ImageStruct.h` of milk-org/ImageStreamIO.
 
-It is that of `ImageStruct.h` in milk-org/ImageStreamIO. Everything here is arithmetic on a copy of the header.
+This module only computes positions from a copy of the header.
 """
 
 import struct
@@ -12,7 +12,7 @@ import numpy as np
 VERSION = "2.00"
 HEADER_BYTES = 384
 DAO_HEADER_BYTES = 4496
-"""Of a library that was built with DAO_COMPAT, under the same version."""
+"""Header size of a library built with DAO_COMPAT, under the same version."""
 SEMAPHORE_BYTES = 32
 _TIME = ("<i8", 2)  # seconds, nanoseconds
 
@@ -37,9 +37,9 @@ HEADER = np.dtype(
     }
 )
 NEWEST, NEWEST_START = struct.Struct("@2q64x2Q8xB"), 184
-"""What changes with each image, in one reading: `atime`, `cnt0`, `cnt1`, `write`; and where it begins."""
+"""Fields that change with each image, read at once: `atime`, `cnt0`, `cnt1`, `write`; and their position."""
 TIMES = struct.Struct("<4q")
-"""There: `atime` and `writetime`, seconds and nanoseconds each."""
+"""`atime` and `writetime` at that position, each in seconds and nanoseconds."""
 KEYWORD = np.dtype(
     {
         "names": ["name", "type", "integer", "real", "text"],
@@ -54,20 +54,21 @@ TYPES = {
 }
 NUMBERS = {dtype: number for number, dtype in TYPES.items()}
 MATRIX = 2
-"""Kind of a stream without a time axis, as the library's own function makes it."""
+"""Kind of a stream without a time axis, as created by the C library."""
 _TIME_AXIS, _TIME_MASK = 0x20001, 0xF000F
 
 
 class Layout(NamedTuple):
-    """Where the parts of a stream are.
+    """Positions of the parts of a stream.
 
     Attributes:
-        dtype: of a pixel.
-        shape: (planes, rows, columns); more than one plane only where each image goes to the next plane.
-        keywords: how many there are; `semaphores` likewise.
-        ring: images in the circular buffer beside the data.
-        starts: first byte of each part, by its name.
-        file_bytes: of the whole file.
+        dtype: type of a pixel.
+        shape: (planes, rows, columns); more than one plane only if images are written to the planes in turn.
+        keywords: number of keywords.
+        semaphores: number of semaphores.
+        ring: number of images in the circular buffer.
+        starts: first byte of each part, by name.
+        file_bytes: size of the file.
     """
 
     dtype: np.dtype[np.generic]
@@ -80,7 +81,7 @@ class Layout(NamedTuple):
 
     @classmethod
     def of(cls, header: np.void, file_bytes: int) -> "Layout":
-        """The layout that a header declares, for a file of that size; ValueError where it is another, and which."""
+        """Layout declared by a header, for a file of that size; ValueError with the difference if not supported."""
         version = header["version"].partition(b"\0")[0].decode("ascii", "backslashreplace")
         if version != VERSION:
             raise ValueError(f"has layout version {version!r}, expected {VERSION!r}")
@@ -122,7 +123,7 @@ class Layout(NamedTuple):
         *,
         in_time: bool = False,
     ) -> "Layout":
-        """The layout of a stream with these numbers of everything."""
+        """Compute the layout of a stream with these numbers of parts."""
         data_bytes, numbers = prod(shape) * dtype.itemsize, 4 * semaphores
         parts = {
             "header": HEADER_BYTES,

@@ -1,4 +1,4 @@
-"""The images of a stream one after the other, whatever its writer does to it."""
+"""Reads the images of a stream in turn, robust against everything its writer may do."""
 
 import time
 from pathlib import Path
@@ -9,15 +9,15 @@ import numpy.typing as npt
 
 from lowfc.adapters.image_stream.stream import Stream, StreamAbsentError, alive
 
-_TURN_S = 0.1
-_ABSENT_TURN_S = 0.005
+_CHECK_S = 0.1
+_ABSENT_CHECK_S = 0.005
 _ATTEMPTS = 3
 
 
 class StreamImage(NamedTuple):
-    """A copy of an image (rows, columns) as it was read; its number in its stream, and its stream's, from one on.
+    """Copy of an image (rows, columns), its number in the stream, and the stream's `generation`, both from 1.
 
-    Its writer says that it was acquired at `acquired_ns`, nanoseconds since the epoch.
+    `acquired_ns` is the acquisition time stated by its writer, ns since the epoch.
     """
 
     pixels: npt.NDArray[np.generic]
@@ -27,40 +27,40 @@ class StreamImage(NamedTuple):
 
 
 class StreamReader:
-    """Waits for images by a semaphore of its own, and follows a stream that is made anew.
+    """Waits for images on its own semaphore, and reopens a recreated stream.
 
-    `stream` is the one that is mapped, None while there is none; `generation` counts them, from one.
+    `stream` is the mapped stream, None while there is none; `generation` counts the streams, from 1.
     """
 
     def __init__(self, path: Path) -> None:
-        """Read the stream at `path`, now or once it is there; what it holds already is nobody's new image.
+        """Open the stream at `path`, which may be created later; its present image does not count as new.
 
-        StreamError where it has another layout, or no free semaphore.
+        StreamError if it has another layout, or no free semaphore.
         """
         self.stream: Stream | None = None
         self.generation = 0
         self._path = path
-        self._seen = self._semaphore = 0
+        self._last_number = self._semaphore = 0
         self._open()
 
     def next(self, timeout_s: float) -> StreamImage | None:
-        """The newest image that was not yet returned; None where none came in time, StreamError as at the start."""
+        """Newest image not yet returned; None if none arrived in time. StreamError as at the start."""
         end_s = time.monotonic() + timeout_s
-        there = self._open()
+        mapped = self._open()
         while True:
-            if there and (image := self._image()) is not None:
+            if mapped and (image := self._image()) is not None:
                 return image
             left_s = end_s - time.monotonic()
             if left_s <= 0:
                 return None
             if self.stream is None:
-                time.sleep(min(left_s, _ABSENT_TURN_S))
-            elif self.stream.semaphores.wait(self._semaphore, min(left_s, _TURN_S)):
-                continue  # its writer has just posted: it is there still
-            there = self._open()
+                time.sleep(min(left_s, _ABSENT_CHECK_S))
+            elif self.stream.semaphores.wait(self._semaphore, min(left_s, _CHECK_S)):
+                continue  # just posted by its writer: the stream still exists
+            mapped = self._open()
 
     def silence(self) -> str:
-        """Why no image comes, as far as the stream shows it."""
+        """Reason for the missing images, as far as the stream shows it."""
         stream = self.stream
         if stream is None or not stream.current():
             return f"there is no stream {self._path.name.removesuffix('.im.shm')!r}"
@@ -71,13 +71,13 @@ class StreamReader:
         return f"{died}, in the middle of an image" if stream.writing else died
 
     def close(self) -> None:
-        """Give the semaphore back."""
+        """Release the semaphore."""
         if self.stream is not None and self.stream.current():
-            self.stream.give_back(self._semaphore)
+            self.stream.release_semaphore(self._semaphore)
         self.stream = None
 
     def _open(self) -> bool:
-        """Whether the stream of that name is mapped: the one that there is now."""
+        """Map the present stream of that name if necessary; return whether one is mapped."""
         if self.stream is not None and self.stream.current():
             return True
         self.stream = None
@@ -86,21 +86,21 @@ class StreamReader:
         except StreamAbsentError:
             return False
         self._semaphore = stream.take_semaphore()
-        self._seen = 0 if self.generation else stream.count
+        self._last_number = 0 if self.generation else stream.count
         self.generation += 1
         self.stream = stream
         return True
 
     def _image(self) -> StreamImage | None:
-        """The newest image, if it is whole and new; one that is being written posts the semaphore when it is."""
+        """Newest image if it is complete and new; an image being written posts the semaphore on completion."""
         stream = self.stream
         assert stream is not None  # noqa: S101
         for _ in range(_ATTEMPTS):
             newest = stream.newest
-            if newest.number == self._seen or newest.writing:
+            if newest.number == self._last_number or newest.writing:
                 return None
             pixels = stream.data[newest.plane % stream.layout.shape[0]].copy()
             if stream.newest == newest:
-                self._seen = newest.number
+                self._last_number = newest.number
                 return StreamImage(pixels, newest.number, newest.acquired_ns, self.generation)
         return None

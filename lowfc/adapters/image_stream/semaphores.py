@@ -1,4 +1,4 @@
-"""POSIX semaphores inside a mapping, by the C library's own functions."""
+"""POSIX semaphores in shared memory, through the functions of the C library."""
 
 import ctypes
 import errno
@@ -8,10 +8,10 @@ import time
 from lowfc.adapters.image_stream.layout import SEMAPHORE_BYTES
 
 MOST = 10
-"""Value from which on a semaphore is not posted: its reader is behind, or there is none."""
+"""Value at which a semaphore is no longer posted: its reader is behind or absent."""
 
 _LIBC = ctypes.CDLL(None, use_errno=True)
-_FIXED = slice(8, 12)  # of a semaphore: shared between processes or not, which no wait and no post changes
+_FIXED = slice(8, 12)  # bytes of a semaphore with its sharing mode, which no operation changes
 
 
 class _TimeSpec(ctypes.Structure):
@@ -19,10 +19,10 @@ class _TimeSpec(ctypes.Structure):
 
 
 class Semaphores:
-    """Some semaphores side by side."""
+    """An array of semaphores."""
 
     def __init__(self, mapping: mmap.mmap, start: int, count: int) -> None:
-        """Those that begin at byte `start` of the mapping, which is kept for as long as this is."""
+        """Use `count` semaphores from byte `start` of the mapping, which stays mapped as long as this object exists."""
         self._memory = (ctypes.c_char * (SEMAPHORE_BYTES * count)).from_buffer(mapping, start)
         first = ctypes.addressof(self._memory)
         self._addresses = [ctypes.c_void_p(first + SEMAPHORE_BYTES * index) for index in range(count)]
@@ -30,12 +30,12 @@ class Semaphores:
         self._end = _TimeSpec()
 
     def initialise(self) -> None:
-        """Make them, at zero, for all processes."""
+        """Initialise the semaphores to zero, shared between processes."""
         for address in self._addresses:
             _LIBC.sem_init(address, 1, 0)
 
     def usable(self) -> bool:
-        """Whether they are as this C library makes them; it would end the process over others."""
+        """Whether this C library created them; it would abort the process on others."""
         fresh = ctypes.create_string_buffer(SEMAPHORE_BYTES)
         _LIBC.sem_init(fresh, 1, 0)
         memory = self._memory.raw
@@ -43,24 +43,24 @@ class Semaphores:
         return all(memory[start : start + SEMAPHORE_BYTES][_FIXED] == fresh.raw[_FIXED] for start in starts)
 
     def value(self, index: int) -> int:
-        """How often it was posted and not waited for."""
+        """Value of a semaphore: posts not yet consumed."""
         _LIBC.sem_getvalue(self._addresses[index], ctypes.byref(self._value))
         return self._value.value
 
     def wait(self, index: int, timeout_s: float) -> bool:
-        """Wait for a post; False where none came in time, or a signal did."""
+        """Wait for a post; False after the timeout or a signal."""
         end_ns = time.monotonic_ns() + int(timeout_s * 1e9)
         self._end.seconds, self._end.nanoseconds = divmod(end_ns, 1_000_000_000)
         return bool(_LIBC.sem_clockwait(self._addresses[index], time.CLOCK_MONOTONIC, ctypes.byref(self._end)) == 0)
 
     def drain(self, index: int) -> None:
-        """Take all posts that nobody has waited for."""
+        """Consume all pending posts."""
         for _ in range(self.value(index)):
             if _LIBC.sem_trywait(self._addresses[index]) and ctypes.get_errno() == errno.EAGAIN:
                 return
 
     def post_all(self) -> list[int]:
-        """Post each, but for those whose reader is too far behind; which were posted."""
+        """Post each semaphore except those at `MOST`; return the indices posted."""
         value, found = self._value, ctypes.byref(self._value)
         posted = []
         for index, address in enumerate(self._addresses):

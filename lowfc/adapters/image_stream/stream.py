@@ -1,4 +1,4 @@
-"""One ImageStreamIO stream, mapped: opened or created, read and written within its bounds."""
+"""A memory-mapped ImageStreamIO stream: opened or created, read and written within its bounds."""
 
 import mmap
 import os
@@ -28,7 +28,7 @@ from lowfc.adapters.image_stream.semaphores import Semaphores
 from lowfc.contract.errors import LowfcError
 
 SEMAPHORES = 10
-"""Of a stream that is created here; as the C library makes them, as are the numbers below."""
+"""Number of semaphores of a stream created here; this and the numbers below are those of the C library."""
 TRACES = 10
 _LONGEST_NAME = 79
 _MODE = 0o666
@@ -40,11 +40,11 @@ class StreamError(LowfcError):
 
 
 class StreamAbsentError(StreamError):
-    """There is no such stream, or it is just being made."""
+    """The stream does not exist, or is being created."""
 
 
 def stream_path(name: str) -> Path:
-    """File of a stream: in $MILK_SHM_DIR, /milk/shm or /tmp, whichever is the first that is there."""
+    """File of a stream in the first existing folder of $MILK_SHM_DIR, /milk/shm and /tmp."""
     if not 0 < len(name) <= _LONGEST_NAME or not name.isprintable() or "/" in name:
         raise StreamError(f"a stream's name has 1 to {_LONGEST_NAME} characters without '/', got {name!r}")
     folders = (Path(one) for one in (os.environ.get("MILK_SHM_DIR"), "/milk/shm", "/tmp") if one)  # noqa: S108
@@ -52,9 +52,9 @@ def stream_path(name: str) -> Path:
 
 
 class Newest(NamedTuple):
-    """What the header says of the newest image: its `atime`, and how many images were written.
+    """Header fields of the newest image: its `atime`, number of images written, and plane.
 
-    It is in this plane; `writing` is set while an image is written, and stays so where its writer died in the middle.
+    `writing` is set while an image is being written, and stays set if its writer dies meanwhile.
     """
 
     seconds: int
@@ -65,7 +65,7 @@ class Newest(NamedTuple):
 
     @property
     def acquired_ns(self) -> int:
-        """When it was acquired, nanoseconds since the epoch."""
+        """Acquisition time, ns since the epoch."""
         return _since_epoch_ns(self.seconds, self.nanoseconds)
 
 
@@ -73,18 +73,18 @@ class Stream:
     """A stream of images in shared memory.
 
     Attributes:
-        layout: where its parts are, as its header declared them when it was opened.
+        layout: positions of its parts, as declared in its header when opened.
         data: (planes, rows, columns) view of the pixels.
-        semaphores: one for each reader.
-        readers: (semaphores,) view of the processes that wait for them; zero and less where none does.
-        writers: (semaphores,) view of the processes that posted them last.
-        identity: of the file, by which another one of the same name is known.
+        semaphores: semaphores, one for each reader.
+        readers: (semaphores,) view of the process ids that wait for them; 0 or less for none.
+        writers: (semaphores,) view of the process ids that posted them last.
+        identity: identity of the file, which differs for another file of the same name.
     """
 
     def __init__(self, path: Path) -> None:
         """Map an existing stream.
 
-        StreamAbsentError where there is none yet; StreamError where it has another layout, or may not be opened.
+        StreamAbsentError if it does not exist yet; StreamError if it has another layout, or cannot be opened.
         """
         self.path, self._file = path, os.fspath(path)
         self.name = path.name.removesuffix(".im.shm")
@@ -92,9 +92,9 @@ class Stream:
             with path.open("r+b", buffering=0) as file:
                 found = os.fstat(file.fileno())
                 if not stat.S_ISREG(found.st_mode):
-                    raise StreamError(f"stream {self.name!r} is no file: {path}")
+                    raise StreamError(f"stream {self.name!r} is not a file: {path}")
                 if found.st_size < HEADER_BYTES:
-                    raise StreamAbsentError(f"stream {self.name!r} is just being made: {path} is too short yet")
+                    raise StreamAbsentError(f"stream {self.name!r} is being created: {path} is still too short")
                 self._mapping = mmap.mmap(file.fileno(), found.st_size)
         except FileNotFoundError:
             raise StreamAbsentError(f"there is no stream {self.name!r} ({path})") from None
@@ -104,7 +104,7 @@ class Stream:
         self._header = np.frombuffer(self._mapping, HEADER, 1)
         header = self._header.copy()[0]
         if not header["version"]:
-            raise StreamAbsentError(f"stream {self.name!r} is just being made: its header has no version yet")
+            raise StreamAbsentError(f"stream {self.name!r} is being created: its header has no version yet")
         try:
             self.layout = layout = Layout.of(header, found.st_size)
         except ValueError as fault:
@@ -121,9 +121,9 @@ class Stream:
 
     @classmethod
     def create(cls, path: Path, shape: tuple[int, int], dtype: npt.DTypeLike) -> "Stream":
-        """Make a stream (rows, columns) where there is none; it appears complete, or not at all.
+        """Create a stream (rows, columns) atomically.
 
-        StreamError where it is there already, or cannot be made.
+        StreamError if it exists already, or cannot be created.
         """
         rows, columns = shape
         kind = np.dtype(dtype)
@@ -151,13 +151,13 @@ class Stream:
                 os.fchmod(file.fileno(), _MODE)
                 os.link(file.name, path)
         except FileExistsError:
-            raise StreamError(f"stream {path.name.removesuffix('.im.shm')!r} is there already: {path}") from None
+            raise StreamError(f"stream {path.name.removesuffix('.im.shm')!r} exists already: {path}") from None
         except OSError as fault:
-            raise StreamError(f"stream {path} cannot be made: {fault.strerror}") from None
+            raise StreamError(f"stream {path} cannot be created: {fault.strerror}") from None
         return cls(path)
 
     def current(self) -> bool:
-        """Whether its file is still the one of its name, whole; if not, nothing of it may be touched any more."""
+        """Whether its name still refers to this complete file; otherwise the mapping must not be accessed."""
         try:
             return _identity(os.stat(self._file)) == self.identity  # noqa: PTH116  # half the time, before every image
         except OSError:
@@ -165,26 +165,26 @@ class Stream:
 
     @property
     def count(self) -> int:
-        """Images written so far."""
+        """Number of images written so far."""
         return int(self._cnt0[0])
 
     @property
     def writing(self) -> bool:
-        """Whether an image is being written, or its writer died in the middle."""
+        """Whether an image is being written, or its writer died meanwhile."""
         return bool(self._write[0])
 
     @property
     def newest(self) -> Newest:
-        """The newest image."""
+        """Header fields of the newest image."""
         return Newest._make(NEWEST.unpack_from(self._mapping, NEWEST_START))
 
     @property
     def written_ns(self) -> int:
-        """When the newest image was written, nanoseconds since the epoch."""
+        """Write time of the newest image, ns since the epoch."""
         return _since_epoch_ns(*self._header["writetime"][0].tolist())
 
     def keywords(self) -> dict[str, float | str]:
-        """Its keywords, by name."""
+        """Values of the stream's keywords, by name."""
         words = np.frombuffer(self._mapping, KEYWORD, self.layout.keywords, self.layout.starts["keywords"]).copy()
         fields = {b"L": "integer", b"D": "real", b"S": "text"}
         found = {}
@@ -196,7 +196,7 @@ class Stream:
         return found
 
     def put(self, image: npt.NDArray[np.generic], acquired_ns: int | None = None) -> None:
-        """Write an image (rows, columns) of its type into the first plane, and post every semaphore below its bound."""
+        """Write an image (rows, columns) of the stream's type to the first plane, and post the semaphores."""
         self._write[0] = 1
         np.copyto(self.data[0], image, casting="no")
         if self.layout.ring:
@@ -221,7 +221,7 @@ class Stream:
         self._header["ring_index"] = index
 
     def take_semaphore(self) -> int:
-        """Reserve a semaphore for this process; StreamError where each is another living process's."""
+        """Reserve a semaphore for this process; StreamError if living processes hold all of them."""
         pid = os.getpid()
         holders = self.readers.tolist()
         free = (index for index, one in enumerate(holders) if one == pid or not alive(one))
@@ -232,17 +232,17 @@ class Stream:
         self.semaphores.drain(index)
         return index
 
-    def give_back(self, index: int) -> None:
-        """Let another process have the semaphore."""
+    def release_semaphore(self, index: int) -> None:
+        """Release a semaphore for other processes."""
         if self.readers[index] == os.getpid():
             self.readers[index] = 0
 
     def other_writer(self) -> int:
-        """Another living process that has written this stream; zero where there is none."""
+        """Process id of another living process that has written this stream; 0 if there is none."""
         return next((pid for pid in set(self.writers.tolist()) - {os.getpid()} if self._wrote(pid)), 0)
 
     def _wrote(self, pid: int) -> bool:
-        """Whether that process is the one that wrote, not a later one of the same number."""
+        """Whether that process wrote, and not a later one with the same process id."""
         try:
             return alive(pid) and psutil.Process(pid).create_time() * _NS <= self.written_ns + _NS
         except psutil.Error:
@@ -250,12 +250,12 @@ class Stream:
 
 
 def alive(pid: int) -> bool:
-    """Whether there is a process of that number."""
+    """Whether a process with that id exists."""
     try:
         os.getpgid(pid if pid > 0 else -1)
     except (ProcessLookupError, OverflowError):
         return False
-    except OSError:  # it may not be asked
+    except OSError:  # no permission: it exists
         return True
     return True
 
@@ -269,7 +269,7 @@ def _text(raw: bytes) -> str:
 
 
 def _since_epoch_ns(seconds: int, nanoseconds: int) -> int:
-    """A time of a header; the C library writes TAI, which is ahead where the host knows the leap seconds."""
+    """Convert a header's time; the C library writes TAI, which is ahead if the host knows the leap seconds."""
     time_ns, ahead_ns = seconds * _NS + nanoseconds, _tai_ahead_ns()
     return time_ns - ahead_ns if ahead_ns and time_ns > time.time_ns() + ahead_ns // 2 else time_ns
 
@@ -279,5 +279,5 @@ def _now() -> tuple[int, int]:
 
 
 def _tai_ahead_ns() -> int:
-    """By how much TAI is ahead of the wall clock on this host, in whole seconds."""
+    """Lead of TAI over the wall clock on this host, ns, rounded to whole seconds."""
     return round((time.clock_gettime_ns(time.CLOCK_TAI) - time.time_ns()) / _NS) * _NS

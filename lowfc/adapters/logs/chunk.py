@@ -1,4 +1,4 @@
-"""A chunk of a log: its head and its content, checked, whatever tool compressed it."""
+"""Chunks of a log, checked and decompressed, with any compression of MCAP."""
 
 import re
 import struct
@@ -10,13 +10,13 @@ import lz4.frame
 import zstandard
 
 LARGEST_BYTES = 1 << 28
-"""Of a record, compressed or not: a damaged length must not take all memory."""
+"""Largest size of a record, compressed or not: a damaged length must not use up the memory."""
 
 CHUNK_HERE = re.compile(
     rb"\x06(?=.{36}(?:\x03\x00{3}lz4.{8}\x04\x22\x4d\x18|\x04\x00{3}zstd.{8}\x28\xb5\x2f\xfd|\x00{4}.{8}[\x03-\x05].{4}\x00{4}))",
     re.DOTALL,
 )
-"""The opcode of a chunk, before a head with a compression that is read, and what its content begins with."""
+"""Pattern of a chunk's opcode and head with a supported compression, and of the start of its content."""
 
 _FIXED = struct.Struct("<QQQII")  # times of first and last message, size, CRC, length of the compression's name
 _COMPRESSED = struct.Struct("<Q")
@@ -25,25 +25,25 @@ _LONGEST_NAME = 40
 
 
 class UnsoundError(Exception):
-    """A part of a log is not as it was written; the text is why."""
+    """A part of a log is damaged; the text is the reason."""
 
 
 class CompressionError(UnsoundError):
-    """A chunk is compressed in a way that is not read."""
+    """A chunk has an unsupported compression."""
 
     def __init__(self, name: str) -> None:
-        super().__init__(f"a chunk is compressed with {name!r}; lz4, zstd and none are read")
+        super().__init__(f"a chunk is compressed with {name!r}; lz4, zstd and none are supported")
         self.name = name
 
 
 class Chunk(NamedTuple):
-    """Messages and their declarations, decompressed.
+    """Decompressed messages and declarations.
 
     Attributes:
-        position: of the chunk in the file.
-        length: its bytes there.
-        crc: of `content`.
-        content: records, one after the other.
+        position: first byte of the chunk in the file.
+        length: size of the chunk in the file, bytes.
+        crc: checksum of `content`.
+        content: concatenated records.
     """
 
     position: int
@@ -66,7 +66,7 @@ def _uncompressed(data: memoryview, size: int) -> bytes:
     return bytes(data[:size])
 
 
-# How each compression is read, and the largest ratio of sizes that its format allows.
+# Decompressor of each compression, and the largest ratio of sizes that its format allows.
 _COMPRESSIONS: dict[bytes, tuple[Callable[[memoryview, int], bytes], int]] = {
     b"lz4": (_lz4, 255),
     b"zstd": (_zstd, LARGEST_BYTES),
@@ -75,15 +75,15 @@ _COMPRESSIONS: dict[bytes, tuple[Callable[[memoryview, int], bytes], int]] = {
 
 
 def read_chunk(body: bytes, at: int, *, may_lack_crc: bool = False) -> Chunk:
-    """The chunk whose record begins at `at` in the file and has this body.
+    """Decompress and check a chunk.
 
     Args:
-        body: of the record, behind its opcode and length.
+        body: body of its record, after opcode and length.
         at: position of the record in the file.
-        may_lack_crc: accept one without a checksum.
+        may_lack_crc: whether to accept a chunk without a checksum.
 
     Raises:
-        UnsoundError: it is not as it was written.
+        UnsoundError: the chunk is damaged.
     """
     try:
         _, _, size, crc, named = _FIXED.unpack_from(body)
@@ -98,7 +98,7 @@ def read_chunk(body: bytes, at: int, *, may_lack_crc: bool = False) -> Chunk:
         raise CompressionError(name[:_LONGEST_NAME].decode(errors="backslashreplace"))
     decompressed, largest_ratio = _COMPRESSIONS[name]
     if not 0 < size <= min(LARGEST_BYTES, largest_ratio * compressed):
-        raise UnsoundError("a chunk says that it has a size that it cannot have")
+        raise UnsoundError("a chunk declares an impossible size")
     try:
         content = decompressed(memoryview(body)[begin:], size)
     except (RuntimeError, EOFError, zstandard.ZstdError) as fault:

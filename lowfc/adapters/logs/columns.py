@@ -1,4 +1,4 @@
-"""Messages of the loop as columns, a row for each: what reports, exports, what-ifs, tuning and views read of them."""
+"""Messages of the loop as columns with one row per message, for reports, exports, tuning and views."""
 
 from array import array
 from collections.abc import Iterable, Mapping
@@ -19,21 +19,23 @@ STAGES = ("transport", "wakeup", "compute", "publish", "frame_to_command")
 """Durations of the controller, as in ControlTiming."""
 
 _KINDS = {"sequence": "Q", "time_ns": "q", "mode": "B", "reasons": "q", "saturated_pixels": "q", "instants": "q"}
-_BITS = 63  # of a column of whole numbers, but for the sign
+_BITS = 63  # of an integer column, without the sign
 
 
 @dataclass(frozen=True, slots=True)
 class Steps:
-    """One row for every step, in the order they were recorded; (steps,) or (steps, modes).
+    """Steps of the control law, one row per step in recorded order; (steps,) or (steps, modes).
 
     Attributes:
-        sequence: of the frame it was made from.
-        time_ns: of that frame, nanoseconds since the epoch.
+        sequence: sequence of the step's frame.
+        time_ns: time of that frame, ns since the epoch.
         mode: loop mode, as `LoopMode`.
-        reasons: bit `1 << reason` for each reason given.
-        error_nm: measured modal error; NaN where the frame was refused. So is pol_nm, pseudo-open-loop.
-        command_nm: modal command after the step.
-        flux_dn: sum of the good pixels.
+        reasons: bits `1 << reason` of the step's reasons.
+        error_nm: measured modal error, nm rms of wavefront; NaN if the frame was refused.
+        pol_nm: pseudo-open-loop modes, nm rms of wavefront; NaN if the frame was refused.
+        command_nm: modal command after the step, nm rms of wavefront.
+        flux_dn: sum of the good pixels, DN.
+        saturated_pixels: number of saturated pixels.
     """
 
     sequence: Sequences
@@ -47,7 +49,7 @@ class Steps:
     saturated_pixels: Long
 
     def at(self, rows: npt.NDArray[Any]) -> "Steps":
-        """The steps at some rows, by index or by whether each is one."""
+        """Steps at these rows, by index or boolean mask."""
         return Steps(*(getattr(self, part.name)[rows] for part in fields(self)))
 
 
@@ -55,19 +57,23 @@ class Steps:
 class Truths:
     """Truth of a simulation, one row per frame; empty for a log of real devices.
 
-    Rms are over the frame's whole period where `instants` is not 0: the star moves while the mirror holds. In older
-    logs, and where a simulation does not compute it, they are those at the instant at which the exposure starts.
+    Rms values are over the frame's whole period if `instants` is not 0: the star moves while the mirror holds. In older
+    logs, and if the simulation does not compute them, they are values at the start of the exposure.
 
     Attributes:
-        sequence: of the frame.
-        time_ns: of that frame, nanoseconds since the epoch.
-        disturbance_nm: (frames, modes) at the start of the exposure; so is residual_nm.
-        sensed_nm: (frames, modes) mean of the residual over the exposure, as the sensor sees it.
-        modes_disturbance_rms_nm: (frames, modes) rms over the period; so is modes_residual_rms_nm.
-        disturbance_rms_nm: over the open pupil, rms over the period; so is residual_rms_nm.
-        sampled_residual_rms_nm: over the open pupil, at the start of the exposure.
-        instants: of the period, over which the rms are; 0 for the start of the exposure alone.
-        added_contrast: of the residual, and `added_contrast_flat` of the disturbance; 0 where it was not computed.
+        sequence: sequence of the frame.
+        time_ns: time of the frame, ns since the epoch.
+        disturbance_nm: (frames, modes) disturbance at the start of the exposure.
+        residual_nm: (frames, modes) residual at the start of the exposure.
+        sensed_nm: (frames, modes) mean of the residual over the exposure, as sensed.
+        modes_disturbance_rms_nm: (frames, modes) rms of the disturbance over the period.
+        modes_residual_rms_nm: (frames, modes) rms of the residual over the period.
+        disturbance_rms_nm: rms of the disturbance over the open pupil and the period.
+        residual_rms_nm: rms of the residual over the open pupil and the period.
+        sampled_residual_rms_nm: rms of the residual over the open pupil at the start of the exposure.
+        instants: number of times in the period that the rms values are averaged over; 0: start of the exposure only.
+        added_contrast: added contrast of the residual; 0 if not computed.
+        added_contrast_flat: added contrast of the disturbance; 0 if not computed.
     """
 
     sequence: Sequences
@@ -91,10 +97,10 @@ class Truths:
 
 
 class Columns:
-    """Columns that grow by rows: a number in each row, or a vector."""
+    """Columns that grow row by row, each with a number or a vector per row."""
 
     def __init__(self, widths: Mapping[str, int] = MappingProxyType({}), /, **kinds: str) -> None:
-        """Columns by name, of the kinds that `array` has; those in `widths` have so many numbers in a row."""
+        """Make columns by name, with type codes of `array`; `widths` has the vector lengths."""
         self._columns: dict[str, array[Any]] = {name: array(kind) for name, kind in kinds.items()}
         self._widths = widths
         self._rows = 0
@@ -104,10 +110,10 @@ class Columns:
         return self._rows
 
     def add(self, **values: int | float | Iterable[int | float]) -> bool:
-        """Add to every column; to none, and return False, where the values do not make whole rows.
+        """Add to every column; if the values do not form complete rows, add nothing and return False.
 
         Raises:
-            OverflowError: a value is beyond what its column can hold.
+            OverflowError: a value is out of the range of its column.
         """
         columns = self._columns
         try:
@@ -117,22 +123,22 @@ class Columns:
                 else:
                     columns[name].extend(value)  # type: ignore[arg-type]  # the numbers are above
         except OverflowError:
-            self._cut()
+            self._truncate()
             raise
         rows = len(self._each[0][0])
         for column, width in self._each:
             if len(column) != rows * width:
-                self._cut()
+                self._truncate()
                 return False
         self._rows = rows
         return True
 
-    def taken(self, name: str) -> npt.NDArray[Any]:
-        """One column, (rows,) or (rows, width)."""
+    def values(self, name: str) -> npt.NDArray[Any]:
+        """Array of one column, (rows,) or (rows, width)."""
         column = np.array(self._columns[name])
         return column.reshape(self._rows, self._widths[name]) if name in self._widths else column
 
-    def _cut(self) -> None:
+    def _truncate(self) -> None:
         for column, width in self._each:
             del column[self._rows * width :]
 
@@ -141,35 +147,35 @@ T = TypeVar("T")
 
 
 class _Rows(Generic[T]):
-    """Messages with one number of modes as columns of `T`, whose fields are called as the message's."""
+    """Columns of `T` from messages with a fixed number of modes; fields have the names of the message's."""
 
     def __init__(self, made: type[T], wide: Iterable[str], modes: int) -> None:
         self.modes = modes
         self._made = made
         kinds = {name: _KINDS.get(name, "f") for name in made.__annotations__}
         self._columns = Columns(dict.fromkeys(wide, modes), **kinds)
-        self._alike = [name for name in kinds if name not in ("sequence", "time_ns")]
+        self._same_name = [name for name in kinds if name not in ("sequence", "time_ns")]
 
     def __len__(self) -> int:
         return len(self._columns)
 
     def add(self, message: Any) -> bool:
-        """Add a message; False where it has another number of modes.
+        """Add a message; False if it has another number of modes.
 
         Raises:
-            OverflowError: a value that nobody of the loop sends.
+            OverflowError: a value is out of range, as the loop never sends it.
         """
         special = self._special(message)
-        row = {name: getattr(message, name) for name in self._alike if name not in special} | special
+        row = {name: getattr(message, name) for name in self._same_name if name not in special} | special
         return self._columns.add(sequence=message.frame_sequence, time_ns=from_timestamp(message.timestamp), **row)
 
     def _special(self, message: Any) -> dict[str, Any]:
-        """Values that are not as in the message."""
+        """Values that differ from the message's fields."""
         return {}
 
-    def taken(self) -> T:
-        """All of them."""
-        return self._made(**{name: self._columns.taken(name) for name in self._made.__annotations__})
+    def values(self) -> T:
+        """Return all rows as arrays."""
+        return self._made(**{name: self._columns.values(name) for name in self._made.__annotations__})
 
 
 class StepRows(_Rows[Steps]):
@@ -177,10 +183,10 @@ class StepRows(_Rows[Steps]):
 
     def __init__(self, modes: int) -> None:
         super().__init__(Steps, ("error_nm", "pol_nm", "command_nm"), modes)
-        self._nothing = [np.nan] * modes
+        self._refused = [np.nan] * modes
 
     def _special(self, message: wire.ControlStep) -> dict[str, Any]:
-        measured = {"error_nm": message.error_nm or self._nothing, "pol_nm": message.pol_nm or self._nothing}
+        measured = {"error_nm": message.error_nm or self._refused, "pol_nm": message.pol_nm or self._refused}
         return measured | {"reasons": bits_of(message.reasons)}
 
 
@@ -210,21 +216,21 @@ class TruthRows(_Rows[Truths]):
 
 
 def of_steps(steps: Iterable[Step], modes: int) -> Steps:
-    """Steps of a running loop, as a log's."""
+    """Columns of steps from a running loop, as from a log."""
     rows = StepRows(modes)
     for step in steps:
         rows.add(wire.ControlStep.FromString(encode_step(step, 0)))
-    return rows.taken()
+    return rows.values()
 
 
 def count_reasons(bits: Long) -> dict[Reason, int]:
-    """How often each reason was given, of those that were."""
+    """Number of rows with each reason, without reasons that do not occur."""
     counts = {reason: int(np.count_nonzero(bits & (1 << reason))) for reason in REASONS} if bits.any() else {}
     return {reason: count for reason, count in counts.items() if count}
 
 
 def mode_name(number: int) -> str:
-    """Name of a loop mode, also of one that this version does not know."""
+    """Name of a loop mode; a numbered name if this version does not know it."""
     return LoopMode(number).name.lower() if number in list(LoopMode) else f"mode {number}"
 
 
@@ -238,20 +244,20 @@ class TimingRows:
         return len(self._columns)
 
     def add(self, timing: wire.ControlTiming) -> bool:
-        """Add the frames of a message; False where its columns differ in length."""
+        """Add the frames of a message; False if its columns differ in length."""
         stages = {stage: getattr(timing, f"{stage}_ns") for stage in STAGES}
         return self._columns.add(sequence=timing.frame_sequence, **stages)
 
-    def taken(self) -> tuple[Sequences, dict[str, Long]]:
+    def values(self) -> tuple[Sequences, dict[str, Long]]:
         """Sequence (frames,) of each frame, and each of `STAGES` in ns."""
-        return self._columns.taken("sequence"), {stage: self._columns.taken(stage) for stage in STAGES}
+        return self._columns.values("sequence"), {stage: self._columns.values(stage) for stage in STAGES}
 
 
 def bits_of(reasons: Iterable[int]) -> int:
-    """Bit `1 << reason` for each.
+    """Combine reasons as bits `1 << reason`.
 
     Raises:
-        OverflowError: there is no such bit.
+        OverflowError: a reason is out of range.
     """
     bits = 0
     for reason in reasons:
@@ -262,7 +268,7 @@ def bits_of(reasons: Iterable[int]) -> int:
 
 
 def rows_of(sequence: Sequences, among: Sequences) -> Long:
-    """Row in `among` of each sequence, the first one where there are several; -1 where there is none."""
+    """Row in `among` of each sequence, the first if there are several, -1 if there is none."""
     if not among.size:
         return np.full(sequence.shape, -1, np.int64)
     order = np.argsort(among, kind="stable")
@@ -272,19 +278,19 @@ def rows_of(sequence: Sequences, among: Sequences) -> Long:
 
 
 def joined(values: npt.NDArray[Any], rows: Long) -> npt.NDArray[Any]:
-    """These rows of `values`; NaN for row -1."""
+    """Rows of `values`; NaN for row -1."""
     found = values[rows] if values.size else np.zeros((rows.size, *values.shape[1:]), np.float32)
     found[rows < 0] = np.nan
     return found
 
 
 def exposure_fraction(camera: wire.CameraState | None) -> float | None:
-    """Exposure over period; None where they are not known."""
+    """Exposure divided by period; None if not known."""
     return camera.exposure_ns / camera.period_ns if camera is not None and camera.period_ns else None
 
 
 def frame_rate_hz(camera: wire.CameraState | None, steps: Steps) -> float:
-    """Frame rate: the camera's period where it is known, the median interval of the steps otherwise; 0 for none."""
+    """Frame rate from the camera's period if known, otherwise from the median interval of steps; 0 without steps."""
     if camera is not None and camera.period_ns:
         return 1e9 / camera.period_ns
     intervals_ns = np.diff(steps.time_ns)

@@ -1,6 +1,6 @@
-"""The history of a run, as columns: everything that a log has of every step, for reports, exports and what-ifs.
+"""History of a run as columns: all content of a log except the images, for reports, exports and what-ifs.
 
-Frames are not in it (read them from the log); everything else that is known of a frame is one row.
+Everything known about a frame is one row; read the images from the log.
 """
 
 from collections import Counter
@@ -61,51 +61,51 @@ _LAST_NS = (1 << 63) - 1
 _DECODED = {STEP, TRUTH, MIRROR_STATE, TIMING, CALIBRATION, CONTROLLER_STATE, CAMERA_STATE, REQUEST, HEALTH, EVENT}
 
 
-_SEQUENCES, _WHOLE, _SINGLE = (
+_SEQUENCES, _INTEGERS, _SINGLE = (
     cast("Callable[[], Any]", partial(np.zeros, 0, kind)) for kind in (np.uint64, np.int64, np.float32)
 )
-_NOWHERE = cast("Callable[[], Any]", partial(np.zeros, (0, 0), np.float32))
+_NO_GRID = cast("Callable[[], Any]", partial(np.zeros, (0, 0), np.float32))
 
 
 @dataclass(slots=True)
 class MirrorStates:
-    """One row for every state of the mirror.
+    """States of the mirror, one row per message.
 
     Attributes:
-        sequence: of the frame behind the command applied.
-        publish_time_ns: when the mirror reported it.
-        stroke_nm: largest deviation of an actuator from flat.
-        limits: bit `1 << reason` for each of the mirror's own limits that acted.
-        highest_nm, lowest_nm: (rows, columns) extremes of each actuator over the run.
+        sequence: sequence of the frame of the applied command.
+        publish_time_ns: time at which the mirror published the state.
+        stroke_nm: largest deviation of an actuator from flat, nm of surface.
+        limits: bits `1 << reason` of the mirror's own limits that acted.
+        highest_nm, lowest_nm: (rows, columns) extremes of each actuator over the run, nm of surface.
     """
 
     sequence: Sequences = field(default_factory=_SEQUENCES)
-    publish_time_ns: Long = field(default_factory=_WHOLE)
+    publish_time_ns: Long = field(default_factory=_INTEGERS)
     stroke_nm: Single = field(default_factory=_SINGLE)
-    limits: Long = field(default_factory=_WHOLE)
-    highest_nm: Single = field(default_factory=_NOWHERE)
-    lowest_nm: Single = field(default_factory=_NOWHERE)
+    limits: Long = field(default_factory=_INTEGERS)
+    highest_nm: Single = field(default_factory=_NO_GRID)
+    lowest_nm: Single = field(default_factory=_NO_GRID)
 
 
 @dataclass
 class History:
-    """Everything that a log has of a run, but the frames.
+    """Content of a run's log, without the images.
 
     Attributes:
-        log: the reader, read to its end: metadata, attachments, whether the log is complete.
-        configuration: that the log was recorded with; None without one that can be read.
-        remarks: what of that this version cannot use, a sentence each that names the log.
+        log: reader, read to its end: metadata, attachments, whether the log is complete.
+        configuration: configuration of the recorded loop; None if there is no readable one.
+        remarks: sentences on parts of the configuration that this version cannot use; each names the log.
         controllers: states of the controllers, in order.
-        frame_sequence, frame_publish_ns: of every frame in the log.
-        command_publish_ns: of every mirror command in the log.
-        stages_ns: (timed steps,) each of `STAGES`, for the frames of `timed_sequence`.
-        left_out: steps of another number of modes than the last calibration's, or with impossible values.
-        requests: what operators asked, with the answers.
-        events: (log time ns, message).
-        health: the last of each process.
-        counts: messages by topic key.
-        published: laws and tables that were played, by identity.
-        span_ns: log times of the first and the last message; (0, 0) for none.
+        frame_sequence, frame_publish_ns: sequence and publish time of every frame in the log.
+        command_publish_ns: publish time of every mirror command in the log.
+        stages_ns: (timed steps,) durations of each of `STAGES`, for the frames of `timed_sequence`.
+        left_out: number of steps with another number of modes than the last calibration, or with impossible values.
+        requests: operators' requests, with the answers.
+        events: (log time in ns, message) of each event.
+        health: last Health of each process, by name.
+        counts: number of messages, by topic key.
+        published: laws and played tables, by identity.
+        span_ns: log times of the first and the last message; (0, 0) without messages.
     """
 
     log: LogReader
@@ -115,10 +115,10 @@ class History:
     controllers: list[wire.ControllerState] = field(default_factory=list)
     camera: wire.CameraState | None = None
     frame_sequence: Sequences = field(default_factory=_SEQUENCES)
-    frame_publish_ns: Long = field(default_factory=_WHOLE)
-    command_publish_ns: Long = field(default_factory=_WHOLE)
-    steps: Steps = field(default_factory=lambda: StepRows(0).taken())
-    truths: Truths = field(default_factory=lambda: TruthRows(0).taken())
+    frame_publish_ns: Long = field(default_factory=_INTEGERS)
+    command_publish_ns: Long = field(default_factory=_INTEGERS)
+    steps: Steps = field(default_factory=lambda: StepRows(0).values())
+    truths: Truths = field(default_factory=lambda: TruthRows(0).values())
     mirror: MirrorStates = field(default_factory=MirrorStates)
     timed_sequence: Sequences = field(default_factory=_SEQUENCES)
     stages_ns: dict[str, Long] = field(default_factory=dict)
@@ -132,7 +132,7 @@ class History:
 
     @property
     def controller(self) -> wire.ControllerState | None:
-        """The controller's last state; None without one."""
+        """Last state of the controller; None if there is none."""
         return self.controllers[-1] if self.controllers else None
 
     @property
@@ -147,7 +147,7 @@ class History:
 
     @cached_property
     def true(self) -> Truths | None:
-        """The truths by step, NaN for one that has none; None without any."""
+        """Truths joined to the steps, NaN for steps without one; None without any truth."""
         rows = rows_of(self.steps.sequence, self.truths.sequence)
         if not (rows >= 0).any():
             return None
@@ -161,17 +161,17 @@ class History:
         return Truths(self.steps.sequence, self.steps.time_ns, **values, instants=instants)
 
     def again(self, topic: Topic) -> WholeLog:
-        """The log once more, for what the history does not hold: its messages of one topic."""
+        """Reader of the same log for the messages of one topic that the history does not hold."""
         log = WholeLog(self.log.paths, topics=(topic,), skip_damaged=True)
         log.progress = self.log.progress
         return log
 
 
 def read_history(log: LogReader) -> History:
-    """Read a log, with a reader that has not been read, to its end.
+    """Read a log to its end with a new reader.
 
     Raises:
-        DataFileError: as `LogReader`, or the log has a calibration that cannot be read.
+        DataFileError: as for `LogReader`, or the log's calibration cannot be read.
     """
     rows = _Rows(history := History(log))
     for message in log:
@@ -182,9 +182,9 @@ def read_history(log: LogReader) -> History:
 
 
 def attached_configuration(log: LogReader) -> tuple[Configuration | None, list[str]]:
-    """The configuration that a log was recorded with, and remarks on what of it this version cannot use.
+    """Configuration attached to a log, and remarks on the parts of it that this version cannot use.
 
-    None where the log has none that can be read: a log is never refused for its configuration.
+    None if the log has no readable one: a log is never refused because of its configuration.
     """
     name, content = next((one for one in log.attachments.items() if one[0].endswith(".toml")), ("", None))
     if content is None:
@@ -197,7 +197,7 @@ def attached_configuration(log: LogReader) -> tuple[Configuration | None, list[s
 
 
 class _Rows:
-    """The columns of a history while they grow; what has none of its own goes there at once."""
+    """Growing columns of a history; content that is not a column is stored in the history directly."""
 
     def __init__(self, history: History) -> None:
         self._history = history
@@ -209,7 +209,7 @@ class _Rows:
         self._steps, self._truths = StepRows(0), TruthRows(0)
 
     def take(self, message: Sample) -> None:
-        """Take one message of the log."""
+        """Add one message of the log."""
         history = self._history
         if max(message.receive_time_ns, message.publish_time_ns) > _LAST_NS:
             history.left_out += 1
@@ -220,9 +220,9 @@ class _Rows:
         try:
             self._decode(message)
         except (KeyError, DecodeError):
-            return  # a message that nobody of the loop could read either
+            return  # unreadable for the loop as well
         except OverflowError:
-            history.left_out += 1  # protobuf allows it, and nobody of the loop sends it
+            history.left_out += 1  # valid in protobuf, but never sent by the loop
 
     def _decode(self, message: Sample) -> None:
         topic, history = topic_of(message.key), self._history
@@ -280,14 +280,14 @@ class _Rows:
             self._steps, self._truths = StepRows(modes), TruthRows(modes)
 
     def finish(self) -> None:
-        """Everything as arrays."""
+        """Convert all columns to arrays."""
         history = self._history
-        history.frame_sequence, history.frame_publish_ns = map(self._frames.taken, ("sequence", "publish_ns"))
-        history.command_publish_ns = self._commands.taken("publish_ns")
-        history.steps, history.truths = self._steps.taken(), self._truths.taken()
+        history.frame_sequence, history.frame_publish_ns = map(self._frames.values, ("sequence", "publish_ns"))
+        history.command_publish_ns = self._commands.values("publish_ns")
+        history.steps, history.truths = self._steps.values(), self._truths.values()
         for name in ("sequence", "publish_time_ns", "stroke_nm", "limits"):
-            setattr(history.mirror, name, self._mirror.taken(name))
-        history.timed_sequence, history.stages_ns = self._timings.taken()
+            setattr(history.mirror, name, self._mirror.values(name))
+        history.timed_sequence, history.stages_ns = self._timings.values()
         try:
             history.calibration = None if self._calibration is None else decode_calibration(self._calibration)
         except ValueError as error:

@@ -1,4 +1,4 @@
-"""Copying logs: what a file holds, message by message, into a new log that is complete and indexed."""
+"""Copying logs message by message to a new log that is complete and indexed."""
 
 import contextlib
 import os
@@ -19,10 +19,10 @@ from lowfc.contract.errors import DataFileError
 
 
 class LogCopy:
-    """A new log, into which files are copied, one after the other.
+    """A new log to which files are copied in turn.
 
     Attributes:
-        messages: written so far.
+        messages: number of messages written so far.
     """
 
     def __init__(self, file: IO[bytes]) -> None:
@@ -55,12 +55,12 @@ class LogCopy:
         wanted: Callable[[Sample], bool] = lambda message: True,
         described: Callable[[Metadata | Attachment], bool] = lambda record: True,
     ) -> None:
-        """Copy a file's messages, and where it stands what describes it.
+        """Copy a file's messages, metadata and attachments, in their order.
 
         Args:
-            reader: of the file; it has not been read.
-            wanted: whether to copy a message.
-            described: whether to copy metadata or an attachment.
+            reader: new reader of the file.
+            wanted: decides whether to copy a message.
+            described: decides whether to copy metadata or an attachment.
         """
         done = 0
         for message in reader:
@@ -97,18 +97,18 @@ class LogCopy:
 
 @contextlib.contextmanager
 def new_log(path: Path, source: Path) -> Iterator[IO[bytes]]:
-    """A file with the permissions of `source`: it has its name when it is whole, and is gone when something fails.
+    """Yield a file with the permissions of `source` that is renamed to `path` on success and removed on failure.
 
     Raises:
-        DataFileError: there is such a file, or the disk refuses.
+        DataFileError: the file exists already, or cannot be written.
     """
-    never = f"{path} already exists; a log is never overwritten; name another one with --out"
+    exists = f"{path} already exists; a log is never overwritten; name another one with --out"
     if path.exists():
-        raise DataFileError(never)
+        raise DataFileError(exists)
     with being_written(path, source) as part, part.open("wb") as file:
         yield file
         file.flush()
         os.fsync(file.fileno())
-        if path.exists():  # it has come into being meanwhile
-            raise DataFileError(never)
+        if path.exists():  # created by another process meanwhile
+            raise DataFileError(exists)
     path.chmod(source.stat().st_mode & 0o666)

@@ -1,4 +1,4 @@
-"""The account of a recording: which messages there were, and which of them are missing."""
+"""Account of the messages of a recording: recorded and lost ones, by topic."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -13,21 +13,25 @@ from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.messages import EVENT, HEALTH, Log, Topic, topic_of, wire
 
 MOST_STARTS = 8
-"""Starts of one publisher that are counted apart, the newest; the earlier ones are one sum."""
+"""Number of a publisher's newest starts with separate counts; earlier ones are summed."""
 _EARLIER = -1
 _UNNAMED = "?"
 
 
 @dataclass(slots=True)
 class _Tally:
-    """Messages of one topic of one start of one publisher; counts as in their envelopes.
+    """Counts of the messages of one topic from one start of a publisher.
 
     Attributes:
-        published: by its own last count, in which one that it sent twice is two.
-        twice: of those recorded, messages that had come before.
-        never: lost before they could be sent, by its own account: frames of a camera; `before` the first message.
-        unconfirmed: lost when news were asked last.
-        safe: recorded, and twice, flushed since.
+        gaps: gaps in the received sequences.
+        published: number published according to its last Health; a message sent twice counts twice.
+        recorded: number recorded.
+        twice: number of those recorded that were duplicates.
+        never: number it never sent, according to its Health: frames lost by a camera, without `before`.
+        before: number it had never sent before the first recorded message; None until its first Health.
+        unconfirmed: number lost at the last call of `news`.
+        safe: `recorded` and `twice` at the last flush.
+        reported: number reported as lost by `news`.
     """
 
     gaps: Gaps
@@ -46,7 +50,7 @@ class _Tally:
 
     @property
     def confirmed(self) -> int:
-        """Of a camera that loses frames: lost at the last call, too, since its own account comes later than a frame."""
+        """Number lost; for a camera that loses frames, lost also at the last call, as its Health follows the frames."""
         return min(self.lost, self.unconfirmed) if self.never else self.lost
 
     @property
@@ -58,7 +62,7 @@ class _Tally:
             new = self.gaps.came(count)
             self.recorded += recorded
             self.twice += recorded and not new
-            if unwanted:  # the disk cannot lose it
+            if unwanted:  # never written, so the disk cannot lose it
                 self.safe = self.safe[0] + 1, self.safe[1] + (not new)
 
     def absorb(self, other: "_Tally") -> None:
@@ -70,15 +74,15 @@ class _Tally:
 
 
 class LossAccount:
-    """Account of all messages, from the counts of those that arrived and from their publishers' own counts.
+    """Account of all messages, from the sequences of those that arrived and from the publishers' own counts.
 
     Attributes:
-        names: on the topics; the caller admits a message's name before it enters the message.
-        starts: how many starts of publishers have been counted, of each topic apart.
+        names: names on the topics; the caller admits a message's name before it enters the message.
+        starts: number of publishers' starts counted so far, over all topics.
     """
 
     def __init__(self, selection: Selection = EVERYTHING) -> None:
-        """Nothing has been received; topics of a log that `selection` thins out are not accounted for."""
+        """Start an empty account; topics thinned by `selection` are not counted."""
         self._selection = selection
         self.names = Names()
         self.starts = 0
@@ -86,9 +90,9 @@ class LossAccount:
         self._tallies: dict[tuple[str, str], dict[int, _Tally]] = {}
 
     def enter(self, topic: Topic, sample: Sample, *, recorded: bool, unwanted: bool = False) -> None:
-        """Account for a message; the first one of a publisher's start is its beginning.
+        """Count a received message; counting begins with the first message of a publisher's start.
 
-        One that is left out of the log on purpose counts as recorded, and is `unwanted`.
+        A message left out of the log on purpose is `unwanted` and counts as recorded.
         """
         if not self._selection.records_all(topic):
             return
@@ -97,10 +101,10 @@ class LossAccount:
         tally.enter(count, recorded=recorded or unwanted, unwanted=unwanted)
 
     def believe(self, sample: Sample, health: wire.Health) -> None:
-        """Take over a publisher's own counts; what it sent before its first message arrived does not count as lost.
+        """Use a publisher's own counts from its Health; messages sent before its first one arrived are not lost.
 
         Raises:
-            BadMessageError: it names what there is no room for; what comes after that is left out.
+            BadMessageError: the Health has too many names; its remaining counts are ignored.
         """
         for count in health.topics:
             topic = _published(health.process, count.topic)
@@ -115,28 +119,28 @@ class LossAccount:
                     tally.published = count.published
 
     def settle(self) -> None:
-        """Everything recorded so far has been flushed."""
+        """Note that everything recorded so far has been flushed."""
         for _, tally in self._all():
             tally.safe = tally.recorded, tally.twice
 
     def revert(self) -> None:
-        """Everything recorded since `settle` was lost before the disk."""
+        """Note that everything recorded since `settle` was lost."""
         for _, tally in self._all():
             tally.recorded, tally.twice = tally.safe
 
     def recorded(self) -> dict[str, int]:
-        """Messages recorded so far, by key; keys that lost all of theirs too."""
+        """Number of messages recorded so far, by key, including keys whose messages were all lost."""
         sums: dict[str, int] = {}
         for key, tally in self._all():
             sums[key] = sums.get(key, 0) + tally.recorded
         return sums
 
     def lost(self) -> dict[str, int]:
-        """Messages lost so far, by key; only keys that lost some."""
+        """Number of messages lost so far, by key, without keys that lost none."""
         return self._sum(lambda tally: tally.lost)
 
     def news(self) -> dict[str, int]:
-        """Messages lost since this was asked last, by key; one that comes late after all is not taken back."""
+        """Number of messages lost since the last call, by key; late messages are not subtracted again."""
         found = self._sum(lambda tally: max(0, tally.confirmed - tally.reported))
         for _, tally in self._all():
             tally.reported = max(tally.reported, tally.confirmed)
@@ -144,12 +148,12 @@ class LossAccount:
         return found
 
     def _tally(self, key: str, author: str, start_s: int, first: int) -> _Tally:
-        """The count of a publisher's start; one that is new begins with the message `first`."""
+        """Tally of a publisher's start; a new one begins with the message `first`."""
         tallies = self._tallies.setdefault((key, author), {})
         tally = tallies.get(start_s)
         if tally is None:
-            if len(apart := tallies.keys() - {_EARLIER}) >= MOST_STARTS:
-                tallies.setdefault(_EARLIER, _Tally(Gaps(0))).absorb(tallies.pop(min(apart)))
+            if len(separate := tallies.keys() - {_EARLIER}) >= MOST_STARTS:
+                tallies.setdefault(_EARLIER, _Tally(Gaps(0))).absorb(tallies.pop(min(separate)))
             tally = tallies[start_s] = _Tally(Gaps(first))
             self.starts += 1
         return tally
@@ -165,7 +169,7 @@ class LossAccount:
         return sums
 
     def _author(self, topic: Topic, sample: Sample) -> str:
-        """Who published on a topic that all share, where equal starts do not tell; elsewhere nothing."""
+        """Publisher of an event, since several processes with equal starts publish events; otherwise empty."""
         if topic is not EVENT:
             return ""
         try:
@@ -182,7 +186,7 @@ class LossAccount:
 
 
 def _published(process: str, key: str) -> Topic | None:
-    """The topic of a process's count, where it publishes that and does not receive it."""
+    """Topic of a count in a process's Health if the process publishes it; None if it receives it."""
     try:
         topic = topic_of(key)
     except KeyError:

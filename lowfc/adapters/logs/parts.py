@@ -1,4 +1,4 @@
-"""The files of one recording, which are one log: which belong together, which is the newest, reading them as one."""
+"""The files (parts) of one recording: find those that belong together, find the newest log, read them as one log."""
 
 import contextlib
 import re
@@ -18,29 +18,29 @@ from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.messages import topic_of
 
 LAST = "last"
-"""Stands for the newest log where a log is named."""
+"""Name that stands for the newest log on a command line."""
 
 Parts = tuple[Path, ...]
 """Files of one log, in order."""
 LogFiles = Path | Sequence[Path]
-"""A log to be read: its file, or its files in order."""
+"""A log to read: its file, or its files in order."""
 
 _NAMED = re.compile(r"(\d{8}T\d{6}Z)(?:-(\d+))?(-[a-z].*)?\.mcap(\.part)?", re.ASCII)
 
 
 class Repeated:
-    """Tells which messages a file of a log repeats at its start: calibrations and states of the file before."""
+    """Detects messages that a file of a log repeats from the previous one at its start: calibrations and states."""
 
     def __init__(self) -> None:
         self._newest: dict[str, int] = {}
         self._before: dict[str, int] = {}
 
     def next_file(self) -> None:
-        """The messages of another file follow."""
+        """Begin the next file."""
         self._before = dict(self._newest)
 
     def __call__(self, message: Sample) -> bool:
-        """Whether this message was in the files before."""
+        """Whether this message was in a previous file."""
         with contextlib.suppress(KeyError):
             if topic_of(message.key).queryable:
                 if message.sequence <= self._before.get(message.key, -1):
@@ -50,15 +50,15 @@ class Repeated:
 
 
 class WholeLog(LogReader):
-    """Reads the files of one log as one; what a file repeats at its start of the one before is delivered once.
+    """Reads the files of a log as one; messages repeated at the start of a file are delivered once.
 
     Attributes:
-        path: of the first file; schemas and channels are those of the file being read, all others of all files.
+        path: path of the first file; `schemas` and `channels` are those of the present file, other attributes of all.
         parts: readers of the files so far.
     """
 
     def __init__(self, log: LogFiles, *, skip_damaged: bool = False, **options: Any) -> None:
-        """Read a log; `options` as those of `LogReader`."""
+        """Read a log; `options` as for `LogReader`."""
         paths = (log,) if isinstance(log, Path) else tuple(log)
         super().__init__(paths[0], skip_damaged=skip_damaged, **options)
         self.paths = paths
@@ -96,7 +96,7 @@ class WholeLog(LogReader):
                             self.progress(self.position, self.size)
                     if not repeated(message):
                         yield message
-            finally:  # of what has been read, should that be all
+            finally:  # also if the caller stops reading
                 self.described = described = described + part.described
                 for damage in part.damage:
                     damage.why += f" ({path.name})"
@@ -108,62 +108,62 @@ class WholeLog(LogReader):
 
 
 def one_by_one(names: Sequence[Path], out: Path | None = None, *, as_json: bool = False) -> list[Parts]:
-    """Logs that a command line names, each with all of its files that are named.
+    """Logs named on a command line, each with all of its named files.
 
-    `last` is the newest log in the default folder, with every file of its recording, and FOLDER/last that of another
-    folder; a file of that name goes before.
+    `last` is the newest log in the default folder, with all files of its recording, and FOLDER/last that of another
+    folder, unless a file of that name exists.
 
     Args:
-        names: as given.
-        out: the one file that is written, if so.
-        as_json: one JSON object is printed.
+        names: names on the command line.
+        out: output file, if the command writes a single one.
+        as_json: whether the command prints a single JSON object.
 
     Raises:
-        ConfigurationError: there are several logs, and one place for what is made of them; or a part is named twice.
-        DataFileError: there is no log in the folder.
+        ConfigurationError: several logs are named for a single output, or a part is named twice.
+        DataFileError: the folder contains no log.
     """
     logs: dict[tuple[str, ...], dict[int, Path]] = {}
     for path in _files(names):
         key, number = _place(path) if len(names) > 1 or path != names[0] else ((), 1)
-        there = logs.setdefault(key or (str(path.absolute()),), {})
-        if number in there:
-            raise ConfigurationError(f"{there[number]} and {path} are the same part of one log: name one of them")
-        there[number] = path
+        parts = logs.setdefault(key or (str(path.absolute()),), {})
+        if number in parts:
+            raise ConfigurationError(f"{parts[number]} and {path} are the same part of one log: name one of them")
+        parts[number] = path
     found = [tuple(parts[number] for number in sorted(parts)) for parts in logs.values()]
     _refuse_several(found, out, as_json=as_json)
     return found
 
 
 def the_one(names: Sequence[Path]) -> Parts:
-    """The one log that a command line names; see `one_by_one`.
+    """The single log named on a command line; see `one_by_one`.
 
     Raises:
-        ConfigurationError: they are several.
-        DataFileError: there is no log in the folder.
+        ConfigurationError: several logs are named.
+        DataFileError: the folder contains no log.
     """
     found = one_by_one(names)
     if len(found) > 1:
-        raise ConfigurationError(f"this reads one log: name one, not {_listed(found)}; the newest one is `{LAST}`")
+        raise ConfigurationError(f"this command reads one log: name one, not {_listed(found)}; the newest is `{LAST}`")
     return found[0]
 
 
 def in_order(names: Sequence[Path], out: Path | None = None, *, as_json: bool = False) -> list[Path]:
-    """Files of logs that follow each other, as named, those of one recording in their order; see `one_by_one`."""
+    """Files of consecutive logs in the order named, files of a recording in their order; see `one_by_one`."""
     files = [path for parts in one_by_one(names) for path in parts]
     _refuse_several([(path,) for path in files], out, as_json=as_json)
     return files
 
 
 def titled(paths: Parts) -> str:
-    """Name of a log's files for a person."""
+    """Short name of a log's files."""
     return str(paths[0]) if len(paths) == 1 else f"{paths[0]} to {paths[-1].name} ({len(paths)} files)"
 
 
 def metadata_at_start(path: Path) -> dict[str, dict[str, str]]:
-    """Metadata that stand before the messages of a log, by name.
+    """Metadata before the messages of a log, by name.
 
     Raises:
-        DataFileError: it cannot be read.
+        DataFileError: the log cannot be read.
     """
     found: dict[str, dict[str, str]] = {}
     with LogFile(path) as file:
@@ -194,10 +194,10 @@ def _files(names: Sequence[Path]) -> Iterator[Path]:
 
 
 def _newest(folder: Path) -> list[Path]:
-    """Files of the newest log of a folder, by their names, which begin with the time; in order.
+    """Files of the newest log of a folder, in order; the newest is found by its name, which begins with the time.
 
     Raises:
-        DataFileError: there is none.
+        DataFileError: there is no log.
     """
     hint = f"that of another folder is FOLDER/{LAST}"
     try:
@@ -208,7 +208,7 @@ def _newest(folder: Path) -> list[Path]:
         ) from None
     if not files:
         raise DataFileError(f"`{LAST}` is the newest log in {folder}, and there is none; {hint}")
-    # Of several files of one time the finished one as recorded, then one that was recovered, then an unfinished one.
+    # Of several files of one time prefer the recorded finished one, then a recovered one, then an unfinished one.
     order = {
         path: (time, int(number or 1), not (suffix or part), suffix == "-recovered", bool(part))
         for path, match in files.items()
@@ -231,11 +231,11 @@ def _time(path: Path) -> str:
 
 
 def _place(path: Path) -> tuple[tuple[str, ...], int]:
-    """Recording that a file belongs to (none in files of 0.1), and its number there."""
+    """Recording of a file (none in files of version 0.1), and the file's number in it."""
     try:
         metadata = metadata_at_start(path)
     except DataFileError:
-        return (), 1  # reading it raises this again
+        return (), 1  # reading the file raises this again
     entries = metadata.get(PART, {})
     number, of = entries.get("number", ""), entries.get("of", "")
     if not of or not re.fullmatch("[1-9][0-9]{0,8}", number):

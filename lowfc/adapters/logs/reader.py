@@ -1,4 +1,4 @@
-"""Reading logs, finished or not: messages in the order they were recorded, every checksum checked."""
+"""Reading logs, finished or not: messages in recorded order, with all checksums checked."""
 
 import re
 import struct
@@ -17,28 +17,28 @@ from lowfc.contract.envelope import COUNT_BITS, sequence_of, start_of
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import Topic
 
-_BEGINNING = 64  # bytes of a chunk, with the first message's times: a night has too many chunks for 32 bits of CRC
+_PREFIX_BYTES = 64  # of a chunk, with its first message's times: a 32-bit CRC alone is too short for a night's chunks
 _MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, count, log time, publish time
 
 
 class LogReader:
     """Reads a log from its start, finished or not, and checks every checksum.
 
-    Nothing is delivered of a chunk that is not as it was written.
+    No message of a damaged chunk is delivered.
 
     Attributes:
-        path: of the log; `paths` are its files, this one alone.
-        size: bytes of it; of one that is still growing, when reading began.
-        position: bytes read so far.
-        described: the metadata and attachments met so far, in their order; those of the start are there with the first
-            message.
-        schemas: those declared so far, by id.
-        channels: those declared so far, by key and start of the publisher.
-        damage: what was left out because it is damaged.
-        unreadable: messages left out because their declaration was damaged.
-        finished: it ends as a log that was finished ends, whatever is before; False for one whose recorder died.
-        complete: the end was reached, and the summary there is sound; False while reading.
-        progress: called now and then with the bytes read and their total.
+        path: path of the log.
+        paths: files of the log; here only `path`.
+        size: size of the log when reading began, bytes.
+        position: number of bytes read so far.
+        described: metadata and attachments read so far, in order; with the first message, those at the start.
+        schemas: schemas declared so far, by id.
+        channels: channels declared so far, by key and start of the publisher.
+        damage: damaged stretches that were left out.
+        unreadable: number of messages left out because their declaration was damaged.
+        finished: whether the log ends as a finished one; False if its recorder died.
+        complete: whether the end was reached with a valid summary; False while reading.
+        progress: function called at intervals with the bytes read and their total.
     """
 
     progress: Callable[[int, int], None] | None = None
@@ -56,13 +56,13 @@ class LogReader:
         """Read the log at `path`.
 
         Args:
-            path: of a log, whatever its name.
-            topics: deliver only messages of these; all when None.
-            skip_damaged: leave out what is damaged instead of raising an error.
-            from_ns: leave out the chunks that end before this log time.
-            always: topics of which nothing is left out for that.
-            sparse: leave chunks unread that have no message of `topics`, by their indexes: for topics with few messages
-                in a long log. Of those chunks no checksum is checked.
+            path: path of the log, with any name.
+            topics: topics whose messages are delivered; None: all.
+            skip_damaged: whether to leave out damaged stretches instead of raising an error.
+            from_ns: log time; chunks that end before it are left out.
+            always: topics to which `from_ns` does not apply.
+            sparse: whether to skip chunks without messages of `topics`, by their indexes: for topics with few messages
+                in a long log. The checksums of skipped chunks are not checked.
         """
         self.path = path
         self.paths: tuple[Path, ...] = (path,)
@@ -81,7 +81,7 @@ class LogReader:
         self._always = always
         self._sparse = sparse
         self._declared: dict[int, Channel] = {}
-        self._wanted: dict[int, tuple[str, int] | None] = {}
+        self._delivered: dict[int, tuple[str, int] | None] = {}
         self._chunks: set[int] = set()
         self._last_ns: int | None = None
         self._spanned = 0
@@ -89,12 +89,12 @@ class LogReader:
 
     @property
     def metadata(self) -> dict[str, dict[str, str]]:
-        """Metadata met so far, by name."""
+        """Metadata read so far, by name."""
         return {record.name: record.metadata for record in self.described if isinstance(record, Metadata)}
 
     @property
     def attachments(self) -> dict[str, bytes]:
-        """Attachments met so far, by name."""
+        """Attachments read so far, by name."""
         return {record.name: record.data for record in self.described if isinstance(record, Attachment)}
 
     @property
@@ -103,10 +103,10 @@ class LogReader:
         return Selection.of(self.metadata)
 
     def __iter__(self) -> Iterator[Sample]:
-        """Messages in the order they were recorded; a reader reads once.
+        """Messages in recorded order; a reader reads once.
 
         Raises:
-            DataFileError: this is no log, or a part of it is damaged.
+            DataFileError: the file is not a log, or a part of it is damaged.
         """
         with LogFile(self.path) as file:
             self.size, self.finished, self._file = file.size, file.finished, file
@@ -132,27 +132,27 @@ class LogReader:
             raise DataFileError(f"{self.path} is not an MCAP file")
 
     def _needs(self, end_ns: int, channels: Collection[int]) -> bool:
-        """Whether one of these channels is wanted then, or not declared yet: that stands with its first message."""
-        if any(number not in self._wanted for number in channels):
+        """Whether a chunk with these channels is needed; a channel not declared yet is declared in the chunk."""
+        if any(number not in self._delivered for number in channels):
             return True
         if end_ns < self._from_ns:
             keys = [self._declared[number].topic.removeprefix("/") for number in channels]
             return any(topic.matches(key) for topic in self._always for key in keys)
-        return not self._sparse or any(self._wanted[number] for number in channels)
+        return not self._sparse or any(self._delivered[number] for number in channels)
 
     def _chunk(self, chunk: Chunk) -> list[Sample]:
-        """Messages of a chunk, unless it is not in its place."""
-        identity = hash((chunk.crc, chunk.content[:_BEGINNING]))
+        """Messages of a chunk; a repeated or inconsistent chunk is left out."""
+        identity = hash((chunk.crc, chunk.content[:_PREFIX_BYTES]))
         try:
             if identity in self._chunks:
-                raise UnsoundError("a chunk is there a second time")
+                raise UnsoundError("a chunk occurs a second time")
             messages = self._messages(chunk.content)
         except UnsoundError as fault:
             self._leave_out(Damage(chunk.position, chunk.length, str(fault)))
             return []
         self._chunks.add(identity)
         if self.unreadable and not self._skip_damaged:
-            raise self._error(chunk.position, "what declares its messages is not there")
+            raise self._error(chunk.position, "the declaration of its messages is missing")
         if messages:
             for damage in self.damage[self._spanned :]:
                 damage.before_ns = messages[0].receive_time_ns
@@ -161,13 +161,13 @@ class LogReader:
         return messages
 
     def _messages(self, content: bytes) -> list[Sample]:
-        """Messages in a chunk that are wanted; what it declares is remembered.
+        """Decode the messages of a chunk that are to be delivered, and store its declarations.
 
         Raises:
-            UnsoundError: its records do not hold together, or contradict those before.
+            UnsoundError: its records are inconsistent, or contradict earlier ones.
         """
         found: list[Sample] = []
-        wanted, at, end = self._wanted, 0, len(content)
+        delivered, at, end = self._delivered, 0, len(content)
         read_head, read_message, logged = HEAD.unpack_from, _MESSAGE_HEAD.unpack_from, Sample._make
         message_opcode, head_bytes, message_bytes = int(Opcode.MESSAGE), HEAD.size, HEAD.size + _MESSAGE_HEAD.size
         try:
@@ -176,12 +176,12 @@ class LogReader:
                 begin, at = at, at + head_bytes + length
                 if opcode == message_opcode:
                     number, count, receive_time_ns, publish_time_ns = read_message(content, begin + head_bytes)
-                    channel = wanted.get(number)
+                    channel = delivered.get(number)
                     if channel is not None:
                         key, start = channel
                         payload = content[begin + message_bytes : at]
                         found.append(logged((key, payload, start | count, publish_time_ns, receive_time_ns)))
-                    elif number not in wanted:
+                    elif number not in delivered:
                         self.unreadable += 1
                 elif opcode == Opcode.SCHEMA:
                     self._declare_schema(parsed(Schema, content[begin + head_bytes : at]))
@@ -195,24 +195,24 @@ class LogReader:
 
     def _declare_schema(self, schema: Schema) -> None:
         if self.schemas.setdefault(schema.id, schema) != schema:
-            raise UnsoundError(f"schema {schema.id} is declared a second time, and not as before")
+            raise UnsoundError(f"schema {schema.id} is declared a second time, differently")
 
     def _declare_channel(self, channel: Channel) -> None:
         if self._declared.setdefault(channel.id, channel) != channel:
-            raise UnsoundError(f"channel {channel.id} is declared a second time, and not as before")
+            raise UnsoundError(f"channel {channel.id} is declared a second time, differently")
         if channel.schema_id not in self.schemas:
             return  # the schema's declaration was in a damaged chunk: its messages are unreadable
-        given = channel.metadata.get(START_KEY, "0")
-        start_s = int(given) if re.fullmatch("[0-9]{1,10}", given) else -1
+        start = channel.metadata.get(START_KEY, "0")
+        start_s = int(start) if re.fullmatch("[0-9]{1,10}", start) else -1
         if not 0 <= start_s < 1 << COUNT_BITS:
-            raise UnsoundError(f"channel {channel.id} has {START_KEY} {given!r}, not a time in seconds")
+            raise UnsoundError(f"channel {channel.id} has {START_KEY} {start!r}, not a time in seconds")
         key = channel.topic.removeprefix("/")
         self.channels[key, start_s] = channel
-        asked = self._topics is None or any(topic.matches(key) for topic in self._topics)
-        self._wanted[channel.id] = (key, sequence_of(start_s, 0)) if asked else None
+        selected = self._topics is None or any(topic.matches(key) for topic in self._topics)
+        self._delivered[channel.id] = (key, sequence_of(start_s, 0)) if selected else None
 
     def schema_of(self, message: Sample) -> str:
-        """Full name of a delivered message's protobuf message."""
+        """Full name of the protobuf type of a delivered message."""
         return self.schemas[self.channels[message.key, start_of(message.sequence)].schema_id].name
 
     def _leave_out(self, damage: Damage) -> None:
@@ -224,9 +224,9 @@ class LogReader:
     def _error(self, position: int, why: str) -> DataFileError:
         if self._file.unread and not self._has_chunks:
             return DataFileError(
-                f"{self.path} is compressed with {self._file.unread!r}, which is not read; lz4, zstd and none are: "
+                f"{self.path} is compressed with {self._file.unread!r}; lz4, zstd and none are supported: "
                 "compress it again with `mcap compress --compression zstd`"
             )
         if position == 0:
-            return DataFileError(f"{self.path} is not an MCAP file; if it was one, `lowfc recover` saves what is whole")
-        return DataFileError(f"{self.path} is damaged at byte {position} ({why}); `lowfc recover` saves what is whole")
+            return DataFileError(f"{self.path} is not an MCAP file; if it was one, `lowfc recover` saves intact parts")
+        return DataFileError(f"{self.path} is damaged at byte {position} ({why}); `lowfc recover` saves intact parts")

@@ -1,8 +1,8 @@
-"""The records of a log file as they lie on the disk: what is whole, what is damaged, where the file breaks off.
+"""Records of a log file: intact ones, damaged stretches, and the end of a truncated file.
 
-Nothing passes that its checksum does not vouch for. Of a finished log every byte is under one: the chunks and the
-attachments have their own, DataEnd has that of all before it, the footer that of the summary. A log that another tool
-has rewritten may lack checksums and chunks: what was not computed is not checked.
+Everything is checked by checksums. In a finished log they cover every byte: chunks and attachments have their own,
+DataEnd has that of the data section, the footer that of the summary. A log rewritten by another tool may lack checksums
+and chunks; a missing checksum is not checked.
 """
 
 import io
@@ -38,22 +38,22 @@ HEAD = struct.Struct("<BQ")
 _FOOTER_BYTES = HEAD.size + 20 + len(MAGIC)
 _BLOCK_BYTES = 1 << 20
 _EXPECTED = {Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METADATA, Opcode.DATA_END}
-_CHANGED = "its parts are whole, but not all are there, or not in order, or what lies between them has changed"
+_CHANGED = "its parts are intact, but some are missing, out of order, or changed in between"
 _OF_CHUNKS = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE}
 _FIRST_BLOCK_BYTES = 1 << 12
-_TRIES = 4  # times the file's size is read in search of chunks; then the rest is given up, of a file made to mislead
+_TRIES = 4  # limit of bytes read in search of chunks, in file sizes: a malicious file must not read for ever
 
 
 @dataclass(slots=True)
 class Damage:
-    """A stretch of a log that is not as it was written, and is left out.
+    """A damaged stretch of a log, which is left out.
 
     Attributes:
-        position: its first byte.
-        length: its bytes.
-        why: what is wrong with it.
+        position: first byte of the stretch.
+        length: size of the stretch, bytes.
+        why: reason.
         after_ns: log time of the last message delivered before it; None before the first.
-        before_ns: log time of the next one delivered; None after the last.
+        before_ns: log time of the next message delivered; None after the last.
     """
 
     position: int
@@ -64,21 +64,21 @@ class Damage:
 
 
 class LogFile:
-    """A log file that is open for reading, up to where it ends now; a context.
+    """A log file open for reading up to its present end; a context manager.
 
     Attributes:
-        path: of the file.
-        size: bytes of it when it was opened.
-        finished: it ends as a log that was finished ends.
-        complete: finished, and read up to a sound summary; known when all `parts` have been taken.
-        unread: compression of a chunk that is not read; empty for none.
+        path: path of the file.
+        size: size of the file when opened, bytes.
+        finished: whether it ends as a finished log.
+        complete: whether it is finished and was read up to a valid summary; known at the end of `parts`.
+        unread: name of an unsupported compression of a chunk; empty for none.
     """
 
     def __init__(self, path: Path) -> None:
         """Open the log at `path`.
 
         Raises:
-            DataFileError: it cannot be read.
+            DataFileError: the file cannot be read.
         """
         self.path = path
         self.complete = False
@@ -94,8 +94,8 @@ class LogFile:
             self._file.close()
             raise DataFileError(f"{path} is empty: nothing was recorded")
         self.finished = self._read(max(0, self.size - len(MAGIC)), len(MAGIC)) == MAGIC
-        self._ours = self._is_ours()
-        self._summary = self._sound_summary()
+        self._by_lowfc = self._is_by_lowfc()
+        self._summary = self._find_summary()
         self._bytes_to_try = _TRIES * self.size
 
     def __enter__(self) -> "LogFile":
@@ -105,38 +105,38 @@ class LogFile:
         self._file.close()
 
     def declarations(self) -> Chunk | None:
-        """What the summary declares, schemas and channels, like a chunk; None unless the summary is sound."""
+        """Schemas and channels declared in the summary, as a chunk; None without a valid summary."""
         if self._summary is None:
             return None
         content = b"".join(self._in_summary(Opcode.SCHEMA, Opcode.CHANNEL))
         return Chunk(self._summary, len(content), zlib.crc32(content), content)
 
     def index(self) -> Iterator[ChunkIndex]:
-        """The summary's index of each chunk, in the order of the file; none unless it is sound."""
+        """Index of each chunk from the summary, in file order; nothing without a valid summary."""
         for record in self._in_summary(Opcode.CHUNK_INDEX):
             yield parsed(ChunkIndex, record[HEAD.size :])
 
     def parts(
         self, needed: Callable[[int, Collection[int]], bool] | None = None
     ) -> Iterator[Chunk | Metadata | Attachment | Damage]:
-        """The file's content, in order.
+        """Content of the file, in order.
 
-        Chunks of which `needed` is false are passed over unread; it is asked with the log time at which one ends and
-        the channels (ids) of its messages.
+        `needed` is called with the end (log time) of each chunk and the ids of its channels; if it returns False, the
+        chunk is skipped unread.
 
         Raises:
-            DataFileError: the disk refuses.
+            DataFileError: the file cannot be read.
         """
         magic = self._read(0, len(MAGIC))
         at, crc, intact = len(MAGIC), zlib.crc32(magic), MAGIC.startswith(magic)
         if not intact:
-            yield Damage(0, len(magic), "it does not begin as an MCAP file")
+            yield Damage(0, len(magic), "it does not begin like an MCAP file")
         while at < self.size:
             head = self._read(at, HEAD.size)
             opcode, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, self.size)
             end = at + HEAD.size + length
             if needed and opcode == Opcode.CHUNK and end <= self.size:
-                intact = False  # no checksum of the whole without all of it
+                intact = False  # the checksum of the data section needs all of it
                 end_ns = int.from_bytes(self._read(at + HEAD.size + 8, 8), "little")
                 if (there := self._channels_after(end)) and not needed(end_ns, there):
                     at = end
@@ -147,7 +147,7 @@ class LogFile:
                     crc, at = zlib.crc32(content, crc), at + len(content)
                     continue
                 if end > self.size or length > LARGEST_BYTES:
-                    raise UnsoundError("a record is longer than it can be")
+                    raise UnsoundError("a record has an impossible length")
                 body = self._read(at + HEAD.size, length)
                 if opcode == Opcode.DATA_END and length == 4 and self._summary in (None, end):
                     if intact and int.from_bytes(body, "little") not in (0, crc):
@@ -161,7 +161,7 @@ class LogFile:
             except UnsoundError as fault:
                 resumed = self._resume(at, end)
                 if resumed == self.size < end and not self.finished:
-                    return  # the last record was not written to its end
+                    return  # the last record is truncated
                 intact = False
                 yield Damage(at, resumed - at, str(fault))
                 at = resumed
@@ -170,15 +170,15 @@ class LogFile:
                     yield part
                 at = end
 
-    def _sound_summary(self) -> int | None:
-        """Where the summary begins; None unless its checksum is right."""
+    def _find_summary(self) -> int | None:
+        """First byte of the summary; None unless its checksum is correct."""
         footer_at = self.size - _FOOTER_BYTES
         footer = self._read(footer_at, _FOOTER_BYTES) if self.finished and footer_at > 0 else b""
         if not footer or HEAD.unpack_from(footer) != (Opcode.FOOTER, 20):
             return None
         start, _, stored = struct.unpack_from("<QQI", footer, HEAD.size)
-        if not self._ours and not (start and stored):
-            start = start or footer_at  # where there is none, nothing follows the data but the footer
+        if not self._by_lowfc and not (start and stored):
+            start = start or footer_at  # without a summary only the footer follows the data
             return start if len(MAGIC) <= start <= footer_at else None
         if not len(MAGIC) <= start < footer_at:
             return None
@@ -188,7 +188,7 @@ class LogFile:
         return start if zlib.crc32(footer[: HEAD.size + 16], crc) == stored else None
 
     def _channels_after(self, at: int) -> list[int]:
-        """Ids of the channels in the indexes of messages at `at`, behind a chunk; none where it has no index."""
+        """Ids of the channels in the message indexes at `at`, after a chunk; empty without an index."""
         found = []
         while len(head := self._read(at, HEAD.size + 2)) == HEAD.size + 2:
             opcode, length = HEAD.unpack_from(head)
@@ -199,7 +199,7 @@ class LogFile:
         return found
 
     def _resume(self, at: int, end: int) -> int:
-        """Where to read on after an unsound record: behind it if a record begins there, else at the next whole one."""
+        """Position to continue after a damaged record: its end if a record begins there, else the next intact chunk."""
         if end == self.size:
             return end
         if end < self.size:
@@ -208,7 +208,7 @@ class LogFile:
                 opcode, length = HEAD.unpack(head)
                 if opcode in _EXPECTED and end + HEAD.size + length <= self.size:
                     return end
-            self._bytes_to_try -= min(end - at, LARGEST_BYTES)  # read once, and now searched
+            self._bytes_to_try -= min(end - at, LARGEST_BYTES)  # read once, now searched
         start, block = at + 1, _FIRST_BLOCK_BYTES
         while start < self.size and self._bytes_to_try > 0:
             for match in CHUNK_HERE.finditer(self._read(start, block + 64)):
@@ -219,34 +219,34 @@ class LogFile:
         return data_end if data_end > at else self.size
 
     def _chunk_at(self, at: int) -> bool:
-        """Whether a whole chunk begins at `at`."""
+        """Whether an intact chunk begins at `at`."""
         _, length = HEAD.unpack(self._read(at, HEAD.size))
         at += HEAD.size
         if at + length > self.size or length > min(LARGEST_BYTES, self._bytes_to_try):
             return False
         try:
             self._bytes_to_try -= length
-            read_chunk(self._read(at, length), at, may_lack_crc=not self._ours)
+            read_chunk(self._read(at, length), at, may_lack_crc=not self._by_lowfc)
         except UnsoundError:
             return False
         return True
 
     def _part(self, opcode: int, body: bytes, at: int) -> Chunk | Metadata | Attachment | None:
-        """A record of the data section, checked; None for one that only helps to find others.
+        """Decode and check a record of the data section; None for an index or header.
 
         Raises:
-            UnsoundError: it is damaged, or has no place in a log.
+            UnsoundError: the record is damaged or not permitted here.
         """
         match opcode:
             case Opcode.CHUNK:
                 try:
-                    return read_chunk(body, at, may_lack_crc=not self._ours)
+                    return read_chunk(body, at, may_lack_crc=not self._by_lowfc)
                 except CompressionError as fault:
                     self.unread = fault.name
                     raise
             case Opcode.ATTACHMENT:
                 crc = int.from_bytes(body[-4:], "little")
-                if crc != zlib.crc32(body[:-4]) and (crc or self._ours):
+                if crc != zlib.crc32(body[:-4]) and (crc or self._by_lowfc):
                     raise UnsoundError("the checksum of an attachment is wrong")
                 return parsed(Attachment, body)
             case Opcode.METADATA:
@@ -257,13 +257,13 @@ class LogFile:
             case Opcode.HEADER if at == len(MAGIC):
                 pass
             case Opcode.MESSAGE | Opcode.SCHEMA | Opcode.CHANNEL:
-                raise UnsoundError("a record stands outside of the chunks, where no checksum vouches for it")
+                raise UnsoundError("a record is outside the chunks, without a checksum")
             case _:
                 raise UnsoundError("no record begins here")
         return None
 
-    def _is_ours(self) -> bool:
-        """Whether the recorder wrote this file, with every checksum; another tool's name is in the header."""
+    def _is_by_lowfc(self) -> bool:
+        """Whether lowfc wrote this file, and so with all checksums, according to the header."""
         head = self._read(len(MAGIC), HEAD.size)
         opcode, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, 0)
         if opcode != Opcode.HEADER or length > _BLOCK_BYTES:
@@ -276,12 +276,12 @@ class LogFile:
 
     @cached_property
     def _unchunked(self) -> bool:
-        """Whether messages may stand outside of chunks."""
+        """Whether messages may be outside chunks."""
         statistics = (parsed(Statistics, one[HEAD.size :]) for one in self._in_summary(Opcode.STATISTICS))
-        return not self._ours or any(not one.chunk_count for one in statistics)
+        return not self._by_lowfc or any(not one.chunk_count for one in statistics)
 
     def _loose(self, at: int) -> bytes:
-        """Whole records from `at` on of those that usually stand in chunks."""
+        """Intact records from `at` on that are usually in chunks."""
         end = at
         while end - at < _BLOCK_BYTES and len(head := self._read(end, HEAD.size)) == HEAD.size:
             opcode, length = HEAD.unpack(head)
@@ -291,7 +291,7 @@ class LogFile:
         return self._read(at, end - at)
 
     def _in_summary(self, *opcodes: Opcode) -> Iterator[bytes]:
-        """Records of some kinds in the summary; none unless it is sound."""
+        """Records of some kinds in the summary; nothing without a valid summary."""
         at = self.size if self._summary is None else self._summary
         while at < self.size - _FOOTER_BYTES:
             opcode, length = HEAD.unpack(self._read(at, HEAD.size))
@@ -311,10 +311,10 @@ _Record = TypeVar("_Record", Attachment, ChunkIndex, Header, Metadata, Schema, S
 
 
 def parsed(kind: type[_Record], body: bytes) -> _Record:
-    """A record of this kind.
+    """Decode a record of this kind.
 
     Raises:
-        UnsoundError: it is not one.
+        UnsoundError: the body is not such a record.
     """
     stream = ReadDataStream(io.BytesIO(body))
     try:

@@ -1,4 +1,4 @@
-"""Recovering logs: what is whole in a truncated or damaged one becomes a complete, indexed log beside it."""
+"""Recovery of truncated or damaged logs: their intact parts are written to a complete, indexed log."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -13,7 +13,7 @@ from lowfc.adapters.logs.writer import UNFINISHED, being_recorded, stem_of
 from lowfc.contract.errors import DataFileError
 
 RECOVERY = "recovery"
-"""Name of the metadata with what a recovered log was made from."""
+"""Name of the metadata with the origin of a recovered log."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,13 +21,13 @@ class Recovery:
     """Result of a recovery.
 
     Attributes:
-        log: which is as it was.
-        bytes: of it.
-        finished: it had been finished.
-        recovered: the new log; None where the log is whole.
-        messages: in the new log.
-        unreadable: messages left out because their declaration was damaged.
-        damage: what was left out.
+        log: the original log, unchanged.
+        bytes: size of the original log.
+        finished: whether the original log had been finished.
+        recovered: the new log; None if the original is intact.
+        messages: number of messages in the new log.
+        unreadable: number of messages left out because their declaration was damaged.
+        damage: damaged stretches that were left out.
     """
 
     log: Path
@@ -40,41 +40,41 @@ class Recovery:
 
     @property
     def figures(self) -> dict[str, Any]:
-        """The same for a program."""
+        """The result as values for JSON."""
         named = {"log": str(self.log), "recovered": None if self.recovered is None else str(self.recovered)}
         return dataclasses.asdict(self) | named
 
     def __str__(self) -> str:
-        """The same for a person."""
+        """The result as text."""
         if self.recovered is None:
             name = self.log.name.removesuffix(UNFINISHED)
             advice = "there is nothing to recover" if name == self.log.name else f"only rename it to {name}"
-            return f"{self.log} is whole; {advice}"
+            return f"{self.log} is intact; {advice}"
         lines = [f"left out {in_words(damage)}" for damage in self.damage]
         if self.unreadable:
-            lines.append(f"left out {self.unreadable} messages: what declares them was in a damaged chunk")
+            lines.append(f"left out {self.unreadable} messages: their declaration was in a damaged chunk")
         if not self.finished:
             lines.append(f"{self.log} had not been finished")
         return "\n".join([*lines, f"{self.recovered}: {self.messages} messages"])
 
 
 def recovered_path(source: Path) -> Path:
-    """Name for what is recovered from a log, beside it."""
+    """Default path of the recovered log, next to the original."""
     return source.with_name(f"{stem_of(source)}-recovered.mcap")
 
 
 def recover(source: Path, out: Path, progress: Callable[[int, int], None] | None = None) -> Recovery:
-    """Write what is whole of `source` to `out`; nothing where all of it is whole.
+    """Write the intact parts of `source` to `out`; nothing if `source` is intact.
 
-    Messages, channels, schemas, attachments and metadata stay as they are; a metadata record "recovery" is added.
+    Messages, channels, schemas, attachments and metadata are copied unchanged; a metadata record "recovery" is added.
 
     Args:
         source: a log, finished or not.
-        out: a file that is not there yet.
-        progress: called with the bytes done and their total.
+        out: a file that does not exist yet.
+        progress: function called with the bytes read and their total.
 
     Raises:
-        DataFileError: `source` is no log or is being recorded, `out` is there already, or the disk refuses.
+        DataFileError: `source` is not a log or is being recorded, `out` exists, or it cannot be written.
     """
     if source.exists() and being_recorded(source):
         raise DataFileError(f"{source} is being recorded, and nothing is lost: `lowfc ctl record stop` finishes it")
@@ -91,14 +91,14 @@ def recover(source: Path, out: Path, progress: Callable[[int, int], None] | None
         copy = LogCopy(file)
         copy.take(reader)
         if not copy.messages and not reader.described:
-            raise DataFileError(f"{source}: nothing in it is whole, so there is nothing to recover")
+            raise DataFileError(f"{source}: no part of it is intact, so there is nothing to recover")
         copy.note(RECOVERY, account(reader, copy.messages))
         copy.finish()
     return Recovery(source, reader.size, reader.finished, out, copy.messages, reader.unreadable, reader.damage)
 
 
 def account(reader: LogReader, messages: int) -> dict[str, str]:
-    """Metadata for a copy of a damaged or unfinished log."""
+    """Metadata on the origin of a copy of a damaged or unfinished log."""
     return {
         "source": reader.path.name,
         "source_bytes": str(reader.size),
@@ -111,7 +111,7 @@ def account(reader: LogReader, messages: int) -> dict[str, str]:
 
 
 def in_words(damage: Damage) -> str:
-    """A damaged stretch, where it is and what it cost."""
+    """Position, reason and lost time of a damaged stretch, as text."""
     place = f"at byte {damage.position}, {damage.length} bytes: {damage.why}"
     if not damage.length or damage.after_ns is None or damage.before_ns is None:
         return place
@@ -119,7 +119,7 @@ def in_words(damage: Damage) -> str:
 
 
 def no_end(paths: Sequence[Path], *, finished: bool) -> str:
-    """Sentence for a person on files without an end; empty for those that are `finished`."""
+    """Sentence on the missing end of a log; empty if it is `finished`."""
     if finished:
         return ""
     if any(map(being_recorded, paths)):
@@ -130,6 +130,6 @@ def no_end(paths: Sequence[Path], *, finished: bool) -> str:
 
 
 def faults(damaged: Sequence[str], no_end: str) -> list[str]:
-    """Lines for a person on what is missing in a log that was read."""
+    """Lines of text on missing parts of a log."""
     lines = [f"truncated          {no_end}"] if no_end else []
     return lines + [f"damaged            left out: {part}" for part in damaged]

@@ -1,6 +1,6 @@
-"""What a recording leaves out on purpose: all but every Nth frame and mirror state, and topics that were not asked for.
+"""Selection of what is recorded: every Nth frame and mirror state, and the requested optional topics.
 
-Steps, commands, requests, events, health, calibrations and states are always whole.
+Steps, commands, requests, events, health, calibrations and states are always complete.
 """
 
 import math
@@ -16,7 +16,7 @@ from lowfc.contract.errors import ConfigurationError, nearest
 from lowfc.contract.messages import FRAME, MIRROR_STATE, TOPICS, Topic, wire
 
 SELECTION = "selection"
-"""Name of the metadata with what was left out; a log without it has everything."""
+"""Name of the metadata with the selection; a log without it is complete."""
 
 _FEWER = {FRAME: "frames", MIRROR_STATE: "mirror states"}
 """Topics of which every Nth message is recorded."""
@@ -24,11 +24,11 @@ _FEWER = {FRAME: "frames", MIRROR_STATE: "mirror states"}
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """What is recorded.
+    """Selection of recorded messages.
 
     Attributes:
-        every: of frames and mirror states, those whose frame number is a multiple of this.
-        left_out: topics of which nothing is recorded; only such as are `optional`.
+        every: frames and mirror states are recorded if their frame number is a multiple of this.
+        left_out: topics that are not recorded; only `optional` ones.
     """
 
     every: int = 1
@@ -36,7 +36,7 @@ class Selection:
 
     @classmethod
     def of(cls, metadata: Mapping[str, Mapping[str, str]]) -> "Selection":
-        """Selection of a log, by the metadata at its start; everything where that cannot be read."""
+        """Selection of a log from the metadata at its start; everything if they cannot be read."""
         entries = metadata.get(SELECTION, {})
         every, keys = entries.get("every", ""), entries.get("left_out", "").split()
         return cls(
@@ -46,14 +46,14 @@ class Selection:
 
     @property
     def metadata(self) -> dict[str, dict[str, str]]:
-        """For the start of a log; nothing where everything is recorded."""
+        """Metadata for the start of a log; empty if everything is recorded."""
         if self == EVERYTHING:
             return {}
         return {SELECTION: {"every": str(self.every), "left_out": " ".join(self._keys)}}
 
     @property
     def sentence(self) -> str:
-        """Description of the selection for people; empty for everything."""
+        """Description of the selection; empty for everything."""
         few = [name for topic, name in _FEWER.items() if topic not in self.left_out]
         parts = [f"1 in {self.every} {' and '.join(few)}"] if self.every > 1 and few else []
         parts += [f"without {', '.join(self._keys)}"] if self.left_out else []
@@ -61,7 +61,7 @@ class Selection:
 
     @property
     def has_every_frame(self) -> bool:
-        """Whether no frame is left out."""
+        """Whether every frame is recorded."""
         return self.every == 1 and FRAME not in self.left_out
 
     def records_all(self, topic: Topic) -> bool:
@@ -71,7 +71,7 @@ class Selection:
     def keeps(self, topic: Topic, sequence: int, payload: bytes) -> bool:
         """Whether a message is recorded.
 
-        The camera's frame number decides for the frame and for the mirror state that followed it, so that they join.
+        The frame number decides for the frame and for its mirror state, so that both are recorded.
         """
         if topic in self.left_out:
             return False
@@ -81,11 +81,11 @@ class Selection:
             try:
                 sequence = wire.MirrorState.FromString(payload).frame_sequence
             except DecodeError:
-                return True  # it is in the log as it came
+                return True  # record an unreadable message unchanged
         return count_of(sequence) % self.every == 0
 
     def within(self, other: "Selection") -> "Selection":
-        """What is left of a log of this selection when another is made of it."""
+        """Selection of a log after both selections."""
         return Selection(math.lcm(self.every, other.every), self.left_out | other.left_out)
 
     @property
@@ -97,23 +97,23 @@ EVERYTHING = Selection()
 
 
 def selection(every: int = 1, patterns: Iterable[str] = ()) -> Selection:
-    """Selection of what is asked for.
+    """Make a selection from options.
 
     Args:
-        every: record each Nth frame and mirror state.
-        patterns: keys or shell patterns of the optional topics to record; all of them where there are none.
+        every: N to record every Nth frame and mirror state.
+        patterns: keys or shell patterns of the optional topics to record; empty: all.
 
     Raises:
-        ConfigurationError: a pattern fits no topic.
+        ConfigurationError: a pattern matches no topic.
     """
-    wanted: set[Topic] = set()
+    chosen: set[Topic] = set()
     for pattern in (given.removeprefix("/") for given in patterns):
-        fitting = {topic for topic in TOPICS if topic.matches(pattern) or fnmatchcase(topic.key, pattern)}
-        if not fitting:
+        matching = {topic for topic in TOPICS if topic.matches(pattern) or fnmatchcase(topic.key, pattern)}
+        if not matching:
             keys = [topic.key for topic in TOPICS]
             raise ConfigurationError(
-                f"no topic fits {pattern!r}{nearest(pattern, keys)}; give a key or a shell pattern, such as "
+                f"no topic matches {pattern!r}{nearest(pattern, keys)}; give a key or a shell pattern, such as "
                 "'lowfc/camera/*'"
             )
-        wanted |= fitting
-    return Selection(every, frozenset(topic for topic in TOPICS if topic.optional and wanted and topic not in wanted))
+        chosen |= matching
+    return Selection(every, frozenset(topic for topic in TOPICS if topic.optional and chosen and topic not in chosen))

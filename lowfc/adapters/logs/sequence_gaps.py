@@ -1,29 +1,29 @@
-"""Messages received from one publisher, in any order: a late one closes its gap."""
+"""Detection of gaps in a publisher's sequence; a late message closes its gap."""
 
 from lowfc.adapters.bus.bus import Sample
 from lowfc.contract.envelope import count_of, start_of
 
 REMEMBERED = 4096
-"""Counts behind the newest in which a late message is still known from one that came before."""
+"""Range of counts below the newest in which late messages are distinguished from duplicates."""
 
 
 class Gaps:
-    """Counts of the messages of one start of a publisher, from the first that came on.
+    """Counts of the messages from one start of a publisher, from the first received one.
 
     Attributes:
-        first: of the first message.
-        next: after the highest one.
-        missing: between the two, those that have not come.
+        first: count of the first message.
+        next: highest count plus 1.
+        missing: number of missing messages between the two.
     """
 
     def __init__(self, first: int, missing: int = 0) -> None:
-        """Begin with a message that is about to come; so many of former starts are `missing`."""
+        """Begin with the count of the first message; `missing` is the number from former starts."""
         self.first = self.next = first
         self.missing = missing
         self._open: set[int] = set()
 
     def came(self, count: int) -> bool:
-        """Account for a message; whether it is there for the first time, as far as that is known."""
+        """Count a message; return whether it is new, as far as known."""
         if count == self.next:
             self.next = count + 1
             return True
@@ -42,12 +42,12 @@ class Gaps:
 
 
 class Arrivals:
-    """Counts messages of one publisher as they arrive.
+    """Counts the received messages of a key.
 
     Attributes:
-        key: what they are.
-        received: how many arrived.
-        last_sequence: of the newest message.
+        key: key of the messages.
+        received: number of received messages.
+        last_sequence: sequence of the newest message.
     """
 
     def __init__(self, key: str = "") -> None:
@@ -57,18 +57,18 @@ class Arrivals:
 
     @property
     def missing(self) -> int:
-        """Messages that never arrived, by gaps in the sequence of one start of the publisher."""
+        """Number of messages that never arrived, from gaps in the sequences of each start of the publisher."""
         return self._gaps.missing
 
     @property
     def skipped(self) -> int:
-        """Messages that arrived and that nobody looked at."""
+        """Number of received messages that were not processed."""
         return 0
 
     def count(self, sample: Sample) -> None:
-        """Account for a message that has arrived."""
+        """Count a received message."""
         sequence = sample.sequence
-        if sequence == self.last_sequence + 1 and self.received:  # as nearly all are, in the loop
+        if sequence == self.last_sequence + 1 and self.received:  # the usual case in the loop
             self.last_sequence = sequence
             self._gaps.next += 1
             self.received += 1

@@ -1,4 +1,4 @@
-"""The logs of one recording, one after the other: when the next is begun, and where the disk ends."""
+"""Consecutive log files of a recording, limited in size, age and disk space."""
 
 import shutil
 import time
@@ -15,13 +15,13 @@ from lowfc.contract.errors import DataFileError
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """When a log is finished and the next one begun, who may read it, and what is left of the disk for others.
+    """Limits of a log file, and free space to leave on the disk.
 
     Attributes:
-        largest_bytes: size at which the next log is begun.
-        longest_s: age at which the next log is begun.
+        largest_bytes: size at which the next file begins.
+        longest_s: age at which the next file begins.
         min_free_bytes: free space below which nothing is recorded.
-        file_mode: permissions of a log.
+        file_mode: permissions of a file.
     """
 
     largest_bytes: int = 4_000_000_000
@@ -31,16 +31,16 @@ class Limits:
 
 
 STANDARD = Limits()
-_TELLING_S = 10.0  # after the start of a recording; then its growth is that of the loop
+_STEADY_S = 10.0  # after the start of a recording its growth is that of the loop
 
 
 class LogSeries:
-    """Writes logs into a folder.
+    """Writes the log files of recordings to a folder.
 
-    A full log is finished by a thread of its own, for the disk may need seconds to have all of it.
+    A full file is finished on a separate thread, as the disk may need seconds to store it.
 
     Attributes:
-        files: of the logs so far, under the names that they have now.
+        files: paths of the files so far, with their present names.
     """
 
     def __init__(
@@ -66,12 +66,12 @@ class LogSeries:
 
     @property
     def messages(self) -> int:
-        """Messages written, up to the last flush."""
+        """Number of messages written up to the last flush."""
         return self._messages + (self._log.messages_written if self._log else 0)
 
     @property
     def bytes_written(self) -> int:
-        """Size of all logs, up to the last flush."""
+        """Size of all files up to the last flush."""
         return self._bytes + (self._log.bytes_written if self._log else 0)
 
     @property
@@ -81,23 +81,23 @@ class LogSeries:
 
     @property
     def bytes_per_s(self) -> float:
-        """How the logs have grown, in bytes per second; 0 where it was too short to tell."""
+        """Growth of the files, bytes per second; 0 during the first 10 s."""
         recorded_s = self._recorded_s + (time.monotonic() - self._opened_s if self._log else 0.0)
-        return self.bytes_written / recorded_s if recorded_s >= _TELLING_S else 0.0
+        return self.bytes_written / recorded_s if recorded_s >= _STEADY_S else 0.0
 
     @property
     def full(self) -> bool:
-        """Whether it is time for the next log."""
+        """Whether the present file has reached its size or age limit."""
         return self._log is not None and (
             self._log.bytes_written >= self._limits.largest_bytes
             or time.monotonic() - self._opened_s >= self._limits.longest_s
         )
 
     def begin(self, first: Iterable[Sample], *, anew: bool = True) -> None:
-        """Begin a log, with the messages that those in it depend on; unless `anew`, as the next part of the last one.
+        """Begin a file with the messages `first`, on which later ones depend; not `anew`: as a part of the recording.
 
         Raises:
-            DataFileError: it cannot be made.
+            DataFileError: the file cannot be created.
         """
         now_ns = self._clock.host_ns()
         path = log_path(self._folder, now_ns)
@@ -112,7 +112,7 @@ class LogSeries:
             self._log.write(sample)
 
     def write(self, sample: Sample) -> bool:
-        """Write a message; False where there is no log.
+        """Write a message; False if no file is open.
 
         Raises:
             DataFileError: the disk refuses; see `give_up`.
@@ -123,7 +123,7 @@ class LogSeries:
         return True
 
     def flush(self) -> None:
-        """Flush the log, and raise what went wrong with the one before.
+        """Flush the file, and raise the fault of finishing the previous one.
 
         Raises:
             DataFileError: the disk refuses; see `give_up`.
@@ -131,32 +131,32 @@ class LogSeries:
         if self._log is not None:
             self._log.flush()
         if self._finishing is not None and self._finishing[1].done():
-            self._finished()
+            self._await_finished()
 
     def shortage(self) -> str:
-        """Sentence for a person where the disk is too full to go on; empty where it is not.
+        """Sentence if the disk is too full to continue; empty otherwise.
 
         Raises:
-            DataFileError: the folder is not there.
+            DataFileError: the folder does not exist.
         """
         return shortage(self._folder, self._limits.min_free_bytes)
 
     def end(self, figures: Mapping[str, str], *, wait: bool = True) -> None:
-        """Finish the log with its "recording" figures, if there is one; without `wait` while the next is written.
+        """Finish the open file with its "recording" metadata; without `wait`, in parallel with the next one.
 
         Raises:
             DataFileError: the disk refuses; see `give_up`.
         """
-        self._finished()
+        self._await_finished()
         if self._log is not None:
             self._log.flush()
-            log = self._put_away()
+            log = self._detach()
             self._finishing = log, self._finisher.submit(_finish, log, figures)
         if wait:
-            self._finished()
+            self._await_finished()
 
     def remove(self) -> None:
-        """Remove the finished logs, in which there is nothing.
+        """Remove the finished files, which are empty.
 
         Raises:
             DataFileError: the disk refuses.
@@ -170,13 +170,13 @@ class LogSeries:
         self._messages = self._bytes = 0
 
     def give_up(self) -> None:
-        """Leave the log as it was when it was flushed last."""
+        """Close the file unfinished, as at the last flush."""
         if self._log is not None:
-            log = self._put_away()
+            log = self._detach()
             log.abandon()
             self._unfinished(log)
 
-    def _put_away(self) -> LogWriter:
+    def _detach(self) -> LogWriter:
         assert self._log is not None  # noqa: S101  # for the type checker
         log, self._log = self._log, None
         self._recorded_s += time.monotonic() - self._opened_s
@@ -185,8 +185,8 @@ class LogSeries:
         self._longest_write_ns = max(self._longest_write_ns, log.longest_write_ns)
         return log
 
-    def _finished(self) -> None:
-        """Wait for the log that is being finished."""
+    def _await_finished(self) -> None:
+        """Wait for the file that is being finished."""
         if self._finishing is None:
             return
         (log, growth_bytes), self._finishing = self._finishing, None
@@ -201,30 +201,30 @@ class LogSeries:
 
 
 def _finish(log: LogWriter, figures: Mapping[str, str]) -> int:
-    """Finish a log; return by how many bytes that made it longer."""
+    """Finish a file; return its growth in bytes."""
     before_bytes = log.bytes_written
     return log.finish({"recording": figures}).stat().st_size - before_bytes
 
 
 def shortage(folder: Path, min_free_bytes: int) -> str:
-    """Sentence for a person where a folder's disk has too little room; empty where it has enough.
+    """Sentence if a folder's disk has too little free space; empty otherwise.
 
     Raises:
-        DataFileError: the folder cannot be looked at.
+        DataFileError: the folder cannot be accessed.
     """
     try:
         free_bytes = shutil.disk_usage(existing(folder)).free
     except OSError as fault:
-        raise DataFileError(f"{folder} cannot be looked at: {fault.strerror}") from fault
+        raise DataFileError(f"{folder} cannot be accessed: {fault.strerror}") from fault
     if free_bytes >= min_free_bytes:
         return ""
     return (
         f"the disk of {folder} has {free_bytes / 1e6:.0f} MB free, and recorder.min_free_mb is "
-        f"{min_free_bytes / 1e6:.0f}; make room, record elsewhere (recorder.folder) or lower it"
+        f"{min_free_bytes / 1e6:.0f}; free some space, record elsewhere (recorder.folder) or lower it"
     )
 
 
 def existing(folder: Path) -> Path:
-    """A folder, or as long as it has not been made the one that it will be made in."""
+    """The folder, or its nearest existing parent."""
     there = folder.absolute()
     return next(one for one in (there, *there.parents) if one.exists())

@@ -1,4 +1,4 @@
-"""Smaller copies of logs, by the rules of a recorder that leaves something out."""
+"""Thinned copies of logs, with the same selection rules as in a recorder."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,14 +17,16 @@ from lowfc.contract.messages import topic_of
 
 @dataclass(frozen=True, slots=True)
 class Thinned:
-    """A smaller copy of a log.
+    """Result of thinning a log.
 
     Attributes:
-        file: the copy.
-        selection: what it has, in words.
-        messages, bytes: of the copy; of the log `messages_before` and `bytes_before`.
-        finished: the log had been finished; `no_end` is why not.
-        damaged: what of the log could not be read, a sentence each.
+        file: path of the copy.
+        selection: description of its selection.
+        messages, bytes: number of messages and size of the copy.
+        messages_before, bytes_before: number of messages and size of the log.
+        finished: whether the log had been finished.
+        no_end: reason why it had not.
+        damaged: descriptions of the parts of the log that could not be read.
     """
 
     file: str
@@ -38,7 +40,7 @@ class Thinned:
     damaged: list[str]
 
     def __str__(self) -> str:
-        """The same for a person."""
+        """The result as text."""
         lines = [
             f"{self.file}: {self.messages} of {self.messages_before} messages, "
             f"{self.bytes / 1e6:.1f} of {self.bytes_before / 1e6:.1f} MB; {self.selection or 'nothing was left out'}"
@@ -46,18 +48,18 @@ class Thinned:
         return "\n".join([*lines, *faults(self.damaged, self.no_end)])
 
 
-def thinned_path(source: Path, asked: Selection) -> Path:
-    """Name for a smaller copy of a log, beside it."""
-    return source.with_name(f"{stem_of(source)}-every-{asked.every}.mcap")
+def thinned_path(source: Path, requested: Selection) -> Path:
+    """Default path of the thinned copy, next to the log."""
+    return source.with_name(f"{stem_of(source)}-every-{requested.every}.mcap")
 
 
-def thin(log: Parts, out: Path, asked: Selection, progress: Callable[[int, int], None] | None = None) -> Thinned:
-    """Write a smaller log of all files of a log; its metadata names what was left out.
+def thin(log: Parts, out: Path, requested: Selection, progress: Callable[[int, int], None] | None = None) -> Thinned:
+    """Write a thinned log from all files of a log; its metadata has the selection.
 
     Raises:
-        DataFileError: a file is no log, `out` is there already, or the disk refuses.
+        DataFileError: a file is not a log, `out` exists already, or it cannot be written.
     """
-    made = Selection.of(metadata_at_start(log[0])).within(asked)
+    combined = Selection.of(metadata_at_start(log[0])).within(requested)
     reader, messages = WholeLog(log, skip_damaged=True), 0
     reader.progress = progress
     described: set[str] = {PART, SELECTION}  # the copy has its own
@@ -65,17 +67,17 @@ def thin(log: Parts, out: Path, asked: Selection, progress: Callable[[int, int],
     def wanted(message: Sample) -> bool:
         nonlocal messages
         messages += 1
-        return made.keeps(topic_of(message.key), message.sequence, message.payload)
+        return combined.keeps(topic_of(message.key), message.sequence, message.payload)
 
     def new(record: Metadata | Attachment) -> bool:
-        """Of a later file only its account, which replaces that of the file before."""
+        """Whether to copy a record; of a later file only its account, which replaces the previous one."""
         known = record.name in described and record.name not in ("recording", RECOVERY)
         described.add(record.name)
         return not known
 
     with new_log(out, log[0]) as file:
         copy = LogCopy(file)
-        for name, entries in made.metadata.items():
+        for name, entries in combined.metadata.items():
             copy.note(name, entries)
         copy.take(reader, wanted=wanted, described=new)
         if not reader.complete or reader.damage or reader.unreadable:
@@ -83,7 +85,7 @@ def thin(log: Parts, out: Path, asked: Selection, progress: Callable[[int, int],
         copy.finish()
     return Thinned(
         str(out),
-        made.sentence,
+        combined.sentence,
         copy.messages,
         out.stat().st_size,
         messages,

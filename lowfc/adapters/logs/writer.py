@@ -1,11 +1,11 @@
-"""Writing logs: MCAP files that describe themselves, so that a crash costs at most the last fraction of a second.
+"""Writing logs: self-describing MCAP files that lose at most the last fraction of a second in a crash.
 
-A log is written as `<name>.mcap.part` and renamed when it is finished. What describes it (metadata, attachments)
-stands at its start. A channel is one topic of one start of its publisher: MCAP's sequence has 32 bits and takes the
-count, the channel's metadata the start.
+A log is written as `<name>.mcap.part` and renamed when it is finished. Its metadata and attachments are at its start.
+A channel is one topic from one start of its publisher: MCAP's 32-bit sequence is the count, the channel's metadata have
+the start.
 
-What was flushed survives the death of the process, at any moment and in any way. It does not survive a loss of power:
-only a finished log, when it has its name, is known to be on the disk itself.
+Flushed data survive any death of the process, but not a loss of power: only a finished log with its final name is known
+to be on the disk.
 """
 
 import contextlib
@@ -34,22 +34,22 @@ if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
 
 UNFINISHED = ".part"
-"""Appended to the name of a log that is being written, or was when its recorder died."""
+"""Suffix of a log that is being written, or whose recorder died."""
 
 FILE_MODE = 0o640
-"""Permissions of a log, of which the process's umask may take more away: notes and frames are not for everybody."""
+"""Default permissions of a log, further reduced by the umask: notes and frames are not public."""
 
-CHUNK_BYTES = 240 * 1024  # a chunk is closed by the message that passes this; with a frame it stays below 256 KiB
+CHUNK_BYTES = 240 * 1024  # closes a chunk once exceeded; with a further frame it stays below 256 KiB
 PART = "part"
-"""Name of the metadata with the recording that a log belongs to, and its number there."""
+"""Name of the metadata with a log's recording and its number in it."""
 
 START_KEY = "start_s"
-"""Of a channel's metadata: the upper half of the sequences in it."""
+"""Key in a channel's metadata: upper half of its sequences."""
 
 
 @dataclass(frozen=True, slots=True)
 class Attachment:
-    """A file inside a log."""
+    """A file attached to a log."""
 
     name: str
     media_type: str
@@ -57,7 +57,7 @@ class Attachment:
 
 
 class _File(FileIO):
-    """A log's file: it knows its size without asking the system, and how long one write took at most."""
+    """File of a log that keeps track of its size and of the longest write."""
 
     def __init__(self, path: Path, mode: int) -> None:
         super().__init__(path, "x", opener=lambda name, flags: os.open(name, flags, mode))
@@ -81,10 +81,10 @@ class LogWriter:
     """Writes one log.
 
     Attributes:
-        path: what the log will be called when it is finished.
-        part: what it is called until then.
-        messages: messages written.
-        messages_written: messages written up to the last flush.
+        path: final name of the log.
+        part: name until it is finished.
+        messages: number of messages written.
+        messages_written: number of messages written up to the last flush.
         bytes_written: size of the file up to the last flush.
     """
 
@@ -96,10 +96,10 @@ class LogWriter:
         attachments: Sequence[Attachment] = (),
         file_mode: int = FILE_MODE,
     ) -> None:
-        """Open `path` + ".part", with these permissions, and write what describes the log, made at `time_ns`.
+        """Create `path` + ".part" with these permissions, and write metadata and attachments, dated `time_ns`.
 
         Raises:
-            DataFileError: there is a log of that name, or the disk refuses.
+            DataFileError: a log of that name exists, or the disk refuses.
         """
         self.path = path
         self.part = path.with_name(path.name + UNFINISHED)
@@ -112,7 +112,7 @@ class LogWriter:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._raw = _File(self.part, file_mode)
         except OSError as fault:
-            raise DataFileError(f"{self.part} cannot be made: {fault.strerror}") from fault
+            raise DataFileError(f"{self.part} cannot be created: {fault.strerror}") from fault
         self._file = BufferedWriter(self._raw)
         self._writer = Writer(
             self._file,
@@ -138,15 +138,15 @@ class LogWriter:
 
     @property
     def longest_write_ns(self) -> int:
-        """How long one write of this log took at most."""
+        """Longest duration of a write, ns."""
         return self._raw.longest_write_ns
 
     def write(self, sample: Sample) -> None:
-        """Add one message, its payload verbatim.
+        """Add a message with its payload unchanged.
 
         Raises:
-            DataFileError: the disk refuses; the log keeps what was flushed and takes no more.
-            KeyError: there is no such topic.
+            DataFileError: the disk refuses; the log is closed as at the last flush.
+            KeyError: the topic does not exist.
         """
         try:
             self._writer.add_message(
@@ -161,10 +161,10 @@ class LogWriter:
         self.messages += 1
 
     def flush(self) -> None:
-        """Hand everything to the operating system: what was flushed survives a kill -9 of this process.
+        """Pass everything to the operating system; flushed data survive a kill -9 of this process.
 
         Raises:
-            DataFileError: as for `write`, or the file is no longer there.
+            DataFileError: as for `write`, or the file has been removed.
         """
         try:
             self._flush()
@@ -172,7 +172,7 @@ class LogWriter:
             raise self._refused(fault) from fault
 
     def finish(self, metadata: Mapping[str, Mapping[str, str]]) -> Path:
-        """Close the log, with what became known at its end, and give it its name once the disk has it.
+        """Write the final metadata, close the log, and rename it once it is on the disk.
 
         Raises:
             DataFileError: as for `write`.
@@ -185,15 +185,15 @@ class LogWriter:
             os.fsync(self._raw.fileno())
             self.bytes_written = self._raw.size
             self.part.rename(self.path)
-            self._file.close()  # in this order: a file that is being recorded is locked until it has its name
+            self._file.close()  # after the rename: the file is locked until it has its final name
         except OSError as fault:
             raise self._refused(fault) from fault
-        with contextlib.suppress(OSError):  # not every file system has this for folders
+        with contextlib.suppress(OSError):  # not every file system supports this
             _sync_folder(self.path.parent)
         return self.path
 
     def abandon(self) -> None:
-        """Close the log unfinished, cut back to its last flush."""
+        """Close the log unfinished, truncated to its last flush."""
         if not self._raw.closed:
             with contextlib.suppress(OSError):
                 self._raw.truncate(self.bytes_written)
@@ -205,17 +205,17 @@ class LogWriter:
 
     def _flush(self) -> None:
         self._writer.flush()  # type: ignore[no-untyped-call]
-        self.part.stat()  # a file that was removed takes data as if nothing had happened
+        self.part.stat()  # detects a removed file, which still accepts data
         self.bytes_written = self._raw.size
         self.messages_written = self.messages
 
     def _refused(self, fault: OSError) -> DataFileError:
-        """Turn a fault of the disk into one error, and cut the file back to whole records."""
+        """Convert an error of the disk, and truncate the file to complete records."""
         self.abandon()
-        rest = "what is there is readable" if self.part.exists() else "somebody removed it"
+        rest = "its content is readable" if self.part.exists() else "the file was removed"
         return DataFileError(
             f"{self.part} cannot be written ({fault.strerror}) after {self.bytes_written} bytes; "
-            f"make room or record elsewhere; {rest}"
+            f"free some space or record elsewhere; {rest}"
         )
 
     def _channel(self, sample: Sample) -> int:
@@ -245,45 +245,45 @@ class LogWriter:
 
 
 def being_recorded(path: Path) -> bool:
-    """Whether a recorder is writing this log, or was until now: it locks the file until it ends, in whatever way."""
+    """Whether a recorder is writing this log: it holds a lock on the file until it ends or dies."""
     try:
         with path.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
         return True
-    except FileNotFoundError:  # finished since its name was looked up
+    except FileNotFoundError:  # finished meanwhile
         return path.name.endswith(UNFINISHED) and path.with_name(path.name.removesuffix(UNFINISHED)).exists()
-    except OSError:  # reading it raises this again
+    except OSError:  # reading the file raises this again
         return False
     return False
 
 
 def stem_of(log: Path) -> str:
-    """Name of a log without its endings."""
+    """Name of a log without its suffixes."""
     return log.name.removesuffix(UNFINISHED).removesuffix(".mcap")
 
 
 def log_path(folder: Path, time_ns: int) -> Path:
-    """Name for a log begun at `time_ns`, UTC, that no log in the folder has, finished or not."""
+    """Unused path for a log that begins at `time_ns`, named by UTC time."""
     stamp = time.strftime("%Y%m%dT%H%M%S", time.gmtime(time_ns // 1_000_000_000))
     for number in itertools.count(1):
         path = folder / (f"{stamp}Z.mcap" if number == 1 else f"{stamp}Z-{number}.mcap")
-        # In this order: a log that is finished in between, by another thread, must not pass unseen.
+        # In this order, so that a log that another thread finishes in between is detected.
         if not path.with_name(path.name + UNFINISHED).exists() and not path.exists():
             return path
     raise AssertionError("unreachable")
 
 
 def declaration(message: type[ProtobufMessage]) -> FileDescriptorSet:
-    """Declaration of a message with all it imports, in the order that a reader needs them."""
+    """Descriptor of a message and its imports, in the order required by readers."""
     declared = FileDescriptorSet()
-    seen: set[str] = set()
+    added: set[str] = set()
 
     def add(file: FileDescriptor) -> None:
         for imported in file.dependencies:
             add(imported)
-        if file.name not in seen:
-            seen.add(file.name)
+        if file.name not in added:
+            added.add(file.name)
             file.CopyToProto(declared.file.add())
 
     add(cast("FileDescriptor", message.DESCRIPTOR.file))

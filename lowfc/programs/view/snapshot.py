@@ -206,9 +206,9 @@ class Accumulator:
         return Snapshot(
             time_ns=self._time_ns(host_ns),
             host_ns=host_ns,
-            steps=steps.taken(),
-            truths=truths.taken(),
-            timings=timings.taken()[1],
+            steps=steps.values(),
+            truths=truths.values(),
+            timings=timings.values()[1],
             frame=frame.pixels if frame is not None else None,
             frame_ns=frame.time_ns if frame is not None else 0,
             mirror=self._newest_of(MIRROR_STATE, wire.MirrorState.FromString),

@@ -24,7 +24,7 @@ def residual_figures(run: Run, stretch: Stretch | None) -> Figures:
     opened = np.flatnonzero(steps.mode == LoopMode.OPEN)
     closed = np.arange(steps.sequence.size)[stretch.rows] if stretch is not None else opened[:0]
     noll = history.calibration.noll if history.calibration is not None else ()
-    true = history.true or TruthRows(0).taken()
+    true = history.true or TruthRows(0).values()
     values = {
         "open_error": _rms(steps.error_nm, opened),
         "open_residual": _rms(true.modes_residual_rms_nm, opened),

@@ -135,9 +135,9 @@ def one_loop(asked: Asked, run: Run, children: list[Child] | None = None) -> dic
         time.sleep(_LAST_WORDS_S)
         drain()
         _check_ends(children)
-    received = timings.taken(), (states.taken("sequence"), states.taken("publish_ns"))
+    received = timings.values(), (states.values("sequence"), states.values("publish_ns"))
     if asked.simulated:
-        joined = join(frames.taken("sequence"), frames.taken("publish_ns"), None, *received)
+        joined = join(frames.values("sequence"), frames.values("publish_ns"), None, *received)
     else:
         with np.load(run.path / SENT_FILE) as sent:
             joined = join(sent["sequence"], sent["put_ns"], sent["due_ns"], *received)
