@@ -1,4 +1,4 @@
-"""Who may do what at the router: by the table of topics, and by a real router on loopback."""
+"""Access control at the router: rules from the table of topics, and a real router on loopback."""
 
 import json
 import socket
@@ -40,13 +40,13 @@ ROLES = roles(["mirror-dm"])
 
 
 @pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.key)
-def test_who_publishes_and_who_receives_is_what_the_table_says(topic: Topic) -> None:
+def test_publish_and_receive_rights_follow_the_table_of_topics(topic: Topic) -> None:
     key = {role: topic.at(role if topic is HEALTH else "dm") for role in ROLES}
-    may_put = {role for role in ROLES if _covers(grant(role).publishes, key[role])}
-    assert may_put == {role for role in ROLES if Role(role.partition("-")[0]) in topic.publisher}
-    may_hear = {role for role in ROLES if _covers(grant(role).receives, key[role])}
-    said = {role for role in ROLES if Role(role.partition("-")[0]) in topic.subscribers}
-    assert may_hear == said | ({"operator"} if "viewer" in said else set())
+    publishers = {role for role in ROLES if _covers(grant(role).publishes, key[role])}
+    assert publishers == {role for role in ROLES if Role(role.partition("-")[0]) in topic.publisher}
+    receivers = {role for role in ROLES if _covers(grant(role).receives, key[role])}
+    subscribers = {role for role in ROLES if Role(role.partition("-")[0]) in topic.subscribers}
+    assert receivers == subscribers | ({"operator"} if "viewer" in subscribers else set())
 
 
 def _covers(keys: tuple[str, ...], key: str) -> bool:
@@ -58,22 +58,22 @@ def _covers(keys: tuple[str, ...], key: str) -> bool:
     )
 
 
-def test_a_process_publishes_in_its_own_name_only_and_requests_are_an_operators() -> None:
+def test_processes_publish_under_their_own_names_and_only_operators_send_requests() -> None:
     own = {"lowfc/mirror/dm/state", "lowfc/mirror/dm/surface", "lowfc/event", "lowfc/health/mirror-dm"}
     assert set(grant("mirror-dm").publishes) == own
     for role in ROLES:
         wild = {key for key in grant(role).publishes if "*" in key}
         bench = {"lowfc/bench/*"} if role in ("bench", "operator") else set()
         assert wild == (bench if role != "controller" else {"lowfc/mirror/*/command"})
-        asks = {key for key in grant(role).queries if "request" in key or "record" in key}
-        assert asks == ({"lowfc/request/*", "lowfc/record/*"} if role == "operator" else set())
+        queries = {key for key in grant(role).queries if "request" in key or "record" in key}
+        assert queries == ({"lowfc/request/*", "lowfc/record/*"} if role == "operator" else set())
         assert CLOCK_KEY in grant(role).queries
     assert "lowfc/request/*" in grant("controller").answers
     assert "lowfc/record/*" in grant("recorder").answers
 
 
-def test_all_that_is_not_allowed_is_denied_and_every_name_is_there() -> None:
-    """Zenoh opens with a policy of rules or subjects that are not there, and does without them."""
+def test_access_control_denies_by_default_and_refers_to_defined_names_only() -> None:
+    """Zenoh silently ignores undefined rules or subjects in a policy."""
     control = access_control(["mirror-dm", "mirror-tip"])
     assert control["enabled"]
     assert control["default_permission"] == "deny"
@@ -88,10 +88,10 @@ def test_all_that_is_not_allowed_is_denied_and_every_name_is_there() -> None:
     assert sorted(name for policy in control["policies"] for name in policy["rules"]) == sorted(rules)
 
 
-def test_the_best_exchange_is_the_quickest_of_the_recent_ones() -> None:
+def test_the_best_clock_exchange_is_the_recent_one_with_the_shortest_round_trip() -> None:
     offset = ClockOffset()
     assert offset.offset_ns == 0
-    offset.exchanged(1000, 5600, 2000)  # slow on one way: 4100 rather than 4000
+    offset.exchanged(1000, 5600, 2000)  # asymmetric: 4100 instead of 4000
     assert offset.best == (4100, 1000)
     offset.exchanged(3000, 7050, 3100)
     assert offset.best == (4000, 100)
@@ -101,7 +101,7 @@ def test_the_best_exchange_is_the_quickest_of_the_recent_ones() -> None:
 
 
 class Hosts:
-    """A router and buses by it, each as on a host of its own, all on loopback."""
+    """A router and buses connected to it, each as on a separate host, all on loopback."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -132,18 +132,18 @@ def hosts(tmp_path: Path) -> Iterator[Hosts]:
         bus.close()
 
 
-def test_what_the_table_allows_arrives_or_is_answered_and_nothing_else(hosts: Hosts) -> None:
+def test_the_router_forwards_exactly_what_the_table_of_topics_allows(hosts: Hosts) -> None:
     hosts.join(ROUTER)
     bus = {role: hosts.join(role) for role in ROLES}
-    heard: set[tuple[str, str, str]] = set()  # who, what, from whom
+    received: set[tuple[str, str, str]] = set()  # receiver, key, publisher
 
-    def hear(role: str) -> Callable[[Sample], None]:
-        return lambda sample: heard.add((role, sample.key, sample.payload.decode()))
+    def handler(role: str) -> Callable[[Sample], None]:
+        return lambda sample: received.add((role, sample.key, sample.payload.decode()))
 
     topics = (FRAME, CAMERA_STATE, STEP, COMMAND, MIRROR_STATE, CALIBRATION, EVENT)
     for role in ROLES:
         for topic in topics:
-            bus[role].subscribe(topic, hear(role), "dm" if role == "mirror-dm" else "*")
+            bus[role].subscribe(topic, handler(role), "dm" if role == "mirror-dm" else "*")
     publishers = [bus[role].publisher(topic, "dm") for role in ROLES for topic in topics]
     roles_of = [role for role in ROLES for _ in topics]
 
@@ -151,36 +151,36 @@ def test_what_the_table_allows_arrives_or_is_answered_and_nothing_else(hosts: Ho
         key = topic.at("dm")
         return _covers(grant(role).receives, key) and _covers(grant(by).publishes, key)
 
-    wanted = {
+    expected = {
         (role, topic.at("dm"), by)
         for role in ROLES
         for topic in topics
         for by in ROLES
         if role != by and allowed(role, topic, by)
     }
-    assert len(wanted) > 30
+    assert len(expected) > 30
 
-    def all_there() -> bool:
+    def all_received() -> bool:
         for publisher, by in zip(publishers, roles_of, strict=True):
             publisher.put(by.encode())
-        return wanted <= heard
+        return expected <= received
 
-    until(all_there)
+    until(all_received)
     time.sleep(0.2)
-    assert {one for one in heard if one[0] != one[2]} == wanted  # what one puts oneself one hears at home
+    assert {one for one in received if one[0] != one[2]} == expected  # own messages are delivered locally
     bus["controller"].queryable("lowfc/request/*", lambda query: query.reply(b"done"))
     bus["camera"].queryable("lowfc/request/*", lambda query: query.reply(b"forged"))
     until(lambda: bus["operator"].get("lowfc/request/status"))
     for role in ROLES:
-        if role not in ("controller", "camera"):  # who answers a key is asked at home, too
+        if role not in ("controller", "camera"):  # a queryable of the key is also queried locally
             answers = [sample.payload for sample in bus[role].get("lowfc/request/status")]
             assert answers == ([b"done"] if role == "operator" else [])
         states = {sample.payload.decode() for sample in bus[role].get("lowfc/camera/state")}
-        assert states | {role} == {"camera", role}  # its own it gets at home
+        assert states | {role} == {"camera", role}  # its own state is answered locally
         assert "camera" in states
 
 
-def test_times_are_those_of_the_host_that_receives(hosts: Hosts) -> None:
+def test_message_times_are_converted_to_the_receiving_hosts_clock(hosts: Hosts) -> None:
     second_ns = 1_000_000_000
     hosts.join(ROUTER)
     camera, recorder = hosts.join("camera", 3 * second_ns), hosts.join("recorder", -7 * second_ns)
@@ -195,21 +195,21 @@ def test_times_are_those_of_the_host_that_receives(hosts: Hosts) -> None:
     until(received)
     for bus, shift_ns in ((camera, 3 * second_ns), (recorder, -7 * second_ns)):
         assert bus.offset.best is not None
-        assert abs(bus.offset.offset_ns + shift_ns) < second_ns  # exactly: tests/e2e/test_hosts.py
+        assert abs(bus.offset.offset_ns + shift_ns) < second_ns  # accuracy: tests/e2e/test_hosts.py
     assert all(abs(sample.receive_time_ns - sample.publish_time_ns) < second_ns for sample in arrived)
     assert Service("camera", "hosts", camera.clock, camera).health().router_round_trip_ns > 0
 
 
-def test_there_is_one_of_each_role(hosts: Hosts) -> None:
+def test_a_role_runs_only_once_across_hosts(hosts: Hosts) -> None:
     hosts.join(ROUTER)
     hosts.join("camera").publisher(HEALTH, "camera").put(b"here")
     with pytest.raises(BusError, match="run 'hosts' has a camera already, on this host or another"):
         hosts.join("camera")
     hosts.join("operator").publisher(HEALTH, "operator").put(b"here")
-    hosts.join("operator")  # of those who only connect there may be several
+    hosts.join("operator")  # roles that only connect may run several times
 
 
-def test_a_foreign_certificate_is_told_so(hosts: Hosts, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_foreign_certificate_is_refused_with_the_reason(hosts: Hosts, monkeypatch: pytest.MonkeyPatch) -> None:
     hosts.join(ROUTER)
     monkeypatch.setattr(routed, "CONNECT_MS", 100)
     certificates.make_certificates(hosts.folder / "foreign", ("camera",), [])
@@ -221,7 +221,7 @@ def test_a_foreign_certificate_is_told_so(hosts: Hosts, monkeypatch: pytest.Monk
         hosts.join("camera", network=hosts.network("foreign"))
 
 
-def test_a_wrong_or_missing_certificate_is_named_before_a_session_is_opened(hosts: Hosts) -> None:
+def test_a_wrong_or_missing_certificate_is_reported_before_a_session_opens(hosts: Hosts) -> None:
     (hosts.folder / "certs" / "viewer.key").unlink()
     with pytest.raises(DataFileError, match=r"viewer\.key cannot be read .No such file.*lowfc certs"):
         hosts.join("viewer")
@@ -235,26 +235,28 @@ def test_a_wrong_or_missing_certificate_is_named_before_a_session_is_opened(host
         hosts.join(ROUTER)
 
 
-def test_a_process_that_loses_its_router_says_why(hosts: Hosts, capfd: pytest.CaptureFixture[str]) -> None:
-    said = ""
+def test_a_lost_router_is_reported_with_the_reason(hosts: Hosts, capfd: pytest.CaptureFixture[str]) -> None:
+    stderr = ""
 
-    def told(text: str) -> Callable[[], bool]:
-        def look() -> bool:
-            nonlocal said
-            said += capfd.readouterr().err
-            return text in said
+    def reports(text: str) -> Callable[[], bool]:
+        def check() -> bool:
+            nonlocal stderr
+            stderr += capfd.readouterr().err
+            return text in stderr
 
-        return look
+        return check
 
     router = hosts.join(ROUTER)
     hosts.join("camera")
     router.close()
-    until(told(f"camera: no link to the router at tls/127.0.0.1:{hosts.port}: Connection refused\n"))
+    until(reports(f"camera: no link to the router at tls/127.0.0.1:{hosts.port}: Connection refused\n"))
     hosts.join(ROUTER)
-    until(told("camera: the router is back\n"))
+    until(reports("camera: the router is back\n"))
 
 
-def test_a_router_is_not_waited_for_where_that_does_not_help(hosts: Hosts, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_there_is_no_wait_for_an_unreachable_router_or_after_a_repeated_refusal(
+    hosts: Hosts, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def unknown(*_: object) -> None:
         raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
 
@@ -272,8 +274,10 @@ def test_a_router_is_not_waited_for_where_that_does_not_help(hosts: Hosts, monke
         hosts.join("camera")
 
 
-def test_a_role_does_not_pass_for_the_router(hosts: Hosts, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("lowfc.adapters.bus.zenoh_bus.require_certificate", lambda *_: None)  # as in a router of theirs
+def test_a_roles_certificate_is_not_accepted_as_the_routers(hosts: Hosts, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        "lowfc.adapters.bus.zenoh_bus.require_certificate", lambda *_: None
+    )  # as in somebody else's router
     folder = hosts.folder / "false"
     folder.mkdir()
     for name, source in (("ca.pem", "ca.pem"), ("router.pem", "camera.pem"), ("router.key", "camera.key")):
@@ -284,20 +288,20 @@ def test_a_role_does_not_pass_for_the_router(hosts: Hosts, monkeypatch: pytest.M
         hosts.join("recorder")
 
 
-def test_a_run_remembers_its_way(tmp_path: Path) -> None:
-    way = Network(router="tls/bench:7447", certificates=str(tmp_path))
-    made = open_run("hosts", base=tmp_path, network=way)
-    assert made.links.network == way
-    for later in (None, Network(), way):
-        assert open_run("hosts", base=tmp_path, network=later).links.network == way
+def test_a_run_keeps_its_network(tmp_path: Path) -> None:
+    network = Network(router="tls/bench:7447", certificates=str(tmp_path))
+    made = open_run("hosts", base=tmp_path, network=network)
+    assert made.links.network == network
+    for later in (None, Network(), network):
+        assert open_run("hosts", base=tmp_path, network=later).links.network == network
     other = Network(router="tls/elsewhere:7447", certificates=str(tmp_path))
     with pytest.raises(BusError, match=r"run 'hosts' is on tls/bench:7447 .* has tls/elsewhere:7447 .* remove its dir"):
         open_run("hosts", base=tmp_path, network=other)
     assert open_run("alone", base=tmp_path).links.network == Network()
     with pytest.raises(BusError, match="run 'alone' is on this host alone"):
-        open_run("alone", base=tmp_path, network=way)
+        open_run("alone", base=tmp_path, network=network)
     open_run("launched", base=tmp_path, listeners=(Role.LAUNCHER,))  # stays on its host
-    assert open_run("launched", base=tmp_path, network=way).links.network == Network()
+    assert open_run("launched", base=tmp_path, network=network).links.network == Network()
 
 
 @pytest.mark.parametrize("router", ["tcp/bench:7447", "tls/bench", "bench:7447", "tls/:7447x"])
@@ -309,10 +313,10 @@ def test_a_router_is_a_tls_endpoint_with_certificates(router: str) -> None:
     assert Network(router="tls/[fe80::1]:7447", certificates="certs").address == ("fe80::1", 7447)
 
 
-def test_the_routers_file_in_deploy_is_the_one_of_the_table(tmp_path: Path) -> None:
-    """Made by `lowfc router --show`; see the file's head."""
+def test_the_router_file_in_deploy_matches_the_table_of_topics(tmp_path: Path) -> None:
+    """The file is generated by `lowfc router --show`; see its header."""
     file = Path(__file__).parents[2] / "deploy" / "zenoh" / "router.json5"
     text = "".join(line for line in file.read_text().splitlines(keepends=True) if not line.startswith("//"))
-    way = Network(router="tls/bench.example.org:7447", certificates="/etc/lowfc/certs")
-    links = open_run("hosts", base=tmp_path, network=way).links
+    network = Network(router="tls/bench.example.org:7447", certificates="/etc/lowfc/certs")
+    links = open_run("hosts", base=tmp_path, network=network).links
     assert json.loads(text) == session_config(links, ROUTER)

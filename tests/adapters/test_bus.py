@@ -1,4 +1,4 @@
-"""The bus: what the bus in memory and zenoh's have in common, then links, secrets, freezes and ends of sessions."""
+"""The bus: common behaviour of the memory bus and zenoh's, links, passwords, stopped readers, ends of sessions."""
 
 import itertools
 import json
@@ -35,9 +35,9 @@ Join = Callable[..., ZenohBus]
 
 @pytest.fixture(autouse=True)
 def _runtime(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    with tempfile.TemporaryDirectory(prefix="bus-") as path:  # short enough for the sockets in it
+    with tempfile.TemporaryDirectory(prefix="bus-") as path:  # short enough for socket paths
         monkeypatch.setenv("XDG_RUNTIME_DIR", path)
-        monkeypatch.setenv("ZENOH_RUNTIME", "")  # what a bus puts there is gone after the test
+        monkeypatch.setenv("ZENOH_RUNTIME", "")  # restored after the test
         monkeypatch.delenv("ZENOH_RUNTIME")
         yield
 
@@ -73,22 +73,26 @@ def pair(request: pytest.FixtureRequest, run: Run, join: Join) -> tuple[Bus, Bus
 
 def test_a_put_reaches_every_subscriber_of_its_key(pair: tuple[Bus, Bus]) -> None:
     controller, operator = pair
-    everybody, dm, tip, frames = ([] for _ in range(4))
-    for heard, topic, *name in ((everybody, COMMAND), (dm, COMMAND, "dm"), (tip, COMMAND, "tip"), (frames, FRAME)):
-        controller.subscribe(topic, heard.append, *name)
+    all_mirrors, dm, tip, frames = ([] for _ in range(4))
+    for received, topic, *name in ((all_mirrors, COMMAND), (dm, COMMAND, "dm"), (tip, COMMAND, "tip"), (frames, FRAME)):
+        controller.subscribe(topic, received.append, *name)
     publisher = operator.publisher(COMMAND, "dm")
 
     def put() -> bool:
         publisher.put(b"body", publish_time_ns=3)
-        return bool(everybody and dm)
+        return bool(all_mirrors and dm)
 
     until(put)
-    assert (everybody[0].key, everybody[0].payload, everybody[0].publish_time_ns) == (COMMAND.at("dm"), b"body", 3)
+    assert (all_mirrors[0].key, all_mirrors[0].payload, all_mirrors[0].publish_time_ns) == (
+        COMMAND.at("dm"),
+        b"body",
+        3,
+    )
     assert not tip
     assert not frames
 
 
-def test_a_late_joiner_gets_the_last_message_with_its_envelope(pair: tuple[Bus, Bus]) -> None:
+def test_a_query_returns_the_last_message_with_its_envelope(pair: tuple[Bus, Bus]) -> None:
     controller, late = pair
     calibrations, frames = controller.publisher(CALIBRATION), controller.publisher(FRAME)
     assert late.get(CALIBRATION.key, timeout_s=0.1) == []
@@ -107,14 +111,14 @@ def test_a_late_joiner_gets_the_last_message_with_its_envelope(pair: tuple[Bus, 
     until(lambda: {one.payload for one in late.get(HEALTH.at("*"))} == {b"controller", b"operator"})
 
 
-def test_a_question_is_answered_later_from_another_thread(pair: tuple[Bus, Bus]) -> None:
+def test_a_query_may_be_answered_later_from_another_thread(pair: tuple[Bus, Bus]) -> None:
     controller, operator = pair
     waiting: list[Query] = []
     controller.queryable(REQUEST_KEY.format(name="*"), waiting.append)
     answers: list[Sample] = []
 
     def ask() -> None:
-        while not answers:  # until the link is up, nobody is asked
+        while not answers:  # queries reach nobody until the link is up
             answers.extend(operator.get("lowfc/request/gain", b"0.5", timeout_s=PATIENCE_S))
 
     asker = threading.Thread(target=ask)
@@ -126,7 +130,7 @@ def test_a_question_is_answered_later_from_another_thread(pair: tuple[Bus, Bus])
     assert [(answer.key, answer.payload) for answer in answers] == [("lowfc/request/gain", b"done")]
 
 
-def test_a_broken_handler_harms_nobody_else_and_is_shown_once(
+def test_a_failing_handler_affects_no_other_and_is_printed_once(
     pair: tuple[Bus, Bus], capfd: pytest.CaptureFixture[str]
 ) -> None:
     controller, operator = pair
@@ -144,7 +148,7 @@ def test_a_broken_handler_harms_nobody_else_and_is_shown_once(
         publisher.put(b"")
         return box.received >= 3
 
-    until(put)  # so the question finds its way too
+    until(put)  # the link is up, so the query arrives too
     assert operator.get("lowfc/request/open", timeout_s=0.5) == []
     assert controller.faults.counts["controller: handler of lowfc/mirror/*/command"] >= 3
     assert controller.faults.counts["controller: queryable of lowfc/request/open"] == 1
@@ -163,7 +167,7 @@ def test_sequences_count_from_zero_and_never_repeat(run: Run, join: Join) -> Non
     assert starts == sorted(set(starts))
 
 
-def test_sequences_of_the_bus_in_memory_never_repeat_either() -> None:
+def test_sequences_of_the_memory_bus_never_repeat() -> None:
     hub, clock = MemoryHub(), FakeClock()
     camera = MemoryBus(hub, "camera", clock)
     first = camera.publisher(FRAME).put(b"").sequence
@@ -173,7 +177,7 @@ def test_sequences_of_the_bus_in_memory_never_repeat_either() -> None:
         camera.publisher(FRAME).put(b"")
 
 
-def test_without_the_password_nobody_is_let_in(run: Run, join: Join, tmp_path: Path) -> None:
+def test_sessions_without_the_password_receive_and_send_nothing(run: Run, join: Join, tmp_path: Path) -> None:
     camera = join(run, "camera")
     configs = [session_config(run.links, "operator")]
     del configs[0]["transport"]["auth"]
@@ -181,26 +185,26 @@ def test_without_the_password_nobody_is_let_in(run: Run, join: Join, tmp_path: P
         (tmp_path / "credentials").write_text(f"{user}:wrong\n")
         configs.append(session_config(replace(run.links, user=user, secret_file=tmp_path / "credentials"), "operator"))
     overheard: list[zenoh.Sample] = []
-    heard, forgeries, frames = Mailbox(), Mailbox(), camera.publisher(FRAME)
+    received, forgeries, frames = Mailbox(), Mailbox(), camera.publisher(FRAME)
     camera.subscribe(COMMAND, forgeries.put)
     with ExitStack() as stack:
         sessions = [zenoh.open(zenoh.Config.from_json5(json.dumps(config))) for config in configs]
         intruders = [stack.enter_context(session) for session in sessions]
         for intruder in intruders:
             intruder.declare_subscriber(FRAME.key, overheard.append)
-        join(run, "viewer").subscribe(FRAME, heard.put)  # after the intruders, with the right password
+        join(run, "viewer").subscribe(FRAME, received.put)  # after the intruders, with the right password
 
-        def talk() -> bool:
+        def exchange() -> bool:
             frames.put(b"frame")
             for intruder in intruders:
                 intruder.put(COMMAND.at("dm"), b"command", attachment=Envelope(1, 1).encode())
-            return heard.received > 20
+            return received.received > 20
 
-        until(talk)
+        until(exchange)
     assert (overheard, forgeries.received) == ([], 0)
 
 
-def test_messages_without_a_readable_envelope_are_counted_and_no_traceback(
+def test_messages_without_a_valid_envelope_are_counted_without_traceback(
     run: Run, join: Join, capfd: pytest.CaptureFixture[str]
 ) -> None:
     controller = join(run, "controller")
@@ -233,15 +237,15 @@ def test_a_ring_that_is_closed_has_no_subscriber(run: Run, join: Join) -> None:
     ring.close()
 
 
-def test_a_role_can_be_taken_once(run: Run, join: Join) -> None:
+def test_a_listening_role_runs_only_once(run: Run, join: Join) -> None:
     join(run, "camera")
     with pytest.raises(BusError, match=rf"camera of run '{run.run_id}' .* 127.0.0.1:{run.links.ports['camera']}"):
         join(run, "camera")
     join(run, "operator")
-    join(run, "operator")  # who does not listen may be there twice
+    join(run, "operator")  # a role that does not listen may run twice
 
 
-def test_everybody_listens_on_its_own_port_and_socket_and_connects_to_all_others(run: Run) -> None:
+def test_each_role_listens_on_its_port_and_socket_and_connects_to_all_others(run: Run) -> None:
     endpoints = {role: f"tcp/127.0.0.1:{port}" for role, port in run.links.ports.items()}
     sockets = {role: f"unixsock-stream/{run.path}/{role}.sock" for role in endpoints}
     for role, own in endpoints.items():
@@ -251,13 +255,13 @@ def test_everybody_listens_on_its_own_port_and_socket_and_connects_to_all_others
         assert not config["scouting"]["multicast"]["enabled"]
         assert not config["scouting"]["gossip"]["enabled"]
         assert not config["transport"]["shared_memory"]["enabled"]
-    for role, monitor, wanted in (("operator", False, endpoints), ("viewer", True, sockets)):
+    for role, monitor, expected in (("operator", False, endpoints), ("viewer", True, sockets)):
         config = session_config(run.links, role, monitor=monitor)
         assert config["listen"]["endpoints"] == []
-        assert set(config["connect"]["endpoints"]) == set(wanted.values())
+        assert set(config["connect"]["endpoints"]) == set(expected.values())
 
 
-def test_where_a_socket_has_too_long_a_name_a_port_serves_monitors(tmp_path: Path) -> None:
+def test_monitors_connect_by_port_if_the_socket_path_is_too_long(tmp_path: Path) -> None:
     base = tmp_path / ("long" * 25)
     base.mkdir(mode=0o700)
     links = open_run(new_run_id(), base=base).links
@@ -267,41 +271,41 @@ def test_where_a_socket_has_too_long_a_name_a_port_serves_monitors(tmp_path: Pat
 
 
 @pytest.mark.exclusive
-def test_a_monitor_gets_every_row_and_no_more_pictures_than_it_draws(run: Run, join: Join) -> None:
+def test_a_monitor_receives_every_row_and_images_at_display_rate(run: Run, join: Join) -> None:
     camera, viewer, recorder = join(run, "camera"), join(run, "viewer", monitor=True), join(run, "recorder")
     frames, truths = camera.publisher(FRAME), camera.publisher(TRUTH)
-    kept, rows, recorded = viewer.ring(FRAME, 5000), viewer.ring(TRUTH, 5000), Mailbox()
+    images, rows, recorded = viewer.ring(FRAME, 5000), viewer.ring(TRUTH, 5000), Mailbox()
     recorder.subscribe(FRAME, recorded.put)
-    seen: dict[Topic, list[Sample]] = {FRAME: [], TRUTH: []}
+    drained: dict[Topic, list[Sample]] = {FRAME: [], TRUTH: []}
 
-    def look() -> None:
-        seen[FRAME] += kept.drain()
-        seen[TRUTH] += rows.drain()
+    def drain() -> None:
+        drained[FRAME] += images.drain()
+        drained[TRUTH] += rows.drain()
 
-    def met() -> bool:
+    def connected() -> bool:
         frames.put(b"picture")
         truths.put(b"row")
-        look()
-        return bool(seen[FRAME] and seen[TRUTH] and recorded.received)
+        drain()
+        return bool(drained[FRAME] and drained[TRUTH] and recorded.received)
 
-    until(met)
-    first = {topic: len(samples) for topic, samples in seen.items()}
-    heard = recorded.received
+    until(connected)
+    first = {topic: len(samples) for topic, samples in drained.items()}
+    before = recorded.received
     for _ in range(250):
         frames.put(b"picture")
         last = truths.put(b"row")
         time.sleep(0.002)
 
-    def got_the_last() -> bool:
-        look()
-        return seen[TRUTH][-1].sequence == last.sequence and recorded.received >= heard + 250
+    def received_last() -> bool:
+        drain()
+        return drained[TRUTH][-1].sequence == last.sequence and recorded.received >= before + 250
 
-    until(got_the_last)
-    assert len(seen[TRUTH]) - first[TRUTH] >= 250
-    assert 5 < len(seen[FRAME]) - first[FRAME] < 125
+    until(received_last)
+    assert len(drained[TRUTH]) - first[TRUTH] >= 250
+    assert 5 < len(drained[FRAME]) - first[FRAME] < 125
 
 
-# A recorder that receives on request: number of messages, how many of them are whole, and which was the last.
+# A recorder that drains on request: prints the number of messages, of complete ones, and of the last one.
 READER = """
 import sys
 from lowfc.adapters.bus.run import open_run
@@ -321,7 +325,7 @@ while sys.stdin.readline():
 
 
 class Reader:
-    """A recorder in a process of its own, which the camera's frames have reached."""
+    """A recorder in a separate process, connected to the camera."""
 
     def __init__(self, run: Run, camera: ZenohBus) -> None:
         self.process = subprocess.Popen(
@@ -336,26 +340,26 @@ class Reader:
         self.frames.put(b"%08d" % number * 1600)
         return number
 
-    def look(self) -> list[int]:
+    def drained(self) -> list[int]:
         self.process.stdin.write("\n")
         self.process.stdin.flush()
         return [int(word) for word in self.process.stdout.readline().split()]
 
-    def reached(self) -> bool:
+    def connected(self) -> bool:
         self.put()
-        return self.look()[0] > 0
+        return self.drained()[0] > 0
 
 
 @pytest.fixture
 def reader(run: Run, join: Join) -> Iterator[Reader]:
     made = Reader(run, join(run, "camera"))
-    until(made.reached)
+    until(made.connected)
     yield made
     made.process.kill()
     made.process.communicate()
 
 
-def test_a_frozen_subscriber_costs_the_others_nothing(reader: Reader, run: Run, join: Join) -> None:
+def test_a_stopped_subscriber_does_not_delay_the_others(reader: Reader, run: Run, join: Join) -> None:
     box = Mailbox()
     join(run, "controller").subscribe(FRAME, box.put)
 
@@ -365,7 +369,7 @@ def test_a_frozen_subscriber_costs_the_others_nothing(reader: Reader, run: Run, 
 
     until(received)
     reader.process.send_signal(signal.SIGSTOP)
-    for _ in range(1500):  # 19 MB, more than the link can hold; a put that waits would close it
+    for _ in range(1500):  # 19 MB, more than the link buffers; a blocking put would close it
         reader.put()
         assert box.take(PATIENCE_S)
     reader.process.send_signal(signal.SIGCONT)
@@ -373,19 +377,19 @@ def test_a_frozen_subscriber_costs_the_others_nothing(reader: Reader, run: Run, 
 
     def caught_up() -> bool:
         reader.put()
-        return reader.look()[2] > last
+        return reader.drained()[2] > last
 
     until(caught_up)
-    received_number, whole, _ = reader.look()
+    received_number, whole, _ = reader.drained()
     assert received_number == whole < reader.frames.published
 
 
-def test_a_session_that_ends_leaves_no_half_message_with_a_slow_reader(reader: Reader) -> None:
+def test_closing_a_session_leaves_a_slow_reader_only_complete_messages(reader: Reader) -> None:
     reader.process.send_signal(signal.SIGSTOP)
-    for _ in range(1000):  # more than the socket takes
+    for _ in range(1000):  # more than the socket buffers
         reader.put()
     threading.Timer(0.2, reader.process.send_signal, [signal.SIGCONT]).start()
     reader.camera.close()
-    received, whole, _ = reader.look()
+    received, whole, _ = reader.drained()
     assert received == whole
-    assert whole > 15  # what the queue and the socket held
+    assert whole > 15  # content of queue and socket

@@ -1,4 +1,4 @@
-"""The direct link beside the real bus: every message once and in order, whoever comes, goes, stalls or is too large."""
+"""The direct link in parallel with the bus: each message once and in order, despite restarts, stalls and large ones."""
 
 import socket
 import threading
@@ -23,13 +23,13 @@ PATIENCE_S = 30.0
 
 
 class Ends:
-    """A run with a camera and a controller that notes what it gets, from which thread."""
+    """A run with a camera and a controller that records its messages and their threads."""
 
     def __init__(self, base: Path) -> None:
         self.run: Run = open_run("direct-link", base=base)
         self.clock = HostClock(base)
         self.buses: list[ZenohBus] = []
-        self.got: list[int] = []
+        self.received: list[int] = []
         self.threads: list[str] = []
         self.sizes: list[int] = []
 
@@ -37,10 +37,10 @@ class Ends:
         self.buses.append(ZenohBus(self.run.links, role, self.clock))
         return self.buses[-1]
 
-    def hear(self, sample: Sample) -> None:
+    def receive(self, sample: Sample) -> None:
         assert sample.key == FRAME.key
         assert sample.publish_time_ns <= sample.receive_time_ns
-        self.got.append(count_of(sample.sequence))
+        self.received.append(count_of(sample.sequence))
         self.threads.append(threading.current_thread().name)
         self.sizes.append(len(sample.payload))
 
@@ -49,15 +49,15 @@ class Ends:
             publisher.put(bytes(1000))
             time.sleep(pause_s)
 
-    def meet(self, publisher: ZenohPublisher) -> None:
-        """Publish until the direct link is the only one."""
+    def until_direct_only(self, publisher: ZenohPublisher) -> None:
+        """Publish until messages arrive over the direct link only."""
 
         def only() -> bool:
             publisher.put(b"")
             return self.threads[-5:] == ["direct-link"] * 5 and len(self.threads) > 20
 
         until(only)
-        del self.got[:-1], self.threads[:], self.sizes[:]
+        del self.received[:-1], self.threads[:], self.sizes[:]
 
     def close(self) -> None:
         for bus in self.buses:
@@ -71,23 +71,23 @@ def ends(tmp_path: Path) -> Iterator[Ends]:
     made.close()
 
 
-def test_the_reader_gets_everything_by_the_short_way_and_others_by_the_bus(ends: Ends) -> None:
+def test_the_direct_subscriber_receives_over_the_direct_link_and_others_over_the_bus(ends: Ends) -> None:
     controller, recorder, camera = ends.bus("controller"), ends.bus("recorder"), ends.bus("camera")
-    controller.subscribe(FRAME, ends.hear)
+    controller.subscribe(FRAME, ends.receive)
     recorded: list[int] = []
     recorder.subscribe(FRAME, lambda sample: recorded.append(count_of(sample.sequence)))
     frames = camera.publisher(FRAME)
-    ends.meet(frames)
+    ends.until_direct_only(frames)
     ends.publish(frames, 100)
-    until(lambda: recorded[-1:] == [frames.published - 1] == ends.got[-1:])
-    assert ends.got == list(range(ends.got[0], frames.published))
+    until(lambda: recorded[-1:] == [frames.published - 1] == ends.received[-1:])
+    assert ends.received == list(range(ends.received[0], frames.published))
     assert set(ends.threads) == {"direct-link"}
-    assert recorded[-100:] == ends.got[-100:]
+    assert recorded[-100:] == ends.received[-100:]
 
 
-def test_a_reader_of_the_same_process_gets_each_message_by_a_call(ends: Ends) -> None:
+def test_a_reader_in_the_same_process_receives_each_message_by_a_call(ends: Ends) -> None:
     controller, recorder = ends.bus("controller"), ends.bus("recorder")
-    controller.subscribe(FRAME, ends.hear)
+    controller.subscribe(FRAME, ends.receive)
     recorded: list[int] = []
     recorder.subscribe(FRAME, lambda sample: recorded.append(count_of(sample.sequence)))
     camera = ZenohBus(ends.run.links, "camera", ends.clock, beside=controller)
@@ -96,27 +96,27 @@ def test_a_reader_of_the_same_process_gets_each_message_by_a_call(ends: Ends) ->
     ends.publish(frames, 100)
     until(lambda: recorded[-1:] == [99])
     camera.close()
-    assert ends.got == list(range(100)), "none twice, though the bus had them too"
+    assert ends.received == list(range(100)), "none twice, although the bus carried them too"
     assert set(ends.threads) == {threading.current_thread().name}
     del ends.threads[:]
-    again = ends.bus("camera").publisher(FRAME)  # in a process of its own
-    ends.meet(again)
+    again = ends.bus("camera").publisher(FRAME)  # in a separate process
+    ends.until_direct_only(again)
 
 
-def test_the_switch_loses_and_repeats_nothing(ends: Ends) -> None:
+def test_switching_to_the_direct_link_loses_and_repeats_nothing(ends: Ends) -> None:
     camera = ends.bus("camera")
     frames = camera.publisher(FRAME)
     controller = ends.bus("controller")
-    controller.subscribe(FRAME, ends.hear)
+    controller.subscribe(FRAME, ends.receive)
     until(lambda: controller.peers() and camera.peers())
     ends.publish(frames, 250)
-    until(lambda: ends.got[-1:] == [frames.published - 1])
-    assert ends.got == sorted(set(ends.got))
-    assert ends.got == list(range(ends.got[0], frames.published))
+    until(lambda: ends.received[-1:] == [frames.published - 1])
+    assert ends.received == sorted(set(ends.received))
+    assert ends.received == list(range(ends.received[0], frames.published))
     assert "direct-link" in ends.threads
 
 
-def test_a_message_under_way_while_the_bus_is_left_comes_once(tmp_path: Path) -> None:
+def test_a_message_in_transit_during_the_switch_is_delivered_once(tmp_path: Path) -> None:
     got: list[int] = []
     left: list[bool] = []
     reader = direct_link.DirectReader(
@@ -138,53 +138,53 @@ def test_a_message_under_way_while_the_bus_is_left_comes_once(tmp_path: Path) ->
     assert got == [1, 2]
 
 
-def test_a_restarted_reader_and_writer_find_each_other_again_and_without_its_writer_it_hears_the_bus(
+def test_reader_and_writer_reconnect_after_restarts_and_the_bus_serves_without_a_writer(
     ends: Ends, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     controller, camera = ends.bus("controller"), ends.bus("camera")
-    controller.subscribe(FRAME, ends.hear)
+    controller.subscribe(FRAME, ends.receive)
     frames = camera.publisher(FRAME)
-    ends.meet(frames)
+    ends.until_direct_only(frames)
     controller.close()
     ends.publish(frames, 5)
     controller = ends.bus("controller")
-    controller.subscribe(FRAME, ends.hear)
-    ends.meet(frames)
+    controller.subscribe(FRAME, ends.receive)
+    ends.until_direct_only(frames)
     camera.close()
     camera = ends.bus("camera")
-    ends.meet(camera.publisher(FRAME))
+    ends.until_direct_only(camera.publisher(FRAME))
     camera.close()
-    monkeypatch.setattr(direct_link.DirectWriter, "send", lambda *_: None)  # as one in another language
+    monkeypatch.setattr(direct_link.DirectWriter, "send", lambda *_: None)  # as a publisher without this library
     frames = ends.bus("camera").publisher(FRAME)
 
-    def heard() -> bool:
+    def received() -> bool:
         frames.put(b"")
         return ends.threads[-1:] not in ([], ["direct-link"])
 
-    until(heard)
+    until(received)
 
 
-def test_a_message_that_a_socket_does_not_take_comes_by_the_bus(ends: Ends) -> None:
+def test_a_message_too_large_for_the_socket_arrives_over_the_bus(ends: Ends) -> None:
     controller, camera = ends.bus("controller"), ends.bus("camera")
-    controller.subscribe(FRAME, ends.hear)
+    controller.subscribe(FRAME, ends.receive)
     frames = camera.publisher(FRAME)
     large = 17 << 20
 
-    def heard() -> bool:
+    def received() -> bool:
         frames.put(bytes(large))
         time.sleep(0.05)
         return ends.sizes[-1:] == [large]
 
-    until(heard)
+    until(received)
     assert ends.threads[-1] != "direct-link"
 
 
-def test_a_reader_that_stalls_never_holds_the_writer(tmp_path: Path) -> None:
+def test_a_stalled_reader_never_blocks_the_writer(tmp_path: Path) -> None:
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     listener.bind(str(tmp_path / "stalled.in"))
     listener.listen(1)
     writer = direct_link.DirectWriter(tmp_path / "stalled.in")
-    for _ in range(2000):  # far more than a socket holds: a send that waited would wait for ever
+    for _ in range(2000):  # far more than a socket buffers: a blocking send would never return
         writer.send(Envelope(1, 2).encode(), bytes(12800))
     taken, _ = listener.accept()
     taken.settimeout(PATIENCE_S)
@@ -195,110 +195,108 @@ def test_a_reader_that_stalls_never_holds_the_writer(tmp_path: Path) -> None:
     listener.close()
 
 
-def test_a_message_that_makes_no_sense_is_counted_and_the_next_is_heard(
-    ends: Ends, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_an_invalid_message_is_counted_and_the_next_is_delivered(ends: Ends, capfd: pytest.CaptureFixture[str]) -> None:
     controller = ends.bus("controller")
-    controller.subscribe(FRAME, ends.hear)
+    controller.subscribe(FRAME, ends.receive)
     path = ends.run.links.direct_link("controller")
     assert path is not None
     writer = direct_link.DirectWriter(path)
     writer.send(b"short", b"")
     writer.send(b"\xff" * 16, b"from the end of time")
     writer.send(Envelope(7, 0).encode(), b"fine")
-    until(lambda: ends.got == [7])
+    until(lambda: ends.received == [7])
     (found,) = controller.faults.take_unreadable().items()
     assert (found[0], found[1][0]) == (FRAME.key, 2)
     assert "Traceback" not in capfd.readouterr().err
     writer.close()
 
 
-def test_only_who_waits_for_a_topic_has_a_short_way(ends: Ends) -> None:
-    ends.bus("recorder").subscribe(FRAME, ends.hear)
+def test_only_direct_subscribers_have_a_direct_link(ends: Ends) -> None:
+    ends.bus("recorder").subscribe(FRAME, ends.receive)
     ends.bus("mirror-other").subscribe(COMMAND, lambda _: None, "dm")
     assert not list(ends.run.path.glob("*.in"))
-    ends.bus("controller").subscribe(FRAME, ends.hear)
+    ends.bus("controller").subscribe(FRAME, ends.receive)
     ends.bus("mirror-dm").subscribe(COMMAND, lambda _: None, "dm")
     assert sorted(path.name for path in ends.run.path.glob("*.in")) == ["controller.in", "mirror-dm.in"]
 
 
 class Commanded:
-    """A mirror that notes its commands, beside the controller and an operator who both command it."""
+    """A mirror that records its commands, with a controller and an operator that both publish commands."""
 
     def __init__(self, ends: Ends) -> None:
         self.ends = ends
-        self.got: list[Sample] = []
+        self.received: list[Sample] = []
         self.threads: list[str] = []
-        ends.bus("mirror-dm").subscribe(COMMAND, self.hear, "dm")
+        ends.bus("mirror-dm").subscribe(COMMAND, self.receive, "dm")
         controller, operator = ends.bus("controller"), ends.bus("operator")
         self.controller, self.operator = controller.publisher(COMMAND, "dm"), operator.publisher(COMMAND, "dm")
         self.links = controller, operator
 
-    def hear(self, sample: Sample) -> None:
-        self.got.append(sample)
+    def receive(self, sample: Sample) -> None:
+        self.received.append(sample)
         self.threads.append(threading.current_thread().name)
 
-    def until_both_ways(self) -> None:
+    def until_both_paths(self) -> None:
         def both() -> bool:
             self.controller.put(b"controller")
             self.operator.put(b"operator")
             time.sleep(0.01)
-            return "direct-link" in self.threads and any(one.payload == b"operator" for one in self.got)
+            return "direct-link" in self.threads and any(one.payload == b"operator" for one in self.received)
 
         until(both)
 
 
-def test_a_mirror_gets_each_command_once_and_the_controllers_by_the_short_way(ends: Ends) -> None:
+def test_a_mirror_receives_each_command_once_and_the_controllers_over_the_direct_link(ends: Ends) -> None:
     mirror = Commanded(ends)
-    mirror.until_both_ways()
-    begun = len(mirror.got)
+    mirror.until_both_paths()
+    begun = len(mirror.received)
     for _ in range(100):
         mirror.controller.put(b"controller")
         mirror.operator.put(b"operator")
         time.sleep(0.001)
     last = mirror.controller.published - 1, mirror.operator.published - 1
 
-    def all_came() -> bool:
-        return {(one.payload, count_of(one.sequence)) for one in mirror.got[-20:]} >= {
+    def all_received() -> bool:
+        return {(one.payload, count_of(one.sequence)) for one in mirror.received[-20:]} >= {
             (b"controller", last[0]),
             (b"operator", last[1]),
         }
 
-    until(all_came)
-    time.sleep(0.1)  # in which a copy by the bus would come
-    by_whom = list(zip(mirror.got, mirror.threads, strict=True))[begun:]
+    until(all_received)
+    time.sleep(0.1)  # time for a copy over the bus
+    by_publisher = list(zip(mirror.received, mirror.threads, strict=True))[begun:]
     for payload, last_count in zip((b"controller", b"operator"), last, strict=True):
-        counts = [count_of(one.sequence) for one, _ in by_whom if one.payload == payload]
+        counts = [count_of(one.sequence) for one, _ in by_publisher if one.payload == payload]
         assert counts[-100:] == list(range(last_count - 99, last_count + 1))
         assert len(counts) == len(set(counts))
-    ways = [name == "direct-link" for one, name in by_whom if one.payload == b"controller"]
-    assert sum(ways) > 0.5 * len(ways)  # the bus can be quicker now and then
-    assert all(name != "direct-link" for one, name in by_whom if one.payload == b"operator")
-    newest = next(one for one in reversed(mirror.got) if one.payload == b"controller")
+    direct = [name == "direct-link" for one, name in by_publisher if one.payload == b"controller"]
+    assert sum(direct) > 0.5 * len(direct)  # the bus is sometimes faster
+    assert all(name != "direct-link" for one, name in by_publisher if one.payload == b"operator")
+    newest = next(one for one in reversed(mirror.received) if one.payload == b"controller")
     mirror.operator.put(b"a copy", publish_time_ns=newest.publish_time_ns, sequence=newest.sequence)
     mirror.operator.put(b"another", sequence=newest.sequence)
-    until(lambda: mirror.got[-1].payload == b"another")
-    assert all(one.payload != b"a copy" for one in mirror.got)
+    until(lambda: mirror.received[-1].payload == b"another")
+    assert all(one.payload != b"a copy" for one in mirror.received)
 
 
-def test_handed_is_before_the_bus_where_there_is_a_reader_and_after_it_where_there_is_none(ends: Ends) -> None:
+def test_handed_ns_precedes_the_bus_put_with_a_direct_reader_and_follows_it_without(ends: Ends) -> None:
     mirror = Commanded(ends)
-    mirror.until_both_ways()
+    mirror.until_both_paths()
     put_ns: list[int] = []
 
-    class Noting:
+    class Timed:
         def put(self, payload: bytes, attachment: bytes) -> None:
             put_ns.append(ends.clock.host_ns())
 
     for publisher, is_read in ((mirror.controller, True), (mirror.operator, False)):
-        publisher._publisher = Noting()  # type: ignore[assignment]
+        publisher._publisher = Timed()  # type: ignore[assignment]
         envelope = publisher.put(b"")
         assert envelope.publish_time_ns <= publisher.handed_ns
         assert (publisher.handed_ns <= put_ns[-1]) is is_read
 
 
-def test_after_a_stall_in_which_the_bus_was_quicker_nothing_comes_twice(tmp_path: Path) -> None:
-    """A few thousand commands are the most that wait in a socket."""
+def test_after_a_stall_with_the_bus_ahead_nothing_is_delivered_twice(tmp_path: Path) -> None:
+    """A socket buffers at most a few thousand commands."""
     got: list[int] = []
     by_bus: list[direct_link.Handler] = []
 
@@ -318,7 +316,7 @@ def test_after_a_stall_in_which_the_bus_was_quicker_nothing_comes_twice(tmp_path
     assert got == list(range(number + 1))
 
 
-def test_by_a_router_there_is_no_short_way_round_its_access_control(ends: Ends) -> None:
+def test_with_a_router_there_is_no_direct_link(ends: Ends) -> None:
     assert ends.run.links.direct_link("mirror-dm") is not None
     across = replace(ends.run.links, network=Network(router="tls/localhost:7447", certificates="certs"))
     assert across.direct_link("mirror-dm") is None

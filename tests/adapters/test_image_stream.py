@@ -1,4 +1,4 @@
-"""ImageStreamIO streams: the product against a reader and a writer that were made from the layout alone."""
+"""ImageStreamIO streams, against an independent reader and writer made from the layout definition."""
 
 import contextlib
 import os
@@ -69,7 +69,7 @@ def test_images_of_every_type_are_read_and_written(path: Path, number: int) -> N
     assert other.count == 2
 
 
-def test_one_that_is_made_here_is_read_by_others(path: Path) -> None:
+def test_a_created_stream_is_readable_by_others(path: Path) -> None:
     stream = Stream.create(path, (ROWS, COLUMNS), np.float32)
     other = PlainStream(path, COLUMNS, ROWS, FLOAT32)
     assert (path.stat().st_mode & 0o777, other.get("<Q", 232)) == (0o666, path.stat().st_ino)
@@ -104,7 +104,7 @@ def test_keywords_of_every_kind_are_read(path: Path) -> None:
         ({"axes": 4}, "4 axes"),
     ],
 )
-def test_other_layouts_are_refused_by_name(path: Path, options: dict[str, object], found: str) -> None:
+def test_other_layouts_are_refused_with_the_difference(path: Path, options: dict[str, object], found: str) -> None:
     made(path, **options)
     with pytest.raises(StreamError, match=found) as fault:
         Stream(path)
@@ -112,7 +112,7 @@ def test_other_layouts_are_refused_by_name(path: Path, options: dict[str, object
     assert not isinstance(fault.value, StreamAbsentError)
 
 
-def test_what_is_just_being_made_is_absent_yet(path: Path) -> None:
+def test_a_stream_being_created_counts_as_absent(path: Path) -> None:
     with pytest.raises(StreamAbsentError):
         Stream(path)
     path.write_bytes(b"")
@@ -127,19 +127,19 @@ def test_what_is_just_being_made_is_absent_yet(path: Path) -> None:
         Stream(path)
 
 
-def test_a_stream_of_planes_gives_the_newest_one(path: Path) -> None:
+def test_the_newest_plane_of_a_stream_is_returned(path: Path) -> None:
     writer = made(path, planes=4, axes=3, kind=0x20001)
     reader = StreamReader(path)
     for number in range(1, 7):
         writer.write(image(number), plane=number % 4)
         got = newest(reader)
         assert np.array_equal(got.pixels, image(number))
-    writer.pack("<Q", 272, 2**64 - 1)  # a plane that is none
+    writer.pack("<Q", 272, 2**64 - 1)  # an invalid plane
     writer.pack("<Q", 264, 7)
     newest(reader)
 
 
-def test_an_image_that_is_being_written_is_waited_for(path: Path) -> None:
+def test_an_image_being_written_is_awaited(path: Path) -> None:
     writer = made(path)
     reader = StreamReader(path)
     writer.write(image(1))
@@ -165,7 +165,7 @@ for number in range(1, 1 << 30):
 """
 
 
-def test_no_torn_image_is_returned_and_a_writer_that_dies_is_named(path: Path) -> None:
+def test_no_torn_image_is_returned_and_a_dead_writer_is_reported(path: Path) -> None:
     stream = PlainStream.make(path, 64, 64, UINT16)
     reader = StreamReader(path)
     with subprocess.Popen([sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE) as writer:
@@ -181,12 +181,12 @@ def test_no_torn_image_is_returned_and_a_writer_that_dies_is_named(path: Path) -
     while reader.next(0.1) is not None:
         pass
     assert reader.silence().startswith(f"its writer (process {writer.pid}) has ended")
-    stream.write(np.full((64, 64), stream.count + 1))  # another one takes over
+    stream.write(np.full((64, 64), stream.count + 1))  # another writer takes over
     got = newest(reader)
     assert (got.pixels == got.number % 65536).all()
 
 
-def test_a_stream_that_is_made_anew_is_followed(path: Path) -> None:
+def test_a_recreated_stream_is_reopened(path: Path) -> None:
     writer = made(path)
     reader = StreamReader(path)
     writer.write(image(1))
@@ -212,7 +212,7 @@ def test_a_stream_that_is_made_anew_is_followed(path: Path) -> None:
     newest(reader)
 
 
-def test_a_file_that_is_cut_short_is_not_touched_any_more(path: Path) -> None:
+def test_a_truncated_file_is_no_longer_accessed(path: Path) -> None:
     writer = made(path)
     reader = StreamReader(path)
     writer.write(image(1))
@@ -222,15 +222,15 @@ def test_a_file_that_is_cut_short_is_not_touched_any_more(path: Path) -> None:
     reader.close()
 
 
-def test_each_reader_has_a_semaphore_of_its_own(path: Path) -> None:
+def test_each_reader_has_its_own_semaphore(path: Path) -> None:
     writer = made(path)
     writer.take(0, os.getppid())
     writer.take(1, dead_pid())
     reader = StreamReader(path)
-    assert writer.get("<i", writer.readers + 4) == os.getpid()  # that of the dead one
+    assert writer.get("<i", writer.readers + 4) == os.getpid()  # the dead process's semaphore
     writer.write(image(1))
     newest(reader)
-    assert writer.value(0) == 1  # nobody's was taken
+    assert writer.value(0) == 1  # the parent's semaphore is not consumed
     reader.close()
     assert writer.get("<i", writer.readers + 4) == 0
     for index in range(10):
@@ -239,7 +239,7 @@ def test_each_reader_has_a_semaphore_of_its_own(path: Path) -> None:
         StreamReader(path)
 
 
-def test_semaphores_are_posted_below_ten_only_and_one_that_is_full_stops_nobody(path: Path) -> None:
+def test_semaphores_are_posted_up_to_ten_and_a_full_one_blocks_nothing(path: Path) -> None:
     writer = made(path)
     reader = StreamReader(path)
     stream = Stream(path)
@@ -255,21 +255,21 @@ def test_semaphores_are_posted_below_ten_only_and_one_that_is_full_stops_nobody(
     assert got.number == 26
 
 
-def test_who_else_writes_is_known(path: Path) -> None:
+def test_another_living_writer_is_detected(path: Path) -> None:
     writer = made(path)
     stream = Stream(path)
     assert not stream.other_writer()
     writer.write(image(1))
-    assert not stream.other_writer()  # this process itself
+    assert not stream.other_writer()  # this process is not another writer
     writer.pack("<i", writer.writers + 4 * 9, dead_pid())
     assert not stream.other_writer()
     writer.pack("<i", writer.writers + 4 * 9, os.getppid())
     assert stream.other_writer() == os.getppid()
-    writer.pack("<q", 200, 1_000_000_000)  # written long before that process began: it has a dead one's number
+    writer.pack("<q", 200, 1_000_000_000)  # written before that process began: its id was reused
     assert not stream.other_writer()
 
 
-def test_the_folder_is_the_first_that_there_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_first_existing_folder_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MILK_SHM_DIR", str(tmp_path))
     assert stream_path("dm00disp03") == tmp_path / "dm00disp03.im.shm"
     monkeypatch.setenv("MILK_SHM_DIR", str(tmp_path / "none"))
@@ -279,11 +279,11 @@ def test_the_folder_is_the_first_that_there_is(tmp_path: Path, monkeypatch: pyte
             stream_path(name)
 
 
-def test_wrong_headers_do_no_harm(path: Path) -> None:
+def test_damaged_headers_cause_no_access_outside_the_stream(path: Path) -> None:
     rng = np.random.default_rng(7)
     writer = made(path, planes=2, axes=3, kind=0x20001, keywords={"tint": 1e-3})
     good = bytes(writer.map)
-    rest = slice(writer.semaphores + 10 * 32 + 32 + 4 * 40, None)  # behind all that a reader and a writer may change
+    rest = slice(writer.semaphores + 10 * 32 + 32 + 4 * 40, None)  # after all bytes that a reader or writer may change
     opened = 0
     for _ in range(1500):
         writer.map[:] = good

@@ -1,4 +1,4 @@
-"""ImageStreamIO streams against the C library itself, where the loader finds libImageStreamIO.so."""
+"""ImageStreamIO streams against the C library, if the loader finds libImageStreamIO.so."""
 
 import ctypes
 import multiprocessing
@@ -50,7 +50,7 @@ class Image:
 
 @pytest.fixture
 def path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """One folder for all tests of this module: the library asks for it once."""
+    """One folder for all tests of this module: the library reads its name once."""
     folder = tmp_path.parent / "milk"
     folder.mkdir(exist_ok=True)
     monkeypatch.setenv("MILK_SHM_DIR", str(folder))
@@ -61,7 +61,7 @@ def image(seed: int, dtype: str) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 1000, (ROWS, COLUMNS)).astype(dtype)
 
 
-def test_its_images_are_read(path: Path) -> None:
+def test_images_of_the_c_library_are_read(path: Path) -> None:
     library = Image(path.name.removesuffix(".im.shm")).create(3, keywords=4)
     reader = StreamReader(path)
     for number in range(1, 100):
@@ -77,7 +77,7 @@ def test_its_images_are_read(path: Path) -> None:
     assert reader.next(0.02) is None
 
 
-def test_it_hands_out_no_semaphore_that_is_held_here(path: Path) -> None:
+def test_the_c_library_respects_our_semaphore(path: Path) -> None:
     library = Image(path.name.removesuffix(".im.shm")).create(3)
     reader = StreamReader(path)
     queue = multiprocessing.get_context("fork").SimpleQueue()
@@ -85,11 +85,11 @@ def test_it_hands_out_no_semaphore_that_is_held_here(path: Path) -> None:
     child = multiprocessing.get_context("fork").Process(target=ask)
     child.start()
     child.join()
-    assert queue.get() == 1  # the first one is the reader's
+    assert queue.get() == 1  # 0 is the reader's
     reader.close()
 
 
-def _follow(name: str, images: int, started: object, queue: object) -> None:
+def _receive(name: str, images: int, started: object, queue: object) -> None:
     library = Image(name).open()
     index = LIBRARY.ImageStreamIO_getsemwaitindex(library.memory, 5)
     started.set()  # type: ignore[attr-defined]
@@ -99,7 +99,7 @@ def _follow(name: str, images: int, started: object, queue: object) -> None:
 
 
 @pytest.mark.parametrize("made_by", ["library", "here"])
-def test_it_is_woken_by_what_is_written_here(path: Path, made_by: str) -> None:
+def test_our_images_wake_readers_of_the_c_library(path: Path, made_by: str) -> None:
     name = path.name.removesuffix(".im.shm")
     if made_by == "library":
         Image(name).create(9, ring=3)
@@ -108,7 +108,7 @@ def test_it_is_woken_by_what_is_written_here(path: Path, made_by: str) -> None:
         stream = Stream.create(path, (ROWS, COLUMNS), np.float32)
     context = multiprocessing.get_context("fork")
     queue, started = context.SimpleQueue(), context.Event()
-    child = context.Process(target=_follow, args=(name, 50, started, queue))
+    child = context.Process(target=_receive, args=(name, 50, started, queue))
     child.start()
     assert started.wait(5)
     for number in range(50):
@@ -118,7 +118,7 @@ def test_it_is_woken_by_what_is_written_here(path: Path, made_by: str) -> None:
     assert child.exitcode == 0
 
 
-def test_the_ring_is_kept_as_it_keeps_it(path: Path) -> None:
+def test_the_ring_buffer_is_written_as_by_the_c_library(path: Path) -> None:
     name = path.name.removesuffix(".im.shm")
     kept = []
     for by_library in (True, False):

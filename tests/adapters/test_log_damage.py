@@ -1,4 +1,4 @@
-"""Damaged and rewritten logs: no crash, no message that was not sent, and nothing is missing without a word."""
+"""Damaged and rewritten logs: no crash, no message that was never sent, no loss that is not reported."""
 
 import dataclasses
 import io
@@ -39,7 +39,7 @@ SENT: list[Message] = identity(small_samples())
 
 
 def read_of(reader: LogReader) -> tuple[list[Message], str]:
-    """What a reader delivers, and how it complains."""
+    """Messages that a reader delivers, and its error."""
     read: list[Sample] = []
     try:
         read.extend(reader)
@@ -49,10 +49,10 @@ def read_of(reader: LogReader) -> tuple[list[Message], str]:
 
 
 @pytest.mark.parametrize("finished", [True, False])
-def test_no_damage_passes_for_a_message(tmp_path: Path, finished: bool) -> None:
+def test_a_damaged_log_yields_no_false_message_and_no_silent_loss(tmp_path: Path, finished: bool) -> None:
     data = small_log(tmp_path / "whole.mcap", finished=finished).read_bytes()
     assert len(boundaries(data)) > 50
-    path, kept = tmp_path / "mutated.mcap", 0
+    path, delivered = tmp_path / "mutated.mcap", 0
     for number, kind, changed in mutations(data, range(finished, MUTATIONS, 2)):
         path.write_bytes(changed)
         case = f"mutation {number}: {kind}"
@@ -64,27 +64,27 @@ def test_no_damage_passes_for_a_message(tmp_path: Path, finished: bool) -> None:
         assert strictly == read[: len(strictly)], case
         assert set(SENT).issuperset(read), case
         assert len(set(read)) == len(read), case
-        kept += len(read)
+        delivered += len(read)
         assert bool(refusal) == bool(nothing or reader.damage or reader.unreadable), case
-        assert refusal or not (finished and reader.complete), f"{case}: it passes for whole"
+        assert refusal or not (finished and reader.complete), f"{case}: it counts as intact"
         if read != SENT and (finished or kind not in MISPLACED):
             broken_off = not reader.complete and read == SENT[: len(read)]
-            assert refusal or broken_off, f"{case}: something is missing without a word"
-    assert kept > 0.5 * len(SENT) * MUTATIONS / 2, "nearly nothing was read: the test is of no use"
+            assert refusal or broken_off, f"{case}: an unreported loss"
+    assert delivered > 0.5 * len(SENT) * MUTATIONS / 2, "too little was read for a meaningful test"
 
 
 def heads(size: int, magic: bytes) -> bytes:
-    """Heads of chunks, one every 64 bytes, each of a chunk that takes almost the rest of the file."""
+    """Chunk headers every 64 bytes, each declaring a chunk of almost the rest of the file."""
     made = b""
     for at in range(0, size, 64):
         length = max(size - at - 9, 43)
-        told = struct.pack("<QQQII3sQ", 0, 0, length, 0, 3, b"lz4", length - 43)
-        made += (struct.pack("<BQ", 6, length) + told + magic).ljust(64, b"\0")
+        fields = struct.pack("<QQQII3sQ", 0, 0, length, 0, 3, b"lz4", length - 43)
+        made += (struct.pack("<BQ", 6, length) + fields + magic).ljust(64, b"\0")
     return made
 
 
 def between(size: int, sound: bytes) -> bytes:
-    """Sound chunks, each followed by a record that takes almost the rest of the file."""
+    """Intact chunks, each followed by a record that declares almost the rest of the file."""
     made = b""
     while len(made) < size:
         made += sound
@@ -93,9 +93,7 @@ def between(size: int, sound: bytes) -> bytes:
 
 
 @pytest.mark.parametrize("kind", ["heads", "heads of frames", "sound chunks between", "sound chunks and zeros"])
-def test_a_file_made_to_mislead_is_read_only_a_few_times(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
-) -> None:
+def test_a_malicious_file_is_read_only_a_few_times(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
     data = small_log(tmp_path / "whole.mcap", finished=False).read_bytes()
     sound = min((data[a:b] for a, b in pairwise(boundaries(data)) if data[a] == 6), key=len)
     size = 1 << 19
@@ -170,7 +168,7 @@ def test_a_rewritten_log_is_read_as_the_original(tmp_path: Path, source: Path, o
 @pytest.mark.parametrize("compression", CompressionType)
 @pytest.mark.parametrize("at", [8, 60])  # of a chunk: its length, and its content
 @pytest.mark.parametrize("finished", [True, False])
-def test_of_a_damaged_one_only_the_damaged_chunk_is_lost(
+def test_only_the_damaged_chunk_of_a_rewritten_log_is_lost(
     tmp_path: Path, source: Path, compression: CompressionType, at: int, finished: bool
 ) -> None:
     path = rewritten(source, tmp_path / "rewritten.mcap", {"compression": compression})
@@ -190,7 +188,7 @@ def test_of_a_damaged_one_only_the_damaged_chunk_is_lost(
     assert identity(list(LogReader(done.recovered))) == read
 
 
-def test_messages_without_chunks_are_under_the_checksum_of_the_whole_and_read_up_to_the_end(
+def test_unchunked_messages_are_covered_by_the_data_checksum_and_read_up_to_a_truncation(
     tmp_path: Path, source: Path
 ) -> None:
     path = rewritten(source, tmp_path / "rewritten.mcap", NO_CHUNKS | {"enable_data_crcs": True})
@@ -209,9 +207,7 @@ def test_messages_without_chunks_are_under_the_checksum_of_the_whole_and_read_up
 
 
 @pytest.mark.parametrize("skip_damaged", [True, False])
-def test_an_unknown_compression_is_named_and_not_called_damage(
-    tmp_path: Path, source: Path, skip_damaged: bool
-) -> None:
+def test_an_unsupported_compression_is_reported_as_such(tmp_path: Path, source: Path, skip_damaged: bool) -> None:
     path, builder = tmp_path / "rewritten.mcap", RecordBuilder()
     with rewritten(source, path, {}).open("rb") as stream:
         for record in StreamReader(stream, emit_chunks=True).records:

@@ -44,7 +44,7 @@ def written(path: Path, messages: list[Sample]) -> Path:
     return log.finish({})
 
 
-def test_what_is_written_is_read(tmp_path: Path) -> None:
+def test_a_written_log_is_read_back(tmp_path: Path) -> None:
     reader = LogReader(small_log(tmp_path / "logs" / "a.mcap"))
     read = list(reader)
     assert identity(read) == identity(SENT)
@@ -55,7 +55,7 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     assert [path.name for path in (tmp_path / "logs").iterdir()] == ["a.mcap"]
 
 
-def test_another_reader_understands_every_topic_from_the_log_alone(tmp_path: Path) -> None:
+def test_every_topic_is_decodable_by_other_readers_without_lowfc(tmp_path: Path) -> None:
     messages = [
         Sample(topic.at("dm"), topic.message().SerializeToString() or b"", sequence_of(START_S, 5), START_NS, START_NS)
         for topic in TOPICS
@@ -79,7 +79,7 @@ def test_another_reader_understands_every_topic_from_the_log_alone(tmp_path: Pat
     assert all(schema.encoding == "protobuf" and schema.data for schema in summary.schemas.values())
 
 
-def test_what_describes_a_log_stands_at_its_start_and_chunks_are_small(tmp_path: Path) -> None:
+def test_metadata_and_attachments_precede_the_messages_and_chunks_are_small(tmp_path: Path) -> None:
     path = written(tmp_path / "a.mcap", small_samples(400))
     with path.open("rb") as file:
         records = list(StreamReader(file, emit_chunks=True, validate_crcs=True).records)
@@ -93,7 +93,7 @@ def test_what_describes_a_log_stands_at_its_start_and_chunks_are_small(tmp_path:
     assert Channel not in kinds[: kinds.index(Chunk)]
 
 
-def test_a_log_cut_anywhere_yields_its_whole_chunks(tmp_path: Path) -> None:
+def test_a_truncated_log_yields_its_complete_chunks(tmp_path: Path) -> None:
     data = small_log(tmp_path / "whole.mcap").read_bytes()
     cut, found = tmp_path / "cut.mcap", []
     for size in [*range(1, 40), *range(40, len(data), 1001), *range(len(data) - 40, len(data) + 1)]:
@@ -124,7 +124,7 @@ def flipped(path: Path, at: int, bit: int = 0) -> Path:
 
 
 def crafted(path: Path, *records: McapRecord) -> Path:
-    """An unfinished file of these records."""
+    """Write an unfinished file of these records."""
     builder = RecordBuilder()
     for record in records:
         record.write(builder)
@@ -152,12 +152,12 @@ def message(number: int, channel: int = 1) -> Message:
     return Message(channel, START_NS, b"x", START_NS, number)
 
 
-def test_damage_is_found_and_can_be_left_out(tmp_path: Path) -> None:
+def test_damage_is_detected_and_can_be_skipped(tmp_path: Path) -> None:
     path = small_log(tmp_path / "a.mcap")
     begin, end = chunks_of(path)[1]
     flipped(path, (begin + end) // 2, 4)
-    said = rf"is damaged at byte {begin} \((the checksum of a chunk is wrong|a chunk cannot be decompressed)\)"
-    with pytest.raises(DataFileError, match=said):
+    error = rf"is damaged at byte {begin} \((the checksum of a chunk is wrong|a chunk cannot be decompressed)\)"
+    with pytest.raises(DataFileError, match=error):
         list(LogReader(path))
     reader = LogReader(path, skip_damaged=True)
     read = list(reader)
@@ -172,7 +172,7 @@ def test_damage_is_found_and_can_be_left_out(tmp_path: Path) -> None:
     assert damage.before_ns - damage.after_ns == max(b - a for a, b in pairwise(times))
 
 
-def test_a_summary_says_what_a_damaged_chunk_declared(tmp_path: Path) -> None:
+def test_the_summary_replaces_the_declarations_of_a_damaged_chunk(tmp_path: Path) -> None:
     path = small_log(tmp_path / "a.mcap")
     (begin, end), *_ = chunks_of(path)
     flipped(path, (begin + end) // 2)  # the first chunk declares frames and steps of the first start
@@ -190,24 +190,22 @@ def test_a_summary_says_what_a_damaged_chunk_declared(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("at", "new"),
     [
-        (0, b"\x07"),  # taken for an index of messages
-        (0, b"\x86"),  # for a record of somebody else's
-        (0, b"\x03"),  # for a declaration that no checksum covers
+        (0, b"\x07"),  # opcode of a message index
+        (0, b"\x86"),  # opcode of a private record
+        (0, b"\x03"),  # opcode of a declaration without checksum
         (1, b"\x00"),
         (4, b"\x01"),  # 16 MB longer
         (6, b"\xff"),
         (8, b"\xff"),
-        (25, bytes(12)),  # size and checksum: a chunk that says that it is empty
-        (32, b"\xff"),  # size: more than memory has
+        (25, bytes(12)),  # size and checksum of an empty chunk
+        (32, b"\xff"),  # size: more than the memory
         (33, bytes(4)),  # "no checksum"
         (41, b"zzz"),
         (44, b"\x00\x01"),
     ],
 )
 @pytest.mark.parametrize("finished", [True, False])
-def test_whatever_a_chunk_says_of_itself_only_that_chunk_is_lost(
-    tmp_path: Path, at: int, new: bytes, finished: bool
-) -> None:
+def test_a_damaged_chunk_header_loses_only_its_chunk(tmp_path: Path, at: int, new: bytes, finished: bool) -> None:
     path = small_log(tmp_path / "a.mcap")
     whole = list(LogReader(path))
     chunks = chunks_of(path)
@@ -225,30 +223,30 @@ def test_whatever_a_chunk_says_of_itself_only_that_chunk_is_lost(
     assert before < after < len(whole)
 
 
-def test_a_damaged_attachment_is_left_out_and_damaged_metadata_named(tmp_path: Path) -> None:
+def test_a_damaged_attachment_is_left_out_and_damaged_metadata_are_reported(tmp_path: Path) -> None:
     path = written(tmp_path / "a.mcap", SENT[:8])
     data = path.read_bytes()
     flipped(path, data.index(b"[loop]"))
-    path.write_bytes(path.read_bytes()[: chunks_of(path)[-1][1]])  # nothing but its own checksum can tell
+    path.write_bytes(path.read_bytes()[: chunks_of(path)[-1][1]])  # only its own checksum detects it
     with pytest.raises(DataFileError, match="the checksum of an attachment is wrong"):
         list(LogReader(path))
     reader = LogReader(path, skip_damaged=True)
     assert len(list(reader)) == 8
     assert (list(reader.attachments), len(reader.damage)) == (["h.fits"], 1)
     path.write_bytes(data)
-    flipped(path, data.index(b"night"))  # which no checksum of its own covers
+    flipped(path, data.index(b"night"))  # metadata have no checksum of their own
     with pytest.raises(DataFileError, match="its parts are intact, but"):
         list(LogReader(path))
 
 
 DECLARED = chunk(STEPS, CHANNEL, message(0))
-OTHERWISE = [
+DIFFERENT = [
     dataclasses.replace(CHANNEL, topic="/lowfc/camera/frame"),
     dataclasses.replace(CHANNEL, metadata={"start_s": "8"}),
     dataclasses.replace(STEPS, name="lowfc.v1.Truth"),
 ]
-NO_TIMES = ["", "-1", "7.0", "seven", "\u0667", "9" * 30, "9" * 10]
-NO_FIT = [
+INVALID_STARTS = ["", "-1", "7.0", "seven", "\u0667", "9" * 30, "9" * 10]
+INVALID_LENGTHS = [
     b"\x05",
     b"\x05" + b"\xff" * 8,
     b"\x05" + bytes(20),
@@ -259,27 +257,27 @@ NO_FIT = [
 
 
 @pytest.mark.parametrize(
-    ("records", "said", "delivered"),
+    ("records", "error", "delivered"),
     [
         *(
             ([DECLARED, chunk(one, message(1)), chunk(message(2))], "1 is declared a second", [0, 2])
-            for one in OTHERWISE
+            for one in DIFFERENT
         ),
         *(
             ([chunk(STEPS, dataclasses.replace(CHANNEL, metadata={"start_s": start}), message(0))], "1 has start_s", [])
-            for start in NO_TIMES
+            for start in INVALID_STARTS
         ),
-        ([DECLARED, message(1), chunk(message(2))], "outside of the chunks", [0, 2]),
+        ([DECLARED, message(1), chunk(message(2))], "outside the chunks", [0, 2]),
         ([chunk(STEPS, CHANNEL, message(0), message(1, channel=2))], "the declaration of its messages is missing", [0]),
-        *(([DECLARED, packed(content), chunk(message(2))], "is damaged", [0, 2]) for content in NO_FIT),
+        *(([DECLARED, packed(content), chunk(message(2))], "is damaged", [0, 2]) for content in INVALID_LENGTHS),
     ],
 )
-def test_records_that_contradict_what_vouches_for_them_are_damage(
-    tmp_path: Path, records: list[McapRecord], said: str, delivered: list[int]
+def test_contradictory_or_unchecked_records_are_damage(
+    tmp_path: Path, records: list[McapRecord], error: str, delivered: list[int]
 ) -> None:
-    """A second declaration that differs, a start that is no time, a message that nothing vouches for, lengths."""
+    """A differing second declaration, an invalid start, a message without checksum, impossible lengths."""
     path = crafted(tmp_path / "a", *records)
-    with pytest.raises(DataFileError, match=said):
+    with pytest.raises(DataFileError, match=error):
         list(LogReader(path))
     reader = LogReader(path, skip_damaged=True)
     assert [(reader.schema_of(one), one.sequence) for one in reader] == [
@@ -288,7 +286,7 @@ def test_records_that_contradict_what_vouches_for_them_are_damage(
     assert len(reader.damage) + reader.unreadable == 1
 
 
-def test_a_summary_that_declares_nonsense_is_damage(tmp_path: Path) -> None:
+def test_an_invalid_declaration_in_the_summary_is_damage(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with path.open("wb") as file:
         writer = Writer(file, compression=CompressionType.LZ4, enable_data_crcs=True)
@@ -302,11 +300,11 @@ def test_a_summary_that_declares_nonsense_is_damage(tmp_path: Path) -> None:
     assert list(LogReader(path, skip_damaged=True)) == []
 
 
-def test_a_chunk_that_would_fill_the_memory_does_not(tmp_path: Path) -> None:
+def test_a_decompression_bomb_does_not_fill_the_memory(tmp_path: Path) -> None:
     zeros = bytes(60_000_000)
     bomb = dataclasses.replace(packed(zeros), uncompressed_size=1000)
-    boast = chunk(STEPS, uncompressed_size=1 << 40)
-    path = crafted(tmp_path / "a", DECLARED, bomb, boast)
+    oversized = chunk(STEPS, uncompressed_size=1 << 40)
+    path = crafted(tmp_path / "a", DECLARED, bomb, oversized)
     del zeros
     long = crafted(tmp_path / "b", DECLARED)
     with long.open("ab") as file:
@@ -334,7 +332,7 @@ def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
     assert peaks[2] < 1.1 * peaks[1]
 
 
-def test_only_the_topics_asked_for_are_delivered(tmp_path: Path) -> None:
+def test_only_requested_topics_are_delivered(tmp_path: Path) -> None:
     path = small_log(tmp_path / "a.mcap")
     everything = list(LogReader(path))
     reader = LogReader(path, topics=(STEP, COMMAND))
@@ -346,7 +344,7 @@ def test_only_the_topics_asked_for_are_delivered(tmp_path: Path) -> None:
         list(LogReader(path, topics=()))
 
 
-def test_a_log_that_grows_is_read_up_to_where_it_ended(tmp_path: Path) -> None:
+def test_a_growing_log_is_read_up_to_its_size_at_opening(tmp_path: Path) -> None:
     log = LogWriter(tmp_path / "a.mcap", START_NS, METADATA, ATTACHMENTS)
     messages = SENT[:40]
     for sample in messages[:20]:
@@ -378,15 +376,15 @@ def test_a_log_is_never_overwritten(tmp_path: Path) -> None:
             LogWriter(tmp_path / name, START_NS, {})
 
 
-def test_a_log_that_is_finished_meanwhile_keeps_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_log_finished_meanwhile_keeps_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     log = LogWriter(log_path(tmp_path, START_NS), START_NS, {})
     exists = Path.exists
 
     def then_finished(path: Path) -> bool:
-        there = exists(path)
+        found = exists(path)
         if not exists(log.path):
             log.finish({})
-        return there
+        return found
 
     monkeypatch.setattr(Path, "exists", then_finished)
     assert log_path(tmp_path, START_NS).name == "20260101T000000Z-2.mcap"

@@ -1,4 +1,4 @@
-"""Messages that wait, are handed over where they arrive, or never came: each is handled, skipped or missing."""
+"""Mailbox, dispatch and gap detection: each message is handled, skipped or missing."""
 
 import threading
 import time
@@ -22,7 +22,7 @@ def sample(count: int, start_s: int = 100) -> Sample:
     return Sample("lowfc/camera/frame", b"", sequence_of(start_s, count), 0, 0)
 
 
-def test_a_gap_is_missing_and_a_new_start_is_none() -> None:
+def test_a_gap_counts_as_missing_and_a_new_start_does_not() -> None:
     box = Mailbox()
     for count in (5, 6, 9):
         box.put(sample(count))
@@ -31,7 +31,7 @@ def test_a_gap_is_missing_and_a_new_start_is_none() -> None:
     assert box.missing == 2
     box.put(sample(42, start_s=101))
     assert box.missing == 3
-    box.put(sample(41, start_s=101))  # old news: delivered, and no gap any more
+    box.put(sample(41, start_s=101))  # a late message is delivered and closes its gap
     assert (box.missing, box.last_sequence) == (2, sequence_of(101, 42))
     assert box.take(0.0) == sample(41, start_s=101)
 
@@ -48,7 +48,7 @@ def test_wake_ends_the_wait_at_once_and_only_once() -> None:
     box.wake()
     box.put(sample(0))
     assert box.take(PATIENCE_S) == sample(0)
-    assert box.take(PATIENCE_S) is None  # the wake that came with the message is not forgotten
+    assert box.take(PATIENCE_S) is None  # the wake before the message is still pending
 
 
 def test_a_message_ends_the_wait_of_another_thread() -> None:
@@ -94,76 +94,76 @@ PERIOD_NS = 1_000_000
 
 
 class Bench:
-    """A dispatch whose handler takes a given time, and messages that come as soon as they are due."""
+    """A Dispatch whose handler takes a given time, and messages that arrive as soon as they are due."""
 
-    def __init__(self, period_ns: int | None = PERIOD_NS, *, told: bool = False) -> None:
+    def __init__(self, period_ns: int | None = PERIOD_NS, *, handle_superseded: bool = False) -> None:
         self.now_ns, self.work_ns = 10**9, 100_000
         self.handled: list[int] = []
         self.superseded: list[int] = []
-        superseded = self._hear(self.superseded) if told else None
-        self.dispatch = Dispatch(FRAME.key, self._hear(self.handled), lambda: self.now_ns, period_ns, superseded)
+        superseded = self._handler(self.superseded) if handle_superseded else None
+        self.dispatch = Dispatch(FRAME.key, self._handler(self.handled), lambda: self.now_ns, period_ns, superseded)
 
-    def _hear(self, where: list[int]) -> Callable[[Sample], None]:
-        def hear(sample: Sample) -> None:
-            where.append(count_of(sample.sequence))
+    def _handler(self, handled: list[int]) -> Callable[[Sample], None]:
+        def handle(sample: Sample) -> None:
+            handled.append(count_of(sample.sequence))
             self.now_ns += self.work_ns
 
-        return hear
+        return handle
 
-    def come(self, count: int, put_ns: int) -> None:
-        self.now_ns = max(self.now_ns + 10_000, put_ns)  # it takes the bus a moment to hand over the next one
+    def arrive(self, count: int, put_ns: int) -> None:
+        self.now_ns = max(self.now_ns + 10_000, put_ns)  # time between two messages of the bus
         self.dispatch.put(Sample(FRAME.key, b"", sequence_of(7, count), put_ns, self.now_ns))
 
 
-def test_of_what_waited_only_the_newest_is_as_good_as_ever() -> None:
-    """The reader stood still for ten periods, while ten messages came."""
-    bench = Bench(told=True)
+def test_only_the_newest_of_the_queued_messages_is_handled() -> None:
+    """The process was stopped for ten periods, in which ten messages arrived."""
+    bench = Bench(handle_superseded=True)
     bench.work_ns = 20_000
     begun_ns = bench.now_ns + 10**8
-    bench.come(0, begun_ns)
+    bench.arrive(0, begun_ns)
     bench.now_ns = begun_ns + 10 * PERIOD_NS + 1000
     for count in range(1, 11):
-        bench.come(count, begun_ns + count * PERIOD_NS)
+        bench.arrive(count, begun_ns + count * PERIOD_NS)
     assert (bench.handled, bench.superseded) == ([0, 10], list(range(1, 10)))
     assert (bench.dispatch.received, bench.dispatch.skipped, bench.dispatch.missing) == (11, 0, 0)
 
 
-def test_who_does_not_want_what_was_superseded_skips_it() -> None:
+def test_superseded_messages_are_skipped_without_their_own_handler() -> None:
     bench = Bench()
     begun_ns = bench.now_ns + 10**8
     bench.now_ns = begun_ns + 9 * PERIOD_NS + PERIOD_NS // 2
     for count in range(10):
-        bench.come(count, begun_ns + count * PERIOD_NS)
+        bench.arrive(count, begun_ns + count * PERIOD_NS)
     assert len(bench.handled) + bench.dispatch.skipped == 10
     assert bench.handled == [9]
 
 
-def test_an_old_message_alone_was_superseded_too() -> None:
+def test_a_single_old_message_counts_as_superseded() -> None:
     bench = Bench()
-    bench.come(0, bench.now_ns + 10**8)
+    bench.arrive(0, bench.now_ns + 10**8)
     bench.now_ns += 10**9
-    bench.come(1, bench.now_ns - LONG_AGO_NS)
+    bench.arrive(1, bench.now_ns - LONG_AGO_NS)
     bench.now_ns += 10**9
-    bench.come(2, bench.now_ns - PERIOD_NS)  # late by a period, and nothing suggests that there is a newer one
+    bench.arrive(2, bench.now_ns - PERIOD_NS)  # late by a period, without a sign of a newer one
     assert bench.handled == [0, 2]
 
 
-def test_where_each_waits_for_the_last_nothing_is_superseded() -> None:
+def test_without_a_period_nothing_is_superseded() -> None:
     bench = Bench(None)
     for count in range(50):
-        bench.come(count, 0)
+        bench.arrive(count, 0)
     assert bench.handled == list(range(50))
     assert bench.dispatch.skipped == 0
 
 
-def test_a_slow_handler_is_never_far_behind() -> None:
-    bench = Bench(told=True)
+def test_a_slow_handler_never_falls_far_behind() -> None:
+    bench = Bench(handle_superseded=True)
     bench.work_ns = 3 * PERIOD_NS
     begun_ns, behind = bench.now_ns + 10**8, []
     for count in range(500):
         put_ns = begun_ns + count * PERIOD_NS
         before = len(bench.handled)
-        bench.come(count, put_ns)
+        bench.arrive(count, put_ns)
         if len(bench.handled) > before:
             behind.append((bench.now_ns - bench.work_ns - put_ns) / PERIOD_NS)
     assert max(behind) < 5
@@ -171,15 +171,15 @@ def test_a_slow_handler_is_never_far_behind() -> None:
     assert len(bench.handled) + len(bench.superseded) + bench.dispatch.skipped == bench.dispatch.received == 500
 
 
-def test_two_threads_that_receive_take_turns() -> None:
-    """Each link of the bus has a thread of its own, and so has the direct way beside it."""
-    inside, together, entered = 0, 0, threading.Barrier(2)
+def test_two_receive_threads_take_turns() -> None:
+    """Each link of the bus has its own thread, and so has the direct link."""
+    inside, most_inside, entered = 0, 0, threading.Barrier(2)
 
     def handle(_: Sample) -> None:
-        nonlocal inside, together
+        nonlocal inside, most_inside
         inside += 1
-        time.sleep(0)  # gives the other thread every chance
-        together = max(together, inside)
+        time.sleep(0)  # lets the other thread run
+        most_inside = max(most_inside, inside)
         inside -= 1
 
     dispatch = Dispatch(FRAME.key, handle, time.monotonic_ns)
@@ -194,20 +194,20 @@ def test_two_threads_that_receive_take_turns() -> None:
         thread.start()
     for thread in threads:
         thread.join(PATIENCE_S)
-    assert (dispatch.received, together) == (2000, 1)
+    assert (dispatch.received, most_inside) == (2000, 1)
 
 
-def test_whatever_the_order_only_what_never_came_is_missing() -> None:
+def test_only_messages_that_never_arrived_are_missing_in_any_order() -> None:
     rng = np.random.default_rng(5)
-    there = [0, *rng.permutation(rng.choice(np.arange(1, 1000), 800, replace=False)).tolist()]
+    arrived = [0, *rng.permutation(rng.choice(np.arange(1, 1000), 800, replace=False)).tolist()]
     gaps, seen = Gaps(0), set()
-    for count in [*there, *there[:50]]:
+    for count in [*arrived, *arrived[:50]]:
         assert gaps.came(count) == (count not in seen)
         seen.add(count)
         assert gaps.missing == max(seen) + 1 - len(seen)
 
 
-def test_a_gap_of_any_size_takes_no_room() -> None:
+def test_a_gap_of_any_size_uses_bounded_memory() -> None:
     gaps = Gaps(0)
     far = 1 << 31
     for count in (0, far, far + 3 * REMEMBERED, far + 6 * REMEMBERED):
@@ -215,4 +215,4 @@ def test_a_gap_of_any_size_takes_no_room() -> None:
     assert gaps.missing == far + 6 * REMEMBERED - 3
     assert len(gaps._open) <= 2 * REMEMBERED
     assert gaps.came(far + 6 * REMEMBERED - 1)
-    assert not gaps.came(7), "too long ago to be known"
+    assert not gaps.came(7), "below the remembered range"

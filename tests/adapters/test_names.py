@@ -1,4 +1,4 @@
-"""Envelopes, sequences, names and starts: what a process accepts from the bus and what it refuses."""
+"""Envelopes, sequences, names and starts: which ones a process accepts from the bus."""
 
 from collections.abc import Callable
 
@@ -35,7 +35,7 @@ def test_an_envelope_is_16_little_endian_bytes() -> None:
 
 @pytest.mark.parametrize("data", [b"", b"x" * 15, b"x" * 17])
 @pytest.mark.parametrize("read", [Envelope.decode, Envelope.decode_checked])
-def test_other_lengths_are_no_envelope(data: bytes, read: Callable[[bytes], object]) -> None:
+def test_other_lengths_are_refused_as_envelopes(data: bytes, read: Callable[[bytes], object]) -> None:
     with pytest.raises(BusError, match=f"16 bytes.*got {len(data)}"):
         read(data)
 
@@ -50,7 +50,7 @@ def test_sequences_grow_past_2_to_the_32_messages_in_any_year(year_start_s: int)
 
 
 @pytest.mark.parametrize("numbers", [(2**64 - 2**33, 0), (2**64 - 1, 0), (0, 2**62 + 1), (0, 2**64 - 1)])
-def test_numbers_that_would_overflow_are_no_envelope(numbers: tuple[int, int]) -> None:
+def test_numbers_that_would_overflow_are_refused(numbers: tuple[int, int]) -> None:
     with pytest.raises(BadMessageError, match=f"below 2.64 - 2.33.*got {numbers[0]} and {numbers[1]} ns"):
         Envelope.decode_checked(Envelope(*numbers).encode())
 
@@ -60,20 +60,20 @@ DAY_S = 86_400
 
 
 def test_starts_far_ahead_are_refused_with_both_clocks() -> None:
-    named: list[tuple[str, str]] = []
+    reported: list[tuple[str, str]] = []
     clock = FakeClock()
-    check = StartCheck(clock, 24.0, lambda start, here: named.append((start, here)))
+    check = StartCheck(clock, 24.0, lambda start, here: reported.append((start, here)))
     assert not check.ahead(sequence_of(NOW_S, 5))
     assert not check.ahead(sequence_of(NOW_S + DAY_S - 5, 0))
     year = sequence_of(NOW_S + 365 * DAY_S, 0)
     assert check.ahead(year)
     assert check.ahead(year + 7)
-    assert named == [("2027-01-01T00:00:00Z", "2026-01-01T00:00:00Z")], "named once"
+    assert reported == [("2027-01-01T00:00:00Z", "2026-01-01T00:00:00Z")], "reported once"
     assert check.ahead((1 << 64) - (1 << 33) - 1)
     later = sequence_of(NOW_S + DAY_S + 60, 0)
     assert check.ahead(later)
     clock.advance(120 * 10**9)
-    assert not check.ahead(later), "what is ahead today is not so tomorrow"
+    assert not check.ahead(later), "no longer ahead after the clock has advanced"
 
 
 @pytest.mark.parametrize(
@@ -81,12 +81,12 @@ def test_starts_far_ahead_are_refused_with_both_clocks() -> None:
     [
         (FakeClock(), 0.0, NOW_S + 400 * DAY_S, False),
         (FakeClock(lockstep=True), 24.0, NOW_S + 400 * DAY_S, False),
-        (FakeClock(5 * 10**9), 24.0, NOW_S, True),  # a host that woke in 1970
-        (FakeClock(4_102_444_800 * 10**9), 24.0, 4_102_444_800, False),  # and one in 2100
+        (FakeClock(5 * 10**9), 24.0, NOW_S, True),  # a host with a clock in 1970
+        (FakeClock(4_102_444_800 * 10**9), 24.0, 4_102_444_800, False),  # a host in 2100
         (FakeClock(4_102_444_800 * 10**9), 24.0, 4_102_444_800 + 2 * DAY_S, True),
     ],
 )
-def test_a_start_is_compared_with_the_hosts_clock(
+def test_starts_are_compared_with_the_hosts_clock(
     clock: FakeClock, max_ahead_h: float, start_s: int, ahead: bool
 ) -> None:
     assert StartCheck(clock, max_ahead_h, lambda start, here: None).ahead(sequence_of(start_s, 1 << 20)) is ahead
@@ -99,21 +99,21 @@ def health(number: int = 0) -> bytes:
     return wire.Health(process=f"forged-{number}", pid=number, state="ready").SerializeToString()
 
 
-def test_a_topic_has_a_number_of_names_and_roles_always_have_room() -> None:
+def test_the_number_of_names_per_topic_is_limited_except_for_roles() -> None:
     names = Names()
     for number in range(MOST_NAMES):
         assert names.admit(MIRROR_STATE, MIRROR_STATE.at(f"m{number}")) == f"m{number}"
     with pytest.raises(BadMessageError, match=f"{MOST_NAMES} names are known.*'one-more'"):
         names.admit(MIRROR_STATE, MIRROR_STATE.at("one-more"))
     assert names.admit(MIRROR_STATE, MIRROR_STATE.at("m7")) == "m7"
-    assert names.admit(HEALTH, HEALTH.at("one-more")) == "one-more", "names of another topic have their own room"
+    assert names.admit(HEALTH, HEALTH.at("one-more")) == "one-more", "each topic has its own limit"
     for number in range(MOST_NAMES - 1):
         names.admit(HEALTH, HEALTH.at(f"p{number}"))
     assert [names.admit(HEALTH, HEALTH.at(role)) for role in Role] == list(Role)
     assert names.admit(FRAME, FRAME.key) == ""
 
 
-def test_names_and_healths_have_a_size() -> None:
+def test_the_sizes_of_names_and_healths_are_limited() -> None:
     names = Names()
     assert names.admit(HEALTH, HEALTH.at("n" * LONGEST_NAME))
     with pytest.raises(BadMessageError, match=f"up to {LONGEST_NAME} characters, got {LONGEST_NAME + 1}"):
@@ -123,7 +123,7 @@ def test_names_and_healths_have_a_size() -> None:
         names.health(HEALTH.at("camera"), body)
 
 
-def test_a_very_long_key_is_not_remembered() -> None:
+def test_a_very_long_key_is_not_cached() -> None:
     topic_of.cache_clear()
     with pytest.raises(KeyError):
         topic_of(HEALTH.at("n" * 10_000))
@@ -146,7 +146,7 @@ def forge(hub: MemoryHub) -> Callable[[], None]:
     return flood
 
 
-def test_forged_names_fill_no_process_and_are_one_event(hub: MemoryHub, forge: Callable[[], None]) -> None:
+def test_forged_names_do_not_fill_a_process_and_give_one_event(hub: MemoryHub, forge: Callable[[], None]) -> None:
     listener = Listener(hub, FakeClock())
     camera = listener.service("camera")
     forge()
@@ -158,7 +158,7 @@ def test_forged_names_fill_no_process_and_are_one_event(hub: MemoryHub, forge: C
     assert event.startswith(f"BAD_MESSAGE {FORGED - MOST_NAMES} messages on lowfc/health/* could not be read")
 
 
-def test_a_process_that_returns_under_many_numbers_is_remembered_once(hub: MemoryHub) -> None:
+def test_a_process_with_many_pids_is_stored_once(hub: MemoryHub) -> None:
     camera = Listener(hub, FakeClock()).service("camera")
     stranger = MemoryBus(hub, "operator", FakeClock()).publisher(HEALTH, "stranger")
     for number in range(FORGED):
@@ -168,7 +168,7 @@ def test_a_process_that_returns_under_many_numbers_is_remembered_once(hub: Memor
     assert len(camera._known) == 1
 
 
-def test_a_launcher_and_a_view_are_not_filled_either(hub: MemoryHub) -> None:
+def test_forged_names_do_not_fill_launcher_and_viewer(hub: MemoryHub) -> None:
     watch, view = Watch({}, []), Accumulator()
     launcher = MemoryBus(hub, "launcher", FakeClock())
     launcher.subscribe(HEALTH, watch.hear)

@@ -1,4 +1,4 @@
-"""What a process needs of its host: clocks, children that die with it, real time, and advice on packages."""
+"""Process adapters: clocks, child processes, real-time set-up, and install advice."""
 
 import json
 import os
@@ -22,9 +22,9 @@ from lowfc.contract.errors import DataFileError
 from tests.support.loops import until
 
 
-def test_all_who_ask_at_once_have_one_offset(tmp_path: Path) -> None:
-    with ThreadPoolExecutor(8) as asking:
-        assert len(set(asking.map(boot_offset_ns, [tmp_path] * 8))) == 1
+def test_simultaneous_calls_get_the_same_clock_offset(tmp_path: Path) -> None:
+    with ThreadPoolExecutor(8) as pool:
+        assert len(set(pool.map(boot_offset_ns, [tmp_path] * 8))) == 1
     (file,) = tmp_path.iterdir()
     assert file.stat().st_mode & 0o777 == 0o600
     file.write_text("noon")
@@ -32,35 +32,35 @@ def test_all_who_ask_at_once_have_one_offset(tmp_path: Path) -> None:
         boot_offset_ns(tmp_path)
 
 
-def test_the_clock_is_the_hosts_and_does_not_step_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_clock_does_not_step_with_the_wall_clock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     clock = HostClock(tmp_path)
     before = clock.now_ns()
-    monkeypatch.setattr(time, "time_ns", lambda: 0)  # somebody sets the wall clock back to 1970
+    monkeypatch.setattr(time, "time_ns", lambda: 0)  # the wall clock is set back to 1970
     assert HostClock(tmp_path).now_ns() >= before
     assert clock.host_ns() >= before
     assert clock.start_s == before // 1_000_000_000 or clock.start_s + 1 == before // 1_000_000_000
     assert clock.now_ns() - time.monotonic_ns() <= clock.offset_ns
 
 
-def test_it_knows_how_far_it_is_from_the_wall_clock(tmp_path: Path) -> None:
+def test_the_clock_reports_its_lead_over_the_wall_clock(tmp_path: Path) -> None:
     clock = HostClock(tmp_path)
     assert abs(clock.ahead_ns()) < 1_000_000_000
     (file,) = tmp_path.iterdir()
-    file.write_text(str(clock.offset_ns - 3600 * 10**9))  # as fixed before NTP was there
+    file.write_text(str(clock.offset_ns - 3600 * 10**9))  # as if fixed before NTP synchronised
     late = HostClock(tmp_path)
     assert abs(late.ahead_ns() + 3600 * 10**9) < 1_000_000_000
     assert abs(SimulatedClock(base=tmp_path).ahead_ns() + 3600 * 10**9) < 1_000_000_000
 
 
-def test_sleep_ends_after_its_deadline_and_not_before(tmp_path: Path) -> None:
+def test_sleep_ends_at_its_deadline(tmp_path: Path) -> None:
     clock = HostClock(tmp_path)
     deadline = clock.now_ns() + 3_000_000
     clock.sleep_until_ns(deadline)
     assert clock.now_ns() >= deadline
-    clock.sleep_until_ns(deadline)  # passed: no wait, no error
+    clock.sleep_until_ns(deadline)  # already passed: no wait, no error
 
 
-def test_simulated_time_moves_by_hand_and_host_time_by_itself(tmp_path: Path) -> None:
+def test_simulated_time_is_set_explicitly_and_host_time_advances(tmp_path: Path) -> None:
     host = HostClock(tmp_path)
     clock = SimulatedClock(base=tmp_path)
     assert (clock.now_ns(), clock.start_s, clock.lockstep) == (SIMULATED_START_NS, SIMULATED_START_NS // 10**9, True)
@@ -73,7 +73,7 @@ def test_simulated_time_moves_by_hand_and_host_time_by_itself(tmp_path: Path) ->
 
 PATIENCE_S = 30.0
 
-# Starts a child that ignores SIGTERM, and says its number.
+# Starts a child that ignores SIGTERM, and prints its process id.
 PARENT = """
 import signal, sys, time
 from pathlib import Path
@@ -87,15 +87,15 @@ time.sleep(600)
 
 
 def command_line(pid: int) -> bytes:
-    """Of a process; empty once it is gone, or nobody has waited for it."""
+    """Command line of a process; empty once it has ended, also as a zombie."""
     try:
         return Path(f"/proc/{pid}/cmdline").read_bytes()
     except OSError:
         return b""
 
 
-def test_a_child_dies_with_a_parent_that_was_killed(tmp_path: Path) -> None:
-    parent = subprocess.Popen([sys.executable, "-c", PARENT, tmp_path / "said"], stdout=subprocess.PIPE, text=True)
+def test_a_child_ends_when_its_parent_is_killed(tmp_path: Path) -> None:
+    parent = subprocess.Popen([sys.executable, "-c", PARENT, tmp_path / "stderr"], stdout=subprocess.PIPE, text=True)
     pid = int(parent.stdout.readline())
     until(lambda: b"SIG_IGN" in command_line(pid) and b"prctl" not in command_line(pid))
     parent.kill()
@@ -103,24 +103,24 @@ def test_a_child_dies_with_a_parent_that_was_killed(tmp_path: Path) -> None:
     until(lambda: not command_line(pid))
 
 
-def test_a_child_is_the_program_itself_in_a_session_of_its_own(tmp_path: Path) -> None:
+def test_a_child_is_the_program_itself_in_its_own_session(tmp_path: Path) -> None:
     program = "import os, sys, time; sys.stderr.write(repr((os.getpid(), os.getsid(0), os.environ['WORD'])))"
-    child = Child("one", [sys.executable, "-c", program], tmp_path / "said", {**os.environ, "WORD": "heard"})
+    child = Child("one", [sys.executable, "-c", program], tmp_path / "stderr", {**os.environ, "WORD": "received"})
     child.start()
     child.process.wait(PATIENCE_S)
-    assert (child.status, child.stderr_tail()) == (0, repr((child.process.pid, child.process.pid, "heard")))
+    assert (child.status, child.stderr_tail()) == (0, repr((child.process.pid, child.process.pid, "received")))
     child.stop(PATIENCE_S)
 
 
-def test_how_a_child_ended_and_that_its_program_is_missing_are_named(tmp_path: Path) -> None:
-    child = Child("one", ["sleep", "600"], tmp_path / "said")
+def test_the_end_of_a_child_and_a_missing_program_are_reported(tmp_path: Path) -> None:
+    child = Child("one", ["sleep", "600"], tmp_path / "stderr")
     child.start()
     child.process.kill()
     child.process.wait(PATIENCE_S)
     assert child.how_it_ended() == "one was killed by SIGKILL"
     child.stop(PATIENCE_S)
     with pytest.raises(FileNotFoundError, match="no-such-program"):
-        Child("one", ["no-such-program"], tmp_path / "said").start()
+        Child("one", ["no-such-program"], tmp_path / "stderr").start()
 
 
 LATENCY_DEVICE = "/dev/cpu_dma_latency"
@@ -142,7 +142,7 @@ print(json.dumps({{
 }}))
 """
 
-# What a host without privileges refuses; the process gives its own up first.
+# The process drops its privileges and limits first.
 UNPRIVILEGED = """
 import ctypes, resource
 resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
@@ -153,7 +153,7 @@ assert ctypes.CDLL(None).capset(version_3, no_capabilities) == 0
 
 NO_DEVICE = """
 import lowfc.adapters.process.realtime
-lowfc.adapters.process.realtime._LATENCY_DEVICE = "/there/is/none"
+lowfc.adapters.process.realtime._LATENCY_DEVICE = "/no/such/device"
 """
 
 
@@ -164,7 +164,7 @@ def report(call: str, limits: str = "") -> dict[str, object]:
     return json.loads(done.stdout)
 
 
-def test_the_interpreter_is_quiet_and_nothing_unasked_is_changed() -> None:
+def test_set_up_changes_only_blas_threads_and_garbage_collection_by_default() -> None:
     found = report("set_up(None, None, lock_memory=False, disable_cpu_idle=False)")
     assert found["granted"] == ["one BLAS thread", "garbage collector off"]
     assert found["refused"] == []
@@ -174,7 +174,7 @@ def test_the_interpreter_is_quiet_and_nothing_unasked_is_changed() -> None:
     assert set(found["blas"]) == {1}
 
 
-def test_what_the_host_refuses_is_named_with_its_cost() -> None:
+def test_refused_measures_are_reported_with_their_cost() -> None:
     found = report("set_up(50, {4096}, lock_memory=True, disable_cpu_idle=True)", UNPRIVILEGED + NO_DEVICE)
     measures = [measure for measure, _ in found["refused"]]
     assert [measure.split(" (")[0] for measure in measures] == [
@@ -189,8 +189,8 @@ def test_what_the_host_refuses_is_named_with_its_cost() -> None:
     assert found["granted"] == ["one BLAS thread", "garbage collector off"]
 
 
-def test_locked_memory_is_what_is_used_and_not_what_is_reserved() -> None:
-    reserve = "from mmap import *; kept = mmap(-1, 1 << 28, MAP_PRIVATE | MAP_ANONYMOUS)"
+def test_locking_memory_does_not_allocate_reserved_memory() -> None:
+    reserve = "from mmap import *; reserved = mmap(-1, 1 << 28, MAP_PRIVATE | MAP_ANONYMOUS)"
     found = report("set_up(None, None, lock_memory=True, disable_cpu_idle=False)", reserve)
     if found["refused"]:
         pytest.skip(str(found["refused"]))
@@ -198,12 +198,12 @@ def test_locked_memory_is_what_is_used_and_not_what_is_reserved() -> None:
     assert found["resident_kb"] < 150_000
 
 
-def may_be_real_time() -> bool:
+def fifo_permitted() -> bool:
     limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[1]
     return os.geteuid() == 0 or limit == resource.RLIM_INFINITY or limit >= 10
 
 
-@pytest.mark.skipif(not may_be_real_time(), reason="this user may not have SCHED_FIFO")
+@pytest.mark.skipif(not fifo_permitted(), reason="this user may not have SCHED_FIFO")
 def test_a_host_that_allows_it_grants_real_time() -> None:
     cpu = min(os.sched_getaffinity(0))
     found = report(f"set_up(10, {{{cpu}}}, lock_memory=False, disable_cpu_idle=False)")
@@ -213,33 +213,33 @@ def test_a_host_that_allows_it_grants_real_time() -> None:
     assert found["granted"][-2:] == [f"processors [{cpu}]", "SCHED_FIFO priority 10"]
 
 
-@pytest.mark.skipif(not os.access(LATENCY_DEVICE, os.W_OK), reason="this user may not keep processors awake")
-def test_processors_are_kept_awake_as_long_as_the_process_lives() -> None:
+@pytest.mark.skipif(not os.access(LATENCY_DEVICE, os.W_OK), reason="this user may not disable CPU idle")
+def test_cpu_idle_stays_disabled_while_the_process_lives() -> None:
     twice = "[set_up(None, None, lock_memory=False, disable_cpu_idle=True) for _ in range(2)][-1]"
     found = report(twice)
     assert (found["granted"][-1], found["open"].count(LATENCY_DEVICE)) == ("processors awake", 1)
 
 
-def test_the_recorder_steps_back_out_of_its_parents_class() -> None:
-    limits = "os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))" if may_be_real_time() else ""
+def test_the_recorder_leaves_its_parents_scheduling_class() -> None:
+    limits = "os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))" if fifo_permitted() else ""
     cpu = min(os.sched_getaffinity(0))
     found = report(f"step_back(None, {{{cpu}}})", limits)
     assert (found["policy"], found["cpus"]) == (os.SCHED_OTHER, [cpu])
     assert found["granted"] == ["normal scheduling class", f"processors [{cpu}]"]
 
 
-def test_processes_are_kept_apart_as_far_as_there_are_processors() -> None:
-    def of(*cpus: int, simulated: bool = True) -> list[list[int]]:
+def test_processes_are_spread_over_the_available_processors() -> None:
+    def cpus_of(*cpus: int, simulated: bool = True) -> list[list[int]]:
         return list(spread(cpus, simulated=simulated).values())
 
-    assert of(3) == []
-    assert of(5, 1) == [[1], [5], [5], []]
-    assert of(5, 1, simulated=False) == [[1], [5], [1], [1]]
-    assert of(0, 1, 2) == [[0], [1], [2], [0, 2]]
-    assert of(0, 1, 2, 3) == [[0], [1], [2], [0, 2, 3]]
+    assert cpus_of(3) == []
+    assert cpus_of(5, 1) == [[1], [5], [5], []]
+    assert cpus_of(5, 1, simulated=False) == [[1], [5], [1], [1]]
+    assert cpus_of(0, 1, 2) == [[0], [1], [2], [0, 2]]
+    assert cpus_of(0, 1, 2, 3) == [[0], [1], [2], [0, 2, 3]]
 
 
-def test_the_advice_names_the_packages_of_an_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_install_advice_lists_the_packages_of_an_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     assert install_advice("deploy") == f"{sys.executable} -m pip install 'cryptography>=44'"
 
     def missing(name: str) -> list[str]:
@@ -249,7 +249,7 @@ def test_the_advice_names_the_packages_of_an_extra(monkeypatch: pytest.MonkeyPat
     assert install_advice("plots").endswith("pip install -e '.[plots]' in its checkout")
 
 
-def test_the_cause_of_zenohs_fault_is_without_its_sources() -> None:
+def test_zenohs_errors_are_shown_without_source_locations() -> None:
     text = (
         "Can not create a new TCP listener bound to tcp/127.0.0.1:4: [127.0.0.1:4: Address already in use "
         "(os error 98) at /root/.cargo/git/zenoh/io/tcp.rs:61.] at /root/.cargo/git/zenoh/unicast.rs:338."

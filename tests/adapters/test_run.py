@@ -1,4 +1,4 @@
-"""A run's directory: links, secret, starts, the latch of safe mode, and files that are replaced as a whole."""
+"""A run's directory: links, secret, starts, the safe-mode latch, and atomic replacement of files."""
 
 import errno
 import os
@@ -23,7 +23,7 @@ from tests.support.loops import lowfc, until
 pytestmark = pytest.mark.usefixtures("own_runtime")
 
 
-def test_a_run_has_ports_a_secret_and_closed_doors() -> None:
+def test_a_run_has_ports_a_secret_and_private_files() -> None:
     run = open_run("night", mirrors=("dm", "tip"))
     assert set(run.links.ports) == {"camera", "controller", "mirror-dm", "mirror-tip", "recorder"}
     assert len(set(run.links.ports.values())) == 5
@@ -40,15 +40,15 @@ def test_a_run_has_ports_a_secret_and_closed_doors() -> None:
     assert not run.path.exists()
 
 
-def test_all_who_open_a_run_at_once_get_the_same(own_runtime: Path) -> None:
-    with ThreadPoolExecutor(8) as asking:
-        links = [run.links for run in asking.map(open_run, ["one"] * 8)]
+def test_simultaneous_opens_get_the_same_run(own_runtime: Path) -> None:
+    with ThreadPoolExecutor(8) as pool:
+        links = [run.links for run in pool.map(open_run, ["one"] * 8)]
     assert all((one, one.secret) == (links[0], links[0].secret) for one in links)
     assert [path.name for path in (own_runtime / "lowfc").iterdir()] == ["one"]
 
 
 @pytest.mark.parametrize("name", ["", "../up", "a/b", ".hidden", "Night", "x" * 49, "a b"])
-def test_a_name_that_is_no_name_is_refused(name: str) -> None:
+def test_an_invalid_run_name_is_refused(name: str) -> None:
     with pytest.raises(BusError, match="a run's name"):
         open_run(name)
 
@@ -77,9 +77,7 @@ def test_damaged_files_of_a_run_are_an_error(name: str, text: str | None) -> Non
         _ = open_run("night").links.secret
 
 
-def test_directories_of_others_open_ones_and_links_are_refused(
-    own_runtime: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_foreign_public_and_linked_directories_are_refused(own_runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     base = own_runtime / "lowfc"
     base.mkdir(mode=0o755)
     with pytest.raises(DataFileError, match="mode 700"):
@@ -96,7 +94,7 @@ def test_directories_of_others_open_ones_and_links_are_refused(
         own_directory(own_runtime / "link")
 
 
-def test_a_runtime_directory_that_is_none_is_an_error(own_runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_invalid_runtime_directory_is_an_error(own_runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (own_runtime / "lowfc").write_text("")
     with pytest.raises(DataFileError, match="should be a directory"):
         runtime_base()
@@ -104,8 +102,10 @@ def test_a_runtime_directory_that_is_none_is_an_error(own_runtime: Path, monkeyp
     with pytest.raises(DataFileError, match="XDG_RUNTIME_DIR"):
         runtime_base()
     monkeypatch.delenv("XDG_RUNTIME_DIR")
-    monkeypatch.setattr(os, "geteuid", lambda: 4_000_000_000)  # nobody's: the directory is made, and is not theirs
-    shared = Path("/tmp/lowfc-4000000000")  # noqa: S108  # the place it is about
+    monkeypatch.setattr(
+        os, "geteuid", lambda: 4_000_000_000
+    )  # an unused user id: the created directory belongs to another user
+    shared = Path("/tmp/lowfc-4000000000")  # noqa: S108  # the path under test
     try:
         with pytest.raises(DataFileError, match="of user 4000000000"):
             runtime_base()
@@ -130,23 +130,23 @@ def test_a_start_is_claimed_once() -> None:
 
 
 @pytest.mark.parametrize("text", ["", "9" * 5000, str(2**32), "\u00b2", "-7", "later"])
-def test_a_start_that_is_none_is_not_believed(text: str) -> None:
+def test_an_invalid_stored_start_is_ignored(text: str) -> None:
     links = open_run("night").links
     file = links.secret_file.parent / "start-camera"
     file.write_text(text)
     assert [links.claim_start("camera", 100), links.claim_start("camera", 100)] == [100, 101]
     file.unlink()
-    file.mkdir()  # which root cannot write either
+    file.mkdir()  # not writable, even for root
     assert links.claim_start("camera", 100) == 100
 
 
-def test_safe_is_asked_for_where_the_directory_cannot_be_written() -> None:
+def test_safe_is_requested_even_if_the_runs_directory_is_read_only() -> None:
     run = open_run("night")
     bus = ZenohBus(run.links, "controller", HostClock())
-    asked: list[str] = []
+    requested: list[str] = []
 
     def answer(query: Query) -> None:
-        asked.append(query.name)
+        requested.append(query.name)
         query.reply(
             wire.Request(name=query.name, accepted=True, reply="the mirror relaxes to flat").SerializeToString()
         )
@@ -161,7 +161,7 @@ def test_safe_is_asked_for_where_the_directory_cannot_be_written() -> None:
     finally:
         subprocess.run(["umount", "--lazy", run.path], check=True)
         bus.close()
-    assert (done.exit_code, asked) == (0, ["safe"]), done.output
+    assert (done.exit_code, requested) == (0, ["safe"]), done.output
 
 
 @pytest.fixture
@@ -171,7 +171,7 @@ def files(tmp_path: Path) -> tuple[Path, Path]:
     return tmp_path / "run" / "safe", tmp_path / "state" / "lowfc" / "night.safe"
 
 
-def test_it_is_kept_in_both_places_and_either_is_enough_to_restore_the_other(files: tuple[Path, Path]) -> None:
+def test_the_latch_is_kept_in_two_places_and_each_restores_the_other(files: tuple[Path, Path]) -> None:
     first = Latch(files)
     assert (first.safe, first.kept) == (False, True)
     first.set(True)
@@ -190,7 +190,7 @@ def test_it_is_kept_in_both_places_and_either_is_enough_to_restore_the_other(fil
     assert not Latch(files).safe
 
 
-def test_the_former_name_counts(files: tuple[Path, Path]) -> None:
+def test_a_latch_under_its_former_name_counts(files: tuple[Path, Path]) -> None:
     files[0].with_name("safed").touch()
     latch = Latch(files)
     assert latch.safe
@@ -200,14 +200,14 @@ def test_the_former_name_counts(files: tuple[Path, Path]) -> None:
     assert not files[0].with_name("safed").exists(), "cleared under either name"
 
 
-def test_a_directory_that_is_gone_harms_nobody_and_comes_back(
+def test_a_missing_directory_does_no_harm_and_is_used_again_later(
     files: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(latch_module, "RETRY_S", 0.01)
-    said: list[str] = []
+    reported: list[str] = []
 
     def failed(why: str) -> None:
-        said.append(why)
+        reported.append(why)
         raise OSError("the disk is full")
 
     latch = Latch(files, failed)
@@ -215,8 +215,8 @@ def test_a_directory_that_is_gone_harms_nobody_and_comes_back(
     files[0].parent.touch()  # a file where the run's directory was
     latch.set(True)
     until(files[1].exists)
-    until(lambda: bool(said))
-    assert str(files[0]) in said[0]
+    until(lambda: bool(reported))
+    assert str(files[0]) in reported[0]
     latch.set(False)
     until(lambda: not files[1].exists())
     latch.set(True)
@@ -224,26 +224,26 @@ def test_a_directory_that_is_gone_harms_nobody_and_comes_back(
     files[0].parent.mkdir()
     until(lambda: all(file.exists() for file in files))
     latch.close()
-    assert len(said) == 1, "said once, however often it was tried, and who is told cannot end it"
+    assert len(reported) == 1, "reported once despite retries, and a failing handler does not end the thread"
 
 
-def test_what_cannot_be_read_is_safe_and_what_cannot_be_written_is_not_kept(tmp_path: Path) -> None:
-    said: list[str] = []
+def test_an_unreadable_latch_is_safe_and_an_unwritable_one_is_not_kept(tmp_path: Path) -> None:
+    reported: list[str] = []
     loop = tmp_path / "loop"
     loop.symlink_to(loop)
-    latch = Latch([loop / "safe"], said.append)
+    latch = Latch([loop / "safe"], reported.append)
     assert (latch.safe, latch.kept) == (True, False)
-    assert "cannot be read" in said[0]
+    assert "cannot be read" in reported[0]
     latch.close()
     (tmp_path / "file").touch()
-    nowhere = Latch([tmp_path / "file" / "safe"], said.append)
+    nowhere = Latch([tmp_path / "file" / "safe"], reported.append)
     assert (nowhere.safe, nowhere.kept) == (False, False)
     nowhere.set(True)
     nowhere.close()
-    assert "cannot be written" in said[-1]
+    assert "cannot be written" in reported[-1]
 
 
-def test_a_run_of_a_launcher_needs_its_directory_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_latch_of_a_launchers_run_is_in_its_directory_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("STATE_DIRECTORY", raising=False)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "home"))
     by_hand = open_run("night", base=tmp_path)
@@ -254,7 +254,7 @@ def test_a_run_of_a_launcher_needs_its_directory_alone(tmp_path: Path, monkeypat
     assert latch_files(launched) == (tmp_path / "launched" / "safe",)
 
 
-def test_what_cannot_be_written_leaves_the_old_file_and_nothing_else(tmp_path: Path, monkeypatch) -> None:
+def test_a_failed_write_leaves_the_old_file_only(tmp_path: Path, monkeypatch) -> None:
     path = tmp_path / "file"
     for content in (b"former", b"first"):
         write_whole(path, content)

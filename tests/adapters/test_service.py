@@ -31,7 +31,7 @@ def service(hub: MemoryHub, clock: FakeClock, name: str, **more: object) -> Serv
     return Service(name, "night", clock, MemoryBus(hub, name, clock), **more)
 
 
-def test_health_is_sent_when_due_and_tells_everything(hub: MemoryHub, clock: FakeClock) -> None:
+def test_health_is_published_when_due_with_all_fields(hub: MemoryHub, clock: FakeClock) -> None:
     listener = Listener(hub, clock, HEALTH)
 
     def fill(health: wire.Health) -> None:
@@ -64,18 +64,18 @@ def test_health_is_sent_when_due_and_tells_everything(hub: MemoryHub, clock: Fak
     }
 
 
-@pytest.mark.parametrize(("ahead_ms", "said"), [(-99, False), (100, False), (101, True), (-250, True)])
-def test_a_clock_that_is_off_is_reported_at_the_start(
-    hub: MemoryHub, clock: FakeClock, monkeypatch: pytest.MonkeyPatch, ahead_ms: int, said: bool
+@pytest.mark.parametrize(("ahead_ms", "reported"), [(-99, False), (100, False), (101, True), (-250, True)])
+def test_a_wrong_clock_is_reported_at_the_start(
+    hub: MemoryHub, clock: FakeClock, monkeypatch: pytest.MonkeyPatch, ahead_ms: int, reported: bool
 ) -> None:
     listener = Listener(hub, clock, HEALTH)
     monkeypatch.setattr(clock, "ahead_ns", lambda: ahead_ms * 1_000_000)
     service(hub, clock, "camera")
     found = listener.event_texts(f"CLOCK_OFF this boot's clock is {ahead_ms:+d} ms from the wall clock")
-    assert len(found) == len(listener.event_texts("CLOCK_OFF")) == said
+    assert len(found) == len(listener.event_texts("CLOCK_OFF")) == reported
 
 
-def test_what_a_mailbox_got_is_in_health(hub: MemoryHub, clock: FakeClock) -> None:
+def test_health_has_the_counts_of_a_mailbox(hub: MemoryHub, clock: FakeClock) -> None:
     camera, controller = service(hub, clock, "camera"), service(hub, clock, "controller")
     box = controller.mailbox(FRAME)
     frames = camera.publisher(FRAME)
@@ -87,7 +87,7 @@ def test_what_a_mailbox_got_is_in_health(hub: MemoryHub, clock: FakeClock) -> No
     assert (count.received, count.skipped, count.missing, count.last_sequence) == (3, 2, 1, last)
 
 
-def test_events_are_published_and_warnings_shown(
+def test_events_are_published_and_warnings_printed(
     hub: MemoryHub, clock: FakeClock, capsys: pytest.CaptureFixture[str]
 ) -> None:
     listener = Listener(hub, clock, HEALTH)
@@ -100,25 +100,27 @@ def test_events_are_published_and_warnings_shown(
     ]
     assert listener.messages(EVENT)[-1].message == "FRAMES_BACK frames are back after 12 ms"
     assert from_timestamp(listener.messages(EVENT)[-1].timestamp) == clock.now_ns()
-    shown = capsys.readouterr().err
-    assert shown == "controller: REALTIME_REFUSED the host refused SCHED_FIFO: a longer tail\n"
+    printed = capsys.readouterr().err
+    assert printed == "controller: REALTIME_REFUSED the host refused SCHED_FIFO: a longer tail\n"
 
 
-def test_processes_meet_when_each_has_heard_the_other(hub: MemoryHub, clock: FakeClock) -> None:
+def test_processes_are_connected_when_each_has_received_the_others_health(hub: MemoryHub, clock: FakeClock) -> None:
     camera, controller = service(hub, clock, "camera"), service(hub, clock, "controller")
     assert camera.wait_for(["controller", "mirror-dm"], 0.0) == ("controller", "mirror-dm")
-    camera.state = controller.state = "ready"  # controller heard camera's Health before it sent its own
+    camera.state = controller.state = "ready"  # controller received camera's Health before publishing its own
     assert camera.wait_for(["controller"], 0.0) == ()
-    assert controller.wait_for(["camera"], 0.0) == ("camera",)  # camera's Health was sent before it heard controller
+    assert controller.wait_for(["camera"], 0.0) == (
+        "camera",
+    )  # camera's Health was published before it received controller's
     camera.beat()
     assert controller.wait_for(["camera"], 0.0) == ()
     mirror = service(hub, clock, "mirror-dm")
-    mirror.beat()  # there, and not ready
+    mirror.beat()  # running, but not ready
     assert camera.wait_for(["mirror-dm"], 0.0) == ("mirror-dm",)
     assert camera.last_health["mirror-dm"].state == "starting"
 
 
-def test_a_newcomer_is_answered_before_the_next_health_is_due(hub: MemoryHub, clock: FakeClock) -> None:
+def test_a_newcomer_gets_a_health_before_the_next_is_due(hub: MemoryHub, clock: FakeClock) -> None:
     camera = service(hub, clock, "camera")
     camera.beat()
     listener = Listener(hub, clock, HEALTH)
@@ -130,12 +132,12 @@ def test_a_newcomer_is_answered_before_the_next_health_is_due(hub: MemoryHub, cl
     again = service(hub, clock, "controller")
     camera.beat()
     assert len(listener.messages(HEALTH)) == 2  # one of each process
-    again.beat()  # the same name and the same process: no news
+    again.beat()  # the same name and process: not a newcomer
     camera.beat()
     assert [health.process for health in listener.messages(HEALTH)] == ["controller", "camera", "controller"]
 
 
-def test_a_flood_of_bad_messages_is_one_event_and_the_last_health_has_all_counts(
+def test_a_flood_of_bad_messages_gives_one_event_and_the_last_health_has_all_counts(
     hub: MemoryHub, clock: FakeClock
 ) -> None:
     listener = Listener(hub, clock, HEALTH)
@@ -160,7 +162,7 @@ def test_a_flood_of_bad_messages_is_one_event_and_the_last_health_has_all_counts
     }
 
 
-def test_a_message_that_cannot_be_read_is_an_event_and_neither_a_traceback_nor_the_end(
+def test_an_unreadable_message_gives_an_event_without_traceback_or_stop(
     hub: MemoryHub, clock: FakeClock, capsys: pytest.CaptureFixture[str]
 ) -> None:
     listener = Listener(hub, clock, HEALTH)
@@ -184,14 +186,14 @@ def test_a_message_that_cannot_be_read_is_an_event_and_neither_a_traceback_nor_t
     assert "Traceback" not in capsys.readouterr().err
 
 
-def test_a_stop_wakes_the_loop(hub: MemoryHub, clock: FakeClock) -> None:
+def test_stop_wakes_the_loop(hub: MemoryHub, clock: FakeClock) -> None:
     camera = service(hub, clock, "camera")
     box = camera.mailbox(FRAME)
-    teller = threading.Timer(0.01, camera.stop, ["told"])
-    teller.start()
+    timer = threading.Timer(0.01, camera.stop, ["stopped by test"])
+    timer.start()
     assert box.take(PATIENCE_S) is None
-    teller.join()
-    assert (camera.running, camera.why) == (False, "told")
+    timer.join()
+    assert (camera.running, camera.why) == (False, "stopped by test")
 
 
 LOOP = """
@@ -227,7 +229,7 @@ def test_a_signal_ends_the_loop_and_a_second_interrupt_the_process(number: str, 
         assert process.wait(PATIENCE_S) == status
 
 
-def test_a_process_says_once_that_it_is_ready_and_once_for_whom_it_waits(
+def test_a_process_prints_once_that_it_is_ready_and_once_what_it_waits_for(
     hub: MemoryHub, clock: FakeClock, capsys: pytest.CaptureFixture[str]
 ) -> None:
     camera = service(hub, clock, "camera", announces=True)
@@ -242,9 +244,9 @@ def test_a_process_says_once_that_it_is_ready_and_once_for_whom_it_waits(
         for process in (camera, controller, quiet):
             process.state = "running"
             process.beat()
-    shown = capsys.readouterr().err.splitlines()
-    assert shown[:2] == ["camera: ready (run night)", "controller: ready (run night)"]
-    assert shown[2:] == ["camera: waiting for recorder (run night)", "controller: waiting for a camera (run night)"]
+    printed = capsys.readouterr().err.splitlines()
+    assert printed[:2] == ["camera: ready (run night)", "controller: ready (run night)"]
+    assert printed[2:] == ["camera: waiting for recorder (run night)", "controller: waiting for a camera (run night)"]
     camera.work = 1
     controller.stop("SIGINT")
     for process in (camera, controller, quiet):
