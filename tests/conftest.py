@@ -1,4 +1,4 @@
-"""What all tests share: runs that leave nothing behind, and no silent skips where none are allowed."""
+"""Fixtures of all tests: private runtime directories and caches, and no silent skips where none are allowed."""
 
 import os
 from collections.abc import Iterator
@@ -11,33 +11,33 @@ LONGEST = (
     *("test_lockstep", "test_gain_watch", "test_calibrate", "test_optics_twin", "test_tutorials", "test_validate"),
     *("test_commission", "test_calibrate_commands", "test_validate_figures", "test_what_if", "test_guard", "test_site"),
 )
-"""Files that are begun first, so that no worker is left alone with one of them at the end."""
+"""Test files that are started first, so that no worker runs one of them alone at the end."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    place = {name: number for number, name in enumerate(LONGEST)}
-    items.sort(key=lambda item: place.get(item.path.stem, len(LONGEST)))
+    order = {name: number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: order.get(item.path.stem, len(LONGEST)))
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _private_runtime(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Give all runs of the tests a runtime directory of their own, so that they meet no loop of the user's."""
+    """Give all tests a private runtime directory, separate from the user's loops."""
     path = tmp_path_factory.mktemp("runtime")
     path.chmod(0o700)
     os.environ["XDG_RUNTIME_DIR"] = str(path)
-    os.environ["XDG_STATE_HOME"] = str(path / "state")  # where latches of safe mode are kept
+    os.environ["XDG_STATE_HOME"] = str(path / "state")  # for latches of safe mode
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _private_cache(pytestconfig: pytest.Config) -> None:
-    """Keep optical models apart from the user's, in a folder that all workers and later sessions share."""
+    """Cache optical models separately from the user's, in a folder shared by all workers and later sessions."""
     assert pytestconfig.cache is not None
     os.environ["XDG_CACHE_HOME"] = str(pytestconfig.cache.mkdir("home"))
 
 
 @pytest.fixture(autouse=True)
 def _same_process() -> Iterator[None]:
-    """A command run in this process leaves later tests no scheduling class, niceness or processors of its own."""
+    """Check that a command run in this process leaves scheduling class, niceness and processors unchanged."""
     before = _scheduling()
     yield
     assert _scheduling() == before
@@ -49,7 +49,7 @@ def _scheduling() -> tuple[int, int, set[int]]:
 
 @pytest.fixture
 def own_runtime(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Give a test a runtime directory of its own, in which there is no run yet, and no latch of another test's run."""
+    """Give a test its own runtime directory, without runs and latches of other tests."""
     path = tmp_path_factory.mktemp("own")  # not `tmp_path`: a folder `lowfc` there would hide the package
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(path))
     monkeypatch.setenv("XDG_STATE_HOME", str(path / "state"))
@@ -58,7 +58,7 @@ def own_runtime(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Mo
 
 @pytest.fixture
 def without_drawings(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reports whose drawings nobody looks at have none: they take ten times as long as all the rest."""
+    """Omit the drawings of reports, which take ten times as long as the rest."""
     monkeypatch.setattr("lowfc.programs.logs.report.drawings._DRAWINGS", {})
 
 
@@ -69,7 +69,7 @@ def pytest_runtest_logreport(report: pytest.TestReport) -> None:
 
 @pytest.fixture(scope="session")
 def artefacts() -> Path:
-    """Where tests leave pictures for people to look at."""
+    """Folder in which tests leave images for inspection."""
     path = Path(__file__).parent / "artefacts"
     path.mkdir(exist_ok=True)
     return path

@@ -1,4 +1,4 @@
-"""The client of a running loop, its command line, and the recorder's switch: what is asked, and what comes back."""
+"""The client of a running loop, its command line, and start and stop of recordings."""
 
 import contextlib
 import itertools
@@ -64,22 +64,22 @@ SHAPE = np.arange(20.0).reshape(KNOWN.grid)
 
 
 class FakeController:
-    """Reads requests as the controller does, and answers what it is told to."""
+    """Decodes requests as the controller does, and answers with `reply`."""
 
     def __init__(self) -> None:
         self.hub = MemoryHub()
         self.bus = MemoryBus(self.hub, "controller", HostClock())
-        self.bus.queryable(REQUEST_KEY.format(name="*"), self._ask)
+        self.bus.queryable(REQUEST_KEY.format(name="*"), self._answer)
         self.calibrations = self.bus.publisher(CALIBRATION)
         self.calibrations.put(encode_calibration(KNOWN, 0))
-        self.asked: list[Request] = []
+        self.requests: list[Request] = []
         self.reply = Reply(True, "done", 77)
         self.silent = False
 
-    def _ask(self, query: Query) -> None:
-        self.asked.append(codec.decode_request(query.payload, query.name, 0))
+    def _answer(self, query: Query) -> None:
+        self.requests.append(codec.decode_request(query.payload, query.name, 0))
         if not self.silent:
-            query.reply(codec.encode_request(self.asked[-1], self.reply, 1, None))
+            query.reply(codec.encode_request(self.requests[-1], self.reply, 1, None))
 
     def join(self) -> Client:
         return Client(bus=MemoryBus(self.hub, "operator", HostClock()))
@@ -103,7 +103,7 @@ def short_patience(monkeypatch: pytest.MonkeyPatch) -> None:
 
 SIMPLE = ("open", "close", "pause", "safe", "clear", "reset", "stop")
 METHODS = {"open": Client.open_loop, "close": Client.close_loop}
-ASKS: tuple[tuple[Callable[[Client], object], Request], ...] = (
+CALLS: tuple[tuple[Callable[[Client], object], Request], ...] = (
     *((METHODS.get(name) or getattr(Client, name), Request(0, name)) for name in ("status", *SIMPLE)),
     (lambda loop: loop.step(7), Request(0, "step", (), (7.0,))),
     (lambda loop: loop.gain(0.5, [2, 3]), Request(0, "gain", (2, 3), (0.5,))),
@@ -126,40 +126,41 @@ ASKS: tuple[tuple[Callable[[Client], object], Request], ...] = (
 )
 
 
-@pytest.mark.parametrize(("ask", "wanted"), ASKS, ids=lambda one: getattr(one, "name", ""))
-def test_the_controller_reads_what_was_meant(
-    controller: FakeController, loop: Client, ask: Callable[[Client], object], wanted: Request
+@pytest.mark.parametrize(("ask", "expected"), CALLS, ids=lambda one: getattr(one, "name", ""))
+def test_the_controller_decodes_each_request(
+    controller: FakeController, loop: Client, ask: Callable[[Client], object], expected: Request
 ) -> None:
     answer = ask(loop)
-    assert controller.asked == [wanted]
-    assert answer == ("done" if wanted.name == "configuration" else (True, "done", 77, wanted.text, None, "default"))
+    assert controller.requests == [expected]
+    accepted = (True, "done", 77, expected.text, None, "default")
+    assert answer == ("done" if expected.name == "configuration" else accepted)
 
 
-def test_every_request_has_its_method() -> None:
-    assert {wanted.name for _, wanted in ASKS} == set(REQUESTS)
+def test_every_request_is_tested() -> None:
+    assert {request.name for _, request in CALLS} == set(REQUESTS)
 
 
-def test_every_request_names_its_sender(controller: FakeController, loop: Client) -> None:
+def test_every_request_has_its_requester(controller: FakeController, loop: Client) -> None:
     loop.safe()
-    (asked,) = controller.asked
-    assert asked.requester.endswith(f"(process {os.getpid()})")
-    logged = wire.Request.FromString(codec.encode_request(asked, controller.reply, 1, None))
-    assert logged.requester == asked.requester
-    kept = codec.only_requester(wire.Request(text="\0" * 5000, requester="ann").SerializeToString())
-    assert kept == wire.Request(requester="ann").SerializeToString()
+    (request,) = controller.requests
+    assert request.requester.endswith(f"(process {os.getpid()})")
+    logged = wire.Request.FromString(codec.encode_request(request, controller.reply, 1, None))
+    assert logged.requester == request.requester
+    stripped = codec.only_requester(wire.Request(text="\0" * 5000, requester="ann").SerializeToString())
+    assert stripped == wire.Request(requester="ann").SerializeToString()
     assert codec.only_requester(b"\xff" * 9000) == b""
     assert codec.decode_request(wire.Request(requester="a\n" * 200).SerializeToString(), "open", 0).requester == (
         "a\\n" * 50
     )
 
 
-def test_a_reservation_is_renewed_and_every_request_of_its_holder_carries_it(controller: FakeController) -> None:
+def test_a_reservation_is_renewed_and_its_id_is_in_the_holders_requests(controller: FakeController) -> None:
     loop = controller.join()
     with loop.reserved("a test", 30.0) as lease:
         loop.gain(0.1)
         loop.check_lease()
     loop.gain(0.2)
-    first, gain, *renewals, release, after = controller.asked
+    first, gain, *renewals, release, after = controller.requests
     assert (first.name, first.lease_id, first.values) == ("lease", lease.id, (10.0,))
     assert first.text.startswith("a test by ")
     assert f"(process {os.getpid()}), about 30 s to go" in first.text
@@ -170,7 +171,7 @@ def test_a_reservation_is_renewed_and_every_request_of_its_holder_carries_it(con
     assert after.lease_id == 0
 
 
-def test_a_reservation_that_ended_says_why(controller: FakeController) -> None:
+def test_an_ended_reservation_gives_the_reason(controller: FakeController) -> None:
     loop = controller.join()
     with loop.reserved("a test"):
         controller.reply = Reply(False, "the lease ended: operator asked to open", 77)
@@ -179,7 +180,7 @@ def test_a_reservation_that_ended_says_why(controller: FakeController) -> None:
                 loop.check_lease()
 
 
-def test_frames_have_the_same_number_everywhere() -> None:
+def test_frame_numbers_agree_in_status_stream_step_and_answer() -> None:
     sequence = sequence_of(1_800_000_000, 812)
     shown = figures(wire.ControllerState(frame_sequence=sequence))["frame"]
     frame = Frame(sequence, 0, np.zeros((1, 1), np.uint16))
@@ -187,13 +188,13 @@ def test_frames_have_the_same_number_everywhere() -> None:
     assert {shown, frame.number, step.frame, Answer(True, "done", sequence).frame} == {812}
 
 
-def test_arrays_arrive_as_they_were(controller: FakeController, loop: Client) -> None:
+def test_arrays_arrive_unchanged(controller: FakeController, loop: Client) -> None:
     loop.channel("dark-hole", SHAPE)
     loop.channel("dark-hole")
     loop.play(np.stack([SHAPE, -SHAPE]), [[1, 2], [3, 4], [5, 6]])
     loop.play_offset(np.ones((4, 3)))
     loop.law(LAW)
-    shape, removed, played, offset, law = controller.asked
+    shape, removed, played, offset, law = controller.requests
     assert np.array_equal(shape.actuators_nm, SHAPE.ravel())
     assert removed.actuators_nm.size == 0
     assert np.array_equal(played.actuators_nm, [*SHAPE.ravel(), *-SHAPE.ravel()])
@@ -202,7 +203,7 @@ def test_arrays_arrive_as_they_were(controller: FakeController, loop: Client) ->
     assert law.law.id == LAW.id
 
 
-def test_a_refusal_is_an_error_with_the_controllers_sentence(controller: FakeController, loop: Client) -> None:
+def test_a_refusal_raises_with_the_controllers_reply(controller: FakeController, loop: Client) -> None:
     controller.reply = Reply(False, "the loop is in safe mode", 3)
     with pytest.raises(RequestRefusedError, match=r"^close refused: the loop is in safe mode \(run default\)$"):
         loop.close_loop()
@@ -224,15 +225,15 @@ def test_a_refusal_is_an_error_with_the_controllers_sentence(controller: FakeCon
         (lambda loop: loop.play_offset(np.zeros((3_000_000, 3))), "at most 16,000,000 bytes, got 36,000,0"),
     ],
 )
-def test_what_cannot_be_asked_is_refused_here(
+def test_invalid_requests_are_refused_by_the_client(
     controller: FakeController, loop: Client, ask: Callable[[Client], object], why: str
 ) -> None:
     with pytest.raises(RequestRefusedError, match=why):
         ask(loop)
-    assert controller.asked == []
+    assert controller.requests == []
 
 
-def test_nobody_there_and_nobody_answering_are_told_apart(controller: FakeController, loop: Client) -> None:
+def test_an_absent_and_a_silent_controller_give_different_errors(controller: FakeController, loop: Client) -> None:
     controller.silent = True
     with pytest.raises(BusError, match=r"the controller of run 'default' did not answer within 0.05 s"):
         loop.open_loop()
@@ -246,7 +247,9 @@ def test_nobody_there_and_nobody_answering_are_told_apart(controller: FakeContro
             ask()
 
 
-def test_the_configuration_of_a_loop_and_of_one_of_another_version(controller: FakeController, loop: Client) -> None:
+def test_the_configuration_of_a_loop_is_read_and_another_versions_is_refused(
+    controller: FakeController, loop: Client
+) -> None:
     for toml, rate_hz in ((Configuration().to_toml(), 250.0), ("[camera]\nrate_hz = 500.0\n", 500.0)):
         controller.reply = Reply(True, toml, 77)
         assert configuration_of(loop).camera.rate_hz == rate_hz
@@ -260,7 +263,7 @@ def test_the_configuration_of_a_loop_and_of_one_of_another_version(controller: F
 
 @pytest.fixture
 def listen(own_runtime: Path) -> Iterator[Callable[..., None]]:
-    """Begin processes of a run that do nothing but listen."""
+    """Open the ports of a run's processes, as if they were running."""
     with contextlib.ExitStack() as held:
 
         def begin(name: str, *roles: str) -> None:
@@ -271,7 +274,7 @@ def listen(own_runtime: Path) -> Iterator[Callable[..., None]]:
         yield begin
 
 
-def test_a_run_is_found_by_who_is_there(own_runtime: Path, listen: Callable[..., None]) -> None:
+def test_runs_are_found_by_their_listening_processes(own_runtime: Path, listen: Callable[..., None]) -> None:
     where = rf"no loop of user \S+ is running here: {own_runtime}/lowfc was searched \(from XDG_RUNTIME_DIR\)"
     with pytest.raises(BusError, match=where):
         the_run(None)
@@ -283,32 +286,32 @@ def test_a_run_is_found_by_who_is_there(own_runtime: Path, listen: Callable[...,
     listen("whole", "camera", "controller")
     assert running() == ["whole"]
     (open_run("damaged").path / "links.json").write_text("")
-    assert (the_run("whole"), the_run("left")) == ("whole", "left"), "a damaged one hides no other"
+    assert (the_run("whole"), the_run("left")) == ("whole", "left"), "a damaged run does not affect others"
     with pytest.raises(BusError, match=r"choose a run with --run.*: there are left \(no controller yet\), whole$"):
-        the_run(None)  # the other one may be starting
+        the_run(None)  # `left` may be starting
     with pytest.raises(DataFileError, match=r"links\.json"):
         the_run("damaged")
 
 
-def test_who_waits_for_a_run_that_nobody_is_in_is_told_the_others(listen: Callable[..., None]) -> None:
+def test_a_wait_for_an_empty_run_reports_the_other_runs(listen: Callable[..., None]) -> None:
     assert nobody_yet("bnch").endswith("on this host yet; no other loop of yours is running")
     listen("bench", "camera", "controller")
     assert nobody_yet("bench") == ""
-    open_run("bnch")  # as the recorder itself does
+    open_run("bnch")  # as the waiting process itself does
     assert nobody_yet("bnch").endswith("on this host yet; running: bench (did you mean 'bench'?)")
 
 
-def test_a_run_that_sim_loop_has_begun_is_starting(listen: Callable[..., None]) -> None:
+def test_a_run_started_by_sim_loop_counts_as_starting(listen: Callable[..., None]) -> None:
     open_run("night", listeners=(Role.LAUNCHER,))
     listen("night", "launcher", "recorder")
     assert starting("night", Role.CONTROLLER)
     assert not starting("night", Role.RECORDER)
     listen("bench", "camera")
-    assert not starting("bench", Role.CONTROLLER), "it is to be started by hand"
+    assert not starting("bench", Role.CONTROLLER), "not started by sim-loop"
     assert not starting("noon", Role.CONTROLLER)
 
 
-def test_the_beginning_of_a_runs_name_is_enough(listen: Callable[..., None]) -> None:
+def test_an_unambiguous_beginning_of_a_name_selects_a_run(listen: Callable[..., None]) -> None:
     for name in ("night", "night-2", "noon"):
         listen(name, "controller")
     assert [the_run(word) for word in ("night", "night-", "noo")] == ["night", "night-2", "noon"]
@@ -320,8 +323,8 @@ def test_the_beginning_of_a_runs_name_is_enough(listen: Callable[..., None]) -> 
         the_run("ngiht")
 
 
-def test_a_loop_that_is_not_seen_from_here_is_named(own_runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its owner, its process and its runtime directory, where the system tells; one that starts here is waited for."""
+def test_a_loop_outside_this_runtime_directory_is_reported(own_runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With owner, process and, if readable, runtime directory; a loop in this directory is reported as starting."""
     name = f"night-{os.getpid()}"
     words = [sys.executable, "-c", "print(flush=True); input()", "lowfc", "controller", "--run", name]
     wrapped = ["/bin/sh", "-c", 'echo; read end; "$@"', *words[3:]]
@@ -351,7 +354,7 @@ def test_a_loop_that_is_not_seen_from_here_is_named(own_runtime: Path, monkeypat
 # The mirror.
 
 
-def test_a_mirrors_restart_and_its_expired_command_are_seen_and_damaged_messages_are_not() -> None:
+def test_mirror_watch_reports_restarts_and_expired_commands_and_ignores_damaged_messages() -> None:
     hub = MemoryHub()
 
     def process(role: str) -> Callable[[int], object]:
@@ -379,7 +382,7 @@ def test_a_mirrors_restart_and_its_expired_command_are_seen_and_damaged_messages
 
 
 class Announced(MemoryBus):
-    """Others report as soon as somebody listens."""
+    """A bus on which `report` is called at each subscription of a ring."""
 
     def __init__(self, hub: MemoryHub, report: Callable[[], object]) -> None:
         super().__init__(hub, "operator", HostClock())
@@ -406,14 +409,14 @@ def stream(*samples: Sample, count: int | None = None) -> Stream[client.Frame]:
     return Stream(SimpleNamespace(drain=lambda: next(drained), close=lambda: None), frame_of, "frame", count, 0.02)
 
 
-def test_frames_come_in_their_order_as_arrays() -> None:
+def test_frames_arrive_in_order_as_arrays() -> None:
     found = list(stream(*map(frame_sample, range(5, 15)), count=4))
     assert [frame.pixels[0, 0] for frame in found] == [5, 6, 7, 8]
     assert [(frame.number, frame.time_ns) for frame in found] == [(5, 5000), (6, 6000), (7, 7000), (8, 8000)]
     assert (found[0].pixels.shape, found[0].pixels.dtype) == ((3, 4), np.uint16)
 
 
-def test_what_did_not_get_here_is_counted_and_a_restart_or_a_repetition_is_no_loss() -> None:
+def test_lost_frames_are_counted_but_not_restarts_or_duplicates() -> None:
     broken = frame_sample(9)._replace(payload=b"\xff")
     again = [frame_sample(count, 1_700_000_060) for count in (0, 2)]
     frames = stream(frame_sample(5), frame_sample(8), broken, frame_sample(10), *again, count=5)
@@ -422,10 +425,10 @@ def test_what_did_not_get_here_is_counted_and_a_restart_or_a_repetition_is_no_lo
     before = frame_sample(2, 1_699_999_000)
     frames = stream(*map(frame_sample, (5, 7, 7, 6)), before, *map(frame_sample, (8, 8, 11, 10)), count=9)
     assert [frame.number for frame in frames] == [5, 7, 7, 6, 2, 8, 8, 11, 10]
-    assert frames.lost == 1, "9 alone did not come"
+    assert frames.lost == 1, "only 9 is missing"
 
 
-def test_silence_is_an_error_and_so_is_a_stream_that_never_begins() -> None:
+def test_a_silent_stream_raises_also_at_its_start() -> None:
     frames = stream(frame_sample(1))
     next(frames)
     with pytest.raises(BusError, match=r"no frame came within 0.02 s: `lowfc ctl status` shows why"):
@@ -434,11 +437,11 @@ def test_silence_is_an_error_and_so_is_a_stream_that_never_begins() -> None:
         stream()
 
 
-def test_a_stream_that_has_ended_is_sent_nothing_more(controller: FakeController) -> None:
+def test_an_ended_stream_unsubscribes(controller: FakeController) -> None:
     publisher = controller.bus.publisher(FRAME)
     bus = Announced(controller.hub, lambda: [publisher.put(frame_sample(count).payload) for count in range(3)])
     loop, before = Client(bus=bus), list(bus._subscriptions)
-    assert [frame.pixels[0, 0] for frame in loop.frames(2)] == [0, 1], "from the moment `frames` returns"
+    assert [frame.pixels[0, 0] for frame in loop.frames(2)] == [0, 1], "from the first frame after the call"
     assert bus._subscriptions == before
     frames = loop.frames(patience_s=0.02)
     with pytest.raises(BusError):
@@ -447,7 +450,7 @@ def test_a_stream_that_has_ended_is_sent_nothing_more(controller: FakeController
     assert list(frames) == []
 
 
-def test_a_slow_reader_loses_the_oldest_and_knows(controller: FakeController, loop: Client) -> None:
+def test_a_slow_reader_loses_the_oldest_frames(controller: FakeController, loop: Client) -> None:
     ring = loop._bus.ring(FRAME, WAITING)
     publisher = controller.bus.publisher(FRAME)
     payload = frame_sample(1).payload
@@ -459,11 +462,11 @@ def test_a_slow_reader_loses_the_oldest_and_knows(controller: FakeController, lo
         publisher.put(payload)
     assert first.sequence & 0xFFFF == 30
     assert len(list(frames)) == WAITING - 1
-    assert frames.lost == 0, "what came before the first one was not asked for"
+    assert frames.lost == 0, "frames before the first one do not count"
 
 
 @pytest.mark.parametrize("payload", [b"\xff", b""])
-def test_an_answer_that_is_none_is_an_error_with_a_sentence(payload: bytes) -> None:
+def test_an_invalid_answer_is_an_error_message(payload: bytes) -> None:
     hub = MemoryHub()
     controller = MemoryBus(hub, "controller", HostClock())
     controller.queryable(REQUEST_KEY.format(name="*"), lambda query: query.reply(b"\xff"))
@@ -475,7 +478,7 @@ def test_an_answer_that_is_none_is_an_error_with_a_sentence(payload: bytes) -> N
         loop.calibration()
 
 
-def test_a_step_comes_as_it_was_sent() -> None:
+def test_a_step_is_decoded_unchanged() -> None:
     three = np.array([1.5, -2.0, 0.25], np.float32)
     sent = Step(9, 5_000, LoopMode.CLOSED, three, (Limit.SLEW,), three + 1, three + 2, 1234.5, 3)
     got = step_of(Sample(STEP.key, codec.encode_step(sent, 1), 0, 0, 0))
@@ -487,25 +490,25 @@ def test_a_step_comes_as_it_was_sent() -> None:
     assert step_of(Sample(STEP.key, b"\xff", 0, 0, 0)) is None
 
 
-def test_the_loop_is_held_for_a_move_and_given_back(controller: FakeController, loop: Client) -> None:
+def test_held_holds_the_loop_and_releases_it(controller: FakeController, loop: Client) -> None:
     assert loop.permit("moving the mask").accepted
     with pytest.raises(KeyError), loop.held("moving the mask", 5.0):
         raise KeyError
-    asks, hold, back = controller.asked
-    assert [one.name for one in controller.asked] == ["permit", "permit", "release"]
-    assert (asks.values, hold.values) == ((), (5.0,))
+    permission, hold, release = controller.requests
+    assert [one.name for one in controller.requests] == ["permit", "permit", "release"]
+    assert (permission.values, hold.values) == ((), (5.0,))
     assert hold.text.startswith("moving the mask by ")
-    assert hold.lease_id == back.lease_id != asks.lease_id
+    assert hold.lease_id == release.lease_id != permission.lease_id
 
 
 @pytest.mark.parametrize("value", [True, 3, 2.5, "parked"])
-def test_a_bench_value_arrives_as_it_was_published(controller: FakeController, loop: Client, value: Value) -> None:
-    came: list[Sample] = []
-    controller.bus.subscribe(BENCH, came.append, "mask")
+def test_a_bench_value_arrives_unchanged(controller: FakeController, loop: Client, value: Value) -> None:
+    received: list[Sample] = []
+    controller.bus.subscribe(BENCH, received.append, "mask")
     for _ in range(2):
         loop.bench("mask", value)
     loop.bench("another", value)
-    assert [decode_bench_value(one.payload) for one in came] == [value, value]
+    assert [decode_bench_value(one.payload) for one in received] == [value, value]
     for name, wrong in (("a b", True), ("mask", float("nan")), ("mask", "x" * 201)):
         with pytest.raises(ConfigurationError, match=name):
             loop.bench(name, wrong)
@@ -514,8 +517,8 @@ def test_a_bench_value_arrives_as_it_was_published(controller: FakeController, l
 # The declaration, the document and the command line.
 
 
-def test_the_declared_requests_are_those_that_there_are() -> None:
-    by_key = {asked.key: asked for asked in DECLARED}
+def test_the_declared_requests_match_the_implemented_ones() -> None:
+    by_key = {declared.key: declared for declared in DECLARED}
     assert len(by_key) == len(DECLARED)
     assert list(by_key) == [
         *(REQUEST_KEY.format(name=name) for name in REQUESTS),
@@ -523,11 +526,11 @@ def test_the_declared_requests_are_those_that_there_are() -> None:
         "lowfc/record/stop",
     ]
     fields = set(wire.Request.DESCRIPTOR.fields_by_name)
-    assert all({name for name, _ in asked.fields} <= fields for asked in DECLARED)
+    assert all({name for name, _ in declared.fields} <= fields for declared in DECLARED)
     assert all(not by_key[REQUEST_KEY.format(name=name)].fields for name in SIMPLE)
 
 
-def test_modes_are_read_as_people_write_them() -> None:
+def test_mode_lists_are_parsed() -> None:
     assert noll_of(None) == ()
     assert noll_of(["2", "3"]) == noll_of(["2,3"]) == (2, 3)
     assert noll_of(["4-7, 11"]) == (4, 5, 6, 7, 11)
@@ -537,7 +540,7 @@ def test_modes_are_read_as_people_write_them() -> None:
             noll_of([word])
 
 
-def test_a_number_that_is_none_is_shown() -> None:
+def test_an_invalid_number_is_quoted_in_the_error() -> None:
     for words in (["gain", "0,3"], ["limit", "60", "0,3"], ["offset", "-5", "0,3"]):
         done = lowfc("ctl", *words)
         assert done.exit_code == 2
@@ -545,7 +548,7 @@ def test_a_number_that_is_none_is_shown() -> None:
     assert "'1.5' is not a whole number" in lowfc("ctl", "step", "1.5").output
 
 
-def test_the_status_says_everything() -> None:
+def test_the_status_shows_the_whole_state() -> None:
     shape, reached = (np.float32(values).tobytes() for values in ([3, 4], [3, 3]))
     state = wire.ControllerState(
         mode=wire.LOOP_MODE_CLOSED,
@@ -574,8 +577,8 @@ def test_the_status_says_everything() -> None:
         "limits_hit": ["SLEW"],
         "calibration_provisional": True,
     }
-    said = figures(state)
-    assert {name: said[name] for name in expected} == expected
+    shown = figures(state)
+    assert {name: shown[name] for name in expected} == expected
     for words in (
         "closed, opens after 12 frames",
         "dark-hole 3.54 nm rms",
@@ -598,7 +601,7 @@ def bench(own_runtime: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
     return Bench(own_runtime / "logs")
 
 
-def test_a_recording_is_stopped_and_started(bench: Bench) -> None:
+def test_a_recording_is_stopped_and_restarted(bench: Bench) -> None:
     put(bench.controller.publisher(CALIBRATION), 1)
     states = bench.camera.publisher(CAMERA_STATE)
     frames = bench.camera.publisher(FRAME)
@@ -606,9 +609,9 @@ def test_a_recording_is_stopped_and_started(bench: Bench) -> None:
         role == "recorder" and key == FRAME.key and envelope.sequence & 0xFFFF in (5, 95)
     )
     bench.start()
-    hand = Client(bus=MemoryBus(bench.hub, "operator", bench.clock))
+    operator = Client(bus=MemoryBus(bench.hub, "operator", bench.clock))
     first = put(frames, 50)
-    stopped = Path(hand.record(False).text)
+    stopped = Path(operator.record(False).text)
     assert stopped.is_absolute()
     reader = LogReader(stopped)
     read = list(reader)
@@ -619,44 +622,44 @@ def test_a_recording_is_stopped_and_started(bench: Bench) -> None:
     put(frames, 40)
     put(states, 1)
     with pytest.raises(RequestRefusedError, match="nothing is being recorded"):
-        hand.record(False)
+        operator.record(False)
     until(lambda: not len(bench.recorder._backlog))
-    started = hand.record(True)
+    started = operator.record(True)
     with pytest.raises(RequestRefusedError, match="it is being recorded already"):
-        hand.record(True)
+        operator.record(True)
     second = put(frames, 30)
-    hand.record(False)
+    operator.record(False)
     put(frames, 10)
     (answer,) = MemoryBus(bench.hub, "operator", bench.clock).get("lowfc/record/dance", timeout_s=10)
     assert not wire.Request.FromString(answer.payload).accepted
     summary = bench.stop()
     assert [path.absolute() for path in summary.files] == [stopped, Path(started.text)]
     read = list(LogReader(summary.files[1]))
-    assert [message.key for message in read[:2]] == [CALIBRATION.key, CAMERA_STATE.key], "what came meanwhile too"
+    assert [message.key for message in read[:2]] == [CALIBRATION.key, CAMERA_STATE.key], "with the latest state"
     assert bodies_of(read, FRAME) == second[:5] + second[6:]
     assert "RECORDING recording" in [Log.FromString(body).message for body in bodies_of(read, EVENT)]
-    assert (summary.lost, summary.failure) == ({FRAME.key: 2}, ""), "what nobody wanted recorded is not lost"
+    assert (summary.lost, summary.failure) == ({FRAME.key: 2}, ""), "messages while stopped do not count as lost"
     assert summary.messages == sum(len(list(LogReader(path))) for path in summary.files)
 
 
-def test_a_log_that_cannot_be_begun_is_refused_and_may_be_asked_for_again(bench: Bench) -> None:
+def test_a_log_that_cannot_be_created_is_refused_and_can_be_requested_again(bench: Bench) -> None:
     bench.start()
-    hand = Client(bus=MemoryBus(bench.hub, "operator", bench.clock))
-    whole = hand.record(False).text
+    operator = Client(bus=MemoryBus(bench.hub, "operator", bench.clock))
+    first = operator.record(False).text
     moved = bench.folder.with_name("elsewhere")
     bench.folder.rename(moved)
     bench.folder.write_text("a file")
     with pytest.raises(RequestRefusedError, match="cannot be made"):
-        hand.record(True)
+        operator.record(True)
     bench.folder.unlink()
     moved.rename(bench.folder)
-    assert hand.record(True).text != whole
+    assert operator.record(True).text != first
     summary = bench.stop()
     assert len(summary.files) == 2
     assert summary.failure == ""
 
 
-def test_contrast_is_said_of_a_real_camera_as_measured_and_of_a_simulated_one_as_it_is() -> None:
+def test_contrast_is_estimated_for_a_real_camera_and_true_for_a_simulated_one() -> None:
     measured = wire.Health(recent_wavefront={"added_contrast_flat": 2e-9, "added_contrast": 3e-11})
     true = wire.Health(recent_wavefront={"added_contrast_flat": 4e-9, "added_contrast": 5e-11})
     processes = {Role.CAMERA: wire.Health(), Role.CONTROLLER: measured}

@@ -13,7 +13,7 @@ from lowfc.control.loop.advance import advance
 from lowfc.control.loop.inputs import CameraSettings, Load, MirrorReport, MirrorShape, Report, Tick
 from lowfc.control.loop.interlocks import BenchReport
 from lowfc.control.loop.state import State
-from tests.support.happenings import CALIBRATION
+from tests.support.controller_inputs import CALIBRATION
 from tests.support.toy import frame, loaded, settings
 
 

@@ -98,7 +98,7 @@ class Bench:
 
     def seen(self) -> list[dict[str, Any]]:
         """Everything the observer said so far."""
-        lines = self.lab.middle.said("observer").splitlines()
+        lines = self.lab.middle.stderr("observer").splitlines()
         found = []
         for line in lines:
             with contextlib.suppress(json.JSONDecodeError):
@@ -133,11 +133,11 @@ class Bench:
     def check_alive(self) -> None:
         for host in self.lab.hosts.values():
             for name, child in host.children.items():
-                assert child.status is None, f"{name} on {host.name} ended: {host.said(name)}"
+                assert child.status is None, f"{name} on {host.name} ended: {host.stderr(name)}"
 
     def stderr_tail(self) -> str:
         everybody = [(host, name) for host in self.lab.hosts.values() for name in host.children if name != "observer"]
-        return "\n".join(f"{name}: {host.said(name)[-400:]}" for host, name in everybody)
+        return "\n".join(f"{name}: {host.stderr(name)[-400:]}" for host, name in everybody)
 
 
 @pytest.fixture(scope="module")
@@ -216,10 +216,10 @@ def test_without_the_cameras_link_the_command_is_held_and_repeated(bench: Bench)
 def test_without_the_mirrors_link_its_dead_man_acts(bench: Bench) -> None:
     bench.settled()
     mirror = bench.lab["mirror"]
-    before = mirror.said("mirror-dm").count("COMMAND_EXPIRED")
+    before = mirror.stderr("mirror-dm").count("COMMAND_EXPIRED")
     with bench.lab.cut("mirror"):
-        bench.wait(lambda: mirror.said("mirror-dm").count("COMMAND_EXPIRED") > before, "the mirror's dead-man")
-        assert "relaxing to flat" in mirror.said("mirror-dm")
+        bench.wait(lambda: mirror.stderr("mirror-dm").count("COMMAND_EXPIRED") > before, "the mirror's dead-man")
+        assert "relaxing to flat" in mirror.stderr("mirror-dm")
         start = len(bench.seen())
         bench.wait(lambda: len(bench.seen()) > start + 10, "a second")
         assert sum(one["states"] for one in bench.seen()[start + 5 :]) == 0
@@ -229,10 +229,10 @@ def test_without_the_mirrors_link_its_dead_man_acts(bench: Bench) -> None:
 def test_without_the_controllers_link_the_mirror_relaxes_and_the_controller_holds(bench: Bench) -> None:
     bench.settled()
     controller = bench.lab["controller"]
-    before = controller.said("controller").count("NO_FRAMES"), bench.events("mirror-dm COMMAND_EXPIRED")
+    before = controller.stderr("controller").count("NO_FRAMES"), bench.events("mirror-dm COMMAND_EXPIRED")
     with bench.lab.cut("controller"):
         bench.wait(lambda: bench.events("mirror-dm COMMAND_EXPIRED") > before[1], "the mirror's dead-man")
-        bench.wait(lambda: controller.said("controller").count("NO_FRAMES") > before[0], "NO_FRAMES")
+        bench.wait(lambda: controller.stderr("controller").count("NO_FRAMES") > before[0], "NO_FRAMES")
         bench.wait(lambda: bench.newest()["highest_nm"] < 0.1, "a flat mirror")
         assert bench.newest()["status"] == "MIRROR_STATUS_EXPIRED"
     bench.settled()

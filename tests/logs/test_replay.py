@@ -49,8 +49,8 @@ from lowfc.programs.logs.replay.account import Account
 from lowfc.programs.logs.replay.controller_replay import PATIENCE_NS, Segment
 from lowfc.programs.logs.replay.fold import replay
 from lowfc.programs.logs.replay.frames import Frames
-from tests.support import happenings, report_log
-from tests.support.happenings import TIGHT, inputs
+from tests.support import controller_inputs, report_log
+from tests.support.controller_inputs import TIGHT, inputs
 from tests.support.loops import lowfc
 from tests.support.toy import NOLL, frame, settings
 
@@ -109,8 +109,8 @@ class Night:
 
     def _start(self) -> None:
         self.state, self._last_number = State(), 0
-        self._put(CALIBRATION, encode_calibration(happenings.CALIBRATION, self.now_ns))
-        self.apply(Load(self.now_ns, happenings.CALIBRATION, "a test"))
+        self._put(CALIBRATION, encode_calibration(controller_inputs.CALIBRATION, self.now_ns))
+        self.apply(Load(self.now_ns, controller_inputs.CALIBRATION, "a test"))
 
     def _put_state(self) -> None:
         message = controller_state(self.state, self.loop_settings, self.now_ns)

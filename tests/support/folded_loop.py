@@ -1,4 +1,4 @@
-"""A loop in one process: behind the interface of `lowfc.client`, and folded over a run of the configured bench."""
+"""A loop in one process with the interface of `lowfc.client`, and a fold over a run of the configured bench."""
 
 import contextlib
 import tomllib
@@ -30,7 +30,7 @@ from tools.law_bench import Bench, calibrated
 
 FIRST = 1 << 32
 SMALL_MIRROR = {"mirror.rows": 12, "mirror.columns": 12, "mirror.pitches_per_pupil": 10}
-"""For what does not hang on the number of actuators: a calibration is computed ten times as fast."""
+"""For tests that do not depend on the number of actuators: computes a calibration ten times as fast."""
 
 
 @lru_cache(maxsize=4)
@@ -40,14 +40,14 @@ def computed(toml: str) -> Calibration:
 
 
 class Reservation:
-    """In the place of `lowfc.client.lease.Lease`; nobody is told how long it is going to take."""
+    """Stand-in for `lowfc.client.lease.Lease` that does not report the remaining time."""
 
     def expecting(self, progress: Callable[[str, int, int], None], rate_hz: float) -> Callable[[str, int, int], None]:
         return progress
 
 
 class OperatorBus(MemoryBus):
-    """The connection of an operator's program; a frame is exposed while it subscribes."""
+    """Connection of an operator's program; a frame is exposed at each subscription of a ring."""
 
     def __init__(self, loop: "FoldedLoop") -> None:
         super().__init__(loop.hub, "operator", HostClock())
@@ -60,13 +60,13 @@ class OperatorBus(MemoryBus):
 
 
 class FoldedLoop(Client):
-    """Camera, controller and mirror, one frame after the other, as a client of theirs sees them.
+    """Camera, controller and mirror, one frame at a time, with the interface of a client.
 
     Attributes:
-        hub: on which the mirror's process reports.
-        mirror_bus: that process's connection; once it is closed, the mirror stays as it is.
+        hub: hub on which the mirror's process reports.
+        mirror_bus: connection of the mirror's process; once closed, the mirror keeps its shape.
         first: sequence of frame 0.
-        surfaces_nm: shape of the mirror in each exposure.
+        surfaces_nm: shape of the mirror in each exposure, nm of surface.
     """
 
     def __init__(
@@ -77,9 +77,9 @@ class FoldedLoop(Client):
         lose: Callable[[int], bool] = lambda index: False,
         cut: int | None = None,
     ) -> None:
-        """A loop under `config` in a world that may be another one; frames that `lose` names do not arrive.
+        """Start a loop with `config`, in a simulated `world` that may differ; frames selected by `lose` do not arrive.
 
-        Where `cut` is given, frames lack so many pixels at each edge, and the loop begins without a calibration.
+        With `cut`, frames lack that many pixels at each edge, and the loop starts without a calibration.
         """
         self.config, self.run_id = config, "folded"
         self._cut = cut or 0
@@ -104,9 +104,9 @@ class FoldedLoop(Client):
         self._states: Publisher = self.mirror_bus.publisher(MIRROR_STATE, "dm")
 
     def expose(self) -> None:
-        seen, whole = self._bench.expose()
-        pixels = whole[self._cut : whole.shape[0] - self._cut, self._cut : whole.shape[1] - self._cut]
-        self.surfaces_nm.append(seen)
+        surface_nm, image = self._bench.expose()
+        pixels = image[self._cut : image.shape[0] - self._cut, self._cut : image.shape[1] - self._cut]
+        self.surfaces_nm.append(surface_nm)
         if self._lose(len(self.surfaces_nm) - 1):
             return
         frame = self._bench.frame(pixels, self.first)
@@ -118,7 +118,7 @@ class FoldedLoop(Client):
             waiting.append(Image(frame.sequence, frame.time_ns, pixels) if kind == "frames" else outputs.step)
 
     def residual_nm(self, first: int, last: int | None = None) -> npt.NDArray[np.float64]:
-        """True modes (frames, modes) in the exposures from `first` to before `last`, numbered as of a slice."""
+        """True residual modes (frames, modes) in the exposures of the slice `first:last`."""
         frames = range(len(self.surfaces_nm))[first:last]
         truths = [self.scene.truth(index, self.surfaces_nm[index]) for index in frames]
         return np.array([truth.sampled.residual_nm for truth in truths], np.float64)
@@ -134,19 +134,19 @@ class FoldedLoop(Client):
         if name == "stop":
             self.stops += 1
         numbers = tuple(np.atleast_1d(np.asarray(values, float)).tolist())
-        asked = Request(0, name, tuple(np.atleast_1d(modes).tolist()) if np.size(modes) else (), numbers, **fields)
-        outputs = self._bench.take(asked)
+        request = Request(0, name, tuple(np.atleast_1d(modes).tolist()) if np.size(modes) else (), numbers, **fields)
+        outputs = self._bench.take(request)
         if not outputs.reply.accepted:
             raise RequestRefusedError(f"{name} refused: {outputs.reply.text}")
         state = controller_state(self._bench.state, self._bench.settings, 0) if name == "status" else None
         return Answer(True, outputs.reply.text, outputs.reply.frame_sequence, state=state)
 
     def play(self, basis_nm: npt.ArrayLike, table: npt.ArrayLike) -> Answer:
-        self.expose()  # time goes on while somebody asks
+        self.expose()  # a frame passes during the request
         return super().play(basis_nm, table)
 
     def disconnect(self) -> None:
-        """It goes on."""
+        """Do nothing."""
 
     @contextlib.contextmanager
     def reserved(self, purpose: str, duration_s: float | None = None) -> Iterator[Reservation]:
@@ -211,10 +211,10 @@ class FoldedLoop(Client):
 
 
 def fold(config: Configuration, frames: int, calibration: Calibration | None = None) -> SimpleNamespace:
-    """The loop of a configuration, of which every frame must be used.
+    """Run the loop of a configuration; every frame must be used.
 
-    Of the steps, error_nm, pol_nm and command_nm (frames, modes); of the truth, disturbance_nm and residual_nm
-    (frames, modes), disturbance_rms_nm and residual_rms_nm (frames,) over the open pupil; nm of wavefront.
+    Returns error_nm, pol_nm and command_nm (frames, modes) of the steps, and disturbance_nm and residual_nm
+    (frames, modes), disturbance_rms_nm and residual_rms_nm (frames,) over the open pupil, of the truth; nm of wavefront.
     """
     bench = Bench(config, calibration or calibrated(config))
     bench.run(frames)

@@ -1,4 +1,4 @@
-"""Feed readers with damaged inputs, watched for crashes, hangs and memory: python tests/support/fuzzing.py --help."""
+"""Feed damaged inputs to readers, detect crashes, hangs and memory growth: python tests/support/fuzzing.py --help."""
 
 import argparse
 import json
@@ -19,9 +19,9 @@ import numpy as np
 from tests.support.targets import Target, targets
 
 HANG_S = 10.0
-"""An input that takes longer hangs."""
+"""Time after which an input counts as a hang."""
 MOST_GROWTH_BYTES = 200_000_000
-"""Memory that one target's inputs may add to the process."""
+"""Largest permitted growth of the process by one target's inputs."""
 
 
 class HungError(Exception):
@@ -32,7 +32,7 @@ def fuzz(target: Target, numbers: range) -> dict[str, Any]:
     """Feed inputs of these numbers to a target.
 
     Returns:
-        name, inputs, refused (those that raised what they may), crashes (number, error), hangs (number), grown_bytes.
+        name, inputs, refused (inputs with a permitted error), crashes (number, error), hangs (number), grown_bytes.
     """
     refused, crashes, hangs = 0, [], []
     before = _peak_bytes()
@@ -60,7 +60,7 @@ def fuzz(target: Target, numbers: range) -> dict[str, Any]:
 
 
 def shares(every: list[Target], inputs: int) -> dict[str, int]:
-    """How many inputs each gets: fewer of those that take longer."""
+    """Number of inputs of each target: fewer for slower ones."""
     weights = {target.name: target.cost**-0.75 for target in every}
     total = sum(weights.values())
     return {name: max(1, round(inputs * weight / total)) for name, weight in weights.items()}
@@ -86,25 +86,25 @@ def _peak_bytes() -> int:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--inputs", type=int, default=1_000_000, help="for all targets together")
+    parser.add_argument("--inputs", type=int, default=1_000_000, help="total of all targets")
     parser.add_argument("--first", type=int, default=0, help="number of the first input of each target")
-    parser.add_argument("--only", help="targets whose name holds this")
+    parser.add_argument("--only", help="targets whose name contains this")
     parser.add_argument("--json", action="store_true")
-    asked = parser.parse_args()
+    options = parser.parse_args()
     begun_s = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
-        every = [one for one in targets(Path(folder)) if not asked.only or asked.only in one.name]
-        counts = shares(every, asked.inputs)
+        every = [one for one in targets(Path(folder)) if not options.only or options.only in one.name]
+        counts = shares(every, options.inputs)
         results = []
         for target in every:
-            results.append(fuzz(target, range(asked.first, asked.first + counts[target.name])))
+            results.append(fuzz(target, range(options.first, options.first + counts[target.name])))
             found = results[-1]
             line = f"{found['name']:20} {found['inputs']:8} inputs, {found['refused']:8} refused, "
             line += (
                 f"{len(found['crashes'])} crashes, {len(found['hangs'])} hangs, {found['grown_bytes'] / 1e6:.0f} MB\n"
             )
             sys.stderr.write(line)
-    if asked.json:
+    if options.json:
         sys.stdout.write(json.dumps({"targets": results, "seconds": round(time.monotonic() - begun_s, 1)}) + "\n")
     for found in results:
         for number, error in found["crashes"][:3]:

@@ -1,4 +1,4 @@
-"""What one host of a run on several receives, ten times a second as a line of JSON on standard error."""
+"""Print what one host of a multi-host run receives, ten times a second as a line of JSON on standard error."""
 
 import json
 import sys
@@ -20,11 +20,11 @@ def main(run: str, config: str, role: str) -> None:
     bus = ZenohBus(links, role, HostClock())
     events = Counter[str]()
 
-    def hear_event(sample: object) -> None:
+    def count_event(sample: object) -> None:
         log = Log.FromString(sample.payload)  # type: ignore[attr-defined]
         events[f"{log.name} {log.message.split(' ')[0]}"] += 1
 
-    bus.subscribe(EVENT, hear_event)
+    bus.subscribe(EVENT, count_event)
     steps, states = bus.ring(STEP, 1000), bus.ring(MIRROR_STATE, 1000)
     good = following = 0
     while True:

@@ -1,4 +1,4 @@
-"""Runs of the real processes, and what their logs hold."""
+"""Helpers to run the real processes and read their logs."""
 
 import contextlib
 import json
@@ -32,17 +32,17 @@ start_mode = "closed"
 tilt_gain = 0.3
 gain = 0.3
 """
-"""Configuration of a bright star and a wavefront that stands still, 8 nm of tilt and 5 nm of focus."""
+"""Configuration of a bright star and a static wavefront of 8 nm tilt and 5 nm focus."""
 LOWFC = [sys.executable, "-m", "lowfc"]
 PROGRAMS = Path(sys.executable).parent
 
 
 FIXED = "[control]\ntilt_gain = 0.5\ngain = 0.05\n"
-"""Gains of a loop that is closed from its first frame on."""
+"""Fixed gains, for a loop that is closed from its first frame on."""
 
 
 def run(folder: Path, *arguments: str, config: str = "", timeout_s: float = 120) -> "subprocess.CompletedProcess[str]":
-    """`lowfc` with these arguments, in a folder of its own."""
+    """Run `lowfc` with these arguments in a folder."""
     words = [*LOWFC, *arguments]
     if config:
         (folder / "test.toml").write_text(config)
@@ -51,12 +51,12 @@ def run(folder: Path, *arguments: str, config: str = "", timeout_s: float = 120)
 
 
 def lowfc(*words: object) -> Result:
-    """`lowfc` with these words, in this process; the error that ended it is its `exception`."""
+    """Run `lowfc` with these words in this process; an error that ended it is its `exception`."""
     return CliRunner().invoke(app, [*map(str, words)])
 
 
 def told(folder: Path, line: str) -> str:
-    """What a documented command that starts no loop prints, run in this process as if in this folder."""
+    """Output of a documented command that starts no loop, run in this process with this working directory."""
     words, _, output = line.partition(" > ")
     with contextlib.chdir(folder):
         done = lowfc(*shlex.split(words)[1:])
@@ -67,7 +67,7 @@ def told(folder: Path, line: str) -> str:
 
 
 def loop(folder: Path, *arguments: str, config: str = "", timeout_s: float = 120) -> dict[str, Any]:
-    """Figures of a `sim-loop` that must succeed; `log` becomes an absolute path."""
+    """Run `sim-loop`, which must succeed, and return its figures; `log` becomes an absolute path."""
     done = run(folder, "sim-loop", "--json", *arguments, config=config, timeout_s=timeout_s)
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
@@ -101,7 +101,7 @@ def children(launcher: int) -> dict[str, int]:
 
 
 def start(folder: Path, *arguments: object) -> "subprocess.Popen[str]":
-    """A `lowfc` that goes on while the test does something."""
+    """Start `lowfc` in the background."""
     return subprocess.Popen(
         [*LOWFC, *map(str, arguments)],
         cwd=folder,
@@ -113,7 +113,7 @@ def start(folder: Path, *arguments: object) -> "subprocess.Popen[str]":
 
 
 def command(folder: Path, line: str, timeout_s: float = 120, good: tuple[int, ...] = (0,)) -> str:
-    """What a documented command prints; what it redirects is left in the file."""
+    """Output of a documented command; redirected output is also written to its file."""
     words, _, output = line.partition(" > ")
     program, *rest = shlex.split(words, comments=True)
     done = subprocess.run(
@@ -128,23 +128,23 @@ def command(folder: Path, line: str, timeout_s: float = 120, good: tuple[int, ..
 
 @contextlib.contextmanager
 def going_on(folder: Path, *lines: str) -> Iterator[list[str]]:
-    """Documented commands that go on until told to stop, and end cleanly then; their standard error is in the list."""
+    """Run documented commands in the background, then stop them; yields the list of their standard errors."""
     processes = [
         subprocess.Popen([PROGRAMS / program, *rest], cwd=folder, stderr=subprocess.PIPE, text=True)
         for program, *rest in map(shlex.split, lines)
     ]
-    complaints: list[str] = []
+    stderr: list[str] = []
     try:
-        yield complaints
+        yield stderr
     finally:
         for process in processes:
             process.terminate()
-        complaints += [process.communicate(timeout=20)[1] for process in processes]
-    assert all(process.returncode in (0, -signal.SIGTERM, 130) for process in processes), complaints
+        stderr += [process.communicate(timeout=20)[1] for process in processes]
+    assert all(process.returncode in (0, -signal.SIGTERM, 130) for process in processes), stderr
 
 
 def interrupt(process: "subprocess.Popen[str]", timeout_s: float = 20) -> tuple[str, str]:
-    """Ctrl-C, and everything it said."""
+    """Send Ctrl-C and return standard output and standard error."""
     process.send_signal(signal.SIGINT)
     return process.communicate(timeout=timeout_s)
 
@@ -152,10 +152,10 @@ def interrupt(process: "subprocess.Popen[str]", timeout_s: float = 20) -> tuple[
 def until(condition: Callable[[], object], timeout_s: float = 30.0) -> None:
     deadline_s = time.monotonic() + timeout_s
     while not condition():
-        assert time.monotonic() < deadline_s, "waited in vain"
+        assert time.monotonic() < deadline_s, "timeout"
         time.sleep(0.01)
 
 
 def recorded_bytes(folder: Path) -> int:
-    """Size of the log that is being written in a folder; 4 MB are more than calibration and configuration."""
+    """Size of the log being written in a folder; more than 4 MB means that frames are recorded."""
     return sum(path.stat().st_size for path in (folder / "logs").glob("*.part"))

@@ -1,4 +1,4 @@
-"""Bytes, messages and logs damaged at random: each from a generator that is passed in, or from its number alone."""
+"""Randomly damaged bytes, messages and logs, reproducible from a generator or from a number."""
 
 import struct
 from collections.abc import Iterator, Sequence
@@ -25,11 +25,11 @@ ATTACHMENTS = (
 )
 MUTATIONS = 1000
 MISPLACED = ("shuffled", "repeated", "removed", "swapped", "doubled")
-"""Damage to a log by moving whole records; without a summary nothing can tell that one is gone."""
+"""Kinds of damage that move whole records; without a summary a missing one cannot be detected."""
 
 
 def small_samples(frames: int = 40) -> list[Sample]:
-    """Messages of some topics, of two starts of their publishers; the surface and the events are rare."""
+    """Messages of some topics from two starts of their publishers; surfaces and events are rare."""
     rng = np.random.default_rng(1)
     made = []
     for number in range(frames):
@@ -61,12 +61,12 @@ def small_log(path: Path, *, finished: bool = True) -> Path:
 
 
 def identity(messages: list[Sample]) -> list[tuple[str, bytes, int, int, int]]:
-    """What a message is, as it was sent or as it was read."""
+    """Content of messages as tuples, to compare sent and read ones."""
     return [(m.key, m.payload, m.sequence, m.publish_time_ns, m.receive_time_ns) for m in messages]
 
 
 def boundaries(data: bytes) -> list[int]:
-    """Where the records of a log begin, and where the last one ends."""
+    """First byte of each record of a log, and the end of the last one."""
     found = [len(MAGIC)]
     while found[-1] + 9 <= len(data) - len(MAGIC) * data.endswith(MAGIC):
         found.append(found[-1] + 9 + struct.unpack_from("<Q", data, found[-1] + 1)[0])
@@ -74,7 +74,7 @@ def boundaries(data: bytes) -> list[int]:
 
 
 def mutated(data: bytes, number: int) -> tuple[str, bytes]:
-    """Mutation `number` of a log, and what kind of damage it is; never the log itself."""
+    """Kind of damage and content of mutation `number` of a log; never the log itself."""
     rng = np.random.default_rng(number)
     starts = boundaries(data)
     records = [data[a:b] for a, b in pairwise(starts)]
@@ -90,7 +90,7 @@ def mutated(data: bytes, number: int) -> tuple[str, bytes]:
         case "flipped":
             for _ in range(rng.integers(1, 5)):
                 changed[rng.integers(len(data))] ^= 1 << int(rng.integers(8))
-        case "flipped head":  # opcode, length, and what a chunk says of itself
+        case "flipped head":  # opcode, length, and header of a chunk
             at = int(rng.choice(starts[:-1])) + int(rng.integers(48))
             changed[min(at, len(data) - 1)] ^= 1 << int(rng.integers(8))
         case "cut":
@@ -129,11 +129,11 @@ _BITS = {
     FieldDescriptor.CPPTYPE_INT64: 63,
     FieldDescriptor.CPPTYPE_UINT64: 64,
 }
-"""Of a whole number but for its sign."""
+"""Bits of each integer type, without the sign."""
 
 
 def damaged(data: bytes, others: Sequence[bytes], rng: Random) -> bytes:
-    """Bytes with one to eight changes: flipped, overwritten, cut, repeated, spliced with another input."""
+    """Bytes with one to eight changes: flipped, overwritten, truncated, repeated, spliced with another input."""
     changed = bytearray(data)
     for _ in range(1 << rng.randrange(4)):
         at = rng.randrange(len(changed) + 1)
@@ -160,7 +160,7 @@ def damaged(data: bytes, others: Sequence[bytes], rng: Random) -> bytes:
 
 
 def rewritten(message: Message, rng: Random) -> bytes:
-    """A message that is whole, with odd values in some of its fields."""
+    """A valid message with extreme values in some of its fields."""
     for _ in range(1 << rng.randrange(3)):
         _alter(message, rng, 3)
     return message.SerializeToString()

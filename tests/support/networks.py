@@ -1,7 +1,7 @@
-"""Hosts on one machine: network namespaces with addresses of their own, joined by a bridge.
+"""Emulated hosts on one machine: network namespaces with their own addresses, joined by a bridge.
 
-A namespace lives as long as a process in it. Each is held by a `cat` that ends when our end of its pipe does, and every
-other process in it dies with us: nothing is left behind, however the test ends.
+A namespace exists as long as a process in it. Each is held by a `cat` that ends when its pipe is closed, and all other
+processes end with the test process, so that nothing is left behind.
 """
 
 import contextlib
@@ -21,7 +21,7 @@ ROUTER_ADDRESS = f"{SUBNET}.1"
 
 
 def possible() -> bool:
-    """Whether this machine lets us make network namespaces with a bridge."""
+    """Whether this machine permits network namespaces with a bridge."""
     if shutil.which("unshare") is None or shutil.which("nsenter") is None or shutil.which("ip") is None:
         return False
     trial = "ip link add name trial type bridge && ip link add name one type veth peer name two"
@@ -29,7 +29,7 @@ def possible() -> bool:
 
 
 class Host:
-    """One namespace, with a folder of its own for what a machine keeps."""
+    """A namespace with its own folder for runtime files."""
 
     def __init__(self, name: str, address: str, folder: Path, clock_shift_ns: int = 0) -> None:
         self.name = name
@@ -42,9 +42,9 @@ class Host:
         self.children: dict[str, Child] = {}
         home = self.folder / "runtime" / "lowfc"
         home.mkdir(mode=0o700, parents=True)
-        HostClock(home)  # chooses the offset of this boot, which is then another one here
-        for chosen in home.glob("clock-*"):
-            chosen.write_text(str(int(chosen.read_text()) + clock_shift_ns))
+        HostClock(home)  # fixes the offset of this boot, which is then shifted for this host
+        for file in home.glob("clock-*"):
+            file.write_text(str(int(file.read_text()) + clock_shift_ns))
 
     @property
     def environment(self) -> Mapping[str, str]:
@@ -71,7 +71,7 @@ class Host:
         child = Child(
             name,
             self.inside(sys.executable, "-P", *words),
-            self.folder / f"{name}.said",
+            self.folder / f"{name}.stderr",
             self.environment,
             death_signal=signal.SIGKILL,
         )
@@ -79,8 +79,8 @@ class Host:
         self.children[name] = child
         return child
 
-    def said(self, name: str) -> str:
-        return (self.folder / f"{name}.said").read_text(errors="replace")
+    def stderr(self, name: str) -> str:
+        return (self.folder / f"{name}.stderr").read_text(errors="replace")
 
     def close(self) -> None:
         for child in self.children.values():
@@ -90,10 +90,10 @@ class Host:
 
 
 class Lab:
-    """A machine in the middle with the bridge, and hosts with one link each, which can be cut."""
+    """A central host with the bridge, and hosts with one link each that can be cut."""
 
     def __init__(self, folder: Path, shifts_ns: Mapping[str, int]) -> None:
-        """Make the hosts, with the named shifts of their clocks."""
+        """Create the hosts, with clock shifts by name."""
         self.middle = Host("middle", ROUTER_ADDRESS, folder)
         self.hosts = {self.middle.name: self.middle}
         try:
@@ -118,7 +118,7 @@ class Lab:
 
     @contextlib.contextmanager
     def cut(self, name: str) -> Iterator[None]:
-        """Lose everything to and from a host, without either end being told."""
+        """Drop all traffic to and from a host silently."""
         self.middle.ip("link", "set", name, "nomaster")
         try:
             yield

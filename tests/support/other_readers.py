@@ -1,4 +1,4 @@
-"""Readers of MCAP that are not ours: Foxglove's, on node, and rerun's."""
+"""Independent readers of MCAP: Foxglove's (node) and rerun's."""
 
 import json
 import os
@@ -14,7 +14,7 @@ NODE = Path(__file__).parents[1] / "node"
 
 
 def foxglove(paths: Iterable[Path]) -> list[dict[str, Any]]:
-    """What @mcap/core finds in each finished log, its checksums checked."""
+    """Content of each finished log according to @mcap/core, with checksums checked."""
     if shutil.which("node") is None or not (NODE / "node_modules").is_dir():
         pytest.skip("node or its packages are missing: make node")
     words = ["node", "count.mjs", *map(str, paths)]
@@ -24,7 +24,7 @@ def foxglove(paths: Iterable[Path]) -> list[dict[str, Any]]:
 
 
 def rerun(word: str, path: Path) -> str:
-    """What `rerun mcap info` or `rerun mcap check` says of a log."""
+    """Output of `rerun mcap info` or `rerun mcap check` for a log."""
     import rerun_cli
 
     binary = str(Path(rerun_cli.__file__).parent / "rerun")

@@ -1,4 +1,4 @@
-"""A recorder, a camera and a controller on a bus in memory."""
+"""A recorder, a camera and a controller on a memory bus."""
 
 import threading
 from pathlib import Path
@@ -42,7 +42,7 @@ class Bench:
     def stop(self) -> Summary:
         for service in (self.camera, self.controller):
             service.finish()
-        self.recorder.service.stop("told")
+        self.recorder.service.stop("stopped by test")
         self.thread.join(PATIENCE_S)
         assert self.summary is not None
         return self.summary

@@ -1,4 +1,4 @@
-"""A log of the toy's loop, message by message as the live controller's `advance` makes them, without processes."""
+"""A log of the toy's loop, with the messages of the real controller's `advance`, without processes."""
 
 from collections.abc import Collection
 from pathlib import Path
@@ -47,10 +47,10 @@ METADATA = {"lowfc": {"lowfc": "0.1.0", "numpy": "2.0", "host": "bench", "run": 
 
 
 class Night:
-    """Messages of a run, appended as it goes on; the disturbance of tip is a sine of 12 nm at 7 Hz."""
+    """Messages of a run, appended frame by frame; the tip disturbance is a sine of 12 nm at 7 Hz."""
 
     def __init__(self, *, truth: bool = True, calibration: Calibration = TOYS, **changes: object) -> None:
-        """A loop whose settings have some `changes`."""
+        """Start a loop with `changes` to its settings."""
         self.samples: list[Sample] = []
         self.truth = truth
         self.now_ns = START * 10**9
@@ -75,7 +75,7 @@ class Night:
         self.put(CAMERA_STATE, camera)
 
     def start_controller(self) -> None:
-        """A controller that knows nothing of the one before."""
+        """Start a new controller, without the state of the previous one."""
         self.event("STARTED", process="controller", version="0.1.0")
         self.put(CALIBRATION, encode_calibration(self.calibration, self.now_ns))
         self._state = State()
@@ -86,7 +86,7 @@ class Night:
         self._count = 0
 
     def frames(self, number: int, *, lost: Collection[int] = (), dark: Collection[int] = ()) -> None:
-        """So many frames; some never reach the controller, some have no light."""
+        """Append frames; those in `lost` never reach the controller, those in `dark` have no light."""
         for index in range(number):
             self.now_ns += PERIOD_NS
             sequence = sequence_of(self._camera_start, self._count)
@@ -111,11 +111,11 @@ class Night:
                 self._take(advance(self.settings, self._state, taken), DELAY_NS + 1000 * (self._count % 50))
 
     def request(self, name: str, values: tuple[float, ...] = (), modes: tuple[int, ...] = (), **fields: Any) -> None:
-        asked = Request(self.now_ns, name, modes, values, **fields)
+        request = Request(self.now_ns, name, modes, values, **fields)
         before = self._state
-        after, outputs = advance(self.settings, before, asked)
+        after, outputs = advance(self.settings, before, request)
         assert outputs.reply is not None
-        self.put(REQUEST, codec.encode_request(asked, outputs.reply, after.input_number, None))
+        self.put(REQUEST, codec.encode_request(request, outputs.reply, after.input_number, None))
         self._take((after, outputs))
 
     def event(self, name: str, **details: object) -> None:
@@ -127,7 +127,7 @@ class Night:
     def put(
         self, topic: Topic, message: Message | bytes, sequence: int | None = None, name: str = "dm", late_ns: int = 0
     ) -> None:
-        """Append a message; its sequence counts by itself where none is given."""
+        """Append a message, by default with the next sequence of its topic."""
         key = topic.at(name)
         if sequence is None:
             count = self._counts[key, START] = self._counts.get((key, START), -1) + 1
@@ -139,7 +139,7 @@ class Night:
     def write(
         self, path: Path, *, finish: bool = True, config: bool = True, toml: str | None = None, **more: str
     ) -> Path:
-        """Write the log, finished (with `more` in the recorder's account) or as a recorder that died leaves it."""
+        """Write the log, finished (with `more` in the recorder's account) or as left by a recorder that died."""
         content = (Configuration().to_toml() if toml is None else toml).encode()
         attached = [Attachment("config.toml", "application/toml", content)] if config else []
         log = LogWriter(path, START * 10**9, METADATA, attached)
@@ -153,8 +153,8 @@ class Night:
         log.abandon()
         return log.part
 
-    def _take(self, answered: tuple[State, Outputs], late_ns: int = 0) -> None:
-        self._state, outputs = answered
+    def _take(self, advanced: tuple[State, Outputs], late_ns: int = 0) -> None:
+        self._state, outputs = advanced
         for raised in outputs.events:
             self.event(raised.name, **raised.details)
         if outputs.command is not None:
@@ -187,7 +187,7 @@ class Night:
         return np.array([12 * np.sin(2 * np.pi * 7 * time_s), 3.0, -2.0], np.float32)
 
     def _pixels(self, residual_nm: Single, flux_dn: float) -> Pixels:
-        """Photons are drawn, and read-out adds its noise."""
+        """Draw photon and read noise."""
         mean_dn = TOY.pixels(residual_nm, flux_dn).astype(float)
         dark_dn = self.calibration.dark.reshape(SHAPE).astype(float)
         drawn = dark_dn + self._rng.poisson(mean_dn - dark_dn) + READ_NOISE_E * self._rng.standard_normal(SHAPE)

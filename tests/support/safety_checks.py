@@ -1,4 +1,4 @@
-"""What must hold of `limit`, cases chosen by hand, and the simulated mirror behind its guard as functions of values."""
+"""Properties of `limit`, hand-chosen cases, and the simulated mirror behind its guard as pure functions."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ LIMITS = Limits(stroke_nm=700.0, slew_nm=100.0, neighbour_nm=400.0)
 
 @dataclass(frozen=True)
 class Case:
-    """From `previous_nm`, `wanted_nm` is asked `steps` times; the end is `expected_nm` to 0.01 nm where it is given."""
+    """From `previous_nm`, `wanted_nm` is commanded `steps` times; the result is `expected_nm` to 0.01 nm, if given."""
 
     name: str
     previous_nm: Single
@@ -27,12 +27,12 @@ class Case:
 
 
 def rows(*values: float) -> Single:
-    """A shape of three columns whose rows have these heights."""
+    """Shape of three columns with these heights of its rows."""
     return np.repeat(np.array(values, np.float32)[:, None], 3, axis=1)
 
 
 def columns(*values: float) -> Single:
-    """A shape of three rows whose columns have these heights."""
+    """Shape of three rows with these heights of its columns."""
     return np.ascontiguousarray(rows(*values).T)
 
 
@@ -55,14 +55,14 @@ CASES = (
     Case("neighbours upside down", rows(-190, 190, 190), rows(-230, 230, 230), ("NEIGHBOUR",), rows(-200, 200, 200)),
     Case("neighbours crossing over", rows(60, -60, 0), rows(-45, 45, 0), ("SLEW",), rows(-40, 40, 0)),
     Case("all neighbours together", rows(500, 500, 500), rows(550, 550, 550), (), rows(550, 550, 550)),
-    Case("pressed against neighbours", rows(0, 0, 0), rows(600, -600, -600), ("STROKE",), rows(200, -200, -200), 40),
+    Case("clipped against neighbours", rows(0, 0, 0), rows(600, -600, -600), ("STROKE",), rows(200, -200, -200), 40),
     Case(
         "in the margin of neighbours", rows(200, -199.9996, 0), rows(250, -250, 0), ("NEIGHBOUR",), rows(200, -200, 0)
     ),
-    Case("apart, to flat", rows(600, 0, 0), rows(0, 0, 0), (), rows(0, 0, 0), 20),
-    Case("apart, wanting more", rows(600, 0, 0), rows(680, 0, 0), ("NEIGHBOUR",), rows(500, 0, 0)),
-    Case("far out, to flat", rows(5000, 5000, 5000), rows(0, 0, 0), (), rows(0, 0, 0), 60),
-    Case("far out, one step", rows(900, 900, 900), rows(0, 0, 0), ("SLEW",), rows(800, 800, 800)),
+    Case("beyond neighbours, to flat", rows(600, 0, 0), rows(0, 0, 0), (), rows(0, 0, 0), 20),
+    Case("beyond neighbours, to more", rows(600, 0, 0), rows(680, 0, 0), ("NEIGHBOUR",), rows(500, 0, 0)),
+    Case("beyond the stroke, to flat", rows(5000, 5000, 5000), rows(0, 0, 0), (), rows(0, 0, 0), 60),
+    Case("beyond the stroke, one step", rows(900, 900, 900), rows(0, 0, 0), ("SLEW",), rows(800, 800, 800)),
     Case("NaN", rows(1, 2, 3), rows(np.nan, 0, 0), ("NOT_FINITE",), rows(1, 2, 3)),
     Case("infinity", rows(1, 2, 3), rows(0, -np.inf, 0), ("NOT_FINITE",), rows(1, 2, 3)),
     Case("huge", rows(0, 0, 0), rows(3e38, 3e38, 3e38), ("STROKE", "SLEW"), rows(100, 100, 100)),
@@ -82,22 +82,22 @@ CASES = (
 
 
 def violations(limits: Limits, previous_nm: Single, actuators_nm: Single) -> list[str]:
-    """Limits that a command breaks after one that kept them; exact, by float64 and without tolerance."""
+    """Limits that a command violates after one within them; exact, in float64 without tolerance."""
     now, before = actuators_nm.astype(np.float64), previous_nm.astype(np.float64)
     if now.shape != before.shape or not np.isfinite(now).all():
         return ["finite"]
-    apart = [np.abs(np.diff(now, axis=axis)).max(initial=0) for axis in (0, 1)]
+    differences = [np.abs(np.diff(now, axis=axis)).max(initial=0) for axis in (0, 1)]
     figures = {
         "stroke": (np.abs(now).max(), limits.stroke_nm),
         "slew": (np.abs(now - before).max(), limits.slew_nm),
-        "neighbours in a column": (apart[0], limits.neighbour_nm),
-        "neighbours in a row": (apart[1], limits.neighbour_nm),
+        "neighbours in a column": (differences[0], limits.neighbour_nm),
+        "neighbours in a row": (differences[1], limits.neighbour_nm),
     }
     return [f"{name}: {value} > {bound}" for name, (value, bound) in figures.items() if not value <= bound]
 
 
 def check_kept(limit: Callable[[Limits, Single, Single], Limited], case: Case) -> None:
-    """AssertionError where `limit` does not do with a case what it must."""
+    """Assert that `limit` gives the expected result of a case."""
     shape = case.previous_nm
     outside = bool(violations(LIMITS, shape, shape))
     for _ in range(case.steps):
@@ -113,7 +113,7 @@ def check_kept(limit: Callable[[Limits, Single, Single], Limited], case: Case) -
         assert names == case.reasons, f"{case.name}: {names}"
     if case.expected_nm is not None:
         worst = np.abs(shape - case.expected_nm).max()
-        assert worst < 0.01, f"{case.name}: {worst} nm from what was expected\n{shape}"
+        assert worst < 0.01, f"{case.name}: {worst} nm from the expected shape\n{shape}"
 
 
 def apply_command(device: Device, status: Status, command: Command, now_ns: int) -> tuple[Status, Reason | None]:

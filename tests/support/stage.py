@@ -1,4 +1,4 @@
-"""What an operator is shown: a run of the toy state by state, and a stream that keeps what is drawn on it."""
+"""Helpers for the display: a scripted run of the toy, and a recording stream that stores what is drawn."""
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable
@@ -50,18 +50,18 @@ def accumulated(samples: Iterable[Sample]) -> Accumulator:
 
 
 def snapshot_of(samples: list[Sample]) -> Snapshot:
-    """Everything of a run as one snapshot."""
+    """Snapshot of all messages of a run."""
     return accumulated(samples).snapshot(samples[-1].publish_time_ns)
 
 
 class Stage:
-    """A run of the toy, whose processes send what they are made to send.
+    """A scripted run of the toy's processes.
 
     Attributes:
-        silent: processes that send nothing any more; a silent camera sends no frames, and so on.
+        silent: processes that no longer send; a silent camera sends no frames, and so on.
         states: state in each process's Health.
-        health: more of a process's Health.
-        reasons: of every step; from the first seven on the frame was refused.
+        health: further fields of a process's Health.
+        reasons: reasons of every step; with a rejection the frame counts as refused.
     """
 
     def __init__(self, *, data_ns: int = START * 10**9) -> None:
@@ -140,11 +140,11 @@ class Stage:
 
 
 class Tape:
-    """In place of a RecordingStream.
+    """Stand-in for a RecordingStream.
 
     Attributes:
-        now_ns: time of what is logged next.
-        logged: (time in ns, archetypes) by entity path; the time is None for what holds for ever.
+        now_ns: time of the next logged item.
+        logged: (time in ns, archetypes) by entity path; the time is None for static items.
         rows: (times in ns, values (rows, series)) of columns of scalars, by entity path.
     """
 
@@ -171,9 +171,9 @@ class Tape:
 
     @property
     def paths(self) -> set[str]:
-        """Where something was drawn that is not style alone."""
-        moving = {path for path, found in self.logged.items() if any(at is not None for at, _ in found)}
-        return moving | set(self.rows)
+        """Entity paths with content other than static style."""
+        timed = {path for path, found in self.logged.items() if any(at is not None for at, _ in found)}
+        return timed | set(self.rows)
 
     def column(self, path: str) -> tuple[npt.NDArray[np.int64], Array]:
         times, values = zip(*self.rows[path], strict=True)
@@ -194,7 +194,7 @@ def values_of(component: Any) -> list[Any]:
 
 
 def pixels(tape: Tape, path: str) -> npt.NDArray[np.uint8]:
-    """Colours (rows, columns, 3) of the last picture at a path; its format may have come before it."""
+    """Colours (rows, columns, 3) of the last image at a path; its format may have been logged earlier."""
 
     def last(component: str) -> Any:
         logged = [batches for _, (batches, *_) in tape.logged[path]]

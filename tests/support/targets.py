@@ -1,4 +1,4 @@
-"""Everything that reads what others wrote, each with whole inputs to begin from and the errors it may raise."""
+"""Fuzzing targets: all readers of external data, each with valid inputs to start from and its permitted errors."""
 
 import json
 import tempfile
@@ -46,24 +46,26 @@ from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from sim_dm.device import Device, initial
 from sim_dm.driver import SimulatedMirror
-from tests.support.happenings import CALIBRATION, INTERLOCKS
+from tests.support.controller_inputs import CALIBRATION, INTERLOCKS
 from tests.support.mutated_logs import damaged, mutated, rewritten, small_log
 from tests.support.report_log import Night
 from tests.support.safety_checks import apply_command, tick, violations
 from tests.support.toy import GRID, NOLL, calibration, frame, loaded, settings
 
-USUAL = settings(interlocks=INTERLOCKS)
+NORMAL = settings(interlocks=INTERLOCKS)
 
 
 @dataclass(frozen=True)
 class Target:
-    """A reader of foreign bytes.
+    """A reader of external bytes.
 
     Attributes:
-        corpus: whole inputs.
-        read: reads one; raises nothing but `errors`.
-        message: the inputs' class, where they are messages.
-        cost: how many times as long one takes as a message does, about.
+        name: name of the target.
+        corpus: valid inputs.
+        read: reads an input; may raise only `errors`.
+        errors: permitted exceptions.
+        message: class of the inputs if they are protobuf messages.
+        cost: approximate duration of an input relative to a message.
     """
 
     name: str
@@ -74,7 +76,7 @@ class Target:
     cost: int = 1
 
     def input(self, number: int) -> bytes:
-        """Input `number`, made from its number alone."""
+        """Input `number`, reproducible from its number."""
         rng = Random(f"{self.name} {number}")  # noqa: S311
         data = rng.choice(self.corpus)
         if self.message is not None and rng.random() < 0.5:
@@ -85,24 +87,24 @@ class Target:
 
 
 class Loop:
-    """A controller that takes whatever comes, and the limits that its commands must keep."""
+    """A controller that takes any input; checks the limits of its commands."""
 
     def __init__(self) -> None:
-        self.state = loaded(USUAL)
+        self.state = loaded(NORMAL)
         self.count = 0
 
     def take(self, taken: Input) -> None:
         before = self.state.loop.actuators_nm if self.state.loop is not None else np.zeros(GRID, np.float32)
-        self.state, outputs = advance(USUAL, self.state, taken)
+        self.state, outputs = advance(NORMAL, self.state, taken)
         if outputs.step is not None:
             codec.encode_step(outputs.step, self.state.input_number)
         if outputs.command is not None:
-            assert violations(USUAL.limits, before, outputs.command.actuators_nm) == []
+            assert violations(NORMAL.limits, before, outputs.command.actuators_nm) == []
             codec.encode_command(outputs.command, 1, "lowfc", 1)
-        controller_state(self.state, USUAL, 0).SerializeToString()
+        controller_state(self.state, NORMAL, 0).SerializeToString()
 
     def frame(self, payload: bytes) -> None:
-        """A frame behind the sixteen bytes of its envelope."""
+        """Take a frame preceded by the 16 bytes of its envelope."""
         self.count += 1
         sequence, time_ns = Envelope.decode_checked(payload[:16])
         self.take(codec.decode_frame(payload[16:], sequence, -time_ns))
@@ -116,7 +118,7 @@ class Loop:
 
 
 def targets(folder: Path) -> list[Target]:
-    """All of them; files are written to `folder`."""
+    """All targets; files are written to `folder`."""
     return [*_messages(), *_requests(), *_files(folder), *_logs(folder)]
 
 
@@ -124,7 +126,7 @@ ENVELOPE = Envelope(1 << 32, 5).encode()
 
 
 class Processes:
-    """A controller and a mirror as they run, on the bus in memory: no message ends them."""
+    """The real controller and mirror on a memory bus: no message may stop them."""
 
     def __init__(self) -> None:
         config = load(None, {"mirror.rows": GRID[0], "mirror.columns": GRID[1], "realtime.cache_warmup": False})
@@ -138,31 +140,31 @@ class Processes:
         self.commands = MemoryBus(self.hub, "somebody", self.clock).publisher(COMMAND, "dm")
 
     def frame(self, data: bytes) -> None:
-        """Frames with extreme sequences and times, in the envelope too."""
+        """Publish a frame with extreme sequence and time, also in the envelope."""
         self.number += 1
         rng = Random(self.number)  # noqa: S311
         self.frames.put(data, rng.choice(EXTREMES), rng.choice(EXTREMES))
-        self._live()
+        self._run_once()
 
     def command(self, data: bytes) -> None:
         self.commands.put(data)
-        self._live()
+        self._run_once()
 
     def settings(self, data: bytes) -> None:
         self.settings_of.put(data)
-        self._live()
+        self._run_once()
 
-    def _live(self) -> None:
+    def _run_once(self) -> None:
         self.clock.advance(1_000_000)
-        self.mirror._wait()
+        self.mirror._idle()
         self.controller._between_frames(self.controller._camera.wait(0))
         self.controller._publish_state(self.clock.now_ns())
         for service in self.services:
             assert service.running, service.why
             service.health().SerializeToString()
-        kept = self.mirror._status.driven_nm
-        assert np.isfinite(kept).all()
-        assert violations(self.mirror._guard.limits, kept, kept) == []
+        driven_nm = self.mirror._status.driven_nm
+        assert np.isfinite(driven_nm).all()
+        assert violations(self.mirror._guard.limits, driven_nm, driven_nm) == []
 
 
 ROLES = ("controller", "mirror-dm")
@@ -173,13 +175,13 @@ def _messages() -> list[Target]:
     loop, processes = Loop(), Processes()
     whole = frame(1).pixels
     assert whole is not None
-    state = loaded(USUAL)
+    state = loaded(NORMAL)
     shape = np.ones(GRID, np.float32)
     modes = np.ones(len(NOLL), np.float32)
     loading, mirror = Load(0, CALIBRATION, "x"), MirrorShape(0, shape, modes)
     inputs = (loading, mirror, CameraSettings(0, (6, 7), 100.0, 6e4), Tick(0, 5), BenchReport(0, "mask", 2.5))
-    told = wire.MirrorCommand(frame_sequence=5, channel="lowfc", valid_for_ns=10**8, rows=4, columns=5)
-    told.actuators, told.command_nm[:] = shape.tobytes(), modes.tolist()
+    sent = wire.MirrorCommand(frame_sequence=5, channel="lowfc", valid_for_ns=10**8, rows=4, columns=5)
+    sent.actuators, sent.command_nm[:] = shape.tobytes(), modes.tolist()
     mirror_state = wire.MirrorState(rows=4, columns=5, actuators=shape.tobytes(), command_nm=modes.tolist())
     camera = wire.CameraState(rows=6, columns=7, bias_dn=100, saturation_dn=6e4)
     return [
@@ -193,7 +195,7 @@ def _messages() -> list[Target]:
             cost=10,
         ),
         Target(
-            "controller to mirror", (told.SerializeToString(),), processes.command, message=wire.MirrorCommand, cost=10
+            "controller to mirror", (sent.SerializeToString(),), processes.command, message=wire.MirrorCommand, cost=10
         ),
         Target(
             "camera's settings", (camera.SerializeToString(),), processes.settings, message=wire.CameraState, cost=10
@@ -226,15 +228,15 @@ def _messages() -> list[Target]:
         Target(
             "controller state",
             (_busy(state).SerializeToString(),),
-            lambda data: _go_on(*decode_state(wire.ControllerState.FromString(data), calibration(), *_arrays())),
+            lambda data: _advance_from(*decode_state(wire.ControllerState.FromString(data), calibration(), *_arrays())),
             (ValueError, codec.DecodeError),
             wire.ControllerState,
             10,
         ),
         Target(
-            "mirror command", (told.SerializeToString(),), _obey, (codec.DecodeError, LowfcError), wire.MirrorCommand, 2
+            "mirror command", (sent.SerializeToString(),), _apply, (codec.DecodeError, LowfcError), wire.MirrorCommand, 2
         ),
-        Target("a view's messages", (told.SerializeToString(),), _shown, cost=10),
+        Target("a view's messages", (sent.SerializeToString(),), _shown, cost=10),
     ]
 
 
@@ -242,7 +244,7 @@ def _mirror(loop: Loop, data: bytes) -> None:
     shape = codec.decode_mirror(data)
     if shape is not None:
         loop.take(shape)
-        advance(USUAL, loaded(USUAL), shape)  # one that has commanded nothing takes it for its own
+        advance(NORMAL, loaded(NORMAL), shape)  # a controller that has sent no command adopts the shape
 
 
 def _camera(loop: Loop, data: bytes) -> None:
@@ -251,27 +253,27 @@ def _camera(loop: Loop, data: bytes) -> None:
 
 @cache
 def _arrays() -> tuple[dict[str, LinearLaw], dict[str, PlayTable]]:
-    asked = [prepared(USUAL, codec.request(one, one.name, 0)) for one in _asked()]
+    asked = [prepared(NORMAL, codec.request(one, one.name, 0)) for one in _valid_requests()]
     laws = {one.law.id: one.law for one in asked if one.law is not None}
     return laws, {one.played.id: one.played for one in asked if one.played is not None}
 
 
 def _busy(state: State) -> wire.ControllerState:
-    state, _ = advance(USUAL, state, BenchReport(0, "mask", None))
-    for asked in _asked():
+    state, _ = advance(NORMAL, state, BenchReport(0, "mask", None))
+    for asked in _valid_requests():
         if asked.name in ("channel", "offset", "law", "play"):
-            state, _ = advance(USUAL, state, codec.request(asked, asked.name, 0))
-    return controller_state(state, USUAL, 0)
+            state, _ = advance(NORMAL, state, codec.request(asked, asked.name, 0))
+    return controller_state(state, NORMAL, 0)
 
 
-def _go_on(what: object, state: State) -> None:
-    """A state that was read is one to go on from."""
+def _advance_from(what: object, state: State) -> None:
+    """Check that a decoded state can be advanced."""
     for number in range(1, 4):
-        state, _ = advance(USUAL, state, frame(number + 1000))
+        state, _ = advance(NORMAL, state, frame(number + 1000))
 
 
-def _obey(data: bytes) -> None:
-    device = Device(GRID, USUAL.limits, 0.01, True, 5e4, np.full(GRID, np.nan, np.float32))
+def _apply(data: bytes) -> None:
+    device = Device(GRID, NORMAL.limits, 0.01, True, 5e4, np.full(GRID, np.nan, np.float32))
     status = initial(device)
     after, _ = apply_command(device, status, command_of(data), 10)
     assert violations(device.limits, status.driven_nm, after.driven_nm) == []
@@ -279,14 +281,14 @@ def _obey(data: bytes) -> None:
 
 
 def _shown(data: bytes) -> None:
-    """A message under the name of each topic that is looked at."""
+    """Pass a message to the viewer as each displayed topic."""
     accumulator = Accumulator()
     for topic in SHOWN:
         accumulator.add(Sample(topic.at("dm"), data, 0, 1, 1))
     accumulator.snapshot(2)
 
 
-def _asked() -> list[wire.Request]:
+def _valid_requests() -> list[wire.Request]:
     law = Law(*(np.full(len(NOLL), value, np.float32) for value in (0.4, 0.0, 50.0)))
     shape = np.ones(GRID, np.float32).tobytes()
     table = np.ones((5, 1), np.float32).tobytes()
@@ -307,7 +309,7 @@ def _asked() -> list[wire.Request]:
 
 def _requests() -> list[Target]:
     found = []
-    for asked in _asked():
+    for asked in _valid_requests():
         read = partial(Loop().request, asked.name)
         name, corpus = f"request {asked.name}", (asked.SerializeToString(),)
         found.append(Target(name, corpus, read, (ValueError,), wire.Request, 10))

@@ -1,4 +1,4 @@
-"""What an integrator's loop leaves, worked out by its open loop alone: beside `lowfc.control.laws.margins`."""
+"""Residual of an integrator loop from its open-loop transfer function, independent of `lowfc.control.laws.margins`."""
 
 from collections.abc import Iterable
 
@@ -25,7 +25,7 @@ from lowfc.control.laws.vibration import Model
 def law_of(
     gain: npt.ArrayLike = 0.5, leak: npt.ArrayLike = 0.0, limit_nm: npt.ArrayLike = 1000.0, modes: int = 3
 ) -> Law:
-    """An integrator; one gain for all modes, or one for each."""
+    """Make an integrator with one gain for all modes, or one for each."""
     return Law(*(np.broadcast_to(np.asarray(each, np.float32), (modes,)) for each in (gain, leak, limit_nm)))
 
 
@@ -46,25 +46,25 @@ def noise_transfer(frequency_hz: Array, rate_hz: float, gain: float, leak: float
 
 def noise_gain(gain: float, leak: float, delay_frames: float) -> float:
     """Variance of the residual per variance of white measurement noise: the mean of |T|^2 over frequency."""
-    turns = (np.arange(1 << 14) + 0.5) / (1 << 15)
-    return float(np.mean(noise_transfer(turns, 1.0, gain, leak, delay_frames) ** 2))
+    cycles = (np.arange(1 << 14) + 0.5) / (1 << 15)
+    return float(np.mean(noise_transfer(cycles, 1.0, gain, leak, delay_frames) ** 2))
 
 
 def integrators(modes: Iterable[tuple[float, float]], signal: Signal, delay_frames: float) -> LinearLaw:
-    """Integrators of gain and leak, as a linear law of this signal, at 1 kHz."""
+    """Integrators with these gains and leaks as a linear law of this signal, at 1 kHz."""
     blocks = [integrator_block(gain, leak, signal, delay_frames) for gain, leak in modes]
     return of_blocks(blocks, signal, "integrator", tuple(range(2, 2 + len(blocks))), delay_frames, 1000.0)
 
 
 def run(law: LinearLaw, disturbance_nm: Array, delay_frames: float, limit_nm: float = np.inf) -> tuple[Array, Array]:
-    """Errors and commands (frames, modes) of a loop in which nothing else acts; its delay may not be the law's."""
+    """Errors and commands (frames, modes) of a loop without noise; its delay may differ from the law's."""
     weights = delay_weights(delay_frames).astype(np.float32)
-    believed = delay_weights(law.delay_frames).astype(np.float32)
-    history = [np.zeros(disturbance_nm.shape[1], np.float32)] * max(len(weights), len(believed))
+    assumed = delay_weights(law.delay_frames).astype(np.float32)
+    history = [np.zeros(disturbance_nm.shape[1], np.float32)] * max(len(weights), len(assumed))
     x, errors, commands = at_rest(law), [], []
     for disturbance in disturbance_nm.astype(np.float32):
         error = disturbance + sum(weight * past for weight, past in zip(weights, history, strict=False))
-        pol = error - sum(weight * past for weight, past in zip(believed, history, strict=False))
+        pol = error - sum(weight * past for weight, past in zip(assumed, history, strict=False))
         x = predict_and_update(law, x, error if law.signal == "error" else pol, history[0])
         history = [np.clip(respond(law, x), -limit_nm, limit_nm, dtype=np.float32), *history[:-1]]
         errors.append(error)
@@ -73,7 +73,7 @@ def run(law: LinearLaw, disturbance_nm: Array, delay_frames: float, limit_nm: fl
 
 
 def realised(model: Model, frames: int, seed: int = 0) -> Array:
-    """A disturbance that the model describes, and its noise, (frames, 1)."""
+    """Realisation (frames, 1) of a model's disturbance plus its noise."""
     rng = np.random.default_rng(seed)
     F, Q, C = model.states()
     root = np.linalg.svd(Q)
@@ -91,4 +91,4 @@ LAWS = {
     "pi": pi_notch((2, 3, 4), _GAIN, _GAIN / 2, _NONE, [()] * 3, 1.0, 1000.0),
     "notch": pi_notch((2, 3, 4), _GAIN, _NONE, _NONE, _NOTCHES, 1.0, 1000.0),
 }
-"""Of three modes and one frame of delay, at 1 kHz."""
+"""Laws for three modes and a delay of one frame, at 1 kHz."""

@@ -1,4 +1,4 @@
-"""A small sensor and mirror with exact algebra, in place of diffraction: for tests of the control law alone."""
+"""A small, exactly linear sensor and mirror without diffraction, for tests of the control law."""
 
 from collections.abc import Container
 from dataclasses import dataclass
@@ -57,7 +57,7 @@ TOY = toy()
 
 
 def calibration(noll: tuple[int, ...] = NOLL, scale: float = 1.0) -> Calibration:
-    """The toy's calibration, of some of its modes; `scale` makes a different one."""
+    """Calibration of the toy with some of its modes; another `scale` makes a different one."""
     good = np.ones(SHAPE[0] * SHAPE[1])
     chosen = [NOLL.index(index) for index in noll]
     I0, H = normalise_flux(TOY.reference, TOY.response[:, chosen] * scale, good)
@@ -82,7 +82,7 @@ def calibration(noll: tuple[int, ...] = NOLL, scale: float = 1.0) -> Calibration
 
 
 def settings(**changes: object) -> Settings:
-    usual: dict[str, object] = {
+    defaults: dict[str, object] = {
         "limits": Limits(700.0, 100.0, 400.0),
         "delay_frames": 1.0,
         "start_mode": LoopMode.CLOSED,
@@ -95,7 +95,7 @@ def settings(**changes: object) -> Settings:
         "leak": (0.0, 0.0),
         "limit_nm": (150.0, 50.0),
     }
-    return Settings(**(usual | changes))
+    return Settings(**(defaults | changes))
 
 
 def loaded(what: Settings) -> State:
@@ -103,17 +103,17 @@ def loaded(what: Settings) -> State:
 
 
 def frame(count: int, modes_nm: npt.ArrayLike = (0, 0, 0), **changes: object) -> Frame:
-    usual: dict[str, object] = {
+    defaults: dict[str, object] = {
         "sequence": frame_sequence(count),
         "time_ns": START * 10**9 + count * PERIOD_NS,
         "age_ns": 100_000,
         "pixels": TOY.pixels(modes_nm),
     }
-    return Frame(**(usual | changes))
+    return Frame(**(defaults | changes))
 
 
 def feed(what: Settings, state: State, *inputs: Input) -> tuple[State, list[Outputs]]:
-    """The state after these inputs, and what each gave rise to."""
+    """State after these inputs, and the outputs of each."""
     every = []
     for taken in inputs:
         state, outputs = advance(what, state, taken)
@@ -126,7 +126,7 @@ def names(every: list[Outputs]) -> list[str]:
 
 
 def answered(outputs: Outputs, accepted: bool, *words: str) -> None:
-    """Assert that a request was accepted, or refused, in a sentence with these words."""
+    """Assert that a request was accepted or refused with a reply that contains these words."""
     assert outputs.reply.accepted is accepted, outputs.reply.text
     for word in words:
         assert word in outputs.reply.text
@@ -141,25 +141,25 @@ def live(
     missing: Container[int] = (),
     dark: Container[int] = (),
 ) -> tuple[list[Step], Array, State]:
-    """Steps of the live loop, the residual (frames, modes) in each exposure, and the state at the end.
+    """Run the loop; return its steps, the residual (frames, modes) in each exposure, and the final state.
 
     Args:
-        what: the controller's.
-        disturbance_nm: (frames, modes), to which the mirror adds.
-        noise_nm: of the sensor, which sees the residual and this.
-        state: to begin with; of `loaded` when None.
+        what: settings of the controller.
+        disturbance_nm: (frames, modes) disturbance, nm rms of wavefront.
+        noise_nm: measurement noise, added to the residual.
+        state: initial state; that of `loaded` when None.
         first: number of the first frame.
-        missing: exposures whose frames do not arrive, counted from 0.
-        dark: those without light.
+        missing: indices of exposures whose frames do not arrive, from 0.
+        dark: indices of exposures without light.
     """
     state = loaded(what) if state is None else state
     weights, to_modes = delay_weights(what.delay_frames), np.linalg.pinv(TOY.modes_to_actuators)
-    given = [np.zeros(len(NOLL))] * len(weights)
+    commanded = [np.zeros(len(NOLL))] * len(weights)
     noise_nm = np.broadcast_to(noise_nm, disturbance_nm.shape)
     steps, residual_nm = [], np.empty(disturbance_nm.shape)
     for count, wave_nm in enumerate(disturbance_nm):
-        residual_nm[count] = wave_nm + sum(weight * past for weight, past in zip(weights, given, strict=True))
-        newest = given[0]
+        residual_nm[count] = wave_nm + sum(weight * past for weight, past in zip(weights, commanded, strict=True))
+        newest = commanded[0]
         if count not in missing:
             light = {"pixels": TOY.pixels((0, 0, 0), flux_dn=0)} if count in dark else {}
             state, outputs = advance(what, state, frame(first + count, residual_nm[count] + noise_nm[count], **light))
@@ -167,5 +167,5 @@ def live(
             steps.append(outputs.step)
             if outputs.command is not None:
                 newest = to_modes @ outputs.command.actuators_nm.reshape(-1)
-        given = [newest, *given[:-1]]
+        commanded = [newest, *commanded[:-1]]
     return steps, residual_nm, state

@@ -1,4 +1,4 @@
-"""Viewers as the tests look at them: rerun's own, and its page in a real browser."""
+"""Helpers for tests of viewers: rerun's own, and its page in a real browser."""
 
 import base64
 import contextlib
@@ -26,7 +26,7 @@ from lowfc.adapters.viewer.rerun_viewer import RerunViewer, vulkan_drivers
 from tests.support.loops import until
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-CALL_S = 60.0  # software that draws a frame of WebGL on a busy machine takes its time
+CALL_S = 60.0  # software rendering of WebGL is slow on a busy machine
 
 needs_vulkan = pytest.mark.skipif(
     not vulkan_drivers() and "VK_ICD_FILENAMES" not in os.environ,
@@ -36,7 +36,7 @@ needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no browser is inst
 
 
 def on_screen(test: Callable[..., None]) -> Callable[..., None]:
-    """Mark a test of what rerun's viewer draws: it needs a Vulkan driver, and the host to itself."""
+    """Mark a test of rerun's drawing: it needs a Vulkan driver, and runs exclusively."""
     return pytest.mark.exclusive(pytest.mark.viewer(needs_vulkan(test)))
 
 
@@ -44,34 +44,34 @@ Pixels = npt.NDArray[np.uint8]
 
 
 def pixels(png: bytes) -> Pixels:
-    """(rows, columns, 3) of a PNG."""
+    """Pixels (rows, columns, 3) of a PNG."""
     with Image.open(io.BytesIO(png)) as picture:
         return np.asarray(picture.convert("RGB"))
 
 
 def share_of(picture: Pixels, colour: tuple[int, int, int], tolerance: int = 12) -> float:
-    """Which part of a picture has a colour, 0 to 1."""
+    """Fraction of an image with a colour, 0 to 1."""
     return float(np.all(np.abs(picture.astype(int) - colour) <= tolerance, axis=2).mean())
 
 
 def complaints(viewer: RerunViewer) -> list[str]:
-    """What its views could not draw, and its warnings and errors."""
+    """Reports of the viewer's views, and its warnings and errors."""
     reports = [report.summary for view in viewer.state().views for report in view.reports]
     logs = ViewerClient.connect(viewer.url).get_logs()
     return reports + [entry.message for entry in logs if entry.level != "INFO"]
 
 
 def listening(pid: int) -> set[tuple[str, int]]:
-    """Address and port of every socket on which a process listens, of IPv4 and IPv6."""
+    """Address and port of every listening IPv4 and IPv6 socket of a process."""
     sockets = psutil.Process(pid).net_connections("inet")
     return {(one.laddr.ip, one.laddr.port) for one in sockets if one.status == "LISTEN"}
 
 
 class Page:
-    """One page of a headless Chromium, by its debugging protocol.
+    """A page of a headless Chromium, controlled by its debugging protocol.
 
     Attributes:
-        fetched: address of everything it asked for, by number; without what its own policy forbade.
+        fetched: addresses requested by the page, by request id, without those blocked by its policy.
         complaints: errors and warnings of its console.
     """
 
@@ -87,13 +87,13 @@ class Page:
             self.call(f"{domain}.enable")
 
     def open(self, address: str) -> None:
-        """Go there and wait until the page has loaded, which the viewer in it has not yet."""
+        """Open an address and wait until the page has loaded; the viewer in it may still be loading."""
         self.call("Page.navigate", url=address)
         while self._next().get("method") != "Page.loadEventFired":
             pass
 
     def screenshot_when(self, shows: Callable[[Pixels], bool], seconds: float) -> bytes:
-        """PNG of the page once it shows what is waited for, or at the end of the time."""
+        """PNG of the page once `shows` is true, or after the timeout."""
         deadline_s = time.monotonic() + seconds
         while True:
             picture = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
@@ -125,12 +125,12 @@ class Page:
 
 @contextlib.contextmanager
 def browser(folder: Path, size_px: tuple[int, int]) -> Iterator[Page]:
-    """A headless Chromium that draws WebGL in software, with a profile of its own; it fetches from this host only."""
+    """Run a headless Chromium with software WebGL and its own profile; it can connect to this host only."""
     quiet = ("quic", "background-networking", "component-update", "sync", "default-apps", "extensions", "dev-shm-usage")
     options = ["headless", "no-sandbox", "no-first-run", "hide-scrollbars", "remote-debugging-port=0"]
     options += ["use-angle=swiftshader", "enable-unsafe-swiftshader", "ignore-gpu-blocklist"]
     options += [f"disable-{name}" for name in quiet]
-    options += ["proxy-server=http://127.0.0.1:9", f"user-data-dir={folder / 'profile'}"]  # nobody listens there
+    options += ["proxy-server=http://127.0.0.1:9", f"user-data-dir={folder / 'profile'}"]  # no proxy listens there
     options += [f"window-size={size_px[0]},{size_px[1]}"]
     with (folder / "browser.txt").open("wb") as output:
         words = [str(CHROMIUM), *(f"--{option}" for option in options)]
@@ -150,7 +150,7 @@ def browser(folder: Path, size_px: tuple[int, int]) -> Iterator[Page]:
 def browser_screenshot(
     address: str, path: Path, seconds: float, shows: Callable[[Pixels], bool], size_px: tuple[int, int]
 ) -> Page:
-    """Write a PNG of a page in a browser, once it shows what is waited for or after so many seconds."""
+    """Write a PNG of a page in a browser once `shows` is true, or after so many seconds."""
     folder = path.parent / f"{path.stem}-browser"
     folder.mkdir()
     try:

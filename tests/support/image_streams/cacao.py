@@ -1,9 +1,9 @@
-"""A bench beside the loop, as CACAO has one: the simulated camera's frames in a stream, the mirror behind channels.
+"""Emulation of a CACAO bench: the simulated camera's frames in a stream, the mirror behind channels.
 
-A program, with a file of configuration and a folder of streams. It knows nothing of the run: frames go into `camnsv`,
-the channels dm00disp00 to dm00disp11 that there are are summed into `dm00disp`, without their mean, and the optics see
-that sum. A line on standard input is done between two frames: `renew` and `region` make the camera's stream anew,
-`die` ends it in the middle of an image, `stop` prints what was left of the wavefront and ends.
+A program with a configuration file and a folder of streams as arguments, independent of the run: it writes frames to
+`camnsv`, sums the existing channels dm00disp00 to dm00disp11 into `dm00disp`, without the mean, and applies the sum to
+the optics. It executes lines of standard input between two frames: `renew` and `region` recreate the camera's stream,
+`die` ends the program in the middle of an image, `stop` prints the residual wavefront and ends.
 """
 
 import json
@@ -29,7 +29,7 @@ from tests.support.image_streams.plain import PlainStream
 UINT16, FLOAT32 = 3, 9
 CAMERA, TOTAL = "camnsv", "dm00disp"
 REGION = 2
-"""Rows that a smaller region leaves out."""
+"""Number of rows omitted by the smaller region."""
 
 
 def file_of(folder: Path, name: str) -> Path:
@@ -37,10 +37,10 @@ def file_of(folder: Path, name: str) -> Path:
 
 
 class Comb:
-    """The process that sums the channels, in a thread."""
+    """Thread that sums the channels, like CACAO's DM comb process."""
 
     def __init__(self, folder: Path, rows: int, columns: int, publish: object) -> None:
-        """Make the sum and the first channel; the others are found once they are there."""
+        """Create the sum and the first channel; other channels are found once they exist."""
         self.shape = (columns, rows)
         self.folder, self.publish = folder, publish
         self.total = PlainStream.make(file_of(folder, TOTAL), *self.shape, FLOAT32)
@@ -50,7 +50,7 @@ class Comb:
         PlainStream.make(file_of(folder, f"{TOTAL}00"), *self.shape, FLOAT32)
         threading.Thread(target=self.run, daemon=True).start()
 
-    def look(self) -> None:
+    def find_channels(self) -> None:
         for index in range(12):
             path = file_of(self.folder, f"{TOTAL}{index:02d}")
             if path.name not in self.channels and path.exists():
@@ -58,15 +58,13 @@ class Comb:
                 self.channels[path.name].take(0)
 
     def run(self) -> None:
-        """Wait for the loop's channel; sum all whenever any was written."""
-        looked_s = 0.0
+        """Wait for the loop's channel; update the sum whenever a channel was written."""
+        searched_s = 0.0
         while self.running:
-            if time.monotonic() - looked_s > 0.2:
-                self.look()
-                looked_s = time.monotonic()
-            newest = max(
-                self.channels.values(), key=lambda one: one.count
-            )  # the loop's, for it is written all the time
+            if time.monotonic() - searched_s > 0.2:
+                self.find_channels()
+                searched_s = time.monotonic()
+            newest = max(self.channels.values(), key=lambda one: one.count)  # the loop's, which is written most often
             newest.wait(0, 0.01)
             counts = {name: one.count for name, one in self.channels.items()}
             if counts != self.counts:
@@ -108,7 +106,7 @@ def main() -> None:
         stream.begin(exposure.pixels[:rows])
         ahead_ns = round(clock.ahead_ns() - (time.clock_gettime(time.CLOCK_TAI) - time.time()) * 1e9)
         stream.end(exposure.end_ns - ahead_ns)
-        let_send()  # the loop's processes run before this one computes the truth
+        let_send()  # lets the loop's processes run before the truth is computed
         driver.sent(Envelope(sequence_of(clock.start_s, count), clock.host_ns()))
         count += 1
         if not select.select([sys.stdin], [], [], 0)[0]:

@@ -1,6 +1,6 @@
-"""ImageStreamIO streams by their published layout alone: a reader and a writer that share nothing with the product.
+"""Independent reader and writer of ImageStreamIO streams from the published layout, without code of the product.
 
-Byte offsets are written out, packed and unpacked with `struct`.
+Byte offsets are explicit, packed and unpacked with `struct`.
 """
 
 import ctypes
@@ -20,7 +20,7 @@ HEADER, KEYWORD, SEMAPHORE, TRACE = 384, 128, 32, 64
 
 
 class PlainStream:
-    """A stream, mapped: `offset` of each part from sizes that are given, never from the header."""
+    """A mapped stream; positions of its parts are computed from the arguments, never from the header."""
 
     def __init__(self, path: Path, columns: int, rows: int, number: int, planes: int = 1, keywords: int = 0) -> None:
         self.type, self.shape = np.dtype(NUMPY_TYPES[number]), (planes, rows, columns)
@@ -30,7 +30,7 @@ class PlainStream:
         self.data = HEADER
         self.keywords = self.data + (length + 7) // 8 * 8
         self.semaphores = self.keywords + KEYWORD * keywords
-        self.readers = self.semaphores + 11 * SEMAPHORE  # ten, and that of the log
+        self.readers = self.semaphores + 11 * SEMAPHORE  # ten, and one for the log
         self.writers = self.readers + 40
         self.address = ctypes.addressof(ctypes.c_char.from_buffer(self.map))
 
@@ -50,7 +50,7 @@ class PlainStream:
         kind: int = 2,
         axes: int = 2,
     ) -> Self:
-        """Make a stream as the C library does: unlink a former one, size, header, semaphores, the version last."""
+        """Create a stream as the C library does: unlink a former one; size, header, semaphores, version last."""
         words = keywords or {}
         itemsize = np.dtype(NUMPY_TYPES.get(number, "f8")).itemsize
         elements = columns * rows * planes
@@ -107,7 +107,7 @@ class PlainStream:
         return flat.reshape(self.shape)
 
     def begin(self, image: npt.NDArray[np.generic], plane: int = 0) -> None:
-        """Begin to write an image: the flag, and the pixels."""
+        """Begin to write an image: set the flag, write the pixels."""
         self.pack("B", 288, 1)
         raw = np.ascontiguousarray(image, self.type).tobytes()
         at = self.data + plane * len(raw)
@@ -115,7 +115,7 @@ class PlainStream:
         self.pack("<Q", 272, plane)
 
     def end(self, acquired_ns: int | None = None) -> None:
-        """Finish it: times, counter, flag, and the semaphores that are below ten."""
+        """Finish the image: times, counter, flag, and post the semaphores below ten."""
         now_ns = time.clock_gettime_ns(time.CLOCK_TAI)
         self.pack("<qq", 184, *divmod(now_ns if acquired_ns is None else acquired_ns, 10**9))
         self.pack("<qq", 200, *divmod(now_ns, 10**9))

@@ -1,4 +1,4 @@
-"""What may come to a controller, in any order."""
+"""Hypothesis strategy for inputs of a controller in any order."""
 
 import numpy as np
 from hypothesis import strategies as st
@@ -21,12 +21,12 @@ TIGHT = {
     "rate_hz": 1000.0,
     "interlocks": INTERLOCKS,
 }
-"""Settings under which limits and interlocks act."""
+"""Settings under which limits and interlocks often act."""
 
 
 @st.composite
 def inputs(draw: st.DrawFn) -> list[Input]:
-    """Good and bad frames, gaps, silence, operators, devices."""
+    """Draw good and bad frames, gaps, ticks, requests, states of devices and bench values."""
     taken: list[Input] = []
     count = 0
     for kind in draw(st.lists(st.sampled_from("fffffbltrmcsvp"), min_size=1, max_size=40)):
