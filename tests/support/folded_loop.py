@@ -214,7 +214,7 @@ def fold(config: Configuration, frames: int, calibration: Calibration | None = N
     """Run the loop of a configuration; every frame must be used.
 
     Returns error_nm, pol_nm and command_nm (frames, modes) of the steps, and disturbance_nm and residual_nm
-    (frames, modes), disturbance_rms_nm and residual_rms_nm (frames,) over the open pupil, of the truth; nm of wavefront.
+    (frames, modes), disturbance_rms_nm and residual_rms_nm (frames,) over the open pupil of the truth; nm.
     """
     bench = Bench(config, calibration or calibrated(config))
     bench.run(frames)
