@@ -54,18 +54,18 @@ def starting(name: str, role: Role) -> bool:
     return Role.LAUNCHER in roles and role not in roles
 
 
-def living(wanted: str | None = None) -> dict[str, set[str]]:
-    """Runs with a listening process, and their roles; a damaged run is omitted unless it is the wanted one.
+def living(required: str | None = None) -> dict[str, set[str]]:
+    """Runs with a listening process, and their roles; a damaged run is omitted unless it is the required one.
 
     Raises:
-        BusError, DataFileError: the wanted one is damaged.
+        BusError, DataFileError: the required run is damaged.
     """
     found: dict[str, set[str]] = {}
     for name in sorted(path.parent.name for path in runtime_base().glob("*/links.json")):
         try:
             roles = open_run(name, ()).links.live()
         except (BusError, DataFileError, OSError):
-            if name == wanted:
+            if name == required:
                 raise
             continue
         if roles:

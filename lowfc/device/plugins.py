@@ -63,9 +63,9 @@ def opened(kind: Kind, name: str, config: Configuration, words: Sequence[str] = 
     `driver` is its class, if known.
     """
     driver = load(kind, name) if driver is None else driver
-    given = options(driver, table(config, kind, name), words)
+    values = options(driver, table(config, kind, name), words)
     with opening(f"the {kind} {name!r} cannot be opened"):
-        return driver(given, config)
+        return driver(values, config)
 
 
 def faults(config: Configuration, folder: Path) -> list[str]:
@@ -109,14 +109,14 @@ def options(driver: Any, found: dict[str, Any], words: Sequence[str] = ()) -> Dr
     ConfigurationError if one is unknown or wrong.
     """
     model: type[DriverOptions] = getattr(driver, "Options", DriverOptions)
-    given, faults = _given(words), []
+    values, faults = _parsed(words), []
     try:
         validated = model.model_validate(found)
     except ValidationError as error:  # options missing here may be among the words
-        faults = [one for one in error.errors() if not (given and one["type"] == "missing")]
-    if given and not faults:
+        faults = [one for one in error.errors() if not (values and one["type"] == "missing")]
+    if values and not faults:
         try:
-            validated = model.model_validate({**found, **given}, strict=False)
+            validated = model.model_validate({**found, **values}, strict=False)
         except ValidationError as error:
             faults = error.errors()
     if faults:
@@ -147,7 +147,7 @@ def _explained(fault: Any, model: type[DriverOptions]) -> str:
     return explain(fault)
 
 
-def _given(words: Sequence[str]) -> dict[str, Any]:
+def _parsed(words: Sequence[str]) -> dict[str, Any]:
     """Parse a command line into values by field name; lists are written as in TOML."""
     found: dict[str, Any] = {}
     rest = list(words)

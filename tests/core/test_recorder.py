@@ -180,7 +180,7 @@ def test_frames_that_the_camera_missed_before_publishing_are_not_losses() -> Non
     def health(published: int, missing: int) -> None:
         message = wire.Health(process="camera")
         message.topics.add(topic=FRAME.key, published=published, missing=missing)
-        account.believe(entry(HEALTH, 0, key=HEALTH.at("camera"))[1], message)
+        account.reconcile(entry(HEALTH, 0, key=HEALTH.at("camera"))[1], message)
 
     account.enter(*entry(FRAME, 50), recorded=True)
     health(51, 7)  # missed before the first frame received
@@ -197,13 +197,13 @@ def test_duplicates_neither_count_as_losses_nor_hide_them() -> None:
     account = LossAccount()
     for count in (0, 1, 1, 2, 2, 4, 4):
         account.enter(*entry(FRAME, count), recorded=True)
-    account.settle()
+    account.mark_flushed()
     account.enter(*entry(FRAME, 4), recorded=True)
     account.revert()
     for published, lost in ((7, 1), (8, 1), (9, 2)):
         message = wire.Health(process="camera", state="stopped")
         message.topics.add(topic=FRAME.key, published=published)
-        account.believe(entry(HEALTH, 0)[1], message)
+        account.reconcile(entry(HEALTH, 0)[1], message)
         assert account.lost() == {FRAME.key: lost}, (
             "frame 3 was not received; more than seven published are further losses"
         )
@@ -218,7 +218,7 @@ def test_the_last_health_of_each_start_determines_its_losses() -> None:
         message.topics.add(topic=FRAME.key, published=published)
         message.topics.add(topic=STEP.key, received=9)
         message.topics.add(topic="lowfc/nothing", published=9)
-        account.believe(entry(HEALTH, 0, start_s)[1], message)
+        account.reconcile(entry(HEALTH, 0, start_s)[1], message)
 
     health(40, "running")  # messages before its first Health are not lost
     health(90, "running")  # messages may still arrive

@@ -13,7 +13,7 @@ from tests.docs import test_tutorials as tutorials
 from tests.e2e.test_bench_day import COMMANDS as BENCH_DAY
 from tests.e2e.test_operator import COMMANDS as OPERATING
 from tests.e2e.test_own_hardware import COMMISSIONING, DOCUMENTED
-from tests.support.loops import command, going_on, interrupt, recorded_bytes, start, told, until
+from tests.support.loops import command, going_on, interrupt, output_of, recorded_bytes, start, until
 from tests.support.viewers import on_screen
 
 ROOT = Path(__file__).parents[2]
@@ -251,5 +251,5 @@ def test_the_logs(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_configuration(tmp_path: Path) -> None:
     for line in FILES[:-1]:
-        told(tmp_path, line)
+        output_of(tmp_path, line)
     run(tmp_path, FILES[-1])

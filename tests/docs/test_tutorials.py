@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.loops import command, going_on, interrupt, recorded_bytes, start, told, until
+from tests.support.loops import command, going_on, interrupt, output_of, recorded_bytes, start, until
 
 ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "tutorials"
@@ -45,7 +45,7 @@ def followed(folder: Path, page: str, *, shorter: bool = False) -> dict[str, str
         line = found.split("  #")[0].strip()
         if followed_here(line):
             short = line.replace("--duration 20", "--duration 0.5") if shorter else line
-            printed[line] = (told if _ALONE.match(line) else command)(folder, short)
+            printed[line] = (output_of if _ALONE.match(line) else command)(folder, short)
     return printed
 
 

@@ -16,7 +16,7 @@ from lowfc.contract.messages import topic_of, wire
 from lowfc.contract.sections import SENSORS
 from lowfc.optics.chain.sensor import light_budget
 from sim_camera.prediction import tilt_residual_mas
-from tests.support.loops import children, loop, lowfc, payloads, recorded_bytes, run, start, told, until
+from tests.support.loops import children, loop, lowfc, output_of, payloads, recorded_bytes, run, start, until
 from tools.measure import measured
 
 GENTLE = """
@@ -43,7 +43,7 @@ def test_two_runs_with_one_seed_write_the_same_bytes_and_have_one_digest(tmp_pat
         assert figures["frames_published"] == figures["commands_applied"] == frames
         assert figures["messages_lost"] == 0
         logs.append(payloads(figures["log"]))
-        infos.append(json.loads(told(folder, "lowfc info last --digest --json")))
+        infos.append(json.loads(output_of(folder, "lowfc info last --digest --json")))
     digests = [info["digest"] for info in infos]
     assert digests[0] == digests[1] != digests[2]
     assert {key for key, line in infos[0]["topics"].items() if "digest" not in line} == {
@@ -58,7 +58,7 @@ def test_two_runs_with_one_seed_write_the_same_bytes_and_have_one_digest(tmp_pat
     asked = [wire.Request.FromString(payload) for payload in one["/lowfc/control/request"]]
     assert [(request.name, request.accepted) for request in asked[:2]] == [("gain", True), ("close", True)]
     assert {request.requester for request in asked[:2]} == {"automatic gains"}
-    assert json.loads(told(tmp_path / "one", "lowfc replay last --json"))["identical"] is True
+    assert json.loads(output_of(tmp_path / "one", "lowfc replay last --json"))["identical"] is True
 
 
 @pytest.mark.parametrize("frames", [1_200, pytest.param(20_000, marks=pytest.mark.slow)])
@@ -128,7 +128,7 @@ def test_the_documents_table_is_of_the_sensors_as_they_are() -> None:
 
 
 def test_a_configuration_that_was_shown_does_not_open_the_loop(tmp_path: Path) -> None:
-    shown = told(tmp_path, "lowfc config show")
+    shown = output_of(tmp_path, "lowfc config show")
     for gain in ("tilt_gain", "gain"):  # not measured first
         shown = shown.replace(f'\n#{gain} = "auto"', f"\n{gain} = 0.3")
     done = run(tmp_path, "sim-loop", "--lockstep", "--duration", "0.2", "--no-record", config=shown)

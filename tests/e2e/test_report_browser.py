@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.support.loops import told
+from tests.support.loops import output_of
 from tests.support.report_log import Night
 from tests.support.viewers import Page, browser, needs_chromium, pixels
 
@@ -59,7 +59,7 @@ def figures(folder: Path) -> dict[str, Any]:
     night.request("close")
     night.frames(900, lost={300})
     log = night.write(folder / "night.mcap")
-    found: dict[str, Any] = json.loads(told(folder, f"lowfc report {log} --json --out report.html"))
+    found: dict[str, Any] = json.loads(output_of(folder, f"lowfc report {log} --json --out report.html"))
     return found
 
 

@@ -23,10 +23,10 @@ from tests.support.loops import (
     children,
     loop,
     lowfc,
+    output_of,
     payloads,
     recorded_bytes,
     start,
-    told,
     until,
 )
 from tests.support.other_readers import foxglove
@@ -83,7 +83,7 @@ def test_the_log_holds_every_topic_and_says_what_it_lost(live: dict[str, Any], t
 
 
 def test_the_log_is_as_large_as_said_before(live: dict[str, Any]) -> None:
-    info = json.loads(told(live["log"].parent, f"lowfc info {live['log']} --json"))
+    info = json.loads(output_of(live["log"].parent, f"lowfc info {live['log']} --json"))
     constant = sum(info["attachments"].values()) + info["topics"]["lowfc/calibration"]["bytes"]
     growth = (info["bytes"] - constant) * 500 / FRAMES
     assert bytes_per_s(load(None, {"camera.rate_hz": 500.0}), EVERYTHING) == pytest.approx(growth, rel=0.25)

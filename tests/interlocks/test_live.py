@@ -12,7 +12,7 @@ from lowfc.adapters.logs.reader import LogReader
 from lowfc.client import Client, running
 from lowfc.contract.errors import BusError, RequestRefusedError
 from lowfc.contract.messages import BENCH, CONTROL_INPUT, FRAME, STEP, wire
-from tests.support.loops import FIXED, interrupt, start, told, until
+from tests.support.loops import FIXED, interrupt, output_of, start, until
 
 FLIPS = 60
 MAX_AGE_S = 1
@@ -57,7 +57,7 @@ def test_interlocks_with_changing_flooding_and_missing_values(tmp_path: Path) ->
     assert figures["frames_missing"] == figures["messages_lost"] == 0
     assert figures["frames_skipped"] <= 3, "a stall of the host skips a few, a flood would skip hundreds"
     log = tmp_path / figures["log"]
-    replayed = json.loads(told(tmp_path, f"lowfc replay --json {log}"))
+    replayed = json.loads(output_of(tmp_path, f"lowfc replay --json {log}"))
     assert replayed["identical"]
     assert replayed["unchecked"] == 0
     _steps_follow_the_inputs(log)

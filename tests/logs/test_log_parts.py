@@ -31,7 +31,7 @@ def recorded(folder: Path, samples: Sequence[Sample], files: int, *, finish: boo
     series = LogSeries(folder, HostClock(), METADATA, TOML, STANDARD)
     states: dict[str, Sample] = {}
     for number in range(files):
-        series.begin(states.values(), anew=not number)
+        series.begin(states.values(), new_recording=not number)
         for sample in samples[len(samples) * number // files : len(samples) * (number + 1) // files]:
             series.write(sample)
             if topic_of(sample.key).queryable:

@@ -55,7 +55,7 @@ def lowfc(*words: object) -> Result:
     return CliRunner().invoke(app, [*map(str, words)])
 
 
-def told(folder: Path, line: str) -> str:
+def output_of(folder: Path, line: str) -> str:
     """Output of a documented command that starts no loop, run in this process with this working directory."""
     words, _, output = line.partition(" > ")
     with contextlib.chdir(folder):

@@ -168,9 +168,9 @@ class Faults:
             return
         where = f"{place} {key}"
         with self._lock:
-            seen = self.counts.get(where, 0)
-            self.counts[where] = seen + 1
-        if not seen:
+            before = self.counts.get(where, 0)
+            self.counts[where] = before + 1
+        if not before:
             text = "".join(traceback.format_exception(fault))
             sys.stderr.write(f"{where}: {text}(further ones at this place are only counted)\n")
 

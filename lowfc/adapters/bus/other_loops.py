@@ -23,9 +23,9 @@ def none_here() -> str:
     transient = [each.removesuffix(_STARTING) for each in found if each.endswith(_STARTING)]
     if transient:
         return f"{transient[0]}, which is starting or ending: try again in a few seconds"
-    given = f"from {_FOLDER}" if os.environ.get(_FOLDER) else f"{_FOLDER} is not set"
+    origin = f"from {_FOLDER}" if os.environ.get(_FOLDER) else f"{_FOLDER} is not set"
     sentence = (
-        f"no loop of user {_name(os.geteuid())} is running here: {runtime_path()} was searched ({given}); loops of "
+        f"no loop of user {_name(os.geteuid())} is running here: {runtime_path()} was searched ({origin}); loops of "
         f"other users, or started with another {_FOLDER}, are not seen"
     )
     more = [f"and {len(found) - _MOST} more"] if len(found) > _MOST else []

@@ -200,8 +200,8 @@ def mirror_role(name: str) -> str:
 
 def runtime_path() -> Path:
     """Path of the user's runtime directory for lowfc, which may not exist."""
-    given = os.environ.get("XDG_RUNTIME_DIR")
-    return Path(given) / "lowfc" if given else Path("/tmp") / f"lowfc-{os.geteuid()}"  # noqa: S108  # own_directory() checks it
+    configured = os.environ.get("XDG_RUNTIME_DIR")
+    return Path(configured) / "lowfc" if configured else Path("/tmp") / f"lowfc-{os.geteuid()}"  # noqa: S108  # own_directory() checks it
 
 
 def runtime_base() -> Path:

@@ -260,7 +260,7 @@ class ZenohBus:
     def queryable(self, key_expression: str, handler: Callable[[Query], None]) -> None:
         """See `Bus.queryable`."""
 
-        def asked(query: zenoh.Query) -> None:
+        def queried(query: zenoh.Query) -> None:
             key = str(query.key_expr)
             try:
                 handler(
@@ -270,7 +270,7 @@ class ZenohBus:
                 query.drop()  # type: ignore[no-untyped-call]
                 self.faults.add(f"{self.role}: queryable of", key, fault)
 
-        self._session.declare_queryable(key_expression, Callback(asked, indirect=False))
+        self._session.declare_queryable(key_expression, Callback(queried, indirect=False))
 
     def get(
         self,

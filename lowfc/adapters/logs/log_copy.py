@@ -52,23 +52,23 @@ class LogCopy:
         self,
         reader: LogReader,
         *,
-        wanted: Callable[[Sample], bool] = lambda message: True,
-        described: Callable[[Metadata | Attachment], bool] = lambda record: True,
+        include: Callable[[Sample], bool] = lambda message: True,
+        include_record: Callable[[Metadata | Attachment], bool] = lambda record: True,
     ) -> None:
         """Copy a file's messages, metadata and attachments, in their order.
 
         Args:
             reader: new reader of the file.
-            wanted: decides whether to copy a message.
-            described: decides whether to copy metadata or an attachment.
+            include: decides whether to copy a message.
+            include_record: decides whether to copy metadata or an attachment.
         """
         done = 0
         for message in reader:
-            self.describe(list(filter(described, reader.described[done:])))
+            self.describe(list(filter(include_record, reader.described[done:])))
             done = len(reader.described)
-            if wanted(message):
+            if include(message):
                 self._add(reader, message)
-        self.describe(list(filter(described, reader.described[done:])))
+        self.describe(list(filter(include_record, reader.described[done:])))
 
     def finish(self) -> None:
         """Write the index."""

@@ -100,7 +100,7 @@ class LossAccount:
         tally = self._tally(sample.key, self._author(topic, sample), start_of(sample.sequence), count)
         tally.enter(count, recorded=recorded or unwanted, unwanted=unwanted)
 
-    def believe(self, sample: Sample, health: wire.Health) -> None:
+    def reconcile(self, sample: Sample, health: wire.Health) -> None:
         """Use a publisher's own counts from its Health; messages sent before its first one arrived are not lost.
 
         Raises:
@@ -118,13 +118,13 @@ class LossAccount:
                 if health.state == "stopped":
                     tally.published = count.published
 
-    def settle(self) -> None:
+    def mark_flushed(self) -> None:
         """Note that everything recorded so far has been flushed."""
         for _, tally in self._all():
             tally.safe = tally.recorded, tally.twice
 
     def revert(self) -> None:
-        """Note that everything recorded since `settle` was lost."""
+        """Note that everything recorded since `mark_flushed` was lost."""
         for _, tally in self._all():
             tally.recorded, tally.twice = tally.safe
 

@@ -107,7 +107,7 @@ def selection(every: int = 1, patterns: Iterable[str] = ()) -> Selection:
         ConfigurationError: a pattern matches no topic.
     """
     chosen: set[Topic] = set()
-    for pattern in (given.removeprefix("/") for given in patterns):
+    for pattern in (one.removeprefix("/") for one in patterns):
         matching = {topic for topic in TOPICS if topic.matches(pattern) or fnmatchcase(topic.key, pattern)}
         if not matching:
             keys = [topic.key for topic in TOPICS]

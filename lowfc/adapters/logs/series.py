@@ -93,15 +93,15 @@ class LogSeries:
             or time.monotonic() - self._opened_s >= self._limits.longest_s
         )
 
-    def begin(self, first: Iterable[Sample], *, anew: bool = True) -> None:
-        """Begin a file with the messages `first`, on which later ones depend; not `anew`: as a part of the recording.
+    def begin(self, first: Iterable[Sample], *, new_recording: bool = True) -> None:
+        """Begin a file of a new or of the present recording with the messages `first`, on which later ones depend.
 
         Raises:
             DataFileError: the file cannot be created.
         """
         now_ns = self._clock.host_ns()
         path = log_path(self._folder, now_ns)
-        if anew:
+        if new_recording:
             self._recording, self._part = path.stem, 0
         self._part += 1
         metadata = {**self._metadata, PART: {"of": self._recording, "number": str(self._part)}}

@@ -64,12 +64,12 @@ def thin(log: Parts, out: Path, requested: Selection, progress: Callable[[int, i
     reader.progress = progress
     described: set[str] = {PART, SELECTION}  # the copy has its own
 
-    def wanted(message: Sample) -> bool:
+    def include(message: Sample) -> bool:
         nonlocal messages
         messages += 1
         return combined.keeps(topic_of(message.key), message.sequence, message.payload)
 
-    def new(record: Metadata | Attachment) -> bool:
+    def include_record(record: Metadata | Attachment) -> bool:
         """Whether to copy a record; of a later file only its account, which replaces the previous one."""
         known = record.name in described and record.name not in ("recording", RECOVERY)
         described.add(record.name)
@@ -79,7 +79,7 @@ def thin(log: Parts, out: Path, requested: Selection, progress: Callable[[int, i
         copy = LogCopy(file)
         for name, entries in combined.metadata.items():
             copy.note(name, entries)
-        copy.take(reader, wanted=wanted, described=new)
+        copy.take(reader, include=include, include_record=include_record)
         if not reader.complete or reader.damage or reader.unreadable:
             copy.note(RECOVERY, account(reader, copy.messages))
         copy.finish()

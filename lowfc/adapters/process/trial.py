@@ -33,14 +33,14 @@ class Trial(NamedTuple):
     first_ns: list[int]
 
 
-def try_out(asked: Realtime, cpus: set[int], seconds: float) -> Trial:
+def try_out(requested: Realtime, cpus: set[int], seconds: float) -> Trial:
     """Request the measures of a process of the loop, and time 1000 wake-ups per second in each scheduling class.
 
     It runs on these processors (all when empty). OSError if the trial's process cannot be started, or fails.
     """
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         try:
-            return pool.submit(_try, asked, cpus, seconds).result()
+            return pool.submit(_try, requested, cpus, seconds).result()
         except BrokenExecutor as fault:
             raise OSError(f"the trial's process ended: {fault}") from fault
 
@@ -60,7 +60,7 @@ def lateness_ns(wake_ups: int, period_ns: int = 1_000_000_000 // RATE_HZ) -> lis
     return late_ns
 
 
-def _try(asked: Realtime, cpus: set[int], seconds: float) -> Trial:
+def _try(requested: Realtime, cpus: set[int], seconds: float) -> Trial:
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # do not inherit the parent's class
     wake_ups = max(1, round(seconds * RATE_HZ))
     inherited = os.sched_getaffinity(0)
@@ -74,9 +74,9 @@ def _try(asked: Realtime, cpus: set[int], seconds: float) -> Trial:
         if found := set_up(priority, None, **measures).refused:
             refused[name] = found[0]
 
-    ask("lock_memory", lock_memory=asked.lock_memory)
-    ask("disable_cpu_idle", disable_cpu_idle=asked.disable_cpu_idle)
+    ask("lock_memory", lock_memory=requested.lock_memory)
+    ask("disable_cpu_idle", disable_cpu_idle=requested.disable_cpu_idle)
     normal_ns = lateness_ns(wake_ups)
-    ask("priority", asked.priority or None)
-    first_ns = lateness_ns(wake_ups) if asked.priority and "priority" not in refused else []
+    ask("priority", requested.priority or None)
+    first_ns = lateness_ns(wake_ups) if requested.priority and "priority" not in refused else []
     return Trial(refused, reachable, normal_ns, first_ns)

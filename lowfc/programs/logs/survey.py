@@ -137,7 +137,7 @@ class _Account:
         author = ""
         with contextlib.suppress(BadMessageError, DecodeError):  # the log holds it as received
             if topic is HEALTH:
-                self._losses.believe(message, wire.Health.FromString(message.payload))
+                self._losses.reconcile(message, wire.Health.FromString(message.payload))
             elif topic is CONTROLLER_STATE:
                 mode = mode_name(wire.ControllerState.FromString(message.payload).mode)
                 if self._modes[-1:] != [mode]:

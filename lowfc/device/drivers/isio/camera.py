@@ -67,10 +67,10 @@ class IsioCamera:
                 "or set MILK_SHM_DIR to its folder"
             )
         shape = self._reader.stream.layout.shape[1:]
-        given = options.model_dump(include={one.name for one in fields(CameraSettings)}, exclude_none=True)
+        settings = options.model_dump(include={one.name for one in fields(CameraSettings)}, exclude_none=True)
         if options.exposure_us is not None:
-            given["exposure_ns"] = round(options.exposure_us * 1e3)
-        self._settings = replace(CameraSettings.configured(config, *shape), clock="realtime", **given)
+            settings["exposure_ns"] = round(options.exposure_us * 1e3)
+        self._settings = replace(CameraSettings.configured(config, *shape), clock="realtime", **settings)
         self._generation = self._reader.generation
         self._silent = False
 

@@ -138,7 +138,7 @@ class Recorder:
 
     def _begin(self, *, anew: bool = True) -> None:
         """Begin a log, or unless `anew` its next part, with the calibration and states that its messages depend on."""
-        self._series.begin(self._peers.newest.values(), anew=anew)
+        self._series.begin(self._peers.newest.values(), new_recording=anew)
         self._most_starts = self._account.starts + MOST_CHANNELS
         self.service.event("RECORDING")
 
@@ -255,7 +255,7 @@ class Recorder:
             return  # the log has it as received; the service counts it
         self._peers.note(sample, health)
         try:
-            self._account.believe(sample, health)
+            self._account.reconcile(sample, health)
         except BadMessageError as fault:
             self.service.unreadable(topic.key, fault)
 
@@ -298,7 +298,7 @@ class Recorder:
         return growth_sentence(growth, self._folder, self._min_free_bytes) if growth else ""
 
     def _flushed(self) -> None:
-        self._account.settle()
+        self._account.mark_flushed()
         if self._oldest_ns:
             age_ns = self._clock.host_ns() - self._oldest_ns
             self._longest_unflushed_ns = max(self._longest_unflushed_ns, age_ns)
