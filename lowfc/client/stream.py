@@ -74,7 +74,7 @@ class Stream(Generic[T]):
             self._fill()
             sample = self._waiting.popleft()
             count = count_of(sample.sequence)
-            self._gaps.setdefault(start_of(sample.sequence), Gaps(count)).came(count)
+            self._gaps.setdefault(start_of(sample.sequence), Gaps(count)).add(count)
             found = self._decode(sample)
             if found is not None:
                 self._remaining -= 1

@@ -202,7 +202,7 @@ def test_only_messages_that_never_arrived_are_missing_in_any_order() -> None:
     arrived = [0, *rng.permutation(rng.choice(np.arange(1, 1000), 800, replace=False)).tolist()]
     gaps, seen = Gaps(0), set()
     for count in [*arrived, *arrived[:50]]:
-        assert gaps.came(count) == (count not in seen)
+        assert gaps.add(count) == (count not in seen)
         seen.add(count)
         assert gaps.missing == max(seen) + 1 - len(seen)
 
@@ -211,8 +211,8 @@ def test_a_gap_of_any_size_uses_bounded_memory() -> None:
     gaps = Gaps(0)
     far = 1 << 31
     for count in (0, far, far + 3 * REMEMBERED, far + 6 * REMEMBERED):
-        gaps.came(count)
+        gaps.add(count)
     assert gaps.missing == far + 6 * REMEMBERED - 3
     assert len(gaps._open) <= 2 * REMEMBERED
-    assert gaps.came(far + 6 * REMEMBERED - 1)
-    assert not gaps.came(7), "below the remembered range"
+    assert gaps.add(far + 6 * REMEMBERED - 1)
+    assert not gaps.add(7), "below the remembered range"

@@ -173,7 +173,7 @@ def files(tmp_path: Path) -> tuple[Path, Path]:
 
 def test_the_latch_is_kept_in_two_places_and_each_restores_the_other(files: tuple[Path, Path]) -> None:
     first = Latch(files)
-    assert (first.safe, first.kept) == (False, True)
+    assert (first.safe, first.writable) == (False, True)
     first.set(True)
     until(lambda: all(file.exists() for file in files))
     first.close()
@@ -227,17 +227,17 @@ def test_a_missing_directory_does_no_harm_and_is_used_again_later(
     assert len(reported) == 1, "reported once despite retries, and a failing handler does not end the thread"
 
 
-def test_an_unreadable_latch_is_safe_and_an_unwritable_one_is_not_kept(tmp_path: Path) -> None:
+def test_an_unreadable_latch_is_safe_and_an_unwritable_one_is_detected(tmp_path: Path) -> None:
     reported: list[str] = []
     loop = tmp_path / "loop"
     loop.symlink_to(loop)
     latch = Latch([loop / "safe"], reported.append)
-    assert (latch.safe, latch.kept) == (True, False)
+    assert (latch.safe, latch.writable) == (True, False)
     assert "cannot be read" in reported[0]
     latch.close()
     (tmp_path / "file").touch()
     nowhere = Latch([tmp_path / "file" / "safe"], reported.append)
-    assert (nowhere.safe, nowhere.kept) == (False, False)
+    assert (nowhere.safe, nowhere.writable) == (False, False)
     nowhere.set(True)
     nowhere.close()
     assert "cannot be written" in reported[-1]

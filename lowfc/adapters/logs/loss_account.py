@@ -59,7 +59,7 @@ class _Tally:
 
     def enter(self, count: int, *, recorded: bool, unwanted: bool) -> None:
         if count >= self.gaps.first:
-            new = self.gaps.came(count)
+            new = self.gaps.add(count)
             self.recorded += recorded
             self.twice += recorded and not new
             if unwanted:  # never written, so the disk cannot lose it

@@ -22,7 +22,7 @@ class Gaps:
         self.missing = missing
         self._open: set[int] = set()
 
-    def came(self, count: int) -> bool:
+    def add(self, count: int) -> bool:
         """Count a message; return whether it is new, as far as known."""
         if count == self.next:
             self.next = count + 1
@@ -77,6 +77,6 @@ class Arrivals:
         if start_s > newest_s or not self.received:
             self._gaps, newest_s = Gaps(count, self._gaps.missing), start_s
         if start_s == newest_s:
-            self._gaps.came(count)
+            self._gaps.add(count)
         self.last_sequence = max(sequence, self.last_sequence)
         self.received += 1

@@ -44,13 +44,13 @@ class Latch:
 
         Attributes:
             safe: whether a file exists or cannot be checked.
-            kept: whether at least one file can be written.
+            writable: whether at least one file can be written.
         """
         self._files = tuple(files)
         self._failed = failed
         self._reported: set[Path] = set()
         self.safe = True in [self._exists(file) for file in self._files]
-        self.kept = True in [self._try(_probe, file) for file in self._files]
+        self.writable = True in [self._try(_probe, file) for file in self._files]
         self._target = self.safe
         self._done: bool | None = None if self.safe else False  # one file exists: write the others, too
         self._ended = False

@@ -75,7 +75,7 @@ def settings_under(latch: Latch, config: Configuration, event: Callable[..., Non
         event("KERNEL", kernel=configured)
     if latch.safe:
         return replace(settings, start_mode=LoopMode.SAFE)
-    return settings if latch.kept else replace(settings, start_mode=LoopMode.OPEN)
+    return settings if latch.writable else replace(settings, start_mode=LoopMode.OPEN)
 
 
 class StartUp:

@@ -96,7 +96,7 @@ def _enter(found: Evidence, message: Sample, number: int | None) -> None:
     if start_s <= FORGED_S:
         return
     if number is not None and message.key != EVENT.key:  # all publish there, and their counts do not tell them apart
-        found.came.setdefault((number, message.key, start_s), Gaps(count)).came(count)
+        found.came.setdefault((number, message.key, start_s), Gaps(count)).add(count)
     topic = next((one for one in DECODED if one.matches(message.key)), None)
     if topic is None:
         return

@@ -50,7 +50,7 @@ class LogChecker:
                 self.messages += 1
                 if message.key != EVENT.key:  # all publish there, and their counts do not tell them apart
                     count = count_of(message.sequence)
-                    self._came.setdefault((message.key, start_of(message.sequence)), Gaps(count)).came(count)
+                    self._came.setdefault((message.key, start_of(message.sequence)), Gaps(count)).add(count)
             self.logs += 1
             path.unlink()
 
