@@ -66,7 +66,7 @@ def came(*lost: int) -> Gaps:
     found = Gaps(0)
     for number in range(FRAMES):
         if number not in lost:
-            found.came(number)
+            found.add(number)
     return found
 
 
