@@ -135,7 +135,7 @@ class Client:
         return self.ask("gain", modes, text=AUTO)
 
     def leak(self, values: npt.ArrayLike, modes: Modes = ()) -> Answer:
-        """Set integrator leaks: one value, or one for each of `modes`, as in `gain`."""
+        """Set integrator leaks: one value, or one for each mode, (modes,), as in `gain`."""
         return self.ask("leak", modes, values)
 
     def limit(self, values: npt.ArrayLike, modes: Modes = ()) -> Answer:

@@ -649,7 +649,7 @@ def test_a_log_that_cannot_be_created_is_refused_and_can_be_requested_again(benc
     moved = bench.folder.with_name("elsewhere")
     bench.folder.rename(moved)
     bench.folder.write_text("a file")
-    with pytest.raises(RequestRefusedError, match="cannot be made"):
+    with pytest.raises(RequestRefusedError, match="cannot be created"):
         operator.record(True)
     bench.folder.unlink()
     moved.rename(bench.folder)
