@@ -234,7 +234,12 @@ def _messages() -> list[Target]:
             10,
         ),
         Target(
-            "mirror command", (sent.SerializeToString(),), _apply, (codec.DecodeError, LowfcError), wire.MirrorCommand, 2
+            "mirror command",
+            (sent.SerializeToString(),),
+            _apply,
+            (codec.DecodeError, LowfcError),
+            wire.MirrorCommand,
+            2,
         ),
         Target("a view's messages", (sent.SerializeToString(),), _shown, cost=10),
     ]
