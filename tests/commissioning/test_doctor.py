@@ -216,7 +216,7 @@ def test_each_property_of_a_host_has_its_status_and_text(
 
 def test_unreadable_data_gives_a_note(tmp_path: Path) -> None:
     unreadable = dict.fromkeys(METAL)
-    failed = OSError("the process that tries it ended with exit status 1: no")
+    failed = OSError("the trial's process ended with exit status 1: no")
     found = examine(facts(tmp_path, unreadable, trial=failed))
     unknown = {name for name, check in found.items() if check.got.startswith("not known: ")}
     assert unknown >= set(OF_THE_HOST)
@@ -318,10 +318,10 @@ print(*trial.refused["priority"], *trial.refused["lock_memory"], len(trial.norma
 
 def test_a_failed_trial_has_its_cause(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(multiprocessing.spawn, "get_executable", lambda: b"/bin/false")
-    with pytest.raises(OSError, match="the process that tries it ended"):
+    with pytest.raises(OSError, match="the trial's process ended"):
         try_out(Realtime(), set(), 0.01)
     found = examine(gather(Host(), Configuration(), 0.01))
-    assert "the process that tries it ended" in found["wake-up"].got
+    assert "the trial's process ended" in found["wake-up"].got
     assert found["wake-up"].status == "note"
 
 

@@ -10,7 +10,7 @@ from lowfc.contract.errors import ConfigurationError
 GROUP = "lowfc"
 DEVICE = "dev/cpu_dma_latency"
 _LIMITS = f"@{GROUP}  -  rtprio   98\n@{GROUP}  -  memlock  unlimited\n"
-_RULE = f"""# The loop's processes keep idle processors awake (realtime.disable_cpu_idle).
+_RULE = f"""# The loop's processes disable CPU idle states (realtime.disable_cpu_idle).
 SUBSYSTEM=="misc", KERNEL=="cpu_dma_latency", GROUP="{GROUP}", MODE="0660"
 """
 FILES = {"etc/security/limits.d/90-lowfc.conf": _LIMITS, "etc/udev/rules.d/90-lowfc-user.rules": _RULE}
