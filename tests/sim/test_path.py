@@ -32,7 +32,7 @@ def test_delay_postpones_a_shape_by_a_fraction_of_a_period() -> None:
 
 
 def test_mirror_settles_exponentially_from_shape_to_shape() -> None:
-    """Against an integration of the first-order response in small steps."""
+    """Compared with an integration of the first-order response in small steps."""
     path, settling, moves = MirrorPath(FLAT, settling=0.2), 0.2, [(0.05, ONE), (0.45, TWO), (1.7, FLAT)]
     for moment, shape in moves:
         path.applied(moment, shape)

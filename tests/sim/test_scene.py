@@ -158,7 +158,7 @@ def test_blurred_image_is_as_accurate_as_one_at_rest() -> None:
 
 
 def test_continuous_truth_is_the_rms_over_the_period_with_a_moving_mirror(calibration: Calibration) -> None:
-    """Against static scenes with the wavefront of each instant; the mirror moves in mid-period."""
+    """Compared with static scenes with the wavefront of each instant; the mirror moves in mid-period."""
     config = configured(disturbance__preset="bench", camera__rate_hz=20.0, camera__instants=4)
     scene, disturbance = scene_of(config), disturbance_of(config)
     shapes = [shape_of(calibration, height_nm * np.eye(MODES)[3]) for height_nm in (5.0, -8.0)]

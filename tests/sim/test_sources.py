@@ -39,7 +39,7 @@ def wheel(course: str, change: float, start_hz: float = 30.0) -> Wheel:
     ],
 )
 def test_phase_of_wheel_harmonics_is_the_integral_of_the_speed(course: str, change: float, speed_hz: Any) -> None:
-    """Against a numerically integrated phase; a ramp passes through zero speed, where the amplitude vanishes."""
+    """Compared with a numerically integrated phase; a ramp passes through zero speed, where the amplitude vanishes."""
     made, speed = wheel(course, change), speed_hz(TIME_S)
     phase = 2 * np.pi * cumulative_trapezoid(speed, TIME_S, initial=0)
     expected = np.zeros((TIME_S.size, 2))
