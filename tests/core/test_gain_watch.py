@@ -55,7 +55,7 @@ def gains(loop: Bench) -> Single:
 
 @pytest.fixture(scope="module")
 def gain_bank_responses() -> list[Array | Single]:
-    """Arguments of GainBank.remade in the loop of the faint star."""
+    """Arguments of GainBank.use_reconstructor in the loop of the faint star."""
     return []
 
 
