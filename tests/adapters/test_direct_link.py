@@ -311,7 +311,7 @@ def test_after_a_stall_with_the_bus_ahead_nothing_is_delivered_twice(tmp_path: P
     for count in range(number):
         by_bus[0](Sample("k", b"", sequence_of(5, count), count, 0))
     for count in range(number + 1):
-        reader.take(Envelope(sequence_of(5, count), count).encode(), b"")
+        reader.take(Envelope(sequence_of(5, count), count).encode(), b"", 0)
     reader.close()
     assert got == list(range(number + 1))
 

@@ -82,7 +82,7 @@ class DirectCall:
 
     def send(self, envelope: bytes, payload: bytes) -> bool:
         """Pass a message to the reader; always succeeds."""
-        self._reader.take(envelope, payload)
+        self._reader.take(envelope, payload, self._reader.now_ns())
         return True
 
     def close(self) -> None:
@@ -123,16 +123,17 @@ class DirectReader:
         """
         self._handler = handler
         self._subscribe = subscribe
-        self._now_ns = now_ns
+        self.now_ns = now_ns
         self._failed = failed
         self._shared = shared
         self._turn = threading.Lock()
         self._key = key
         self._closed = False
-        self._recent: dict[tuple[int, int], None] = {}
+        self._recent, self._before = set[tuple[int, int]](), set[tuple[int, int]]()
         self._first = self._newest = -1  # sequences: first one from the socket, newest one from either path
         self._both = False
-        self._leave_bus: Callable[[], None] | None = subscribe(self._by_bus)
+        self._leave_bus: Callable[[], None] | None = lambda: None  # a message may arrive before `subscribe` returns
+        self._leave_bus = subscribe(self._by_bus)
         path.unlink(missing_ok=True)  # left by a killed process: each role runs only once
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._listener.bind(os.fspath(path))
@@ -140,9 +141,8 @@ class DirectReader:
         self._accepting = threading.Thread(target=self._accept, name="direct-link-accept", daemon=True)
         self._accepting.start()
 
-    def take(self, envelope: bytes, payload: bytes) -> None:
-        """Forward a message of a writer, on the calling thread: the socket's, or the writer's in this process."""
-        now_ns = self._now_ns()
+    def take(self, envelope: bytes, payload: bytes, now_ns: int) -> None:
+        """Forward a message received at `now_ns`, on the calling thread: the socket's, or that of a writer here."""
         try:
             self._by_socket(Sample(self._key, payload, *Envelope.decode_checked(envelope), now_ns))
         except Exception as fault:
@@ -174,13 +174,16 @@ class DirectReader:
 
     def _forward(self, sample: Sample) -> bool:
         """Forward a message unless it is a copy or late."""
-        envelope = sample.sequence, sample.publish_time_ns
         late = not self._shared and self._first >= 0 and sample.sequence <= self._newest
-        if self._closed or late or envelope in self._recent:
+        if self._closed or late:
             return False
-        self._recent[envelope] = None
-        if len(self._recent) > _RECENT:
-            del self._recent[next(iter(self._recent))]
+        if self._leave_bus is not None:  # a copy may arrive by the other path
+            envelope = sample.sequence, sample.publish_time_ns
+            if envelope in self._recent or envelope in self._before:
+                return False
+            self._recent.add(envelope)
+            if len(self._recent) == _RECENT:
+                self._before, self._recent = self._recent, set()
         self._newest = sample.sequence
         self._handler(sample)
         return True
@@ -233,7 +236,8 @@ class DirectReader:
                 return
             if not size:
                 return
-            self.take(bytes(buffer[: min(size, _ENVELOPE_BYTES)]), bytes(buffer[_ENVELOPE_BYTES:size]))
+            now_ns = self.now_ns()
+            self.take(bytes(buffer[: min(size, _ENVELOPE_BYTES)]), bytes(buffer[_ENVELOPE_BYTES:size]), now_ns)
 
 
 def _shut_down(one: socket.socket) -> None:
