@@ -171,7 +171,7 @@ def test_a_process_with_many_pids_is_stored_once(hub: MemoryHub) -> None:
 def test_forged_names_do_not_fill_launcher_and_viewer(hub: MemoryHub) -> None:
     watch, view = Watch({}, []), Accumulator()
     launcher = MemoryBus(hub, "launcher", FakeClock())
-    launcher.subscribe(HEALTH, watch.hear)
+    launcher.subscribe(HEALTH, watch.add_health)
     for number in range(FORGED):
         view.add(Sample(HEALTH.at(f"forged-{number}"), health(number), 1, 1, 1))
         launcher.publisher(HEALTH, f"forged-{number}").put(health(number))

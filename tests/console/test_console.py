@@ -43,8 +43,8 @@ def _nobody_waits_for_a_process_at_rest(monkeypatch: pytest.MonkeyPatch) -> None
 
     for module in ("app", "pilot"):
         monkeypatch.setattr(f"textual.{module}.wait_for_idle", pause)
-    monkeypatch.setattr("lowfc.programs.console.app.FIGURES_S", 0.05)
-    monkeypatch.setattr("lowfc.programs.console.feed.CUT_S", 0.4)
+    monkeypatch.setattr("lowfc.programs.console.app.READ_PERIOD_S", 0.05)
+    monkeypatch.setattr("lowfc.programs.console.feed.DISCONNECTED_S", 0.4)
 
 
 @contextlib.asynccontextmanager
@@ -363,17 +363,17 @@ def test_a_console_that_is_cut_off_says_so_and_shows_no_old_figures(
 
 
 def test_a_console_whose_terminal_is_gone_ends() -> None:
-    from lowfc.programs.console.app import FIGURES_S, Console
+    from lowfc.programs.console.app import READ_PERIOD_S, Console
 
     gone, clock = threading.Event(), HostClock()
     app = Console(MemoryBus(MemoryHub(), "operator", clock), RUN, clock, terminal_gone=gone.is_set)
 
     async def scenario() -> None:
         async with app.run_test(size=(100, 30)) as pilot:
-            await pilot.pause(2 * FIGURES_S)
+            await pilot.pause(2 * READ_PERIOD_S)
             assert app.is_running
             gone.set()
-            await pilot.pause(3 * FIGURES_S)
+            await pilot.pause(3 * READ_PERIOD_S)
             assert app.return_code == 0
 
     asyncio.run(scenario())

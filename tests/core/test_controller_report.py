@@ -100,7 +100,7 @@ def test_summary_and_status_show_the_time_not_closed() -> None:
     assert lines[1].split(maxsplit=1)[1] == "refuses commands: OUT_OF_ORDER"
     held = status.text(status.figures(message, {"controller": wire.Health(holding="no frame comes")})).splitlines()[1]
     assert " open for 12 s (" in held
-    assert held.endswith("), but holding: no frame comes"), "12 s is the time open, not the time without frames"
+    assert held.endswith("), command held: no frame comes"), "12 s is the time open, not the time without frames"
     assert status.figures(message, {"mirror-x": wire.Health(command_expired=True)})["mirrors"]["mirror-x"]["expired"]
 
 

@@ -27,7 +27,7 @@ _HEADER = (
 def commented(config: Configuration) -> str:
     """TOML of a configuration: each key below its description, commented out unless it was set.
 
-    If it were not commented out, a default here would replace the command's own default.
+    An uncommented default would override a command's own default.
     """
     return "\n".join([*_HEADER, *_lines(config)])
 
@@ -35,14 +35,14 @@ def commented(config: Configuration) -> str:
 def _lines(section: BaseModel, prefix: str = "") -> Iterator[str]:
     """Keys of a section, then the sections in it."""
     names = type(section).model_fields
-    inner = {name: _tables(getattr(section, name)) for name in names}
+    subsections = {name: _tables(getattr(section, name)) for name in names}
     for name in names:
-        if inner[name]:
+        if subsections[name]:
             continue
         yield f"# {' '.join((names[name].description or '').split())}"
         mark = "" if name in section.model_fields_set else "#"
         yield from (f"{mark}{line}" for line in _assignment(name, getattr(section, name)))
-    for name, tables in inner.items():
+    for name, tables in subsections.items():
         header = f"[{prefix}{name}]" if isinstance(getattr(section, name), BaseModel) else f"[[{prefix}{name}]]"
         for table in tables:
             yield from ("", header, *_lines(table, f"{prefix}{name}."))
@@ -54,7 +54,7 @@ def _tables(value: object) -> list[BaseModel]:
 
 
 def _assignment(name: str, value: object) -> list[str]:
-    """A key and its value; a table as one inline line, so that it can be between other keys."""
+    """Lines of a key and its value; a table is written inline, so that other keys can follow it."""
     if not isinstance(value, dict):
         return tomli_w.dumps({name: value}).splitlines()
     items = ", ".join(" ".join(_assignment(key, one)) for key, one in value.items())
@@ -100,5 +100,5 @@ def config_zenoh(
     known = sorted({*joined.links.ports, "bench", "operator", "launcher"})
     if role not in known:
         raise BusError(f"run {run!r} has no role {role!r}; its roles are {', '.join(known)}")
-    HostClock()  # writes the file with the clock of this host's time stamps
+    HostClock()  # writes the file that the zenoh configuration refers to
     typer.echo(json.dumps(session_config(joined.links, role), indent=2))

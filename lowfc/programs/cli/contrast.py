@@ -27,7 +27,7 @@ def added_contrast(contrast: ModalContrast | None, covariance_nm2: Mapping[str, 
 
 
 def with_variances(covariance_nm2: Array, rms_nm: Array) -> Array:
-    """Replace the variances of a covariance (modes, modes) sampled at instants by the continuous, larger ones (modes,).
+    """Replace the sampled variances of a covariance (modes, modes) by the larger continuous-time ones (modes,).
 
     Off-diagonal terms come from command noise, which is constant over the period.
     """
@@ -48,9 +48,9 @@ def with_this_mirror(added: Mapping[str, float]) -> dict[str, float | None]:
 def sentence(added: Mapping[str, float | None], most: tuple[str, float] | None, beyond: Sequence[str] = ()) -> str:
     """The added contrast of each case, and the modes that contribute most to the last one."""
     cases = ", ".join(f"{name} {one:+.1e}" for name, one in added.items() if one is not None)
-    which = "" if most is None else f"; {most[0]} contributes most ({100 * most[1]:.0f} %)"
-    but = f"; beyond quadratic, full images differ by more than 10 %: {', '.join(beyond)}" if beyond else ""
-    return f"added to the dark zone's contrast: {cases}{which}{but}"
+    largest = "" if most is None else f"; {most[0]} contributes most ({100 * most[1]:.0f} %)"
+    caveat = f"; beyond quadratic, full images differ by more than 10 %: {', '.join(beyond)}" if beyond else ""
+    return f"added to the dark zone's contrast: {cases}{largest}{caveat}"
 
 
 def sentence_of(found: Mapping[str, Any]) -> str:

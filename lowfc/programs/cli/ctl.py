@@ -114,7 +114,7 @@ def _status(run: AnyRun = None, as_json: Json = False) -> None:
 
     with _joined(run) as loop:
         state, processes = loop.status().state, loop.processes()
-        assert state is not None  # noqa: S101  # that is what it answers with
+        assert state is not None  # noqa: S101  # a status reply always has one
     known = figures(state, processes, loop.run_id)
     print_result(known, text(known), as_json=as_json)
 
@@ -163,22 +163,22 @@ def bench(name: BenchName, value: BenchValue, run: AnyRun = None, as_json: Json 
     """
     from lowfc.programs.cli.status import figures, interlocks
 
-    truths: dict[str, bool | float | str] = {"true": True, "false": False}
+    booleans: dict[str, bool | float | str] = {"true": True, "false": False}
     try:
-        read = truths[value] if value in truths else float(value)
+        parsed = booleans[value] if value in booleans else float(value)
     except ValueError:
-        read = value
+        parsed = value
     with _joined(run) as loop:
-        loop.status()  # once it answers, it receives
-        loop.bench(name, read)
+        loop.status()  # a controller that has replied receives bench values, too
+        loop.bench(name, parsed)
         state = loop.status().state
-        assert state is not None  # noqa: S101  # that is what it answers with
+        assert state is not None  # noqa: S101  # a status reply always has one
     known = figures(state, run=loop.run_id)
     names = sorted({one.name for one in state.settings.interlocks})
     unused = "" if name in names else f"; no interlock uses it (they use {', '.join(names)})" if names else ""
     acting = f"interlocks: {interlocks(known)}" if names else "no interlock is configured"
-    said = {"run": loop.run_id, "name": name, "value": read, "interlocks": known["interlocks"]}
-    print_result(said, f"{name} is {value}{unused}; {acting} (run {loop.run_id})", as_json=as_json)
+    result = {"run": loop.run_id, "name": name, "value": parsed, "interlocks": known["interlocks"]}
+    print_result(result, f"{name} is {value}{unused}; {acting} (run {loop.run_id})", as_json=as_json)
 
 
 def _load(file: CalibrationFile, run: AnyRun = None, as_json: Json = False) -> None:
@@ -191,16 +191,16 @@ def _load(file: CalibrationFile, run: AnyRun = None, as_json: Json = False) -> N
 def _law(file: LawFile, run: AnyRun = None, as_json: Json = False) -> None:
     from lowfc.adapters.files import law_file
 
-    wanted = None if file == INTEGRATOR else law_file.load(Path(file))
-    _ask(run, as_json, lambda loop: loop.law(wanted))
+    law = None if file == INTEGRATOR else law_file.load(Path(file))
+    _ask(run, as_json, lambda loop: loop.law(law))
 
 
 def _recording(name: str) -> _Command:
     def ask(run: AnyRun = None, as_json: Json = False) -> None:
         with _joined(run) as loop:
             answer = loop.record(name == "record/start")
-        said = {"run": answer.run, "accepted": answer.accepted, "reply": answer.reply, "log": answer.text}
-        print_result(said, f"{answer.reply} (run {answer.run})", as_json=as_json)
+        result = {"run": answer.run, "accepted": answer.accepted, "reply": answer.reply, "log": answer.text}
+        print_result(result, f"{answer.reply} (run {answer.run})", as_json=as_json)
 
     return ask
 
@@ -218,30 +218,30 @@ _OWN: dict[str, _Command] = {
     "load": _load,
     "law": _law,
 }
-"""Commands of requests with files as arguments or with more than a sentence as answer."""
+"""Commands of requests that need more than their declared fields, or print more than the reply."""
 _BY_FIELDS: dict[tuple[str, ...], Callable[[str], _Command]] = {(): _plain, ("modes", "values"): _of_modes}
 
-for _name, _asked in BY_NAME.items():
-    if _asked.example:
-        _fields = tuple(field for field, _ in _asked.fields)
+for _name, _request in BY_NAME.items():
+    if _request.example:
+        _fields = tuple(field for field, _ in _request.fields)
         _records = _name.startswith("record/")
-        _made = _recording(_name) if _records else _OWN.get(_name) or _BY_FIELDS[_fields](_name)
+        _command = _recording(_name) if _records else _OWN.get(_name) or _BY_FIELDS[_fields](_name)
         (record_app if _records else ctl_app).command(
-            _asked.name,
-            help=f"{_asked.sentence}\n\nExample: lowfc ctl {_asked.example}",
-            context_settings={"ignore_unknown_options": "values" in _fields},  # -5 is a value and no option
-        )(_made)
+            _request.name,
+            help=f"{_request.sentence}\n\nExample: lowfc ctl {_request.example}",
+            context_settings={"ignore_unknown_options": "values" in _fields},  # -5 is a value, not an option
+        )(_command)
 ctl_app.command()(bench)
-for measured in (dark, reference):
-    ctl_app.command(help=str(measured.__doc__).replace("lowfc calibrate", "lowfc ctl"))(measured)
+for _measurement in (dark, reference):
+    ctl_app.command(help=str(_measurement.__doc__).replace("lowfc calibrate", "lowfc ctl"))(_measurement)
 
 
 @ctl_app.callback()
 def _of_run(context: typer.Context, run: AnyRun = None) -> None:
     """Accept --run before the request, too."""
-    given = {"run": run}
+    defaults = {"run": run}
     names = [*BY_NAME, "record", dark.__name__, reference.__name__]
-    context.default_map = {key: {**given, "start": given, "stop": given} for key in names}
+    context.default_map = {name: {**defaults, "start": defaults, "stop": defaults} for name in names}
 
 
 def _joined(run: str | None) -> "Client":
@@ -253,7 +253,5 @@ def _joined(run: str | None) -> "Client":
 def _ask(run: str | None, as_json: bool, ask: "Callable[[Client], Answer]") -> None:
     with _joined(run) as loop:
         answer = ask(loop)
-    said = {"run": answer.run, "accepted": answer.accepted, "reply": answer.reply}
-    print_result(
-        {**said, "frame": answer.frame, "frame_sequence": answer.frame_sequence}, answer.sentence, as_json=as_json
-    )
+    result = {name: getattr(answer, name) for name in ("run", "accepted", "reply", "frame", "frame_sequence")}
+    print_result(result, answer.sentence, as_json=as_json)

@@ -1,4 +1,4 @@
-"""The commands for a run on several hosts: certificates, the router, and the processes with their clocks."""
+"""The commands for a run on several hosts: make certificates, run the router, list the processes with their clocks."""
 
 import datetime
 import json
@@ -19,10 +19,10 @@ from lowfc.programs.cli.result import Result, figure, print_result
 if TYPE_CHECKING:
     from lowfc.contract.messages import wire
 
-LINKED_S = 0.5
+CONNECT_S = 0.5
 """Time for a session to connect to all running processes."""
 
-_TURN_S = 0.1
+_POLL_S = 0.1
 
 
 class HostProcess(Result):
@@ -42,8 +42,8 @@ class HostsResult(Result):
 
     def remarks(self) -> list[str]:
         """The reason if no clock is compared."""
-        one = all(each.clock_offset_us is None for each in self.processes)
-        return ["no clock is compared: the run has no router, or its router reports no clock"] if one else []
+        none = all(each.clock_offset_us is None for each in self.processes)
+        return ["no clock is compared: the run has no router, or its router reports no clock"] if none else []
 
 
 def certs(
@@ -71,11 +71,11 @@ def certs(
             f"making certificates requires the package cryptography, which is missing ({fault}): "
             f"{install_advice('deploy')}"
         ) from None
-    wanted = (ROUTER, *roles(map(mirror_role, mirror or ["dm"])))
-    made = make_certificates(folder, wanted, router or [], days, renew=renew)
+    names = (ROUTER, *roles(map(mirror_role, mirror or ["dm"])))
+    made = make_certificates(folder, names, router or [], days, renew=renew)
     for file in made:
         sys.stdout.write(f"{file}\n")
-    sys.stderr.write(f"{len(made)} made, {len(wanted) - len(made)} existed already; keep {folder / 'ca.key'} secret\n")
+    sys.stderr.write(f"{len(made)} made, {len(names) - len(made)} existed already; keep {folder / 'ca.key'} secret\n")
 
 
 def router(
@@ -87,8 +87,8 @@ def router(
 ) -> None:
     """Run the router of a run on several hosts: mutual TLS, and only the messages that each role may send or receive.
 
-    It listens on network.listen of the configuration, or else on network.router. Your own zenohd works as well, except
-    that clocks are not compared: each host then stamps envelopes by its own clock.
+    It listens on network.listen of the configuration, or else on network.router. Your own zenohd works as well, but
+    does not compare clocks: each host then stamps envelopes by its own clock.
 
     Example: lowfc router --config lowfc.toml --run bench
     """
@@ -106,8 +106,8 @@ def router(
             "certificates in [network]"
         )
     if show:
-        with tempfile.TemporaryDirectory(prefix="lowfc-") as elsewhere:  # no run is made by looking
-            links = open_run(run, (settings.mirror.name,), Path(elsewhere), network=settings.network).links
+        with tempfile.TemporaryDirectory(prefix="lowfc-") as temporary:  # --show creates no run
+            links = open_run(run, (settings.mirror.name,), Path(temporary), network=settings.network).links
             text = json.dumps(session_config(links, ROUTER), indent=2)
         # each list of plain values on one line
         text = re.sub(r"\[\s+([^][{}]*?)\s+\]", lambda found: f"[{' '.join(found[1].split())}]", text)
@@ -120,7 +120,7 @@ def router(
         sys.stderr.write(f"routing at {settings.network.listen or settings.network.router}; Ctrl-C ends it\n")
         while service.running:
             service.beat()
-            time.sleep(_TURN_S)
+            time.sleep(_POLL_S)
         service.finish()
 
 
@@ -149,13 +149,13 @@ def hosts(
     run = run or DEFAULT_RUN  # with a router, all processes of the run may be on other hosts
     links = open_run(run, (settings.mirror.name,), network=settings.network).links
     with closing(ZenohBus(links, Role.OPERATOR, HostClock())) as bus:
-        time.sleep(LINKED_S)
+        time.sleep(CONNECT_S)
         found = Client(run, bus=bus).processes()
     if not found:
         raise BusError(f"no process of run {run!r} reports its health")
     if links.network.router:
-        for said in ending_certificates(links.network, datetime.datetime.now(datetime.UTC)):
-            sys.stderr.write(f"warning: {said}; lowfc certs --renew\n")
+        for warning in ending_certificates(links.network, datetime.datetime.now(datetime.UTC)):
+            sys.stderr.write(f"warning: {warning}; lowfc certs --renew\n")
     print_result(HostsResult(run=run, processes=[_row(health) for _, health in sorted(found.items())]), as_json=as_json)
 
 

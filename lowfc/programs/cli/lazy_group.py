@@ -14,7 +14,7 @@ from lowfc.adapters.process.terminal import new_app
 class Row(NamedTuple):
     """A command: its name, its "module:attribute" below `lowfc.programs` (empty for a group), and its description.
 
-    Name and sentence fit in 80 columns. The attribute is a function or a typer application.
+    Name and description fit in 80 columns. The attribute is a function or a typer application.
     """
 
     name: str
@@ -35,9 +35,9 @@ class Commands(Mapping[str, Any]):
             module, _, attribute = row.where.partition(":")
             found = getattr(import_module(f"lowfc.programs.{module}"), attribute)
         else:
-            own = [part for part in self._parts if part.name.startswith(f"{name} ")]
-            named = [part._replace(name=part.name.removeprefix(f"{name} ")) for part in own]
-            found = lazy_app(f"{row.sentence}\n\nExample: lowfc {own[0].name}", {"Commands": named})
+            parts = [part for part in self._parts if part.name.startswith(f"{name} ")]
+            commands = [part._replace(name=part.name.removeprefix(f"{name} ")) for part in parts]
+            found = lazy_app(f"{row.sentence}\n\nExample: lowfc {parts[0].name}", {"Commands": commands})
             found.callback()(lambda: None)
         app = found if isinstance(found, typer.Typer) else new_app("")
         if app is not found:
@@ -54,7 +54,13 @@ class Commands(Mapping[str, Any]):
 
 
 def lazy_app(help_text: str, panels: Mapping[str, Sequence[Row]], parts: Sequence[Row] = ()) -> typer.Typer:
-    """A command line from the rows by help heading, and the rows "group command" of its groups. It needs a callback."""
+    """A typer application; the caller adds its callback.
+
+    Args:
+        help_text: text at the head of `--help`.
+        panels: commands by the heading under which `--help` lists them.
+        parts: commands of its groups, named "GROUP COMMAND".
+    """
     rows = [row for panel in panels.values() for row in panel]
     wide = max(len(row.name) for row in rows)
 

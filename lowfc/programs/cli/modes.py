@@ -21,8 +21,8 @@ def noll_of(words: Sequence[str] | None) -> tuple[int, ...]:
     if not words:
         return ()
     found: list[int] = []
-    said = ",".join(words).replace(" ", "")
-    for part in [part for part in said.split(",") if part] or [said]:
+    joined = ",".join(words).replace(" ", "")
+    for part in [part for part in joined.split(",") if part] or [joined]:
         first, dash, last = part.partition("-")
         last = last if dash else first
         if not (first.isdecimal() and last.isdecimal() and int(first) <= int(last) <= HIGHEST):

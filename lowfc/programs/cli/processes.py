@@ -53,7 +53,7 @@ def controller(
     from lowfc.programs.commissioning.analytic import analytic
     from lowfc.programs.core.controller import Controller
 
-    signalled: list[int] = []  # before there is a loop to be made safe
+    signalled: list[int] = []  # signals received before the controller exists
     signal.signal(signal.SIGUSR1, lambda number, _: signalled.append(number))
     settings = configuration(config)
     driver = None if camera is None else opened("camera", camera, settings)
@@ -77,8 +77,8 @@ def controller(
         process.safe_by_signal()
     service.fill = process.fill
     service.catch_signals()
-    beside = nullcontext() if driver is None else camera_beside(driver, settings, service)
-    with closing(service.bus), beside:  # a callback on zenoh's threads must not outlive the interpreter
+    own_camera = nullcontext() if driver is None else camera_beside(driver, settings, service)
+    with closing(service.bus), own_camera:  # a callback on zenoh's threads must not outlive the interpreter
         process.run()
 
 

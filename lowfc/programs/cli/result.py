@@ -1,4 +1,4 @@
-"""Typed result of a command, from which both its `--json` object and its text are made.
+"""Typed result of a command: the source of both its `--json` object and its text.
 
 `figure` declares a field with label, unit and format. The text has a line for each labelled figure, then a table for
 each list of parts; figures declared as columns have the same length and share one table.

@@ -21,15 +21,15 @@ def runs(as_json: Json = False) -> None:
 
 
 def _row(name: str, roles: set[str]) -> dict[str, Any]:
-    """State of a run from the Health of its processes; a process that only listens yet is starting."""
+    """State of a run from the Health of its processes; a process that has not sent one yet is starting."""
     from lowfc.client import Client
     from lowfc.contract.messages import Role
-    from lowfc.programs.cli.status import NOBODY, recording_state
+    from lowfc.programs.cli.status import NO_HEALTH, recording_state
     from lowfc.programs.launch.watch import mode_name
 
     with Client(name) as loop:
         found = loop.processes()
-    controller, recorder = found.get(Role.CONTROLLER, NOBODY), found.get(Role.RECORDER, NOBODY)
+    controller, recorder = found.get(Role.CONTROLLER, NO_HEALTH), found.get(Role.RECORDER, NO_HEALTH)
     starting = [{"process": role, "state": "starting", "pid": None} for role in roles - {*found, Role.LAUNCHER}]
     processes = [{"process": key, "state": health.state, "pid": health.pid} for key, health in found.items()]
     return {
@@ -51,10 +51,10 @@ def _lines(rows: list[dict[str, Any]]) -> list[str]:
     for row in rows:
         mode = "no controller" if row["mode"] is None else mode_word(row["mode"])
         if row["holding"]:
-            mode += f", but holding: {row['holding']};"
+            mode += f" (command held: {row['holding']})"
         rate = "" if row["rate_hz"] is None else f" at {row['rate_hz']:.0f} Hz, up {row['uptime_s']:.0f} s"
-        log = {"recording": f"recording {row['log']}", "none": "not recording"}
+        recordings = {"recording": f"recording {row['log']}", "none": "not recording"}
         processes = ", ".join(one["process"] for one in row["processes"]) or "no process yet"
-        what = log.get(row["recording"], f"recording {row['recording']}")
-        lines.append(f"{row['run']}  {mode}{rate}; {processes}; {what}")
+        recording = recordings.get(row["recording"], f"recording {row['recording']}")
+        lines.append(f"{row['run']}  {mode}{rate}; {processes}; {recording}")
     return lines

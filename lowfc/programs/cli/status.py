@@ -16,7 +16,8 @@ from lowfc.control.loop.wording import PAUSED, counted, mode_word
 from lowfc.programs.cli.contrast import most_of, sentence, with_this_mirror
 from lowfc.programs.launch.watch import mode_name, topic_count, wavefront
 
-NOBODY = wire.Health()
+NO_HEALTH = wire.Health()
+"""Health of an absent process."""
 _NO_PROCESSES: Mapping[str, wire.Health] = MappingProxyType({})
 
 
@@ -41,27 +42,27 @@ def figures(
         }
     command_nm = list(state.command_history_nm)[: len(state.gain)]
     settings = state.settings
-    controller, recorder = processes.get(Role.CONTROLLER, NOBODY), processes.get(Role.RECORDER, NOBODY)
-    lately, arrived = controller.last_second, topic_count(controller, FRAME.key)
-    camera = processes.get(Role.CAMERA, NOBODY)
-    true = wavefront(camera.recent_wavefront) if camera.HasField("recent_wavefront") else None
-    contrast = true
-    if (true is None or true["added_contrast"] is None) and controller.HasField("recent_wavefront"):
+    controller, recorder = processes.get(Role.CONTROLLER, NO_HEALTH), processes.get(Role.RECORDER, NO_HEALTH)
+    last_second, frames_in = controller.last_second, topic_count(controller, FRAME.key)
+    camera = processes.get(Role.CAMERA, NO_HEALTH)
+    simulated = wavefront(camera.recent_wavefront) if camera.HasField("recent_wavefront") else None
+    contrast = simulated
+    if (simulated is None or simulated["added_contrast"] is None) and controller.HasField("recent_wavefront"):
         contrast = wavefront(controller.recent_wavefront)
     return {
         "run": run,
         "mode": mode_name(state.mode) or "starting",
         "paused": state.mode == wire.LOOP_MODE_OPEN and state.mode_cause == PAUSED,
         "rate_hz": controller.rate_hz,
-        "frames_used_last_second": lately.frames,
-        "residual_rms_nm": lately.residual_rms_nm if lately.frames else None,
-        "true_residual_rms_nm": None if true is None else true["residual_rms_nm"],
+        "frames_used_last_second": last_second.frames,
+        "residual_rms_nm": last_second.residual_rms_nm if last_second.frames else None,
+        "true_residual_rms_nm": None if simulated is None else simulated["residual_rms_nm"],
         "added_contrast": contrast and contrast["added_contrast"],
-        "added_contrast_estimated": contrast is not true,
+        "added_contrast_estimated": contrast is not simulated,
         "costliest_modes": contrast and contrast["costliest_modes"],
-        "flux_fraction": lately.flux_fraction if lately.frames else None,
-        "frames_skipped": arrived.skipped,
-        "frames_missing": arrived.missing,
+        "flux_fraction": last_second.flux_fraction if last_second.frames else None,
+        "frames_skipped": frames_in.skipped,
+        "frames_missing": frames_in.missing,
         "recording": recording_state(recorder),
         "log": recorder.recording.file or None,
         "last_warning": _last_warning(state, processes),
@@ -132,7 +133,7 @@ def text(known: dict[str, Any]) -> str:
         **{name: _of_mirror(one) for name, one in known["mirrors"].items()},
         "frame": f"number {known['frame']}; {known['frames_used']} used since the controller started"
         + (f"; the last was refused as {_spoken(known['refused'])}" if known["refused"] else ""),
-        "command": f"{known['command_rms_nm']:.3f} nm rms" + (", on its way to zero" if known["homing"] else ""),
+        "command": f"{known['command_rms_nm']:.3f} nm rms" + (", returning to zero" if known["homing"] else ""),
         "offset": f"{known['offset_rms_nm']:.3f} nm rms",
         **_contrast(known),
         "law": law_in_words(known),
@@ -168,15 +169,15 @@ def law_in_words(known: dict[str, Any]) -> str:
     """Text of the law in force and of the modes that the guard returned to the integrator."""
     law, weight = known["law"], known["law"]["weight"]
     fading = "" if weight == 1 else f" with weight {weight:.2f}; the integrator has the rest"
-    instead = f"; overruled: the integrator drives {' and '.join(law['overruled'])}" if law["overruled"] else ""
-    return f"{law['name']}{fading}{instead}"
+    overruled_modes = f"; overruled: the integrator drives {' and '.join(law['overruled'])}" if law["overruled"] else ""
+    return f"{law['name']}{fading}{overruled_modes}"
 
 
 def channels_in_words(known: dict[str, Any]) -> str:
     """Text of the command channels."""
     channels = [
         f"{one['name']} {one['rms_nm']:.3g} nm rms of surface"
-        f"{'' if one['reached'] else ', on its way'}{'' if one['shifts_zero_point'] else ', zero point not shifted'}"
+        f"{'' if one['reached'] else ', not yet reached'}{'' if one['shifts_zero_point'] else ', zero point not shifted'}"
         for one in known["channels"]
     ]
     return "; ".join(channels) or "no channel"
@@ -241,18 +242,18 @@ def _last_warning(state: wire.ControllerState, processes: Mapping[str, wire.Heal
 
 def _mode(known: dict[str, Any], since: str = "") -> str:
     word = ("paused" if known["paused"] else mode_word(known["mode"])) + since
-    return f"{word}, but holding: {known['holding']}" if known["holding"] else word
+    return f"{word}, command held: {known['holding']}" if known["holding"] else word
 
 
 def _reason(number: int) -> str:
-    """Name of a reason, or its number if a mirror of a later version sent an unknown one."""
+    """Name of a reason, or its number if it is unknown (sent by a mirror of a later version)."""
     return next((reason.name for reason in REASONS if reason == number), str(number))
 
 
 def _of_mirror(mirror: dict[str, Any]) -> str:
     if mirror["refused"]:
         return f"refuses commands: {mirror['refused']}"
-    state = "its last command has expired" if mirror["expired"] else "follows"
+    state = "last command expired" if mirror["expired"] else "follows commands"
     return f"{state}; {_acting(mirror['limits_hit'])}" if mirror["limits_hit"] else state
 
 
@@ -280,7 +281,7 @@ def _spoken(reason: str) -> str:
 
 
 def _values(values: list[float], unit: str = "") -> str:
-    """All values, or one figure if they are equal; "none" without a calibration."""
+    """All values, or one value if they are equal; "none" without a calibration."""
     if not values:
         return "none"
     same = len(set(values)) == 1

@@ -21,14 +21,14 @@ class Field(NamedTuple):
 
     name: str
     label: str
-    usual: Callable[[], str] = str
+    default: Callable[[], str] = str
 
 
 class Action(NamedTuple):
     """A button and its key.
 
-    The operator first fills in its fields or answers its question `confirm`. Then it sends a request to the loop, or
-    starts `task` as a `lowfc` command in a separate process, with the fields as options.
+    The operator first fills in `fields` or answers the question `confirm`. The button then sends a request to the loop
+    (`ask`), or starts the `lowfc` command `task` in a separate process, with the fields as options.
     """
 
     key: str
@@ -40,7 +40,7 @@ class Action(NamedTuple):
     confirm: str = ""
 
     def command(self, values: Values, run: str) -> list[str]:
-        """The words of a task's command."""
+        """Arguments of `lowfc` for the task."""
         options = [word for name, value in values.items() if value and name != LOAD for word in (f"--{name}", value)]
         load = ["--load"] if values.get(LOAD, "").lower() in ("y", "yes") else []
         return [*self.task, *options, *load, "--run", run]
@@ -50,7 +50,7 @@ LOAD = "load"
 
 
 def _shape(text: str) -> Any:
-    from lowfc.adapters.files.mirror_maps import read_shape  # astropy, which a console needs for files alone
+    from lowfc.adapters.files.mirror_maps import read_shape  # imports astropy, needed only for files
 
     return read_shape(Path(text)) if text else None
 
@@ -86,11 +86,11 @@ _LABELS = {
     "leak values": "leak: one, or one for each mode",
     "limit values": "limit: one, or one for each mode, nm rms of wavefront",
     "offset values": "offset: one, or one for each mode, nm rms of wavefront; empty for zero",
-    "channel text": "name: up to 32 of a-z, 0-9 and -, a letter first",
+    "channel text": "name: up to 32 of a-z, 0-9 and -, starting with a letter",
     "note text": "note",
 }
 """Label of each field of a request in a form, by the field or by request and field."""
-_LAST = "modes"
+_LAST_FIELD = "modes"
 
 
 def numbers(text: str) -> list[float]:
@@ -109,22 +109,22 @@ def requested(key: str, name: str, confirm: str = "") -> Action:
         if values.get("values") == AUTO:
             return loop.automatic_gain(_READERS["modes"][1](values["modes"]))
         read = {_READERS[field][0]: _READERS[field][1](text) for field, text in values.items()}
-        if name == "channel":  # the client knows the mirror's rows and columns
+        if name == "channel":  # this method of the client checks the shape against the mirror's grid
             return loop.channel(read["text"], read["actuators_nm"])
         return loop.ask(name, **read)
 
-    names = sorted((field for field, _ in declared.fields), key=lambda field: field == _LAST)
+    names = sorted((field for field, _ in declared.fields), key=lambda field: field == _LAST_FIELD)
     labels = ((field, _LABELS.get(field) or _LABELS.get(f"{name} {field}")) for field in names)
     fields = tuple(Field(field, label) for field, label in labels if label)
     return Action(key, name, declared.sentence, fields, ask, confirm=confirm)
 
 
 def _record(loop: Client, values: Values) -> Answer:
-    with suppress(RequestRefusedError):  # nothing is being recorded
+    with suppress(RequestRefusedError):  # refused if nothing is being recorded
         loop.record(False)
     answer = loop.record(True)
-    if said := "; ".join(f"{name}: {value}" for name, value in values.items() if value):
-        loop.note(said)
+    if note := "; ".join(f"{name}: {value}" for name, value in values.items() if value):
+        loop.note(note)
     return answer
 
 
@@ -151,15 +151,15 @@ ACTIONS = (
     Action(
         "d",
         "dark",
-        "Take a dark and find bad pixels. Block the star before you start it: it does not ask.",
-        (Field("frames", "frames: how many are averaged", lambda: "400"), _OUT, _LOAD),
+        "Measure the dark and find bad pixels. Block the star first: there is no prompt.",
+        (Field("frames", "frames: number averaged", lambda: "400"), _OUT, _LOAD),
         task=("calibrate", "dark", "--dark-taken"),
     ),
     Action(
         "e",
         "reference",
         "Take the present wavefront as the zero point.",
-        (Field("frames", "frames: how many are averaged", lambda: "1000"), _OUT, _LOAD),
+        (Field("frames", "frames: number averaged", lambda: "1000"), _OUT, _LOAD),
         task=("calibrate", "reference"),
     ),
     Action(

@@ -32,14 +32,15 @@ from lowfc.programs.console.phrases import phrased
 from lowfc.programs.console.task import Task
 from lowfc.programs.view.verdicts.tile import FILL, INK, Level
 
-FIGURES_S = 0.2
-"""Between two readings; a picture is drawn from every other one or less."""
+READ_PERIOD_S = 0.2
+"""Time between two readings."""
 PICTURES_EVERY = 3
-MOVED = "moved"
-"""What the application ends with where the run was begun anew, to be joined again."""
-_LEFT = 62
-_MOVED_EVERY = 10
-_OTHERS = (
+"""Readings from one drawing of the pictures to the next."""
+RESTARTED = "restarted"
+"""Result of the application if the run restarted and must be joined again."""
+_LEFT = 62  # columns of the left half
+_RESTART_CHECK_EVERY = 10  # readings
+_OTHER_KEYS = (
     ("↑↓ ←→", "knobs", "Choose a gain knob and turn it: largest gain of its modes, whose ratios stay"),
     ("u", "auto", "Set the gains of the chosen knob to automatic"),
     ("m", "mute", "Switch the terminal's bell for errors on or off"),
@@ -48,11 +49,11 @@ _OTHERS = (
 
 
 class Answered(Message):
-    """An action has come to its answer, good or not."""
+    """The answer to an action, or the reason why it failed."""
 
-    def __init__(self, action: Action, sentence: str, *, good: bool) -> None:
+    def __init__(self, action: Action, sentence: str, *, ok: bool) -> None:
         super().__init__()
-        self.action, self.sentence, self.good = action, sentence, good
+        self.action, self.sentence, self.ok = action, sentence, ok
 
 
 class Console(OrderedKeys):
@@ -72,7 +73,7 @@ class Console(OrderedKeys):
     #sparks {{ height: 2; }}
     #gains {{ height: 5; }}
     #facts {{ height: 5; }}
-    .cut {{ visibility: hidden; }}
+    .disconnected {{ visibility: hidden; }}
     #log {{ height: 1fr; }}
     #answer {{ height: 2; padding: 0 1; }}
     #tasks {{ height: auto; padding: 0 1; display: none; }}
@@ -110,23 +111,31 @@ class Console(OrderedKeys):
         bus: Bus,
         run_id: str,
         clock: Clock,
-        moved: Callable[[], bool] = lambda: False,
+        restarted: Callable[[], bool] = lambda: False,
         terminal_gone: Callable[[], bool] = lambda: False,
     ) -> None:
-        """Look at a run; `moved` says whether it was begun anew, with other links."""
+        """Console of a run.
+
+        Args:
+            bus: bus of the run, joined as a monitor.
+            run_id: name of the run.
+            clock: clock of the run.
+            restarted: whether the run restarted, so that its links are others.
+            terminal_gone: whether the terminal was closed.
+        """
         super().__init__()
-        self._bus, self._run_id, self._run_clock, self._moved = bus, run_id, clock, moved
+        self._bus, self._run_id, self._restarted = bus, run_id, restarted
         self._terminal_gone = terminal_gone
         self._feed = Feed(bus, run_id, clock)
         self._history = History()
         self._shown: dict[str, Text] = {}
         self._tasks: list[Task] = []
-        self._asking: dict[str, threading.Thread] = {}
+        self._requesting: dict[str, threading.Thread] = {}
         self._mute = False
         self._readings = 0
 
     def compose(self) -> ComposeResult:
-        """Lay it out."""
+        """Lay out the screen."""
         with Horizontal(id="top"):
             yield Static(id="verdict", markup=False)
             yield Static(id="clock", markup=False)
@@ -149,11 +158,11 @@ class Console(OrderedKeys):
         yield Lines("peers")
 
     def on_mount(self) -> None:
-        """Begin to read."""
-        self.set_interval(FIGURES_S, self._read)
+        """Start the readings."""
+        self.set_interval(READ_PERIOD_S, self._read)
 
     def awaits_focus(self, screen: Screen[object]) -> bool:
-        """A form does, which is being drawn."""
+        """Whether a form is open that does not have the focus yet."""
         return isinstance(screen, Form) and screen.focused is None
 
     def action_press(self, name: str) -> None:
@@ -173,20 +182,20 @@ class Console(OrderedKeys):
         self.query_one(Gains).turn(steps)
 
     def action_automatic(self) -> None:
-        """Let the gains of the chosen knob be automatic."""
+        """Set the gains of the chosen knob to automatic."""
         self.query_one(Gains).automatic()
 
     def action_mute(self) -> None:
-        """Ring no bell, or ring it again."""
+        """Switch the bell off or on."""
         self._mute = not self._mute
-        self._answer(f"the bell is {'off' if self._mute else 'on'}", good=True)
+        self._answer(f"the bell is {'off' if self._mute else 'on'}", ok=True)
 
     def action_help(self) -> None:
         """Show the keys."""
         rows = [
             ("s F12", "SAFE", f"At once, in a form with F12: {SAFE.sentence}"),
             *((one.key, one.name, one.sentence) for one in ACTIONS),
-            *_OTHERS,
+            *_OTHER_KEYS,
         ]
         self.push_screen(Help(rows))
 
@@ -207,13 +216,16 @@ class Console(OrderedKeys):
         self._do(EVERY["gain"], {"modes": modes, "values": values or AUTO})
 
     def _do(self, action: Action, values: Values) -> None:
-        """Start a task, or ask in a thread of its own: only the same button waits for an answer, and SAFE does not."""
-        self._answer(f"{action.name}: requested", good=True)
-        before = self._asking.get(action.name) if action is not SAFE else None
+        """Start a task, or send a request in its own thread.
+
+        Requests of the same button wait for each other's answers, except those of SAFE.
+        """
+        self._answer(f"{action.name}: requested", ok=True)
+        previous = self._requesting.get(action.name) if action is not SAFE else None
 
         def ask() -> None:
-            if before is not None:
-                before.join()  # two turns of a knob are asked in their order
+            if previous is not None:
+                previous.join()  # two turns of a knob are requested in their order
             tasks: list[Task] = []
             try:
                 if action.ask is None:
@@ -224,41 +236,41 @@ class Console(OrderedKeys):
                     since = f", from frame {answer.frame} on" if answer.frame else ""
                     sentence = f"{action.name}: {answer.reply}{since}"
             except (LowfcError, OSError, ValueError) as fault:
-                self.post_message(Answered(action, phrased(str(fault)), good=False))
+                self.post_message(Answered(action, phrased(str(fault)), ok=False))
             else:
-                self.post_message(Answered(action, phrased(sentence), good=True))
-                self.call_later(self._tasks.extend, tasks)  # it has started before it has ended
+                self.post_message(Answered(action, phrased(sentence), ok=True))
+                self.call_later(self._tasks.extend, tasks)  # "started" is shown before "done"
 
-        self._asking[action.name] = threading.Thread(target=ask, name=action.name, daemon=True)
-        self._asking[action.name].start()
+        self._requesting[action.name] = threading.Thread(target=ask, name=action.name, daemon=True)
+        self._requesting[action.name].start()
 
     @on(Answered)
     def _answered(self, event: Answered) -> None:
         if self._torn_down:
             return
-        self._answer(event.sentence, good=event.good)
-        self.query_one(f"#{_id(event.action)}").set_class(not event.good, "refused")
-        if event.action.name == "gain" and not event.good:
-            self.query_one(Gains).forget()
+        self._answer(event.sentence, ok=event.ok)
+        self.query_one(f"#{_id(event.action)}").set_class(not event.ok, "refused")
+        if event.action.name == "gain" and not event.ok:
+            self.query_one(Gains).discard_pending()
         form = self.screen
-        if isinstance(form, Form) and form.what is event.action:
-            if event.good:
+        if isinstance(form, Form) and form.button is event.action:
+            if event.ok:
                 form.dismiss()
             else:
                 form.refuse(event.sentence)
 
-    def _answer(self, sentence: str, *, good: bool) -> None:
+    def _answer(self, sentence: str, *, ok: bool) -> None:
         answer = self.screen_stack[0].query_one("#answer", Static)
-        answer.set_class(not good, "refused")
+        answer.set_class(not ok, "refused")
         answer.update(sentence, layout=False)
 
     @property
     def _torn_down(self) -> bool:
-        """Whether the screen is no longer whole: what is under way then has nowhere to go."""
+        """Whether the screen is being removed, so that late answers and readings are dropped."""
         return not (self.screen_stack and any(one.id == "peers" for one in self.screen_stack[0].children))
 
     def _read(self) -> None:
-        if self._terminal_gone():  # nobody looks, and what reads the keys would never rest
+        if self._terminal_gone():  # without a terminal, the thread that reads the keys would spin
             self.exit()
             return
         if self._torn_down:
@@ -267,54 +279,54 @@ class Console(OrderedKeys):
         self._readings += 1
         self._show(reading)
         self._watch_tasks()
-        if not reading.connected and self._readings % _MOVED_EVERY == 0 and self._moved():
-            self.exit(MOVED)
+        if not reading.connected and self._readings % _RESTART_CHECK_EVERY == 0 and self._restarted():
+            self.exit(RESTARTED)
 
     def _show(self, reading: Reading) -> None:
         level, sentence = panels.verdict(reading, self._run_id)
         self._colour(level)
-        self._put("verdict", Text(sentence))
-        self._put("clock", Text(f"{panels.clock(reading.state.snapshot.host_ns)}\nUTC"))
-        self.screen_stack[0].query_one("#figures").set_class(not reading.connected, "cut")
+        self._show_text("verdict", Text(sentence))
+        self._show_text("clock", Text(f"{panels.clock(reading.state.snapshot.host_ns)}\nUTC"))
+        self.screen_stack[0].query_one("#figures").set_class(not reading.connected, "disconnected")
         if reading.connected:
-            self._drawn("tiles").show(panels.tiles(reading))
-            self._drawn("sparks").show(panels.sparks(reading))
-            self._drawn("modes").show(panels.modes(reading, _LEFT))
-            self._put("facts", panels.facts(reading))
+            self._lines("tiles").show(panels.tiles(reading))
+            self._lines("sparks").show(panels.sparks(reading))
+            self._lines("modes").show(panels.modes(reading, _LEFT))
+            self._show_text("facts", panels.facts(reading))
             if self._readings % PICTURES_EVERY == 0:
-                self._drawn("pictures").show(panels.pictures(reading))
+                self._lines("pictures").show(panels.pictures(reading))
             self.screen_stack[0].query_one(Gains).update(reading)
-        self._drawn("peers").show([panels.peers(reading, self._run_id)])
+        self._lines("peers").show([panels.peers(reading, self._run_id)])
         for request in reading.requests:
             self._history.add(request)
         events = reading.state.snapshot.events
         for event in events:
             self._history.add(event)
-        self._put("log", self._history.last(self._main("#log").size.height))
+        self._show_text("log", self._history.last(self._static("#log").size.height))
         if not self._mute and any(event.level >= Severity.ERROR for event in events):
             self.bell()
 
     def _watch_tasks(self) -> None:
         for task in [one for one in self._tasks if one.status is not None]:
             self._tasks.remove(task)
-            self._answer(task.sentence, good=not task.status)
-        self._main("#tasks").display = bool(self._tasks)
-        self._put("tasks", Text("\n".join(task.sentence for task in self._tasks)))
+            self._answer(task.sentence, ok=not task.status)
+        self._static("#tasks").display = bool(self._tasks)
+        self._show_text("tasks", Text("\n".join(task.sentence for task in self._tasks)))
 
     def _colour(self, level: Level) -> None:
         for name in ("#verdict", "#clock"):
-            styles = self._main(name).styles
+            styles = self._static(name).styles
             styles.background, styles.color = Color(*FILL[level]), Color(*INK[level])
 
-    def _put(self, name: str, text: Text) -> None:
+    def _show_text(self, name: str, text: Text) -> None:
         if self._shown.get(name) != text:
             self._shown[name] = text
-            self._main(f"#{name}").update(text, layout=False)
+            self._static(f"#{name}").update(text, layout=False)
 
-    def _drawn(self, name: str) -> Lines:
+    def _lines(self, name: str) -> Lines:
         return self.screen_stack[0].query_one(f"#{name}", Lines)
 
-    def _main(self, name: str) -> Static:
+    def _static(self, name: str) -> Static:
         return self.screen_stack[0].query_one(name, Static)
 
 

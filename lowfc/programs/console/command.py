@@ -33,23 +33,23 @@ def _operated(run_id: str) -> bool:
     from lowfc.adapters.process.join import clock_of
     from lowfc.contract.configuration import load
     from lowfc.contract.messages import Role
-    from lowfc.programs.console.app import MOVED, Console
+    from lowfc.programs.console.app import RESTARTED, Console
 
     joined = open_run(run_id, ())
-    links, own = joined.path / "links.json", joined.path / "config.toml"
-    made_ns = links.stat().st_ctime_ns
-    clock = clock_of(load(own if own.exists() else None))
+    links, config = joined.path / "links.json", joined.path / "config.toml"
+    created_ns = links.stat().st_ctime_ns
+    clock = clock_of(load(config if config.exists() else None))
     bus = ZenohBus(joined.links, Role.OPERATOR, clock, monitor=True)
     try:
         app = Console(
             bus,
             run_id,
             clock,
-            moved=lambda: links.exists() and links.stat().st_ctime_ns != made_ns,
+            restarted=lambda: links.exists() and links.stat().st_ctime_ns != created_ns,
             terminal_gone=lambda: not sys.stdin.isatty(),
         )
-        for ends in (signal.SIGTERM, signal.SIGINT):  # textual's threads would outlive an exception
-            signal.signal(ends, lambda *_: app.exit())
-        return app.run() == MOVED
+        for number in (signal.SIGTERM, signal.SIGINT):  # textual's threads would outlive an exception
+            signal.signal(number, lambda *_: app.exit())
+        return app.run() == RESTARTED
     finally:
         bus.close()

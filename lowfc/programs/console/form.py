@@ -22,34 +22,34 @@ HELP = (
 )
 
 
-_ENDS = re.compile(r"\. |; |, (?:and|whatever)|: it ")
-"""Where the help leaves a sentence."""
+_CLAUSE_END = re.compile(r"\. |; |, (?:and|whatever)|: it ")
+"""Where the help cuts off a description."""
 
 
 class Form(ModalScreen[None]):
-    """The fields of an action, or its question; it stays open until the request is accepted, and shows a refusal."""
+    """The fields of an action, or its question; open until the request is accepted. It shows the reason of a refusal."""
 
     AUTO_FOCUS = "Input, #ok"
     BINDINGS: ClassVar[list[BindingType]] = [("escape", "dismiss", "leave")]
 
     class Filled(Message):
-        """Somebody pressed OK."""
+        """The operator pressed OK."""
 
         def __init__(self, action: Action, values: dict[str, str]) -> None:
             super().__init__()
             self.action, self.values = action, values
 
-    def __init__(self, action: Action) -> None:
+    def __init__(self, button: Action) -> None:
         super().__init__()
-        self.what = action
+        self.button = button
 
     def compose(self) -> ComposeResult:
-        """Lay it out."""
+        """Lay out the form."""
         with Vertical():
-            yield Static(self.what.confirm or f"{self.what.name}: {self.what.sentence}", markup=False)
-            for field in self.what.fields:
+            yield Static(self.button.confirm or f"{self.button.name}: {self.button.sentence}", markup=False)
+            for field in self.button.fields:
                 yield Label(field.label, markup=False)
-                yield Input(field.usual(), name=field.name, compact=True)
+                yield Input(field.default(), name=field.name, compact=True)
             yield Static("", id="refusal", markup=False)
             with Horizontal():
                 yield Button("OK", id="ok", compact=True, variant="primary")
@@ -63,7 +63,7 @@ class Form(ModalScreen[None]):
     @on(Button.Pressed, "#ok")
     def _filled(self) -> None:
         self.refuse("requested, waiting for the answer")
-        self.post_message(self.Filled(self.what, {one.name or "": one.value.strip() for one in self.query(Input)}))
+        self.post_message(self.Filled(self.button, {one.name or "": one.value.strip() for one in self.query(Input)}))
 
     @on(Button.Pressed, "#leave")
     def _leave(self) -> None:
@@ -82,9 +82,9 @@ class Help(ModalScreen[None]):
         self._rows = list(rows)
 
     def compose(self) -> ComposeResult:
-        """Lay it out."""
+        """Lay out the help."""
         lines = [
-            Text.assemble((f"{key:6}", "bold"), f"{name:11}", _ENDS.split(sentence, maxsplit=1)[0].rstrip("."))
+            Text.assemble((f"{key:6}", "bold"), f"{name:11}", _CLAUSE_END.split(sentence, maxsplit=1)[0].rstrip("."))
             for key, name, sentence in self._rows
         ]
         with Vertical():

@@ -1,4 +1,4 @@
-"""The gain knobs: one for all modes, one for each radial order. A knob is at the largest gain of its modes."""
+"""The gain knobs: one for all modes, one for each radial order. A knob shows the largest gain of its modes."""
 
 import math
 import time
@@ -18,17 +18,17 @@ from lowfc.programs.view.draw.colours import BLUE, GREY
 HIGHEST = 1.5
 STEP, FINE_STEP = 0.05, 0.01
 FINE_BELOW = 0.1
-"""Knobs below it are turned in fine steps."""
-_BAR = 8
+"""Knobs below this gain are turned in fine steps."""
+_BAR = 8  # columns of the bar
 _BEFORE = 11  # columns before the bar
-_PENDING_S = 1.0  # after which the controller's state has what was asked
+_PENDING_S = 1.0  # until the controller's state has the requested gain
 
 
 class Gains(Lines):
-    """The knobs; one is chosen, and turned by keys or by a click on its bar: its modes keep their ratios."""
+    """The knobs. Keys or a click on a bar turn the chosen one; its modes keep their ratios."""
 
     class Turned(Message):
-        """Somebody turned a knob: these gains are wanted for these modes, automatic ones where there are none."""
+        """A knob was turned: gains requested for these modes; no values request automatic gains."""
 
         def __init__(self, modes: tuple[int, ...], values: list[float]) -> None:
             super().__init__()
@@ -43,7 +43,7 @@ class Gains(Lines):
         self._pending: dict[int, tuple[float, float]] = {}
 
     def update(self, reading: Reading) -> None:
-        """Take in the gains of the run."""
+        """Show the gains of the run."""
         state, noll = reading.state.snapshot.controller, reading.state.snapshot.noll
         if state is None or len(state.gain) != len(noll):
             self._noll = ()
@@ -53,7 +53,7 @@ class Gains(Lines):
         self._draw()
 
     def choose(self, by: int) -> None:
-        """Choose the knob so many lines below."""
+        """Choose the knob this many lines below."""
         self._chosen = (self._chosen + by) % max(1, len(groups(self._noll)))
         self._draw()
 
@@ -62,15 +62,15 @@ class Gains(Lines):
         if self._noll:
             knob = self._knob(self._chosen)
             fine = knob < FINE_BELOW or (steps < 0 and knob <= FINE_BELOW)
-            self._want(self._chosen, knob + steps * (FINE_STEP if fine else STEP))
+            self._request(self._chosen, knob + steps * (FINE_STEP if fine else STEP))
 
     def automatic(self) -> None:
-        """Let the controller choose the gains of the chosen knob."""
+        """Request automatic gains for the chosen knob."""
         if self._noll:
             self.post_message(self.Turned(groups(self._noll)[self._chosen][1], []))
 
-    def forget(self) -> None:
-        """What was asked has been refused: the knobs are where the controller's gains are."""
+    def discard_pending(self) -> None:
+        """Discard refused requests: the knobs return to the controller's gains."""
         self._pending.clear()
 
     def on_click(self, event: events.Click) -> None:
@@ -78,30 +78,30 @@ class Gains(Lines):
         if 0 <= event.y < len(groups(self._noll)):
             self._chosen = event.y
             if _BEFORE <= event.x <= _BEFORE + _BAR:
-                self._want(self._chosen, (event.x - _BEFORE) / _BAR * HIGHEST)
+                self._request(self._chosen, (event.x - _BEFORE) / _BAR * HIGHEST)
             self._draw()
 
-    def _want(self, number: int, knob: float) -> None:
+    def _request(self, number: int, knob: float) -> None:
         knob = round(min(max(knob, 0.0), HIGHEST), 3)
-        places, before = self._places(number), self._gain[self._places(number)]
-        gains = np.full(len(places), knob) if not before.any() else before / before.max() * knob
+        present = self._gain[self._indices(number)]
+        gains = np.full(len(present), knob) if not present.any() else present / present.max() * knob
         self._pending[number] = knob, time.monotonic() + _PENDING_S
         values = [float(f"{value:.4g}") for value in gains.tolist()]
         self.post_message(self.Turned(groups(self._noll)[number][1], values))
 
-    def _places(self, number: int) -> list[int]:
+    def _indices(self, number: int) -> list[int]:
         return [self._noll.index(mode) for mode in groups(self._noll)[number][1]]
 
     def _knob(self, number: int) -> float:
         knob, until_s = self._pending.get(number, (0.0, 0.0))
-        return knob if time.monotonic() < until_s else float(self._gain[self._places(number)].max())
+        return knob if time.monotonic() < until_s else float(self._gain[self._indices(number)].max())
 
     def _draw(self) -> None:
         lines = []
         for number, (name, _) in enumerate(groups(self._noll)):
-            knob, places = self._knob(number), self._places(number)
+            knob, indices = self._knob(number), self._indices(number)
             at = min(round(knob / HIGHEST * _BAR), _BAR)
-            lowest = float(self._gain[places].min())
+            lowest = float(self._gain[indices].min())
             least = "" if lowest > 0.99 * knob else f"{lowest:.2g}-"
             chosen = number == self._chosen
             lines.append(
@@ -111,14 +111,14 @@ class Gains(Lines):
                     ("●", BOLD),
                     ("━" * (_BAR - at), style(GREY)),
                     f" {least}{knob:.2g}" if least else f" {knob:.3g}",
-                    (" auto" if self._automatic[places].all() else "", DIM),
+                    (" auto" if self._automatic[indices].all() else "", DIM),
                 )
             )
         self.show(lines or [Text("gains are not known yet", DIM)])
 
 
 def groups(noll: Sequence[int]) -> list[tuple[str, tuple[int, ...]]]:
-    """All modes, and those of each radial order, by a name."""
+    """Name and modes of each knob: all modes, then those of each radial order."""
     orders: dict[int, list[int]] = {}
     for mode in noll:
         orders.setdefault((math.isqrt(8 * mode - 7) - 1) // 2, []).append(mode)

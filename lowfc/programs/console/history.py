@@ -1,4 +1,4 @@
-"""Events and requests, newest last; a repeated event has one line."""
+"""Events and requests, newest last; an event that repeats is one line with its count."""
 
 import re
 from collections import deque
@@ -8,10 +8,10 @@ from rich.text import Text
 from lowfc.contract.messages import Log, from_timestamp, wire
 from lowfc.programs.console import panels
 
-_MOST = 200
-_WITHIN_S = 10.0
+_LINES = 200
+_REPEAT_S = 10.0
 """An event repeated within this time is shown once, with its count."""
-_LOOKED_AT = 8
+_SEARCHED = 8  # last lines in which a repeated event is searched
 _DIGITS = re.compile(r"\d+")
 
 
@@ -19,20 +19,20 @@ class History:
     """Lines for the events and requests of a run."""
 
     def __init__(self) -> None:
-        self._lines: deque[tuple[wire.Request | Log, int]] = deque(maxlen=_MOST)
+        self._lines: deque[tuple[wire.Request | Log, int]] = deque(maxlen=_LINES)
 
     def add(self, one: wire.Request | Log) -> None:
-        """Add the newest; an event like one of the last ones takes its place."""
+        """Add an event or request; an event that repeats one of the last lines replaces it."""
         times = 1
-        for place in range(len(self._lines) - 1, max(-1, len(self._lines) - 1 - _LOOKED_AT), -1):
-            if _alike(self._lines[place][0], one):
-                times += self._lines[place][1]
-                del self._lines[place]
+        for line in range(len(self._lines) - 1, max(-1, len(self._lines) - 1 - _SEARCHED), -1):
+            if _repeats(self._lines[line][0], one):
+                times += self._lines[line][1]
+                del self._lines[line]
                 break
         self._lines.append((one, times))
 
     def last(self, count: int) -> Text:
-        """The newest ones, a line each."""
+        """The newest lines."""
         shown = list(self._lines)[-max(1, count) :]
         return Text("\n").join(
             panels.request_line(one) if isinstance(one, wire.Request) else panels.event_line(one, times)
@@ -40,12 +40,12 @@ class History:
         )
 
 
-def _alike(before: wire.Request | Log, now: wire.Request | Log) -> bool:
+def _repeats(before: wire.Request | Log, now: wire.Request | Log) -> bool:
     if isinstance(before, wire.Request) or isinstance(now, wire.Request):
         return False
     apart_s = (from_timestamp(now.timestamp) - from_timestamp(before.timestamp)) * 1e-9
     return (
-        apart_s < _WITHIN_S
+        apart_s < _REPEAT_S
         and (before.name, before.level) == (now.name, now.level)
         and _DIGITS.sub("", before.message) == _DIGITS.sub("", now.message)
     )

@@ -1,4 +1,4 @@
-"""Keys in the order in which they were typed, each to where the one before has led."""
+"""Keys processed one at a time: each goes to the widget that has the focus after the previous key."""
 
 from collections import deque
 from functools import partial
@@ -9,57 +9,58 @@ from textual.dom import DOMNode
 from textual.screen import Screen
 
 AT_ONCE = "f12"
-_PATIENCE_S = 1.0
-"""Seconds after which a key waits no longer for the one before."""
-_LOOK_S = 0.02
+"""Key that does not wait for the others."""
+_TIMEOUT_S = 1.0
+"""Longest time that a key waits for the previous one."""
+_POLL_S = 0.02
 
 
 class OrderedKeys(App[str]):
-    """An application in which a form that a key opens receives the keys after it, however fast they come.
+    """An application in which a form opened by a key receives the next keys, however fast they arrive.
 
-    Textual hands each key to what has the focus as it arrives, though the key before may be about to move it: over a
-    slow line, where several arrive at once, a form would lose its first letters, and a Tab would come too late.
+    Textual sends a key to the widget that has the focus when it arrives, even if the previous key is about to move the
+    focus. Over a slow line several keys arrive at once: a form would lose its first letters, and Tab would be too late.
     """
 
     def __init__(self) -> None:
         super().__init__()
-        self._typed: deque[events.Key] = deque()
-        self._turn = 0
-        self._under_way = False
+        self._waiting: deque[events.Key] = deque()
+        self._turn = 0  # number of the key in progress
+        self._busy = False
 
     def awaits_focus(self, screen: Screen[object]) -> bool:
-        """Whether a screen that is new will have the focus somewhere, and has not yet."""
+        """Whether a new screen is about to take the focus."""
         return False
 
     async def on_event(self, event: events.Event) -> None:
-        """Let keys queue; `AT_ONCE` does not."""
+        """Queue keys, except `AT_ONCE`."""
         if not isinstance(event, events.Key) or event.is_forwarded or event.key == AT_ONCE:
             await super().on_event(event)
             return
-        self._typed.append(event)
-        if not self._under_way:
-            await self._hand_on(self._turn)
+        self._waiting.append(event)
+        if not self._busy:
+            await self._next_key(self._turn)
 
-    async def _hand_on(self, turn: int) -> None:
-        """Hand the next key on, unless the key of this turn is followed already."""
+    async def _next_key(self, turn: int) -> None:
+        """Send the next key, unless this was already done after the key of this turn."""
         if turn != self._turn:
             return
         self._turn += 1
-        self._under_way = bool(self._typed)
-        if self._typed:
+        self._busy = bool(self._waiting)
+        if self._waiting:
             target = self.focused or self.screen
-            await super().on_event(self._typed.popleft())
+            await super().on_event(self._waiting.popleft())
             self._follow(target, self._turn)
-            self.set_timer(_PATIENCE_S, partial(self._hand_on, self._turn))
+            self.set_timer(_TIMEOUT_S, partial(self._next_key, self._turn))
 
     def _follow(self, node: DOMNode, turn: int) -> None:
-        """Wait behind the key in the queue of each widget that it comes to, up to the application's own."""
+        """Queue behind the key in each widget that it passes, up to the application itself."""
         if node is self or not node.call_later(self._follow, node.parent or self, turn):
             self.call_later(self._settle, turn)
 
     async def _settle(self, turn: int) -> None:
-        """Go on with the next key once what the last one opened has the focus."""
+        """Send the next key once the form opened by the last one has the focus."""
         if turn == self._turn and self.awaits_focus(self.screen):
-            self.set_timer(_LOOK_S, partial(self._settle, turn))
+            self.set_timer(_POLL_S, partial(self._settle, turn))
         else:
-            await self._hand_on(turn)
+            await self._next_key(turn)

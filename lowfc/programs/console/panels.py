@@ -33,7 +33,7 @@ _GAINS = re.compile(r", gain .*?(?=, leak|;)")
 
 @lru_cache(maxsize=4096)
 def style(ink: Colour | None = None, ground: Colour | None = None, *, bold: bool = False) -> Style:
-    """Style of these colours; None leaves the terminal's."""
+    """Style of these colours; None means the terminal's own."""
     red_green_blue = [None if one is None else "#{:02x}{:02x}{:02x}".format(*one) for one in (ink, ground)]
     return Style(color=red_green_blue[0], bgcolor=red_green_blue[1], bold=bold or None)
 
@@ -94,7 +94,7 @@ def reduced(array: Array) -> Array:
     for axis in (0, 1):
         edges = np.linspace(0, array.shape[axis], _PIXELS + 1).astype(int)[:-1]
         sizes = np.diff([*edges, array.shape[axis]])
-        sums = np.add.reduceat(array, edges, axis=axis)  # where there are fewer pixels, one stands more than once
+        sums = np.add.reduceat(array, edges, axis=axis)  # with fewer pixels than parts, some are repeated
         array = sums / np.maximum(sizes, 1).reshape((-1, 1) if axis == 0 else (1, -1))
     return array
 
@@ -111,10 +111,10 @@ def halves(colours: Rgb) -> list[Text]:
 
 
 def sparks(reading: Reading) -> list[Text]:
-    """Residual and light of the last minute."""
-    found, flux = reading.state.wavefront, reading.light[-1] if reading.light else float("nan")
+    """Sparklines of residual and light over the last minute."""
+    wavefront, flux = reading.state.wavefront, reading.light[-1] if reading.light else float("nan")
     kind = "true" if reading.state.true else "measured"
-    residual = "?" if found is None else f"{figure(found.residual_nm)} nm {kind}"
+    residual = "?" if wavefront is None else f"{figure(wavefront.residual_nm)} nm {kind}"
     light = "?" if np.isnan(flux) else f"{100 * flux:.0f} %"
     rows = ("residual", reading.residual_nm, residual), ("light", reading.light, light)
     return [
@@ -162,7 +162,7 @@ def _mode(noll: int, command_nm: float, limit_nm: float, width: int) -> Text:
 
 
 def facts(reading: Reading) -> Text:
-    """Settings: law, offset and channels, reservation of the loop, the last note."""
+    """Settings: law, offset and channels, lease or last note."""
     known, state = reading.verdict.facts, reading.state.snapshot.controller
     law = _GAINS.sub("", known["CONTROL LAW"])
     rows = {"law": law, "shapes": known["OFFSET AND CHANNELS"], "note": known["LAST NOTE"]}
@@ -198,17 +198,17 @@ def event_line(event: Log, times: int = 1) -> Text:
     )
 
 
-def request_line(asked: wire.Request) -> Text:
-    """A request with requester, answer, and the frame from which it is in force."""
-    fields = [numbers(list(asked.values)), printable(asked.text)]
-    if asked.modes:
-        fields.append(f"modes {','.join(map(str, asked.modes))}")
-    reply = phrased(printable(asked.reply))
+def request_line(request: wire.Request) -> Text:
+    """A request with requester, answer, and the first frame for which it is in force."""
+    fields = [numbers(list(request.values)), printable(request.text)]
+    if request.modes:
+        fields.append(f"modes {','.join(map(str, request.modes))}")
+    reply = phrased(printable(request.reply))
     return Text.assemble(
-        (f"{clock(from_timestamp(asked.timestamp))} ", DIM),
-        (" ".join(filter(None, [printable(asked.name), *fields])), BOLD),
-        (f" ({printable(asked.requester) or 'unknown requester'}): ", DIM),
-        (f"{reply}, from frame {count_of(asked.frame_sequence)} on", style())
-        if asked.accepted
+        (f"{clock(from_timestamp(request.timestamp))} ", DIM),
+        (" ".join(filter(None, [printable(request.name), *fields])), BOLD),
+        (f" ({printable(request.requester) or 'unknown requester'}): ", DIM),
+        (f"{reply}, from frame {count_of(request.frame_sequence)} on", style())
+        if request.accepted
         else (f"refused: {reply}", WRONG),
     )

@@ -1,4 +1,4 @@
-"""Adaptation of the loop's sentences to the console: its keys instead of commands, ranges instead of long lists."""
+"""The loop's sentences for the console: with its keys in place of commands, and ranges in place of long lists."""
 
 import re
 
@@ -16,7 +16,7 @@ _LIST = re.compile(rf"(?<![\w.]){_NUMBER}(?: {_NUMBER}){{3,}}(?![\w.])")
 
 
 def phrased(sentence: str) -> str:
-    """A sentence that an operator of the console can act on, and that fits its lines."""
+    """A sentence with the console's keys, and short enough for its lines."""
     return _LIST.sub(lambda found: numbers([float(one) for one in found[0].split()]), _COMMAND.sub(_key, sentence))
 
 

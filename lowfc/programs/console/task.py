@@ -12,15 +12,15 @@ _TAIL_BYTES = 4000
 
 
 class Task:
-    """One such process, named as its button; `output` is the file with everything that it writes."""
+    """A command in its own process, with the name of its button; its output goes to the file `output`."""
 
     def __init__(self, name: str, words: Sequence[str]) -> None:
-        """Start `lowfc` with these words, in a session of its own: neither Ctrl-C nor a lost terminal reaches it."""
+        """Start `lowfc` with these arguments, in its own session: neither Ctrl-C nor a lost terminal reaches it."""
         self.name = name
         self._began_s = time.monotonic()
         number, path = tempfile.mkstemp(prefix=f"lowfc-{words[0]}-", suffix=".txt")
         self.output = Path(path)
-        environment = {key: value for key, value in os.environ.items() if key != "ZENOH_RUNTIME"}  # this monitor's own
+        environment = {key: value for key, value in os.environ.items() if key != "ZENOH_RUNTIME"}  # set for monitors
         with os.fdopen(number, "wb") as stream:
             self._process = subprocess.Popen(  # noqa: S603  # our own program
                 [sys.executable, "-m", "lowfc", *words],
@@ -38,7 +38,7 @@ class Task:
 
     @property
     def sentence(self) -> str:
-        """How it is, in one line, with the last that it wrote."""
+        """State of the command in one line, with the last line of its output."""
         lines = [line.strip() for line in self._tail().splitlines() if line.strip()]
         last = lines[-1] if lines else ""
         if self.status is None:
@@ -46,7 +46,7 @@ class Task:
         if self.status == 0:
             return f"{self.name}: done; {last}"
         wrong = next((line for line in reversed(lines) if line.startswith("error:")), last)
-        return f"{self.name} failed: {wrong.removeprefix('error: ')} (all of it: {self.output})"
+        return f"{self.name} failed: {wrong.removeprefix('error: ')} (full output: {self.output})"
 
     def _tail(self) -> str:
         with self.output.open("rb") as stream:

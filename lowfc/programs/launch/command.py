@@ -55,8 +55,8 @@ def sim_loop(
     settings = configuration(config, overrides, {"control.start_mode": "closed", **spread(os.sched_getaffinity(0))})
     check_files(settings)
     if settings.control.start_mode == "open":
-        chosen = "--open" if open_loop else f"control.start_mode of {config}"
-        typer.echo(f"the loop starts open ({chosen}): `lowfc ctl close` closes it", err=True)
+        source = "--open" if open_loop else f"control.start_mode of {config}"
+        typer.echo(f"the loop starts open ({source}): `lowfc ctl close` closes it", err=True)
     if view_ and web:
         raise ConfigurationError("--view and --web exclude each other: use one")
     if has_screen() and not (view_ or web):

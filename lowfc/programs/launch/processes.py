@@ -6,10 +6,10 @@ from pathlib import Path
 from lowfc.adapters.process.child import Child
 
 
-def program(name: str, arguments: list[str], said: Path) -> Child:
+def program(name: str, arguments: list[str], stderr_path: Path) -> Child:
     """A Python program of the project as a child process, not yet started."""
     # -P: do not import from a folder named lowfc in the working directory
-    return Child(name, [sys.executable, "-P", *arguments], said)
+    return Child(name, [sys.executable, "-P", *arguments], stderr_path)
 
 
 def start_all(children: list[Child]) -> None:

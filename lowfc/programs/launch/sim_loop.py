@@ -46,7 +46,7 @@ def sim_loop(
 ) -> dict[str, Any]:
     """Run the simulated loop for a time, or until Ctrl-C; return the summary that `--json` prints.
 
-    The end of the view does not stop the loop. ProcessDiedError: another process ended; the text quotes its output.
+    The loop continues if the view ends. ProcessDiedError: another process ended; the error quotes its output.
     """
     console = Console(stderr=True)
     require_screen(show)
@@ -56,10 +56,10 @@ def sim_loop(
         console.print(estimate(config), highlight=False, markup=False, soft_wrap=True)
     watch = Watch({}, [])
     children: list[Child] = []
-    bus = ZenohBus(run.links, Role.LAUNCHER, HostClock())  # listens: shows that a loop starts
+    bus = ZenohBus(run.links, Role.LAUNCHER, HostClock())  # its listener marks the run as starting
     try:
-        bus.subscribe(HEALTH, watch.hear)
-        bus.subscribe(EVENT, watch.note)
+        bus.subscribe(HEALTH, watch.add_health)
+        bus.subscribe(EVENT, watch.add_event)
         prepare(config, run, console)
         children += children_of(config, run, duration_s, record)
         if show is not None:
@@ -77,7 +77,7 @@ def sim_loop(
 
 
 def _new_run(config: Configuration, name: str | None) -> Run:
-    """Open a run that no other launcher uses; the remains of a killed launcher are reused."""
+    """Open a run that no other launcher uses; a directory left by a killed launcher is reused."""
     run = open_run(name or new_run_id(), (config.mirror.name,), listeners=(Role.LAUNCHER,))
     if living := run.links.live():
         raise BusError(f"run {run.run_id!r} is already running ({', '.join(sorted(living))}): use another name")
@@ -96,7 +96,7 @@ def prepare(config: Configuration, run: Run, console: Console) -> None:
 
 
 def children_of(config: Configuration, run: Run, duration_s: float | None, record: bool) -> list[Child]:
-    """The processes in the order in which they are stopped: along the flow of the data."""
+    """The processes in the order in which they are stopped, which is that of the data flow."""
     shared = ["--run", run.run_id, "--config", str(run.path / "config.toml")]
     calibration = ["--calibration", str(run.path / "calibration.fits")]
     mirror = mirror_role(config.mirror.name)
@@ -104,10 +104,11 @@ def children_of(config: Configuration, run: Run, duration_s: float | None, recor
     camera = ["-m", "sim_camera", *shared, *(word for name in awaited for word in ("--wait-for", str(name)))]
     if duration_s is not None:
         camera += ["--frames", str(max(1, math.ceil(duration_s * config.camera.rate_hz)))]
-    whole = ["--wait-for", str(Role.RECORDER)] if record and config.lockstep else []  # all logs of a seed start alike
+    # Recording starts before the controller, so that all logs of one seed start with the same message.
+    after_recorder = ["--wait-for", str(Role.RECORDER)] if record and config.lockstep else []
     commands = {
         str(Role.CAMERA): camera,
-        str(Role.CONTROLLER): ["-m", "lowfc", "controller", *shared, *calibration, *whole],
+        str(Role.CONTROLLER): ["-m", "lowfc", "controller", *shared, *calibration, *after_recorder],
         mirror: ["-m", "sim_dm", *shared],
     }
     if record:
@@ -120,8 +121,19 @@ def _view(run: Run, show: Show, console: Console) -> Child:
     port, web_port = free_ports(2)
     if show is Show.WEB:
         console.print(f"view: {web_address(stream_url(port), web_port)}", soft_wrap=True, highlight=False)
-    words = ["-m", "lowfc", "view", "--run", run.run_id, f"--{show}", "--port", str(port), "--web-port", str(web_port)]
-    return program(str(Role.VIEWER), words, run.path / f"{Role.VIEWER}.stderr")
+    arguments = [
+        "-m",
+        "lowfc",
+        "view",
+        "--run",
+        run.run_id,
+        f"--{show}",
+        "--port",
+        str(port),
+        "--web-port",
+        str(web_port),
+    ]
+    return program(str(Role.VIEWER), arguments, run.path / f"{Role.VIEWER}.stderr")
 
 
 def _supervise(
@@ -133,13 +145,13 @@ def _supervise(
 ) -> None:
     camera = children[0]
     view = next((child for child in children if child.name == Role.VIEWER), None)
-    with held_back() as interrupted, _display(console) as show:
+    with deferred_signals() as interrupted, _display(console) as show:
         begun_s = time.monotonic()
         shown_s = 0.0
         while camera.status is None and watch.of(Role.CAMERA).state != "stopped" and not interrupted():
             check(children[1:])
             if view is not None and view.status is not None:
-                _say_view_ended(view, console)
+                _report_view_ended(view, console)
                 view = None
             elapsed_s = time.monotonic() - begun_s
             if elapsed_s > shown_s + SHOW_S:
@@ -164,30 +176,30 @@ def _supervise(
 
 def died(child: Child) -> ProcessDiedError:
     """The error for a process that ended."""
-    words = child.stderr_tail()
-    return ProcessDiedError(child.how_it_ended() + (f"; the end of its output:\n{words}" if words else ""))
+    tail = child.stderr_tail()
+    return ProcessDiedError(child.how_it_ended() + (f"; the end of its output:\n{tail}" if tail else ""))
 
 
 def check(children: list[Child]) -> None:
     """Raise if a process ended unexpectedly; the view may end at any time, the camera after its last frame."""
     for child in children:
-        done = child.name == Role.VIEWER or (child.name == Role.CAMERA and child.status == 0)
-        if child.status is not None and not done:
+        may_end = child.name == Role.VIEWER or (child.name == Role.CAMERA and child.status == 0)
+        if child.status is not None and not may_end:
             raise died(child)
 
 
-def _say_view_ended(view: Child, console: Console) -> None:
+def _report_view_ended(view: Child, console: Console) -> None:
     """Print the end of the view's standard error, unless its window was just closed."""
     if view.status != 0:
         why = view.stderr_tail().splitlines()[-1:] if view.status is not None and view.status > 0 else []
         ending = "; ".join([view.how_it_ended(), *why])
-        text = f"the loop goes on without a view ({ending}); `lowfc view` opens another"
+        text = f"the loop continues without a view ({ending}); `lowfc view` opens another"
         console.print(text, markup=False, soft_wrap=True)
 
 
 @contextlib.contextmanager
-def held_back() -> Iterator[Callable[[], bool]]:
-    """Yield a function that tells whether Ctrl-C or SIGTERM was received; a second Ctrl-C ends at once."""
+def deferred_signals() -> Iterator[Callable[[], bool]]:
+    """Yield a function: whether Ctrl-C or SIGTERM was received. A second one raises KeyboardInterrupt at once."""
     caught: list[int] = []
 
     def catch(number: int, frame: FrameType | None) -> None:
@@ -207,7 +219,7 @@ def held_back() -> Iterator[Callable[[], bool]]:
 def _display(console: Console) -> Iterator[Callable[..., None]]:
     if console.is_terminal:
         with Live(console=console, refresh_per_second=4, transient=True) as live:
-            yield lambda *what: live.update(screen(*what))
+            yield lambda *status: live.update(screen(*status))
     else:
         due_s = [LINE_PERIOD_S]
 

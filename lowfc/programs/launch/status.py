@@ -17,7 +17,7 @@ from lowfc.programs.cli.contrast import most_of, sentence, with_this_mirror
 from lowfc.programs.launch.watch import Watch, mode_name, topic_count, wavefront
 
 SILENT_S = 2.0
-"""Processes send Health twice a second; after this time without one, the figures are no longer shown."""
+"""Time without Health (sent twice a second) after which the figures are no longer shown."""
 _FIGURES_S = 2.5
 """Span of the recent wavefront figures, plus the delay of their report."""
 _EVENTS_SHOWN = 4
@@ -44,8 +44,8 @@ def screen(watch: Watch, config: Configuration, duration_s: float | None, elapse
     for log in watch.events[-_EVENTS_SHOWN:]:
         table.add_row(Text(printable(log.name)), Text(printable(log.message), style=_STYLES.get(Level(log.level), "")))
     left = f" of {duration_s:g} s" if duration_s is not None else ", Ctrl-C ends it"
-    what = f"{config.disturbance.preset}, V = {config.star.magnitude:g}, {config.sensor.sam}"
-    return Panel(Group(table), title="lowfc", subtitle=f"{what}; {elapsed_s:.0f} s{left}", expand=False)
+    scene = f"{config.disturbance.preset}, V = {config.star.magnitude:g}, {config.sensor.sam}"
+    return Panel(Group(table), title="lowfc", subtitle=f"{scene}; {elapsed_s:.0f} s{left}", expand=False)
 
 
 def status_line(watch: Watch, elapsed_s: float) -> str:
@@ -57,26 +57,26 @@ def status_line(watch: Watch, elapsed_s: float) -> str:
         return f"{elapsed_s:5.0f} s  {mode(controller)}  {silent}"
     frames, recent = topic_count(controller, FRAME.key), wavefront(camera.recent_wavefront)
     return (
-        f"{elapsed_s:5.0f} s  {mode(controller)}{_only_just(controller, camera.rate_hz)}  {camera.rate_hz:6.0f} Hz  "
+        f"{elapsed_s:5.0f} s  {mode(controller)}{_closed_for(controller, camera.rate_hz)}  {camera.rate_hz:6.0f} Hz  "
         f"residual {recent['residual_rms_nm']:.2f} of {recent['disturbance_rms_nm']:.2f} nm rms  {_added(recent)}"
         f"frame to command {latency(controller.frame_to_command)}  "
         f"skipped {frames.skipped} missing {frames.missing}  {recording(watch.of(Role.RECORDER))}"
     )
 
 
-def _only_just(controller: wire.Health, rate_hz: float) -> str:
+def _closed_for(controller: wire.Health, rate_hz: float) -> str:
     """Time since the loop closed if shorter than the span of the residual figures; otherwise empty."""
     frames = topic_count(controller, FRAME.key).received
     closed_s = frames / rate_hz - controller.not_closed_ns * 1e-9 if rate_hz else 0.0
-    just = controller.mode == wire.LOOP_MODE_CLOSED and 0 < closed_s < _FIGURES_S
-    return f" for {closed_s:.1f} s" if just else ""
+    just_closed = controller.mode == wire.LOOP_MODE_CLOSED and 0 < closed_s < _FIGURES_S
+    return f" for {closed_s:.1f} s" if just_closed else ""
 
 
 def _silent(watch: Watch) -> str:
-    """A notice if the camera stopped reporting, so that its figures are out of date; otherwise empty."""
+    """A notice if the camera stopped sending Health, so that its figures are out of date; otherwise empty."""
     silent_s = watch.silent_s(Role.CAMERA)
-    known = bool(watch.of(Role.CAMERA).process)
-    return f"the camera has been silent for {silent_s:.0f} s" if known and silent_s > SILENT_S else ""
+    reported = bool(watch.of(Role.CAMERA).process)
+    return f"the camera has been silent for {silent_s:.0f} s" if reported and silent_s > SILENT_S else ""
 
 
 def _added(recent: dict[str, Any]) -> str:
@@ -97,7 +97,7 @@ def _wavefront(camera: wire.Health) -> str:
 def mode(controller: wire.Health) -> str:
     """Text of the loop mode, with the reason if a closed loop holds its command."""
     word = mode_word(mode_name(controller.mode) or "starting")
-    return f"{word}, but holding: {controller.holding}" if controller.holding else word
+    return f"{word} (command held: {controller.holding})" if controller.holding else word
 
 
 def latency(durations: wire.Latency) -> str:

@@ -27,13 +27,13 @@ class Watch:
         newest_ns = max((health.timestamp.ToNanoseconds() for health in self.health.values()), default=0)
         return (newest_ns - self.of(name).timestamp.ToNanoseconds()) * 1e-9
 
-    def hear(self, sample: Sample) -> None:
-        """Keep a Health."""
+    def add_health(self, sample: Sample) -> None:
+        """Store a Health."""
         name, health = self._names.health(sample.key, sample.payload)
         self.health[name] = health
 
-    def note(self, sample: Sample) -> None:
-        """Keep an event."""
+    def add_event(self, sample: Sample) -> None:
+        """Store an event; the last 100 are kept."""
         self.events.append(Log.FromString(sample.payload))
         del self.events[:-100]
 
@@ -70,12 +70,12 @@ def summary(watch: Watch, record: bool, rate_hz: float) -> dict[str, Any]:
     }
     if record:
         recorder = watch.of(Role.RECORDER)
-        recording, counted = recorder.recording, topic_count(recorder, FRAME.key)
+        recording, frames_in_log = recorder.recording, topic_count(recorder, FRAME.key)
         lost = {topic.topic: topic.missing for topic in recorder.topics if topic.missing}
         # Without the camera's last Health, the recorder cannot count frames lost after the last recorded one.
-        unknown = figures["frames_published"] - counted.received - counted.missing
-        if counted.received and unknown > 0:
-            lost[FRAME.key] = counted.missing + unknown
+        uncounted = figures["frames_published"] - frames_in_log.received - frames_in_log.missing
+        if frames_in_log.received and uncounted > 0:
+            lost[FRAME.key] = frames_in_log.missing + uncounted
         figures |= {
             "messages_recorded": recording.messages,
             "messages_lost": max(recording.lost, sum(lost.values())),
@@ -88,7 +88,7 @@ def summary(watch: Watch, record: bool, rate_hz: float) -> dict[str, Any]:
 
 
 def wavefront(known: wire.WavefrontFigures) -> dict[str, Any]:
-    """Figures of the true wavefront: continuous if available, and sampled at the starts of the exposures."""
+    """Figures of the true wavefront: continuous in time if available, and sampled at the exposure starts."""
     names = ("disturbance_rms_nm", "residual_rms_nm", "tilt_disturbance_mas", "tilt_residual_mas")
     kind = "continuous_" if known.instants else ""
     return {

@@ -28,7 +28,7 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import FRAME, HEALTH, MIRROR_STATE, TIMING, Role, wire
 from lowfc.programs.launch.processes import program, start_all, stop_all
-from lowfc.programs.launch.sim_loop import children_of, died, held_back, prepare
+from lowfc.programs.launch.sim_loop import children_of, died, deferred_signals, prepare
 from lowfc.programs.launch.watch import Watch
 from lowfc.programs.measure import bare_loop, echo
 from lowfc.programs.measure.bare_loop import PROCESSES_FILE, TRACED, trace_file
@@ -124,7 +124,7 @@ def one_loop(asked: Asked, run: Run, children: list[Child] | None = None) -> dic
     with contextlib.ExitStack() as stack:
         bus = ZenohBus(run.links, Role.LAUNCHER, HostClock())
         stack.callback(bus.close)
-        bus.subscribe(HEALTH, watch.hear)
+        bus.subscribe(HEALTH, watch.add_health)
         bus.subscribe(TIMING, time_frames)
         state_ring = bus.ring(MIRROR_STATE, _RING)
         frame_ring = bus.ring(FRAME, _RING) if asked.simulated else None
@@ -223,7 +223,7 @@ def _run(
     meanwhile: Callable[[], None],
     started: Callable[[], None] = lambda: None,
 ) -> None:
-    with held_back() as interrupted:  # while a process forks, Python may swallow what signals would raise
+    with deferred_signals() as interrupted:  # while a process forks, Python may swallow what signals would raise
         start_all(children)
         started()
         while any(child.status is None for child in awaited) and not interrupted():
