@@ -177,7 +177,7 @@ def channels_in_words(known: dict[str, Any]) -> str:
     """Text of the command channels."""
     channels = [
         f"{one['name']} {one['rms_nm']:.3g} nm rms of surface"
-        f"{'' if one['reached'] else ', not yet reached'}{'' if one['shifts_zero_point'] else ', zero point not shifted'}"
+        f"{'' if one['reached'] else ', not reached'}{'' if one['shifts_zero_point'] else ', zero point not shifted'}"
         for one in known["channels"]
     ]
     return "; ".join(channels) or "no channel"

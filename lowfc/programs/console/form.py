@@ -27,7 +27,7 @@ _CLAUSE_END = re.compile(r"\. |; |, (?:and|whatever)|: it ")
 
 
 class Form(ModalScreen[None]):
-    """The fields of an action, or its question; open until the request is accepted. It shows the reason of a refusal."""
+    """The fields of an action, or its question. It stays open until the request is accepted, and shows refusals."""
 
     AUTO_FOCUS = "Input, #ok"
     BINDINGS: ClassVar[list[BindingType]] = [("escape", "dismiss", "leave")]

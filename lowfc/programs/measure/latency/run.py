@@ -28,7 +28,7 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import FRAME, HEALTH, MIRROR_STATE, TIMING, Role, wire
 from lowfc.programs.launch.processes import program, start_all, stop_all
-from lowfc.programs.launch.sim_loop import children_of, died, deferred_signals, prepare
+from lowfc.programs.launch.sim_loop import children_of, deferred_signals, died, prepare
 from lowfc.programs.launch.watch import Watch
 from lowfc.programs.measure import bare_loop, echo
 from lowfc.programs.measure.bare_loop import PROCESSES_FILE, TRACED, trace_file
