@@ -19,7 +19,7 @@ from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.optics.detector.detector import saturation_dn
 from lowfc.programs.measure.frame_source import FRAMES_FILE
-from lowfc.programs.measure.latency.run import Asked, prepared, run_repeats
+from lowfc.programs.measure.latency.run import LatencyOptions, prepared, run_repeats
 
 Single = npt.NDArray[np.float32]
 Frames = npt.NDArray[np.uint16]
@@ -117,7 +117,7 @@ def laid_out(size: Size, config: Configuration) -> Iterator[Run]:
 def run_loop(size: Size, config: Configuration, seconds: float) -> dict[str, Any]:
     """Run the loop of that size once, and then a bare echo of its messages; one repeat's figures of `run_repeats`."""
     with laid_out(size, config) as run:
-        (found,) = run_repeats(Asked(config, seconds, 1), run, lambda _: None)
+        (found,) = run_repeats(LatencyOptions(config, seconds, 1), run, lambda _: None)
     return found
 
 

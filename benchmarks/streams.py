@@ -25,7 +25,7 @@ from lowfc.contract.messages import Role
 from lowfc.programs.launch.processes import program
 from lowfc.programs.launch.sim_loop import children_of
 from lowfc.programs.measure.latency.figures import WARM_UP_S
-from lowfc.programs.measure.latency.run import Asked, one_loop
+from lowfc.programs.measure.latency.run import LatencyOptions, one_loop
 
 ROOT = Path(__file__).parents[1]
 SIZE = Size()
@@ -68,7 +68,7 @@ def one_run(rate_hz: float, seconds: float, name: str) -> Result:
     driver = stream_ends.__name__
     config = configuration(SIZE, rate_hz).model_copy(update={"drivers": {driver: {"stream": FRAMES}}})
     by_streams = name != DIRECT
-    asked = Asked(config, seconds, 1)
+    asked = LatencyOptions(config, seconds, 1)
     with laid_out(SIZE, config) as run, tempfile.TemporaryDirectory(prefix="lowfc-streams-", dir=_MEMORY) as folder:
         found = one_loop(asked, run, _loop(asked, run, Path(folder), name) if by_streams else None)
     start = "due" if by_streams else "frame"
@@ -78,7 +78,7 @@ def one_run(rate_hz: float, seconds: float, name: str) -> Result:
     return spans_us | {"frames": found["frames"], "without_command": found["frames_without_command"]}
 
 
-def _loop(asked: Asked, run: Run, folder: Path, name: str) -> list[Child]:
+def _loop(asked: LatencyOptions, run: Run, folder: Path, name: str) -> list[Child]:
     """Processes of a loop whose streams are in a folder; the first is the program that writes the frames."""
     config, seconds = asked.config, WARM_UP_S + asked.duration_s
     Stream.create(folder / stream_path(FRAMES).name, (SIZE.side, SIZE.side), np.uint16)

@@ -42,7 +42,7 @@ from lowfc.adapters.process.child import Child
 from lowfc.adapters.process.realtime import set_up
 from lowfc.contract.errors import ConfigurationError, LowfcError
 from lowfc.programs.measure.latency.figures import percentiles
-from lowfc.programs.measure.latency.run import Asked, one_loop
+from lowfc.programs.measure.latency.run import LatencyOptions, one_loop
 
 ROOT = Path(__file__).parents[2]
 SIZE = Size(SIDE, MODES, MIRROR_SIDE)
@@ -179,7 +179,7 @@ def _lowfc(kernel: str, rules: argparse.Namespace, priority: int) -> dict[str, A
     """Run lowfc's own loop with the size of the comparison; it warms up for half a second by itself."""
     config = configuration(SIZE, rules.rate_hz, priority=priority, disable_cpu_idle=True, kernel=kernel)
     with laid_out(SIZE, config) as run:
-        found = one_loop(Asked(config, rules.seconds, 1), run)
+        found = one_loop(LatencyOptions(config, rules.seconds, 1), run)
     return {
         "frames": found["frames"],
         "without_command": found["frames_without_command"],

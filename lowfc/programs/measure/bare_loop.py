@@ -1,7 +1,7 @@
-"""A loop that does nothing, beside one of the real loop's processes: what holds up both is the host's.
+"""An idle loop beside a process of the control loop: a delay of both is caused by the host.
 
-It runs on the processor of that process, with a priority above it, so that nothing of ours holds it up. In the middle
-between two frames it wakes, notes how late it is, and reads what the kernel counts of the processor and of the process.
+It runs on the processor of that process with a higher priority, so that no process of lowfc can delay it. Halfway
+between two frames it wakes, records how late it is, and reads the kernel's counters of the processor and the process.
 """
 
 import json
@@ -28,46 +28,46 @@ from lowfc.programs.measure.frame_source import BEGIN_FILE
 from lowfc.programs.measure.latency.figures import WARM_UP_S
 
 PROCESSES_FILE = "processes.json"
-"""In the run's directory: number of each role's process."""
+"""File in the run's directory: process id of each role."""
 TRACED = (Role.CAMERA, Role.CONTROLLER)
-"""Processes that a bare loop stands beside."""
+"""Processes beside which a bare loop runs."""
 
-_HIGHEST = 99
-_WAIT_S = 60.0
-_LOOK_S = 0.01
+_HIGHEST_PRIORITY = 99
+_TIMEOUT_S = 60.0
+_POLL_S = 0.01
 
-app = new_app("A loop that does nothing.")
+app = new_app("An idle loop beside a process of the control loop.")
 
 
 def trace_file(role: str) -> str:
-    """File in the run's directory, of the bare loop beside a role: `latency.stalls.Trace`, a row for each waking."""
+    """File in the run's directory with the trace of the bare loop beside a role: a row of `Trace` for each waking."""
     return f"trace-{role}.npy"
 
 
 @app.command()
 def bare_loop(
-    role: Annotated[Role, typer.Argument(help="Process to stand beside.")],
+    role: Annotated[Role, typer.Argument(help="Process beside which it runs.")],
     run: RunId = DEFAULT_RUN,
     config: ConfigFile = None,
-    seconds: Annotated[float, typer.Option(help="Of frames.")] = 10.0,
+    seconds: Annotated[float, typer.Option(help="Duration of the frames.")] = 10.0,
 ) -> None:
-    """Wake once between two frames, as long as there are frames, and note what the kernel counts."""
+    """Wake once between two frames, as long as frames are sent, and record the kernel's counters."""
     settings = configuration(config)
     cpus = settings.realtime.controller_cpus if role is Role.CONTROLLER else settings.realtime.camera_cpus
     priority = settings.realtime.priority
-    above = settings.realtime.model_copy(update={"priority": min(priority + 1, _HIGHEST) if priority else 0})
+    above = settings.realtime.model_copy(update={"priority": min(priority + 1, _HIGHEST_PRIORITY) if priority else 0})
     prepare(settings.model_copy(update={"realtime": above}), cpus)
     folder = open_run(run, (settings.mirror.name,)).path
-    process = json.loads(_awaited(folder / PROCESSES_FILE))[role]
-    begin_ns = int(_awaited(folder / BEGIN_FILE))
-    counters = Counters(process, busiest_thread(process, WARM_UP_S / 2), cpus)
+    pid = json.loads(_wait_and_read(folder / PROCESSES_FILE))[role]
+    begin_ns = int(_wait_and_read(folder / BEGIN_FILE))
+    counters = Counters(pid, busiest_thread(pid, WARM_UP_S / 2), cpus)
     rows = _wake(settings, counters, begin_ns, seconds)
     with being_written(folder / trace_file(role)) as part, part.open("wb") as file:
         np.save(file, rows)
 
 
 def _wake(config: Configuration, counters: Counters, begin_ns: int, seconds: float) -> Long:
-    """A row for each waking: when it was due, when it came, and the counts; the first frame was due at `begin_ns`."""
+    """A row for each waking: due time, wake-up time and counts. The first frame is due at `begin_ns`."""
     clock, period_ns = HostClock(), config.period_ns
     middle_ns = begin_ns + period_ns // 2
     first = (clock.host_ns() - middle_ns) // period_ns + 1
@@ -78,17 +78,17 @@ def _wake(config: Configuration, counters: Counters, begin_ns: int, seconds: flo
         woke_ns = clock.host_ns()
         try:
             rows.extend((due_ns, woke_ns, *counters.read()))
-        except OSError:  # it has ended
+        except OSError:  # the process has ended
             break
     return np.array(rows, np.int64).reshape(-1, 2 + len(Counts._fields))
 
 
-def _awaited(file: Path) -> str:
-    deadline_s = time.monotonic() + _WAIT_S
+def _wait_and_read(file: Path) -> str:
+    deadline_s = time.monotonic() + _TIMEOUT_S
     while not file.exists():
         if time.monotonic() > deadline_s:
-            raise BusError(f"no frame came in {_WAIT_S:g} s; nothing is traced without")
-        time.sleep(_LOOK_S)
+            raise BusError(f"no frame in {_TIMEOUT_S:g} s, so that nothing can be traced")
+        time.sleep(_POLL_S)
     return file.read_text()
 
 

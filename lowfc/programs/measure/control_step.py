@@ -1,4 +1,4 @@
-"""What a loop's latency is set against in one process: the control step without a bus, and the host's timer."""
+"""References for a loop's latency, measured in one process: the control step without a bus, and the host's timer."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -30,15 +30,20 @@ class ControlStep:
         self.state, _ = advance(self._settings, State(), Load(now_ns, calibration, "the run's"))
 
     def __call__(self, payload: bytes) -> bytes:
-        """A frame, newer than the last."""
+        """The command for a frame, which must be newer than the last."""
         frame = codec.decode_frame(payload, self.state.frame_sequence + 1, 0)
         self.state, outputs = advance(self._settings, self.state, frame)
-        assert outputs.command is not None  # noqa: S101  # every frame yields one
+        assert outputs.command is not None  # noqa: S101  # each of these frames yields a command
         return codec.encode_command(outputs.command, self._valid_ns, CHANNEL, self.state.input_number)
 
 
 class Alone(NamedTuple):
-    """Durations of the control step alone, a frame each, and of how late sleeps ended; none without a schedule."""
+    """Times without a bus, ns, (frames,).
+
+    Attributes:
+        timer_ns: wake-up latency of the host's timer; empty without a schedule.
+        step_ns: duration of the control step.
+    """
 
     timer_ns: Long
     step_ns: Long
@@ -47,7 +52,7 @@ class Alone(NamedTuple):
 def time_alone(
     step: Callable[[bytes], object], payloads: Payloads, clock: HostClock, seconds: float, period_ns: int | None
 ) -> Alone:
-    """Sleep to the next moment of a schedule, then do one control step, over and over; or without one, step by step."""
+    """Time the control step for `seconds`: once per period after a sleep, or back to back if `period_ns` is None."""
     timer_ns: list[int] = []
     step_ns: list[int] = []
     due_ns = clock.host_ns()
@@ -55,7 +60,9 @@ def time_alone(
     while due_ns < end_ns:
         payload = payloads.at(len(step_ns), due_ns)
         if period_ns is not None:
-            due_ns += period_ns * (1 + max(0, clock.host_ns() - due_ns) // period_ns)  # always a sleep
+            due_ns += period_ns * (
+                1 + max(0, clock.host_ns() - due_ns) // period_ns
+            )  # in the future, so that it sleeps
             clock.sleep_until_ns(due_ns)
         begun_ns = clock.host_ns()
         step(payload)

@@ -1,8 +1,7 @@
-"""A bare zenoh echo, what a loop's latency is set against: a frame out, a command back, and nothing done in between.
+"""A bare zenoh echo, the reference for a loop's latency: a frame out, a command back, no work in between.
 
-Two processes with one plain zenoh session each, over the same links, with the same settings of session, publishers and
-scheduling as the loop's. The one that answers then times the control step and the host's timer alone, for it stands
-where the controller does.
+Two processes with one plain zenoh session each use the loop's links and its settings of session, publishers and
+scheduling. The one that answers is set up like the controller: it then times the control step and the host's timer.
 """
 
 import dataclasses
@@ -33,24 +32,24 @@ from lowfc.programs.measure.frame_source import FRAMES_FILE, Payloads
 from lowfc.programs.measure.latency.figures import WARM_UP_S
 
 ECHO_FILE = "echo.npz"
-"""In the run's directory: round_trip_ns of every frame after the warm-up, -1 where none came back."""
+"""File in the run's directory: round_trip_ns of every frame after the warm-up, -1 without an answer."""
 ALONE_FILE = "alone.npz"
-"""In the run's directory: timer_ns, step_ns and hot_step_ns, see `Alone`; hot is one step after the other."""
+"""File in the run's directory: timer_ns and step_ns as in `Alone`, and hot_step_ns, the step back to back."""
 
 _READY_S = 30.0
-_LOOK_S = 0.02
+_POLL_S = 0.02
 _SETTLE_S = 0.1
-_HOT_S = 0.3
+_HOT_S = 0.3  # duration of the steps back to back
 _LOST = -1
 
-Seconds = Annotated[float, typer.Option(help="For how long.")]
+Seconds = Annotated[float, typer.Option(help="Duration, seconds.")]
 
 app = new_app("A bare zenoh echo.")
 
 
 @app.command()
 def ask(run: RunId = DEFAULT_RUN, config: ConfigFile = None, seconds: Seconds = 10.0) -> None:
-    """Send frames at the camera's place, and time each until its answer is there."""
+    """Send frames in place of the camera, and time each round trip."""
     settings = configuration(config)
     joined = _joined(settings, run, Role.CAMERA, settings.realtime.camera_cpus)
     payloads = Payloads(np.load(joined.path / FRAMES_FILE))
@@ -61,7 +60,7 @@ def ask(run: RunId = DEFAULT_RUN, config: ConfigFile = None, seconds: Seconds = 
 
 @app.command()
 def answer(run: RunId = DEFAULT_RUN, config: ConfigFile = None, seconds: Seconds = 10.0) -> None:
-    """Answer frames at the controller's place until an empty one; then time what it does alone."""
+    """Answer frames in place of the controller until an empty one; then time control step and timer alone."""
     from lowfc.adapters.files import calibration_file
     from lowfc.programs.measure.control_step import ControlStep, time_alone
 
@@ -79,17 +78,17 @@ def answer(run: RunId = DEFAULT_RUN, config: ConfigFile = None, seconds: Seconds
 
 
 def _ask(config: Configuration, run: Run, payloads: Payloads, seconds: float) -> Long:
-    """Send frames for a time, after the warm-up's, then an empty one; round trips, -1 for an answer lost."""
+    """Send frames for the warm-up and `seconds`, then an empty one; round trips after the warm-up, -1 if lost."""
     clock = HostClock()
-    put_ns: list[int] = []
+    sent_ns: list[int] = []
     round_trip_ns: list[int] = []
 
     def received(sample: zenoh.Sample) -> None:
         now_ns = clock.host_ns()
-        assert sample.attachment is not None  # noqa: S101  # our own
-        index, sent_ns = Envelope.decode_checked(sample.attachment.to_bytes())
+        assert sample.attachment is not None  # noqa: S101  # sent by `answer`
+        index, time_ns = Envelope.decode_checked(sample.attachment.to_bytes())
         sample.payload.to_bytes()
-        round_trip_ns[index] = now_ns - sent_ns
+        round_trip_ns[index] = now_ns - time_ns
 
     session = _session(run, Role.CAMERA)
     try:
@@ -98,17 +97,17 @@ def _ask(config: Configuration, run: Run, payloads: Payloads, seconds: float) ->
         deadline_s = time.monotonic() + _READY_S
         while not publisher.matching_status.matching:  # type: ignore[attr-defined]  # not a bool
             if time.monotonic() > deadline_s:
-                raise BusError(f"nobody answers the bare echo after {_READY_S:g} s")
-            time.sleep(_LOOK_S)
-        time.sleep(_SETTLE_S)  # the other one's publisher is there, too
+                raise BusError(f"the answering process of the bare echo was not ready within {_READY_S:g} s")
+            time.sleep(_POLL_S)
+        time.sleep(_SETTLE_S)  # for the publisher of the other process to connect
         due_ns = clock.host_ns()
         end_ns = due_ns + round((WARM_UP_S + seconds) * 1e9)
         while due_ns < end_ns:
-            payload = payloads.at(len(put_ns), due_ns)
+            payload = payloads.at(len(sent_ns), due_ns)
             clock.sleep_until_ns(due_ns)
             round_trip_ns.append(_LOST)
-            put_ns.append(clock.host_ns())
-            publisher.put(payload, attachment=Envelope(len(put_ns) - 1, put_ns[-1]).encode())
+            sent_ns.append(clock.host_ns())
+            publisher.put(payload, attachment=Envelope(len(sent_ns) - 1, sent_ns[-1]).encode())
             let_send()
             due_ns += config.period_ns
         time.sleep(_SETTLE_S)
@@ -116,8 +115,8 @@ def _ask(config: Configuration, run: Run, payloads: Payloads, seconds: float) ->
         subscriber.undeclare()  # type: ignore[no-untyped-call]
     finally:
         session.close()  # type: ignore[no-untyped-call]
-    warm = np.array(put_ns) >= put_ns[0] + round(WARM_UP_S * 1e9)
-    return np.array(round_trip_ns, np.int64)[warm]
+    after_warm_up = np.array(sent_ns) >= sent_ns[0] + round(WARM_UP_S * 1e9)
+    return np.array(round_trip_ns, np.int64)[after_warm_up]
 
 
 def _answer(config: Configuration, run: Run, command: bytes) -> None:
@@ -138,7 +137,7 @@ def _answer(config: Configuration, run: Run, command: bytes) -> None:
 
 
 def _joined(config: Configuration, run_id: str, role: str, cpus: list[int]) -> Run:
-    """The run, its links only those of the two, for a process that is set up as the role's in the loop."""
+    """Set this process up as that of the role in the loop; the run with the links of the two processes only."""
     prepare(config, cpus)
     run = open_run(run_id, (config.mirror.name,))
     ports = {str(role): run.links.ports[role] for role in (Role.CAMERA, Role.CONTROLLER)}

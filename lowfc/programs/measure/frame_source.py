@@ -1,7 +1,7 @@
-"""A camera that only sends: frames made beforehand, on an absolute schedule.
+"""A camera that sends prepared frames on an absolute schedule.
 
-It takes the simulated camera's place where the loop is timed, so that the arithmetic of the simulation is not in the
-measurement. What it put, and when each frame was due, is written to a file at its end.
+It replaces the simulated camera when the loop is timed, so that the simulation does not load the host. At its end it
+writes a file with the time at which each frame was due and sent.
 """
 
 import math
@@ -29,37 +29,37 @@ from lowfc.optics.detector.detector import expose
 from lowfc.optics.twin.twin import Evaluator, node_radii
 
 FRAMES_FILE = "frames.npy"
-"""In the run's directory: the frames, (frames, rows, columns) uint16."""
+"""File in the run's directory: the frames, (frames, rows, columns) uint16."""
 SENT_FILE = "sent.npz"
-"""In the run's directory: sequence, put_ns and due_ns of every frame sent."""
+"""File in the run's directory: sequence, put_ns and due_ns of every frame sent."""
 BEGIN_FILE = "begin"
-"""In the run's directory: the moment for which the schedule has the first frame, ns."""
+"""File in the run's directory: time at which the first frame is due, ns."""
 
-_COUNT = 32
-_TILT_NM, _OTHER_NM = 3.0, 1.0
-_FASTEST = 3
+_COUNT = 32  # different frames
+_TILT_NM, _OTHER_NM = 3.0, 1.0  # amplitudes, nm rms
+_MAX_CYCLES = 3  # oscillations of a mode in _COUNT frames
 _WAIT_S = 60.0  # a view may have to load
 _LEAD_PERIODS = 10
 
-app = new_app("A camera that sends frames made beforehand.")
+app = new_app("A camera that sends prepared frames.")
 
 
 def prepared_frames(config: Configuration) -> Pixels:
-    """Noisy frames (frames, rows, columns) of a wavefront that moves by a few nm and returns, from the instrument."""
+    """Noisy frames (frames, rows, columns) of the configured sensor, whose modes oscillate by a few nm."""
     optics = factory.twin(config, None, lambda _: None)
     evaluator, detector = Evaluator(optics), factory.detector(config)
     electrons = np.float32(factory.electrons_per_exposure(config))
     rng = np.random.default_rng([config.seed, 4])
     noll = np.array(config.noll)
     amplitude_nm = np.where(noll <= 3, _TILT_NM, _OTHER_NM)
-    cycles, phase = rng.integers(1, _FASTEST + 1, noll.size), rng.uniform(0, 2 * np.pi, noll.size)
+    cycles, phase = rng.integers(1, _MAX_CYCLES + 1, noll.size), rng.uniform(0, 2 * np.pi, noll.size)
     modes_nm = amplitude_nm * np.sin(2 * np.pi * np.outer(np.arange(_COUNT) / _COUNT, cycles) + phase)
     wavefronts_nm = (modes_nm @ zernikes(config.noll, *node_radii(optics))).astype(np.float32)
     return np.stack([expose(detector, evaluator.image(opd_nm) * electrons, rng) for opd_nm in wavefronts_nm])
 
 
 class Payloads:
-    """Frames as messages: encoded once, only the time put before each."""
+    """Frames as messages, encoded once; only the time stamp is added for each use."""
 
     def __init__(self, pixels: Pixels) -> None:
         self.shape: tuple[int, int] = (pixels.shape[1], pixels.shape[2])
@@ -70,7 +70,7 @@ class Payloads:
             self._bodies.append(message.SerializeToString())
 
     def at(self, index: int, time_ns: int) -> bytes:
-        """Payload number `index`, of that time: fields of a protobuf message may follow each other in pieces."""
+        """Payload number `index` with this time stamp: encoded protobuf fields can be concatenated."""
         head = RawImage(timestamp=timestamp(time_ns)).SerializeToString()
         return head + self._bodies[index % len(self._bodies)]
 
@@ -79,10 +79,10 @@ class Payloads:
 def frame_source(
     run: RunId = DEFAULT_RUN,
     config: ConfigFile = None,
-    seconds: Annotated[float, typer.Option(help="For how long.")] = 10.0,
-    wait_for: Annotated[list[str] | None, typer.Option(help="Process that the first frame waits for; repeat.")] = None,
+    seconds: Annotated[float, typer.Option(help="Duration, seconds.")] = 10.0,
+    wait_for: Annotated[list[str] | None, typer.Option(help="Process to wait for; repeat for several.")] = None,
 ) -> None:
-    """Send the frames in the run's directory as its camera, and write there when each was due and put."""
+    """Send the frames in the run's directory as its camera, and write there when each was due and sent."""
     settings = configuration(config)
     folder = open_run(run, (settings.mirror.name,)).path
     payloads = Payloads(np.load(folder / FRAMES_FILE))
@@ -93,7 +93,7 @@ def frame_source(
 
 
 class Source:
-    """Sends frame after frame for a time, or until it is stopped."""
+    """Sends frames on a schedule for a time, or until it is stopped."""
 
     def __init__(self, config: Configuration, service: Service, payloads: Payloads) -> None:
         self._config = config
@@ -104,7 +104,7 @@ class Source:
         self._sequence, self._put_ns, self._due_ns = array("Q"), array("q"), array("q")
 
     def run(self, seconds: float, wait_for: tuple[str, ...], folder: Path) -> None:
-        """Wait for those named, send, and write what was sent into `folder`."""
+        """Wait for these processes, send frames, and write their times to `folder`."""
         service = self._service
         service.state = "ready"
         service.require(wait_for, _WAIT_S, "no frame is sent without")
@@ -113,17 +113,17 @@ class Source:
         service.state = "running"
         begin_ns = service.clock.now_ns() + _LEAD_PERIODS * self._config.period_ns
         write_whole(folder / BEGIN_FILE, str(begin_ns).encode())
-        self._on_schedule(begin_ns, math.ceil(seconds * self._config.camera.rate_hz))
+        self._send_frames(begin_ns, math.ceil(seconds * self._config.camera.rate_hz))
         with being_written(folder / SENT_FILE) as part, part.open("wb") as file:
             put_ns, due_ns = np.array(self._put_ns), np.array(self._due_ns)
             np.savez(file, sequence=np.array(self._sequence), put_ns=put_ns, due_ns=due_ns)
         service.finish()
 
-    def _on_schedule(self, origin_ns: int, frames: int) -> None:
-        """Every frame at its moment, whatever became of the last; what is late is put at once, and none left out."""
+    def _send_frames(self, begin_ns: int, frames: int) -> None:
+        """Send each frame when it is due, or at once if that is past; no frame is left out."""
         clock, period_ns = self._service.clock, self._config.period_ns
         for index in range(frames):
-            due_ns = origin_ns + index * period_ns
+            due_ns = begin_ns + index * period_ns
             payload = self._payloads.at(index, due_ns)
             clock.sleep_until_ns(due_ns)
             if not self._service.running:

@@ -1,4 +1,4 @@
-"""The messages of a loop without the loop: what camera, controller and mirror send, at any rate, from one process."""
+"""The messages of a loop without the loop: one process sends those of camera, controller and mirror at any rate."""
 
 import time
 from typing import Any
@@ -30,14 +30,14 @@ _FRAME_SHAPE = (80, 80)
 _MIRROR = "dm"
 _TIME_NS = 1_767_225_600_000_000_000
 
-_VARIETY = 32  # the same payload comes back later than the log's compression remembers
+_VARIETY = 32  # a payload repeats only after the window of the log's compression
 _TIMING_HZ = 10.0
 _BEAT_FRAMES = 50
 _WAIT_S = 0.05
 
 
 class Traffic:
-    """Three roles of a run, and their messages of one frame after the other."""
+    """Sender of the messages of three roles of a run, frame after frame."""
 
     def __init__(self, run: Run, rate_hz: float) -> None:
         """Join `run` as camera, controller and mirror of a loop of `rate_hz`."""
@@ -67,11 +67,11 @@ class Traffic:
 
     @property
     def messages(self) -> int:
-        """Messages sent so far, those of the services too."""
+        """Messages sent so far, including Health and events."""
         return sum(publisher.published for service in self._services for publisher in service.publishers)
 
     def wait_for(self, name: str, timeout_s: float) -> bool:
-        """Whether a process got ready in time and has received from all three roles."""
+        """Whether a process became ready in time and has received from all three roles."""
         deadline_s = time.monotonic() + timeout_s
         while sum(len(service.wait_for([name], _WAIT_S)) for service in self._services):
             if time.monotonic() >= deadline_s:
@@ -79,7 +79,7 @@ class Traffic:
         return True
 
     def run(self, seconds: float) -> None:
-        """Send a loop's messages at its rate; what is late is sent at once, so that the number is right."""
+        """Send a loop's messages at its rate; late ones are sent at once, so that none is left out."""
         due_ns = begun_ns = self._clock.host_ns()
         while due_ns - begun_ns < seconds * 1e9:
             self._clock.sleep_until_ns(due_ns)
@@ -87,7 +87,7 @@ class Traffic:
             due_ns += self._period_ns
 
     def finish(self) -> None:
-        """Send what each role counted: nothing may be sent after it."""
+        """Send the last Health of each role, with its counts; nothing may be sent afterwards."""
         for service in self._services:
             service.finish()
 
@@ -108,7 +108,7 @@ class Traffic:
 
 
 def frame_payloads(seed: int = 1) -> list[list[bytes]]:
-    """Payloads of different frames: frame, command, step, mirror state and truth, of the sizes that a loop's have."""
+    """Payloads of different frames: frame, command, step, mirror state and truth, with the sizes of a loop's."""
     rng = np.random.default_rng(seed)
     return [[message.SerializeToString() for message in _messages(rng)] for _ in range(_VARIETY)]
 

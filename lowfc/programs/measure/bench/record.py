@@ -22,12 +22,18 @@ from lowfc.programs.cli.output import print_result
 RATES_HZ = (1000.0, 2000.0, 5000.0)
 
 _READY_S = 30.0
-_LOOK_S = 0.5
+_POLL_S = 0.5
 _WARM_UP_S = 0.5
 _COPY_S = 0.5
 _COPY_BYTES = 256 * 1024
-_TAKEN = ("messages_recorded", "messages_lost", "longest_wait_ms", "longest_unflushed_ms", "longest_write_ms")
-"""What the recorder prints at its end."""
+_RECORDER_FIGURES = (
+    "messages_recorded",
+    "messages_lost",
+    "longest_wait_ms",
+    "longest_unflushed_ms",
+    "longest_write_ms",
+)
+"""Figures that the recorder prints at its end."""
 
 
 def bench_record(
@@ -62,14 +68,14 @@ def measure(rates_hz: tuple[float, ...], seconds: float, folder: Path | None = N
     """Record at each rate for a time, into `folder`, which is left as it was.
 
     Returns:
-        host, payload_bytes_per_frame, copy_us_per_frame (processor time of copying the payloads) and rates, one for
-        each: rate_hz as asked and offered_hz as sent; seconds; cpu_share (of one processor) and publisher_cpu_share;
-        ratio (cpu_share over that of copying); messages_published, messages_recorded and messages_lost by the
-        recorder's account; log_bytes; and three stalls: longest_wait_ms (a message's arrival to its being written),
-        longest_unflushed_ms (arrival to its surviving a kill -9) and longest_write_ms (one write to the disk).
+        host, payload_bytes_per_frame, copy_us_per_frame (processor time of copying the payloads) and rates. For each
+        rate: rate_hz (requested) and offered_hz (sent); seconds; cpu_share (of one processor) and publisher_cpu_share;
+        ratio (cpu_share over that of copying); messages_published; messages_recorded and messages_lost as counted by
+        the recorder; log_bytes; and three durations: longest_wait_ms (from a message's arrival until it is written),
+        longest_unflushed_ms (from arrival until it survives a kill -9) and longest_write_ms (one write to the disk).
 
     Raises:
-        BusError: the recorder did not get ready, or failed.
+        BusError: the recorder did not become ready, or failed.
     """
     from rich.console import Console
 
@@ -104,9 +110,10 @@ def render(figures: dict[str, Any]) -> str:
         for rate in figures["rates"]
     ]
     lines.append(
-        f"processor: of one, all threads of the recorder; copying a frame's {figures['payload_bytes_per_frame']:.0f} "
-        f"bytes to the same disk takes {figures['copy_us_per_frame']:.1f} us of it. Longest wait: from a message's "
-        "arrival to its being written; unflushed: to its surviving a kill -9; write: of one write to the disk."
+        f"processor: all threads of the recorder, share of one processor; copying a frame's "
+        f"{figures['payload_bytes_per_frame']:.0f} bytes to the same disk takes {figures['copy_us_per_frame']:.1f} us. "
+        "Longest wait: from a message's arrival until it is written; unflushed: until it survives a kill -9; write: "
+        "one write to the disk."
     )
     return "\n".join(lines)
 
@@ -123,15 +130,15 @@ def _one_rate(rate_hz: float, seconds: float, folder: Path) -> dict[str, Any]:
         process = stack.enter_context(
             subprocess.Popen(words, **pipes, text=True, start_new_session=True)  # noqa: S603  # our own program
         )
-        stack.callback(process.kill)  # unless it has ended
+        stack.callback(process.kill)  # no effect if it has ended
         traffic = stack.enter_context(contextlib.closing(Traffic(run, rate_hz)))
         deadline_s = time.monotonic() + _READY_S
-        while not traffic.wait_for("recorder", _LOOK_S):
+        while not traffic.wait_for("recorder", _POLL_S):
             if process.poll() is not None or time.monotonic() > deadline_s:
                 process.kill()
-                raise BusError(f"the recorder did not get ready: {process.communicate()[1].strip()[-500:]}")
+                raise BusError(f"the recorder did not become ready: {process.communicate()[1].strip()[-500:]}")
         traffic.run(_WARM_UP_S)
-        begun_s, frames = time.monotonic(), traffic.frames
+        begun_s, first_frame = time.monotonic(), traffic.frames
         own_s, before = time.process_time(), psutil.Process(process.pid).cpu_times()
         traffic.run(seconds)
         elapsed_s = time.monotonic() - begun_s
@@ -147,13 +154,13 @@ def _one_rate(rate_hz: float, seconds: float, folder: Path) -> dict[str, Any]:
     log.unlink()
     return {
         "rate_hz": rate_hz,
-        "offered_hz": (traffic.frames - frames) / elapsed_s,
+        "offered_hz": (traffic.frames - first_frame) / elapsed_s,
         "seconds": elapsed_s,
         "cpu_share": (after.user + after.system - before.user - before.system) / elapsed_s,
         "publisher_cpu_share": own_s / elapsed_s,
         "messages_published": traffic.messages,
         "log_bytes": size,
-        **{name: done[name] for name in _TAKEN},
+        **{name: done[name] for name in _RECORDER_FIGURES},
     }
 
 

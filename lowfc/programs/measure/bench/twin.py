@@ -37,8 +37,8 @@ def twin(as_json: Json = False) -> None:
 def bench_twin(seconds: float = 1.0, cache_dir: Path | None = None) -> dict[str, Any]:
     """Measure the three twins; the figures of the live loop's default are also at the top level.
 
-    Times are medians of one frame, from the phase to the binned image, the two models in turn. `relative_l2` is the
-    worst of 20 random wavefronts: radial degrees 1 to 5 within the literal bounds of Sect. 3.1.
+    Times are medians of one frame, from the phase to the binned image, with the two models in turn. `relative_l2` is
+    the worst of 20 random wavefronts of radial degrees 1 to 5 within the bounds of Subedi et al. 2015, Sect. 3.1.
     """
     optics = sensor_named(SENSOR)
     nm = optics.wavelength_nm

@@ -20,7 +20,7 @@ from lowfc.programs.cli.output import print_result
 
 if TYPE_CHECKING:
     from lowfc.contract.configuration import Configuration
-    from lowfc.programs.measure.latency.run import Asked
+    from lowfc.programs.measure.latency.run import LatencyOptions
 
 _RATE_HZ = 1000.0
 _LEAK = 0.01
@@ -70,7 +70,7 @@ def latency(
 
     Prepared frames are sent on an absolute schedule and late frames are counted, so that stalls are not hidden. In
     turns with the loop, a bare zenoh echo of the same sizes, one control step alone and the host's timer are measured.
-    Times are from just before a frame is put to just after its command is put.
+    Times are from just before a frame is published to just after its command is published.
 
     Example: lowfc latency --duration 10 --repeats 5 --json > latency.json
     """
@@ -91,7 +91,7 @@ def latency(
         settings = _configuration(config, rate, camera, plain=plain_scheduling)
         from lowfc.adapters.process import compiled
         from lowfc.control.kernel.tables import FUSED, KERNELS
-        from lowfc.programs.measure.latency.run import Asked
+        from lowfc.programs.measure.latency.run import LatencyOptions
 
         simulated = camera is Camera.SIMULATED
         kernels = KERNELS if kernel is Kernels.BOTH else (str(kernel),) if kernel is not None else ()
@@ -99,7 +99,7 @@ def latency(
             raise ConfigurationError(compiled.missing())
         if trace and simulated:
             raise ConfigurationError("--trace requires prepared frames: omit --trace or --camera simulated")
-        figures = _measure(Asked(settings, duration, repeats, simulated, record, view, kernels, trace))
+        figures = _measure(LatencyOptions(settings, duration, repeats, simulated, record, view, kernels, trace))
     if plot is not None:
         write_whole(plot, picture(figures))
     print_result(figures, table(figures), as_json=as_json)
@@ -111,17 +111,17 @@ def _configuration(file: Path | None, rate: float | None, camera: Camera, *, pla
     from lowfc.contract.configuration import FIXED_GAINS
 
     overrides: dict[str, Any] = {"camera.rate_hz": rate, "lockstep": False}
-    if camera is Camera.PREPARED:  # or the integrator would accumulate noise
+    if camera is Camera.PREPARED:  # without a leak, the integrator would accumulate noise
         overrides |= {"control.tilt_leak": _LEAK, "control.leak": _LEAK}
     if plain:
         overrides |= {"realtime.priority": 0, "realtime.lock_memory": False, "realtime.disable_cpu_idle": False}
         overrides |= {f"realtime.{role}_cpus": [] for role in ("camera", "controller", "mirror", "recorder")}
-    apart = spread(os.sched_getaffinity(0), simulated=camera is Camera.SIMULATED)
-    defaults = {"control.start_mode": "closed", **FIXED_GAINS, "camera.rate_hz": _RATE_HZ, **apart}
+    pinning = spread(os.sched_getaffinity(0), simulated=camera is Camera.SIMULATED)
+    defaults = {"control.start_mode": "closed", **FIXED_GAINS, "camera.rate_hz": _RATE_HZ, **pinning}
     return configuration(file, overrides, defaults)
 
 
-def _measure(asked: "Asked") -> dict[str, Any]:
+def _measure(options: "LatencyOptions") -> dict[str, Any]:
     from rich.console import Console
 
     from lowfc.adapters.process.host import Host
@@ -134,15 +134,15 @@ def _measure(asked: "Asked") -> dict[str, Any]:
     with contextlib.suppress(OSError):
         host["clock_source"] = Host().clock_source()
     begun = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
-    with prepared(asked.config) as run, passing_bar(Console(stderr=True)) as bar:
-        task = bar.add_task("starting", total=1 + 2 * asked.repeats * max(1, len(asked.kernels)))
-        done = run_repeats(asked, run, lambda what: bar.update(task, description=what, advance=1))
+    with prepared(options.config) as run, passing_bar(Console(stderr=True)) as bar:
+        task = bar.add_task("starting", total=1 + 2 * options.repeats * max(1, len(options.kernels)))
+        done = run_repeats(options, run, lambda what: bar.update(task, description=what, advance=1))
     return of_kernels(done) | {
         "settings": {
-            "rate_hz": asked.config.camera.rate_hz,
-            **{name: getattr(asked, name) for name in ("duration_s", "repeats", "record", "view", "trace")},
-            "camera": str(Camera.SIMULATED if asked.simulated else Camera.PREPARED),
-            "realtime": asked.config.realtime.model_dump(),
+            "rate_hz": options.config.camera.rate_hz,
+            **{name: getattr(options, name) for name in ("duration_s", "repeats", "record", "view", "trace")},
+            "camera": str(Camera.SIMULATED if options.simulated else Camera.PREPARED),
+            "realtime": options.config.realtime.model_dump(),
         },
         "logs": [log for one in done for log in one["logs"]],
         "date": begun,
@@ -183,7 +183,7 @@ def _result(file: Path) -> dict[str, Any]:
         found = json.loads(file.read_text(encoding="utf-8"))
     except OSError as fault:
         raise DataFileError(f"{file} cannot be read: {fault.strerror}") from None
-    except ValueError as fault:  # no UTF-8, no JSON
+    except ValueError as fault:  # not UTF-8, or not JSON
         raise DataFileError(f"{file} must be a result of `lowfc latency --json`, but is not JSON: {fault}") from None
     if not isinstance(found, dict) or "latency_us" not in found:
         raise DataFileError(f"{file} must be a result of `lowfc latency --json`, but has no latency_us")

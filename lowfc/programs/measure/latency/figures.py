@@ -15,12 +15,12 @@ from lowfc.control.loop.safety import Rejection, reason_of
 from lowfc.programs.launch.watch import topic_count
 
 WARM_UP_S = 0.5
-"""Frames put within this time after the first one are left out."""
+"""Frames published within this time after the first one are left out."""
 STAGES = TIMED[1:-1]
-"""Parts of receive to command, as in ControlTiming."""
+"""Stages from receive to command, as in ControlTiming."""
 LOOP_SPANS = ("frame_to_receive", "receive_to_command", "frame_to_command", "command_to_mirror", "frame_to_mirror")
 PERCENTILES = {"p50": 500, "p90": 900, "p99": 990, "p99_9": 999, "max": 1000}
-"""Each in thousandths, so that its place among the values is exact."""
+"""Percentiles in thousandths: integers, so that their index among the values is exact."""
 
 SPANS = {
     "frame_to_receive": "frame to receive",
@@ -49,10 +49,10 @@ RATIOS_AT = ("p50", "p99")
 COUNTS = {
     "frames": "frames",
     "frames_without_command": "without a command",
-    "frames_crowded_out": "of these crowded out by the next frame",
+    "frames_crowded_out": "of these superseded by the next frame",
     "frames_untimed": "with a command of unknown timing",
     "frames_without_mirror_state": "without a mirror state",
-    "frames_sent_late": "put more than a period after they were due",
+    "frames_sent_late": "sent more than a period after they were due",
     "frames_skipped": "skipped by the controller",
     "frames_missing": "missing at the controller",
     "warm_up_frames": "left out for warm-up",
@@ -60,21 +60,23 @@ COUNTS = {
     "echo_lost": "frames of the bare echo without an answer",
     "messages_lost": "messages lost by the recorder",
 }
-"""Sums over the repeats, and the words after each; None where it does not apply."""
+"""Counts of a repeat and their labels; a count is None if it does not apply."""
 
 _BINS_PER_OCTAVE = 8
 _LOWEST_US, _OCTAVES = 1.0, 20
-_MOMENTS = 200
+_TIME_PARTS = 200
 _BURST = 0.5
+"""Fraction of the mean period: frames closer together came in a burst."""
 
 
 @dataclass(frozen=True, slots=True)
 class Frames:
-    """Outcome of each frame, in the order of their puts, just before `put_ns`; all are (frames,).
+    """Outcome of each frame, in the order of publication; all arrays are (frames,).
 
     Attributes:
-        commanded: whether a command from it was timed or followed by the mirror.
-        spans_us: of `SPANS`, NaN if unknown; those from the due time only with a schedule.
+        put_ns: time just before the frame was published.
+        commanded: whether its command was timed by the controller or applied by the mirror.
+        spans_us: times by the names of `SPANS`, NaN if unknown; those from the due time only with a schedule.
     """
 
     put_ns: Long
@@ -89,10 +91,14 @@ def join(
     timing: tuple[Sequences, Mapping[str, Long]],
     mirror: tuple[Sequences, Long],
 ) -> Frames:
-    """Sent frames with their outcomes; `due_ns` is None without a schedule.
+    """Published frames with their outcomes.
 
-    `timing` has sequences and the controller's stages as in ControlTiming, `mirror` the frame sequence and time of each
-    state, of which the first of a frame counts.
+    Args:
+        sequence: sequence of each frame.
+        put_ns: time just before it was published.
+        due_ns: time at which it was due; None without a schedule.
+        timing: frame sequences, and the controller's stages by name as in ControlTiming.
+        mirror: frame sequence and time of each mirror state; the first state of a frame counts.
     """
     row, mirror_row = rows_of(sequence, timing[0]), rows_of(sequence, mirror[0])
     stages_us = {stage: np.append(column / 1e3, np.nan)[row] for stage, column in timing[1].items()}
@@ -121,8 +127,8 @@ def percentiles(values: npt.NDArray[Any]) -> dict[str, float] | None:
     known = np.sort(values[np.isfinite(values)])
     if not known.size:
         return None
-    places = {name: -(-known.size * thousandths // 1000) - 1 for name, thousandths in PERCENTILES.items()}
-    return {name: round(float(known[place]), 3) for name, place in places.items()}
+    indices = {name: -(-known.size * thousandths // 1000) - 1 for name, thousandths in PERCENTILES.items()}
+    return {name: round(float(known[index]), 3) for name, index in indices.items()}
 
 
 def edges_us() -> Array:
@@ -140,12 +146,12 @@ def histogram(values_us: Array) -> Long:
 def repeat_figures(frames: Frames) -> dict[str, Any]:
     """Figures of one repeat, the warm-up left out.
 
-    Frames without a command are crowded out if the next frame was put within half the mean period. Untimed frames have
-    a command but no timing.
+    A frame without a command counts as crowded out (superseded) if the next frame was published within half the mean
+    period. Untimed frames have a command but no timing.
     """
-    warm = frames.put_ns - frames.put_ns[:1] >= round(WARM_UP_S * 1e9)
-    put_ns, commanded = frames.put_ns[warm], frames.commanded[warm]
-    spans = {span: column[warm] for span, column in frames.spans_us.items()}
+    counted = frames.put_ns - frames.put_ns[:1] >= round(WARM_UP_S * 1e9)
+    put_ns, commanded = frames.put_ns[counted], frames.commanded[counted]
+    spans = {span: column[counted] for span, column in frames.spans_us.items()}
     count = put_ns.size
     span_ns = int(put_ns[-1] - put_ns[0]) if count > 1 else 0
     period_ns = span_ns / (count - 1) if span_ns else 0.0
@@ -166,8 +172,8 @@ def repeat_figures(frames: Frames) -> dict[str, Any]:
     }
 
 
-def controllers_account(health: wire.Health) -> dict[str, Any]:
-    """The controller's counts of the whole run: frames_skipped, frames_missing, and reasons for frames."""
+def controller_counts(health: wire.Health) -> dict[str, Any]:
+    """The controller's counts of the whole run: frames_skipped, frames_missing, and frames by reason of refusal."""
     frames = topic_count(health, FRAME.key)
     reasons = {reason_of(one.reason): one.count for one in health.counts}
     return {
@@ -178,9 +184,9 @@ def controllers_account(health: wire.Health) -> dict[str, Any]:
 
 
 def _over_time(put_ns: Long, command_us: Array) -> dict[str, list[float]]:
-    """Median and largest in each of up to `_MOMENTS` equal parts, by the time of the first frame of each."""
+    """Median and largest in each of up to `_TIME_PARTS` parts with equal numbers of frames, at its first frame."""
     known = np.flatnonzero(np.isfinite(command_us))
-    parts = np.array_split(known, min(_MOMENTS, known.size)) if known.size else []
+    parts = np.array_split(known, min(_TIME_PARTS, known.size)) if known.size else []
     return {
         "seconds": [round(float(put_ns[part[0]] - put_ns[0]) / 1e9, 6) for part in parts],
         "p50_us": [round(float(np.median(command_us[part])), 3) for part in parts],

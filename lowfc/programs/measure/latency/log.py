@@ -9,15 +9,15 @@ from lowfc.adapters.logs.history import read_history
 from lowfc.adapters.logs.parts import LogFiles, WholeLog
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import HEALTH, Role, wire
-from lowfc.programs.measure.latency.figures import controllers_account, join, repeat_figures
+from lowfc.programs.measure.latency.figures import controller_counts, join, repeat_figures
 
 _LOOP = frozenset({Role.CAMERA, Role.CONTROLLER, Role.MIRROR})
 
 
 def log_figures(files: LogFiles, progress: Callable[[int, int], None]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Figures of one log as of one repeat, and what its metadata say of the host.
+    """Figures of one log as of one repeat, and the host as in the log's metadata.
 
-    Where the loop was on several hosts, `clock_error_us` is what a span from one to another is wrong by at most.
+    For a loop on several hosts, `clock_error_us` is the largest error of a span from one host to another.
     """
     log = WholeLog(files)
     log.progress = progress
@@ -27,8 +27,8 @@ def log_figures(files: LogFiles, progress: Callable[[int, int], None]) -> tuple[
     figures = repeat_figures(join(history.frame_sequence, history.frame_publish_ns, None, timing, mirror))
     if "frame_to_command" not in figures["latency_us"]:
         raise DataFileError(
-            f"{log.path} has no frame after the first half second whose timing the controller reported; it is too "
-            "short, or of no loop"
+            f"{log.path} has no frame with a timing of the controller after the first half second; it is too short, or "
+            "not the log of a loop"
         )
     controller = history.health.get(Role.CONTROLLER, wire.Health())
     host: dict[str, Any] = dict(log.metadata.get("lowfc", {}))
@@ -40,4 +40,4 @@ def log_figures(files: LogFiles, progress: Callable[[int, int], None]) -> tuple[
                 trip_ns = wire.Health.FromString(message.payload).router_round_trip_ns
                 round_trips_ns[name] = max(round_trips_ns[name], trip_ns)
         host["clock_error_us"] = sum(sorted(round_trips_ns.values())[-2:]) / 2e3
-    return figures | controllers_account(controller), host
+    return figures | controller_counts(controller), host

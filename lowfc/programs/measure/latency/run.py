@@ -1,7 +1,7 @@
-"""The live latency test: controller and mirror driven by a source of frames; then what they are set against.
+"""The live latency test: controller and mirror driven by a frame source, then the references.
 
-Every repeat starts its processes anew: first the loop's, then those of the bare echo, which also time the control step
-and the host's timer alone. Nothing else of ours runs beside either.
+Every repeat starts its processes anew: first those of the loop, then those of the bare echo, which also time the
+control step and the host's timer alone. No other process of lowfc runs meanwhile.
 """
 
 import contextlib
@@ -35,22 +35,22 @@ from lowfc.programs.measure.bare_loop import PROCESSES_FILE, TRACED, trace_file
 from lowfc.programs.measure.frame_source import BEGIN_FILE, FRAMES_FILE, SENT_FILE, prepared_frames
 from lowfc.programs.measure.latency.figures import (
     WARM_UP_S,
-    controllers_account,
+    controller_counts,
     join,
     percentiles,
     repeat_figures,
 )
 from lowfc.programs.measure.latency.stalls import Trace, stalls_of
 
-_TURN_S = 0.25
+_POLL_S = 0.25
 _RING = 1 << 14
 _SETTLE_S = 0.15
-_LAST_WORDS_S = 0.1
+_LAST_HEALTH_S = 0.1
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
-    """What to run: the options of `lowfc latency`; with several `kernels`, each in turn."""
+class LatencyOptions:
+    """Options of `lowfc latency`; several `kernels` run in turns."""
 
     config: Configuration
     duration_s: float
@@ -63,15 +63,15 @@ class Asked:
 
 
 def fill(config: Configuration, run: Run) -> None:
-    """Put into the run's directory what its processes share, the frames among it."""
-    with threadpool_limits(limits=1):  # more spin, and are waited for where something else has their processor
+    """Write the files that the processes share to the run's directory: calibration, configuration, frames."""
+    with threadpool_limits(limits=1):  # more threads would spin, and wait for those without a processor
         prepare(config, run, Console(stderr=True))
         np.save(run.path / FRAMES_FILE, prepared_frames(config))
 
 
 @contextlib.contextmanager
 def prepared(config: Configuration, fill: Callable[[Configuration, Run], None] = fill) -> Iterator[Run]:
-    """A run with what its processes share; nothing is left of it afterwards."""
+    """A run with the files that its processes share; removed at the end."""
     run = open_run(new_run_id(), (config.mirror.name,), listeners=(Role.LAUNCHER,))
     try:
         fill(config, run)
@@ -80,29 +80,33 @@ def prepared(config: Configuration, fill: Callable[[Configuration, Run], None] =
         run.remove()
 
 
-def run_repeats(asked: Asked, run: Run, progress: Callable[[str], None]) -> list[dict[str, Any]]:
-    """Figures of each repeat, and in it of each kernel: of `one_loop`, and percentiles of echo, step and timer."""
-    repeats, kernels = [], asked.kernels or (asked.config.realtime.kernel,)
-    for number in range(asked.repeats):
+def run_repeats(options: LatencyOptions, run: Run, progress: Callable[[str], None]) -> list[dict[str, Any]]:
+    """Figures of each repeat and kernel: those of `one_loop`, and percentiles of echo, step and timer."""
+    repeats, kernels = [], options.kernels or (options.config.realtime.kernel,)
+    for number in range(options.repeats):
         for kernel in kernels[:: -1 if number % 2 else 1]:
-            realtime = asked.config.realtime.model_copy(update={"kernel": kernel})
-            turn = replace(asked, config=asked.config.model_copy(update={"realtime": realtime}))
+            realtime = options.config.realtime.model_copy(update={"kernel": kernel})
+            turn = replace(options, config=options.config.model_copy(update={"realtime": realtime}))
             (run.path / "config.toml").write_text(turn.config.to_toml(), encoding="utf-8")
-            progress(f"{number + 1} of {asked.repeats}: the loop by {kernel}")
+            progress(f"{number + 1} of {options.repeats}: the loop by {kernel}")
             loop = one_loop(turn, run)
-            progress(f"{number + 1} of {asked.repeats}: the bare echo, the step by {kernel} and the timer")
-            repeats.append(loop | _alone(turn, run) | {"kernel": kernel})
+            progress(f"{number + 1} of {options.repeats}: the bare echo, the step by {kernel} and the timer")
+            repeats.append(loop | _references(turn, run) | {"kernel": kernel})
     return repeats
 
 
-def one_loop(asked: Asked, run: Run, children: list[Child] | None = None) -> dict[str, Any]:
-    """One repeat of the loop alone: figures of its frames, and what its processes reported at their end.
+def one_loop(options: LatencyOptions, run: Run, children: list[Child] | None = None) -> dict[str, Any]:
+    """One repeat of the loop alone: figures of its frames, and the last reports of its processes.
 
-    Python is woken ten times a second, and by Health; frames and mirror states wait in rings. `children` are the
-    loop's processes where they are others; the first ends by itself, and they leave the times of frames as the source.
+    This process is woken only ten times a second and by Health; frames and mirror states wait in rings.
+
+    Args:
+        options: options.
+        run: run with the files that the processes share.
+        children: other processes than those of `lowfc latency`: the first ends by itself and writes `SENT_FILE`.
 
     Raises:
-        ProcessDiedError: a process ended that should not have, or with an error.
+        ProcessDiedError: a process ended unexpectedly or with an error.
         BusError: the controller did not report its timing.
     """
     watch, timings = Watch({}, []), TimingRows()
@@ -118,25 +122,25 @@ def one_loop(asked: Asked, run: Run, children: list[Child] | None = None) -> dic
         for sample in frame_ring.drain() if frame_ring is not None else ():
             frames.add(sequence=sample.sequence, publish_ns=sample.publish_time_ns)
 
-    children, traced = _children(asked, run) if children is None else children, TRACED if asked.trace else ()
+    children, traced = _children(options, run) if children is None else children, TRACED if options.trace else ()
     for file in (BEGIN_FILE, PROCESSES_FILE):
-        (run.path / file).unlink(missing_ok=True)  # of the last repeat
+        (run.path / file).unlink(missing_ok=True)  # left by the previous repeat
     with contextlib.ExitStack() as stack:
         bus = ZenohBus(run.links, Role.LAUNCHER, HostClock())
         stack.callback(bus.close)
         bus.subscribe(HEALTH, watch.add_health)
         bus.subscribe(TIMING, time_frames)
         state_ring = bus.ring(MIRROR_STATE, _RING)
-        frame_ring = bus.ring(FRAME, _RING) if asked.simulated else None
+        frame_ring = bus.ring(FRAME, _RING) if options.simulated else None
         stack.callback(stop_all, children)
-        _run(children, children[: 1 + len(traced)], drain, partial(_name_processes, run, children))
+        _run(children, children[: 1 + len(traced)], drain, partial(_write_pids, run, children))
         time.sleep(_SETTLE_S)
         stop_all([*children[1:], children[0]])
-        time.sleep(_LAST_WORDS_S)
+        time.sleep(_LAST_HEALTH_S)
         drain()
         _check_ends(children)
     received = timings.values(), (states.values("sequence"), states.values("publish_ns"))
-    if asked.simulated:
+    if options.simulated:
         joined = join(frames.values("sequence"), frames.values("publish_ns"), None, *received)
     else:
         with np.load(run.path / SENT_FILE) as sent:
@@ -144,59 +148,59 @@ def one_loop(asked: Asked, run: Run, children: list[Child] | None = None) -> dic
     figures = repeat_figures(joined)
     if traced:
         traces: dict[str, Trace] = {role: Trace(*np.load(run.path / trace_file(role)).T) for role in traced}
-        figures["stalls"] = stalls_of(joined, asked.config.period_ns, traces)
+        figures["stalls"] = stalls_of(joined, options.config.period_ns, traces)
     if "frame_to_command" not in figures["latency_us"]:
-        raise BusError("the controller reported the timing of no frame after the warm-up; let the test last longer")
+        raise BusError("the controller reported no timing after the warm-up: use a longer --duration")
     controller, recording = watch.of(Role.CONTROLLER), watch.of(Role.RECORDER).recording
     if recording.failure:
         raise BusError(f"the recorder stopped: {recording.failure}")
-    loop = {role: watch.of(role) for role in (Role.CAMERA, Role.CONTROLLER, mirror_role(asked.config.mirror.name))}
-    account = {
+    loop = {role: watch.of(role) for role in (Role.CAMERA, Role.CONTROLLER, mirror_role(options.config.mirror.name))}
+    reports = {
         "memory_mb": {str(role): health.memory_bytes / 1e6 for role, health in loop.items()},
         "granted": list(controller.realtime_granted),
         "refused": list(controller.realtime_refused),
         "logs": list(recording.files),
-        "messages_lost": recording.lost if asked.record else None,
-        "commands_late": watch.of(Role.CAMERA).commands_late if asked.simulated else None,
+        "messages_lost": recording.lost if options.record else None,
+        "commands_late": watch.of(Role.CAMERA).commands_late if options.simulated else None,
     }
-    return figures | controllers_account(controller) | account
+    return figures | controller_counts(controller) | reports
 
 
-def _children(asked: Asked, run: Run) -> list[Child]:
+def _children(options: LatencyOptions, run: Run) -> list[Child]:
     """The loop's processes in the order in which they are stopped; the first one ends by itself."""
-    config, seconds = asked.config, WARM_UP_S + asked.duration_s
-    children = children_of(config, run, seconds, asked.record)
-    if asked.view:
-        words = ["-m", "lowfc", "view", "--run", run.run_id, "--web"]
-        view = program(str(Role.VIEWER), words, run.path / f"{Role.VIEWER}.stderr")
-        children.insert(len(children) - asked.record, view)  # the recorder ends last
+    config, seconds = options.config, WARM_UP_S + options.duration_s
+    children = children_of(config, run, seconds, options.record)
+    if options.view:
+        arguments = ["-m", "lowfc", "view", "--run", run.run_id, "--web"]
+        view = program(str(Role.VIEWER), arguments, run.path / f"{Role.VIEWER}.stderr")
+        children.insert(len(children) - options.record, view)  # the recorder ends last
     awaited = [str(Role.CONTROLLER), mirror_role(config.mirror.name)]
-    awaited += [str(Role.RECORDER)] * asked.record + [str(Role.VIEWER)] * asked.view
+    awaited += [str(Role.RECORDER)] * options.record + [str(Role.VIEWER)] * options.view
     waits = [word for name in awaited for word in ("--wait-for", name)]
-    if asked.simulated:
-        children[0].command += waits[-2:] if asked.view else []
+    if options.simulated:
+        children[0].command += waits[-2:] if options.view else []
     else:
-        words = ["-m", "lowfc.programs.measure.frame_source", *_shared(run), "--seconds", str(seconds), *waits]
-        children[0] = program(str(Role.CAMERA), words, run.path / f"{Role.CAMERA}.stderr")
-    if asked.trace:
+        arguments = ["-m", "lowfc.programs.measure.frame_source", *_shared(run), "--seconds", str(seconds), *waits]
+        children[0] = program(str(Role.CAMERA), arguments, run.path / f"{Role.CAMERA}.stderr")
+    if options.trace:
         children[1:1] = [_bare_loop(run, role, seconds) for role in TRACED]
     return children
 
 
 def _bare_loop(run: Run, role: Role, seconds: float) -> Child:
-    words = ["-m", bare_loop.__name__, str(role), *_shared(run), "--seconds", str(seconds)]
-    return program(f"bare loop beside the {role}", words, run.path / f"bare-{role}.stderr")
+    arguments = ["-m", bare_loop.__name__, str(role), *_shared(run), "--seconds", str(seconds)]
+    return program(f"bare loop beside the {role}", arguments, run.path / f"bare-{role}.stderr")
 
 
-def _name_processes(run: Run, children: list[Child]) -> None:
-    numbers = {child.name: child.process.pid for child in children if child.process is not None}
-    write_whole(run.path / PROCESSES_FILE, json.dumps(numbers).encode())
+def _write_pids(run: Run, children: list[Child]) -> None:
+    pids = {child.name: child.process.pid for child in children if child.process is not None}
+    write_whole(run.path / PROCESSES_FILE, json.dumps(pids).encode())
 
 
-def _alone(asked: Asked, run: Run) -> dict[str, Any]:
-    words = [*_shared(run), "--seconds", str(asked.duration_s / 2)]
+def _references(options: LatencyOptions, run: Run) -> dict[str, Any]:
+    arguments = [*_shared(run), "--seconds", str(options.duration_s / 2)]
     children = [
-        program(f"echo ({verb})", ["-m", echo.__name__, verb, *words], run.path / f"echo-{verb}.stderr")
+        program(f"echo ({verb})", ["-m", echo.__name__, verb, *arguments], run.path / f"echo-{verb}.stderr")
         for verb in ("ask", "answer")
     ]
     try:
@@ -208,7 +212,7 @@ def _alone(asked: Asked, run: Run) -> dict[str, Any]:
         durations_ns = {"echo_us": round_trip_ns[round_trip_ns >= 0]}
         durations_ns |= {name: alone[name.replace("_us", "_ns")] for name in ("step_us", "hot_step_us", "timer_us")}
     if not durations_ns["echo_us"].size:
-        raise BusError("no answer of the bare echo came back; let the test last longer (--duration)")
+        raise BusError("the bare echo returned no answer: use a longer --duration")
     found = {name: percentiles(each_ns / 1e3) for name, each_ns in durations_ns.items()}
     return found | {"echo_lost": int(np.sum(round_trip_ns < 0))}
 
@@ -223,7 +227,9 @@ def _run(
     meanwhile: Callable[[], None],
     started: Callable[[], None] = lambda: None,
 ) -> None:
-    with deferred_signals() as interrupted:  # while a process forks, Python may swallow what signals would raise
+    with (
+        deferred_signals() as interrupted
+    ):  # while a process forks, Python may swallow an exception of a signal handler
         start_all(children)
         started()
         while any(child.status is None for child in awaited) and not interrupted():
@@ -231,7 +237,7 @@ def _run(
                 if child.status is not None and (child.status != 0 or child not in awaited):
                     raise died(child)
             meanwhile()
-            time.sleep(_TURN_S)
+            time.sleep(_POLL_S)
     if interrupted():
         raise KeyboardInterrupt
     _check_ends(awaited)

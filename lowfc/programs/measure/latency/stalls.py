@@ -14,10 +14,10 @@ from lowfc.arrays import Array, Long
 from lowfc.programs.cli.result import Result, figure
 from lowfc.programs.measure.latency.figures import WARM_UP_S, Frames, percentiles
 
-Holder = Literal["host", "loop", "unknown"]
+Cause = Literal["host", "loop", "unknown"]
 """Cause of a stall: the loop if one of its processes waited for a processor or pages, and no bare loop did."""
 
-_PART = 0.25
+_SHORTEST = 0.25
 """Fraction of a period: shorter waits do not explain a stall."""
 _FAULT_US = 1.0
 """Approximate time to map a page."""
@@ -26,7 +26,7 @@ _SHOWN = 20
 
 
 class Trace(NamedTuple):
-    """Records of the bare loop beside one process; (wakings,), the counts as in `host.Counts`."""
+    """Records of the bare loop beside one process, (wakings,); the counts are those of `host.Counts`."""
 
     due_ns: Long
     woke_ns: Long
@@ -59,8 +59,8 @@ class Stall(Result):
     second: float = figure("at, s", form=".3f")
     frame_to_command_us: float | None = figure("frame to command, us", form=".0f")
     longest: str = figure("longest in")
-    held_up_by: Holder = figure("held up by")
-    signs: str = figure("signs")
+    held_up_by: Cause = figure("cause")
+    signs: str = figure("evidence")
     counted: dict[str, Counted] = figure()
 
 
@@ -79,10 +79,10 @@ class Stalls(Result):
     frames: int = figure()
     stalled: int = figure("stalled", "frames: no command, or more than a period from frame to command")
     of_host: int = figure(
-        "  by the host", "frames: a bare loop was delayed too, a processor stolen, or a quota used up"
+        "  by the host", "frames: a bare loop was delayed too, processor time was stolen, or a quota used up"
     )
     of_loop: int = figure("  by the loop", "frames: a process waited for a processor or for pages, no bare loop did")
-    unknown: int = figure("  unknown", "frames: nothing was counted")
+    unknown: int = figure("  unknown", "frames: no counter explains them")
     bare: list[BareLoop] = figure()
     stalls: list[Stall] = figure()
 
@@ -95,41 +95,41 @@ class Stalls(Result):
 
 def signs_of(counted: Counted, period_us: float) -> tuple[list[str], list[str]]:
     """Text of the evidence against the host and against the loop; delays too short for a stall are ignored."""
-    long_us = _PART * period_us
-    hosts = {
+    long_us = _SHORTEST * period_us
+    host = {
         f"bare loop {counted.bare_late_us:.0f} us late": counted.bare_late_us >= long_us,
         f"{counted.stolen_ms:.0f} ms stolen": counted.stolen_ms > 0,
         "quota used up": counted.throttled > 0,
     }
-    own = {
+    loop = {
         f"waited {counted.waited_us:.0f} us for the processor": counted.waited_us >= long_us,
         f"{counted.major_faults} pages read": counted.major_faults > 0,
         f"{counted.minor_faults} pages mapped": counted.minor_faults * _FAULT_US >= long_us,
     }
-    return [sign for sign, holds in hosts.items() if holds], [sign for sign, holds in own.items() if holds]
+    return [sign for sign, holds in host.items() if holds], [sign for sign, holds in loop.items() if holds]
 
 
 def stalls_of(frames: Frames, period_ns: int, traces: Mapping[str, Trace]) -> Stalls:
-    """The stalls among these frames, the warm-up left out; traces by the process that each stands beside."""
+    """The stalls among these frames, the warm-up left out; `traces` by the process beside which each was taken."""
     command_us = frames.spans_us["frame_to_command"]
-    warm = frames.put_ns - frames.put_ns[:1] >= round(WARM_UP_S * 1e9)
-    slow = warm & (~frames.commanded | (command_us * 1e3 > period_ns))
+    counted = frames.put_ns - frames.put_ns[:1] >= round(WARM_UP_S * 1e9)
+    slow = counted & (~frames.commanded | (command_us * 1e3 > period_ns))
     end_ns = _ends_ns(frames, period_ns)
     found = [_stall(frames, int(index), float(end_ns[index]), period_ns, traces) for index in np.flatnonzero(slow)]
-    held = [stall.held_up_by for stall in found]
+    causes = [stall.held_up_by for stall in found]
     return Stalls(
-        frames=int(warm.sum()),
+        frames=int(counted.sum()),
         stalled=len(found),
-        of_host=held.count("host"),
-        of_loop=held.count("loop"),
-        unknown=held.count("unknown"),
+        of_host=causes.count("host"),
+        of_loop=causes.count("loop"),
+        unknown=causes.count("unknown"),
         bare=[_bare(role, trace, period_ns) for role, trace in traces.items()],
         stalls=found,
     )
 
 
 def together(repeats: Sequence[Stalls]) -> Stalls:
-    """The stalls of several repeats; of the bare loops' lateness the percentiles of the worst repeat."""
+    """The stalls of several repeats; the percentiles of a bare loop's lateness are those of the worst repeat."""
     names = "frames", "stalled", "of_host", "of_loop", "unknown"
     bare = []
     for loops in zip(*(one.bare for one in repeats), strict=True):
@@ -156,14 +156,14 @@ def _stall(frames: Frames, index: int, end_ns: float, period_ns: int, traces: Ma
     timed = bool(np.isfinite(command_us))
     counted = {role: _counted(trace, begin_ns, end_ns) for role, trace in traces.items() if trace.woke_ns.size}
     signs = {role: signs_of(one, period_ns / 1e3) for role, one in counted.items()}
-    hosts, own = (any(each[which] for each in signs.values()) for which in (0, 1))
-    words = [f"{role}: {', '.join([*first, *second])}" for role, (first, second) in signs.items() if first or second]
+    by_host, by_loop = (any(each[which] for each in signs.values()) for which in (0, 1))
+    evidence = [f"{role}: {', '.join([*host, *loop])}" for role, (host, loop) in signs.items() if host or loop]
     return Stall(
         second=round(int(frames.put_ns[index] - frames.put_ns[0]) / 1e9, 4),
         frame_to_command_us=command_us if timed else None,
         longest=max(spans_us, key=lambda name: spans_us[name]) if timed else "no command",
-        held_up_by="host" if hosts else "loop" if own else "unknown",
-        signs="; ".join(words) or "none",
+        held_up_by="host" if by_host else "loop" if by_loop else "unknown",
+        signs="; ".join(evidence) or "none",
         counted=counted,
     )
 
@@ -172,13 +172,13 @@ def _counted(trace: Trace, begin_ns: int, end_ns: float) -> Counted:
     last = trace.woke_ns.size - 1
     before = max(int(np.searchsorted(trace.woke_ns, begin_ns, side="right")) - 1, 0)
     after = min(int(np.searchsorted(trace.woke_ns, end_ns)), last)
-    moved = {name: int(column[after] - column[before]) for name, column in trace._asdict().items()}
+    changes = {name: int(column[after] - column[before]) for name, column in trace._asdict().items()}
     late_ns = (trace.woke_ns - trace.due_ns)[before : after + 1]
     return Counted(
         bare_late_us=float(late_ns.max(initial=0)) / 1e3,
-        stolen_ms=moved["stolen_ns"] / 1e6,
-        waited_us=moved["waited_ns"] / 1e3,
-        **{name: moved[name] for name in ("throttled", "preempted", "minor_faults", "major_faults")},
+        stolen_ms=changes["stolen_ns"] / 1e6,
+        waited_us=changes["waited_ns"] / 1e3,
+        **{name: changes[name] for name in ("throttled", "preempted", "minor_faults", "major_faults")},
     )
 
 

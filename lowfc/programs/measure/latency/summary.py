@@ -19,11 +19,11 @@ def together(repeats: Repeats) -> dict[str, Any]:
     """Figures of all repeats.
 
     Returns:
-        latency_us and spread_us by span: median, and lowest and highest, over the repeats of each percentile (max: the
-        largest); echo_us{round_trip}, step_us, hot_step_us, timer_us, ratio (p50 and p99; see `RATIOS`) and ratio_hot,
-        its step of those back to back, and the same with _spread; histogram{edges_us, counts by span}; over_time of
-        each repeat; `COUNTS`, and reasons; memory_mb, the most of each process, of a live loop; repeats, the
-        percentiles of each; and stalls (`Stalls`) where they were traced.
+        latency_us and spread_us by span: for each percentile the median (max: the largest), and the lowest and highest
+        over the repeats; the same, with and without _spread, for echo_us{round_trip}, step_us, hot_step_us, timer_us,
+        ratio (p50 and p99; see `RATIOS`) and ratio_hot (with the step back to back); histogram{edges_us, counts by
+        span}; over_time of each repeat; `COUNTS` and reasons; memory_mb, the largest of each process (live loop only);
+        repeats, the percentiles of each; and stalls (`Stalls`) if they were traced.
     """
     spans = [span for span in repeats[0]["latency_us"] if all(span in one["latency_us"] for one in repeats)]
     each = {span: [one["latency_us"][span] for one in repeats] for span in spans}
@@ -31,10 +31,10 @@ def together(repeats: Repeats) -> dict[str, Any]:
         "latency_us": {span: median_of(values) for span, values in each.items()},
         "spread_us": {span: spread_of(values) for span, values in each.items()},
     }
-    beside = {name: [one[name] for one in repeats if one.get(name)] for name in ALONE}
+    references = {name: [one[name] for one in repeats if one.get(name)] for name in ALONE}
     for name in RATIOS:
-        beside[name] = [{at: ratio(one, at, name) for at in RATIOS_AT} for one in repeats if one.get("echo_us")]
-    for name, values in beside.items():
+        references[name] = [{at: ratio(one, at, name) for at in RATIOS_AT} for one in repeats if one.get("echo_us")]
+    for name, values in references.items():
         found[name], found[f"{name}_spread"] = (median_of(values), spread_of(values)) if values else (None, None)
     for name in ("echo_us", "echo_us_spread"):
         found[name] = found[name] and {"round_trip": found[name]}
@@ -47,27 +47,27 @@ def together(repeats: Repeats) -> dict[str, Any]:
     found["histogram"] = _histogram(repeats, spans)
     found["over_time"] = [one["over_time"] for one in repeats]
     found["repeats"] = [{name: one.get(name) for name in ("latency_us", *ALONE)} for one in repeats]
-    if used := [one["memory_mb"] for one in repeats if "memory_mb" in one]:
-        found["memory_mb"] = {name: max(one[name] for one in used) for name in used[0]}
+    if memory := [one["memory_mb"] for one in repeats if "memory_mb" in one]:
+        found["memory_mb"] = {name: max(one[name] for one in memory) for name in memory[0]}
     if traced := [one["stalls"] for one in repeats if "stalls" in one]:
         found["stalls"] = stalls.together(traced).figures()
     return found
 
 
 def of_kernels(repeats: Repeats) -> dict[str, Any]:
-    """`together` of the repeats, where they are of one kernel; else of the fused step's, beside numpy's.
+    """`together` of the repeats if they have one kernel; otherwise that of the fused step, compared with numpy's.
 
     Returns:
-        kernel: numpy, fused or both; with both, kernel_ratio (p50 and p99), frame to command of the fused step over
-        numpy's, the median of those that followed each other, kernel_ratio_spread, and numpy_us, numpy's own.
+        kernel: numpy, fused or both. With both: numpy_us, frame to command with numpy; kernel_ratio (p50 and p99), the
+        median over the repeats of frame to command with the fused step over that with numpy; and kernel_ratio_spread.
     """
-    of = {name: [one for one in repeats if one["kernel"] == name] for name in KERNELS}
-    if not all(of.values()):
+    by_kernel = {name: [one for one in repeats if one["kernel"] == name] for name in KERNELS}
+    if not all(by_kernel.values()):
         return together(repeats) | {"kernel": repeats[0]["kernel"]}
-    each = [[one["latency_us"]["frame_to_command"] for one in of[name]] for name in reversed(KERNELS)]
+    each = [[one["latency_us"]["frame_to_command"] for one in by_kernel[name]] for name in reversed(KERNELS)]
     ratios = [{at: fused[at] / numpy[at] for at in RATIOS_AT} for fused, numpy in zip(*each, strict=True)]
-    beside = {"kernel_ratio": median_of(ratios), "kernel_ratio_spread": spread_of(ratios)}
-    return together(of["fused"]) | {"kernel": "both", "numpy_us": median_of(each[1])} | beside
+    comparison = {"kernel_ratio": median_of(ratios), "kernel_ratio_spread": spread_of(ratios)}
+    return together(by_kernel["fused"]) | {"kernel": "both", "numpy_us": median_of(each[1])} | comparison
 
 
 def median_of(repeats: Sequence[Mapping[str, float]]) -> dict[str, float]:
@@ -83,18 +83,18 @@ def spread_of(repeats: Sequence[Mapping[str, float]]) -> dict[str, list[float]]:
 
 def ratio(repeat: Mapping[str, Any], at: str, name: str = "ratio") -> float:
     """Ratio of frame to command to half the round trip of the bare echo plus one control step alone."""
-    made_of_us: float = repeat["echo_us"][at] / 2 + repeat[RATIOS[name][0]][at]
-    return float(repeat["latency_us"]["frame_to_command"][at] / made_of_us)
+    reference_us: float = repeat["echo_us"][at] / 2 + repeat[RATIOS[name][0]][at]
+    return float(repeat["latency_us"]["frame_to_command"][at] / reference_us)
 
 
 def compare(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
     """Two results side by side.
 
     Returns:
-        rows, one for each span and percentile that both have, and for each ratio to what the host can do: name, at,
-        a, b, ratio (b over a), better ("a", "b" or "same"), difference (b minus a), spread (the larger of both ranges
-        over the repeats; None for a single one) and beyond_spread; unit is us, or empty for a ratio. And counts: of
-        each of `COUNTS` that both have, a and b.
+        rows, one for each span and percentile that both have, and for each ratio to the references: name, at, unit (us,
+        or empty for a ratio), a, b, ratio (b over a), better ("a", "b" or "same"), difference (b minus a), spread (the
+        larger of both ranges over the repeats; None for a single one) and beyond_spread. counts: a and b for each of
+        `COUNTS` that both have.
     """
     both = (before, after)
     pairs = [

@@ -11,7 +11,7 @@ from lowfc.programs.measure.latency.summary import OVER
 
 _COMPARED = SPANS | {OVER: "over echo and step"}
 _ALWAYS = ("frames", "frames_without_command", "warm_up_frames", "messages_lost")
-"""Counts that are shown even if they are 0."""
+"""Counts shown even if they are 0."""
 _HOST = ("processor", "processors", "kernel", "python", "clock_source", "load")
 _BLOCKS = " ▁▂▃▄▅▆▇█"
 _LINE = 32
@@ -25,15 +25,15 @@ def table(figures: Mapping[str, Any]) -> str:
     lines = [f"{title}   log counts, {edges[0]:.0f} to {edges[-1]:.0f} us"]
     for span, values in figures["latency_us"].items():
         if span == "due_to_frame":
-            lines.append("from the time the frame was due instead of the time it was put:")
+            lines.append("from the time the frame was due instead of the time it was published:")
         bars = sparkline(figures["histogram"]["counts"][span])
         lines.append(f"{_row(SPANS[span], values)}   {bars}")
-    for name, words in ALONE.items():
+    for name, label in ALONE.items():
         values = figures[name]
         if name == "echo_us" and values:
             values = {at: value / 2 for at, value in values["round_trip"].items()}
         if values:
-            lines.append(_row(words, values))
+            lines.append(_row(label, values))
     return "\n".join([*lines, *_remarks(figures)])
 
 
@@ -56,7 +56,7 @@ def compared(comparison: Mapping[str, Any]) -> str:
 
 
 def sparkline(counts: Sequence[int]) -> str:
-    """Counts as blocks of logarithmic height, several bins in one where there are many."""
+    """Counts as blocks of logarithmic height; many bins are combined into at most `_LINE`."""
     per = math.ceil(len(counts) / _LINE)
     sums = [sum(counts[start : start + per]) for start in range(0, len(counts), per)]
     highest = math.log1p(max(sums, default=0)) or 1.0
@@ -97,14 +97,14 @@ def _ratio(value: float) -> str:
 
 def _remarks(figures: Mapping[str, Any]) -> list[str]:
     lines = []
-    for name, (_, words) in RATIOS.items():
+    for name, (_, suffix) in RATIOS.items():
         if figures[name]:
             spread = figures[f"{name}_spread"]
             parts = [
                 f"{at} {_ratio(figures[name][at])} ({_ratio(low)} to {_ratio(high)})"
                 for at, (low, high) in spread.items()
             ]
-            lines.append(f"frame to command over half a bare echo and one control step{words}: {', '.join(parts)}")
+            lines.append(f"frame to command over half a bare echo and one control step{suffix}: {', '.join(parts)}")
     if figures.get("kernel_ratio"):
         spread, numpy_us = figures["kernel_ratio_spread"], figures["numpy_us"]
         parts = [
@@ -137,7 +137,7 @@ def _what(figures: Mapping[str, Any]) -> str:
     settings, count = figures["settings"], len(figures["repeats"])
     if settings.get("log"):
         return f"{Path(settings['log']).name}, {figures['rate_hz']:.1f} Hz"
-    beside = "".join(f", {name} beside" for name in ("record", "view", "trace") if settings.get(name))
+    also = "".join(f", with --{name}" for name in ("record", "view", "trace") if settings.get(name))
     times = f"medians over {count} times {settings['duration_s']:g} s" if count > 1 else f"{settings['duration_s']:g} s"
     reached = f"{settings['rate_hz']:g} Hz ({figures['rate_hz']:.1f} Hz reached)"
-    return f"{reached}, {settings['camera']} frames{beside}, {times}"
+    return f"{reached}, {settings['camera']} frames{also}, {times}"
