@@ -1,4 +1,4 @@
-"""Chaos cases on the real processes: one of them always, all of them and a soak in the whole suite."""
+"""Chaos cases on the real processes: one in every run of the tests; all of them, and a soak, with the slow tests."""
 
 import json
 from pathlib import Path
@@ -15,7 +15,7 @@ OTHERS = [pytest.param(name, marks=pytest.mark.slow) for name in CASES if name !
 
 
 @pytest.mark.parametrize("name", [ALWAYS, *OTHERS])
-def test_a_case_passes_and_leaves_its_log(tmp_path: Path, name: str) -> None:
+def test_a_case_passes_and_its_log_is_kept(tmp_path: Path, name: str) -> None:
     done = run(tmp_path, "chaos", "--case", name, "--seed", "2", "--keep", "kept", "--json", timeout_s=200)
     (row,) = json.loads(done.stdout)["cases"]
     assert row["passed"] or row["skipped"], json.dumps(row["findings"], indent=1)
@@ -31,7 +31,7 @@ def test_a_case_passes_and_leaves_its_log(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(2400)
-def test_half_an_hour_grows_and_loses_nothing(tmp_path: Path) -> None:
+def test_half_an_hour_shows_no_growth_and_no_loss(tmp_path: Path) -> None:
     done = run(tmp_path, "soak", "--hours", "0.5", "--json", timeout_s=2300)
     assert json.loads(done.stdout)["why"] == []
     assert done.returncode == 0

@@ -1,4 +1,4 @@
-"""The rules of the chaos cases: each passes a run without fault, and notices the one that it is for."""
+"""The rules of the chaos cases: each holds in a run without a fault, and detects its own kind of fault."""
 
 import json
 import signal
@@ -18,12 +18,12 @@ from lowfc.contract.envelope import sequence_of
 from lowfc.contract.errors import ConfigurationError, LowfcError
 from lowfc.contract.events import EVENTS, Level
 from lowfc.contract.messages import COMMAND, EVENT, FRAME, MIRROR_STATE, STEP, TRUTH, Log, wire
-from lowfc.programs.reliability.chaos.bench import PATIENCE_S, Ended, Left
+from lowfc.programs.reliability.chaos.bench import PATIENCE_S, Ended, Outcome
 from lowfc.programs.reliability.chaos.case import Case, lacking
 from lowfc.programs.reliability.chaos.cases import CASES
 from lowfc.programs.reliability.chaos.command import chaos, configured
 from lowfc.programs.reliability.chaos.evidence import FORGED_S, Entry, Evidence
-from lowfc.programs.reliability.chaos.frames import FIRST, STRUCK
+from lowfc.programs.reliability.chaos.frames import FAULTY_FRAMES, FIRST
 from lowfc.programs.reliability.chaos.rules import FLOOR_NM, WITHIN, Finding, judge, recovered_s, restart_steps_nm
 from sim_camera.faults import Kind
 
@@ -62,7 +62,7 @@ def event(level: Level, text: str) -> Entry:
     return Entry(sequence_of(START_S, 1), ns(1), Log(name="controller", level=level, message=text))
 
 
-def came(*lost: int) -> Gaps:
+def received(*lost: int) -> Gaps:
     found = Gaps(0)
     for number in range(FRAMES):
         if number not in lost:
@@ -72,39 +72,39 @@ def came(*lost: int) -> Gaps:
 
 @pytest.fixture
 def evidence() -> Evidence:
-    """Four seconds of a loop to which nothing happened."""
+    """Logs of a loop without a fault, four seconds long."""
     found = Evidence(messages=5 * FRAMES, last_ns=[(ns(FRAMES), True)])
     found.entries[COMMAND] = [shape(index, index % 7) for index in range(FRAMES)]
     found.entries[MIRROR_STATE] = [shape(index, index % 7) for index in range(FRAMES)]
     found.entries[STEP] = [step(index) for index in range(FRAMES)]
     found.entries[TRUTH] = [truth(index, 2.0) for index in range(FRAMES)]
-    found.came = {(0, key, START_S): came() for key in (FRAME.key, STEP.key)}
+    found.received = {(0, key, START_S): received() for key in (FRAME.key, STEP.key)}
     return found
 
 
 @pytest.fixture
-def left(tmp_path: Path) -> Left:
-    found = Left(tmp_path, load(None), marks={"quiet": ns(300), "end": ns(FRAMES)}, mode=wire.LOOP_MODE_CLOSED)
+def outcome(tmp_path: Path) -> Outcome:
+    found = Outcome(tmp_path, load(None), marks={"quiet": ns(300), "end": ns(FRAMES)}, mode=wire.LOOP_MODE_CLOSED)
     found.ended = [Ended("camera", 0, 0.1, True), Ended("controller", 0, 0.1, True)]
     return found
 
 
-def broken(case: Case, left: Left, evidence: Evidence) -> dict[str, str]:
-    return {one.rule: one.found for one in judge(case, left, evidence) if not one.held}
+def broken(case: Case, outcome: Outcome, evidence: Evidence) -> dict[str, str]:
+    return {one.rule: one.found for one in judge(case, outcome, evidence) if not one.held}
 
 
-def unflushed(evidence: Evidence, left: Left) -> None:
-    left.killed_ns.append(ns(FRAMES))
+def unflushed(evidence: Evidence, outcome: Outcome) -> None:
+    outcome.killed_ns.append(ns(FRAMES))
     evidence.last_ns.append((ns(500), False))
 
 
-def ended(name: str, *how: object) -> Callable[[Evidence, Left], None]:
-    return lambda _, left: left.ended.append(Ended(name, *how))
+def ended(name: str, *how: object) -> Callable[[Evidence, Outcome], None]:
+    return lambda _, outcome: outcome.ended.append(Ended(name, *how))
 
 
-LATER = [truth(FRAMES - 1, 5 * (WITHIN * 2 + FLOOR_NM))] * 100
-LINE = (0, STEP.key, START_S)
-SPOILT: list[tuple[str, str, Callable[[Evidence, Left], object]]] = [
+LARGE_RESIDUALS = [truth(FRAMES - 1, 5 * (WITHIN * 2 + FLOOR_NM))] * 100
+STEPS = (0, STEP.key, START_S)
+FAULTS: list[tuple[str, str, Callable[[Evidence, Outcome], object]]] = [
     ("limits", "stroke", lambda e, _: e.entries[COMMAND].append(shape(FRAMES, 701))),
     ("limits", "slew", lambda e, _: e.entries[COMMAND].append(shape(FRAMES, 110))),
     ("limits", "not finite", lambda e, _: e.entries[COMMAND].append(shape(FRAMES, np.nan))),
@@ -117,178 +117,183 @@ SPOILT: list[tuple[str, str, Callable[[Evidence, Left], object]]] = [
         lambda e, _: e.entries[STEP].__setitem__(500, step(500, wire.REASON_DARK, used=False)),
     ),
     ("bad frames", "twice", lambda e, _: e.entries[STEP].insert(500, step(500))),
-    ("recovery", "closed", lambda e, _: e.entries[TRUTH].extend(LATER)),
-    ("recovery", "open", lambda _, left: setattr(left, "mode", wire.LOOP_MODE_OPEN)),
-    ("recovery", "in vain", lambda _, left: left.notes.append("waited in vain")),
+    ("recovery", "closed", lambda e, _: e.entries[TRUTH].extend(LARGE_RESIDUALS)),
+    ("recovery", "open", lambda _, outcome: setattr(outcome, "mode", wire.LOOP_MODE_OPEN)),
+    ("recovery", "in vain", lambda _, outcome: outcome.notes.append("waited in vain")),
     ("events", "1 unexpected SAFED", lambda e, _: e.entries[EVENT].append(event(Level.ERROR, "SAFED why"))),
-    ("account", f"2 of {STEP.key} missing, 0 counted", lambda e, _: e.came.__setitem__(LINE, came(7, 8))),
-    ("account", f"5 of {STEP.key} missing", lambda e, _: e.sent.__setitem__(LINE, FRAMES + 5)),
+    ("account", f"2 of {STEP.key} missing, 0 counted", lambda e, _: e.received.__setitem__(STEPS, received(7, 8))),
+    ("account", f"5 of {STEP.key} missing", lambda e, _: e.sent.__setitem__(STEPS, FRAMES + 5)),
     ("account", "damaged", lambda e, _: e.unreadable.append("damaged")),
     ("account", "no log", lambda e, _: setattr(e, "messages", 0)),
     ("account", "flushed", unflushed),
-    ("account", "nothing is counted", lambda _, left: setattr(left, "failure", "disk")),
+    ("account", "no message is counted", lambda _, outcome: setattr(outcome, "failure", "disk")),
     ("processes", "did not end", ended("mirror-dm", -signal.SIGKILL, PATIENCE_S, True)),
     ("processes", "camera ended with 1, by itself", ended("camera", 1, 0.0, False)),
     ("processes", "by itself", ended("camera", 0, 0.0, False)),
-    ("processes", "lives on", lambda _, left: left.alive.append("python (1, Z)")),
-    ("processes", "traceback in one", lambda _, left: (left.folder / "one.stderr").write_text("Traceback (most")),
+    ("processes", "is still running", lambda _, outcome: outcome.alive.append("python (1, Z)")),
+    ("processes", "traceback in one", lambda _, outcome: (outcome.folder / "one.stderr").write_text("Traceback (most")),
 ]
 
 
-@pytest.mark.parametrize(("rule", "words", "spoil"), SPOILT)
-def test_each_rule_notices_what_it_is_for(
-    rule: str, words: str, spoil: Callable[[Evidence, Left], object], left: Left, evidence: Evidence
+@pytest.mark.parametrize(("rule", "text", "inject"), FAULTS)
+def test_a_fault_breaks_its_rule_and_no_other(
+    rule: str, text: str, inject: Callable[[Evidence, Outcome], object], outcome: Outcome, evidence: Evidence
 ) -> None:
-    assert broken(CASE, left, evidence) == {}
-    assert len(judge(CASE, left, evidence)) == 6
-    spoil(evidence, left)
-    found = broken(CASE, left, evidence)
+    assert broken(CASE, outcome, evidence) == {}
+    assert len(judge(CASE, outcome, evidence)) == 6
+    inject(evidence, outcome)
+    found = broken(CASE, outcome, evidence)
     assert set(found) == {rule}
-    assert words in found[rule]
+    assert text in found[rule]
 
 
-def test_what_is_counted_or_held_is_no_fault(left: Left, evidence: Evidence) -> None:
-    evidence.came[0, STEP.key, START_S] = came(7, 8)
+def test_losses_that_are_counted_and_refused_frames_that_hold_the_command_break_no_rule(
+    outcome: Outcome, evidence: Evidence
+) -> None:
+    evidence.received[STEPS] = received(7, 8)
     evidence.lost = {STEP.key: 2}
-    evidence.entries[COMMAND].append(shape(FRAMES + 1, 110))  # a lost command allows as many moves
-    assert broken(CASE, left, evidence) == {}
+    evidence.entries[COMMAND].append(shape(FRAMES + 1, 110))  # after a lost command, twice the slew limit is allowed
+    assert broken(CASE, outcome, evidence) == {}
     evidence.entries[STEP][500] = step(500, wire.REASON_DARK, used=False)
     for shapes in (evidence.entries[COMMAND], evidence.entries[MIRROR_STATE]):
         shapes[500] = shapes[500]._replace(actuators_nm=shapes[499].actuators_nm)
 
-    def where(bad: Callable[[int], bool]) -> dict[str, str]:
-        return broken(replace(CASE, bad=bad), left, evidence)
+    def broken_with(bad: Callable[[int], bool]) -> dict[str, str]:
+        return broken(replace(CASE, bad=bad), outcome, evidence)
 
-    assert where(lambda number: number == 500) == {}
-    assert "bad frame 501 was used" in where(lambda number: number == 501)["bad frames"]
-    assert "no bad frame came" in where(lambda number: False)["bad frames"]
+    assert broken_with(lambda number: number == 500) == {}
+    assert "bad frame 501 was used" in broken_with(lambda number: number == 501)["bad frames"]
+    assert "no bad frame was received" in broken_with(lambda number: False)["bad frames"]
 
 
-def test_an_expected_event_must_be_there(left: Left, evidence: Evidence) -> None:
+def test_a_missing_expected_event_breaks_the_rule(outcome: Outcome, evidence: Evidence) -> None:
     case = replace(CASE, expected=("FRAMES_REFUSED frames refused: DARK",))
-    assert "no event" in broken(case, left, evidence)["events"]
+    assert "no event" in broken(case, outcome, evidence)["events"]
     evidence.entries[EVENT].append(event(Level.WARNING, "FRAMES_REFUSED frames refused: DARK"))
-    assert broken(case, left, evidence) == {}
+    assert broken(case, outcome, evidence) == {}
 
 
-def test_safed_means_latched_and_flat(left: Left, evidence: Evidence) -> None:
+def test_a_safe_case_requires_the_safe_mode_and_a_flat_mirror(outcome: Outcome, evidence: Evidence) -> None:
     case = replace(CASE, safe=True)
-    assert "closed" in broken(case, left, evidence)["recovery"]
-    left.mode = wire.LOOP_MODE_SAFE
-    assert "mirror at" in broken(case, left, evidence)["recovery"]
+    assert "closed" in broken(case, outcome, evidence)["recovery"]
+    outcome.mode = wire.LOOP_MODE_SAFE
+    assert "nm of flat" in broken(case, outcome, evidence)["recovery"]
     evidence.entries[MIRROR_STATE].append(shape(FRAMES))
-    assert broken(case, left, evidence) == {}
+    assert broken(case, outcome, evidence) == {}
 
 
-def test_the_step_at_a_restart_is_measured_from_where_the_mirror_was(evidence: Evidence) -> None:
+def test_the_step_at_a_restart_is_the_largest_move_from_the_last_mirror_state(evidence: Evidence) -> None:
     assert restart_steps_nm(evidence) == []
     evidence.entries[COMMAND].append(shape(FRAMES, 40, START_S + 5))
     at_nm = float(evidence.entries[MIRROR_STATE][-1].actuators_nm.max())
     assert restart_steps_nm(evidence) == pytest.approx([40 - at_nm])
 
 
-def test_the_time_to_recover_begins_with_the_new_controllers_first_frame(left: Left, evidence: Evidence) -> None:
-    assert recovered_s(left, evidence) is None
+def test_the_time_to_recover_starts_with_the_first_frame_of_the_new_controller(
+    outcome: Outcome, evidence: Evidence
+) -> None:
+    assert recovered_s(outcome, evidence) is None
     evidence.entries[STEP][600:] = [step(index, start_s=START_S + 5) for index in range(600, FRAMES)]
     evidence.entries[TRUTH][550:650] = [truth(index, 40.0) for index in range(550, 650)]
-    assert recovered_s(left, evidence) == pytest.approx(50 * 0.004, abs=0.01)
+    assert recovered_s(outcome, evidence) == pytest.approx(50 * 0.004, abs=0.01)
     evidence.entries[TRUTH][600:] = [truth(index, 40.0) for index in range(600, FRAMES)]
-    assert recovered_s(left, evidence) is None
+    assert recovered_s(outcome, evidence) is None
 
 
-def test_every_case_can_be_run(tmp_path: Path) -> None:
+def test_every_case_has_a_valid_configuration_and_known_events(tmp_path: Path) -> None:
     names = {event.name for event in EVENTS.values()}
     for name, case in CASES.items():
         assert case.name == name
         assert {text.partition(" ")[0] for text in (*case.expected, *case.allowed)} <= names
-    for case in {str(case.config): case for case in CASES.values()}.values():  # most have the usual one
+    for case in {str(case.config): case for case in CASES.values()}.values():  # each configuration once
         assert configured(case, tmp_path).control.start_mode == "closed"
     assert {case.fault for case in CASES.values() if case.fault} == set(Kind)
     first = next(case for case in CASES.values() if case.bad is not None).bad
-    edges = (FIRST - 1, FIRST, FIRST + STRUCK - 1, FIRST + STRUCK)
+    edges = (FIRST - 1, FIRST, FIRST + FAULTY_FRAMES - 1, FIRST + FAULTY_FRAMES)
     assert [first(number) for number in edges] == [False, True, True, False]
     assert FORGED_S < START_S
-    bad = CASES["frames-stuck"].bad  # may be used as long as the loop lets it
-    assert [bad(number) for number in (FIRST, FIRST + 2, FIRST + 3, FIRST + STRUCK)] == [False, False, True, False]
+    bad = CASES["frames-stuck"].bad  # the first ones may be used, up to max_identical_frames
+    edges = (FIRST, FIRST + 2, FIRST + 3, FIRST + FAULTY_FRAMES)
+    assert [bad(number) for number in edges] == [False, False, True, False]
 
 
-def run(*words: str, status: int = 0) -> str:
+def run(*arguments: str, status: int = 0) -> str:
     app = typer.Typer()
     app.command("chaos")(chaos)
     app.command("other")(lambda: None)
-    done = CliRunner().invoke(app, ["chaos", *words], catch_exceptions=False)
+    done = CliRunner().invoke(app, ["chaos", *arguments], catch_exceptions=False)
     assert done.exit_code == status
     return done.stdout
 
 
 @pytest.fixture
-def acted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Cases that act without a loop."""
+def without_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cases that run without a loop."""
 
-    def held(case: Case, left: Left, evidence: Evidence) -> list[Finding]:
-        return [Finding("notes", not left.notes, "; ".join(left.notes))]
+    def judge_notes(case: Case, outcome: Outcome, evidence: Evidence) -> list[Finding]:
+        return [Finding("notes", not outcome.notes, "; ".join(outcome.notes))]
 
-    def acting(case: Case, folder: Path, rng: object) -> Left:
-        found = Left(folder, load(None))
+    def act_only(case: Case, folder: Path, rng: object) -> Outcome:
+        found = Outcome(folder, load(None))
         try:
-            case.act(None)  # type: ignore[arg-type]  # they need none
+            case.act(None)  # type: ignore[arg-type]  # these need no bench
         except LowfcError as error:
             found.notes.append(str(error))
         return found
 
-    def wrong(bench: object) -> None:
+    def faulty(bench: object) -> None:
         raise KeyError("odd")
 
-    def stopped(bench: object) -> None:
+    def interrupted(bench: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("lowfc.programs.reliability.chaos.command._run", acting)
-    monkeypatch.setattr("lowfc.programs.reliability.chaos.rules.judge", held)
-    acts = {"good": lambda bench: None, "odd": wrong, "stopped": stopped, "last": lambda bench: None}
+    monkeypatch.setattr("lowfc.programs.reliability.chaos.command._run", act_only)
+    monkeypatch.setattr("lowfc.programs.reliability.chaos.rules.judge", judge_notes)
+    acts = {"good": lambda bench: None, "odd": faulty, "stopped": interrupted, "last": lambda bench: None}
     cases = {name: replace(CASE, name=name, act=act) for name, act in acts.items()}
-    cases["lacking"] = replace(CASE, name="lacking", act=wrong, lacks=lambda: "takes a mount of its own (not here)")
+    cases["lacking"] = replace(CASE, name="lacking", act=faulty, lacks=lambda: "requires a mount (not here)")
     monkeypatch.setattr("lowfc.programs.reliability.chaos.cases.CASES", cases)
 
 
-@pytest.mark.usefixtures("acted")
-def test_what_a_host_cannot_do_is_skipped_and_not_passed() -> None:
-    words = ("--case", "lacking", "--case", "good")
-    table = run(*words)
-    assert table.splitlines()[0].startswith("lacking  skipped: takes a mount of its own (not here) ")
+@pytest.mark.usefixtures("without_loop")
+def test_a_case_that_the_host_cannot_run_is_skipped_and_not_passed() -> None:
+    arguments = ("--case", "lacking", "--case", "good")
+    table = run(*arguments)
+    assert table.splitlines()[0].startswith("lacking  skipped: requires a mount (not here) ")
     assert table.endswith("1 passed, 0 failed, 1 skipped, seed 1\n")
-    figures = json.loads(run(*words, "--json"))
+    figures = json.loads(run(*arguments, "--json"))
     assert (figures["passed"], figures["failed"], figures["skipped"]) == (1, 0, 1)
     assert [(row["passed"], row["skipped"]) for row in figures["cases"]] == [
-        (False, "takes a mount of its own (not here)"),
+        (False, "requires a mount (not here)"),
         (True, None),
     ]
 
 
-@pytest.mark.usefixtures("acted")
-def test_an_odd_error_fails_its_case_alone_and_leaves_its_traceback() -> None:
+@pytest.mark.usefixtures("without_loop")
+def test_an_unexpected_error_fails_only_its_case_and_its_traceback_is_kept() -> None:
     table = run("--case", "good", "--case", "odd", "--case", "last", status=1)
     assert "    error: KeyError: 'odd'\n" in table
     assert table.endswith("2 passed, 1 failed, seed 1\n")
     assert 'raise KeyError("odd")' in Path("chaos-logs/odd-1/error.txt").read_text()
 
 
-@pytest.mark.usefixtures("acted")
-def test_interrupted_it_prints_what_it_has() -> None:
+@pytest.mark.usefixtures("without_loop")
+def test_an_interrupted_command_prints_the_results_so_far() -> None:
     table = run("--case", "good", "--case", "stopped", "--case", "last", status=INTERRUPTED)
     assert table.splitlines()[0].split()[:2] == ["good", "passed"]
     assert table.endswith("1 passed, 0 failed, 2 not run, seed 1\n")
     assert not Path("chaos-logs").exists()
 
 
-def test_what_cannot_be_tried_is_a_reason() -> None:
-    assert lacking("takes it", "true") == ""
-    assert lacking("takes it", "ls", "/not/there").startswith("takes it (ls: ")
-    assert lacking("takes it", "false") == "takes it (false ended with 1)"
-    assert lacking("takes it", "/not/there") == "takes it (/not/there: No such file or directory)"
+def test_the_reason_why_a_command_fails_is_given() -> None:
+    assert lacking("requires it", "true") == ""
+    assert lacking("requires it", "ls", "/not/there").startswith("requires it (ls: ")
+    assert lacking("requires it", "false") == "requires it (false ended with 1)"
+    assert lacking("requires it", "/not/there") == "requires it (/not/there: No such file or directory)"
 
 
-def test_without_a_case_they_are_listed_and_one_that_is_not_there_is_named() -> None:
+def test_without_a_case_all_are_listed_and_the_error_of_an_unknown_one_suggests_a_name() -> None:
     assert all(name in run() for name in CASES)
     with pytest.raises(ConfigurationError, match="frames-dark"):
         run("--case", "frame-dark")

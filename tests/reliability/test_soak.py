@@ -1,4 +1,4 @@
-"""What a soak makes of its samples: growth is found, noise is not, gaps are counted."""
+"""Evaluation of a soak's samples: growth is detected, noise is not taken for growth, gaps are counted."""
 
 import json
 from pathlib import Path
@@ -42,24 +42,24 @@ def usage(leak_mb_per_hour: float, seed: int = 1, handles_per_hour: float = 0.0)
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_noise_and_the_start_are_no_growth(seed: int) -> None:
+def test_noise_and_the_warm_up_do_not_count_as_growth(seed: int) -> None:
     found = of_process(usage(0.0, seed))
     assert found["grows"] == []
     assert abs(found["memory_mb_per_hour"]) < 4 * found["memory_mb_per_hour_error"] < 4
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_a_leak_is_found_and_measured(seed: int) -> None:
+def test_a_memory_leak_is_detected_with_its_rate(seed: int) -> None:
     found = of_process(usage(20.0, seed))
     assert found["grows"] == ["memory"]
     assert found["memory_mb_per_hour"] == pytest.approx(20, abs=5 * found["memory_mb_per_hour_error"])
 
 
-def test_handles_that_are_not_given_back_are_found() -> None:
+def test_a_growing_number_of_handles_is_detected() -> None:
     assert of_process(usage(0.0, handles_per_hour=60))["grows"] == ["handles"]
 
 
-def test_what_is_too_short_is_not_judged_and_has_not_passed() -> None:
+def test_too_few_samples_are_reported_as_too_short_to_judge() -> None:
     assert slope([0.0, 1.0, 2.0], [1.0, 2.0, 3.0]) is None
     assert slope(range(100), [5.0] * 100) == (0.0, 0.0)
     processes = {"camera": of_process(usage(0.0)), "recorder": of_process(usage(0.0)[:3])}
@@ -80,13 +80,13 @@ def test_what_is_too_short_is_not_judged_and_has_not_passed() -> None:
     assert text.endswith("FAILED: the camera's memory grow")
 
 
-def test_latencies_are_those_that_the_controller_reports() -> None:
+def test_latencies_are_those_of_the_controllers_timing_messages() -> None:
     bus = MemoryBus(MemoryHub(), "launcher", HostClock())
-    times = CommandTimes(SimpleNamespace(bus=bus, left=SimpleNamespace(figures={})))
+    times = CommandTimes(SimpleNamespace(bus=bus, outcome=SimpleNamespace(figures={})))
     bus.publisher(TRUTH).put(wire.Truth(residual_rms_nm=9).SerializeToString())
     bus.publisher(TIMING).put(wire.ControlTiming(frame_to_command_ns=[100_000, 300_000]).SerializeToString())
-    assert times.taken() == {"frames": 2, "p50_us": 200.0, "p99_us": 298.0}
-    assert times.taken() == {}
+    assert times.drain() == {"frames": 2, "p50_us": 200.0, "p99_us": 298.0}
+    assert times.drain() == {}
 
 
 def log(folder: Path, name: str, counts: dict[str, list[int]]) -> None:
@@ -97,12 +97,12 @@ def log(folder: Path, name: str, counts: dict[str, list[int]]) -> None:
     writer.finish({})
 
 
-def test_gaps_are_counted_within_logs_and_between_them(tmp_path: Path) -> None:
+def test_missing_messages_are_counted_within_logs_and_between_them(tmp_path: Path) -> None:
     checker = LogChecker(tmp_path)
     log(tmp_path, "1", {STEP.key: [0, 1, 3], TRUTH.key: [5, 6]})
-    checker.look()
+    checker.check()
     assert (checker.logs, checker.messages, checker.gaps) == (1, 5, 1)
     assert list(tmp_path.iterdir()) == []
     log(tmp_path, "2", {STEP.key: [4, 5], TRUTH.key: [9]})
-    checker.look()
+    checker.check()
     assert (checker.logs, checker.messages, checker.gaps) == (2, 8, 3)

@@ -1,4 +1,4 @@
-"""The bench of one chaos case: the real processes, what is done to them, and what is left of it."""
+"""The bench of one chaos case: the real processes, ways to disturb them, and the outcome."""
 
 import contextlib
 import itertools
@@ -33,33 +33,51 @@ _POLL_S = 0.02
 _QUIET_FRAMES = 250
 _LAST_HEALTH_S = 0.2
 SETTLED_FRAMES = 500
-"""After a fault: two seconds, of which the last is judged."""
+"""Frames after a fault: two seconds, of which the last is judged."""
 PATIENCE_S = 5.0
-"""How long a process may take to end after it was asked to."""
+"""Time that a process may take to exit after the signal to stop."""
 START_S = 240.0
 WAIT_S = 60.0
 
 
 class CaseFailedError(LowfcError):
-    """What a case waits for does not come."""
+    """A case failed, or waited in vain."""
 
 
 @dataclass(slots=True)
 class Ended:
-    """How a process ended: exit status, negative for a signal, after so long; whether the case meant it to."""
+    """End of a process.
+
+    Attributes:
+        name: name of the process.
+        status: exit status; negative for a signal.
+        after_s: time from the request to its end.
+        requested: whether the case ended it.
+    """
 
     name: str
     status: int
     after_s: float
-    meant: bool
+    requested: bool
 
 
 @dataclass(slots=True)
-class Left:
-    """What is left of a case: its folder has the logs and what the processes wrote on standard error.
+class Outcome:
+    """Outcome of a case.
 
-    marks and killed_ns (of each recorder) are by the host's clock; lost, by key, and failure are what the last recorder
-    reports; residuals_nm are true ones of the last second, rms; notes tell what went wrong while it ran.
+    Attributes:
+        folder: folder with the logs and the standard error of the processes.
+        config: configuration of the loop.
+        marks: times by name, host clock, ns.
+        ended: processes that ended.
+        alive: processes still there after the end.
+        killed_ns: times at which a recorder was killed, host clock.
+        mode: last loop mode.
+        lost: messages that the last recorder reports as lost, by key.
+        failure: why the recording failed; empty if it did not.
+        residuals_nm: true residuals of the last second, nm rms of wavefront.
+        figures: figures of the case for `--json`.
+        notes: errors while the case ran.
     """
 
     folder: Path
@@ -77,18 +95,18 @@ class Left:
 
 
 class ChaosBench:
-    """A simulated loop to which things are done; children and health are of the process that has each role now."""
+    """A simulated loop with injected faults; `children` and `health` are those of the present process of each role."""
 
     def __init__(self, config: Configuration, folder: Path, rng: random.Random, fault: dict[str, Any] | None) -> None:
-        """Prepare a run in a folder of its own; `fault` befalls the camera's frames."""
+        """Prepare a run in its own folder; `fault` is injected into the camera's frames."""
         self.config = config
         self.folder = folder
         self.rng = rng
-        self.left = Left(folder, config)
+        self.outcome = Outcome(folder, config)
         self.mirror = mirror_role(config.mirror.name)
         self.newest_frame = 0
         self.health: dict[str, wire.Health] = {}
-        self._steps = self._good = 0
+        self._steps = self._closed_frames = 0
         self._numbers = itertools.count(1)
         self.run = open_run(new_run_id(), (config.mirror.name,), listeners=(Role.LAUNCHER,))
         prepare(config, self.run, Console(stderr=True, quiet=True))
@@ -100,11 +118,11 @@ class ChaosBench:
         for child in self.children.values():
             child.stderr_path = folder / f"{child.name}.stderr"
         self._started: list[Child] = []
-        self._noted: set[int] = set()
+        self._recorded_ends: set[int] = set()
         self.bus: ZenohBus | None = None
 
     def begin(self) -> None:
-        """Start the processes, and wait for the loop to run quietly."""
+        """Start the processes, and wait until the loop has settled."""
         self._started += self.children.values()
         start_all(self._started)
         self.bus = ZenohBus(self.run.links, Role.LAUNCHER, HostClock())
@@ -115,25 +133,25 @@ class ChaosBench:
         self.mark("quiet")
 
     def client(self) -> Client:
-        """An operator, on this process's connection."""
+        """A client in the role of an operator, on this process's connection."""
         return Client(self.run.run_id, bus=self.bus)
 
     def mark(self, name: str) -> None:
-        """Note when something was."""
-        self.left.marks[name] = HostClock().host_ns()
+        """Record the present time by a name."""
+        self.outcome.marks[name] = HostClock().host_ns()
 
     def frames(self, count: int) -> None:
-        """Wait until the controller has made so many more steps."""
-        wanted = self._steps + count
-        self.wait(lambda: self._steps >= wanted, f"{count} steps")
+        """Wait for this many more steps of the controller."""
+        last = self._steps + count
+        self.wait(lambda: self._steps >= last, f"{count} steps")
 
     def settled(self, frames: int = SETTLED_FRAMES) -> None:
-        """Wait until so many frames have been used since the loop was closed."""
-        self._good = 0
-        self.wait(lambda: self._good >= frames, f"{frames} good frames with the loop closed")
+        """Wait until this many frames were used with the loop closed, from now or the next closing."""
+        self._closed_frames = 0
+        self.wait(lambda: self._closed_frames >= frames, f"{frames} good frames with the loop closed")
 
     def wait(self, condition: Callable[[], bool], what: str, timeout_s: float = WAIT_S) -> None:
-        """Wait for something; CaseFailedError where it does not come."""
+        """Wait for a condition; CaseFailedError after the timeout."""
         deadline_s = time.monotonic() + timeout_s
         while not condition():
             if time.monotonic() >= deadline_s:
@@ -145,24 +163,24 @@ class ChaosBench:
         time.sleep(self.rng.uniform(shortest_s, longest_s))
 
     def process(self, role: Role) -> str:
-        """Name of the process with a role; a viewer, which writes into a file, is started first."""
+        """Name of the process with a role; for the viewer, one that writes to a file is started first."""
         if role is Role.VIEWER:
-            words = ["-m", "lowfc", "view", "--run", self.run.run_id, "--save", str(self.folder / "view.rrd")]
-            self._start(program(role, words, self.folder / f"{role}.stderr"), ready=True)
+            arguments = ["-m", "lowfc", "view", "--run", self.run.run_id, "--save", str(self.folder / "view.rrd")]
+            self._start(program(role, arguments, self.folder / f"{role}.stderr"), ready=True)
         return self.mirror if role is Role.MIRROR else str(role)
 
     def kill(self, name: str) -> None:
-        """Kill -9."""
+        """Kill a process (kill -9)."""
         child = self.children[name]
         if name == Role.RECORDER:
-            self.left.killed_ns.append(HostClock().host_ns())
+            self.outcome.killed_ns.append(HostClock().host_ns())
         self.signal(name, signal.SIGKILL)
         self.wait(lambda: child.status is not None, f"the end of {name}")
-        self._note_end(child, 0.0, meant=True)
+        self._record_end(child, 0.0, requested=True)
 
     @contextlib.contextmanager
     def stopped(self, name: str) -> Iterator[None]:
-        """A process stands still meanwhile: SIGSTOP, SIGCONT."""
+        """Stop a process (SIGSTOP) within the context; continue it (SIGCONT) at its end."""
         self.signal(name, signal.SIGSTOP)
         try:
             yield
@@ -176,37 +194,37 @@ class ChaosBench:
         process.send_signal(number)
 
     def restart(self, name: str, command: list[str] | None = None, *, ready: bool = True) -> None:
-        """Start a process that has ended anew, with its command line or another; wait until it reports to be ready."""
+        """Restart a process that has ended, with the same or another command line; wait until it is ready."""
         stderr = self.folder / f"{name}-{next(self._numbers)}.stderr"
         self._start(Child(name, command or self.children[name].command, stderr), ready=ready)
 
-    def ends(self, name: str, status: int) -> str:
-        """Wait until a process ends by itself with this exit status, as the case means it to; the last it wrote."""
+    def await_end(self, name: str, status: int) -> str:
+        """Wait until a process ends by itself with the expected exit status; the end of its standard error."""
         child, begun_s = self.children[name], time.monotonic()
         self.wait(lambda: child.status is not None, f"the end of {name}")
-        self._note_end(child, time.monotonic() - begun_s, meant=True)
+        self._record_end(child, time.monotonic() - begun_s, requested=True)
         if child.status != status:
             raise CaseFailedError(f"{name} should have ended with exit status {status}, got {child.status}")
         return child.stderr_tail()
 
     def end(self, patience_s: float = PATIENCE_S) -> None:
-        """Stop everything; what is left can be judged."""
+        """Stop all processes; afterwards the outcome is complete."""
         self.mark("end")
         try:
             order = (Role.CAMERA, Role.CONTROLLER, self.mirror, Role.VIEWER, Role.RECORDER)
             rank = {str(name): number for number, name in enumerate(order)}
             for child in sorted(self._started, key=lambda one: rank[one.name]):
-                begun_s, meant = time.monotonic(), child.status is None
+                begun_s, running = time.monotonic(), child.status is None
                 child.stop(patience_s)
-                self._note_end(child, time.monotonic() - begun_s, meant=meant)
+                self._record_end(child, time.monotonic() - begun_s, requested=running)
             time.sleep(_LAST_HEALTH_S)
             last = self.health.get(Role.RECORDER, wire.Health())
-            self.left.lost = {count.topic: count.missing for count in last.topics if count.missing}
-            self.left.failure = last.recording.failure
+            self.outcome.lost = {count.topic: count.missing for count in last.topics if count.missing}
+            self.outcome.failure = last.recording.failure
         finally:
             if self.bus is not None:
                 self.bus.close()
-            self.left.alive = _alive({child.process.pid for child in self._started if child.process is not None})
+            self.outcome.alive = _alive({child.process.pid for child in self._started if child.process is not None})
             self.run.remove()
 
     def _start(self, child: Child, *, ready: bool) -> None:
@@ -218,10 +236,10 @@ class ChaosBench:
         if ready:
             self.wait(lambda: name in self.health and self.health[name].state in ("ready", "running"), f"a new {name}")
 
-    def _note_end(self, child: Child, after_s: float, *, meant: bool) -> None:
-        if id(child) not in self._noted:
-            self._noted.add(id(child))
-            self.left.ended.append(Ended(child.name, child.status or 0, after_s, meant))
+    def _record_end(self, child: Child, after_s: float, *, requested: bool) -> None:
+        if id(child) not in self._recorded_ends:
+            self._recorded_ends.add(id(child))
+            self.outcome.ended.append(Ended(child.name, child.status or 0, after_s, requested))
 
     def _receive(self, sample: Sample) -> None:
         topic = topic_of(sample.key)
@@ -230,18 +248,18 @@ class ChaosBench:
             if topic is HEALTH:
                 self.health[message.process] = message
             elif topic is TRUTH:
-                self.left.residuals_nm.append(message.residual_rms_nm)
+                self.outcome.residuals_nm.append(message.residual_rms_nm)
             else:
                 self._steps += 1
-                self.newest_frame, self.left.mode = message.frame_sequence, message.mode
+                self.newest_frame, self.outcome.mode = message.frame_sequence, message.mode
                 if message.mode != wire.LOOP_MODE_CLOSED:
-                    self._good = 0
+                    self._closed_frames = 0
                 elif message.error_nm:
-                    self._good += 1
+                    self._closed_frames += 1
 
 
 def _alive(sessions: set[int]) -> list[str]:
-    """Processes of these sessions that are there still; each child has a session of its own."""
+    """Processes of these sessions that still exist; each child has its own session."""
     found = []
     for process in psutil.process_iter(["name", "status"]):
         with contextlib.suppress(ProcessLookupError):

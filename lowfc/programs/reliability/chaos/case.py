@@ -1,4 +1,4 @@
-"""A chaos case as data: what befalls a running loop, what must come of it, and by which events it is named."""
+"""A chaos case as data: the injected fault, the required outcome, and the events that must name it."""
 
 import contextlib
 import subprocess
@@ -13,23 +13,26 @@ from lowfc.programs.reliability.chaos.bench import ChaosBench
 Act = Callable[[ChaosBench], None]
 
 LOST = ("MESSAGES_LOST", "MIRROR_LOST")
-WHILE_FRAMES = 250
+WHILE_FRAMES = 250  # frames that a state lasts
 
 
 @dataclass(frozen=True)
 class Case:
-    """One case: `act` does what its sentence says once the loop is quiet; then the loop is left to come to its end.
+    """One case: once the loop has settled, `act` injects the fault; then the loop must recover.
 
     Attributes:
-        fault: kind of the frames' fault, of the camera from the start.
-        config: keys that differ from a chaos run's own.
-        expected: events that must be in the log, by how they begin.
-        allowed: names of events of the level ERROR that may be there.
-        safe: it must come to a latched loop and a flat mirror, not to a closed one with the residual as before.
-        bad: which frames, by their number, may not be used.
-        statuses: exit statuses that a process may end with, beside 0.
-        noisy: tracebacks of what could not be read are to be expected.
-        lacks: why this host cannot do it; empty where it can.
+        name: name for `--case`.
+        sentence: description of the fault.
+        act: function that injects the fault.
+        fault: kind of the fault of the camera's frames, present from the start of the camera.
+        config: keys that differ from those of other cases.
+        expected: beginnings of the events that must be in the log.
+        allowed: names of events of the level ERROR that may be in the log.
+        safe: whether the loop must end latched safe with a flat mirror, instead of closed with the former residual.
+        bad: which frames, by number, must not be used.
+        statuses: exit status other than 0 with which a process may end, by process.
+        noisy: whether tracebacks are expected, from messages that cannot be decoded.
+        lacks: function that returns why this host cannot run the case; empty if it can.
     """
 
     name: str
@@ -45,8 +48,8 @@ class Case:
     noisy: bool = False
     lacks: Callable[[], str] = str
 
-    def play(self, bench: ChaosBench) -> None:
-        """Do it, and wait until what must come of it has come."""
+    def run(self, bench: ChaosBench) -> None:
+        """Inject the fault, and wait until the loop has recovered."""
         self.act(bench)
         if self.safe:
             bench.frames(WHILE_FRAMES)
@@ -58,7 +61,7 @@ REGISTERED: dict[str, Case] = {}
 
 
 def case(name: str, sentence: str, **more: Any) -> Callable[[Act], Act]:
-    """Register a function as what a case does; `more` are the case's other attributes."""
+    """Register a function as the `act` of a case; `more` are the case's other attributes."""
 
     def register(act: Act) -> Act:
         REGISTERED[name] = Case(name, sentence, act, **more)
@@ -68,29 +71,29 @@ def case(name: str, sentence: str, **more: Any) -> Callable[[Act], Act]:
 
 
 def no_other_clock() -> str:
-    """Why no process can have a clock of its own here; empty where one can."""
-    return lacking("takes a time namespace", "unshare", "--time", "--monotonic", "1", "true")
+    """Why a process cannot have its own clock on this host; empty if it can."""
+    return lacking("requires a time namespace", "unshare", "--time", "--monotonic", "1", "true")
 
 
 def no_mounts() -> str:
-    """Why nothing can be mounted here; empty where it can."""
+    """Why this process cannot mount on this host; empty if it can."""
     mount = ("mount", "-t", "tmpfs", "-o", "ro,size=1m", "tmpfs", tempfile.gettempdir())
-    return lacking("takes a mount of its own", "unshare", "--mount", *mount)
+    return lacking("requires a mount namespace", "unshare", "--mount", *mount)
 
 
-def lacking(what: str, *words: str) -> str:
-    """Try a command that harms nobody: `what` and why it fails, empty where it does not."""
+def lacking(requirement: str, *command: str) -> str:
+    """Try a harmless command: the requirement and why the command failed, empty if it succeeded."""
     try:
-        done = subprocess.run(words, capture_output=True, text=True, check=False)  # noqa: S603  # ours
+        done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603  # ours
     except OSError as fault:
-        return f"{what} ({words[0]}: {fault.strerror})"
-    why = done.stderr.strip().splitlines() or [f"{words[0]} ended with {done.returncode}"]
-    return f"{what} ({why[0]})" if done.returncode else ""
+        return f"{requirement} ({command[0]}: {fault.strerror})"
+    why = done.stderr.strip().splitlines() or [f"{command[0]} ended with {done.returncode}"]
+    return f"{requirement} ({why[0]})" if done.returncode else ""
 
 
 @contextlib.contextmanager
 def read_only(folder: Path) -> Iterator[None]:
-    """A folder that cannot be written meanwhile, by root neither, whatever is open in it."""
+    """Make a folder read-only within the context, for root too, even with open files in it."""
     subprocess.run(["mount", "--bind", folder, folder], check=True)  # noqa: S603, S607  # ours
     try:
         subprocess.run(["mount", "-o", "remount,ro,bind", folder], check=True)  # noqa: S603, S607  # ours

@@ -4,5 +4,5 @@ from lowfc.programs.reliability.chaos import console, control, disk, frames, jun
 from lowfc.programs.reliability.chaos.case import REGISTERED
 
 MODULES = (frames, processes, console, junk, control, disk)
-"""Which register the cases."""
+"""Modules that register the cases."""
 CASES = REGISTERED

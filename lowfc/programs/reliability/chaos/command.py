@@ -18,7 +18,7 @@ from lowfc.programs.cli.output import print_result
 
 if TYPE_CHECKING:
     from lowfc.contract.configuration import Configuration
-    from lowfc.programs.reliability.chaos.bench import Left
+    from lowfc.programs.reliability.chaos.bench import Outcome
     from lowfc.programs.reliability.chaos.case import Case
 
 FAILED_LOGS = Path("chaos-logs")
@@ -60,9 +60,9 @@ def chaos(
         for number, name in enumerate(names, 1):
             sys.stderr.write(f"{number} of {len(names)}: {name}: {CASES[name].sentence}\n")
             rows.append(run_case(CASES[name], seed, keep))
-            sys.stderr.write(f"    {_word(rows[-1])} in {rows[-1]['seconds']:.0f} s\n")
+            sys.stderr.write(f"    {_result(rows[-1])} in {rows[-1]['seconds']:.0f} s\n")
     except KeyboardInterrupt:
-        interrupted = True  # what is known is printed all the same
+        interrupted = True  # the results so far are printed
     figures = {"seed": seed, "asked": len(names), **counts(rows), "cases": rows}
     print_result(figures, render(figures), as_json=as_json)
     if interrupted:
@@ -72,7 +72,7 @@ def chaos(
 
 
 def run_case(case: "Case", seed: int, keep: Path | None) -> dict[str, Any]:
-    """Run one case in a folder of its own, and judge it; without `keep` only the log of one that fails stays."""
+    """Run one case in its own folder, and judge it; without `keep`, only the log of a failed case is kept."""
     row: dict[str, Any] = {"name": case.name, "sentence": case.sentence, "seconds": 0.0}
     row |= {"passed": False, "skipped": case.lacks() or None, "findings": {}, "figures": {}}
     if row["skipped"]:
@@ -80,7 +80,7 @@ def run_case(case: "Case", seed: int, keep: Path | None) -> dict[str, Any]:
     begun_s, folder = time.monotonic(), Path(tempfile.mkdtemp(prefix=f"lowfc-chaos-{case.name}-"))
     try:
         row |= _judged(_run(case, folder, random.Random(f"{seed} {case.name}")), case)  # noqa: S311  # nothing secret
-    except Exception as error:  # a mistake of ours fails this case alone
+    except Exception as error:  # an error in the case itself fails only this case
         row["findings"] = {"error": {"held": False, "found": _in_one_line(error, folder)}}
     finally:
         if keep is not None or (row["findings"] and not row["passed"]):
@@ -92,15 +92,15 @@ def run_case(case: "Case", seed: int, keep: Path | None) -> dict[str, Any]:
     return row | {"seconds": time.monotonic() - begun_s}
 
 
-def _judged(left: "Left", case: "Case") -> dict[str, Any]:
+def _judged(outcome: "Outcome", case: "Case") -> dict[str, Any]:
     from lowfc.programs.reliability.chaos.evidence import read
     from lowfc.programs.reliability.chaos.rules import judge, recovered_s, restart_steps_nm
 
-    evidence = read(left.folder)
-    findings, figures = judge(case, left, evidence), dict(left.figures)
+    evidence = read(outcome.folder)
+    findings, figures = judge(case, outcome, evidence), dict(outcome.figures)
     if steps_nm := restart_steps_nm(evidence):
         figures["restart_step_nm"] = round(max(steps_nm), 3)
-    if (seconds := recovered_s(left, evidence)) is not None:
+    if (seconds := recovered_s(outcome, evidence)) is not None:
         figures["recovered_s"] = round(seconds, 3)
     return {
         "passed": all(finding.held for finding in findings),
@@ -110,27 +110,27 @@ def _judged(left: "Left", case: "Case") -> dict[str, Any]:
 
 
 def _in_one_line(error: Exception, folder: Path) -> str:
-    """An error in one line; its traceback is written into the case's folder."""
+    """An error in one line; its traceback is written to the case's folder."""
     with (folder / "error.txt").open("a") as file:
         traceback.print_exception(error, file=file)
     return str(error) if isinstance(error, LowfcError) else f"{type(error).__name__}: {error}"
 
 
-def _run(case: "Case", folder: Path, rng: random.Random) -> "Left":
-    """Run a case; what goes wrong on the way is noted, and the processes end whatever happens."""
+def _run(case: "Case", folder: Path, rng: random.Random) -> "Outcome":
+    """Run a case; errors are added to the outcome's notes, and the processes are stopped in any case."""
     from lowfc.programs.reliability.chaos.bench import ChaosBench
-    from lowfc.programs.reliability.chaos.frames import FIRST, STRUCK
+    from lowfc.programs.reliability.chaos.frames import FAULTY_FRAMES, FIRST
 
-    fault = {"kind": case.fault, "first": FIRST, "frames": STRUCK, "seed": rng.getrandbits(32)}
+    fault = {"kind": case.fault, "first": FIRST, "frames": FAULTY_FRAMES, "seed": rng.getrandbits(32)}
     bench = ChaosBench(configured(case, folder), folder, rng, fault if case.fault else None)
     try:
         bench.begin()
-        case.play(bench)
+        case.run(bench)
     except Exception as error:
-        bench.left.notes.append(_in_one_line(error, folder))
+        bench.outcome.notes.append(_in_one_line(error, folder))
     finally:
         bench.end()
-    return bench.left
+    return bench.outcome
 
 
 def configured(case: "Case", folder: Path) -> "Configuration":
@@ -138,39 +138,39 @@ def configured(case: "Case", folder: Path) -> "Configuration":
     from lowfc.adapters.process.realtime import spread
     from lowfc.contract.configuration import FIXED_GAINS, load
 
-    usual = {
+    defaults = {
         "control.start_mode": "closed",
         **FIXED_GAINS,
         "recorder.folder": str(folder),
         "recorder.min_free_mb": 50.0,
         **spread(os.sched_getaffinity(0)),
     }
-    return load(None, {**usual, **case.config})
+    return load(None, {**defaults, **case.config})
 
 
 def counts(rows: list[dict[str, Any]]) -> dict[str, int]:
-    """How many cases ended in which way."""
+    """Numbers of cases passed, failed and skipped."""
     passed, skipped = (sum(bool(row[key]) for row in rows) for key in ("passed", "skipped"))
     return {"passed": passed, "failed": len(rows) - passed - skipped, "skipped": skipped}
 
 
-def _word(row: dict[str, Any]) -> str:
+def _result(row: dict[str, Any]) -> str:
     return f"skipped: {row['skipped']}" if row["skipped"] else "passed" if row["passed"] else "FAILED"
 
 
 def render(figures: dict[str, Any]) -> str:
-    """The table for people: a line for each case, and below it the rules that did not hold."""
+    """The results as text: a line for each case, and below it the rules that did not hold."""
     lines = []
     width = max((len(row["name"]) for row in figures["cases"]), default=0)
     for row in figures["cases"]:
         recovery = row["findings"].get("recovery", {}).get("found", "")
-        lines.append(f"{row['name']:{width}}  {_word(row):6}  {row['seconds']:5.1f} s  {recovery}")
+        lines.append(f"{row['name']:{width}}  {_result(row):6}  {row['seconds']:5.1f} s  {recovery}")
         lines += [f"    {rule}: {one['found']}" for rule, one in row["findings"].items() if not one["held"]]
         lines += [f"    {name}: {value}" for name, value in row["figures"].items()]
-    ended = [f"{figures['passed']} passed", f"{figures['failed']} failed"]
+    totals = [f"{figures['passed']} passed", f"{figures['failed']} failed"]
     if figures["skipped"]:
-        ended.append(f"{figures['skipped']} skipped")
+        totals.append(f"{figures['skipped']} skipped")
     if not_run := figures["asked"] - len(figures["cases"]):
-        ended.append(f"{not_run} not run")
-    lines.append(f"{', '.join(ended)}, seed {figures['seed']}")
+        totals.append(f"{not_run} not run")
+    lines.append(f"{', '.join(totals)}, seed {figures['seed']}")
     return "\n".join(lines)

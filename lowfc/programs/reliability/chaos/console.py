@@ -1,4 +1,4 @@
-"""Chaos case: a console beside the loop that is flooded, stands still and dies."""
+"""Chaos case: a console that is flooded with events, stopped and killed."""
 
 import contextlib
 import os
@@ -27,8 +27,8 @@ START_S = 60.0
 FLOOD_HZ = 2000
 _STEP_S = 0.02
 _SIZE = 30, 100
-_SHOWN = rb"\b(OPEN|CLOSED)\b"
-"""What it says of the loop."""
+_LOOP_MODE = rb"\b(OPEN|CLOSED)\b"
+"""Text on the screen once the console shows the loop."""
 
 
 @case(
@@ -39,45 +39,45 @@ _SHOWN = rb"\b(OPEN|CLOSED)\b"
 )
 def _console(bench: ChaosBench) -> None:
     times = CommandTimes(bench)
-    times.note("without", SPAN_S)
+    times.measure("without", SPAN_S)
     with TerminalConsole(bench.run.run_id) as console:
-        before_s, began_s = console.used_s(), time.monotonic()
-        times.note("open", SPAN_S)
-        share = (console.used_s() - before_s) / (time.monotonic() - began_s)
-        bench.left.figures["console"] = {"start_s": round(console.start_s, 2), "share": round(share, 3)}
+        cpu_before_s, began_s = console.cpu_s(), time.monotonic()
+        times.measure("open", SPAN_S)
+        share = (console.cpu_s() - cpu_before_s) / (time.monotonic() - began_s)
+        bench.outcome.figures["console"] = {"start_s": round(console.start_s, 2), "share": round(share, 3)}
         with _flood(bench):
-            times.note("flooded", SPAN_S)
+            times.measure("flooded", SPAN_S)
             console.process.send_signal(signal.SIGSTOP)
-            times.note("flooded and frozen", SPAN_S)
-        times.note("frozen", SPAN_S)
+            times.measure("flooded and frozen", SPAN_S)
+        times.measure("frozen", SPAN_S)
         console.process.kill()
-        times.note("killed", SPAN_S)
+        times.measure("killed", SPAN_S)
     with _flood(bench):
-        times.note("flood without", SPAN_S)
+        times.measure("flood without", SPAN_S)
 
 
 class TerminalConsole(contextlib.AbstractContextManager["TerminalConsole"]):
-    """`lowfc console` as a process with a terminal of its own, once it shows the loop, `start_s` after its start."""
+    """`lowfc console` as a process with its own terminal; it showed the loop `start_s` after its start."""
 
     def __init__(self, run: str, folder: Path | None = None) -> None:
-        """Start it in a folder, and wait; CaseFailedError where it shows nothing."""
-        self._terminal, its_own = pty.openpty()
+        """Start the console in a folder, and wait until it shows the loop; CaseFailedError after `START_S`."""
+        self._terminal, console_end = pty.openpty()
         termios.tcsetwinsize(self._terminal, _SIZE)
         self._screen = b""
         began_s = time.monotonic()
         self.process = subprocess.Popen(  # noqa: S603  # our own program
             [sys.executable, "-m", "lowfc", "console", "--run", run],
             cwd=folder,
-            stdin=its_own,
-            stdout=its_own,
-            stderr=its_own,
+            stdin=console_end,
+            stdout=console_end,
+            stderr=console_end,
             env={**os.environ, "TERM": "xterm-256color"},
             start_new_session=True,
         )
-        os.close(its_own)
-        self._reader = threading.Thread(target=self._look, daemon=True)
+        os.close(console_end)
+        self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
-        while not self.drew(_SHOWN):
+        while not self.drew(_LOOP_MODE):
             time.sleep(_STEP_S)
             if time.monotonic() > began_s + START_S:
                 self.close()
@@ -85,13 +85,13 @@ class TerminalConsole(contextlib.AbstractContextManager["TerminalConsole"]):
                 raise CaseFailedError(f"the console did not show the loop within {START_S:g} s, but {drawn!r}")
         self.start_s = time.monotonic() - began_s
 
-    def used_s(self) -> float:
-        """Processor time so far."""
+    def cpu_s(self) -> float:
+        """Processor time used so far."""
         times = psutil.Process(self.process.pid).cpu_times()
         return float(times.user + times.system)
 
     def drew(self, pattern: bytes) -> bool:
-        """Whether it drew this of late."""
+        """Whether its recent output matches the pattern."""
         return re.search(pattern, self._screen) is not None
 
     def press(self, keys: bytes) -> None:
@@ -99,7 +99,7 @@ class TerminalConsole(contextlib.AbstractContextManager["TerminalConsole"]):
         os.write(self._terminal, keys)
 
     def close(self) -> None:
-        """Kill it, if it is there still."""
+        """Kill the console if it still runs."""
         self.process.kill()
         self.process.wait()
         self._reader.join()
@@ -108,16 +108,16 @@ class TerminalConsole(contextlib.AbstractContextManager["TerminalConsole"]):
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _look(self) -> None:
-        with contextlib.suppress(OSError):  # it has ended
+    def _read(self) -> None:
+        with contextlib.suppress(OSError):  # the console has ended
             while drawn := os.read(self._terminal, 1 << 16):
                 self._screen = (self._screen + drawn)[-(1 << 16) :]
 
 
 @contextlib.contextmanager
 def _flood(bench: ChaosBench) -> Iterator[None]:
-    """Events meanwhile, `FLOOD_HZ` of them a second."""
-    assert bench.bus is not None  # noqa: S101  # it has begun
+    """Publish `FLOOD_HZ` events a second within the context."""
+    assert bench.bus is not None  # noqa: S101  # the bench has begun
     publisher, clock, over = bench.bus.publisher(EVENT), HostClock(), threading.Event()
 
     def send() -> None:

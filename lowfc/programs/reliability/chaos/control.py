@@ -36,7 +36,7 @@ def _highest_gain(bench: ChaosBench) -> None:
     except RequestRefusedError:
         pass
     else:
-        raise CaseFailedError(f"a gain of {1.01 * limiting:.3g} was granted, where {limiting:.3g} is unstable")
+        raise CaseFailedError(f"a gain of {1.01 * limiting:.3g} was accepted, although {limiting:.3g} is unstable")
     client.gain(JUST_BELOW * limiting)
     bench.frames(WHILE_FRAMES)
     client.gain(FIXED_GAINS["control.gain"])
@@ -55,7 +55,7 @@ def _law_that_fails(bench: ChaosBench) -> None:
     bench.frames(SETTLING_FRAMES + FADING_FRAMES + (WORSE_BLOCKS + 2) * FEWEST)
 
 
-def _good(bench: ChaosBench) -> Calibration:
+def _calibration(bench: ChaosBench) -> Calibration:
     return calibration_file.load(bench.run.path / "calibration.fits")
 
 
@@ -70,7 +70,7 @@ def _load_and_close(client: Client, calibration: Calibration) -> None:
     expected=("SAFED",),
 )
 def _reversed_calibration(bench: ChaosBench) -> None:
-    client, good = bench.client(), _good(bench)
+    client, good = bench.client(), _calibration(bench)
     client.open_loop()
     _load_and_close(client, identified(replace(good, reconstructor=-good.reconstructor)))
     bench.frames(WHILE_FRAMES)
@@ -86,17 +86,17 @@ def _reversed_calibration(bench: ChaosBench) -> None:
     expected=("FRAMES_REFUSED frames refused: WRONG_SIZE",),
 )
 def _foreign_calibration(bench: ChaosBench) -> None:
-    client, good = bench.client(), _good(bench)
+    client, good = bench.client(), _calibration(bench)
     rows, columns = good.shape
-    kept = np.arange(rows * columns).reshape(rows, columns)[1:, 1:].ravel()
+    cropped = np.arange(rows * columns).reshape(rows, columns)[1:, 1:].ravel()
     foreign = replace(
         good,
         shape=(rows - 1, columns - 1),
-        reference=good.reference[kept],
-        response=good.response[kept],
-        reconstructor=np.ascontiguousarray(good.reconstructor[:, kept]),
-        good=good.good[kept],
-        dark=good.dark[kept],
+        reference=good.reference[cropped],
+        response=good.response[cropped],
+        reconstructor=np.ascontiguousarray(good.reconstructor[:, cropped]),
+        good=good.good[cropped],
+        dark=good.dark[cropped],
     )
     client.open_loop()
     client.load(identified(foreign))
@@ -119,7 +119,7 @@ def _damaged_calibration(bench: ChaosBench) -> None:
     bench.kill(Role.CONTROLLER)
     good = bench.children[Role.CONTROLLER].command
     bench.restart(Role.CONTROLLER, [*good[:-1], str(path)], ready=False)
-    stderr_tail = bench.ends(Role.CONTROLLER, 2)
+    stderr_tail = bench.await_end(Role.CONTROLLER, 2)
     if "damaged" not in stderr_tail:
         raise CaseFailedError(f"the controller should have named the damaged calibration, got: {stderr_tail}")
     bench.restart(Role.CONTROLLER, good)
@@ -159,7 +159,7 @@ def _interlock(bench: ChaosBench) -> None:
             time.sleep(0.01)
     client.bench("mask", True)
     bench.wait(lambda: bool(_acting(client)), "the interlock to act")
-    bench.wait(lambda: not _acting(client), "a value that is too old")
+    bench.wait(lambda: not _acting(client), "the interlock's value to expire")
 
 
 def _acting(client: Client) -> list[str]:
@@ -176,22 +176,22 @@ def _moved_away(folder: Path) -> Iterator[None]:
         aside.rename(folder)
 
 
-def _safe_while(unkept: Callable[[Path], contextlib.AbstractContextManager[None]], bench: ChaosBench) -> None:
-    """Enter safe mode and kill the controller while the run's directory cannot keep it; then start it anew."""
+def _safe_while(no_latch: Callable[[Path], contextlib.AbstractContextManager[None]], bench: ChaosBench) -> None:
+    """Enter safe mode and kill the controller while the run's directory cannot hold the latch; then restart it."""
     client = bench.client()
-    with unkept(bench.run.path):
+    with no_latch(bench.run.path):
         client.safe()
         bench.frames(WHILE_FRAMES)
         bench.kill(Role.CONTROLLER)
     bench.restart(Role.CONTROLLER)
 
 
-unkept_case = partial(case, expected=("SAFED", "LATCH_FAILED"), safe=True)
-unkept_case(
+no_latch_case = partial(case, expected=("SAFED", "LATCH_FAILED"), safe=True)
+no_latch_case(
     "safe-without-directory",
     "safe mode while the run's directory is missing; then the controller is killed and restarted",
 )(partial(_safe_while, _moved_away))
-unkept_case(
+no_latch_case(
     "safe-read-only",
     "safe mode while the run's directory is read-only; then the controller is killed and restarted",
     lacks=no_mounts,
@@ -199,11 +199,12 @@ unkept_case(
 
 
 def _other_clock(bench: ChaosBench, seconds: int) -> None:
-    usual = bench.children[Role.CAMERA].command
-    for command in (["unshare", "--time", "--monotonic", str(seconds), *usual], usual):
+    """Replace the camera by one with a shifted clock, then by one with the host's clock."""
+    normal = bench.children[Role.CAMERA].command
+    for command in (["unshare", "--time", "--monotonic", str(seconds), *normal], normal):
         bench.kill(Role.CAMERA)
         bench.restart(Role.CAMERA, command)
-        if command is not usual:
+        if command is not normal:
             bench.frames(WHILE_FRAMES)
 
 

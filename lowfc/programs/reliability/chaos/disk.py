@@ -1,4 +1,4 @@
-"""Chaos cases: disks that are full, slow, or not to be written."""
+"""Chaos cases: disks that are full, slow or read-only."""
 
 import contextlib
 import resource
@@ -11,11 +11,11 @@ from lowfc.programs.reliability.chaos.case import LOST, case, no_mounts, read_on
 from lowfc.programs.reliability.chaos.processes import STALL_S, compare
 
 ROOM_BYTES = 3_000_000
-"""What the log may still grow before its disk is full: about a second of the loop."""
+"""Growth of the log until the disk is full: about a second of the loop."""
 SLOW_S = 3.0
 
 
-# The recorder itself, with a file that takes its time, and reports it as a slow one would.
+# The recorder with a file whose writes sleep and are timed, as on a slow disk.
 _SLOW = """
 import sys, time
 from lowfc.adapters.logs import writer
@@ -43,7 +43,7 @@ main()
     statuses={Role.RECORDER: 1},
 )
 def _full(bench: ChaosBench) -> None:
-    """Let no file of the recorder grow any further: as a full disk, it refuses the next write."""
+    """Limit the size of the recorder's files: writes beyond it fail as on a full disk."""
     process = bench.children[Role.RECORDER].process
     assert process is not None  # noqa: S101  # it was started
     limit = max(path.stat().st_size for path in bench.folder.glob("*.part")) + ROOM_BYTES
@@ -61,19 +61,20 @@ def _read_only(bench: ChaosBench) -> None:
     locked = bench.folder / "locked"
     locked.mkdir()
     with read_only(locked):
-        usual = bench.children[Role.RECORDER].command
-        _instead(bench, [*usual, "--folder", str(locked)], ready=False)
-        stderr_tail = bench.ends(Role.RECORDER, 2)
+        normal = bench.children[Role.RECORDER].command
+        _replace_recorder(bench, [*normal, "--folder", str(locked)], ready=False)
+        stderr_tail = bench.await_end(Role.RECORDER, 2)
         if "error:" not in stderr_tail or "Traceback" in stderr_tail:
             raise CaseFailedError(f"the recorder should have named what is wrong in one line, got: {stderr_tail}")
-    bench.restart(Role.RECORDER, [*usual, "--folder", str(bench.folder)])  # the last one wrote its own into the run's
+    # The folder is given, because the failed recorder set its own as that of the run.
+    bench.restart(Role.RECORDER, [*normal, "--folder", str(bench.folder)])
 
 
 @case("disk-slow", "each write takes 3 s", expected=("DISK_SLOW",), allowed=LOST)
 def _slow(bench: ChaosBench) -> None:
     _on_slow_disk(bench, SLOW_S, 8, 2)
     bench.wait(lambda: bench.health[Role.RECORDER].recording.messages > 0, "a recording")
-    bench.frames(1000)  # of which two writes take the most
+    bench.frames(1000)  # longer than the two slow writes
 
 
 @case("stall-disk", "a write blocks for 10 s", allowed=LOST)
@@ -82,18 +83,19 @@ def _stalled(bench: ChaosBench) -> None:
     def stall() -> Iterator[None]:
         _on_slow_disk(bench, STALL_S + 2, 12, 1)
         yield
-        bench.wait(lambda: bench.health[Role.RECORDER].recording.messages > 1000, "the disk to go on")
+        bench.wait(lambda: bench.health[Role.RECORDER].recording.messages > 1000, "the disk to continue")
 
     compare(bench, stall)
 
 
 def _on_slow_disk(bench: ChaosBench, seconds: float, after: int, times: int) -> None:
-    words = bench.children[Role.RECORDER].command
-    at = words.index("-m")
-    _instead(bench, [*words[:at], "-c", _SLOW, str(seconds), str(after), str(times), *words[at + 2 :]])
+    """Replace the recorder by one of which writes number `after` + 1 to `after` + `times` take `seconds`."""
+    command = bench.children[Role.RECORDER].command
+    at = command.index("-m")
+    _replace_recorder(bench, [*command[:at], "-c", _SLOW, str(seconds), str(after), str(times), *command[at + 2 :]])
 
 
-def _instead(bench: ChaosBench, command: list[str], *, ready: bool = True) -> None:
+def _replace_recorder(bench: ChaosBench, command: list[str], *, ready: bool = True) -> None:
     bench.signal(Role.RECORDER, signal.SIGTERM)
-    bench.ends(Role.RECORDER, 0)
+    bench.await_end(Role.RECORDER, 0)
     bench.restart(Role.RECORDER, command, ready=ready)

@@ -1,4 +1,4 @@
-"""What the logs of a chaos case hold, read and decoded once for all rules."""
+"""Contents of the logs of a chaos case, read and decoded once for all rules."""
 
 from collections import defaultdict
 from dataclasses import dataclass, field
@@ -18,13 +18,20 @@ from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import COMMAND, EVENT, HEALTH, MIRROR_STATE, STEP, TRUTH, Topic
 
 FORGED_S = 1
-"""Start that our forged and damaged messages have, in 1970: no process of a run has it."""
+"""Start time in the sequence of injected messages, 1970: no process of a run has it."""
 DECODED = (COMMAND, MIRROR_STATE, STEP, EVENT, TRUTH, HEALTH)
 _NONE = np.zeros((0, 0), np.float32)
 
 
 class Entry(NamedTuple):
-    """A decoded message of the loop's processes; of a command or a mirror's state also its actuators."""
+    """A decoded message of the loop's processes.
+
+    Attributes:
+        sequence: its sequence, with the start time of its publisher.
+        log_time_ns: time at which it was recorded.
+        message: decoded message.
+        actuators_nm: actuators of a command or mirror state, nm of surface; otherwise empty.
+    """
 
     sequence: int
     log_time_ns: int
@@ -33,25 +40,27 @@ class Entry(NamedTuple):
 
     @property
     def start_s(self) -> int:
-        """Start of its publisher."""
+        """Start time of its publisher."""
         return start_of(self.sequence)
 
 
 @dataclass(slots=True)
 class Evidence:
-    """What the logs hold.
+    """Contents of the logs.
 
     Attributes:
-        entries: of each topic of `DECODED`, in the order of the logs.
-        came: which messages are in each finished log, by the log's number, key and start of the publisher; each log is
-            of another recorder, which answers for what came while it was there.
-        sent: what each publisher reported at its end that it had sent, by the same.
-        lost: what the recorders report as lost, by key.
-        last_ns: when the last message of each log was recorded, and whether that log was finished.
+        entries: messages of each topic of `DECODED`, in the order of the logs.
+        received: counts of the messages in each finished log, by number of the log, key and start of the publisher;
+            each log is that of another recorder, which accounts for the messages of its time.
+        sent: messages that each publisher reported at its end as sent, by the same.
+        lost: messages that the recorders report as lost, by key.
+        unreadable: errors of logs and messages that cannot be read.
+        last_ns: time of the last message of each log, and whether the log was finished.
+        messages: number of messages.
     """
 
     entries: dict[Topic, list[Entry]] = field(default_factory=lambda: {topic: [] for topic in DECODED})
-    came: dict[tuple[int, str, int], Gaps] = field(default_factory=dict)
+    received: dict[tuple[int, str, int], Gaps] = field(default_factory=dict)
     sent: dict[tuple[int, str, int], int] = field(default_factory=dict)
     lost: dict[str, int] = field(default_factory=lambda: defaultdict(int))
     unreadable: list[str] = field(default_factory=list)
@@ -59,13 +68,13 @@ class Evidence:
     messages: int = 0
 
     def residuals_nm(self) -> tuple[Long, Array]:
-        """Log times of the true residuals, and the residuals, nm rms over the pupil."""
+        """True residuals: their log times, ns, and values, nm rms over the pupil."""
         truths = self.entries[TRUTH]
         times_ns = np.array([truth.log_time_ns for truth in truths], np.int64)
         return times_ns, np.array([truth.message.residual_rms_nm for truth in truths], np.float64)
 
     def residual_nm(self, begin_ns: int, end_ns: int) -> float:
-        """Root mean square of the true residual between two times; NaN where there is none."""
+        """Root mean square of the true residual between two times; NaN without data."""
         times_ns, residuals_nm = self.residuals_nm()
         within = residuals_nm[(times_ns >= begin_ns) & (times_ns < end_ns)]
         return float(np.sqrt(np.mean(within**2))) if within.size else float("nan")
@@ -95,8 +104,8 @@ def _enter(found: Evidence, message: Sample, number: int | None) -> None:
     start_s, count = start_of(message.sequence), count_of(message.sequence)
     if start_s <= FORGED_S:
         return
-    if number is not None and message.key != EVENT.key:  # all publish there, and their counts do not tell them apart
-        found.came.setdefault((number, message.key, start_s), Gaps(count)).add(count)
+    if number is not None and message.key != EVENT.key:  # all processes publish events: the publisher is ambiguous
+        found.received.setdefault((number, message.key, start_s), Gaps(count)).add(count)
     topic = next((one for one in DECODED if one.matches(message.key)), None)
     if topic is None:
         return

@@ -5,18 +5,18 @@ from lowfc.programs.reliability.chaos.bench import ChaosBench
 from lowfc.programs.reliability.chaos.case import LOST, case
 
 FIRST = 600
-"""Index of the first frame that a camera's fault befalls: the loop has settled and been quiet for a second."""
-STRUCK = 250
-"""Frames that it befalls: a second."""
-LATEST = 50
-"""Frames by which one may be late."""
+"""Index of the first frame with the fault: the loop has settled and been quiet for a second."""
+FAULTY_FRAMES = 250
+"""Number of frames with the fault: one second."""
+MOST_LATE = 50
+"""Largest delay of a frame, in frames."""
 
-# Kind, what befalls the frames, event, how many of those struck (the first ones) may be used, whether some get lost.
+# Kind, fault of the frames, event, how many of the faulty frames (the first ones) may be used, whether some are lost.
 _KINDS = (
-    ("lost", "10 % of the frames are not sent", "FRAMES_MISSING", STRUCK, True),
-    ("duplicated", "each frame is sent twice", "REPEATED", STRUCK, True),
-    ("reordered", "frames arrive in pairs, in reverse order", "OUT_OF_ORDER", STRUCK, True),
-    ("late", "each frame arrives 1 to 50 frames late", "OUT_OF_ORDER", STRUCK, True),
+    ("lost", "10 % of the frames are not sent", "FRAMES_MISSING", FAULTY_FRAMES, True),
+    ("duplicated", "each frame is sent twice", "REPEATED", FAULTY_FRAMES, True),
+    ("reordered", "frames arrive in pairs, in reverse order", "OUT_OF_ORDER", FAULTY_FRAMES, True),
+    ("late", "each frame arrives 1 to 50 frames late", "OUT_OF_ORDER", FAULTY_FRAMES, True),
     ("wrong-size", "frames of another size", "WRONG_SIZE", 0, False),
     ("truncated", "truncated messages", "WRONG_SIZE", 0, False),
     ("random", "random bytes", "WRONG_SIZE", 0, False),
@@ -24,13 +24,13 @@ _KINDS = (
     ("saturated", "all pixels at full well", "SATURATED", 0, False),
     ("dark", "the star vanishes and returns", "DARK", 0, False),
     ("hot-pixels", "a tenth of the pixels at full well", "SATURATED", 0, False),
-    ("cosmic-rays", "a track of six pixels at full well in every fifth frame", "", STRUCK, False),
+    ("cosmic-rays", "a track of six pixels at full well in every fifth frame", "", FAULTY_FRAMES, False),
     ("stuck", "the same image repeated as new frames", "STUCK", Control().max_identical_frames, False),
 )
 
 
-def _through(bench: ChaosBench) -> None:
-    last = FIRST + STRUCK + LATEST
+def _wait_for_last(bench: ChaosBench) -> None:
+    last = FIRST + FAULTY_FRAMES + MOST_LATE
     bench.wait(lambda: bench.newest_frame & 0xFFFFFFFF >= last, f"frame {last}")
 
 
@@ -42,16 +42,16 @@ for _kind, _sentence, _reason, _used, _lost in _KINDS:
         fault=_kind,
         expected=(_event,) if _event else (),
         allowed=LOST if _lost else (),
-        bad=range(FIRST + _used, FIRST + STRUCK).__contains__ if _used < STRUCK else None,
-    )(_through)
+        bad=range(FIRST + _used, FIRST + FAULTY_FRAMES).__contains__ if _used < FAULTY_FRAMES else None,
+    )(_wait_for_last)
 case(
     "stuck-actuators",
     "dead and stuck actuators, whose wavefront the modes cannot correct",
     config={"mirror.dead": [500, 501], "mirror.stuck_nm": {"600": 80.0}},
-)(_through)
+)(_wait_for_last)
 case(
     "saturating",
     "a disturbance beyond the modal limit of tip and tilt",
     config={"disturbance.preset": "step", "disturbance.scale": 6.0, "control.tilt_limit_nm": 20.0},
     expected=("LIMIT_HIT",),
-)(_through)
+)(_wait_for_last)

@@ -20,15 +20,15 @@ from lowfc.programs.reliability.chaos.evidence import FORGED_S
 FLOOD_HZ = 2000
 FLOOD_S = 2.0
 FORGED = 200
-ASKERS = 8
-ASKED = 25
-_TURN_S = 0.01
+OPERATORS = 8
+REQUESTS = 25
+_POLL_S = 0.01
 _NAMES = ("status", "open", "close", "gain", "leak", "limit", "offset", "channel", "play", "load", "law", "nonsense")
-_GRANTED = ("status", "open", "close", "offset", "play", "law", "channel")  # which chance could ask for
+_MAY_SUCCEED = ("status", "open", "close", "offset", "play", "law", "channel")  # random bytes could be valid fields
 
 
 class Intruder:
-    """A connection that has the run's secret and means no good; `rng` is the case's."""
+    """A hostile connection with the run's secret."""
 
     def __init__(self, bench: ChaosBench) -> None:
         self.rng = np.random.default_rng(bench.rng.getrandbits(32))
@@ -41,7 +41,7 @@ class Intruder:
         self._counts = dict.fromkeys(TOPICS, 0)
         deadline_s = time.monotonic() + 2
         while self._bus.peers() < 3 and time.monotonic() < deadline_s:
-            time.sleep(_TURN_S)
+            time.sleep(_POLL_S)
 
     def __enter__(self) -> "Intruder":
         return self
@@ -50,12 +50,12 @@ class Intruder:
         self._bus.close()
 
     def send(self, topic: Topic, payload: bytes) -> None:
-        """Put a message with a number of long ago."""
+        """Publish a message whose sequence has the start time `FORGED_S`."""
         self._publishers[topic].put(payload, self._clock.host_ns(), sequence_of(FORGED_S, self._counts[topic]))
         self._counts[topic] += 1
 
     def ask(self, name: str, payload: bytes, patience_s: float) -> int:
-        """Ask the controller; return how many answers came."""
+        """Send a request to the controller; the number of answers."""
         return len(self._bus.get(REQUEST_KEY.format(name=name), payload, patience_s))
 
 
@@ -68,7 +68,7 @@ def _flood(bench: ChaosBench) -> None:
             if elapsed_s >= FLOOD_S:
                 break
             if number >= elapsed_s * FLOOD_HZ:
-                time.sleep(_TURN_S)
+                time.sleep(_POLL_S)
             intruder.send(TOPICS[number % len(TOPICS)], intruder.rng.bytes(int(intruder.rng.integers(0, 2000))))
 
 
@@ -101,7 +101,7 @@ def _forged_commands(bench: ChaosBench) -> None:
         for command in _commands(bench, intruder.rng):
             command.frame_sequence = bench.newest_frame
             intruder.send(COMMAND, command.SerializeToString())
-            time.sleep(_TURN_S)
+            time.sleep(_POLL_S)
 
 
 @case("forged-frames", "frames with past sequence numbers, and with none", allowed=LOST, noisy=True)
@@ -110,16 +110,16 @@ def _forged_frames(bench: ChaosBench) -> None:
         for _ in range(FORGED):
             pixels = intruder.rng.integers(0, 40_000, (80, 80)).astype(np.uint16)
             intruder.send(FRAME, image(pixels, HostClock().host_ns(), "forged").SerializeToString())
-            time.sleep(_TURN_S)
+            time.sleep(_POLL_S)
 
 
 @case("malformed-requests", "requests of random bytes")
 def _malformed_requests(bench: ChaosBench) -> None:
-    """Each is answered."""
+    """Every request is answered."""
     with Intruder(bench) as intruder:
         for number in range(200):
             name = _NAMES[number % len(_NAMES)]
-            if name in _GRANTED:
+            if name in _MAY_SUCCEED:
                 name += "-not"
             body = intruder.rng.bytes(int(intruder.rng.integers(1, 3000)))
             if not intruder.ask(name, body, 2.0):
@@ -128,7 +128,7 @@ def _malformed_requests(bench: ChaosBench) -> None:
 
 @case("huge-requests", "requests of up to 64 MB", allowed=LOST)
 def _huge_requests(bench: ChaosBench) -> None:
-    """They are refused, or lost by the bus; the loop goes on."""
+    """The requests are refused, or lost by the bus; the loop continues."""
     with Intruder(bench) as intruder:
         for megabytes in (1, 8, 32, 64):
             message = wire.Request(name="channel", text="huge", actuators=bytes(megabytes * 1_000_000))
@@ -137,7 +137,7 @@ def _huge_requests(bench: ChaosBench) -> None:
 
 @case("concurrent-requests", "eight operators at once")
 def _concurrent_requests(bench: ChaosBench) -> None:
-    """Each has a connection of its own, and every request is answered."""
+    """Each operator has its own connection, and every request is answered."""
     failed: list[str] = []
 
     def operate(number: int) -> None:
@@ -145,7 +145,7 @@ def _concurrent_requests(bench: ChaosBench) -> None:
         try:
             client = Client(bench.run.run_id, bus=bus)
             time.sleep(0.5)
-            for turn in range(ASKED):
+            for turn in range(REQUESTS):
                 if turn % 3 == 0:
                     client.status()
                 else:
@@ -155,10 +155,10 @@ def _concurrent_requests(bench: ChaosBench) -> None:
         finally:
             bus.close()
 
-    operators = [threading.Thread(target=operate, args=(number,)) for number in range(ASKERS)]
+    operators = [threading.Thread(target=operate, args=(number,)) for number in range(OPERATORS)]
     for operator in operators:
         operator.start()
     for operator in operators:
         operator.join()
     if failed:
-        raise CaseFailedError(f"{len(failed)} of {ASKERS} operators failed: {failed[0]}")
+        raise CaseFailedError(f"{len(failed)} of {OPERATORS} operators failed: {failed[0]}")

@@ -1,4 +1,4 @@
-"""Chaos cases: processes that die or stand still."""
+"""Chaos cases: processes that are killed or stopped."""
 
 import contextlib
 import time
@@ -16,12 +16,12 @@ process_case = partial(case, allowed=LOST)
 
 STALL_S = 10.0
 CALM_S = STALL_S / 2
-"""Before a stall, and after it: together as many frames as during it."""
-STRIKES = 6
-_AFTER_S = 0.3
+"""Time measured before a stall, and after it: together as many frames as during it."""
+RANDOM_FAULTS = 6
+_SETTLE_S = 0.3
 _STATIC = {"disturbance.static_nm": {"4": 40.0}}
 
-# What the log must have of a process that was killed, and of one that stood still.
+# Events that the log must have if the process of a role is killed, and if it is stopped.
 _EVENTS: dict[Role, tuple[tuple[str, ...], tuple[str, ...]]] = {
     Role.CAMERA: (("CAMERA_RESTARTED",), ("NO_FRAMES", "FRAMES_BACK")),
     Role.CONTROLLER: (("STARTED controller",), ("COMMAND_EXPIRED", "COMMAND_BACK")),
@@ -32,7 +32,7 @@ _EVENTS: dict[Role, tuple[tuple[str, ...], tuple[str, ...]]] = {
 
 
 def killed(role: Role, after_s: tuple[float, float] = (0.1, 1.0)) -> Act:
-    """Kill a process, and start it anew between so many seconds later."""
+    """Kill a process, and restart it after a random time in this range."""
 
     def act(bench: ChaosBench) -> None:
         name = bench.process(role)
@@ -45,7 +45,7 @@ def killed(role: Role, after_s: tuple[float, float] = (0.1, 1.0)) -> Act:
 
 
 def frozen(role: Role, for_s: tuple[float, float] = (0.5, 2.0)) -> Act:
-    """Stop a process by SIGSTOP, and let it go on between so many seconds later."""
+    """Stop a process (SIGSTOP), and continue it after a random time in this range."""
 
     def act(bench: ChaosBench) -> None:
         name = bench.process(role)
@@ -56,10 +56,10 @@ def frozen(role: Role, for_s: tuple[float, float] = (0.5, 2.0)) -> Act:
     return act
 
 
-for _role, (_seen, _) in _EVENTS.items():
-    process_case(f"kill-{_role}", f"kill -9 of the {_role}, restarted up to 1 s later", expected=_seen)(killed(_role))
-for _role, (_, _seen) in _EVENTS.items():
-    process_case(f"freeze-{_role}", f"SIGSTOP of the {_role}, SIGCONT 0.5 to 2 s later", expected=_seen)(frozen(_role))
+for _role, (_names, _) in _EVENTS.items():
+    process_case(f"kill-{_role}", f"kill -9 of the {_role}, restarted up to 1 s later", expected=_names)(killed(_role))
+for _role, (_, _names) in _EVENTS.items():
+    process_case(f"freeze-{_role}", f"SIGSTOP of the {_role}, SIGCONT 0.5 to 2 s later", expected=_names)(frozen(_role))
 process_case(
     "silent-camera",
     'kill -9 of the camera with `on_frame_timeout = "flat"` and 40 nm of static focus; restarted after 1 s',
@@ -76,7 +76,7 @@ process_case(
 
 @process_case("random", "six kill -9 or SIGSTOP of random processes, at random times")
 def _at_random(bench: ChaosBench) -> None:
-    for _ in range(STRIKES):
+    for _ in range(RANDOM_FAULTS):
         role = bench.rng.choice((Role.CAMERA, Role.CONTROLLER, Role.MIRROR, Role.RECORDER))
         act = killed(role) if bench.rng.random() < 0.5 else frozen(role, (0.1, 1.0))
         act(bench)
@@ -96,29 +96,29 @@ def _stalled_viewer(bench: ChaosBench) -> None:
 
 
 class CommandTimes:
-    """Frame-to-command latencies of a bench that has begun; those noted are among the figures of its case."""
+    """Frame-to-command latencies of a bench that has begun; those of `measure` are figures of its case."""
 
     def __init__(self, bench: ChaosBench) -> None:
-        assert bench.bus is not None  # noqa: S101  # it has begun
+        assert bench.bus is not None  # noqa: S101  # the bench has begun
         self.found: dict[str, dict[str, float]] = {}
         self._latencies_ns: list[int] = []
         bench.bus.subscribe(TIMING, self._receive)
-        bench.left.figures["frame_to_command"] = self.found
+        bench.outcome.figures["frame_to_command"] = self.found
 
-    def taken(self) -> dict[str, float]:
-        """How many frames have been timed since the last call, and their p50 and p99; empty where none has."""
+    def drain(self) -> dict[str, float]:
+        """Number of frames timed since the last call, their p50 and p99; empty without frames."""
         latencies_ns, self._latencies_ns = self._latencies_ns, []
         if not latencies_ns:
             return {}
         p50, p99 = (np.percentile(latencies_ns, (50, 99)) / 1e3).round(1).tolist()
         return {"frames": len(latencies_ns), "p50_us": p50, "p99_us": p99}
 
-    def note(self, name: str, seconds: float) -> None:
-        """Listen for so long."""
-        time.sleep(_AFTER_S)  # what is on its way belongs to the time before
-        self.taken()
+    def measure(self, name: str, seconds: float) -> None:
+        """Collect latencies for this time, as the phase `name`."""
+        time.sleep(_SETTLE_S)  # timings still in transit belong to the phase before
+        self.drain()
         time.sleep(seconds)
-        if found := self.taken():
+        if found := self.drain():
             self.found[name] = found
 
     def _receive(self, sample: Sample) -> None:
@@ -126,13 +126,13 @@ class CommandTimes:
 
 
 def compare(bench: ChaosBench, stall: Callable[[], contextlib.AbstractContextManager[None]]) -> None:
-    """Note frame-to-command latencies before, during and after a stall among the case's figures, with ratios of p99."""
+    """Add frame-to-command latencies before, during and after a stall to the case's figures, with ratios of p99."""
     times = CommandTimes(bench)
-    times.note("before", CALM_S)
+    times.measure("before", CALM_S)
     with stall():
-        times.note("during", STALL_S)
-    times.note("after", CALM_S)
+        times.measure("during", STALL_S)
+    times.measure("after", CALM_S)
     if len(times.found) == 3:
         before, during, after = (one["p99_us"] for one in times.found.values())
-        bench.left.figures["p99_during_over_calm"] = round(during / ((before + after) / 2), 2)
-        bench.left.figures["p99_after_over_before"] = round(after / before, 2)
+        bench.outcome.figures["p99_during_over_calm"] = round(during / ((before + after) / 2), 2)
+        bench.outcome.figures["p99_after_over_before"] = round(after / before, 2)

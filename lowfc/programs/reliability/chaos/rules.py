@@ -1,4 +1,4 @@
-"""What must hold of every chaos case, judged by its logs and by how its processes ended."""
+"""Rules that hold in every chaos case, checked in its logs and in how its processes ended."""
 
 import signal
 from collections import Counter
@@ -12,58 +12,58 @@ from lowfc.arrays import Mask
 from lowfc.contract.events import Level
 from lowfc.contract.messages import COMMAND, EVENT, FRAME, MIRROR_STATE, STEP, Role, wire
 from lowfc.control.loop.safety import Limits
-from lowfc.programs.reliability.chaos.bench import PATIENCE_S, Left
+from lowfc.programs.reliability.chaos.bench import PATIENCE_S, Outcome
 from lowfc.programs.reliability.chaos.case import Case
 from lowfc.programs.reliability.chaos.evidence import Entry, Evidence
 
 WITHIN = 2.0
-"""Factor within which the residual comes back."""
+"""Largest ratio of the residual after recovery to that before the fault."""
 FLOOR_NM = 1.0
-"""Residuals below are noise: this much is added to what they were."""
+"""Noise of the residual, added to the limit."""
 FLUSHED_S = 1.0
-"""What was recorded longer ago than this before a kill is in the log: it is flushed four times a second."""
+"""Messages recorded longer than this before a kill must be in the log, which is flushed four times a second."""
 SPAN_NS = 1_000_000_000
 SHORT_FRAMES = 50
 ROUNDING_NM = 0.03
-"""The driver rounds to 0.023 nm: a mirror's state may be that far from its command."""
+"""Largest difference of a mirror state from its command: the driver rounds to 0.023 nm."""
 REFUSALS = frozenset({*range(wire.REASON_NO_CALIBRATION, wire.REASON_STUCK + 1), wire.REASON_HELD})
 HOST_EVENTS = frozenset({"COMMANDS_LATE", "FRAMES_REFUSED", "FRAMES_MISSING", "REALTIME_REFUSED", "DISK_SLOW"})
-"""Warnings for which a busy host is enough."""
+"""Warnings that a busy host can cause."""
 
 
 class Finding(NamedTuple):
-    """One rule: whether it held, and what was found."""
+    """Result of one rule: whether it held, and what was found."""
 
     rule: str
     held: bool
     found: str
 
 
-def _found(rule: str, wrong: list[str], else_: str) -> Finding:
-    """A rule that held unless something is wrong, of which the first three are named."""
-    return Finding(rule, not wrong, "; ".join(wrong[:3]) or else_)
+def _found(rule: str, wrong: list[str], otherwise: str) -> Finding:
+    """A rule that held if nothing is wrong; at most three violations are named."""
+    return Finding(rule, not wrong, "; ".join(wrong[:3]) or otherwise)
 
 
-def judge(case: Case, left: Left, evidence: Evidence) -> list[Finding]:
-    """Every rule of a case."""
+def judge(case: Case, outcome: Outcome, evidence: Evidence) -> list[Finding]:
+    """Check every rule of a case."""
     return [
-        _limits(left, evidence),
+        _limits(outcome, evidence),
         _bad_frames(case, evidence),
-        _recovery(case, left, evidence),
+        _recovery(case, outcome, evidence),
         _events(case, evidence),
-        _account(left, evidence),
-        _processes(case, left),
+        _account(outcome, evidence),
+        _processes(case, outcome),
     ]
 
 
-def _limits(left: Left, evidence: Evidence) -> Finding:
-    config = left.config
+def _limits(outcome: Outcome, evidence: Evidence) -> Finding:
+    config = outcome.config
     commands, states = evidence.entries[COMMAND], evidence.entries[MIRROR_STATE]
     moving = np.ones((config.mirror.rows, config.mirror.columns), bool)
     moving.flat[[*config.mirror.dead, *map(int, config.mirror.stuck_nm)]] = False
     wrong = [
-        *_broken("command", settings(config).limits, commands, np.ones_like(moving)),
-        *_broken("mirror", mirror_limits(config), states, moving),
+        *_violations("command", settings(config).limits, commands, np.ones_like(moving)),
+        *_violations("mirror", mirror_limits(config), states, moving),
     ]
     wrong += [
         f"a restarted controller moved the mirror by {step_nm:.2f} nm"
@@ -74,8 +74,8 @@ def _limits(left: Left, evidence: Evidence) -> Finding:
     return _found("limits", wrong if states else [count], count)
 
 
-def _broken(what: str, limits: Limits, shapes: list[Entry], moving: Mask) -> Iterator[str]:
-    """Limits that shapes break; a gap in their counts allows as many moves. Fixed actuators are left out."""
+def _violations(what: str, limits: Limits, shapes: list[Entry], moving: Mask) -> Iterator[str]:
+    """Limits that shapes violate, without fixed actuators; a gap of n in the sequence allows n + 1 slew steps."""
     if not shapes:
         return
     surface = np.array([shape.actuators_nm for shape in shapes], np.float64)
@@ -86,10 +86,10 @@ def _broken(what: str, limits: Limits, shapes: list[Entry], moving: Mask) -> Ite
     moves = np.diff([shape.sequence for shape in shapes])
     same = (np.diff([shape.start_s for shape in shapes]) == 0) & (moves > 0)
     slews = np.nanmax(np.abs(np.diff(surface, axis=0)), axis=(1, 2)) / np.maximum(moves, 1)
-    apart = max(np.nanmax(np.abs(np.diff(surface, axis=axis)), initial=0) for axis in (1, 2))
+    neighbours = max(np.nanmax(np.abs(np.diff(surface, axis=axis)), initial=0) for axis in (1, 2))
     for name, value, bound in (
         ("stroke", np.nanmax(np.abs(surface)), limits.stroke_nm),
-        ("neighbours", apart, limits.neighbour_nm),
+        ("neighbours", neighbours, limits.neighbour_nm),
         ("slew", slews[same].max(initial=0), limits.slew_nm),
     ):
         if value > bound:
@@ -97,7 +97,7 @@ def _broken(what: str, limits: Limits, shapes: list[Entry], moving: Mask) -> Ite
 
 
 def restart_steps_nm(evidence: Evidence) -> list[float]:
-    """Largest move of an actuator by the first command of each restarted controller, from where the mirror was."""
+    """Largest move of an actuator by the first command of each restarted controller, from the mirror's last state."""
     first: dict[int, Entry] = {}
     for command in evidence.entries[COMMAND]:
         first.setdefault(command.start_s, command)
@@ -108,16 +108,16 @@ def restart_steps_nm(evidence: Evidence) -> list[float]:
     return [float(np.abs(move).max()) for move in moves]
 
 
-def recovered_s(left: Left, evidence: Evidence) -> float | None:
-    """Time from the first frame that a restarted controller used to a residual as before; None without a restart.
+def recovered_s(outcome: Outcome, evidence: Evidence) -> float | None:
+    """Time from the first frame used by a restarted controller until the residual is within its limit again.
 
-    A residual is that of the next 50 frames.
+    The residual is the rms of the next 50 frames. None without a restart or recovery.
     """
     steps = evidence.entries[STEP]
     started = [step for step in steps if step.message.error_nm and step.start_s > steps[0].start_s]
-    if not started or "quiet" not in left.marks:
+    if not started or "quiet" not in outcome.marks:
         return None
-    begun_ns, quiet_ns = started[0].log_time_ns, left.marks["quiet"]
+    begun_ns, quiet_ns = started[0].log_time_ns, outcome.marks["quiet"]
     most_nm = WITHIN * evidence.residual_nm(quiet_ns - SPAN_NS, quiet_ns) + FLOOR_NM
     times_ns, residuals_nm = evidence.residuals_nm()
     later = times_ns >= begun_ns
@@ -134,7 +134,7 @@ def _number(step: Entry) -> int:
 
 
 def _bad_frames(case: Case, evidence: Evidence) -> Finding:
-    """A refused frame holds the command; what is bad is refused; nothing is used twice or after a newer one."""
+    """A refused frame holds the command; bad frames are refused; no frame is used twice or after a newer one."""
     commands, steps = evidence.entries[COMMAND], evidence.entries[STEP]
     at = {(command.start_s, command.message.input_number): number for number, command in enumerate(commands)}
     refused = [step for step in steps if REFUSALS.intersection(step.message.reasons)]
@@ -143,7 +143,7 @@ def _bad_frames(case: Case, evidence: Evidence) -> Finding:
         number = at.get((step.start_s, step.message.input_number), 0)
         if number and step.message.mode != wire.LOOP_MODE_SAFE:
             before, now = commands[number - 1 : number + 1]
-            adjacent = now.sequence == before.sequence + 1  # and so of one controller
+            adjacent = now.sequence == before.sequence + 1  # which implies the same controller
             if adjacent and not np.array_equal(now.actuators_nm, before.actuators_nm):
                 wrong.append(f"a command was made from frame {_number(step)}, which was refused")
     newest: dict[int, int] = {}
@@ -154,27 +154,28 @@ def _bad_frames(case: Case, evidence: Evidence) -> Finding:
                 wrong.append(f"frame {_number(step)} was used after a newer one, or twice")
             newest[step.start_s] = max(step.message.frame_sequence, last)
     if case.bad is not None:
-        struck = [step for step in steps if case.bad(_number(step))]
-        wrong += [f"bad frame {_number(step)} was used" for step in struck if step.message.error_nm]
-        wrong += [] if struck else ["no bad frame came"]
+        bad = [step for step in steps if case.bad(_number(step))]
+        wrong += [f"bad frame {_number(step)} was used" for step in bad if step.message.error_nm]
+        wrong += [] if bad else ["no bad frame was received"]
     return _found("bad frames", wrong, f"{len(refused)} refused, {len(steps)} steps")
 
 
-def _recovery(case: Case, left: Left, evidence: Evidence) -> Finding:
-    quiet_ns, end_ns = left.marks.get("quiet", 0), left.marks["end"]
+def _recovery(case: Case, outcome: Outcome, evidence: Evidence) -> Finding:
+    quiet_ns, end_ns = outcome.marks.get("quiet", 0), outcome.marks["end"]
     before = evidence.residual_nm(quiet_ns - SPAN_NS, quiet_ns)
     after = evidence.residual_nm(end_ns - SPAN_NS, end_ns)
-    if np.isnan(after) and left.failure and left.residuals_nm:  # the recording ended before the loop did
-        after = float(np.sqrt(np.mean(np.square(left.residuals_nm))))
-    where = wire.LoopMode.Name(left.mode).removeprefix("LOOP_MODE_").lower()
-    if left.notes:
-        return Finding("recovery", False, "; ".join(left.notes))
+    if np.isnan(after) and outcome.failure and outcome.residuals_nm:  # the recording ended before the loop did
+        after = float(np.sqrt(np.mean(np.square(outcome.residuals_nm))))
+    mode = wire.LoopMode.Name(outcome.mode).removeprefix("LOOP_MODE_").lower()
+    if outcome.notes:
+        return Finding("recovery", False, "; ".join(outcome.notes))
     if not case.safe:
-        held = left.mode == wire.LOOP_MODE_CLOSED and after <= WITHIN * before + FLOOR_NM
-        return Finding("recovery", held, f"residual {before:.2f} -> {after:.2f} nm, {where}")
+        held = outcome.mode == wire.LOOP_MODE_CLOSED and after <= WITHIN * before + FLOOR_NM
+        return Finding("recovery", held, f"residual {before:.2f} -> {after:.2f} nm, {mode}")
     states = evidence.entries[MIRROR_STATE]
     flat_nm = float(np.abs(states[-1].actuators_nm).max()) if states else float("inf")
-    return Finding("recovery", left.mode == wire.LOOP_MODE_SAFE and flat_nm < 1, f"{where}, mirror at {flat_nm:.2f} nm")
+    held = outcome.mode == wire.LOOP_MODE_SAFE and flat_nm < 1
+    return Finding("recovery", held, f"{mode}, mirror within {flat_nm:.2f} nm of flat")
 
 
 def _events(case: Case, evidence: Evidence) -> Finding:
@@ -186,21 +187,23 @@ def _events(case: Case, evidence: Evidence) -> Finding:
     ]
     names = [(event.message.partition(" ")[0], event.level) for event in events]
     allowed = {*(text.partition(" ")[0] for text in case.expected), *case.allowed, *HOST_EVENTS}
-    loud = Counter(name for name, level in names if level >= Level.WARNING)
-    bad = {name for name, level in names if level >= Level.ERROR}
-    wrong += [f"{loud[name]} unexpected {name}" for name in sorted(bad - allowed)]
-    rest = ", ".join(f"{name} {count}" for name, count in sorted(loud.items()))
-    return Finding("events", not wrong, "; ".join(wrong) or rest or "none above info")
+    warnings = Counter(name for name, level in names if level >= Level.WARNING)
+    errors = {name for name, level in names if level >= Level.ERROR}
+    wrong += [f"{warnings[name]} unexpected {name}" for name in sorted(errors - allowed)]
+    counts = ", ".join(f"{name} {count}" for name, count in sorted(warnings.items()))
+    return Finding("events", not wrong, "; ".join(wrong) or counts or "none above info")
 
 
-def _account(left: Left, evidence: Evidence) -> Finding:
+def _account(outcome: Outcome, evidence: Evidence) -> Finding:
     wrong = list(evidence.unreadable)
     missing: Counter[str] = Counter()
-    counted = {key: max(evidence.lost.get(key, 0), left.lost.get(key, 0)) for key in (*evidence.lost, *left.lost)}
-    for line, came in evidence.came.items():
-        missing[line[1]] += came.missing
-        if line[1] != FRAME.key:  # of which a faulty camera sends more, or fewer, than it numbers
-            missing[line[1]] += max(0, evidence.sent.get(line, 0) - came.next)
+    keys = (*evidence.lost, *outcome.lost)
+    counted = {key: max(evidence.lost.get(key, 0), outcome.lost.get(key, 0)) for key in keys}
+    for publication, received in evidence.received.items():
+        _, key, _ = publication
+        missing[key] += received.missing
+        if key != FRAME.key:  # a faulty camera sends more or fewer frames than it numbers
+            missing[key] += max(0, evidence.sent.get(publication, 0) - received.next)
     wrong += [
         f"{count} of {key} missing, {counted.get(key, 0)} counted as lost"
         for key, count in missing.items()
@@ -209,30 +212,31 @@ def _account(left: Left, evidence: Evidence) -> Finding:
     unfinished = [last_ns for last_ns, finished in evidence.last_ns if not finished]
     wrong += [
         f"nothing was flushed within {FLUSHED_S:g} s before the recorder was killed"
-        for killed_ns in left.killed_ns
+        for killed_ns in outcome.killed_ns
         if not any(abs(killed_ns - last_ns) < FLUSHED_S * 1e9 for last_ns in unfinished)
     ]
     lost = sum(counted.values())
-    if left.failure and not lost:
-        wrong.append(f"the recording failed ({left.failure}), and nothing is counted as lost")
+    if outcome.failure and not lost:
+        wrong.append(f"the recording failed ({outcome.failure}), but no message is counted as lost")
     if not evidence.messages:
         wrong.append("there is no log")
     return _found("account", wrong, f"{evidence.messages} recorded, {lost} counted as lost")
 
 
-def _processes(case: Case, left: Left) -> Finding:
-    wrong = [f"{name} lives on" for name in left.alive]
-    for ended in left.ended:
-        allowed = {0, -signal.SIGTERM, case.statuses.get(ended.name, 0)} | ({-signal.SIGKILL} if ended.meant else set())
+def _processes(case: Case, outcome: Outcome) -> Finding:
+    wrong = [f"{name} is still running" for name in outcome.alive]
+    for ended in outcome.ended:
+        allowed = {0, -signal.SIGTERM, case.statuses.get(ended.name, 0)}
+        allowed |= {-signal.SIGKILL} if ended.requested else set()
         if ended.after_s >= PATIENCE_S and ended.status == -signal.SIGKILL:
             wrong.append(f"{ended.name} did not end within {PATIENCE_S:g} s")
         elif ended.status not in allowed:
-            wrong.append(f"{ended.name} ended with {ended.status}" + ("" if ended.meant else ", by itself"))
-        elif not ended.meant and ended.status == 0:
+            wrong.append(f"{ended.name} ended with {ended.status}" + ("" if ended.requested else ", by itself"))
+        elif not ended.requested and ended.status == 0:
             wrong.append(f"{ended.name} ended by itself")
-    written = [] if case.noisy else sorted(left.folder.glob("*.stderr"))
-    wrong += [f"a traceback in {one.name}" for one in written if "Traceback" in one.read_text(errors="replace")]
-    if not {ended.name for ended in left.ended} & set(map(str, Role)):
+    outputs = [] if case.noisy else sorted(outcome.folder.glob("*.stderr"))
+    wrong += [f"a traceback in {one.name}" for one in outputs if "Traceback" in one.read_text(errors="replace")]
+    if not {ended.name for ended in outcome.ended} & set(map(str, Role)):
         wrong.append("no process ended")
-    slowest_s = max((ended.after_s for ended in left.ended), default=0.0)
+    slowest_s = max((ended.after_s for ended in outcome.ended), default=0.0)
     return _found("processes", wrong, f"ended within {slowest_s:.1f} s")

@@ -15,8 +15,8 @@ def soak(
 ) -> None:
     """Run the simulated loop for hours and check memory, handles, threads, latency and losses; exit status 1 on growth.
 
-    Finished logs are checked for gaps and removed. Slopes are of the last three quarters of the time, with standard
-    errors; memory grows if its slope exceeds three of them. A check for which the time was too short does not pass.
+    Finished logs are checked for gaps and removed. Slopes are fitted to the last three quarters of the time, with
+    standard errors; memory grows if its slope exceeds three of them. If the time is too short for a check, it fails.
 
     Example: lowfc soak --hours 0.5
     """

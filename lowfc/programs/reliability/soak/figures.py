@@ -1,4 +1,4 @@
-"""What a soak found: how each process's memory, handles, threads and the latency went with time."""
+"""Results of a soak: growth of each process's memory, handles and threads, and drift of the latency."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -10,18 +10,18 @@ from lowfc.control.loop.wording import counted
 from lowfc.programs.cli.result import table
 
 BLOCKS = 12
-"""Means over which a slope is fitted: neighbouring samples are not independent, means of many nearly are."""
+"""Number of means to which a slope is fitted: neighbouring samples are correlated, means of many nearly are not."""
 WARM_UP = 0.25
-"""Part of the time at the start that does not count: caches and queues fill."""
+"""Fraction of the time at the start that is left out, while caches and queues fill."""
 SIGNIFICANT = 3.0
-"""Standard errors above which a slope is one."""
+"""Standard errors above which a slope is significant."""
 LEAST_GROWTH_MB = 1.0
-"""Over the time that counts; less than a leak of a night would be, and more than the allocator's steps."""
+"""Growth over the evaluated time that counts as a leak; the allocator's steps are smaller."""
 TOO_SHORT = "too short to judge"
 
 
 class Usage(NamedTuple):
-    """What a process has at one time."""
+    """Resources of a process at one time."""
 
     time_s: float
     memory_bytes: int
@@ -30,18 +30,18 @@ class Usage(NamedTuple):
 
 
 def slope(times_s: Sequence[float], values: Sequence[float]) -> tuple[float, float] | None:
-    """Change per hour and its standard error, fitted to means of blocks after the warm-up; None of too little."""
-    times, found = np.asarray(times_s, np.float64) / 3600, np.asarray(values, np.float64)
-    later = times >= times[0] + WARM_UP * (times[-1] - times[0]) if times.size else times
+    """Change per hour and its standard error, fitted to means of blocks after the warm-up; None if too short."""
+    hours, found = np.asarray(times_s, np.float64) / 3600, np.asarray(values, np.float64)
+    later = hours >= hours[0] + WARM_UP * (hours[-1] - hours[0]) if hours.size else hours
     if np.count_nonzero(later) < 2 * BLOCKS:
         return None
-    when, means = (np.array([part.mean() for part in np.array_split(one[later], BLOCKS)]) for one in (times, found))
-    fit = stats.linregress(when, means)
-    return float(fit.slope), float(np.nan_to_num(fit.stderr))  # NaN where all are equal
+    at, means = (np.array([part.mean() for part in np.array_split(one[later], BLOCKS)]) for one in (hours, found))
+    fit = stats.linregress(at, means)
+    return float(fit.slope), float(np.nan_to_num(fit.stderr))  # NaN if all are equal
 
 
-def _more(counts: Sequence[int]) -> bool:
-    """Whether there are usually more of something in the last quarter of the samples than in the second."""
+def _grew(counts: Sequence[int]) -> bool:
+    """Whether the median of the last quarter of the samples exceeds that of the second quarter."""
     quarter = len(counts) // 4
     return bool(np.median(counts[-quarter:]) > np.median(counts[quarter : 2 * quarter]))
 
@@ -53,10 +53,10 @@ def of_process(samples: Sequence[Usage]) -> dict[str, Any]:
     memory = slope(times_s, memory_mb)
     grows, too_short = [], ["memory", "handles", "threads"]
     if memory is not None:
-        counted_hours = (times_s[-1] - times_s[0]) / 3600 * (1 - WARM_UP)
-        leaks = memory[0] > SIGNIFICANT * memory[1] and memory[0] * counted_hours > LEAST_GROWTH_MB
-        grown = {"memory": leaks, "handles": _more(handles), "threads": _more(threads)}
-        grows, too_short = [name for name, grew in grown.items() if grew], []
+        evaluated_h = (times_s[-1] - times_s[0]) / 3600 * (1 - WARM_UP)
+        leaks = memory[0] > SIGNIFICANT * memory[1] and memory[0] * evaluated_h > LEAST_GROWTH_MB
+        checks = {"memory": leaks, "handles": _grew(handles), "threads": _grew(threads)}
+        grows, too_short = [name for name, grew in checks.items() if grew], []
     measured = {"memory": [round(one, 2) for one in memory_mb], "handles": handles, "threads": threads}
     ends = {
         f"{what}_{at}{'_mb' * (what == 'memory')}": value
@@ -67,7 +67,7 @@ def of_process(samples: Sequence[Usage]) -> dict[str, Any]:
 
 
 def of_latency(samples: Sequence[tuple[float, float, float]]) -> dict[str, float | None]:
-    """How the frame-to-command latency went: from when it was looked at, s, and its p50 and p99 since before, us."""
+    """Median and drift of the latency, from samples of time, s, and p50 and p99 since the previous sample, us."""
     times_s, *each = zip(*samples, strict=True) if samples else ((), (), ())
     found: dict[str, float | None] = {}
     for name, latencies_us in zip(("p50_us", "p99_us"), each, strict=True):
@@ -77,32 +77,32 @@ def of_latency(samples: Sequence[tuple[float, float, float]]) -> dict[str, float
 
 
 def _per_hour(name: str, found: tuple[float, float] | None) -> dict[str, float | None]:
-    """A slope as JSON has it: null where it was too short to judge."""
+    """A slope for JSON: null if the time was too short to judge."""
     per_hour, error = found or (None, None)
     return {f"{name}_per_hour": per_hour, f"{name}_per_hour_error": error}
 
 
 def too_short(processes: Mapping[str, Mapping[str, Any]], latency: Mapping[str, float | None]) -> list[str]:
-    """What the time was too short to judge."""
+    """Checks for which the time was too short."""
     found = [f"the {name}'s {what}" for name, one in processes.items() for what in one["too_short"]]
     return found + ["the latency"] * (latency["p50_us_per_hour"] is None)
 
 
 def verdict(figures: Mapping[str, Any]) -> str:
-    """Passed, failed and why, or too short to judge and of what."""
+    """Text of the verdict: passed, failed with the reasons, or too short to judge with the checks concerned."""
     if figures["why"]:
         return "FAILED: " + "; ".join(figures["why"])
     return f"{TOO_SHORT}: {', '.join(figures['too_short'])}" if figures["too_short"] else "passed"
 
 
 def latency_in_words(latency: Mapping[str, float | None]) -> str:
-    """The latencies and how they change."""
-    words = []
+    """Text of the latencies and their drift."""
+    parts = []
     for name in ("p50", "p99"):
         value_us, per_hour, error = (latency[f"{name}_us{end}"] for end in ("", "_per_hour", "_per_hour_error"))
         change = _change(per_hour, error, "+.1f", " us per hour")
-        words.append(f"{name} {TOO_SHORT}" if value_us is None else f"{name} {value_us:.0f} us, {change}")
-    return "; ".join(words)
+        parts.append(f"{name} {TOO_SHORT}" if value_us is None else f"{name} {value_us:.0f} us, {change}")
+    return "; ".join(parts)
 
 
 def _change(per_hour: float | None, error: float | None, form: str, unit: str = "") -> str:
@@ -110,7 +110,7 @@ def _change(per_hour: float | None, error: float | None, form: str, unit: str = 
 
 
 def render(figures: dict[str, Any]) -> str:
-    """For people."""
+    """The results as text."""
     rows = [
         (
             name,

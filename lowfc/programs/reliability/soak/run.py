@@ -1,4 +1,4 @@
-"""A soak: the simulated loop for hours, looked at once a second, its logs checked and removed as they are finished."""
+"""A soak: the simulated loop for hours, sampled once a second; finished logs are checked and removed."""
 
 import contextlib
 import random
@@ -21,36 +21,36 @@ from lowfc.programs.reliability.chaos.bench import ChaosBench
 from lowfc.programs.reliability.chaos.processes import CommandTimes
 from lowfc.programs.reliability.soak.figures import Usage, of_latency, of_process, too_short
 
-LOOK_S = 1.0
+SAMPLE_S = 1.0
 _PATIENCE_S = 10.0
-_NONE_OF = {
+_MUST_BE_ZERO = {
     "messages_lost": "messages lost",
     "gaps": "messages missing in the logs",
-    "frames_missing": "frames never arrived",
+    "frames_missing": "frames missing",
 }
 
 
 class LogChecker:
-    """Reads each log once it is finished, and removes it: a night's would not fit on a disk."""
+    """Checks each finished log for gaps, then removes it, because those of a night would fill the disk."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._came: dict[tuple[str, int], Gaps] = {}
+        self._received: dict[tuple[str, int], Gaps] = {}
         self.logs = self.messages = 0
 
     @property
     def gaps(self) -> int:
-        """Messages that are not in the logs, between others of the same publisher."""
-        return sum(one.missing for one in self._came.values())
+        """Messages missing in the logs between others of the same publisher."""
+        return sum(one.missing for one in self._received.values())
 
-    def look(self) -> None:
-        """Check and remove what has been finished."""
+    def check(self) -> None:
+        """Check and remove the finished logs."""
         for path in sorted(self._folder.glob("*.mcap"), key=lambda one: (one.stat().st_mtime_ns, one.name)):
             for message in LogReader(path):
                 self.messages += 1
-                if message.key != EVENT.key:  # all publish there, and their counts do not tell them apart
+                if message.key != EVENT.key:  # all processes publish events: the publisher is ambiguous
                     count = count_of(message.sequence)
-                    self._came.setdefault((message.key, start_of(message.sequence)), Gaps(count)).add(count)
+                    self._received.setdefault((message.key, start_of(message.sequence)), Gaps(count)).add(count)
             self.logs += 1
             path.unlink()
 
@@ -63,22 +63,22 @@ class _Soak:
         self.latency: list[tuple[float, float, float]] = []
         self._times = CommandTimes(bench)
 
-    def look(self, now_s: float) -> None:
+    def sample(self, now_s: float) -> None:
         """Sample processes and latency, and check finished logs."""
         children = list(self.bench.children.values())
         check(children)
         for child in children:
             assert child.process is not None  # noqa: S101  # it was started
-            with contextlib.suppress(psutil.Error):  # one that has just ended: the next look says so
+            with contextlib.suppress(psutil.Error):  # the process has just ended: the next check raises
                 process = psutil.Process(child.process.pid)
                 used = Usage(now_s, process.memory_info().rss, process.num_fds(), process.num_threads())
                 self.usage.setdefault(child.name, []).append(used)
-        if timed := self._times.taken():
+        if timed := self._times.drain():
             self.latency.append((now_s, timed["p50_us"], timed["p99_us"]))
-        self.checker.look()
+        self.checker.check()
 
     def figures(self, seconds: float, stopped_s: float, unfinished: list[str]) -> dict[str, Any]:
-        """What `lowfc soak --json` prints."""
+        """The figures that `lowfc soak --json` prints."""
         controller, recorder, camera = (
             self.bench.health.get(role, wire.Health()) for role in (Role.CONTROLLER, Role.RECORDER, Role.CAMERA)
         )
@@ -99,16 +99,16 @@ class _Soak:
             "latency": of_latency(self.latency),
         }
         why = [f"the {name}'s {what} grow" for name, one in processes.items() for what in one["grows"]]
-        why += [f"{found[key]} {word}" for key, word in _NONE_OF.items() if found[key]]
+        why += [f"{found[key]} {text}" for key, text in _MUST_BE_ZERO.items() if found[key]]
         why += [f"{name} was not finished" for name in unfinished]
         if recording.messages != self.checker.messages:
-            why.append(f"the recorder reports {recording.messages} messages, in the logs are {self.checker.messages}")
+            why.append(f"the recorder reports {recording.messages} messages, the logs have {self.checker.messages}")
         unjudged = too_short(processes, found["latency"])
         return found | {"why": why, "too_short": unjudged, "passed": not why and not unjudged}
 
 
 def soak_loop(config: Configuration, seconds: float, progress: Callable[[float], None]) -> dict[str, Any]:
-    """Run the loop for so long; the figures that `lowfc soak --json` prints."""
+    """Run the loop for this time; the figures that `lowfc soak --json` prints."""
     with tempfile.TemporaryDirectory(prefix="lowfc-soak-") as name:
         logged = config.model_copy(update={"recorder": config.recorder.model_copy(update={"folder": name})})
         bench = ChaosBench(logged, Path(name), random.Random(), None)  # noqa: S311  # nothing secret
@@ -117,13 +117,13 @@ def soak_loop(config: Configuration, seconds: float, progress: Callable[[float],
             soak = _Soak(bench)
             begun_s = time.monotonic()
             while (elapsed_s := time.monotonic() - begun_s) < seconds:
-                soak.look(elapsed_s)
+                soak.sample(elapsed_s)
                 progress(elapsed_s)
-                time.sleep(max(0.0, LOOK_S - (time.monotonic() - begun_s - elapsed_s)))
+                time.sleep(max(0.0, SAMPLE_S - (time.monotonic() - begun_s - elapsed_s)))
         finally:
             begun_s = time.monotonic()
             bench.end(_PATIENCE_S)
             stopped_s = time.monotonic() - begun_s
-        soak.checker.look()
+        soak.checker.check()
         unfinished = [path.name for path in Path(name).glob("*.part")]
     return soak.figures(seconds, stopped_s, unfinished)
