@@ -1,4 +1,4 @@
-"""`lowfc certs`, read by another implementation: the standard library's OpenSSL."""
+"""Certificates of `lowfc certs`, checked with the standard library's OpenSSL."""
 
 import contextlib
 import datetime
@@ -21,10 +21,10 @@ make = pytest.importorskip("lowfc.adapters.bus.certificates", reason="needs the 
 
 
 def handshake(server: Path, client: Path, role: str, name: str = "localhost") -> None:
-    """Mutual TLS of a folder's router with another folder's role, in memory.
+    """Mutual TLS handshake, in memory, of the router of one folder with a role of another.
 
     Raises:
-        ssl.SSLError: one of them does not take the other.
+        ssl.SSLError: one of them does not accept the other.
     """
     theirs, ours = (ssl.SSLContext(kind) for kind in (ssl.PROTOCOL_TLS_SERVER, ssl.PROTOCOL_TLS_CLIENT))
     theirs.verify_mode = ssl.CERT_REQUIRED
@@ -46,7 +46,7 @@ def handshake(server: Path, client: Path, role: str, name: str = "localhost") ->
     assert ends[0].getpeercert()["subject"] == ((("commonName", role),),)  # type: ignore[index]
 
 
-def test_router_and_roles_take_each_other(tmp_path: Path) -> None:
+def test_router_and_roles_of_one_authority_accept_each_other(tmp_path: Path) -> None:
     made = make(tmp_path, (ROUTER, "camera", "mirror-dm"), ["localhost", "10.0.0.1"])
     assert [file.name for file in made] == ["router.pem", "camera.pem", "mirror-dm.pem"]
     for role in ("camera", "mirror-dm"):
@@ -56,7 +56,7 @@ def test_router_and_roles_take_each_other(tmp_path: Path) -> None:
         handshake(tmp_path, tmp_path, "camera", "example.org")
 
 
-def test_nobody_takes_another_authoritys(tmp_path: Path) -> None:
+def test_certificates_of_another_authority_are_rejected(tmp_path: Path) -> None:
     for name in ("ours", "theirs"):
         make(tmp_path / name, (ROUTER, "camera"), ["localhost"])
     with pytest.raises(ssl.SSLCertVerificationError):
@@ -66,21 +66,21 @@ def test_nobody_takes_another_authoritys(tmp_path: Path) -> None:
         handshake(tmp_path / "theirs", tmp_path / "ours", "camera")
 
 
-def test_what_is_there_stays_unless_it_is_renewed(tmp_path: Path) -> None:
+def test_existing_certificates_are_kept_unless_renewed(tmp_path: Path) -> None:
     make(tmp_path, (ROUTER, "camera"), ["localhost"])
     before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
     assert [file.name for file in make(tmp_path, (ROUTER, "camera", "viewer"), [])] == ["viewer.pem"]
     assert {name: (tmp_path / name).read_bytes() for name in before} == before
     make(tmp_path, ("camera",), [], renew=True)
     changed = {name for name in before if (tmp_path / name).read_bytes() != before[name]}
-    assert changed == {"camera.pem"}  # it is of the key that is there: a machine that has the old key takes the new one
+    assert changed == {"camera.pem"}  # the key is kept, so that hosts with the old key accept the new certificate
     handshake(tmp_path, tmp_path, "camera")
     handshake(tmp_path, tmp_path, "viewer")
 
 
 @pytest.mark.parametrize("gone", [(), ("camera.key",), ("camera.pem",), ("camera.key", "camera.pem")])
 @pytest.mark.parametrize("file", ["camera.key", "camera.pem", "viewer.pem"])
-def test_wherever_it_is_interrupted_a_pair_is_whole_or_not_there(
+def test_an_interruption_leaves_no_certificate_without_its_key(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file: str, gone: tuple[str, ...]
 ) -> None:
     roles = (ROUTER, "camera", "viewer")
@@ -107,7 +107,7 @@ def test_wherever_it_is_interrupted_a_pair_is_whole_or_not_there(
     assert stat.S_IMODE((tmp_path / "camera.key").stat().st_mode) == 0o600
 
 
-def test_a_connection_that_ends_in_the_handshake_is_no_refusal_of_the_certificate(tmp_path: Path) -> None:
+def test_a_connection_that_ends_in_the_handshake_is_not_reported_as_a_rejected_certificate(tmp_path: Path) -> None:
     make(tmp_path, (ROUTER, "camera"), ["127.0.0.1"])
     with socket.create_server(("127.0.0.1", 0)) as server:
 
@@ -124,7 +124,7 @@ def test_a_connection_that_ends_in_the_handshake_is_no_refusal_of_the_certificat
     assert "refused" in router_trouble(network, "camera")
 
 
-def test_a_certificate_is_read_as_its_peers_read_it(tmp_path: Path) -> None:
+def test_a_certificate_is_checked_as_its_peers_check_it(tmp_path: Path) -> None:
     made = datetime.datetime.now(datetime.UTC)
     make(tmp_path, (ROUTER, "camera"), ["localhost"], 100)
     for role in (ROUTER, "camera"):
@@ -155,13 +155,13 @@ def test_certificates_are_warned_about_before_their_end(tmp_path: Path) -> None:
     assert ending_certificates(network, now + (100.5 - WARN_DAYS) * day) == [
         f"the certificate of {role} ends in {WARN_DAYS - 1} days, on {date:%Y-%m-%d}" for role in ("camera", "router")
     ]
-    assert len(ending_certificates(network, now + (3650 - WARN_DAYS + 1) * day)) == 3, "and the authority's own"
+    assert len(ending_certificates(network, now + (3650 - WARN_DAYS + 1) * day)) == 3, "including that of the authority"
     (tmp_path / "camera.key").write_bytes((tmp_path / "viewer.key").read_bytes())
-    (said,) = ending_certificates(network, now)
-    assert "camera.pem is not a valid certificate" in said
+    (warning,) = ending_certificates(network, now)
+    assert "camera.pem is not a valid certificate" in warning
 
 
-def test_mistakes_are_said(tmp_path: Path) -> None:
+def test_errors_name_the_file_or_option_at_fault(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="by which others reach it"):
         make(tmp_path / "none", (ROUTER,), [])
     with pytest.raises(ConfigurationError, match=r"without port; got 'host:7447'"):
@@ -184,7 +184,7 @@ def test_mistakes_are_said(tmp_path: Path) -> None:
         make(tmp_path / "one", ("viewer",), [])
 
 
-def test_the_command_makes_all_roles(tmp_path: Path) -> None:
+def test_the_command_makes_a_certificate_for_every_role(tmp_path: Path) -> None:
     words = ["certs", str(tmp_path / "certs"), "--router", "localhost", "--mirror", "dm", "--mirror", "tip"]
     done = lowfc(*words)
     assert done.exit_code == 0, done.output
@@ -193,6 +193,8 @@ def test_the_command_makes_all_roles(tmp_path: Path) -> None:
     assert (
         {file.stem for file in folder.glob("*.pem")} == {file.stem for file in folder.glob("*.key")} == roles | {"ca"}
     )
-    assert {stat.S_IMODE(file.stat().st_mode) for file in folder.glob("*.key")} == {0o600}, "keys are closed to others"
+    assert {stat.S_IMODE(file.stat().st_mode) for file in folder.glob("*.key")} == {0o600}, (
+        "keys are readable by their owner only"
+    )
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
     handshake(folder, folder, "mirror-tip")

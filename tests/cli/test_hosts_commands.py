@@ -1,4 +1,4 @@
-"""`lowfc hosts` and `lowfc router` leave nothing of having asked; docs/howto/hosts.md has the code's figures."""
+"""`lowfc hosts` and `lowfc router --show` create no run; the figures in docs/howto/hosts.md are those of the code."""
 
 import inspect
 import json
@@ -17,14 +17,14 @@ from tests.e2e.test_hosts import SHIFTS_NS
 from tests.support.loops import lowfc
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "howto" / "hosts.md"
-WAY = Network(router="tls/127.0.0.1:7447", certificates="/etc/lowfc/certs")
+NETWORK = Network(router="tls/127.0.0.1:7447", certificates="/etc/lowfc/certs")
 
 
 @pytest.fixture
 def toml(own_runtime: Path) -> Path:
-    """A configuration with a router, and no run at all."""
+    """A configuration with a router; no run exists."""
     file = own_runtime / "lowfc.toml"
-    file.write_text(f'[network]\nrouter = "{WAY.router}"\ncertificates = "{WAY.certificates}"\n')
+    file.write_text(f'[network]\nrouter = "{NETWORK.router}"\ncertificates = "{NETWORK.certificates}"\n')
     return file
 
 
@@ -33,29 +33,29 @@ def runs() -> list[str]:
 
 
 @pytest.mark.usefixtures("toml")
-def test_a_run_that_is_not_there_is_not_made_by_asking() -> None:
-    words = ["config", "zenoh", "--role", "camera", "--run", "tpyo"]
-    for asked in (["hosts", "--run", "tpyo"], words):
-        done = lowfc(*asked)
+def test_a_missing_run_is_created_only_with_make() -> None:
+    show_zenoh = ["config", "zenoh", "--role", "camera", "--run", "tpyo"]
+    for command in (["hosts", "--run", "tpyo"], show_zenoh):
+        done = lowfc(*command)
         assert isinstance(done.exception, BusError)
         assert "there is no run 'tpyo'" in str(done.exception)
         assert runs() == []
-    made = lowfc(*words, "--make")
+    made = lowfc(*show_zenoh, "--make")
     assert made.exit_code == 0
     assert runs() == ["tpyo"]
-    assert lowfc(*words).stdout == made.stdout
+    assert lowfc(*show_zenoh).stdout == made.stdout
 
 
-def test_the_routers_configuration_is_shown_without_making_its_run(toml: Path) -> None:
+def test_the_configuration_of_the_router_is_shown_without_creating_its_run(toml: Path) -> None:
     done = lowfc("router", "--show", "--config", toml, "--run", "bench")
     assert done.exit_code == 0
-    assert json.loads(done.stdout)["listen"]["endpoints"] == [WAY.router]
+    assert json.loads(done.stdout)["listen"]["endpoints"] == [NETWORK.router]
     assert runs() == []
 
 
-def test_the_documents_figures_are_the_codes() -> None:
+def test_the_figures_of_the_document_are_those_of_the_code() -> None:
     text = " ".join(DOCUMENT.read_text().split())
-    retry = routed.client_session(WAY, "camera", {})["connect"]["retry"]
+    retry = routed.client_session(NETWORK, "camera", {})["connect"]["retry"]
     shifts = [f"{ns / 1e9:g} s" if abs(ns) >= 1e9 else f"{ns / 1e6:g} ms" for ns in SHIFTS_NS.values()]
     assert inspect.signature(certs).parameters["days"].default == certificates.DAYS
     assert retry["period_max_ms"] == 1000
@@ -69,4 +69,4 @@ def test_the_documents_figures_are_the_codes() -> None:
         f"with clocks {max(SHIFTS_NS.values()) / 1e9:g} s apart",
     ):
         assert sentence in text
-    assert not re.findall(r"\d+ (?:us|MHz|kB|MB|%)", text)  # what is measured is not typed in
+    assert not re.findall(r"\d+ (?:us|MHz|kB|MB|%)", text)  # measured figures are generated, not typed

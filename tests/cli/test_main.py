@@ -1,4 +1,4 @@
-"""`lowfc --help`, and how a typed result becomes text and JSON."""
+"""`lowfc --help`, and the text and JSON of a typed result."""
 
 import re
 import subprocess
@@ -13,7 +13,7 @@ from lowfc.programs.cli.main import COMMANDS, app
 from lowfc.programs.cli.result import Result, figure
 
 
-def test_every_command_is_listed_under_its_purpose_with_a_whole_sentence() -> None:
+def test_every_command_is_listed_under_its_heading_with_its_whole_description() -> None:
     lines = CliRunner().invoke(app, ["--help"], terminal_width=80).stdout.splitlines()
     assert max(map(len, lines)) <= 80
     for heading, rows in COMMANDS.items():
@@ -22,8 +22,7 @@ def test_every_command_is_listed_under_its_purpose_with_a_whole_sentence() -> No
             assert any(line.split(maxsplit=1) == [row.name, row.sentence] for line in lines), row.name
 
 
-def test_every_command_has_help_with_an_example_in_the_fields_words() -> None:
-    """Not those that say who told whom what; no sentence is cut off where commands are listed."""
+def test_every_help_page_has_an_example_whole_descriptions_and_no_colloquial_verbs() -> None:
     pages, context = [], click.Context(typer.main.get_command(app))
     waiting = [(context.command, context)]
     for command, above in waiting:
@@ -40,14 +39,14 @@ def test_every_command_has_help_with_an_example_in_the_fields_words() -> None:
     assert [one[0] for one in found if one] == []
 
 
-def test_a_command_is_imported_when_it_is_used() -> None:
+def test_the_command_line_imports_no_large_package_before_a_command_is_used() -> None:
     names = "('numpy', 'zenoh', 'rich')"
-    said = f"import sys, lowfc.programs.cli.main; print(*(name for name in {names} if name in sys.modules))"
-    done = subprocess.run([sys.executable, "-c", said], capture_output=True, text=True, check=True)
+    code = f"import sys, lowfc.programs.cli.main; print(*(name for name in {names} if name in sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "\n"
 
 
-def test_a_name_that_is_none_is_answered_with_the_nearest() -> None:
+def test_the_error_of_an_unknown_command_suggests_the_nearest() -> None:
     group = typer.main.get_command(app)
     with pytest.raises(Exception, match="Did you mean 'sim-loop'"), group.make_context("lowfc", ["sim-lop"]) as context:
         group.resolve_command(context, ["sim-lop"])  # type: ignore[attr-defined]
@@ -71,7 +70,7 @@ class Found(Result):
     missing: float | None = figure("missing", default=None)
 
 
-def test_a_result_is_text_and_json_of_the_same_fields() -> None:
+def test_text_and_json_of_a_result_have_the_same_fields() -> None:
     modes = [Mode(noll=2, gain=0.5), Mode(noll=11, gain=None)]
     found = Found(rate_hz=250, good=True, noll=[2, 11], noise_nm=[1, 12.25], modes=modes)
     assert found.text().splitlines() == [

@@ -1,4 +1,4 @@
-"""A run in one process, in real time: controller and mirror as they are, the toy's frames, a recorder that answers."""
+"""A run in one process, in real time: real controller and mirror, the toy's frames, a stand-in for the recorder."""
 
 import threading
 import time
@@ -43,9 +43,9 @@ class LiveRun:
     """The run.
 
     Attributes:
-        asked: requests as the controller published them, but for those of consoles that begin.
-        recorded: what was asked of the recorder.
-        flux: of the star, as the calibration expects it at 1.
+        asked: requests as published by the controller, without those that a console sends at its start.
+        recorded: names of the requests to the recorder.
+        flux: flux of the star over that of the calibration.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -53,10 +53,10 @@ class LiveRun:
         self.asked: list[wire.Request] = []
         self.recorded: list[str] = []
         self.flux = 1.0
-        observer = self.bus("observer")
-        observer.subscribe(REQUEST, self._note)
+        monitor = self.bus("monitor")
+        monitor.subscribe(REQUEST, self._add_request)
         mirror_states: list[object] = []
-        observer.subscribe(MIRROR_STATE, mirror_states.append)
+        monitor.subscribe(MIRROR_STATE, mirror_states.append)
         self.bus("recorder").queryable(RECORD_KEY.format(name="*"), self._record)
         self.services = [
             Service(name, RUN, self.clock, self.bus(name)) for name in ("controller", "mirror-dm", "camera")
@@ -75,10 +75,10 @@ class LiveRun:
             thread.start()
         until(lambda: mirror_states)
 
-    def _note(self, sample: Sample) -> None:
-        asked = wire.Request.FromString(sample.payload)
-        if asked.name != "configuration":
-            self.asked.append(asked)
+    def _add_request(self, sample: Sample) -> None:
+        request = wire.Request.FromString(sample.payload)
+        if request.name != "configuration":
+            self.asked.append(request)
 
     def bus(self, role: str) -> MemoryBus:
         return MemoryBus(self.hub, role, self.clock)

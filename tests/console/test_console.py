@@ -1,4 +1,4 @@
-"""The console: every button by its key against a running loop, what it shows, and what it says when it is cut off."""
+"""The console: every button by its key against a running loop, its display, and the loss of the connection."""
 
 import asyncio
 import contextlib
@@ -35,8 +35,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveRun]:
 
 
 @pytest.fixture(autouse=True)
-def _nobody_waits_for_a_process_at_rest(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Textual does after each key, for 2 s at most; with the loop in it, a process is never at rest."""
+def _no_wait_for_idle(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Textual waits for an idle process after each key, up to 2 s; this process, with the loop in it, is never idle."""
 
     async def pause(*_: float) -> None:
         await asyncio.sleep(0)
@@ -68,9 +68,9 @@ class Screen:
     def text(self, name: str) -> str:
         return str(self.app.screen_stack[0].query_one(f"#{name}").render())
 
-    async def until(self, met: Callable[[], object]) -> None:
+    async def until(self, condition: Callable[[], object]) -> None:
         for _ in range(round(PATIENCE_S / 0.01)):
-            if met():
+            if condition():
                 return
             await self.pilot.pause(0.01)
         raise AssertionError(f"waited in vain; the answer is {self.text('answer')!r}")
@@ -82,15 +82,15 @@ class Screen:
         await self.pilot.press("enter")
 
 
-def played(run: LiveRun, scenario: Callable[[Screen], Awaitable[None]]) -> None:
-    async def whole() -> None:
+def operate(run: LiveRun, scenario: Callable[[Screen], Awaitable[None]]) -> None:
+    async def with_console() -> None:
         async with console(run) as screen:
             await scenario(screen)
 
-    asyncio.run(whole())
+    asyncio.run(with_console())
 
 
-PRESSED: dict[str, tuple[tuple[str, ...], dict[str, object]]] = {
+BUTTONS: dict[str, tuple[tuple[str, ...], dict[str, object]]] = {
     "open": ((), {"name": "open"}),
     "close": ((), {"name": "close"}),
     "pause": ((), {"name": "pause"}),
@@ -111,8 +111,8 @@ PRESSED: dict[str, tuple[tuple[str, ...], dict[str, object]]] = {
     "safe": ((), {"name": "safe"}),
     "clear": ((), {"name": "clear"}),
 }
-"""What is typed for each button, and what the controller publishes then."""
-ORDER = ("open", *(name for name in PRESSED if name not in ("open", "close", "pause")), "close", "pause")
+"""Input typed for each button, and the fields of the request that the controller then publishes."""
+ORDER = ("open", *(name for name in BUTTONS if name not in ("open", "close", "pause")), "close", "pause")
 TASKS = {
     "dark": "calibrate dark --dark-taken --frames 400 --out",
     "reference": "calibrate reference --frames 1000 --out",
@@ -120,10 +120,12 @@ TASKS = {
 }
 
 
-def test_every_button_by_its_key(run: LiveRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_key_of_every_button_sends_its_request(
+    run: LiveRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from lowfc.programs.console.actions import EVERY
 
-    assert {*PRESSED, *TASKS} == set(EVERY)
+    assert {*BUTTONS, *TASKS} == set(EVERY)
     monkeypatch.chdir(tmp_path)
     np.save("shape.npy", np.full(GRID, 3.0))
     law_file.save(LAW, Path("law.fits"))
@@ -131,27 +133,27 @@ def test_every_button_by_its_key(run: LiveRun, tmp_path: Path, monkeypatch: pyte
 
     async def scenario(screen: Screen) -> None:
         for name in ORDER:
-            typed, wanted = PRESSED[name]
+            typed, expected = BUTTONS[name]
             before = len(run.asked)
             await screen.pilot.press(EVERY[name].key)
             if typed:
                 await screen.fill(*typed)
             elif EVERY[name].confirm:
                 await screen.until(lambda: len(screen.app.screen_stack) == 2)
-                assert len(run.asked) == before, "nothing is asked before the question is answered"
+                assert len(run.asked) == before, "no request before the question is answered"
                 await screen.pilot.press("enter")
             await screen.until(
                 lambda name=name: (
                     screen.text("answer").startswith(f"{name}: ") and not screen.text("answer").endswith(": requested")
                 )
             )
-            if wanted:
-                asked = run.asked[-1]
-                assert asked.accepted, asked.reply
-                assert {field: getattr(asked, field) for field in wanted} == wanted
-                assert asked.requester.endswith(f"(process {os.getpid()})")
-            assert len(screen.app.screen_stack) == 1, "a form that was answered closes"
-        laws = [asked for asked in run.asked if asked.name == "law"]
+            if expected:
+                request = run.asked[-1]
+                assert request.accepted, request.reply
+                assert {field: getattr(request, field) for field in expected} == expected
+                assert request.requester.endswith(f"(process {os.getpid()})")
+            assert len(screen.app.screen_stack) == 1, "a form closes when its request is accepted"
+        laws = [request for request in run.asked if request.name == "law"]
         assert [one.HasField("law") for one in laws] == [True, False]
         assert run.recorded == ["stop", "start", "stop"]
         await screen.until(lambda: "pause (" in screen.text("log"))
@@ -161,10 +163,10 @@ def test_every_button_by_its_key(run: LiveRun, tmp_path: Path, monkeypatch: pyte
         await screen.pilot.press("c")
         await screen.until(lambda: "CLOSED" in screen.text("tiles"))
 
-    played(run, scenario)
+    operate(run, scenario)
 
 
-def test_what_is_refused_says_why_in_the_form_and_at_the_button(run: LiveRun) -> None:
+def test_the_reason_of_a_refusal_is_in_the_form_and_its_button_turns_red(run: LiveRun) -> None:
     async def scenario(screen: Screen) -> None:
         await screen.pilot.press("g")
         await screen.fill("much", "2")
@@ -181,10 +183,10 @@ def test_what_is_refused_says_why_in_the_form_and_at_the_button(run: LiveRun) ->
         await screen.fill("0.1", "")
         await screen.until(lambda: not button.has_class("refused"))
 
-    played(run, scenario)
+    operate(run, scenario)
 
 
-def test_safe_is_one_key_even_in_a_form_and_one_large_button(run: LiveRun) -> None:
+def test_safe_is_requested_by_s_by_its_button_and_by_f12_in_a_form(run: LiveRun) -> None:
     async def scenario(screen: Screen) -> None:
         for press in (lambda: screen.pilot.press("S"), lambda: screen.pilot.click("#safe")):
             before = len(run.asked)
@@ -201,10 +203,10 @@ def test_safe_is_one_key_even_in_a_form_and_one_large_button(run: LiveRun) -> No
         await screen.pilot.click("#close")
         await screen.until(lambda: run.asked[-1].name == "close")
 
-    played(run, scenario)
+    operate(run, scenario)
 
 
-def test_the_knobs_turn_all_gains_or_those_of_an_order(run: LiveRun) -> None:
+def test_a_gain_knob_scales_the_gains_of_all_modes_or_of_one_radial_order(run: LiveRun) -> None:
     def gain() -> list[float]:
         return list(run.asked[-1].values) if run.asked[-1].name == "gain" else []
 
@@ -216,7 +218,7 @@ def test_the_knobs_turn_all_gains_or_those_of_an_order(run: LiveRun) -> None:
         await screen.pilot.press(*["right"] * 4)
         await screen.until(lambda: gain() == pytest.approx([0.7, 0.7, 0.07]))
         turned = [one.values[0] for one in run.asked[before:]]
-        assert turned == sorted(turned), "asked in the order of the keys"
+        assert turned == sorted(turned), "requested in the order of the keys"
         await screen.until(lambda: "0.07-0.7" in screen.text("gains"))
         await screen.pilot.press("down", "left")
         await screen.until(lambda: gain() == pytest.approx([0.65, 0.65]))
@@ -229,14 +231,14 @@ def test_the_knobs_turn_all_gains_or_those_of_an_order(run: LiveRun) -> None:
         await screen.pilot.press("u")
         await screen.until(lambda: any(one.text == "auto" and one.accepted for one in run.asked))
         await screen.until(lambda: "auto" in screen.text("gains"))
-        await screen.pilot.press("g")  # automatic gains would ask for themselves in tests to come
+        await screen.pilot.press("g")  # automatic gains would send requests during the next tests
         await screen.fill("0.5 0.5 0.05", "2-4")
         await screen.until(lambda: "auto" not in screen.text("gains"))
 
-    played(run, scenario)
+    operate(run, scenario)
 
 
-def test_what_is_typed_while_a_form_is_drawn_is_in_it(run: LiveRun) -> None:
+def test_keys_typed_while_a_form_opens_are_entered_in_it(run: LiveRun) -> None:
     async def scenario(screen: Screen) -> None:
         before = len(run.asked)
         for key in ("n", "o", "s", "escape", "g", "0", ".", "2", "tab", "2", "tab", "shift+tab", "enter"):
@@ -245,10 +247,10 @@ def test_what_is_typed_while_a_form_is_drawn_is_in_it(run: LiveRun) -> None:
         (gain,) = run.asked[before:]
         assert (gain.name, list(gain.values), list(gain.modes)) == ("gain", [pytest.approx(0.2)], [2])
 
-    played(run, scenario)
+    operate(run, scenario)
 
 
-def test_an_event_that_comes_again_and_again_has_one_line() -> None:
+def test_a_repeated_event_has_one_line_with_its_count() -> None:
     from lowfc.programs.console.history import History
 
     history = History()
@@ -260,10 +262,10 @@ def test_an_event_that_comes_again_and_again_has_one_line() -> None:
     assert [line.split()[1:4] for line in lines[:2]] == [["20", "x", "controller:"]] * 2
     assert "open (" in lines[2]
     history.add(EVENTS["LIMIT_HIT"].log("controller", 60 * 10**9, reason="SLEW"))
-    assert len(history.last(5).plain.splitlines()) == 4, "later it is news again"
+    assert len(history.last(5).plain.splitlines()) == 4, "a repetition after 10 s has its own line"
 
 
-def test_sentences_name_keys_in_place_of_commands_and_ranges_in_place_of_lists() -> None:
+def test_sentences_have_keys_in_place_of_commands_and_ranges_in_place_of_lists() -> None:
     from lowfc.programs.console.phrases import phrased
 
     assert phrased("`lowfc ctl clear` first, when it is safe") == "clear (key k) first, when it is safe"
@@ -278,7 +280,7 @@ def test_tasks_are_commands_with_the_options_of_their_form(run: LiveRun, monkeyp
     from lowfc.programs.console.actions import EVERY
 
     started: list[list[str]] = []
-    monkeypatch.setattr(app, "Task", lambda name, words: started.append(words) or Ended(name))
+    monkeypatch.setattr(app, "Task", lambda name, words: started.append(words) or FinishedTask(name))
 
     async def scenario(screen: Screen) -> None:
         for name, words in TASKS.items():
@@ -286,26 +288,26 @@ def test_tasks_are_commands_with_the_options_of_their_form(run: LiveRun, monkeyp
             await screen.until(lambda: len(screen.app.screen_stack) == 2)
             await screen.pilot.press("enter")
             await screen.until(lambda name=name: screen.text("answer") == f"{name}: done")
-            said = " ".join(started[-1])
-            assert said.startswith(f"{words} calibration-")
-            assert said.endswith(f".fits --load --run {RUN}")
+            command = " ".join(started[-1])
+            assert command.startswith(f"{words} calibration-")
+            assert command.endswith(f".fits --load --run {RUN}")
 
-    played(run, scenario)
+    operate(run, scenario)
 
 
-class Ended:
+class FinishedTask:
     status = 0
 
     def __init__(self, name: str) -> None:
         self.sentence = f"{name}: done"
 
 
-def test_tasks_are_processes_of_their_own() -> None:
+def test_a_task_runs_in_its_own_session_and_reports_its_end() -> None:
     from lowfc.programs.console.task import Task
 
-    wanted = (["--version"], 0, "t: done; 0."), (["no-such"], 2, "t failed: ")
-    for words, status, sentence in wanted:
-        task = Task("t", words)
+    cases = (["--version"], 0, "t: done; 0."), (["no-such"], 2, "t failed: ")
+    for arguments, status, sentence in cases:
+        task = Task("t", arguments)
         assert task.sentence.startswith("t: running for ")
         assert os.getsid(task._process.pid) == task._process.pid, "neither Ctrl-C nor a lost terminal reaches it"
         until(lambda task=task: task.status is not None)
@@ -314,7 +316,7 @@ def test_tasks_are_processes_of_their_own() -> None:
         task.output.unlink()
 
 
-def test_two_consoles_see_what_the_other_asked(run: LiveRun) -> None:
+def test_a_request_is_in_the_log_of_every_console(run: LiveRun) -> None:
     async def both() -> None:
         async with console(run) as one, console(run) as other:
             await one.pilot.press("n")
@@ -326,43 +328,41 @@ def test_two_consoles_see_what_the_other_asked(run: LiveRun) -> None:
 
 
 def test_errors_ring_the_bell_until_it_is_muted(run: LiveRun, monkeypatch: pytest.MonkeyPatch) -> None:
-    rung: list[str] = []
+    bells: list[str] = []
 
     async def scenario(screen: Screen) -> None:
-        monkeypatch.setattr(screen.app, "bell", lambda: rung.append("bell"))
+        monkeypatch.setattr(screen.app, "bell", lambda: bells.append("bell"))
         events = run.bus("recorder").publisher(EVENT)
 
-        async def happens(name: str, **details: object) -> None:
+        async def publish(name: str, **details: object) -> None:
             events.put(EVENTS[name].log("recorder", run.clock.now_ns(), **details).SerializeToString())
             await screen.until(lambda: name in screen.text("log"))
 
-        await happens("DISK_SLOW", stall_s=2.0, waiting=3)
-        assert rung == []
-        await happens("RECORDING_FAILED", why="no space")
-        assert rung == ["bell"]
+        await publish("DISK_SLOW", stall_s=2.0, waiting=3)
+        assert bells == []
+        await publish("RECORDING_FAILED", why="no space")
+        assert bells == ["bell"]
         await screen.pilot.press("m")
-        await happens("MESSAGES_LOST", count=3, topic="lowfc/event")
-        assert rung == ["bell"]
+        await publish("MESSAGES_LOST", count=3, topic="lowfc/event")
+        assert bells == ["bell"]
 
-    played(run, scenario)
+    operate(run, scenario)
 
 
-def test_a_console_that_is_cut_off_says_so_and_shows_no_old_figures(
-    run: LiveRun, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_disconnected_console_reports_it_and_hides_the_figures(run: LiveRun, monkeypatch: pytest.MonkeyPatch) -> None:
     async def scenario(screen: Screen) -> None:
-        with monkeypatch.context() as cut:
-            cut.setattr(run.hub, "lose", lambda role, key, envelope: role == "operator")
+        with monkeypatch.context() as disconnected:
+            disconnected.setattr(run.hub, "lose", lambda role, key, envelope: role == "operator")
             await screen.until(lambda: screen.text("verdict").startswith("NOT CONNECTED"))
             assert not screen.app.screen.query_one("#tiles").visible
             assert not screen.app.screen.query_one("#gains").visible
         await screen.until(lambda: not screen.text("verdict").startswith("NOT CONNECTED"))
         assert screen.app.screen.query_one("#tiles").visible
 
-    played(run, scenario)
+    operate(run, scenario)
 
 
-def test_a_console_whose_terminal_is_gone_ends() -> None:
+def test_a_console_without_its_terminal_ends() -> None:
     from lowfc.programs.console.app import READ_PERIOD_S, Console
 
     gone, clock = threading.Event(), HostClock()
@@ -379,22 +379,22 @@ def test_a_console_whose_terminal_is_gone_ends() -> None:
     asyncio.run(scenario())
 
 
-def test_the_words_are_those_of_the_tiles() -> None:
+def test_verdict_and_tiles_have_the_text_of_the_view() -> None:
     from lowfc.programs.console import panels
     from lowfc.programs.console.feed import Reading
 
     stage = Stage()
     stage.begin()
     stage.flux = 0.01
-    found = stage.run(2.0)
-    none = np.zeros(0, np.float32)
-    reading = Reading(0.1, stage.watcher.state(), found, None, none, [], [], [])
-    assert panels.verdict(reading, RUN) == (found.level, f"CHECK  {found.headline}")
-    for line, tile in zip(panels.tiles(reading), found.tiles, strict=True):
+    verdict = stage.run(2.0)
+    no_command = np.zeros(0, np.float32)
+    reading = Reading(0.1, stage.watcher.state(), verdict, None, no_command, [], [], [])
+    assert panels.verdict(reading, RUN) == (verdict.level, f"CHECK  {verdict.headline}")
+    for line, tile in zip(panels.tiles(reading), verdict.tiles, strict=True):
         assert all(word in line.plain for word in (tile.title, tile.value, tile.detail))
 
 
-def test_figures_of_any_size_fit_their_place() -> None:
+def test_pictures_and_sparklines_have_a_fixed_size() -> None:
     from lowfc.programs.console.panels import _PIXELS, halves, reduced, sparkline
 
     assert sparkline([1.0, float("nan"), 0.5, 0.0], 3) == " █▁"

@@ -1,4 +1,4 @@
-"""The console as a process: how it ends, and what it leaves running."""
+"""The console as a process: it ends on a signal, and a calibration started in it continues."""
 
 import signal
 from pathlib import Path
@@ -23,7 +23,7 @@ start_mode = "open"
 """
 
 
-def test_a_calibration_outlives_a_console_that_is_killed(tmp_path: Path) -> None:
+def test_a_calibration_continues_when_its_console_is_killed(tmp_path: Path) -> None:
     (tmp_path / "bench.toml").write_text(CONFIG)
     process = start(tmp_path, "sim-loop", "--config", "bench.toml", "--run", "outlived", "--duration", "600")
     try:
@@ -40,17 +40,17 @@ def test_a_calibration_outlives_a_console_that_is_killed(tmp_path: Path) -> None
                 until(lambda: reserved(loop), 60)
                 console.process.kill()
                 assert console.process.wait(10) == -signal.SIGKILL
-                assert reserved(loop), "it goes on"
+                assert reserved(loop), "the calibration continues"
             until(lambda: list(tmp_path.glob("calibration-*.fits")), 200)
             until(lambda: not reserved(loop))
-            (made,) = tmp_path.glob("calibration-*.fits")
-            assert calibration_file.load(made).noll == loop.calibration().noll
+            (file,) = tmp_path.glob("calibration-*.fits")
+            assert calibration_file.load(file).noll == loop.calibration().noll
     finally:
         interrupt(process)
 
 
 def state(loop: Client) -> wire.ControllerState:
-    """What the controller says of itself; nothing where it does not answer yet."""
+    """State of the controller; empty while it does not answer."""
     try:
         return loop.status().state or wire.ControllerState()
     except BusError:

@@ -1,4 +1,4 @@
-"""Percentiles without keeping what was counted."""
+"""Percentiles from a histogram of durations."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import pytest
 from lowfc.control.durations import RATIO, Durations
 
 
-def test_percentiles_are_numpys_to_a_bin() -> None:
+def test_percentiles_agree_with_numpys_to_one_bin() -> None:
     rng = np.random.default_rng(6)
     values_ns = (rng.gamma(2.0, 100_000, 5000)).astype(int)
     durations = Durations()
@@ -20,7 +20,7 @@ def test_percentiles_are_numpys_to_a_bin() -> None:
 
 
 @pytest.mark.parametrize(("duration_ns", "expected_ns"), [(-5, 0), (0, 0), (10**13, 10**13)])
-def test_what_is_outside_the_bins_is_counted_at_their_ends(duration_ns: int, expected_ns: int) -> None:
+def test_durations_beyond_the_bins_are_counted_in_the_outermost_ones(duration_ns: int, expected_ns: int) -> None:
     durations = Durations()
     durations.add(duration_ns)
     assert durations.count == 1
@@ -28,5 +28,5 @@ def test_what_is_outside_the_bins_is_counted_at_their_ends(duration_ns: int, exp
     assert durations.percentiles_ns(0.5) == [expected_ns]
 
 
-def test_nothing_counted_is_zero() -> None:
+def test_percentiles_without_durations_are_zero() -> None:
     assert Durations().percentiles_ns(0.5, 0.99) == [0, 0]
