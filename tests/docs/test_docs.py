@@ -241,7 +241,7 @@ def test_the_logs(tmp_path: Path) -> None:
     assert "400 frames, commands identical, largest difference 0 nm" in printed[1]
     assert "what if" in printed[2]
     assert "published" in printed[3]
-    assert "is whole" in printed[4]
+    assert "is intact" in printed[4]
     assert "1 in 10 frames and mirror states" in printed[7]
     assert "digest " in printed[8]
     assert "-every-10.mcap" not in printed[8], "`last` is the recorded log"

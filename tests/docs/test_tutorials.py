@@ -51,7 +51,7 @@ def followed(folder: Path, page: str, *, shorter: bool = False) -> dict[str, str
 
 def tilt_mas(summary: str) -> float:
     """Residual tilt in a summary, mas."""
-    return float(re.findall(r"tilt per axis +(\S+) mas", summary)[0])
+    return float(re.findall(r"tilt per axis +residual (\S+) of", summary)[0])
 
 
 @pytest.mark.parametrize("shorter", [True, pytest.param(False, marks=pytest.mark.slow)])
