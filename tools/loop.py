@@ -46,8 +46,8 @@ def measure() -> Figures:
 LOOP_COLUMNS = {
     "loop": "{name}",
     "rate": "{rate_hz:.1f} Hz",
-    "tilt per axis, mas rms: disturbance": "{tilt_disturbance_mas:.1f}",
-    "residual": "{tilt_residual_mas:.2f}",
+    "tilt disturbance, mas rms per axis": "{tilt_disturbance_mas:.1f}",
+    "tilt residual, mas rms per axis": "{tilt_residual_mas:.2f}",
     "predicted residual": "{tilt_predicted_mas:.2f}",
     **{
         f"{title}, us": " / ".join(f"{{latency_us[{stage}][{p}]:.0f}}" for p in ("p50", "p99", "p99_9"))
@@ -62,8 +62,8 @@ SHORT_COLUMNS = {
     "simulated loop, reaction-wheel jitter": "{rate_hz:.0f} frames per second",
     "frame to command, p50 / p99, us": "{latency_us[frame_to_command][p50]:.0f} / "
     "{latency_us[frame_to_command][p99]:.0f}",
-    "tilt per axis, mas rms: disturbance": "{tilt_disturbance_mas:.1f}",
-    "residual": "{tilt_residual_mas:.1f}",
+    "tilt disturbance, mas rms per axis": "{tilt_disturbance_mas:.1f}",
+    "tilt residual, mas rms per axis": "{tilt_residual_mas:.1f}",
 }
 
 

@@ -15,7 +15,7 @@ _POLL_S = 0.002
 
 
 class MirrorWatch:
-    """Reports of the mirrors of a run since construction, which returns once a first mirror has reported.
+    """States of a run's mirrors received since construction, which returns after the first one.
 
     Attributes:
         frame_sequence: frame of the newest command that every known mirror has applied.

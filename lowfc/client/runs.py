@@ -12,7 +12,7 @@ def running() -> list[str]:
 
 
 def the_run(name: str | None) -> str:
-    """Find the run with that name or unambiguous beginning of a name, or the only run; any running process suffices.
+    """Find a run by its name or a unique prefix, or the only run without a name; it needs no controller.
 
     Raises:
         BusError: there is no such run, none at all, or more than one to choose from.

@@ -1,6 +1,6 @@
 """The mirror's own protection: limits, command timeout and validation of commands, as pure functions.
 
-It trusts no sender and is the same for simulated and real mirrors. The mirror itself is a function `Move`.
+It trusts no sender and is the same for simulated and real mirrors. The driver is passed in as a function, `Move`.
 """
 
 from collections.abc import Callable, Mapping
@@ -55,7 +55,7 @@ class Command:
         actuators_nm: (rows, columns) float32, nm of surface; None if the bytes are not a grid.
         safe: whether it was sent in safe mode.
         clear_id: identity of the operator's last `clear`; a new one permits sequences below the newest received.
-        ahead: whether its sequence starts further ahead of the mirror's clock than allowed.
+        ahead: whether its sender's start time (upper bits of the sequence) is too far ahead of the mirror's clock.
     """
 
     channel: str
@@ -75,7 +75,7 @@ class Status(NamedTuple):
     Attributes:
         driven_nm: (rows, columns) as sent to the driver, before its rounding; always within the limits.
         surface_nm: (rows, columns) positions of the actuators, nm of surface.
-        channels: last actuators of each channel; the mirror applies their sum.
+        channels: last shape (rows, columns) of each command channel, nm of surface; the mirror applies their sum.
         command_nm: modal command of the last command; empty if the mirror's own limits changed it.
         limits_hit: the mirror's own limits that acted on the last command.
         frame_sequence: sequence of the frame of the last command; its time is `time_ns`.

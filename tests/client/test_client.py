@@ -625,7 +625,7 @@ def test_a_recording_is_stopped_and_restarted(bench: Bench) -> None:
         operator.record(False)
     until(lambda: not len(bench.recorder._backlog))
     started = operator.record(True)
-    with pytest.raises(RequestRefusedError, match="it is being recorded already"):
+    with pytest.raises(RequestRefusedError, match="recording is already in progress"):
         operator.record(True)
     second = put(frames, 30)
     operator.record(False)

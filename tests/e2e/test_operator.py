@@ -136,7 +136,7 @@ def _the_rest(night: Night) -> None:
             (lambda: loop.load(loop.calibration()), "the loop is closed"),
             (lambda: loop.note(" "), "1 to"),
             (lambda: loop.ask("dance"), "unknown request 'dance'"),
-            (lambda: loop.record(True), "recorded already"),
+            (lambda: loop.record(True), "already in progress"),
         ):
             with pytest.raises(RequestRefusedError, match=why):
                 ask()

@@ -1,4 +1,4 @@
-"""Reads the images of a stream in turn, robust against everything its writer may do."""
+"""Reads the newest image of a stream; tolerates restarts, crashes and rewrites by its writer."""
 
 import time
 from pathlib import Path

@@ -28,8 +28,8 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on sta
 _LOGS = "Logs (MCAP), finished or not; all files of a recording are one log. `last`: the newest in the log folder."
 Logs = Annotated[list[Path], typer.Argument(help=_LOGS, metavar="LOG...", readable=False, show_default=False)]
 _IfAny = partial(typer.Argument, metavar="[LOG...]", readable=False, show_default=False)
-LogsIfAny = Annotated[list[Path] | None, _IfAny(help=f"{_LOGS} None: a running loop.")]
-LogsOrMeasure = Annotated[list[Path] | None, _IfAny(help=f"{_LOGS} None: a loop that is run for it.")]
+LogsIfAny = Annotated[list[Path] | None, _IfAny(help=f"{_LOGS} Without one: the running loop.")]
+LogsOrMeasure = Annotated[list[Path] | None, _IfAny(help=f"{_LOGS} Without one: a loop started for this measurement.")]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="Configuration file (TOML).", show_default=False)]
 
 

@@ -24,7 +24,7 @@ from lowfc.control.loop.lease import Lease
 from lowfc.control.loop.safety import Limits, LoopMode, Reason, Rejection
 
 SETTLING_FRAMES = 100
-"""Frames for which a new law only observes."""
+"""Frames for which a new linear law is updated but does not drive the mirror."""
 FADING_FRAMES = 100
 """Frames of the cross-fade in which a law takes over."""
 MOST_COASTED = 100
@@ -37,7 +37,7 @@ class Settings:
 
     Attributes:
         limits: limits of the mirror, applied here and again by the mirror.
-        delay_frames: frames from the frame that a command is computed from to the first frame exposed wholly with it.
+        delay_frames: frames from the one measured to the first exposed entirely under the resulting command.
         start_mode: mode once a calibration is loaded: open or closed.
         max_frame_age_ns: age above which a frame is refused.
         frame_timeout_ns: time without frames after which an event is raised and `on_frame_timeout` applies.

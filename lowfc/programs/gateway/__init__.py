@@ -1,1 +1,1 @@
-"""`lowfc gateway`: serve a loop's variables to a control system, and read the control system's as bench values."""
+"""`lowfc gateway`: serve a loop to a control system, and publish its variables on the bus for interlocks."""

@@ -210,7 +210,7 @@ class Recorder:
         if self._failure:
             return f"{self._failure}; start another recorder"
         if not self._paused or not self.service.running:
-            return "it is being recorded already" if self.service.running else "the recorder is ending"
+            return "recording is already in progress" if self.service.running else "the recorder is ending"
         try:
             if short := self._series.shortage():
                 return short

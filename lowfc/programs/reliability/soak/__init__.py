@@ -1,1 +1,1 @@
-"""`lowfc soak`: run the simulated loop for hours; check for growth, drift and loss."""
+"""`lowfc soak`: run the simulated loop for hours; check memory growth, drift of the figures and lost messages."""
