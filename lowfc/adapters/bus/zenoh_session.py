@@ -52,9 +52,14 @@ def session_config(links: Links, role: str, *, monitor: bool = False) -> dict[st
             ],
             "timeout_ms": -1,
             "exit_on_failure": False,
-            # A new process connects to all others itself. Attempts to reach an absent process (such as the recorder)
-            # five times a second each delayed a frame.
-            "retry": {"period_init_ms": 50, "period_max_ms": 4000, "period_increase_factor": 2},
+            "retry": {
+                "period_init_ms": 50,
+                # A new process connects to all others that listen. Attempts to reach an absent one (such as the
+                # recorder) five times a second each delayed a frame. A role without a port cannot be reached: it must
+                # attempt often itself.
+                "period_max_ms": 4000 if role in links.ports else 200,
+                "period_increase_factor": 2,
+            },
         },
         # Opening waits `delay` ms for missing links; running processes are connected within a few ms.
         "scouting": scouting,

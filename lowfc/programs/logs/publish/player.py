@@ -31,9 +31,9 @@ from lowfc.programs.logs.publish.selection import Selection, role_of
 BEHIND_NS = 1_000_000
 """Delay after which a message is counted as behind."""
 
-_LONGEST_SLEEP_NS = 100_000_000
+_MAX_SLEEP_NS = 100_000_000
 _PROGRESS_NS = 200_000_000
-_SETTLE_S = 0.5  # other programs retry their connection at least every 0.2 s
+_SETTLE_S = 0.5  # programs without a port retry their connection every 0.2 s
 _PATIENCE_S = 2.0
 _REORDERING_NS = 2_000_000_000  # by which messages in a log may be out of order
 
@@ -163,8 +163,8 @@ class Player:
 
     def _sleep_until(self, due_ns: int) -> None:
         while (left_ns := due_ns - self._clock.host_ns()) > 0 and self._service.running:
-            time.sleep(min(left_ns, _LONGEST_SLEEP_NS) * 1e-9)
-            if left_ns > _LONGEST_SLEEP_NS:
+            time.sleep(min(left_ns, _MAX_SLEEP_NS) * 1e-9)
+            if left_ns > _MAX_SLEEP_NS:
                 self._service.beat()
 
     def _publisher(self, key: str) -> Publisher | None:
