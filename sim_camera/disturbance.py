@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lowfc.arrays import Array, Complex, Single
-from lowfc.control.laws.law import TIP_TILT
+from lowfc.control.laws.integrator import TIP_TILT
 from sim_camera.wheel import Wheel, walk
 
 BLOCK = 8

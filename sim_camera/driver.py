@@ -20,7 +20,7 @@ from lowfc.contract.envelope import Envelope
 from lowfc.contract.errors import BusError, ConfigurationError
 from lowfc.contract.messages import MIRROR_STATE, TRUTH, timestamp, wire
 from lowfc.control.durations import Durations
-from lowfc.control.laws.law import TIP_TILT
+from lowfc.control.laws.integrator import TIP_TILT
 from lowfc.control.laws.stability import delay_weights
 from lowfc.device import CameraSettings, DriverOptions, Exposure, Puts
 from lowfc.optics.detector.detector import saturation_dn

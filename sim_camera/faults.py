@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 Frame = npt.NDArray[np.uint16]
 
-MOST_FRAMES_LATE = 50
+MAX_FRAMES_LATE = 50
 LOST_SHARE = 0.1
 HOT_SHARE = 0.1
 COSMIC_SHARE = 0.2
@@ -59,7 +59,7 @@ class Fault:
         """Indices of the frames that are published at the end of exposure `index`, the newest first."""
         return tuple(
             frame
-            for frame in range(index, max(index - MOST_FRAMES_LATE, 0) - 1, -1)
+            for frame in range(index, max(index - MAX_FRAMES_LATE, 0) - 1, -1)
             for when in self._due(frame)
             if when == index
         )
@@ -74,7 +74,7 @@ class Fault:
             case Kind.REORDERED:  # in pairs, the second one first
                 return (frame + 1 - (frame - self.first) % 2,)
             case Kind.LATE:
-                return (frame + int(self.random(frame).integers(1, MOST_FRAMES_LATE + 1)),)
+                return (frame + int(self.random(frame).integers(1, MAX_FRAMES_LATE + 1)),)
         return (frame,)
 
     def pixels(self, index: int, frame: Frame, before: Frame, dark: int, highest: int) -> Frame:

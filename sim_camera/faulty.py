@@ -11,7 +11,7 @@ from lowfc.adapters.bus.bus import Publisher
 from lowfc.contract.envelope import Envelope, sequence_of, start_of
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.messages import RawImage, from_timestamp, image
-from sim_camera.faults import MOST_FRAMES_LATE, Fault, Frame, Kind
+from sim_camera.faults import MAX_FRAMES_LATE, Fault, Frame, Kind
 
 EARLIER_S = 3600
 """Time by which the clock is set back in the fault "old-sequence"."""
@@ -42,7 +42,7 @@ class FaultyFrames:
         self._dark, self._highest = round(dark), highest
         self._now_ns = now_ns
         self._before: Frame | None = None
-        self._made: deque[tuple[int, bytes, int]] = deque(maxlen=MOST_FRAMES_LATE + 1)
+        self._made: deque[tuple[int, bytes, int]] = deque(maxlen=MAX_FRAMES_LATE + 1)
         self._index = self._start_s = 0
 
     def put(self, payload: bytes) -> Envelope:

@@ -6,13 +6,13 @@ import numpy as np
 import numpy.typing as npt
 
 from lowfc.arrays import Single
-from lowfc.control.laws.law import TIP_TILT
+from lowfc.control.laws.integrator import TIP_TILT
 from lowfc.optics.chain.added_contrast import by_group, costliest
 from sim_camera.scene import Truth, Wavefront
 
 BLOCK = 500
 """Frames summed together: the second half is correct to this many frames."""
-MOST_BLOCKS = 256
+MAX_BLOCKS = 256
 """Blocks stored; then pairs are merged, so that memory does not grow with the length of the run."""
 
 
@@ -75,7 +75,7 @@ class Figures:
         if self._count == self._block:
             self._blocks.append(self._sums)
             self._sums, self._count = [0.0] * self._values, 0
-        if len(self._blocks) == MOST_BLOCKS:
+        if len(self._blocks) == MAX_BLOCKS:
             pairs = zip(self._blocks[::2], self._blocks[1::2], strict=True)
             self._blocks = [[one + other for one, other in zip(*pair, strict=True)] for pair in pairs]
             self._block *= 2

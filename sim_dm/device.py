@@ -7,11 +7,11 @@ from math import expm1
 import numpy as np
 
 from lowfc.arrays import Single, Whole
-from lowfc.device.guard import Guard, Status
+from lowfc.device.guard import MirrorGuard, Status
 
 
 @dataclass(frozen=True)
-class Device(Guard):
+class Device(MirrorGuard):
     """Properties of the mirror in addition to those of its protection.
 
     Attributes:

@@ -11,12 +11,12 @@ from typing import Any, get_args
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
 from lowfc.client import requests, stream
-from lowfc.contract.codecs.codec import MOST_BYTES
+from lowfc.contract.codecs.codec import MAX_BYTES
 from lowfc.contract.configuration import Acceptance, keys
 from lowfc.contract.messages import CAMERA_STATE, COMMAND, EVENT, FRAME, HEALTH, MIRROR_STATE, SURFACE, Role, Topic
 from lowfc.control.calibration import linearity
 from lowfc.control.laws import transfer_function
-from lowfc.control.laws.stability import LEAST_GAIN_MARGIN, LEAST_PHASE_MARGIN_DEG, LOWEST_GAIN
+from lowfc.control.laws.stability import LOWEST_GAIN, MIN_GAIN_MARGIN, MIN_PHASE_MARGIN_DEG
 from lowfc.control.laws.vibration import FEWEST
 from lowfc.control.loop import guard
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
@@ -40,8 +40,8 @@ _TAKEOVER = (
 _TUNING = (
     ("minimum number of consecutive frames for tuning", FEWEST),
     ("tilt of an open loop above which it is flagged, mas rms per axis", OPTICAL_GAIN_MAS),
-    ("minimum gain margin of an integrator", LEAST_GAIN_MARGIN),
-    ("minimum phase margin of an integrator, deg", LEAST_PHASE_MARGIN_DEG),
+    ("minimum gain margin of an integrator", MIN_GAIN_MARGIN),
+    ("minimum phase margin of an integrator, deg", MIN_PHASE_MARGIN_DEG),
     ("minimum integrator gain", LOWEST_GAIN),
     *_TAKEOVER,
 )
@@ -55,11 +55,11 @@ _GUARD = (
     ("duration of a cross-fade, s", guard.FADED_S),
     ("law is far better: ratio of its mean squared error to the integrator's below", guard.BETTER),
     ("time for which the law must be far better, at first, s", guard.BETTER_S),
-    ("takeovers after which only an operator reactivates the law", guard.MOST_TAKEOVERS),
+    ("takeovers after which only an operator reactivates the law", guard.MAX_TAKEOVERS),
 )
 _ACCEPTANCE = (
     ("rejection: minimum ratio of tolerance to standard error for a line to be evaluated", transfer_function.SURE),
-    ("rejection: minimum fraction of a mode's lines that are evaluated", acceptance_rejection.LEAST_JUDGED),
+    ("rejection: minimum fraction of a mode's lines that are evaluated", acceptance_rejection.MIN_JUDGED),
     ("linearity: amplitudes, times `linear_nm`", *acceptance_linearity.AMPLITUDES),
     ("linearity: standard errors above the limit at which a value fails", linearity.SURE),
     ("capture-range: amplitudes, times the required one", *acceptance_capture.SIZES),
@@ -68,7 +68,7 @@ _ACCEPTANCE = (
 _OPERATING = (
     *_TAKEOVER,
     ("frames or steps that wait for a Python program, at most", stream.WAITING),
-    ("size of a request, at most, MB", MOST_BYTES / 1e6),
+    ("size of a request, at most, MB", MAX_BYTES / 1e6),
 )
 
 

@@ -13,13 +13,13 @@ from threadpoolctl import threadpool_limits
 from lowfc.adapters.files.factory import frame_noise_nm2
 from lowfc.arrays import Array
 from lowfc.contract.configuration import Configuration
+from lowfc.control.laws.integrator import TIP_TILT, Integrator
 from lowfc.control.laws.kalman import lqg
-from lowfc.control.laws.law import TIP_TILT, Law
 from lowfc.control.laws.linear_law import LinearLaw, at_rest
 from lowfc.control.laws.stability import LOWEST_GAIN, highest_gain
 from lowfc.control.laws.tuning import best_gains
 from lowfc.control.laws.vibration import Line, Model
-from lowfc.control.loop.guard import Group, Guard
+from lowfc.control.loop.guard import Group, LawGuard
 from lowfc.control.loop.wording import counted
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from sim_camera.disturbance import LINE_WIDTH, LINES_HZ, LINES_MAS
@@ -73,7 +73,7 @@ LawOf = Callable[[Configuration, Array, ModalBench], tuple[LinearLaw, Array]]
 
 
 def identified_law(config: Configuration, covariance_nm2: Array, bench: ModalBench) -> tuple[LinearLaw, Array]:
-    """Law and gains identified from a log, as by an operator."""
+    """Integrator and gains identified from a log, as by an operator."""
     bench.forget()
     bench.run(_IDENTIFY)
     run, timing = bench.pol(), timing_of(config)
@@ -81,7 +81,7 @@ def identified_law(config: Configuration, covariance_nm2: Array, bench: ModalBen
 
 
 def known_law(config: Configuration, covariance_nm2: Array, bench: ModalBench) -> tuple[LinearLaw, Array]:
-    """Law and gains from the simulation's exact lines, without identification."""
+    """Integrator and gains from the simulation's exact lines, without identification."""
     width = LINE_WIDTH if config.disturbance.preset == "reaction-wheel" else LINE_WIDTH / 1000
     variances_nm2 = (np.array(LINES_MAS) * bench.nm_per_mas) ** 2
     lines = tuple(Line(hz, width * hz, nm2) for hz, nm2 in zip(LINES_HZ, variances_nm2.tolist(), strict=True))
@@ -133,9 +133,9 @@ def cost_us(law: LinearLaw) -> dict[str, float]:
     """Least time that the guard adds to a frame, while the law drives and while it is virtual."""
     modes = len(law.noll)
     rest, value_nm = np.zeros(modes, np.float32), np.ones(modes, np.float32)
-    loop = Law(rest + np.float32(0.5), rest, rest + np.float32(150)), ((0, np.float32(1)),), (rest,)
-    driving, x = Guard.of(law), at_rest(law)
-    virtual = Guard.of(law, [Group(True, driving.spans.faded, 1)] * 2)
+    loop = Integrator(rest + np.float32(0.5), rest, rest + np.float32(150)), ((0, np.float32(1)),), (rest,)
+    driving, x = LawGuard.of(law), at_rest(law)
+    virtual = LawGuard.of(law, [Group(True, driving.spans.faded, 1)] * 2)
     found = {}
     for name, guard in (("driving", driving), ("virtual", virtual)):
         begun, _ = guard.judged(law, x, *loop, value_nm, value_nm, limited=False)

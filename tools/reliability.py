@@ -45,9 +45,9 @@ def measure_again(figures: Figures, seed: int, names: Sequence[str]) -> None:
     """Run cases of a seed and store their results: those named, or those without a result."""
     run = next(one for one in figures["runs"] if one["seed"] == seed)
     kept = {case["name"]: case for case in run["cases"] if case["name"] in CASES}
-    if wanted := list(names) or [name for name in CASES if name not in kept]:
+    if missing := list(names) or [name for name in CASES if name not in kept]:
         about = host()
-        found = _run(" ".join(f"--case {name}" for name in wanted), seed)["cases"]
+        found = _run(" ".join(f"--case {name}" for name in missing), seed)["cases"]
         figures.setdefault("later", {}).update(dict.fromkeys((case["name"] for case in found), about))
         kept |= {case["name"]: case for case in found}
     run["cases"] = list(kept.values())

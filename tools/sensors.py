@@ -100,8 +100,8 @@ def in_the_loop(name: str, preset: str) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "FILE").write_text(GAINS)
         run = json_of(f"{COMMAND.replace('NAME', name)} --disturbance {preset}", folder)
-    wanted = ("disturbance_rms_nm", "residual_rms_nm", "tilt_disturbance_mas", "tilt_residual_mas")
-    return {key: run[key] for key in wanted}
+    keys = ("disturbance_rms_nm", "residual_rms_nm", "tilt_disturbance_mas", "tilt_residual_mas")
+    return {key: run[key] for key in keys}
 
 
 def render(figures: Figures) -> str:

@@ -75,7 +75,7 @@ def _gains(sensor: str, magnitude: float) -> tuple[float, ...]:
     bench = Bench(config, calibrated(config))
     bench.run(round(_UNTIL_GAINS_S * RATE_HZ))
     assert bench.state.loop is not None  # noqa: S101  # a calibration is loaded
-    return tuple(bench.state.loop.law.gain.tolist())
+    return tuple(bench.state.loop.integrator.gain.tolist())
 
 
 def _residual(sensor: str, magnitude: float, keys: dict[str, Any], seconds: float, again: bool) -> Figures:

@@ -171,8 +171,8 @@ def _off(folder: Path, frames: int) -> float:
     step, payload = NumpyStep(problem), b""
     for number in range(1, frames + 1):
         payload = step.command(problem.frame(number).tobytes())
-    wanted, found = np.frombuffer(payload, np.float32), np.fromfile(folder / LAST, np.float32)
-    return float(np.abs(found - wanted).max() / np.abs(wanted).max())
+    expected, found = np.frombuffer(payload, np.float32), np.fromfile(folder / LAST, np.float32)
+    return float(np.abs(found - expected).max() / np.abs(expected).max())
 
 
 def _lowfc(kernel: str, rules: argparse.Namespace, priority: int) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from lowfc.contract.messages import Role
 
 def running() -> list[str]:
     """Names of the runs on this host whose controller is listening; directories of killed runs do not count."""
-    return [name for name, roles in living().items() if Role.CONTROLLER in roles]
+    return [name for name, roles in live_runs().items() if Role.CONTROLLER in roles]
 
 
 def the_run(name: str | None) -> str:
@@ -17,7 +17,7 @@ def the_run(name: str | None) -> str:
     Raises:
         BusError: there is no such run, none at all, or more than one to choose from.
     """
-    runs = living(name)
+    runs = live_runs(name)
     if name in runs:
         return name
     found = [run for run in runs if run.startswith(name or "")]
@@ -39,9 +39,9 @@ def the_known_run(name: str | None) -> str:
     return name if name is not None and (runtime_base() / name).is_dir() else the_run(name)
 
 
-def nobody_yet(name: str) -> str:
+def waiting_message(name: str) -> str:
     """Message while a process is alone in its run on this host; empty once another process is running."""
-    runs = living()
+    runs = live_runs()
     if name in runs:
         return ""
     there = f"running: {_listed(runs)}{nearest(name, runs)}" if runs else "no other loop of yours is running"
@@ -50,11 +50,11 @@ def nobody_yet(name: str) -> str:
 
 def starting(name: str, role: Role) -> bool:
     """Whether `lowfc sim-loop` has started this run but its process of this role is not listening yet."""
-    roles = living().get(name, set())
+    roles = live_runs().get(name, set())
     return Role.LAUNCHER in roles and role not in roles
 
 
-def living(required: str | None = None) -> dict[str, set[str]]:
+def live_runs(required: str | None = None) -> dict[str, set[str]]:
     """Runs with a listening process, and their roles; a damaged run is omitted unless it is the required one.
 
     Raises:

@@ -37,9 +37,9 @@ from lowfc.control.kernel.tables import KernelName
 
 MIN_FRAME_AGE_NS, MIN_FRAME_TIMEOUT_NS = 20_000_000, 50_000_000
 """Minimum of max_frame_age_ms and of frame_timeout_ms if the configuration does not set them."""
-MOST_FAULTS = 20
+MAX_FAULTS = 20
 """Most faults of a file that an error explains."""
-_LONGEST_KEY = 100  # characters of an unknown key that are compared with the known ones
+_MAX_KEY_LENGTH = 100  # characters of an unknown key that are compared with the known ones
 _ALTERNATIVE = re.compile(r"\.(?:constrained-\w+|literal\[[^]]*\])")  # appended by pydantic to a key of two types
 
 
@@ -188,7 +188,7 @@ class Realtime(Section):
 
 
 class Configuration(Section):
-    """All sections."""
+    """The configuration: a field per section."""
 
     seed: int = Field(1, ge=0, lt=2**63)
     """Seed of every random number in the simulation."""
@@ -298,7 +298,7 @@ def load(
     data: dict[str, Any] = {}
     if path is not None:
         try:
-            data = toml_text.parsed(input_file.read_whole(path, toml_text.LARGEST_BYTES))
+            data = toml_text.parsed(input_file.read_whole(path, toml_text.MAX_BYTES))
             for text in renamed_keys(data):
                 remark(f"{path}: {text}")
         except FileNotFoundError:
@@ -314,9 +314,9 @@ def load(
         return Configuration.model_validate(data)
     except ValidationError as error:
         faults = error.errors()
-        lines = [explain(detail) for detail in faults[:MOST_FAULTS]]
-        if len(faults) > MOST_FAULTS:
-            lines.append(f"and {len(faults) - MOST_FAULTS} more")
+        lines = [explain(detail) for detail in faults[:MAX_FAULTS]]
+        if len(faults) > MAX_FAULTS:
+            lines.append(f"and {len(faults) - MAX_FAULTS} more")
         where = f"{path}: " if path is not None else ""
         raise ConfigurationError("\n".join(f"{where}{line}" for line in lines)) from None
 
@@ -343,12 +343,12 @@ def keys(section: type[BaseModel] = Configuration, prefix: str = "") -> dict[str
     return found
 
 
-def _nearest(wanted: str, known: Sequence[str]) -> str:
+def _nearest(key: str, known: Sequence[str]) -> str:
     """The known key most similar to a wrong one, or else a key with a similar name in another section."""
     names = {one.rpartition(".")[2]: one for one in reversed(known)}
-    nearest = difflib.get_close_matches(wanted, known, 1, 0.0)
-    elsewhere = difflib.get_close_matches(wanted.rpartition(".")[2], names, 1, 0.75)
-    similar = difflib.get_close_matches(wanted, known, 1, 0.8)
+    nearest = difflib.get_close_matches(key, known, 1, 0.0)
+    elsewhere = difflib.get_close_matches(key.rpartition(".")[2], names, 1, 0.75)
+    similar = difflib.get_close_matches(key, known, 1, 0.8)
     return next(iter(similar or [names[one] for one in elsewhere] or nearest))
 
 
@@ -356,10 +356,10 @@ def explain(detail: Any) -> str:
     """One of pydantic's errors as a message for the user."""
     key = _ALTERNATIVE.sub("", ".".join(str(part) for part in detail["loc"]))
     if detail["type"] == "missing":
-        return printable(f"{key[:_LONGEST_KEY]} is missing")
+        return printable(f"{key[:_MAX_KEY_LENGTH]} is missing")
     if detail["type"] == "extra_forbidden":
         known = [*keys(), *Configuration.model_fields, *keys(InterlockSection, "interlocks.")]
         plain = ".".join(part for part in detail["loc"] if isinstance(part, str))
-        return f"unknown key {brief(key)}; the nearest known one is {_nearest(plain[:_LONGEST_KEY], known)!r}"
+        return f"unknown key {brief(key)}; the nearest known one is {_nearest(plain[:_MAX_KEY_LENGTH], known)!r}"
     message = detail["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
-    return printable(f"{key[:_LONGEST_KEY]} = {brief(detail['input'])}: {message[:300]}" if key else message)
+    return printable(f"{key[:_MAX_KEY_LENGTH]} = {brief(detail['input'])}: {message[:300]}" if key else message)

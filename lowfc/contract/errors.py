@@ -58,7 +58,7 @@ def brief(value: object) -> str:
         return "a number of too many digits"
 
 
-def nearest(wanted: str, known: Iterable[str]) -> str:
+def nearest(name: str, known: Iterable[str]) -> str:
     """Suffix of a "no such name" error that suggests the nearest known name; empty if none is near."""
-    close = get_close_matches(wanted, list(known), n=1)
+    close = get_close_matches(name, list(known), n=1)
     return f" (did you mean {close[0]!r}?)" if close else ""

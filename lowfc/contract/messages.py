@@ -272,13 +272,13 @@ RECORD_KEY = "lowfc/record/{name}"
 MONO16 = "mono16"
 FLOAT32 = "32FC1"
 
-_LONGEST_KEY = 200
+_MAX_KEY_LENGTH = 200
 
 
 @lru_cache(maxsize=256)
 def topic_of(key: str) -> Topic:
     """Topic of a key on the bus; KeyError if there is none."""
-    if len(key) > _LONGEST_KEY:
+    if len(key) > _MAX_KEY_LENGTH:
         raise KeyError(key)
     for topic in TOPICS:
         if topic.matches(key):

@@ -5,7 +5,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from lowfc.contract import toml_text
-from lowfc.contract.configuration import MOST_FAULTS, Configuration, explain
+from lowfc.contract.configuration import MAX_FAULTS, Configuration, explain
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.former_names import renamed_keys
 from lowfc.contract.sections import InterlockSection
@@ -36,10 +36,10 @@ def recorded(content: bytes) -> tuple[Configuration, list[str]]:
         of_keys = [detail for detail in faults if _is_of_key(data, detail)]
         for detail in of_keys or faults:
             done = _mend(data, detail) if of_keys else "used as recorded"
-            if len(remarks) < MOST_FAULTS:
+            if len(remarks) < MAX_FAULTS:
                 remarks.append(f"{explain(detail)}; {done}")
-        if len(of_keys) > MOST_FAULTS:
-            remarks.append(f"and {len(of_keys) - MOST_FAULTS} more")
+        if len(of_keys) > MAX_FAULTS:
+            remarks.append(f"and {len(of_keys) - MAX_FAULTS} more")
         if not of_keys:
             return _constructed(data, {str(detail["loc"][0]) for detail in faults if detail["loc"]}), remarks
     return Configuration.model_validate(data), remarks

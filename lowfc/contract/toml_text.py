@@ -4,20 +4,20 @@ import re
 import tomllib
 from typing import Any
 
-LARGEST_BYTES = 1 << 20
+MAX_BYTES = 1 << 20
 """Largest size of a configuration; one with every key has 12 kB."""
 
-_MOST_DOTS = 100  # in a line: the time to parse a dotted key grows with the square of the number of its parts
+_MAX_DOTS = 100  # in a line: the time to parse a dotted key grows with the square of the number of its parts
 
 
 def parsed(content: bytes) -> dict[str, Any]:
     """Tables of a TOML file; ValueError, with a short text, if it is invalid, too large or slow to parse."""
-    if len(content) > LARGEST_BYTES:
-        raise ValueError(f"larger than {LARGEST_BYTES} bytes")
+    if len(content) > MAX_BYTES:
+        raise ValueError(f"larger than {MAX_BYTES} bytes")
     text = content.decode()
     for number, line in enumerate(text.split("\n"), 1):
-        if line.count(".") > _MOST_DOTS and len(re.findall(r"\.+", line)) > _MOST_DOTS:
-            raise ValueError(f"line {number} has more than {_MOST_DOTS} dots")
+        if line.count(".") > _MAX_DOTS and len(re.findall(r"\.+", line)) > _MAX_DOTS:
+            raise ValueError(f"line {number} has more than {_MAX_DOTS} dots")
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

@@ -4,7 +4,7 @@ from math import log
 
 import numpy as np
 
-_SMALLEST_NS = 1_000
+_MIN_NS = 1_000
 RATIO = 1.01
 _BINS = 2_000
 
@@ -19,7 +19,7 @@ class Durations:
 
     def add(self, duration_ns: int) -> None:
         """Count one duration."""
-        place = int(log(duration_ns / _SMALLEST_NS) * _PER_RATIO) + 1 if duration_ns > _SMALLEST_NS else 0
+        place = int(log(duration_ns / _MIN_NS) * _PER_RATIO) + 1 if duration_ns > _MIN_NS else 0
         self._counts[min(place, _BINS - 1)] += 1
         self.count += 1
         self.max_ns = max(self.max_ns, duration_ns)
@@ -27,7 +27,7 @@ class Durations:
     def percentiles_ns(self, *fractions: float) -> list[int]:
         """Percentiles for these fractions, to the upper edge of a bin; 0 if nothing was counted."""
         places = np.searchsorted(np.cumsum(self._counts), np.ceil(np.array(fractions) * self.count))
-        edges_ns = [round(_SMALLEST_NS * RATIO ** int(place)) if place < _BINS - 1 else self.max_ns for place in places]
+        edges_ns = [round(_MIN_NS * RATIO ** int(place)) if place < _BINS - 1 else self.max_ns for place in places]
         return [min(edge_ns, self.max_ns) for edge_ns in edges_ns]
 
 

@@ -27,7 +27,7 @@ from lowfc.optics.chain.pupil import circle, from_quarter
 FOCAL_MASK_RADIUS = 4.0
 """Radius of the disk for which the fraction of the light is reported, in lambda / D (Sect. 2.1)."""
 
-LEAST_OPEN = 0.01
+MIN_OPEN_AREA = 0.01
 """Smallest open fraction of the circle: below it a request counts as infeasible, since a closed mask is dark."""
 
 SYMMETRIES = ("quarter", "octant")
@@ -156,7 +156,7 @@ def exchange(request: Request) -> Iterator[Round]:
             quarter[y, x] = values
             if request.symmetry == "octant":
                 quarter[x, y] = values
-            is_open = _open_area(quarter) >= LEAST_OPEN
+            is_open = _open_area(quarter) >= MIN_OPEN_AREA
             contrast = largest_contrast(quarter, request) if is_open else np.inf
             bound_area = bound / (cells**2 * OPEN_AREA)
             yield Round(number, len(points), quarter, _open_area(quarter), bound_area, contrast)

@@ -32,7 +32,7 @@ Kind = Literal["integrator", "lqg"]
 KINDS: tuple[Kind, ...] = ("integrator", "lqg")
 
 DELAY = 1.0
-_LEAST_DRIFT = 1e-12  # drift in the model of a filter for a line only, nm^2 per frame
+_MIN_DRIFT = 1e-12  # drift in the model of a filter for a line only, nm^2 per frame
 _GAINS = np.geomspace(0.01, 1.0, 30)
 _LINE_RATIOS = np.geomspace(1e-6, 1e10, 49)  # variance of a line over that of a frame's noise
 
@@ -96,7 +96,7 @@ def tolerated_lines(kind: Kind, line: Line, rate_hz: float, exposure: float) -> 
     timing = Timing.of(DELAY, exposure)
 
     def residual(law: LinearLaw, variance: float) -> float:
-        model = Model(_LEAST_DRIFT, np.inf, (replace(line, variance_nm2=variance),), 1.0, rate_hz)
+        model = Model(_MIN_DRIFT, np.inf, (replace(line, variance_nm2=variance),), 1.0, rate_hz)
         return float(predicted_nm(law, [model], timing)[0] ** 2)
 
     if kind == "integrator":  # v = A line + B noise at each gain
@@ -106,7 +106,7 @@ def tolerated_lines(kind: Kind, line: Line, rate_hz: float, exposure: float) -> 
         return lambda allowed: np.asarray(np.max((allowed[..., None] - of_noise) / of_line, axis=-1))
 
     def filtered(variance: float) -> float:
-        model = Model(_LEAST_DRIFT, np.inf, (replace(line, variance_nm2=variance),), 1.0, rate_hz)
+        model = Model(_MIN_DRIFT, np.inf, (replace(line, variance_nm2=variance),), 1.0, rate_hz)
         return min(residual(lqg([model], (2,), timing), variance), variance)
 
     found = np.log([filtered(variance) for variance in _LINE_RATIOS.tolist()])

@@ -19,8 +19,9 @@ REST_NS = 100_000_000
 """Longest sleep between beats while the driver must not be called."""
 AHEAD_NS = 5_000_000
 """Largest time by which the end of an exposure may be ahead of its clock."""
-MOST_LOST, MOST_FASTER = 100, 4
-"""Largest plausible step of frame numbers: MOST_LOST + MOST_FASTER x periods since the last frame; else a restart."""
+MAX_LOST_FRAMES, MAX_RATE_RATIO = 100, 4
+"""Largest plausible step of frame numbers: MAX_LOST_FRAMES + MAX_RATE_RATIO x periods since the last frame. A
+larger one is a restart."""
 FRAME_ID = "lowfc_camera"
 
 _NO_EXTRAS = CameraExtras()
@@ -133,7 +134,7 @@ class CameraLoop:
             step = (exposure.number - self._number) % settings.number_wrap
             if step == 0:
                 raise ValueError(f"it returned frame number {exposure.number} twice")
-            most = MOST_LOST + MOST_FASTER * (now_ns - self._number_ns) // settings.period_ns
+            most = MAX_LOST_FRAMES + MAX_RATE_RATIO * (now_ns - self._number_ns) // settings.period_ns
             if step > most:
                 self._restart()
             else:

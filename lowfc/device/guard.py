@@ -12,12 +12,12 @@ from typing import NamedTuple
 import numpy as np
 
 from lowfc.arrays import Single
-from lowfc.control.loop.command_channels import LONGEST_NAME, MOST_CHANNELS
+from lowfc.control.loop.command_channels import MAX_CHANNELS, MAX_NAME_LENGTH
 from lowfc.control.loop.safety import Limit, Limited, Limits, Reason, Rejection, expired, limit
 
 _NONE: Single = np.zeros(0, np.float32)
 
-LONGEST_VALID_NS = 2_000_000_000
+MAX_VALID_NS = 2_000_000_000
 """Longest time for which a command may be held; longer requests are shortened to it."""
 AHEAD_NS = 1_000_000_000
 """Largest time by which a frame may be ahead of the mirror's clock; beyond it the surface is timed by that clock."""
@@ -29,7 +29,7 @@ is the run's time since the last call, ns."""
 
 
 @dataclass(frozen=True)
-class Guard:
+class MirrorGuard:
     """Limits of a mirror, and its action on the command timeout: flat if `flatten`, otherwise hold the shape.
 
     The limits apply after the driver has rounded to `step_nm`.
@@ -103,11 +103,11 @@ class Status(NamedTuple):
 
 
 def apply_command(
-    guard: Guard, status: Status, command: Command, now_ns: int, move: Move, beside_nm: Single | None = None
+    guard: MirrorGuard, status: Status, command: Command, now_ns: int, move: Move, others_nm: Single | None = None
 ) -> tuple[Status, Reason | None]:
     """Apply a command received at `now_ns`; a refused command changes nothing, and its reason is returned.
 
-    `beside_nm` (rows, columns) is the shape of other programs on the mirror; it uses part of the stroke.
+    `others_nm` (rows, columns) is the shape of other programs on the mirror; it uses part of the stroke.
     """
     reason = _refusal(guard, status, command)
     if reason is not None:
@@ -118,7 +118,7 @@ def apply_command(
     if len(channels) > 1:
         with np.errstate(over="ignore", invalid="ignore"):  # a sum that is not finite is refused by `limit`
             target_nm = sum(channels.values(), np.zeros(guard.grid, np.float32))
-    limited = _limited(guard, status.driven_nm, target_nm, beside_nm)
+    limited = _limited(guard, status.driven_nm, target_nm, others_nm)
     # From frame to frame, not from the last tick: ticks use the mirror's own clock, which is ahead of a frame's time.
     elapsed_ns = command.time_ns - status.commanded_ns if status.commanded_ns else np.inf
     if elapsed_ns <= 0:  # a command repeated for the same frame: only the mirror's own clock has advanced
@@ -133,7 +133,7 @@ def apply_command(
         time_ns=command.time_ns,
         commanded_ns=command.time_ns,
         received_ns=now_ns,
-        valid_for_ns=min(command.valid_for_ns, LONGEST_VALID_NS),
+        valid_for_ns=min(command.valid_for_ns, MAX_VALID_NS),
         following=True,
         safe=status.safe | {command.channel} if command.safe else status.safe - {command.channel},
         clear_id=command.clear_id or status.clear_id,
@@ -141,18 +141,18 @@ def apply_command(
     return applied, None
 
 
-def _limited(guard: Guard, previous_nm: Single, target_nm: Single, beside_nm: Single | None) -> Limited:
+def _limited(guard: MirrorGuard, previous_nm: Single, target_nm: Single, others_nm: Single | None) -> Limited:
     """Limit the command so that its sum with other programs' shape is within the stroke, or exceeds it no further."""
-    if beside_nm is None or not beside_nm.any() or not np.isfinite(target_nm).all():
+    if others_nm is None or not others_nm.any() or not np.isfinite(target_nm).all():
         return limit(guard.tighter, previous_nm, target_nm)
     stroke_nm = np.float32(guard.tighter.kept_stroke_nm)
-    room_nm = np.clip(target_nm, np.minimum(-stroke_nm - beside_nm, 0), np.maximum(stroke_nm - beside_nm, 0))
+    room_nm = np.clip(target_nm, np.minimum(-stroke_nm - others_nm, 0), np.maximum(stroke_nm - others_nm, 0))
     limited = limit(guard.tighter, previous_nm, room_nm)
     clipped = Limit.STROKE not in limited.reasons and not np.array_equal(room_nm, target_nm)
     return limited._replace(reasons=(Limit.STROKE, *limited.reasons)) if clipped else limited
 
 
-def tick(guard: Guard, status: Status, now_ns: int, move: Move) -> Status:
+def tick(guard: MirrorGuard, status: Status, now_ns: int, move: Move) -> Status:
     """Advance the mirror without a new command: let it settle, and apply the command timeout."""
     if status.following and expired(now_ns - status.received_ns, status.valid_for_ns):
         status = status._replace(following=False, channels={})
@@ -165,7 +165,7 @@ def tick(guard: Guard, status: Status, now_ns: int, move: Move) -> Status:
     return status._replace(surface_nm=move(status.driven_nm, elapsed_ns), time_ns=time_ns)
 
 
-def _refusal(guard: Guard, status: Status, command: Command) -> Reason | None:
+def _refusal(guard: MirrorGuard, status: Status, command: Command) -> Reason | None:
     if command.actuators_nm is None or command.actuators_nm.shape != guard.grid:
         return Limit.WRONG_GRID
     if not (np.isfinite(command.actuators_nm).all() and np.isfinite(command.command_nm).all()):
@@ -175,7 +175,7 @@ def _refusal(guard: Guard, status: Status, command: Command) -> Reason | None:
     cleared = command.clear_id and command.clear_id != status.clear_id
     if command.frame_sequence < status.frame_sequence and not cleared:
         return Rejection.OUT_OF_ORDER
-    full = len(status.channels) >= MOST_CHANNELS and command.channel not in status.channels
-    if full or len(command.channel) > LONGEST_NAME:
+    full = len(status.channels) >= MAX_CHANNELS and command.channel not in status.channels
+    if full or len(command.channel) > MAX_NAME_LENGTH:
         return Limit.CHANNEL
     return None

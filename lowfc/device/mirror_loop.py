@@ -29,7 +29,7 @@ from lowfc.contract.messages import (
 )
 from lowfc.control.loop.safety import Limits, Reason, Rejection
 from lowfc.device.driver import Mirror, MirrorExtras, geometry
-from lowfc.device.guard import Command, Guard, Status, apply_command, tick
+from lowfc.device.guard import Command, MirrorGuard, Status, apply_command, tick
 from lowfc.device.watch import DriverWatch
 from lowfc.optics.chain.grid import pupil_axis
 from lowfc.optics.chain.mirror import influence_factors
@@ -50,7 +50,7 @@ _NO_EXTRAS = MirrorExtras()
 _NONE: Single = np.zeros(0, np.float32)
 
 
-def guard_of(driver: Mirror, config: Configuration) -> Guard:
+def guard_of(driver: Mirror, config: Configuration) -> MirrorGuard:
     """Limits of a mirror: the tighter of its driver's and those of [mirror].
 
     ConfigurationError if its grid is not that of [mirror].
@@ -66,7 +66,7 @@ def guard_of(driver: Mirror, config: Configuration) -> Guard:
         min(own.slew_nm, configured.slew_nm),
         min(own.neighbour_nm, configured.neighbour_nm),
     )
-    return Guard((own.rows, own.columns), limits, own.step_nm, config.mirror.on_command_timeout == "flat")
+    return MirrorGuard((own.rows, own.columns), limits, own.step_nm, config.mirror.on_command_timeout == "flat")
 
 
 class MirrorLoop:

@@ -145,13 +145,13 @@ def test_an_image_being_written_is_awaited(path: Path) -> None:
     writer.write(image(1))
     writer.begin(image(2))
     assert reader.next(0.02) is None
-    assert reader.silence() == "its writer is silent, in the middle of an image"
+    assert reader.silence_cause() == "its writer is silent, in the middle of an image"
     writer.end()
     got = newest(reader)
     assert got.number == 2
     assert np.array_equal(got.pixels, image(2))
     assert reader.next(0.02) is None
-    assert reader.silence() == "its writer is silent"
+    assert reader.silence_cause() == "its writer is silent"
 
 
 WRITER = """
@@ -180,7 +180,7 @@ def test_no_torn_image_is_returned_and_a_dead_writer_is_reported(path: Path) -> 
     assert numbers == sorted(set(numbers))
     while reader.next(0.1) is not None:
         pass
-    assert reader.silence().startswith(f"its writer (process {writer.pid}) has ended")
+    assert reader.silence_cause().startswith(f"its writer (process {writer.pid}) has ended")
     stream.write(np.full((64, 64), stream.count + 1))  # another writer takes over
     got = newest(reader)
     assert (got.pixels == got.number % 65536).all()
@@ -201,7 +201,7 @@ def test_a_recreated_stream_is_reopened(path: Path) -> None:
     assert got.pixels.shape == (2, 3)
     path.unlink()
     assert reader.next(0.02) is None
-    assert reader.silence() == "there is no stream 'camnsv'"
+    assert reader.silence_cause() == "there is no stream 'camnsv'"
     made(path).write(image(3))
     got = newest(reader)
     assert got.generation == 4

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import pytest
 
 from lowfc.adapters.bus.bus import Sample
-from lowfc.adapters.bus.names import LARGEST_HEALTH_BYTES, LONGEST_NAME, MOST_NAMES, Names
+from lowfc.adapters.bus.names import MAX_HEALTH_BYTES, MAX_NAME_LENGTH, MAX_NAMES, Names
 from lowfc.adapters.bus.start_check import StartCheck
 from lowfc.adapters.process.clock import SIMULATED_START_NS
 from lowfc.contract.envelope import Envelope, count_of, sequence_of, start_of
@@ -101,13 +101,13 @@ def health(number: int = 0) -> bytes:
 
 def test_the_number_of_names_per_topic_is_limited_except_for_roles() -> None:
     names = Names()
-    for number in range(MOST_NAMES):
+    for number in range(MAX_NAMES):
         assert names.admit(MIRROR_STATE, MIRROR_STATE.at(f"m{number}")) == f"m{number}"
-    with pytest.raises(BadMessageError, match=f"{MOST_NAMES} names are known.*'one-more'"):
+    with pytest.raises(BadMessageError, match=f"{MAX_NAMES} names are known.*'one-more'"):
         names.admit(MIRROR_STATE, MIRROR_STATE.at("one-more"))
     assert names.admit(MIRROR_STATE, MIRROR_STATE.at("m7")) == "m7"
     assert names.admit(HEALTH, HEALTH.at("one-more")) == "one-more", "each topic has its own limit"
-    for number in range(MOST_NAMES - 1):
+    for number in range(MAX_NAMES - 1):
         names.admit(HEALTH, HEALTH.at(f"p{number}"))
     assert [names.admit(HEALTH, HEALTH.at(role)) for role in Role] == list(Role)
     assert names.admit(FRAME, FRAME.key) == ""
@@ -115,11 +115,11 @@ def test_the_number_of_names_per_topic_is_limited_except_for_roles() -> None:
 
 def test_the_sizes_of_names_and_healths_are_limited() -> None:
     names = Names()
-    assert names.admit(HEALTH, HEALTH.at("n" * LONGEST_NAME))
-    with pytest.raises(BadMessageError, match=f"up to {LONGEST_NAME} characters, got {LONGEST_NAME + 1}"):
-        names.admit(HEALTH, HEALTH.at("n" * (LONGEST_NAME + 1)))
-    body = wire.Health(state="x" * LARGEST_HEALTH_BYTES).SerializeToString()
-    with pytest.raises(BadMessageError, match=f"up to {LARGEST_HEALTH_BYTES} bytes, got {len(body)}"):
+    assert names.admit(HEALTH, HEALTH.at("n" * MAX_NAME_LENGTH))
+    with pytest.raises(BadMessageError, match=f"up to {MAX_NAME_LENGTH} characters, got {MAX_NAME_LENGTH + 1}"):
+        names.admit(HEALTH, HEALTH.at("n" * (MAX_NAME_LENGTH + 1)))
+    body = wire.Health(state="x" * MAX_HEALTH_BYTES).SerializeToString()
+    with pytest.raises(BadMessageError, match=f"up to {MAX_HEALTH_BYTES} bytes, got {len(body)}"):
         names.health(HEALTH.at("camera"), body)
 
 
@@ -152,10 +152,10 @@ def test_forged_names_do_not_fill_a_process_and_give_one_event(hub: MemoryHub, f
     forge()
     listener.service("controller").beat()
     camera.beat()
-    assert len(camera.last_health) == MOST_NAMES + 1
+    assert len(camera.last_health) == MAX_NAMES + 1
     assert "controller" in camera.last_health
     (event,) = listener.event_texts("BAD_MESSAGE")
-    assert event.startswith(f"BAD_MESSAGE {FORGED - MOST_NAMES} messages on lowfc/health/* could not be read")
+    assert event.startswith(f"BAD_MESSAGE {FORGED - MAX_NAMES} messages on lowfc/health/* could not be read")
 
 
 def test_a_process_with_many_pids_is_stored_once(hub: MemoryHub) -> None:
@@ -175,5 +175,5 @@ def test_forged_names_do_not_fill_launcher_and_viewer(hub: MemoryHub) -> None:
     for number in range(FORGED):
         view.add(Sample(HEALTH.at(f"forged-{number}"), health(number), 1, 1, 1))
         launcher.publisher(HEALTH, f"forged-{number}").put(health(number))
-    assert len(watch.health) == len(view.snapshot(1).health) == MOST_NAMES
-    assert view.unreadable == launcher.faults.unreadable[HEALTH.at("*")][0] == FORGED - MOST_NAMES
+    assert len(watch.health) == len(view.snapshot(1).health) == MAX_NAMES
+    assert view.unreadable == launcher.faults.unreadable[HEALTH.at("*")][0] == FORGED - MAX_NAMES

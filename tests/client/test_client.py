@@ -21,7 +21,7 @@ from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.process.clock import HostClock
 from lowfc.client import Answer, Client, Frame, Stream, client, configuration_of, running, the_run
 from lowfc.client.requests import DECLARED
-from lowfc.client.runs import nobody_yet, starting
+from lowfc.client.runs import starting, waiting_message
 from lowfc.client.stream import WAITING, frame_of, step_of
 from lowfc.contract.codecs import codec
 from lowfc.contract.codecs.bench_codec import decode_bench_value
@@ -294,11 +294,11 @@ def test_runs_are_found_by_their_listening_processes(own_runtime: Path, listen: 
 
 
 def test_a_wait_for_an_empty_run_reports_the_other_runs(listen: Callable[..., None]) -> None:
-    assert nobody_yet("bnch").endswith("on this host yet; no other loop of yours is running")
+    assert waiting_message("bnch").endswith("on this host yet; no other loop of yours is running")
     listen("bench", "camera", "controller")
-    assert nobody_yet("bench") == ""
+    assert waiting_message("bench") == ""
     open_run("bnch")  # as the waiting process itself does
-    assert nobody_yet("bnch").endswith("on this host yet; running: bench (did you mean 'bench'?)")
+    assert waiting_message("bnch").endswith("on this host yet; running: bench (did you mean 'bench'?)")
 
 
 def test_a_run_started_by_sim_loop_counts_as_starting(listen: Callable[..., None]) -> None:

@@ -21,7 +21,7 @@ from lowfc.programs.commissioning.acceptance.probe import (
     _announced,
     chosen,
 )
-from tests.support.folded_loop import SMALL_MIRROR, FoldedLoop
+from tests.support.in_process_loop import SMALL_MIRROR, InProcessLoop
 from tests.support.loops import lowfc
 
 REQUIRED = Acceptance(lowest_hz=2.0)
@@ -35,7 +35,7 @@ def configured(**changes: object) -> Configuration:
     )
 
 
-def responses_of(loop: FoldedLoop, test: Any, *arguments: Any) -> list[ProbeResponse]:
+def responses_of(loop: InProcessLoop, test: Any, *arguments: Any) -> list[ProbeResponse]:
     """Run a test on a loop, check that the loop mode is restored, and return the responses to its probe sequences."""
     loop.run(5)
     live = Live(loop, lambda *_: None)
@@ -53,13 +53,13 @@ def drawn(module: Any, result: AcceptanceResult) -> bytes:
 
 
 @pytest.fixture(scope="module", params=[1.0, 1.5])
-def multisine(request: pytest.FixtureRequest) -> tuple[FoldedLoop, ProbeResponse]:
-    loop = FoldedLoop(configured(camera__delay_frames=request.param))
+def multisine(request: pytest.FixtureRequest) -> tuple[InProcessLoop, ProbeResponse]:
+    loop = InProcessLoop(configured(camera__delay_frames=request.param))
     (one,) = responses_of(loop, rejection, MULTISINE, REQUIRED)
     return loop, one
 
 
-def test_the_rejection_of_the_simulated_bench_matches_theory(multisine: tuple[FoldedLoop, ProbeResponse]) -> None:
+def test_the_rejection_of_the_simulated_bench_matches_theory(multisine: tuple[InProcessLoop, ProbeResponse]) -> None:
     one = multisine[1]
     found = rejection.judge([one], REQUIRED)
     assert found.passed, found.text()
@@ -79,7 +79,7 @@ def test_the_rejection_of_the_simulated_bench_matches_theory(multisine: tuple[Fo
 
 
 def test_with_a_pseudo_open_loop_law_the_multisine_is_added_to_the_mirror() -> None:
-    loop = FoldedLoop(configured())
+    loop = InProcessLoop(configured())
     loop.law(of_blocks([integrator_block(0.3, 0.001, "pol", 1.0)] * 3, "pol", "leaky", (2, 3, 4), 1.0, 250.0))
     found = rejection.judge(responses_of(loop, rejection, MULTISINE, REQUIRED), REQUIRED)
     assert (found.injected, found.law) == ("mirror", "leaky")
@@ -88,7 +88,7 @@ def test_with_a_pseudo_open_loop_law_the_multisine_is_added_to_the_mirror() -> N
 
 
 @pytest.mark.parametrize("multisine", [1.0], indirect=True)
-def test_a_disturbed_measurement_is_refused(multisine: tuple[FoldedLoop, ProbeResponse]) -> None:
+def test_a_disturbed_measurement_is_refused(multisine: tuple[InProcessLoop, ProbeResponse]) -> None:
     loop, one = multisine
     with pytest.raises(AcceptanceError, match=r"2 modes|3 modes"):
         responses_of(loop, rejection, replace(MULTISINE, duration_s=0.1), REQUIRED)
@@ -116,7 +116,7 @@ def test_a_disturbed_measurement_is_refused(multisine: tuple[FoldedLoop, ProbeRe
 
 
 def test_linearity_passes_the_simulated_sensor_and_fails_noise_or_a_halved_gain() -> None:
-    loop = FoldedLoop(configured())
+    loop = InProcessLoop(configured())
     with pytest.raises(AcceptanceError, match="2 frames at each level are too few: the first 3"):
         responses_of(loop, linearity, linearity.Staircase(2, 3, (2,)), REQUIRED)
     (one,) = responses_of(loop, linearity, linearity.Staircase(7, 3, (2,)), REQUIRED)
@@ -146,7 +146,7 @@ def test_the_capture_range_ends_at_the_modal_limit_or_the_sensor_range(
     changes: dict[str, Any], tilt_nm: float, captured_nm: float, lost_nm: float | None, limits: list[str]
 ) -> None:
     required = Acceptance(capture_tilt_nm=tilt_nm)
-    trials = responses_of(FoldedLoop(configured(**changes)), capture, (2,), required)  # Z2, tip
+    trials = responses_of(InProcessLoop(configured(**changes)), capture, (2,), required)  # Z2, tip
     found = capture.judge(trials, required)
     (mode,) = found.modes
     assert (mode.captured_nm, mode.lost_nm, mode.limits) == (captured_nm, lost_nm, limits)
@@ -158,12 +158,12 @@ def test_the_capture_range_ends_at_the_modal_limit_or_the_sensor_range(
 
 def test_a_capture_range_needs_a_gain() -> None:
     with pytest.raises(AcceptanceError, match="gain"):
-        capture.judge(responses_of(FoldedLoop(configured(control__gain=0.0)), capture, (4,), REQUIRED), REQUIRED)
+        capture.judge(responses_of(InProcessLoop(configured(control__gain=0.0)), capture, (4,), REQUIRED), REQUIRED)
 
 
 def test_the_noise_floor_matches_photon_and_read_noise() -> None:
     config = configured(disturbance__preset="bench")
-    loop = FoldedLoop(config)
+    loop = InProcessLoop(config)
     responses, calibration = responses_of(loop, noise, 3.0), loop.calibration()
     found = noise.judge(responses, REQUIRED, config, calibration)
     assert found.passed, found.text()

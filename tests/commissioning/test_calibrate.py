@@ -22,7 +22,7 @@ from lowfc.programs.commissioning.calibrate import pokes, recording
 from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest
 from lowfc.programs.commissioning.calibrate.result import measured_calibration
 from lowfc.programs.commissioning.calibrate.run import CalibrationData, Calibrator, keep, partial_of, resumed
-from tests.support.folded_loop import SMALL_MIRROR, FoldedLoop
+from tests.support.in_process_loop import SMALL_MIRROR, InProcessLoop
 
 OUT = Path("night.fits")
 BRIGHT = (
@@ -61,24 +61,24 @@ Action = Callable[[Any], object]
 
 
 def calibrator_of(
-    loop: FoldedLoop, method: str, cycles: int = 4, *, report: Callable[[str], None] = ignore, **more: Any
+    loop: InProcessLoop, method: str, cycles: int = 4, *, report: Callable[[str], None] = ignore, **more: Any
 ) -> Calibrator:
     request = CalibrationRequest(method, **{"out": OUT, "snr": 50.0, "cycles": cycles, **more})
     return Calibrator(loop, request, report, ignore)
 
 
-def measure(loop: FoldedLoop, method: str, cycles: int = 4, **options: Any) -> tuple[Calibrator, CalibrationData]:
+def measure(loop: InProcessLoop, method: str, cycles: int = 4, **options: Any) -> tuple[Calibrator, CalibrationData]:
     calibrator = calibrator_of(loop, method, cycles, **options)
     with calibrator.required_mode():
         return calibrator, calibrator.run()
 
 
-def mode_of(loop: FoldedLoop) -> int:
+def mode_of(loop: InProcessLoop) -> int:
     state = loop.status().state
     return state.mode
 
 
-def calibrated(loop: FoldedLoop, method: str, cycles: int) -> tuple[Calibration, CalibrationData]:
+def calibrated(loop: InProcessLoop, method: str, cycles: int) -> tuple[Calibration, CalibrationData]:
     calibrator, data = measure(loop, method, cycles)
     made, _ = measured_calibration(loop.config, calibrator.before, data.measured, CalibrationRequest(method, OUT, 50.0))
     return made, data
@@ -96,7 +96,7 @@ def calibrated(loop: FoldedLoop, method: str, cycles: int) -> tuple[Calibration,
 def test_a_measured_calibration_reads_the_true_modes(method: str, delay: float, modes: int, lost: bool) -> None:
     """Lost frames do not affect the others."""
     config = configured(camera__delay_frames=delay, sensor__modes=modes)
-    loop = FoldedLoop(config, lose=lambda index: lost and index > 300 and index % 41 == 0)
+    loop = InProcessLoop(config, lose=lambda index: lost and index > 300 and index % 41 == 0)
     if method == "in-loop":
         loop.close_loop()
         loop.run(30)
@@ -115,14 +115,14 @@ def test_a_measured_calibration_reads_the_true_modes(method: str, delay: float, 
 
 def closed(config: Configuration, calibration: Calibration, frames: int, world: Configuration) -> np.ndarray:
     """True residual (frames, modes) of the second half of a closed loop."""
-    loop = FoldedLoop(config, calibration, world)
+    loop = InProcessLoop(config, calibration, world)
     loop.close_loop()
     loop.run(frames)
     return loop.residual_nm(frames // 2)
 
 
 def test_measured_and_computed_calibrations_give_residuals_within_5_percent() -> None:
-    loop = FoldedLoop(configured(**FEW))
+    loop = InProcessLoop(configured(**FEW))
     made, _ = calibrated(loop, "hadamard", 4)
     disturbed = configured(**FEW, disturbance__preset="bench")
     residuals = (closed(disturbed, each, 300, disturbed) for each in (loop.calibration(), made))
@@ -137,7 +137,7 @@ def test_a_mirror_with_dead_actuators_and_misregistration_is_calibrated_and_clos
     np.save("active.npy", active.reshape(12, 12))
     config = configured(**NOISELESS, mirror__active="active.npy")
     true = {"mirror__dead": dead, "mirror__magnification": 1.01, "mirror__shift_pitches": 0.1}
-    loop = FoldedLoop(config, world=configured(**NOISELESS, **true))
+    loop = InProcessLoop(config, world=configured(**NOISELESS, **true))
     made, data = calibrated(loop, "hadamard", 4)
     assert calibrator_of(loop, "hadamard", 4).pokes.amplitude_nm <= 3
     assert not made.modes_to_actuators[dead].any()
@@ -152,7 +152,7 @@ def test_a_mirror_with_dead_actuators_and_misregistration_is_calibrated_and_clos
 def test_the_loop_holds_a_zero_point_that_is_not_flat() -> None:
     state = {"3": -10.0, "4": 15.0}
     config = configured(**NOISELESS)
-    loop = FoldedLoop(config, world=configured(**NOISELESS, disturbance__static_nm=state))
+    loop = InProcessLoop(config, world=configured(**NOISELESS, disturbance__static_nm=state))
     made, _ = calibrated(loop, "hadamard", 4)
     zero = loop.residual_nm(0, 1)[0]
     moved = configured(**NOISELESS, disturbance__static_nm={"2": 20.0, "3": -10.0, "4": 35.0})  # by 20 nm from `state`
@@ -161,7 +161,7 @@ def test_the_loop_holds_a_zero_point_that_is_not_flat() -> None:
 
 
 def test_a_closed_loop_is_opened_for_pokes_and_closed_afterwards() -> None:
-    loop = FoldedLoop(configured(**FEW))
+    loop = InProcessLoop(configured(**FEW))
     with pytest.raises(CalibrationError, match="the loop is open: `lowfc ctl close` first"):
         measure(loop, "in-loop", 4)
     loop.close_loop()
@@ -193,20 +193,20 @@ def test_unreadable_cycles_give_an_error_of_one_line() -> None:
 
 def test_errors_name_why_a_calibration_is_impossible(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recording, "ATTEMPTS", 2)
-    dead_mirror = FoldedLoop(configured(**FEW), world=configured(**FEW, mirror__dead=list(range(12 * 12))))
+    dead_mirror = InProcessLoop(configured(**FEW), world=configured(**FEW, mirror__dead=list(range(12 * 12))))
     with pytest.raises(CalibrationError, match="pokes are not seen"):
         measure(dead_mirror, "hadamard", 4)
-    loop = FoldedLoop(configured(**FEW))
+    loop = InProcessLoop(configured(**FEW))
     with pytest.raises(CalibrationError, match="at most 3 nm of each"):
         calibrator_of(loop, "hadamard", 4, amplitude_nm=5.0)
     with pytest.raises(CalibrationError, match="slew limit; at most"):
         calibrator_of(loop, "poke", 4, amplitude_nm=500.0)
-    lossy = FoldedLoop(configured(**FEW), lose=lambda index: index % 50 == 49)
+    lossy = InProcessLoop(configured(**FEW), lose=lambda index: index % 50 == 49)
     with pytest.raises(CalibrationError, match="in 2 attempts there were no 240 consecutive frames"):
         measure(lossy, "hadamard", 4)
 
 
-class FaultyLoop(FoldedLoop):
+class FaultyLoop(InProcessLoop):
     """A loop in which a device fails during some of the probe sequences, and recovers 20 frames later.
 
     Attributes:
@@ -239,21 +239,21 @@ class FaultyLoop(FoldedLoop):
         self._due.get(len(self.surfaces_nm), ignore)(self)
 
 
-def kill_mirror(loop: FoldedLoop) -> None:
+def kill_mirror(loop: InProcessLoop) -> None:
     loop.mirror_bus.close()
 
 
-def expire(loop: FoldedLoop) -> None:
+def expire(loop: InProcessLoop) -> None:
     event = EVENTS["COMMAND_EXPIRED"].log("mirror-dm", 0, command_timeout_ms=200.0, action="relaxing to flat")
     loop.mirror_bus.publisher(EVENT).put(event.SerializeToString())
 
 
-def restart_camera(loop: FoldedLoop) -> None:
+def restart_camera(loop: InProcessLoop) -> None:
     loop.first += 5 << 32
 
 
 def test_a_sequence_during_a_device_restart_is_stopped_at_once_and_repeated() -> None:
-    faults = {1: (kill_mirror, FoldedLoop.start_mirror), 3: (expire, ignore), 5: (restart_camera, ignore)}
+    faults = {1: (kill_mirror, InProcessLoop.start_mirror), 3: (expire, ignore), 5: (restart_camera, ignore)}
     loop, reports = FaultyLoop(faults), list[str]()
     calibrator = calibrator_of(loop, "hadamard", report=reports.append)
     with calibrator.required_mode():
@@ -276,7 +276,7 @@ def test_a_sequence_during_a_device_restart_is_stopped_at_once_and_repeated() ->
 
 
 def test_ctrl_c_restores_the_mirror_and_keeps_the_completed_cycles() -> None:
-    def interrupt(_: FoldedLoop) -> None:
+    def interrupt(_: InProcessLoop) -> None:
         raise KeyboardInterrupt
 
     loop = FaultyLoop({3: (interrupt, ignore)}, disturbance__static_nm={"4": 5.0})
@@ -312,7 +312,7 @@ def test_ctrl_c_restores_the_mirror_and_keeps_the_completed_cycles() -> None:
     ids=["safe", "open"],
 )
 def test_another_operators_request_ends_a_calibration_and_stays_in_force(
-    action: Callable[[FoldedLoop], None], why: str, mode: int, cause: str
+    action: Callable[[InProcessLoop], None], why: str, mode: int, cause: str
 ) -> None:
     loop, reports = FaultyLoop({1: (action, ignore)}), list[str]()
     loop.close_loop()

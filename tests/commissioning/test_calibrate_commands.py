@@ -30,7 +30,7 @@ from lowfc.programs.commissioning.calibrate.align import on_sensor
 from lowfc.programs.commissioning.calibrate.command import calibrate_app
 from lowfc.programs.commissioning.calibrate.run import Calibrator
 from lowfc.programs.commissioning.calibrate.tasks import zero_point
-from tests.support.folded_loop import SMALL_MIRROR, FoldedLoop
+from tests.support.in_process_loop import SMALL_MIRROR, InProcessLoop
 
 BRIGHT = (
     FIXED_GAINS
@@ -47,14 +47,14 @@ def _few_frames(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FoldedLoop:
+def loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> InProcessLoop:
     monkeypatch.chdir(tmp_path)
-    made = FoldedLoop(load(None, CONFIG), world=load(None, CONFIG | {"disturbance.static_nm": {"4": 6.0}}))
+    made = InProcessLoop(load(None, CONFIG), world=load(None, CONFIG | {"disturbance.static_nm": {"4": 6.0}}))
     connect(made, monkeypatch)
     return made
 
 
-def connect(loop: FoldedLoop, monkeypatch: pytest.MonkeyPatch) -> None:
+def connect(loop: InProcessLoop, monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (calibrate_commands, calibrate_align):
         monkeypatch.setattr(module, "Client", lambda run: loop)
 
@@ -79,7 +79,7 @@ def frames_to_go(stderr: str) -> float:
 
 
 def test_a_resumed_calibration_is_written_loaded_and_reported_when_complete(
-    loop: FoldedLoop, monkeypatch: pytest.MonkeyPatch
+    loop: InProcessLoop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def stop(*_: object) -> None:
         raise KeyboardInterrupt
@@ -128,7 +128,7 @@ def test_a_calibration_that_is_not_recommended_is_written_but_not_loaded(
 ) -> None:
     """First with a faint star; then its image also moves before R is checked, which the verdict reports too."""
     monkeypatch.chdir(tmp_path)
-    loop = FoldedLoop(load(None, CONFIG | {"star.magnitude": 3.0}))
+    loop = InProcessLoop(load(None, CONFIG | {"star.magnitude": 3.0}))
     connect(loop, monkeypatch)
     before = loop.calibration()
     words = ["--cycles", "4", "--snr", "200", "--out", "night.fits", "--load"]
@@ -178,7 +178,7 @@ def test_work_before_the_first_cycle_does_not_affect_the_time_to_go() -> None:
     assert lines == ["hadamard cycle: 50%, about 15 s to go"]
 
 
-def test_the_reference_is_the_present_image(loop: FoldedLoop) -> None:
+def test_the_reference_is_the_present_image(loop: InProcessLoop) -> None:
     found = json_of("reference", "--frames", "200", "--out", "there.fits")
     shift = dict(zip(found["noll"], found["reference_shift_nm"], strict=True))
     assert shift[4] == pytest.approx(6.0, abs=0.6)
@@ -187,7 +187,9 @@ def test_the_reference_is_the_present_image(loop: FoldedLoop) -> None:
     assert np.array_equal(made.response, loop.calibration().response)
 
 
-def test_a_dark_finds_bad_pixels_and_is_refused_with_light(loop: FoldedLoop, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_dark_finds_bad_pixels_and_is_refused_with_light(
+    loop: InProcessLoop, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(CalibrationError, match=r"not dark: .*; block the star|not dark"):
         json_of("dark", "--dark-taken", "--frames", "50")
     rng = np.random.default_rng(5)
@@ -204,7 +206,7 @@ def test_a_dark_finds_bad_pixels_and_is_refused_with_light(loop: FoldedLoop, mon
         json_of("dark", "--file", "small.fits")
     np.save("cube.npy", cube)
     assert json_of("dark", "--file", "cube.npy")["frames"] == 64
-    dark = FoldedLoop(load(None, CONFIG), world=load(None, CONFIG | {"star.magnitude": 20.0}))
+    dark = InProcessLoop(load(None, CONFIG), world=load(None, CONFIG | {"star.magnitude": 20.0}))
     connect(dark, monkeypatch)
     found = json_of("dark", "--dark-taken", "--frames", "50", "--out", "night.fits")
     assert found["dark_dn"] == pytest.approx(100, abs=0.5)
@@ -213,7 +215,7 @@ def test_a_dark_finds_bad_pixels_and_is_refused_with_light(loop: FoldedLoop, mon
 
 @pytest.mark.parametrize("words", ["", "reference", "align", "dark --dark-taken"])
 def test_frames_of_another_size_than_the_calibration_are_refused(
-    loop: FoldedLoop, monkeypatch: pytest.MonkeyPatch, words: str
+    loop: InProcessLoop, monkeypatch: pytest.MonkeyPatch, words: str
 ) -> None:
     other = replace(loop.calibration(), shape=(64, 100))
     monkeypatch.setattr(loop, "calibration", lambda: other)
@@ -224,7 +226,7 @@ def test_frames_of_another_size_than_the_calibration_are_refused(
         json_of(*words.split(), *(["--frames", "16"] if words else []))
 
 
-def test_the_computed_calibration_is_resampled_to_a_scaled_and_rotated_sensor(loop: FoldedLoop) -> None:
+def test_the_computed_calibration_is_resampled_to_a_scaled_and_rotated_sensor(loop: InProcessLoop) -> None:
     before, shape = loop.calibration(), (90, 96)
     geometry = Geometry(1.08, 44.0, 47.5, 12.0, -1)
     model = before.reference.astype(float).reshape(80, 80)
@@ -238,14 +240,14 @@ def test_the_computed_calibration_is_resampled_to_a_scaled_and_rotated_sensor(lo
     assert np.abs(cross_talk(made.reconstructor, H)).max() < 0.03
 
 
-def test_a_poke_resolves_the_rotation_by_180_degrees(loop: FoldedLoop) -> None:
+def test_a_poke_resolves_the_rotation_by_180_degrees(loop: InProcessLoop) -> None:
     found = json_of("align", "--out", "aligned.fits", "--frames", "200")
     assert (found["pixels_per_lambda_d"], found["parity"]) == (pytest.approx(4, rel=0.003), 1)
     made = calibration_file.load(Path("aligned.fits"))
     assert np.abs(cross_talk(made.reconstructor, loop.calibration().response)).max() < 0.05
 
 
-def test_a_computed_calibration_may_truncate_singular_values(loop: FoldedLoop) -> None:
+def test_a_computed_calibration_may_truncate_singular_values(loop: InProcessLoop) -> None:
     config = toml(loop.config)
     found = json_of("--method", "analytic", "--config", config, "--out", "all.fits")
     assert found["kept"] == [1.0] * 3
@@ -259,7 +261,7 @@ def test_a_computed_calibration_may_truncate_singular_values(loop: FoldedLoop) -
     assert "no regularisation needed" in done.stdout
 
 
-def test_a_calibration_can_be_computed_at_another_wavefront(loop: FoldedLoop) -> None:
+def test_a_calibration_can_be_computed_at_another_wavefront(loop: InProcessLoop) -> None:
     config = toml(loop.config)
     json_of("--method", "analytic", "--config", config, "--out", "flat.fits")
     json_of("--method", "analytic", "--config", config, "--out", "there.fits", "--at", "3=-10,4=15")
@@ -279,14 +281,14 @@ def test_a_calibration_can_be_computed_at_another_wavefront(loop: FoldedLoop) ->
         ("--at 4=15", "--at requires --method analytic"),
     ],
 )
-def test_an_option_without_effect_is_refused(loop: FoldedLoop, words: str, why: str) -> None:
+def test_an_option_without_effect_is_refused(loop: InProcessLoop, words: str, why: str) -> None:
     before = {path.name for path in Path().iterdir()}
     with pytest.raises(ConfigurationError, match=why):
         CliRunner().invoke(calibrate_app, words.split(), catch_exceptions=False)
     assert {path.name for path in Path().iterdir()} == before
 
 
-def test_a_comparison_of_different_sensors_is_refused(loop: FoldedLoop) -> None:
+def test_a_comparison_of_different_sensors_is_refused(loop: InProcessLoop) -> None:
     one = loop.calibration()
     calibration_file.save(one, Path("one.fits"))
     other = replace(
@@ -356,7 +358,7 @@ def test_a_loop_with_such_a_calibration_converges_to_that_wavefront() -> None:
     few = load(None, BRIGHT | {"sensor.modes": 6})
     world = load(None, BRIGHT | {"sensor.modes": 6, "disturbance.static_nm": {"4": 35.0, "6": 20.0}})
     made = analytic(few, SILENT, zero_point(few, "4=15,7=-10")[1])
-    loop = FoldedLoop(few, made, world)
+    loop = InProcessLoop(few, made, world)
     loop.close_loop()
     loop.run(200)
     held = np.mean(loop.residual_nm(100), axis=0)[:6]

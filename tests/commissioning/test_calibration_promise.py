@@ -21,7 +21,7 @@ from lowfc.programs.commissioning.calibrate import pokes
 from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest
 from lowfc.programs.commissioning.calibrate.result import Verdict, computed_noise_nm, judge, measured_calibration
 from lowfc.programs.commissioning.calibrate.run import Calibrator
-from tests.support.folded_loop import SMALL_MIRROR, FoldedLoop
+from tests.support.in_process_loop import SMALL_MIRROR, InProcessLoop
 from tests.support.loops import interrupt, run, start, until
 
 SLOW = ("quiet", "thermal", "bench", "step", "kolmogorov")
@@ -40,7 +40,7 @@ class Outcome(NamedTuple):
     verdict: Verdict
 
 
-def true_response(loop: FoldedLoop, first: int, *, closed: bool) -> np.ndarray:
+def true_response(loop: InProcessLoop, first: int, *, closed: bool) -> np.ndarray:
     """The analytic H (pixels, modes) of the commands, averaged over the wavefront since frame `first` without pokes."""
     before, config, scene = loop.calibration(), loop.config, loop.scene
     optics = factory.twin(config, None, lambda _: None)
@@ -64,7 +64,7 @@ def true_response(loop: FoldedLoop, first: int, *, closed: bool) -> np.ndarray:
 def outcome(method: str, preset: str, seed: int, snr: float, folder: Path, modes: int = 14) -> Outcome:
     mirror = SMALL_MIRROR if modes < 14 else {}
     config = load(None, mirror | {"disturbance.preset": preset, "seed": seed, "sensor.modes": modes})
-    loop = FoldedLoop(config)
+    loop = InProcessLoop(config)
     before = loop.calibration()
     if method == "in-loop":
         loop.close_loop()
@@ -140,7 +140,7 @@ def test_pokes_below_the_disturbance_give_an_error(tmp_path: Path) -> None:
 def test_the_default_calibration_takes_less_than_three_minutes_at_250_hz(tmp_path: Path) -> None:
     config = load(None, {"camera.rate_hz": 250.0})
     request = CalibrationRequest("hadamard", tmp_path / "night.fits", 70.0)
-    plans = Calibrator(FoldedLoop(config), request, lambda _: None, lambda *_: None).pokes
+    plans = Calibrator(InProcessLoop(config), request, lambda _: None, lambda *_: None).pokes
     assert plans.frames(plans.cycles()) / 250 < 180
 
 
@@ -173,7 +173,7 @@ def test_calibrations_over_the_bus_have_the_requested_accuracy(method: str, pres
     assert calibrated.returncode == 0, calibrated.stdout + calibrated.stderr + stderr
     (log,) = (tmp_path / "logs").glob("*.mcap")
     states = [wire.MirrorState.FromString(each.payload) for each in WholeLog([log], topics=(MIRROR_STATE,))]
-    scene = FoldedLoop(load(tmp_path / "test.toml"))
+    scene = InProcessLoop(load(tmp_path / "test.toml"))
     scene.surfaces_nm = [shape for state in states if (shape := actuators(state)) is not None]
     first = next(row for row, state in enumerate(states) if state.frame_sequence > begun)
     H = true_response(scene, first, closed=method == "in-loop")

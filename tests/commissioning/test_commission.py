@@ -22,7 +22,7 @@ from lowfc.programs.commissioning.commission import commissioning
 from lowfc.programs.commissioning.commission.commissioning import Commission, Commissioning, first_of
 from lowfc.programs.commissioning.commission.first_calibration import linear_nm
 from lowfc.programs.commissioning.conformance.settings import AGREEMENTS, Agreement, agreement_checks
-from tests.support.folded_loop import FoldedLoop, computed
+from tests.support.in_process_loop import InProcessLoop, computed
 from tests.support.loops import lowfc
 
 TOML = """
@@ -52,7 +52,7 @@ class Bench:
 
     def __init__(self, folder: Path, config: Configuration = QUIET) -> None:
         self.config, self.out = config, folder / "calibration.fits"
-        self.loop = FoldedLoop(config, cut=8)
+        self.loop = InProcessLoop(config, cut=8)
         self.loop.run(5)
         self.reports: list[str] = []
         self.questions: list[str] = []
@@ -139,7 +139,7 @@ def test_the_loop_holds_the_wavefront_of_the_reference_image(commissioned: tuple
 def test_without_close_the_residual_is_only_predicted(commissioned: tuple[Bench, dict[str, Any]]) -> None:
     bench, _ = commissioned
     bench.loop.open_loop()
-    text = bench.steps(close=False)._close(factory.settings(bench.config).law(bench.config.noll), 1.0)
+    text = bench.steps(close=False)._close(factory.settings(bench.config).integrator(bench.config.noll), 1.0)
     assert "predicted measured error" in text
     assert "`lowfc ctl close` closes it" in text
     assert bench.loop.status().state.mode == wire.LOOP_MODE_OPEN

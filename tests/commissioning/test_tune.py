@@ -25,7 +25,7 @@ from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.commissioning.tune.command import integrate
 from lowfc.programs.commissioning.tune.data import Telemetry, of_log, of_run
 from lowfc.programs.commissioning.tune.figures import result_of, tuned
-from tests.support.folded_loop import FoldedLoop
+from tests.support.in_process_loop import InProcessLoop
 from tests.support.loops import lowfc
 from tests.support.report_log import Night
 from tests.support.theory import LAWS
@@ -141,7 +141,7 @@ class StepStream:
         self.steps = iter(())
 
 
-class StreamedLoop(FoldedLoop):
+class StreamedLoop(InProcessLoop):
     def steps(self, count: int | None = None, patience_s: float = 0.0) -> StepStream:
         return StepStream(6000)
 
@@ -185,7 +185,7 @@ def test_a_too_short_live_time_is_refused_at_once() -> None:
         of_run(StreamedLoop(CONFIG), 2.0)
 
 
-class RequestedLoop(FoldedLoop):
+class RequestedLoop(InProcessLoop):
     """A loop that records the requests, and does not answer those whose number is in `unanswered`."""
 
     def __init__(self) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from lowfc.adapters.logs.history import attached_configuration, read_history
 from lowfc.adapters.logs.reader import LogReader
-from lowfc.contract.configuration import MOST_FAULTS, Configuration, load
+from lowfc.contract.configuration import MAX_FAULTS, Configuration, load
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.recorded_configuration import recorded
 from lowfc.programs.commissioning.acceptance.probe import ANNOUNCEMENT
@@ -69,8 +69,8 @@ def test_contradicting_values_stay_as_recorded() -> None:
 
 def test_the_number_of_remarks_is_limited() -> None:
     _, remarks = recorded("".join(f"k{number} = 1\n" for number in range(2000)).encode())
-    assert len(remarks) == MOST_FAULTS + 1
-    assert remarks[-1] == f"and {2000 - MOST_FAULTS} more"
+    assert len(remarks) == MAX_FAULTS + 1
+    assert remarks[-1] == f"and {2000 - MAX_FAULTS} more"
 
 
 @pytest.mark.parametrize("toml", ["[camera", "a = " + "[" * 100_000, "#" * (1 << 20) + "#"])

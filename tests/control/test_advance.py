@@ -253,7 +253,7 @@ def test_safe_mode_flattens_the_mirror_while_frames_are_refused(reason: Reason) 
 @pytest.mark.parametrize("name", ["gain", "leak"])
 def test_gain_and_leak_are_set_for_all_some_or_each_mode(name: str) -> None:
     def now(state: State) -> list[float]:
-        return getattr(state.loop.law, name).tolist()
+        return getattr(state.loop.integrator, name).tolist()
 
     state, _ = feed(DEFAULTS, running(), ask(name, 0.25))
     assert now(state) == [0.25, 0.25, 0.25]
@@ -287,7 +287,7 @@ def test_a_bad_value_is_refused_and_changes_nothing(request_: Request, message: 
     after, (outputs,) = feed(DEFAULTS, state, request_)
     answered(outputs, False, message)
     assert not outputs.changed
-    assert after.loop.law is state.loop.law
+    assert after.loop.integrator is state.loop.integrator
 
 
 @pytest.mark.parametrize("delay", [1.0, 1.5, 2.0, 3.0])

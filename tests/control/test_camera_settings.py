@@ -62,7 +62,7 @@ def test_changed_camera_settings_open_the_loop() -> None:
 
 @pytest.mark.parametrize("name", ["close", "step", "law"])
 def test_the_loop_is_not_closed_with_changed_camera_settings(name: str) -> None:
-    law = linear(DEFAULTS.law((2, 3, 4)))
+    law = linear(DEFAULTS.integrator((2, 3, 4)))
     fields: dict[str, object] = {"close": {}, "step": {"values": (9.0,)}, "law": {"law": law}}[name]
     state = opened(CAMERA, frame(1), WRONG)
     after, reply = ask(state, name, **fields)

@@ -10,7 +10,7 @@ from lowfc.arrays import Array, Single
 from lowfc.contract.codecs.codec import decode_request, encode_request
 from lowfc.control.laws.linear_law import LinearLaw, Signal
 from lowfc.control.loop.advance import advance
-from lowfc.control.loop.command_channels import ADOPTED, EXTERNAL, FLAT, MIRROR, MOST_CHANNELS, OFFSET
+from lowfc.control.loop.command_channels import ADOPTED, EXTERNAL, FLAT, MAX_CHANNELS, MIRROR, OFFSET
 from lowfc.control.loop.inputs import Frame, Input, Load, MirrorShape, Outputs, Reply, Request
 from lowfc.control.loop.safety import Limits, LoopMode
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES, Settings
@@ -261,7 +261,7 @@ def test_an_invalid_channel_is_refused(text: str, shape_nm: Array, why: str) -> 
 
 def test_the_number_of_channels_is_limited() -> None:
     loop, shape = ToyLoop(), dark_hole(1.0).reshape(-1)
-    for number in range(MOST_CHANNELS):
+    for number in range(MAX_CHANNELS):
         assert loop.ask("channel", text=f"c{number}", actuators_nm=shape).accepted
     assert not loop.ask("channel", text="one-more", actuators_nm=shape).accepted
     assert loop.ask("channel", text="c3", actuators_nm=2 * shape).accepted

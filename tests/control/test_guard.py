@@ -11,12 +11,12 @@ from lowfc.arrays import Array
 from lowfc.contract.codecs.state_codec import controller_state, decode_state
 from lowfc.control.laws.linear_law import LinearLaw, integrator
 from lowfc.control.loop.advance import advance
-from lowfc.control.loop.guard import BETTER_S, LAW_RETURNS, MOST_TAKEOVERS, WORSE_BLOCKS, Group, Spans
+from lowfc.control.loop.guard import BETTER_S, LAW_RETURNS, MAX_TAKEOVERS, WORSE_BLOCKS, Group, Spans
 from lowfc.control.loop.inputs import Request
 from lowfc.control.loop.safety import Limit
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES, Settings, State
 from lowfc.programs.cli import status
-from tests.support.folded_loop import SMALL_MIRROR
+from tests.support.in_process_loop import SMALL_MIRROR
 from tests.support.toy import NOLL, calibration, feed, frame, live, loaded, names, settings
 from tools.guard import MOVED, SEEDS, Case, identified_law, known_law, moved, undisturbed
 from tools.law_bench import Bench, calibrated, configured
@@ -98,7 +98,7 @@ def test_the_takeover_has_an_event_and_no_jump() -> None:
 
 def test_the_waiting_time_doubles_until_a_takeover_is_final() -> None:
     group, waited = Group(usual_nm2=100.0), []
-    for _ in range(MOST_TAKEOVERS):
+    for _ in range(MAX_TAKEOVERS):
         for _ in range(WORSE_BLOCKS):
             group, why = group.judged((10.0, 5.0, 100.0), SPANS, void=False)
         assert group.overruled
@@ -134,8 +134,8 @@ def test_the_law_returns_once_it_would_be_far_better() -> None:
     frames = BEFORE + WORSE_BLOCKS * SPANS.block + SPANS.faded
     _, state = run(state, frames)
     assert overruled(state) == [True, False]
-    noisy = replace(state.loop.law, gain=np.array([1.9, 1.9, 0.3], np.float32))
-    state = state._replace(loop=state.loop._replace(law=noisy))
+    noisy = replace(state.loop.integrator, gain=np.array([1.9, 1.9, 0.3], np.float32))
+    state = state._replace(loop=state.loop._replace(integrator=noisy))
     quiet = np.zeros(((SPANS.better + 3) * SPANS.block, len(NOLL)))
     steps, _, state = live(SETUP, quiet, NOISE_NM[: len(quiet)], state, frames + 1)
     assert [group.takeovers for group in state.loop.law_runner.guard.groups] == [1, 0]

@@ -202,7 +202,7 @@ def test_an_unwise_value_is_granted_with_a_remark(name: str, value: float, remar
     after, reply = replied(loaded(DEFAULTS), name, value, modes=(3,))
     assert reply.accepted
     attribute = {"gain": "gain", "limit": "limit_nm", "leak": "leak"}[name]
-    assert getattr(after.loop.law, attribute)[NOLL.index(3)] == np.float32(value)
+    assert getattr(after.loop.integrator, attribute)[NOLL.index(3)] == np.float32(value)
     assert reply.text.startswith(f"{name} is now ")
     assert remark in reply.text
     assert (":" in reply.text) == bool(remark)

@@ -58,13 +58,13 @@ def allowed_shapes(limits: Limits = LIMITS) -> st.SearchStrategy[Single]:
 
 
 @settings(max_examples=400, deadline=None, derandomize=True)
-@given(previous=allowed_shapes(), wanted=hnp.arrays(np.float32, GRID, elements=anything.map(np.float32)))
-def test_whatever_is_wanted_the_limits_hold(previous: Single, wanted: Single) -> None:
+@given(previous=allowed_shapes(), requested=hnp.arrays(np.float32, GRID, elements=anything.map(np.float32)))
+def test_the_limits_hold_for_any_requested_shape(previous: Single, requested: Single) -> None:
     assert within(LIMITS, previous)
-    limited = limit(LIMITS, previous, wanted)
+    limited = limit(LIMITS, previous, requested)
     assert violations(LIMITS, previous, limited.actuators_nm) == []
     assert limited.actuators_nm.dtype == np.float32
-    if not np.isfinite(wanted).all():
+    if not np.isfinite(requested).all():
         assert limited.reasons == (Limit.NOT_FINITE,)
         assert np.array_equal(limited.actuators_nm, previous)
 
@@ -78,8 +78,8 @@ def test_the_limits_hold_for_any_limits(stroke: float, slew: float, neighbour: f
     rng = np.random.default_rng(seed)
     shape = np.zeros(GRID, np.float32)
     for _ in range(20):
-        wanted = (rng.choice([0.01, 1, 3]) * stroke * rng.standard_normal(GRID)).astype(np.float32)
-        after = limit(limits, shape, wanted).actuators_nm
+        requested = (rng.choice([0.01, 1, 3]) * stroke * rng.standard_normal(GRID)).astype(np.float32)
+        after = limit(limits, shape, requested).actuators_nm
         assert violations(limits, shape, after) == []
         shape = after
 
@@ -93,13 +93,13 @@ def test_cases_by_hand(case: Case) -> None:
 @given(previous=allowed_shapes(), fraction=st.floats(0, 1))
 def test_what_is_allowed_goes_through_unchanged(previous: Single, fraction: float) -> None:
     """A move well within all limits is not changed, and no reason is reported."""
-    wanted = (previous * np.float32(fraction)).astype(np.float32)
-    assume(np.abs(wanted.astype(np.float64) - previous).max() < LIMITS.slew_nm - 0.01)
-    assume(np.abs(wanted).max() < LIMITS.stroke_nm - 0.01)
-    assume(neighbour_difference_nm(wanted.astype(np.float64)) < LIMITS.neighbour_nm - 0.01)
-    limited = limit(LIMITS, previous, wanted)
+    requested = (previous * np.float32(fraction)).astype(np.float32)
+    assume(np.abs(requested.astype(np.float64) - previous).max() < LIMITS.slew_nm - 0.01)
+    assume(np.abs(requested).max() < LIMITS.stroke_nm - 0.01)
+    assume(neighbour_difference_nm(requested.astype(np.float64)) < LIMITS.neighbour_nm - 0.01)
+    limited = limit(LIMITS, previous, requested)
     assert limited.reasons == ()
-    assert np.array_equal(limited.actuators_nm, wanted)
+    assert np.array_equal(limited.actuators_nm, requested)
 
 
 def test_diagonal_actuators_are_not_neighbours() -> None:
@@ -135,23 +135,23 @@ def test_what_was_kept_is_wanted_again_without_a_reason(stroke_nm: float) -> Non
 def test_nothing_given_is_changed() -> None:
     rng = np.random.default_rng(4)
     previous = (200 * rng.standard_normal(GRID)).astype(np.float32)
-    wanted = (900 * rng.standard_normal(GRID)).astype(np.float32)
-    copies = previous.copy(), wanted.copy()
-    limit(LIMITS, previous, wanted)
+    requested = (900 * rng.standard_normal(GRID)).astype(np.float32)
+    copies = previous.copy(), requested.copy()
+    limit(LIMITS, previous, requested)
     assert np.array_equal(previous, copies[0])
-    assert np.array_equal(wanted, copies[1])
+    assert np.array_equal(requested, copies[1])
 
 
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(
     previous=hnp.arrays(np.float32, GRID, elements=st.floats(-3000, 3000, width=32)),
-    wanted=hnp.arrays(np.float32, GRID, elements=finite.map(np.float32)),
+    requested=hnp.arrays(np.float32, GRID, elements=finite.map(np.float32)),
 )
-def test_a_shape_outside_the_limits_comes_back(previous: Single, wanted: Single) -> None:
+def test_a_shape_outside_the_limits_comes_back(previous: Single, requested: Single) -> None:
     """A shape outside the limits never moves further out, and returns at no more than the slew limit."""
     shape, steps = previous, 0
     while not within(LIMITS, shape):
-        after = limit(LIMITS, shape, wanted).actuators_nm
+        after = limit(LIMITS, shape, requested).actuators_nm
         assert np.isfinite(after).all()
         largest, apart = np.abs(shape).max(), neighbour_difference_nm(shape.astype(np.float64))
         assert np.abs(after.astype(np.float64) - shape).max() <= LIMITS.slew_nm
@@ -162,7 +162,7 @@ def test_a_shape_outside_the_limits_comes_back(previous: Single, wanted: Single)
             assert neighbour_difference_nm(after.astype(np.float64)) < apart
         shape, steps = after, steps + 1
         assert steps < 200
-    assert violations(LIMITS, shape, limit(LIMITS, shape, wanted).actuators_nm) == []
+    assert violations(LIMITS, shape, limit(LIMITS, shape, requested).actuators_nm) == []
 
 
 @settings(max_examples=200, deadline=None, derandomize=True)
@@ -182,12 +182,12 @@ def test_relaxing_reaches_flat(previous: Single) -> None:
 def test_a_mirror_pressed_against_the_neighbour_limit_stays_there(shape: Single, seed: int) -> None:
     """Repeated requests beyond the limit neither move it back towards flat nor make it oscillate."""
     rng = np.random.default_rng(seed)
-    wanted = (5000 * rng.standard_normal(GRID)).astype(np.float32)
+    requested = (5000 * rng.standard_normal(GRID)).astype(np.float32)
     for _ in range(30):
-        shape = limit(LIMITS, shape, wanted).actuators_nm
+        shape = limit(LIMITS, shape, requested).actuators_nm
     settled = shape
     for _ in range(10):
-        shape = limit(LIMITS, shape, wanted).actuators_nm
+        shape = limit(LIMITS, shape, requested).actuators_nm
         assert np.abs(shape - settled).max() < 0.1
 
 
@@ -349,8 +349,8 @@ def _check_random_walks(module: Any) -> None:
     for bounds in (usual, far, free):  # the last has no effective neighbour limit
         limits, shape = module.Limits(*bounds), np.zeros((3, 4), np.float32)
         for _ in range(60):
-            wanted = (rng.choice([0.3, 1, 3]) * limits.stroke_nm * rng.standard_normal((3, 4))).astype(np.float32)
-            after = module.limit(limits, shape, wanted).actuators_nm
+            requested = (rng.choice([0.3, 1, 3]) * limits.stroke_nm * rng.standard_normal((3, 4))).astype(np.float32)
+            after = module.limit(limits, shape, requested).actuators_nm
             assert violations(limits, shape, after) == []
             shape = after
 

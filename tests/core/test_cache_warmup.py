@@ -2,7 +2,7 @@
 
 import pytest
 
-from lowfc.programs.core.cache_warmup import LATEST_NS, LEAD_NS, SHORTEST_PERIOD_NS, CacheWarmup
+from lowfc.programs.core.cache_warmup import LATEST_NS, LEAD_NS, MIN_PERIOD_NS, CacheWarmup
 
 PERIOD_NS = 1_000_000
 START_NS = 5_000_000_000
@@ -59,4 +59,4 @@ def test_the_schedule_follows_a_camera_with_a_different_clock_rate(scale: float)
 
 
 def test_no_warm_up_at_short_frame_periods() -> None:
-    assert after(0, period_ns=SHORTEST_PERIOD_NS).wait_ns(START_NS) is None
+    assert after(0, period_ns=MIN_PERIOD_NS).wait_ns(START_NS) is None

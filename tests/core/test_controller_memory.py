@@ -329,7 +329,7 @@ def test_states_refer_to_law_and_probe_sequence_by_identity(rig: Rig) -> None:
     rig.expose(1)
     settings = factory.settings(rig.config)
     noll = rig.calibration.noll
-    present = settings.law(noll)
+    present = settings.integrator(noll)
     law = integrator(present.gain, present.leak, noll, settings.delay_frames, rig.config.camera.rate_hz)
     table = np.zeros((50_000, 14), np.float32)
     play = wire.Request(text="offset", table=table.tobytes(), columns=14)

@@ -14,7 +14,7 @@ from lowfc.contract.configuration import FIXED_GAINS, load
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.map_reconstructor import noise_covariance_nm2
 from lowfc.control.laws.automatic_gain import GainBank, TiltCrossTalk
-from lowfc.control.laws.law import RELAXING
+from lowfc.control.laws.integrator import RELAXING
 from lowfc.control.loop.safety import LoopMode
 from tools.law_bench import Bench, calibrated, configured
 
@@ -50,7 +50,7 @@ def rms_nm(loop: Bench, frames: int) -> tuple[float, float]:
 
 
 def gains(loop: Bench) -> Single:
-    return loop.state.loop.law.gain
+    return loop.state.loop.integrator.gain
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +106,7 @@ def test_modes_not_corrected_reduce_the_noise_of_the_others(faint: Bench) -> Non
     active_loop = faint.state.loop
     uncorrected = active_loop.weighting.prior_nm2 > 0
     assert 0 < uncorrected.sum() < uncorrected.size
-    np.testing.assert_array_equal(uncorrected, active_loop.law.gain == 0)
+    np.testing.assert_array_equal(uncorrected, active_loop.integrator.gain == 0)
     original, reweighted = (
         np.diag(
             noise_covariance_nm2(
@@ -176,7 +176,7 @@ def test_a_decoded_state_has_the_same_reconstructor(faint: Bench) -> None:
     assert settings == faint.settings
     np.testing.assert_array_equal(again.loop.estimator.rows, active_loop.estimator.rows)
     np.testing.assert_array_equal(again.loop.automatic, active_loop.automatic)
-    np.testing.assert_array_equal(again.loop.law.kept, active_loop.law.kept)
+    np.testing.assert_array_equal(again.loop.integrator.kept, active_loop.integrator.kept)
     assert controller_state(again, settings, 1) == message
 
 
@@ -185,7 +185,7 @@ def test_a_state_decoded_before_gains_are_measured_has_the_same_law() -> None:
     loop = bench(2.0)
     active_loop, message = loop.state.loop, controller_state(loop.state, loop.settings, 1)
     again = decode_state(message, active_loop.calibration)[1].loop
-    np.testing.assert_array_equal(again.law.rows, active_loop.law.rows)
+    np.testing.assert_array_equal(again.integrator.rows, active_loop.integrator.rows)
 
 
 def test_tilt_cross_talk_uses_the_tilt_on_the_sensor_including_the_offset(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -233,7 +233,7 @@ def test_manual_gains_are_kept_and_harm_is_reported_before_and_after_closing() -
     assert named(loop, "CLOSING_HARMS")[0]["harm"].startswith("closing adds")
     assert named(loop, "LOOP_HARMS")[0]["action"] == "nothing is done"
     active_loop = loop.state.loop
-    assert set(active_loop.law.gain.tolist()) == {np.float32(0.5), np.float32(0.05)}
+    assert set(active_loop.integrator.gain.tolist()) == {np.float32(0.5), np.float32(0.05)}
     assert not named(loop, "GAINS_CHANGED")
     residual_nm, open_nm = rms_nm(loop, 600)
     assert residual_nm > open_nm
@@ -262,7 +262,7 @@ def test_a_mode_can_have_a_manual_gain_and_return_to_automatic() -> None:
     loop.ask("gain", values=(0.3,), modes=(4,))
     loop.run(300)
     active_loop = loop.state.loop
-    assert active_loop.law.gain[2] == np.float32(0.3)
+    assert active_loop.integrator.gain[2] == np.float32(0.3)
     assert not active_loop.automatic[2]
     loop.ask("gain", text="auto", modes=(4,))
     assert loop.state.loop.automatic.all()

@@ -7,7 +7,7 @@ from lowfc.contract.configuration import Configuration, load
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.stability import limiting_gain
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
-from tests.support.folded_loop import fold
+from tests.support.in_process_loop import fold
 from tools.law_bench import calibrated
 
 QUIET = {

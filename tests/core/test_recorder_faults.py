@@ -14,7 +14,7 @@ import pytest
 
 from lowfc.adapters.bus.backlog import Backlog
 from lowfc.adapters.bus.bus import Publisher, Sample
-from lowfc.adapters.bus.names import MOST_NAMES
+from lowfc.adapters.bus.names import MAX_NAMES
 from lowfc.adapters.logs import writer
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.series import Limits
@@ -306,7 +306,7 @@ def test_the_backlog_is_bounded_by_number_and_size() -> None:
 def test_forged_names_and_starts_do_not_fill_the_recorder_or_a_log(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("lowfc.programs.core.recording.recorder.MOST_CHANNELS", 100)
+    monkeypatch.setattr("lowfc.programs.core.recording.recorder.MAX_CHANNELS", 100)
     bench.start()
     forger = MemoryBus(bench.hub, "operator", bench.clock)
     for number in range(1000):
@@ -320,5 +320,5 @@ def test_forged_names_and_starts_do_not_fill_the_recorder_or_a_log(
     until(lambda: bench.recorder.service.health().recording.file != first)
     summary = bench.stop()
     keys = {message.key for log in summary.files for message in LogReader(log)}
-    assert sum("forged" in key for key in keys) == 2 * MOST_NAMES
-    assert sum("forged" in key for key in bench.recorder._account.recorded()) == 2 * MOST_NAMES
+    assert sum("forged" in key for key in keys) == 2 * MAX_NAMES
+    assert sum("forged" in key for key in bench.recorder._account.recorded()) == 2 * MAX_NAMES

@@ -35,7 +35,7 @@ LOOP = ("lowfc-controller.service", "lowfc-sim-camera.service", "lowfc-sim-mirro
 COMMON = "lowfc-.service.d/10-common.conf"
 INSTALLED = "/opt/lowfc/bin/"
 CONFIGURED = "/etc/lowfc/lowfc.toml"
-MOST_EXPOSED = 2.0
+MAX_EXPOSURE_SCORE = 2.0
 needs_systemd = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
 
 
@@ -114,9 +114,9 @@ def test_systemd_accepts_the_units(units: Path) -> None:
 
 @needs_systemd
 def test_the_units_are_hardened(units: Path, tmp_path: Path) -> None:
-    assert {name: exposure(units, name) for name in UNITS if exposure(units, name) >= MOST_EXPOSED} == {}
+    assert {name: exposure(units, name) for name in UNITS if exposure(units, name) >= MAX_EXPOSURE_SCORE} == {}
     shutil.copy(units / UNITS[0], tmp_path)
-    assert exposure(tmp_path, UNITS[0]) > 3 * MOST_EXPOSED  # without the common drop-in
+    assert exposure(tmp_path, UNITS[0]) > 3 * MAX_EXPOSURE_SCORE  # without the common drop-in
 
 
 @needs_systemd

@@ -67,7 +67,7 @@ def loop(folder: Path, *options: str) -> Iterator[None]:
 
 @pytest.mark.slow
 @pytest.mark.timeout(2400)
-def test_a_day_on_the_bench(tmp_path: Path) -> None:
+def test_every_command_of_the_calibration_and_acceptance_pages_runs(tmp_path: Path) -> None:
     (tmp_path / "lowfc.toml").write_text(CONFIG)
     for line in COMPUTED:
         assert run(tmp_path, line)

@@ -50,7 +50,7 @@ def test_the_loop_does_not_undo_the_steps(night: Night) -> None:
     assert error < 0.005
 
 
-def test_without_the_shift_it_does_undo_them(night: Night) -> None:
+def test_without_the_shift_the_loop_undoes_the_steps(night: Night) -> None:
     undone, _ = night.channels[PLAIN].undone()
     assert undone == pytest.approx(1, abs=0.1)
 
@@ -61,15 +61,15 @@ def test_the_residual_is_as_small_as_before(night: Night) -> None:
     assert after_nm < 1.2 * before_nm
 
 
-def test_the_flat_map_is_there_from_the_start_and_dead_actuators_are_left_alone(said: dict[str, list[bytes]]) -> None:
+def test_commands_contain_the_flat_map_and_leave_dead_actuators_at_zero(said: dict[str, list[bytes]]) -> None:
     calibration = decode_calibration(wire.Calibration.FromString(said[f"/{CALIBRATION.key}"][0]))
-    wanted = flat_nm().reshape(-1)
-    wanted[list(DEAD)] = 0
+    expected = flat_nm().reshape(-1)
+    expected[list(DEAD)] = 0
     messages = [wire.MirrorCommand.FromString(body) for body in said[f"/{COMMAND.at('dm')}"][:300]]
     for message in messages:
         beside = np.frombuffer(message.actuators, "<f4") - calibration.modes_to_actuators @ message.command_nm
         assert not np.frombuffer(message.actuators, "<f4")[list(DEAD)].any()
-        np.testing.assert_allclose(beside, wanted, atol=1e-3)
+        np.testing.assert_allclose(beside, expected, atol=1e-3)
 
 
 def test_the_mean_command_is_published_once_a_second(said: dict[str, list[bytes]]) -> None:
@@ -82,8 +82,8 @@ def test_the_mean_command_is_published_once_a_second(said: dict[str, list[bytes]
         assert offload.frames == 1000
         assert list(offload.noll) == list(range(2, 16))
         last = offload.frame_sequence
-        wanted = np.mean([commands[sequence] for sequence in range(last - 999, last + 1)], axis=0)
-        np.testing.assert_allclose(offload.command_nm, wanted, atol=1e-4)
+        expected = np.mean([commands[sequence] for sequence in range(last - 999, last + 1)], axis=0)
+        np.testing.assert_allclose(offload.command_nm, expected, atol=1e-4)
     times_ns = [offload.timestamp.ToNanoseconds() for offload in offloads]
     assert np.diff(times_ns) == pytest.approx(1e9)
 

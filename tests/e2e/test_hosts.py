@@ -316,7 +316,7 @@ def forge(host: Host, certificate: Path | None, protocol: str = "tls") -> str:
     return done.stdout.strip()
 
 
-def test_the_controllers_certificate_could_move_the_mirror(bench: Bench) -> None:
+def test_a_forged_command_with_the_controllers_certificate_reaches_the_mirror(bench: Bench) -> None:
     """So that the tests below can fail: it is the certificate that keeps a forger out, and not its message."""
     bench.settled()
     give(bench.lab["desk"], bench.authority, "controller")

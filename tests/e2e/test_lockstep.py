@@ -77,7 +77,7 @@ def test_the_residual_is_the_predicted_one(tmp_path: Path, frames: int) -> None:
 
 
 @pytest.mark.slow
-def test_a_process_that_stands_still_is_named(tmp_path: Path) -> None:
+def test_a_lockstep_run_ends_and_names_a_stopped_process(tmp_path: Path) -> None:
     """Five seconds of real time without progress end a lockstep run."""
     process = start(tmp_path, "sim-loop", "--lockstep", "--duration", "600")
     until(lambda: recorded_bytes(tmp_path) > 4e6)
@@ -119,7 +119,7 @@ def test_every_mode_of_a_static_wavefront_is_removed(tmp_path: Path, sensor: str
     assert np.mean([truth.residual_rms_nm for truth in last]) < 0.15 * first.residual_rms_nm
 
 
-def test_the_documents_table_is_of_the_sensors_as_they_are() -> None:
+def test_stored_light_budgets_match_the_sensors() -> None:
     assert set(SENSORS) < set(measured("sensors")["sensors"])
     for name, figures in measured("sensors")["sensors"].items():
         budget = light_budget(sensor_named(name))
@@ -127,7 +127,7 @@ def test_the_documents_table_is_of_the_sensors_as_they_are() -> None:
         assert budget.peak == pytest.approx(figures["peak"], rel=1e-6), name
 
 
-def test_a_configuration_that_was_shown_does_not_open_the_loop(tmp_path: Path) -> None:
+def test_a_loop_with_the_output_of_config_show_starts_closed(tmp_path: Path) -> None:
     shown = output_of(tmp_path, "lowfc config show")
     for gain in ("tilt_gain", "gain"):  # not measured first
         shown = shown.replace(f'\n#{gain} = "auto"', f"\n{gain} = 0.3")
@@ -136,7 +136,7 @@ def test_a_configuration_that_was_shown_does_not_open_the_loop(tmp_path: Path) -
     assert "starts open" not in done.stderr
 
 
-def test_a_loop_that_starts_open_says_by_whose_wish(tmp_path: Path) -> None:
+def test_a_loop_that_starts_open_names_the_key_or_option(tmp_path: Path) -> None:
     file = tmp_path / "open.toml"
     file.write_text('[control]\nstart_mode = "open"\n')
     for options, chosen in ((("--config", file), f"control.start_mode of {file}"), (("--open",), "--open")):

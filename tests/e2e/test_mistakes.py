@@ -46,7 +46,7 @@ def layout(**changes: object) -> str:
         ("[mirror]\ndead = [99999]", "actuator '99999'"),
     ],
 )
-def test_configuration(tmp_path: Path, config: str, expected: str) -> None:
+def test_an_invalid_configuration_is_refused(tmp_path: Path, config: str, expected: str) -> None:
     _refused(tmp_path, *SHORT, config=config, expected=expected)
 
 
@@ -59,7 +59,7 @@ def test_configuration(tmp_path: Path, config: str, expected: str) -> None:
         ("{", "JSON"),
     ],
 )
-def test_a_layout(tmp_path: Path, content: str, expected: str) -> None:
+def test_an_invalid_layout_is_refused(tmp_path: Path, content: str, expected: str) -> None:
     (tmp_path / "mask.json").write_text(content)
     _refused(tmp_path, *SHORT, "--sensor", "mask.json:mine", expected=expected)
 
@@ -73,7 +73,7 @@ def test_an_even_symmetric_layout_is_warned_about(tmp_path: Path) -> None:
     assert "Traceback" not in done.stderr
 
 
-def test_a_calibration(tmp_path: Path) -> None:
+def test_an_invalid_calibration_is_refused(tmp_path: Path) -> None:
     missing = ["controller", "--run", "mistakes", "--calibration", "none.fits"]
     _refused(tmp_path, *missing, expected="there is no such calibration file")
     config = load(None)
@@ -84,7 +84,7 @@ def test_a_calibration(tmp_path: Path) -> None:
         _refused(tmp_path, *missing[:-1], f"{name}.fits", expected=f"{name}.fits")
 
 
-def test_a_port_in_use(tmp_path: Path) -> None:
+def test_a_port_in_use_is_named(tmp_path: Path) -> None:
     held = open_run("mistakes-port")
     try:
         with socket.socket() as taken:
@@ -99,7 +99,7 @@ def test_a_port_in_use(tmp_path: Path) -> None:
         held.remove()
 
 
-def test_nobody_is_there(tmp_path: Path, own_runtime: Path) -> None:
+def test_unknown_runs_arguments_and_files_are_named(tmp_path: Path, own_runtime: Path) -> None:
     _refused(tmp_path, "ctl", "status", expected="lowfc was searched")
     _refused(tmp_path, "ctl", "status", "--run", "none-such", expected="there is no run 'none-such': no loop of user")
     _refused(tmp_path, "ctl", "--run", "none-such", "record", "stop", expected="there is no run 'none-such'")
@@ -146,7 +146,7 @@ def test_a_full_disk_on_standard_output_is_one_line(tmp_path: Path) -> None:
     assert done.stderr == "error: standard output cannot be written: No space left on device\n"
 
 
-def test_ctrl_c_while_it_loads_is_quiet(tmp_path: Path) -> None:
+def test_ctrl_c_during_startup_prints_no_traceback(tmp_path: Path) -> None:
     process = subprocess.Popen([*LOWFC, "config", "show"], cwd=tmp_path, stderr=subprocess.PIPE, text=True)
     time.sleep(0.15)
     process.send_signal(signal.SIGINT)
@@ -170,7 +170,7 @@ def test_ctrl_c_while_it_loads_is_quiet(tmp_path: Path) -> None:
         (("bench", "record", "--folder", "nowhere"), "nowhere cannot be written"),
     ],
 )
-def test_logs(tmp_path: Path, words: tuple[str, ...], expected: str) -> None:
+def test_unusable_logs_and_files_are_refused_in_one_line(tmp_path: Path, words: tuple[str, ...], expected: str) -> None:
     (tmp_path / "empty.mcap").touch()
     (tmp_path / "header.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(12))
     LogWriter(tmp_path / "night.mcap", 1, {}).finish({})
@@ -182,7 +182,9 @@ def test_logs(tmp_path: Path, words: tuple[str, ...], expected: str) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == before
 
 
-def test_a_loop_that_is_starting_is_there_for_others(own_runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_starting_loop_is_listed_and_makes_an_unnamed_request_ambiguous(
+    own_runtime: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """So that an unnamed request does not reach the only other one."""
     found: list[object] = []
 

@@ -247,15 +247,15 @@ def test_the_log_has_every_request_and_nothing_was_lost(night: Night) -> None:
     taken = [request.input_number for request in requests if request.input_number]
     assert taken == sorted(taken)
     events = [Log.FromString(body).message for found in messages for body in found[f"/{EVENT.key}"]]
-    for wanted in (
+    for expected in (
         "RECORDING_STOPPED recording stopped: operator asked",
         "NOTE HD 209458, seeing 0.8 arcsec",
         "LOOP_STEPPED the loop opened after its last step",
     ):
-        assert wanted in events
+        assert expected in events
 
 
-def test_the_mirror_never_jumped(night: Night) -> None:
+def test_every_command_keeps_the_actuator_limits(night: Night) -> None:
     limits = Limits(700.0, 100.0, 400.0)
     shapes = []
     for found in map(payloads, night.logs):

@@ -91,8 +91,8 @@ def listening() -> Iterator[ZenohBus]:
         bus.close()
 
 
-def heard(bus: ZenohBus) -> None:
-    """Wait until camera and mirror are there."""
+def wait_for_devices(bus: ZenohBus) -> None:
+    """Wait for the first frame and the first state of the mirror."""
     there: set[str] = set()
     for topic in (FRAME, MIRROR_STATE):
         bus.subscribe(topic, lambda sample: there.add(sample.key))
@@ -100,7 +100,7 @@ def heard(bus: ZenohBus) -> None:
 
 
 def conformance(folder: Path, *commands: str) -> None:
-    """Nothing is wrong with the devices; all are looked at at once."""
+    """Check all devices at the same time; none may fail a check."""
     checking = [started(folder, f"{line} --json --duration 0.6") for line in commands]
     for line, process in zip(commands, checking, strict=True):
         out, complaints = process.communicate(timeout=60)
@@ -115,7 +115,7 @@ def conformance(folder: Path, *commands: str) -> None:
 
 def test_the_loop_closes_on_a_camera_and_a_mirror_of_ones_own(bench: Path) -> None:
     with going_on(bench, *DEVICES), listening() as bus:
-        heard(bus)
+        wait_for_devices(bus)
         conformance(bench, *CONFORMANCE)
         errors_nm: list[list[float]] = []
 
@@ -149,12 +149,12 @@ def test_the_simulated_devices_and_a_camera_in_plain_zenoh_keep_the_contract(ben
     command(bench, PLAIN[0].replace("bench", "plain"))
     with going_on(bench, *SIMULATED, PLAIN[1]):
         with listening() as bus:
-            heard(bus)
+            wait_for_devices(bus)
         conformance(bench, *CONFORMANCE, CONFORMANCE[0].partition(" --config")[0].replace("bench", "plain"))
 
 
 @pytest.mark.slow
-def test_a_camera_written_from_the_page_is_right_at_its_first_run(bench: Path) -> None:
+def test_the_camera_of_the_tutorial_passes_conformance(bench: Path) -> None:
     (bench / "counting.py").write_text(block("python", (ROOT / "docs/tutorials/your_camera.md").read_text()))
     with going_on(bench, COUNTING[0]):
         until(lambda: (bench / "run/lowfc/counting").exists())
@@ -210,7 +210,7 @@ def test_a_camera_of_another_size_comes_to_a_closed_loop(bench: Path, own: bool)
         assert not any(" sim " in line for line in devices)
     with going_on(bench, *devices, CONTROLLER):
         with listening() as bus:
-            heard(bus)
+            wait_for_devices(bus)
         process = started(bench, f"{COMMISSION} --json")
         out, shown = process.communicate(timeout=400)
         assert process.returncode == 0, shown

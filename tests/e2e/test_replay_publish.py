@@ -91,7 +91,9 @@ def figures_of(process: "subprocess.Popen[str]", status: int = 0) -> dict[str, A
     return figures
 
 
-def test_a_tool_sees_the_night_again(log: Path, logged: dict[str, list[Sample]], run: Run, tool: Tool) -> None:
+def test_a_subscriber_receives_the_log_in_order_and_at_its_rate(
+    log: Path, logged: dict[str, list[Sample]], run: Run, tool: Tool
+) -> None:
     begun_ns = tool.bus.clock.host_ns()
     playing = start(log, run, "--speed", "2")
     until(lambda: tool.heard[FRAME.key] or playing.poll() is not None)
@@ -127,7 +129,7 @@ def test_a_tool_sees_the_night_again(log: Path, logged: dict[str, list[Sample]],
     assert figures["timing_error_us"]["max"] >= figures["timing_error_us"]["p50"] > 0
 
 
-def test_a_truncated_log_faster_with_commands(log: Path, run: Run, tool: Tool, tmp_path: Path) -> None:
+def test_a_truncated_log_is_published_faster_and_with_commands(log: Path, run: Run, tool: Tool, tmp_path: Path) -> None:
     cut = tmp_path / "cut.mcap.part"
     content = log.read_bytes()
     cut.write_bytes(content[: len(content) * 2 // 3])
@@ -144,7 +146,9 @@ def test_a_truncated_log_faster_with_commands(log: Path, run: Run, tool: Tool, t
     assert figures["took_s"] < figures["span_s"] * 0.9 or figures["messages_behind"]
 
 
-def test_a_controller_under_test(log: Path, logged: dict[str, list[Sample]], run: Run, tool: Tool, tmp_path: Path):
+def test_a_live_controller_computes_the_recorded_errors(
+    log: Path, logged: dict[str, list[Sample]], run: Run, tool: Tool, tmp_path: Path
+):
     next(iter(reader := LogReader(log)))
     for name, content in reader.attachments.items():
         (tmp_path / name).write_bytes(content)
@@ -169,7 +173,7 @@ def test_a_controller_under_test(log: Path, logged: dict[str, list[Sample]], run
     assert len(tool.heard[COMMAND.at("dm")]) >= len(steps)
 
 
-def test_ctrl_c_ends_with_the_summary_and_until_then_no_mirror_can_come_up(log: Path, run: Run, tool: Tool) -> None:
+def test_ctrl_c_prints_the_summary_and_the_mirrors_role_is_taken_until_then(log: Path, run: Run, tool: Tool) -> None:
     playing = start(log, run, "--speed", "0.05", "--topics", FRAME.key)
     until(lambda: tool.heard[FRAME.key] or playing.poll() is not None)
     with pytest.raises(BusError, match="mirror-dm"):
@@ -182,7 +186,7 @@ def test_ctrl_c_ends_with_the_summary_and_until_then_no_mirror_can_come_up(log: 
     assert "interrupted" in render(figures)
 
 
-def test_whose_places_are_taken(run: Run) -> None:
+def test_publishing_takes_over_the_roles_of_its_topics_and_with_frames_the_mirrors(run: Run) -> None:
     frames, steps = [FRAME.key], [STEP.key]
     assert Selection(run.links, frames, ()).roles == ("camera", "mirror-dm")
     assert Selection(run.links, frames, (), allow_commands=True).roles == ("camera",)
@@ -190,7 +194,7 @@ def test_whose_places_are_taken(run: Run) -> None:
     assert set(Selection(run.links, (), ()).roles) == {"camera", "controller", "mirror-dm"}
 
 
-def test_nothing_to_play(log: Path, run: Run) -> None:
+def test_a_log_without_the_selected_topics_is_an_error(log: Path, run: Run) -> None:
     with pytest.raises(DataFileError, match="no message of the selected topics"):
         publish([log], run.run_id, topics=["lowfc/control/request"])
 
@@ -205,7 +209,7 @@ def test_nothing_to_play(log: Path, run: Run) -> None:
         ({"speed": 0.0}, "above 0"),
     ],
 )
-def test_a_mistake(log: Path, run: Run, options: dict[str, Any], expected: str) -> None:
+def test_invalid_options_are_refused(log: Path, run: Run, options: dict[str, Any], expected: str) -> None:
     with pytest.raises(ConfigurationError, match=expected):
         publish([log], run.run_id, **options)
 

@@ -75,13 +75,13 @@ def seen(page: Page) -> dict[str, Any]:
     return measured(page)
 
 
-def test_the_browser_has_nothing_to_complain_of(page: Page, seen: dict[str, Any]) -> None:
+def test_the_report_has_no_browser_errors_and_fetches_nothing_remote(page: Page, seen: dict[str, Any]) -> None:
     assert seen["pictures"]
     assert page.complaints == []
     assert {address.partition(":")[0] for address in page.fetched.values()} <= {"file", "data"}
 
 
-def test_every_picture_is_there_and_has_a_size(seen: dict[str, Any]) -> None:
+def test_every_picture_is_drawn_within_the_page(seen: dict[str, Any]) -> None:
     assert set(seen["pictures"]) == PICTURES
     for name, (left, _, width, height) in seen["pictures"].items():
         assert width > 600, name
@@ -92,21 +92,24 @@ def test_every_picture_is_there_and_has_a_size(seen: dict[str, Any]) -> None:
     assert seen["overflow"] <= 0
 
 
-def test_the_text_says_what_the_figures_say(seen: dict[str, Any], figures: dict[str, Any]) -> None:
+def test_the_text_contains_the_figures_of_the_json(seen: dict[str, Any], figures: dict[str, Any]) -> None:
     text, budget = seen["text"], figures["error_budget"]
     headings = ("Wavefront", "Timing", "Spectra", "Error budget", "Light", "Mirror", "Events and requests", "What ran")
-    wanted = [figures["verdict"]["heading"], *headings, figures["run"]["calibration"]["id"]]
-    wanted += [check["text"] for check in figures["verdict"]["checks"]]
+    expected = [figures["verdict"]["heading"], *headings, figures["run"]["calibration"]["id"]]
+    expected += [check["text"] for check in figures["verdict"]["checks"]]
     for mode in figures["residual"]["modes"]:
-        wanted += [f"Z{mode['noll']} {mode['name']}", f"{mode['error_rms_nm']:.3f}"]
-    wanted += [f"{stage['p99']:.1f}" for stage in figures["timing"]["latency_us"].values()]
-    wanted += [term[key] for term in budget["terms"] for key in ("name", "how")]
-    wanted += [f"{budget['true_residual']['rms_nm']['all modes']:.3f}", "rate_hz = 250.0"]  # the configuration, folded
-    assert [one for one in wanted if one not in text] == []
+        expected += [f"Z{mode['noll']} {mode['name']}", f"{mode['error_rms_nm']:.3f}"]
+    expected += [f"{stage['p99']:.1f}" for stage in figures["timing"]["latency_us"].values()]
+    expected += [term[key] for term in budget["terms"] for key in ("name", "how")]
+    expected += [
+        f"{budget['true_residual']['rms_nm']['all modes']:.3f}",
+        "rate_hz = 250.0",
+    ]  # the configuration, folded
+    assert [one for one in expected if one not in text] == []
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_it_can_be_read_in_light_and_in_the_dark(
+def test_the_pictures_are_visible_in_light_and_dark_mode(
     page: Page, seen: dict[str, Any], artefacts: Path, scheme: str
 ) -> None:
     page.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
@@ -130,7 +133,7 @@ def test_it_can_be_read_in_light_and_in_the_dark(
     assert np.ptp(shown[::3, ::3], axis=2).max() > 80, "there is no colour in it"
 
 
-def test_what_is_wrong_would_be_found(folder: Path, page: Page) -> None:
+def test_the_checks_detect_a_broken_page(folder: Path, page: Page) -> None:
     wrong = folder / "wrong.html"
     wrong.write_text(
         "<!DOCTYPE html><body><img src='http://127.0.0.1:9/picture.png'><script>throw new Error('broken')</script>"

@@ -95,7 +95,7 @@ def test_a_new_viewer_on_the_same_port_takes_a_new_stream(web: RerunViewer) -> N
     before.disconnect()
 
 
-def test_it_dies_with_its_parent_though_it_hangs() -> None:
+def test_a_stopped_viewer_dies_with_its_parent() -> None:
     program = (
         "import os, signal\nfrom lowfc.adapters.viewer.rerun_viewer import RerunViewer, Show\n"
         "viewer = RerunViewer(Show.WEB)\nprint(viewer.pid, flush=True)\n"
@@ -114,7 +114,7 @@ def test_it_dies_with_its_parent_though_it_hangs() -> None:
         (Show.HEADLESS, "VK_ICD_FILENAMES", "/nowhere.json", "mesa-vulkan-drivers"),
     ],
 )
-def test_what_is_missing_is_one_line_that_says_what_to_do(
+def test_a_missing_display_or_driver_is_a_one_line_error(
     monkeypatch: pytest.MonkeyPatch, show: Show, variable: str, value: str, complaint: str
 ) -> None:
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
@@ -124,14 +124,14 @@ def test_what_is_missing_is_one_line_that_says_what_to_do(
     assert "\n" not in str(caught.value)
 
 
-def test_a_port_that_is_taken_is_one_line(web: RerunViewer) -> None:
+def test_a_port_in_use_is_a_one_line_error(web: RerunViewer) -> None:
     with pytest.raises(ViewerError) as caught:
         RerunViewer(Show.WEB, port=web.port)
     assert str(web.port) in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_the_page_may_ask_this_host_alone(web: RerunViewer) -> None:
+def test_the_content_security_policy_allows_this_host_only(web: RerunViewer) -> None:
     with urlopen(web.web_address) as page:  # noqa: S310
         policy = page.headers["Content-Security-Policy"]
     addresses = set(re.findall(r"https?://\S+", policy))

@@ -107,11 +107,11 @@ def bench(folder: Path, request: pytest.FixtureRequest) -> Iterator[Bench]:
     made.stop()
 
 
-def test_any_start_order(bench: Bench) -> None:
+def test_the_loop_closes_in_any_start_order(bench: Bench) -> None:
     bench.settled()
 
 
-def test_kill_and_restart_of_each(bench: Bench) -> None:
+def test_the_loop_recovers_from_kill_and_restart_of_each_process(bench: Bench) -> None:
     bench.settled()
     for name in ("camera", "controller", "mirror"):
         before = bench.shapes[-1]
@@ -133,7 +133,7 @@ def _alive(bench: Bench, name: str) -> bool:
     return bool(bench.bus.get(f"lowfc/health/{process}", timeout_s=0.1))
 
 
-def test_a_mirror_that_dies_is_missed_and_taken_back(bench: Bench) -> None:
+def test_the_controller_holds_without_a_mirror_and_closes_after_its_restart(bench: Bench) -> None:
     bench.settled()
     before = bench.shapes[-1]
     bench.kill("mirror")

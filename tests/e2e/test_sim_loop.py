@@ -47,7 +47,7 @@ def topics(live: dict[str, Any]) -> dict[str, list[bytes]]:
     return payloads(live["log"])
 
 
-def test_the_loop_holds_the_wavefront_and_accounts_for_every_frame(live: dict[str, Any]) -> None:
+def test_the_loop_halves_the_residual_and_counts_every_frame(live: dict[str, Any]) -> None:
     assert live["frames_published"] == FRAMES
     assert live["frames_processed"] + live["frames_skipped"] + live["frames_missing"] == FRAMES
     assert live["frames_processed"] > 0.9 * FRAMES
@@ -59,7 +59,9 @@ def test_the_loop_holds_the_wavefront_and_accounts_for_every_frame(live: dict[st
         assert 0 < values["p50"] <= values["p99"] <= values["p99_9"] <= values["max"]
 
 
-def test_the_log_holds_every_topic_and_says_what_it_lost(live: dict[str, Any], topics: dict[str, list[bytes]]) -> None:
+def test_the_log_holds_every_topic_and_lost_messages_are_counted(
+    live: dict[str, Any], topics: dict[str, list[bytes]]
+) -> None:
     recorded = sum(map(len, topics.values()))
     assert recorded == live["messages_recorded"]
     assert {topic_of(topic[1:]).key for topic in topics} >= {
@@ -82,7 +84,7 @@ def test_the_log_holds_every_topic_and_says_what_it_lost(live: dict[str, Any], t
     assert live["messages_lost"] >= missing
 
 
-def test_the_log_is_as_large_as_said_before(live: dict[str, Any]) -> None:
+def test_the_log_grows_at_the_estimated_rate(live: dict[str, Any]) -> None:
     info = json.loads(output_of(live["log"].parent, f"lowfc info {live['log']} --json"))
     constant = sum(info["attachments"].values()) + info["topics"]["lowfc/calibration"]["bytes"]
     growth = (info["bytes"] - constant) * 500 / FRAMES
@@ -110,12 +112,12 @@ def test_frame_step_command_and_state_join(topics: dict[str, list[bytes]]) -> No
         joined += 1
         assert step.timestamp == command.timestamp
         assert list(step.command_nm) == list(command.command_nm)
-        wanted, driven = (np.frombuffer(message.actuators, "<f4") for message in (command, state))
-        np.testing.assert_allclose(driven, wanted, atol=0.02)  # the driver's steps
+        expected, driven = (np.frombuffer(message.actuators, "<f4") for message in (command, state))
+        np.testing.assert_allclose(driven, expected, atol=0.02)  # the driver's steps
     assert joined > 0.8 * len(steps)
 
 
-def test_an_independent_reader_agrees(live: dict[str, Any], topics: dict[str, list[bytes]]) -> None:
+def test_npm_mcap_core_reads_the_same_messages(live: dict[str, Any], topics: dict[str, list[bytes]]) -> None:
     """npm's @mcap/core: same counts, CRCs right, attachments there."""
     (found,) = foxglove([live["log"]])
     assert found["messages"] == found["counted"] == live["messages_recorded"]
@@ -166,7 +168,7 @@ def test_two_loops_on_one_host_do_not_mix(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_disk_that_refuses_ends_the_recording_and_nothing_else(tmp_path: Path) -> None:
+def test_a_log_at_the_file_size_limit_does_not_stop_the_loop(tmp_path: Path) -> None:
     words = [*LOWFC, "sim-loop", "--rate", "200", "--duration", "1", "--json"]
     small = (3_000_000, 3_000_000)
     done = subprocess.run(

@@ -32,7 +32,7 @@ from tests.support.loops import LOWFC, children, interrupt, run, start, until
 from tests.support.report_log import Night
 from tests.support.viewers import browser_screenshot, complaints, needs_chromium, on_screen, pixels, share_of
 
-LEAST_SHADES = 8  # of a panel with something in it; an empty one has its ground and the letters of its title
+MIN_SHADES = 8  # of a panel with something in it; an empty one has its ground and the letters of its title
 TITLE_ROWS = 30
 
 
@@ -70,7 +70,7 @@ def test_every_panel_of_every_tab_shows_the_live_loop(live: str, artefacts: Path
             assert pixels(picture).shape == (1000, 1600, 3)
             shown = {view.name: _shades(viewer, view.id) for view in _views(blueprint.root_container.contents[number])}
             assert len(shown) > 4
-            assert {name: shades for name, shades in shown.items() if shades < LEAST_SHADES} == {}, tab
+            assert {name: shades for name, shades in shown.items() if shades < MIN_SHADES} == {}, tab
         assert complaints(viewer) == []
     finally:
         bridge.close()
@@ -80,7 +80,7 @@ def test_every_panel_of_every_tab_shows_the_live_loop(live: str, artefacts: Path
 @pytest.mark.exclusive
 @pytest.mark.browser
 @needs_chromium
-def test_the_page_shows_the_live_loop_and_nobody_else_can_see_it(live: str, artefacts: Path) -> None:
+def test_the_web_view_shows_the_live_loop_and_fetches_from_this_host_only(live: str, artefacts: Path) -> None:
     page_of = subprocess.Popen([*LOWFC, "view", "--web", "--run", live], stderr=subprocess.PIPE, text=True)
     try:
         address = re.search(r"http://127\.0\.0\.1:\S+", page_of.stderr.readline())
@@ -97,7 +97,7 @@ def test_the_page_shows_the_live_loop_and_nobody_else_can_see_it(live: str, arte
 
 @pytest.mark.exclusive
 @pytest.mark.slow
-def test_the_loop_goes_on_whatever_happens_to_its_view(tmp_path: Path) -> None:
+def test_the_loop_continues_when_its_view_is_killed(tmp_path: Path) -> None:
     process = start(tmp_path, "sim-loop", "--web", "--rate", "200", "--duration", "4", "--json")
     until(lambda: "view" in children(process.pid))
     view = children(process.pid)["view"]
@@ -111,7 +111,7 @@ def test_the_loop_goes_on_whatever_happens_to_its_view(tmp_path: Path) -> None:
     assert figures["messages_lost"] == 0
 
 
-def test_a_log_without_an_end_is_a_file_for_rerun(tmp_path: Path) -> None:
+def test_a_log_without_an_end_is_saved_as_a_valid_rrd_file(tmp_path: Path) -> None:
     night = Night()
     night.frames(300)
     log = night.write(tmp_path / "cut.mcap", finish=False)
@@ -138,7 +138,7 @@ def test_a_log_without_an_end_is_a_file_for_rerun(tmp_path: Path) -> None:
         ({"logs": [Path("nothing.mcap")], "seconds": 3.0}, "--seconds"),
     ],
 )
-def test_mistakes_are_one_line(
+def test_invalid_view_options_are_one_line_errors(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: dict[str, object], complaint: str
 ) -> None:
     monkeypatch.chdir(tmp_path)

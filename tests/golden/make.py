@@ -161,7 +161,7 @@ def expect_refusal(request: Callable[..., object], *arguments: object) -> None:
 def law(config: Configuration) -> LinearLaw:
     """An integrator on pseudo-open-loop modes, whose state includes past commands."""
     settings = factory.settings(config)
-    delay, gains = settings.delay_frames, settings.law(config.noll).gain.astype(float).tolist()
+    delay, gains = settings.delay_frames, settings.integrator(config.noll).gain.astype(float).tolist()
     blocks = [integrator_block(gain, 0.01, "pol", delay) for gain in gains]
     return of_blocks(blocks, "pol", "golden integrator", config.noll, delay, config.camera.rate_hz)
 

@@ -14,13 +14,13 @@ from lowfc.adapters.files.layouts import load_layout
 from lowfc.adapters.files.sensors import load_pupil
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.contract.codecs import input_file
-from lowfc.contract.configuration import MOST_FAULTS, load
+from lowfc.contract.configuration import MAX_FAULTS, load
 from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError
 from lowfc.programs.core.start_up import check_files
 from lowfc.programs.design.sam_files import read_state
 from lowfc.programs.logs.replay.workers import replay_files
 
-MOST_CHARACTERS = 500
+MAX_CHARACTERS = 500
 """Longest error."""
 
 
@@ -28,7 +28,7 @@ def error_of(call: Callable[[], object]) -> str:
     with pytest.raises(LowfcError) as caught:
         call()
     text = str(caught.value)
-    assert len(text) < MOST_CHARACTERS + len(str(Path.cwd()))
+    assert len(text) < MAX_CHARACTERS + len(str(Path.cwd()))
     assert text.isprintable(), "the error has one line"
     return text
 
@@ -66,7 +66,7 @@ def test_only_the_first_of_many_mistakes_are_listed(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError) as caught:
         load(path)
     lines = str(caught.value).splitlines()
-    assert (len(lines), lines[-1]) == (MOST_FAULTS + 1, f"{path}: and {50_000 - MOST_FAULTS} more")
+    assert (len(lines), lines[-1]) == (MAX_FAULTS + 1, f"{path}: and {50_000 - MAX_FAULTS} more")
 
 
 def test_many_dots_in_a_comment_or_a_list_are_accepted(tmp_path: Path) -> None:

@@ -222,7 +222,7 @@ def test_the_state_of_the_log_is_in_the_verdict(
 
 
 def test_only_the_end_of_a_very_long_stretch_is_analysed(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(closed_loop, "MOST_STEPS", 400)
+    monkeypatch.setattr(closed_loop, "MAX_STEPS", 400)
     stretch = figures(good)["closed_stretch"]
     assert stretch["frames"] == 400
     assert stretch["steps_settling"] + stretch["steps_earlier"] == 1100

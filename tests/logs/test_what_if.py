@@ -29,7 +29,7 @@ from lowfc.programs.logs.what_if.compare import LINEAR_WAVES, render, what_if
 from lowfc.programs.logs.what_if.options import WhatIf, requested, user_controller
 from lowfc.programs.logs.what_if.run import LoggedRun
 from tests.support import toy
-from tests.support.folded_loop import SMALL_MIRROR, fold
+from tests.support.in_process_loop import SMALL_MIRROR, fold
 from tests.support.report_log import Night
 from tools.law_bench import calibrated
 
@@ -66,7 +66,7 @@ def as_if(run: SimpleNamespace, config: Configuration) -> np.ndarray:
     settings = factory.settings(config)
     weights = delay_weights(settings.delay_frames).astype(np.float32)
     pol_nm = run.pol_nm.astype(np.float32)
-    law = settings.law(config.noll)
+    law = settings.integrator(config.noll)
     return counterfactual(as_logged(law), weights, pol_nm, np.zeros(len(pol_nm), np.int64))[0]
 
 

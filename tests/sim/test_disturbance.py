@@ -30,7 +30,7 @@ from sim_camera.disturbance import (
     screen,
     variances_nm2,
 )
-from sim_camera.faults import LOST_SHARE, MOST_FRAMES_LATE, TRACK_PIXELS, Fault, Kind
+from sim_camera.faults import LOST_SHARE, MAX_FRAMES_LATE, TRACK_PIXELS, Fault, Kind
 from sim_camera.faulty import EARLIER_S, FaultyFrames, read_fault
 
 NOLL = tuple(range(2, 16))
@@ -214,7 +214,7 @@ def test_unknown_presets_and_modes_are_refused() -> None:
 
 
 FIRST, FRAMES = 100, 400
-LAST = FIRST + FRAMES + MOST_FRAMES_LATE + 1
+LAST = FIRST + FRAMES + MAX_FRAMES_LATE + 1
 IMAGE = np.arange(400, dtype=np.uint16).reshape(20, 20)
 DARK, HIGHEST = 100, 60_000
 
@@ -233,7 +233,7 @@ def faulty_frame(kind: Kind, index: int) -> np.ndarray:
 
 @pytest.mark.parametrize("kind", Kind)
 def test_fault_changes_no_frame_outside_its_range(kind: Kind) -> None:
-    for index in (1, FIRST - 1, FIRST + FRAMES + MOST_FRAMES_LATE + 1):
+    for index in (1, FIRST - 1, FIRST + FRAMES + MAX_FRAMES_LATE + 1):
         assert fault(kind).sent(index) == (index,)
         assert faulty_frame(kind, index) is IMAGE
         assert fault(kind).payload(index, b"whole", 5) == b"whole"
@@ -256,7 +256,7 @@ def test_late_frames_are_all_published_within_fifty_frames() -> None:
     when = {frame: index for index in range(LAST) for frame in fault(Kind.LATE).sent(index)}
     assert set(when) == set(range(LAST))
     late = [when[frame] - frame for frame in range(FIRST, FIRST + FRAMES)]
-    assert (min(late), max(late)) == (1, MOST_FRAMES_LATE)
+    assert (min(late), max(late)) == (1, MAX_FRAMES_LATE)
 
 
 def test_detector_faults_change_the_pixels() -> None:

@@ -13,7 +13,7 @@ from lowfc.contract.messages import EVENT, MIRROR_STATE, Log, wire
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from sim_camera.driver import SimulatedCamera
-from sim_camera.figures import BLOCK, MOST_BLOCKS, Figures, WavefrontFigures
+from sim_camera.figures import BLOCK, MAX_BLOCKS, Figures, WavefrontFigures
 from sim_camera.lateness import WINDOW, Lateness
 from sim_camera.scene import Scene, Truth, Wavefront
 
@@ -38,14 +38,14 @@ def figures(*residuals_nm: float, nm_per_mas: float = 1.0, recent: int = 1) -> F
     return found
 
 
-@pytest.mark.parametrize("blocks", [2, MOST_BLOCKS - 1, MOST_BLOCKS, MOST_BLOCKS + 2, 2 * MOST_BLOCKS + 4])
+@pytest.mark.parametrize("blocks", [2, MAX_BLOCKS - 1, MAX_BLOCKS, MAX_BLOCKS + 2, 2 * MAX_BLOCKS + 4])
 def test_figures_cover_the_second_half_of_a_run_of_any_length(monkeypatch: pytest.MonkeyPatch, blocks: int) -> None:
     monkeypatch.setattr("sim_camera.figures.BLOCK", 2)
     half = blocks // 2 * 2
     run = figures(*[5.0] * half, *[3.0] * (2 * blocks - half))
     found = run.wavefront()
     assert (found.residual_rms_nm, found.tilt_disturbance_mas) == pytest.approx((3.0, 6.0), rel=0.05)
-    assert len(run._blocks) < MOST_BLOCKS
+    assert len(run._blocks) < MAX_BLOCKS
 
 
 def test_figures_before_the_first_block_cover_all_frames() -> None:

@@ -11,7 +11,7 @@ from hypothesis.extra import numpy as hnp
 from lowfc.arrays import Single
 from lowfc.contract.configuration import load
 from lowfc.control.loop.safety import Limit, Limits, Reason, Rejection, neighbour_difference_nm
-from lowfc.device.guard import LONGEST_VALID_NS, Command, Status
+from lowfc.device.guard import MAX_VALID_NS, Command, Status
 from sim_dm.device import Device, initial
 from sim_dm.driver import device as device_of
 from tests.support.safety_checks import apply_command, tick, violations
@@ -73,7 +73,7 @@ def test_safe_mode_is_stored_by_channel() -> None:
     status, _ = apply_command(device, initial(device), command(even(1.0), safe=True), START_NS)
     status, _ = apply_command(device, status, command(even(1.0), channel="other"), START_NS)
     assert status.safe == {"lowfc"}
-    assert tick(device, status, START_NS + 10 * LONGEST_VALID_NS).safe == {"lowfc"}
+    assert tick(device, status, START_NS + 10 * MAX_VALID_NS).safe == {"lowfc"}
     assert apply_command(device, status, command(even(1.0), 2), START_NS)[0].safe == frozenset()
 
 
@@ -82,7 +82,7 @@ def test_command_with_a_time_in_the_far_future_still_times_out_to_flat() -> None
     ahead = replace(command(even(100.0)), time_ns=1 << 62)
     status, _ = apply_command(device, initial(device), ahead, START_NS)
     for number in range(1, 5):
-        status = tick(device, status, START_NS + LONGEST_VALID_NS + number * 10 * MS)
+        status = tick(device, status, START_NS + MAX_VALID_NS + number * 10 * MS)
     assert not status.following
     assert not status.surface_nm.any()
 
@@ -187,7 +187,7 @@ def test_repeated_command_renews_the_timeout() -> None:
 
 @pytest.mark.parametrize(
     ("valid_ns", "held_ns"),
-    [(200 * MS, 200 * MS), (2**64 - 1, LONGEST_VALID_NS), (0, 0)],
+    [(200 * MS, 200 * MS), (2**64 - 1, MAX_VALID_NS), (0, 0)],
     ids=["200 ms", "longest", "zero"],
 )
 def test_command_expires_just_after_its_validity(valid_ns: int, held_ns: int) -> None:

@@ -20,7 +20,7 @@ from tests.support.targets import Target, targets
 
 HANG_S = 10.0
 """Time after which an input counts as a hang."""
-MOST_GROWTH_BYTES = 200_000_000
+MAX_GROWTH_BYTES = 200_000_000
 """Largest permitted growth of the process by one target's inputs."""
 
 

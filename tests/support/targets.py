@@ -29,7 +29,7 @@ from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.envelope import Envelope
 from lowfc.contract.errors import LowfcError
 from lowfc.contract.messages import CAMERA_STATE, COMMAND, FRAME, image, wire
-from lowfc.control.laws.law import Law
+from lowfc.control.laws.integrator import Integrator
 from lowfc.control.laws.linear_law import LinearLaw, integrator
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.camera import CameraSettings
@@ -294,7 +294,7 @@ def _shown(data: bytes) -> None:
 
 
 def _valid_requests() -> list[wire.Request]:
-    law = Law(*(np.full(len(NOLL), value, np.float32) for value in (0.4, 0.0, 50.0)))
+    law = Integrator(*(np.full(len(NOLL), value, np.float32) for value in (0.4, 0.0, 50.0)))
     shape = np.ones(GRID, np.float32).tobytes()
     table = np.ones((5, 1), np.float32).tobytes()
     whole = wire.Calibration.FromString(encode_calibration(CALIBRATION, 0))
@@ -335,7 +335,7 @@ def _bytes_of(save: Callable[[Path], object], path: Path) -> tuple[bytes]:
 
 
 def _files(folder: Path) -> list[Target]:
-    law = Law(*(np.full(len(NOLL), value, np.float32) for value in (0.4, 0.0, 50.0)))
+    law = Integrator(*(np.full(len(NOLL), value, np.float32) for value in (0.4, 0.0, 50.0)))
     linear = integrator(law.gain, law.leak, NOLL, 1.0, 1000.0)
     with_modes = identified(replace(CALIBRATION, actuators_to_modes=np.ones((len(NOLL), 20), np.float32)))
     fits = tuple(calibration_file.to_bytes(each) for each in (CALIBRATION, with_modes))

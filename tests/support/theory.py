@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lowfc.arrays import Array
-from lowfc.control.laws.law import Law
+from lowfc.control.laws.integrator import Integrator
 from lowfc.control.laws.linear_law import (
     LinearLaw,
     Signal,
@@ -24,12 +24,14 @@ from lowfc.control.laws.vibration import Model
 
 def law_of(
     gain: npt.ArrayLike = 0.5, leak: npt.ArrayLike = 0.0, limit_nm: npt.ArrayLike = 1000.0, modes: int = 3
-) -> Law:
+) -> Integrator:
     """Make an integrator with one gain for all modes, or one for each."""
-    return Law(*(np.broadcast_to(np.asarray(each, np.float32), (modes,)) for each in (gain, leak, limit_nm)))
+    return Integrator(*(np.broadcast_to(np.asarray(each, np.float32), (modes,)) for each in (gain, leak, limit_nm)))
 
 
-def linear(law: Law, noll: tuple[int, ...] = (2, 3, 4), delay_frames: float = 1.0, rate_hz: float = 1e3) -> LinearLaw:
+def linear(
+    law: Integrator, noll: tuple[int, ...] = (2, 3, 4), delay_frames: float = 1.0, rate_hz: float = 1e3
+) -> LinearLaw:
     return integrator(law.gain, law.leak, noll, delay_frames, rate_hz)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.logs.sequence_gaps import Arrivals
 
-MOST_IN_A_ROW = 16
+MAX_IN_A_ROW = 16
 """Messages dispatched back to back before waiting ones are skipped."""
 REST_NS = 50_000
 """A gap of this length means that no message was waiting."""
@@ -19,7 +19,7 @@ class Dispatch(Arrivals):
 
     Messages queue while the process stands still. A queued message is superseded if it is at least a period old when
     dispatched, any message if it is older than `LONG_AGO_NS`. So that a slow handler cannot fall further and further
-    behind, messages that still wait after `MOST_IN_A_ROW` back to back are skipped.
+    behind, messages that still wait after `MAX_IN_A_ROW` back to back are skipped.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class Dispatch(Arrivals):
             queued = sample.receive_time_ns - self._done_ns <= REST_NS
             self._in_a_row = self._in_a_row + 1 if queued else 1
             age_ns = sample.receive_time_ns - sample.publish_time_ns
-            if self._in_a_row > MOST_IN_A_ROW:
+            if self._in_a_row > MAX_IN_A_ROW:
                 handler = None
             elif age_ns >= (self._period_ns if queued else self._old_ns):
                 handler = self._superseded

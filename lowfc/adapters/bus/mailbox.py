@@ -7,7 +7,7 @@ from collections import deque
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.logs.sequence_gaps import Arrivals
 
-LONGEST_WAIT_S = 0.5
+MAX_WAIT_S = 0.5
 """Bound of one wait: a signal that arrives just before the wait begins is handled only after the wait."""
 
 
@@ -53,7 +53,7 @@ class Mailbox(Arrivals):
                 if self._woken or left_s <= 0:
                     self._woken = False
                     return None
-                self._signal.acquire(timeout=min(left_s, LONGEST_WAIT_S))
+                self._signal.acquire(timeout=min(left_s, MAX_WAIT_S))
             else:
                 self._taken += 1
                 return sample

@@ -4,10 +4,10 @@ from lowfc.adapters.bus.bus import name_in
 from lowfc.contract.errors import BadMessageError
 from lowfc.contract.messages import HEALTH, Role, Topic, wire
 
-MOST_NAMES = 64
+MAX_NAMES = 64
 """Largest number of names on one topic, in addition to those of `Role`."""
-LONGEST_NAME = 128
-LARGEST_HEALTH_BYTES = 256_000
+MAX_NAME_LENGTH = 128
+MAX_HEALTH_BYTES = 256_000
 """Enough for a recorder's Health with the names of about 3000 logs."""
 
 
@@ -20,17 +20,17 @@ class Names:
     def admit(self, topic: Topic, key: str) -> str:
         """Name of the mirror or process in a key of this topic; empty for a topic without one.
 
-        BadMessageError if it is too long, or new when `MOST_NAMES` are known.
+        BadMessageError if it is too long, or new when `MAX_NAMES` are known.
         """
         name = name_in(topic, key)
         known = self._known.setdefault(topic.key, set())
         if name in known:
             return name
-        if len(name) > LONGEST_NAME:
-            raise BadMessageError(f"a name has up to {LONGEST_NAME} characters, got {len(name)}: {name[:40]!r}...")
+        if len(name) > MAX_NAME_LENGTH:
+            raise BadMessageError(f"a name has up to {MAX_NAME_LENGTH} characters, got {len(name)}: {name[:40]!r}...")
         if name not in _ROLES:
-            if len(known) >= MOST_NAMES:
-                raise BadMessageError(f"{MOST_NAMES} names are known on this topic, and there is no room for {name!r}")
+            if len(known) >= MAX_NAMES:
+                raise BadMessageError(f"{MAX_NAMES} names are known on this topic, and there is no room for {name!r}")
             known.add(name)
         return name
 
@@ -39,8 +39,8 @@ class Names:
 
         BadMessageError as for `admit`, or if the message is too large; DecodeError if it is not a Health.
         """
-        if len(payload) > LARGEST_HEALTH_BYTES:
-            raise BadMessageError(f"a Health has up to {LARGEST_HEALTH_BYTES} bytes, got {len(payload)}")
+        if len(payload) > MAX_HEALTH_BYTES:
+            raise BadMessageError(f"a Health has up to {MAX_HEALTH_BYTES} bytes, got {len(payload)}")
         health = wire.Health.FromString(payload)
         return self.admit(HEALTH, key), health
 

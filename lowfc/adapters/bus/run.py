@@ -30,9 +30,9 @@ _USER = "lowfc"
 _RUN_ID = re.compile(r"[a-z0-9][a-z0-9._-]{0,47}")
 _LOWEST_PORT = 15000
 _CONNECT_S = 1.0
-_LONGEST_START = 20  # characters
+_MAX_START_LENGTH = 20  # characters
 _LATEST_START_S = (1 << 32) - 3  # latest start that fits a sequence
-_LONGEST_SOCKET = 107  # bytes of a Unix socket's address
+_MAX_SOCKET_PATH_BYTES = 107  # bytes of a Unix socket's address
 _PORT_RANGE = Path("/proc/sys/net/ipv4/ip_local_port_range")
 
 
@@ -78,7 +78,7 @@ class Links:
 
     def _beside(self, name: str) -> Path | None:
         path = self.secret_file.parent / name
-        return path if len(os.fsencode(path)) <= _LONGEST_SOCKET else None
+        return path if len(os.fsencode(path)) <= _MAX_SOCKET_PATH_BYTES else None
 
     def live(self) -> set[str]:
         """Roles whose processes listen now; a killed run leaves its directory behind.
@@ -104,7 +104,7 @@ class Links:
         with contextlib.suppress(OSError, ValueError), path.open("a+") as file:
             fcntl.flock(file, fcntl.LOCK_EX)
             file.seek(0)
-            last = file.read(_LONGEST_START).strip()
+            last = file.read(_MAX_START_LENGTH).strip()
             claimed = max(start_s, int(last) + 1) if last.isdecimal() else start_s
             claimed = claimed if claimed <= _LATEST_START_S else start_s
             file.truncate(0)

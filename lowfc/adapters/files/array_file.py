@@ -36,7 +36,7 @@ def read_array(path: Path, what: str, dimensions: tuple[int, ...]) -> npt.NDArra
 
 
 def _npy(path: Path) -> npt.NDArray[np.generic]:
-    with input_file.opened(path, fits_file.LARGEST_BYTES) as stream:
+    with input_file.opened(path, fits_file.MAX_BYTES) as stream:
         try:
             return np.asarray(read_npy(stream, allow_pickle=False))
         except TokenError as error:

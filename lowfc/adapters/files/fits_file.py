@@ -18,7 +18,7 @@ from lowfc.contract.errors import DataFileError
 
 T = TypeVar("T")
 
-LARGEST_BYTES = 1 << 33
+MAX_BYTES = 1 << 33
 """Largest size of a file of arrays."""
 DAMAGED = (
     *(OSError, KeyError, TypeError, ValueError, EOFError, MemoryError, RecursionError),
@@ -55,7 +55,7 @@ def opened(path: Path) -> Iterator[fits.HDUList]:
     """Open a file for reading; raises one of `DAMAGED` if it is incomplete."""
     with (
         warnings.catch_warnings(),
-        input_file.opened(path, LARGEST_BYTES) as stream,
+        input_file.opened(path, MAX_BYTES) as stream,
     ):  # closes it if astropy raises
         warnings.simplefilter("error", AstropyWarning)  # astropy only warns of a truncated file
         with fits.open(stream, mode="readonly", memmap=False) as units:

@@ -13,7 +13,7 @@ from lowfc.optics.chain import sam as sams
 
 SHIPPED = resources.files("lowfc") / "data" / "sam_layouts.json"
 
-_LARGEST_BYTES = 1 << 24
+_MAX_BYTES = 1 << 24
 
 
 def layout_names() -> list[str]:
@@ -87,9 +87,7 @@ def layout_warnings(layout: sams.Layout) -> list[str]:
 
 def _read_layouts(file: Traversable) -> dict[str, Any]:
     try:
-        content = json.loads(
-            input_file.read_whole(file, _LARGEST_BYTES) if isinstance(file, Path) else file.read_bytes()
-        )
+        content = json.loads(input_file.read_whole(file, _MAX_BYTES) if isinstance(file, Path) else file.read_bytes())
     except FileNotFoundError:
         raise DataFileError(f"there is no layout file {file}") from None
     except (OSError, ValueError) as error:

@@ -23,7 +23,7 @@ from lowfc.optics.chain.relay import ApertureMask, Defocus, PupilImage, Relay, f
 from lowfc.optics.chain.sensor import Sensor
 
 _DATA = resources.files("lowfc") / "data"
-_LARGEST_BYTES = 1 << 30
+_MAX_BYTES = 1 << 30
 _WITH_LYOT_STOP = ("circle", "prolate")
 _LYOT_OUTER = 12.0
 """Outer radius of the annular dark zone with a Lyot stop, lambda / D; the inner radius is the mask's edge."""
@@ -42,7 +42,7 @@ def load_pupil(samples: int = SAMPLES, file: Traversable = _DATA / "spc_quarter1
         ConfigurationError: The quadrant does not divide `samples`.
     """
     try:
-        opened = input_file.opened(file, _LARGEST_BYTES) if isinstance(file, Path) else file.open("rb")
+        opened = input_file.opened(file, _MAX_BYTES) if isinstance(file, Path) else file.open("rb")
         with opened as stream, np.load(stream, allow_pickle=False) as arrays:
             quarter = np.asarray(arrays["quarter"])
     except FileNotFoundError:

@@ -59,7 +59,7 @@ class StreamReader:
                 continue  # just posted by its writer: the stream still exists
             mapped = self._open()
 
-    def silence(self) -> str:
+    def silence_cause(self) -> str:
         """Reason for the missing images, as far as the stream shows it."""
         stream = self.stream
         if stream is None or not stream.current():

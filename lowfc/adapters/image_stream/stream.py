@@ -30,7 +30,7 @@ from lowfc.contract.errors import LowfcError
 SEMAPHORES = 10
 """Number of semaphores of a stream created here; this and the numbers below are those of the C library."""
 TRACES = 10
-_LONGEST_NAME = 79
+_MAX_NAME_LENGTH = 79
 _MODE = 0o666
 _NS = 1_000_000_000
 
@@ -45,8 +45,8 @@ class StreamAbsentError(StreamError):
 
 def stream_path(name: str) -> Path:
     """File of a stream in the first existing folder of $MILK_SHM_DIR, /milk/shm and /tmp."""
-    if not 0 < len(name) <= _LONGEST_NAME or not name.isprintable() or "/" in name:
-        raise StreamError(f"a stream's name has 1 to {_LONGEST_NAME} characters without '/', got {name!r}")
+    if not 0 < len(name) <= _MAX_NAME_LENGTH or not name.isprintable() or "/" in name:
+        raise StreamError(f"a stream's name has 1 to {_MAX_NAME_LENGTH} characters without '/', got {name!r}")
     folders = (Path(one) for one in (os.environ.get("MILK_SHM_DIR"), "/milk/shm", "/tmp") if one)  # noqa: S108
     return next(one for one in folders if one.is_dir() or one == Path("/tmp")) / f"{name}.im.shm"  # noqa: S108
 

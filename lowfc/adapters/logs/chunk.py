@@ -9,7 +9,7 @@ from typing import NamedTuple
 import lz4.frame
 import zstandard
 
-LARGEST_BYTES = 1 << 28
+MAX_BYTES = 1 << 28
 """Largest size of a record, compressed or not: a damaged length must not use up the memory."""
 
 CHUNK_HERE = re.compile(
@@ -21,7 +21,7 @@ CHUNK_HERE = re.compile(
 _FIXED = struct.Struct("<QQQII")  # times of first and last message, size, CRC, length of the compression's name
 _COMPRESSED = struct.Struct("<Q")
 _RECORD_HEAD_BYTES = 9  # opcode and length
-_LONGEST_NAME = 40
+_MAX_NAME_LENGTH = 40
 
 
 class UnsoundError(Exception):
@@ -69,7 +69,7 @@ def _uncompressed(data: memoryview, size: int) -> bytes:
 # Decompressor of each compression, and the largest ratio of sizes that its format allows.
 _COMPRESSIONS: dict[bytes, tuple[Callable[[memoryview, int], bytes], int]] = {
     b"lz4": (_lz4, 255),
-    b"zstd": (_zstd, LARGEST_BYTES),
+    b"zstd": (_zstd, MAX_BYTES),
     b"": (_uncompressed, 1),
 }
 
@@ -95,9 +95,9 @@ def read_chunk(body: bytes, at: int, *, may_lack_crc: bool = False) -> Chunk:
         raise UnsoundError("the head of a chunk is damaged")
     name = body[_FIXED.size : _FIXED.size + named]
     if name not in _COMPRESSIONS:
-        raise CompressionError(name[:_LONGEST_NAME].decode(errors="backslashreplace"))
+        raise CompressionError(name[:_MAX_NAME_LENGTH].decode(errors="backslashreplace"))
     decompressed, largest_ratio = _COMPRESSIONS[name]
-    if not 0 < size <= min(LARGEST_BYTES, largest_ratio * compressed):
+    if not 0 < size <= min(MAX_BYTES, largest_ratio * compressed):
         raise UnsoundError("a chunk declares an impossible size")
     try:
         content = decompressed(memoryview(body)[begin:], size)

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus.bus import Sample
-from lowfc.adapters.bus.names import LONGEST_NAME, MOST_NAMES, Names
+from lowfc.adapters.bus.names import MAX_NAME_LENGTH, MAX_NAMES, Names
 from lowfc.adapters.logs.selection import EVERYTHING, Selection
 from lowfc.adapters.logs.sequence_gaps import Gaps
 from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.messages import EVENT, HEALTH, Log, Topic, topic_of, wire
 
-MOST_STARTS = 8
+MAX_STARTS = 8
 """Number of a publisher's newest starts with separate counts; earlier ones are summed."""
 _EARLIER = -1
 _UNNAMED = "?"
@@ -152,7 +152,7 @@ class LossAccount:
         tallies = self._tallies.setdefault((key, author), {})
         tally = tallies.get(start_s)
         if tally is None:
-            if len(separate := tallies.keys() - {_EARLIER}) >= MOST_STARTS:
+            if len(separate := tallies.keys() - {_EARLIER}) >= MAX_STARTS:
                 tallies.setdefault(_EARLIER, _Tally(Gaps(0))).absorb(tallies.pop(min(separate)))
             tally = tallies[start_s] = _Tally(Gaps(first))
             self.starts += 1
@@ -179,7 +179,7 @@ class LossAccount:
 
     def _known(self, author: str) -> str:
         if author not in self._authors:
-            if len(author) > LONGEST_NAME or len(self._authors) >= MOST_NAMES:
+            if len(author) > MAX_NAME_LENGTH or len(self._authors) >= MAX_NAMES:
                 return _UNNAMED
             self._authors.add(author)
         return author

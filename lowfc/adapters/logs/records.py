@@ -22,7 +22,7 @@ from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from lowfc.adapters.logs.chunk import (
     CHUNK_HERE,
-    LARGEST_BYTES,
+    MAX_BYTES,
     Chunk,
     CompressionError,
     UnsoundError,
@@ -146,7 +146,7 @@ class LogFile:
                     yield Chunk(at, len(content), zlib.crc32(content), content)
                     crc, at = zlib.crc32(content, crc), at + len(content)
                     continue
-                if end > self.size or length > LARGEST_BYTES:
+                if end > self.size or length > MAX_BYTES:
                     raise UnsoundError("a record has an impossible length")
                 body = self._read(at + HEAD.size, length)
                 if opcode == Opcode.DATA_END and length == 4 and self._summary in (None, end):
@@ -208,7 +208,7 @@ class LogFile:
                 opcode, length = HEAD.unpack(head)
                 if opcode in _EXPECTED and end + HEAD.size + length <= self.size:
                     return end
-            self._bytes_to_try -= min(end - at, LARGEST_BYTES)  # read once, now searched
+            self._bytes_to_try -= min(end - at, MAX_BYTES)  # read once, now searched
         start, block = at + 1, _FIRST_BLOCK_BYTES
         while start < self.size and self._bytes_to_try > 0:
             for match in CHUNK_HERE.finditer(self._read(start, block + 64)):
@@ -222,7 +222,7 @@ class LogFile:
         """Whether an intact chunk begins at `at`."""
         _, length = HEAD.unpack(self._read(at, HEAD.size))
         at += HEAD.size
-        if at + length > self.size or length > min(LARGEST_BYTES, self._bytes_to_try):
+        if at + length > self.size or length > min(MAX_BYTES, self._bytes_to_try):
             return False
         try:
             self._bytes_to_try -= length
@@ -285,7 +285,7 @@ class LogFile:
         end = at
         while end - at < _BLOCK_BYTES and len(head := self._read(end, HEAD.size)) == HEAD.size:
             opcode, length = HEAD.unpack(head)
-            if opcode not in _OF_CHUNKS or length > LARGEST_BYTES or end + HEAD.size + length > self.size:
+            if opcode not in _OF_CHUNKS or length > MAX_BYTES or end + HEAD.size + length > self.size:
                 break
             end += HEAD.size + length
         return self._read(at, end - at)

@@ -6,9 +6,9 @@ from google.protobuf.message import DecodeError
 
 from lowfc.contract.errors import BadMessageError
 from lowfc.contract.messages import checked_time_ns, from_timestamp, timestamp, wire
-from lowfc.control.loop.interlocks import MAX_TEXT, Acting, Action, BenchReport, Interlock, Value
+from lowfc.control.loop.interlocks import MAX_TEXT_LENGTH, Acting, Action, BenchReport, Interlock, Value
 
-LARGEST_BYTES = 4 * MAX_TEXT + 200
+MAX_BYTES = 4 * MAX_TEXT_LENGTH + 200
 """Largest size of a bench value: a text of up to four bytes per character, and the other fields."""
 
 
@@ -22,8 +22,8 @@ def encode_bench_value(value: Value, time_ns: int) -> bytes:
 
 def decode_bench_value(payload: bytes) -> Value:
     """Value of a received BenchValue; BadMessageError if it cannot be read or is invalid."""
-    if len(payload) > LARGEST_BYTES:
-        raise BadMessageError(f"a bench value has at most {LARGEST_BYTES} bytes, got {len(payload)}")
+    if len(payload) > MAX_BYTES:
+        raise BadMessageError(f"a bench value has at most {MAX_BYTES} bytes, got {len(payload)}")
     try:
         message = wire.BenchValue.FromString(payload)
     except DecodeError as error:
@@ -46,9 +46,11 @@ def value_of(message: wire.BenchValue) -> Value:
             return message.number
         case "truth":
             return message.truth
-        case "text" if len(message.text) <= MAX_TEXT:
+        case "text" if len(message.text) <= MAX_TEXT_LENGTH:
             return message.text
-    raise ValueError(f"a bench value is a finite number, true or false, or a text of at most {MAX_TEXT} characters")
+    raise ValueError(
+        f"a bench value is a finite number, true or false, or a text of at most {MAX_TEXT_LENGTH} characters"
+    )
 
 
 def _checked(message: wire.BenchValue) -> Value:

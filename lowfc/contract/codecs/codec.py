@@ -42,7 +42,7 @@ from lowfc.control.loop.inputs import (
 )
 from lowfc.control.loop.interlocks import BenchReport
 from lowfc.control.loop.safety import LoopMode, Reason
-from lowfc.control.loop.wording import MOST_TEXT
+from lowfc.control.loop.wording import MAX_NOTE_LENGTH
 
 _PIXEL = np.dtype("<u2")  # parsing its name would cost 0.2 us in every frame
 
@@ -200,23 +200,23 @@ def _mirror_shape(state: wire.MirrorState) -> MirrorShape | None:
     return MirrorShape(from_timestamp(state.timestamp), surface, command_nm, state.safe)
 
 
-MOST_BYTES = 16_000_000
+MAX_BYTES = 16_000_000
 """Largest size of any request; the bus loses a far larger one."""
 _SMALL_BYTES = 8_000
-MOST_REQUESTER = 100
+MAX_REQUESTER_LENGTH = 100
 """Most characters of a requester that are kept."""
-_MOST_BYTES = {
+_MAX_BYTES = {
     "channel": 4 * 128 * 128 + _SMALL_BYTES,
-    "note": 4 * MOST_TEXT + _SMALL_BYTES,
-    "play": MOST_BYTES,
-    "law": MOST_BYTES,
-    "load": MOST_BYTES,
+    "note": 4 * MAX_NOTE_LENGTH + _SMALL_BYTES,
+    "play": MAX_BYTES,
+    "law": MAX_BYTES,
+    "load": MAX_BYTES,
 }
 
 
 def most_bytes(name: str) -> int:
     """Largest size of a request of this name; a larger one is refused before it is decoded."""
-    return _MOST_BYTES.get(name, _SMALL_BYTES)
+    return _MAX_BYTES.get(name, _SMALL_BYTES)
 
 
 def only_requester(payload: bytes) -> bytes:
@@ -271,7 +271,7 @@ def request(
         law_of(message.law, laws) if message.HasField("law") else None,
         calibration,
         lease_id=message.lease_id,
-        requester=printable(message.requester[:MOST_REQUESTER]),
+        requester=printable(message.requester[:MAX_REQUESTER_LENGTH]),
         prior_nm2=tuple(message.prior_nm2),
         flux_dn=message.flux_dn,
     )

@@ -8,7 +8,7 @@ import numpy as np
 
 from lowfc.arrays import Single
 from lowfc.contract.messages import fields_of, floats, timestamp, wire
-from lowfc.control.laws.law import Law
+from lowfc.control.laws.integrator import Integrator
 from lowfc.control.laws.linear_law import LinearLaw, matrix_shapes
 from lowfc.control.loop.command_channels import Channel, CommandChannels, Play, PlayTable, play_table
 from lowfc.control.loop.guard import NAMES
@@ -56,10 +56,10 @@ def overruled(state: wire.ControllerState) -> list[str]:
     return [name for name, group in zip(NAMES, groups, strict=False) if group.overruled]
 
 
-def gains_of(state: wire.ControllerState) -> Law:
+def gains_of(state: wire.ControllerState) -> Integrator:
     """The integrator of a controller's state."""
     gain, leak, limit_nm = (np.array(values, np.float32) for values in (state.gain, state.leak, state.limit_nm))
-    return Law(gain, leak, limit_nm)
+    return Integrator(gain, leak, limit_nm)
 
 
 def wire_play(table: PlayTable, time_ns: int) -> wire.Play:

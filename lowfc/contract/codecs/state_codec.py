@@ -17,7 +17,7 @@ from lowfc.control.laws import linear_law
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.loop.command_channels import PlayTable
 from lowfc.control.loop.estimator import Estimate
-from lowfc.control.loop.guard import Group, Guard
+from lowfc.control.loop.guard import Group, LawGuard
 from lowfc.control.loop.lease import Lease
 from lowfc.control.loop.safety import Limits, LoopMode, Rejection, reason_of
 from lowfc.control.loop.state import ActiveLoop, Conditions, LawRunner, Settings, State, Weighting
@@ -79,9 +79,9 @@ def controller_state(state: State, settings: Settings, time_ns: int) -> wire.Con
         if loop.weighting is not None:
             message.prior_nm2.extend(loop.weighting.prior_nm2.tolist())
             message.weighting_flux_dn = loop.weighting.flux_dn
-        message.gain.extend(loop.law.gain.tolist())
-        message.leak.extend(loop.law.leak.tolist())
-        message.limit_nm.extend(loop.law.limit_nm.tolist())
+        message.gain.extend(loop.integrator.gain.tolist())
+        message.leak.extend(loop.integrator.leak.tolist())
+        message.limit_nm.extend(loop.integrator.limit_nm.tolist())
         message.command_history_nm.extend(np.concatenate(loop.history_nm).tolist())
         message.actuators = loop.actuators_nm.tobytes()
     return message
@@ -112,7 +112,7 @@ def decode_state(
         law = gains_of(message)
         history = np.array(message.command_history_nm, np.float32).reshape(len(loop.history_nm), -1)
         actuators = floats(message.actuators, *calibration.grid)
-        if law.gain.shape != loop.law.gain.shape or history.shape[1] != len(calibration.noll):
+        if law.gain.shape != loop.integrator.gain.shape or history.shape[1] != len(calibration.noll):
             raise ValueError(f"the controller's state does not have {len(calibration.noll)} modes")
         law_runner = None
         if message.HasField("law"):
@@ -155,7 +155,7 @@ def decode_state(
     return settings, state
 
 
-def _put_guard(message: wire.Guard, guard: Guard) -> None:
+def _put_guard(message: wire.Guard, guard: LawGuard) -> None:
     message.frames, message.void = guard.frames, guard.void
     message.groups.extend(wire.GuardedGroup(**group._asdict()) for group in guard.groups)
     message.sums_nm2.extend(guard.sums_nm2.ravel().tolist())
@@ -164,8 +164,8 @@ def _put_guard(message: wire.Guard, guard: Guard) -> None:
         message.law_state.extend(guard.x.tolist())
 
 
-def _decode_guard(message: wire.Guard, law: LinearLaw, commands: int) -> Guard:
-    rest = Guard.of(law, [Group(**fields_of(group, Group._fields)) for group in message.groups])
+def _decode_guard(message: wire.Guard, law: LinearLaw, commands: int) -> LawGuard:
+    rest = LawGuard.of(law, [Group(**fields_of(group, Group._fields)) for group in message.groups])
     found = rest._replace(
         **fields_of(message, ("frames", "void")),
         sums_nm2=np.array(message.sums_nm2).reshape(rest.sums_nm2.shape),

@@ -10,7 +10,7 @@ from lowfc.control.calibration.regularised import reconstruct
 
 MEASURED = frozenset(("poke", "hadamard", "in-loop"))
 """Parts of `Calibration.estimator` that name a method to measure H."""
-_SMALLEST_RESPONSE = 1e-3
+_MIN_RESPONSE = 1e-3
 """Singular value of R H, relative to the largest, below which a combination of modes counts as not measured."""
 
 
@@ -69,9 +69,9 @@ def _same_response(before: Calibration, changed: Calibration) -> Array:
     response = before.reconstructor.astype(np.float64) @ before.response
     rows = before.reconstructor.astype(np.float64) * changed.good
     remaining = rows @ changed.response
-    if np.linalg.matrix_rank(remaining, _SMALLEST_RESPONSE) < np.linalg.matrix_rank(response, _SMALLEST_RESPONSE):
+    if np.linalg.matrix_rank(remaining, _MIN_RESPONSE) < np.linalg.matrix_rank(response, _MIN_RESPONSE):
         raise ValueError("the remaining good pixels do not tell the modes apart")
-    return np.asarray(response @ np.linalg.pinv(remaining, _SMALLEST_RESPONSE) @ rows)
+    return np.asarray(response @ np.linalg.pinv(remaining, _MIN_RESPONSE) @ rows)
 
 
 def _reconstructed(calibration: Calibration, read_noise_e: float, gain_e: float) -> Calibration:

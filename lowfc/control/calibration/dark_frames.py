@@ -9,7 +9,7 @@ from lowfc.arrays import Array, Mask
 
 _SIGMAS = 8.0
 """Robust standard deviations from the median beyond which a pixel is bad; none of 6400 good pixels is that far."""
-_MOST_LIGHT = 0.02
+_MAX_LIGHT = 0.02
 """Largest fraction of the star's light in dark frames."""
 _TO_SIGMA = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
@@ -76,7 +76,7 @@ def check_dark(dark_dn: Array, reference: Array, flux_dn: float) -> None:
         ValueError: the dark contains too much light.
     """
     light = light_in(dark_dn, reference)
-    if light > _MOST_LIGHT * flux_dn:
+    if light > _MAX_LIGHT * flux_dn:
         raise ValueError(
             f"the dark frames are not dark: {light / flux_dn:.1%} of the star's light is in them; block the star"
         )

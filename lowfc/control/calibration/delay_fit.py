@@ -13,8 +13,8 @@ from lowfc.arrays import Array
 
 LAGS = 6
 """Number of frames in which a poke is searched for, from its own frame on."""
-LEAST_FRAMES = 40 * LAGS
-LEAST_SNR = 10.0
+MIN_FRAMES = 40 * LAGS
+MIN_SNR = 10.0
 """Least signal-to-noise ratio of a detected poke; noise alone exceeds it with a probability below 1e-13."""
 
 
@@ -53,8 +53,8 @@ def measure_delay(fractions: Array, reference: Array, poke: Array, command: Arra
         ValueError: there are too few frames, or the response is later than the longest lag.
         NotSeenError: the poke is not detected.
     """
-    if len(fractions) < LEAST_FRAMES:
-        raise ValueError(f"the delay needs at least {LEAST_FRAMES} frames without a gap, got {len(fractions)}")
+    if len(fractions) < MIN_FRAMES:
+        raise ValueError(f"the delay needs at least {MIN_FRAMES} frames without a gap, got {len(fractions)}")
     light = np.sqrt(
         np.maximum(reference, 0) + 1e-3 * reference.max()
     )  # photon noise is proportional to the square root of the light
@@ -77,7 +77,7 @@ def measure_delay(fractions: Array, reference: Array, poke: Array, command: Arra
         power += float(((found[:, 0] / noise[:, 0]) ** 2).sum())
     snr = float(np.sqrt(power))
     total = factors.sum()
-    if snr < LEAST_SNR:
+    if snr < MIN_SNR:
         raise NotSeenError(
             "the pokes are not seen in the frames: is the light on the sensor, does the mirror follow the commands, is "
             "the amplitude too small for the disturbance?"

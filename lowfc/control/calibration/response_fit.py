@@ -15,11 +15,11 @@ import numpy.typing as npt
 
 from lowfc.arrays import Array, Whole
 
-LEAST_CYCLES = 4
+MIN_CYCLES = 4
 """Least number of cycles for a useful scatter."""
-MOST_RMS = 1.2
+MAX_ELEMENT_RMS = 1.2
 """Largest rms of the elements of R H - I of a good calibration, in units of 1 / snr."""
-MOST_LARGEST = 4.0
+MAX_ELEMENT = 4.0
 """Largest element of R H - I of a good calibration, in the same units."""
 WORST_CONDITION = 1e3
 """Condition number of R H above which a reconstructor does not tell the modes apart."""
@@ -33,7 +33,7 @@ _BETTER = 0.95
 """Ratio of noise to that of an earlier candidate below which a later one is chosen."""
 _MEAN_SQUARE_ERRORS = 3.0
 """Allowed standard errors of the mean square of the elements."""
-_LARGEST_ERRORS = 5.0
+_MAX_ELEMENT_ERRORS = 5.0
 """Allowed standard errors of the largest of some hundred elements."""
 
 
@@ -282,7 +282,7 @@ class Check(NamedTuple):
 
     def bound(self, largest: float) -> float:
         """Largest element that these frames may show if none is above `largest`, with their noise."""
-        return largest + _LARGEST_ERRORS * float(self.error.max())
+        return largest + _MAX_ELEMENT_ERRORS * float(self.error.max())
 
 
 def check(answers: Array, expected: Array, error: Array) -> Check:

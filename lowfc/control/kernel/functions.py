@@ -176,7 +176,7 @@ def respond(
         shift_nm: (modes,) shift by the channels seen in the exposure.
         target_nm: (modes,) target of the loop.
         previous_command_nm: (modes,) last command.
-        integrator: (3, modes) gain, fraction of the command that is kept, and limit, as in `lowfc.control.laws.law`.
+        integrator: (3, modes) gain, fraction of the command that is kept, and limit, as in `Integrator.rows`.
         x: (states,) state of a linear law; empty for the integrator, like the next two.
         transition: (states, states + 2 modes) F, G and U of a linear law, side by side.
         output: (modes, states) K.

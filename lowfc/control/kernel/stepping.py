@@ -7,8 +7,8 @@ import numpy as np
 from lowfc.arrays import Single
 from lowfc.control.kernel.tables import Tables
 from lowfc.control.laws import linear_law
-from lowfc.control.laws.law import integrate
-from lowfc.control.loop.guard import Guard
+from lowfc.control.laws.integrator import integrate
+from lowfc.control.loop.guard import LawGuard
 from lowfc.control.loop.inputs import PendingEvent
 from lowfc.control.loop.safety import Limit, LoopMode, Reason, limit
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES, ActiveLoop, LawRunner, Settings, State
@@ -78,14 +78,14 @@ def _fused(
     shift_nm = target_nm = tables.no_modes
     channels_nm = tables.no_channels
     if additions is not None:
-        shift_nm, target_nm, channels_nm = additions.seen_nm(loop.weights), additions.offset_nm, additions.sum_nm
+        shift_nm, target_nm, channels_nm = additions.seen_nm(loop.delay_weights), additions.offset_nm, additions.sum_nm
     modes, limits = measured_nm.size, settings.limits
     results = np.empty(3 * modes + x.size, np.float32)
     actuators_nm = np.empty_like(loop.actuators_nm)
     signals = measured_nm, loop.seen_nm(), shift_nm, target_nm, loop.history_nm[0]
-    mirror = tables.shapes, channels_nm, loop.actuators_nm
+    integrator, mirror = loop.integrator.rows, (tables.shapes, channels_nm, loop.actuators_nm)
     limits_nm = limits.kept_stroke_nm, limits.kept_slew_nm, limits.neighbour_nm - limits.margin_nm / 2
-    if not tables.respond(*signals, loop.law.rows, x, *law, from_error, *mirror, *limits_nm, results, actuators_nm):
+    if not tables.respond(*signals, integrator, x, *law, from_error, *mirror, *limits_nm, results, actuators_nm):
         return None
     error_nm, pol_nm, command_nm = results[:modes], results[modes : 2 * modes], results[2 * modes : 3 * modes]
     return error_nm, pol_nm, command_nm, results[3 * modes :], actuators_nm
@@ -100,7 +100,7 @@ def _pseudo_open_loop(
     """
     additions, error_nm = loop.command_channels, measured_nm
     if additions is not None:
-        error_nm = measured_nm - additions.seen_nm(loop.weights)
+        error_nm = measured_nm - additions.seen_nm(loop.delay_weights)
     pol_nm = pol_from_target_nm = error_nm - loop.seen_nm()
     if additions is not None:
         target_nm = additions.target_nm(sequence)
@@ -128,8 +128,8 @@ def _update_guard(
 
 
 def _guarded(
-    state: State, loop: ActiveLoop, law: LawRunner, guard: Guard, error_nm: Single, pol_from_target_nm: Single
-) -> tuple[Guard, list[PendingEvent]]:
+    state: State, loop: ActiveLoop, law: LawRunner, guard: LawGuard, error_nm: Single, pol_from_target_nm: Single
+) -> tuple[LawGuard, list[PendingEvent]]:
     """The guard of a law after a frame, and its events; error and POL (modes,) are relative to the loop's target."""
     closed, additions = state.mode is LoopMode.CLOSED, loop.command_channels
     probed = state.returning_to_zero or (additions is not None and additions.play is not None)
@@ -142,7 +142,7 @@ def _guarded(
     limited = any(
         reason is not Limit.MODAL_LIMIT for reason in state.limits_hit
     )  # virtual commands have the modal limit, too
-    integrator = loop.law, loop.weights, loop.history_nm
+    integrator = loop.integrator, loop.delay_weights, loop.history_nm
     return guard.judged(law.law, law.x, *integrator, error_nm, pol_from_target_nm, limited=limited)
 
 
@@ -188,14 +188,14 @@ def _law_output(loop: ActiveLoop, error_nm: Single) -> tuple[Single, bool]:
     law_runner, held_nm = loop.law_runner, loop.history_nm[0]
     alone = law_runner is not None and law_runner.alone()
     if law_runner is None or not alone:
-        integrated_nm, clipped = integrate(loop.law, held_nm, error_nm)
+        integrated_nm, clipped = integrate(loop.integrator, held_nm, error_nm)
         if law_runner is None or law_runner.frames <= SETTLING_FRAMES:
             return integrated_nm, clipped
     requested_nm = linear_law.respond(law_runner.law, law_runner.x)
     if not alone:
         weight = law_runner.weight
         requested_nm = requested_nm * weight + integrated_nm * (1 - weight)
-    limited_nm = np.clip(requested_nm, -loop.law.limit_nm, loop.law.limit_nm)
+    limited_nm = np.clip(requested_nm, -loop.integrator.limit_nm, loop.integrator.limit_nm)
     return limited_nm, not np.array_equal(limited_nm, requested_nm)
 
 

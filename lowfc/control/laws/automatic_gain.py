@@ -8,14 +8,14 @@ from lowfc.arrays import Array, Mask, Single, Whole
 from lowfc.control.laws.stability import highest_gain
 from lowfc.control.laws.virtual import VirtualIntegrators, Weights
 
-LEAST_GAIN = 1e-3
+MIN_GAIN = 1e-3
 """Least gain of the rows, which start at the highest gain with margins and halve each time; another row has gain 0."""
 BLOCKS = 10
 """Blocks of a window, for the standard errors of its means."""
 CONFIDENCE = 2.0
-"""Standard errors by which one gain must beat another. Winning in `MOST_OF` of the blocks is enough as well, since
-one block may outweigh all others when the open loop wanders."""
-MOST_OF = 9
+"""Standard errors by which one gain must beat another. To be better in `WINNING_BLOCKS` of the blocks is enough
+as well, since one block may outweigh all others when the open loop wanders."""
+WINNING_BLOCKS = 9
 GRANTED = 3.0
 """Standard errors of white noise by which a gain must beat the open loop in a first window, and for a mode at 0: on a
 faint star, a single gain granted because of noise may add as much contrast as the dark zone has."""
@@ -26,7 +26,7 @@ LONGEST = 16
 """Factor of its first length to which a window grows while it decides nothing."""
 FEW = 3
 """Number of modes below which each is judged by itself only; with more, the majority is evidence for each."""
-LEAST_CORRECTED = 0.1
+MIN_CORRECTED = 0.1
 """Ratio of injected noise to correctable power below which the least gain is used if no gain is shown to be better."""
 
 SURE = 4.0
@@ -89,7 +89,7 @@ class GainBank:
             delay_frames: Of the loop.
             windows: Frames of the first window, and of those after it.
         """
-        halvings = int(np.log2(highest_gain(delay_frames) / LEAST_GAIN))
+        halvings = int(np.log2(highest_gain(delay_frames) / MIN_GAIN))
         rows = highest_gain(delay_frames) * 0.5 ** np.arange(halvings, -1.0, -1)
         self.rows = np.concatenate([[0], rows]).astype(np.float32)
         gain = np.repeat(self.rows[:, None], kept.size, axis=1)
@@ -196,7 +196,7 @@ class GainBank:
         if self.first and noise_nm2 is not None:
             scatter = _mean(np.subtract(self._powers, self._changed))[1]  # noise of a faint star has long tails
             there = power - noise_nm2 - GRANTED * np.maximum(noise_nm2 * np.sqrt(2 / frames), scatter)
-            little = injected(self.rows[1]) * noise_nm2 < LEAST_CORRECTED * there
+            little = injected(self.rows[1]) * noise_nm2 < MIN_CORRECTED * there
             chosen = np.where((chosen == 0) & little & (suspected_nm == 0), 1, chosen)
         found = Verdict(
             self.rows[chosen],
@@ -362,7 +362,7 @@ def _mean(blocks: Array) -> tuple[Array, Array]:
 def _better(blocks: Array) -> tuple[Array, Mask]:
     """Mean over the blocks, and whether it is below 0 beyond doubt."""
     mean, error = _mean(blocks)
-    return mean, (mean < -CONFIDENCE * error) | ((mean < 0) & (np.sum(blocks < 0, axis=0) >= MOST_OF))
+    return mean, (mean < -CONFIDENCE * error) | ((mean < 0) & (np.sum(blocks < 0, axis=0) >= WINNING_BLOCKS))
 
 
 def injected(gain: Single) -> Single:

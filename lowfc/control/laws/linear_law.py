@@ -12,7 +12,7 @@ from lowfc.control.laws.stability import delay_weights
 
 Signal = Literal["error", "pol"]
 
-MOST_STATES = 512
+MAX_STATES = 512
 """Most states of a law: a step with this number takes a frame period at 1 kHz."""
 SIGNALS: tuple[Signal, ...] = ("error", "pol")
 
@@ -63,8 +63,8 @@ class LinearLaw:
             if not np.isfinite(array).all():
                 raise ValueError(f"{name} holds values that are not finite")
             object.__setattr__(self, name, array)
-        if not (states and modes) or states > MOST_STATES:
-            raise ValueError(f"a law must have modes, and 1 to {MOST_STATES} states; got {modes} and {states}")
+        if not (states and modes) or states > MAX_STATES:
+            raise ValueError(f"a law must have modes, and 1 to {MAX_STATES} states; got {modes} and {states}")
         delay_weights(self.delay_frames)  # raises for a wrong delay
         if not (np.isfinite(self.rate_hz) and self.rate_hz > 0):
             raise ValueError(f"rate_hz must be above 0, got {self.rate_hz}")

@@ -16,7 +16,7 @@ from lowfc.control.loop.wording import counted
 
 SAME_RATE = 0.01
 """Relative difference allowed between a law's frame rate and the camera's."""
-MOST_COUPLED = 100
+MAX_COUPLED_STATES = 100
 """Most coupled states: computing the poles of this many takes 30 ms, during which no frame is processed."""
 
 _GRID = 2048
@@ -95,13 +95,13 @@ def check_stable(law: LinearLaw, delay_frames: float) -> None:
     It takes a few milliseconds, as it only needs poles; `margins` takes a hundred times as long.
 
     Raises:
-        ValueError: it is unstable (the message has the pole), or more than `MOST_COUPLED` states are coupled.
+        ValueError: it is unstable (the message has the pole), or more than `MAX_COUPLED_STATES` states are coupled.
     """
     weights = delay_weights(delay_frames)
     for part in _parts(law):
-        if len(part.F) > MOST_COUPLED:
+        if len(part.F) > MAX_COUPLED_STATES:
             raise ValueError(
-                f"{len(part.F)} states of the law {law.name!r} are coupled; {MOST_COUPLED} are the most "
+                f"{len(part.F)} states of the law {law.name!r} are coupled; {MAX_COUPLED_STATES} are the most "
                 "whose poles can be found between two frames"
             )
         matrices = (

@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from lowfc.arrays import Array, Sequences, Whole
 
-MOST_BRIDGED = 3
+MAX_INTERPOLATED_FRAMES = 3
 """Longest gap, in frames, that is interpolated; a longer one starts a new piece."""
 SHORTEST, LONGEST = 64, 2048
 """Shortest and longest segment of Welch's method, frames; with fewer than the shortest there is no spectrum."""
@@ -89,12 +89,12 @@ def pieces(sequence: Sequences, values: npt.NDArray[np.floating]) -> Pieces:
     newer = np.concatenate([[True], sequence[1:] > newest[:-1]])
     sequence, values = sequence[newer], values[newer]
     missing = np.diff(sequence) - np.uint64(1)
-    cuts = np.flatnonzero(missing > MOST_BRIDGED) + 1
+    cuts = np.flatnonzero(missing > MAX_INTERPOLATED_FRAMES) + 1
     found = [
         _even((numbers - numbers[0]).astype(np.int64), rows)
         for numbers, rows in zip(np.split(sequence, cuts), np.split(values, cuts), strict=True)
     ]
-    return Pieces(tuple(found), int(missing[missing <= MOST_BRIDGED].sum()))
+    return Pieces(tuple(found), int(missing[missing <= MAX_INTERPOLATED_FRAMES].sum()))
 
 
 def spectrum(run: Pieces, rate_hz: float) -> Spectrum | None:

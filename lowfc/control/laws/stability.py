@@ -1,6 +1,6 @@
 """The integrator's limits: the gains at which its loop oscillates, or has exactly the least allowed margins.
 
-The loop of `lowfc.control.laws.law`: command[k+1] = (1 - leak) command[k] - gain error[k], and
+The loop of `lowfc.control.laws.integrator`: command[k+1] = (1 - leak) command[k] - gain error[k], and
 error[k] = disturbance[k] + sum_j w_j command[k - j] + noise[k], with w from the delay in frames.
 """
 
@@ -10,8 +10,8 @@ import numpy as np
 
 from lowfc.arrays import Array, Complex, Single
 
-LEAST_GAIN_MARGIN = 1.8
-LEAST_PHASE_MARGIN_DEG = 45.0
+MIN_GAIN_MARGIN = 1.8
+MIN_PHASE_MARGIN_DEG = 45.0
 LOWEST_GAIN = 0.01
 """Gain of a mode whose drift is below the noise of a log, which should follow nevertheless."""
 SETTLING = 5.0
@@ -78,6 +78,6 @@ def highest_gain(delay_frames: float, leak: float = 0.0) -> float:
     """Integrator gain at which the first of the margins reaches its least allowed value."""
     omega = np.linspace(1e-4, np.pi, 1 << 14)
     loop = open_loop(omega, 1.0, leak, delay_frames)
-    late = np.unwrap(np.angle(loop)) < -np.radians(180 - LEAST_PHASE_MARGIN_DEG)
+    late = np.unwrap(np.angle(loop)) < -np.radians(180 - MIN_PHASE_MARGIN_DEG)
     by_phase = 1 / np.abs(loop[np.argmax(late)]) if late.any() else np.inf
-    return float(min(limiting_gain(delay_frames, leak) / LEAST_GAIN_MARGIN, by_phase))
+    return float(min(limiting_gain(delay_frames, leak) / MIN_GAIN_MARGIN, by_phase))

@@ -18,9 +18,9 @@ from lowfc.control.laws.margins import sensitivity
 from lowfc.control.laws.pi_notch import Notch, pi_notch
 from lowfc.control.laws.spectra import Pieces, Spectrum, floor_nm2_hz, spectrum
 from lowfc.control.laws.stability import (
-    LEAST_GAIN_MARGIN,
-    LEAST_PHASE_MARGIN_DEG,
     LOWEST_GAIN,
+    MIN_GAIN_MARGIN,
+    MIN_PHASE_MARGIN_DEG,
     delay_weights,
     highest_gain,
 )
@@ -312,9 +312,9 @@ def within_margins(model: Model, timing: Timing) -> Block | None:
 def _holds(found: margins.Margins) -> bool:
     return bool(
         found.stable
-        and found.gain_margin.min() >= LEAST_GAIN_MARGIN
-        and found.gain_reduction.max() <= 1 / LEAST_GAIN_MARGIN
-        and found.phase_margin_deg.min() >= 0.7 * LEAST_PHASE_MARGIN_DEG
+        and found.gain_margin.min() >= MIN_GAIN_MARGIN
+        and found.gain_reduction.max() <= 1 / MIN_GAIN_MARGIN
+        and found.phase_margin_deg.min() >= 0.7 * MIN_PHASE_MARGIN_DEG
     )
 
 

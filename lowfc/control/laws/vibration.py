@@ -18,7 +18,7 @@ FEWEST = 2048
 """Least frames in a row for a fit."""
 
 _LONGEST = 1 << 16  # frames of a segment
-_MOST_LINES = 12
+_MAX_LINES = 12
 _SCALES = (3, 9, 27, 81)  # numbers of frequencies over which lines are searched
 _PENALTY = 2.5  # of a line: log-likelihood per log(frequencies); 1.5 is Schwarz's for 3 figures, 1 for choosing a place
 _SHARE = 0.3
@@ -26,8 +26,8 @@ _HANN = 1.5  # neighbours are correlated: three count as two
 _LOBE = 12  # frequencies on either side of a line into which the window spreads it
 _FULL = 40  # frequencies on either side of a line, and from 0 on, that are not averaged
 _PER_DECADE = 48
-_LEAST_DRIFT = 1e-8  # variance of its step per variance of noise: a constant is followed in 10^4 frames
-_LEAST_NOISE = 1e-3  # of the level of the upper frequencies; drift may explain all of it, but a filter needs noise
+_MIN_DRIFT = 1e-8  # variance of its step per variance of noise: a constant is followed in 10^4 frames
+_MIN_NOISE = 1e-3  # of the level of the upper frequencies; drift may explain all of it, but a filter needs noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +111,7 @@ def identify(run: Pieces, rate_hz: float) -> Model | None:
     if whittle is None:
         return None
     model = whittle.fit_floor(Model(0.0, np.inf, (), 1.0, rate_hz), robust=True)
-    while len(model.lines) < _MOST_LINES:
+    while len(model.lines) < _MAX_LINES:
         line = whittle.another_line(model)
         if line is None:
             break
@@ -203,7 +203,7 @@ class _Whittle:
                 corner = np.exp(min(figures[2], 0.0)) * self.rate_hz if np.isfinite(cutoff) else np.inf
                 return replace(
                     model,
-                    drift_nm2=max(np.exp(figures[0]), _LEAST_DRIFT * np.exp(figures[1])),
+                    drift_nm2=max(np.exp(figures[0]), _MIN_DRIFT * np.exp(figures[1])),
                     noise_nm2=float(np.exp(figures[1])),
                     cutoff_hz=float(np.clip(corner, self.spacing_hz, self.rate_hz / 2)) if corner < np.inf else corner,
                 )
@@ -219,7 +219,7 @@ class _Whittle:
             if best is None or found.fun + price < best[0]:
                 best = found.fun + price, of(found.x)
         assert best is not None  # noqa: S101  # there was a first one
-        return replace(best[1], noise_nm2=max(best[1].noise_nm2, _LEAST_NOISE * white))
+        return replace(best[1], noise_nm2=max(best[1].noise_nm2, _MIN_NOISE * white))
 
     def another_line(self, model: Model) -> Line | None:
         """The most significant missing line; None if none is certain."""
@@ -310,7 +310,7 @@ class _Whittle:
         found = minimize(cost, start, method="L-BFGS-B", bounds=wide, options={"maxiter": 60})
         fitted = of(found.x) if found.fun < cost(start) else model
         fitted = replace(fitted, lines=tuple(self._with_its_power(line, fitted) for line in fitted.lines))
-        return replace(fitted, drift_nm2=max(fitted.drift_nm2, _LEAST_DRIFT * fitted.noise_nm2))
+        return replace(fitted, drift_nm2=max(fitted.drift_nm2, _MIN_DRIFT * fitted.noise_nm2))
 
     def _with_its_power(self, line: Line, model: Model) -> Line:
         """Set the variance of an unresolved line from the measured power: so far only its wings were fitted."""

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lowfc.arrays import Array, Mask, Sequences, Single, Whole
-from lowfc.control.laws.law import Law
+from lowfc.control.laws.integrator import Integrator
 from lowfc.control.laws.linear_law import LinearLaw, at_rest, integrator, predict_and_update, respond
 from lowfc.control.laws.stability import delay_weights
 from lowfc.control.loop.inputs import COUNT_BITS
@@ -19,7 +19,7 @@ from lowfc.control.loop.inputs import COUNT_BITS
 Controller = Callable[[Any, Single, Single], tuple[Any, Single]]
 """(state, error_nm, pol_nm) to (state, command_nm); the state is None at first, the arrays are (modes,) float32."""
 
-LONGEST_DELAY = 5
+MAX_DELAY_FRAMES = 5
 """Longest plausible delay of a working loop, frames."""
 _STILL_NM = 0.01
 _FEWEST = 20
@@ -39,7 +39,7 @@ def driven_by(law: LinearLaw, limit_nm: Single | None = None) -> Controller:
     return step
 
 
-def as_logged(law: Law) -> Controller:
+def as_logged(law: Integrator) -> Controller:
     """The live loop's integrator with its limits."""
     noll = tuple(range(2, 2 + law.gain.size))  # not used, like delay and rate
     return driven_by(integrator(law.gain, law.leak, noll, 1.0, 1.0), law.limit_nm)
@@ -116,7 +116,7 @@ def delay_from_truth(true_nm: Single, command_nm: Single, missing: Whole) -> flo
     if rows.sum() < _FEWEST:
         return None
     first_nm, best = command_nm[0], (np.inf, 1.0)
-    for lag in range(1, LONGEST_DELAY):
+    for lag in range(1, MAX_DELAY_FRAMES):
         newer, older = (
             seen_nm(delay_weights(delay).astype(np.float32), command_nm, missing, first_nm)[rows].astype(np.float64)
             for delay in (lag, lag + 1)
@@ -149,7 +149,7 @@ def delay_from_times(
     behind, after = behind[known], after[known]
     neighbours = sequence[after] - sequence[after - 1] == 1  # else an earlier frame may be missing here
     delay = (sequence[after] - behind).astype(np.int64)[neighbours]
-    delay = delay[(delay >= 1) & (delay <= 2 * LONGEST_DELAY)]
+    delay = delay[(delay >= 1) & (delay <= 2 * MAX_DELAY_FRAMES)]
     return float(delay.mean()) if len(delay) >= _FEWEST else None
 
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 
-LEAST_DN = 1.0
+MIN_DN = 1.0
 """Change of bias or saturation that is always tolerated, DN."""
 GAIN_TOLERANCE = 0.01
 """Relative change of a gain that is tolerated: gains are settings, not measurements."""
@@ -42,7 +42,7 @@ class CameraSettings:
 
 def changes(now: CameraSettings, then: CameraSettings) -> list[str]:
     """List differences larger than noise explains, one phrase each; `then` are the settings of the calibration."""
-    tolerance_dn = max(LEAST_DN, then.noise_dn)
+    tolerance_dn = max(MIN_DN, then.noise_dn)
     exact = (
         ("rows", now.shape[0], then.shape[0]),
         ("columns", now.shape[1], then.shape[1]),

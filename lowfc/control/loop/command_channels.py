@@ -18,11 +18,11 @@ ADOPTED = "adopted"
 """Channel of the mirror's shape at the controller's start, beyond the modes."""
 EXTERNAL = "external"
 """Channel of shapes that other programs apply to the mirror: the loop does not command it."""
-MOST_CHANNELS = 16
-MOST_PLAYED = 1 << 24
+MAX_CHANNELS = 16
+MAX_PROBE_NUMBERS = 1 << 24
 """Most numbers in the table of a probe sequence, and in its basis."""
 MIRROR, OFFSET = "mirror", "offset"
-LONGEST_NAME = 32
+MAX_NAME_LENGTH = 32
 
 
 class Channel(NamedTuple):
@@ -173,11 +173,11 @@ class CommandChannels(NamedTuple):
             ValueError: the name is invalid, or there are too many channels.
         """
         plain = name.isascii() and name == name.lower() and name.replace("-", "").isalnum()
-        if not (plain and name[0].isalpha() and len(name) <= LONGEST_NAME):
+        if not (plain and name[0].isalpha() and len(name) <= MAX_NAME_LENGTH):
             raise ValueError(f"a channel's name is up to 32 of a-z, 0-9 and -, a letter first; got {name!r}")
         before = self.channel(name)
-        if before is None and len(self.channels) >= MOST_CHANNELS:
-            raise ValueError(f"there are {MOST_CHANNELS} channels already, which is the most: remove one")
+        if before is None and len(self.channels) >= MAX_CHANNELS:
+            raise ValueError(f"there are {MAX_CHANNELS} channels already, which is the most: remove one")
         if name == EXTERNAL:
             after = self.having(Channel(name, shape_nm, shape_nm), to_modes)
             more_nm = after.shift_nm - self.shift_nm
@@ -245,10 +245,10 @@ def play_table(target: str, rows: Single, basis: Single) -> PlayTable:
         raise ValueError(
             f"a probe sequence on the mirror needs a shape for each of {columns} columns, got {basis.size} actuators"
         )
-    if max(rows.size, basis.size) > MOST_PLAYED:
+    if max(rows.size, basis.size) > MAX_PROBE_NUMBERS:
         raise ValueError(
-            f"a probe sequence has at most {MOST_PLAYED} numbers, {MOST_PLAYED // columns} rows of {columns} columns; "
-            f"got {max(rows.size, basis.size)}: play it in parts"
+            f"a probe sequence has at most {MAX_PROBE_NUMBERS} numbers, {MAX_PROBE_NUMBERS // columns} rows of "
+            f"{columns} columns; got {max(rows.size, basis.size)}: play it in parts"
         )
     if not (np.isfinite(rows).all() and np.isfinite(basis).all()):
         raise ValueError("every number of a probe sequence must be finite")

@@ -7,11 +7,11 @@ import numpy as np
 import numpy.typing as npt
 
 from lowfc.arrays import Mask, Single
-from lowfc.control.laws.law import Law
+from lowfc.control.laws.integrator import Integrator
 from lowfc.control.laws.stability import (
-    LEAST_GAIN_MARGIN,
-    LEAST_PHASE_MARGIN_DEG,
     LOWEST_GAIN,
+    MIN_GAIN_MARGIN,
+    MIN_PHASE_MARGIN_DEG,
     highest_gain,
     limiting_gain,
 )
@@ -22,7 +22,7 @@ from lowfc.control.loop.wording import AUTO, counted
 Changed = tuple[ActiveLoop, str, *tuple[PendingEvent, ...]]
 
 
-def changed_law(settings: Settings, loop: ActiveLoop, request: Request) -> Changed:
+def changed_integrator(settings: Settings, loop: ActiveLoop, request: Request) -> Changed:
     """The loop after a request for gain, leak or limit, and the reply; ValueError with the reason if refused."""
     if request.name == "gain" and request.text == AUTO:
         return _automatic_gain(settings, loop, request)
@@ -31,7 +31,7 @@ def changed_law(settings: Settings, loop: ActiveLoop, request: Request) -> Chang
             f"the law {loop.law_runner.law.name!r} drives the mirror, and has no {request.name}: "
             "`lowfc ctl law integrator` returns to the integrator"
         )
-    law = _changed(loop.law, loop.calibration.noll, settings.delay_frames, request)
+    integrator = _changed(loop.integrator, loop.calibration.noll, settings.delay_frames, request)
     if request.name == "gain":  # a gain set by a person is not automatic, and R treats its mode as corrected
         given = _chosen(loop, request)
         weighting = loop.weighting
@@ -39,8 +39,8 @@ def changed_law(settings: Settings, loop: ActiveLoop, request: Request) -> Chang
         if weighting is not None and (weighting.prior_nm2[given] > 0).any():
             prior_nm2 = np.where(given, np.float32(0), weighting.prior_nm2)
             loop = loop.with_weighting(weighting._replace(prior_nm2=prior_nm2))
-    loop = loop.with_gains(law)
-    text = f"{request.name} is now {_listed(getattr(law, _ATTRIBUTES[request.name]))}"
+    loop = loop.with_gains(integrator)
+    text = f"{request.name} is now {_listed(getattr(integrator, _ATTRIBUTES[request.name]))}"
     return loop, text + remark(settings, loop, request)
 
 
@@ -48,19 +48,19 @@ def _automatic_gain(settings: Settings, loop: ActiveLoop, request: Request) -> C
     """Automatic gains: switched on by a request without values, changed by one with measured values."""
     chosen, noll = _chosen(loop, request), loop.calibration.noll
     if not request.values:
-        loop = loop._replace(automatic=loop.automatic | chosen).with_gains(loop.law)
+        loop = loop._replace(automatic=loop.automatic | chosen).with_gains(loop.integrator)
         names = ", ".join(f"Z{index}" for index, one in zip(noll, chosen, strict=True) if one)
         return loop, f"the gain of {names} is automatic"
-    changed = _changed(loop.law, noll, settings.delay_frames, request)
+    changed = _changed(loop.integrator, noll, settings.delay_frames, request)
     prior_nm2 = np.array(request.prior_nm2, np.float32)
     if prior_nm2.size and not (
         prior_nm2.shape == chosen.shape and np.isfinite(prior_nm2).all() and (prior_nm2 >= 0).all()
     ):
         raise ValueError(f"the mean squares of the modes must be {chosen.size}, finite and at least 0 nm^2")
     mine = chosen & loop.automatic
-    gain = np.where(mine, changed.gain, loop.law.gain)
+    gain = np.where(mine, changed.gain, loop.integrator.gain)
     weighting = Weighting(prior_nm2, request.flux_dn) if prior_nm2.any() else None
-    loop = loop.with_gains(replace(loop.law, gain=gain)).with_weighting(weighting)
+    loop = loop.with_gains(replace(loop.integrator, gain=gain)).with_weighting(weighting)
     text = _listed(gain)
     return loop, f"gain is now {text}", PendingEvent("GAINS_CHANGED", {"gains": text})
 
@@ -94,10 +94,10 @@ def per_mode(noll: tuple[int, ...], request: Request, before: Single) -> Single:
     return array
 
 
-def _changed(law: Law, noll: tuple[int, ...], delay_frames: float, request: Request) -> Law:
-    """The law with new gains, leaks or limits; ValueError if the request is wrong."""
+def _changed(integrator: Integrator, noll: tuple[int, ...], delay_frames: float, request: Request) -> Integrator:
+    """The integrator with new gains, leaks or limits; ValueError if the request is wrong."""
     attribute = _ATTRIBUTES[request.name]
-    values = per_mode(noll, request, getattr(law, attribute))
+    values = per_mode(noll, request, getattr(integrator, attribute))
     lowest, highest = min(request.values), max(request.values)
     if request.name == "gain":
         limiting = limiting_gain(delay_frames)
@@ -111,7 +111,7 @@ def _changed(law: Law, noll: tuple[int, ...], delay_frames: float, request: Requ
     elif lowest < 0:
         raise ValueError(f"limit must be at least 0 nm, got {lowest:g}")
     changed: dict[str, Any] = {attribute: values}
-    return replace(law, **changed)
+    return replace(integrator, **changed)
 
 
 def remark(settings: Settings, loop: ActiveLoop, request: Request) -> str:
@@ -121,8 +121,8 @@ def remark(settings: Settings, loop: ActiveLoop, request: Request) -> str:
         recommended = highest_gain(settings.delay_frames)
         if highest > recommended:
             return (
-                f": above {recommended:.3g} the margins are below the {LEAST_GAIN_MARGIN:g} in gain and "
-                f"{LEAST_PHASE_MARGIN_DEG:g} degrees in phase that `lowfc tune` keeps, and the loop may ring"
+                f": above {recommended:.3g} the margins are below the {MIN_GAIN_MARGIN:g} in gain and "
+                f"{MIN_PHASE_MARGIN_DEG:g} degrees in phase that `lowfc tune` keeps, and the loop may ring"
             )
         if 0 < lowest < np.float32(LOWEST_GAIN):  # as a request has it
             return f": below {LOWEST_GAIN:g}, the least that `lowfc tune` chooses, next to nothing is corrected"
@@ -143,7 +143,7 @@ def remark(settings: Settings, loop: ActiveLoop, request: Request) -> str:
 
 def offset_remark(loop: ActiveLoop, offset_nm: Single) -> str:
     """Remark on offsets (modes,) of modes that cannot follow at a gain of 0; empty if there are none."""
-    fixed = (offset_nm != 0) & (loop.law.gain == 0) & ~loop.automatic & (loop.law_runner is None)
+    fixed = (offset_nm != 0) & (loop.integrator.gain == 0) & ~loop.automatic & (loop.law_runner is None)
     names = ", ".join(f"Z{mode}" for mode, one in zip(loop.calibration.noll, fixed, strict=True) if one)
     return f": {names} would not follow at a gain of 0" if names else ""
 
@@ -154,7 +154,7 @@ def check_offset(loop: ActiveLoop, largest_nm: npt.NDArray[np.floating[Any]]) ->
     Raises:
         ValueError: an offset is too large; the text names its mode.
     """
-    for mode, limit_nm, asked_nm in zip(loop.calibration.noll, loop.law.limit_nm, largest_nm, strict=True):
+    for mode, limit_nm, asked_nm in zip(loop.calibration.noll, loop.integrator.limit_nm, largest_nm, strict=True):
         if asked_nm > limit_nm:
             raise ValueError(f"offset of mode {mode}: at most its limit, {limit_nm:g} nm; asked for {asked_nm:g} nm")
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from lowfc.arrays import Array, Mask, Single
 from lowfc.control.laws import linear_law
-from lowfc.control.laws.law import TIP_TILT, Law, integrate
+from lowfc.control.laws.integrator import TIP_TILT, Integrator, integrate
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.loop.inputs import PendingEvent
 
@@ -26,7 +26,7 @@ FADED_S = 0.1
 """Duration of the cross-fade."""
 BETTER_S = 10.0
 """Time for which the law must be better in every block before it drives again; doubles with each takeover."""
-MOST_TAKEOVERS = 4
+MAX_TAKEOVERS = 4
 """Number of takeovers after which only an operator can let the law drive again."""
 WORSE, BETTER = 1.2, 0.25
 """Ratio of the law's mean squared error to the integrator's above which it is worse, and below which it is better."""
@@ -76,7 +76,7 @@ class Group(NamedTuple):
     @property
     def final(self) -> bool:
         """Whether only an operator can let the law drive it again."""
-        return self.takeovers >= MOST_TAKEOVERS
+        return self.takeovers >= MAX_TAKEOVERS
 
     def judged(self, means_nm2: Sequence[float], spans: Spans, *, void: bool) -> tuple["Group", str]:
         """The group after a block, and why the law is overruled, or `LAW_RETURNS`; empty if nothing changes.
@@ -103,12 +103,12 @@ class Group(NamedTuple):
         takeovers, rival_nm2 = self.takeovers + 1, virtual_nm2
         what = "the integrator would leave"
         if not worse:
-            takeovers, rival_nm2, what = MOST_TAKEOVERS, self.usual_nm2, "without correction there would be"
+            takeovers, rival_nm2, what = MAX_TAKEOVERS, self.usual_nm2, "without correction there would be"
         after = after._replace(overruled=True, takeovers=takeovers, blocks=0)
         return after, f"it leaves {error_nm2**0.5:.3g} nm rms, {what} {rival_nm2**0.5:.3g}"
 
 
-class Guard(NamedTuple):
+class LawGuard(NamedTuple):
     """The guard's state, from one frame to the next.
 
     Attributes:
@@ -133,7 +133,7 @@ class Guard(NamedTuple):
     x: Single | None = None
 
     @classmethod
-    def of(cls, law: LinearLaw, groups: Sequence[Group] = ()) -> "Guard":
+    def of(cls, law: LinearLaw, groups: Sequence[Group] = ()) -> "LawGuard":
         """The guard of a law, with these groups or new ones."""
         tilt = np.isin(law.noll, TIP_TILT)
         members = np.array([tilt, ~tilt], np.float32).T
@@ -150,19 +150,19 @@ class Guard(NamedTuple):
         shares = np.array([1 - group.faded / self.spans.faded for group in self.groups], np.float32)
         return self.members @ shares
 
-    def with_groups(self, groups: Sequence[Group]) -> "Guard":
+    def with_groups(self, groups: Sequence[Group]) -> "LawGuard":
         """A copy at rest, as at the beginning of a block, with these groups."""
-        return Guard(self.spans, self.members, tuple(groups), 0, np.zeros_like(self.sums_nm2))
+        return LawGuard(self.spans, self.members, tuple(groups), 0, np.zeros_like(self.sums_nm2))
 
-    def reset(self) -> "Guard":
+    def reset(self) -> "LawGuard":
         """Reset for a law that takes over from the integrator; the long-term mean squares are kept."""
         return self.with_groups([Group(usual_nm2=group.usual_nm2) for group in self.groups])
 
-    def at_rest(self) -> "Guard":
+    def at_rest(self) -> "LawGuard":
         """A copy with a new block, while there is nothing to judge."""
         return self.with_groups([group._replace(blocks=0) for group in self.groups])
 
-    def observed(self, pol_nm: Single, frames: int) -> "Guard":
+    def observed(self, pol_nm: Single, frames: int) -> "LawGuard":
         """A copy at rest, advanced by one frame, the last of `frames` in which the law did not drive."""
         part = 1 / min(frames, self.spans.long_term * self.spans.block)
         squares = np.square(pol_nm).dot(self.members).tolist()
@@ -173,7 +173,7 @@ class Guard(NamedTuple):
             ]
         )
 
-    def held(self, frames: int, law: LinearLaw) -> "Guard":
+    def held(self, frames: int, law: LinearLaw) -> "LawGuard":
         """A copy advanced by frames without measurements: commands are held, as in the loop."""
         if not self.virtual_nm:
             return self
@@ -188,14 +188,14 @@ class Guard(NamedTuple):
         self,
         law: LinearLaw,
         x: Single,
-        integrator: Law,
+        integrator: Integrator,
         weights: tuple[tuple[int, np.float32], ...],
         history_nm: tuple[Single, ...],
         error_nm: Single,
         pol_nm: Single,
         *,
         limited: bool,
-    ) -> tuple["Guard", list[PendingEvent]]:
+    ) -> tuple["LawGuard", list[PendingEvent]]:
         """A copy advanced by one frame of a closed loop, and the resulting events.
 
         Args:
@@ -236,7 +236,7 @@ class Guard(NamedTuple):
         np.square(squares, out=squares)
         frames, sums_nm2, void = self.frames + 1, self.sums_nm2 + squares.dot(self.members), self.void or limited
         if frames < spans.block:
-            return Guard(spans, self.members, groups, frames, sums_nm2, void, virtual_nm, virtual_x), []
+            return LawGuard(spans, self.members, groups, frames, sums_nm2, void, virtual_nm, virtual_x), []
         means_nm2 = (sums_nm2 / frames).T.tolist()
         judged = [group.judged(means, spans, void=void) for group, means in zip(groups, means_nm2, strict=True)]
         after, events = self.with_groups([group for group, _ in judged]), _events(law.name, judged)

@@ -9,7 +9,7 @@ from enum import StrEnum
 from typing import NamedTuple
 
 Value = bool | float | str
-MAX_TEXT = 200
+MAX_TEXT_LENGTH = 200
 """Most characters of a text value."""
 
 

@@ -49,7 +49,7 @@ def loaded(
             loop = loop._replace(command_channels=command_channels.settled())
         command_nm = loop.inverse @ shape_nm.reshape(-1)
         loop = loop._replace(
-            law=before.law if same else loop.law,
+            integrator=before.integrator if same else loop.integrator,
             automatic=before.automatic if same else loop.automatic,
             law_runner=before.law_runner if same else None,
             actuators_nm=before.actuators_nm,
@@ -159,7 +159,7 @@ def mirror_reported(settings: Settings, state: State, shape: MirrorShape) -> tup
         why = f"the mirror has a grid of {shape.actuators_nm.shape}, the calibration {loop.calibration.grid}"
         events.append(PendingEvent("MIRROR_REFUSED", {"why": why}))
         return state, Outputs(events=events, changed=bool(safe))
-    limit_nm = loop.law.limit_nm
+    limit_nm = loop.integrator.limit_nm
     plausible = shape.command_nm.shape == limit_nm.shape and (np.abs(shape.command_nm) <= limit_nm).all()
     command_nm = shape.command_nm if plausible else loop.inverse @ shape.actuators_nm.reshape(-1)
     loop = loop._replace(actuators_nm=shape.actuators_nm, history_nm=(command_nm,) * len(loop.history_nm))

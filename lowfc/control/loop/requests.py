@@ -13,17 +13,17 @@ from lowfc.control.laws.margins import check_law
 from lowfc.control.laws.stability import highest_gain
 from lowfc.control.loop import interlocks
 from lowfc.control.loop.command_channels import EXTERNAL, FLAT, MIRROR, CommandChannels, Play, play_table
-from lowfc.control.loop.gains import changed_law, check_offset, offset_remark, per_mode
+from lowfc.control.loop.gains import changed_integrator, check_offset, offset_remark, per_mode
 from lowfc.control.loop.inputs import Outputs, PendingEvent, Reply, Request
 from lowfc.control.loop.lease import ENDED_BY, Lease, asked_by, refusal
 from lowfc.control.loop.loading import holding, in_mode, loaded, misfit, mode_event, uncalibrated
 from lowfc.control.loop.reservation import lease, lease_checked, lease_ended, permit, release, renew
 from lowfc.control.loop.safety import Limits, LoopMode, Rejection, neighbour_difference_nm, request_mode
 from lowfc.control.loop.state import ActiveLoop, LawRunner, Settings, State
-from lowfc.control.loop.wording import MEASURED_FIRST, MOST_TEXT, PAUSED, counted
+from lowfc.control.loop.wording import MAX_NOTE_LENGTH, MEASURED_FIRST, PAUSED, counted
 
-MOST_STEPS = 1 << 32
-MOST_REPLY = 1000
+MAX_STEPS = 1 << 32
+MAX_REPLY_LENGTH = 1000
 """Most characters of a reply."""
 
 
@@ -80,7 +80,7 @@ def prepared(settings: Settings, request: Request) -> Request:
 
 
 def _short(text: str) -> str:
-    return text if len(text) <= MOST_REPLY else f"{text[: MOST_REPLY - 3]}..."
+    return text if len(text) <= MAX_REPLY_LENGTH else f"{text[: MAX_REPLY_LENGTH - 3]}..."
 
 
 Handled = tuple[State, str, *tuple[PendingEvent, ...]]
@@ -159,7 +159,7 @@ def _check_camera(state: State) -> None:
 
 def _step(settings: Settings, state: State, request: Request) -> Handled:
     frames = request.values[0] if len(request.values) == 1 else 0.0
-    if not (1 <= frames <= MOST_STEPS and frames == int(frames)):
+    if not (1 <= frames <= MAX_STEPS and frames == int(frames)):
         given = " ".join(map("{:g}".format, request.values)) or "none"
         raise ValueError(f"step takes one whole number of frames, 1 or more; got {given}")
     state = in_mode(state, _granted(state, "close"), request.time_ns, asked_by(state.conditions.lease, request))
@@ -177,7 +177,7 @@ def _reset(settings: Settings, state: State, request: Request) -> Handled:
 
 def _law_of_modes(settings: Settings, state: State, request: Request) -> Handled:
     """gain, leak and limit of the integrator."""
-    loop, text, *events = changed_law(settings, _calibrated_loop(state), request)
+    loop, text, *events = changed_integrator(settings, _calibrated_loop(state), request)
     return state._replace(loop=loop), text, *events
 
 
@@ -287,8 +287,8 @@ def _load(settings: Settings, state: State, request: Request) -> Handled:
 
 
 def _note(settings: Settings, state: State, request: Request) -> Handled:
-    if not 0 < len(request.text.strip()) <= MOST_TEXT:
-        raise ValueError(f"a note has 1 to {MOST_TEXT} characters, got {len(request.text)}")
+    if not 0 < len(request.text.strip()) <= MAX_NOTE_LENGTH:
+        raise ValueError(f"a note has 1 to {MAX_NOTE_LENGTH} characters, got {len(request.text)}")
     return state, "noted", PendingEvent("NOTE", {"text": request.text.strip()})
 
 

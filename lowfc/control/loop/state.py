@@ -12,13 +12,13 @@ from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.map_reconstructor import map_reconstructor
 from lowfc.control.kernel.tables import NUMPY, Kernel
 from lowfc.control.laws import linear_law
-from lowfc.control.laws.law import TIP_TILT, Law
+from lowfc.control.laws.integrator import TIP_TILT, Integrator
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.stability import delay_weights
 from lowfc.control.loop.camera import CameraSettings
 from lowfc.control.loop.command_channels import CommandChannels, Play, seen_nm
 from lowfc.control.loop.estimator import Estimate, Estimator
-from lowfc.control.loop.guard import Guard
+from lowfc.control.loop.guard import LawGuard
 from lowfc.control.loop.interlocks import Acting, Interlock
 from lowfc.control.loop.lease import Lease
 from lowfc.control.loop.safety import Limits, LoopMode, Reason, Rejection
@@ -27,7 +27,7 @@ SETTLING_FRAMES = 100
 """Frames for which a new linear law is updated but does not drive the mirror."""
 FADING_FRAMES = 100
 """Frames of the cross-fade in which a law takes over."""
-MOST_COASTED = 100
+MAX_PREDICTED_FRAMES = 100
 """Frames missing in a row after which a law restarts."""
 
 
@@ -71,13 +71,13 @@ class Settings:
     interlocks: tuple[Interlock, ...] = ()
     kernel: Kernel = NUMPY
 
-    def law(self, noll: tuple[int, ...]) -> Law:
-        """The law for these modes: the first value of each pair for tip and tilt, the second for the others."""
+    def integrator(self, noll: tuple[int, ...]) -> Integrator:
+        """The integrator for these modes: the first value of each pair for tip and tilt, the second for the others."""
 
         def per_mode(pair: tuple[float, float]) -> Single:
             return np.array([pair[0] if index in TIP_TILT else pair[1] for index in noll], dtype=np.float32)
 
-        return Law(per_mode(self.gain), per_mode(self.leak), per_mode(self.limit_nm))
+        return Integrator(per_mode(self.gain), per_mode(self.leak), per_mode(self.limit_nm))
 
     def automatic(self, noll: tuple[int, ...]) -> Mask:
         """The modes (modes,) whose gain is automatic at the start."""
@@ -94,12 +94,12 @@ class LawRunner(NamedTuple):
     law: LinearLaw
     x: Single
     frames: int = 0
-    guard: Guard | None = None
+    guard: LawGuard | None = None
 
     @classmethod
     def at_rest(cls, law: LinearLaw, *, guarded: bool) -> "LawRunner":
         """A law before its first frame."""
-        return cls(law, linear_law.at_rest(law), 0, Guard.of(law) if guarded else None)
+        return cls(law, linear_law.at_rest(law), 0, LawGuard.of(law) if guarded else None)
 
     def restarted(self) -> "LawRunner":
         """The same law, at rest."""
@@ -114,9 +114,9 @@ class LawRunner(NamedTuple):
     def predicted(self, frames: int, command_nm: Single) -> "LawRunner":
         """A copy advanced by some missing or refused frames."""
         x = self.x
-        for _ in range(min(frames, MOST_COASTED)):
+        for _ in range(min(frames, MAX_PREDICTED_FRAMES)):
             x = linear_law.predict(self.law, x, command_nm)
-        if frames > MOST_COASTED:
+        if frames > MAX_PREDICTED_FRAMES:
             return LawRunner(self.law, x, 0, self.guard)
         return LawRunner(self.law, x, self.frames, None if self.guard is None else self.guard.held(frames, self.law))
 
@@ -168,11 +168,11 @@ class ActiveLoop(NamedTuple):
 
     calibration: Calibration
     estimator: Estimator
-    law: Law
+    integrator: Integrator
     to_actuators: Single
     inverse: Single
     to_modes: Single
-    weights: tuple[tuple[int, np.float32], ...]
+    delay_weights: tuple[tuple[int, np.float32], ...]
     camera: CameraSettings | None
     automatic: Mask
     weighting: Weighting | None
@@ -183,15 +183,15 @@ class ActiveLoop(NamedTuple):
 
     @classmethod
     def at_rest(cls, settings: Settings, calibration: Calibration) -> "ActiveLoop":
-        """A loop before its first command, with the initial law of the settings."""
+        """A loop before its first command, with the initial integrator of the settings."""
         modes = len(calibration.noll)
         weights = delay_weights(settings.delay_frames).astype(np.float32)
         inverse = np.linalg.pinv(calibration.modes_to_actuators.astype(np.float64)).astype(np.float32)
-        law = settings.law(calibration.noll)
+        integrator = settings.integrator(calibration.noll)
         loop = cls(
             calibration,
             Estimator.of(calibration, settings.kernel),
-            law,
+            integrator,
             np.asfortranarray(calibration.modes_to_actuators),
             inverse,
             calibration.actuators_to_modes if calibration.actuators_to_modes.size else inverse,
@@ -204,15 +204,15 @@ class ActiveLoop(NamedTuple):
             (np.zeros(modes, np.float32),) * len(weights),
             np.zeros(calibration.grid, np.float32),
         )
-        return loop.with_gains(law)
+        return loop.with_gains(integrator)
 
     def seen_nm(self) -> Single:
         """The modal command (modes,) that the last exposure saw."""
-        return seen_nm(self.weights, self.history_nm)
+        return seen_nm(self.delay_weights, self.history_nm)
 
-    def with_gains(self, law: Law) -> "ActiveLoop":
+    def with_gains(self, integrator: Integrator) -> "ActiveLoop":
         """A copy with these gains; the command of a mode whose automatic gain is 0 relaxes to zero."""
-        return self._replace(law=replace(law, uncorrected=self.automatic & (law.gain == 0)))
+        return self._replace(integrator=replace(integrator, uncorrected=self.automatic & (integrator.gain == 0)))
 
     def with_weighting(self, weighting: Weighting | None) -> "ActiveLoop":
         """A copy with R computed for other uncorrected modes or another flux."""

@@ -6,7 +6,7 @@ AUTO = "auto"
 """Text of a request for automatic gains, and the prefix of the text of those not made by a person."""
 MEASURED_FIRST = "the gains are measured before the loop closes"
 """Cause of the open mode in which a loop with automatic gains begins."""
-MOST_TEXT = 10_000
+MAX_NOTE_LENGTH = 10_000
 """Most characters of a note."""
 
 

@@ -20,10 +20,10 @@ STEP_E = 1 / 64
 _ENTRIES_BITS = 10
 _ENTRIES = 1 << _ENTRIES_BITS
 _CHANCE_BITS = 16  # resolution of the probability of rounding up
-_MOST_E = 64  # tabulated electrons; at a mean of 24 e- a pixel exceeds it once in 1e11 frames
+_MAX_TABULATED_E = 64  # tabulated electrons; at a mean of 24 e- a pixel exceeds it once in 1e11 frames
 _TAIL = 8.0  # tabulated range of the read noise, standard deviations
 _WIDEST = 256  # largest range of digital numbers that is tabulated
-_LEAST_NOISE_DN = 0.05  # with less read noise the table does not resolve the rounding
+_MIN_NOISE_DN = 0.05  # with less read noise the table does not resolve the rounding
 _APART = 65535  # never a tabulated digital number, since those are below saturation
 
 
@@ -53,11 +53,11 @@ def noise_table(gain_e_per_dn: float, read_noise_e: float, bias_dn: float, satur
 
     noise_dn = read_noise_e / gain_e_per_dn
     first = int(np.floor(bias_dn - _TAIL * noise_dn))
-    last = int(np.ceil(bias_dn + _MOST_E / gain_e_per_dn + _TAIL * noise_dn))
-    if noise_dn < _LEAST_NOISE_DN or first < 0 or last >= saturation_dn or last - first >= _WIDEST:
+    last = int(np.ceil(bias_dn + _MAX_TABULATED_E / gain_e_per_dn + _TAIL * noise_dn))
+    if noise_dn < _MIN_NOISE_DN or first < 0 or last >= saturation_dn or last - first >= _WIDEST:
         return None
     mean = STEP_E * np.arange(round(FAINT_E / STEP_E) + 1)[:, None]
-    electrons = np.arange(_MOST_E)
+    electrons = np.arange(_MAX_TABULATED_E)
     poisson = np.cumprod(np.hstack([np.exp(-mean), mean / electrons[1:]]), axis=1)  # P(k) = P(k - 1) mean / k
     edges = np.arange(first, last + 2) - 0.5 - bias_dn
     probability = poisson @ np.diff(ndtr((edges - electrons[:, None] / gain_e_per_dn) / noise_dn), axis=1)

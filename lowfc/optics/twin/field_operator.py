@@ -74,10 +74,10 @@ def field_operator(
     functions: Array,
     y_factors: Array,
     x_factors: Array,
-    wanted: Whole,
+    products: Whole,
     advance: Callable[[], None] = lambda: None,
 ) -> Array:
-    """Real matrix (rows, wanted) from amplitudes of separable functions in the pupil.
+    """Real matrix (rows, products) from amplitudes of separable functions in the pupil.
 
     With an aperture mask, its rows are coefficients of the functions on the sensor. Without, they are the cosine and
     sine amplitudes of the focal plane within its mask. `on_sensor` propagates either to the sensor.
@@ -88,20 +88,20 @@ def field_operator(
         functions: (sensor samples, functions) from `sensor_functions`.
         y_factors: (n, p) factors of the functions along y at the pupil's samples.
         x_factors: (n, q) factors along x.
-        wanted: Flat indices (p, q) of the products to compute.
+        products: Flat indices (p, q) of the products to compute.
         advance: Called after each of k / 2 steps, where k is the number of samples across the focal-plane mask.
     """
     samples = sensor.pupil.shape[0]
     unit = scale * sensor.pitch / (samples**2 * np.sqrt(OPEN_AREA))
     waves = _waves(sensor, scale)
-    rows = _focal_rows(sensor, waves, y_factors, x_factors, wanted, advance)
+    rows = _focal_rows(sensor, waves, y_factors, x_factors, products, advance)
     if not isinstance(sensor.relay, ApertureMask):
         return np.asarray(unit * np.vstack([amplitudes for *_, amplitudes in rows]))
     half, count = waves.shape[1], functions.shape[1]
     quarter = sensor.focal_mask[half:, half:].real
     kernels = _kernels(sensor, scale, functions)
     relayed = (kernels[:, None, None] * waves).transpose(3, 1, 2, 0).reshape(samples, -1)  # columns (parity, d, k)
-    total = np.zeros((count**2, wanted.size))
+    total = np.zeros((count**2, products.size))
     for parity, c, columns, amplitudes in rows:
         left = ((kernels * waves[parity, c]) @ sensor.relay.transmission @ relayed).reshape(count, 2, half, count)
         outer = left[:, :, columns].transpose(0, 3, 1, 2) * quarter[c, columns]
@@ -114,13 +114,13 @@ def _focal_rows(
     waves: Array,
     y_factors: Array,
     x_factors: Array,
-    wanted: Whole,
+    products: Whole,
     advance: Callable[[], None],
 ) -> Iterator[tuple[int, int, Whole, Array]]:
     """Focal-plane amplitudes row by row, for amplitudes in the pupil; arguments as for `field_operator`.
 
     Yields:
-        Parity and index of the row, the columns within the mask, and the amplitudes (2 columns, wanted) there, even
+        Parity and index of the row, the columns within the mask, and the amplitudes (2 columns, products) there, even
         and odd along x.
     """
     samples, half = sensor.pupil.shape[0], waves.shape[1]
@@ -130,7 +130,7 @@ def _focal_rows(
         columns = np.flatnonzero(sensor.focal_mask[half + c, half:])
         for parity in (0, 1):
             right = ((y_factors.T * waves[parity, c]) @ sensor.pupil @ entering).reshape(p, 2, half, q)
-            amplitudes = right[:, :, columns].transpose(1, 2, 0, 3).reshape(2 * columns.size, p * q)[:, wanted]
+            amplitudes = right[:, :, columns].transpose(1, 2, 0, 3).reshape(2 * columns.size, p * q)[:, products]
             yield parity, c, columns, amplitudes
         advance()
 

@@ -19,8 +19,8 @@ from lowfc.optics.twin.field_operator import field_operator, sensor_functions
 from lowfc.optics.twin.nodes import interpolation
 from lowfc.optics.twin.twin import Twin
 
-_LEAST_WEIGHT = 0.01  # of the largest; excludes guard nodes that hardly affect the pupil
-_SMALLEST_SINGULAR_VALUE = 0.01  # of the largest; smaller ones do not reduce the correction's error
+_MIN_WEIGHT = 0.01  # of the largest; excludes guard nodes that hardly affect the pupil
+_MIN_SINGULAR_VALUE = 0.01  # of the largest; smaller ones do not reduce the correction's error
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,12 +58,12 @@ def twin_mirror(sensor: Sensor, twin: Twin, mirror: Mirror) -> TwinMirror:
     y_full = influence_factors(mirror, u, mirror.rows)
     x_full = influence_factors(mirror, u, mirror.columns)
     to_field = operator.modes.T @ field_operator(sensor, scale, functions, y_full, x_full, actuators)
-    fit = np.linalg.pinv(interpolation(u.size, twin.spec.nodes, twin.spec.order), _LEAST_WEIGHT)
+    fit = np.linalg.pinv(interpolation(u.size, twin.spec.nodes, twin.spec.order), _MIN_WEIGHT)
     y_factors, x_factors = fit @ y_full, fit @ x_full
     rows, columns = np.divmod(twin.used, twin.axis.size)
     sampled = (y_factors[rows][:, :, None] * x_factors[columns][:, None, :]).reshape(twin.used.size, -1)
     left, values, right = np.linalg.svd(operator.to_modes, full_matrices=False)
-    significant = values > _SMALLEST_SINGULAR_VALUE * values[0]
+    significant = values > _MIN_SINGULAR_VALUE * values[0]
     missing = left[:, significant].T @ (to_field - operator.to_modes @ sampled) / values[significant, None]
     return TwinMirror(
         used=twin.used,

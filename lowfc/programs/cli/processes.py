@@ -105,7 +105,7 @@ def record(
     Example: lowfc record --run bench --folder logs --longest-s 600 --min-free-mb 2000
     """
     from lowfc.adapters.bus.run import open_run
-    from lowfc.client.runs import nobody_yet
+    from lowfc.client.runs import waiting_message
     from lowfc.programs.core.recording.process import record as run_recorder
     from lowfc.programs.core.recording.summary import figures, report
 
@@ -122,7 +122,7 @@ def record(
         raise ConfigurationError(f"lowfc record takes options only, got {' '.join(words)!r}{hint}")
     settings = configuration(config, overrides)
     joined = open_run(run, (settings.mirror.name,), network=settings.network)
-    if not joined.links.network.router and (nobody := nobody_yet(run)):
+    if not joined.links.network.router and (nobody := waiting_message(run)):
         typer.echo(f"recorder: {nobody}", err=True)
     done = run_recorder(joined, settings, calibration)
     typer.echo(json.dumps(figures(done)) if as_json else report(done), err=not as_json)

@@ -13,9 +13,9 @@ def runs(as_json: Json = False) -> None:
     """
     from lowfc.adapters.bus.other_loops import none_here
     from lowfc.adapters.bus.run import runtime_path
-    from lowfc.client.runs import living
+    from lowfc.client.runs import live_runs
 
-    rows = [_row(name, roles) for name, roles in living().items()]
+    rows = [_row(name, roles) for name, roles in live_runs().items()]
     figures = {"runs": rows, "searched": str(runtime_path())}
     print_result(figures, "\n".join(_lines(rows)) if rows else none_here(), as_json=as_json)
 

@@ -4,7 +4,7 @@ LEAD_NS = 300_000
 """Time from the warm-up to the next frame: short enough to keep the caches warm, with a margin for late wake-ups."""
 LATEST_NS = 80_000
 """Time before the next frame after which a warm-up would delay it."""
-SHORTEST_PERIOD_NS = 500_000
+MIN_PERIOD_NS = 500_000
 """Frame period below which there is no time for a warm-up, and no need: the caches stay warm."""
 DRIFT = 50
 """The schedule moves by 1/DRIFT of the lateness of a frame."""
@@ -30,7 +30,7 @@ class CacheWarmup:
         else:
             self._due_ns += late_ns // DRIFT
         self._due_ns += self._period_ns
-        self._pending = self._period_ns > SHORTEST_PERIOD_NS
+        self._pending = self._period_ns > MIN_PERIOD_NS
 
     def wait_ns(self, now_ns: int) -> int | None:
         """Time until the next warm-up; None if none is pending."""

@@ -38,7 +38,7 @@ from lowfc.control.durations import Durations
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.inputs import Input, Load, MirrorReport, Outputs, Reply, Report, Request, Tick
 from lowfc.control.loop.loading import holding, misfit
-from lowfc.control.loop.requests import CONFIGURATION, MOST_REPLY, prepared
+from lowfc.control.loop.requests import CONFIGURATION, MAX_REPLY_LENGTH, prepared
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import State
 from lowfc.programs.core.bench_values import BenchValues
@@ -255,7 +255,8 @@ class Controller:
             request = prepared(self._settings, codec.decode_request(query.payload, query.name, now_ns))
         except ValueError as error:
             request = Request(now_ns, query.name)
-            reply, state, number = Reply(False, str(error)[:MOST_REPLY], self._state.frame_sequence + 1), self._state, 0
+            reply = Reply(False, str(error)[:MAX_REPLY_LENGTH], self._state.frame_sequence + 1)
+            state, number = self._state, 0
         else:
             reply, state, number = self._carry_out(request)
         message = controller_state(state, self._settings, now_ns) if request.name == "status" else None

@@ -20,7 +20,7 @@ TIMING_PERIOD_NS = 100_000_000
 SECOND_NS = 1_000_000_000
 CAUSES_NAMED = 4
 """Number of the most frequent causes of a loop not closed that are listed with their counts."""
-MOST_CAUSES = 20
+MAX_CAUSES = 20
 """Number of different causes counted; a cause may contain figures, so that their number has no limit."""
 
 
@@ -172,7 +172,7 @@ class NotClosed:
                 cause, self._since_ns = state.conditions.mode_cause, now_ns
                 if cause and (before_ns is None or cause != self._cause):
                     self._times += 1
-                    if cause in self._causes or len(self._causes) < MOST_CAUSES:
+                    if cause in self._causes or len(self._causes) < MAX_CAUSES:
                         self._causes[cause] += 1
                 self._cause = cause
             return self._total_ns, self._listed()

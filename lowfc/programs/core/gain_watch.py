@@ -8,7 +8,7 @@ import numpy as np
 from lowfc.arrays import Array, Mask, Single, single
 from lowfc.control.calibration.map_reconstructor import noise_covariance_nm2
 from lowfc.control.laws.automatic_gain import CONFIDENCE, GainBank, Verdict, injected, uncorrected_prior_nm2
-from lowfc.control.laws.law import TIP_TILT
+from lowfc.control.laws.integrator import TIP_TILT
 from lowfc.control.loop.inputs import COUNT_BITS, PendingEvent, Request, Step
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import ActiveLoop, Settings, State, Weighting
@@ -26,7 +26,7 @@ HARMFUL_WINDOWS = 3
 """Consecutive windows in which an open loop would have had a smaller residual, before this is reported."""
 CAUTIOUS_GAIN = 0.05
 """Highest gain of the other modes until tip and tilt are corrected: the square of a tilt looks like other modes."""
-LEAST_FRAMES = 50
+MIN_FRAMES = 50
 """Smallest number of frames in a window."""
 REQUESTER = "automatic gains"
 
@@ -47,17 +47,17 @@ class _Group:
     def __init__(self, mask: Mask, tilt: Mask | None, settings: Settings, loop: ActiveLoop, window_s: float) -> None:
         """Evaluate the modes in `mask` (modes,); `tilt` (modes,) selects tip and tilt, both in the other group."""
         rate_hz = settings.rate_hz or 1.0
-        frames = [max(round(seconds * rate_hz), LEAST_FRAMES) for seconds in (FIRST_S, window_s)]
+        frames = [max(round(seconds * rate_hz), MIN_FRAMES) for seconds in (FIRST_S, window_s)]
         self.mask, self.tilt = mask, tilt
         self.bank = GainBank(
-            1 - loop.law.leak[mask],
-            loop.law.limit_nm[mask],
-            loop.weights,
+            1 - loop.integrator.leak[mask],
+            loop.integrator.limit_nm[mask],
+            loop.delay_weights,
             settings.delay_frames,
             (frames[0], frames[1]),
         )
         self.verdict: Verdict | None = None
-        self.gain = loop.law.gain[mask]
+        self.gain = loop.integrator.gain[mask]
         self.harmful = 0
         self.unrestricted = window_s == TILT_S
 
@@ -154,7 +154,7 @@ class GainWatch:
         return float(per_nm2 @ open_nm2), per_nm2 * now_nm2
 
     def _begin(self, loop: ActiveLoop) -> None:
-        identity = loop.calibration.id, loop.law.leak.tobytes(), loop.law.limit_nm.tobytes()
+        identity = loop.calibration.id, loop.integrator.leak.tobytes(), loop.integrator.limit_nm.tobytes()
         if identity == self._identity:
             return
         self._identity, self._weighting = identity, None
@@ -190,21 +190,21 @@ class GainWatch:
         events = (PendingEvent("STAR_CHANGED", {"ratio": ratio}),)
         if not loop.automatic.any():
             return Actions(events=events)
-        lowered = loop.law.gain * np.float32(min(ratio, 0.5))
-        return Actions((self._gains(step, loop, np.where(loop.automatic, lowered, loop.law.gain)),), events)
+        lowered = loop.integrator.gain * np.float32(min(ratio, 0.5))
+        return Actions((self._gains(step, loop, np.where(loop.automatic, lowered, loop.integrator.gain)),), events)
 
     def _judge(self, judged: list[_Group], step: Step, state: State, loop: ActiveLoop) -> Actions:
         noise_nm2 = self._noise_nm2(loop) if any(group.bank.complete for group in judged) else None
-        gain, initial, events = loop.law.gain.copy(), False, []
+        gain, initial, events = loop.integrator.gain.copy(), False, []
         for group in judged:
             if not group.bank.complete:
-                early = group.bank.early(loop.law.gain[group.mask])
+                early = group.bank.early(loop.integrator.gain[group.mask])
                 gain[group.mask] = np.where(loop.automatic[group.mask], early, gain[group.mask])
                 continue
             initial |= group.bank.first
             noise = None if noise_nm2 is None else noise_nm2[group.mask]
-            group.gain = loop.law.gain[group.mask]
-            group.verdict = verdict = group.bank.verdict(loop.law.gain[group.mask], noise)
+            group.gain = loop.integrator.gain[group.mask]
+            group.verdict = verdict = group.bank.verdict(loop.integrator.gain[group.mask], noise)
             best = verdict.gain if group.unrestricted else np.minimum(verdict.gain, CAUTIOUS_GAIN)
             gain[group.mask] = np.where(loop.automatic[group.mask], best, gain[group.mask])
             if not group.unrestricted:
@@ -212,7 +212,7 @@ class GainWatch:
                 group.bank.begin_first_window()
             events += self._harm(group, verdict, loop)
         requests = []
-        if loop.automatic.any() and (initial or not np.array_equal(gain, loop.law.gain)):
+        if loop.automatic.any() and (initial or not np.array_equal(gain, loop.integrator.gain)):
             requests.append(self._gains(step, loop, gain))
         self.closing_harm = "" if state.mode is LoopMode.CLOSED else self._closing_harm(gain, loop)
         close_pending = state.mode is LoopMode.OPEN and state.conditions.mode_cause == MEASURED_FIRST
@@ -228,7 +228,7 @@ class GainWatch:
         noll, added, harm_nm2 = np.array(loop.calibration.noll), "", np.zeros(len(loop.calibration.noll))
         for group in self._groups:
             one = group.verdict
-            if one is None or not np.array_equal(gain[group.mask], loop.law.gain[group.mask]):
+            if one is None or not np.array_equal(gain[group.mask], loop.integrator.gain[group.mask]):
                 continue
             harmful = one.change_nm2 > CONFIDENCE * one.change_error_nm2
             harm_nm2[group.mask] = np.where(harmful, one.change_nm2, 0)

@@ -18,7 +18,7 @@ from lowfc.design.sam_search import Chain
 from lowfc.optics.chain.sam import Layout
 from lowfc.programs.design.sam_request import Search
 
-_LARGEST_BYTES = 1 << 26
+_MAX_BYTES = 1 << 26
 UNITS = "pupil diameters, origin at the pupil centre, x to the right (columns), y up the row index"
 
 
@@ -65,7 +65,7 @@ def write_state(path: Path, search: Search, pupil: str, chains: Sequence[Chain])
 def read_state(path: Path, pupil: str) -> tuple[Search, list[Chain]]:
     """Read the search and its chains from a file of `write_state`."""
     try:
-        state = json.loads(input_file.read_whole(path, _LARGEST_BYTES))
+        state = json.loads(input_file.read_whole(path, _MAX_BYTES))
         search = Search(**state["search"])
         chains = [Chain(**{key: _as_tuple(value) for key, value in chain.items()}) for chain in state["chains"]]
         made_for = state["pupil"]

@@ -21,7 +21,7 @@ from lowfc.design.dark_zone import FINE_STEP, fine_grid
 from lowfc.design.linear_program import NotSolvedError
 from lowfc.design.shaped_pupil import (
     FOCAL_MASK_RADIUS,
-    LEAST_OPEN,
+    MIN_OPEN_AREA,
     Request,
     Round,
     exchange,
@@ -75,7 +75,7 @@ def design_spc(request: Request, out: Path, plot: Path | None, console: Console)
     with console.status("solving linear programs"):
         rounds = _interruptibly(lambda: _rounds(request, console))
     last = rounds[-1]
-    if last.open_area < LEAST_OPEN:
+    if last.open_area < MIN_OPEN_AREA:
         with console.status("infeasible; looking for the nearest feasible request"):
             raise ConfigurationError(_infeasible(request, *_interruptibly(lambda: nearest_feasible(request))))
     if last.contrast > request.contrast:
@@ -125,7 +125,7 @@ def _infeasible(request: Request, inner: float | None, contrast: float | None) -
     nearest = f"the nearest feasible {', or '.join(ways)}" if ways else "nothing near it is feasible"
     return (
         f"inner angle {request.inner:g} lambda/D at {request.contrast:g} is infeasible (no mask is more open than "
-        f"{LEAST_OPEN:.0%}); {nearest}"
+        f"{MIN_OPEN_AREA:.0%}); {nearest}"
     )
 
 

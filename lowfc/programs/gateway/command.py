@@ -20,7 +20,7 @@ from lowfc.programs.gateway.watch import Watch
 
 PERIOD_S = 0.1
 """Update period of the variables."""
-SHORTEST_PERIOD_S = 0.005
+MIN_PERIOD_S = 0.005
 """Shortest time between two updates, however fast a variable changes."""
 BENCH_PERIOD_S = 0.25
 """Period at which a bench value is published again while its variable is connected."""
@@ -69,4 +69,4 @@ def epics(run: AnyRun = None, config: ConfigFile = None) -> None:
                 values = {one.name: one.read(view, status) for one in offered if one.read is not None}
                 gateway.update(values, "" if view.connected else "the controller does not answer")
             changed.wait(max(0.0, min(due_s, bench_s) - time.monotonic()))
-            stop.wait(SHORTEST_PERIOD_S)
+            stop.wait(MIN_PERIOD_S)

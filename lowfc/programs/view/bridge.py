@@ -35,14 +35,14 @@ VIEWER_SPARE_BYTES = 1_500_000_000
 """Memory granted to a viewer for textures, plots and window, beyond its limit for the stream."""
 STUCK_S = 10.0
 """Time without a drawn snapshot after which the viewer counts as hung."""
-MOST_EARLIER = 1000
+MAX_EARLIER_EVENTS = 1000
 """Largest number of events shown from before the start of the view."""
 
 _RECORDER_S = 3.0  # after which a recorder without Health counts as absent
 _POLL_S = 0.1
 _CHECK_S = 1.0
 _FROZEN_S = 3.0
-_MOST_RENEWALS = 5
+_MAX_RENEWALS = 5
 _RENEWALS_S = 60.0
 
 
@@ -64,7 +64,7 @@ class Bridge:
         self.viewer: RerunViewer | None = None
         self._render: RenderThread | None = None
         self._drawn = self.renewals = self.most_bytes = 0
-        self._renewed_s: deque[float] = deque(maxlen=_MOST_RENEWALS)
+        self._renewed_s: deque[float] = deque(maxlen=_MAX_RENEWALS)
         self._stuck = self._past_known = False
         self._awake_s = self._began_s = time.monotonic()
         self._rings = {topic: bus.ring(topic, WAITING[topic]) for topic in SHOWN}
@@ -176,9 +176,9 @@ class Bridge:
             raise ViewError(f"writing the view to a file failed: {why}")
         while True:
             now_s = time.monotonic()
-            if len(self._renewed_s) == _MOST_RENEWALS and now_s - self._renewed_s[0] < _RENEWALS_S:
+            if len(self._renewed_s) == _MAX_RENEWALS and now_s - self._renewed_s[0] < _RENEWALS_S:
                 raise ViewError(
-                    f"the view was restarted {_MOST_RENEWALS} times in {_RENEWALS_S:g} s; the last time: {why}"
+                    f"the view was restarted {_MAX_RENEWALS} times in {_RENEWALS_S:g} s; the last time: {why}"
                 )
             self._renewed_s.append(now_s)
             self.service.event("VIEW_RENEWED", why=why)
@@ -213,9 +213,9 @@ def earlier_events(recorder: wire.Health | None, now_ns: int) -> list[Sample]:
             found[:0] = log
         except DataFileError as fault:
             missing.append(_line(f"earlier events are missing here: {fault}", now_ns))
-        if len(found) >= MOST_EARLIER:
+        if len(found) >= MAX_EARLIER_EVENTS:
             break
-    return [*found[-MOST_EARLIER:], *missing]
+    return [*found[-MAX_EARLIER_EVENTS:], *missing]
 
 
 def _line(text: str, now_ns: int) -> Sample:

@@ -49,7 +49,7 @@ _KNOWN_EVENTS = 5000
 _UNREADABLE = (BadMessageError, DecodeError, KeyError, OverflowError, ValueError)
 
 
-class Waves(NamedTuple):
+class Wavefronts(NamedTuple):
     """The wavefront of some frames, nm: `residual`, and `open`, as it would be with a flat mirror.
 
     The modes (frames, modes) are values at one instant of each frame, and rms over each frame if known. `rms_nm`
@@ -139,17 +139,17 @@ class Snapshot:
         error_nm = self.steps.error_nm
         return np.asarray(np.isfinite(error_nm).all(axis=1) & (error_nm.shape[1] > 0))
 
-    def waves(self, *, true: bool) -> Waves:
+    def wavefronts(self, *, true: bool) -> Wavefronts:
         """New wavefronts: the true ones of a simulation, or those measured in the frames that were used."""
         if true:
             new = self.truths
             rms_nm = np.stack([new.residual_rms_nm, new.disturbance_rms_nm], axis=1)
             over = new.modes_residual_rms_nm, new.modes_disturbance_rms_nm
-            return Waves(new.sequence, new.time_ns, new.residual_nm, new.disturbance_nm, *over, rms_nm)
+            return Wavefronts(new.sequence, new.time_ns, new.residual_nm, new.disturbance_nm, *over, rms_nm)
         steps, used = self.steps, self.used
         modes_nm = steps.error_nm[used], steps.pol_nm[used]
         rms_nm = np.stack([np.linalg.norm(one, axis=1) for one in modes_nm], axis=1)
-        return Waves(steps.sequence[used], steps.time_ns[used], *modes_nm, *modes_nm, rms_nm)
+        return Wavefronts(steps.sequence[used], steps.time_ns[used], *modes_nm, *modes_nm, rms_nm)
 
 
 class Accumulator:

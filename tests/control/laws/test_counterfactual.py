@@ -65,7 +65,9 @@ def test_the_logged_gains_reproduce_the_logged_run(delay: float) -> None:
     assert missing.sum() == 9
     assert np.isnan(error).any(axis=1).sum() == len(DARK)
     assert (np.abs(command[:, 0]) == 12.0).any()
-    replayed_error, replayed_command = counterfactual(as_logged(setup.law((2, 3, 4))), weights(delay), pol, missing)
+    replayed_error, replayed_command = counterfactual(
+        as_logged(setup.integrator((2, 3, 4))), weights(delay), pol, missing
+    )
     np.testing.assert_allclose(replayed_error, error, atol=2e-5, rtol=0)
     np.testing.assert_allclose(replayed_command, command, atol=2e-5, rtol=0)
 
@@ -78,7 +80,7 @@ def test_other_gains_reproduce_a_run_with_these_gains(delay: float) -> None:
     disturbance = walk(160)
     _, pol, _, missing = columns(used(before, disturbance))
     error, _, command, _ = columns(used(after, disturbance))
-    other_error, other_command = counterfactual(as_logged(after.law((2, 3, 4))), weights(delay), pol, missing)
+    other_error, other_command = counterfactual(as_logged(after.integrator((2, 3, 4))), weights(delay), pol, missing)
     np.testing.assert_allclose(other_error, error, atol=0.05)
     np.testing.assert_allclose(other_command, command, atol=0.05)
     assert np.nanmax(np.abs(other_error - pol)) > 5

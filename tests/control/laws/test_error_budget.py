@@ -12,7 +12,7 @@ from lowfc.control.laws.continuous import Timing, residual_power
 from lowfc.control.laws.error_budget import Term, lag, lag_under_noise, measurement_error, sensor_noise, white_noise
 from lowfc.control.laws.linear_law import LinearLaw, integrator
 from lowfc.control.laws.spectra import Pieces, spectrum
-from tests.support.folded_loop import SMALL_MIRROR, fold
+from tests.support.in_process_loop import SMALL_MIRROR, fold
 from tests.support.theory import rejection
 from tools.law_bench import calibrated
 
@@ -172,7 +172,7 @@ def test_the_terms_add_up_to_the_residual_of_a_simulated_loop() -> None:
     ran = fold(config, 1600, calibration)
     signals = {name: getattr(ran, name)[100:] for name in ("error_nm", "pol_nm", "disturbance_nm", "residual_nm")}
     settings = factory.settings(config)
-    law = settings.law(calibration.noll)
+    law = settings.integrator(calibration.noll)
     law = integrator(law.gain, law.leak, calibration.noll, settings.delay_frames, RATE_HZ)
     noise = sensor_noise(
         calibration.reconstructor.astype(float), calibration.reference.astype(float), calibration.flux_dn, 1.0

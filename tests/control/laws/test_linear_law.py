@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from lowfc.arrays import Array
-from lowfc.control.laws.law import integrate
+from lowfc.control.laws.integrator import integrate
 from lowfc.control.laws.linear_law import LinearLaw, Signal, at_rest, predict, predict_and_update, respond
 from lowfc.control.laws.margins import (
-    MOST_COUPLED,
+    MAX_COUPLED_STATES,
     check_stable,
     margins,
     noise_gain,
@@ -302,7 +302,7 @@ def test_margins_of_coupled_modes_are_those_of_the_rotated_loop() -> None:
 
 
 def test_a_law_with_too_many_coupled_states_is_refused() -> None:
-    states, ones = MOST_COUPLED + 1, np.ones((MOST_COUPLED + 1, 1), np.float32)
+    states, ones = MAX_COUPLED_STATES + 1, np.ones((MAX_COUPLED_STATES + 1, 1), np.float32)
     dense = np.full((states, states), 1e-3, np.float32)
     law = LinearLaw("error", dense, ones, 0 * ones, dense, -ones.T, "dense", (4,), 1.0, RATE_HZ)
     with pytest.raises(ValueError, match="are coupled"):

@@ -10,7 +10,7 @@ from lowfc.control.laws.kalman import lqg_block
 from lowfc.control.laws.linear_law import of_blocks
 from lowfc.control.laws.margins import margins
 from lowfc.control.laws.spectra import Pieces
-from lowfc.control.laws.stability import LEAST_GAIN_MARGIN, LEAST_PHASE_MARGIN_DEG
+from lowfc.control.laws.stability import MIN_GAIN_MARGIN, MIN_PHASE_MARGIN_DEG
 from lowfc.control.laws.tuning import within_margins
 from lowfc.control.laws.vibration import Line, Model
 from sim_camera.disturbance import LINES_HZ, LINES_MAS
@@ -52,8 +52,8 @@ def test_a_filter_keeps_the_margins_at_any_noise(noise_nm: float, width: float, 
     def over(one: object) -> float:
         """Smallest ratio of a margin to its limit."""
         found = margins(one, delay)
-        gain = min(found.gain_margin[0], 1 / max(found.gain_reduction[0], 1e-9)) / LEAST_GAIN_MARGIN
-        return float(min(gain, found.phase_margin_deg[0] / (0.7 * LEAST_PHASE_MARGIN_DEG)))
+        gain = min(found.gain_margin[0], 1 / max(found.gain_reduction[0], 1e-9)) / MIN_GAIN_MARGIN
+        return float(min(gain, found.phase_margin_deg[0] / (0.7 * MIN_PHASE_MARGIN_DEG)))
 
     assert over(law) >= 1
     assert over(law) < 1.1 or over(law) == over(free)

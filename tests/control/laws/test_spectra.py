@@ -10,9 +10,18 @@ from lowfc.arrays import Array
 from lowfc.control.calibration.excitation import FEWEST_CYCLES, build_staircase, lines, multisine, with_lead_in
 from lowfc.control.calibration.linearity import captured, gains, levels
 from lowfc.control.laws import margins
-from lowfc.control.laws.law import Law
+from lowfc.control.laws.integrator import Integrator
 from lowfc.control.laws.linear_law import LinearLaw
-from lowfc.control.laws.spectra import LONGEST, MOST_BRIDGED, SHORTEST, Pieces, floor_nm2_hz, in_bins, pieces, spectrum
+from lowfc.control.laws.spectra import (
+    LONGEST,
+    MAX_INTERPOLATED_FRAMES,
+    SHORTEST,
+    Pieces,
+    floor_nm2_hz,
+    in_bins,
+    pieces,
+    spectrum,
+)
 from lowfc.control.laws.stability import delay_weights, settling_frames
 from lowfc.control.laws.transfer_function import departure, measured, seen_of_mirror
 from lowfc.control.loop.advance import advance
@@ -65,14 +74,14 @@ def test_the_standard_error_equals_the_scatter() -> None:
 def test_short_gaps_are_interpolated_and_long_gaps_split_the_run() -> None:
     values = np.arange(20.0)[:, None] * [1.0, -2.0]
     present = np.ones(20, bool)
-    present[5 : 5 + MOST_BRIDGED] = False
-    present[12 : 13 + MOST_BRIDGED] = False
+    present[5 : 5 + MAX_INTERPOLATED_FRAMES] = False
+    present[12 : 13 + MAX_INTERPOLATED_FRAMES] = False
     found = pieces(numbers(20)[present], values[present])
-    assert [len(piece) for piece in found.values] == [12, 20 - 13 - MOST_BRIDGED]
-    assert found.bridged == MOST_BRIDGED
+    assert [len(piece) for piece in found.values] == [12, 20 - 13 - MAX_INTERPOLATED_FRAMES]
+    assert found.bridged == MAX_INTERPOLATED_FRAMES
     assert np.array_equal(found.values[0], values[:12])  # interpolation of a straight line is exact
-    assert np.array_equal(found.values[1], values[13 + MOST_BRIDGED :])
-    assert found.frames == 20 - 1 - MOST_BRIDGED
+    assert np.array_equal(found.values[1], values[13 + MAX_INTERPOLATED_FRAMES :])
+    assert found.frames == 20 - 1 - MAX_INTERPOLATED_FRAMES
 
 
 def test_repeated_and_older_frames_are_ignored() -> None:
@@ -115,11 +124,11 @@ GAIN = (0.4, 0.1)
 TOLERANCE_DB = 1.0
 
 
-def law(gain: tuple[float, float] = GAIN) -> Law:
-    return settings(gain=gain).law(NOLL)
+def law(gain: tuple[float, float] = GAIN) -> Integrator:
+    return settings(gain=gain).integrator(NOLL)
 
 
-def theory_of(one: Law, delay_frames: float) -> LinearLaw:
+def theory_of(one: Integrator, delay_frames: float) -> LinearLaw:
     return linear(one, NOLL, delay_frames, 1.0)
 
 

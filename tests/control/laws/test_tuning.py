@@ -7,7 +7,7 @@ from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.margins import margins
 from lowfc.control.laws.spectra import Pieces
-from lowfc.control.laws.stability import LEAST_GAIN_MARGIN, LEAST_PHASE_MARGIN_DEG, highest_gain
+from lowfc.control.laws.stability import MIN_GAIN_MARGIN, MIN_PHASE_MARGIN_DEG, highest_gain
 from lowfc.control.laws.tuning import (
     best_gains,
     identified,
@@ -45,9 +45,9 @@ def true_mas(law: LinearLaw, pol: Pieces, truth: np.ndarray, delay_frames: float
 @pytest.mark.parametrize("delay_frames", [1.0, 1.5, 2.0, 3.0])
 def test_the_highest_gain_has_exactly_the_least_allowed_margins(delay_frames: float) -> None:
     found = margins(integrators([(highest_gain(delay_frames), 0.0)], "error", delay_frames), delay_frames)
-    assert found.gain_margin[0] >= LEAST_GAIN_MARGIN * 0.999
-    assert found.phase_margin_deg[0] >= LEAST_PHASE_MARGIN_DEG * 0.999
-    at_a_limit = (found.gain_margin[0] / LEAST_GAIN_MARGIN, found.phase_margin_deg[0] / LEAST_PHASE_MARGIN_DEG)
+    assert found.gain_margin[0] >= MIN_GAIN_MARGIN * 0.999
+    assert found.phase_margin_deg[0] >= MIN_PHASE_MARGIN_DEG * 0.999
+    at_a_limit = (found.gain_margin[0] / MIN_GAIN_MARGIN, found.phase_margin_deg[0] / MIN_PHASE_MARGIN_DEG)
     assert min(at_a_limit) == pytest.approx(1, rel=0.01)
 
 
@@ -108,7 +108,7 @@ def test_laws_on_the_reaction_wheel_leave_the_predicted_residual(
         predicted_mas = float(np.sqrt(np.mean(one.predicted_nm**2)) / NM_PER_MAS)
         assert residual_mas[one.law.name] == pytest.approx(predicted_mas, rel=0.05), one.law.name
         assert one.margins.stable
-        assert one.margins.gain_margin.min() >= LEAST_GAIN_MARGIN * 0.999
+        assert one.margins.gain_margin.min() >= MIN_GAIN_MARGIN * 0.999
     assert residual_mas["lqg"] < of_notch * residual_mas["pi-notch"] < residual_mas["integrator"]
     assert all(residual_mas[name] > least for name, least in at_least_mas.items())
     assert all(residual_mas[name] < most for name, most in at_most_mas.items())

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lowfc.control.laws.law import Law, integrate
+from lowfc.control.laws.integrator import Integrator, integrate
 from lowfc.control.laws.stability import delay_weights
 from lowfc.control.laws.virtual import VirtualIntegrators
 
@@ -13,7 +13,7 @@ def test_each_row_equals_a_loop_with_its_gain() -> None:
     gain = np.array([[0, 0], [0.1, 0.4], [0.3, 0.2]], np.float32)
     leak, limit = np.array([0, 0.01], np.float32), np.array([2.0, 100], np.float32)
     rows = VirtualIntegrators.at_rest(gain, 1 - leak, limit, weights)
-    laws, commands = [Law(row, leak, limit) for row in gain], [[np.zeros(2, np.float32)] * 2 for _ in gain]
+    laws, commands = [Integrator(row, leak, limit) for row in gain], [[np.zeros(2, np.float32)] * 2 for _ in gain]
     for frame in range(200):
         if frame % 50 == 7:  # missing: the command is held
             rows = rows.held()

@@ -93,7 +93,7 @@ class IsioCamera:
         if image is None:
             if not self._silent:
                 self._silent = True
-                self._service.event("STREAM_SILENT", stream=self._options.stream, why=self._reader.silence())
+                self._service.event("STREAM_SILENT", stream=self._options.stream, why=self._reader.silence_cause())
             return None
         self._silent = False
         if image.generation != self._generation:

@@ -9,7 +9,7 @@ from lowfc.arrays import Single
 from lowfc.contract.configuration import Acceptance
 from lowfc.control.calibration.excitation import build_staircase
 from lowfc.control.calibration.linearity import captured
-from lowfc.control.laws.law import TIP_TILT, Law
+from lowfc.control.laws.integrator import TIP_TILT, Integrator
 from lowfc.control.loop.safety import LoopMode
 from lowfc.optics.chain.zernike import mode_name
 from lowfc.programs.cli.result import figure
@@ -69,11 +69,11 @@ def play(live: Live, modes: Sequence[int], required: Acceptance) -> list[ProbeRe
 def _trials(live: Live, noll: int, required: Acceptance) -> list[tuple[dict[str, Any], Single, Single]]:
     """Trials of a mode, smallest amplitude first: announcement, staircase and shape; empty if its gain is zero."""
     row, law = live.loop.noll.index(noll), live.loop.law
-    if isinstance(law, Law) and not law.gain[row]:
+    if isinstance(law, Integrator) and not law.gain[row]:
         return []
     # settling_frames() of an integrator ignores the delay, hence twice that; of a linear law it is five time constants
     # of the slowest pole, of which three are enough: they leave 5 %.
-    hold = round(live.loop.settling_frames() * (2 if isinstance(law, Law) else 0.6))
+    hold = round(live.loop.settling_frames() * (2 if isinstance(law, Integrator) else 0.6))
     averaged = hold // _AVERAGED_PART
     shape = live.calibration.modes_to_actuators[:, row][None]
     step_nm = live.configuration.safety.slew_nm / 2 / float(np.abs(shape).max())

@@ -20,7 +20,7 @@ from lowfc.contract.errors import DataFileError, LowfcError
 from lowfc.contract.messages import wire
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws import margins
-from lowfc.control.laws.law import Law
+from lowfc.control.laws.integrator import Integrator
 from lowfc.control.laws.linear_law import LinearLaw, integrator
 from lowfc.control.laws.stability import settling_frames
 from lowfc.control.loop.safety import Limit, LoopMode, Rejection
@@ -29,9 +29,9 @@ from lowfc.programs.cli.result import Result, figure
 Kind = Literal["rejection", "linearity", "capture-range", "noise-floor"]
 
 LIMITS = (Limit.MODAL_LIMIT, Limit.STROKE, Limit.SLEW, Limit.NEIGHBOUR)
-MOST_MISSING = 0.01
+MAX_MISSING = 0.01
 """Largest fraction of the frames that may be missing or refused."""
-LONGEST_SETTLING = 4000
+MAX_SETTLING_FRAMES = 4000
 """Upper limit of a linear law's settling time, frames."""
 
 ANNOUNCEMENT = "acceptance "
@@ -76,7 +76,7 @@ class AcceptanceResult(Result):
 class Loop:
     """The measured loop: control law, modes, configured delay and frame rate."""
 
-    law: Law | LinearLaw
+    law: Integrator | LinearLaw
     noll: tuple[int, ...]
     delay_frames: float
     rate_hz: float
@@ -90,10 +90,10 @@ class Loop:
 
     def settling_frames(self) -> int:
         """Settling time, frames."""
-        if isinstance(self.law, Law):
+        if isinstance(self.law, Integrator):
             return settling_frames(self.law.gain, self.law.leak)
         radius = float(margins.margins(self.law, self.delay_frames).radius.max())
-        return int(min(5 / max(1 - radius, 1e-9), LONGEST_SETTLING)) + 1
+        return int(min(5 / max(1 - radius, 1e-9), MAX_SETTLING_FRAMES)) + 1
 
     @property
     def name(self) -> str:
@@ -150,10 +150,10 @@ class ProbeResponse:
                 f"a limit acted ({', '.join(self.limits_hit)}) and ended the probe: use a smaller amplitude, or "
                 "measure when the disturbance is smaller"
             )
-        if self.missing > MOST_MISSING * len(self.error_nm):
+        if self.missing > MAX_MISSING * len(self.error_nm):
             raise AcceptanceError(
                 f"{self.missing} of {len(self.error_nm)} frames are missing or were refused (limit "
-                f"{MOST_MISSING:.0%}): `lowfc info` and `lowfc ctl status` show the reasons"
+                f"{MAX_MISSING:.0%}): `lowfc info` and `lowfc ctl status` show the reasons"
             )
 
     def filled(self, values: Array) -> Array:

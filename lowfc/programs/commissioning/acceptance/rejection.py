@@ -29,7 +29,7 @@ from lowfc.programs.commissioning.acceptance.probe import (
 )
 
 KIND: Kind = "rejection"
-LEAST_JUDGED = 0.5
+MIN_JUDGED = 0.5
 """Smallest fraction of a mode's lines whose rejection must be certain enough to judge.
 
 The noise transfer has no such limit: where it is small, it is below the measurement noise.
@@ -157,7 +157,7 @@ def judge(responses: Sequence[ProbeResponse], required: Acceptance) -> Rejection
         if rows.size:
             rejection, noise = _comparison(of_s, rows, frequency_hz), _comparison(of_t, rows, frequency_hz)
             within = rejection.within and noise.within
-            enough = rejection.judged >= LEAST_JUDGED * rows.size
+            enough = rejection.judged >= MIN_JUDGED * rows.size
             modes.append(
                 RejectionMode(
                     noll=noll,

@@ -78,14 +78,14 @@ def calibrate(
         return
     from lowfc.adapters.files.calibration_file import load as read
     from lowfc.programs.commissioning.calibrate import tasks
-    from lowfc.programs.commissioning.calibrate.pokes import LEAST_SNR, CalibrationRequest
+    from lowfc.programs.commissioning.calibrate.pokes import MIN_SNR, CalibrationRequest
     from lowfc.programs.commissioning.calibrate.result import comparison
 
     if compare is not None:
         print_result(comparison(*map(read, compare)), as_json=as_json)
         return
     if cycles is not None and "--snr" not in given:
-        snr = LEAST_SNR
+        snr = MIN_SNR
     request = CalibrationRequest(method, out, snr, cycles, amplitude, resume, truncate, tikhonov)
     if method == "analytic":
         print_result(tasks.computed(config, request, at, run if load else None, load=load), as_json=as_json)

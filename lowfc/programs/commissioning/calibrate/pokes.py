@@ -11,16 +11,16 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError
 from lowfc.control.calibration import poke_plan
 from lowfc.control.calibration.calibration import Calibration
-from lowfc.control.calibration.response_fit import LEAST_CYCLES
+from lowfc.control.calibration.response_fit import MIN_CYCLES
 from lowfc.programs.commissioning.calibrate.recording import AFTERWARDS
 
 AMPLITUDE_NM = {"poke": 8.0, "hadamard": 3.0, "in-loop": 2.0}
 """Default amplitude of a mode by method, nm rms of wavefront."""
-LEAST_SNR = 20.0
+MIN_SNR = 20.0
 """Signal-to-noise ratio required of a calibration with a given number of cycles."""
 FULL_AMPLITUDE_SNR = 70.0
 """Highest signal-to-noise ratio for the default amplitude: the error of third-order terms goes as its square."""
-MOST_HADAMARD_NM = 3.0
+MAX_HADAMARD_NM = 3.0
 """Largest amplitude of a mode, nm rms: all modes at once add up to some four times that, within the linear range."""
 SETTLE = 2
 """Frames left out after each change: one for a fractional delay, and one for a late command."""
@@ -32,13 +32,13 @@ PIECE = 1024
 """Length of a piece of a dither, frames."""
 MARGIN = 0.9
 """Error to aim for, as a fraction of the required one, so that scatter of the cycles seldom requires more cycles."""
-MOST_TIMES = 4
+MAX_CYCLES_RATIO = 4
 """Largest ratio of cycles to the number required by photon and read noise; beyond it the operator decides."""
-MOST_FEW = 32
-"""Number of cycles always allowed, whatever MOST_TIMES: on a bright star they take little time."""
+ALWAYS_ALLOWED_CYCLES = 32
+"""Number of cycles always allowed, whatever MAX_CYCLES_RATIO: on a bright star they take little time."""
 CHECK_PART = 0.25
 """Number of check cycles relative to the cycles that R is computed from."""
-_LEAST_CHECKS = 3
+_MIN_CHECKS = 3
 _OF_THE_SLEW = 0.8
 """Largest fraction of the slew limit that a poke uses."""
 SEED = 1
@@ -100,14 +100,15 @@ class Pokes:
         """Number of cycles required by photon and read noise."""
         request = self._request
         if request.cycles is not None:
-            return max(request.cycles, LEAST_CYCLES)
+            return max(request.cycles, MIN_CYCLES)
         frames = poke_plan.frames_for(request.snr / MARGIN, float(self._noise_nm.max()), self.amplitude_nm)
-        return max(-(-frames // self.cycle(0).per_column), LEAST_CYCLES)
+        return max(-(-frames // self.cycle(0).per_column), MIN_CYCLES)
 
     def more_cycles(self, cycles: int, error: float) -> int:
         """Number of cycles required, given the standard error after `cycles`; `cycles` if too many are required."""
         needed = cycles_for(self._request.snr, cycles, error)
-        reachable = self._request.cycles is None and needed <= max(MOST_TIMES * self.cycles(), MOST_FEW)
+        allowed = max(MAX_CYCLES_RATIO * self.cycles(), ALWAYS_ALLOWED_CYCLES)
+        reachable = self._request.cycles is None and needed <= allowed
         return needed if reachable and error * self._request.snr > 1 else cycles
 
     def frames(self, cycles: int, done: int = 0) -> int:
@@ -129,10 +130,10 @@ class Pokes:
     def _amplitude(self) -> float:
         """The requested or default amplitude, within the mirror's slew limit."""
         requested, method = self._request.amplitude_nm, self._request.method
-        if method == "hadamard" and requested is not None and requested > MOST_HADAMARD_NM:
+        if method == "hadamard" and requested is not None and requested > MAX_HADAMARD_NM:
             raise CalibrationError(
                 f"--amplitude {requested:g} nm is too large for hadamard, which pokes all modes at once: at most "
-                f"{MOST_HADAMARD_NM:g} nm of each"
+                f"{MAX_HADAMARD_NM:g} nm of each"
             )
         shapes = self._cycle(0, 1.0).table @ self._basis
         steepest = float(np.abs(np.diff(shapes, axis=0)).max())
@@ -172,4 +173,4 @@ def cycles_for(snr: float, cycles: int, error: float) -> int:
 
 def checks(cycles: int) -> int:
     """Number of check cycles for a reconstructor made from a number of cycles."""
-    return max(_LEAST_CHECKS, round(CHECK_PART * cycles))
+    return max(_MIN_CHECKS, round(CHECK_PART * cycles))

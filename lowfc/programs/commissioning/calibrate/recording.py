@@ -26,11 +26,11 @@ T = TypeVar("T")
 
 AFTERWARDS = 8
 """Frames recorded after the end of a probe sequence: the longest delay that can be measured."""
-MOST_BEHIND = 100
+MAX_FRAMES_BEHIND = 100
 """Frames by which the mirror's reports may lag behind the controller's steps; beyond it the mirror is dead."""
 CHECKED = 100
 """Frames between two renewals of the lease."""
-MOST_REFUSED = 50
+MAX_REFUSED_FRAMES = 50
 """Consecutive refused frames after which a probe sequence is abandoned."""
 ATTEMPTS = 5
 """Attempts at a sequence if frames are lost or a device restarts."""
@@ -199,12 +199,12 @@ def _commanded(step: Step) -> bool:
 
 
 def _check_refused(steps: list[Step]) -> None:
-    last = steps[-MOST_REFUSED:]
-    if len(last) == MOST_REFUSED and not any(_commanded(step) for step in last):
+    last = steps[-MAX_REFUSED_FRAMES:]
+    if len(last) == MAX_REFUSED_FRAMES and not any(_commanded(step) for step in last):
         reasons = sorted({reason.name for step in last for reason in step.reasons})
         raise CalibrationError(
-            f"the last {MOST_REFUSED} frames were refused as {', '.join(reasons)}, which ended the sequence; correct "
-            "this first: `lowfc ctl status` shows whether frames are used again"
+            f"the last {MAX_REFUSED_FRAMES} frames were refused as {', '.join(reasons)}, which ended the sequence; "
+            "correct this first: `lowfc ctl status` shows whether frames are used again"
         )
 
 
@@ -214,7 +214,7 @@ def _check_devices(mirror: MirrorWatch, sequence: int, first: int) -> None:
     behind = sequence - max(mirror.frame_sequence, first)
     if start_of(sequence) != start_of(first):
         why = "the camera restarted"
-    elif mirror.interruption or behind <= MOST_BEHIND:
+    elif mirror.interruption or behind <= MAX_FRAMES_BEHIND:
         why = mirror.interruption
     else:
         why = f"the mirror has not reported an applied command for {behind} frames"

@@ -15,7 +15,7 @@ from lowfc.contract.errors import CalibrationError
 from lowfc.control.calibration.actuator_response import actuators_to_modes
 from lowfc.control.calibration.calibration import Calibration, comparable
 from lowfc.control.calibration.regularised import Reconstruction, advice, reconstruct
-from lowfc.control.calibration.response_fit import MOST_LARGEST, MOST_RMS, Check, Measured, cross_talk
+from lowfc.control.calibration.response_fit import MAX_ELEMENT, MAX_ELEMENT_RMS, Check, Measured, cross_talk
 from lowfc.optics.twin.twin import reference as twin_reference
 from lowfc.optics.twin.twin import response as twin_response
 from lowfc.optics.twin.twin_mirror import wavefront_nm
@@ -23,7 +23,7 @@ from lowfc.programs.cli.result import Result, figure
 from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest, cycles_for
 from lowfc.programs.commissioning.calibrate.run import CalibrationData, Calibrator
 
-MOST_NOISE = 1.5
+MAX_NOISE_RATIO = 1.5
 """Largest ratio of the noise of R to that of the computed R at the same flux; far from flat the ratio is higher."""
 DELAY_APART = 0.1
 """Largest difference between measured and configured delay without a warning, frames."""
@@ -238,7 +238,7 @@ def judge(
         noll: Noll index of each mode.
     """
     reached = 1 / max(float(error.max()), 1e-300)
-    rms, largest = MOST_RMS / required_snr, MOST_LARGEST / required_snr
+    rms, largest = MAX_ELEMENT_RMS / required_snr, MAX_ELEMENT / required_snr
     faults = []
     if reached < required_snr:
         needed = cycles_for(required_snr, cycles, float(error.max()))
@@ -253,11 +253,11 @@ def judge(
             f"and, with the noise of these frames, {check.bound(largest):.3g}: did the wavefront, the flux or the "
             "sensor change during the calibration?"
         )
-    if noise_ratio is not None and noise_ratio.max() > MOST_NOISE:
+    if noise_ratio is not None and noise_ratio.max() > MAX_NOISE_RATIO:
         faults.append(
             f"Z{noll[int(noise_ratio.argmax())]} has {noise_ratio.max():.2g} times the noise of the computed "
-            f"reconstructor, expected at most {MOST_NOISE:g}: is the sensor aligned (`lowfc calibrate align`), and the "
-            "wavefront near its zero point?"
+            f"reconstructor, expected at most {MAX_NOISE_RATIO:g}: is the sensor aligned (`lowfc calibrate align`), "
+            "and the wavefront near its zero point?"
         )
     return Verdict(
         snr=required_snr,

@@ -34,7 +34,7 @@ from lowfc.control.calibration.response_fit import (
     correlation,
     measured,
 )
-from lowfc.control.laws.law import TIP_TILT
+from lowfc.control.laws.integrator import TIP_TILT
 from lowfc.control.loop.wording import counted
 from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest, Pokes, checks
 from lowfc.programs.commissioning.calibrate.recording import Player, Report, check_size

@@ -8,7 +8,7 @@ import typer
 
 from lowfc.adapters.process.terminal import AnyRun, Json
 from lowfc.contract.errors import ConfigurationError, DataFileError
-from lowfc.control.calibration.response_fit import LEAST_CYCLES
+from lowfc.control.calibration.response_fit import MIN_CYCLES
 from lowfc.programs.cli.output import print_result
 from lowfc.programs.commissioning.calibrate.command import Out, Resume, Snr
 
@@ -26,7 +26,7 @@ def commission(
     snr: Snr = 50.0,
     cycles: Annotated[
         int | None,
-        typer.Option(min=LEAST_CYCLES, help="Cycles of the response; --snr is then 20 by default."),
+        typer.Option(min=MIN_CYCLES, help="Cycles of the response; --snr is then 20 by default."),
     ] = None,
     resume: Resume = False,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,

@@ -18,12 +18,12 @@ from lowfc.contract.errors import CalibrationError, LowfcError
 from lowfc.contract.messages import wire
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.delay_fit import Delay
-from lowfc.control.laws.law import Law
+from lowfc.control.laws.integrator import Integrator
 from lowfc.control.laws.stability import delay_weights, settling_frames
 from lowfc.control.laws.what_if import as_logged, counterfactual, missing_before, rms
 from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import LoopMode
-from lowfc.programs.commissioning.calibrate.pokes import LEAST_SNR, CalibrationRequest, Pokes
+from lowfc.programs.commissioning.calibrate.pokes import MIN_SNR, CalibrationRequest, Pokes
 from lowfc.programs.commissioning.calibrate.recording import CHECKED, Player, Report, watch
 from lowfc.programs.commissioning.calibrate.result import finished
 from lowfc.programs.commissioning.calibrate.run import Calibrator, partial_of, stored
@@ -166,12 +166,12 @@ class Commissioning:
         for path in (first_file, partial_of(options.out)):
             path.unlink(missing_ok=True)
         self._report(result.text())
-        law = factory.settings(config).law(calibration.noll)
+        law = factory.settings(config).integrator(calibration.noll)
         return self._figures, self._close(law, delay.delay_frames)
 
     def _request(self, amplitude_nm: float | None = None, *, resume: bool = False) -> CalibrationRequest:
         options = self._options
-        snr = options.snr if options.cycles is None else LEAST_SNR
+        snr = options.snr if options.cycles is None else MIN_SNR
         return CalibrationRequest(METHOD, options.out, snr, options.cycles, amplitude_nm, resume)
 
     def _step(self, name: str) -> None:
@@ -218,7 +218,7 @@ class Commissioning:
         first = aligned(self._config, self._computed, before, delay, self._report, self._figures)
         return poked(player, self._config, delay) if first is None else first
 
-    def _close(self, law: Law, delay_frames: float) -> str:
+    def _close(self, law: Integrator, delay_frames: float) -> str:
         """Predict the residual; if requested, close the loop and compare."""
         rate_hz = self._config.camera.rate_hz
         settling = settling_frames(law.gain, law.leak, rate_hz)

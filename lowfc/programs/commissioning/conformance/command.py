@@ -101,11 +101,11 @@ def mirror(
 def _run_with(role: str, name: str | None) -> "Run":
     """The run of that name, or the only one with such a device."""
     from lowfc.adapters.bus.run import open_run
-    from lowfc.client.runs import living, the_known_run
+    from lowfc.client.runs import live_runs, the_known_run
     from lowfc.contract.errors import BusError
 
     if name is None:
-        found = [run for run, roles in living().items() if role in roles]
+        found = [run for run, roles in live_runs().items() if role in roles]
         if len(found) > 1:
             raise BusError(f"several runs have a {role} ({', '.join(found)}): choose one with --run")
         if not found:

@@ -26,7 +26,7 @@ Show = Callable[[str], None]
 
 _PATTERN_SEED = 5
 _GENTLE = 0.05
-_MOST_MOVES = 400
+_MAX_MOVES = 400
 
 
 class Expected:
@@ -191,7 +191,7 @@ class Dialogue(Collected):
 
     def reachable(self, height_nm: float) -> bool:
         """Whether all actuators can be moved by this height in a reasonable number of moves."""
-        return height_nm / self.expected.move_nm < _MOST_MOVES
+        return height_nm / self.expected.move_nm < _MAX_MOVES
 
     def moved(self, before_nm: Single, state: wire.MirrorState) -> bool:
         """Whether a state differs from a former surface by more than a driver step, or is not a finite grid."""

@@ -15,7 +15,7 @@ from lowfc.programs.commissioning.conformance.camera import Camera
 
 _FIELDS = tuple(field.name for field in wire.CameraState.DESCRIPTOR.fields if field.name != "timestamp")
 _ABOVE_ZERO = ("exposure_ns", "period_ns", "gain_e_per_dn", "saturation_dn", "rows", "columns", "bit_depth")
-_MOST_BITS = 16
+_MAX_BITS = 16
 _NS_PER_MS = 1e6
 
 SETTINGS: Table[Camera] = Table()
@@ -44,8 +44,8 @@ def _values(camera: Camera) -> Check | None:
     impossible += [f"{field} 0" for field in _ABOVE_ZERO if values[field] == 0]
     if not from_timestamp(state.timestamp):
         impossible.append("no timestamp")
-    if state.bit_depth > _MOST_BITS:
-        impossible.append(f"bit_depth {state.bit_depth}, but pixels have {_MOST_BITS} bits")
+    if state.bit_depth > _MAX_BITS:
+        impossible.append(f"bit_depth {state.bit_depth}, but pixels have {_MAX_BITS} bits")
     elif 0 < highest < state.saturation_dn:
         impossible.append(f"saturation_dn {state.saturation_dn:g} above {highest:g}, the converter's largest value")
     if 0 < state.saturation_dn <= state.bias_dn:

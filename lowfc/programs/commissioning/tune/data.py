@@ -17,7 +17,7 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BusError, DataFileError
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.continuous import Timing
-from lowfc.control.laws.law import Law
+from lowfc.control.laws.integrator import Integrator
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.spectra import Pieces, pieces
 from lowfc.control.laws.vibration import FEWEST
@@ -54,7 +54,7 @@ class Telemetry:
     noll: tuple[int, ...]
     rate_hz: float
     timing: Timing
-    law: Law
+    law: Integrator
     driving: LinearLaw | None
     closed: bool
     pol: Pieces
@@ -167,7 +167,7 @@ def _telemetry(
     source: str,
     rate_hz: float,
     timing: Timing,
-    laws: tuple[Law, LinearLaw | None],
+    laws: tuple[Integrator, LinearLaw | None],
     steps: Steps,
     usable: Mask,
     true_nm: Single | None,

@@ -8,7 +8,7 @@ import numpy as np
 from lowfc.arrays import Array
 from lowfc.control.laws import margins
 from lowfc.control.laws.continuous import Timing, residual_spectrum
-from lowfc.control.laws.law import TIP_TILT
+from lowfc.control.laws.integrator import TIP_TILT
 from lowfc.control.laws.linear_law import LinearLaw, integrator
 from lowfc.control.laws.spectra import in_bins, spectrum
 from lowfc.control.laws.tuning import (

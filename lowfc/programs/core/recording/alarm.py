@@ -22,7 +22,7 @@ from lowfc.contract.printable import printable
 
 PATIENCE_S = 60.0
 """Time after which a command is killed."""
-_MOST_WAITING = 1000
+_MAX_WAITING_EVENTS = 1000
 _LEVELS: dict[int, str] = {level.value: level.name.lower() for level in Level}
 _OWN = EVENTS["ON_EVENT_FAILED"].name
 
@@ -33,7 +33,7 @@ class Alarm:
     def __init__(self, service: Service, command: str, level: Level, every_s: float) -> None:
         """Run the command from the next event on; its failure is published as an event that does not trigger it."""
         self._command, self._level, self._every_s, self._service = command, level, every_s, service
-        self._waiting: deque[Log] = deque(maxlen=_MOST_WAITING)
+        self._waiting: deque[Log] = deque(maxlen=_MAX_WAITING_EVENTS)
         self._arrived = threading.Event()
         service.bus.subscribe(EVENT, self._receive)
         threading.Thread(target=self._work, name="on-event", daemon=True).start()

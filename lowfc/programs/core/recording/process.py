@@ -22,7 +22,7 @@ from lowfc.programs.core.recording.recorder import Recorder
 from lowfc.programs.core.recording.summary import Summary
 from lowfc.programs.core.recording.volume import bytes_per_s, configured_selection, estimate
 
-_LARGEST_ATTACHMENT_BYTES = 1 << 28
+_MAX_ATTACHMENT_BYTES = 1 << 28
 
 
 def record(run: Run, config: Configuration, calibration: Path | None) -> Summary:
@@ -82,6 +82,6 @@ def _launched(run: Run) -> AbstractSet[str]:
 
 def _attached(path: Path, media_type: str) -> Attachment:
     try:
-        return Attachment(path.name, media_type, input_file.read_whole(path, _LARGEST_ATTACHMENT_BYTES))
+        return Attachment(path.name, media_type, input_file.read_whole(path, _MAX_ATTACHMENT_BYTES))
     except OSError as fault:
         raise DataFileError(f"{path} cannot be read for the log: {fault.strerror}") from fault

@@ -33,7 +33,7 @@ QUEUE_MESSAGES = 20_000
 """Largest number of messages waiting for the disk: about 4 s of a 1 kHz loop, 90 MB."""
 QUEUE_BYTES = 256_000_000
 """Largest total size of payloads waiting for the disk."""
-MOST_CHANNELS = 4096
+MAX_CHANNELS = 4096
 """Number of publisher starts after which the next log is begun: each is a channel of the log and costs memory."""
 
 _ITERATION_S = 0.02
@@ -139,7 +139,7 @@ class Recorder:
     def _begin(self, *, anew: bool = True) -> None:
         """Begin a log, or unless `anew` its next part, with the calibration and states that its messages depend on."""
         self._series.begin(self._peers.newest.values(), new_recording=anew)
-        self._most_starts = self._account.starts + MOST_CHANNELS
+        self._most_starts = self._account.starts + MAX_CHANNELS
         self.service.event("RECORDING")
 
     def _iterate(self) -> None:

@@ -13,7 +13,7 @@ _FLOAT32_FIELDS = ("actuators", "offset")
 """Bytes that hold little-endian float32, nm."""
 _IN_NM = ("_nm", "actuators", "law_state")
 """Endings of the names of fields in nm; a law's state has the unit of its author, nm for lowfc's own laws."""
-_MOST_SHOWN = 4
+_MAX_SHOWN = 4
 
 
 @dataclass(slots=True)
@@ -70,8 +70,8 @@ def _compare(found: Difference, prefix: str, logged: Message, replayed: Message)
             continue
         difference_nm = np.abs(after - before)
         indices = np.flatnonzero(difference_nm)
-        shown = ", ".join(f"[{i}] log {before[i]:.9g}, replay {after[i]:.9g}" for i in indices[:_MOST_SHOWN])
-        more = f" and {len(indices) - _MOST_SHOWN} more" if len(indices) > _MOST_SHOWN else ""
+        shown = ", ".join(f"[{i}] log {before[i]:.9g}, replay {after[i]:.9g}" for i in indices[:_MAX_SHOWN])
+        more = f" and {len(indices) - _MAX_SHOWN} more" if len(indices) > _MAX_SHOWN else ""
         found.fields.append(f"{prefix}{name}: {shown}{more}; largest difference {difference_nm.max():.3g} nm")
         found.largest_nm = max(found.largest_nm, float(difference_nm.max()))
 

@@ -16,7 +16,7 @@ from lowfc.control.laws.stability import settling_frames
 from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.logs.report.source import Figures, InForce, Run
 
-MOST_STEPS = 200_000
+MAX_STEPS = 200_000
 """Only the last steps of a longer stretch are used, to bound the memory."""
 BANDS_HZ = (1.0, 10.0, 100.0, 1000.0)
 """Upper ends of the frequency bands, above the resolution."""
@@ -74,7 +74,7 @@ def longest_stretch(run: Run) -> Stretch | None:
     in_force = run.laws[laws[first]]
     gain, leak = np.array(in_force.gain, float), np.array(in_force.leak, float)
     settling = min(settling_frames(gain, leak), (last - first) // 10)
-    rows = slice(max(first + settling, last - MOST_STEPS), last)
+    rows = slice(max(first + settling, last - MAX_STEPS), last)
     earlier = rows.start - first - settling
     signals = [steps.error_nm[rows], steps.pol_nm[rows]]
     residual_ms_nm2, timing, true = None, Timing.sampled(in_force.delay_frames), history.true

@@ -25,7 +25,7 @@ _BESIDE_TRUTH: dict[str, Any] = {"linestyle": ":", "linewidth": 0.9, "alpha": 0.
 """Style of measured curves if the log also has the true ones."""
 _NEAR = 0.25
 """Fraction of the stroke above which its limit is drawn."""
-_MOST_MARKS = 300
+_MAX_MARKS = 300
 _SECONDS = "seconds since the first step"
 
 
@@ -234,7 +234,7 @@ def _light(figure: "Figure", report: Report) -> bool:
     _envelope(upper, time_s[starts], flux, starts, INK)
     refused = (steps.reasons & ((1 << 20) - 1)) != 0
     if refused.any():
-        marks = time_s[refused][bin_starts(int(refused.sum()), _MOST_MARKS)]
+        marks = time_s[refused][bin_starts(int(refused.sum()), _MAX_MARKS)]
         look: dict[str, Any] = {"color": COLOURS["error"], "markersize": 5, "clip_on": False}
         upper.plot(marks, np.zeros(marks.size), "x", label="frame refused", **look)
     expected = report.figures["light"]["flux_expected_dn"]
@@ -263,10 +263,10 @@ def _timeline(figure: "Figure", report: Report) -> bool:
     looks = {"info": ("o", INK, "none"), "warning": ("^", INK, OPEN), "error": ("X", INK, COLOURS["error"])}
     for level, (marker, edge, face) in looks.items():
         found = [e["time_s"] for e in events if e["level"] == level or (level, e["level"]) == ("error", "fatal")]
-        times_s = np.array(found)[bin_starts(len(found), _MOST_MARKS)]
+        times_s = np.array(found)[bin_starts(len(found), _MAX_MARKS)]
         place = np.full(times_s.size, levels.index(level))
         axes.plot(times_s, place, marker, markeredgecolor=edge, markerfacecolor=face, markersize=7, linestyle="none")
-    for number, request in enumerate(requests[:_MOST_MARKS]):
+    for number, request in enumerate(requests[:_MAX_MARKS]):
         axes.axvline(request["time_s"], color=FAINT, linewidth=0.8, linestyle=":")
         values = " ".join(f"{value:g}" for value in request["values"][:2])
         text = f"{printable(request['name'])} {values}{'' if request['accepted'] else ' refused'}".strip()

@@ -14,7 +14,7 @@ from lowfc.contract.errors import CalibrationError, ConfigurationError
 from lowfc.contract.messages import MIRROR_STATE
 from lowfc.control.calibration.calibration import ESTIMATORS, Calibration, reconstructor
 from lowfc.control.laws.continuous import continuous_residual_nm2
-from lowfc.control.laws.law import TIP_TILT, Law
+from lowfc.control.laws.integrator import TIP_TILT, Integrator
 from lowfc.control.laws.stability import limiting_gain
 from lowfc.control.laws.what_if import as_logged, counterfactual, rms
 from lowfc.control.loop.safety import Limit
@@ -213,7 +213,7 @@ def _in_other_modes(logged: Calibration, other: Calibration, command_nm: Single)
     return np.asarray(command_nm @ change.T, np.float32)
 
 
-def _law_values(law: Law, row: int, suffix: str = "") -> dict[str, float]:
+def _law_values(law: Integrator, row: int, suffix: str = "") -> dict[str, float]:
     return {f"{key}{suffix}": round(float(getattr(law, key)[row]), 6) for key in LAW_KEYS}
 
 
@@ -284,7 +284,7 @@ def _range_warnings(calibration: Calibration, columns: dict[str, Array]) -> list
     ]
 
 
-def _law_warnings(run: LoggedRun, law: Law, command_nm: Single) -> list[str]:
+def _law_warnings(run: LoggedRun, law: Integrator, command_nm: Single) -> list[str]:
     """Remarks on instability and modal limits of the what-if with its commands `command_nm` (frames, modes)."""
     found = []
     noll = run.calibration.noll

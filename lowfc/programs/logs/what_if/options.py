@@ -15,7 +15,7 @@ from lowfc.arrays import Single
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import ConfigurationError, nearest
 from lowfc.control.calibration.calibration import ESTIMATORS
-from lowfc.control.laws.law import TIP_TILT, Law
+from lowfc.control.laws.integrator import TIP_TILT, Integrator
 from lowfc.control.laws.what_if import Controller
 
 LAW_KEYS = ("gain", "leak", "limit_nm")
@@ -82,9 +82,9 @@ def requested(
     )
 
 
-def law(what: WhatIf, noll: tuple[int, ...], logged: Law) -> Law:
+def law(what: WhatIf, noll: tuple[int, ...], logged: Integrator) -> Integrator:
     """The law of the what-if: the logged or the configured one, with the given values replaced."""
-    base = settings(what.config).law(noll) if what.config is not None else logged
+    base = settings(what.config).integrator(noll) if what.config is not None else logged
     tilts = np.isin(noll, TIP_TILT)
     changed = []
     for key in LAW_KEYS:
@@ -94,7 +94,7 @@ def law(what: WhatIf, noll: tuple[int, ...], logged: Law) -> Law:
         changed.append(values)
     try:
         gain, leak, limit_nm = changed
-        return Law(gain, leak, limit_nm)
+        return Integrator(gain, leak, limit_nm)
     except ValueError as error:
         raise ConfigurationError(f"--set: {error}") from None
 

@@ -15,10 +15,10 @@ from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import FRAME, floats, wire
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.continuous import Timing
-from lowfc.control.laws.law import Law
+from lowfc.control.laws.integrator import Integrator
 from lowfc.control.laws.stability import delay_weights, settling_frames
 from lowfc.control.laws.what_if import (
-    LONGEST_DELAY,
+    MAX_DELAY_FRAMES,
     delay_from_times,
     delay_from_truth,
     exposed,
@@ -101,7 +101,7 @@ class LoggedRun:
         waited_ns = history.mirror.publish_time_ns[known] - self.steps.time_ns[rows[known]]
         return Timing.measured(delay, exposure, float(np.median(waited_ns)) * 1e-9 * history.rate_hz)
 
-    def rows_to_compare(self, laws: list[Law], usable: Mask) -> tuple[Mask, int, str]:
+    def rows_to_compare(self, laws: list[Integrator], usable: Mask) -> tuple[Mask, int, str]:
         """Usable steps to compare, the settling time of the laws in frames, and a description."""
         steps, missing = self.steps, self.missing
         closed, over = steps.mode == LoopMode.CLOSED, "closed loop"
@@ -160,7 +160,7 @@ def _played(sequence: Sequences, requests: Sequence[wire.Request], plays: Mappin
             first = request.frame_sequence
             known = plays.get(request.play_id)
             table = floats(request.table, -1, request.columns or 1) if known is None else known.rows
-            last = first + len(table) + LONGEST_DELAY
+            last = first + len(table) + MAX_DELAY_FRAMES
             rows |= (sequence >= first) & (sequence < last)
     return rows
 
@@ -179,11 +179,11 @@ def _target_nm(states: Sequence[wire.ControllerState], sequence: Sequences, mode
     return np.array([offset_nm for _, offset_nm in known], np.float32)[np.maximum(rows, 0)]
 
 
-def _law_and_delay(history: History, calibration: Calibration) -> tuple[Law, float]:
+def _law_and_delay(history: History, calibration: Calibration) -> tuple[Integrator, float]:
     state = history.controller
     if state is not None and len(state.gain) == len(calibration.noll):
         return gains_of(state), state.delay_frames
     if history.configuration is None:
         raise DataFileError(f"{history.log.path}: its gains and delay are unknown: it has no controller state")
     known = settings(history.configuration)
-    return known.law(calibration.noll), known.delay_frames
+    return known.integrator(calibration.noll), known.delay_frames

@@ -8,7 +8,7 @@ FIRST = 600
 """Index of the first frame with the fault: the loop has settled and been quiet for a second."""
 FAULTY_FRAMES = 250
 """Number of frames with the fault: one second."""
-MOST_LATE = 50
+MAX_FRAMES_LATE = 50
 """Largest delay of a frame, in frames."""
 
 # Kind, fault of the frames, event, how many of the faulty frames (the first ones) may be used, whether some are lost.
@@ -30,7 +30,7 @@ _KINDS = (
 
 
 def _wait_for_last(bench: ChaosBench) -> None:
-    last = FIRST + FAULTY_FRAMES + MOST_LATE
+    last = FIRST + FAULTY_FRAMES + MAX_FRAMES_LATE
     bench.wait(lambda: bench.newest_frame & 0xFFFFFFFF >= last, f"frame {last}")
 
 

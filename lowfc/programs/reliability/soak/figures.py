@@ -15,7 +15,7 @@ WARM_UP = 0.25
 """Fraction of the time at the start that is left out, while caches and queues fill."""
 SIGNIFICANT = 3.0
 """Standard errors above which a slope is significant."""
-LEAST_GROWTH_MB = 1.0
+MIN_GROWTH_MB = 1.0
 """Growth over the evaluated time that counts as a leak; the allocator's steps are smaller."""
 TOO_SHORT = "too short to judge"
 
@@ -54,7 +54,7 @@ def of_process(samples: Sequence[Usage]) -> dict[str, Any]:
     grows, too_short = [], ["memory", "handles", "threads"]
     if memory is not None:
         evaluated_h = (times_s[-1] - times_s[0]) / 3600 * (1 - WARM_UP)
-        leaks = memory[0] > SIGNIFICANT * memory[1] and memory[0] * evaluated_h > LEAST_GROWTH_MB
+        leaks = memory[0] > SIGNIFICANT * memory[1] and memory[0] * evaluated_h > MIN_GROWTH_MB
         checks = {"memory": leaks, "handles": _grew(handles), "threads": _grew(threads)}
         grows, too_short = [name for name, grew in checks.items() if grew], []
     measured = {"memory": [round(one, 2) for one in memory_mb], "handles": handles, "threads": threads}

@@ -35,7 +35,7 @@ WINDOW_NS = 1_000_000_000
 BINS = 40
 """Bars of the histogram; the last one includes all longer latencies."""
 
-_LEAST_US = 100.0
+_MIN_US = 100.0
 _AXIS_PERCENTILE = 99.0
 """Percentile at the end of the histogram's axis: a single late frame does not squeeze all others into one bar."""
 
@@ -48,7 +48,7 @@ class Latency(Panel):
 
     def __init__(self) -> None:
         self._recent: deque[tuple[int, Array]] = deque()
-        self._scale = Scale(_LEAST_US)
+        self._scale = Scale(_MIN_US)
 
     def draw(self, stream: rr.RecordingStream, snapshot: Snapshot) -> None:
         """Keep the durations of one second; draw twice a second."""
@@ -74,7 +74,7 @@ class Latency(Panel):
 
     def _draw_histogram(self, stream: rr.RecordingStream, time_ns: int, us: Array) -> None:
         """Draw bars of even width from 0 to the end of the axis, which changes rarely."""
-        width_us = max(self._scale.limit, _LEAST_US) / BINS
+        width_us = max(self._scale.limit, _MIN_US) / BINS
         counts = np.bincount(np.minimum(us // width_us, BINS - 1).astype(int), minlength=BINS)
         middles_us = (np.arange(BINS) + 0.5) * width_us
         at(stream, time_ns)

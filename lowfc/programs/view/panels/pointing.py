@@ -8,7 +8,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from lowfc.arrays import Long
-from lowfc.control.laws.law import TIP_TILT
+from lowfc.control.laws.integrator import TIP_TILT
 from lowfc.programs.view.draw.colours import BLUE, GREY, YELLOW
 from lowfc.programs.view.draw.pictures import Scale
 from lowfc.programs.view.draw.plots import at, labels
@@ -17,11 +17,11 @@ from lowfc.programs.view.snapshot import Snapshot
 
 TRAIL = "pointing/trail"
 BOUNDS = rrb.VisualBounds2D(x_range=[-1.15, 1.15], y_range=[-1.15, 1.15])
-_MOST_POINTS = 400
+_MAX_POINTS = 400
 """Points of the trail; for a fast loop not every frame has one."""
 _TRAIL_NS = 2_000_000_000
 _RINGS = (0.25, 0.5, 1.0)
-_LEAST_MAS = 0.5
+_MIN_MAS = 0.5
 
 Points = npt.NDArray[np.floating]
 
@@ -31,7 +31,7 @@ class Pointing(Panel):
 
     def __init__(self, nm_per_mas: float) -> None:
         self._nm_per_mas = nm_per_mas
-        self._scale = Scale(_LEAST_MAS)
+        self._scale = Scale(_MIN_MAS)
         self._pieces: deque[tuple[Long, Points]] = deque()
 
     def draw(self, stream: rr.RecordingStream, snapshot: Snapshot) -> None:
@@ -39,16 +39,16 @@ class Pointing(Panel):
         if snapshot.calibration is None or not set(TIP_TILT) <= set(snapshot.calibration.noll):
             return
         noll = snapshot.calibration.noll
-        waves = snapshot.waves(true=snapshot.truths.time_ns.size > 0)
-        if not waves.time_ns.size or waves.residual_nm.shape[1] != len(noll):
+        wavefronts = snapshot.wavefronts(true=snapshot.truths.time_ns.size > 0)
+        if not wavefronts.time_ns.size or wavefronts.residual_nm.shape[1] != len(noll):
             return
-        mas = waves.residual_nm[:, [noll.index(index) for index in TIP_TILT]] / self._nm_per_mas
+        mas = wavefronts.residual_nm[:, [noll.index(index) for index in TIP_TILT]] / self._nm_per_mas
         finite = np.isfinite(mas).all(axis=1)
-        self._pieces.append((waves.time_ns[finite], mas[finite]))
+        self._pieces.append((wavefronts.time_ns[finite], mas[finite]))
         while self._pieces and self._pieces[0][0].max(initial=0) < snapshot.time_ns - _TRAIL_NS:
             self._pieces.popleft()
         mas = np.concatenate([piece for _, piece in self._pieces] or [mas[:0]])
-        mas = mas[:: max(1, len(mas) // _MOST_POINTS)]
+        mas = mas[:: max(1, len(mas) // _MAX_POINTS)]
         if not len(mas):
             return
         at(stream, snapshot.time_ns)

@@ -54,7 +54,9 @@ class Science(Panel):
         self._noll: tuple[int, ...] = ()
         self._camera: ScienceCamera | None = None
         self._flat = np.nan
-        self._waves: dict[str, deque[tuple[Single, Single]]] = {source: deque(maxlen=_MEAN_OF) for source in _NAMES}
+        self._wavefronts: dict[str, deque[tuple[Single, Single]]] = {
+            source: deque(maxlen=_MEAN_OF) for source in _NAMES
+        }
         self._picture = Picture(f"{IMAGE}/contrast")
         self._named = ""
 
@@ -78,22 +80,22 @@ class Science(Panel):
             self._camera = ScienceCamera(pupil, noll, self._wavelength_nm, _HALF_WIDTH, _SAMPLES_PER, lyot)
             self._flat = self._camera.mean_contrast(self._camera.image(np.zeros(len(noll))), self._wedge)
             self._clear()
-        for source, waves in self._waves.items():
-            new = snapshot.waves(true=source == "true")
+        for source, wavefronts in self._wavefronts.items():
+            new = snapshot.wavefronts(true=source == "true")
             if new.time_ns.size and new.residual_nm.shape[1] == len(self._noll):
-                waves.append((new.residual_nm[-1], new.open_nm[-1]))
-        source = next((name for name, waves in self._waves.items() if waves), "")
+                wavefronts.append((new.residual_nm[-1], new.open_nm[-1]))
+        source = next((name for name, wavefronts in self._wavefronts.items() if wavefronts), "")
         if source and self.due(snapshot):
             self._show(stream, snapshot.time_ns, self._camera, source)
             self._clear()
 
     def _clear(self) -> None:
-        for waves in self._waves.values():
-            waves.clear()
+        for wavefronts in self._wavefronts.values():
+            wavefronts.clear()
 
     def _show(self, stream: rr.RecordingStream, time_ns: int, camera: ScienceCamera, source: str) -> None:
-        waves = self._waves[source]
-        images = [np.mean([camera.image(wave[which]) for wave in waves], axis=0) for which in (0, 1)]
+        wavefronts = self._wavefronts[source]
+        images = [np.mean([camera.image(wave[which]) for wave in wavefronts], axis=0) for which in (0, 1)]
         means = [camera.mean_contrast(image, self._wedge) for image in images]
         if source != self._named:
             self._named = source

@@ -23,9 +23,9 @@ WIDTH = 150.0
 
 _HIGHEST_TILT = 3
 _SEGMENT = 1024
-_MOST_DECADES = 2
+_MAX_DECADES = 2
 """Decades by which a scale may exceed the range of the data before it shrinks."""
-_MOST_LABELS = 6
+_MAX_LABELS = 6
 _STATE = (WIDTH - 34.0, BOX_HEIGHT - 12.0)
 _LEAST = 1e-12
 """Lowest power drawn, as a fraction of the highest; lower values are drawn there."""
@@ -74,12 +74,12 @@ class Spectra(Panel):
         """Fit the axes: they grow at once, and shrink only if they are far too large."""
         low, high = floor(log10(power.min())), ceil(log10(power.max()) + 1e-9)
         drawn_low, drawn_high = self._decades[axes.path]
-        if drawn_low <= low and high <= drawn_high and drawn_high - drawn_low <= high - low + _MOST_DECADES:
+        if drawn_low <= low and high <= drawn_high and drawn_high - drawn_low <= high - low + _MAX_DECADES:
             low, high = drawn_low, drawn_high
         self._decades[axes.path] = low, high
         x = (log10(rate_hz / _SEGMENT), log10(rate_hz / 2))
         x_ticks = [(float(n), f"{10.0**n:g} Hz") for n in range(ceil(x[0]), floor(x[1]) + 1)]
-        y_ticks = [(float(n), f"1e{n}") for n in range(low, high + 1, ceil((high - low) / _MOST_LABELS))]
+        y_ticks = [(float(n), f"1e{n}") for n in range(low, high + 1, ceil((high - low) / _MAX_LABELS))]
         axes.fit(stream, x, (low, high), x_ticks, y_ticks)
 
 

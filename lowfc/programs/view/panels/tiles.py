@@ -25,14 +25,14 @@ TILES = "status/tiles"
 WIDTH, HEIGHT = 1760, 256
 GROUND: Colour = (13, 16, 17)
 """Rerun's background, so that only the tiles are visible."""
-SHORTEST_NS = 250_000_000
+MIN_PERIOD_NS = 250_000_000
 """Shortest time between pictures with another word or colour. If only figures differ, there is one picture per second:
 more cannot be read, and each stays in the viewer's memory."""
 
 _GAP, _INSET, _BAND, _CLOCK = 6, 9, 46, 190  # gap of boxes, inset of text, height of headline, width of clock, px
 _TILES_END = 196
 _FACTS = (3, 4, 4, 4)  # relative widths of the facts below the tiles
-_SMALLEST_FONT = 8
+_MIN_FONT = 8
 _SHADES = 16
 _PITCH = 1.16  # of lines, in font sizes
 
@@ -60,7 +60,7 @@ class Tiles(Panel):
         self._log_verdict.feed(snapshot)
         if snapshot.ended is not None:
             self._show(stream, snapshot.time_ns, self._log_verdict.verdict(self._watcher.state(), snapshot.ended))
-        elif not 0 <= snapshot.host_ns - self._judged_ns < SHORTEST_NS:
+        elif not 0 <= snapshot.host_ns - self._judged_ns < MIN_PERIOD_NS:
             self._judged_ns = snapshot.host_ns
             verdict = judge(self._watcher.state(), self._nm_per_mas)
             words = [(tile.title, tile.level, re.sub(r"[^a-zA-Z]", "", tile.value)) for tile in verdict.tiles]
@@ -140,7 +140,7 @@ def _shades(width: int, height: int, texts: tuple[Text, ...]) -> Shades:
 def _write(pen: ImageDraw.ImageDraw, box: Box, text: str, largest: int) -> None:
     """Draw wrapped text in the largest size that fits: centred in a low box, from the top of a high one."""
     x0, y0, x1, y1 = box
-    for size in range(largest, _SMALLEST_FONT - 1, -1):
+    for size in range(largest, _MIN_FONT - 1, -1):
         lines, pitch = _wrapped(text, size, x1 - x0), size * _PITCH
         if len(lines) * pitch <= y1 - y0 and all(_width(line, size) <= x1 - x0 for line in lines):
             break

@@ -22,7 +22,7 @@ WIDTH = 200.0
 _FIRST_SPAN_S, _LONGER = 60.0, 1.4
 """First span of the time axis, and the factor by which it grows when it is full."""
 _TICKS_S = (10, 30, 60, 120, 300, 600, 1800, 3600, 7200, 10_800, 21_600, 86_400)
-_MOST_TICKS = 6
+_MAX_TICKS = 6
 
 
 class Trend(Panel):
@@ -50,7 +50,7 @@ class Trend(Panel):
             span_s = _FIRST_SPAN_S * _LONGER ** max(0, ceil(log(span_s / _FIRST_SPAN_S, _LONGER)))
         y_ticks = _nm_ticks(float(rms_nm[known].min()), float(rms_nm[known].max()))
         y = (y_ticks[0][0], y_ticks[-1][0])
-        if len(y_ticks) > _MOST_TICKS:
+        if len(y_ticks) > _MAX_TICKS:
             y_ticks = [tick for tick in y_ticks if tick[0] == round(tick[0])]
         self._axes.fit(stream, (0.0, span_s), y, _clock_ticks(means.begin_ns, span_s), y_ticks)
         kind = "true" if means.true else "measured"
@@ -70,7 +70,7 @@ def _nm_ticks(least: float, most: float) -> list[tuple[float, str]]:
 
 def _clock_ticks(begin_ns: int, span_s: float) -> Ticks:
     """Ticks at round times of day, UTC, in seconds since `begin_ns`."""
-    step_s = next((one for one in _TICKS_S if span_s / one <= (_MOST_TICKS if one >= 60 else 3)), _TICKS_S[-1])
+    step_s = next((one for one in _TICKS_S if span_s / one <= (_MAX_TICKS if one >= 60 else 3)), _TICKS_S[-1])
     form = "%H:%M" if step_s >= 60 else "%H:%M:%S"
     first_s = -(-begin_ns // (step_s * 10**9)) * step_s
     times_s = range(first_s, int(begin_ns * 1e-9 + span_s) + 1, step_s)

@@ -6,7 +6,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from lowfc.arrays import Long, Whole
-from lowfc.control.laws.law import TIP_TILT
+from lowfc.control.laws.integrator import TIP_TILT
 from lowfc.optics.chain.zernike import mode_name, noll_to_nm
 from lowfc.programs.view.draw.colours import BLUE, GREEN, GREY, ORANGE, PINK, RED, YELLOW, distinct
 from lowfc.programs.view.draw.plots import Plot

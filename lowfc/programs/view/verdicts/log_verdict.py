@@ -19,7 +19,7 @@ from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict, duration, fi
 from lowfc.programs.view.verdicts.verdict import LIMITS, stroke, stroke_used_nm
 from lowfc.programs.view.verdicts.wavefront_verdict import GOOD_FACTOR
 
-_LONGEST_STEP_NS = 1_000_000_000
+_MAX_STEP_NS = 1_000_000_000
 """A longer gap between two steps counts as time without steps."""
 _MODES = {mode.value: mode for mode in LoopMode}
 _NAMES = {LoopMode.OPEN: "open", LoopMode.SAFE: "safe", LoopMode.IDLE: "idle", None: "without frames"}
@@ -40,11 +40,11 @@ class LogVerdict:
     def feed(self, snapshot: Snapshot) -> None:
         """Add a snapshot."""
         self._means.feed(snapshot)
-        steps, waves = snapshot.steps, snapshot.waves(true=self._means.true)
+        steps, wavefronts = snapshot.steps, snapshot.wavefronts(true=self._means.true)
         if steps.time_ns.size:
             self._add_modes(steps)
-            closed = np.isin(waves.sequence, steps.sequence[steps.mode == LoopMode.CLOSED.value])
-            self._closed += (closed.sum(), *np.sum(waves.rms_nm[closed].astype(float) ** 2, axis=0))
+            closed = np.isin(wavefronts.sequence, steps.sequence[steps.mode == LoopMode.CLOSED.value])
+            self._closed += (closed.sum(), *np.sum(wavefronts.rms_nm[closed].astype(float) ** 2, axis=0))
         for duration_ns in snapshot.timings["frame_to_command"].tolist():
             self._latency.add(duration_ns)
         self._stroke_nm = max(self._stroke_nm, stroke_used_nm(snapshot.mirror))
@@ -72,7 +72,7 @@ class LogVerdict:
         time_ns = steps.time_ns
         self._first_ns = self._first_ns or int(time_ns[0])
         after_ns = np.diff(time_ns, prepend=self._last_ns or time_ns[0])
-        with_steps = (after_ns >= 0) & (after_ns <= _LONGEST_STEP_NS)
+        with_steps = (after_ns >= 0) & (after_ns <= _MAX_STEP_NS)
         self._mode_ns[None] += int(after_ns[~with_steps & (after_ns > 0)].sum())
         for value in np.unique(steps.mode):
             self._mode_ns[_MODES.get(int(value))] += int(after_ns[with_steps & (steps.mode == value)].sum())

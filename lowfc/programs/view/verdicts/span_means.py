@@ -29,9 +29,9 @@ class SpanMeans:
     def feed(self, snapshot: Snapshot) -> None:
         """Add the steps and truths of a snapshot."""
         for true, columns in ((True, _TRUE), (False, _MEASURED)):
-            waves = snapshot.waves(true=true)
-            self.true |= true and waves.time_ns.size > 0
-            self.add(waves.time_ns, columns, waves.rms_nm.astype(float) ** 2)
+            wavefronts = snapshot.wavefronts(true=true)
+            self.true |= true and wavefronts.time_ns.size > 0
+            self.add(wavefronts.time_ns, columns, wavefronts.rms_nm.astype(float) ** 2)
         if snapshot.calibration is not None:
             steps, used = snapshot.steps, snapshot.used
             self.add(steps.time_ns[used], _LIGHT, steps.flux_dn[used, None] / snapshot.calibration.flux_dn)

@@ -22,11 +22,11 @@ from lowfc.contract.messages import (
     wire,
 )
 from lowfc.contract.printable import printable
-from lowfc.control.laws.law import TIP_TILT
+from lowfc.control.laws.integrator import TIP_TILT
 from lowfc.control.loop.estimator import saturated_pixels
 from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.launch.watch import topic_count
-from lowfc.programs.view.snapshot import Accumulator, Snapshot, Waves
+from lowfc.programs.view.snapshot import Accumulator, Snapshot, Wavefronts
 from lowfc.programs.view.verdicts.run_state import NOW_S, RECENT_S, Counts, Liveness, Process, Rms, RunState
 from lowfc.programs.view.verdicts.steady import Attained, Steady, attained
 
@@ -217,7 +217,10 @@ class Watcher:
         steps = snapshot.steps
         counts = Counts(count_reasons(steps.reasons))
         counts.update(steps=len(steps.mode), **self._grown(snapshot))
-        squares = _squares(snapshot, snapshot.waves(true=True)), _squares(snapshot, snapshot.waves(true=False))
+        squares = (
+            _squares(snapshot, snapshot.wavefronts(true=True)),
+            _squares(snapshot, snapshot.wavefronts(true=False)),
+        )
         durations_ns = snapshot.timings["frame_to_command"]
         return _Sample(snapshot.host_ns, counts, squares, steps.sequence, steps.time_ns, durations_ns)
 
@@ -256,12 +259,12 @@ def _rate_hz(samples: list[_Sample]) -> float | None:
     return frames * 1e9 / elapsed_ns if elapsed_ns > 0 and frames > 0 else None
 
 
-def _squares(snapshot: Snapshot, waves: Waves) -> Array:
+def _squares(snapshot: Snapshot, wavefronts: Wavefronts) -> Array:
     """Count of rows, and sums of squares of `Rms`; tip and tilt only if the calibration has as many modes."""
-    noll = snapshot.noll if len(snapshot.noll) == waves.residual_nm.shape[1] else ()
+    noll = snapshot.noll if len(snapshot.noll) == wavefronts.residual_nm.shape[1] else ()
     tilts = [place for place, index in enumerate(noll) if index in TIP_TILT]
     tilt_nm2 = [
         np.square(one[:, tilts], dtype=float).sum() / max(1, len(tilts))
-        for one in (waves.residual_rms_nm, waves.open_rms_nm)
+        for one in (wavefronts.residual_rms_nm, wavefronts.open_rms_nm)
     ]
-    return np.array([len(waves.rms_nm), *np.square(waves.rms_nm, dtype=float).sum(axis=0), *tilt_nm2])
+    return np.array([len(wavefronts.rms_nm), *np.square(wavefronts.rms_nm, dtype=float).sum(axis=0), *tilt_nm2])

@@ -49,7 +49,7 @@ class Reservation:
 class OperatorBus(MemoryBus):
     """Connection of an operator's program; a frame is exposed at each subscription of a ring."""
 
-    def __init__(self, loop: "FoldedLoop") -> None:
+    def __init__(self, loop: "InProcessLoop") -> None:
         super().__init__(loop.hub, "operator", HostClock())
         self._loop = loop
 
@@ -59,7 +59,7 @@ class OperatorBus(MemoryBus):
         return ring
 
 
-class FoldedLoop(Client):
+class InProcessLoop(Client):
     """Camera, controller and mirror, one frame at a time, with the interface of a client.
 
     Attributes:

@@ -14,7 +14,7 @@ what an earlier gain put on the mirror."""
 
 
 @dataclass(frozen=True, slots=True)
-class Law:
+class Integrator:
     """Gain, leak and limit of each mode, each (modes,) float32; the limit is nm of wavefront rms.
 
     Attributes:
@@ -47,12 +47,12 @@ class Law:
         object.__setattr__(self, "rows", single([self.gain, self.kept, self.limit_nm]))
 
 
-def integrate(law: Law, command_nm: Single, error_nm: Single) -> tuple[Single, bool]:
+def integrate(integrator: Integrator, command_nm: Single, error_nm: Single) -> tuple[Single, bool]:
     """Compute command[k+1] = kept command[k] - gain error[k], clipped to each mode's limit; and whether any was.
 
     All (modes,) float32, nm of wavefront rms.
     """
-    next_nm = law.kept * command_nm - law.gain * error_nm
-    if np.count_nonzero(np.abs(next_nm) > law.limit_nm):
-        return np.clip(next_nm, -law.limit_nm, law.limit_nm), True
+    next_nm = integrator.kept * command_nm - integrator.gain * error_nm
+    if np.count_nonzero(np.abs(next_nm) > integrator.limit_nm):
+        return np.clip(next_nm, -integrator.limit_nm, integrator.limit_nm), True
     return next_nm, False
