@@ -53,7 +53,7 @@ class Rejection(IntEnum):
 
 
 class Limit(IntEnum):
-    """The limit that changed a command; numbered as on the wire."""
+    """The limit that changed a command, or why a command was refused; numbered as on the wire."""
 
     MODAL_LIMIT = 20
     STROKE = 21
