@@ -137,7 +137,7 @@ def test_a_calibration_that_is_not_recommended_is_written_but_not_loaded(
     found = json.loads(done.stdout)
     assert not found["recommended"]
     assert found["snr_reached"] < 200
-    assert "200 required: find the disturbance of this mode, or take about" in found["faults"][0]
+    assert "200 required: find what disturbs this mode, or measure about" in found["faults"][0]
     assert found["file"] == "night.rejected.fits"
     assert calibration_file.load(Path("night.rejected.fits")).id != before.id
     assert not Path("night.fits").exists(), "an existing calibration would be overwritten"
@@ -191,7 +191,7 @@ def test_a_dark_finds_bad_pixels_and_is_refused_with_light(
     loop: InProcessLoop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(CalibrationError, match=r"not dark: .*; block the star|not dark"):
-        json_of("dark", "--dark-taken", "--frames", "50")
+        json_of("dark", "--star-blocked", "--frames", "50")
     rng = np.random.default_rng(5)
     cube = np.rint(100 + 1.5 * rng.standard_normal((64, 80, 80)))
     cube[:, 40, 41] += 500
@@ -208,12 +208,12 @@ def test_a_dark_finds_bad_pixels_and_is_refused_with_light(
     assert json_of("dark", "--file", "cube.npy")["frames"] == 64
     dark = InProcessLoop(load(None, CONFIG), world=load(None, CONFIG | {"star.magnitude": 20.0}))
     connect(dark, monkeypatch)
-    found = json_of("dark", "--dark-taken", "--frames", "50", "--out", "night.fits")
+    found = json_of("dark", "--star-blocked", "--frames", "50", "--out", "night.fits")
     assert found["dark_dn"] == pytest.approx(100, abs=0.5)
     assert found["hot"] < 5
 
 
-@pytest.mark.parametrize("words", ["", "reference", "align", "dark --dark-taken"])
+@pytest.mark.parametrize("words", ["", "reference", "align", "dark --star-blocked"])
 def test_frames_of_another_size_than_the_calibration_are_refused(
     loop: InProcessLoop, monkeypatch: pytest.MonkeyPatch, words: str
 ) -> None:
@@ -275,7 +275,7 @@ def test_a_calibration_can_be_computed_at_another_wavefront(loop: InProcessLoop)
 @pytest.mark.parametrize(
     ("words", "why"),
     [
-        ("--out there.fits dark --dark-taken", "--out is before `dark`: .* after it"),
+        ("--out there.fits dark --star-blocked", "--out is before `dark`: .* after it"),
         ("--json reference", "--json is before `reference`"),
         ("--method poke --config test.toml", "--config requires --method analytic"),
         ("--at 4=15", "--at requires --method analytic"),

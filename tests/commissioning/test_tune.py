@@ -284,11 +284,11 @@ def test_a_damaged_law_file_is_an_error(tmp_path: Path) -> None:
     law_file.save(LAWS["notch"], path)
     with fits.open(path, mode="update") as units:
         units["MEASUREMENT_GAIN"].data[0, 0] += 1
-    with pytest.raises(DataFileError, match="damaged: its content has identity"):
+    with pytest.raises(DataFileError, match="damaged: the identity of its content"):
         law_file.load(path)
     path.write_bytes(path.read_bytes()[:5000])
-    with pytest.raises(DataFileError, match=r"law\.fits: not a whole law file"):
+    with pytest.raises(DataFileError, match=r"law\.fits: not a readable law file"):
         law_file.load(path)
     fits.PrimaryHDU().writeto(path, overwrite=True)
-    with pytest.raises(DataFileError, match="its header should say KIND = 'lowfc law 2'"):
+    with pytest.raises(DataFileError, match="KIND in its header must be 'lowfc law 2'"):
         law_file.load(path)

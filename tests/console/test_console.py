@@ -114,7 +114,7 @@ BUTTONS: dict[str, tuple[tuple[str, ...], dict[str, object]]] = {
 """Input typed for each button, and the fields of the request that the controller then publishes."""
 ORDER = ("open", *(name for name in BUTTONS if name not in ("open", "close", "pause")), "close", "pause")
 TASKS = {
-    "dark": "calibrate dark --dark-taken --frames 400 --out",
+    "dark": "calibrate dark --star-blocked --frames 400 --out",
     "reference": "calibrate reference --frames 1000 --out",
     "calibrate": "calibrate --method hadamard --snr 70 --out",
 }

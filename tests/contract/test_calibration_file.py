@@ -65,7 +65,7 @@ def test_a_damaged_file_is_refused(tmp_path: Path) -> None:
     path.write_bytes(content)
     with fits.open(path, mode="update") as units:
         units["DARK"].data[3] += 1
-    with pytest.raises(DataFileError, match="damaged: its content has identity"):
+    with pytest.raises(DataFileError, match="damaged: the identity of its content"):
         load(path)
     path.write_bytes(content[: len(content) // 2])
     with pytest.raises(DataFileError, match=r"night\.fits"):
@@ -76,7 +76,7 @@ def test_files_of_another_kind_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "picture.fits"
     for content in (b"", b"not FITS at all" * 400):
         path.write_bytes(content)
-        with pytest.raises(DataFileError, match="not a whole calibration file"):
+        with pytest.raises(DataFileError, match="not a readable calibration file"):
             load(path)
     fits.PrimaryHDU(np.zeros((3, 3))).writeto(path, overwrite=True)
     with pytest.raises(DataFileError, match="KIND"):

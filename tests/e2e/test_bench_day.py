@@ -76,7 +76,7 @@ def test_every_command_of_the_calibration_and_acceptance_pages_runs(tmp_path: Pa
             assert run(tmp_path, line)
     with loop(tmp_path, "--open", "--no-record", "--star-magnitude", "20"):
         run(tmp_path, "lowfc ctl load night.fits")
-        assert run(tmp_path, DARK + " --dark-taken")
+        assert run(tmp_path, DARK + " --star-blocked")
     with loop(tmp_path):
         for line in CLOSED_LOOP:
             assert run(tmp_path, line)

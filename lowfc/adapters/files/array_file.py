@@ -28,7 +28,7 @@ def read_array(path: Path, what: str, dimensions: tuple[int, ...]) -> npt.NDArra
     except FileNotFoundError:
         raise DataFileError(f"{path}: there is no such file") from None
     except fits_file.DAMAGED as error:
-        why = fits_file.in_a_line(error)
+        why = fits_file.one_line(error)
         raise DataFileError(f"{path}: neither a FITS image nor a numpy array (.npy): {why}") from None
     if array.ndim not in dimensions or not array.size or array.dtype.kind not in "biuf":
         raise DataFileError(f"{path}: {what} of numbers, got {array.shape} of {array.dtype}")

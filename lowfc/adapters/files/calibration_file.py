@@ -34,7 +34,7 @@ _CAMERA = (
 
 def to_bytes(calibration: Calibration) -> bytes:
     """Encode a calibration as a FITS file."""
-    primary = fits_file.header_of(KIND)
+    primary = fits_file.primary_hdu(KIND)
     header = primary.header
     header["CALID"] = calibration.id
     header["OPERATOR"] = calibration.operator_hash

@@ -27,20 +27,20 @@ DAMAGED = (
 """Exceptions that reading a damaged or unrelated file may raise."""
 
 
-def header_of(kind: str) -> fits.PrimaryHDU:
+def primary_hdu(kind: str) -> fits.PrimaryHDU:
     """Make the primary HDU of a file of this kind."""
     primary = fits.PrimaryHDU()
     primary.header["KIND"] = (kind, "what this file is")
     return primary
 
 
-def extension(name: str, array: npt.NDArray[np.generic], sentence: str, unit: str | None = None) -> fits.ImageHDU:
+def extension(name: str, array: npt.NDArray[np.generic], description: str, unit: str | None = None) -> fits.ImageHDU:
     """Make a named extension from an array, with its description and unit."""
-    unit_hdu = fits.ImageHDU(array, name=name)
+    hdu = fits.ImageHDU(array, name=name)
     if unit is not None:
-        unit_hdu.header["BUNIT"] = unit
-    unit_hdu.header["CONTENT"] = sentence
-    return unit_hdu
+        hdu.header["BUNIT"] = unit
+    hdu.header["CONTENT"] = description
+    return hdu
 
 
 def to_bytes(primary: fits.PrimaryHDU, extensions: list[fits.ImageHDU]) -> bytes:
@@ -55,11 +55,11 @@ def opened(path: Path) -> Iterator[fits.HDUList]:
     """Open a file for reading; raises one of `DAMAGED` if it is incomplete."""
     with (
         warnings.catch_warnings(),
-        input_file.opened(path, MAX_BYTES) as stream,
-    ):  # closes it if astropy raises
+        input_file.opened(path, MAX_BYTES) as stream,  # closes the file if astropy raises
+    ):
         warnings.simplefilter("error", AstropyWarning)  # astropy only warns of a truncated file
-        with fits.open(stream, mode="readonly", memmap=False) as units:
-            yield units
+        with fits.open(stream, mode="readonly", memmap=False) as hdus:
+            yield hdus
 
 
 def load(path: Path, kinds: tuple[str, ...], what: str, parse: Callable[[fits.HDUList], T], advice: str = "") -> T:
@@ -67,7 +67,7 @@ def load(path: Path, kinds: tuple[str, ...], what: str, parse: Callable[[fits.HD
 
     Args:
         path: path of the file.
-        kinds: permitted kinds, the present one first.
+        kinds: accepted values of KIND, the current one first.
         what: description of the file, for errors.
         parse: decodes the open file; raises one of `DAMAGED` if its content is invalid.
         advice: instruction to make such a file, for errors.
@@ -76,37 +76,37 @@ def load(path: Path, kinds: tuple[str, ...], what: str, parse: Callable[[fits.HD
         DataFileError: the file is missing, damaged or holds something else.
     """
     try:
-        with opened(path) as units:
-            found = units[0].header.get("KIND")
+        with opened(path) as hdus:
+            found = hdus[0].header.get("KIND")
             if found not in kinds:
-                raise ValueError(f"its header should say KIND = {kinds[0]!r}, got {found!r}")
-            return parse(units)
+                raise ValueError(f"KIND in its header must be {kinds[0]!r}, found {found!r}")
+            return parse(hdus)
     except FileNotFoundError:
         raise DataFileError(f"{path}: there is no such {what}{advice}") from None
     except DAMAGED as error:
-        raise DataFileError(f"{path}: not a whole {what}: {in_a_line(error)}") from None
+        raise DataFileError(f"{path}: not a readable {what}: {one_line(error)}") from None
 
 
-def single(units: fits.HDUList, name: str) -> Single:
+def single(hdus: fits.HDUList, name: str) -> Single:
     """Read an extension's array as float32.
 
     Raises:
         KeyError: there is no such extension.
         ValueError: it holds no array.
     """
-    data = getattr(units[name], "data", None)  # a damaged extension may have an unknown type
+    data = getattr(hdus[name], "data", None)  # a damaged extension may have an unknown type
     if data is None:
         raise ValueError(f"the extension {name} holds no array")
     return np.ascontiguousarray(data, dtype=np.float32)
 
 
-def first_image(units: fits.HDUList) -> npt.NDArray[np.generic]:
+def first_image(hdus: fits.HDUList) -> npt.NDArray[np.generic]:
     """Read the first image or cube.
 
     Raises:
         ValueError: there is none.
     """
-    found = next((unit.data for unit in units if unit.is_image and unit.data is not None), None)
+    found = next((hdu.data for hdu in hdus if hdu.is_image and hdu.data is not None), None)
     if found is None:
         raise ValueError("there is no image in it")
     return np.asarray(found)
@@ -119,10 +119,13 @@ def require_identity(path: Path, found: str, stated: str) -> None:
         DataFileError: the identities differ.
     """
     if found != stated:
-        raise DataFileError(f"{path}: damaged: its content has identity {found[:12]}, it says {stated[:12]}")
+        raise DataFileError(
+            f"{path}: damaged: the identity of its content is {found[:12]}, but its header states {stated[:12]}; "
+            "restore the file from a copy, or make it again"
+        )
 
 
-def in_a_line(error: BaseException) -> str:
+def one_line(error: BaseException) -> str:
     """Text of an error on one line, at most 300 characters."""
     if "SIMPLE card" in str(error):
         return "it is not a FITS file"

@@ -25,7 +25,7 @@ _EXTENSIONS = (
 
 def to_bytes(law: LinearLaw) -> bytes:
     """Encode a law as a FITS file."""
-    primary = fits_file.header_of(KIND)
+    primary = fits_file.primary_hdu(KIND)
     header = primary.header
     header["LAWID"] = law.id
     header["NAME"] = (law.name, "what kind of law it is")

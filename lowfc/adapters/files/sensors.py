@@ -123,7 +123,9 @@ def _layout(name: str) -> sams.Layout:
     except ConfigurationError as error:  # on the command line sensors and layouts share an option
         if name.partition(":")[0].endswith(".json"):
             raise
-        raise ConfigurationError(f"{error}; nor is it a sensor{nearest(name, SENSORS)}: {', '.join(SENSORS)}") from None
+        raise ConfigurationError(
+            f"unknown sensor {name!r}{nearest(name, SENSORS)}; sensors: {', '.join(SENSORS)}; {error}"
+        ) from None
 
 
 def _pupil(section: SensorSection) -> Array:

@@ -19,12 +19,12 @@ COUNT_BITS = 32
 
 
 class Frame(NamedTuple):
-    """A sensor image that arrived.
+    """A received frame.
 
     Attributes:
         pixels: (rows, columns) uint16, DN, or None if the message held no valid image.
-        ahead: whether its sequence starts further ahead of the host's clock than allowed; like its age, determined from
-            the clock before the step.
+        ahead: whether the camera's start time, encoded in `sequence`, is too far in the future. The process computes
+            this and `age_ns` before it calls `advance`, which reads no clock.
     """
 
     sequence: int
@@ -51,7 +51,8 @@ class Request:
         prepared: whether the checks that need no state are done; see `lowfc.control.loop.requests.prepared`.
         lease_id: identity of the sender's lease, or of the requested one; 0 for none.
         requester: user and program that sent it, for people.
-        prior_nm2: for automatic gains, as in `lowfc.control.loop.state.Weighting`, with the flux `flux_dn`.
+        prior_nm2: mean squares (modes,) of the uncorrected modes, nm^2, by which automatic gains weight R.
+        flux_dn: the flux at which they were measured.
     """
 
     time_ns: int
@@ -88,7 +89,7 @@ class MirrorShape:
 
 @dataclass(frozen=True, slots=True)
 class MirrorReport:
-    """Whether the mirror follows commands, determined from the clock before the step.
+    """Whether the mirror follows commands, as the process found before it called `advance`.
 
     Attributes:
         fault: the fault, a phrase that continues "the mirror ..."; empty if there is none.
@@ -111,7 +112,7 @@ class Load:
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """No frame arrived; `silent_ns` is the time since the last, determined from the clock before the step."""
+    """No frame arrived; `silent_ns` is the time since the last, computed before the call of `advance`."""
 
     time_ns: int
     silent_ns: int
@@ -123,7 +124,12 @@ Input = Frame | Request | Report
 
 
 class Step(NamedTuple):
-    """One step of the control law, made for every frame; arrays (modes,) float32, nm of wavefront rms."""
+    """Result of one frame, used or refused; arrays (modes,) float32, nm of wavefront rms.
+
+    Attributes:
+        reasons: rejections of the frame, and limits that acted.
+        error_nm: None if the frame was not used; so is `pol_nm`.
+    """
 
     frame_sequence: int
     time_ns: int
@@ -173,7 +179,7 @@ class Reply(NamedTuple):
 
 
 class Outputs(NamedTuple):
-    """Outputs of one input; `changed`: whether the state changed in ways that the next step does not show."""
+    """Outputs of one input; `changed`: whether the state changed by more than a frame's ordinary update."""
 
     step: Step | None = None
     command: Command | None = None

@@ -40,7 +40,7 @@ def prolate(samples: int, mask_radius: float) -> Array:
         ValueError: The radius is not positive.
     """
     if not mask_radius > 0:
-        raise ValueError(f"the focal-plane mask must have a radius, got {mask_radius} lambda0 / D")
+        raise ValueError(f"the radius of the focal-plane mask must be positive, got {mask_radius} lambda0 / D")
     points, weights = np.polynomial.legendre.leggauss(64)
     rho = 0.25 * (points + 1.0)  # 0 to 1/2
     weights = 0.25 * weights * rho

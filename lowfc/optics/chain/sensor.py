@@ -51,7 +51,7 @@ class Sensor:
             if self.relay.distance < least:
                 raise ValueError(
                     f"{self.samples_per} samples per lambda/D resolve a defocus of at least {least:.3g} (lambda/D)^2, "
-                    f"got {self.relay.distance:.3g}; take a longer distance or a smaller focal ratio"
+                    f"got {self.relay.distance:.3g}; increase the distance or use a smaller focal ratio"
                 )
         if not self.wavelength_nm > 0:
             raise ValueError(f"the wavelength must be positive, got {self.wavelength_nm} nm")

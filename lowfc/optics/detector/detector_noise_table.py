@@ -1,8 +1,9 @@
 """Fast draws of a faint pixel's digital number (photon noise, read noise, rounding) from a precomputed table.
 
 The distribution of the digital number for a mean of m electrons is known: Poisson, plus Gaussian, rounded. The table
-has a row for each m of a grid, with 1024 equally likely entries (Marsaglia, Tsang and Wang 2004). Probability that is
-not a multiple of 1/1024 is drawn separately: entries marked `_APART` select it. A mean between two grid values is
+has a row for each m of a grid, with 1024 equally likely entries (Marsaglia, Tsang and Wang 2004). Each probability is
+rounded down to a multiple of 1/1024. The remainder is drawn from a second distribution, `rest`: entries equal to
+`_REMAINDER` select it. A mean between two grid values is
 rounded at random to one of them, so that the mean of the draws is exact.
 """
 
@@ -19,21 +20,21 @@ STEP_E = 1 / 64
 
 _ENTRIES_BITS = 10
 _ENTRIES = 1 << _ENTRIES_BITS
-_CHANCE_BITS = 16  # resolution of the probability of rounding up
+_FRACTION_BITS = 16  # resolution of the probability of rounding up
 _MAX_TABULATED_E = 64  # tabulated electrons; at a mean of 24 e- a pixel exceeds it once in 1e11 frames
 _TAIL = 8.0  # tabulated range of the read noise, standard deviations
 _WIDEST = 256  # largest range of digital numbers that is tabulated
 _MIN_NOISE_DN = 0.05  # with less read noise the table does not resolve the rounding
-_APART = 65535  # never a tabulated digital number, since those are below saturation
+_REMAINDER = 65535  # never a tabulated digital number, since those are below saturation
 
 
 @dataclass(frozen=True, eq=False)
 class NoiseTable:
-    """Distributions of the digital number at the means 0, STEP_E, ... FAINT_E (levels).
+    """Distributions of the digital number at the means 0, STEP_E, ... FAINT_E (means).
 
     Attributes:
-        entries: (levels, entries) digital numbers, all equally likely; `_APART` where `rest` decides.
-        rest: (levels, numbers) cumulative distribution of the probability that is not a multiple of 1/1024.
+        entries: (means, entries) digital numbers, all equally likely; `_REMAINDER` where `rest` decides.
+        rest: (means, numbers) cumulative distribution of the probability that is not a multiple of 1/1024.
         first_dn: Digital number of the first column of `rest`.
     """
 
@@ -43,11 +44,11 @@ class NoiseTable:
 
 
 def noise_table(gain_e_per_dn: float, read_noise_e: float, bias_dn: float, saturation_dn: int) -> NoiseTable | None:
-    """Table for a detector without multiplication.
+    """Table for a detector without electron multiplication.
 
     Returns:
-        None if the read noise is below 0.05 DN, or the range of digital numbers reaches below zero or up to saturation
-        or has more than 256 numbers.
+        The table, or None if it does not apply: read noise below 0.05 DN; digital numbers that reach below 0 or the
+        saturation level; or more than 256 of them.
     """
     from scipy.special import ndtr  # its import takes a quarter of a second; only the camera process needs it
 
@@ -64,7 +65,7 @@ def noise_table(gain_e_per_dn: float, read_noise_e: float, bias_dn: float, satur
     probability *= _ENTRIES / probability.sum(axis=1, keepdims=True)  # in units of one entry
     whole = np.floor(probability).astype(np.intp)
     numbers = np.arange(first, last + 1, dtype=np.uint16)
-    entries = np.full((len(probability), _ENTRIES), _APART, np.uint16)
+    entries = np.full((len(probability), _ENTRIES), _REMAINDER, np.uint16)
     for row, counts in zip(entries, whole, strict=True):
         row[: counts.sum()] = np.repeat(numbers, counts)
     rest = np.cumsum(probability - whole, axis=1)
@@ -77,19 +78,19 @@ def draw(table: NoiseTable, mean_e: Single, rng: np.random.Generator) -> Pixels:
     Args:
         table: The detector's table.
         mean_e: (pixels,) mean electrons, clipped to 0 ... FAINT_E.
-        rng: Generator of all random numbers; its raw words must have 64 random bits, as all of numpy's but MT19937.
+        rng: Generator of all random numbers; its bit generator must produce 64-bit words: any of numpy's but MT19937.
     """
     words = rng.bit_generator.random_raw((mean_e.size + 1) // 2).view(np.uint32)[: mean_e.size]
-    level = mean_e * np.float32((1 << _CHANCE_BITS) / STEP_E)
+    level = mean_e * np.float32((1 << _FRACTION_BITS) / STEP_E)
     np.maximum(level, np.float32(0), out=level)
-    np.minimum(level, np.float32((1 << _CHANCE_BITS) * FAINT_E / STEP_E), out=level)
-    place = level.astype(np.int32)
-    place += words.view(np.int32) & ((1 << _CHANCE_BITS) - 1)
-    place >>= _CHANCE_BITS - _ENTRIES_BITS
+    np.minimum(level, np.float32((1 << _FRACTION_BITS) * FAINT_E / STEP_E), out=level)
+    index = level.astype(np.int32)
+    index += words.view(np.int32) & ((1 << _FRACTION_BITS) - 1)
+    index >>= _FRACTION_BITS - _ENTRIES_BITS
     words >>= 32 - _ENTRIES_BITS
-    place ^= words.view(np.int32)  # the low bits depend on the rounding above: XOR with fresh bits
-    drawn = table.entries.ravel().take(place)
-    apart = np.flatnonzero(drawn == _APART)
-    rest = table.rest.take(place.take(apart) >> _ENTRIES_BITS, axis=0)
-    drawn[apart] = table.first_dn + (rest > rng.random((apart.size, 1), np.float32)).argmax(axis=1)
+    index ^= words.view(np.int32)  # the low bits depend on the rounding above: XOR with fresh bits
+    drawn = table.entries.ravel().take(index)
+    remainder = np.flatnonzero(drawn == _REMAINDER)
+    rest = table.rest.take(index.take(remainder) >> _ENTRIES_BITS, axis=0)
+    drawn[remainder] = table.first_dn + (rest > rng.random((remainder.size, 1), np.float32)).argmax(axis=1)
     return drawn

@@ -153,7 +153,7 @@ ACTIONS = (
         "dark",
         "Measure the dark and find bad pixels. Block the star first: there is no prompt.",
         (Field("frames", "frames: number averaged", lambda: "400"), _OUT, _LOAD),
-        task=("calibrate", "dark", "--dark-taken"),
+        task=("calibrate", "dark", "--star-blocked"),
     ),
     Action(
         "e",

@@ -22,12 +22,12 @@ def console(run: AnyRun = None) -> None:
     from lowfc.client.runs import the_run
 
     run_id = the_run(run)
-    while _operated(run_id):
+    while _show_console(run_id):
         pass
 
 
-def _operated(run_id: str) -> bool:
-    """Operate a run until the operator leaves; True if the run restarted and must be joined again."""
+def _show_console(run_id: str) -> bool:
+    """Show the console until it is closed; True if the run restarted, so that the console must connect again."""
     from lowfc.adapters.bus.run import open_run
     from lowfc.adapters.bus.zenoh_bus import ZenohBus
     from lowfc.adapters.process.join import clock_of

@@ -1,6 +1,6 @@
-"""Variables of a gateway, independent of its protocol: readings of the loop, and puts that send requests.
+"""Process variables of a gateway, independent of its protocol: readings, and writable variables that send requests.
 
-The puts are generated from the declared requests whose fields are numbers, a text, or none.
+A declared request is offered if its only arguments are numbers or one text.
 """
 
 from collections.abc import Callable, Iterator
@@ -32,7 +32,8 @@ Put = Callable[[Client, Any], Answer]
 class Variable(NamedTuple):
     """A variable; its name, in lower case, follows the gateway's prefix.
 
-    `read` is None for a request without a value; `put` is None for a read-only variable.
+    `read` is None for a write-only variable, a request without a reading of its name; `put` is
+    None for a read-only one.
     """
 
     name: str
@@ -60,13 +61,25 @@ def _step(field: str) -> Callable[[RunView, dict[str, Any]], Any]:
 
 
 READINGS = (
-    Variable("mode", Kind.TEXT, "", "Loop mode: idle, open, closed, safe.", _status("mode", "")),
+    Variable(
+        "mode",
+        Kind.TEXT,
+        "",
+        "Loop mode: starting, idle, open (also when paused), closed or safe.",
+        _status("mode", ""),
+    ),
     Variable("verdict", Kind.TEXT, "", "State of the loop in a sentence.", lambda view, _: view.verdict.headline),
     Variable("verdict_level", Kind.TEXT, "", "Level of the verdict.", lambda view, _: view.verdict.level.name.lower()),
     Variable("holding", Kind.TEXT, "", "Why a closed loop holds its command.", _status("holding", "")),
     Variable("interlocks", Kind.TEXT, "", "Interlocks that are tripped.", lambda _, status: interlocks(status)),
     Variable("reserved_for", Kind.TEXT, "", "Holder of the loop's reservation.", _status("reserved_for", "")),
-    Variable("residual", Kind.NUMBER, "nm", "Modal error, rms of the last second.", _status("residual_rms_nm", 0.0)),
+    Variable(
+        "residual",
+        Kind.NUMBER,
+        "nm",
+        "Modal error, rms over the last second, with noise.",
+        _status("residual_rms_nm", 0.0),
+    ),
     Variable("flux", Kind.NUMBER, "", "Flux relative to the calibration.", _status("flux_fraction", 0.0)),
     Variable("rate", Kind.NUMBER, "Hz", "Frame rate.", _status("rate_hz", 0.0)),
     Variable("frames_missing", Kind.NUMBER, "", "Frames that never arrived.", _status("frames_missing", 0)),
@@ -105,7 +118,7 @@ def _request(one: Declaration) -> Variable | None:
 
 def variables() -> Iterator[Variable]:
     """All variables: readings, writable if a request has the same name, then the other requests."""
-    puts = {made.name: made for one in DECLARED if (made := _request(one)) is not None}
+    puts = {variable.name: variable for one in DECLARED if (variable := _request(one)) is not None}
     for reading in READINGS:
         declared = puts.pop(reading.name, None)
         yield reading if declared is None else reading._replace(put=declared.put)

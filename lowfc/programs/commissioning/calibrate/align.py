@@ -20,7 +20,7 @@ from lowfc.programs.cli.result import Result, figure
 from lowfc.programs.commissioning.analytic import analytic
 from lowfc.programs.commissioning.calibrate.pokes import AMPLITUDE_NM, sequence
 from lowfc.programs.commissioning.calibrate.recording import Player, check_size, watch
-from lowfc.programs.commissioning.calibrate.result import reconstructed
+from lowfc.programs.commissioning.calibrate.result import compute_reconstructor
 from lowfc.programs.commissioning.calibrate.tasks import reporter, write
 
 
@@ -86,7 +86,7 @@ def on_sensor(
     good = before.good.astype(np.float64)
     try:
         I0, H = normalise_flux(np.maximum(I0, 0), H, good)
-        reconstruction = reconstructed(config, I0, H, None, good, flux, estimator=config.control.estimator)
+        reconstruction = compute_reconstructor(config, I0, H, None, good, flux, estimator=config.control.estimator)
     except (ValueError, CalibrationError) as error:
         raise CalibrationError(f"too little of the image falls on the sensor: {error}") from None
     return identified(

@@ -107,7 +107,9 @@ def dark(
     out: Out = Path("calibration.fits"),
     run: AnyRun = None,
     frames: Frames = 400,
-    dark_taken: Annotated[bool, typer.Option("--dark-taken", help="The star is already blocked: do not ask.")] = False,
+    star_blocked: Annotated[
+        bool, typer.Option("--star-blocked", help="The star is already blocked: do not ask.")
+    ] = False,
     file: Annotated[
         Path | None, typer.Option("--file", help="Take the dark frames from a FITS cube (frames, rows, columns).")
     ] = None,
@@ -122,7 +124,7 @@ def dark(
     """
     from lowfc.programs.commissioning.calibrate.tasks import darkened
 
-    if file is None and not dark_taken:
+    if file is None and not star_blocked:
         typer.confirm("block the star; is it dark?", default=True, abort=True, err=True)
     print_result(darkened(out, run, frames, file, load=load), as_json=as_json)
 

@@ -24,8 +24,9 @@ from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest, cyc
 from lowfc.programs.commissioning.calibrate.run import CalibrationData, Calibrator
 
 MAX_NOISE_RATIO = 1.5
-"""Largest ratio of the noise of R to that of the computed R at the same flux; far from flat the ratio is higher."""
-DELAY_APART = 0.1
+"""Largest accepted ratio of the noise of the measured R to that of the computed R, at the same flux. A sensor far from
+its zero point exceeds it."""
+DELAY_TOLERANCE_FRAMES = 0.1
 """Largest difference between measured and configured delay without a warning, frames."""
 
 
@@ -35,12 +36,12 @@ class Verdict(Result):
     snr: float = figure("signal-to-noise ratio requested", form=".3g")
     snr_reached: float = figure("signal-to-noise ratio reached", form=".3g")
     check_cycles: int = figure("check cycles")
-    check_cross_talk_rms: float = figure("cross-talk in them, rms", form=".3g")
-    check_cross_talk_max: float = figure("cross-talk in them, largest, with noise", form=".3g")
-    check_cross_talk_bound: float = figure("limit with this noise", form=".3g")
-    check_error: float = figure("noise of an element", form=".2g")
-    promised_cross_talk_rms: float = figure("expected cross-talk, rms", form=".3g")
-    promised_cross_talk_max: float = figure("expected cross-talk, largest", form=".3g")
+    check_cross_talk_rms: float = figure("check frames: cross-talk, rms", form=".3g")
+    check_cross_talk_max: float = figure("check frames: largest cross-talk, with noise", form=".3g")
+    check_cross_talk_bound: float = figure("limit of the largest, with noise", form=".3g")
+    check_error: float = figure("standard error of an element of R H", form=".2g")
+    promised_cross_talk_rms: float = figure("limit of the cross-talk, rms", form=".3g")
+    promised_cross_talk_max: float = figure("limit of the largest cross-talk", form=".3g")
     recommended: bool = figure()
     faults: list[str] = figure()
 
@@ -92,19 +93,19 @@ class Comparison(Result):
     estimators: list[str] = figure("estimators")
     cross_talk: float = figure("largest cross-talk", form=".4f")
     gain: list[float] = figure("gain", form=".4f", column=True)
-    reference_shift_nm: list[float] = figure("zero point", "nm", ".3f", column=True)
+    reference_shift_nm: list[float] = figure("zero-point shift", "nm", ".3f", column=True)
     flux_ratio: float = figure("flux ratio", form=".4f")
     dark_shift_dn: float = figure("shift of the dark", "DN", "+.2f")
     bad_pixels: list[int] = figure("bad pixels")
     same_commands: bool = figure("same commands")
 
 
-def rejected_of(out: Path) -> Path:
+def rejected_path(out: Path) -> Path:
     """Path of a calibration that is not recommended; it differs from `out`, so that an existing file is kept."""
     return out.with_name(f"{out.stem}.rejected{out.suffix}")
 
 
-def finished(
+def finish_calibration(
     calibrator: Calibrator, request: CalibrationRequest, data: CalibrationData, computed: Calibration
 ) -> tuple[Calibration, CalibrationResult]:
     """Compute R, check it on separate frames, write the file, under another name if it is not recommended."""
@@ -114,58 +115,58 @@ def finished(
     noise = computed_noise_nm(config, calibration, computed)
     ratio = None if noise is None else factory.frame_noise_nm(config, calibration) / noise
     verdict = judge(request.snr, data.measured.cycles, data.measured.error, check, ratio, calibration.noll)
-    file = rejected_of(request.out) if verdict.faults else request.out
-    found = result_of(config, calibration, quality, request.method, file, data, computed, verdict)
+    file = rejected_path(request.out) if verdict.faults else request.out
+    result = result_of(config, calibration, quality, request.method, file, data, computed, verdict)
     calibration_file.save(calibration, file)
     configured = configured_delay(config)
-    if abs(data.delay.delay_frames - configured) > DELAY_APART:
-        found.advice.append(
+    if abs(data.delay.delay_frames - configured) > DELAY_TOLERANCE_FRAMES:
+        result.advice.append(
             f"warning: the configured delay is {configured:g} frames: set control.delay_frames = "
             f"{max(data.delay.delay_frames, 1):.2f}"
         )
-    return calibration, found
+    return calibration, result
 
 
-def reconstructed(
+def compute_reconstructor(
     config: Configuration,
     reference: Array,
     response: Array,
     initial: Array | None,
     good: Array,
     flux_dn: float,
-    **how: Any,
+    **options: Any,
 ) -> Reconstruction:
     """R from H with the camera of a configuration; arguments as for `reconstruct`, flux in DN."""
     camera = factory.detector(config)
     flux_e, read_noise_e = flux_dn * camera.gain_e_per_dn / camera.em_gain, factory.equivalent_read_noise_e(camera)
     try:
-        return reconstruct(reference, response, initial, good, flux_e, read_noise_e, **how)
+        return reconstruct(reference, response, initial, good, flux_e, read_noise_e, **options)
     except ValueError as error:
         raise CalibrationError(str(error)) from None
 
 
 def measured_calibration(
-    config: Configuration, before: Calibration, found: Measured, request: CalibrationRequest
+    config: Configuration, before: Calibration, measured: Measured, request: CalibrationRequest
 ) -> tuple[Calibration, Reconstruction]:
     """The calibration from cycles of pokes, with dark, mask and mirror commands of the previous one."""
-    I0 = found.reference if found.reference is not None else before.reference.astype(np.float64)
-    reconstruction = reconstructed(
+    I0 = measured.reference if measured.reference is not None else before.reference.astype(np.float64)
+    reconstruction = compute_reconstructor(
         config,
         I0,
-        found.response,
-        found.initial.matrix,
+        measured.response,
+        measured.initial.matrix,
         before.good.astype(np.float64),
-        found.flux_dn,
+        measured.flux_dn,
         truncate=request.truncate,
         tikhonov=request.tikhonov,
     )
-    names = dict.fromkeys([*found.initial.estimator.split("+"), request.method])
+    names = dict.fromkeys([*measured.initial.estimator.split("+"), request.method])
     calibration = replace(
         before,
         reference=single(I0),
-        response=single(found.response),
+        response=single(measured.response),
         reconstructor=single(reconstruction.matrix),
-        flux_dn=found.flux_dn,
+        flux_dn=measured.flux_dn,
         estimator="+".join(names),
         operator_hash="",
         actuators_to_modes=single(_actuators_to_modes(config, before, reconstruction.matrix)),
@@ -192,12 +193,12 @@ def result_of(
 ) -> CalibrationResult:
     """The figures of a measured or computed calibration."""
     delay_frames, error_frames = (configured_delay(config), 0.0) if data is None else data.delay[:2]
-    found: dict[str, Any] = {}
+    optional: dict[str, Any] = {}
     noise = None if computed is None else computed_noise_nm(config, calibration, computed)
     if data is not None and computed is not None and noise is not None:
-        found["cross_talk"] = float(np.abs(cross_talk(calibration.reconstructor, computed.response)).max())
-        found["cross_talk_error"] = float(data.measured.error.max())
-        found["computed_noise_nm"] = noise.tolist()
+        optional["cross_talk"] = float(np.abs(cross_talk(calibration.reconstructor, computed.response)).max())
+        optional["cross_talk_error"] = float(data.measured.error.max())
+        optional["computed_noise_nm"] = noise.tolist()
     return CalibrationResult.model_construct(
         method=method,
         modes=len(calibration.noll),
@@ -214,7 +215,7 @@ def result_of(
         cycles=0 if data is None else data.measured.cycles,
         file=str(file),
         advice=[advice(reconstruction, calibration.noll, config.control.limit_nm)],
-        **found,
+        **optional,
         **({} if verdict is None else verdict.figures()),
     )
 
@@ -243,15 +244,15 @@ def judge(
     if reached < required_snr:
         needed = cycles_for(required_snr, cycles, float(error.max()))
         faults.append(
-            f"signal-to-noise ratio {reached:.3g} in Z{noll[int(error.argmax())]}, {required_snr:g} required: find the "
-            f"disturbance of this mode, or take about {needed} cycles (the same command with --resume --cycles "
+            f"signal-to-noise ratio {reached:.3g} in Z{noll[int(error.argmax())]}, {required_snr:g} required: find "
+            f"what disturbs this mode, or measure about {needed} cycles (repeat the command with --resume --cycles "
             f"{needed})"
         )
     if not check.within(rms, largest):
         faults.append(
-            f"cross-talk on separate frames: rms {check.rms:.3g} and at most {check.largest:.3g}; expected {rms:.3g} "
-            f"and, with the noise of these frames, {check.bound(largest):.3g}: did the wavefront, the flux or the "
-            "sensor change during the calibration?"
+            f"cross-talk on separate frames: rms {check.rms:.3g} (limit {rms:.3g}), largest {check.largest:.3g} (limit "
+            f"{check.bound(largest):.3g}, with noise): did the wavefront, the flux or the sensor change during the "
+            "calibration?"
         )
     if noise_ratio is not None and noise_ratio.max() > MAX_NOISE_RATIO:
         faults.append(
@@ -278,8 +279,9 @@ def comparison(one: Calibration, other: Calibration) -> Comparison:
     """Differences of two calibrations; figures of each mode are in the order of `noll`."""
     if not comparable(one, other):
         raise CalibrationError(
-            f"they cannot be compared: {one.shape[0]} x {one.shape[1]} pixels and modes {_span(one)} against "
-            f"{other.shape[0]} x {other.shape[1]} and {_span(other)}"
+            "calibrations with different sensors or modes cannot be compared: the first has "
+            f"{one.shape[0]} x {one.shape[1]} pixels and modes {_span(one)}, the second {other.shape[0]} x "
+            f"{other.shape[1]} and {_span(other)}"
         )
     both = (one.good * other.good).astype(np.float64)
     R = one.reconstructor.astype(np.float64)
@@ -301,9 +303,9 @@ def comparison(one: Calibration, other: Calibration) -> Comparison:
 
 
 def _actuators_to_modes(config: Configuration, before: Calibration, matrix: Array) -> Array:
-    """Z (modes, actuators): measured for the modal commands, from the optical model for other shapes."""
+    """Modes (modes, actuators) seen of each actuator: measured for modal shapes, modelled for others."""
     commands = before.modes_to_actuators.astype(np.float64)
-    measured = np.asarray(np.linalg.pinv(commands))  # without a model: other shapes are projected on the commands
+    measured = np.asarray(np.linalg.pinv(commands))  # without a model: other shapes are projected onto the modal shapes
     optics = factory.twin(config, None, lambda _: None)
     light = twin_reference(optics)
     if light.shape != before.shape:

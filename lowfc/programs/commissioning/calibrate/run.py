@@ -275,5 +275,5 @@ def stored(path: Path) -> tuple[dict[str, Any], Sums]:
             )
             return dict(json.loads(str(arrays["what"]))), sums
     except (*fits_file.DAMAGED, zipfile.BadZipFile) as error:
-        why = fits_file.in_a_line(error)
+        why = fits_file.one_line(error)
         raise DataFileError(f"{path} is damaged or not from a calibration: {why}; remove it") from None

@@ -34,8 +34,8 @@ from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest
 from lowfc.programs.commissioning.calibrate.recording import Report, check_size, watch
 from lowfc.programs.commissioning.calibrate.result import (
     CalibrationResult,
-    finished,
-    reconstructed,
+    compute_reconstructor,
+    finish_calibration,
     result_of,
 )
 from lowfc.programs.commissioning.calibrate.run import Calibrator, partial_of
@@ -77,7 +77,7 @@ def poked(request: CalibrationRequest, run: str | None, *, load: bool) -> Calibr
         calibrator = Calibrator(loop, request, report, progress, computed)
         try:
             with calibrator.required_mode():
-                calibration, result = finished(calibrator, request, calibrator.run(), computed)
+                calibration, result = finish_calibration(calibrator, request, calibrator.run(), computed)
                 if result.recommended:
                     partial_of(request.out).unlink(missing_ok=True)
                     if load:
@@ -111,7 +111,7 @@ def computed(
     config = configuration(file)
     name, wavefront = ("", None) if at is None else zero_point(config, at)
     calibration = analytic(config, Console(stderr=True), wavefront)
-    quality = reconstructed(
+    quality = compute_reconstructor(
         config,
         calibration.reference.astype(np.float64),
         calibration.response.astype(np.float64),

@@ -25,7 +25,7 @@ from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.commissioning.calibrate.pokes import MIN_SNR, CalibrationRequest, Pokes
 from lowfc.programs.commissioning.calibrate.recording import CHECKED, Player, Report, watch
-from lowfc.programs.commissioning.calibrate.result import finished
+from lowfc.programs.commissioning.calibrate.result import finish_calibration
 from lowfc.programs.commissioning.calibrate.run import Calibrator, partial_of, stored
 from lowfc.programs.commissioning.calibrate.tasks import images
 from lowfc.programs.commissioning.commission.first_calibration import aligned, first_delay, linear_nm, poked
@@ -154,7 +154,7 @@ class Commissioning:
         calibrator = Calibrator(self._loop, request, self._report, self._progress, self._computed)
         data = calibrator.run(delay)
         self._step("verdict")
-        calibration, result = finished(calibrator, request, data, self._computed)
+        calibration, result = finish_calibration(calibrator, request, data, self._computed)
         self._figures |= result.figures()
         if not result.recommended:
             raise CalibrationError(

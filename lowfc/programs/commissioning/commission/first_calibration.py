@@ -17,7 +17,7 @@ from lowfc.control.calibration.response_fit import correlation
 from lowfc.programs.commissioning.calibrate.align import computed_scale, in_words, on_sensor
 from lowfc.programs.commissioning.calibrate.pokes import AMPLITUDE_NM, HOLD, SETTLE, largest_nm, sequence
 from lowfc.programs.commissioning.calibrate.recording import AFTERWARDS, Player, PokesNotSeenError, Report
-from lowfc.programs.commissioning.calibrate.result import reconstructed
+from lowfc.programs.commissioning.calibrate.result import compute_reconstructor
 
 FIRST_NM = AMPLITUDE_NM["poke"]
 MAX_FIRST_NM = 32.0
@@ -104,7 +104,7 @@ def poked(player: Player, config: Configuration, poke: Delay) -> Calibration:
         plan = _poke_cycle(modes, amplitude_nm, number)
         response += player.cycle(plan, poke.delay_frames).response / CYCLES
     good, reference = before.good.astype(np.float64), before.reference.astype(np.float64)
-    matrix = reconstructed(config, reference, response, None, good, before.flux_dn).matrix
+    matrix = compute_reconstructor(config, reference, response, None, good, before.flux_dn).matrix
     player.report(f"{CYCLES} pokes of each mode by {amplitude_nm:.3g} nm")
     calibration = replace(
         before,
