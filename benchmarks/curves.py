@@ -23,7 +23,7 @@ import numpy as np
 
 from benchmarks.load import shares, watched
 from benchmarks.runner import Lines, Result, Tell, add_times, ranged, us
-from benchmarks.sizes import FRAMES, Size, configuration, made_up, run_loop
+from benchmarks.sizes import FRAMES, Size, configuration, random_calibration, run_loop
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.realtime import set_up
 from lowfc.contract.errors import ConfigurationError, LowfcError
@@ -54,7 +54,7 @@ def step_figures(size: Size, seconds: float) -> Result:
         RuntimeError: frames were refused or limits acted.
     """
     config = configuration(size, RATE_HZ)
-    calibration, frames = made_up(size, config)
+    calibration, frames = random_calibration(size, config)
     step = ControlStep(config, calibration, HostClock().host_ns())
     made = Payloads(frames)
     payloads = cycle([made.at(index, HostClock().host_ns()) for index in range(FRAMES)])

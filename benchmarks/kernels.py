@@ -1,10 +1,10 @@
-"""The control step with each kernel, relative to one matrix-vector product of its size and to the memory limit.
+"""Time of the control step with each kernel, and its ratio to one product R x and to one read of the same memory.
 
 Each turn times, one after the other: the numpy step, the fused step, the product R x, and one read of every byte that a
 step must touch. Ratios are taken within a turn.
 
 Example:
-    python -m benchmarks kernels --pixels 80 256 --repeats 9
+    python -m benchmarks kernels --side 80 256 --repeats 9
 """
 
 import argparse
@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.curves import RATE_HZ, timed
 from benchmarks.runner import Lines, Result, Tell, add_times, ranged
-from benchmarks.sizes import FRAMES, Size, configuration, made_up
+from benchmarks.sizes import FRAMES, Size, configuration, random_calibration
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.realtime import set_up
 from lowfc.control.kernel.tables import KERNELS
@@ -24,14 +24,14 @@ from lowfc.programs.measure.control_step import ControlStep
 from lowfc.programs.measure.frame_source import Payloads
 
 SIDES = (80, 256, 512)
-PRODUCT, STREAM = "product", "memory"
+PRODUCT, MEMORY = "product", "memory"
 
 
 def options(parser: argparse.ArgumentParser) -> None:
     """Add the sizes, the duration and the repeats."""
     add_times(parser, seconds=0.3, repeats=9)
     parser.add_argument(
-        "--pixels", type=int, nargs="+", default=SIDES, metavar="N", help="pixels across the frame (%(default)s)"
+        "--side", type=int, nargs="+", default=SIDES, metavar="N", help="pixels across the square frame (%(default)s)"
     )
 
 
@@ -39,14 +39,14 @@ def measure(options: argparse.Namespace, tell: Tell) -> Result:
     """Measure each size in turns: p50 of numpy, fused, product and memory in us, and their ratios."""
     set_up(None, None, lock_memory=False, disable_cpu_idle=False)
     found = []
-    for side in options.pixels:
+    for side in options.side:
         size = Size(side)
-        works = _works(size)
+        calls = _timed_calls(size)
         turns = []
         for number in range(options.repeats):
             tell(f"{size.pixels} pixels, {number + 1} of {options.repeats}")
-            turns.append({name: timed(work, options.seconds)["p50"] for name, work in works.items()})
-        pairs = [(kernel, other) for kernel in KERNELS for other in (PRODUCT, STREAM)]
+            turns.append({name: timed(call, options.seconds)["p50"] for name, call in calls.items()})
+        pairs = [(kernel, other) for kernel in KERNELS for other in (PRODUCT, MEMORY)]
         ratios = {
             f"{one} over {other}": [turn[one] / turn[other] for turn in turns] for one, other in (*pairs, KERNELS[::-1])
         }
@@ -67,7 +67,7 @@ def tables(found: Result) -> list[Lines]:
 
 
 def about(found: Result) -> str:
-    """Medians in us."""
+    """Median times, in us, as a sentence."""
     each = [
         ", ".join(f"{name} {median(turn[name] for turn in one['turns']):.1f}" for name in one["turns"][0])
         for one in found["sizes"]
@@ -75,8 +75,8 @@ def about(found: Result) -> str:
     return f"us, p50, medians over {len(found['sizes'][0]['turns'])} turns: {'; '.join(each)}."
 
 
-def _works(size: Size) -> dict[str, Callable[[], object]]:
-    calibration, frames = made_up(size, configuration(size, RATE_HZ))
+def _timed_calls(size: Size) -> dict[str, Callable[[], object]]:
+    calibration, frames = random_calibration(size, configuration(size, RATE_HZ))
     made = Payloads(frames)
     payloads = cycle([made.at(index, HostClock().host_ns()) for index in range(FRAMES)])
     R, x = calibration.reconstructor, np.random.default_rng(1).standard_normal(size.pixels, np.float32)
@@ -87,4 +87,4 @@ def _works(size: Size) -> dict[str, Callable[[], object]]:
         return lambda: control_step(next(payloads))
 
     steps = {kernel: step(kernel) for kernel in KERNELS}
-    return steps | {PRODUCT: lambda: R @ x, STREAM: lambda: one_half.dot(other_half)}
+    return steps | {PRODUCT: lambda: R @ x, MEMORY: lambda: one_half.dot(other_half)}

@@ -51,7 +51,7 @@ class Size:
 
     @property
     def bytes(self) -> int:
-        """What a step must touch: the frame; in float32 R, the reference, the dark, the mask and the modes' shapes."""
+        """Bytes that a step reads: the uint16 frame; in float32 R, reference, dark, mask and the modes' shapes."""
         return 4 * self.pixels * (self.modes + 3) + 2 * self.pixels + 4 * self.modes * self.actuators
 
 
@@ -71,7 +71,7 @@ def configuration(size: Size, rate_hz: float, **realtime: Any) -> Configuration:
     return load(None, overrides, spread(os.sched_getaffinity(0), simulated=False))
 
 
-def made_up(size: Size, config: Configuration) -> tuple[Calibration, Frames]:
+def random_calibration(size: Size, config: Configuration) -> tuple[Calibration, Frames]:
     """A random calibration, and frames (frames, rows, columns) whose noise is 1 nm rms in every mode."""
     rng = np.random.default_rng(size.bytes)
     light_dn = _LIGHT_DN * rng.uniform(0.5, 1.5, size.pixels)
@@ -99,11 +99,11 @@ def made_up(size: Size, config: Configuration) -> tuple[Calibration, Frames]:
 
 
 @contextlib.contextmanager
-def laid_out(size: Size, config: Configuration) -> Iterator[Run]:
+def prepared_run(size: Size, config: Configuration) -> Iterator[Run]:
     """A run of that size with the files of its processes; removed afterwards."""
 
     def fill(config: Configuration, run: Run) -> None:
-        calibration, frames = made_up(size, config)
+        calibration, frames = random_calibration(size, config)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", VerifyWarning)  # with hundreds of modes a card's comment is truncated
             calibration_file.save(calibration, run.path / "calibration.fits")
@@ -115,8 +115,11 @@ def laid_out(size: Size, config: Configuration) -> Iterator[Run]:
 
 
 def run_loop(size: Size, config: Configuration, seconds: float) -> dict[str, Any]:
-    """Run the loop of that size once, and then a bare echo of its messages; one repeat's figures of `run_repeats`."""
-    with laid_out(size, config) as run:
+    """Run the loop of that size once, then the bare echo (its messages without computation).
+
+    Returns the figures of one repeat, as `run_repeats`.
+    """
+    with prepared_run(size, config) as run:
         (found,) = run_repeats(LatencyOptions(config, seconds, 1), run, lambda _: None)
     return found
 

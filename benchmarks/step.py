@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.runner import Lines, Result, Tell, add_times
-from benchmarks.sizes import Size, configuration, made_up
+from benchmarks.sizes import Size, configuration, random_calibration
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.realtime import set_up
 from lowfc.arrays import Long
@@ -56,7 +56,7 @@ def measure(options: argparse.Namespace, tell: Tell) -> Result:
     """Time the stages: percentiles by stage, and the whole step over the product; back to back and paced."""
     size = Size()
     config = configuration(size, RATE_HZ)
-    calibration, frames = made_up(size, config)
+    calibration, frames = random_calibration(size, config)
     payloads = Payloads(frames)
     granted = set_up(config.realtime.priority or None, None, lock_memory=True, disable_cpu_idle=True)
     step = ControlStep(config, calibration, 0)

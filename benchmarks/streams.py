@@ -17,7 +17,7 @@ import numpy as np
 
 from benchmarks import stream_ends
 from benchmarks.runner import Lines, Result, Tell, add_times, ranged
-from benchmarks.sizes import Size, configuration, laid_out
+from benchmarks.sizes import Size, configuration, prepared_run
 from lowfc.adapters.bus.run import Run, mirror_role
 from lowfc.adapters.image_stream.stream import Stream, stream_path
 from lowfc.adapters.process.child import Child
@@ -69,7 +69,7 @@ def one_run(rate_hz: float, seconds: float, name: str) -> Result:
     config = configuration(SIZE, rate_hz).model_copy(update={"drivers": {driver: {"stream": FRAMES}}})
     by_streams = name != DIRECT
     asked = LatencyOptions(config, seconds, 1)
-    with laid_out(SIZE, config) as run, tempfile.TemporaryDirectory(prefix="lowfc-streams-", dir=_MEMORY) as folder:
+    with prepared_run(SIZE, config) as run, tempfile.TemporaryDirectory(prefix="lowfc-streams-", dir=_MEMORY) as folder:
         found = one_loop(asked, run, _loop(asked, run, Path(folder), name) if by_streams else None)
     start = "due" if by_streams else "frame"
     spans_us = {f"frame_to_{end}": found["latency_us"][f"{start}_to_{end}"] for end in ("command", "mirror")}

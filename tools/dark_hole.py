@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 from rich.progress import track
 
-from lowfc.programs.paper.dark_hole import COMMAND, PLAIN, SETTLE, SHIFTED, STEPS, dark_hole
+from lowfc.programs.paper.dark_hole import AT_ONCE, COMMAND, PLAIN, SETTLE, SHIFTED, STEPS, dark_hole
 from tools.shared import Figures, markdown
 
-EACH_NM = (1.0, 2.0, 5.0)
+STEP_RMS_NM = (1.0, 2.0, 5.0)
 
 __all__ = ["COMMAND", "measure", "render"]
 
@@ -17,7 +17,7 @@ __all__ = ["COMMAND", "measure", "render"]
 def measure() -> Figures:
     """Fractions undone of small and of large steps."""
     runs = {}
-    for each_nm in track(EACH_NM, "dark holes"):
+    for each_nm in track(STEP_RMS_NM, "dark holes"):
         with tempfile.TemporaryDirectory() as folder:
             night = dark_hole(Path(folder), each_nm)
         run: Figures = {"together_nm": each_nm * STEPS**0.5}
@@ -32,8 +32,9 @@ def measure() -> Figures:
 def render(figures: Figures) -> str:
     """A row for each size of the steps."""
     head = (
-        *("each step, nm rms of surface", "all steps", "as seen by the sensor, nm of wavefront", "undone, %"),
-        *("undone without the shift, %", "true residual before -> after, nm"),
+        *("each step, nm rms of surface", "sum of the steps, nm rms of surface"),
+        *("as seen by the sensor, nm of wavefront", "undone, %", "undone without the shift, %"),
+        "true residual before -> after, nm",
     )
     rows = [
         (
@@ -46,9 +47,10 @@ def render(figures: Figures) -> str:
         for each, run in figures["runs"].items()
     ]
     return (
-        f"{markdown(head, rows)}\n{STEPS} random steps, {SETTLE} frames apart, each added to those before it. Undone "
-        "is the fraction of the channel, as seen by the sensor, that the loop's own command cancels "
-        "beyond the disturbance; least squares over all steps and modes, with the "
-        "standard error. A negative value means that the loop adds to the steps. The true residual is the rms of all "
-        "modes about their mean, over the circle, before the first step and after the last."
+        f"{markdown(head, rows)}\n{STEPS} random steps, {SETTLE} frames apart, each added to those before it; "
+        f"without the shift, {AT_ONCE} steps at a time. Undone: the fraction of the channel's shape, as seen by the "
+        "sensor, that the loop removes. It is the slope of (command + disturbance) against the channel's modes, sign "
+        "reversed; least squares over all steps and modes, with its standard error. A negative value means "
+        "that the loop adds to the steps. The true residual is the rms of all modes about their mean, over the circle, "
+        "before the first step and after the last."
     )

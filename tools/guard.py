@@ -74,7 +74,7 @@ LawOf = Callable[[Configuration, Array, ModalBench], tuple[LinearLaw, Array]]
 
 def identified_law(config: Configuration, covariance_nm2: Array, bench: ModalBench) -> tuple[LinearLaw, Array]:
     """Integrator and gains identified from a log, as by an operator."""
-    bench.forget()
+    bench.new_record()
     bench.run(_IDENTIFY)
     run, timing = bench.pol(), timing_of(config)
     return tuned(run, config)["lqg"].law, best_gains(run, RATE_HZ, timing, np.zeros(len(config.noll))).gain
@@ -99,7 +99,7 @@ def moved(case: Case, factor: float, seed: int, *, guard: bool = True, law: bool
     bench.run(_BEFORE)
     if bench.events and bench.events[-1][1].name == "LAW_OVERRULED":
         raise RuntimeError(f"the law was overruled before its lines moved: {bench.events[-1]}")
-    bench.forget()
+    bench.new_record()
     bench.move_lines(factor)
     bench.run(3 * int(RATE_HZ))
     first = _SETTLE + _BEFORE
@@ -112,8 +112,8 @@ def undisturbed(case: Case, seed: int, minutes: float = MINUTES) -> int:
     """Number of times a good law is overruled, with steps and lines that wander within their width."""
     bench = case.bench(case.configured(seed), case.law, STEPS_MAS)
     bench.run(round(minutes * 60 * RATE_HZ), record=False)
-    if bench.refused:
-        raise RuntimeError(f"{bench.refused} frames were refused")
+    if bench.frames_refused:
+        raise RuntimeError(f"{bench.frames_refused} frames were refused")
     return sum(event.name == "LAW_OVERRULED" for _, event in bench.events)
 
 

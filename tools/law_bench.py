@@ -65,12 +65,12 @@ def with_lines_moved(disturbance: Disturbance, factor: float) -> Disturbance:
 
 
 class Bench:
-    """A loop in one process that starts with a flat mirror; it records until `forget`.
+    """A loop in one process that starts with a flat mirror. `new_record` discards the record and begins a new one.
 
     Attributes:
         config: configuration of the controller.
         nm_per_mas: nm rms of wavefront per milliarcsecond of tilt.
-        refused: number of frames that the controller did not use.
+        frames_refused: number of frames that the controller did not use.
         events: frame number and event of the controller, since the start.
     """
 
@@ -91,7 +91,7 @@ class Bench:
         """
         self.config, self.world = config, config if world is None else world
         self.nm_per_mas = tilt_nm_per_mas(config.star.diameter_m)
-        self.refused = 0
+        self.frames_refused = 0
         self._other_disturbance = disturbance
         self.scene = scene(self.world, disturbance)
         self._settings = factory.settings(config)
@@ -105,13 +105,13 @@ class Bench:
         self._shapes = [self._status.surface_nm] * len(self._weights)
         self._path = MirrorPath(self._status.surface_nm, self.world.camera.delay_frames - 1)
         self._index = 0
-        self.forget()
+        self.new_record()
 
     def start_mirror(self) -> None:
         """Replace the mirror by a new, flat one."""
         self._mirror, self._status = SimulatedMirror(DriverOptions(), self.world), initial(self._guard)
 
-    def forget(self) -> None:
+    def new_record(self) -> None:
         """Begin a new record."""
         self.steps: list[Step] = []
         self.truths: list[Truth] = []
@@ -150,7 +150,7 @@ class Bench:
         """Close the loop, and begin a new record after this number of frames."""
         self.ask("close")
         self.run(frames)
-        self.forget()
+        self.new_record()
 
     def load(self, law: LinearLaw) -> None:
         """Let a law drive the mirror."""
@@ -195,7 +195,7 @@ class Bench:
                 self.steps.append(outputs.step)
                 self.truths.append(truth)
             else:
-                self.refused += 1
+                self.frames_refused += 1
             if outputs.command is not None:
                 self.follow(frame, outputs.command)
 

@@ -68,7 +68,7 @@ def case(config: Configuration) -> Figures:
     }
     for kind, one in laws.items():
         bench.load(one.law)
-        bench.forget()
+        bench.new_record()
         bench.run(SETTLE + MEASURE)
         S, T = theory_mas(config, calibration, one.law)
         figures["laws"][kind] = {

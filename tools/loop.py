@@ -68,8 +68,8 @@ SHORT_COLUMNS = {
 
 
 SHORT_NOTE = """\
-The star has V = 2. Latency is from publishing the frame to publishing the command; read-out is not included. The jitter
-is drawn frame by frame, so its realisation differs between rates. [Performance](docs/measured/performance.md) has all
+The star has V = 2. Latency is from sending the frame to sending the command; read-out is not included. The jitter is
+drawn frame by frame, so its realisation differs between rates. [Performance](docs/measured/performance.md) has all
 runs and the method."""
 
 

@@ -1,7 +1,7 @@
 """Generate the tables and pictures of the documentation, from measurements and from the code.
 
-A page names its table between `[[[cog` and `[[[end]]]`. Measured tables come from the JSON files in
-`tools/measured`, the others from the code; a test compares every page with them.
+A table is generated between `]]]` and `[[[end]]]`; the line with `[[[cog` names it. Measured tables come from the JSON
+files in `tools/measured`, the others from the code; a test compares every page with them.
 
 Example:
     python -m tools.measure                # regenerate the pages from stored measurements and the code
@@ -49,29 +49,31 @@ class Measurement(NamedTuple):
     """One table of the documentation.
 
     Attributes:
-        commands: commands that it runs besides its own code.
+        commands: commands that the measurement runs, as printed under the table.
         measure: returns its figures.
         render: returns the table of the figures.
-        signed: whether the table includes date, host and method.
+        has_provenance: whether the table includes date, host and method.
     """
 
     commands: tuple[str, ...]
     measure: Callable[[], Figures]
     render: Callable[[Figures], str]
-    signed: bool = False
+    has_provenance: bool = False
 
 
-def _of(command: str, render: Callable[[Figures], str], signed: bool = False) -> Measurement:
+def _command_measurement(command: str, render: Callable[[Figures], str], has_provenance: bool = False) -> Measurement:
     """The measurement made by one command."""
-    return Measurement((command,), partial(json_of, command), render, signed)
+    return Measurement((command,), partial(json_of, command), render, has_provenance)
 
 
 def _latency(command: str) -> Measurement:
-    return _of(command, lambda figures: f"```\n$ {command}\n{latency_text.table(figures)}\n```\n", signed=True)
+    return _command_measurement(
+        command, lambda figures: f"```\n$ {command}\n{latency_text.table(figures)}\n```\n", has_provenance=True
+    )
 
 
 def _bench(command: str, benchmark: Benchmark) -> Measurement:
-    return _of(command, partial(in_markdown, benchmark))
+    return _command_measurement(command, partial(in_markdown, benchmark))
 
 
 MEASUREMENTS = {
@@ -85,8 +87,8 @@ MEASUREMENTS = {
     "slow_modes": Measurement((), slow_modes.measure, slow_modes.render),
     "zero_point": Measurement((dark_hole.COMMAND,), dark_hole.measure, dark_hole.render),
     "chaos": Measurement((reliability.CHAOS,), reliability.chaos, reliability.render_chaos),
-    "soak": _of("lowfc soak --hours 0.5", reliability.render_soak),
-    "fuzz": _of("python -m tests.support.fuzzing --inputs 1000000", reliability.render_fuzz),
+    "soak": _command_measurement("lowfc soak --hours 0.5", reliability.render_soak),
+    "fuzz": _command_measurement("python -m tests.support.fuzzing --inputs 1000000", reliability.render_fuzz),
     "latency": _latency("lowfc latency --duration 10 --repeats 5"),
     "watched": _latency("lowfc latency --duration 60 --record --view"),
     "kernels": _bench("python -m benchmarks kernels", kernels),
@@ -114,7 +116,7 @@ def table(name: str) -> str:
         return COMPOSED[name]()
     one, figures = MEASUREMENTS[name], measured(name)
     text = one.render(figures)
-    if one.signed:
+    if one.has_provenance:
         return text
     between = "" if text.endswith("\n") else " "
     return f"{text}{between}{where(name, figures)}\n"

@@ -1,7 +1,7 @@
-"""The simulated loop without images: a linear sensor with the noise covariance of the twin's images.
+"""The simulated loop with a linear sensor instead of diffraction; its noise has a given covariance of the modes.
 
 The live loop's own `advance` receives frames of a few pixels that encode the measured modes, so that hours can be
-simulated. Not included: the sensor's nonlinearity, the mirror's print-through and the steps of its driver.
+simulated. Not included: the sensor's nonlinearity, the mirror's print-through and DAC quantisation.
 """
 
 from dataclasses import replace
@@ -24,12 +24,12 @@ from sim_camera.driver import disturbance_of
 from tools.law_bench import Bench, with_lines_moved
 
 _LEVEL_DN, _DN_PER_NM = 32_000.0, 80.0
-_EXPOSURE_NODES = (1 + np.array([-1, 1]) / np.sqrt(3)) / 2
+_GAUSS_LEGENDRE_NODES = (1 + np.array([-1, 1]) / np.sqrt(3)) / 2
 _TRUTH_SAMPLES = (np.arange(8) + 0.5) / 8
-_FRAMES_OF_NOISE = 1024
+_NOISE_BLOCK = 1024
 
 
-def _two_pixels_a_mode(noll: tuple[int, ...]) -> Calibration:
+def _differential_calibration(noll: tuple[int, ...]) -> Calibration:
     """A sensor with two pixels for each mode, of opposite response, and a mirror with one actuator for each."""
     modes = len(noll)
     flux_dn, pixels = 2 * modes * _LEVEL_DN, 2 * modes
@@ -59,58 +59,64 @@ def _two_pixels_a_mode(noll: tuple[int, ...]) -> Calibration:
 
 
 class ModalBench(Bench):
-    """A loop of modes; it records until `forget`."""
+    """A modal loop in one process. `new_record` discards the record and begins a new one."""
 
     def __init__(self, config: Configuration, covariance_nm2: Array, disturbance: Disturbance | None = None) -> None:
-        """Noise of this covariance (modes, modes); `disturbance` replaces the configuration's."""
-        self.config, self.refused = config, 0
+        """Build the loop.
+
+        Args:
+            config: configuration of the controller and of the simulation.
+            covariance_nm2: (modes, modes) of the measurement noise.
+            disturbance: replaces the configuration's.
+        """
+        self.config, self.frames_refused = config, 0
         self.nm_per_mas = tilt_nm_per_mas(config.star.diameter_m)
         self._disturbance = disturbance_of(config) if disturbance is None else disturbance
         self._settings = factory.settings(config)
         self._watch = GainWatch(self._settings, config.control.on_harm)
         self.events = []
-        self._state = advance(self._settings, State(), Load(0, _two_pixels_a_mode(config.noll), "bench"))[0]
+        self._state = advance(self._settings, State(), Load(0, _differential_calibration(config.noll), "bench"))[0]
         self._sampler = self._sampled()
         self._mix = np.linalg.cholesky(covariance_nm2).T.astype(np.float32)
         self._noise = np.random.Generator(np.random.SFC64(np.random.SeedSequence([config.seed, 3])))
         self._weights = delay_weights(config.camera.delay_frames).astype(np.float32)
         self._mirror_shapes_nm = [np.zeros(len(config.noll), np.float32)] * len(self._weights)
         self._index = 0
-        self.forget()
+        self.new_record()
 
-    def forget(self) -> None:
+    def new_record(self) -> None:
         """Begin a new record."""
-        super().forget()
+        super().new_record()
         self._squares: list[Single] = []
 
     def _sampled(self) -> Sampler:
-        instants = np.concatenate([self.config.camera.exposure_fraction * _EXPOSURE_NODES, _TRUTH_SAMPLES])
+        instants = np.concatenate([self.config.camera.exposure_fraction * _GAUSS_LEGENDRE_NODES, _TRUTH_SAMPLES])
         return Sampler(self._disturbance, instants, self.config.camera.rate_hz)
 
     def move_lines(self, factor: float) -> None:
-        """Change the frequencies of the lines from now on, without a jump; only at the start of a block of frames."""
+        """Scale the vibration frequencies from now on, continuous in phase; only at a multiple of BLOCK frames."""
         if self._index % BLOCK:
             raise ValueError(f"lines can move only at a frame that is a multiple of {BLOCK}, not at {self._index}")
         moved = with_lines_moved(self._disturbance, factor)
-        turns = (self._disturbance.frequency_hz - moved.frequency_hz) * self._index / self.config.camera.rate_hz
-        amplitude_nm = self._disturbance.amplitude_nm * np.exp(2j * np.pi * turns)[:, None]
+        phase_cycles = (self._disturbance.frequency_hz - moved.frequency_hz) * self._index / self.config.camera.rate_hz
+        amplitude_nm = self._disturbance.amplitude_nm * np.exp(2j * np.pi * phase_cycles)[:, None]
         self._disturbance = replace(moved, amplitude_nm=amplitude_nm)
         before, self._sampler = self._sampler, self._sampled()
-        was, now = vars(before)["_lines"], vars(self._sampler)["_lines"]
-        for name in ("_rng", "_next", "_vector") if now is not None else ():  # damped lines keep their state
-            setattr(now, name, getattr(was, name))
+        old, new = vars(before)["_lines"], vars(self._sampler)["_lines"]
+        for name in ("_rng", "_next", "_vector") if new is not None else ():  # damped lines keep their state
+            setattr(new, name, getattr(old, name))
 
     def run(self, frames: int, *, record: bool = True) -> None:
         """Expose, control, move the mirror; events are always recorded."""
         noise_nm = np.zeros((0, 0), np.float32)
         for count in range(frames):
-            if not count % _FRAMES_OF_NOISE:
-                noise_nm = self._noise.standard_normal((_FRAMES_OF_NOISE, len(self._mix)), np.float32) @ self._mix
+            if not count % _NOISE_BLOCK:
+                noise_nm = self._noise.standard_normal((_NOISE_BLOCK, len(self._mix)), np.float32) @ self._mix
             mirror_nm: Any = sum(
                 weight * past for weight, past in zip(self._weights, self._mirror_shapes_nm, strict=True)
             )
             modes_nm = self._sampler.at(self._index)
-            pixels = _encoded(modes_nm[:2].mean(axis=0) + mirror_nm + noise_nm[count % _FRAMES_OF_NOISE])
+            pixels = _encoded(modes_nm[:2].mean(axis=0) + mirror_nm + noise_nm[count % _NOISE_BLOCK])
             time_ns = 10**18 + self._index * self.config.period_ns
             self._state, outputs = advance(
                 self._settings, self._state, Frame((1 << 32) + self._index, time_ns, 0, pixels)
@@ -122,7 +128,7 @@ class ModalBench(Bench):
                 newest_nm = 2 * outputs.command.actuators_nm.ravel()
             self._mirror_shapes_nm = [newest_nm, *self._mirror_shapes_nm[:-1]]
             if outputs.step is None or outputs.step.pol_nm is None:
-                self.refused += 1
+                self.frames_refused += 1
             elif record:
                 self.steps.append(outputs.step)
                 self._squares.append(np.square(modes_nm[2:] + mirror_nm).mean(axis=0))
@@ -130,7 +136,7 @@ class ModalBench(Bench):
     def residual_nm(self, *, continuous: bool = True) -> Array:
         """True residual (frames, modes) of the record, rms over each period."""
         if not continuous:
-            raise ValueError("a modal bench has only means over periods")
+            raise ValueError("a modal bench records only the rms over each frame period")
         return np.sqrt(np.array(self._squares, np.float64))
 
 

@@ -46,7 +46,7 @@ def case(config: Configuration) -> Figures:
     left_nm, drift_nm, other_nm = (np.zeros((WINDOWS, len(config.noll))) for _ in range(3))
     bench.run(round(SETTLE_S * RATE_HZ))
     for window in track(range(WINDOWS), f"exposed for {config.camera.exposure_fraction:g} of a frame"):
-        bench.forget()
+        bench.new_record()
         bench.run(frames)
         left_nm[window] = bench.residual_nm(continuous=False).mean(axis=0)
         drift_nm[window] = np.mean([truth.sampled.disturbance_nm for truth in bench.truths], axis=0, dtype=np.float64)
@@ -66,7 +66,7 @@ def case(config: Configuration) -> Figures:
         "light_e_per_s": light_e * RATE_HZ,
         "gain": config.control.gain,
         "tilt_gain": config.control.tilt_gain,
-        "frames_refused": bench.refused,
+        "frames_refused": bench.frames_refused,
         "modes": {
             f"{noll} {mode_name(noll)}": {name: float(values[place]) for name, values in columns.items()}
             for place, noll in enumerate(config.noll)

@@ -94,7 +94,7 @@ def _residual(sensor: str, magnitude: float, keys: dict[str, Any], seconds: floa
     return {
         "residual_nm": float(np.sqrt(np.mean(squares_nm2))),
         "contrast": float(np.einsum("nj,jl,nl->", modes_nm, modal.form, modes_nm)) / len(modes_nm),
-        "refused": bench.refused,
+        "refused": bench.frames_refused,
     }
 
 

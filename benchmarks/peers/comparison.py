@@ -1,6 +1,7 @@
 """Comparison of lowfc with other implementations of the same loop: same frames, sizes and processors, in turns.
 
-All run under SCHED_FIFO with processors kept from idling if the host grants it to this user; otherwise none does.
+All use SCHED_FIFO if the host grants it, and the normal scheduling class otherwise. CPU idle states are disabled for
+all if permitted.
 
 Example:
     git clone https://github.com/milk-org/ImageStreamIO DIR
@@ -36,12 +37,12 @@ from benchmarks.peers.implementations import (
 from benchmarks.peers.plain_zenoh import PORTS
 from benchmarks.peers.shared import ACTUATORS, LAST, MARKS, MIRROR_SIDE, MODES, SIDE, NumpyStep, Problem
 from benchmarks.runner import Lines, Result, Tell, add_times, ranged
-from benchmarks.sizes import Size, configuration, laid_out, made_up
+from benchmarks.sizes import Size, configuration, prepared_run, random_calibration
 from lowfc.adapters.bus.run import free_ports
 from lowfc.adapters.process.child import Child
 from lowfc.adapters.process.realtime import set_up
 from lowfc.contract.errors import ConfigurationError, LowfcError
-from lowfc.programs.measure.latency.figures import percentiles
+from lowfc.programs.measure.latency.figures import WARM_UP_S, percentiles
 from lowfc.programs.measure.latency.run import LatencyOptions, one_loop
 
 ROOT = Path(__file__).parents[2]
@@ -49,9 +50,9 @@ SIZE = Size(SIDE, MODES, MIRROR_SIDE)
 PRIORITY = 50
 
 _MEMORY = Path("/dev/shm")  # noqa: S108  # a private folder is created in it
-_READY_S, _SETTLE_S, _LATER_S, _LOOK_S, _PATIENCE_S = 60.0, 0.3, 10.0, 0.02, 0.5
+_READY_S, _SETTLE_S, _DEADLINE_MARGIN_S, _POLL_S, _STOP_TIMEOUT_S = 60.0, 0.3, 10.0, 0.02, 0.5
 _ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
-_FIRST = ("source", "mirror", "modal_mirror")  # roles on the first processor
+_FIRST_CPU_ROLES = ("source", "mirror", "modal_mirror")  # roles on the first processor
 
 DEFINITIONS = {
     "t0": "just before the source sends a frame: before it writes the stream, before the zenoh put, or before "
@@ -129,14 +130,14 @@ def one_run(implementation: Implementation, rules: argparse.Namespace, priority:
     frames = rules.warm_up + round(rules.seconds * rules.rate_hz)
     with tempfile.TemporaryDirectory(prefix="lowfc-peers-", dir=_MEMORY) as name:
         folder = Path(name)
-        lay_out(folder, frames)
+        write_shared_files(folder, frames)
         with _processes(implementation, rules, folder, [str(rules.rate_hz), str(frames)], priority) as children:
             time.sleep(_SETTLE_S)
             shared.go(folder)
             pacer = children["source"]
-            deadline_s = time.monotonic() + frames / rules.rate_hz + _LATER_S
+            deadline_s = time.monotonic() + frames / rules.rate_hz + _DEADLINE_MARGIN_S
             while pacer.status is None and time.monotonic() < deadline_s:
-                time.sleep(_LOOK_S)
+                time.sleep(_POLL_S)
             if pacer.status != 0:
                 raise ComparisonError(f"the source of frames did not end: {pacer.stderr_tail()}")
             words = "\n".join(child.stderr_tail() for child in children.values())
@@ -153,7 +154,7 @@ def figures(folder: Path, warm_up: int) -> dict[str, Any]:
     command is missing.
     """
     due, published, commanded, received = (np.fromfile(folder / name, np.int64)[1:] for name in MARKS)
-    off = _off(folder, commanded.size) if commanded.all() and received[-1] else None
+    command_error = _command_error(folder, commanded.size) if commanded.all() and received[-1] else None
     due, published, commanded, received = (times[warm_up:] for times in (due, published, commanded, received))
     period_ns = np.diff(due).mean() if due.size > 1 else np.inf
     return {
@@ -162,11 +163,11 @@ def figures(folder: Path, warm_up: int) -> dict[str, Any]:
         "sent_late": int((published - due > period_ns).sum()),
         "frame_to_command": percentiles((commanded - published)[commanded > 0] / 1e3),
         "frame_to_mirror": percentiles((received - published)[received > 0] / 1e3),
-        "off": off,
+        "off": command_error,
     }
 
 
-def _off(folder: Path, frames: int) -> float:
+def _command_error(folder: Path, frames: int) -> float:
     problem = Problem(folder)
     step, payload = NumpyStep(problem), b""
     for number in range(1, frames + 1):
@@ -178,7 +179,7 @@ def _off(folder: Path, frames: int) -> float:
 def _lowfc(kernel: str, rules: argparse.Namespace, priority: int) -> dict[str, Any]:
     """Run lowfc's own loop with the size of the comparison; it warms up for half a second by itself."""
     config = configuration(SIZE, rules.rate_hz, priority=priority, disable_cpu_idle=True, kernel=kernel)
-    with laid_out(SIZE, config) as run:
+    with prepared_run(SIZE, config) as run:
         found = one_loop(LatencyOptions(config, rules.seconds, 1), run)
     return {
         "frames": found["frames"],
@@ -189,9 +190,9 @@ def _lowfc(kernel: str, rules: argparse.Namespace, priority: int) -> dict[str, A
     }
 
 
-def lay_out(folder: Path, frames: int) -> None:
+def write_shared_files(folder: Path, frames: int) -> None:
     """Write the files that the processes of a run share."""
-    calibration, images = made_up(SIZE, configuration(SIZE, 1.0))
+    calibration, images = random_calibration(SIZE, configuration(SIZE, 1.0))
     images.tofile(folder / "frames")
     (calibration.dark + calibration.flux_dn * calibration.reference).tofile(folder / "I0")
     (calibration.reconstructor / calibration.flux_dn).tofile(folder / "R")
@@ -228,7 +229,7 @@ def _processes(
     environment = os.environ | _ONE_THREAD | {"PYTHONPATH": str(ROOT), "MILK_SHM_DIR": str(folder)}
 
     def command(role: str) -> list[str]:
-        processor = processors()[role not in _FIRST]
+        processor = processors()[role not in _FIRST_CPU_ROLES]
         return [*start, role, str(folder), *words, str(processor), str(priority)]
 
     children = {role: Child(role, command(role), folder / f"{role}.txt", environment) for role in implementation.roles}
@@ -239,7 +240,7 @@ def _processes(
             while not shared.ready_file(folder, role).exists():
                 if child.status is not None or time.monotonic() > deadline_s:
                     raise ComparisonError(f"{role} did not become ready: {child.stderr_tail()}")
-                time.sleep(_LOOK_S)
+                time.sleep(_POLL_S)
         yield children
     except BaseException:
         if implementation.program == PYRTCAO:  # streams may remain in shared memory
@@ -247,7 +248,7 @@ def _processes(
         raise
     finally:
         for child in children.values():
-            child.stop(_PATIENCE_S)
+            child.stop(_STOP_TIMEOUT_S)
 
 
 PERCENTILES = {"p50": "p50", "p99": "p99", "p99_9": "p99.9", "max": "max"}
@@ -255,10 +256,10 @@ HEADINGS = ["implementation", *PERCENTILES.values(), "without a command", "to th
 
 
 def tables(result: Result) -> list[Lines]:
-    """Tables of the latencies, of the differences within a turn, and of the implementations' other functions."""
+    """Tables of the latencies, of the differences within a turn, and of the features of the implementations."""
     runs = result["runs"]
-    does = [
-        [one.name, str(len(one.roles) or 3), one.log, one.safety, one.elsewhere]
+    features = [
+        [one.name, str(len(one.roles) or 3), one.log, one.safety, one.multi_host]
         for one in IMPLEMENTATIONS
         if one.name in runs
     ]
@@ -267,10 +268,10 @@ def tables(result: Result) -> list[Lines]:
     return [
         latencies,
         [
-            [f"{FUSED}, minus", "p50", "p99", "turns ahead in p50", "in p99"],
+            [f"{FUSED}, minus", "p50", "p99", "turns with lower p50", "turns with lower p99"],
             *(_difference(runs, name) for name in others),
         ],
-        [["implementation", "processes", "log", "safety", "other machines"], *does],
+        [["implementation", "processes", "log", "safety", "other machines"], *features],
     ]
 
 
@@ -307,18 +308,19 @@ def about(result: Result) -> str:
     lines = [f"{name}: {what}." for name, what in (DEFINITIONS | what).items()]
     lines.append(
         f"{rules['repeats']} turns of {rules['seconds']:g} s at {rules['rate_hz']:g} Hz after {rules['warm_up']} "
-        f"frames; {SIDE} x {SIDE} uint16 pixels, {MODES} modes, {ACTUATORS} actuators."
+        f"frames (lowfc: {WARM_UP_S:g} s); {SIDE} x {SIDE} uint16 pixels, {MODES} modes, {ACTUATORS} actuators."
     )
     done = [turn for turns in runs.values() for turn in turns if turn is not None]
     late, sent = (sum(turn[name] for turn in done) for name in ("sent_late", "frames"))
     lines.append(f"{late} of all {sent} frames were sent more than a period late.")
-    if off := [turn["off"] for turn in done if turn["off"] is not None]:
+    if command_errors := [turn["off"] for turn in done if turn["off"] is not None]:
         lines.append(
-            f"In the {len(off)} runs with a command for every frame, the last actuators agree with numpy's within "
-            f"{max(off):.1g} of the largest actuator; lowfc's step divides by the flux and is not compared."
+            f"In the {len(command_errors)} runs with a command for every frame, the final mirror command agrees with "
+            f"the numpy reference within {max(command_errors):.1g} of its largest actuator; lowfc is left out, because "
+            "its step also divides by the flux."
         )
     lines += [f"{name}: {why}." for name, why in result["missing"].items()]
-    lines += [f"Failed, {fault}." for fault in result["failed"]]
+    lines += [f"Failed run of {fault}." for fault in result["failed"]]
     priority = result["priority"]
     scheduling = f"SCHED_FIFO {priority} for all" if priority else "the normal class for all: SCHED_FIFO is refused"
     versions = ", ".join(f"{name} {version}" for name, version in result["versions"].items())

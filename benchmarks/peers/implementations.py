@@ -38,7 +38,7 @@ class Implementation:
     what: str
     log: str
     safety: str
-    elsewhere: str
+    multi_host: str
     roles: tuple[str, ...] = ()
     program: str = ""
     kernel: str = ""
@@ -56,7 +56,7 @@ def _lowfc(kernel: str) -> Implementation:
         log="every frame, command, mirror state and step is published for a recorder; bit-exact replay",
         safety="late, dark, saturated, identical and missing frames refused or bridged; limits of mode, stroke, slew "
         "and neighbours, in the mirror too; command timeout",
-        elsewhere="yes, mutual TLS",
+        multi_host="yes, mutual TLS",
         kernel=kernel,
     )
 

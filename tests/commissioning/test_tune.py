@@ -27,7 +27,7 @@ from lowfc.programs.commissioning.tune.data import Telemetry, of_log, of_run
 from lowfc.programs.commissioning.tune.figures import result_of, tuned
 from tests.support.in_process_loop import InProcessLoop
 from tests.support.loops import lowfc
-from tests.support.report_log import Night
+from tests.support.report_log import SyntheticLog
 from tests.support.theory import LAWS
 from tests.support.toy import NOLL, PERIOD_NS, frame_sequence
 
@@ -45,7 +45,7 @@ def tune(*words: object) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    night = Night()
+    night = SyntheticLog()
     night.request("close")
     night.frames(4000)
     return night.write(tmp_path_factory.mktemp("night") / "night.mcap")
@@ -81,7 +81,7 @@ def test_the_command_writes_the_law_and_draws_it(log: Path, telemetry: Telemetry
 
 def test_probe_sequences_affect_neither_the_tuning_nor_the_delay(tmp_path: Path) -> None:
     """During a probe sequence on the mirror, the true wavefront does not follow the loop's commands alone."""
-    night = Night()
+    night = SyntheticLog()
     night.request("close")
     night.frames(1000)
     shape = night.calibration.modes_to_actuators[:, 0]
@@ -96,7 +96,7 @@ def test_probe_sequences_affect_neither_the_tuning_nor_the_delay(tmp_path: Path)
 
 
 def test_an_open_loop_with_much_tilt_is_flagged(tmp_path: Path) -> None:
-    night = Night()
+    night = SyntheticLog()
     night.request("open")
     night.frames(3000)
     path = night.write(tmp_path / "open.mcap")
@@ -248,7 +248,7 @@ def test_the_previous_law_is_restored_without_an_answer_or_the_error_says_that_i
 
 
 def test_a_log_that_is_too_short_is_refused(tmp_path: Path) -> None:
-    night = Night()
+    night = SyntheticLog()
     night.request("close")
     night.frames(700)
     with pytest.raises(

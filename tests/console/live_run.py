@@ -43,14 +43,14 @@ class LiveRun:
     """The run.
 
     Attributes:
-        asked: requests as published by the controller, without those that a console sends at its start.
+        requests: requests as published by the controller, without those that a console sends at its start.
         recorded: names of the requests to the recorder.
         flux: flux of the star over that of the calibration.
     """
 
     def __init__(self, folder: Path) -> None:
         self.hub, self.clock = MemoryHub(), HostClock()
-        self.asked: list[wire.Request] = []
+        self.requests: list[wire.Request] = []
         self.recorded: list[str] = []
         self.flux = 1.0
         monitor = self.bus("monitor")
@@ -78,7 +78,7 @@ class LiveRun:
     def _add_request(self, sample: Sample) -> None:
         request = wire.Request.FromString(sample.payload)
         if request.name != "configuration":
-            self.asked.append(request)
+            self.requests.append(request)
 
     def bus(self, role: str) -> MemoryBus:
         return MemoryBus(self.hub, role, self.clock)

@@ -1,4 +1,4 @@
-"""The console: every button by its key against a running loop, its display, and the loss of the connection."""
+"""The console with a running loop: the key of every button, the display, and a lost connection."""
 
 import asyncio
 import contextlib
@@ -24,7 +24,7 @@ from tests.support.stage import Stage
 from tests.support.toy import GRID, NOLL, calibration
 
 LAW = of_blocks([integrator_block(0.2, 0.01, "pol", 1.0)] * 3, "pol", "leaky", NOLL, 1.0, 50.0)
-PATIENCE_S = 15.0
+TIMEOUT_S = 15.0
 
 
 @pytest.fixture(scope="module")
@@ -69,11 +69,11 @@ class Screen:
         return str(self.app.screen_stack[0].query_one(f"#{name}").render())
 
     async def until(self, condition: Callable[[], object]) -> None:
-        for _ in range(round(PATIENCE_S / 0.01)):
+        for _ in range(round(TIMEOUT_S / 0.01)):
             if condition():
                 return
             await self.pilot.pause(0.01)
-        raise AssertionError(f"waited in vain; the answer is {self.text('answer')!r}")
+        raise AssertionError(f"condition not met in {TIMEOUT_S:g} s; the console shows {self.text('answer')!r}")
 
     async def fill(self, *values: str) -> None:
         await self.until(lambda: len(self.app.screen_stack) == 2 and self.app.focused is not None)
@@ -134,13 +134,13 @@ def test_the_key_of_every_button_sends_its_request(
     async def scenario(screen: Screen) -> None:
         for name in ORDER:
             typed, expected = BUTTONS[name]
-            before = len(run.asked)
+            before = len(run.requests)
             await screen.pilot.press(EVERY[name].key)
             if typed:
                 await screen.fill(*typed)
             elif EVERY[name].confirm:
                 await screen.until(lambda: len(screen.app.screen_stack) == 2)
-                assert len(run.asked) == before, "no request before the question is answered"
+                assert len(run.requests) == before, "no request before the question is answered"
                 await screen.pilot.press("enter")
             await screen.until(
                 lambda name=name: (
@@ -148,12 +148,12 @@ def test_the_key_of_every_button_sends_its_request(
                 )
             )
             if expected:
-                request = run.asked[-1]
+                request = run.requests[-1]
                 assert request.accepted, request.reply
                 assert {field: getattr(request, field) for field in expected} == expected
                 assert request.requester.endswith(f"(process {os.getpid()})")
             assert len(screen.app.screen_stack) == 1, "a form closes when its request is accepted"
-        laws = [request for request in run.asked if request.name == "law"]
+        laws = [request for request in run.requests if request.name == "law"]
         assert [one.HasField("law") for one in laws] == [True, False]
         assert run.recorded == ["stop", "start", "stop"]
         await screen.until(lambda: "pause (" in screen.text("log"))
@@ -166,14 +166,14 @@ def test_the_key_of_every_button_sends_its_request(
     operate(run, scenario)
 
 
-def test_the_reason_of_a_refusal_is_in_the_form_and_its_button_turns_red(run: LiveRun) -> None:
+def test_a_refused_request_shows_its_reason_and_turns_its_button_red(run: LiveRun) -> None:
     async def scenario(screen: Screen) -> None:
         await screen.pilot.press("g")
         await screen.fill("much", "2")
         await screen.until(lambda: "write numbers" in str(screen.app.screen.query_one("#refusal").render()))
         await screen.fill("9", "2")
         await screen.until(lambda: "becomes unstable" in str(screen.app.screen.query_one("#refusal").render()))
-        assert not run.asked[-1].accepted
+        assert not run.requests[-1].accepted
         assert "becomes unstable" in screen.text("answer")
         await screen.pilot.press("escape")
         await screen.until(lambda: len(screen.app.screen_stack) == 1)
@@ -189,47 +189,47 @@ def test_the_reason_of_a_refusal_is_in_the_form_and_its_button_turns_red(run: Li
 def test_safe_is_requested_by_s_by_its_button_and_by_f12_in_a_form(run: LiveRun) -> None:
     async def scenario(screen: Screen) -> None:
         for press in (lambda: screen.pilot.press("S"), lambda: screen.pilot.click("#safe")):
-            before = len(run.asked)
+            before = len(run.requests)
             await press()
-            await screen.until(lambda before=before: [one.name for one in run.asked[before:]] == ["safe"])
+            await screen.until(lambda before=before: [one.name for one in run.requests[before:]] == ["safe"])
         await screen.pilot.press("n")
         await screen.until(lambda: len(screen.app.screen_stack) == 2)
-        before = len(run.asked)
+        before = len(run.requests)
         await screen.pilot.press("s", "f12")
-        await screen.until(lambda: [one.name for one in run.asked[before:]] == ["safe"])
+        await screen.until(lambda: [one.name for one in run.requests[before:]] == ["safe"])
         await screen.until(lambda: screen.app.screen.query_one("Input").value == "s")
         await screen.pilot.press("escape", "k", "enter")
-        await screen.until(lambda: run.asked[-1].name == "clear")
+        await screen.until(lambda: run.requests[-1].name == "clear")
         await screen.pilot.click("#close")
-        await screen.until(lambda: run.asked[-1].name == "close")
+        await screen.until(lambda: run.requests[-1].name == "close")
 
     operate(run, scenario)
 
 
 def test_a_gain_knob_scales_the_gains_of_all_modes_or_of_one_radial_order(run: LiveRun) -> None:
     def gain() -> list[float]:
-        return list(run.asked[-1].values) if run.asked[-1].name == "gain" else []
+        return list(run.requests[-1].values) if run.requests[-1].name == "gain" else []
 
     async def scenario(screen: Screen) -> None:
         await screen.pilot.press("g")
         await screen.fill("0.5 0.5 0.05", "2-4")
         await screen.until(lambda: "0.05-0.5" in screen.text("gains"))
-        before = len(run.asked)
+        before = len(run.requests)
         await screen.pilot.press(*["right"] * 4)
         await screen.until(lambda: gain() == pytest.approx([0.7, 0.7, 0.07]))
-        turned = [one.values[0] for one in run.asked[before:]]
+        turned = [one.values[0] for one in run.requests[before:]]
         assert turned == sorted(turned), "requested in the order of the keys"
         await screen.until(lambda: "0.07-0.7" in screen.text("gains"))
         await screen.pilot.press("down", "left")
         await screen.until(lambda: gain() == pytest.approx([0.65, 0.65]))
-        assert list(run.asked[-1].modes) == [2, 3]
+        assert list(run.requests[-1].modes) == [2, 3]
         await screen.pilot.press("down", "left")
         await screen.until(lambda: gain() == pytest.approx([0.06]))
         await screen.until(lambda: "0.06-0.65" in screen.text("gains"))
         await screen.pilot.click("#gains", offset=(11 + 8, 0))
         await screen.until(lambda: gain() == pytest.approx([1.5, 1.5, 0.1385]))
         await screen.pilot.press("u")
-        await screen.until(lambda: any(one.text == "auto" and one.accepted for one in run.asked))
+        await screen.until(lambda: any(one.text == "auto" and one.accepted for one in run.requests))
         await screen.until(lambda: "auto" in screen.text("gains"))
         await screen.pilot.press("g")  # automatic gains would send requests during the next tests
         await screen.fill("0.5 0.5 0.05", "2-4")
@@ -240,11 +240,11 @@ def test_a_gain_knob_scales_the_gains_of_all_modes_or_of_one_radial_order(run: L
 
 def test_keys_typed_while_a_form_opens_are_entered_in_it(run: LiveRun) -> None:
     async def scenario(screen: Screen) -> None:
-        before = len(run.asked)
+        before = len(run.requests)
         for key in ("n", "o", "s", "escape", "g", "0", ".", "2", "tab", "2", "tab", "shift+tab", "enter"):
             screen.app.post_message(Key(key, key if len(key) == 1 else None))
-        await screen.until(lambda: len(run.asked) > before)
-        (gain,) = run.asked[before:]
+        await screen.until(lambda: len(run.requests) > before)
+        (gain,) = run.requests[before:]
         assert (gain.name, list(gain.values), list(gain.modes)) == ("gain", [pytest.approx(0.2)], [2])
 
     operate(run, scenario)
@@ -265,7 +265,7 @@ def test_a_repeated_event_has_one_line_with_its_count() -> None:
     assert len(history.last(5).plain.splitlines()) == 4, "a repetition after 10 s has its own line"
 
 
-def test_sentences_have_keys_in_place_of_commands_and_ranges_in_place_of_lists() -> None:
+def test_texts_name_keys_for_commands_and_ranges_for_long_lists() -> None:
     from lowfc.programs.console.phrases import phrased
 
     assert phrased("`lowfc ctl clear` first, when it is safe") == "clear (key k) first, when it is safe"

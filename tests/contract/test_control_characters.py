@@ -20,7 +20,7 @@ from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from tests.support import report_log
 from tests.support.loops import lowfc
-from tests.support.report_log import Night
+from tests.support.report_log import SyntheticLog
 from tests.support.stage import Tape
 
 HOSTILE = "clouds\x1b[2J\x07 \x9b31mred \u202egnorts \u2028 caf\u00e9 5\u2009nm\r\nerror: fine"
@@ -79,7 +79,7 @@ def test_configuration_errors_are_escaped() -> None:
 def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A log whose recorder did not escape anything."""
     monkeypatch.setattr(report_log, "METADATA", {"lowfc": {"host": HOSTILE, "numpy": HOSTILE}})
-    night = Night()
+    night = SyntheticLog()
     night.frames(200)
     night.put(EVENT, Log(level=3, name=HOSTILE, message=HOSTILE))  # type: ignore[arg-type]
     night.put(EVENT, Log(level=2, name="controller", message=f"MODE_CHANGED loop open -> closed: {HOSTILE}"))  # type: ignore[arg-type]

@@ -15,7 +15,7 @@ from lowfc.programs.commissioning.acceptance.probe import ANNOUNCEMENT
 from lowfc.programs.view.recorded import draw_logs
 from lowfc.programs.view.renderer import Renderer
 from tests.support.loops import lowfc
-from tests.support.report_log import Night
+from tests.support.report_log import SyntheticLog
 from tests.support.stage import Tape
 
 OTHER = "[camera]\nrate_hz = 300.0\nshutter = 'rolling'\n[control]\nleak = 7.0\n[weather]\nwind = 3\n"
@@ -77,7 +77,7 @@ def test_the_number_of_remarks_is_limited() -> None:
 def test_an_unreadable_configuration_is_a_remark(tmp_path: Path, toml: str) -> None:
     with pytest.raises(ConfigurationError, match="not a readable TOML file"):
         recorded(toml.encode())
-    night = Night()
+    night = SyntheticLog()
     night.frames(5)
     log = night.write(tmp_path / "night.mcap", toml=toml)
     history = read_history(LogReader(log))
@@ -87,9 +87,9 @@ def test_an_unreadable_configuration_is_a_remark(tmp_path: Path, toml: str) -> N
 
 
 @pytest.fixture(scope="module")
-def night() -> Night:
+def night() -> SyntheticLog:
     """A loop that was open, then closed, with an acceptance test of its noise."""
-    night_ = Night()
+    night_ = SyntheticLog()
     for loop, frames in (("open", 500), ("closed", 1200)):
         night_.request({"open": "open", "closed": "close"}[loop])
         night_.frames(200)
@@ -99,7 +99,7 @@ def night() -> Night:
 
 
 @pytest.fixture
-def log(tmp_path: Path, night: Night) -> Path:
+def log(tmp_path: Path, night: SyntheticLog) -> Path:
     return night.write(tmp_path / "night.mcap", toml=OTHER)
 
 
@@ -147,7 +147,7 @@ def test_a_replay_does_not_depend_on_the_configuration(log: Path) -> None:
 
 @pytest.mark.parametrize(("toml", "rate_hz"), [(OTHER, 300.0), ("[camera", Configuration().camera.rate_hz)])
 def test_a_view_uses_the_recorded_or_the_default_configuration(
-    tmp_path: Path, night: Night, toml: str, rate_hz: float
+    tmp_path: Path, night: SyntheticLog, toml: str, rate_hz: float
 ) -> None:
     log, tape = night.write(tmp_path / "night.mcap", toml=toml), Tape()
     used: list[Configuration] = []
@@ -157,7 +157,7 @@ def test_a_view_uses_the_recorded_or_the_default_configuration(
     assert toml != OTHER or drawn.remarks == attached_configuration_of(log)
 
 
-def test_an_acceptance_test_needs_a_configuration(tmp_path: Path, night: Night) -> None:
+def test_an_acceptance_test_needs_a_configuration(tmp_path: Path, night: SyntheticLog) -> None:
     log = night.write(tmp_path / "night.mcap", toml="[camera")
     done = lowfc("acceptance", "noise-floor", log)
     assert isinstance(done.exception, DataFileError)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.sizes import Size, configuration, made_up
+from benchmarks.sizes import Size, configuration, random_calibration
 from lowfc.adapters.process import compiled
 from lowfc.adapters.process.latch import Latch
 from lowfc.arrays import Pixels, Single
@@ -224,7 +224,7 @@ def test_the_kernel_in_use_is_an_event_and_numpy_without_numba(monkeypatch: pyte
 
 def test_several_threads_give_the_same_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
     size = Size(side=100, modes=13, mirror_side=8)
-    calibration, frames = made_up(size, configuration(size, RATE_HZ))
+    calibration, frames = random_calibration(size, configuration(size, RATE_HZ))
     reference, pixels = calibration.reconstructor @ calibration.reference, frames[0].ravel()
     reference_loop = Tables.of(compiled.kernel(FUSED), calibration, reference)
     assert reference_loop is not None

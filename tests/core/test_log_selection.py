@@ -35,7 +35,7 @@ from lowfc.programs.logs.what_if.options import WhatIf, requested
 from lowfc.programs.logs.what_if.run import LoggedRun
 from tests.support.loops import lowfc
 from tests.support.recording import Bench, bodies_of, logged, put
-from tests.support.report_log import Night
+from tests.support.report_log import SyntheticLog
 
 pytestmark = pytest.mark.usefixtures("own_runtime")
 
@@ -44,7 +44,7 @@ EVERY, FRAMES = 10, 1200
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    night = Night()
+    night = SyntheticLog()
     night.request("close")
     night.frames(FRAMES)
     night.health("camera", topics=[wire.TopicCount(topic=FRAME.key, published=FRAMES)], state="stopped")

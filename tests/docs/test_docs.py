@@ -1,4 +1,4 @@
-"""Every command in the documentation is run, and every link leads to a file."""
+"""Every documented command is run here, or named as tested elsewhere; every link leads to a file."""
 
 import json
 import re
@@ -18,8 +18,8 @@ from tests.support.viewers import on_screen
 
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
-# Commands that CI itself or another test runs, and where.
 ROUTE = "rerun rrd route --application-id $(basename $log .mcap) deploy/layouts/log.rbl | rerun $log -"
+# Commands that CI itself or another test runs, and where.
 ELSEWHERE = {
     "make sim-loop": ".ci/run",
     "make test": ".ci/run",
@@ -30,7 +30,7 @@ ELSEWHERE = {
     "rerun $(ls -t logs/*.mcap | head -1)": "tests/e2e/test_rerun_viewer.py",
     ROUTE: "tests/design/test_layout_files.py",
 }
-SHORTER = {
+SHORTENED_OPTIONS = {
     "--duration 20": "--duration 2",
     "--duration 5": "--duration 0.5",
     "--seconds 2": "--seconds 0.5",
@@ -48,8 +48,8 @@ def commands(document: Path) -> list[str]:
 
 
 def run(folder: Path, line: str) -> str:
-    """Run a documented command, shortened by `SHORTER`."""
-    for long, short in SHORTER.items():
+    """Run a documented command, shortened by `SHORTENED_OPTIONS`."""
+    for long, short in SHORTENED_OPTIONS.items():
         line = line.replace(long, short)
     return command(folder, line)
 
@@ -62,13 +62,13 @@ def test_every_command_in_the_documentation_is_tested() -> None:
         if document.parent != tutorials.PAGES or not tutorials.followed_here(line)
     ]
     assert len(found) > 15
-    tested = {*ELSEWHERE, LOOP, *LOGS, *REQUESTS, *FILES, *BY_HAND, *SESSION, *BENCH, *VALIDATE, *DESIGN, *LOOKING}
+    tested = {*ELSEWHERE, LOOP, *LOGS, *REQUESTS, *FILES, *BY_HAND, *SESSION, *BENCH, *VALIDATE, *DESIGN, *VIEW_FILES}
     tested |= {
         *tutorials.LIVE,
         tutorials.CHAOS,
         tutorials.BASLER,
-        FEWER,
-        *STAYING,
+        RECORD_SELECTED,
+        *UNTIL_INTERRUPTED,
         *DOCUMENTED,
         *OPERATING,
         *BENCH_DAY,
@@ -97,7 +97,7 @@ DESIGN = (
 )
 REQUESTS = (
     "lowfc ctl status",
-    "lowfc ctl gain 0.3 --mode 2 --mode 3",
+    "lowfc ctl gain 0.3 --modes 2,3",
     "lowfc ctl gain auto",
     "lowfc ctl open",
     "lowfc ctl close",
@@ -110,11 +110,11 @@ FILES = (
     "lowfc config check lowfc.toml",
     "lowfc sim-loop --config lowfc.toml --duration 5",
 )
-FEWER = "lowfc record --run bench --every 10 --topics lowfc/camera/frame --topics 'lowfc/mirror/*/state'"
+RECORD_SELECTED = "lowfc record --run bench --every 10 --topics lowfc/camera/frame --topics 'lowfc/mirror/*/state'"
 BY_HAND = ("sim-camera --run bench", "sim-dm --run bench", "lowfc controller --run bench", "lowfc record --run bench")
 SESSION = ("lowfc config zenoh --run bench --role camera",)
 BENCH = ("lowfc bench twin", "lowfc bench record --rate 1000 --seconds 2")
-STAYING = (
+UNTIL_INTERRUPTED = (
     "lowfc sim-loop --web",
     "lowfc view",
     "lowfc view --web",
@@ -122,7 +122,7 @@ STAYING = (
     "lowfc view last",
 )
 """Commands that run until Ctrl-C."""
-LOOKING = (
+VIEW_FILES = (
     "lowfc view --headless-screenshot now.png",
     "lowfc view --save night.rrd --seconds 60",
     "lowfc view last --headless-screenshot log.png --tab optics",
@@ -158,8 +158,8 @@ def test_the_requests(tmp_path: Path, own_runtime: Path) -> None:
         )
         printed = [run(tmp_path, line) for line in REQUESTS]
     finally:
-        out, complaints = interrupt(loop)
-    assert loop.returncode == 0, complaints
+        out, stderr = interrupt(loop)
+    assert loop.returncode == 0, stderr
     assert printed[0].startswith("closed · residual ")
     assert printed[1].startswith("gain is now 0.3 0.3 0.0"), "only tip and tilt"
     assert printed[2].startswith("the gain of Z2"), "all modes"
@@ -171,15 +171,15 @@ def test_the_requests(tmp_path: Path, own_runtime: Path) -> None:
 
 @pytest.mark.exclusive
 @pytest.mark.slow
-@pytest.mark.parametrize("recorder", [BY_HAND[3], FEWER])
+@pytest.mark.parametrize("recorder", [BY_HAND[3], RECORD_SELECTED])
 def test_the_processes_started_separately(tmp_path: Path, recorder: str) -> None:
-    with going_on(tmp_path, *BY_HAND[:3], recorder) as complaints:
+    with going_on(tmp_path, *BY_HAND[:3], recorder) as all_stderr:
         status = [sys.executable, "-m", "lowfc", "ctl", "status", "--run", "bench"]
         until(lambda: subprocess.run(status, cwd=tmp_path, capture_output=True, check=False).returncode == 0, 120)
         until(lambda: recorded_bytes(tmp_path) > 4e6)
         session = json.loads(run(tmp_path, SESSION[0]))
         assert session["listen"]["endpoints"][0].startswith("tcp/127.0.0.1:")
-    for name, stderr in zip(("camera", "mirror-dm", "controller", "recorder"), complaints, strict=True):
+    for name, stderr in zip(("camera", "mirror-dm", "controller", "recorder"), all_stderr, strict=True):
         assert f"{name}: ready (run bench)\n" in stderr
     assert len(list((tmp_path / "logs").glob("*.mcap"))) == 1
 
@@ -194,19 +194,19 @@ def test_the_bench(tmp_path: Path) -> None:
 @pytest.mark.slow
 @on_screen
 def test_the_views(tmp_path: Path) -> None:
-    loop = start(tmp_path, *STAYING[0].split()[1:], "--rate", "100")
+    loop = start(tmp_path, *UNTIL_INTERRUPTED[0].split()[1:], "--rate", "100")
     try:
         until(lambda: recorded_bytes(tmp_path) > 4e6)
-        for line in STAYING[1:4]:
+        for line in UNTIL_INTERRUPTED[1:4]:
             look(tmp_path, line)
-        for line in LOOKING[:2]:
+        for line in VIEW_FILES[:2]:
             run(tmp_path, line.replace("--seconds 60", "--seconds 1").replace("now.png", "now.png --seconds 2"))
     finally:
-        _, complaints = interrupt(loop)
-    assert loop.returncode == 0, complaints
-    assert "http://127.0.0.1:" in complaints
-    look(tmp_path, STAYING[4])
-    run(tmp_path, LOOKING[2])
+        _, stderr = interrupt(loop)
+    assert loop.returncode == 0, stderr
+    assert "http://127.0.0.1:" in stderr
+    look(tmp_path, UNTIL_INTERRUPTED[4])
+    run(tmp_path, VIEW_FILES[2])
     assert {path.name for path in tmp_path.iterdir()} >= {"now.png", "night.rrd", "log.png"}
 
 
@@ -214,8 +214,8 @@ def look(folder: Path, line: str) -> None:
     """Run a view until it prints its address, then Ctrl-C."""
     process = start(folder, *line.split()[1:])
     assert "127.0.0.1" in process.stderr.readline()
-    _, complaints = interrupt(process)
-    assert process.returncode == 0, complaints
+    _, stderr = interrupt(process)
+    assert process.returncode == 0, stderr
 
 
 @pytest.mark.slow

@@ -20,9 +20,9 @@ def test_every_table_is_on_exactly_one_page():
 
 
 @pytest.mark.parametrize("name", MEASUREMENTS)
-def test_stored_measurements_are_of_the_present_commands(name):
+def test_stored_measurements_were_made_by_the_current_commands(name):
     figures, (commands, *_) = measured(name), MEASUREMENTS[name]
-    if MEASUREMENTS[name].signed:
+    if MEASUREMENTS[name].has_provenance:
         command = figures.get("command", figures.get("command_line"))
         assert command is None or command.replace("benchmarks.", "benchmarks ").startswith(commands[0])
     else:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.support.loops import output_of
-from tests.support.report_log import Night
+from tests.support.report_log import SyntheticLog
 from tests.support.viewers import Page, browser, needs_chromium, pixels
 
 PICTURES = {"overview", "intervals", "residual", "spectra", "budget", "light", "timeline", "stroke"}
@@ -53,7 +53,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def figures(folder: Path) -> dict[str, Any]:
     """Figures of a run with a request and a warning in it, from the command that writes the page too."""
-    night = Night()
+    night = SyntheticLog()
     night.request("open")
     night.frames(150)
     night.request("close")

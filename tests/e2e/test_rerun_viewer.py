@@ -19,7 +19,7 @@ from rerun.chunk import McapReader
 from lowfc.adapters.viewer.rerun_viewer import RerunViewer, Show, ViewerError
 from lowfc.contract.messages import SURFACE, RawImage, image, topic_of, wire
 from tests.support.loops import payloads, until
-from tests.support.report_log import Night
+from tests.support.report_log import SyntheticLog
 from tests.support.viewers import complaints, listening, on_screen, pixels, share_of
 
 ORANGE, BLUE = (214, 110, 20), (20, 90, 214)
@@ -165,7 +165,7 @@ def _runs(pid: int) -> bool:
 @pytest.fixture(scope="module")
 def night(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A log with messages of most topics."""
-    made = Night()
+    made = SyntheticLog()
     made.frames(100)
     made.put(SURFACE, image(np.random.default_rng(1).normal(size=(6, 9)).astype(np.float32), made.now_ns, "dm"))
     made.health("recorder", state="running")

@@ -31,8 +31,8 @@ on_command_timeout = "hold"
 """
 
 
-class Bench:
-    """Processes of one run, and what is heard of them."""
+class ManualRun:
+    """Processes of one run, and their received messages."""
 
     def __init__(self, folder: Path) -> None:
         self.run_id = new_run_id()
@@ -69,8 +69,8 @@ class Bench:
         os.kill(self.running[name].pid, signal.SIGKILL)
         self.running.pop(name).wait()
 
-    def settled(self) -> None:
-        """Twenty good frames in a row, from now on, with the loop closed and the disturbance held."""
+    def wait_until_settled(self) -> None:
+        """Wait for more than 20 consecutive good frames: loop closed, no reason, error below 3 nm."""
         self.closed = 0
         until(lambda: self.closed > 20)
 
@@ -97,9 +97,9 @@ ORDERS = list(itertools.permutations(["camera", "controller", "mirror"]))
 
 
 @pytest.fixture(scope="module", params=[ORDERS[0], *(pytest.param(one, marks=pytest.mark.slow) for one in ORDERS[1:])])
-def bench(folder: Path, request: pytest.FixtureRequest) -> Iterator[Bench]:
-    """Each is up before the next is started, so that every one of them is first and last once."""
-    made = Bench(folder)
+def bench(folder: Path, request: pytest.FixtureRequest) -> Iterator[ManualRun]:
+    """Each process is up before the next starts; the parameters are all start orders."""
+    made = ManualRun(folder)
     for name in request.param:
         made.start(name)
         until(lambda: all(_alive(made, process) for process in made.running))
@@ -107,19 +107,19 @@ def bench(folder: Path, request: pytest.FixtureRequest) -> Iterator[Bench]:
     made.stop()
 
 
-def test_the_loop_closes_in_any_start_order(bench: Bench) -> None:
-    bench.settled()
+def test_the_loop_closes_in_any_start_order(bench: ManualRun) -> None:
+    bench.wait_until_settled()
 
 
-def test_the_loop_recovers_from_kill_and_restart_of_each_process(bench: Bench) -> None:
-    bench.settled()
+def test_the_loop_recovers_from_kill_and_restart_of_each_process(bench: ManualRun) -> None:
+    bench.wait_until_settled()
     for name in ("camera", "controller", "mirror"):
         before = bench.shapes[-1]
         bench.kill(name)
         bench.shapes.clear()
         bench.start(name)
         until(lambda: len(bench.shapes) > 20)
-        bench.settled()
+        bench.wait_until_settled()
         shapes = np.array(bench.shapes.copy())
         moves = np.abs(np.diff(shapes, axis=0)).max()
         assert moves < 100, "no jump beyond the controller's slew limit"
@@ -128,13 +128,13 @@ def test_the_loop_recovers_from_kill_and_restart_of_each_process(bench: Bench) -
             assert np.abs(shapes - before).max() < 12
 
 
-def _alive(bench: Bench, name: str) -> bool:
+def _alive(bench: ManualRun, name: str) -> bool:
     process = {"mirror": "mirror-dm"}.get(name, name)
     return bool(bench.bus.get(f"lowfc/health/{process}", timeout_s=0.1))
 
 
-def test_the_controller_holds_without_a_mirror_and_closes_after_its_restart(bench: Bench) -> None:
-    bench.settled()
+def test_the_controller_holds_while_the_mirror_is_dead_and_closes_when_it_is_back(bench: ManualRun) -> None:
+    bench.wait_until_settled()
     before = bench.shapes[-1]
     bench.kill("mirror")
     with Client(bench.run_id) as loop:
@@ -146,5 +146,5 @@ def test_the_controller_holds_without_a_mirror_and_closes_after_its_restart(benc
         bench.start("mirror")
         until(lambda: not loop.ask("status").state.mirror_fault)
         loop.ask("close")
-    bench.settled()
+    bench.wait_until_settled()
     np.testing.assert_allclose(bench.shapes[-1], before, atol=5)

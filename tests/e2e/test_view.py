@@ -29,7 +29,7 @@ from lowfc.programs.view.panels.tiles import FILL
 from lowfc.programs.view.target import Target
 from lowfc.programs.view.verdicts.tile import Level
 from tests.support.loops import LOWFC, children, interrupt, run, start, until
-from tests.support.report_log import Night
+from tests.support.report_log import SyntheticLog
 from tests.support.viewers import browser_screenshot, complaints, needs_chromium, on_screen, pixels, share_of
 
 MIN_SHADES = 8  # of a panel with something in it; an empty one has its ground and the letters of its title
@@ -112,7 +112,7 @@ def test_the_loop_continues_when_its_view_is_killed(tmp_path: Path) -> None:
 
 
 def test_a_log_without_an_end_is_saved_as_a_valid_rrd_file(tmp_path: Path) -> None:
-    night = Night()
+    night = SyntheticLog()
     night.frames(300)
     log = night.write(tmp_path / "cut.mcap", finish=False)
     done = run(tmp_path, "view", str(log), "--save", "cut.rrd", "--json")

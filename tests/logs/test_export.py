@@ -37,7 +37,7 @@ from lowfc.contract.messages import (
 from lowfc.programs.logs.export.command import Format, export_log, render
 from tests.support import toy
 from tests.support.loops import lowfc
-from tests.support.report_log import METADATA, Night
+from tests.support.report_log import METADATA, SyntheticLog
 
 STEPS, REFUSED, WITHOUT_COMMAND, WITHOUT_TRUTH = 30, 4, 7, 9
 MODES, ACTUATORS = len(toy.NOLL), toy.GRID[0] * toy.GRID[1]
@@ -46,9 +46,9 @@ GOOD = np.arange(toy.SHAPE[0] * toy.SHAPE[1]) != 10
 CALIBRATED = identified(replace(toy.calibration(), good=GOOD.astype(np.float32)))
 
 
-def a_night() -> Night:
+def a_night() -> SyntheticLog:
     """An open and 29 closed steps, one of them refused; a command and a truth are missing; the camera is restarted."""
-    night = Night(calibration=CALIBRATED)
+    night = SyntheticLog(calibration=CALIBRATED)
     night.request("open")
     night.frames(1)
     night.request("close")
@@ -63,7 +63,7 @@ def a_night() -> Night:
     return night
 
 
-def payloads_of(night: Night, topic: Topic) -> list[bytes]:
+def payloads_of(night: SyntheticLog, topic: Topic) -> list[bytes]:
     return [sample.payload for sample in night.samples if topic.matches(sample.key)]
 
 

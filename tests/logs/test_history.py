@@ -10,21 +10,21 @@ import pytest
 from lowfc.adapters.logs.history import History, read_history
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.contract.messages import EVENT, MIRROR_STATE, STEP, TIMING, TRUTH, Message, Topic, wire
-from tests.support.report_log import Night
+from tests.support.report_log import SyntheticLog
 
 STEPS = 20
 
 
-def change_one(night: Night, topic: Topic, change: Callable[[Any], object]) -> None:
+def change_one(night: SyntheticLog, topic: Topic, change: Callable[[Any], object]) -> None:
     """Change one message of a topic, the tenth from the end."""
-    number = [place for place, sample in enumerate(night.samples) if topic.matches(sample.key)][-10]
-    sample = night.samples[number]
+    position = [index for index, sample in enumerate(night.samples) if topic.matches(sample.key)][-10]
+    sample = night.samples[position]
     message: Message = topic.message.FromString(sample.payload)
     change(message)
-    night.samples[number] = sample._replace(payload=message.SerializeToString())
+    night.samples[position] = sample._replace(payload=message.SerializeToString())
 
 
-def history_of(night: Night, path: Path) -> History:
+def history_of(night: SyntheticLog, path: Path) -> History:
     return read_history(LogReader(night.write(path)))
 
 
@@ -42,7 +42,7 @@ def history_of(night: Night, path: Path) -> History:
     ],
 )
 def test_an_invalid_step_is_left_out_of_every_column(tmp_path: Path, change: Callable[[Any], object]) -> None:
-    night = Night()
+    night = SyntheticLog()
     night.frames(STEPS)
     change_one(night, STEP, change)
     steps = (history := history_of(night, tmp_path / "x.mcap")).steps
@@ -53,7 +53,7 @@ def test_an_invalid_step_is_left_out_of_every_column(tmp_path: Path, change: Cal
 
 
 def test_a_repeated_reason_sets_one_bit(tmp_path: Path) -> None:
-    night = Night()
+    night = SyntheticLog()
     night.frames(STEPS)
     change_one(night, STEP, lambda step: step.reasons.extend([62, 62, 5]))
     history = history_of(night, tmp_path / "x.mcap")
@@ -74,7 +74,7 @@ def test_a_repeated_reason_sets_one_bit(tmp_path: Path) -> None:
 def test_an_invalid_message_is_left_out_of_every_column(
     tmp_path: Path, topic: Topic, change: Callable[[Any], object]
 ) -> None:
-    night = Night()
+    night = SyntheticLog()
     night.frames(STEPS)
     before = history_of(night, tmp_path / "before.mcap")
     change_one(night, topic, change)
@@ -90,7 +90,7 @@ def test_an_invalid_message_is_left_out_of_every_column(
 
 
 def test_a_message_with_an_impossible_time_is_left_out(tmp_path: Path) -> None:
-    night = Night()
+    night = SyntheticLog()
     night.frames(STEPS)
     night.put(EVENT, wire.Tick(), late_ns=(1 << 63) - night.now_ns)
     history = history_of(night, tmp_path / "x.mcap")

@@ -30,14 +30,15 @@ def event(name: str, process: str, start_s: int, number: int, **details: object)
 
 @pytest.fixture
 def log(tmp_path: Path) -> Path:
-    """Ten seconds: a camera that restarts, frames 5 to 7 and the last step lost, two processes with events."""
+    """Ten seconds: camera restart, frames 5 to 7 lost after each start, last step lost, events from two processes."""
     writer = LogWriter(
         tmp_path / "night.mcap",
         START_NS,
         {"lowfc": {"lowfc": "0.1.0", "host": "bench", "run": "night", "seed": "3"}},
         [Attachment("config.toml", "application/toml", b"[loop]\n")],
     )
-    writer.write(sample(CALIBRATION.key, wire.Calibration(id="c1"), 0, START_NS - 3600 * SECOND))  # requested
+    # Calibration loaded an hour before: its time does not extend the log.
+    writer.write(sample(CALIBRATION.key, wire.Calibration(id="c1"), 0, START_NS - 3600 * SECOND))
     frames = [n for n in range(50) if n not in (5, 6, 7)]
     for number in range(101):
         now_ns = START_NS + number * SECOND // 10
@@ -64,7 +65,7 @@ def test_info_reports_what_was_written(log: Path) -> None:
     assert done.exit_code == 0, done.output
     found = json.loads(done.stdout)
     frame = found["topics"].pop(FRAME.key)
-    assert not any(line["restarts"] for line in found["topics"].values()), "starts are counted by publisher"
+    assert not any(line["restarts"] for line in found["topics"].values()), "only the camera restarted"
     assert {key: line["messages"] for key, line in found.pop("topics").items()} == {
         CALIBRATION.key: 1,
         CONTROLLER_STATE.key: 3,
@@ -160,7 +161,7 @@ def test_a_log_that_is_finished_while_it_is_read_is_not_called_truncated(tmp_pat
     log = LogWriter(tmp_path / "20270101T000000Z.mcap", START_NS, {"lowfc": {"run": "night"}})
     log.finish({})
     assert "it was finished while it was read" in no_end([log.part], finished=False)
-    assert being_recorded(log.part), "a summary is of the file as it was read"
+    assert being_recorded(log.part), "it was being recorded when the summary was read"
 
 
 def test_an_empty_log_is_summarised(tmp_path: Path) -> None:

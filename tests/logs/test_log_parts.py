@@ -20,7 +20,7 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError
 from lowfc.contract.messages import CALIBRATION, CONTROLLER_STATE, FRAME, topic_of
 from tests.support.loops import lowfc
-from tests.support.report_log import METADATA, Night
+from tests.support.report_log import METADATA, SyntheticLog
 
 FRAMES = 2200
 TOML = [Attachment("config.toml", "application/toml", Configuration().to_toml().encode())]
@@ -46,7 +46,7 @@ def recorded(folder: Path, samples: Sequence[Sample], files: int, *, finish: boo
 
 @pytest.fixture(scope="module")
 def samples() -> list[Sample]:
-    night = Night()
+    night = SyntheticLog()
     night.request("close")
     night.frames(FRAMES, lost=[100, 101])
     return night.samples
@@ -142,7 +142,7 @@ def without_files(figures: Any) -> Any:
 @pytest.fixture(scope="module")
 def ten_files_and_one(tmp_path_factory: pytest.TempPathFactory, samples: list[Sample]) -> Path:
     folder = tmp_path_factory.mktemp("recorded")
-    calibration_file.save(Night().calibration, folder / "other.fits")
+    calibration_file.save(SyntheticLog().calibration, folder / "other.fits")
     recorded(folder / "logs", samples[:9], 1)  # an older log
     recorded(folder / "logs", samples, 10)
     recorded(folder / "one", samples, 1)
@@ -177,7 +177,7 @@ ONE_BY_ONE = [["info"], ["report"], ["export", "--to", "csv", "--force"], ["reco
 @pytest.mark.usefixtures("without_drawings")
 @pytest.mark.parametrize("words", ONE_BY_ONE, ids=lambda words: words[0])
 def test_several_logs_are_processed_one_by_one(folder: Path, words: list[str]) -> None:
-    (night := Night()).frames(3)
+    (night := SyntheticLog()).frames(3)
     first, second = (str(night.write(Path(f"{name}.mcap"))) for name in "ab")
     several = lowfc(*words, first, second)
     alone = [lowfc(*words, log).stdout for log in (first, second)]

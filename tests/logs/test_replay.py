@@ -400,7 +400,7 @@ def test_frames_are_kept_within_a_limit_of_memory(monkeypatch: pytest.MonkeyPatc
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    made = report_log.Night()
+    made = report_log.SyntheticLog()
     made.frames(STEPS)
     return made.write(tmp_path_factory.mktemp("night") / "night.mcap")
 
@@ -433,7 +433,7 @@ def test_a_damaged_log_is_replayed_except_for_the_damage(log: Path, tmp_path: Pa
 
 
 def test_a_forged_command_and_another_host_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    made = report_log.Night()
+    made = report_log.SyntheticLog()
     made.frames(STEPS)
     place = [index for index, sample in enumerate(made.samples) if COMMAND.matches(sample.key)][700]
     command = wire.MirrorCommand.FromString(made.samples[place].payload)

@@ -23,7 +23,7 @@ from lowfc.programs.logs.report.page import NOT_HERE, page
 from lowfc.programs.logs.report.source import read_run
 from tests.support import report_log
 from tests.support.loops import lowfc
-from tests.support.report_log import READ_NOISE_E, Night
+from tests.support.report_log import READ_NOISE_E, SyntheticLog
 from tests.support.theory import noise_gain, rejection
 
 RATE_HZ = 1000.0
@@ -38,7 +38,7 @@ def figures(log: Path) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def eventful(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """A log with the loop open and closed, frames lost and dark, gains changed, controller and camera restarted."""
-    night = Night()
+    night = SyntheticLog()
     night.request("open")
     night.frames(300)
     night.request("close")
@@ -111,7 +111,7 @@ def test_the_longest_stretch_under_one_law_is_analysed(eventful: dict[str, Any])
 
 
 def test_the_error_budget_agrees_with_the_toy(eventful: dict[str, Any]) -> None:
-    made = Night().calibration
+    made = SyntheticLog().calibration
     noise = sensor_noise(
         made.reconstructor.astype(float), made.reference.astype(float), made.flux_dn, np.hypot(READ_NOISE_E, 12**-0.5)
     )
@@ -165,7 +165,7 @@ def test_the_verdict_names_what_was_wrong(eventful: dict[str, Any]) -> None:
     assert "nm after over the open pupil;" in text
 
 
-def uneventful(night: Night, number: int = 700) -> Night:
+def uneventful(night: SyntheticLog, number: int = 700) -> SyntheticLog:
     night.frames(number)
     night.health("camera", state="stopped")
     return night
@@ -173,7 +173,7 @@ def uneventful(night: Night, number: int = 700) -> Night:
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return uneventful(Night(), 1500).write(tmp_path_factory.mktemp("good") / "x.mcap")
+    return uneventful(SyntheticLog(), 1500).write(tmp_path_factory.mktemp("good") / "x.mcap")
 
 
 def damaged(good: Path, folder: Path) -> Path:
@@ -195,7 +195,7 @@ def recovered(good: Path, folder: Path) -> Path:
 
 
 def stopped(good: Path, folder: Path) -> Path:
-    return uneventful(Night()).write(folder / "x.mcap", stopped="the disk is full")
+    return uneventful(SyntheticLog()).write(folder / "x.mcap", stopped="the disk is full")
 
 
 @pytest.mark.parametrize(
@@ -231,7 +231,7 @@ def test_only_the_end_of_a_very_long_stretch_is_analysed(good: Path, monkeypatch
 
 @pytest.mark.parametrize("empty", [True, False])
 def test_a_log_without_a_step_still_has_a_page(tmp_path: Path, empty: bool) -> None:
-    night = Night()
+    night = SyntheticLog()
     if empty:
         night.samples.clear()
     made = report_of(read_run(night.write(tmp_path / "x.mcap", config=not empty)))
@@ -242,14 +242,14 @@ def test_a_log_without_a_step_still_has_a_page(tmp_path: Path, empty: bool) -> N
 
 @pytest.mark.usefixtures("without_drawings")
 def test_imperfections_of_the_simulated_world_are_named(tmp_path: Path) -> None:
-    night, imperfect = uneventful(Night()), {"disturbance.wheel_hz": 40.0, "camera.hot_pixels": 0.01}
+    night, imperfect = uneventful(SyntheticLog()), {"disturbance.wheel_hz": 40.0, "camera.hot_pixels": 0.01}
     made = report_of(read_run(night.write(tmp_path / "x.mcap", toml=load(None, imperfect).to_toml())))
     assert made.figures["run"]["imperfections"] == imperfect
     assert "simulated with disturbance.wheel_hz = 40.0, camera.hot_pixels = 0.01;" in page(made)
 
 
 def test_a_loop_in_safe_mode_is_not_a_good_run(tmp_path: Path) -> None:
-    night = uneventful(Night())
+    night = uneventful(SyntheticLog())
     night.request("safe")
     night.frames(50)
     found = figures(night.write(tmp_path / "x.mcap"))
@@ -259,7 +259,7 @@ def test_a_loop_in_safe_mode_is_not_a_good_run(tmp_path: Path) -> None:
 
 
 def test_without_truth_the_terms_that_need_it_are_missing_and_not_zero(tmp_path: Path) -> None:
-    found = figures(uneventful(Night(truth=False), 1500).write(tmp_path / "x.mcap"))
+    found = figures(uneventful(SyntheticLog(truth=False), 1500).write(tmp_path / "x.mcap"))
     terms = {term["name"]: term for term in found["error_budget"]["terms"]}
     for name in ("cross-talk and aliasing", "nonlinearity"):
         assert terms[name]["missing"]
@@ -277,7 +277,7 @@ def test_without_truth_the_terms_that_need_it_are_missing_and_not_zero(tmp_path:
 
 
 def test_a_log_of_an_open_loop_has_neither_spectra_nor_budget(tmp_path: Path) -> None:
-    night = Night()
+    night = SyntheticLog()
     night.request("open")
     found = figures(uneventful(night, 300).write(tmp_path / "x.mcap"))
     assert found["closed_stretch"] is None
@@ -288,7 +288,7 @@ def test_a_log_of_an_open_loop_has_neither_spectra_nor_budget(tmp_path: Path) ->
 
 
 def test_a_loop_without_a_calibration_has_no_residual(tmp_path: Path) -> None:
-    night = Night()
+    night = SyntheticLog()
     night.samples = [sample for sample in night.samples if sample.key != CALIBRATION.key]
     night._state = State()
     night.frames(300)
@@ -299,7 +299,7 @@ def test_a_loop_without_a_calibration_has_no_residual(tmp_path: Path) -> None:
 
 
 def test_a_loop_closed_under_an_unknown_law_is_not_called_open(tmp_path: Path) -> None:
-    night = Night()
+    night = SyntheticLog()
     night.frames(300)
     night.samples = [sample for sample in night.samples if sample.key != CONTROLLER_STATE.key]
     found = figures(night.write(tmp_path / "x.mcap"))
@@ -310,7 +310,7 @@ def test_a_loop_closed_under_an_unknown_law_is_not_called_open(tmp_path: Path) -
 
 
 def test_a_closed_loop_without_a_good_frame_has_neither_spectra_nor_budget(tmp_path: Path) -> None:
-    night = Night()
+    night = SyntheticLog()
     night.frames(200, dark=range(200))
     found = figures(night.write(tmp_path / "x.mcap"))
     assert found["closed_stretch"]["frames"] == 0
@@ -324,14 +324,14 @@ def test_a_closed_loop_without_a_good_frame_has_neither_spectra_nor_budget(tmp_p
 def test_the_last_frames_may_have_their_command_after_the_log(
     tmp_path: Path, lost: int, without: int, at_the_end: int
 ) -> None:
-    night = Night()
+    night = SyntheticLog()
     night.frames(200, lost=range(200 - lost, 200))
     found = figures(night.write(tmp_path / "x.mcap"))["timing"]["frames"]
     assert (found["without_command"], found["at_the_end"]) == (without, at_the_end)
 
 
 def test_the_command_prints_one_object_or_writes_one_page(tmp_path: Path) -> None:
-    night = uneventful(Night(), 3)
+    night = uneventful(SyntheticLog(), 3)
     night.put(REQUEST, wire.Request(name="gain", values=[np.nan, np.inf, 0.5]))
     log = night.write(tmp_path / "night.mcap")
     printed = lowfc("report", str(log), "--json")
@@ -364,7 +364,7 @@ MARKUP = '<script>alert("x")</script>'
 
 
 def test_text_of_a_log_is_escaped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    night = uneventful(Night(), 30)
+    night = uneventful(SyntheticLog(), 30)
     for name in (f"1 {MARKUP}", r"2 $\foo{$", "3 $x^2$"):
         night.put(REQUEST, wire.Request(name=name, reply=f"4 {MARKUP}", accepted=False))
     night.put(EVENT, Log(name=f"5 {MARKUP}", message=f"6{MARKUP} 7 {MARKUP}", level=3))
@@ -398,7 +398,7 @@ def test_missing_packages_are_reported_before_the_log_is_read(
 
 @pytest.mark.parametrize("name", ["night.mcap", "other.mcap.part", "link.html"])
 def test_a_report_never_overwrites_a_log(tmp_path: Path, name: str) -> None:
-    log = uneventful(Night(), 3).write(tmp_path / "night.mcap")
+    log = uneventful(SyntheticLog(), 3).write(tmp_path / "night.mcap")
     before = log.read_bytes()
     (tmp_path / "link.html").hardlink_to(log)
     done = lowfc("report", str(log), "--out", str(tmp_path / name))

@@ -30,7 +30,7 @@ from lowfc.programs.logs.what_if.options import WhatIf, requested, user_controll
 from lowfc.programs.logs.what_if.run import LoggedRun
 from tests.support import toy
 from tests.support.in_process_loop import SMALL_MIRROR, fold
-from tests.support.report_log import Night
+from tests.support.report_log import SyntheticLog
 from tools.law_bench import calibrated
 
 RATE_HZ = 250
@@ -121,7 +121,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, LoggedRun]:
     other = {"gain": (0.2, 0.3), "leak": (0.01, 0.01), "delay_frames": 2.0}
     toml = load(None, {"sensor.modes": 10}).to_toml()  # with 10 modes no contrast is computed, which is slow
     for name, changes in (("default", {}), ("other", other)):
-        night = Night(**changes)
+        night = SyntheticLog(**changes)
         night.frames(FRAMES)
         made[name] = LoggedRun(read_history(LogReader(night.write(folder / f"{name}.mcap", toml=toml))))
     return made

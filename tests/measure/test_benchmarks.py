@@ -15,7 +15,7 @@ from benchmarks import curves, kernels, load, runner, step, streams, throughput
 from benchmarks.peers import comparison, implementations
 from benchmarks.peers.implementations import FUSED, IMPLEMENTATIONS
 from benchmarks.peers.shared import ACTUATORS, MARKS, NumpyStep, Problem
-from benchmarks.sizes import Size, configuration, made_up
+from benchmarks.sizes import Size, configuration, random_calibration
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.sections import Camera
 from lowfc.control.kernel import stepping
@@ -36,7 +36,7 @@ def by_heading(lines: runner.Lines) -> list[dict[str, str]]:
 
 def test_a_step_retains_no_memory_and_allocates_only_frame_and_actuators(monkeypatch: pytest.MonkeyPatch) -> None:
     config = configuration(SMALL, step.RATE_HZ)
-    calibration, frames = made_up(SMALL, config)
+    calibration, frames = random_calibration(SMALL, config)
     found = step.allocated(ControlStep(config, calibration, 0), Payloads(frames))
     assert abs(found["kept_bytes"]) < 1
     assert 2 * SMALL.pixels < found["peak_bytes"] < 2 * SMALL.pixels + 5 * 4 * SMALL.actuators + 4096
@@ -63,7 +63,7 @@ def test_the_stages_are_those_of_a_step_and_add_up(monkeypatch: pytest.MonkeyPat
 
 def test_a_random_calibration_has_the_stated_noise_and_number_of_bytes() -> None:
     size = Size(32, 7, 16)
-    calibration, frames = made_up(size, configuration(SMALL, 100.0))
+    calibration, frames = random_calibration(size, configuration(SMALL, 100.0))
     pixels = frames.reshape(len(frames), -1).astype(float) - calibration.dark
     seen = pixels / pixels.sum(axis=1, keepdims=True) - calibration.reference
     assert 0.5 < np.sqrt(np.mean((seen @ calibration.reconstructor.T) ** 2)) < 2
@@ -270,7 +270,7 @@ def one(p50: float, p99: float, without: int = 0) -> dict[str, Any]:
 
 
 def test_the_figures_of_a_run_are_computed_from_its_times(tmp_path: Path) -> None:
-    comparison.lay_out(tmp_path, 6)
+    comparison.write_shared_files(tmp_path, 6)
     due = np.arange(7) * 1_000_000 + 50_000_000
     published = due + 10_000
     published[5] += 1_200_000
@@ -307,7 +307,9 @@ def test_the_tables_have_ranges_differences_within_a_turn_and_missing_implementa
         "versions": {"lowfc": "1"},
         "failed": ["pyrtcao, fused: it fell"],
     }
-    latencies, differences, does = (by_heading(lines) for lines in comparison.tables(json.loads(json.dumps(result))))
+    latencies, differences, features = (
+        by_heading(lines) for lines in comparison.tables(json.loads(json.dumps(result)))
+    )
     chain, absent, failed, fused = latencies
     assert fused["p50"] == "100 (60 to 150)"
     assert fused["max"] == "660 (600 to 690)"
@@ -315,7 +317,7 @@ def test_the_tables_have_ranges_differences_within_a_turn_and_missing_implementa
     assert (absent["p50"], failed["p50"]) == ("not installed", "failed")
     (against,) = differences
     assert list(against.values()) == ["1 of 2", "1 of 2", "-60 (-240 to +120)", "+20 (-6 to +45)", "C chain"]
-    assert [line["implementation"] for line in does] == list(runs)
+    assert [line["implementation"] for line in features] == list(runs)
     about = comparison.about(result)
     for words in ("CLOCK_MONOTONIC", "get it", "it fell", "refused: that", "SCHED_FIFO 50"):
         assert words in about
@@ -331,7 +333,7 @@ def test_a_missing_implementation_is_reported_with_a_remedy(tmp_path: Path, monk
 
 
 def test_the_step_is_an_integrator_with_a_leak(tmp_path: Path) -> None:
-    comparison.lay_out(tmp_path, 1)
+    comparison.write_shared_files(tmp_path, 1)
     problem = Problem(tmp_path)
     plain_step, pixels = NumpyStep(problem), problem.frame(0)
     error_nm = problem.R @ (pixels.ravel() - problem.I0)
@@ -365,7 +367,7 @@ def test_a_real_run_of_an_implementation(chosen: implementations.Implementation)
 
 def test_kernels_are_measured_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(kernels, "set_up", lambda *_, **__: None)
-    found = kernels.measure(Namespace(pixels=[32], repeats=2, seconds=0.01), lambda _: None)
+    found = kernels.measure(Namespace(side=[32], repeats=2, seconds=0.01), lambda _: None)
     (one,) = found["sizes"]
     assert [set(turn) for turn in one["turns"]] == [{"numpy", "fused", "product", "memory"}] * 2
     assert one["ratios"]["fused over numpy"][1] == one["turns"][1]["fused"] / one["turns"][1]["numpy"]

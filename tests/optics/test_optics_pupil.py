@@ -131,10 +131,10 @@ def encircled(pupil, radius):
 
 def test_prolate_pupil_is_an_eigenfunction_of_the_mask(apodised):
     """The eigenvalue of the circular prolate function is the fraction of light on the mask."""
-    share, image = encircled(apodised, 2.5)
+    encircled_fraction, image = encircled(apodised, 2.5)
     back = to_pupil(image, 256, 32, 1.0)
     inside = circle(256) > 0
-    assert np.abs(back[inside] - share * apodised[inside]).max() < 1e-3
+    assert np.abs(back[inside] - encircled_fraction * apodised[inside]).max() < 1e-3
 
 
 def test_prolate_pupil_throughput_and_symmetry(apodised):

@@ -218,7 +218,7 @@ def fold(config: Configuration, frames: int, calibration: Calibration | None = N
     """
     bench = Bench(config, calibration or calibrated(config))
     bench.run(frames)
-    assert not bench.refused
+    assert not bench.frames_refused
     found = {name: [getattr(step, name) for step in bench.steps] for name in ("error_nm", "pol_nm", "command_nm")}
     for name in ("disturbance_nm", "residual_nm", "disturbance_rms_nm", "residual_rms_nm"):
         found[name] = [getattr(truth.sampled, name) for truth in bench.truths]

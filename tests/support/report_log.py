@@ -46,7 +46,7 @@ READ_NOISE_E = 2.0
 METADATA = {"lowfc": {"lowfc": "0.1.0", "numpy": "2.0", "host": "bench", "run": "night", "seed": "5"}}
 
 
-class Night:
+class SyntheticLog:
     """Messages of a run, appended frame by frame; the tip disturbance is a sine of 12 nm at 7 Hz."""
 
     def __init__(self, *, truth: bool = True, calibration: Calibration = TOYS, **changes: object) -> None:

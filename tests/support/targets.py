@@ -48,7 +48,7 @@ from sim_dm.device import Device, initial
 from sim_dm.driver import SimulatedMirror
 from tests.support.controller_inputs import CALIBRATION, INTERLOCKS
 from tests.support.mutated_logs import damaged, mutated, rewritten, small_log
-from tests.support.report_log import Night
+from tests.support.report_log import SyntheticLog
 from tests.support.safety_checks import apply_command, tick, violations
 from tests.support.toy import GRID, NOLL, calibration, frame, loaded, settings
 
@@ -361,7 +361,7 @@ def _logs(folder: Path) -> list[Target]:
     whole = tuple(
         small_log(folder / f"log{finished}.mcap", finished=finished).read_bytes() for finished in (True, False)
     )
-    night = Night()
+    night = SyntheticLog()
     night.frames(30)
     night.request("gain", (0.3,))
     night.frames(20)

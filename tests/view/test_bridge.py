@@ -23,7 +23,7 @@ from lowfc.programs.view.renderer import RenderThread
 from lowfc.programs.view.snapshot import Snapshot
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from tests.support.loops import until
-from tests.support.report_log import Night
+from tests.support.report_log import SyntheticLog
 from tests.support.stage import Tape
 
 PATIENCE_S = 10.0
@@ -65,7 +65,7 @@ class Scene:
 
     def __init__(self, show: Show | None = Show.WEB, stuck: int = 0) -> None:
         self.hub, self.clock = MemoryHub(), HostClock()
-        self.night = Night()
+        self.night = SyntheticLog()
         self.night.frames(50)
         self.events: list[str] = []
         self.source = MemoryBus(self.hub, "controller", self.clock)
@@ -156,7 +156,7 @@ def test_a_late_view_requests_the_calibration(scenes: Scenes) -> None:
 
 
 def test_a_late_view_shows_earlier_events_once(scenes: Scenes, tmp_path: Path) -> None:
-    before = Night()
+    before = SyntheticLog()
     before.event("NOTE", text="before the view")
     assert before.write(tmp_path / "night.mcap", finish=False).name.endswith(".part")
     scene = scenes()

@@ -22,7 +22,7 @@ from lowfc.programs.view.verdicts import span_means
 from lowfc.programs.view.verdicts.span_means import SpanMeans
 from lowfc.programs.view.verdicts.tile import Level, Verdict
 from tests.support import report_log
-from tests.support.report_log import Night
+from tests.support.report_log import SyntheticLog
 from tests.support.stage import Tape, accumulated, snapshot_of, tile, values_of
 
 Shown = list[Verdict]
@@ -46,8 +46,8 @@ def drawn(*logs: Path, config: Configuration | None = None) -> tuple[Drawn, Tape
     return draw_logs(logs, config or Configuration(), lambda own: Renderer(own, tape)), tape
 
 
-def night(frames: int) -> Night:
-    made = Night()
+def night(frames: int) -> SyntheticLog:
+    made = SyntheticLog()
     made.frames(frames)
     return made
 
@@ -58,7 +58,7 @@ def night(frames: int) -> Night:
 def test_the_final_verdict_is_on_the_log_and_not_on_a_recording(
     tmp_path: Path, shown: Shown, finish: bool, value: str, level: Level
 ) -> None:
-    made = Night()
+    made = SyntheticLog()
     for _ in range(10):
         made.frames(50)
         made.health("recorder", state="running", recording=wire.Recording(file="logs/a.mcap"))
@@ -88,7 +88,7 @@ def test_the_final_verdict_covers_the_whole_log(tmp_path: Path, shown: Shown) ->
 
 
 def test_a_log_without_steps_has_no_verdict_on_the_loop(tmp_path: Path, shown: Shown) -> None:
-    made = Night()
+    made = SyntheticLog()
     made.health("recorder", state="running", recording=wire.Recording(lost=3))
     drawn(made.write(tmp_path / "night.mcap"))
     assert shown[-1].headline.startswith("Log without a step of the controller. The recorder lost 3 messages")

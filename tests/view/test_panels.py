@@ -37,7 +37,7 @@ from lowfc.programs.view.renderer import RETRY_NS, Renderer
 from lowfc.programs.view.snapshot import Accumulator, LastHealth, Snapshot
 from lowfc.programs.view.verdicts import steady
 from lowfc.programs.view.verdicts.steady import LawInForce
-from tests.support.report_log import Night
+from tests.support.report_log import SyntheticLog
 from tests.support.stage import Tape, accumulated, pixels, snapshot_of, values_of
 from tests.support.theory import rejection
 from tests.support.toy import FLUX_DN, NOLL, calibration
@@ -45,8 +45,8 @@ from tests.support.toy import FLUX_DN, NOLL, calibration
 FRAMES = 120
 
 
-def night(*, truth: bool = True) -> Night:
-    made = Night(truth=truth)
+def night(*, truth: bool = True) -> SyntheticLog:
+    made = SyntheticLog(truth=truth)
     made.frames(FRAMES)
     return made
 
@@ -143,7 +143,7 @@ def test_the_mode_band_begins_at_the_last_change_before_the_view() -> None:
 
 
 def test_the_flux_of_refused_frames_is_a_gap() -> None:
-    made = Night()
+    made = SyntheticLog()
     made.frames(100, dark=range(40, 60))
     tape = Tape()
     loop.Loop().draw(tape, snapshot_of(made.samples))

@@ -21,7 +21,7 @@ from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict
 from lowfc.programs.view.verdicts.verdict import judge
 from lowfc.programs.view.verdicts.watcher import Watcher
 from lowfc.programs.view.verdicts.wavefront_verdict import factor, merit
-from tests.support.report_log import Night
+from tests.support.report_log import SyntheticLog
 from tests.support.stage import MAS, Stage, Tape, tile
 from tests.support.toy import START
 
@@ -278,7 +278,7 @@ def test_a_loop_that_corrects_little_is_neutral_and_so_is_its_headline() -> None
 
 def test_the_residual_of_the_best_gains_is_computed_from_the_measured_loop(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lowfc.programs.view.verdicts.watcher.ATTAINED_NS", 1_000_000_000)
-    night = Night(truth=False)
+    night = SyntheticLog(truth=False)
     night.frames(3000)
     accumulator, watcher = Accumulator(), Watcher()
     for number, one in enumerate(night.samples, 1):

@@ -34,7 +34,7 @@ def residual_mas(bench: Bench, run: Pieces, timing: Timing, *, continuous: bool 
     rate_hz, none = bench.config.camera.rate_hz, np.zeros(2)
     gains = best_gains(run, rate_hz, timing, none)
     bench.load(tune_lqg(run, identified(run, rate_hz), gains, (2, 3), none, timing).law)
-    bench.forget()
+    bench.new_record()
     bench.run(SETTLE + MEASURE)
     return bench.tilt_mas(MEASURE, continuous=continuous)
 
