@@ -21,12 +21,12 @@ ADVICE: dict[str, Advice] = {
     "STARTED": Advice("a process has started.", _NOTHING),
     "STOPPED": Advice("a process has ended, for the named reason.", "start it again if nobody meant to stop it."),
     "CLOCK_OFF": Advice(
-        "the wall clock was set after boot; run times keep the initial offset until the next boot.",
+        "the wall clock was set after boot; all times of the run keep the offset until the next boot.",
         "let a time server set the clock before the loop starts; `lowfc doctor` shows the difference.",
     ),
     "REALTIME_REFUSED": Advice(
-        "the host does not grant a real-time measure (SCHED_FIFO, locked memory, awake processors).",
-        "run `lowfc doctor`, which names the right that is missing; until then latencies have a longer tail.",
+        "the host does not grant a real-time measure (SCHED_FIFO, locked memory, disabled CPU idle states).",
+        "run `lowfc doctor`, which names the missing permission; until then latencies have a longer tail.",
     ),
     "KERNEL": Advice("`realtime.kernel` selects this implementation of the control step.", _NOTHING),
     "KERNEL_MISSING": Advice(
@@ -44,11 +44,11 @@ ADVICE: dict[str, Advice] = {
     ),
     "MODE_CHANGED": Advice("the loop mode changed, for the named reason.", "nothing, if the reason is a request."),
     "SAFED": Advice(
-        "an operator, an interlock, SIGUSR1 or an earlier latch put the loop in safe mode; the mirror is flat.",
+        "an operator, an interlock, SIGUSR1 or an earlier latch put the loop in safe mode; the mirror goes to zero.",
         "remove the cause, then `lowfc ctl clear`; the loop is open afterwards, and `lowfc ctl close` closes it.",
     ),
     "FRAMES_REFUSED": Advice(
-        "frames arrive and are not used; the command is held. The reason is in the table of reasons.",
+        "frames arrive and are not used; the command is held.",
         "see the table of reasons.",
     ),
     "FRAMES_ACCEPTED": Advice("frames are used again.", _NOTHING),
@@ -79,8 +79,8 @@ ADVICE: dict[str, Advice] = {
         "keep it if it is a dark hole; else `lowfc ctl channel adopted --zero`.",
     ),
     "LAW_NOT_IN_FORCE": Advice(
-        "the law of `control.law` was refused: another frame rate, other modes, or not stable at this delay.",
-        "tune a law for this loop (`lowfc tune`), or remove `control.law`; the loop starts open.",
+        "the law of `control.law` was refused: the camera's settings do not fit the calibration.",
+        "restore the camera's settings, or load a calibration for them; then `lowfc ctl law FILE`. The loop is open.",
     ),
     "LAW_OVERRULED": Advice(
         "the guard found that the law's residual exceeds the integrator's, or that the loop amplifies.",
@@ -118,7 +118,10 @@ ADVICE: dict[str, Advice] = {
         "remove the cause, or check the publisher of the value.",
     ),
     "INTERLOCK_CLEARED": Advice("the condition no longer holds.", "close the loop again, if the interlock opened it."),
-    "LOOP_STEPPED": Advice("`lowfc ctl step` has finished.", "`lowfc ctl close`, if the residual fell."),
+    "LOOP_STEPPED": Advice(
+        "the requested number of closed frames (`lowfc ctl step`) is complete; the loop is open.",
+        "`lowfc ctl close`, if the residual fell.",
+    ),
     "MIRROR_LOST": Advice(
         "the mirror's process died, hangs, or does not follow; a closed loop holds its command.",
         "check the mirror's process and its driver's events; restart it. The loop resumes by itself.",
@@ -129,14 +132,14 @@ ADVICE: dict[str, Advice] = {
         "set `mirror.rows` and `mirror.columns`, or load the calibration of this mirror.",
     ),
     "LIMIT_HIT": Advice(
-        "a limit of the controller or the mirror clipped a command. The reason is in the table of reasons.",
-        "see the table of reasons; a short one after closing is normal.",
+        "a limit of the controller or the mirror clipped a command.",
+        "see the table of reasons; a limit that acts briefly after closing is normal.",
     ),
     "LIMIT_CLEARED": Advice("the limit no longer acts.", _NOTHING),
     "COMMAND_EXPIRED": Advice(
         "the mirror had no valid command for `control.command_timeout_ms`: the controller died, hangs, or lost its "
-        "link. The mirror relaxes to flat or holds (`mirror.on_command_timeout`).",
-        "restart the controller; it starts from the mirror's shape, with the loop open.",
+        "link. The mirror relaxes to zero command or holds (`mirror.on_command_timeout`).",
+        "restart the controller; it starts from the mirror's shape, in `control.start_mode`.",
     ),
     "COMMAND_BACK": Advice("the mirror follows commands again.", _NOTHING),
     "COMMAND_REFUSED": Advice(
@@ -187,7 +190,7 @@ ADVICE: dict[str, Advice] = {
     ),
     "VIEW_STUCK": Advice("the viewer accepts no data.", "close its window, or wait: it restarts by itself."),
     "VIEW_RENEWED": Advice(
-        "the viewer hung or exceeded its memory.", "reload the page in a browser; a window returns by itself."
+        "the viewer hung or exceeded its memory limit.", "reload the page in a browser; a window returns by itself."
     ),
     "BAD_MESSAGE": Advice(
         "a message could not be decoded or has an impossible time: another version, or a faulty program.",
@@ -200,7 +203,10 @@ REASONS: dict[str, Advice] = {
     "WRONG_SIZE": Advice("rows, columns, encoding or bytes differ from the calibration", "set the camera's region"),
     "OUT_OF_ORDER": Advice("an older frame than the last one", "nothing, unless two cameras publish in one run"),
     "REPEATED": Advice("the frame was used before", "nothing, unless frequent"),
-    "LATE": Advice("older than `control.max_frame_age_ms` on arrival", "`lowfc doctor`; check the clocks of the hosts"),
+    "LATE": Advice(
+        "older than `control.max_frame_age_ms`, or superseded by a newer frame",
+        "`lowfc doctor`; check the clocks of the hosts",
+    ),
     "SATURATED": Advice("more than `control.max_saturated_pixels` at full well", "shorter exposure, lower gain"),
     "DARK": Advice(
         "less light than `control.min_flux_fraction` of the calibration's",
@@ -208,7 +214,7 @@ REASONS: dict[str, Advice] = {
     ),
     "NO_FRAME": Advice("no frame in time", "as for NO_FRAMES"),
     "STUCK": Advice("the same image repeatedly", "restart the camera"),
-    "AHEAD": Advice("the camera's start is ahead of this host's clock", "as for START_AHEAD"),
+    "AHEAD": Advice("the camera process reports a start time ahead of this host's clock", "as for START_AHEAD"),
     "CAMERA_UNKNOWN": Advice(
         "the camera restarted and its settings have not arrived", "nothing; they are sent twice a second"
     ),
@@ -223,4 +229,4 @@ REASONS: dict[str, Advice] = {
     "CHANNEL": Advice("no usable channel name, or more than sixteen", "remove a channel"),
     "LAW_OVERRULED": Advice("the integrator has taken over modes from the law", "as for LAW_OVERRULED"),
 }
-"""Reasons of refusals and limits, without REASON_."""
+"""Cause and remedy of each rejection and limit, by its name on the wire without REASON_."""

@@ -126,7 +126,7 @@ def topics(role: Role, *own: Topic) -> str:
     rows = []
     for topic in (*own, EVENT, HEALTH):
         when = f"{topic.rate:g} Hz" if isinstance(topic.rate, float) else str(topic.rate)
-        does = "publish" if role in topic.publisher else "subscribe"
+        does = "publish" if role in topic.publishers else "subscribe"
         answers = "; the last one is returned on query" if topic.queryable else ""
         name = topic.message.DESCRIPTOR.full_name
         rows.append((f"`{topic.key}`", f"`{name}`", when, does, topic.sentence.rstrip(".") + answers))

@@ -115,7 +115,7 @@ def of_images(case: tuple[str, str, float]) -> Figures:
     return _row(case, np.array(changes), own, open_nm, np.array(left)) | {"images": True}
 
 
-def _row(case: tuple[str, str, float], change: Array, own: float, open_nm: float, left_nm2: Array) -> Figures:
+def _row(case: tuple[str, str, float], change: Array, own: float, open_nm: float, residual_nm2: Array) -> Figures:
     sensor, preset, magnitude = case
     error = float(change.std(ddof=1) / np.sqrt(len(change)))
     return {
@@ -126,7 +126,7 @@ def _row(case: tuple[str, str, float], change: Array, own: float, open_nm: float
         "error": error,
         "own": own,
         "open_nm": float(open_nm),
-        "closed_nm": float(np.sqrt(left_nm2.sum(axis=1).mean())),
+        "closed_nm": float(np.sqrt(residual_nm2.sum(axis=1).mean())),
     }
 
 
@@ -177,9 +177,9 @@ def render(figures: Figures) -> str:
         f"Number of cases: {len(rows)} (V = {stars}; these presets and `quiet`; {len(rows) - len(modal)} of them "
         "with every image simulated). Cases in which "
         f"closing adds more than {100 * OF_DARK_ZONE:g} % of the dark zone's own contrast plus three standard errors "
-        f"(`quiet`: without these), with that ratio: {names or 'none'}. On bright stars (V = {_listed(bright)}) the "
-        f"residual with automatic gains is {min(compared):.2f} to {max(compared):.2f} times that of the best fixed "
-        "gains, chosen afterwards."
+        f"(for `quiet`, without the standard errors), with that ratio: {names or 'none'}. On bright stars "
+        f"(V = {_listed(bright)}) the residual with automatic gains is {min(compared):.2f} to {max(compared):.2f} "
+        "times that of the best fixed gains, chosen afterwards."
     )
 
 

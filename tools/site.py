@@ -94,7 +94,7 @@ def topics() -> str:
         full = one.message.DESCRIPTOR.full_name
         own = full.startswith("lowfc.")
         message = f"[`{full}`](messages.md#{full.rpartition('.')[2].lower()})" if own else f"`{full}`"
-        publisher = "any" if len(one.publisher) > 2 else ", ".join(sorted(map(str, one.publisher)))
+        publisher = "any" if len(one.publishers) > 2 else ", ".join(sorted(map(str, one.publishers)))
         rows.append((f"`{one.key}`", message, when, publisher, one.sentence))
     return markdown(("topic", "message", "when", "published by", ""), rows)
 

@@ -43,7 +43,7 @@ _CAMERA, _MIRROR, _CONTROLLER = frozenset({Role.CAMERA}), frozenset({Role.MIRROR
 
 
 class Rate(StrEnum):
-    """Publication rate of a topic without a rate in hertz."""
+    """Rate of a topic that is not published at a fixed frequency."""
 
     LOOP = "every frame"
     EVENT = "on event"
@@ -57,21 +57,22 @@ class Topic:
         key: zenoh key; `{name}` stands for a mirror's or a process's name.
         message: class of the payload.
         rate: every frame, on event, or a number of hertz.
-        publisher: roles that may publish it; a router drops messages of other roles.
+        publishers: roles that may publish it; a router drops messages of other roles.
         sentence: its description.
         subscribers: roles that receive it.
         deterministic: in lockstep two runs with the same seed write the same payload bytes.
         queryable: a late joiner can query the publisher for the last message.
         latest_only: monitors receive only the newest message, at display rate.
         direct_subscriber: role that receives it over the direct link from a publisher on the same host; None for none.
-        multiple_publishers: other programs may publish it too, so that its direct subscriber also reads the bus.
+        multiple_publishers: several programs of one host may publish it, so that its direct subscriber also reads the
+            bus; a router accepts only the roles in `publishers`.
         optional: a recording may omit it; the other topics do not depend on it.
     """
 
     key: str
     message: type[Message]
     rate: Rate | float
-    publisher: frozenset[Role]
+    publishers: frozenset[Role]
     sentence: str
     subscribers: frozenset[Role] = _MONITORS
     deterministic: bool = True
@@ -87,8 +88,8 @@ class Topic:
 
     @property
     def in_loop(self) -> bool:
-        """Whether a late message costs the loop a frame: it is sent at once, before all others."""
-        return self.rate is Rate.LOOP and Role.CONTROLLER in self.publisher | self.subscribers
+        """Whether it is published every frame by or for the controller: it is sent at once, before all others."""
+        return self.rate is Rate.LOOP and Role.CONTROLLER in self.publishers | self.subscribers
 
     def matches(self, key: str) -> bool:
         """Whether `key` is this topic, for any name."""
@@ -140,7 +141,7 @@ CONTROLLER_STATE = Topic(
     wire.ControllerState,
     1.0,
     _CONTROLLER,
-    "Everything the next command depends on, besides the calibration.",
+    "The controller's state: all that the next command depends on, with calibration, law and probe sequence.",
     queryable=True,
 )
 REQUEST = Topic("lowfc/control/request", wire.Request, Rate.EVENT, _CONTROLLER, "An operator's request and its reply.")
@@ -324,7 +325,7 @@ def floats(data: bytes, *shape: int) -> Single:
 
 
 def fields_of(source: object, names: Iterable[str]) -> dict[str, Any]:
-    """Attributes of these names; a value and its message share them."""
+    """Attributes with these names, which are also the fields of the message."""
     return {name: getattr(source, name) for name in names}
 
 

@@ -1,4 +1,4 @@
-"""Simulation of a loop on images with drifting modes: its residual, to check `lowfc.design.tolerance`."""
+"""Simulation of integrators on noisy images of a drifting wavefront, to check `lowfc.design.tolerance`."""
 
 from dataclasses import dataclass
 
@@ -11,18 +11,18 @@ from lowfc.optics.chain.zernike import zernikes
 from lowfc.optics.twin.twin import Evaluator, Twin, node_radii, reference, response
 
 _NODES = np.array([0.5 - 0.5 / np.sqrt(3.0), 0.5 + 0.5 / np.sqrt(3.0)])  # Gauss-Legendre, in exposure times
-_INSTANTS = (np.arange(8) + 0.5) / 8  # times at which the residual is sampled, in periods
-_SETTLED = 8.0  # time constants of the slowest mode that are discarded
+_SAMPLE_TIMES = (np.arange(8) + 0.5) / 8  # times at which the residual is sampled, in periods
+_SETTLING_TIME_CONSTANTS = 8.0  # time constants of the slowest mode that are discarded
 
 
 @dataclass(frozen=True, eq=False)
 class DriftTrial:
-    """A sensor, a star and a loop.
+    """Sensor, flux and exposure of a simulated loop.
 
     Attributes:
         twin: twin of the sensor.
         noll: Noll indices of the fitted modes.
-        light_e: electrons of the open circle's light in an exposure.
+        light_e: electrons per exposure that enter the unobscured circular pupil.
         read_noise_e: read noise of a pixel, electrons.
         exposure: exposure time, in periods.
     """
@@ -33,8 +33,8 @@ class DriftTrial:
     read_noise_e: float
     exposure: float
 
-    def left_nm2(self, step_nm2: Array, gain: Array, frames: int, rng: np.random.Generator) -> Array:
-        """Mean square (modes,) of the residual of integrators, in continuous time.
+    def residual_nm2(self, step_nm2: Array, gain: Array, frames: int, rng: np.random.Generator) -> Array:
+        """Residual variance (modes,) of the closed loop, nm^2, averaged over each frame period.
 
         Args:
             step_nm2: (modes,) variance of each mode's step in a frame, nm^2.
@@ -50,10 +50,10 @@ class DriftTrial:
             normalised_I0, normalised_H, good, self.light_e * float(I0.sum()), self.read_noise_e, "weighted"
         )
         evaluator, on_nodes = Evaluator(self.twin), basis.astype(np.float32)
-        times = np.concatenate([self.exposure * _NODES, _INSTANTS, [1.0]])
+        times = np.concatenate([self.exposure * _NODES, _SAMPLE_TIMES, [1.0]])
         order = np.argsort(times, kind="stable")
         lengths = np.diff(times[order], prepend=0.0)
-        first = int(np.ceil(_SETTLED / gain[gain > 0].min()))
+        first = int(np.ceil(_SETTLING_TIME_CONSTANTS / gain[gain > 0].min()))
         start, command, squares = np.zeros(len(gain)), np.zeros(len(gain)), np.zeros(len(gain))
         moves = np.sqrt(lengths[:, None] * step_nm2)
         for frame in range(first + frames):

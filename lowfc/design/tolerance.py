@@ -44,15 +44,15 @@ class Drift:
     Attributes:
         step_nm2: D, variance of the drift per frame.
         gain: gain of the integrator.
-        left_nm2: v, variance of the residual in continuous time.
+        residual_nm2: v, variance of the residual in continuous time.
     """
 
     step_nm2: float
     gain: float
-    left_nm2: float
+    residual_nm2: float
 
 
-def left_of_drift_nm2(step_nm2: float, noise_nm2: float, exposure: float, gain: float) -> float:
+def drift_residual_nm2(step_nm2: float, noise_nm2: float, exposure: float, gain: float) -> float:
     """Variance of the residual of an integrator under a drift, in continuous time."""
     drift_nm2 = step_nm2 * (1.0 - gain * exposure + gain**2 * exposure / 3.0)
     return step_nm2 / 2.0 + (drift_nm2 + gain**2 * noise_nm2) / (gain * (2.0 - gain))
@@ -65,23 +65,23 @@ def best_gain(step_nm2: float, noise_nm2: float, exposure: float) -> float:
     return float(2.0 * step_nm2 / (step_nm2 + root))
 
 
-def tolerated_drift(left_nm2: float, noise_nm2: float, exposure: float, kind: Kind = "integrator") -> Drift:
+def tolerated_drift(residual_nm2: float, noise_nm2: float, exposure: float, kind: Kind = "integrator") -> Drift:
     """The fastest drift whose residual does not exceed a variance.
 
     Args:
-        left_nm2: Allowed variance of the residual.
+        residual_nm2: Allowed variance of the residual.
         noise_nm2: Variance of the noise of a frame.
         exposure: Exposure time, in periods.
         kind: The gain of an integrator is limited to the highest within its margins.
     """
     square = (exposure - 1.0) ** 2 / 4.0 - exposure / 3.0 + 0.5
-    linear = (exposure - 2.0) * left_nm2 - noise_nm2
-    step = 2.0 * left_nm2**2 / (-linear + np.sqrt(linear**2 - 4.0 * square * left_nm2**2))
+    linear = (exposure - 2.0) * residual_nm2 - noise_nm2
+    step = 2.0 * residual_nm2**2 / (-linear + np.sqrt(linear**2 - 4.0 * square * residual_nm2**2))
     gain, most = best_gain(step, noise_nm2, exposure), highest_gain(DELAY)
     if kind == "integrator" and gain > most:
-        from_noise_nm2 = left_of_drift_nm2(0.0, noise_nm2, exposure, most)
-        step, gain = (left_nm2 - from_noise_nm2) / left_of_drift_nm2(1.0, 0.0, exposure, most), most
-    return Drift(float(step), gain, left_nm2)
+        from_noise_nm2 = drift_residual_nm2(0.0, noise_nm2, exposure, most)
+        step, gain = (residual_nm2 - from_noise_nm2) / drift_residual_nm2(1.0, 0.0, exposure, most), most
+    return Drift(float(step), gain, residual_nm2)
 
 
 def tolerated_lines(kind: Kind, line: Line, rate_hz: float, exposure: float) -> Callable[[Array], Array]:

@@ -43,7 +43,7 @@ ROLES = roles(["mirror-dm"])
 def test_publish_and_receive_rights_follow_the_table_of_topics(topic: Topic) -> None:
     key = {role: topic.at(role if topic is HEALTH else "dm") for role in ROLES}
     publishers = {role for role in ROLES if _covers(grant(role).publishes, key[role])}
-    assert publishers == {role for role in ROLES if Role(role.partition("-")[0]) in topic.publisher}
+    assert publishers == {role for role in ROLES if Role(role.partition("-")[0]) in topic.publishers}
     receivers = {role for role in ROLES if _covers(grant(role).receives, key[role])}
     subscribers = {role for role in ROLES if Role(role.partition("-")[0]) in topic.subscribers}
     assert receivers == subscribers | ({"operator"} if "viewer" in subscribers else set())

@@ -117,7 +117,7 @@ def test_the_end_of_a_child_and_a_missing_program_are_reported(tmp_path: Path) -
     child.start()
     child.process.kill()
     child.process.wait(PATIENCE_S)
-    assert child.how_it_ended() == "one was killed by SIGKILL"
+    assert child.exit_description() == "one was killed by SIGKILL"
     child.stop(PATIENCE_S)
     with pytest.raises(FileNotFoundError, match="no-such-program"):
         Child("one", ["no-such-program"], tmp_path / "stderr").start()

@@ -129,10 +129,10 @@ def test_each_unusable_file_is_a_line_of_the_error(tmp_path: Path) -> None:
     assert all(words in line for words, line in zip(("none.json", "mirror.flat", "control.law"), several, strict=True))
 
 
-def test_inactive_actuators_get_no_command_and_the_modes_are_still_measured_correctly(
+def test_inactive_actuators_get_no_command_and_modes_and_actuators_stay_inverse(
     tmp_path: Path, calibration: Calibration
 ) -> None:
-    """Five actuators in the pupil are inactive; the sensor still measures each commanded mode correctly."""
+    """Five inactive actuators in the pupil: the product ACT2MODES MODES2ACT remains the identity."""
     dead = [34 * row + column for row, column in ((10, 12), (16, 17), (17, 17), (22, 9), (25, 24))]
     active = np.ones(GRID)
     active.flat[dead] = 0

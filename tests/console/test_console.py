@@ -123,9 +123,9 @@ TASKS = {
 def test_the_key_of_every_button_sends_its_request(
     run: LiveRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from lowfc.programs.console.actions import EVERY
+    from lowfc.programs.console.actions import ALL_ACTIONS
 
-    assert {*BUTTONS, *TASKS} == set(EVERY)
+    assert {*BUTTONS, *TASKS} == set(ALL_ACTIONS)
     monkeypatch.chdir(tmp_path)
     np.save("shape.npy", np.full(GRID, 3.0))
     law_file.save(LAW, Path("law.fits"))
@@ -135,10 +135,10 @@ def test_the_key_of_every_button_sends_its_request(
         for name in ORDER:
             typed, expected = BUTTONS[name]
             before = len(run.requests)
-            await screen.pilot.press(EVERY[name].key)
+            await screen.pilot.press(ALL_ACTIONS[name].key)
             if typed:
                 await screen.fill(*typed)
-            elif EVERY[name].confirm:
+            elif ALL_ACTIONS[name].confirm:
                 await screen.until(lambda: len(screen.app.screen_stack) == 2)
                 assert len(run.requests) == before, "no request before the question is answered"
                 await screen.pilot.press("enter")
@@ -277,14 +277,14 @@ def test_texts_name_keys_for_commands_and_ranges_for_long_lists() -> None:
 
 def test_tasks_are_commands_with_the_options_of_their_form(run: LiveRun, monkeypatch: pytest.MonkeyPatch) -> None:
     from lowfc.programs.console import app
-    from lowfc.programs.console.actions import EVERY
+    from lowfc.programs.console.actions import ALL_ACTIONS
 
     started: list[list[str]] = []
     monkeypatch.setattr(app, "Task", lambda name, words: started.append(words) or FinishedTask(name))
 
     async def scenario(screen: Screen) -> None:
         for name, words in TASKS.items():
-            await screen.pilot.press(EVERY[name].key)
+            await screen.pilot.press(ALL_ACTIONS[name].key)
             await screen.until(lambda: len(screen.app.screen_stack) == 2)
             await screen.pilot.press("enter")
             await screen.until(lambda name=name: screen.text("answer") == f"{name}: done")

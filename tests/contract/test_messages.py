@@ -113,7 +113,7 @@ def test_topics_are_unique_and_found_by_their_keys() -> None:
     for topic in TOPICS:
         assert topic_of(topic.at("dm")) is topic
         assert [other.key for other in TOPICS if other.matches(topic.at("x"))] == [topic.key]
-        assert topic.publisher
+        assert topic.publishers
         assert Role.RECORDER in topic.subscribers
         assert "timestamp" in topic.message.DESCRIPTOR.fields_by_name
     for key in ("", "lowfc", "lowfc/mirror//command", "lowfc/mirror/dm", "lowfc/request/open"):

@@ -9,7 +9,7 @@ from lowfc.control.laws.margins import noise_gain
 from lowfc.control.laws.vibration import Line
 from lowfc.design.tolerance import (
     best_gain,
-    left_of_drift_nm2,
+    drift_residual_nm2,
     tolerated_drift,
     tolerated_lines,
     tolerated_variance,
@@ -26,17 +26,17 @@ def test_residual_of_a_drift_agrees_with_the_continuous_theory(gain):
     law, omega = integrator([gain], [0.0], (2,), 1.0, 250.0), np.geomspace(1e-6, 300 * np.pi, 200_000)
     transmitted = residual_power(law, omega, Timing.of(1.0, EXPOSURE))[:, 0]
     expected = 0.3 * np.trapezoid(transmitted / omega**2, omega) / np.pi + 2.0 * noise_gain(law)[0]
-    assert left_of_drift_nm2(0.3, 2.0, EXPOSURE, gain) == pytest.approx(expected, rel=1e-3)
+    assert drift_residual_nm2(0.3, 2.0, EXPOSURE, gain) == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize("noise", [1e-3, 0.3, 30.0])
 def test_tolerated_drift_leaves_the_allowed_residual_at_the_best_gain(noise):
     for kind in ("integrator", "lqg"):
         found = tolerated_drift(0.5, noise, EXPOSURE, kind)
-        assert left_of_drift_nm2(found.step_nm2, noise, EXPOSURE, found.gain) == pytest.approx(0.5)
+        assert drift_residual_nm2(found.step_nm2, noise, EXPOSURE, found.gain) == pytest.approx(0.5)
     best = best_gain(found.step_nm2, noise, EXPOSURE)
     assert found.gain == pytest.approx(best)
-    assert min(left_of_drift_nm2(found.step_nm2, noise, EXPOSURE, best * f) for f in (0.9, 1.1)) > 0.5
+    assert min(drift_residual_nm2(found.step_nm2, noise, EXPOSURE, best * f) for f in (0.9, 1.1)) > 0.5
 
 
 def test_residual_of_a_slow_loop_is_the_root_of_drift_times_noise():

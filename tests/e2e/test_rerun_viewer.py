@@ -80,7 +80,7 @@ def test_a_viewer_that_hangs_or_dies_is_noticed(web: RerunViewer) -> None:
     assert not web.alive
     assert not web.answers()
     assert web.resident_bytes() == 0
-    assert f"the viewer on port {web.port} was killed by SIGKILL" in web.how_it_ended()
+    assert f"the viewer on port {web.port} was killed by SIGKILL" in web.exit_description()
 
 
 def test_a_new_viewer_on_the_same_port_takes_a_new_stream(web: RerunViewer) -> None:

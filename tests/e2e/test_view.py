@@ -144,7 +144,7 @@ def test_invalid_view_options_are_one_line_errors(
     monkeypatch.chdir(tmp_path)
     for screen in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(screen, raising=False)
-    monkeypatch.setattr("lowfc.adapters.process.realtime.give_way", lambda: None)
+    monkeypatch.setattr("lowfc.adapters.process.realtime.lower_priority", lambda: None)
     if "run" not in given and "logs" not in given:
         given = given | {"run": open_run("mistaken").run_id}
     with pytest.raises(LowfcError, match=complaint) as raised:

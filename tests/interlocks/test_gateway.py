@@ -15,7 +15,7 @@ from lowfc.adapters.bus.run import free_ports
 from lowfc.client import running
 from lowfc.client.requests import DECLARED
 from lowfc.contract.errors import ConfigurationError
-from lowfc.programs.gateway.offer import Kind, variables
+from lowfc.programs.gateway.variables import Kind, variables
 from tests.support.loops import interrupt, lowfc, start, until
 
 Process = subprocess.Popen[str]

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from lowfc.adapters.bus.bus import Sample
-from lowfc.adapters.logs.recovery import no_end, recover, recovered_path
+from lowfc.adapters.logs.recovery import missing_end_text, recover, recovered_path
 from lowfc.adapters.logs.writer import Attachment, LogWriter, being_recorded
 from lowfc.contract.envelope import sequence_of
 from lowfc.contract.errors import DataFileError
@@ -147,20 +147,20 @@ def test_a_log_that_is_being_recorded_is_reported_and_not_recovered(tmp_path: Pa
     done = lowfc("info", log.part)
     assert "being recorded; `lowfc ctl record stop` finishes it" in done.stdout
     assert json.loads(lowfc("info", log.part, "--json").stdout)["state"] == "recording"
-    assert "it is being recorded" in no_end([log.part], finished=False)
+    assert "it is being recorded" in missing_end_text([log.part], finished=False)
     with pytest.raises(DataFileError, match="is being recorded, and nothing is lost: `lowfc ctl record stop`"):
         recover(log.part, recovered_path(log.part))
     assert list(tmp_path.iterdir()) == [log.part]
     log.abandon()  # as if killed
     assert json.loads(lowfc("info", log.part, "--json").stdout)["state"] == "truncated"
-    assert "it was cut off" in no_end([log.part], finished=False)
+    assert "it was cut off" in missing_end_text([log.part], finished=False)
     assert recover(log.part, recovered_path(log.part)).recovered == recovered_path(log.part)
 
 
 def test_a_log_that_is_finished_while_it_is_read_is_not_called_truncated(tmp_path: Path) -> None:
     log = LogWriter(tmp_path / "20270101T000000Z.mcap", START_NS, {"lowfc": {"run": "night"}})
     log.finish({})
-    assert "it was finished while it was read" in no_end([log.part], finished=False)
+    assert "it was finished while it was read" in missing_end_text([log.part], finished=False)
     assert being_recorded(log.part), "it was being recorded when the summary was read"
 
 

@@ -9,7 +9,7 @@ from lowfc.contract.sections import SensorSection
 from lowfc.optics.chain.focal_mask import disk, phase_spot
 from lowfc.optics.chain.fourier import to_image, to_pupil
 from lowfc.optics.chain.grid import OPEN_AREA, SAMPLES, image_axis, pupil_axis
-from lowfc.optics.chain.pupil import circle, from_quarter, prolate, with_bar
+from lowfc.optics.chain.pupil import circle, circle_with_bar, from_quarter, prolate
 from lowfc.optics.chain.relay import ApertureMask
 from lowfc.optics.chain.sensor import Sensor, image
 from lowfc.optics.chain.zernike import mode_name, noll_to_nm, zernike
@@ -99,7 +99,7 @@ def test_noll_indices_below_one_are_refused():
 
 @pytest.mark.parametrize("angle_deg", [0.0, 20.0, 135.0, 300.0])
 def test_bar_reaches_from_the_centre_to_the_edge_on_one_side(angle_deg):
-    barred, angle = with_bar(512, 0.1, angle_deg), np.deg2rad(angle_deg)
+    barred, angle = circle_with_bar(512, 0.1, angle_deg), np.deg2rad(angle_deg)
 
     def at(radius, across):
         x = radius * np.cos(angle) - across * np.sin(angle)

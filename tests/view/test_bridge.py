@@ -50,7 +50,7 @@ class FakeViewer:
     def answers(self) -> bool:
         return not self.stopped.is_set()
 
-    def how_it_ended(self) -> str:
+    def exit_description(self) -> str:
         return "the viewer was killed"
 
     def stop(self) -> None:

@@ -46,7 +46,7 @@ def grant(role: str) -> Grant:
     """Rights of a role according to the table of topics."""
     part, _, name = role.partition("-")
     kind = Role(part)
-    published = [topic for topic in TOPICS if kind in topic.publisher]
+    published = [topic for topic in TOPICS if kind in topic.publishers]
     received = [topic for topic in TOPICS if kind in _receivers(topic)]
     answered = [topic for topic in published if topic.queryable]
     answers = [_own(topic, role, name) for topic in answered]

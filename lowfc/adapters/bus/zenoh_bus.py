@@ -336,7 +336,7 @@ class ZenohBus:
             self._session.close()  # type: ignore[no-untyped-call]
 
     def _direct_writer(self, topic: Topic, name: str, key: str) -> DirectWriter | DirectCall | None:
-        if self.role.partition("-")[0] not in topic.publisher or (path := self._direct_link(topic, name)) is None:
+        if self.role.partition("-")[0] not in topic.publishers or (path := self._direct_link(topic, name)) is None:
             return None
         reader = None if self._beside is None else self._beside.direct_readers.get(key)
         return DirectWriter(path) if reader is None else DirectCall(reader)

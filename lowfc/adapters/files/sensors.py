@@ -18,7 +18,7 @@ from lowfc.optics.chain import sam as sams
 from lowfc.optics.chain.coronagraph import Coronagraph, LyotStop, Wedge
 from lowfc.optics.chain.focal_mask import bowtie, disk, phase_spot
 from lowfc.optics.chain.grid import SAMPLES, pupil_axis
-from lowfc.optics.chain.pupil import circle, from_quarter, prolate, with_bar
+from lowfc.optics.chain.pupil import circle, circle_with_bar, from_quarter, prolate
 from lowfc.optics.chain.relay import ApertureMask, Defocus, PupilImage, Relay, fresnel_distance
 from lowfc.optics.chain.sensor import Sensor
 
@@ -83,7 +83,7 @@ def sensor_from(
             case "zwfs":
                 return Sensor(pupil, focal_mask, PupilImage(), wavelength_nm, pixels=40)
             case "bar":
-                relay = ApertureMask(with_bar(len(pupil), section.bar_width, section.bar_angle_deg))
+                relay = ApertureMask(circle_with_bar(len(pupil), section.bar_width, section.bar_angle_deg))
             case "open":
                 relay = ApertureMask(circle(len(pupil)))
             case "sam":

@@ -191,5 +191,5 @@ def _published(process: str, key: str) -> Topic | None:
         topic = topic_of(key)
     except KeyError:
         return None
-    publishes = key == HEALTH.at(process) if topic is HEALTH else process.partition("-")[0] in topic.publisher
+    publishes = key == HEALTH.at(process) if topic is HEALTH else process.partition("-")[0] in topic.publishers
     return topic if publishes else None

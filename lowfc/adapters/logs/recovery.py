@@ -118,7 +118,7 @@ def in_words(damage: Damage) -> str:
     return f"{place}; {(damage.before_ns - damage.after_ns) / 1e9:.3f} s between the messages around it"
 
 
-def no_end(paths: Sequence[Path], *, finished: bool) -> str:
+def missing_end_text(paths: Sequence[Path], *, finished: bool) -> str:
     """Sentence on the missing end of a log; empty if it is `finished`."""
     if finished:
         return ""

@@ -1,6 +1,6 @@
 """Selection of what is recorded: every Nth frame and mirror state, and the requested optional topics.
 
-Steps, commands, requests, events, health, calibrations and states are always complete.
+Steps, commands, requests, events, health, calibrations, and the states of camera and controller are always complete.
 """
 
 import math
@@ -18,7 +18,7 @@ from lowfc.contract.messages import FRAME, MIRROR_STATE, TOPICS, Topic, wire
 SELECTION = "selection"
 """Name of the metadata with the selection; a log without it is complete."""
 
-_FEWER = {FRAME: "frames", MIRROR_STATE: "mirror states"}
+_DECIMATED = {FRAME: "frames", MIRROR_STATE: "mirror states"}
 """Topics of which every Nth message is recorded."""
 
 
@@ -54,7 +54,7 @@ class Selection:
     @property
     def sentence(self) -> str:
         """Description of the selection; empty for everything."""
-        few = [name for topic, name in _FEWER.items() if topic not in self.left_out]
+        few = [name for topic, name in _DECIMATED.items() if topic not in self.left_out]
         parts = [f"1 in {self.every} {' and '.join(few)}"] if self.every > 1 and few else []
         parts += [f"without {', '.join(self._keys)}"] if self.left_out else []
         return ", ".join(parts)
@@ -66,16 +66,16 @@ class Selection:
 
     def records_all(self, topic: Topic) -> bool:
         """Whether every message of a topic is recorded, so that a gap in its counts is a loss."""
-        return topic not in self.left_out and not (self.every > 1 and topic in _FEWER)
+        return topic not in self.left_out and not (self.every > 1 and topic in _DECIMATED)
 
     def keeps(self, topic: Topic, sequence: int, payload: bytes) -> bool:
         """Whether a message is recorded.
 
-        The frame number decides for the frame and for its mirror state, so that both are recorded.
+        Frames and mirror states are selected by the same frame number, so that they stay paired.
         """
         if topic in self.left_out:
             return False
-        if self.every == 1 or topic not in _FEWER:
+        if self.every == 1 or topic not in _DECIMATED:
             return True
         if topic is MIRROR_STATE:
             try:
@@ -85,7 +85,7 @@ class Selection:
         return count_of(sequence) % self.every == 0
 
     def within(self, other: "Selection") -> "Selection":
-        """Selection of a log after both selections."""
+        """This selection, applied to a log that was recorded with `other`."""
         return Selection(math.lcm(self.every, other.every), self.left_out | other.left_out)
 
     @property

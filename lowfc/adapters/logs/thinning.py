@@ -9,7 +9,7 @@ from mcap.records import Attachment, Metadata
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.logs.log_copy import LogCopy, new_log
 from lowfc.adapters.logs.parts import Parts, WholeLog, metadata_at_start
-from lowfc.adapters.logs.recovery import RECOVERY, account, faults, in_words, no_end
+from lowfc.adapters.logs.recovery import RECOVERY, account, faults, in_words, missing_end_text
 from lowfc.adapters.logs.selection import SELECTION, Selection
 from lowfc.adapters.logs.writer import PART, stem_of
 from lowfc.contract.messages import topic_of
@@ -91,6 +91,6 @@ def thin(log: Parts, out: Path, requested: Selection, progress: Callable[[int, i
         messages,
         reader.size,
         reader.finished,
-        no_end(log, finished=reader.finished),
+        missing_end_text(log, finished=reader.finished),
         [in_words(one) for one in reader.damage],
     )

@@ -229,7 +229,7 @@ class LogWriter:
                 schema_id=self._schema(topic),
                 metadata={
                     "description": topic.sentence,
-                    "publisher": ", ".join(sorted(topic.publisher)),
+                    "publisher": ", ".join(sorted(topic.publishers)),
                     START_KEY: str(start_s),
                 },
             )

@@ -13,14 +13,14 @@ from pathlib import Path
 from typing import IO
 
 _TAIL_LINES = 6
-_DIES_WITH = """
+_EXEC_WITH_DEATH_SIGNAL = """
 import ctypes, os, sys
 number, parent = map(int, sys.argv[1:3])
 ctypes.CDLL(None).prctl(1, number)  # PR_SET_PDEATHSIG, which exec keeps
 if os.getppid() == parent:  # the parent is still alive
     os.execvp(sys.argv[3], sys.argv[3:])
 """
-"""Sets the signal, then becomes the program: a separate process, as no code may run between fork and exec."""
+"""Program that requests the death signal, then executes the child's command; no code may run between fork and exec."""
 
 
 @dataclass(slots=True)
@@ -28,7 +28,7 @@ class Child:
     """A child process whose standard error goes to a file; `name` is its name in Health or in messages.
 
     `environment` defaults to this process's. The child gets `death_signal` when its parent dies; only SIGKILL ends a
-    stopped process.
+    process suspended by SIGSTOP.
     """
 
     name: str
@@ -49,7 +49,15 @@ class Child:
         """
         if shutil.which(self.command[0], path=(self.environment or os.environ).get("PATH")) is None:
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), self.command[0])
-        death = [sys.executable, "-I", "-S", "-c", _DIES_WITH, str(self.death_signal.value), str(os.getpid())]
+        death = [
+            sys.executable,
+            "-I",
+            "-S",
+            "-c",
+            _EXEC_WITH_DEATH_SIGNAL,
+            str(self.death_signal.value),
+            str(os.getpid()),
+        ]
         self._stream = self.stderr_path.open("wb")
         self.process = subprocess.Popen(  # noqa: S603  # our own programs, and the viewer's
             [*death, *self.command],
@@ -84,8 +92,8 @@ class Child:
         lines = self.stderr_path.read_text(errors="replace").strip().splitlines() if self.stderr_path.exists() else []
         return "\n".join(lines[-_TAIL_LINES:])
 
-    def how_it_ended(self) -> str:
-        """One line on how the process ended by itself."""
+    def exit_description(self) -> str:
+        """One line on how the process ended."""
         status = self.status
         if status is not None and status < 0:
             return f"{self.name} was killed by {signal.Signals(-status).name}"

@@ -123,7 +123,7 @@ def let_send() -> None:
         os.sched_yield()
 
 
-def give_way() -> None:
+def lower_priority() -> None:
     """Lower this process's priority below the loop and its recorder; for a monitor, which may be late."""
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # do not inherit the class of a parent in the loop
     os.nice(_MONITOR_NICE)

@@ -151,9 +151,9 @@ class RerunViewer:
         except psutil.NoSuchProcess:
             return 0
 
-    def how_it_ended(self) -> str:
+    def exit_description(self) -> str:
         """One line on how the viewer ended."""
-        how = self._child.how_it_ended()
+        how = self._child.exit_description()
         return how if (self._child.status or 0) < 0 else f"{how} ({self._failure()})"
 
     def stop(self) -> None:
@@ -201,7 +201,7 @@ class RerunViewer:
         ready = self._page_is_served if self.show is Show.WEB else self._draws
         while not (ready() and self.alive):
             if not self.alive:
-                raise ViewerError(f"{self.how_it_ended()}{_ADVICE[self.show]}")
+                raise ViewerError(f"{self.exit_description()}{_ADVICE[self.show]}")
             if time.monotonic() > deadline_s:
                 raise ViewerError(
                     f"the viewer does not answer on {self.url} after {_START_S:g} s; its last output: "
@@ -258,7 +258,7 @@ class RerunViewer:
         if answers:
             return answers[0]
         if not self.alive:
-            raise ViewerError(self.how_it_ended())
+            raise ViewerError(self.exit_description())
         what = f"answers with {faults[0]}" if faults else f"does not answer within {_CALL_S:g} s"
         raise ViewerError(f"the viewer on {self.url} {what}; stop it and start it again")
 

@@ -62,7 +62,7 @@ class AravisCamera:
         self._camera.start_acquisition()
 
     def settings(self) -> CameraSettings:
-        """Settings as the camera accepted them."""
+        """Settings; exposure time and, without a trigger, frame period are those that the camera reports."""
         return self._settings
 
     def expose(self) -> Exposure | None:

@@ -13,7 +13,7 @@ def circle(samples: int) -> Array:
     return (u[:, None] ** 2 + u**2 <= 0.25).astype(np.float64)
 
 
-def with_bar(samples: int, width: float, angle_deg: float) -> Array:
+def circle_with_bar(samples: int, width: float, angle_deg: float) -> Array:
     """Circle (samples, samples) with a bar from the centre to the edge, which makes it asymmetric (Sect. 4, [46]).
 
     Args:

@@ -1,4 +1,4 @@
-"""Phase screens with the power spectrum of Kolmogorov turbulence (Sect. 3.2)."""
+"""Phase screens with the power spectrum of Kolmogorov turbulence (Subedi et al. 2015, Sect. 3.2)."""
 
 import numpy as np
 import scipy.fft
@@ -11,9 +11,9 @@ _SPECTRUM = 0.0229  # power spectrum of the phase at one cycle per D for r0 = D,
 def kolmogorov(rng: np.random.Generator, samples: int, width: int = 4) -> Array:
     """Screen (samples, samples) with spectrum f^-11/3, at the samples of a pupil, in radians for r0 = D.
 
-    It is cut out of a periodic screen, which contains no wave longer than its width, so that it lacks tilt: over a
-    circle, tilt has 0.90 rad^2 of the 1.03 rad^2 of an infinite screen (Noll 1976), but about 0.3 rad^2 here at a width
-    of 4 and 0.04 at a width of 1. At a width of 4 the orders above tilt are nearly complete.
+    It is cut from a periodic screen. Waves longer than the periodic screen are missing, so tilt is too small: over a
+    circle an infinite screen has 0.90 of its 1.03 rad^2 in tilt (Noll 1976); here tilt has about 0.3 rad^2 at width 4
+    and 0.04 at width 1. At width 4 the orders above tilt are nearly complete.
 
     Args:
         rng: Generator of all random numbers.
@@ -31,6 +31,6 @@ def kolmogorov(rng: np.random.Generator, samples: int, width: int = 4) -> Array:
     f2[0, 0] = np.inf  # no piston
     amplitude = np.sqrt(_SPECTRUM) * f2 ** (-11.0 / 12.0)
     spectrum = scipy.fft.rfft2(rng.standard_normal((count, count))) * amplitude
-    # White noise has a power of count^2 at each frequency; the inverse transform divides by it once more.
+    # Each frequency of the white noise has the power count^2; irfft2 divides amplitudes by count^2.
     periodic = (count / width) * scipy.fft.irfft2(spectrum, (count, count))
     return np.ascontiguousarray(periodic[:samples, :samples])

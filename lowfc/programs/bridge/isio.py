@@ -16,7 +16,7 @@ from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.image_stream.channels import OtherChannels, channel_names
 from lowfc.adapters.image_stream.stream import Stream, StreamAbsentError, StreamError, stream_path
 from lowfc.adapters.process.clock import Clock, HostClock
-from lowfc.adapters.process.realtime import give_way
+from lowfc.adapters.process.realtime import lower_priority
 from lowfc.arrays import Single
 from lowfc.client import Client
 from lowfc.client.runs import the_known_run
@@ -53,7 +53,7 @@ def bridge_isio(
         raise ConfigurationError(
             f"--beside must be a channel such as dm00disp03, got {beside!r}; give other channels with --external"
         )
-    give_way()
+    lower_priority()
     run_id, clock = the_known_run(run), HostClock()
     bus = ZenohBus(open_run(run_id, ()).links, Role.OPERATOR, clock, monitor=True)
     with contextlib.closing(bus), contextlib.suppress(KeyboardInterrupt):

@@ -180,4 +180,4 @@ ACTIONS = (
     requested("n", "note"),
 )
 """Buttons in the order of the screen."""
-EVERY = {one.name: one for one in (*ACTIONS, SAFE)}
+ALL_ACTIONS = {one.name: one for one in (*ACTIONS, SAFE)}

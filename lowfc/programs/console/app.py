@@ -21,7 +21,7 @@ from lowfc.contract.errors import LowfcError
 from lowfc.contract.events import Level as Severity
 from lowfc.control.loop.wording import AUTO
 from lowfc.programs.console import panels
-from lowfc.programs.console.actions import ACTIONS, EVERY, SAFE, Action, Values
+from lowfc.programs.console.actions import ACTIONS, ALL_ACTIONS, SAFE, Action, Values
 from lowfc.programs.console.feed import Feed, Reading
 from lowfc.programs.console.form import Form, Help
 from lowfc.programs.console.gains import Gains
@@ -167,7 +167,7 @@ class Console(OrderedKeys):
 
     def action_press(self, name: str) -> None:
         """Do what a button does: at once, or with a form first."""
-        action = EVERY[name]
+        action = ALL_ACTIONS[name]
         if action.fields or action.confirm:
             self.push_screen(Form(action))
         else:
@@ -201,7 +201,7 @@ class Console(OrderedKeys):
 
     @on(Button.Pressed)
     def _pressed(self, event: Button.Pressed) -> None:
-        name = next((one.name for one in EVERY.values() if _id(one) == event.button.id), None)
+        name = next((one.name for one in ALL_ACTIONS.values() if _id(one) == event.button.id), None)
         if name is not None:
             self.set_focus(None)
             self.action_press(name)
@@ -213,7 +213,7 @@ class Console(OrderedKeys):
     @on(Gains.Turned)
     def _turned(self, event: Gains.Turned) -> None:
         modes, values = ",".join(map(str, event.modes)), " ".join(map(str, event.values))
-        self._do(EVERY["gain"], {"modes": modes, "values": values or AUTO})
+        self._do(ALL_ACTIONS["gain"], {"modes": modes, "values": values or AUTO})
 
     def _do(self, action: Action, values: Values) -> None:
         """Start a task, or send a request in its own thread.

@@ -16,9 +16,9 @@ def console(run: AnyRun = None) -> None:
     """
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
         raise ConfigurationError("the console requires a terminal; `lowfc ctl` operates a loop without one")
-    from lowfc.adapters.process.realtime import give_way
+    from lowfc.adapters.process.realtime import lower_priority
 
-    give_way()
+    lower_priority()
     from lowfc.client.runs import the_run
 
     run_id = the_run(run)

@@ -15,7 +15,7 @@ from lowfc.client import Client
 from lowfc.client.runs import the_run
 from lowfc.contract.configuration import load
 from lowfc.contract.messages import Role
-from lowfc.programs.gateway.offer import Put, status_of, variables
+from lowfc.programs.gateway.variables import Put, status_of, variables
 from lowfc.programs.gateway.watch import Watch
 
 PERIOD_S = 0.1

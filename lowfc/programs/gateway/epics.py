@@ -10,7 +10,7 @@ from lowfc.adapters.process.extras import install_advice
 from lowfc.contract.errors import BusError, ConfigurationError, LowfcError
 from lowfc.contract.sections import Gateway
 from lowfc.control.loop.interlocks import Value
-from lowfc.programs.gateway.offer import Kind, Put, Variable
+from lowfc.programs.gateway.variables import Kind, Put, Variable
 
 _CODES = {Kind.BOOLEAN: "?", Kind.NUMBER: "d", Kind.TEXT: "s", Kind.NUMBERS: "ad"}
 _EMPTY: dict[Kind, Any] = {Kind.BOOLEAN: False, Kind.NUMBER: 0.0, Kind.TEXT: "", Kind.NUMBERS: []}

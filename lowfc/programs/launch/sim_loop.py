@@ -177,7 +177,7 @@ def _supervise(
 def died(child: Child) -> ProcessDiedError:
     """The error for a process that ended."""
     tail = child.stderr_tail()
-    return ProcessDiedError(child.how_it_ended() + (f"; the end of its output:\n{tail}" if tail else ""))
+    return ProcessDiedError(child.exit_description() + (f"; the end of its output:\n{tail}" if tail else ""))
 
 
 def check(children: list[Child]) -> None:
@@ -192,7 +192,7 @@ def _report_view_ended(view: Child, console: Console) -> None:
     """Print the end of the view's standard error, unless its window was just closed."""
     if view.status != 0:
         why = view.stderr_tail().splitlines()[-1:] if view.status is not None and view.status > 0 else []
-        ending = "; ".join([view.how_it_ended(), *why])
+        ending = "; ".join([view.exit_description(), *why])
         text = f"the loop continues without a view ({ending}); `lowfc view` opens another"
         console.print(text, markup=False, soft_wrap=True)
 

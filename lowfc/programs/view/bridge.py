@@ -153,7 +153,7 @@ class Bridge:
             if native:
                 self.service.stop("the viewer was closed")
             else:
-                self._renew(viewer.how_it_ended())
+                self._renew(viewer.exit_description())
         elif render.fault is not None:
             self._renew(f"drawing failed: {render.fault!r}")
         elif self._stuck:  # a window belongs to its user and is not restarted

@@ -36,10 +36,10 @@ def view(
 
     Example: lowfc view --web
     """
-    from lowfc.adapters.process.realtime import give_way
+    from lowfc.adapters.process.realtime import lower_priority
     from lowfc.client.runs import the_known_run
 
-    give_way()
+    lower_priority()
     if foxglove:
         if logs or native or web or save or headless_screenshot or seconds or config or as_json:
             raise ConfigurationError("--foxglove serves a running loop until Ctrl-C, with --run and --port alone")

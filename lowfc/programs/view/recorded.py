@@ -6,7 +6,7 @@ from pathlib import Path
 
 from lowfc.adapters.logs.history import attached_configuration
 from lowfc.adapters.logs.reader import LogReader
-from lowfc.adapters.logs.recovery import no_end
+from lowfc.adapters.logs.recovery import missing_end_text
 from lowfc.adapters.process.clock import SimulatedClock
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
@@ -82,10 +82,10 @@ def draw_logs(
         complete &= reader.complete
         drawn.remarks += [f"{log.name}: {damage}" for damage in reader.damage]
         if not reader.complete and not reader.damage:
-            drawn.remarks.append(f"{log.name}: {no_end([log], finished=False)}")
+            drawn.remarks.append(f"{log.name}: {missing_end_text([log], finished=False)}")
     if renderer is None:
         raise DataFileError(f"nothing to show in {', '.join(map(str, logs))}: no message that a view shows")
-    ended = LogEnd(logs[-1].name.partition(".")[0], complete, run, host, no_end(logs, finished=complete))
+    ended = LogEnd(logs[-1].name.partition(".")[0], complete, run, host, missing_end_text(logs, finished=complete))
     renderer.draw(accumulator.snapshot(last_ns, ended=ended))
     if accumulator.unreadable:
         drawn.remarks.append(f"{counted(accumulator.unreadable, 'message')} could not be read")

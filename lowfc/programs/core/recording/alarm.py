@@ -14,7 +14,7 @@ import time
 from collections import deque
 
 from lowfc.adapters.bus.bus import Sample
-from lowfc.adapters.process.realtime import give_way
+from lowfc.adapters.process.realtime import lower_priority
 from lowfc.adapters.process.service import Service
 from lowfc.contract.events import EVENTS, Level
 from lowfc.contract.messages import EVENT, Log, from_timestamp
@@ -45,7 +45,7 @@ class Alarm:
             self._arrived.set()
 
     def _work(self) -> None:
-        give_way()  # only this thread and its child processes
+        lower_priority()  # only this thread and its child processes
         while self._arrived.wait():
             self._arrived.clear()
             events = [self._waiting.popleft() for _ in range(len(self._waiting))]

@@ -46,7 +46,7 @@ def export(
     ] = None,
     topics: Annotated[
         list[str] | None,
-        typer.Option(help="With --decimate: only these of frames, mirror state and surface, truth, timing; repeat."),
+        typer.Option(help="With --decimate: keep only these optional topics (keys or patterns); repeat. Default: all."),
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Output file; default: the log's name, next to the log.")] = None,
     frames: Annotated[
@@ -70,8 +70,8 @@ def export(
     table_options, log_options = bool(frames or force), bool(topics)
     if log_options if decimate is None else (to is not None or table_options):
         raise ConfigurationError(
-            "an export is a table (--to FORMAT, with --frames and --force) or a smaller log (--decimate N, with "
-            "--topics): use one"
+            "--to, --frames and --force convert the log; --topics needs --decimate, which writes a smaller log: use "
+            "one or the other"
         )
     console = Console(stderr=True)
     for log in one_by_one(logs, out, as_json=as_json):
@@ -98,7 +98,7 @@ def export_log(
     from lowfc.adapters.files.whole_file import being_written
     from lowfc.adapters.logs.history import read_history
     from lowfc.adapters.logs.parts import WholeLog
-    from lowfc.adapters.logs.recovery import no_end
+    from lowfc.adapters.logs.recovery import missing_end_text
     from lowfc.adapters.logs.writer import stem_of
     from lowfc.adapters.process.progress import reading_bar
     from lowfc.programs.logs.guard import refuse_log
@@ -130,7 +130,7 @@ def export_log(
         "steps_left_out": history.left_out,
         "selection": reader.selection.sentence,
         "finished": reader.finished,
-        "no_end": no_end(reader.paths, finished=reader.finished),
+        "no_end": missing_end_text(reader.paths, finished=reader.finished),
         "damaged": [f"byte {one.position}, {one.why}" for one in reader.damage],
         "remarks": history.remarks,
     }
@@ -141,17 +141,17 @@ def render(figures: dict[str, Any]) -> str:
     from lowfc.adapters.logs.recovery import faults
 
     frames = f", {figures['frames']} frames" if figures["frames"] else ""
-    lines = [f"the log has        {figures['selection']}"] if figures["selection"] else []
+    lines = [f"recorded           {figures['selection']}"] if figures["selection"] else []
     lines += [f"{', '.join(figures['files'])}: {figures['steps']} steps of {figures['modes']} modes{frames}"]
     if figures["steps_left_out"]:
-        lines.append(f"left out           {figures['steps_left_out']} steps with another calibration's modes")
+        lines.append(f"left out           {figures['steps_left_out']} steps measured with a calibration of other modes")
     lines += faults(figures["damaged"], figures["no_end"])
     lines += [f"configuration      {remark}" for remark in figures["remarks"]]
     return "\n".join(lines)
 
 
 def _writer(to: Format, *, with_frames: bool) -> "Callable[[list[Path], History], None]":
-    """The writer of a format; it receives the output files and the run."""
+    """The writer of a format: a function of the output files and the log's history."""
     if to is Format.AOT:
         try:
             from lowfc.programs.logs.export.aot import write_aot

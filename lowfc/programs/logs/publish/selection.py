@@ -88,9 +88,9 @@ def role_of(key: str) -> str:
         return name
     if topic is BENCH:  # a recorded one would describe the devices connected now
         return Role.BENCH
-    if len(topic.publisher) > 1:
+    if len(topic.publishers) > 1:
         return ""
-    (role,) = topic.publisher
+    (role,) = topic.publishers
     return mirror_role(name) if role is Role.MIRROR else role
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from lowfc.adapters.files.factory import contrast_of, detector, equivalent_read_noise_e
 from lowfc.adapters.logs.columns import count_reasons
-from lowfc.adapters.logs.recovery import no_end
+from lowfc.adapters.logs.recovery import missing_end_text
 from lowfc.arrays import Array, Mask, Single
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.errors import CalibrationError, ConfigurationError
@@ -232,7 +232,7 @@ def _log_warnings(run: LoggedRun) -> list[str]:
         parts = ", ".join(f"byte {one.position}, {one.why}" for one in log.damage)
         found.append(f"the log is damaged; left out: {parts}")
     if not log.finished:
-        found.append(no_end(log.paths, finished=False))
+        found.append(missing_end_text(log.paths, finished=False))
     if log.metadata.get("recording", {}).get("stopped"):
         found.append(f"recording stopped: {log.metadata['recording']['stopped']}")
     if run.measured_delay is None:

@@ -15,9 +15,9 @@ _LOOP = frozenset({Role.CAMERA, Role.CONTROLLER, Role.MIRROR})
 
 
 def log_figures(files: LogFiles, progress: Callable[[int, int], None]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Figures of one log as of one repeat, and the host as in the log's metadata.
+    """Latency figures of a log, as of one repeat of a benchmark, and the host that its metadata describes.
 
-    For a loop on several hosts, `clock_error_us` is the largest error of a span from one host to another.
+    For a loop on several hosts, `clock_error_us` is the largest error of a latency between two hosts.
     """
     log = WholeLog(files)
     log.progress = progress
@@ -27,8 +27,7 @@ def log_figures(files: LogFiles, progress: Callable[[int, int], None]) -> tuple[
     figures = repeat_figures(join(history.frame_sequence, history.frame_publish_ns, None, timing, mirror))
     if "frame_to_command" not in figures["latency_us"]:
         raise DataFileError(
-            f"{log.path} has no frame with a timing of the controller after the first half second; it is too short, or "
-            "not the log of a loop"
+            f"{log.path} has no controller timing after its first 0.5 s: it is too short, or not the log of a loop"
         )
     controller = history.health.get(Role.CONTROLLER, wire.Health())
     host: dict[str, Any] = dict(log.metadata.get("lowfc", {}))

@@ -1,4 +1,4 @@
-"""Figure 9: correction of a Kolmogorov screen by 14 modes."""
+"""Figure 9: estimate of a Kolmogorov screen with 14 modes, and its residual."""
 
 from functools import lru_cache, partial
 from pathlib import Path

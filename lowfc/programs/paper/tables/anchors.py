@@ -22,7 +22,7 @@ from lowfc.control.laws.kalman import lqg
 from lowfc.control.laws.spectra import pieces
 from lowfc.control.laws.tuning import identified, predicted_nm
 from lowfc.design.paper import TABLE4_MAS
-from lowfc.design.tolerance import best_gain, left_of_drift_nm2
+from lowfc.design.tolerance import best_gain, drift_residual_nm2
 from lowfc.design.trials import noisy_e
 from lowfc.optics.chain.zernike import NOLLS_14, mode_name
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
@@ -233,7 +233,7 @@ def added_contrast(name: str, magnitude: float, quantum: bool = False) -> float:
     noise = tolerance.quantum_noise_nm2(prepared(name), magnitude) if quantum else noise
     step = (DRIFT_PM / 1e3) ** 2 / tolerance.RATE_HZ
     residual_nm2 = [
-        left_of_drift_nm2(step, n, tolerance.EXPOSURE, best_gain(step, n, tolerance.EXPOSURE)) for n in noise.tolist()
+        drift_residual_nm2(step, n, tolerance.EXPOSURE, best_gain(step, n, tolerance.EXPOSURE)) for n in noise.tolist()
     ]
     return float(sum(tolerance.contrasts_of(name).added(mode, each) for mode, each in enumerate(residual_nm2)))
 

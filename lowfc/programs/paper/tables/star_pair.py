@@ -7,7 +7,7 @@ import numpy as np
 
 from lowfc.arrays import Array, Mask
 from lowfc.control.calibration.calibration import normalise_flux, reconstructor
-from lowfc.design.tolerance import best_gain, left_of_drift_nm2
+from lowfc.design.tolerance import best_gain, drift_residual_nm2
 from lowfc.optics.chain.band import Band, gauss_legendre
 from lowfc.optics.chain.coronagraph import DARK_ZONE, contrast, wedge_samples
 from lowfc.optics.chain.sensor import reference, response
@@ -79,7 +79,7 @@ def pair_rows(name: str) -> Iterator[Row]:
         noise = np.diag(tolerance.frame_noise_nm2(name, magnitude)).tolist()
         gains = np.array([best_gain(step, n, tolerance.EXPOSURE) for n in noise])
         residual_nm2[star] = np.array(
-            [left_of_drift_nm2(step, n, tolerance.EXPOSURE, g) for n, g in zip(noise, gains.tolist(), strict=True)]
+            [drift_residual_nm2(step, n, tolerance.EXPOSURE, g) for n, g in zip(noise, gains.tolist(), strict=True)]
         )
         yield made(
             f"added contrast, {star}, V = {magnitude:g}",

@@ -192,7 +192,7 @@ def _checked(context: Context) -> list[Row]:
         trial = DriftTrial(prepared(name).twin, NOLLS_14, light_e(magnitude), READ_NOISE_E, EXPOSURE)
         only = np.eye(len(NOLLS_14))[mode]
         rng = context.rng("tolerance", name, round(magnitude), noll)
-        residual_nm2 = trial.left_nm2(drift.step_nm2 * only, drift.gain * only, frames, rng)
+        residual_nm2 = trial.residual_nm2(drift.step_nm2 * only, drift.gain * only, frames, rng)
         return Row(
             name,
             f"contrast added by Z{noll} {mode_name(noll)} at its tolerance, V = {magnitude:g}",
