@@ -59,7 +59,7 @@ LOOP_COLUMNS = {
 
 
 SHORT_COLUMNS = {
-    "simulated loop, reaction-wheel jitter": "{rate_hz:.0f} frames per second",
+    "simulated loop, reaction-wheel jitter": "{name}",
     "frame to command, p50 / p99, us": "{latency_us[frame_to_command][p50]:.0f} / "
     "{latency_us[frame_to_command][p99]:.0f}",
     "tilt disturbance, mas rms per axis": "{tilt_disturbance_mas:.1f}",
@@ -75,7 +75,8 @@ runs and the method."""
 
 def short(figures: Figures) -> str:
     """Rate, latency and residual of the runs with real-time scheduling."""
-    rows = (run for name, run in figures["runs"].items() if "SCHED_FIFO" in name)
+    runs = figures["runs"].items()
+    rows = (run | {"name": name.partition(",")[0]} for name, run in runs if "SCHED_FIFO" in name)
     return f"{columns(SHORT_COLUMNS, rows)}\n{SHORT_NOTE}\n"
 
 
