@@ -128,7 +128,7 @@ def test_the_accuracy_is_reached_at_the_default_snr_and_with_halved_amplitudes(s
 def test_the_verdict_names_the_mode_if_the_snr_is_out_of_reach(seed: int, tmp_path: Path) -> None:
     found = outcome("hadamard", WHEEL, seed, 30.0, tmp_path)
     assert found.verdict.snr_reached < 30
-    assert "required: find the disturbance of this mode, or take about" in found.verdict.faults[0]
+    assert "required: find what disturbs this mode, or measure about" in found.verdict.faults[0]
 
 
 @pytest.mark.slow
