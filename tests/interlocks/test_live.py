@@ -1,4 +1,4 @@
-"""Interlocks with the real processes: a value acts within some frames, replay is identical, a flood loses no frame."""
+"""Interlocks with the real processes: a value acts at the next frame, replay is identical, a flood loses no frame."""
 
 import json
 import random
@@ -19,8 +19,6 @@ MAX_AGE_S = 1
 FLOOD_HZ = 2000
 FLOOD_S = 1
 S = 1_000_000_000
-GRACE_NS = 20_000_000
-"""Ten frames: a value takes less than one on a quiet host."""
 CONFIG = f"""
 [camera]
 rate_hz = 500
@@ -42,10 +40,10 @@ when_old = "passes"
 OPTIONS = ("--config", "night.toml", "--run", "flipped", "--duration", "600")
 
 
-@pytest.mark.slow  # two busy cores may lose messages of the flood
+@pytest.mark.slow  # on two busy cores stalls skip more frames, and the flood loses messages
 @pytest.mark.exclusive
 def test_interlocks_with_changing_flooding_and_missing_values(tmp_path: Path) -> None:
-    """At 500 Hz: frames obey the values before them; a flood loses no frame; old values count as missing."""
+    """At 500 Hz: the first frame after a value obeys it; a flood loses no frame; old values count as missing."""
     (tmp_path / "night.toml").write_text(CONFIG)
     process = start(tmp_path, "sim-loop", "--json", *OPTIONS)
     try:
@@ -58,13 +56,13 @@ def test_interlocks_with_changing_flooding_and_missing_values(tmp_path: Path) ->
     assert process.returncode == 0, complaints
     figures = json.loads(out)
     assert figures["frames_missing"] == figures["messages_lost"] == 0
-    assert figures["frames_skipped"] < 100, "a stall of the host skips a few dozen, a flood would skip hundreds"
+    assert figures["frames_skipped"] <= 3, "a stall of the host skips a few, a flood would skip hundreds"
     log = tmp_path / figures["log"]
     replayed = json.loads(output_of(tmp_path, f"lowfc replay --json {log}"))
     assert replayed["identical"]
     assert replayed["unchecked"] == 0
     _steps_follow_the_inputs(log)
-    _values_act_soon(log)
+    _values_act_at_the_next_frame(log)
 
 
 def _publish(name: str) -> None:
@@ -76,7 +74,7 @@ def _publish(name: str) -> None:
         loop.bench("shutter", "open")
         for number in range(FLIPS):  # some fall between the same two frames
             for acts in (True, False):
-                time.sleep(rng.uniform(0, 0.015) if number % 3 else 2 * GRACE_NS / S)
+                time.sleep(rng.uniform(0, 0.015))
                 if number % 5:
                     loop.bench("mask", acts)
                     continue
@@ -134,8 +132,8 @@ def _steps_follow_the_inputs(log: Path) -> None:
     assert 0 < age_ns - MAX_AGE_S * S < S // 10
 
 
-def _values_act_soon(log: Path) -> None:
-    """The first frame published `GRACE_NS` after a value obeys it; a stall of the host may delay a few values."""
+def _values_act_at_the_next_frame(log: Path) -> None:
+    """The first frame published at least a period after a value obeys it; a few values may arrive later."""
     messages = list(LogReader(log, topics=[BENCH, STEP, FRAME]))
     values = [one for one in messages if one.key == BENCH.at("mask")]
     frames_ns = {one.sequence: one.publish_time_ns for one in messages if one.key == FRAME.key}
@@ -143,10 +141,10 @@ def _values_act_soon(log: Path) -> None:
     obeyed = []
     for value, after in pairwise(values):
         acts = wire.BenchValue.FromString(value.payload).truth
-        begun_ns = value.publish_time_ns + GRACE_NS
+        begun_ns = value.publish_time_ns + S // 500
         made = [step for step in steps if begun_ns < frames_ns[step.frame_sequence] < after.publish_time_ns]
         obeyed += [
             (wire.REASON_HELD in step.reasons) is (acts and step.mode == wire.LOOP_MODE_CLOSED) for step in made[:1]
         ]
-    assert len(obeyed) > FLIPS // 3
+    assert len(obeyed) > FLIPS // 2
     assert obeyed.count(False) <= len(obeyed) // 10, f"{obeyed.count(False)} of {len(obeyed)} values arrived later"
