@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import IO
 
 _TAIL_LINES = 6
-_EXEC_WITH_DEATH_SIGNAL = """
+_WRAPPER = """
 import ctypes, os, sys
 number, parent = map(int, sys.argv[1:3])
 ctypes.CDLL(None).prctl(1, number)  # PR_SET_PDEATHSIG, which exec keeps
@@ -49,15 +49,7 @@ class Child:
         """
         if shutil.which(self.command[0], path=(self.environment or os.environ).get("PATH")) is None:
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), self.command[0])
-        death = [
-            sys.executable,
-            "-I",
-            "-S",
-            "-c",
-            _EXEC_WITH_DEATH_SIGNAL,
-            str(self.death_signal.value),
-            str(os.getpid()),
-        ]
+        death = [sys.executable, "-I", "-S", "-c", _WRAPPER, str(self.death_signal.value), str(os.getpid())]
         self._stream = self.stderr_path.open("wb")
         self.process = subprocess.Popen(  # noqa: S603  # our own programs, and the viewer's
             [*death, *self.command],

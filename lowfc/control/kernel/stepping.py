@@ -83,7 +83,8 @@ def _fused(
     results = np.empty(3 * modes + x.size, np.float32)
     actuators_nm = np.empty_like(loop.actuators_nm)
     signals = measured_nm, loop.seen_nm(), shift_nm, target_nm, loop.history_nm[0]
-    integrator, mirror = loop.integrator.rows, (tables.shapes, channels_nm, loop.actuators_nm)
+    integrator = loop.integrator.rows
+    mirror = tables.shapes, channels_nm, loop.actuators_nm
     limits_nm = limits.kept_stroke_nm, limits.kept_slew_nm, limits.neighbour_nm - limits.margin_nm / 2
     if not tables.respond(*signals, integrator, x, *law, from_error, *mirror, *limits_nm, results, actuators_nm):
         return None

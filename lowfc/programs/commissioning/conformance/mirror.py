@@ -7,6 +7,7 @@ import numpy as np
 
 from lowfc.arrays import Mask, Single
 from lowfc.contract.messages import from_timestamp, wire
+from lowfc.device.guard import MAX_VALID_NS
 from lowfc.programs.commissioning.checks import Check, Status, judged, ok, warning, wrong
 from lowfc.programs.commissioning.conformance.dialogue import ANSWER_S, MODAL_NM, Dialogue, Show
 from lowfc.programs.commissioning.conformance.line import NS
@@ -15,8 +16,6 @@ from lowfc.programs.commissioning.conformance.publisher import PROCESS, PUBLISHE
 IDLE_S = 1.0
 EXPIRES_NS = 300_000_000
 SLACK_NS = 400_000_000
-MAX_VALID_NS = 2_000_000_000
-"""Longest time that a mirror may hold a command, whatever its valid_for_ns."""
 
 _FOLLOWING, _EXPIRED = wire.MIRROR_STATUS_FOLLOWING, wire.MIRROR_STATUS_EXPIRED
 _LONG_NS = 60 * NS

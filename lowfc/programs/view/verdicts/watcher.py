@@ -217,10 +217,8 @@ class Watcher:
         steps = snapshot.steps
         counts = Counts(count_reasons(steps.reasons))
         counts.update(steps=len(steps.mode), **self._grown(snapshot))
-        squares = (
-            _squares(snapshot, snapshot.wavefronts(true=True)),
-            _squares(snapshot, snapshot.wavefronts(true=False)),
-        )
+        true, measured = snapshot.wavefronts(true=True), snapshot.wavefronts(true=False)
+        squares = _squares(snapshot, true), _squares(snapshot, measured)
         durations_ns = snapshot.timings["frame_to_command"]
         return _Sample(snapshot.host_ns, counts, squares, steps.sequence, steps.time_ns, durations_ns)
 
