@@ -5,6 +5,7 @@ Camera, mirror and launcher all use it, so that they interpret the keys in the s
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError, ConfigurationError
 from lowfc.contract.messages import fields_of
-from lowfc.contract.sections import InterlockSection
+from lowfc.contract.sections import InterlockSection, SensorSection
 from lowfc.control.calibration.actuator_response import actuators_to_modes
 from lowfc.control.calibration.calibration import Calibration, noise_nm2, normalise_flux, reconstructor
 from lowfc.control.loop.camera import CameraSettings
@@ -66,8 +67,18 @@ def twin(config: Configuration, progress: Progress | None, warn: Callable[[str],
 
 
 def contrast_of(config: Configuration) -> ModalContrast:
-    """Contrast that the modes add in the dark zone. Takes 0.1 s to compute, with a Lyot stop 0.5 s."""
-    return ModalContrast(coronagraph_from(config.sensor), config.noll, config.star.wavelength_nm)
+    """Contrast that the modes add in the dark zone. Takes 0.1 s to compute, with a Lyot stop 0.5 s, then is cached."""
+    key = config.sensor, config.noll, config.star.wavelength_nm
+    return _contrast_of(*key) if config.sensor.pupil.endswith(".npz") else _cached_contrast_of(*key)  # files change
+
+
+def _contrast_of(section: SensorSection, noll: tuple[int, ...], wavelength_nm: float) -> ModalContrast:
+    contrast = ModalContrast(coronagraph_from(section), noll, wavelength_nm)
+    contrast.form.flags.writeable = False
+    return contrast
+
+
+_cached_contrast_of = lru_cache(maxsize=8)(_contrast_of)
 
 
 def electrons_per_exposure(config: Configuration) -> float:
