@@ -10,30 +10,42 @@ import pytest
 from lowfc.adapters.files import factory
 from lowfc.arrays import Array, Single
 from lowfc.contract.codecs.state_codec import controller_state, decode_state
-from lowfc.contract.configuration import FIXED_GAINS, load
+from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.map_reconstructor import noise_covariance_nm2
 from lowfc.control.laws.automatic_gain import GainBank, TiltCrossTalk
 from lowfc.control.laws.integrator import RELAXING
 from lowfc.control.loop.safety import LoopMode
+from tests.support.in_process_loop import SMALL_MIRROR
 from tools.law_bench import Bench, calibrated, configured
+from tools.modal_bench import ModalBench
 
 AUTO = {"control.tilt_gain": "auto", "control.gain": "auto"}
 
 
 @cache
 def calibration(magnitude: float, sensor: str) -> Calibration:
-    return calibrated(configured(sensor, **{"camera.rate_hz": 250.0, "star.magnitude": magnitude}))
+    return calibrated(configured(sensor, **{"camera.rate_hz": 250.0, "star.magnitude": magnitude}, **SMALL_MIRROR))
 
 
-def bench(magnitude: float, preset: str = "bench", sensor: str = "sam", **changed: Any) -> Bench:
+def configuration(magnitude: float, preset: str = "bench", sensor: str = "sam", **changed: Any) -> Configuration:
     star = {
         "camera.rate_hz": 250.0,
         "star.magnitude": magnitude,
         "disturbance.preset": preset,
         "control.start_mode": "closed",
     }
-    return Bench(configured(sensor, **AUTO | star | changed), calibration(magnitude, sensor))
+    return configured(sensor, **AUTO | star | SMALL_MIRROR | changed)
+
+
+def bench(magnitude: float, preset: str = "bench", sensor: str = "sam", **changed: Any) -> Bench:
+    return Bench(configuration(magnitude, preset, sensor, **changed), calibration(magnitude, sensor))
+
+
+def modal_bench(magnitude: float) -> ModalBench:
+    """A loop with the noise of the images, but without images, for tests of requests."""
+    config = configuration(magnitude)
+    return ModalBench(config, factory.frame_noise_nm2(config, calibration(magnitude, "sam")))
 
 
 def named(loop: Bench, name: str) -> list[dict[str, object]]:
@@ -89,16 +101,20 @@ def test_closing_reduces_the_residual_on_a_faint_star(faint: Bench) -> None:
     assert residual_nm < open_nm
 
 
-@pytest.mark.parametrize("duration_s", [7, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("duration_s", [5, pytest.param(20, marks=pytest.mark.slow)])
 def test_automatic_gains_leave_at_most_ten_percent_more_residual_than_fixed_gains(duration_s: float) -> None:
     """`make sim-loop`, default star and disturbance, compared with gains of 0.5 and 0.05."""
     residual_nm, known = [], calibrated(load(None))
     for keys in ({}, FIXED_GAINS):
         config = load(None, {"control.start_mode": "closed"} | keys)
         loop = Bench(config, known)
-        loop.run(round(duration_s * config.camera.rate_hz))
-        assert loop.steps[round(3 * config.camera.rate_hz)].mode is LoopMode.CLOSED
-        residual_nm.append(rms_nm(loop, len(loop.truths) // 3)[0])
+        frames, closed = (round(seconds * config.camera.rate_hz) for seconds in (duration_s, 3))
+        loop.run(closed, record=False)
+        loop.run(1)
+        assert loop.steps[-1].mode is LoopMode.CLOSED
+        loop.run(frames - frames // 3 - closed - 1, record=False)
+        loop.run(frames // 3)
+        residual_nm.append(rms_nm(loop, frames // 3)[0])
     assert residual_nm[0] < 1.1 * residual_nm[1]
 
 
@@ -131,7 +147,7 @@ def test_the_gain_bank_receives_the_response_of_the_reweighted_reconstructor(
 
 def test_the_command_of_a_mode_with_automatic_gain_zero_relaxes_to_zero() -> None:
     """With a manual gain of 0, the command stays."""
-    loop = bench(0.0)
+    loop = modal_bench(2.0)
     loop.run(560)
     loop.ask("gain", modes=(4,), values=(0.0,))
     gain = gains(loop).copy()
@@ -149,8 +165,9 @@ def _contrast_of_open(magnitude: float, seed: int, frames: int) -> float:
     """Ratio of residual to open-loop contrast for a Zernike sensor with reaction-wheel jitter, second half of a run."""
     loop = bench(magnitude, "reaction-wheel", "zwfs", seed=seed)
     form = np.diag(factory.contrast_of(loop.config).form)
-    loop.run(frames)
-    truths = [truth.continuous for truth in loop.truths[-frames // 2 :]]
+    loop.run(frames - frames // 2, record=False)
+    loop.run(frames // 2)
+    truths = [truth.continuous for truth in loop.truths]
     residual, disturbance = (
         form @ np.mean(np.square(values), axis=0)
         for values in ([one.residual_nm for one in truths], [one.disturbance_nm for one in truths])
@@ -214,7 +231,8 @@ def test_added_contrast_is_measured_in_open_and_closed_loop() -> None:
         return float(form @ np.mean(np.square(truths), axis=0))
 
     assert loop.added_contrast() is None
-    loop.run(1000)
+    loop.run(333, record=False)
+    loop.run(667)
     uncorrected, by_mode = loop.added_contrast()
     assert uncorrected == pytest.approx(true("disturbance_nm", 667), rel=0.3)
     assert 0.5 < by_mode.sum() / true("residual_nm", 500) < 2  # the noise of one frame is some ten times the residual
@@ -226,10 +244,11 @@ def test_added_contrast_is_measured_in_open_and_closed_loop() -> None:
 
 def test_manual_gains_are_kept_and_harm_is_reported_before_and_after_closing() -> None:
     loop = bench(6.5, **FIXED_GAINS | {"control.start_mode": "open"})
-    loop.run(500)
+    loop.run(500, record=False)
     assert "closing adds" in loop.closing_harm
     loop.ask("close")
-    loop.run(850)
+    loop.run(250, record=False)
+    loop.run(600)
     assert named(loop, "CLOSING_HARMS")[0]["harm"].startswith("closing adds")
     assert named(loop, "LOOP_HARMS")[0]["action"] == "nothing is done"
     active_loop = loop.state.loop
@@ -241,14 +260,15 @@ def test_manual_gains_are_kept_and_harm_is_reported_before_and_after_closing() -
 
 def test_a_harmful_loop_opens_if_configured() -> None:
     loop = bench(6.5, **FIXED_GAINS | {"control.on_harm": "open"})
-    loop.run(1150)
+    loop.run(1149, record=False)
+    loop.run(1)
     assert loop.steps[-1].mode is LoopMode.OPEN
     assert named(loop, "MODE_CHANGED")[-1]["why"] == "auto: the loop made it worse"
 
 
 @pytest.mark.parametrize("request_name", ["open", "pause"])
 def test_a_loop_opened_by_an_operator_while_gains_are_measured_stays_open(request_name: str) -> None:
-    loop = bench(3.5)
+    loop = modal_bench(2.0)
     loop.run(100)
     loop.ask(request_name)
     loop.run(500)
@@ -257,7 +277,7 @@ def test_a_loop_opened_by_an_operator_while_gains_are_measured_stays_open(reques
 
 
 def test_a_mode_can_have_a_manual_gain_and_return_to_automatic() -> None:
-    loop = bench(2.0)
+    loop = modal_bench(2.0)
     loop.run(510)
     loop.ask("gain", values=(0.3,), modes=(4,))
     loop.run(300)
@@ -269,13 +289,13 @@ def test_a_mode_can_have_a_manual_gain_and_return_to_automatic() -> None:
 
 
 def test_another_star_lowers_the_gains_and_restarts_their_measurement() -> None:
-    loop = bench(1.5)
-    loop.run(560)
+    loop = bench(2.0)
+    loop.run(560, record=False)
     bright = gains(loop)
-    loop.star(3.0)
-    loop.run(150)
+    loop.star(3.5)
+    loop.run(150, record=False)
     assert named(loop, "STAR_CHANGED")[0]["ratio"] == pytest.approx(0.25, rel=0.1)
     assert (gains(loop) <= 0.5 * bright).all()
     changed = len(named(loop, "GAINS_CHANGED"))
-    loop.run(550)
+    loop.run(550, record=False)
     assert len(named(loop, "GAINS_CHANGED")) > changed
