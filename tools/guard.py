@@ -44,9 +44,7 @@ class Case:
         self.keys: dict[str, Any] = {"disturbance.preset": preset, "star.magnitude": magnitude}
         config = configured(**self.keys)
         self.covariance_nm2: Array = frame_noise_nm2(config, calibrated(config))
-        bench = ModalBench(config, self.covariance_nm2)
-        bench.ask("close")
-        bench.run(1_000)
+        bench = ModalBench(config, self.covariance_nm2, watch=False)
         self.law, self.gains = (law_of or identified_law)(config, self.covariance_nm2, bench)
 
     def configured(self, seed: int, **changed: Any) -> Configuration:
@@ -59,7 +57,7 @@ class Case:
         step_nm: Array = (
             steps_mas * tilt_nm_per_mas(config.star.diameter_m) * np.isin(config.noll, TIP_TILT).astype(float)
         )
-        bench = ModalBench(config, self.covariance_nm2, replace(disturbance, step_nm=step_nm))
+        bench = ModalBench(config, self.covariance_nm2, replace(disturbance, step_nm=step_nm), watch=False)
         bench.ask("gain", modes=config.noll, values=tuple(self.gains.tolist()))
         if law is not None:
             bench.load(law)
@@ -69,12 +67,12 @@ class Case:
 
 
 LawOf = Callable[[Configuration, Array, ModalBench], tuple[LinearLaw, Array]]
-"""A law and integrator gains (modes,) from a configuration, the covariance of a frame's noise, and a closed loop."""
+"""A law and integrator gains (modes,) from a configuration, the covariance of a frame's noise, and an open loop."""
 
 
 def identified_law(config: Configuration, covariance_nm2: Array, bench: ModalBench) -> tuple[LinearLaw, Array]:
     """Integrator and gains identified from a log, as by an operator."""
-    bench.new_record()
+    bench.settle(1_000)
     bench.run(_IDENTIFY)
     run, timing = bench.pol(), timing_of(config)
     return tuned(run, config)["lqg"].law, best_gains(run, RATE_HZ, timing, np.zeros(len(config.noll))).gain

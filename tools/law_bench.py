@@ -95,7 +95,9 @@ class Bench:
         self._other_disturbance = disturbance
         self.scene = scene(self.world, disturbance)
         self._settings = factory.settings(config)
-        self._watch = GainWatch(self._settings, config.control.on_harm, factory.contrast_of(config).form)
+        self._watch: GainWatch | None = GainWatch(
+            self._settings, config.control.on_harm, factory.contrast_of(config).form
+        )
         self.events: list[tuple[int, PendingEvent]] = []
         begin = Load(0, first, "bench") if isinstance(first, Calibration) else first
         self._state = advance(self._settings, State(), begin)[0]
@@ -129,11 +131,11 @@ class Bench:
     @property
     def closing_harm(self) -> str:
         """Harm that closing would do, in words; empty for none."""
-        return self._watch.closing_harm
+        return "" if self._watch is None else self._watch.closing_harm
 
     def added_contrast(self) -> tuple[float, Array] | None:
         """Contrast that the open loop adds to the dark zone, and that of each mode (modes,) now, as measured."""
-        return self._watch.added_contrast()
+        return None if self._watch is None else self._watch.added_contrast()
 
     def star(self, magnitude: float) -> None:
         """Point at another star."""
@@ -202,7 +204,7 @@ class Bench:
     def _watched(self, outputs: Outputs) -> None:
         """Apply the requests of the gain watch, as the controller does."""
         events = list(outputs.events)
-        if outputs.step is not None:
+        if outputs.step is not None and self._watch is not None:
             found = self._watch.observe(outputs.step, self._state)
             events += found.events
             for request in found.requests:

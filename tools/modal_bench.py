@@ -61,19 +61,27 @@ def _differential_calibration(noll: tuple[int, ...]) -> Calibration:
 class ModalBench(Bench):
     """A modal loop in one process. `new_record` discards the record and begins a new one."""
 
-    def __init__(self, config: Configuration, covariance_nm2: Array, disturbance: Disturbance | None = None) -> None:
+    def __init__(
+        self,
+        config: Configuration,
+        covariance_nm2: Array,
+        disturbance: Disturbance | None = None,
+        *,
+        watch: bool = True,
+    ) -> None:
         """Build the loop.
 
         Args:
             config: configuration of the controller and of the simulation.
             covariance_nm2: (modes, modes) of the measurement noise.
             disturbance: replaces the configuration's.
+            watch: whether to compare gains and detect harm, which takes a third of the time.
         """
         self.config, self.frames_refused = config, 0
         self.nm_per_mas = tilt_nm_per_mas(config.star.diameter_m)
         self._disturbance = disturbance_of(config) if disturbance is None else disturbance
         self._settings = factory.settings(config)
-        self._watch = GainWatch(self._settings, config.control.on_harm)
+        self._watch = GainWatch(self._settings, config.control.on_harm) if watch else None
         self.events = []
         self._state = advance(self._settings, State(), Load(0, _differential_calibration(config.noll), "bench"))[0]
         self._sampler = self._sampled()
