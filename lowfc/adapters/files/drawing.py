@@ -24,6 +24,21 @@ def figure_class() -> Any:
 
 def png(figure: Any, dpi: int = 120) -> bytes:
     """Encode a figure as PNG without matplotlib's version, so that the same figure gives the same file."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
     content = io.BytesIO()
+    lay_out(figure, FigureCanvasAgg, dpi)
     figure.savefig(content, format="png", dpi=dpi, metadata={"Software": None})
     return content.getvalue()
+
+
+def lay_out(figure: Any, canvas: Any, dpi: float) -> None:
+    """Place everything on a figure for a canvas. Without this, `savefig` draws the figure twice."""
+    engine = figure.get_layout_engine()
+    if engine is None:
+        return
+    canvas(figure)
+    former_dpi, figure.dpi = figure.dpi, dpi
+    engine.execute(figure)
+    figure.dpi = former_dpi
+    figure.set_layout_engine(None)

@@ -5,7 +5,7 @@ import re
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from lowfc.adapters.files.drawing import figure_class
+from lowfc.adapters.files.drawing import figure_class, lay_out
 from lowfc.programs.logs.report.figures import Report
 
 if TYPE_CHECKING:
@@ -57,12 +57,14 @@ def svg(name: str, height_in: float, draw: Callable[["Figure", Report], bool], r
     """
     figure_type = figure_class()
     from matplotlib import rc_context
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     content = io.StringIO()
     with rc_context(_STYLE | {"svg.hashsalt": name}):
         figure = figure_type(figsize=(_WIDTH_IN, height_in), layout="constrained")
         if not draw(figure, report):
             return None
+        lay_out(figure, FigureCanvasSVG, figure.dpi)
         figure.savefig(content, format="svg", transparent=True)
     text = content.getvalue()
     text = re.sub(r"<metadata>.*?</metadata>", "", text[text.index("<svg") :], flags=re.DOTALL)
