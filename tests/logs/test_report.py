@@ -13,7 +13,7 @@ import pytest
 from lowfc.adapters.logs.recovery import recover
 from lowfc.contract.configuration import load
 from lowfc.contract.errors import ConfigurationError, DataFileError
-from lowfc.contract.messages import CALIBRATION, CONTROLLER_STATE, EVENT, FRAME, REQUEST, Log, wire
+from lowfc.contract.messages import CALIBRATION, CONTROLLER_STATE, EVENT, FRAME, REQUEST, TRUTH, Log, wire
 from lowfc.control.laws.error_budget import sensor_noise
 from lowfc.control.loop.state import State
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
@@ -165,15 +165,20 @@ def test_the_verdict_names_what_was_wrong(eventful: dict[str, Any]) -> None:
     assert "nm after over the open pupil;" in text
 
 
-def uneventful(night: SyntheticLog, number: int = 700) -> SyntheticLog:
+def uneventful(night: SyntheticLog, number: int = 300) -> SyntheticLog:
     night.frames(number)
     night.health("camera", state="stopped")
     return night
 
 
 @pytest.fixture(scope="module")
-def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return uneventful(SyntheticLog(), 1500).write(tmp_path_factory.mktemp("good") / "x.mcap")
+def good_night() -> SyntheticLog:
+    return uneventful(SyntheticLog(), 1500)
+
+
+@pytest.fixture(scope="module")
+def good(good_night: SyntheticLog, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return good_night.write(tmp_path_factory.mktemp("good") / "x.mcap")
 
 
 def damaged(good: Path, folder: Path) -> Path:
@@ -258,8 +263,12 @@ def test_a_loop_in_safe_mode_is_not_a_good_run(tmp_path: Path) -> None:
     assert [event["name"] for event in found["events"] if event["level"] == "error"] == ["SAFED"]
 
 
-def test_without_truth_the_terms_that_need_it_are_missing_and_not_zero(tmp_path: Path) -> None:
-    found = figures(uneventful(SyntheticLog(truth=False), 1500).write(tmp_path / "x.mcap"))
+def test_without_truth_the_terms_that_need_it_are_missing_and_not_zero(
+    good_night: SyntheticLog, tmp_path: Path
+) -> None:
+    night = SyntheticLog()
+    night.samples = [sample for sample in good_night.samples if sample.key != TRUTH.key]
+    found = figures(night.write(tmp_path / "x.mcap"))
     terms = {term["name"]: term for term in found["error_budget"]["terms"]}
     for name in ("cross-talk and aliasing", "nonlinearity"):
         assert terms[name]["missing"]
