@@ -102,11 +102,11 @@ def spectrum(run: Pieces, rate_hz: float) -> Spectrum | None:
 
     Segments have Hann's window and no mean; their length, a power of two, follows from the longest piece.
     """
-    from scipy.signal import welch  # takes half a second to import
-
     longest = max((len(piece) for piece in run.values), default=0)
     if longest < SHORTEST:
         return None
+    from scipy.signal import welch  # takes half a second to import
+
     frames = min(LONGEST, max(SHORTEST, 1 << ((longest // _SEGMENT_SHARE).bit_length() - 1)))
     total = np.zeros((frames // 2 + 1, run.values[0].shape[1]))
     segments = 0

@@ -263,11 +263,11 @@ def simulated_residual_nm2(law: LinearLaw, run: Pieces, noise_nm2: Array, timing
 
 def _whole_spectrum(run: Pieces, rate_hz: float) -> Spectrum | None:
     """The periodogram of the longest piece: coarse segments would lose a slow mode's drift."""
-    from scipy.signal import periodogram
-
     longest = max(run.values, key=len, default=None)
     if longest is None or len(longest) < FEWEST:
         return None
+    from scipy.signal import periodogram
+
     frequency_hz, power = periodogram(longest, rate_hz, "hann", detrend="constant", axis=0)
     return Spectrum(frequency_hz, power, 1)
 
