@@ -201,7 +201,7 @@ def test_a_failed_commissioning_restores_the_previous_calibration(
         raise KeyboardInterrupt
 
     bench.reports.clear()
-    bench.actions = {"[7/10] response": give_up}
+    bench.actions = {"[6/10] poke amplitude": give_up}
     with pytest.raises(KeyboardInterrupt):
         bench.commission()
     bench.actions.clear()
