@@ -1,8 +1,9 @@
 """`lowfc tune`: figures, files and errors, on a log made by the live loop's own `advance`; and law files."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,18 +21,20 @@ from lowfc.contract.errors import BusError, ConfigurationError, DataFileError, R
 from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.margins import check_stable
+from lowfc.control.laws.tuning import Gains, Tuned
 from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.commissioning.tune.command import integrate
 from lowfc.programs.commissioning.tune.data import Telemetry, of_log, of_run
 from lowfc.programs.commissioning.tune.figures import result_of, tuned
-from tests.support.in_process_loop import InProcessLoop
+from tests.support.in_process_loop import SMALL_MIRROR, InProcessLoop
 from tests.support.loops import lowfc
 from tests.support.report_log import SyntheticLog
 from tests.support.theory import LAWS
 from tests.support.toy import NOLL, PERIOD_NS, frame_sequence
 
-CONFIG = load(None, {"sensor.modes": 3, "camera.rate_hz": 1000, "control.tilt_gain": 0.4, "control.gain": 0.2})
+KEYS = {"sensor.modes": 3, "camera.rate_hz": 1000, "control.tilt_gain": 0.4, "control.gain": 0.2}
+CONFIG = load(None, KEYS | SMALL_MIRROR)
 
 
 def tune(*words: object) -> dict[str, Any]:
@@ -56,10 +59,17 @@ def telemetry(log: Path) -> Telemetry:
     return of_log(LogReader(log))
 
 
+@pytest.fixture(scope="module")
+def tuned_as(telemetry: Telemetry) -> Callable[[str], tuple[Tuned, Gains]]:
+    return cache(partial(tuned, telemetry))
+
+
 @pytest.mark.parametrize("controller", ["integrator", "pi-notch", "lqg"])
-def test_each_law_is_tuned_from_a_closed_loop(telemetry: Telemetry, controller: str) -> None:
+def test_each_law_is_tuned_from_a_closed_loop(
+    telemetry: Telemetry, tuned_as: Callable[[str], tuple[Tuned, Gains]], controller: str
+) -> None:
     """Tip is a sine of 12 nm at 7 Hz with noise: the line is found, and each law predicts a smaller residual."""
-    best, gains = tuned(telemetry, controller)
+    best, gains = tuned_as(controller)
     found = result_of(telemetry, best, gains, controller)
     tip = found.modes[0]
     assert [line["frequency_hz"] for line in tip.lines] == pytest.approx([7.0], abs=0.05)
@@ -71,19 +81,21 @@ def test_each_law_is_tuned_from_a_closed_loop(telemetry: Telemetry, controller: 
     check_stable(best.law, found.delay_frames)
 
 
-def test_the_command_writes_the_law_and_draws_it(log: Path, telemetry: Telemetry, tmp_path: Path) -> None:
+def test_the_command_writes_the_law_and_draws_it(
+    log: Path, tuned_as: Callable[[str], tuple[Tuned, Gains]], tmp_path: Path
+) -> None:
     out, plot = tmp_path / "law.fits", tmp_path / "law.png"
     found = tune(log, "--controller", "lqg", "--out", out, "--plot", plot)
     assert found["files"] == [str(out), str(plot)]
     assert plot.read_bytes()[:4] == b"\x89PNG"
-    assert law_file.load(out).id == tuned(telemetry, "lqg")[0].law.id
+    assert law_file.load(out).id == tuned_as("lqg")[0].law.id
 
 
 def test_probe_sequences_affect_neither_the_tuning_nor_the_delay(tmp_path: Path) -> None:
     """During a probe sequence on the mirror, the true wavefront does not follow the loop's commands alone."""
     night = SyntheticLog()
     night.request("close")
-    night.frames(1000)
+    night.frames(100)
     shape = night.calibration.modes_to_actuators[:, 0]
     table = 20 * np.sin(2 * np.pi * 31 * np.arange(1000) * PERIOD_NS * 1e-9).astype(np.float32)[:, None]
     night.request("play", text="mirror", actuators_nm=shape, table=table)
@@ -98,7 +110,7 @@ def test_probe_sequences_affect_neither_the_tuning_nor_the_delay(tmp_path: Path)
 def test_an_open_loop_with_much_tilt_is_flagged(tmp_path: Path) -> None:
     night = SyntheticLog()
     night.request("open")
-    night.frames(3000)
+    night.frames(2300)
     path = night.write(tmp_path / "open.mcap")
     found = tune(path)
     assert not found["closed"]
