@@ -315,23 +315,17 @@ def test_behind_an_aperture_mask_modes_are_odd_and_shear_and_flux_even(name, mod
     assert np.abs(I0 - I0[::-1]).max() < 1e-9 * I0.max()
 
 
-@pytest.fixture
-def calibrated(cache_dir, monkeypatch):
-    """Return a function from configuration keys to a calibration and its noise, with a small mirror, own cache."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(cache_dir))
-
-    def make(**changed):
-        keys = {"mirror.rows": 12, "mirror.columns": 12, "mirror.pitches_per_pupil": 11.0}
-        config = load(None, keys | {key.replace("__", "."): value for key, value in changed.items()})
-        optics = factory.twin(config, None, pytest.fail)
-        made = factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, pytest.fail))
-        return made, factory.frame_noise_nm(config, made)
-
-    return make
+def calibrated(**changed):
+    """A calibration with a small mirror, and its noise, from configuration keys."""
+    keys = {"mirror.rows": 12, "mirror.columns": 12, "mirror.pitches_per_pupil": 11.0}
+    config = load(None, keys | {key.replace("__", "."): value for key, value in changed.items()})
+    optics = factory.twin(config, None, pytest.fail)
+    made = factory.analytic_calibration(config, optics, factory.mirror_on_twin(config, optics, pytest.fail))
+    return made, factory.frame_noise_nm(config, made)
 
 
 @pytest.mark.parametrize(("name", "noise_factor"), [("clowfs", (3, 8)), ("zwfs", (1.2, 2))])
-def test_fitting_shear_and_background_removes_their_bias(name, noise_factor, calibrated):
+def test_fitting_shear_and_background_removes_their_bias(name, noise_factor):
     """Beam sheared by 0.002 D plus 10 % uniform light; the noise of tip, the mode most like shear, increases."""
     optics = sensor_named(name)
     ramp = np.exp(-2j * np.pi * 0.002 * image_axis(64, 8))
@@ -352,6 +346,6 @@ def test_fitting_shear_and_background_removes_their_bias(name, noise_factor, cal
     assert noise_factor[0] < shear_noise_nm[0] / noise_nm[0] < noise_factor[1]
 
 
-def test_saturating_star_is_refused(calibrated):
+def test_saturating_star_is_refused():
     with pytest.raises(CalibrationError, match=r"the star saturates the sensor: \d+ e- in the brightest pixel"):
         calibrated(sensor__kind="zwfs", star__magnitude=-1.0)
