@@ -31,7 +31,7 @@ from lowfc.programs.design.sam_request import Search
 RECORDED = {
     name: entry["command"] for name, entry in json.loads(SHIPPED.read_text())["layouts"].items() if "command" in entry
 }
-SMALL = {"merit": "table4", "holes": "4", "diameter": "0.1:0.2", "steps": BLOCK + 50, "chains": 2, "seed": 7}
+SMALL = {"merit": "table4", "holes": "4", "diameter": "0.1:0.2", "steps": BLOCK + 10, "chains": 2, "seed": 7}
 
 
 class Interrupted(Executor):
