@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -57,11 +58,9 @@ class Fault:
 
     def sent(self, index: int) -> tuple[int, ...]:
         """Indices of the frames that are published at the end of exposure `index`, the newest first."""
+        late = MAX_FRAMES_LATE if self.kind is Kind.LATE else 1
         return tuple(
-            frame
-            for frame in range(index, max(index - MAX_FRAMES_LATE, 0) - 1, -1)
-            for when in self._due(frame)
-            if when == index
+            frame for frame in range(index, max(index - late, 0) - 1, -1) for when in self._due(frame) if when == index
         )
 
     def _due(self, frame: int) -> tuple[int, ...]:
@@ -74,7 +73,7 @@ class Fault:
             case Kind.REORDERED:  # in pairs, the second one first
                 return (frame + 1 - (frame - self.first) % 2,)
             case Kind.LATE:
-                return (frame + int(self.random(frame).integers(1, MAX_FRAMES_LATE + 1)),)
+                return (frame + _delay(self, frame),)
         return (frame,)
 
     def pixels(self, index: int, frame: Frame, before: Frame, dark: int, highest: int) -> Frame:
@@ -112,6 +111,12 @@ class Fault:
             case Kind.RANDOM:
                 return rng.bytes(int(rng.integers(1, 2 * len(message))))
         return message
+
+
+@lru_cache(maxsize=2 * MAX_FRAMES_LATE)
+def _delay(fault: Fault, frame: int) -> int:
+    """Frames by which a late frame is delayed."""
+    return int(fault.random(frame).integers(1, MAX_FRAMES_LATE + 1))
 
 
 def _with_track(frame: Frame, rng: np.random.Generator, highest: int) -> Frame:
