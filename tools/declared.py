@@ -12,7 +12,7 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
 from lowfc.client import requests, stream
 from lowfc.contract.codecs.codec import MAX_BYTES
-from lowfc.contract.configuration import Acceptance, keys
+from lowfc.contract.configuration import Acceptance
 from lowfc.contract.messages import CAMERA_STATE, COMMAND, EVENT, FRAME, HEALTH, MIRROR_STATE, SURFACE, Role, Topic
 from lowfc.control.calibration import linearity
 from lowfc.control.laws import transfer_function
@@ -107,7 +107,8 @@ def limits(rows: Iterable[tuple[str, *tuple[float, ...]]]) -> str:
 
 def requirements() -> str:
     """Requirements of an acceptance run."""
-    rows = ((f"`{key}`", f"{info.default:g}", sentence(info.description)) for key, info in keys(Acceptance).items())
+    descriptions = Acceptance.descriptions()
+    rows = ((f"`{key}`", f"{default:g}", sentence(descriptions[key])) for key, default in Acceptance())
     return markdown(("key", "default", "requirement"), rows)
 
 

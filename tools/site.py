@@ -12,14 +12,14 @@ from types import ModuleType
 from typing import Any, get_args
 
 import typer
-from pydantic import BaseModel
 from typer.main import get_command
 
 import lowfc.programs
-from lowfc.contract.configuration import Configuration, keys
+from lowfc.contract.configuration import Configuration
 from lowfc.contract.events import EVENTS, Event, Level
 from lowfc.contract.former_names import FIELDS, KEYS, LAW_EXTENSIONS, VALUES
 from lowfc.contract.messages import TOPICS
+from lowfc.contract.network import Section
 from lowfc.contract.sections import InterlockSection
 from lowfc.contract.wire import lowfc_pb2
 from lowfc.programs.cli.main import app
@@ -55,27 +55,24 @@ def _contexts(context: typer.Context) -> Iterator[typer.Context]:
 
 def configuration() -> str:
     """Every key of the configuration, by section."""
-    sections: dict[str, type[BaseModel]] = {
-        name: info.annotation
-        for name, info in Configuration.model_fields.items()
-        if isinstance(info.annotation, type) and issubclass(info.annotation, BaseModel)
-    }
-    found = [_keys("Top level", "", {name: 0 for name in Configuration.model_fields if name not in sections})]
-    found += [_keys(f"[{name}]", f"{sentence(one.__doc__)}.", keys(one, f"{name}.")) for name, one in sections.items()]
+    sections = {name: type(value) for name, value in Configuration() if isinstance(value, Section)}
+    found = [_keys("Top level", "", Configuration, "")]
+    found += [_keys(f"[{name}]", f"{sentence(one.__doc__)}.", one, f"{name}.") for name, one in sections.items()]
     about = f"{sentence(InterlockSection.__doc__)}. One table for each interlock."
-    found.append(_keys("[[interlocks]]", about, keys(InterlockSection, "interlocks.")))
+    found.append(_keys("[[interlocks]]", about, InterlockSection, "interlocks."))
     return "\n".join(found)
 
 
-def _keys(heading: str, about: str, names: Any) -> str:
-    known = {**keys(), **keys(InterlockSection, "interlocks.")}
+def _keys(heading: str, about: str, section: type[Section], prefix: str) -> str:
+    descriptions = section.descriptions()
     rows = []
-    for name in names:
-        info = known[name]
+    for key, info in section.model_fields.items():
+        if isinstance(info.default, Section):
+            continue
         default = "required" if info.is_required() else f"`{info.get_default(call_default_factory=True)!r}`"
-        bounds = [str(one) for one in info.metadata if hasattr(one, "__dataclass_fields__")]
-        words = [f"`{one}`" for one in get_args(info.annotation) if isinstance(one, str)]
-        rows.append((f"`{name}`", default, ", ".join((*words, *map(_bound, bounds))), sentence(info.description)))
+        values = [f"`{one}`" for one in get_args(info.annotation) if isinstance(one, str)]
+        values += [_bound(str(one)) for one in info.metadata if hasattr(one, "__dataclass_fields__")]
+        rows.append((f"`{prefix}{key}`", default, ", ".join(values), sentence(descriptions[key])))
     return f"## {heading}\n\n{about}\n\n{markdown(('key', 'default', 'values', ''), rows)}"
 
 

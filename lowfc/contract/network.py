@@ -1,14 +1,28 @@
 """The network section of the configuration, and the base class of all sections."""
 
+import ast
+import inspect
+from itertools import pairwise
+from textwrap import dedent
+
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 
 class Section(BaseModel):
     """A section: unknown keys are errors, values are immutable, and only integers are converted, to floats."""
 
-    model_config = ConfigDict(
-        extra="forbid", strict=True, frozen=True, use_attribute_docstrings=True, allow_inf_nan=False
-    )
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+    @classmethod
+    def descriptions(cls) -> dict[str, str]:
+        """Description of each key: the docstring below it. Only help asks; pydantic would read the source at import."""
+        found = {}
+        for section in reversed([one for one in cls.__mro__ if issubclass(one, Section)]):
+            for statement, below in pairwise(ast.parse(dedent(inspect.getsource(section))).body[0].body):  # type: ignore[attr-defined]
+                match statement, below:
+                    case ast.AnnAssign(target=ast.Name(id=key)), ast.Expr(value=ast.Constant(value=str(text))):
+                        found[key] = inspect.cleandoc(text)
+        return {key: info.description or found.get(key, "") for key, info in cls.model_fields.items()}
 
 
 class Network(Section):

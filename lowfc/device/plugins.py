@@ -127,12 +127,14 @@ def options(driver: Any, found: dict[str, Any], words: Sequence[str] = ()) -> Dr
 def options_help(driver: Any) -> list[tuple[str, str]]:
     """Command-line options of a driver's class, each with its help."""
     found = []
-    for key, info in getattr(driver, "Options", DriverOptions).model_fields.items():
+    model: type[DriverOptions] = getattr(driver, "Options", DriverOptions)
+    descriptions = model.descriptions()
+    for key, info in model.model_fields.items():
         words = [str(word) for word in get_args(info.annotation) if isinstance(word, str)]
         kind = "|".join(words) or getattr(info.annotation, "__name__", str(info.annotation)).removesuffix(" | None")
         default = "required" if info.is_required() else f"default: {info.get_default(call_default_factory=True)}"
         shown = "" if default.endswith((": ", "None")) else f"  [{default}]"
-        found.append((f"--{key.replace('_', '-')} <{kind}>", f"{info.description or ''}{shown}"))
+        found.append((f"--{key.replace('_', '-')} <{kind}>", f"{descriptions[key]}{shown}"))
     return found
 
 

@@ -11,7 +11,8 @@ import tomli_w
 from lowfc.adapters.files.factory import detector, mirror, mirror_limits, settings
 from lowfc.contract.configuration import Configuration, keys, load
 from lowfc.contract.errors import ConfigurationError
-from lowfc.contract.sections import IMPERFECTIONS
+from lowfc.contract.network import Section
+from lowfc.contract.sections import IMPERFECTIONS, InterlockSection
 from lowfc.programs.cli.config import commented
 from sim_dm.driver import device
 from tools.world import CASES
@@ -42,7 +43,12 @@ def test_the_defaults_are_valid_for_every_component() -> None:
 
 
 def test_every_key_has_a_description() -> None:
-    assert [key for key, info in KEYS.items() if not (info.description or "").endswith(".")] == []
+    sections = {type(value) for _, value in Configuration() if isinstance(value, Section)}
+    for section in (Configuration, InterlockSection, *sections):
+        found = section.descriptions()
+        assert found.keys() == section.model_fields.keys()
+        subsections = {key for key, info in section.model_fields.items() if isinstance(info.default, Section)}
+        assert [key for key, text in found.items() if not text.endswith(".") and key not in subsections] == []
 
 
 def test_a_configuration_round_trips_through_toml(tmp_path: Path) -> None:

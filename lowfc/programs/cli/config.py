@@ -7,7 +7,6 @@ from typing import Annotated
 
 import tomli_w
 import typer
-from pydantic import BaseModel
 
 from lowfc.adapters.bus.run import DEFAULT_RUN, open_run
 from lowfc.adapters.bus.zenoh_session import session_config
@@ -16,6 +15,7 @@ from lowfc.adapters.process.terminal import AnyRun, ConfigFile, configuration
 from lowfc.client.runs import the_known_run
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BusError, ConfigurationError
+from lowfc.contract.network import Section
 
 _HEADER = (
     "# Keys after a # have their defaults; remove the # to set a value. For keys that are not set, a command may use",
@@ -32,25 +32,25 @@ def commented(config: Configuration) -> str:
     return "\n".join([*_HEADER, *_lines(config)])
 
 
-def _lines(section: BaseModel, prefix: str = "") -> Iterator[str]:
+def _lines(section: Section, prefix: str = "") -> Iterator[str]:
     """Keys of a section, then the sections in it."""
-    names = type(section).model_fields
+    names = section.descriptions()
     subsections = {name: _tables(getattr(section, name)) for name in names}
     for name in names:
         if subsections[name]:
             continue
-        yield f"# {' '.join((names[name].description or '').split())}"
+        yield f"# {' '.join(names[name].split())}"
         mark = "" if name in section.model_fields_set else "#"
         yield from (f"{mark}{line}" for line in _assignment(name, getattr(section, name)))
     for name, tables in subsections.items():
-        header = f"[{prefix}{name}]" if isinstance(getattr(section, name), BaseModel) else f"[[{prefix}{name}]]"
+        header = f"[{prefix}{name}]" if isinstance(getattr(section, name), Section) else f"[[{prefix}{name}]]"
         for table in tables:
             yield from ("", header, *_lines(table, f"{prefix}{name}."))
 
 
-def _tables(value: object) -> list[BaseModel]:
+def _tables(value: object) -> list[Section]:
     """The section or the list of sections of a value; empty for a plain value."""
-    return [one for one in (value if isinstance(value, list) else [value]) if isinstance(one, BaseModel)]
+    return [one for one in (value if isinstance(value, list) else [value]) if isinstance(one, Section)]
 
 
 def _assignment(name: str, value: object) -> list[str]:
