@@ -30,7 +30,7 @@ def probabilities(camera, mean_e, numbers):
 CAMERAS = [Detector(), Detector(gain_e_per_dn=0.7, read_noise_e=0.4, bias_dn=90.3)]
 
 
-@pytest.mark.parametrize("camera", CAMERAS)
+@pytest.mark.parametrize("camera", [*CAMERAS, Detector(gain_e_per_dn=2.0, read_noise_e=0.12, bias_dn=100.5)])
 def test_noise_table_has_the_exact_distribution_at_its_levels(camera):
     """Entries and rest together have the distribution of Poisson noise, read noise and rounding."""
     table = noise_table_of(camera)

@@ -2,7 +2,6 @@
 
 import contextlib
 import datetime
-import ssl
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,6 +25,8 @@ def read_certificate(authority: Path, certificate: Path, key: Path, *, server: b
 
     DataFileError if a file cannot be read, the three do not match, or the certificate is not valid now.
     """
+    import ssl  # slow to import, and only loops on several hosts need it
+
     try:
         listening, connecting = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
         connecting.check_hostname = False

@@ -4,7 +4,6 @@ import contextlib
 import datetime
 import errno
 import socket
-import ssl
 import sys
 from collections.abc import Iterable
 from pathlib import Path
@@ -117,6 +116,8 @@ def router_trouble(network: Network, role: str) -> str:
         BusError: router and process do not accept each other's certificates, or the router cannot be reached for
             another reason, such as an unknown name.
     """
+    import ssl  # slow to import, and only loops on several hosts need it
+
     ca, certificate, key = certificate_files(network, role)
     host, port = network.address
     try:
