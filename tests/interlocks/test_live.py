@@ -14,6 +14,7 @@ from lowfc.contract.errors import BusError, RequestRefusedError
 from lowfc.contract.messages import BENCH, CONTROL_INPUT, FRAME, STEP, wire
 from tests.support.loops import FIXED, interrupt, output_of, start, until
 
+RATE_HZ = 100  # leaves a host with two cores time for the flood: at 500 Hz its publisher waits for a core instead
 FLIPS = 60
 MAX_AGE_S = 1
 FLOOD_HZ = 2000
@@ -21,7 +22,7 @@ FLOOD_S = 1
 S = 1_000_000_000
 CONFIG = f"""
 [camera]
-rate_hz = 500
+rate_hz = {RATE_HZ}
 {FIXED}
 [[interlocks]]
 name = "mask"
@@ -40,10 +41,9 @@ when_old = "passes"
 OPTIONS = ("--config", "night.toml", "--run", "flipped", "--duration", "600")
 
 
-@pytest.mark.slow  # on two busy cores stalls skip more frames, and the flood loses messages
 @pytest.mark.exclusive
 def test_interlocks_with_changing_flooding_and_missing_values(tmp_path: Path) -> None:
-    """At 500 Hz: the first frame after a value obeys it; a flood loses no frame; old values count as missing."""
+    """The first frame after a value obeys it; a flood loses no frame; old values count as missing."""
     (tmp_path / "night.toml").write_text(CONFIG)
     process = start(tmp_path, "sim-loop", "--json", *OPTIONS)
     try:
@@ -74,7 +74,7 @@ def _publish(name: str) -> None:
         loop.bench("shutter", "open")
         for number in range(FLIPS):  # some fall between the same two frames
             for acts in (True, False):
-                time.sleep(rng.uniform(0, 0.015))
+                time.sleep(rng.uniform(0, 7.5 / RATE_HZ))
                 if number % 5:
                     loop.bench("mask", acts)
                     continue
@@ -141,7 +141,7 @@ def _values_act_at_the_next_frame(log: Path) -> None:
     obeyed = []
     for value, after in pairwise(values):
         acts = wire.BenchValue.FromString(value.payload).truth
-        begun_ns = value.publish_time_ns + S // 500
+        begun_ns = value.publish_time_ns + S // RATE_HZ
         made = [step for step in steps if begun_ns < frames_ns[step.frame_sequence] < after.publish_time_ns]
         obeyed += [
             (wire.REASON_HELD in step.reasons) is (acts and step.mode == wire.LOOP_MODE_CLOSED) for step in made[:1]
