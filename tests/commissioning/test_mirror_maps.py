@@ -190,7 +190,7 @@ def commands(config: Configuration, state: State, frames: int) -> tuple[list[Sin
     for index in range(frames):
         state, outputs = advance(settings, state, Frame(1 + index, index, 0, dark))
         sent.append(outputs.command.actuators_nm)
-    return sent, [one.name for one in state.loop.additions().channels]
+    return sent, [one.name for one in state.loop.channels_or_empty().channels]
 
 
 def test_the_flat_map_is_applied_at_the_start(tmp_path: Path, calibration: Calibration) -> None:

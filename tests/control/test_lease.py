@@ -45,8 +45,8 @@ def played(state: State, frames: int = 500, lease_id: int = MINE) -> State:
 
 
 def remaining_rows(state: State) -> int:
-    additions = state.loop.command_channels
-    return 0 if additions is None or additions.play is None else additions.play.remaining(state.frame_sequence + 1)
+    channels = state.loop.command_channels
+    return 0 if channels is None or channels.play is None else channels.play.remaining(state.frame_sequence + 1)
 
 
 GRANTED = {"safe", "open", "pause", "stop", "status", "note", "lease", "renew", "release", "permit", "configuration"}
