@@ -61,10 +61,10 @@ def render_chaos(figures: Figures) -> str:
     for case in (case for run in runs for case in run["cases"]):
         by_name.setdefault(case["name"], []).append(case)
     passed, failed, skipped = (sum(run[name] for run in runs) for name in ("passed", "failed", "skipped"))
-    left_out = f", {skipped} skipped" if skipped else ""
+    skipped_text = f", {skipped} skipped" if skipped else ""
     seeds = ", ".join(str(run["seed"]) for run in runs)
     parts = [
-        f"{passed} of {passed + failed} passed{left_out}, seeds {seeds}.\n",
+        f"{passed} of {passed + failed} passed{skipped_text}, seeds {seeds}.\n",
         markdown(("case", "injected fault", "passed", "residual, nm rms: before -> after"), _rows(by_name)),
     ]
     failures = [

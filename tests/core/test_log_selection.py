@@ -65,10 +65,10 @@ def of(messages: list[Sample], topic: Topic) -> list[Sample]:
 
 def test_steps_and_commands_are_never_left_out() -> None:
     asked = selection(1, ["lowfc/sim/*"])
-    assert asked.left_out == {FRAME, MIRROR_STATE, SURFACE, TIMING}
-    assert {topic.key for topic in TOPICS if topic.optional} == {topic.key for topic in (*asked.left_out, TRUTH)}
+    assert asked.excluded == {FRAME, MIRROR_STATE, SURFACE, TIMING}
+    assert {topic.key for topic in TOPICS if topic.optional} == {topic.key for topic in (*asked.excluded, TRUTH)}
     assert selection() == EVERYTHING == selection(1, ["lowfc/*"])
-    assert selection(1, ["/lowfc/mirror/dm/state"]).left_out == {FRAME, SURFACE, TIMING, TRUTH}
+    assert selection(1, ["/lowfc/mirror/dm/state"]).excluded == {FRAME, SURFACE, TIMING, TRUTH}
     assert Selection.of(asked.metadata) == asked
     assert Selection.of({"selection": {"every": "-3", "left_out": "nothing"}}) == EVERYTHING
     with pytest.raises(ConfigurationError, match="did you mean 'lowfc/camera/frame'"):

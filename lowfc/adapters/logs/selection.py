@@ -28,11 +28,11 @@ class Selection:
 
     Attributes:
         every: frames and mirror states are recorded if their frame number is a multiple of this.
-        left_out: topics that are not recorded; only `optional` ones.
+        excluded: topics that are not recorded; only `optional` ones.
     """
 
     every: int = 1
-    left_out: frozenset[Topic] = frozenset()
+    excluded: frozenset[Topic] = frozenset()
 
     @classmethod
     def of(cls, metadata: Mapping[str, Mapping[str, str]]) -> "Selection":
@@ -54,26 +54,26 @@ class Selection:
     @property
     def sentence(self) -> str:
         """Description of the selection; empty for everything."""
-        few = [name for topic, name in _DECIMATED.items() if topic not in self.left_out]
+        few = [name for topic, name in _DECIMATED.items() if topic not in self.excluded]
         parts = [f"1 in {self.every} {' and '.join(few)}"] if self.every > 1 and few else []
-        parts += [f"without {', '.join(self._keys)}"] if self.left_out else []
+        parts += [f"without {', '.join(self._keys)}"] if self.excluded else []
         return ", ".join(parts)
 
     @property
     def has_every_frame(self) -> bool:
         """Whether every frame is recorded."""
-        return self.every == 1 and FRAME not in self.left_out
+        return self.every == 1 and FRAME not in self.excluded
 
     def records_all(self, topic: Topic) -> bool:
         """Whether every message of a topic is recorded, so that a gap in its counts is a loss."""
-        return topic not in self.left_out and not (self.every > 1 and topic in _DECIMATED)
+        return topic not in self.excluded and not (self.every > 1 and topic in _DECIMATED)
 
     def keeps(self, topic: Topic, sequence: int, payload: bytes) -> bool:
         """Whether a message is recorded.
 
         Frames and mirror states are selected by the same frame number, so that they stay paired.
         """
-        if topic in self.left_out:
+        if topic in self.excluded:
             return False
         if self.every == 1 or topic not in _DECIMATED:
             return True
@@ -86,11 +86,11 @@ class Selection:
 
     def within(self, other: "Selection") -> "Selection":
         """This selection, applied to a log that was recorded with `other`."""
-        return Selection(math.lcm(self.every, other.every), self.left_out | other.left_out)
+        return Selection(math.lcm(self.every, other.every), self.excluded | other.excluded)
 
     @property
     def _keys(self) -> list[str]:
-        return sorted(topic.key for topic in self.left_out)
+        return sorted(topic.key for topic in self.excluded)
 
 
 EVERYTHING = Selection()

@@ -60,7 +60,7 @@ def growth_sentence(growth_bytes_per_s: float, folder: Path, min_free_bytes: flo
 
 
 def _rate_hz(topic: Topic, config: Configuration, recorded: Selection) -> float:
-    if topic in recorded.left_out:
+    if topic in recorded.excluded:
         return 0.0
     rate_hz = config.camera.rate_hz if topic.rate is Rate.LOOP else float(topic.rate)
     return rate_hz if recorded.records_all(topic) else rate_hz / recorded.every

@@ -127,7 +127,7 @@ def export_log(
         "steps": len(history.steps.sequence),
         "modes": history.steps.error_nm.shape[1],
         "frames": len(history.frame_sequence) if frames else 0,
-        "steps_left_out": history.left_out,
+        "steps_left_out": history.excluded_messages,
         "selection": reader.selection.sentence,
         "finished": reader.finished,
         "no_end": missing_end_text(reader.paths, finished=reader.finished),

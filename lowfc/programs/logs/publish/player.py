@@ -93,7 +93,7 @@ class Player:
         self._selection = selection
         self._speed = speed
         self._publishers: dict[str, Publisher | None] = {}
-        self._left_out: dict[str, str] = {}
+        self._excluded: dict[str, str] = {}
         self._errors = Durations()
         self._behind = 0
         self._first_log_ns = self._last_log_ns = 0
@@ -119,7 +119,7 @@ class Player:
         return {
             "messages": self._errors.count + len(self._initial_keys),
             "published": {key: one.published for key, one in sorted(self._publishers.items()) if one is not None},
-            "left_out": dict(sorted(self._left_out.items())),
+            "left_out": dict(sorted(self._excluded.items())),
             "span_s": (self._last_log_ns - self._first_log_ns) * 1e-9,
             "took_s": (self._sent_ns - self._begun_ns) * 1e-9,
             "timing_error_us": {"p50": p50_ns / 1e3, "p99": p99_ns / 1e3, "max": self._errors.max_ns / 1e3},
@@ -172,12 +172,12 @@ class Player:
         try:
             topic = topic_of(key)
         except KeyError:
-            self._left_out[key] = "unknown to this version"
+            self._excluded[key] = "unknown to this version"
             return None
         if not self._selection.matches(key):
             return None
-        if why := self._selection.why_left_out(key):
-            self._left_out[key] = why
+        if why := self._selection.exclusion_reason(key):
+            self._excluded[key] = why
             return None
         bus = self._buses.get(role_of(key)) or next(iter(self._buses.values()))
         return bus.publisher(topic, name_in(topic, key))

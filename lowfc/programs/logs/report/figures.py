@@ -78,7 +78,7 @@ def _log(run: Run) -> Figures:
         "messages_lost": _count(account.get("messages_lost", "")),
         "lost_by_topic": {name: count for name, count in lost.items() if count is not None},
         "messages_unreadable": log.unreadable,
-        "steps_left_out": run.history.left_out,
+        "steps_left_out": run.history.excluded_messages,
     }
 
 

@@ -55,9 +55,9 @@ class Steady:
             if law is not None and self.mode == LoopMode.CLOSED:
                 self._settling = min(settling_frames(np.array(law.gain), np.array(law.leak)), FRAMES)
         signals = np.concatenate([steps.error_nm, steps.pol_nm], axis=1)
-        left_out = min(self._settling, len(signals) - first)
-        self._settling -= left_out
-        self._kept.append((steps.sequence[first + left_out :], signals[first + left_out :]))
+        excluded = min(self._settling, len(signals) - first)
+        self._settling -= excluded
+        self._kept.append((steps.sequence[first + excluded :], signals[first + excluded :]))
         kept = sum(len(sequence) for sequence, _ in self._kept)
         while kept - len(self._kept[0][0]) >= FRAMES:
             kept -= len(self._kept.popleft()[0])
