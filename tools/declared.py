@@ -135,8 +135,8 @@ def topics(role: Role, *own: Topic) -> str:
 
 def fields(message: str) -> str:
     """Number, type and sentence of every field of one of our messages."""
-    every = FileDescriptorSet.FromString((files("lowfc.contract.wire") / "lowfc.desc").read_bytes())
-    file = next(file for file in every.file if file.package == "lowfc.v1")
+    descriptors = FileDescriptorSet.FromString((files("lowfc.contract.wire") / "lowfc.desc").read_bytes())
+    file = next(file for file in descriptors.file if file.package == "lowfc.v1")
     comments = {
         tuple(location.path): sentence(location.leading_comments) for location in file.source_code_info.location
     }

@@ -39,8 +39,8 @@ GOLDEN = Path(__file__).parents[1] / "golden" / "lowfc_v1.txt"
 
 def declared() -> FileDescriptorProto:
     """The project's file in the committed descriptor, with comments."""
-    every = FileDescriptorSet.FromString((WIRE / "lowfc.desc").read_bytes())
-    return next(file for file in every.file if file.package == "lowfc.v1")
+    descriptors = FileDescriptorSet.FromString((WIRE / "lowfc.desc").read_bytes())
+    return next(file for file in descriptors.file if file.package == "lowfc.v1")
 
 
 def comments(file: FileDescriptorProto) -> dict[tuple[int, ...], str]:

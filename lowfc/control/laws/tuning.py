@@ -253,8 +253,8 @@ def simulated_residual_nm2(law: LinearLaw, run: Pieces, noise_nm2: Array, timing
     squares, frames = np.zeros(len(law.noll)), 0
     for piece in run.values:
         skipped = min(_SETTLING_FRAMES, len(piece) // 3)
-        every = np.zeros(len(piece), np.int64)
-        command_nm = counterfactual(driven_by(law), weights, piece.astype(np.float32), every)[1]
+        missing = np.zeros(len(piece), np.int64)
+        command_nm = counterfactual(driven_by(law), weights, piece.astype(np.float32), missing)[1]
         measured_nm, commanded_nm = piece[skipped:].astype(np.float64), command_nm[skipped:].astype(np.float64)
         more, counted = held_residual_nm2(law, measured_nm, commanded_nm, noise_nm2, timing)
         squares, frames = squares + more, frames + counted
@@ -325,5 +325,5 @@ def _fine_frequencies(model: Model) -> Array:
     for line in model.lines:
         width, centre = (2 * np.pi * hz / model.rate_hz for hz in (line.width_hz, line.frequency_hz))
         grids += [centre - width * apart[::-1], np.array([centre]), centre + width * apart]
-    every = np.unique(np.concatenate(grids))
-    return np.asarray(every[(every >= 1e-7) & (every <= np.pi)])
+    omega = np.unique(np.concatenate(grids))
+    return np.asarray(omega[(omega >= 1e-7) & (omega <= np.pi)])

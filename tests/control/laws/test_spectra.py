@@ -188,12 +188,12 @@ def test_the_measured_rejection_agrees_with_theory(target: str, delay_frames: fl
 def test_lines_are_odd_ascending_and_not_shared_by_modes() -> None:
     for modes in (1, 2, 3, 14):
         places = lines(15_000, modes, 12, 0.1 / 250, 0.3)
-        every = np.sort(np.concatenate(places))
-        assert every.size == np.unique(every).size == 12 * modes
-        assert (every % 2 == 1).all()
-        assert every[0] >= 0.1 / 250 * 15_000
-        assert every[-1] <= 0.3 * 15_000
-        assert every[-1] > 0.28 * 15_000
+        all_lines = np.sort(np.concatenate(places))
+        assert all_lines.size == np.unique(all_lines).size == 12 * modes
+        assert (all_lines % 2 == 1).all()
+        assert all_lines[0] >= 0.1 / 250 * 15_000
+        assert all_lines[-1] <= 0.3 * 15_000
+        assert all_lines[-1] > 0.28 * 15_000
         for one in places:
             assert (np.diff(one) >= 6).all()
 

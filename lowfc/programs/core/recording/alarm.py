@@ -30,9 +30,9 @@ _OWN = EVENTS["ON_EVENT_FAILED"].name
 class Alarm:
     """Runs a shell command on events of a level, one at a time and not too often."""
 
-    def __init__(self, service: Service, command: str, level: Level, every_s: float) -> None:
+    def __init__(self, service: Service, command: str, level: Level, min_interval_s: float) -> None:
         """Run the command from the next event on; its failure is published as an event that does not trigger it."""
-        self._command, self._level, self._every_s, self._service = command, level, every_s, service
+        self._command, self._level, self._min_interval_s, self._service = command, level, min_interval_s, service
         self._waiting: deque[Log] = deque(maxlen=_MAX_WAITING_EVENTS)
         self._arrived = threading.Event()
         service.bus.subscribe(EVENT, self._receive)
@@ -51,7 +51,7 @@ class Alarm:
             events = [self._waiting.popleft() for _ in range(len(self._waiting))]
             if events:
                 self._run(max(events, key=lambda event: event.level), len(events) - 1)
-                time.sleep(self._every_s)
+                time.sleep(self._min_interval_s)
 
     def _run(self, event: Log, others: int) -> None:
         name, _, sentence = printable(event.message).partition(" ")

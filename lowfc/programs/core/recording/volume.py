@@ -63,7 +63,7 @@ def _rate_hz(topic: Topic, config: Configuration, recorded: Selection) -> float:
     if topic in recorded.excluded:
         return 0.0
     rate_hz = config.camera.rate_hz if topic.rate is Rate.LOOP else float(topic.rate)
-    return rate_hz if recorded.records_all(topic) else rate_hz / recorded.every
+    return rate_hz if recorded.records_all(topic) else rate_hz / recorded.interval_frames
 
 
 def _size(count: float) -> str:
