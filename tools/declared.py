@@ -90,7 +90,7 @@ def offered(package: str) -> str:
     else:
         modules = [one.name for one in walk_packages(top.__path__, f"{package}.") if not one.ispkg]
         found = [(name, import_module(name).__doc__) for name in modules]
-    rows = ((f"`{name}`", sentence((text or "").split("\n\n")[0])) for name, text in found)
+    rows = ((f"`{name}`", one_line((text or "").split("\n\n")[0])) for name, text in found)
     return markdown(("name", ""), rows)
 
 
@@ -107,7 +107,7 @@ def limits(rows: Iterable[tuple[str, *tuple[float, ...]]]) -> str:
 
 def requirements() -> str:
     """Requirements of an acceptance run."""
-    rows = ((f"`{key}`", f"{info.default:g}", sentence(info.description)) for key, info in keys(Acceptance).items())
+    rows = ((f"`{key}`", f"{info.default:g}", one_line(info.description)) for key, info in keys(Acceptance).items())
     return markdown(("key", "default", "requirement"), rows)
 
 
@@ -129,16 +129,16 @@ def topics(role: Role, *own: Topic) -> str:
         does = "publish" if role in topic.publishers else "subscribe"
         answers = "; the last one is returned on query" if topic.queryable else ""
         name = topic.message.DESCRIPTOR.full_name
-        rows.append((f"`{topic.key}`", f"`{name}`", when, does, topic.sentence.rstrip(".") + answers))
+        rows.append((f"`{topic.key}`", f"`{name}`", when, does, topic.description.rstrip(".") + answers))
     return markdown(("topic", "message", "when", "you", ""), rows)
 
 
 def fields(message: str) -> str:
-    """Number, type and sentence of every field of one of our messages."""
+    """Number, type and description of every field of one of our messages."""
     descriptors = FileDescriptorSet.FromString((files("lowfc.contract.wire") / "lowfc.desc").read_bytes())
     file = next(file for file in descriptors.file if file.package == "lowfc.v1")
     comments = {
-        tuple(location.path): sentence(location.leading_comments) for location in file.source_code_info.location
+        tuple(location.path): one_line(location.leading_comments) for location in file.source_code_info.location
     }
     index = [one.name for one in file.message_type].index(message)
     rows = []
@@ -150,14 +150,14 @@ def fields(message: str) -> str:
     return markdown(("field", "type", "number", ""), rows)
 
 
-def sentence(text: str | None) -> str:
+def one_line(text: str | None) -> str:
     """Text on one line without its full stop."""
     return " ".join((text or "").split()).removesuffix(".")
 
 
 def buttons() -> str:
     """The console's buttons."""
-    rows = [f"| `{one.key}` | {one.name} | {one.sentence} |" for one in (SAFE, *ACTIONS)]
+    rows = [f"| `{one.key}` | {one.name} | {one.description} |" for one in (SAFE, *ACTIONS)]
     return "\n".join(["| key | button | what it does |", "|---|---|---|", *rows]) + "\n"
 
 

@@ -111,8 +111,8 @@ def _rows(by_name: dict[str, list[Figures]]) -> list[Sequence[object]]:
         why = f", {ended['skipped']} skipped ({cases[0]['skipped']})" if ended["skipped"] else ""
         found = [case["findings"].get("recovery", {}).get("found", "-") for case in cases]
         recovered = "; ".join(_recovery(text) for text in found)
-        sentence = CASES[name].sentence if name in CASES else cases[0]["sentence"]
-        rows.append((f"`{name}`", sentence, f"{ended['passed']} of {len(cases)}{why}", recovered))
+        description = CASES[name].description if name in CASES else cases[0]["sentence"]
+        rows.append((f"`{name}`", description, f"{ended['passed']} of {len(cases)}{why}", recovered))
     return rows
 
 

@@ -19,7 +19,7 @@ def test_every_command_is_listed_under_its_heading_with_its_whole_description() 
     for heading, rows in COMMANDS.items():
         assert f"{heading}:" in lines
         for row in rows:
-            assert any(line.split(maxsplit=1) == [row.name, row.sentence] for line in lines), row.name
+            assert any(line.split(maxsplit=1) == [row.name, row.description] for line in lines), row.name
 
 
 def test_every_help_page_has_an_example_whole_descriptions_and_no_colloquial_verbs() -> None:

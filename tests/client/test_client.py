@@ -339,7 +339,7 @@ def test_a_loop_outside_this_runtime_directory_is_reported(own_runtime: Path, mo
         with subprocess.Popen(words_there, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment) as process:
             process.stdout.readline()
             ours = [one for one in other_loops() if f"(process {process.pid})" in one or name in one]
-            sentence = none_here()
+            message = none_here()
             with monkeypatch.context() as patch:
                 patch.setattr(os, "geteuid", lambda: 4_000_000_000)
                 theirs = list(other_loops())
@@ -348,7 +348,7 @@ def test_a_loop_outside_this_runtime_directory_is_reported(own_runtime: Path, mo
         where = f"`lowfc {program} --run {name}` (process {process.pid}){found}"
         assert ours == [f"you run {where}"] * bool(found)
         assert (f"user {own_runtime.owner()} runs {where}" in theirs) == bool(found)
-        assert sentence.endswith("starting or ending: try again in a few seconds") == ("starting" in found)
+        assert message.endswith("starting or ending: try again in a few seconds") == ("starting" in found)
 
 
 # The mirror.

@@ -299,20 +299,20 @@ class FinishedTask:
     status = 0
 
     def __init__(self, name: str) -> None:
-        self.sentence = f"{name}: done"
+        self.status_line = f"{name}: done"
 
 
 def test_a_task_runs_in_its_own_session_and_reports_its_end() -> None:
     from lowfc.programs.console.task import Task
 
     cases = (["--version"], 0, "t: done; 0."), (["no-such"], 2, "t failed: ")
-    for arguments, status, sentence in cases:
+    for arguments, status, status_line in cases:
         task = Task("t", arguments)
-        assert task.sentence.startswith("t: running for ")
+        assert task.status_line.startswith("t: running for ")
         assert os.getsid(task._process.pid) == task._process.pid, "neither Ctrl-C nor a lost terminal reaches it"
         until(lambda task=task: task.status is not None)
         assert task.status == status
-        assert task.sentence.startswith(sentence)
+        assert task.status_line.startswith(status_line)
         task.output.unlink()
 
 

@@ -121,7 +121,7 @@ def test_a_smaller_copy_has_the_same_steps(whole: Path, small: Path) -> None:
     assert (found["messages_missing"], found["state"], "recovery" in found["metadata"]) == (0, "complete", False)
     again = thin((small,), small.with_name("again.mcap"), selection(4, ["lowfc/camera/*"]))
     made = Selection(20, frozenset({MIRROR_STATE, SURFACE, TIMING, TRUTH}))
-    assert again.selection == made.sentence
+    assert again.selection == made.description
     assert Selection.of(survey(path := Path(again.file))["metadata"]) == made
     assert len(of(list(LogReader(path)), FRAME)) == FRAMES // 20
     with pytest.raises(DataFileError, match="already exists"):

@@ -94,14 +94,14 @@ def test_a_log_of_0_1_is_drawn(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "sentence"),
+    ("words", "message"),
     [
         (["tune", NIGHT, "--out", "law.fits"], "tuning requires at least"),
         (["acceptance", "linearity", NIGHT], "no `lowfc acceptance"),
     ],
 )
-def test_commands_that_need_a_longer_log_say_so(words: list[object], sentence: str) -> None:
-    assert sentence in str(lowfc(*words).exception)
+def test_commands_that_need_a_longer_log_say_so(words: list[object], message: str) -> None:
+    assert message in str(lowfc(*words).exception)
 
 
 def test_the_log_of_0_1_has_every_kind_of_input() -> None:

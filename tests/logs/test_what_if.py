@@ -24,7 +24,7 @@ from lowfc.control.laws.what_if import as_logged, counterfactual, rms
 from lowfc.control.loop.safety import Limit, LoopMode
 from lowfc.optics.chain.added_contrast import contrast_form
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
-from lowfc.programs.cli.contrast import added_contrast, sentence_of
+from lowfc.programs.cli.contrast import added_contrast, added_contrast_in_words
 from lowfc.programs.logs.what_if.compare import LINEAR_WAVES, render, what_if
 from lowfc.programs.logs.what_if.options import WhatIf, requested, user_controller
 from lowfc.programs.logs.what_if.run import LoggedRun
@@ -161,7 +161,7 @@ def test_added_contrast_of_shaped_pupil_and_lyot_coronagraph() -> None:
     expected = 0.01 * contrast_form(factory.sensor(Configuration(), print).pupil, (11,), 550.0).item()
     assert (contrast["was"], contrast["what if"], contrast["other"]) == (0, pytest.approx(expected), None)
     assert contrast["by_group"]["what if"]["spherical"] == pytest.approx(expected)
-    assert sentence_of(contrast) == (
+    assert added_contrast_in_words(contrast) == (
         f"added to the dark zone's contrast: was +0.0e+00, what if +{expected:.1e}; spherical contributes most (100 %)"
     )
     assert found(sensor__modes=10) is None

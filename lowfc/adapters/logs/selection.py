@@ -52,7 +52,7 @@ class Selection:
         return {SELECTION: {"every": str(self.interval_frames), "left_out": " ".join(self._keys)}}
 
     @property
-    def sentence(self) -> str:
+    def description(self) -> str:
         """Description of the selection; empty for everything."""
         few = [name for topic, name in _DECIMATED.items() if topic not in self.excluded]
         parts = [f"1 in {self.interval_frames} {' and '.join(few)}"] if self.interval_frames > 1 and few else []

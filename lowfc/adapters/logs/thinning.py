@@ -85,7 +85,7 @@ def thin(log: Parts, out: Path, requested: Selection, progress: Callable[[int, i
         copy.finish()
     return Thinned(
         str(out),
-        combined.sentence,
+        combined.description,
         copy.messages,
         out.stat().st_size,
         messages,

@@ -122,7 +122,7 @@ def check_stable(law: LinearLaw, delay_frames: float) -> None:
                 )
 
 
-def sentence(found: Margins) -> str:
+def margins_in_words(found: Margins) -> str:
     """The smallest margins of all modes in words."""
     return (
         f"gain margin {found.gain_margin.min():.3g}, phase margin {found.phase_margin_deg.min():.0f} deg, "

@@ -228,7 +228,7 @@ for _name, _request in BY_NAME.items():
         _command = _recording(_name) if _records else _OWN.get(_name) or _BY_FIELDS[_fields](_name)
         (record_app if _records else ctl_app).command(
             _request.name,
-            help=f"{_request.sentence}\n\nExample: lowfc ctl {_request.example}",
+            help=f"{_request.description}\n\nExample: lowfc ctl {_request.example}",
             context_settings={"ignore_unknown_options": "values" in _fields},  # -5 is a value, not an option
         )(_command)
 ctl_app.command()(bench)

@@ -39,7 +39,7 @@ class Variable(NamedTuple):
     name: str
     kind: Kind
     unit: str
-    sentence: str
+    description: str
     read: Callable[[RunView, dict[str, Any]], Any] | None
     put: Put | None = None
 
@@ -113,7 +113,7 @@ def _request(one: Declaration) -> Variable | None:
         kind, put = Kind.NUMBERS, lambda loop, value: loop.ask(one.name, values=value)
     else:
         kind, put = Kind.BOOLEAN, lambda loop, value: loop.ask(one.name)
-    return Variable(name, kind, "", one.sentence, None, put)
+    return Variable(name, kind, "", one.description, None, put)
 
 
 def variables() -> Iterator[Variable]:

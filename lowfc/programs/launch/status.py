@@ -13,7 +13,7 @@ from lowfc.contract.events import Level
 from lowfc.contract.messages import COMMAND, FRAME, Role, wire
 from lowfc.contract.printable import printable
 from lowfc.control.loop.wording import counted, mode_word
-from lowfc.programs.cli.contrast import most_of, sentence, with_this_mirror
+from lowfc.programs.cli.contrast import contrast_in_words, most_of, with_this_mirror
 from lowfc.programs.launch.watch import Watch, mode_name, topic_count, wavefront
 
 SILENT_S = 2.0
@@ -143,7 +143,7 @@ def _contrast(figures: dict[str, Any]) -> list[str]:
         return []
     own = "" if figures["dark_zone_contrast"] is None else f"coronagraph alone {figures['dark_zone_contrast']:.1e}; "
     beyond = ("residual",) if figures["beyond_quadratic"] else ()
-    return [f"contrast           {own}{sentence(with_this_mirror(added), most_of(figures), beyond)}"]
+    return [f"contrast           {own}{contrast_in_words(with_this_mirror(added), most_of(figures), beyond)}"]
 
 
 def summary_text(figures: dict[str, Any]) -> str:

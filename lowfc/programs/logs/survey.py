@@ -191,7 +191,7 @@ def survey(
         "files": [str(path) for path in reader.paths],
         **({"digest": found.of_log()} if digest else {}),
         "lockstep": configuration.lockstep if configuration is not None else None,
-        "selection": reader.selection.sentence,
+        "selection": reader.selection.description,
         "bytes": reader.size,
         "state": _state(reader),
         **figures,

@@ -13,7 +13,7 @@ from lowfc.control.laws import margins
 from lowfc.control.laws.spectra import SHORTEST, Pieces, floor_nm2_hz, spectrum
 from lowfc.control.loop.safety import LoopMode
 from lowfc.optics.chain.zernike import mode_name
-from lowfc.programs.cli.contrast import added_contrast, sentence_of
+from lowfc.programs.cli.contrast import added_contrast, added_contrast_in_words
 from lowfc.programs.cli.result import figure
 from lowfc.programs.commissioning.acceptance.live import Live
 from lowfc.programs.commissioning.acceptance.probe import (
@@ -50,7 +50,7 @@ class NoiseResult(AcceptanceResult):
 
     def remarks(self) -> Sequence[str]:
         """Added contrast, and the verdict."""
-        contrast = [] if self.added_contrast is None else [sentence_of(self.added_contrast)]
+        contrast = [] if self.added_contrast is None else [added_contrast_in_words(self.added_contrast)]
         return [*contrast, *super().remarks()]
 
 

@@ -26,7 +26,7 @@ from lowfc.control.laws.tuning import (
 from lowfc.control.laws.vibration import Model
 from lowfc.control.loop.wording import counted
 from lowfc.optics.chain.zernike import mode_name
-from lowfc.programs.cli.contrast import added_contrast, sentence_of, with_variances
+from lowfc.programs.cli.contrast import added_contrast, added_contrast_in_words, with_variances
 from lowfc.programs.cli.result import Result, figure
 from lowfc.programs.commissioning.tune.data import Telemetry
 
@@ -112,7 +112,7 @@ class TuneResult(Result):
         cases = ", ".join(f"{names.get(name, name)} {rms:.2f}" for name, rms in tilt.items())
         return [
             *([f"tilt per axis, mas rms: {cases}"] if tilt else []),
-            *([] if self.added_contrast is None else [sentence_of(self.added_contrast)]),
+            *([] if self.added_contrast is None else [added_contrast_in_words(self.added_contrast)]),
             *(f"warning: {warning}" for warning in self.warnings),
             *(f"written: {file}" for file in self.files),
             *([] if self.applied is None else [self.applied]),

@@ -54,11 +54,11 @@ class Alarm:
                 time.sleep(self._min_interval_s)
 
     def _run(self, event: Log, others: int) -> None:
-        name, _, sentence = printable(event.message).partition(" ")
+        name, _, text = printable(event.message).partition(" ")
         arguments = {
             "LOWFC_RUN": self._service.run_id,
             "LOWFC_EVENT": name,
-            "LOWFC_TEXT": sentence,
+            "LOWFC_TEXT": text,
             "LOWFC_LEVEL": _LEVELS.get(event.level, str(event.level)),
             "LOWFC_PROCESS": printable(event.name),
             "LOWFC_TIME": f"{from_timestamp(event.timestamp) * 1e-9:.3f}",

@@ -27,7 +27,7 @@ from lowfc.contract.errors import BadMessageError, DataFileError
 from lowfc.contract.messages import EVENT, HEALTH, RECORD_KEY, TOPICS, Role, Topic, timestamp, wire
 from lowfc.programs.core.recording.peers import Peers
 from lowfc.programs.core.recording.summary import Summary
-from lowfc.programs.core.recording.volume import growth_sentence
+from lowfc.programs.core.recording.volume import growth_in_words
 
 QUEUE_MESSAGES = 20_000
 """Largest number of messages waiting for the disk: about 4 s of a 1 kHz loop, 90 MB."""
@@ -295,7 +295,7 @@ class Recorder:
     def _estimate(self) -> str:
         """Sentence on the disk space used, from the growth so far or as expected; empty if unknown."""
         growth = self._series.bytes_per_s or self._expected_bytes_per_s
-        return growth_sentence(growth, self._folder, self._min_free_bytes) if growth else ""
+        return growth_in_words(growth, self._folder, self._min_free_bytes) if growth else ""
 
     def _flushed(self) -> None:
         self._account.mark_flushed()

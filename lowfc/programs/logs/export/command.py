@@ -128,7 +128,7 @@ def export_log(
         "modes": history.steps.error_nm.shape[1],
         "frames": len(history.frame_sequence) if frames else 0,
         "steps_left_out": history.excluded_messages,
-        "selection": reader.selection.sentence,
+        "selection": reader.selection.description,
         "finished": reader.finished,
         "no_end": missing_end_text(reader.paths, finished=reader.finished),
         "damaged": [f"byte {one.position}, {one.why}" for one in reader.damage],

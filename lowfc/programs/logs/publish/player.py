@@ -127,7 +127,7 @@ class Player:
             "finished": log.finished,
             "no_end": missing_end_text(log.paths, finished=log.finished),
             "damaged": [f"byte {one.position}, {one.why}" for one in log.damage],
-            "selection": [log.selection.sentence] if log.selection.sentence else [],
+            "selection": [log.selection.description] if log.selection.description else [],
             "interrupted": not self._service.running,
         }
 

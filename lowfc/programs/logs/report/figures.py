@@ -65,7 +65,7 @@ def _log(run: Run) -> Figures:
     return {
         "file": log.path.name,
         "files": [path.name for path in log.paths],
-        "selection": log.selection.sentence,
+        "selection": log.selection.description,
         "bytes": log.size,
         "finished": log.finished,
         "complete": log.complete and not log.damage,

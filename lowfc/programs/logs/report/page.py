@@ -10,7 +10,7 @@ from lowfc.adapters.files.drawing import figure_class
 from lowfc.adapters.process.extras import install_advice
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.printable import LINES, printable
-from lowfc.programs.cli.contrast import sentence_of
+from lowfc.programs.cli.contrast import added_contrast_in_words
 from lowfc.programs.logs.report.drawings import drawings
 from lowfc.programs.logs.report.figures import Report
 
@@ -26,7 +26,7 @@ def page(report: Report, progress: Callable[[str], None] = lambda name: None) ->
     added = report.figures["residual"]["added_contrast"]
     text: str = template.render(
         **report.figures,
-        contrast_sentence=sentence_of(added) if added is not None else "",
+        contrast_in_words=added_contrast_in_words(added) if added is not None else "",
         drawings=drawings(report, progress),
         toml=tomli_w.dumps(configuration) if configuration is not None else None,
     )

@@ -21,7 +21,7 @@ from lowfc.control.loop.safety import Limit
 from lowfc.control.loop.wording import counted
 from lowfc.optics.chain.zernike import mode_name
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
-from lowfc.programs.cli.contrast import added_contrast, sentence_of, with_variances
+from lowfc.programs.cli.contrast import added_contrast, added_contrast_in_words, with_variances
 from lowfc.programs.cli.result import table
 from lowfc.programs.logs.what_if.options import LAW_KEYS, WhatIf, law
 from lowfc.programs.logs.what_if.run import LoggedRun
@@ -157,7 +157,7 @@ def render(figures: dict[str, Any]) -> str:
         "",
         "measured figures include sensor noise; true: at the start of each exposure; continuous: also between these "
         "instants, while the mirror holds; assumes a linear sensor and no actuator limits",
-        *([] if figures["added_contrast"] is None else [sentence_of(figures["added_contrast"])]),
+        *([] if figures["added_contrast"] is None else [added_contrast_in_words(figures["added_contrast"])]),
         *(f"warning: {warning}" for warning in figures["warnings"]),
     ]
     return "\n".join(lines)
@@ -251,7 +251,9 @@ def _log_warnings(run: LoggedRun) -> list[str]:
         found.append(f"limits acted in the logged run ({', '.join(acted)}); in the what-if only modal limits act")
     count = np.count_nonzero(run.history.mirror.limits)
     if count:
-        few = "" if log.selection.records_all(MIRROR_STATE) else f" (recorded mirror states: {log.selection.sentence})"
+        few = (
+            "" if log.selection.records_all(MIRROR_STATE) else f" (recorded mirror states: {log.selection.description})"
+        )
         found.append(
             f"the mirror's own limits acted on {counted(int(count), 'command')}{few}: pseudo-open-loop modes are wrong "
             "there"

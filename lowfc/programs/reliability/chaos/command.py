@@ -52,13 +52,13 @@ def chaos(
     names = list(CASES) if all_ else case or []
     if not names:
         width = max(map(len, CASES))
-        sys.stdout.write("".join(f"{one.name:{width}}  {one.sentence}\n" for one in CASES.values()))
+        sys.stdout.write("".join(f"{one.name:{width}}  {one.description}\n" for one in CASES.values()))
         return
     rows: list[dict[str, Any]] = []
     interrupted = False
     try:
         for number, name in enumerate(names, 1):
-            sys.stderr.write(f"{number} of {len(names)}: {name}: {CASES[name].sentence}\n")
+            sys.stderr.write(f"{number} of {len(names)}: {name}: {CASES[name].description}\n")
             rows.append(run_case(CASES[name], seed, keep))
             sys.stderr.write(f"    {_result(rows[-1])} in {rows[-1]['seconds']:.0f} s\n")
     except KeyboardInterrupt:
@@ -73,7 +73,7 @@ def chaos(
 
 def run_case(case: "Case", seed: int, keep: Path | None) -> dict[str, Any]:
     """Run one case in its own folder, and judge it; without `keep`, only the log of a failed case is kept."""
-    row: dict[str, Any] = {"name": case.name, "sentence": case.sentence, "seconds": 0.0}
+    row: dict[str, Any] = {"name": case.name, "sentence": case.description, "seconds": 0.0}
     row |= {"passed": False, "skipped": case.lacks() or None, "findings": {}, "figures": {}}
     if row["skipped"]:
         return row

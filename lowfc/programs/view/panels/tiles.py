@@ -102,8 +102,8 @@ def _parts(verdict: Verdict, time_ns: int) -> Iterator[tuple[Box, Level, tuple[T
     headline, *boxes = tile_boxes(len(verdict.tiles))
     word, top, bottom = WORD[verdict.level].upper(), _INSET // 2, _BAND - _INSET // 2
     left = _INSET + round(_width(word, 30)) + (_INSET if word else 0)
-    sentence = ((left, top, WIDTH - _CLOCK - _INSET, bottom), verdict.headline, 27)
-    yield headline, verdict.level, (((_INSET, top, left, bottom), word, 30), sentence)
+    summary = ((left, top, WIDTH - _CLOCK - _INSET, bottom), verdict.headline, 27)
+    yield headline, verdict.level, (((_INSET, top, left, bottom), word, 30), summary)
     clock = f"{datetime.fromtimestamp(time_ns // 10**9, UTC):%H:%M:%S} UTC"
     clock_box = (WIDTH - _CLOCK, 0, WIDTH, _BAND)
     yield clock_box, verdict.level, (((_INSET, top, _CLOCK - _INSET, bottom), clock, 27),)
