@@ -15,7 +15,7 @@ from lowfc.control.loop.wording import counted
 from lowfc.programs.reliability.chaos.cases import CASES
 from lowfc.programs.reliability.chaos.command import counts
 from lowfc.programs.reliability.soak.figures import TOO_SHORT, latency_in_words, verdict
-from tools.shared import ROOT, Figures, columns, host, json_of, markdown, of_host
+from tools.shared import ROOT, Figures, columns, host, host_in_words, json_of, markdown
 
 CHAOS = "lowfc chaos --all --seed N"
 SEEDS = (1, 2, 3, 4, 5)
@@ -92,7 +92,7 @@ def render_chaos(figures: Figures) -> str:
     parts.append(f"Measured again after a change of the case itself: {again}." if again else "")
     hosts: dict[str, list[str]] = {}
     for name, about in figures.get("later", {}).items():
-        hosts.setdefault(of_host(about), []).append(f"`{name}`")
+        hosts.setdefault(host_in_words(about), []).append(f"`{name}`")
     parts += [
         f"Measured {about} by `python -m tools.reliability`: {', '.join(names)}." for about, names in hosts.items()
     ]

@@ -45,7 +45,7 @@ from lowfc.contract.messages import (
     image,
     wire,
 )
-from lowfc.control.laws.linear_law import integrator_block, of_blocks
+from lowfc.control.laws.linear_law import integrator_block, law_from_blocks
 from lowfc.control.loop.inputs import Reply, Request, Step
 from lowfc.control.loop.interlocks import Value
 from lowfc.control.loop.requests import REQUESTS
@@ -58,7 +58,7 @@ from tests.support.recording import Bench, bodies_of, put
 from tests.support.toy import NOLL, calibration
 
 KNOWN = identified(calibration())
-LAW = of_blocks([integrator_block(0.2, 0.01, "pol", 1.5)] * 3, "pol", "leaky", NOLL, 1.5, 1000.0)
+LAW = law_from_blocks([integrator_block(0.2, 0.01, "pol", 1.5)] * 3, "pol", "leaky", NOLL, 1.5, 1000.0)
 LEASE = {"text": "a test", "lease_id": 7}
 SHAPE = np.arange(20.0).reshape(KNOWN.grid)
 

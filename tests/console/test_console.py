@@ -16,14 +16,14 @@ from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import EVENT, wire
-from lowfc.control.laws.linear_law import integrator_block, of_blocks
+from lowfc.control.laws.linear_law import integrator_block, law_from_blocks
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from tests.console.live_run import RUN, LiveRun
 from tests.support.loops import until
 from tests.support.stage import Stage
 from tests.support.toy import GRID, NOLL, calibration
 
-LAW = of_blocks([integrator_block(0.2, 0.01, "pol", 1.0)] * 3, "pol", "leaky", NOLL, 1.0, 50.0)
+LAW = law_from_blocks([integrator_block(0.2, 0.01, "pol", 1.0)] * 3, "pol", "leaky", NOLL, 1.0, 50.0)
 TIMEOUT_S = 15.0
 
 

@@ -22,7 +22,7 @@ from lowfc.client import Client, running
 from lowfc.client.requests import DECLARED
 from lowfc.contract.errors import CalibrationError, RequestRefusedError
 from lowfc.contract.messages import COMMAND, EVENT, REQUEST, Log, wire
-from lowfc.control.laws.linear_law import integrator_block, of_blocks
+from lowfc.control.laws.linear_law import integrator_block, law_from_blocks
 from lowfc.control.loop.requests import REQUESTS
 from lowfc.control.loop.safety import Limits
 from lowfc.programs.cli.ctl import ctl_app
@@ -98,7 +98,7 @@ def _ready(night: Night) -> None:
     calibration_file.save(calibration, night.folder / "calibration.fits")
     delay = status.settings.delay_frames
     blocks = [integrator_block(0.2, 0.001, "pol", delay)] * len(calibration.noll)
-    law_file.save(of_blocks(blocks, "pol", "leaky", calibration.noll, delay, 200.0), night.folder / "law.fits")
+    law_file.save(law_from_blocks(blocks, "pol", "leaky", calibration.noll, delay, 200.0), night.folder / "law.fits")
     rows, columns = np.indices(calibration.grid)
     np.save(night.folder / "shape.npy", 3.0 * np.sin(rows / 3) * np.cos(columns / 4))
 

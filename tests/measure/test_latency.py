@@ -36,7 +36,7 @@ from lowfc.programs.measure.latency.figures import (
     repeat_figures,
 )
 from lowfc.programs.measure.latency.stalls import Counted, Trace, signs_of, stalls_of
-from lowfc.programs.measure.latency.summary import compare, of_kernels, ratio, together
+from lowfc.programs.measure.latency.summary import compare, kernel_summary, ratio, together
 from lowfc.programs.measure.latency.text import compared, sparkline, table
 from tests.support.loops import lowfc, until
 from tools.law_bench import calibrated
@@ -252,13 +252,13 @@ def test_a_stall_has_only_the_counts_of_its_own_time() -> None:
 
 def test_the_ratio_of_two_kernels_is_the_median_over_their_pairs() -> None:
     pairs = [("numpy", 100), ("fused", 80), ("fused", 60), ("numpy", 120), ("numpy", 100), ("fused", 70)]
-    found = of_kernels([repeat(us, kernel=name) for name, us in pairs])
+    found = kernel_summary([repeat(us, kernel=name) for name, us in pairs])
     assert (found["kernel"], found["frames"]) == ("both", 1500)
     assert found["latency_us"]["frame_to_command"]["p50"] == 70
     assert found["kernel_ratio"]["p99"] == pytest.approx(0.7)
     assert found["kernel_ratio_spread"]["p50"] == [0.5, 0.8]
     assert found["numpy_us"]["p50"] == 100
-    alone = of_kernels([repeat(us, kernel="fused") for us in (1, 2)])
+    alone = kernel_summary([repeat(us, kernel="fused") for us in (1, 2)])
     assert (alone["kernel"], "kernel_ratio" in alone) == ("fused", False)
 
 

@@ -13,7 +13,7 @@ from lowfc.arrays import Array
 from lowfc.control.laws import margins
 from lowfc.control.laws.continuous import Timing, commanded, held_residual_nm2, residual_spectrum
 from lowfc.control.laws.kalman import lqg_block
-from lowfc.control.laws.linear_law import Block, LinearLaw, integrator, integrator_block, of_blocks
+from lowfc.control.laws.linear_law import Block, LinearLaw, integrator, integrator_block, law_from_blocks
 from lowfc.control.laws.margins import sensitivity
 from lowfc.control.laws.pi_notch import Notch, pi_notch
 from lowfc.control.laws.spectra import Pieces, Spectrum, floor_nm2_hz, spectrum
@@ -151,7 +151,7 @@ def tune_lqg(
     noise_nm2 = np.array([model.noise_nm2 for model in models])
 
     def law_of(blocks: Sequence[Block]) -> LinearLaw:
-        return of_blocks(blocks, "pol", "lqg", noll, timing.delay, rate_hz)
+        return law_from_blocks(blocks, "pol", "lqg", noll, timing.delay, rate_hz)
 
     def residual(blocks: Sequence[Block]) -> Array:
         return simulated_residual_nm2(law_of(blocks), run, noise_nm2, timing)
@@ -288,7 +288,7 @@ def within_margins(model: Model, timing: Timing) -> Block | None:
 
     def held(octaves: float) -> Block | None:
         block = lqg_block(replace(model, noise_nm2=2.0**octaves * model.noise_nm2), timing)
-        law = of_blocks([block], "pol", "lqg", (2,), timing.delay, model.rate_hz)  # or any other mode
+        law = law_from_blocks([block], "pol", "lqg", (2,), timing.delay, model.rate_hz)  # or any other mode
         return block if _holds(margins.margins(law, timing.delay)) else None
 
     low = 0.0

@@ -74,7 +74,7 @@ class Digest:
             found[key] = hashlib.sha256(b"".join([*early[-1:], *later])).hexdigest()
         return dict(sorted(found.items()))
 
-    def of_log(self) -> str:
+    def hexdigest(self) -> str:
         """Hexadecimal digest of the log."""
         lines = [f"{key} {digest}\n" for key, digest in self.by_key().items()]
         return hashlib.sha256("".join(lines).encode()).hexdigest()
@@ -189,7 +189,7 @@ def survey(
     return {
         "log": str(reader.path),
         "files": [str(path) for path in reader.paths],
-        **({"digest": found.of_log()} if digest else {}),
+        **({"digest": found.hexdigest()} if digest else {}),
         "lockstep": configuration.lockstep if configuration is not None else None,
         "selection": reader.selection.description,
         "bytes": reader.size,

@@ -7,7 +7,7 @@ from scipy.signal import welch
 from lowfc.adapters.files.factory import frame_noise_nm
 from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.kalman import lqg_block
-from lowfc.control.laws.linear_law import of_blocks
+from lowfc.control.laws.linear_law import law_from_blocks
 from lowfc.control.laws.margins import margins
 from lowfc.control.laws.spectra import Pieces
 from lowfc.control.laws.stability import MIN_GAIN_MARGIN, MIN_PHASE_MARGIN_DEG
@@ -47,7 +47,9 @@ def test_a_filter_keeps_the_margins_at_any_noise(noise_nm: float, width: float, 
     model = Model(0.02, 2.0, known, noise_nm**2, RATE_HZ)
     block = within_margins(model, timing)
     assert block is not None
-    law, free = (of_blocks([one], "pol", "lqg", (2,), delay, RATE_HZ) for one in (block, lqg_block(model, timing)))
+    law, free = (
+        law_from_blocks([one], "pol", "lqg", (2,), delay, RATE_HZ) for one in (block, lqg_block(model, timing))
+    )
 
     def over(one: object) -> float:
         """Smallest ratio of a margin to its limit."""

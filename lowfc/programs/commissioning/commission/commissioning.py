@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lowfc.adapters.files import calibration_file, factory
-from lowfc.adapters.logs.columns import Steps, of_steps
+from lowfc.adapters.logs.columns import Steps, steps_as_columns
 from lowfc.adapters.process.progress import Counted
 from lowfc.arrays import Single
 from lowfc.client import Client
@@ -267,7 +267,7 @@ class Commissioning:
                 break
             if len(steps) % CHECKED == 0:
                 self._loop.check_lease()
-        return of_steps(steps, len(self._computed.noll))
+        return steps_as_columns(steps, len(self._computed.noll))
 
 
 def _rms_nm(error_nm: Single, settling: int) -> float:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lowfc.adapters.files.factory import contrast_of, frame_noise_nm2
-from lowfc.adapters.logs.columns import Steps, of_steps
+from lowfc.adapters.logs.columns import Steps, steps_as_columns
 from lowfc.adapters.logs.history import read_history
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.arrays import Array, Mask, Single
@@ -66,7 +66,7 @@ class Telemetry:
     warnings: tuple[str, ...]
 
 
-def of_log(log: LogReader) -> Telemetry:
+def telemetry_from_log(log: LogReader) -> Telemetry:
     """The used closed-loop frames of a log; all used frames if there are too few of them.
 
     Frames with a probe sequence, as in an acceptance test, are excluded: a law must not learn from them.
@@ -102,7 +102,7 @@ def of_log(log: LogReader) -> Telemetry:
     )
 
 
-def of_run(loop: Client, seconds: float, progress: Callable[[float], None] | None = None) -> Telemetry:
+def telemetry_from_run(loop: Client, seconds: float, progress: Callable[[float], None] | None = None) -> Telemetry:
     """The steps of a running loop in the next `seconds`."""
     state = loop.status().state
     calibration = loop.calibration()
@@ -129,7 +129,7 @@ def of_run(loop: Client, seconds: float, progress: Callable[[float], None] | Non
     stream.close()
     if state is None or not state.gain:
         raise DataFileError(f"run {loop.run_id!r} has no calibration: load one with `lowfc ctl load`")
-    columns = of_steps(steps, len(calibration.noll))
+    columns = steps_as_columns(steps, len(calibration.noll))
     period_s = float(np.median(np.diff(columns.time_ns))) * 1e-9 if len(steps) > 1 else 0.0
     rate_hz = 1 / period_s if period_s > 0 else config.camera.rate_hz
     return _telemetry(

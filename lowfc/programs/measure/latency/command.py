@@ -128,7 +128,7 @@ def _measure(options: "LatencyOptions") -> dict[str, Any]:
     from lowfc.adapters.process.progress import passing_bar
     from lowfc.adapters.process.provenance import provenance
     from lowfc.programs.measure.latency.run import prepared, run_repeats
-    from lowfc.programs.measure.latency.summary import of_kernels
+    from lowfc.programs.measure.latency.summary import kernel_summary
 
     host: dict[str, Any] = {**provenance(), "clock_source": "", "load": os.getloadavg()[0]}
     with contextlib.suppress(OSError):
@@ -137,7 +137,7 @@ def _measure(options: "LatencyOptions") -> dict[str, Any]:
     with prepared(options.config) as run, passing_bar(Console(stderr=True)) as bar:
         task = bar.add_task("starting", total=1 + 2 * options.repeats * max(1, len(options.kernels)))
         done = run_repeats(options, run, lambda what: bar.update(task, description=what, advance=1))
-    return of_kernels(done) | {
+    return kernel_summary(done) | {
         "settings": {
             "rate_hz": options.config.camera.rate_hz,
             **{name: getattr(options, name) for name in ("duration_s", "repeats", "record", "view", "trace")},

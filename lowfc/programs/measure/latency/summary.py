@@ -54,7 +54,7 @@ def together(repeats: Repeats) -> dict[str, Any]:
     return found
 
 
-def of_kernels(repeats: Repeats) -> dict[str, Any]:
+def kernel_summary(repeats: Repeats) -> dict[str, Any]:
     """`together` of the repeats if they have one kernel; otherwise that of the fused step, compared with numpy's.
 
     Returns:

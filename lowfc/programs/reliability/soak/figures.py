@@ -46,7 +46,7 @@ def _grew(counts: Sequence[int]) -> bool:
     return bool(np.median(counts[-quarter:]) > np.median(counts[quarter : 2 * quarter]))
 
 
-def of_process(samples: Sequence[Usage]) -> dict[str, Any]:
+def process_statistics(samples: Sequence[Usage]) -> dict[str, Any]:
     """Figures of one process."""
     times_s, memory_bytes, handles, threads = zip(*samples, strict=True)
     memory_mb = [one / 1e6 for one in memory_bytes]
@@ -66,7 +66,7 @@ def of_process(samples: Sequence[Usage]) -> dict[str, Any]:
     return {**ends, **_per_hour("memory_mb", memory), "grows": grows, "too_short": too_short}
 
 
-def of_latency(samples: Sequence[tuple[float, float, float]]) -> dict[str, float | None]:
+def latency_statistics(samples: Sequence[tuple[float, float, float]]) -> dict[str, float | None]:
     """Median and drift of the latency, from samples of time, s, and p50 and p99 since the previous sample, us."""
     times_s, *each = zip(*samples, strict=True) if samples else ((), (), ())
     found: dict[str, float | None] = {}

@@ -19,7 +19,7 @@ from lowfc.programs.launch.sim_loop import check
 from lowfc.programs.launch.watch import topic_count
 from lowfc.programs.reliability.chaos.bench import ChaosBench
 from lowfc.programs.reliability.chaos.processes import CommandTimes
-from lowfc.programs.reliability.soak.figures import Usage, of_latency, of_process, too_short
+from lowfc.programs.reliability.soak.figures import Usage, latency_statistics, process_statistics, too_short
 
 SAMPLE_S = 1.0
 _PATIENCE_S = 10.0
@@ -83,7 +83,7 @@ class _Soak:
             self.bench.health.get(role, wire.Health()) for role in (Role.CONTROLLER, Role.RECORDER, Role.CAMERA)
         )
         frames, recording = topic_count(controller, FRAME.key), recorder.recording
-        processes = {name: of_process(samples) for name, samples in self.usage.items()}
+        processes = {name: process_statistics(samples) for name, samples in self.usage.items()}
         found: dict[str, Any] = {
             "hours": seconds / 3600,
             "rate_hz": round(camera.mean_rate_hz, 2),
@@ -96,7 +96,7 @@ class _Soak:
             "gaps": self.checker.gaps,
             "stopped_within_s": round(stopped_s, 2),
             "processes": processes,
-            "latency": of_latency(self.latency),
+            "latency": latency_statistics(self.latency),
         }
         why = [f"the {name}'s {what} grow" for name, one in processes.items() for what in one["grows"]]
         why += [f"{found[key]} {text}" for key, text in _MUST_BE_ZERO.items() if found[key]]
