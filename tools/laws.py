@@ -14,7 +14,7 @@ from lowfc.control.laws.continuous import residual_power
 from lowfc.control.laws.kalman import lqg_block
 from lowfc.control.laws.linear_law import LinearLaw, law_from_blocks
 from lowfc.control.laws.margins import noise_gain
-from lowfc.control.laws.spectra import Pieces
+from lowfc.control.laws.spectra import TimeSeries
 from lowfc.control.laws.tuning import within_margins
 from lowfc.control.laws.vibration import Line, Model
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
@@ -84,9 +84,9 @@ def case(config: Configuration) -> Figures:
     return figures
 
 
-def tilts(run: Pieces, frames: int) -> Pieces:
+def tilts(run: TimeSeries, frames: int) -> TimeSeries:
     """The last frames of tip and tilt."""
-    return Pieces((run.values[0][-frames:, :2],), 0)
+    return TimeSeries((run.values[0][-frames:, :2],), 0)
 
 
 def moved(config: Configuration, calibration: Calibration, law: LinearLaw) -> dict[str, float]:

@@ -16,7 +16,7 @@ from lowfc.control.laws.kalman import lqg_block
 from lowfc.control.laws.linear_law import Block, LinearLaw, integrator, integrator_block, law_from_blocks
 from lowfc.control.laws.margins import sensitivity
 from lowfc.control.laws.pi_notch import Notch, pi_notch
-from lowfc.control.laws.spectra import Pieces, Spectrum, floor_nm2_hz, spectrum
+from lowfc.control.laws.spectra import Spectrum, TimeSeries, floor_nm2_hz, spectrum
 from lowfc.control.laws.stability import (
     LOWEST_GAIN,
     MIN_GAIN_MARGIN,
@@ -71,7 +71,7 @@ class Gains:
     noise_nm: Array
 
 
-def best_gains(run: Pieces, rate_hz: float, timing: Timing, leak: Array) -> Gains:
+def best_gains(run: TimeSeries, rate_hz: float, timing: Timing, leak: Array) -> Gains:
     """The gain of each mode with the least residual wavefront of an integrator (after Gendron and Lena 1994).
 
     Args:
@@ -116,7 +116,7 @@ def best_gains(run: Pieces, rate_hz: float, timing: Timing, leak: Array) -> Gain
     return Gains(gains, *rms)
 
 
-def identified(run: Pieces, rate_hz: float) -> list[Model]:
+def identified(run: TimeSeries, rate_hz: float) -> list[Model]:
     """A model of each mode of pseudo-open-loop modes (frames, modes).
 
     Raises:
@@ -138,7 +138,7 @@ def tune_integrator(models: Sequence[Model], gains: Gains, noll: tuple[int, ...]
 
 
 def tune_lqg(
-    run: Pieces, models: Sequence[Model], gains: Gains, noll: tuple[int, ...], leak: Array, timing: Timing
+    run: TimeSeries, models: Sequence[Model], gains: Gains, noll: tuple[int, ...], leak: Array, timing: Timing
 ) -> Tuned:
     """LQG for modes in which it beats the best integrator, else that integrator; leaks (modes,) without unit.
 
@@ -242,7 +242,7 @@ def frame_noise_nm2(models: Sequence[Model], noise_nm2: Array) -> Array:
     return np.asarray(noise_nm2 * np.outer(scale, scale))
 
 
-def simulated_residual_nm2(law: LinearLaw, run: Pieces, noise_nm2: Array, timing: Timing) -> Array:
+def simulated_residual_nm2(law: LinearLaw, run: TimeSeries, noise_nm2: Array, timing: Timing) -> Array:
     """Mean square (modes,) residual of the means that a law's commands are to null.
 
     Changes within a command's period, which no law can remove, are not included. Each piece of the run, (frames, modes)
@@ -261,7 +261,7 @@ def simulated_residual_nm2(law: LinearLaw, run: Pieces, noise_nm2: Array, timing
     return np.asarray(squares / max(frames, 1))
 
 
-def _whole_spectrum(run: Pieces, rate_hz: float) -> Spectrum | None:
+def _whole_spectrum(run: TimeSeries, rate_hz: float) -> Spectrum | None:
     """The periodogram of the longest piece: coarse segments would lose a slow mode's drift."""
     from scipy.signal import periodogram
 

@@ -12,7 +12,7 @@ from scipy.linalg import block_diag
 from scipy.optimize import minimize
 
 from lowfc.arrays import Array
-from lowfc.control.laws.spectra import Pieces
+from lowfc.control.laws.spectra import TimeSeries
 
 FEWEST = 2048
 """Least frames in a row for a fit."""
@@ -101,7 +101,7 @@ class Model:
         return np.asarray(block_diag(*blocks))
 
 
-def identify(run: Pieces, rate_hz: float) -> Model | None:
+def identify(run: TimeSeries, rate_hz: float) -> Model | None:
     """The model of a mode, from its pseudo-open-loop values (frames, 1) in pieces; None if there are too few.
 
     The log of a closed loop is as good as an open loop's: its pseudo-open-loop modes are also disturbance plus white
@@ -123,7 +123,7 @@ def identify(run: Pieces, rate_hz: float) -> Model | None:
     return replace(model, lowest_hz=rate_hz / max(map(len, run.values)))
 
 
-def resolution_hz(run: Pieces, rate_hz: float) -> float:
+def resolution_hz(run: TimeSeries, rate_hz: float) -> float:
     """Frequency spacing of the periodogram that `identify` fits; 0 if there is none."""
     longest = max((len(piece) for piece in run.values), default=0)
     return rate_hz / min(longest, _LONGEST) if longest >= FEWEST else 0.0
@@ -139,7 +139,7 @@ class _Whittle:
     rate_hz: float
 
     @classmethod
-    def of(cls, run: Pieces, rate_hz: float) -> "_Whittle | None":
+    def of(cls, run: TimeSeries, rate_hz: float) -> "_Whittle | None":
         longest = max((len(piece) for piece in run.values), default=0)
         frames = min(longest, _LONGEST)
         if frames < FEWEST:

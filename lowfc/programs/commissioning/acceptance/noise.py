@@ -10,7 +10,7 @@ from lowfc.arrays import Array
 from lowfc.contract.configuration import Acceptance, Configuration
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws import margins
-from lowfc.control.laws.spectra import SHORTEST, Pieces, floor_nm2_hz, spectrum
+from lowfc.control.laws.spectra import SHORTEST, TimeSeries, floor_nm2_hz, spectrum
 from lowfc.control.loop.safety import LoopMode
 from lowfc.optics.chain.zernike import mode_name
 from lowfc.programs.cli.contrast import added_contrast, added_contrast_in_words
@@ -123,7 +123,7 @@ def draw(found: dict[str, Any], figure: Any) -> None:
 
 def _floor_nm(response: ProbeResponse) -> Array:
     """White noise (modes,) per frame, nm, from the pseudo-open-loop modes, which the loop does not filter."""
-    power = spectrum(Pieces((response.filled(response.pol_nm),), 0), response.loop.rate_hz)
+    power = spectrum(TimeSeries((response.filled(response.pol_nm),), 0), response.loop.rate_hz)
     if power is None:
         raise AcceptanceError(f"{len(response.pol_nm)} frames are too few for a spectrum, {SHORTEST} are needed")
     return np.asarray(np.sqrt(floor_nm2_hz(power) * response.loop.rate_hz / 2))

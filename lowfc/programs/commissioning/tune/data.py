@@ -19,7 +19,7 @@ from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.integrator import Integrator
 from lowfc.control.laws.linear_law import LinearLaw
-from lowfc.control.laws.spectra import Pieces, pieces
+from lowfc.control.laws.spectra import TimeSeries, time_series
 from lowfc.control.laws.vibration import FEWEST
 from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import LoopMode
@@ -57,8 +57,8 @@ class Telemetry:
     law: Integrator
     driving: LinearLaw | None
     closed: bool
-    pol: Pieces
-    error: Pieces
+    pol: TimeSeries
+    error: TimeSeries
     true_nm2: Array | None
     nm_per_mas: float | None
     contrast: ModalContrast | None
@@ -179,10 +179,10 @@ def _telemetry(
     opened = np.flatnonzero(~was_closed)
     frames_closed = index - np.concatenate([[-1], opened])[np.searchsorted(opened, index)]
     closed, rows = True, usable & was_closed & (frames_closed > _SETTLING_S * rate_hz)
-    pol = pieces(steps.sequence[rows], steps.pol_nm[rows])
+    pol = time_series(steps.sequence[rows], steps.pol_nm[rows])
     if _longest(pol) < FEWEST:
         closed, rows = False, usable
-        pol = pieces(steps.sequence[rows], steps.pol_nm[rows])
+        pol = time_series(steps.sequence[rows], steps.pol_nm[rows])
     if _longest(pol) < FEWEST:
         raise DataFileError(
             f"{source}: tuning requires at least {FEWEST} consecutive frames, {FEWEST / rate_hz:.2g} s; the longest "
@@ -199,7 +199,7 @@ def _telemetry(
         driving=laws[1],
         closed=closed,
         pol=pol,
-        error=pieces(steps.sequence[rows], steps.error_nm[rows]),
+        error=time_series(steps.sequence[rows], steps.error_nm[rows]),
         true_nm2=None if used_nm is None else used_nm.T @ used_nm / len(used_nm),
         nm_per_mas=tilt_nm_per_mas(config.star.diameter_m) if config is not None else None,
         contrast=contrast,
@@ -208,5 +208,5 @@ def _telemetry(
     )
 
 
-def _longest(run: Pieces) -> int:
+def _longest(run: TimeSeries) -> int:
     return max((len(piece) for piece in run.values), default=0)

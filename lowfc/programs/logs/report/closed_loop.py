@@ -11,7 +11,7 @@ from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.error_budget import SensorNoise, sensor_noise
 from lowfc.control.laws.linear_law import LinearLaw, integrator
 from lowfc.control.laws.margins import noise_transfer, rejection
-from lowfc.control.laws.spectra import SHORTEST, Pieces, Spectrum, in_bins, pieces, spectrum
+from lowfc.control.laws.spectra import SHORTEST, Spectrum, TimeSeries, in_bins, spectrum, time_series
 from lowfc.control.laws.stability import settling_frames
 from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.logs.report.source import Figures, InForce, Run
@@ -44,7 +44,7 @@ class Stretch:
     in_force: InForce
     law: LinearLaw
     timing: Timing
-    frames: Pieces
+    frames: TimeSeries
     residual_ms_nm2: Array | None
 
     @property
@@ -52,7 +52,7 @@ class Stretch:
         """Whether the true wavefront is known."""
         return self.residual_ms_nm2 is not None
 
-    def signal(self, number: int) -> Pieces:
+    def signal(self, number: int) -> TimeSeries:
         """One of `ERROR`, `POL`, `DISTURBANCE`, `RESIDUAL` and `SENSED`, (frames, modes)."""
         modes = len(self.law.noll)
         return self.frames.columns(slice(number * modes, (number + 1) * modes))
@@ -83,7 +83,7 @@ def longest_stretch(run: Run) -> Stretch | None:
         residual_ms_nm2 = np.nanmean(true.modes_residual_rms_nm[rows].astype(float) ** 2, axis=0)
         if true.continuous and history.exposure_fraction is not None:
             timing = Timing.of(in_force.delay_frames, history.exposure_fraction)
-    found = pieces(steps.sequence[rows], np.hstack(signals))
+    found = time_series(steps.sequence[rows], np.hstack(signals))
     noll = tuple(range(2, 2 + gain.size))
     rate_hz = history.rate_hz or 1.0  # unknown, and unused, for a single step
     law = integrator(gain, leak, noll, in_force.delay_frames, rate_hz)

@@ -10,7 +10,7 @@ from lowfc.arrays import Sequences, Single
 from lowfc.contract.codecs.law_codec import overruled
 from lowfc.contract.messages import wire
 from lowfc.control.laws.continuous import Timing
-from lowfc.control.laws.spectra import pieces
+from lowfc.control.laws.spectra import time_series
 from lowfc.control.laws.stability import settling_frames
 from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.view.snapshot import Snapshot
@@ -90,7 +90,7 @@ def attained(steady: Steady, rate_hz: float, camera: wire.CameraState | None) ->
     sequence, signals = steady.rows()
     try:
         timing = Timing.of(law.delay_frames, exposure_fraction(camera) or 0.0)
-        best = best_gains(pieces(sequence, signals[:, modes:]), rate_hz, timing, np.array(law.leak))
+        best = best_gains(time_series(sequence, signals[:, modes:]), rate_hz, timing, np.array(law.leak))
     except ValueError:
         return None  # too few frames in a row
     error_nm = signals[np.isfinite(signals).all(axis=1), :modes].astype(np.float64)
