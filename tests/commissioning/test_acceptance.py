@@ -48,7 +48,7 @@ def responses_of(loop: InProcessLoop, test: Any, *arguments: Any) -> list[ProbeR
 
 def drawn(module: Any, result: AcceptanceResult) -> bytes:
     figure = figure_class()(figsize=(4, 3))
-    module.draw(result.figures(), figure)
+    module.draw(result.json_object(), figure)
     return png(figure)
 
 

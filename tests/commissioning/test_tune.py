@@ -156,7 +156,7 @@ def test_tuning_uses_the_steps_of_a_running_loop() -> None:
     assert run.pol.frames == pytest.approx(5500, abs=5)
 
     result = result_of(run, *tuned(run, "lqg"), "lqg")
-    found, text = result.figures(), result.text()
+    found, text = result.json_object(), result.text()
     assert f"{found['modes'][0]['lines'][0]['frequency_hz']:.2f} Hz (" in text
     assert "tilt per axis, mas rms: open" in text
     assert found["modes"][0]["lines"][0]["frequency_hz"] == pytest.approx(20, abs=0.05)

@@ -31,7 +31,7 @@ from lowfc.design.shaped_pupil import (
     stored,
 )
 from lowfc.optics.chain.pupil import from_quarter
-from lowfc.programs.cli.result import Result, figure
+from lowfc.programs.cli.result import Result, result_field
 from lowfc.programs.design.options import command_line
 
 Value = TypeVar("Value")
@@ -44,20 +44,20 @@ class ShapedPupil(Result):
     contrast may be more open; with the contrast itself it may be more.
     """
 
-    open_area_fraction: float = figure("open area", "of the circle", ".2%")
-    energy_fraction: float = figure("throughput", "of the circle's light", ".2%")
-    focal_mask_fraction: float = figure("on the focal mask", "of the light passed", ".2%")
-    focal_mask_radius_lambda_d: float = figure("focal mask radius", "lambda/D", "g")
-    max_contrast: float = figure("largest contrast", form=".2e")
-    mean_contrast: float = figure("mean contrast", form=".2e")
-    contrast_step_lambda_d: float = figure("contrast step", "lambda/D", "g")
-    grey_cells_fraction: float = figure("grey cells", form=".2%")
+    open_area_fraction: float = result_field("open area", "of the circle", ".2%")
+    energy_fraction: float = result_field("throughput", "of the circle's light", ".2%")
+    focal_mask_fraction: float = result_field("on the focal mask", "of the light passed", ".2%")
+    focal_mask_radius_lambda_d: float = result_field("focal mask radius", "lambda/D", "g")
+    max_contrast: float = result_field("largest contrast", form=".2e")
+    mean_contrast: float = result_field("mean contrast", form=".2e")
+    contrast_step_lambda_d: float = result_field("contrast step", "lambda/D", "g")
+    grey_cells_fraction: float = result_field("grey cells", form=".2%")
     below_optimum_at_limit_fraction: float
-    rounds: int = figure("linear programs")
-    points: int = figure("points in the last")
-    file: str = figure("written to")
-    dtype: str = figure("stored as")
-    command: str = figure("reproduced by")
+    rounds: int = result_field("linear programs")
+    points: int = result_field("points in the last")
+    file: str = result_field("written to")
+    dtype: str = result_field("stored as")
+    command: str = result_field("reproduced by")
 
 
 def design_spc(request: Request, out: Path, plot: Path | None, console: Console) -> ShapedPupil:

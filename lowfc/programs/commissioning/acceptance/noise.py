@@ -14,7 +14,7 @@ from lowfc.control.laws.spectra import SHORTEST, TimeSeries, floor_nm2_hz, spect
 from lowfc.control.loop.safety import LoopMode
 from lowfc.optics.chain.zernike import mode_name
 from lowfc.programs.cli.contrast import added_contrast, added_contrast_in_words
-from lowfc.programs.cli.result import figure
+from lowfc.programs.cli.result import result_field
 from lowfc.programs.commissioning.acceptance.live import Live
 from lowfc.programs.commissioning.acceptance.probe import (
     AcceptanceError,
@@ -31,22 +31,22 @@ _LOOPS = {"open": LoopMode.OPEN, "closed": LoopMode.CLOSED}
 class NoiseMode(ModeResult):
     """White noise of a mode per frame, and the residual it causes in closed loop, nm rms of wavefront."""
 
-    expected_nm: float = figure("expected", "nm", ".3f")
-    open_nm: float = figure("open", "nm", ".3f")
-    closed_nm: float = figure("closed", "nm", ".3f")
-    residual_floor_nm: float = figure("residual from it", "nm", ".3f")
-    open_rms_nm: float = figure("error open", "nm", ".3f")
-    closed_rms_nm: float = figure("error closed", "nm", ".3f")
+    expected_nm: float = result_field("expected", "nm", ".3f")
+    open_nm: float = result_field("open", "nm", ".3f")
+    closed_nm: float = result_field("closed", "nm", ".3f")
+    residual_floor_nm: float = result_field("residual from it", "nm", ".3f")
+    open_rms_nm: float = result_field("error open", "nm", ".3f")
+    closed_rms_nm: float = result_field("error closed", "nm", ".3f")
 
 
 class NoiseResult(AcceptanceResult):
     """Noise floor of every mode."""
 
-    noise_ratio: float = figure("required ratio", form="g")
-    law: str = figure("law")
-    frames: dict[str, int] = figure()
-    added_contrast: dict[str, Any] | None = figure()
-    modes: list[NoiseMode] = figure("modes")
+    noise_ratio: float = result_field("required ratio", form="g")
+    law: str = result_field("law")
+    frames: dict[str, int] = result_field()
+    added_contrast: dict[str, Any] | None = result_field()
+    modes: list[NoiseMode] = result_field("modes")
 
     def remarks(self) -> Sequence[str]:
         """Added contrast, and the verdict."""

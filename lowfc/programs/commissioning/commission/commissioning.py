@@ -155,7 +155,7 @@ class Commissioning:
         data = calibrator.run(delay)
         self._step("verdict")
         calibration, result = finish_calibration(calibrator, request, data, self._computed)
-        self._figures |= result.figures()
+        self._figures |= result.json_object()
         if not result.recommended:
             raise CalibrationError(
                 f"{result.text()}\nnot loaded: correct this, then repeat the command; --resume keeps these cycles, "

@@ -50,7 +50,7 @@ def together(repeats: Repeats) -> dict[str, Any]:
     if memory := [one["memory_mb"] for one in repeats if "memory_mb" in one]:
         found["memory_mb"] = {name: max(one[name] for one in memory) for name in memory[0]}
     if traced := [one["stalls"] for one in repeats if "stalls" in one]:
-        found["stalls"] = stalls.together(traced).figures()
+        found["stalls"] = stalls.together(traced).json_object()
     return found
 
 
