@@ -147,8 +147,8 @@ def test_replay_needs_frames_but_no_other_optional_topic(whole: Path) -> None:
 def test_what_if_gives_the_same_result_from_a_smaller_copy(whole: Path, small: Path, tmp_path: Path) -> None:
     asked = requested("gain=0.3", None, None, None)
     found = [what_if(LoggedRun(read_history(LogReader(log))), asked) for log in (whole, small)]
-    for figures in found:
-        del figures["log"]
+    for results in found:
+        del results["log"]
     assert found[0] == found[1]
     other = {"pinv": "weighted", "weighted": "pinv"}[read_history(WholeLog(small)).calibration.estimator]
     with pytest.raises(

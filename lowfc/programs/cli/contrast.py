@@ -1,4 +1,4 @@
-"""Contrast added to the dark zone by the wavefront: figures and text shared by several commands."""
+"""Contrast added to the dark zone by the wavefront: values and text shared by several commands."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -34,9 +34,9 @@ def with_variances(covariance_nm2: Array, rms_nm: Array) -> Array:
     return np.asarray(covariance_nm2 + np.diag(rms_nm**2 - np.diag(covariance_nm2)))
 
 
-def most_of(figures: Mapping[str, Any]) -> tuple[str, float] | None:
-    """The modes that contribute most to the added contrast, from a camera's wavefront figures."""
-    most = figures["costliest_modes"]
+def most_of(known: Mapping[str, Any]) -> tuple[str, float] | None:
+    """The modes that contribute most to the added contrast, from a camera's statistics of the wavefront."""
+    most = known["costliest_modes"]
     return None if most is None else (most["modes"], most["share"])
 
 

@@ -1,4 +1,4 @@
-"""State of the controller, as figures and as text."""
+"""State of the controller, as a JSON object and as text."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -21,7 +21,7 @@ NO_HEALTH = wire.Health()
 _NO_PROCESSES: Mapping[str, wire.Health] = MappingProxyType({})
 
 
-def figures(
+def json_object(
     state: wire.ControllerState,
     processes: Mapping[str, wire.Health] = _NO_PROCESSES,
     run: str = "",
@@ -124,7 +124,7 @@ def figures(
 
 
 def text(known: dict[str, Any]) -> str:
-    """The figures as text; the first line summarises them."""
+    """The state as text; the first line summarises them."""
     since = "" if known["mode_s"] is None else f" for {known['mode_s']:.0f} s ({known['mode_cause']})"
     opens = f", opens after {counted(known['steps_left'], 'frame')}" if known["steps_left"] else ""
     playing = known["playing"]

@@ -64,7 +64,7 @@ class Console(OrderedKeys):
     #top {{ height: 2; }}
     #verdict {{ width: 1fr; height: 2; padding: 0 1; text-style: bold; }}
     #clock {{ width: 11; height: 2; padding: 0 1; text-style: bold; }}
-    #figures {{ height: 17; }}
+    #readings {{ height: 17; }}
     #left {{ width: {_LEFT}; }}
     #right {{ width: 1fr; padding: 0 0 0 1; }}
     #tiles {{ height: 8; }}
@@ -139,7 +139,7 @@ class Console(OrderedKeys):
         with Horizontal(id="top"):
             yield Static(id="verdict", markup=False)
             yield Static(id="clock", markup=False)
-        with Horizontal(id="figures"):
+        with Horizontal(id="readings"):
             with Vertical(id="left"):
                 for name in ("tiles", "sparks", "modes"):
                     yield Lines(name)
@@ -287,7 +287,7 @@ class Console(OrderedKeys):
         self._colour(level)
         self._show_text("verdict", Text(headline))
         self._show_text("clock", Text(f"{panels.clock(reading.state.snapshot.host_ns)}\nUTC"))
-        self.screen_stack[0].query_one("#figures").set_class(not reading.connected, "disconnected")
+        self.screen_stack[0].query_one("#readings").set_class(not reading.connected, "disconnected")
         if reading.connected:
             self._lines("tiles").show(panels.tiles(reading))
             self._lines("sparks").show(panels.sparks(reading))

@@ -193,7 +193,7 @@ class Recorder:
                 self._report_losses()
                 self._write_waiting()
                 self._flush()
-                self._series.end(self._figures(), wait=False)
+                self._series.end(self._totals(), wait=False)
                 self._paused = True
                 self._ending = self._ender.submit(self._series.end, {})  # waits until the log is written
             if not self._ending.done():
@@ -283,10 +283,10 @@ class Recorder:
                 return
             if short := self._series.shortage():
                 self._failure = short
-                self._series.end(self._figures() | {"stopped": short})
+                self._series.end(self._totals() | {"stopped": short})
                 self.service.event("RECORDING_FAILED", why=f"{short}; the log is complete")
             elif self._series.full or self._account.starts >= self._most_starts:
-                self._series.end(self._figures(), wait=False)
+                self._series.end(self._totals(), wait=False)
                 self._begin(anew=False)
                 self._peers.query_soon()
         except DataFileError as fault:
@@ -332,7 +332,7 @@ class Recorder:
         self._iterate()
         self._flush()
         try:
-            self._series.end(self._figures())
+            self._series.end(self._totals())
             own = {EVENT.key, HEALTH.at(self.service.name)}
             peers_recorded = self.service.last_health or self._peers.newest or set(self._account.recorded()) - own
             if not (self._failure or peers_recorded):
@@ -349,8 +349,8 @@ class Recorder:
             self._series.longest_write_ns,
         )
 
-    def _figures(self) -> dict[str, str]:
-        """Figures at the end of a log, for all logs so far."""
+    def _totals(self) -> dict[str, str]:
+        """Totals at the end of a log, over all logs so far."""
         lost = self._account.lost()
         return {
             "messages": str(self._series.messages),
