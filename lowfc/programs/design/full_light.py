@@ -13,7 +13,7 @@ from lowfc.adapters.files.whole_file import require_folder, write_whole
 from lowfc.contract.configuration import load
 from lowfc.contract.sections import SensorSection
 from lowfc.design.full_light import Focus, FullLight, sweep
-from lowfc.design.goal import Goal, figures, merit
+from lowfc.design.goal import Goal, merit, predictions
 from lowfc.design.merit import WAVELENGTH_NM
 from lowfc.programs.cli.result import Result, result_field
 from lowfc.programs.design.full_light_request import Sizes
@@ -23,7 +23,7 @@ _POINTS = 21
 
 
 class Point(Result):
-    """Figures of a sensor of one size."""
+    """Predicted performance of a sensor of one size."""
 
     value: float = result_field("size", form=".3f")
     merit: float = result_field("merit", form=".4g")
@@ -37,7 +37,7 @@ class Point(Result):
 
 
 class Sweep(Result):
-    """Figures of every size, and the best size."""
+    """Predicted performance of every size, and the best size."""
 
     key: str = result_field("key of [sensor]")
     merit: str = result_field("merit")
@@ -66,7 +66,7 @@ def design(sizes: Sizes, goal: Goal, out: Path, plot: Path | None) -> Sweep:
         focus = Focus.of(sensor_from(_section(sizes, sizes.low), WAVELENGTH_NM))
         values, best = sweep(merit_of, sizes.low, sizes.high, _POINTS)
         points = [_point(candidate(value), value, merit_of, goal) for value in sorted({*values.tolist(), best})]
-        of_best = figures(candidate(best))
+        of_best = predictions(candidate(best))
     keys = {"kind": f'"{sizes.kind}"', **sizes.others, key: f"{best:.4g}"}
     write_whole(out, "".join(["[sensor]\n", *(f"{name} = {value}\n" for name, value in keys.items())]).encode())
     if plot is not None:
@@ -88,7 +88,7 @@ def _section(sizes: Sizes, value: float) -> SensorSection:
 
 
 def _point(one: FullLight, value: float, merit_of: Callable[[float], float], goal: Goal) -> Point:
-    found = figures(one)
+    found = predictions(one)
     return Point(
         value=value,
         merit=merit_of(value),
@@ -103,7 +103,7 @@ def _point(one: FullLight, value: float, merit_of: Callable[[float], float], goa
 
 
 def _picture(points: list[Point], key: str, goal: Goal) -> bytes:
-    """Figures against size, relative to their minima (PNG)."""
+    """Predictions against size, relative to their minima (PNG)."""
     drawing = figure_class()(figsize=(7.5, 5.0), layout="constrained")
     axes = drawing.subplots()
     values = [point.value for point in points]

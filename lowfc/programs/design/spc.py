@@ -25,8 +25,8 @@ from lowfc.design.shaped_pupil import (
     Request,
     Round,
     exchange,
-    figures,
     nearest_feasible,
+    properties,
     relative_field,
     stored,
 )
@@ -38,7 +38,7 @@ Value = TypeVar("Value")
 
 
 class ShapedPupil(Result):
-    """Figures of the mask found.
+    """Properties of the mask found.
 
     `below_optimum_at_limit_fraction` is the fraction of the circle by which the best mask with `limit` times the
     contrast may be more open; with the contrast itself it may be more.
@@ -88,7 +88,7 @@ def design_spc(request: Request, out: Path, plot: Path | None, console: Console)
     content = io.BytesIO()
     np.savez_compressed(content, allow_pickle=False, quarter=quarter, made_by=made_by)
     write_whole(out, content.getvalue())
-    found = figures(quarter.astype(np.float64), request)
+    found = properties(quarter.astype(np.float64), request)
     if plot is not None:
         write_whole(plot, _picture(quarter.astype(np.float64), request))
     return ShapedPupil(
