@@ -24,7 +24,7 @@ from lowfc.programs.commissioning.acceptance import capture as acceptance_captur
 from lowfc.programs.commissioning.acceptance import linearity as acceptance_linearity
 from lowfc.programs.commissioning.acceptance import rejection as acceptance_rejection
 from lowfc.programs.commissioning.conformance.settings import AGREEMENTS
-from lowfc.programs.commissioning.tune.figures import OPTICAL_GAIN_MAS
+from lowfc.programs.commissioning.tune.result import OPTICAL_GAIN_MAS
 from lowfc.programs.console.actions import ACTIONS, SAFE
 from tools import continuous
 from tools.shared import ROOT, markdown

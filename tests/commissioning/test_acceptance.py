@@ -1,4 +1,4 @@
-"""The acceptance tests on a loop in one process: verdicts, figures and messages."""
+"""The acceptance tests on a loop in one process: verdicts, results and messages."""
 
 from dataclasses import replace
 from typing import Any

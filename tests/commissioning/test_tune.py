@@ -1,4 +1,4 @@
-"""`lowfc tune`: figures, files and errors, on a log made by the live loop's own `advance`; and law files."""
+"""`lowfc tune`: results, files and errors, on a log made by the live loop's own `advance`; and law files."""
 
 import json
 from collections.abc import Iterator
@@ -24,7 +24,7 @@ from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.commissioning.tune.command import integrate
 from lowfc.programs.commissioning.tune.data import Telemetry, telemetry_from_log, telemetry_from_run
-from lowfc.programs.commissioning.tune.figures import result_of, tuned
+from lowfc.programs.commissioning.tune.result import result_of, tuned
 from tests.support.in_process_loop import InProcessLoop
 from tests.support.loops import lowfc
 from tests.support.report_log import SyntheticLog

@@ -1,4 +1,4 @@
-"""The result of a calibration: contents of the file, figures and verdict."""
+"""The result of a calibration: contents of the file, properties and verdict."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -46,8 +46,8 @@ class Verdict(Result):
     faults: list[str] = result_field()
 
 
-class Figures(Result):
-    """Figures of a calibration; figures of each mode are in the order of `noll`."""
+class CalibrationProperties(Result):
+    """Properties of a calibration; lists have one value per mode, in the order of `noll`."""
 
     method: str = result_field("method")
     modes: int = result_field("modes")
@@ -68,7 +68,7 @@ class Figures(Result):
     file: str = result_field("written")
 
 
-class CalibrationResult(Verdict, Figures):
+class CalibrationResult(Verdict, CalibrationProperties):
     """A measured calibration with its verdict, or a computed one without a verdict."""
 
     advice: list[str] = result_field(exclude=True, default=[])
@@ -86,7 +86,7 @@ class CalibrationResult(Verdict, Figures):
 
 
 class Comparison(Result):
-    """Differences of two calibrations; figures of each mode are in the order of `noll`."""
+    """Differences of two calibrations; lists have one value per mode, in the order of `noll`."""
 
     modes: int = result_field("modes")
     noll: list[int] = result_field("mode", form="Z{}", column=True)
@@ -191,7 +191,7 @@ def result_of(
     computed: Calibration | None = None,
     verdict: Verdict | None = None,
 ) -> CalibrationResult:
-    """The figures of a measured or computed calibration."""
+    """The result of a measured or computed calibration."""
     delay_frames, error_frames = (configured_delay(config), 0.0) if data is None else data.delay[:2]
     optional: dict[str, Any] = {}
     noise = None if computed is None else computed_noise_nm(config, calibration, computed)
@@ -276,7 +276,7 @@ def judge(
 
 
 def comparison(one: Calibration, other: Calibration) -> Comparison:
-    """Differences of two calibrations; figures of each mode are in the order of `noll`."""
+    """Differences of two calibrations; lists have one value per mode, in the order of `noll`."""
     if not comparable(one, other):
         raise CalibrationError(
             "calibrations with different sensors or modes cannot be compared: the first has "

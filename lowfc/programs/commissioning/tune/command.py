@@ -39,7 +39,7 @@ def tune(
     from lowfc.adapters.process.progress import passing_bar, reading_bar
     from lowfc.client import Client
     from lowfc.programs.commissioning.tune.data import telemetry_from_log, telemetry_from_run
-    from lowfc.programs.commissioning.tune.figures import picture, result_of, tuned
+    from lowfc.programs.commissioning.tune.result import picture, result_of, tuned
     from lowfc.programs.logs.guard import refuse_log
 
     if bool(logs) == (live is not None):

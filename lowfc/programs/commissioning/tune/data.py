@@ -47,7 +47,7 @@ class Telemetry:
         nm_per_mas: wavefront rms of a tilt of 1 mas; None if the telescope's diameter is unknown.
         contrast: contrast added by the modes, with `noise_nm2`, the computed covariance (modes, modes) of one frame's
             noise; None without a science image.
-        warnings: doubts about the figures.
+        warnings: doubts about the results.
     """
 
     source: str
