@@ -349,7 +349,7 @@ def test_errors_ring_the_bell_until_it_is_muted(run: LiveRun, monkeypatch: pytes
     operate(run, scenario)
 
 
-def test_a_disconnected_console_reports_it_and_hides_the_figures(run: LiveRun, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disconnected_console_reports_it_and_hides_the_values(run: LiveRun, monkeypatch: pytest.MonkeyPatch) -> None:
     async def scenario(screen: Screen) -> None:
         with monkeypatch.context() as disconnected:
             disconnected.setattr(run.hub, "lose", lambda role, key, envelope: role == "operator")

@@ -158,7 +158,7 @@ def test_what_if_gives_the_same_result_from_a_smaller_copy(whole: Path, small: P
 
 
 @pytest.mark.usefixtures("without_drawings")
-def test_a_report_of_a_smaller_copy_has_the_same_figures(whole: Path, small: Path) -> None:
+def test_a_report_of_a_smaller_copy_has_the_same_results(whole: Path, small: Path) -> None:
     found: list[dict[str, Any]] = []
     for log in (whole, small):
         done = lowfc("report", log, "--json", *(["--out", log.with_suffix(".html")] if log is small else []))

@@ -59,7 +59,7 @@ def publish(
         wait_for: roles that must be running and connected before the first message; their topics are not published.
 
     Returns:
-        Figures for `render` and `--json`.
+        Results for `render` and `--json`.
     """
     if not 0 < speed < float("inf"):
         raise ConfigurationError(f"--speed must be above 0 (1: as recorded); got {speed:g}")
@@ -183,18 +183,18 @@ class Player:
         return bus.publisher(topic, name_in(topic, key))
 
 
-def render(figures: dict[str, Any]) -> str:
+def render(results: dict[str, Any]) -> str:
     """Summary as text."""
-    error = ", ".join(f"{name} {value:.0f} us" for name, value in figures["timing_error_us"].items())
+    error = ", ".join(f"{name} {value:.0f} us" for name, value in results["timing_error_us"].items())
     lines = [
-        f"published          {figures['messages']} messages in run {figures['run']!r}: {figures['span_s']:.1f} s of "
-        f"log in {figures['took_s']:.1f} s" + (", interrupted" if figures["interrupted"] else ""),
+        f"published          {results['messages']} messages in run {results['run']!r}: {results['span_s']:.1f} s of "
+        f"log in {results['took_s']:.1f} s" + (", interrupted" if results["interrupted"] else ""),
         f"timing error       {error}",
-        f"behind             {figures['messages_behind']} messages by more than {BEHIND_NS / 1e6:g} ms",
+        f"behind             {results['messages_behind']} messages by more than {BEHIND_NS / 1e6:g} ms",
     ]
-    lines += faults(figures["damaged"], figures["no_end"])
-    lines += [f"the log has        {selection}" for selection in figures["selection"]]
-    lines += [f"left out           {key}: {why}" for key, why in figures["left_out"].items()]
+    lines += faults(results["damaged"], results["no_end"])
+    lines += [f"the log has        {selection}" for selection in results["selection"]]
+    lines += [f"left out           {key}: {why}" for key, why in results["left_out"].items()]
     return "\n".join(lines)
 
 
