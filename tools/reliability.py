@@ -14,7 +14,7 @@ from typing import Any
 from lowfc.control.loop.wording import counted
 from lowfc.programs.reliability.chaos.cases import CASES
 from lowfc.programs.reliability.chaos.command import counts
-from lowfc.programs.reliability.soak.figures import TOO_SHORT, latency_in_words, verdict
+from lowfc.programs.reliability.soak.evaluation import TOO_SHORT, latency_in_words, verdict
 from tools.shared import ROOT, Figures, columns, host, host_in_words, json_of, markdown
 
 CHAOS = "lowfc chaos --all --seed N"

@@ -13,7 +13,7 @@ from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.envelope import sequence_of
 from lowfc.contract.messages import STEP, TIMING, TRUTH, wire
 from lowfc.programs.reliability.chaos.processes import CommandTimes
-from lowfc.programs.reliability.soak.figures import (
+from lowfc.programs.reliability.soak.evaluation import (
     Usage,
     latency_statistics,
     process_statistics,
@@ -74,22 +74,22 @@ def test_too_few_samples_are_reported_as_too_short_to_judge() -> None:
     assert (processes["camera"]["too_short"], processes["recorder"]["grows"]) == ([], [])
     short = too_short(processes, latency)
     assert short == ["the recorder's memory", "the recorder's handles", "the recorder's threads", "the latency"]
-    figures = {"processes": processes, "latency": latency, **COUNTS, "too_short": short, "why": []}
-    assert json.loads(json.dumps(figures, allow_nan=False)) == figures
-    text = render(figures)
+    results = {"processes": processes, "latency": latency, **COUNTS, "too_short": short, "why": []}
+    assert json.loads(json.dumps(results, allow_nan=False)) == results
+    text = render(results)
     assert "nan" not in text
     assert "too short to judge" in text.splitlines()[2]
     assert "p50 too short to judge; p99 too short to judge" in text
     assert text.endswith(f"too short to judge: {', '.join(short)}")
     latency = latency_statistics([(one, 500 + 8 * one / 3600, 900.0) for one in map(float, range(SECONDS))])
-    text = render(figures | {"latency": latency, "why": ["the camera's memory grow"]})
+    text = render(results | {"latency": latency, "why": ["the camera's memory grow"]})
     assert "p50 502 us, +8.0 +- 0.0 us per hour" in text
     assert text.endswith("FAILED: the camera's memory grow")
 
 
 def test_latencies_are_those_of_the_controllers_timing_messages() -> None:
     bus = MemoryBus(MemoryHub(), "launcher", HostClock())
-    times = CommandTimes(SimpleNamespace(bus=bus, outcome=SimpleNamespace(figures={})))
+    times = CommandTimes(SimpleNamespace(bus=bus, outcome=SimpleNamespace(measurements={})))
     bus.publisher(TRUTH).put(wire.Truth(residual_rms_nm=9).SerializeToString())
     bus.publisher(TIMING).put(wire.ControlTiming(frame_to_command_ns=[100_000, 300_000]).SerializeToString())
     assert times.drain() == {"frames": 2, "p50_us": 200.0, "p99_us": 298.0}

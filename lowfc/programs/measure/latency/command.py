@@ -86,7 +86,7 @@ def latency(
 
         figure_class()  # fail before the work if it is missing
     if logs:
-        figures = _of_log(logs)
+        results = _of_log(logs)
     else:
         settings = _configuration(config, rate, camera, plain=plain_scheduling)
         from lowfc.adapters.process import compiled
@@ -99,10 +99,10 @@ def latency(
             raise ConfigurationError(compiled.missing())
         if trace and simulated:
             raise ConfigurationError("--trace requires prepared frames: omit --trace or --camera simulated")
-        figures = _measure(LatencyOptions(settings, duration, repeats, simulated, record, view, kernels, trace))
+        results = _measure(LatencyOptions(settings, duration, repeats, simulated, record, view, kernels, trace))
     if plot is not None:
-        write_whole(plot, picture(figures))
-    print_result(figures, table(figures), as_json=as_json)
+        write_whole(plot, picture(results))
+    print_result(results, table(results), as_json=as_json)
 
 
 def _configuration(file: Path | None, rate: float | None, camera: Camera, *, plain: bool) -> "Configuration":
@@ -156,13 +156,13 @@ def _of_log(names: list[Path]) -> dict[str, Any]:
 
     from lowfc.adapters.logs.parts import the_one, titled
     from lowfc.adapters.process.progress import reading_bar
-    from lowfc.programs.measure.latency.log import log_figures
+    from lowfc.programs.measure.latency.log import log_statistics
     from lowfc.programs.measure.latency.summary import together
 
     log = the_one(names)
     with reading_bar(Console(stderr=True)) as count:
-        figures, host = log_figures(log, partial(count, f"reading {titled(log)}"))
-    return together([figures]) | {"settings": {"log": str(log[0])}, "host": host}
+        results, host = log_statistics(log, partial(count, f"reading {titled(log)}"))
+    return together([results]) | {"settings": {"log": str(log[0])}, "host": host}
 
 
 def _compare(files: tuple[Path, Path]) -> dict[str, Any]:

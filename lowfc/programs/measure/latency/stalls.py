@@ -12,7 +12,7 @@ import numpy as np
 
 from lowfc.arrays import Array, Long
 from lowfc.programs.cli.result import Result, result_field
-from lowfc.programs.measure.latency.figures import WARM_UP_S, Frames, percentiles
+from lowfc.programs.measure.latency.frame_statistics import WARM_UP_S, Frames, percentiles
 
 Cause = Literal["host", "loop", "unknown"]
 """Cause of a stall: the loop if one of its processes waited for a processor or pages, and no bare loop did."""
