@@ -30,7 +30,7 @@ from lowfc.contract.errors import ConfigurationError, LowfcError
 from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.measure.control_step import ControlStep
 from lowfc.programs.measure.frame_source import Payloads
-from lowfc.programs.measure.latency.figures import WARM_UP_S
+from lowfc.programs.measure.latency.frame_statistics import WARM_UP_S
 
 AXES = {
     "pixels": ((32, 48, 64, 80, 128, 192, 256, 384, 512), "side", "pixels across the frame"),
@@ -44,7 +44,7 @@ _STEP = ("step_us", "stream_us", "products_us")
 _LOOP = ("frame_to_command_us", "echo_us")
 
 
-def step_figures(size: Size, seconds: float) -> Result:
+def step_times(size: Size, seconds: float) -> Result:
     """Times of the control step of that size and of its two lower bounds, each repeated for `seconds`.
 
     stream_us: one read of `Size.bytes` bytes by the dot product of one half with the other, the fastest reader among
@@ -58,15 +58,15 @@ def step_figures(size: Size, seconds: float) -> Result:
     step = ControlStep(config, calibration, HostClock().host_ns())
     made = Payloads(frames)
     payloads = cycle([made.at(index, HostClock().host_ns()) for index in range(FRAMES)])
-    figures: Result = {"step_us": timed(lambda: step(next(payloads)), seconds)}
+    times: Result = {"step_us": timed(lambda: step(next(payloads)), seconds)}
     if step.state.mode is not LoopMode.CLOSED or step.state.counts:
         raise RuntimeError(f"{size}: the step is {step.state.mode.name.lower()}, and was {step.state.counts}")
     one_half, other_half = np.ones((2, size.bytes // 8), np.float32)
-    figures["stream_us"] = timed(lambda: one_half.dot(other_half), seconds)
+    times["stream_us"] = timed(lambda: one_half.dot(other_half), seconds)
     R, shapes = calibration.reconstructor, calibration.modes_to_actuators
     pixels, command_nm = calibration.reference, np.ones(size.modes, np.float32)
-    figures["products_us"] = timed(lambda: (R @ pixels, shapes @ command_nm), seconds)
-    return figures
+    times["products_us"] = timed(lambda: (R @ pixels, shapes @ command_nm), seconds)
+    return times
 
 
 def timed(work: Callable[[], object], seconds: float) -> dict[str, float]:
@@ -85,7 +85,7 @@ def timed(work: Callable[[], object], seconds: float) -> dict[str, float]:
     return {"p50": p50_ns / 1e3, "p99": p99_ns / 1e3, "cpu": cpu_ns / len(durations_ns) / 1e3}
 
 
-def loop_figures(size: Size, rate_hz: float, seconds: float) -> Result:
+def loop_latency(size: Size, rate_hz: float, seconds: float) -> Result:
     """Latency of the loop of that size, and half a round trip of a bare echo of its messages; or `failure`, why not.
 
     cpu is the processor time of the controller for each frame.
@@ -127,8 +127,8 @@ def measure(options: argparse.Namespace, tell: Tell) -> Result:
     for number in range(1, options.repeats + 1):
         for size in sizes:
             tell(f"{number} of {options.repeats}: {size.pixels} pixels, {size.modes} modes, {size.actuators} actuators")
-            figures = step_figures(size, options.seconds)
-            found[size].append(figures | (loop_figures(size, options.rate, options.seconds) if options.loop else {}))
+            times = step_times(size, options.seconds)
+            found[size].append(times | (loop_latency(size, options.rate, options.seconds) if options.loop else {}))
     return {
         "curves": {name: [point(size, found[size]) for size in curve] for name, curve in curves.items()},
         "default": asdict(Size()),
@@ -209,7 +209,7 @@ def _cells(one: Result) -> list[str]:
 
 
 def about(result: Result) -> str:
-    """Definitions of the figures."""
+    """Definitions of the measured quantities."""
     default = Size(**result["default"])
     loops = (
         f"The loop runs at {result['rate_hz']:g} Hz with its real-time set-up; its latency is from just before "

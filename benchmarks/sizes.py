@@ -117,7 +117,7 @@ def prepared_run(size: Size, config: Configuration) -> Iterator[Run]:
 def run_loop(size: Size, config: Configuration, seconds: float) -> dict[str, Any]:
     """Run the loop of that size once, then the bare echo (its messages without computation).
 
-    Returns the figures of one repeat, as `run_repeats`.
+    Returns the statistics of one repeat, as `run_repeats`.
     """
     with prepared_run(size, config) as run:
         (found,) = run_repeats(LatencyOptions(config, seconds, 1), run, lambda _: None)

@@ -30,7 +30,7 @@ from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import ActiveLoop
 from lowfc.programs.measure.control_step import ControlStep, time_alone
 from lowfc.programs.measure.frame_source import Payloads
-from lowfc.programs.measure.latency.figures import percentiles
+from lowfc.programs.measure.latency.frame_statistics import percentiles
 
 RATE_HZ = 1000.0
 STAGES: dict[str, tuple[Any, str]] = {

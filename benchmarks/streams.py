@@ -24,7 +24,7 @@ from lowfc.adapters.process.child import Child
 from lowfc.contract.messages import Role
 from lowfc.programs.launch.processes import program
 from lowfc.programs.launch.sim_loop import children_of
-from lowfc.programs.measure.latency.figures import WARM_UP_S
+from lowfc.programs.measure.latency.frame_statistics import WARM_UP_S
 from lowfc.programs.measure.latency.run import LatencyOptions, one_loop
 
 ROOT = Path(__file__).parents[1]
@@ -47,7 +47,7 @@ def measure(options: argparse.Namespace, tell: Tell) -> Result:
     """Run the loops in turns, every other time in the opposite order.
 
     Returns:
-        turns (the figures of `one_run` by loop), seconds and rate_hz.
+        turns (the results of `one_run` by loop), seconds and rate_hz.
     """
     turns: list[dict[str, Result]] = []
     for number in range(options.repeats):
@@ -120,7 +120,7 @@ def tables(result: Result) -> list[Lines]:
 
 
 def about(result: Result) -> str:
-    """Definitions of the figures."""
+    """Definitions of the measured quantities."""
     turns = result["turns"]
     before, read = (ranged([turn[name]["stream_to_camera"]["p50"] for turn in turns]) for name in (BETWEEN, READ))
     return (

@@ -173,7 +173,7 @@ def _use(name: str, run: Result) -> list[str]:
 
 
 def about(result: Result) -> str:
-    """Definitions of the figures."""
+    """Definitions of the measured quantities."""
     rates = result["rates_hz"]
     runs = sum(len(loop["runs"]) for loop in result["loops"].values())
     return (

@@ -42,14 +42,14 @@ class Contrast:
         self.noll = modal.noll
         self._modal, self._form = modal, modal.form.astype(np.float32)
         self._kept: list[tuple[Single, Single]] = []
-        self._every, self._frames = 1, 0
+        self._stride, self._frames = 1, 0
 
     def add(self, disturbance_nm: Single, residual_nm: Single) -> None:
         """Add the modes (modes,) at one instant of the next frame."""
-        if self._frames % self._every == 0:
+        if self._frames % self._stride == 0:
             self._kept.append((disturbance_nm, residual_nm))
             if len(self._kept) == 4 * IMAGES:
-                self._kept, self._every = self._kept[::2], 2 * self._every
+                self._kept, self._stride = self._kept[::2], 2 * self._stride
         self._frames += 1
 
     def quadratic(self, modes_nm: Single) -> Single:

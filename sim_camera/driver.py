@@ -28,17 +28,17 @@ from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from sim_camera.contrast import AddedContrast, Contrast
 from sim_camera.disturbance import Disturbance, preset_disturbance, with_sources
 from sim_camera.faulty import FaultyFrames, read_fault
-from sim_camera.figures import Figures
 from sim_camera.lateness import Lateness
 from sim_camera.path import MirrorPath
 from sim_camera.pixels import pixel_errors
 from sim_camera.scene import Scene
+from sim_camera.wavefront_statistics import WavefrontAccumulator
 from sim_camera.wheel import wheels
 
 PATIENCE_S = 5.0
 """In lockstep, the run ends after this much real time without progress."""
 RECENT_S = 2.0
-"""Averaging time of the wavefront figures reported while the loop runs."""
+"""Averaging time of the wavefront statistics reported while the loop runs."""
 _REMEMBERED = 256  # mirror states, and publication times of frames
 
 
@@ -169,7 +169,7 @@ class SimulatedCamera:
         self._frame_to_mirror = Durations()
         recent = max(1, round(RECENT_S * config.camera.rate_hz))
         nm_per_mas = tilt_nm_per_mas(config.star.diameter_m)
-        self._figures = Figures(config.noll, nm_per_mas, recent, len(self._scene.instants))
+        self._statistics = WavefrontAccumulator(config.noll, nm_per_mas, recent, len(self._scene.instants))
         self._measured: AddedContrast | None = None
 
     def join(self, service: Service) -> None:
@@ -250,11 +250,11 @@ class SimulatedCamera:
         health.commands_late = self._lateness.total
         if self._frame_to_mirror.count:
             health.frame_to_mirror.CopyFrom(latency(self._frame_to_mirror))
-        if (wavefront := self._figures.wavefront()) is not None:
+        if (wavefront := self._statistics.wavefront()) is not None:
             health.wavefront.CopyFrom(wire.WavefrontFigures(**asdict(wavefront)))
             if self._measured is not None:
                 health.wavefront.MergeFrom(wire.WavefrontFigures(**asdict(self._measured)))
-        if (recent := self._figures.recent()) is not None:
+        if (recent := self._statistics.recent()) is not None:
             health.recent_wavefront.CopyFrom(wire.WavefrontFigures(**asdict(recent)))
 
     def _start_ns(self) -> int:
@@ -273,7 +273,7 @@ class SimulatedCamera:
             self._contrast.add(disturbance_nm[middle], residual_nm[middle])
             added_flat = float(self._contrast.quadratic(disturbance_nm).sum())
             added = self._contrast.quadratic(residual_nm)
-        self._figures.add(truth, added_flat, added)
+        self._statistics.add(truth, added_flat, added)
         sampled, continuous = truth.sampled, truth.continuous
         message = wire.Truth(
             timestamp=timestamp(end_ns),

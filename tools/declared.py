@@ -24,7 +24,7 @@ from lowfc.programs.commissioning.acceptance import capture as acceptance_captur
 from lowfc.programs.commissioning.acceptance import linearity as acceptance_linearity
 from lowfc.programs.commissioning.acceptance import rejection as acceptance_rejection
 from lowfc.programs.commissioning.conformance.settings import AGREEMENTS
-from lowfc.programs.commissioning.tune.figures import OPTICAL_GAIN_MAS
+from lowfc.programs.commissioning.tune.result import OPTICAL_GAIN_MAS
 from lowfc.programs.console.actions import ACTIONS, SAFE
 from tools import continuous
 from tools.shared import ROOT, markdown
@@ -90,7 +90,7 @@ def offered(package: str) -> str:
     else:
         modules = [one.name for one in walk_packages(top.__path__, f"{package}.") if not one.ispkg]
         found = [(name, import_module(name).__doc__) for name in modules]
-    rows = ((f"`{name}`", sentence((text or "").split("\n\n")[0])) for name, text in found)
+    rows = ((f"`{name}`", one_line((text or "").split("\n\n")[0])) for name, text in found)
     return markdown(("name", ""), rows)
 
 
@@ -108,7 +108,7 @@ def limits(rows: Iterable[tuple[str, *tuple[float, ...]]]) -> str:
 def requirements() -> str:
     """Requirements of an acceptance run."""
     descriptions = Acceptance.descriptions()
-    rows = ((f"`{key}`", f"{default:g}", sentence(descriptions[key])) for key, default in Acceptance())
+    rows = ((f"`{key}`", f"{default:g}", one_line(descriptions[key])) for key, default in Acceptance())
     return markdown(("key", "default", "requirement"), rows)
 
 
@@ -130,16 +130,16 @@ def topics(role: Role, *own: Topic) -> str:
         does = "publish" if role in topic.publishers else "subscribe"
         answers = "; the last one is returned on query" if topic.queryable else ""
         name = topic.message.DESCRIPTOR.full_name
-        rows.append((f"`{topic.key}`", f"`{name}`", when, does, topic.sentence.rstrip(".") + answers))
+        rows.append((f"`{topic.key}`", f"`{name}`", when, does, topic.description.rstrip(".") + answers))
     return markdown(("topic", "message", "when", "you", ""), rows)
 
 
 def fields(message: str) -> str:
-    """Number, type and sentence of every field of one of our messages."""
-    every = FileDescriptorSet.FromString((files("lowfc.contract.wire") / "lowfc.desc").read_bytes())
-    file = next(file for file in every.file if file.package == "lowfc.v1")
+    """Number, type and description of every field of one of our messages."""
+    descriptors = FileDescriptorSet.FromString((files("lowfc.contract.wire") / "lowfc.desc").read_bytes())
+    file = next(file for file in descriptors.file if file.package == "lowfc.v1")
     comments = {
-        tuple(location.path): sentence(location.leading_comments) for location in file.source_code_info.location
+        tuple(location.path): one_line(location.leading_comments) for location in file.source_code_info.location
     }
     index = [one.name for one in file.message_type].index(message)
     rows = []
@@ -151,14 +151,14 @@ def fields(message: str) -> str:
     return markdown(("field", "type", "number", ""), rows)
 
 
-def sentence(text: str | None) -> str:
+def one_line(text: str | None) -> str:
     """Text on one line without its full stop."""
     return " ".join((text or "").split()).removesuffix(".")
 
 
 def buttons() -> str:
     """The console's buttons."""
-    rows = [f"| `{one.key}` | {one.name} | {one.sentence} |" for one in (SAFE, *ACTIONS)]
+    rows = [f"| `{one.key}` | {one.name} | {one.description} |" for one in (SAFE, *ACTIONS)]
     return "\n".join(["| key | button | what it does |", "|---|---|---|", *rows]) + "\n"
 
 

@@ -13,7 +13,7 @@ from lowfc.contract.sections import sensor_keys
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.linear_law import LinearLaw
-from lowfc.control.laws.spectra import Pieces
+from lowfc.control.laws.spectra import TimeSeries
 from lowfc.control.laws.stability import delay_weights
 from lowfc.control.laws.tuning import Tuned, best_gains, identified, tune_integrator, tune_lqg, tune_pi_notch
 from lowfc.control.loop.advance import advance
@@ -212,9 +212,9 @@ class Bench:
                 events += others.events
         self.events += [(self._index - 1, event) for event in events]
 
-    def pol(self) -> Pieces:
+    def pol(self) -> TimeSeries:
         """Pseudo-open-loop modes (frames, modes) of the record."""
-        return Pieces((np.array([step.pol_nm for step in self.steps], np.float64),), 0)
+        return TimeSeries((np.array([step.pol_nm for step in self.steps], np.float64),), 0)
 
     def residual_nm(self, *, continuous: bool = True) -> Array:
         """True residual (frames, modes) of the record: rms over each period, or at the start of each exposure."""
@@ -233,7 +233,7 @@ def timing_of(config: Configuration) -> Timing:
     return Timing.of(config.camera.delay_frames, exposure)
 
 
-def tuned(run: Pieces, config: Configuration, kinds: Sequence[str] = ("lqg",)) -> dict[str, Tuned]:
+def tuned(run: TimeSeries, config: Configuration, kinds: Sequence[str] = ("lqg",)) -> dict[str, Tuned]:
     """Laws of these kinds for pseudo-open-loop modes (frames, modes), all or the first few."""
     noll = config.noll[: run.values[0].shape[1]]
     rate_hz, none = config.camera.rate_hz, np.zeros(len(noll))

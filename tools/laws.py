@@ -12,9 +12,9 @@ from lowfc.contract.configuration import Configuration
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.continuous import residual_power
 from lowfc.control.laws.kalman import lqg_block
-from lowfc.control.laws.linear_law import LinearLaw, of_blocks
+from lowfc.control.laws.linear_law import LinearLaw, law_from_blocks
 from lowfc.control.laws.margins import noise_gain
-from lowfc.control.laws.spectra import Pieces
+from lowfc.control.laws.spectra import TimeSeries
 from lowfc.control.laws.tuning import within_margins
 from lowfc.control.laws.vibration import Line, Model
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
@@ -84,9 +84,9 @@ def case(config: Configuration) -> Figures:
     return figures
 
 
-def tilts(run: Pieces, frames: int) -> Pieces:
+def tilts(run: TimeSeries, frames: int) -> TimeSeries:
     """The last frames of tip and tilt."""
-    return Pieces((run.values[0][-frames:, :2],), 0)
+    return TimeSeries((run.values[0][-frames:, :2],), 0)
 
 
 def moved(config: Configuration, calibration: Calibration, law: LinearLaw) -> dict[str, float]:
@@ -141,7 +141,7 @@ def optimum_mas(config: Configuration, calibration: Calibration, *, robust: bool
             block = within_margins(model, timing) if robust else lqg_block(model, timing)
             if block is None:
                 return np.inf
-            law = of_blocks([block], "pol", "lqg", (2 + axis,), timing.delay, RATE_HZ)
+            law = law_from_blocks([block], "pol", "lqg", (2 + axis,), timing.delay, RATE_HZ)
             passed = residual_power(law, 2 * np.pi * frequency_hz / RATE_HZ, timing)[:, 0]
             return float(power @ passed + variance * noise_gain(law, timing.delay)[0])
 

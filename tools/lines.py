@@ -6,7 +6,7 @@ import numpy as np
 
 from lowfc.adapters.files.factory import frame_noise_nm
 from lowfc.contract.configuration import Configuration
-from lowfc.control.laws.spectra import Pieces
+from lowfc.control.laws.spectra import TimeSeries
 from sim_camera.disturbance import Sampler
 from sim_camera.driver import disturbance_of
 from sim_camera.scene import GAUSS_LEGENDRE
@@ -42,10 +42,10 @@ def case(width: float, magnitude: float, delay: float, seeds: int = SEEDS) -> Fi
     }
 
 
-def tilts_of(config: Configuration, noise_nm: Any, frames: int) -> Pieces:
+def tilts_of(config: Configuration, noise_nm: Any, frames: int) -> TimeSeries:
     """Pseudo-open-loop tilts (frames, 2) as the sensor would measure them: means over exposures, with white noise."""
     instants = config.camera.exposure_fraction * GAUSS_LEGENDRE
     sampler = Sampler(disturbance_of(config), instants, RATE_HZ)
     exposure_nm = np.array([sampler.at(index)[:, :2].mean(axis=0) for index in range(frames)], np.float64)
     noise = np.random.default_rng([config.seed, 5]).standard_normal((frames, 2))
-    return Pieces((exposure_nm + noise_nm * noise,), 0)
+    return TimeSeries((exposure_nm + noise_nm * noise,), 0)

@@ -14,8 +14,8 @@ from typing import Any
 from lowfc.control.loop.wording import counted
 from lowfc.programs.reliability.chaos.cases import CASES
 from lowfc.programs.reliability.chaos.command import counts
-from lowfc.programs.reliability.soak.figures import TOO_SHORT, latency_in_words, verdict
-from tools.shared import ROOT, Figures, columns, host, json_of, markdown, of_host
+from lowfc.programs.reliability.soak.evaluation import TOO_SHORT, latency_in_words, verdict
+from tools.shared import ROOT, Figures, columns, host, host_in_words, json_of, markdown
 
 CHAOS = "lowfc chaos --all --seed N"
 SEEDS = (1, 2, 3, 4, 5)
@@ -61,10 +61,10 @@ def render_chaos(figures: Figures) -> str:
     for case in (case for run in runs for case in run["cases"]):
         by_name.setdefault(case["name"], []).append(case)
     passed, failed, skipped = (sum(run[name] for run in runs) for name in ("passed", "failed", "skipped"))
-    left_out = f", {skipped} skipped" if skipped else ""
+    skipped_text = f", {skipped} skipped" if skipped else ""
     seeds = ", ".join(str(run["seed"]) for run in runs)
     parts = [
-        f"{passed} of {passed + failed} passed{left_out}, seeds {seeds}.\n",
+        f"{passed} of {passed + failed} passed{skipped_text}, seeds {seeds}.\n",
         markdown(("case", "injected fault", "passed", "residual, nm rms: before -> after"), _rows(by_name)),
     ]
     failures = [
@@ -92,7 +92,7 @@ def render_chaos(figures: Figures) -> str:
     parts.append(f"Measured again after a change of the case itself: {again}." if again else "")
     hosts: dict[str, list[str]] = {}
     for name, about in figures.get("later", {}).items():
-        hosts.setdefault(of_host(about), []).append(f"`{name}`")
+        hosts.setdefault(host_in_words(about), []).append(f"`{name}`")
     parts += [
         f"Measured {about} by `python -m tools.reliability`: {', '.join(names)}." for about, names in hosts.items()
     ]
@@ -111,8 +111,8 @@ def _rows(by_name: dict[str, list[Figures]]) -> list[Sequence[object]]:
         why = f", {ended['skipped']} skipped ({cases[0]['skipped']})" if ended["skipped"] else ""
         found = [case["findings"].get("recovery", {}).get("found", "-") for case in cases]
         recovered = "; ".join(_recovery(text) for text in found)
-        sentence = CASES[name].sentence if name in CASES else cases[0]["sentence"]
-        rows.append((f"`{name}`", sentence, f"{ended['passed']} of {len(cases)}{why}", recovered))
+        description = CASES[name].description if name in CASES else cases[0]["sentence"]
+        rows.append((f"`{name}`", description, f"{ended['passed']} of {len(cases)}{why}", recovered))
     return rows
 
 

@@ -65,10 +65,10 @@ def where(name: str, figures: Figures) -> str:
     about = figures["host"]
     *most, last = [f"`{command}`" for command in figures["commands"]] or [""]
     runs = f", which runs {', '.join(most)}{' and ' if most else ''}{last}" if last else ""
-    return f"Measured {of_host(about)} by `python -m tools.measure {name}`{runs}."
+    return f"Measured {host_in_words(about)} by `python -m tools.measure {name}`{runs}."
 
 
-def of_host(about: Figures) -> str:
+def host_in_words(about: Figures) -> str:
     """Date and host, from the result of `host`."""
     return (
         f"{about['date']} on {about['processors']} cores of {about['processor']} (a virtual machine, Linux "

@@ -25,7 +25,7 @@ from lowfc.contract.wire import lowfc_pb2
 from lowfc.programs.cli.main import app
 from lowfc.programs.cli.result import Result
 from tools.advice import ADVICE, REASONS
-from tools.declared import API, fields, sentence
+from tools.declared import API, fields, one_line
 from tools.shared import markdown
 
 _BUILT = re.compile(r"^<!-- built: (.+?) -->$", re.MULTILINE)
@@ -57,8 +57,8 @@ def configuration() -> str:
     """Every key of the configuration, by section."""
     sections = {name: type(value) for name, value in Configuration() if isinstance(value, Section)}
     found = [_keys("Top level", "", Configuration, "")]
-    found += [_keys(f"[{name}]", f"{sentence(one.__doc__)}.", one, f"{name}.") for name, one in sections.items()]
-    about = f"{sentence(InterlockSection.__doc__)}. One table for each interlock."
+    found += [_keys(f"[{name}]", f"{one_line(one.__doc__)}.", one, f"{name}.") for name, one in sections.items()]
+    about = f"{one_line(InterlockSection.__doc__)}. One table for each interlock."
     found.append(_keys("[[interlocks]]", about, InterlockSection, "interlocks."))
     return "\n".join(found)
 
@@ -72,7 +72,7 @@ def _keys(heading: str, about: str, section: type[Section], prefix: str) -> str:
         default = "required" if info.is_required() else f"`{info.get_default(call_default_factory=True)!r}`"
         values = [f"`{one}`" for one in get_args(info.annotation) if isinstance(one, str)]
         values += [_bound(str(one)) for one in info.metadata if hasattr(one, "__dataclass_fields__")]
-        rows.append((f"`{prefix}{key}`", default, ", ".join(values), sentence(descriptions[key])))
+        rows.append((f"`{prefix}{key}`", default, ", ".join(values), one_line(descriptions[key])))
     return f"## {heading}\n\n{about}\n\n{markdown(('key', 'default', 'values', ''), rows)}"
 
 
@@ -92,7 +92,7 @@ def topics() -> str:
         own = full.startswith("lowfc.")
         message = f"[`{full}`](messages.md#{full.rpartition('.')[2].lower()})" if own else f"`{full}`"
         publisher = "any" if len(one.publishers) > 2 else ", ".join(sorted(map(str, one.publishers)))
-        rows.append((f"`{one.key}`", message, when, publisher, one.sentence))
+        rows.append((f"`{one.key}`", message, when, publisher, one.description))
     return markdown(("topic", "message", "when", "published by", ""), rows)
 
 
@@ -110,7 +110,7 @@ def json_objects() -> str:
     rows = []
     for one in sorted(_subclasses(Result), key=lambda each: f"{each.__module__}.{each.__name__}"):
         command = " ".join(one.__module__.removeprefix("lowfc.programs.").split(".")[-2:])
-        rows.append(f"### {one.__name__}\n\n{sentence(one.__doc__)}. Printed by `{command}`.\n\n{_figures(one)}")
+        rows.append(f"### {one.__name__}\n\n{one_line(one.__doc__)}. Printed by `{command}`.\n\n{_figures(one)}")
     return "\n".join(rows)
 
 
@@ -147,7 +147,7 @@ def events(*levels: Level) -> str:
 
 def _event(event: Event) -> str:
     why, what = ADVICE[event.name]
-    shown = re.sub(r"\{(\w+)[^}]*\}", r"\1", event.sentence)
+    shown = re.sub(r"\{(\w+)[^}]*\}", r"\1", event.description)
     return (
         f"### {event.name}\n\n`{event.level.name} {event.name} {shown.replace('`', '')}`\n\n"
         f"Why: {why}\n\nWhat to do: {what}\n"

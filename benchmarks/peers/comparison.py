@@ -42,7 +42,7 @@ from lowfc.adapters.bus.run import free_ports
 from lowfc.adapters.process.child import Child
 from lowfc.adapters.process.realtime import set_up
 from lowfc.contract.errors import ConfigurationError, LowfcError
-from lowfc.programs.measure.latency.figures import WARM_UP_S, percentiles
+from lowfc.programs.measure.latency.frame_statistics import WARM_UP_S, percentiles
 from lowfc.programs.measure.latency.run import LatencyOptions, one_loop
 
 ROOT = Path(__file__).parents[2]
@@ -92,7 +92,7 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, tell: Tell) -> Result:
-    """Run all implementations in turns: figures of each turn (None if it failed), and reasons for missing ones."""
+    """Run all implementations in turns: statistics of each turn (None if it failed), and reasons for missing ones."""
     chosen = [one for one in IMPLEMENTATIONS if any(word in one.name for word in options.only or [""])]
     if not chosen:
         raise ConfigurationError(f"--only: none of {'; '.join(one.name for one in IMPLEMENTATIONS)}")
@@ -141,14 +141,14 @@ def one_run(implementation: Implementation, rules: argparse.Namespace, priority:
             if pacer.status != 0:
                 raise ComparisonError(f"the source of frames did not end: {pacer.stderr_tail()}")
             words = "\n".join(child.stderr_tail() for child in children.values())
-        found = figures(folder, rules.warm_up)
+        found = run_statistics(folder, rules.warm_up)
         if found["frame_to_command"] is None:
             raise ComparisonError(f"no command was sent: {words}")
         return found
 
 
-def figures(folder: Path, warm_up: int) -> dict[str, Any]:
-    """Figures of a run without its first `warm_up` frames; percentiles in us, None without any command.
+def run_statistics(folder: Path, warm_up: int) -> dict[str, Any]:
+    """Statistics of a run without its first `warm_up` frames; percentiles in us, None without any command.
 
     off: largest difference of the last actuators from those of numpy, relative to the largest actuator; None if a
     command is missing.

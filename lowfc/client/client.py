@@ -72,7 +72,7 @@ def _plain(name: str) -> Callable[["Client"], Answer]:
     def ask(client: "Client") -> Answer:
         return client.ask(name)
 
-    ask.__doc__ = BY_NAME[name].sentence
+    ask.__doc__ = BY_NAME[name].description
     return ask
 
 

@@ -15,13 +15,13 @@ class Declaration(NamedTuple):
     Attributes:
         key: key of the query.
         fields: fields of the message, with their content.
-        sentence: what it does.
+        description: what it does.
         example: an example command line; empty if the request has no command.
     """
 
     key: str
     fields: tuple[tuple[str, str], ...]
-    sentence: str
+    description: str
     example: str
 
     @property
@@ -34,8 +34,8 @@ _MODES = ("modes", "Noll indices, none for all")
 _ONE_OR_EACH = "one value, or one per mode"
 
 
-def _declared(name: str, sentence: str, example: str, *fields: tuple[str, str]) -> Declaration:
-    return Declaration(REQUEST_KEY.format(name=name), fields, sentence, example)
+def _declared(name: str, description: str, example: str, *fields: tuple[str, str]) -> Declaration:
+    return Declaration(REQUEST_KEY.format(name=name), fields, description, example)
 
 
 DECLARED: tuple[Declaration, ...] = (
@@ -150,5 +150,5 @@ def table() -> str:
     for one in DECLARED:
         fields = "; ".join(f"`{name}`: {what}" for name, what in one.fields)
         example = f"`{one.example}`" if one.example else ""
-        lines.append(f"| `{one.key}` | {fields} | {one.sentence} | {example} |")
+        lines.append(f"| `{one.key}` | {fields} | {one.description} | {example} |")
     return "\n".join(lines) + "\n"

@@ -1,4 +1,4 @@
-"""Definitions of all events: name, level and sentence for the operator. They are sent as Foxglove log messages."""
+"""Definitions of all events: name, level and description for the operator. They are sent as Foxglove log messages."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -28,14 +28,14 @@ class _Number(int):
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Definition of an event; `sentence` is a format string for its details."""
+    """Definition of an event; `description` is a format string for its details."""
 
     name: str
     level: Level
-    sentence: str
+    description: str
 
     def log(self, process: str, time_ns: int, /, **details: object) -> Log:
-        """Message of one occurrence: "NAME sentence", from `process`, at `time_ns` (nanoseconds since the epoch).
+        """Message of one occurrence: "NAME description", from `process`, at `time_ns` (nanoseconds since the epoch).
 
         Control characters in the details are shown as escapes: the message is one line for a terminal.
         """
@@ -43,7 +43,7 @@ class Event:
         return Log(
             timestamp=timestamp(time_ns),
             level=self.level.value,  # type: ignore[arg-type]  # the schema's enum is a plain int at run time
-            message=printable(f"{self.name} {self.sentence.format(**details)}"),
+            message=printable(f"{self.name} {self.description.format(**details)}"),
             name=process,
         )
 

@@ -58,7 +58,7 @@ class Topic:
         message: class of the payload.
         rate: every frame, on event, or a number of hertz.
         publishers: roles that may publish it; a router drops messages of other roles.
-        sentence: its description.
+        description: its description.
         subscribers: roles that receive it.
         deterministic: in lockstep two runs with the same seed write the same payload bytes.
         queryable: a late joiner can query the publisher for the last message.
@@ -73,7 +73,7 @@ class Topic:
     message: type[Message]
     rate: Rate | float
     publishers: frozenset[Role]
-    sentence: str
+    description: str
     subscribers: frozenset[Role] = _MONITORS
     deterministic: bool = True
     queryable: bool = False

@@ -29,7 +29,7 @@ class Goal:
     """The figure of merit to minimise.
 
     Attributes:
-        merit: One of `MERITS`. "paper": the largest ratio of a predicted figure to the paper's over the rows of Tables
+        merit: One of `MERITS`. "paper": the largest ratio of a predicted value to the paper's over the rows of Tables
             3 and 4, those of Table 3 to the power 2 weight, that of Table 4 to the power 2 (1 - weight). "pareto":
             table3^(1 - weight) table4^weight. "contrast": contrast added to the dark zone by the noise of 14 modes in
             one exposure of Table 4's star.
@@ -68,7 +68,7 @@ def merit(candidate: Candidate, goal: Goal) -> float:
 
 
 def paper_ratios(candidate: Candidate, estimator: str = "pinv") -> dict[str, float]:
-    """Ratio of the predicted figure to the paper's for each row of Tables 3 and 4; below 1 is better than the paper."""
+    """Ratio of the predicted value to the paper's for each row of Tables 3 and 4; below 1 is better than the paper."""
     ratios = {}
     for name in candidate.paper_rows:
         for modes in MODES:
@@ -106,8 +106,8 @@ def _tilt_mas(candidate: Candidate, estimator: str) -> float:
     return max(table4_mas(candidate.in_band(), TABLE4_MODES, estimator))
 
 
-def figures(candidate: Candidate) -> dict[str, Any]:
-    """Predicted figures of the first row of Table 3 and of Table 4, as plain values for output and JSON.
+def predictions(candidate: Candidate) -> dict[str, Any]:
+    """Predicted values of the first row of Table 3 and of Table 4, as plain values for output and JSON.
 
     "bound" is the Cramer-Rao bound of Table 3, without second-order errors; in Table 4 "weighted" attains the bound.
     """

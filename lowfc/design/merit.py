@@ -1,6 +1,6 @@
-"""Predicted performance of a sensor: the figures that a search can minimise.
+"""Predicted performance of a sensor: the values that a search can minimise.
 
-A `Candidate` provides I0 and H of eqs. (6) and (12). These determine its figures in Tables 3 and 4, and the contrast
+A `Candidate` provides I0 and H of eqs. (6) and (12). These determine its values in Tables 3 and 4, and the contrast
 that the noise of an exposure adds to the dark zone.
 """
 
@@ -20,7 +20,7 @@ from lowfc.optics.detector.photometry import electrons, tilt_nm_per_mas
 
 WAVELENGTH_NM = 550.0
 HELD = len(NOLLS_14)
-"""Number of controlled modes, in the figures of noise, added contrast and share of the quantum limit."""
+"""Number of controlled modes, in the values of noise, added contrast and share of the quantum limit."""
 
 
 @dataclass(frozen=True)

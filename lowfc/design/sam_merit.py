@@ -3,7 +3,7 @@
 The fields in the relay pupil, after the focal-plane mask, do not depend on the holes: the field of the flat wavefront
 and the first-order field of each mode are propagated once (`build_optics`). Each hole adds a small product of matrices
 to every field at the sensor (`hole_fields`), so that a search that moves one hole recomputes only that hole. I0 and H,
-eqs. (6) and (12), follow from the fields (`signal`, `band_signal`); `lowfc.design.merit` computes their figures.
+eqs. (6) and (12), follow from the fields (`signal`, `band_signal`); `lowfc.design.merit` computes their performance.
 """
 
 from collections.abc import Callable
@@ -94,7 +94,7 @@ def build_optics(
 ) -> Optics:
     """Propagate the flat wavefront and the modes to the relay pupil, eqs. (4), (5) and (12).
 
-    With the default sampling every figure of a mask is within 2 % of that with the paper's sampling (Table 1).
+    With the default sampling every predicted value of a mask is within 2 % of that with the paper's sampling (Table 1).
 
     Args:
         pupil: (n, n) amplitude transmission of the shaped pupil.

@@ -114,8 +114,8 @@ class Round:
 
 
 @dataclass(frozen=True)
-class Figures:
-    """Figures of a mask; contrasts are sampled every `FINE_STEP` in the dark zone.
+class MaskProperties:
+    """Properties of a mask; contrasts are sampled every `FINE_STEP` in the dark zone.
 
     Attributes:
         open_area_fraction: Mean amplitude transmission over the circle.
@@ -189,8 +189,8 @@ def largest_contrast(quarter: Array, request: Request) -> float:
     return float(max(np.abs(on_grid).max(), np.abs(on_edge).max()) ** 2)
 
 
-def figures(quarter: Array, request: Request) -> Figures:
-    """Figures of a mask, transmissions (cells, cells) of one quadrant, for the dark zone of a request."""
+def properties(quarter: Array, request: Request) -> MaskProperties:
+    """Properties of a mask, transmissions (cells, cells) of one quadrant, for the dark zone of a request."""
     axis, zone = fine_grid(request.zone)
     contrast = relative_field(quarter, axis)[zone] ** 2
     pupil = from_quarter(quarter, SAMPLES)
@@ -198,7 +198,7 @@ def figures(quarter: Array, request: Request) -> Figures:
     mask = disk(samples_per, FOCAL_MASK_RADIUS)
     image = np.abs(to_image(pupil.astype(np.complex128), len(mask), samples_per, 1.0)) ** 2
     cells = quarter[_circle_quarter(len(quarter))]
-    return Figures(
+    return MaskProperties(
         open_area_fraction=_open_area(quarter),
         energy_fraction=float((pupil**2).mean() / OPEN_AREA),
         focal_mask_fraction=float((image * mask).sum() / samples_per**2 / (pupil**2).mean()),

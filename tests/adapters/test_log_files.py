@@ -72,7 +72,7 @@ def test_every_topic_is_decodable_by_other_readers_without_lowfc(tmp_path: Path)
     assert summary.statistics.message_count == len(messages)
     command = next(c for c in summary.channels.values() if c.topic == "/" + COMMAND.at("dm"))
     assert command.metadata == {
-        "description": COMMAND.sentence,
+        "description": COMMAND.description,
         "publisher": "controller",
         "start_s": str(START_S),
     }

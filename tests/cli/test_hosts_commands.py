@@ -53,7 +53,7 @@ def test_the_configuration_of_the_router_is_shown_without_creating_its_run(toml:
     assert runs() == []
 
 
-def test_the_figures_of_the_document_are_those_of_the_code() -> None:
+def test_the_numbers_of_the_document_are_those_of_the_code() -> None:
     text = " ".join(DOCUMENT.read_text().split())
     retry = routed.client_session(NETWORK, "camera", {})["connect"]["retry"]
     shifts = [f"{ns / 1e9:g} s" if abs(ns) >= 1e9 else f"{ns / 1e6:g} ms" for ns in SHIFTS_NS.values()]
@@ -69,4 +69,4 @@ def test_the_figures_of_the_document_are_those_of_the_code() -> None:
         f"with clocks {max(SHIFTS_NS.values()) / 1e9:g} s apart",
     ):
         assert sentence in text
-    assert not re.findall(r"\d+ (?:us|MHz|kB|MB|%)", text)  # measured figures are generated, not typed
+    assert not re.findall(r"\d+ (?:us|MHz|kB|MB|%)", text)  # measured values are generated, not typed

@@ -10,7 +10,7 @@ import typer
 from typer.testing import CliRunner
 
 from lowfc.programs.cli.main import COMMANDS, app
-from lowfc.programs.cli.result import Result, figure
+from lowfc.programs.cli.result import Result, result_field
 
 
 def test_every_command_is_listed_under_its_heading_with_its_whole_description() -> None:
@@ -19,7 +19,7 @@ def test_every_command_is_listed_under_its_heading_with_its_whole_description() 
     for heading, rows in COMMANDS.items():
         assert f"{heading}:" in lines
         for row in rows:
-            assert any(line.split(maxsplit=1) == [row.name, row.sentence] for line in lines), row.name
+            assert any(line.split(maxsplit=1) == [row.name, row.description] for line in lines), row.name
 
 
 def test_every_help_page_has_an_example_whole_descriptions_and_no_colloquial_verbs() -> None:
@@ -53,21 +53,21 @@ def test_the_error_of_an_unknown_command_suggests_the_nearest() -> None:
 
 
 class Mode(Result):
-    noll: int = figure("mode", form="Z{}")
-    gain: float | None = figure("gain", form=".2f")
-    hidden: int = figure(default=0)
+    noll: int = result_field("mode", form="Z{}")
+    gain: float | None = result_field("gain", form=".2f")
+    hidden: int = result_field(default=0)
 
     def remarks(self) -> list[str]:
         return ["low"] if self.gain is not None and self.gain < 1 else []
 
 
 class Found(Result):
-    rate_hz: float = figure("rate", "Hz", "g")
-    good: bool = figure("good")
-    noll: list[int] = figure("mode", form="Z{}", column=True)
-    noise_nm: list[float] = figure("noise", "nm", ".1f", column=True)
-    modes: list[Mode] = figure("modes")
-    missing: float | None = figure("missing", default=None)
+    rate_hz: float = result_field("rate", "Hz", "g")
+    good: bool = result_field("good")
+    noll: list[int] = result_field("mode", form="Z{}", column=True)
+    noise_nm: list[float] = result_field("noise", "nm", ".1f", column=True)
+    modes: list[Mode] = result_field("modes")
+    missing: float | None = result_field("missing", default=None)
 
 
 def test_text_and_json_of_a_result_have_the_same_fields() -> None:
@@ -83,7 +83,7 @@ def test_text_and_json_of_a_result_have_the_same_fields() -> None:
         "Z2    0.50   low",
         "Z11      -",
     ]
-    assert found.figures() == {
+    assert found.json_object() == {
         "rate_hz": 250,
         "good": True,
         "noll": [2, 11],

@@ -45,20 +45,20 @@ from lowfc.contract.messages import (
     image,
     wire,
 )
-from lowfc.control.laws.linear_law import integrator_block, of_blocks
+from lowfc.control.laws.linear_law import integrator_block, law_from_blocks
 from lowfc.control.loop.inputs import Reply, Request, Step
 from lowfc.control.loop.interlocks import Value
 from lowfc.control.loop.requests import REQUESTS
 from lowfc.control.loop.safety import Limit, LoopMode
 from lowfc.programs.cli.modes import noll_of
-from lowfc.programs.cli.status import figures, text
+from lowfc.programs.cli.status import json_object, text
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub, MemoryRing
 from tests.support.loops import lowfc, until
 from tests.support.recording import Bench, bodies_of, put
 from tests.support.toy import NOLL, calibration
 
 KNOWN = identified(calibration())
-LAW = of_blocks([integrator_block(0.2, 0.01, "pol", 1.5)] * 3, "pol", "leaky", NOLL, 1.5, 1000.0)
+LAW = law_from_blocks([integrator_block(0.2, 0.01, "pol", 1.5)] * 3, "pol", "leaky", NOLL, 1.5, 1000.0)
 LEASE = {"text": "a test", "lease_id": 7}
 SHAPE = np.arange(20.0).reshape(KNOWN.grid)
 
@@ -182,7 +182,7 @@ def test_an_ended_reservation_gives_the_reason(controller: FakeController) -> No
 
 def test_frame_numbers_agree_in_status_stream_step_and_answer() -> None:
     sequence = sequence_of(1_800_000_000, 812)
-    shown = figures(wire.ControllerState(frame_sequence=sequence))["frame"]
+    shown = json_object(wire.ControllerState(frame_sequence=sequence))["frame"]
     frame = Frame(sequence, 0, np.zeros((1, 1), np.uint16))
     step = Step(sequence, 0, LoopMode.CLOSED, np.zeros(3, np.float32), ())
     assert {shown, frame.number, step.frame, Answer(True, "done", sequence).frame} == {812}
@@ -339,7 +339,7 @@ def test_a_loop_outside_this_runtime_directory_is_reported(own_runtime: Path, mo
         with subprocess.Popen(words_there, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment) as process:
             process.stdout.readline()
             ours = [one for one in other_loops() if f"(process {process.pid})" in one or name in one]
-            sentence = none_here()
+            message = none_here()
             with monkeypatch.context() as patch:
                 patch.setattr(os, "geteuid", lambda: 4_000_000_000)
                 theirs = list(other_loops())
@@ -348,7 +348,7 @@ def test_a_loop_outside_this_runtime_directory_is_reported(own_runtime: Path, mo
         where = f"`lowfc {program} --run {name}` (process {process.pid}){found}"
         assert ours == [f"you run {where}"] * bool(found)
         assert (f"user {own_runtime.owner()} runs {where}" in theirs) == bool(found)
-        assert sentence.endswith("starting or ending: try again in a few seconds") == ("starting" in found)
+        assert message.endswith("starting or ending: try again in a few seconds") == ("starting" in found)
 
 
 # The mirror.
@@ -577,7 +577,7 @@ def test_the_status_shows_the_whole_state() -> None:
         "limits_hit": ["SLEW"],
         "calibration_provisional": True,
     }
-    shown = figures(state)
+    shown = json_object(state)
     assert {name: shown[name] for name in expected} == expected
     for words in (
         "closed, opens after 12 frames",
@@ -586,10 +586,10 @@ def test_the_status_shows_the_whole_state() -> None:
         "acting: slew",
         "integrator only",
     ):
-        assert words in text(figures(state))
-    assert text(figures(state)).splitlines()[-1].endswith("abc, provisional: from the first step of commissioning")
-    assert figures(wire.ControllerState())["mode"] == "starting"
-    assert "without a verdict" not in text(figures(wire.ControllerState(calibration_id="abc")))
+        assert words in text(json_object(state))
+    assert text(json_object(state)).splitlines()[-1].endswith("abc, provisional: from the first step of commissioning")
+    assert json_object(wire.ControllerState())["mode"] == "starting"
+    assert "without a verdict" not in text(json_object(wire.ControllerState(calibration_id="abc")))
 
 
 # The recorder's switch.
@@ -663,7 +663,7 @@ def test_contrast_is_estimated_for_a_real_camera_and_true_for_a_simulated_one() 
     measured = wire.Health(recent_wavefront={"added_contrast_flat": 2e-9, "added_contrast": 3e-11})
     true = wire.Health(recent_wavefront={"added_contrast_flat": 4e-9, "added_contrast": 5e-11})
     processes = {Role.CAMERA: wire.Health(), Role.CONTROLLER: measured}
-    real, simulated = (figures(wire.ControllerState(), processes | more) for more in ({}, {Role.CAMERA: true}))
+    real, simulated = (json_object(wire.ControllerState(), processes | more) for more in ({}, {Role.CAMERA: true}))
     assert real["added_contrast"] == {"open": 2e-9, "closed": 3e-11}
     assert "+3.0e-11, estimated from the sensor" in text(real)
     assert simulated["added_contrast"] == {"open": 4e-9, "closed": 5e-11}

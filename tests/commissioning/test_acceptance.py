@@ -1,4 +1,4 @@
-"""The acceptance tests on a loop in one process: verdicts, figures and messages."""
+"""The acceptance tests on a loop in one process: verdicts, results and messages."""
 
 from dataclasses import replace
 from typing import Any
@@ -10,7 +10,7 @@ from lowfc.adapters.files.drawing import figure_class, png
 from lowfc.contract.configuration import FIXED_GAINS, Acceptance, Configuration, load
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.messages import wire
-from lowfc.control.laws.linear_law import integrator_block, of_blocks
+from lowfc.control.laws.linear_law import integrator_block, law_from_blocks
 from lowfc.control.loop.safety import Limit, LoopMode
 from lowfc.programs.commissioning.acceptance import capture, linearity, noise, rejection
 from lowfc.programs.commissioning.acceptance.live import Live
@@ -48,7 +48,7 @@ def responses_of(loop: InProcessLoop, test: Any, *arguments: Any) -> list[ProbeR
 
 def drawn(module: Any, result: AcceptanceResult) -> bytes:
     figure = figure_class()(figsize=(4, 3))
-    module.draw(result.figures(), figure)
+    module.draw(result.json_object(), figure)
     return png(figure)
 
 
@@ -80,7 +80,7 @@ def test_the_rejection_of_the_simulated_bench_matches_theory(multisine: tuple[In
 
 def test_with_a_pseudo_open_loop_law_the_multisine_is_added_to_the_mirror() -> None:
     loop = InProcessLoop(configured())
-    loop.law(of_blocks([integrator_block(0.3, 0.001, "pol", 1.0)] * 3, "pol", "leaky", (2, 3, 4), 1.0, 250.0))
+    loop.law(law_from_blocks([integrator_block(0.3, 0.001, "pol", 1.0)] * 3, "pol", "leaky", (2, 3, 4), 1.0, 250.0))
     found = rejection.judge(responses_of(loop, rejection, MULTISINE, REQUIRED), REQUIRED)
     assert (found.injected, found.law) == ("mirror", "leaky")
     assert found.passed, found.text()

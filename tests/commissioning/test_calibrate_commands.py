@@ -1,4 +1,4 @@
-"""`lowfc calibrate` and its subcommands: files, figures, errors, other wavefronts; on a loop in one process."""
+"""`lowfc calibrate` and its subcommands: files, results, errors, other wavefronts; on a loop in one process."""
 
 import json
 from dataclasses import replace

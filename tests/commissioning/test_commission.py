@@ -79,8 +79,8 @@ class Bench:
 
     def commission(self, **options: Any) -> dict[str, Any]:
         with self.loop.reserved("a test"):
-            figures, _ = self.steps(**options).run()
-        return figures
+            results, _ = self.steps(**options).run()
+        return results
 
     @property
     def shown(self) -> str:
@@ -102,9 +102,9 @@ def commissioned(tmp_path_factory: pytest.TempPathFactory) -> tuple[Bench, dict[
 
 
 def test_commissioning_closes_a_loop_with_another_frame_size(commissioned: tuple[Bench, dict[str, Any]]) -> None:
-    bench, figures = commissioned
-    assert figures["recommended"]
-    assert figures["measured_error_nm"] == pytest.approx(figures["predicted_error_nm"], rel=0.15)
+    bench, results = commissioned
+    assert results["recommended"]
+    assert results["measured_error_nm"] == pytest.approx(results["predicted_error_nm"], rel=0.15)
     state = bench.loop.status().state
     assert state.mode == wire.LOOP_MODE_CLOSED
     made = calibration_file.load(bench.out)
@@ -130,10 +130,10 @@ def test_disturbance_of_a_mode_is_not_mistaken_for_nonlinearity(scatter: float, 
 
 
 def test_the_loop_holds_the_wavefront_of_the_reference_image(commissioned: tuple[Bench, dict[str, Any]]) -> None:
-    bench, figures = commissioned
+    bench, results = commissioned
     bench.loop.run(200)
     true = bench.loop.residual_nm(-200)
-    assert float(np.sqrt(true.var(axis=0).sum())) < figures["measured_error_nm"]  # which includes noise
+    assert float(np.sqrt(true.var(axis=0).sum())) < results["measured_error_nm"]  # which includes noise
 
 
 def test_without_close_the_residual_is_only_predicted(commissioned: tuple[Bench, dict[str, Any]]) -> None:
@@ -150,9 +150,9 @@ def test_a_sensor_unlike_the_configured_one_is_measured_without_the_model(tmp_pa
     """The optical model of another sensor provides only the modes and the mirror's commands."""
     other = Configuration.model_validate({**tomllib.loads(TOML), "sensor": {"kind": "clowfs"}})
     bench = Bench(tmp_path, CONFIG)
-    figures = bench.commission(model=other, close=False, cycles=None)
+    results = bench.commission(model=other, close=False, cycles=None)
     assert "without the optical model" in bench.shown or "cannot be compared" in bench.shown
-    assert figures["recommended"]
+    assert results["recommended"]
 
 
 def test_a_resumed_commissioning_continues_and_reports_an_operator_who_opens_the_loop(tmp_path: Path) -> None:

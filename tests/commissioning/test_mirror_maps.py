@@ -15,7 +15,7 @@ from lowfc.arrays import Single
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.control.calibration.calibration import Calibration
-from lowfc.control.laws.linear_law import LinearLaw, Signal, integrator_block, of_blocks
+from lowfc.control.laws.linear_law import LinearLaw, Signal, integrator_block, law_from_blocks
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.command_channels import ADOPTED, FLAT
 from lowfc.control.loop.inputs import Frame, Load, MirrorShape, Request
@@ -52,7 +52,7 @@ def saved(folder: Path, name: str, array: npt.ArrayLike) -> str:
 def law_of(config: Configuration, gain: float = 0.2, signal: Signal = "pol") -> LinearLaw:
     delay_frames = factory.settings(config).delay_frames
     blocks = [integrator_block(gain, 0.001, signal, delay_frames)] * len(config.noll)
-    return of_blocks(blocks, signal, "leaky", config.noll, delay_frames, config.camera.rate_hz)
+    return law_from_blocks(blocks, signal, "leaky", config.noll, delay_frames, config.camera.rate_hz)
 
 
 def complaint(overrides: dict[str, Any]) -> str:
@@ -190,7 +190,7 @@ def commands(config: Configuration, state: State, frames: int) -> tuple[list[Sin
     for index in range(frames):
         state, outputs = advance(settings, state, Frame(1 + index, index, 0, dark))
         sent.append(outputs.command.actuators_nm)
-    return sent, [one.name for one in state.loop.additions().channels]
+    return sent, [one.name for one in state.loop.channels_or_empty().channels]
 
 
 def test_the_flat_map_is_applied_at_the_start(tmp_path: Path, calibration: Calibration) -> None:

@@ -1,4 +1,4 @@
-"""`lowfc tune`: figures, files and errors, on a log made by the live loop's own `advance`; and law files."""
+"""`lowfc tune`: results, files and errors, on a log made by the live loop's own `advance`; and law files."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -25,8 +25,8 @@ from lowfc.control.laws.tuning import Gains, Tuned
 from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.commissioning.tune.command import integrate
-from lowfc.programs.commissioning.tune.data import Telemetry, of_log, of_run
-from lowfc.programs.commissioning.tune.figures import result_of, tuned
+from lowfc.programs.commissioning.tune.data import Telemetry, telemetry_from_log, telemetry_from_run
+from lowfc.programs.commissioning.tune.result import result_of, tuned
 from tests.support.in_process_loop import SMALL_MIRROR, InProcessLoop
 from tests.support.loops import lowfc
 from tests.support.report_log import SyntheticLog
@@ -56,7 +56,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def telemetry(log: Path) -> Telemetry:
-    return of_log(LogReader(log))
+    return telemetry_from_log(LogReader(log))
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +117,7 @@ def test_an_open_loop_with_much_tilt_is_flagged(tmp_path: Path) -> None:
     assert found["modes"][0]["achieved_nm"] is None
     small = found["tilt_mas"]["open"]
     assert ("optical gain" in " ".join(found["warnings"])) == (small > 10)
-    run = of_log(LogReader(path))
+    run = telemetry_from_log(LogReader(path))
     larger = replace(run, nm_per_mas=run.nm_per_mas / 10)  # type: ignore[operator]
     warned = result_of(larger, *tuned(larger, "integrator"), "integrator").text()
     assert "above 10: the optical gain of the sensor is low" in warned
@@ -160,7 +160,7 @@ class StreamedLoop(InProcessLoop):
 
 def test_tuning_uses_the_steps_of_a_running_loop() -> None:
     """Missing and refused frames are bridged; the first half second after closing is excluded."""
-    run = of_run(StreamedLoop(CONFIG), 60.0)
+    run = telemetry_from_run(StreamedLoop(CONFIG), 60.0)
     assert run.closed
     assert (run.source, run.noll, run.timing) == ("folded", NOLL, Timing.of(1.0, 0.5))
     assert run.rate_hz == pytest.approx(1000)
@@ -168,7 +168,7 @@ def test_tuning_uses_the_steps_of_a_running_loop() -> None:
     assert run.pol.frames == pytest.approx(5500, abs=5)
 
     result = result_of(run, *tuned(run, "lqg"), "lqg")
-    found, text = result.figures(), result.text()
+    found, text = result.json_object(), result.text()
     assert f"{found['modes'][0]['lines'][0]['frequency_hz']:.2f} Hz (" in text
     assert "tilt per axis, mas rms: open" in text
     assert found["modes"][0]["lines"][0]["frequency_hz"] == pytest.approx(20, abs=0.05)
@@ -188,13 +188,13 @@ class ReportingLoop(StreamedLoop):
 
 
 def test_the_mirrors_reports_give_the_time_of_application() -> None:
-    run = of_run(ReportingLoop(CONFIG), 60.0)
+    run = telemetry_from_run(ReportingLoop(CONFIG), 60.0)
     assert (run.timing.delay, run.timing.applied) == (1.0, pytest.approx(0.7, abs=1e-3))
 
 
 def test_a_too_short_live_time_is_refused_at_once() -> None:
     with pytest.raises(DataFileError, match=r"2048 consecutive frames, 2.05 s at 1000 Hz, but got 2 s: use --live 3"):
-        of_run(StreamedLoop(CONFIG), 2.0)
+        telemetry_from_run(StreamedLoop(CONFIG), 2.0)
 
 
 class RequestedLoop(InProcessLoop):

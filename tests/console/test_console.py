@@ -16,14 +16,14 @@ from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import EVENT, wire
-from lowfc.control.laws.linear_law import integrator_block, of_blocks
+from lowfc.control.laws.linear_law import integrator_block, law_from_blocks
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from tests.console.live_run import RUN, LiveRun
 from tests.support.loops import until
 from tests.support.stage import Stage
 from tests.support.toy import GRID, NOLL, calibration
 
-LAW = of_blocks([integrator_block(0.2, 0.01, "pol", 1.0)] * 3, "pol", "leaky", NOLL, 1.0, 50.0)
+LAW = law_from_blocks([integrator_block(0.2, 0.01, "pol", 1.0)] * 3, "pol", "leaky", NOLL, 1.0, 50.0)
 TIMEOUT_S = 15.0
 
 
@@ -299,20 +299,20 @@ class FinishedTask:
     status = 0
 
     def __init__(self, name: str) -> None:
-        self.sentence = f"{name}: done"
+        self.status_line = f"{name}: done"
 
 
 def test_a_task_runs_in_its_own_session_and_reports_its_end() -> None:
     from lowfc.programs.console.task import Task
 
     cases = (["--version"], 0, "t: done; 0."), (["no-such"], 2, "t failed: ")
-    for arguments, status, sentence in cases:
+    for arguments, status, status_line in cases:
         task = Task("t", arguments)
-        assert task.sentence.startswith("t: running for ")
+        assert task.status_line.startswith("t: running for ")
         assert os.getsid(task._process.pid) == task._process.pid, "neither Ctrl-C nor a lost terminal reaches it"
         until(lambda task=task: task.status is not None)
         assert task.status == status
-        assert task.sentence.startswith(sentence)
+        assert task.status_line.startswith(status_line)
         task.output.unlink()
 
 
@@ -349,7 +349,7 @@ def test_errors_ring_the_bell_until_it_is_muted(run: LiveRun, monkeypatch: pytes
     operate(run, scenario)
 
 
-def test_a_disconnected_console_reports_it_and_hides_the_figures(run: LiveRun, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disconnected_console_reports_it_and_hides_the_values(run: LiveRun, monkeypatch: pytest.MonkeyPatch) -> None:
     async def scenario(screen: Screen) -> None:
         with monkeypatch.context() as disconnected:
             disconnected.setattr(run.hub, "lose", lambda role, key, envelope: role == "operator")

@@ -39,8 +39,8 @@ GOLDEN = Path(__file__).parents[1] / "golden" / "lowfc_v1.txt"
 
 def declared() -> FileDescriptorProto:
     """The project's file in the committed descriptor, with comments."""
-    every = FileDescriptorSet.FromString((WIRE / "lowfc.desc").read_bytes())
-    return next(file for file in every.file if file.package == "lowfc.v1")
+    descriptors = FileDescriptorSet.FromString((WIRE / "lowfc.desc").read_bytes())
+    return next(file for file in descriptors.file if file.package == "lowfc.v1")
 
 
 def comments(file: FileDescriptorProto) -> dict[tuple[int, ...], str]:
@@ -159,8 +159,8 @@ def _raised_in(scope: ast.FunctionDef, path: Path) -> Iterator[tuple[str, str, s
             yield where, node.args[0].value, {str(keyword.arg) for keyword in node.keywords}
 
 
-def details_of(sentence: str) -> set[str]:
-    return {name for _, name, _, _ in string.Formatter().parse(sentence) if name}
+def details_of(description: str) -> set[str]:
+    return {name for _, name, _, _ in string.Formatter().parse(description) if name}
 
 
 def test_every_raised_event_is_in_the_table_with_the_same_details() -> None:
@@ -168,7 +168,7 @@ def test_every_raised_event_is_in_the_table_with_the_same_details() -> None:
     wrong = [
         f"{where}: {name} with {sorted(details)}"
         for where, name, details in found
-        if name not in EVENTS or details != details_of(EVENTS[name].sentence)
+        if name not in EVENTS or details != details_of(EVENTS[name].description)
     ]
     assert wrong == []
     assert len(found) > 25
@@ -178,7 +178,7 @@ def test_every_raised_event_is_in_the_table_with_the_same_details() -> None:
 def test_every_event_formats_as_a_line() -> None:
     for name, event in EVENTS.items():
         assert re.fullmatch(r"[A-Z]+(_[A-Z]+)*", name)
-        log = event.log("controller", 1_500_000_000_123_456_789, **dict.fromkeys(details_of(event.sentence), 3))
+        log = event.log("controller", 1_500_000_000_123_456_789, **dict.fromkeys(details_of(event.description), 3))
         assert re.fullmatch(rf"{name} [^{{]*", log.message)
         assert log.level == event.level
         assert from_timestamp(log.timestamp) == 1_500_000_000_123_456_789

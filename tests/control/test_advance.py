@@ -64,9 +64,9 @@ BAD: dict[Reason, Callable[[int], Frame]] = {
 @pytest.mark.parametrize("reason", BAD)
 def test_a_bad_frame_is_refused_with_an_event_and_the_command_holds(reason: Reason) -> None:
     before = running()
-    state, every = feed(DEFAULTS, before, *(BAD[reason](count) for count in range(6, 9)))
+    state, all_outputs = feed(DEFAULTS, before, *(BAD[reason](count) for count in range(6, 9)))
     held = before.loop
-    for outputs in every:
+    for outputs in all_outputs:
         assert outputs.step.reasons == (reason,)
         assert outputs.step.error_nm is None
         assert outputs.step.pol_nm is None
@@ -76,36 +76,36 @@ def test_a_bad_frame_is_refused_with_an_event_and_the_command_holds(reason: Reas
     assert state.frames_used == before.frames_used
     follows = 6 if reason in (Rejection.OUT_OF_ORDER, Rejection.REPEATED) else 9
     state, back = feed(DEFAULTS, state, frame(follows, SOME), frame(follows + 1, SOME))
-    assert names(every + back) == ["FRAMES_REFUSED", "FRAMES_ACCEPTED"]
-    assert every[0].events[0].details == {"reason": reason.name}
+    assert names(all_outputs + back) == ["FRAMES_REFUSED", "FRAMES_ACCEPTED"]
+    assert all_outputs[0].events[0].details == {"reason": reason.name}
     assert back[0].events[0].details == {"refused": 3, "reason": reason.name}
     assert state.frames_used == before.frames_used + 2
 
 
 def test_frames_of_a_stuck_camera_are_refused_until_the_image_changes() -> None:
     setup = settings(max_identical_frames=3)
-    state, every = feed(setup, loaded(setup), *(frame(count, SOME) for count in range(1, 8)))
-    reasons = [outputs.step.reasons for outputs in every if outputs.step is not None]
+    state, all_outputs = feed(setup, loaded(setup), *(frame(count, SOME) for count in range(1, 8)))
+    reasons = [outputs.step.reasons for outputs in all_outputs if outputs.step is not None]
     assert reasons == [()] * 4 + [(Rejection.STUCK,)] * 3
     used = feed(setup, loaded(setup), *(frame(count, SOME) for count in range(1, 5)))[0].loop
     assert np.array_equal(state.loop.actuators_nm, used.actuators_nm)
     pixels = frame(8, SOME).pixels.copy()
     pixels.flat[0] += 1
     state, back = feed(setup, state, frame(8, pixels=pixels), frame(9, SOME))
-    assert names(every + back) == ["FRAMES_REFUSED", "FRAMES_ACCEPTED"]
+    assert names(all_outputs + back) == ["FRAMES_REFUSED", "FRAMES_ACCEPTED"]
     assert state.counts == {Rejection.STUCK: 3}
     assert state.frames_used == 6
 
 
 def test_without_a_calibration_a_frame_gives_a_step_and_no_command() -> None:
-    state, every = feed(DEFAULTS, State(), frame(1), frame(2))
-    for outputs in every:
+    state, all_outputs = feed(DEFAULTS, State(), frame(1), frame(2))
+    for outputs in all_outputs:
         assert outputs.command is None
         assert outputs.step.reasons == (Rejection.NO_CALIBRATION,)
         assert outputs.step.command_nm.size == 0
-    assert names(every) == ["FRAMES_REFUSED"]
-    state, every = feed(DEFAULTS, state, Load(0, calibration(), "test"), frame(3))
-    assert names(every) == ["CALIBRATION_LOADED", "MODE_CHANGED", "FRAMES_ACCEPTED"]
+    assert names(all_outputs) == ["FRAMES_REFUSED"]
+    state, all_outputs = feed(DEFAULTS, state, Load(0, calibration(), "test"), frame(3))
+    assert names(all_outputs) == ["CALIBRATION_LOADED", "MODE_CHANGED", "FRAMES_ACCEPTED"]
     assert state.counts == {Rejection.NO_CALIBRATION: 2}
 
 
@@ -129,8 +129,8 @@ def test_a_frame_is_used_up_to_each_limit(changes: dict[str, object], reasons: t
 def test_each_reason_in_a_row_raises_one_event() -> None:
     reasons = Rejection.LATE, Rejection.LATE, Rejection.DARK
     inputs = [BAD[reason](count) for count, reason in enumerate(reasons, start=6)]
-    state, every = feed(DEFAULTS, running(), *inputs, frame(9, SOME))
-    assert names(every) == ["FRAMES_REFUSED", "FRAMES_REFUSED", "FRAMES_ACCEPTED"]
+    state, all_outputs = feed(DEFAULTS, running(), *inputs, frame(9, SOME))
+    assert names(all_outputs) == ["FRAMES_REFUSED", "FRAMES_REFUSED", "FRAMES_ACCEPTED"]
     assert state.counts == {Rejection.LATE: 2, Rejection.DARK: 1}
 
 
@@ -140,11 +140,11 @@ def test_missing_and_refused_frames_advance_the_command_history(delay: float) ->
     setup = settings(delay_frames=delay)
     before = running(setup)
     held = before.loop.history_nm[0]
-    missing, every = feed(setup, before, frame(12, SOME))
-    assert names(every) == ["FRAMES_MISSING"]
-    assert every[0].events[0].details == {"count": 6, "number": 12}
-    assert every[0].step.error_nm is not None
-    assert np.array_equal(every[0].step.pol_nm, every[0].step.error_nm - held)
+    missing, all_outputs = feed(setup, before, frame(12, SOME))
+    assert names(all_outputs) == ["FRAMES_MISSING"]
+    assert all_outputs[0].events[0].details == {"count": 6, "number": 12}
+    assert all_outputs[0].step.error_nm is not None
+    assert np.array_equal(all_outputs[0].step.pol_nm, all_outputs[0].step.error_nm - held)
     refused, _ = feed(setup, before, *(BAD[Rejection.LATE](count) for count in range(6, 12)))
     assert all(np.array_equal(command, held) for command in refused.loop.history_nm)
     assert missing.loop.history_nm[0] is not held
@@ -163,23 +163,23 @@ def test_one_missing_frame_advances_the_history_by_one() -> None:
 def test_frames_of_a_restarted_camera_are_used_with_an_event() -> None:
     before = running()
     restarted = frame(0, SOME, sequence=frame_sequence(0, START + 60), time_ns=(START + 60) * 10**9)
-    state, every = feed(DEFAULTS, before, restarted)
-    assert names(every) == ["CAMERA_RESTARTED"]
+    state, all_outputs = feed(DEFAULTS, before, restarted)
+    assert names(all_outputs) == ["CAMERA_RESTARTED"]
     assert state.frames_used == before.frames_used + 1
-    _, every = feed(DEFAULTS, state, frame(6, SOME))
-    assert every[0].step.reasons == (Rejection.OUT_OF_ORDER,)
+    _, all_outputs = feed(DEFAULTS, state, frame(6, SOME))
+    assert all_outputs[0].step.reasons == (Rejection.OUT_OF_ORDER,)
 
 
 def test_a_frame_timeout_raises_an_event_at_its_start_and_at_its_end() -> None:
     before = running()
     short = Tick(0, DEFAULTS.frame_timeout_ns)
     long = Tick(0, DEFAULTS.frame_timeout_ns + 1)
-    state, every = feed(
+    state, all_outputs = feed(
         DEFAULTS, before, short, long, Tick(0, 10 * DEFAULTS.frame_timeout_ns), BAD[Rejection.REPEATED](5), short, long
     )
-    assert [name for name in names(every) if name != "FRAMES_REFUSED"] == ["NO_FRAMES"]
-    assert all(outputs.command is not None for outputs in every)
-    for outputs in every:
+    assert [name for name in names(all_outputs) if name != "FRAMES_REFUSED"] == ["NO_FRAMES"]
+    assert all(outputs.command is not None for outputs in all_outputs)
+    for outputs in all_outputs:
         assert np.array_equal(outputs.command.actuators_nm, before.loop.actuators_nm)
         assert outputs.command.frame_sequence == before.frame_sequence
     state, back = feed(DEFAULTS, state, frame(500, SOME), frame(501, SOME))
@@ -216,11 +216,11 @@ def test_safe_latches_from_every_mode(mode: LoopMode) -> None:
     state = running()._replace(mode=mode)
     if mode is LoopMode.IDLE:
         state = State()
-    state, every = feed(DEFAULTS, state, ask("safe"), ask("close"), ask("open"), Load(0, calibration(), "test"))
+    state, all_outputs = feed(DEFAULTS, state, ask("safe"), ask("close"), ask("open"), Load(0, calibration(), "test"))
     assert state.mode is LoopMode.SAFE
-    assert [outputs.reply.accepted for outputs in every if outputs.reply] == [True, False, False]
+    assert [outputs.reply.accepted for outputs in all_outputs if outputs.reply] == [True, False, False]
     expected = [] if mode is LoopMode.SAFE else ["MODE_CHANGED", "SAFED"]
-    assert [name for name in names(every) if name != "CALIBRATION_LOADED"] == expected
+    assert [name for name in names(all_outputs) if name != "CALIBRATION_LOADED"] == expected
     state, _ = feed(DEFAULTS, state, ask("clear"))
     assert state.mode is LoopMode.OPEN
 
@@ -293,10 +293,10 @@ def test_a_bad_value_is_refused_and_changes_nothing(request_: Request, message: 
 @pytest.mark.parametrize("delay", [1.0, 1.5, 2.0, 3.0])
 def test_an_unstable_gain_is_refused_for_the_configured_delay(delay: float) -> None:
     setup, highest = settings(delay_frames=delay, gain=(0.1, 0.1)), limiting_gain(delay)
-    _, every = feed(
+    _, all_outputs = feed(
         setup, loaded(setup), ask("gain", 0.999 * highest), ask("gain", highest), ask("gain", 1.001 * highest)
     )
-    assert [outputs.reply.accepted for outputs in every if outputs.reply] == [True, False, False]
+    assert [outputs.reply.accepted for outputs in all_outputs if outputs.reply] == [True, False, False]
 
 
 def test_the_first_step_after_closing_is_gain_times_error() -> None:
@@ -308,9 +308,9 @@ def test_the_first_step_after_closing_is_gain_times_error() -> None:
 
 def test_in_open_loop_the_command_holds() -> None:
     state, _ = feed(DEFAULTS, running(), ask("open"))
-    after, every = feed(DEFAULTS, state, *(frame(count, SOME) for count in range(6, 12)))
+    after, all_outputs = feed(DEFAULTS, state, *(frame(count, SOME) for count in range(6, 12)))
     assert after.loop.actuators_nm is state.loop.actuators_nm
-    assert all(outputs.step is not None and outputs.step.error_nm is not None for outputs in every)
+    assert all(outputs.step is not None and outputs.step.error_nm is not None for outputs in all_outputs)
 
 
 @pytest.mark.parametrize("noll", [NOLL, (2, 3)])

@@ -51,12 +51,12 @@ def opened(*inputs: Input) -> State:
 
 def test_changed_camera_settings_open_the_loop() -> None:
     """A bias below the dark is allowed: clock-induced charge and dark current make the difference."""
-    state, every = feed(DEFAULTS, loaded(DEFAULTS), frame(1), CAMERA)
-    assert (state.mode, names(every)) == (LoopMode.CLOSED, [])
+    state, all_outputs = feed(DEFAULTS, loaded(DEFAULTS), frame(1), CAMERA)
+    assert (state.mode, names(all_outputs)) == (LoopMode.CLOSED, [])
     assert feed(DEFAULTS, state, replace(CAMERA, time_ns=9)) == (state, [Outputs()])
-    state, every = feed(DEFAULTS, state, WRONG)
-    assert (state.mode, names(every)) == (LoopMode.OPEN, ["CAMERA_CHANGED", "MODE_CHANGED"])
-    assert "bias_dn" in str(every[0].events[0].details["what"])
+    state, all_outputs = feed(DEFAULTS, state, WRONG)
+    assert (state.mode, names(all_outputs)) == (LoopMode.OPEN, ["CAMERA_CHANGED", "MODE_CHANGED"])
+    assert "bias_dn" in str(all_outputs[0].events[0].details["what"])
     assert state.conditions.mode_cause.startswith("the camera does not fit the calibration")
 
 
@@ -113,14 +113,14 @@ def test_after_a_camera_restart_frames_are_refused_until_its_settings_arrive() -
     state, _ = feed(DEFAULTS, loaded(DEFAULTS), CAMERA, *(frame(count, (20, 0, 0)) for count in range(1, 6)))
     restarted = [frame(1, (20, 0, 0), sequence=frame_sequence(count, START + 9)) for count in range(4)]
     before_nm = state.loop.history_nm[0] if state.loop is not None else None
-    state, every = feed(DEFAULTS, state, *restarted)
-    assert [outputs.step.reasons for outputs in every if outputs.step] == [(Rejection.CAMERA_UNKNOWN,)] * 4
+    state, all_outputs = feed(DEFAULTS, state, *restarted)
+    assert [outputs.step.reasons for outputs in all_outputs if outputs.step] == [(Rejection.CAMERA_UNKNOWN,)] * 4
     assert (state.loop.history_nm[0] == before_nm).all()
     assert not ask(ask(state, "open")[0], "close")[1].accepted
-    state, every = feed(
+    state, all_outputs = feed(
         DEFAULTS, state, replace(CAMERA, start_s=START + 9), frame(1, sequence=frame_sequence(9, START + 9))
     )
-    assert every[-1].step.reasons == ()
+    assert all_outputs[-1].step.reasons == ()
 
 
 def test_settings_received_before_the_first_frame_of_a_restarted_camera_count() -> None:
@@ -205,9 +205,9 @@ def play(state: State, table: Single, basis: Single = BASIS) -> State:
     return state
 
 
-def surfaces(every: list[Outputs]) -> Single:
+def surfaces(all_outputs: list[Outputs]) -> Single:
     """Actuators (frames, actuators) of the commands."""
-    return np.array([one.command.actuators_nm.reshape(-1) for one in every if one.command is not None])
+    return np.array([one.command.actuators_nm.reshape(-1) for one in all_outputs if one.command is not None])
 
 
 def other_size() -> State:
@@ -222,9 +222,9 @@ def test_a_probe_sequence_plays_without_a_calibration(begin: object) -> None:
     state = begin()  # type: ignore[operator]
     assert state.mode is LoopMode.IDLE
     table = np.array([[1], [-2], [3]], np.float32)
-    state, every = feed(DEFAULTS, play(state, table), *(odd(count) for count in range(4, 9)))
-    assert np.allclose(surfaces(every), np.vstack([table * BASIS, 0 * BASIS, 0 * BASIS]))
-    for outputs in every:
+    state, all_outputs = feed(DEFAULTS, play(state, table), *(odd(count) for count in range(4, 9)))
+    assert np.allclose(surfaces(all_outputs), np.vstack([table * BASIS, 0 * BASIS, 0 * BASIS]))
+    for outputs in all_outputs:
         assert outputs.step.error_nm is None
         assert outputs.step.reasons[0] in (Rejection.NO_CALIBRATION, Rejection.WRONG_SIZE)
 
@@ -243,28 +243,28 @@ def test_a_limit_ends_the_probe_sequence() -> None:
     assert state.limits_hit == ()
     assert not before.any()
     state = play(state, table, steep.reshape(-1))
-    _, every = feed(DEFAULTS, state, odd(40))
-    assert "PLAY_ENDED" in names(every)
-    assert Limit.SLEW in every[0].step.reasons
+    _, all_outputs = feed(DEFAULTS, state, odd(40))
+    assert "PLAY_ENDED" in names(all_outputs)
+    assert Limit.SLEW in all_outputs[0].step.reasons
 
 
 def test_an_idle_loop_holds_the_mirror_and_safe_relaxes_it() -> None:
-    state, every = feed(DEFAULTS, idle(shape_nm=30.0), odd(4))
-    assert np.allclose(surfaces(every), 30)
+    state, all_outputs = feed(DEFAULTS, idle(shape_nm=30.0), odd(4))
+    assert np.allclose(surfaces(all_outputs), 30)
     state, outputs = advance(DEFAULTS, state, Request(0, "safe"))
     answered(outputs, True)
-    state, every = feed(DEFAULTS, state, odd(5), odd(6))
-    assert not surfaces(every)[-1].any()
+    state, all_outputs = feed(DEFAULTS, state, odd(5), odd(6))
+    assert not surfaces(all_outputs)[-1].any()
     state, _ = advance(DEFAULTS, state, Request(0, "clear"))
     assert state.mode is LoopMode.IDLE
 
 
 def test_safe_mode_from_before_the_start_remains() -> None:
     safe = settings(start_mode=LoopMode.SAFE)
-    state, every = feed(safe, State(), MirrorShape(0, np.full(GRID, 30, np.float32), np.zeros(0, np.float32)))
-    assert names(every) == ["NOT_CALIBRATED", "MODE_CHANGED", "SAFED"]
-    _, every = feed(safe, state, odd(1))
-    assert not surfaces(every).any()
+    state, all_outputs = feed(safe, State(), MirrorShape(0, np.full(GRID, 30, np.float32), np.zeros(0, np.float32)))
+    assert names(all_outputs) == ["NOT_CALIBRATED", "MODE_CHANGED", "SAFED"]
+    _, all_outputs = feed(safe, state, odd(1))
+    assert not surfaces(all_outputs).any()
 
 
 @pytest.mark.parametrize("begin", [idle, other_size])
@@ -280,15 +280,15 @@ def test_a_calibration_ends_the_idle_mode_and_the_mirror_keeps_its_shape() -> No
     state, _ = advance(DEFAULTS, state, request)
     assert DEFAULTS.start_mode is LoopMode.CLOSED
     assert state.mode is LoopMode.OPEN, "a loaded calibration does not close the loop"
-    state, every = feed(DEFAULTS, state, frame(4, SOME))
-    assert np.allclose(surfaces(every), 30, atol=1e-3)
-    assert every[0].step.error_nm is not None
+    state, all_outputs = feed(DEFAULTS, state, frame(4, SOME))
+    assert np.allclose(surfaces(all_outputs), 30, atol=1e-3)
+    assert all_outputs[0].step.error_nm is not None
 
 
 def test_a_matching_camera_ends_the_idle_mode() -> None:
-    state, every = feed(DEFAULTS, other_size(), CAMERA)
+    state, all_outputs = feed(DEFAULTS, other_size(), CAMERA)
     assert state.mode is LoopMode.OPEN
-    assert names(every) == ["MODE_CHANGED"]
+    assert names(all_outputs) == ["MODE_CHANGED"]
 
 
 def test_a_measured_calibration_of_another_frame_size_opens_the_loop() -> None:
@@ -312,8 +312,8 @@ def test_a_probe_sequence_advances_with_refused_frames() -> None:
 
 def test_a_frame_timeout_ends_the_probe_sequence() -> None:
     state = play(idle(), np.ones((5, 1), np.float32))
-    state, every = feed(DEFAULTS, state, odd(4), Tick(0, DEFAULTS.frame_timeout_ns + 1))
-    assert "PLAY_ENDED" in names(every)
+    state, all_outputs = feed(DEFAULTS, state, odd(4), Tick(0, DEFAULTS.frame_timeout_ns + 1))
+    assert "PLAY_ENDED" in names(all_outputs)
     play(state, np.ones((5, 1), np.float32))
 
 

@@ -82,14 +82,14 @@ def test_the_takeover_has_an_event_and_no_jump() -> None:
     assert not any(overruled(state))
     first = BEFORE + WORSE_BLOCKS * SPANS.block
     before = state.loop.history_nm[0]
-    state, every = feed(SETUP, state, frame(first, SWAY_NM[first] + before))
-    assert names(every) == ["LAW_OVERRULED"]
-    event = every[0].events[0].details
+    state, all_outputs = feed(SETUP, state, frame(first, SWAY_NM[first] + before))
+    assert names(all_outputs) == ["LAW_OVERRULED"]
+    event = all_outputs[0].events[0].details
     assert event["modes"] == "tip and tilt"
     assert event["until"] == f"until the law would be far better for {BETTER_S:g} s"
     assert np.abs(state.loop.history_nm[0] - before).max() < 2  # one hundredth of the cross-fade
     _, state = run(state, SPANS.faded, first + 1)
-    known = status.figures(controller_state(state, SETUP, 1))
+    known = status.json_object(controller_state(state, SETUP, 1))
     assert known["law"]["overruled"] == ["tip and tilt"]
     assert "overruled: the integrator drives tip and tilt" in status.text(known)
     weight = state.loop.law_runner.weight

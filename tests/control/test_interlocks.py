@@ -104,10 +104,10 @@ def test_an_interlock_holds_and_releases_the_command_at_the_next_frame() -> None
 )
 def test_each_action_and_that_clearing_the_interlock_undoes_nothing(action: Action, mode: LoopMode) -> None:
     setup = under(action)
-    state, every = feed(setup, running(setup), mask(True), mask(True))
+    state, all_outputs = feed(setup, running(setup), mask(True), mask(True))
     assert state.mode is mode
     changed = ["MODE_CHANGED"] if mode is not LoopMode.CLOSED else []
-    assert names(every) == ["INTERLOCK_ACTS", *changed, *(["SAFED"] if mode is LoopMode.SAFE else [])]
+    assert names(all_outputs) == ["INTERLOCK_ACTS", *changed, *(["SAFED"] if mode is LoopMode.SAFE else [])]
     state, _ = asked(setup, state, "open") if mode is LoopMode.CLOSED else (state, None)
     refused, clears = action is not Action.WARN, mode is LoopMode.SAFE
     for name, values in (("close", ()), ("step", (3.0,))):
@@ -116,8 +116,8 @@ def test_each_action_and_that_clearing_the_interlock_undoes_nothing(action: Acti
     if clears:
         _, outputs = asked(setup, state, "clear")
         answered(outputs, False, "an interlock acts: mask is true")
-    after, every = feed(setup, state, mask(False))
-    assert names(every) == ["INTERLOCK_CLEARED"]
+    after, all_outputs = feed(setup, state, mask(False))
+    assert names(all_outputs) == ["INTERLOCK_CLEARED"]
     assert after.mode is state.mode
     after, outputs = asked(setup, after, "clear" if clears else "close")
     answered(outputs, True)
@@ -146,20 +146,20 @@ def test_only_a_change_of_the_condition_is_a_logged_input() -> None:
 def test_a_value_that_is_too_old_acts_as_configured() -> None:
     for acting in (True, False):
         setup = under(Action.HOLD, acts_when_old=acting)
-        state, every = feed(setup, running(setup), mask(False, 2 * S + 1), frame(6, SOME))
+        state, all_outputs = feed(setup, running(setup), mask(False, 2 * S + 1), frame(6, SOME))
         assert bool(state.conditions.acting) is acting
-        assert every[-1].step.reasons == ((Rejection.HELD,) if acting else ())
+        assert all_outputs[-1].step.reasons == ((Rejection.HELD,) if acting else ())
         setup = under(Action.HOLD, acts_when_old=acting)
-        state, every = feed(setup, running(setup), mask(True), mask(True, 2 * S + 1))
+        state, all_outputs = feed(setup, running(setup), mask(True), mask(True, 2 * S + 1))
         assert [one.why for one in state.conditions.acting] == ["no value of mask for more than 2 s"] * acting
-        assert names(every) == ["INTERLOCK_ACTS", "INTERLOCK_ACTS" if acting else "INTERLOCK_CLEARED"]
+        assert names(all_outputs) == ["INTERLOCK_ACTS", "INTERLOCK_ACTS" if acting else "INTERLOCK_CLEARED"]
 
 
 def test_a_hold_does_not_stop_measurements_in_open_loop() -> None:
     setup = under(Action.HOLD)
     state, _ = asked(setup, running(setup), "open")
-    _, every = feed(setup, state, mask(True), frame(6, SOME))
-    assert every[-1].step.error_nm is not None
+    _, all_outputs = feed(setup, state, mask(True), frame(6, SOME))
+    assert all_outputs[-1].step.error_nm is not None
 
 
 # Permits.
@@ -177,9 +177,9 @@ def test_a_permit_holds_a_closed_loop_for_its_duration() -> None:
     answered(outputs, False, "the loop is closed")
     state, outputs = permit(setup, state, 0.01)
     answered(outputs, True, "granted for 0.01 s: the loop holds its command")
-    state, every = feed(setup, state, *(frame(count, SOME) for count in range(6, 18)))
-    assert [one.step.reasons for one in every] == [(Rejection.HELD,)] * 10 + [()] * 2
-    assert names(every) == ["FRAMES_REFUSED", "LEASE_ENDED", "FRAMES_ACCEPTED"]
+    state, all_outputs = feed(setup, state, *(frame(count, SOME) for count in range(6, 18)))
+    assert [one.step.reasons for one in all_outputs] == [(Rejection.HELD,)] * 10 + [()] * 2
+    assert names(all_outputs) == ["FRAMES_REFUSED", "LEASE_ENDED", "FRAMES_ACCEPTED"]
     assert state.conditions.lease.ended == "its time is over"
     assert state.mode is LoopMode.CLOSED
 
@@ -190,8 +190,8 @@ def test_a_permit_can_be_released_and_ended_by_open() -> None:
     _, outputs = asked(setup, held, "gain", values=(0.1,))
     answered(outputs, False, "reserved for moving the mask")
     state, outputs = asked(setup, held, "release", lease_id=MOVER)
-    _, every = feed(setup, state, frame(6, SOME))
-    assert every[-1].step.reasons == ()
+    _, all_outputs = feed(setup, state, frame(6, SOME))
+    assert all_outputs[-1].step.reasons == ()
     state, outputs = asked(setup, held, "open")
     answered(outputs, True, "this ended the reservation for moving the mask")
 

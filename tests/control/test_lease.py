@@ -45,8 +45,8 @@ def played(state: State, frames: int = 500, lease_id: int = MINE) -> State:
 
 
 def remaining_rows(state: State) -> int:
-    additions = state.loop.command_channels
-    return 0 if additions is None or additions.play is None else additions.play.remaining(state.frame_sequence + 1)
+    channels = state.loop.command_channels
+    return 0 if channels is None or channels.play is None else channels.play.remaining(state.frame_sequence + 1)
 
 
 GRANTED = {"safe", "open", "pause", "stop", "status", "note", "lease", "renew", "release", "permit", "configuration"}
@@ -152,17 +152,17 @@ def test_an_incomplete_lease_is_refused(fields: dict[str, object], why: str) -> 
 def test_a_lease_ends_after_its_number_of_frames() -> None:
     """A lease of 1 s is in force for 1000 frames at 1 kHz."""
     state = played(held(1.0), 5000)
-    state, every = feed(DEFAULTS, state, *(frame(count) for count in range(4, 1004)))
-    assert names(every) == []
+    state, all_outputs = feed(DEFAULTS, state, *(frame(count) for count in range(4, 1004)))
+    assert names(all_outputs) == []
     assert remaining_rows(state) == 4000
-    state, every = feed(DEFAULTS, state, frame(1004))
-    assert names(every) == ["LEASE_ENDED"]
+    state, all_outputs = feed(DEFAULTS, state, frame(1004))
+    assert names(all_outputs) == ["LEASE_ENDED"]
     assert not remaining_rows(state)
 
 
 def test_without_frames_a_lease_ends_by_the_clock() -> None:
-    state, every = feed(DEFAULTS, played(held(1.0)), Tick(S, 0), Tick(S + 1, 0))
-    assert names(every) == ["LEASE_ENDED"]
+    state, all_outputs = feed(DEFAULTS, played(held(1.0)), Tick(S, 0), Tick(S + 1, 0))
+    assert names(all_outputs) == ["LEASE_ENDED"]
     assert not remaining_rows(state)
 
 

@@ -33,17 +33,17 @@ def test_a_lost_mirror_moves_the_command_back_to_its_last_shape() -> None:
     lost = MirrorReport(0, LOST.fault, shape_of(last_seen))
     moved_nm = np.abs(wound_up.loop.actuators_nm - last_seen.loop.actuators_nm).max()
     assert moved_nm > DEFAULTS.limits.slew_nm, "it takes more than one step"
-    state, every = feed(DEFAULTS, wound_up, lost, lost)
-    assert names(every) == ["MIRROR_LOST"]
+    state, all_outputs = feed(DEFAULTS, wound_up, lost, lost)
+    assert names(all_outputs) == ["MIRROR_LOST"]
     assert feed(DEFAULTS, state, lost)[0] is state
-    state, every = feed(DEFAULTS, state, *frames(*range(30, 60)))
-    assert names(every) == ["FRAMES_REFUSED"]
+    state, all_outputs = feed(DEFAULTS, state, *frames(*range(30, 60)))
+    assert names(all_outputs) == ["FRAMES_REFUSED"]
     assert state.counts == {Rejection.NO_MIRROR: 30}
-    for outputs in every:
+    for outputs in all_outputs:
         assert outputs.step.reasons == (Rejection.NO_MIRROR,)
         np.testing.assert_allclose(outputs.command.actuators_nm, last_seen.loop.actuators_nm, atol=1e-3)
-    state, every = feed(DEFAULTS, state, BACK, *frames(60))
-    assert names(every) == ["MIRROR_BACK", "FRAMES_ACCEPTED"]
+    state, all_outputs = feed(DEFAULTS, state, BACK, *frames(60))
+    assert names(all_outputs) == ["MIRROR_BACK", "FRAMES_ACCEPTED"]
     np.testing.assert_allclose(
         state.loop.history_nm[0], feed(DEFAULTS, last_seen, *frames(6))[0].loop.history_nm[0], atol=1e-3
     )
@@ -75,35 +75,37 @@ def test_a_lost_mirror_restarts_the_law() -> None:
 
 
 def test_without_a_mirror_an_open_loop_measures_and_is_not_closed() -> None:
-    state, every = feed(DEFAULTS, running(), Request(0, "open"), LOST, *frames(6), Request(0, "close"))
-    assert every[2].step.error_nm is not None
-    answered(every[-1], False, "the mirror does not answer", "would only hold")
+    state, all_outputs = feed(DEFAULTS, running(), Request(0, "open"), LOST, *frames(6), Request(0, "close"))
+    assert all_outputs[2].step.error_nm is not None
+    answered(all_outputs[-1], False, "the mirror does not answer", "would only hold")
     answered(feed(DEFAULTS, state, Request(0, "step", values=(3.0,)))[1][0], False, "does not answer")
     answered(feed(DEFAULTS, state, BACK, *frames(7), Request(0, "close"))[1][-1], True)
 
 
 def test_a_lost_mirror_ends_the_probe_sequence_and_refuses_others() -> None:
     probe = Request(0, "play", text="offset", table=np.zeros((50, 3), np.float32))
-    _, every = feed(DEFAULTS, running(), probe, *frames(6), LOST, probe)
-    answered(every[0], True)
-    assert names(every[2:3]) == ["MIRROR_LOST", "PLAY_ENDED"]
-    answered(every[-1], False, "does not answer")
+    _, all_outputs = feed(DEFAULTS, running(), probe, *frames(6), LOST, probe)
+    answered(all_outputs[0], True)
+    assert names(all_outputs[2:3]) == ["MIRROR_LOST", "PLAY_ENDED"]
+    answered(all_outputs[-1], False, "does not answer")
 
 
 def test_safe_flattens_a_lost_mirror() -> None:
-    state, every = feed(DEFAULTS, running(30), LOST, Request(0, "safe"), *frames(*range(31, 60)))
-    answered(every[1], True)
-    assert not every[-1].command.actuators_nm.any()
+    state, all_outputs = feed(DEFAULTS, running(30), LOST, Request(0, "safe"), *frames(*range(31, 60)))
+    answered(all_outputs[1], True)
+    assert not all_outputs[-1].command.actuators_nm.any()
     assert state.mode is LoopMode.SAFE
 
 
 def test_a_mirror_gets_no_command_before_it_reports_and_does_not_jump() -> None:
     shape = MirrorShape(0, np.full(GRID, 20, np.float32), np.zeros(0, np.float32))
     timeout = Tick(0, DEFAULTS.frame_timeout_ns + 1)
-    state, every = feed(DEFAULTS, loaded(DEFAULTS), MirrorReport(0, "has not reported yet"), *frames(1, 2), timeout)
-    assert [outputs.command for outputs in every] == [None] * 4
-    state, every = feed(DEFAULTS, state, shape, BACK, *frames(3))
-    command = every[-1].command
+    state, all_outputs = feed(
+        DEFAULTS, loaded(DEFAULTS), MirrorReport(0, "has not reported yet"), *frames(1, 2), timeout
+    )
+    assert [outputs.command for outputs in all_outputs] == [None] * 4
+    state, all_outputs = feed(DEFAULTS, state, shape, BACK, *frames(3))
+    command = all_outputs[-1].command
     assert isinstance(command, Command)
     assert 0 < np.abs(command.actuators_nm - 20).max() < 15, "one step from its shape"
     in_safe_mode = feed(DEFAULTS, loaded(DEFAULTS), LOST, Request(0, "safe"), *frames(1))[1][-1]

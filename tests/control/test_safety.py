@@ -233,9 +233,9 @@ def test_the_document_on_safety_names_tests_that_exist() -> None:
     root = Path(__file__).parents[2]
     text = (root / "docs" / "explanation" / "safety.md").read_text(encoding="utf-8")
     named = set(re.findall(r"`(test_\w+)`", text))
-    every = "\n".join(path.read_text(encoding="utf-8") for path in (root / "tests").rglob("test_*.py"))
+    sources = "\n".join(path.read_text(encoding="utf-8") for path in (root / "tests").rglob("test_*.py"))
     assert len(named) > 30
-    assert {name for name in named if f"def {name}(" not in every} == set()
+    assert {name for name in named if f"def {name}(" not in sources} == set()
     rows = [line.split("|") for line in text.splitlines() if line.startswith("| ")]
     places = {place for row in rows for place in re.findall(r"`([\w.]+)`", row[3])}
     assert len(places) > 30

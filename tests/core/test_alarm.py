@@ -19,14 +19,14 @@ NOTE = 'printf "%s\\n" "$LOWFC_RUN|$LOWFC_LEVEL|$LOWFC_PROCESS|$LOWFC_EVENT|$LOW
 class Alarmed:
     """A camera that publishes events, and a recorder with an alarm."""
 
-    def __init__(self, command: str, every_s: float = 0.0) -> None:
+    def __init__(self, command: str, min_interval_s: float = 0.0) -> None:
         hub, clock = MemoryHub(), HostClock()
         self.camera, self.recorder = (
             Service(name, "bench", clock, MemoryBus(hub, name, clock)) for name in ("camera", "recorder")
         )
         self.events: list[str] = []
         self.camera.bus.subscribe(EVENT, lambda sample: self.events.append(Log.FromString(sample.payload).message))
-        Alarm(self.recorder, command, Level.WARNING, every_s)
+        Alarm(self.recorder, command, Level.WARNING, min_interval_s)
 
     def failures(self) -> list[str]:
         return [event for event in self.events if event.startswith("ON_EVENT_FAILED")]
@@ -55,7 +55,7 @@ def test_events_during_the_command_run_it_once_more_for_the_worst(tmp_path: Path
 
 def test_the_command_runs_in_the_normal_scheduling_class_and_at_most_once_per_interval(tmp_path: Path) -> None:
     notes = tmp_path / "notes"  # absolute: the second run may come when other tests are running
-    run = Alarmed(f"chrt -p $$ >> {notes}; nice >> {notes}", every_s=60.0)
+    run = Alarmed(f"chrt -p $$ >> {notes}; nice >> {notes}", min_interval_s=60.0)
     run.camera.event("CAMERA_RESTARTED")
     until(lambda: notes.exists() and len(notes.read_text().splitlines()) == 3)
     run.camera.event("CAMERA_RESTARTED")

@@ -1,4 +1,4 @@
-"""Controller reports: time not closed and its causes, figures of the last second, offload; status and summary."""
+"""Controller reports: time not closed and its causes, statistics of the last second, offload; status and summary."""
 
 import io
 from dataclasses import replace
@@ -79,8 +79,8 @@ def test_summary_and_status_show_the_time_not_closed() -> None:
         watch = Watch({"controller": wire.Health(**health)}, [])
         return summary_text(summary(watch, record=False, rate_hz=250.0)).splitlines()[0].split(maxsplit=1)[1]
 
-    figures = summary(Watch({}, []), record=False, rate_hz=250.0)
-    assert "over the open pupil, second half of the run" in summary_text(figures)
+    results = summary(Watch({}, []), record=False, rate_hz=250.0)
+    assert "over the open pupil, second half of the run" in summary_text(results)
     not_closed = {"not_closed_ns": 3 * SECOND, "not_closed_cause": "the camera does not fit"}
     assert first(mode=wire.LOOP_MODE_CLOSED) == "closed"
     expected = "closed; not closed for 3.0 s in total: the camera does not fit"
@@ -95,13 +95,17 @@ def test_summary_and_status_show_the_time_not_closed() -> None:
         state, _ = advance(USUAL, state, one)
     message = controller_state(state, USUAL, (START + 12) * SECOND)
     mirror = wire.Health(command_refused=wire.REASON_OUT_OF_ORDER)
-    _, *lines = status.text(status.figures(message, {"mirror-dm": mirror})).splitlines()
+    _, *lines = status.text(status.json_object(message, {"mirror-dm": mirror})).splitlines()
     assert lines[0].split(maxsplit=1)[1].startswith("open for 12 s (the camera does not fit the calibration: bias_dn")
     assert lines[1].split(maxsplit=1)[1] == "refuses commands: OUT_OF_ORDER"
-    held = status.text(status.figures(message, {"controller": wire.Health(holding="no frame comes")})).splitlines()[1]
+    held = status.text(status.json_object(message, {"controller": wire.Health(holding="no frame comes")})).splitlines()[
+        1
+    ]
     assert " open for 12 s (" in held
     assert held.endswith("), command held: no frame comes"), "12 s is the time open, not the time without frames"
-    assert status.figures(message, {"mirror-x": wire.Health(command_expired=True)})["mirrors"]["mirror-x"]["expired"]
+    assert status.json_object(message, {"mirror-x": wire.Health(command_expired=True)})["mirrors"]["mirror-x"][
+        "expired"
+    ]
 
 
 def test_the_first_line_of_the_status_shows_loop_recording_and_warnings() -> None:
@@ -111,7 +115,7 @@ def test_the_first_line_of_the_status_shows_loop_recording_and_warnings() -> Non
 
     def first(**changes: Any) -> str:
         message = controller_state(state, USUAL, (START + 12) * SECOND)
-        return status.text(status.figures(message, PROCESSES | changes, "night")).splitlines()[0]
+        return status.text(status.json_object(message, PROCESSES | changes, "night")).splitlines()[0]
 
     normal = (
         "closed · residual 2.50 nm rms, noise included (true 2.00) · light 97 % · 3 frames lost · recording logs/a.mcap"
@@ -135,7 +139,7 @@ def test_the_first_line_of_the_status_shows_loop_recording_and_warnings() -> Non
         state, outputs = advance(USUAL, state, Request((START + 2) * SECOND, name))
         assert outputs.reply.accepted
         assert first().startswith(f"{word} ·")
-        assert status.figures(controller_state(state, USUAL, 0))["paused"] == (word == "paused")
+        assert status.json_object(controller_state(state, USUAL, 0))["paused"] == (word == "paused")
 
 
 def test_added_contrast_is_shown_for_a_flat_mirror_and_the_present_one() -> None:
@@ -144,14 +148,14 @@ def test_added_contrast_is_shown_for_a_flat_mirror_and_the_present_one() -> None
     message = controller_state(loaded(USUAL), USUAL, (START + 12) * SECOND)
     watch = Watch({"camera": camera}, [])
     expected = "added to the dark zone's contrast: flat mirror +7.0e-10, residual -4.0e-11"
-    assert expected in status.text(status.figures(message, {"camera": camera}))
+    assert expected in status.text(status.json_object(message, {"camera": camera}))
     assert expected in summary_text(summary(watch, record=False, rate_hz=250.0))
     assert "  contrast -4.0e-11 of +7.0e-10  " in status_line(watch, 5.0)
 
 
-def test_figures_of_the_last_second_exclude_older_and_refused_frames() -> None:
+def test_statistics_of_the_last_second_exclude_older_and_refused_frames() -> None:
     state, last = loaded(USUAL), LastSecond(SECOND // 4)
-    assert last.figures(state, SECOND) == wire.LoopFigures()
+    assert last.statistics(state, SECOND) == wire.LoopFigures()
     flux_dn = state.loop.calibration.flux_dn
 
     def step(error_nm: float | None) -> Step:
@@ -160,12 +164,12 @@ def test_figures_of_the_last_second_exclude_older_and_refused_frames() -> None:
 
     for quarter, error_nm in enumerate((9.0, 9.0, 9.0, 9.0, 9.0, 1.0, 1.0, None, 1.0, 1.0)):
         last.add(step(error_nm), quarter * SECOND // 4)
-    found = last.figures(state, 9 * SECOND // 4)
+    found = last.statistics(state, 9 * SECOND // 4)
     assert (found.frames, found.residual_rms_nm, found.flux_fraction) == (3, pytest.approx(2.0), pytest.approx(0.5))
-    assert last.figures(state, 20 * SECOND).frames == 0
+    assert last.statistics(state, 20 * SECOND).frames == 0
 
 
-def test_the_status_line_shows_recent_figures_and_none_before_the_first_frame() -> None:
+def test_the_status_line_shows_recent_statistics_and_none_before_the_first_frame() -> None:
     watch = Watch({"controller": wire.Health(mode=wire.LOOP_MODE_CLOSED), "camera": wire.Health(process="camera")}, [])
     assert status_line(watch, 5.0) == "    5 s  no frame yet"
     whole = wire.WavefrontFigures(residual_rms_nm=27.0, disturbance_rms_nm=31.0)
@@ -184,7 +188,7 @@ def test_the_status_line_shows_recent_figures_and_none_before_the_first_frame() 
     assert status_line(watch, 17.0) == "   17 s  closed  the camera has been silent for 7 s"
     with Console(width=120, file=io.StringIO(), record=True) as console:
         console.print(screen(watch, Configuration(), None, 17.0))
-    assert "2.20" not in console.export_text(), "figures seven seconds old are not shown"
+    assert "2.20" not in console.export_text(), "statistics seven seconds old are not shown"
 
 
 @pytest.mark.parametrize(("received", "missing", "lost"), [(500, 0, 0), (371, 129, 129), (309, 0, 191), (0, 0, 0)])
@@ -194,8 +198,8 @@ def test_frames_published_after_the_last_received_one_count_as_lost(received: in
         topics=[wire.TopicCount(topic=FRAME.key, received=received, missing=missing)],
     )
     camera = wire.Health(topics=[wire.TopicCount(topic=FRAME.key, published=500)])
-    figures = summary(Watch({"recorder": recorder, "camera": camera}, []), record=True, rate_hz=250.0)
-    assert (figures["messages_lost"], figures["lost"].get(FRAME.key, 0)) == (lost, lost)
+    results = summary(Watch({"recorder": recorder, "camera": camera}, []), record=True, rate_hz=250.0)
+    assert (results["messages_lost"], results["lost"].get(FRAME.key, 0)) == (lost, lost)
 
 
 def test_the_mean_modal_command_is_published_for_offload() -> None:

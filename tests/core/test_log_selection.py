@@ -65,10 +65,10 @@ def of(messages: list[Sample], topic: Topic) -> list[Sample]:
 
 def test_steps_and_commands_are_never_left_out() -> None:
     asked = selection(1, ["lowfc/sim/*"])
-    assert asked.left_out == {FRAME, MIRROR_STATE, SURFACE, TIMING}
-    assert {topic.key for topic in TOPICS if topic.optional} == {topic.key for topic in (*asked.left_out, TRUTH)}
+    assert asked.excluded == {FRAME, MIRROR_STATE, SURFACE, TIMING}
+    assert {topic.key for topic in TOPICS if topic.optional} == {topic.key for topic in (*asked.excluded, TRUTH)}
     assert selection() == EVERYTHING == selection(1, ["lowfc/*"])
-    assert selection(1, ["/lowfc/mirror/dm/state"]).left_out == {FRAME, SURFACE, TIMING, TRUTH}
+    assert selection(1, ["/lowfc/mirror/dm/state"]).excluded == {FRAME, SURFACE, TIMING, TRUTH}
     assert Selection.of(asked.metadata) == asked
     assert Selection.of({"selection": {"every": "-3", "left_out": "nothing"}}) == EVERYTHING
     with pytest.raises(ConfigurationError, match="did you mean 'lowfc/camera/frame'"):
@@ -121,7 +121,7 @@ def test_a_smaller_copy_has_the_same_steps(whole: Path, small: Path) -> None:
     assert (found["messages_missing"], found["state"], "recovery" in found["metadata"]) == (0, "complete", False)
     again = thin((small,), small.with_name("again.mcap"), selection(4, ["lowfc/camera/*"]))
     made = Selection(20, frozenset({MIRROR_STATE, SURFACE, TIMING, TRUTH}))
-    assert again.selection == made.sentence
+    assert again.selection == made.description
     assert Selection.of(survey(path := Path(again.file))["metadata"]) == made
     assert len(of(list(LogReader(path)), FRAME)) == FRAMES // 20
     with pytest.raises(DataFileError, match="already exists"):
@@ -147,8 +147,8 @@ def test_replay_needs_frames_but_no_other_optional_topic(whole: Path) -> None:
 def test_what_if_gives_the_same_result_from_a_smaller_copy(whole: Path, small: Path, tmp_path: Path) -> None:
     asked = requested("gain=0.3", None, None, None)
     found = [what_if(LoggedRun(read_history(LogReader(log))), asked) for log in (whole, small)]
-    for figures in found:
-        del figures["log"]
+    for results in found:
+        del results["log"]
     assert found[0] == found[1]
     other = {"pinv": "weighted", "weighted": "pinv"}[read_history(WholeLog(small)).calibration.estimator]
     with pytest.raises(
@@ -158,7 +158,7 @@ def test_what_if_gives_the_same_result_from_a_smaller_copy(whole: Path, small: P
 
 
 @pytest.mark.usefixtures("without_drawings")
-def test_a_report_of_a_smaller_copy_has_the_same_figures(whole: Path, small: Path) -> None:
+def test_a_report_of_a_smaller_copy_has_the_same_results(whole: Path, small: Path) -> None:
     found: list[dict[str, Any]] = []
     for log in (whole, small):
         done = lowfc("report", log, "--json", *(["--out", log.with_suffix(".html")] if log is small else []))

@@ -14,7 +14,7 @@ from lowfc.contract.configuration import load
 from lowfc.contract.sections import SensorSection
 from lowfc.design.fisher import cramer_rao, quantum_information, variance_e
 from lowfc.design.full_light import Focus, FullLight, sweep
-from lowfc.design.goal import Goal, figures, merit
+from lowfc.design.goal import Goal, merit, predictions
 from lowfc.design.merit import contrast_noise
 from lowfc.design.paper import STAR, TABLE4_EXPOSURE_S
 from lowfc.optics.chain.added_contrast import contrast_form
@@ -92,7 +92,7 @@ def test_prediction_of_a_candidate_agrees_with_the_full_chain(name, focus, modes
     assert merit(one, Goal("contrast", "weighted")) == contrast_noise(one.forms, central, "weighted")
     measured = {"zwfs_tuned": 9.0e-4, "clowfs_tuned": 1.4e-3}[name]  # second order alone, plain pseudo-inverse
     assert one.nonlinearity_waves(14) == pytest.approx(measured, rel=0.2)
-    assert figures(one)["table3_waves"]["pinv"]["14"] > one.nonlinearity_waves(14)
+    assert predictions(one)["table3_waves"]["pinv"]["14"] > one.nonlinearity_waves(14)
 
 
 def test_sweep_finds_the_minimum_between_its_values():

@@ -1,4 +1,4 @@
-"""Predicted figures of aperture masks, and the search for better ones."""
+"""Predicted performance of aperture masks, and the search for better ones."""
 
 import json
 from dataclasses import replace
@@ -13,7 +13,7 @@ from lowfc.adapters.files.layouts import load_layout
 from lowfc.adapters.files.sensors import load_pupil
 from lowfc.contract.sections import SensorSection
 from lowfc.design import sam_search
-from lowfc.design.goal import MERITS, Goal, figures, merit, paper_ratios
+from lowfc.design.goal import MERITS, Goal, merit, paper_ratios, predictions
 from lowfc.design.merit import contrast_noise, covariance_nm2, table3_waves
 from lowfc.design.sam_merit import TABLE3_NONLINEARITY_WAVES, Mask, build_optics, hole_fields, signal
 from lowfc.design.sam_search import BLOCK, Bounds, advance, holes, images, start
@@ -88,7 +88,7 @@ def test_sum_over_holes_agrees_with_the_field_of_the_full_chain(pupil, modes):
 
 
 def test_predictions_agree_with_the_full_chain(pupil, modes, layout, fields, optics):
-    predicted = figures(Mask(optics, fields))
+    predicted = predictions(Mask(optics, fields))
     mask = transmission(layout, 512)
     I0, H = full_chain(pupil, modes, mask, 550.0)
     open_ = modes[:, pupil > 0.5]
@@ -113,7 +113,7 @@ def test_predictions_agree_with_the_full_chain(pupil, modes, layout, fields, opt
 
 def test_merits_agree_with_their_definitions(optics, fields):
     mask = Mask(optics, fields)
-    predicted = figures(mask)
+    predicted = predictions(mask)
     tilt = max(predicted["table4_mas"]["pinv"]["2"])
     expected = {
         "paper": max(paper_ratios(mask).values()),

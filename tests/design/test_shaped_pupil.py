@@ -20,8 +20,8 @@ from lowfc.design.linear_program import NotSolvedError
 from lowfc.design.shaped_pupil import (
     Request,
     exchange,
-    figures,
     is_feasible,
+    properties,
     relative_field,
     stored,
 )
@@ -60,8 +60,8 @@ def test_field_agrees_with_the_sensor_transform():
     np.testing.assert_allclose(relative_field(quarter, axis), field, atol=1e-12)
 
 
-def test_figures_of_the_open_circle():
-    found = figures(circle(512)[256:, 256:], Request())
+def test_properties_of_the_open_circle():
+    found = properties(circle(512)[256:, 256:], Request())
     assert found.open_area_fraction == pytest.approx(1.0, abs=1e-3)
     assert found.energy_fraction == found.open_area_fraction
     encircled = 1.0 - j0(4 * np.pi) ** 2 - j1(4 * np.pi) ** 2
@@ -112,7 +112,7 @@ def test_command_writes_a_mask_that_meets_the_contrast_between_the_points(tmp_pa
         request = Request(**json.loads(str(file["made_by"])))
         quarter = file["quarter"].astype(float)
     assert request == Request(outer=8.0, cells=64)
-    assert figures(quarter, request).max_contrast == result["max_contrast"] <= request.contrast
+    assert properties(quarter, request).max_contrast == result["max_contrast"] <= request.contrast
     axis, field = image_of(quarter, 30, 8)
     zone = in_zone(request, axis)
     assert (np.abs(field[zone]) ** 2).max() < 1.1 * request.contrast
@@ -222,7 +222,7 @@ def recorded():
 def test_packaged_mask_meets_its_recorded_request():
     quarter, request = recorded()
     assert request == Request()
-    found = figures(quarter, request)
+    found = properties(quarter, request)
     assert found.max_contrast <= request.contrast == 1e-9
     assert found.open_area_fraction > 0.26
 

@@ -84,8 +84,8 @@ class Bench:
         self.process.stdin.flush()
 
     def stopped(self) -> dict[str, float]:
-        figures: dict[str, float] = json.loads(self.process.communicate("stop\n", timeout=60)[0])
-        return figures
+        results: dict[str, float] = json.loads(self.process.communicate("stop\n", timeout=60)[0])
+        return results
 
     def close(self) -> None:
         self.process.kill()
@@ -210,7 +210,7 @@ def test_a_minute_at_500_hz_loses_no_frame_and_matches_the_simulated_loop(folder
                 state = client.status().state
         assert not [event for event in bench.events if "FRAMES" in event and "LATE" not in event]
         assert sum(one.count for one in state.counts) < 0.01 * state.frames_used  # late frames
-        figures = bench.stopped()
+        results = bench.stopped()
     config = '[disturbance]\npreset = "bench"\n[control]\ntilt_gain = 0.5\ngain = 0.2\n'
     direct = loop(folder, "--no-record", "--rate", "500", "--duration", "60", config=config)
-    assert figures["residual_rms_nm"] == pytest.approx(direct["residual_rms_nm"], rel=0.05)
+    assert results["residual_rms_nm"] == pytest.approx(direct["residual_rms_nm"], rel=0.05)

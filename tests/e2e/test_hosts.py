@@ -185,12 +185,12 @@ def test_a_log_of_several_hosts_says_how_far_its_latencies_can_be_trusted(bench:
     log = next(path for path in (desk.folder / "logs").iterdir() if path.suffix == ".mcap")
     told = desk.run("-m", "lowfc", "latency", str(log), "--json", timeout_s=90)
     assert told.returncode == 0, told.stderr
-    figures = json.loads(told.stdout)
-    bound_us = figures["host"]["clock_error_us"]
+    results = json.loads(told.stdout)
+    bound_us = results["host"]["clock_error_us"]
     assert bound_us > 0
     # by the hosts' own clocks, frames would come 287 ms before they are sent, and the mirror 3 s after them
     for span in ("frame_to_command", "frame_to_mirror", "command_to_mirror"):
-        assert -bound_us < figures["latency_us"][span]["p50"] < 100_000
+        assert -bound_us < results["latency_us"][span]["p50"] < 100_000
     text = desk.run("-m", "lowfc", "latency", str(log), timeout_s=90)
     assert "on several hosts, with the measured offsets of their clocks" in text.stdout + text.stderr
     assert desk.run("-m", "lowfc", "ctl", "record", "start", "--run", RUN).returncode == 0

@@ -39,10 +39,10 @@ def test_two_runs_with_one_seed_write_the_same_bytes_and_have_one_digest(tmp_pat
         folder.mkdir()
         seed, frames = ("8", 50) if name == "other" else ("7", 600)
         length = ("--duration", str(frames / 250), "--seed", seed)
-        figures = loop(folder, "--lockstep", *length, "--disturbance", "bench")
-        assert figures["frames_published"] == figures["commands_applied"] == frames
-        assert figures["messages_lost"] == 0
-        logs.append(payloads(figures["log"]))
+        results = loop(folder, "--lockstep", *length, "--disturbance", "bench")
+        assert results["frames_published"] == results["commands_applied"] == frames
+        assert results["messages_lost"] == 0
+        logs.append(payloads(results["log"]))
         infos.append(json.loads(output_of(folder, "lowfc info last --digest --json")))
     digests = [info["digest"] for info in infos]
     assert digests[0] == digests[1] != digests[2]
@@ -67,13 +67,13 @@ def test_the_residual_is_the_predicted_one(tmp_path: Path, frames: int) -> None:
 
     Beyond 10 mas the sensor's optical gain drops (0.92 at 14 mas), so that this holds for small tilts only.
     """
-    figures = loop(
+    results = loop(
         tmp_path, "--lockstep", "--duration", str(frames / 1000), "--no-record", config=GENTLE, timeout_s=200
     )
-    assert figures["frames_published"] == figures["commands_applied"] == frames
-    assert figures["tilt_disturbance_mas"] == pytest.approx(5, rel=0.15)
+    assert results["frames_published"] == results["commands_applied"] == frames
+    assert results["tilt_disturbance_mas"] == pytest.approx(5, rel=0.15)
     predicted_mas = tilt_residual_mas(load(tmp_path / "test.toml"), delay_frames=1.0)
-    assert figures["tilt_residual_mas"] == pytest.approx(predicted_mas, rel=0.1)
+    assert results["tilt_residual_mas"] == pytest.approx(predicted_mas, rel=0.1)
 
 
 @pytest.mark.slow
@@ -109,9 +109,9 @@ static_nm = {{ {", ".join(f'"{noll}" = {nm}' for noll, nm in STATIC_NM.items())}
 
 @pytest.mark.parametrize("sensor", ["zwfs", *(pytest.param(one, marks=pytest.mark.slow) for one in ("clowfs", "bar"))])
 def test_every_mode_of_a_static_wavefront_is_removed(tmp_path: Path, sensor: str) -> None:
-    figures = loop(tmp_path, "--lockstep", "--duration", "0.6", "--sensor", sensor, config=STILL)
-    assert figures["frames_published"] == figures["commands_applied"] == 150
-    truths = [wire.Truth.FromString(payload) for payload in payloads(figures["log"])["/lowfc/sim/truth"]]
+    results = loop(tmp_path, "--lockstep", "--duration", "0.6", "--sensor", sensor, config=STILL)
+    assert results["frames_published"] == results["commands_applied"] == 150
+    truths = [wire.Truth.FromString(payload) for payload in payloads(results["log"])["/lowfc/sim/truth"]]
     first, last = truths[0], truths[-50:]
     np.testing.assert_allclose(first.residual_nm[:14], list(STATIC_NM.values()), atol=0.1)
     left_nm = np.mean([truth.residual_nm[:14] for truth in last], axis=0)
@@ -121,10 +121,10 @@ def test_every_mode_of_a_static_wavefront_is_removed(tmp_path: Path, sensor: str
 
 def test_stored_light_budgets_match_the_sensors() -> None:
     assert set(SENSORS) < set(measured("sensors")["sensors"])
-    for name, figures in measured("sensors")["sensors"].items():
+    for name, results in measured("sensors")["sensors"].items():
         budget = light_budget(sensor_named(name))
-        assert budget.total == pytest.approx(figures["light"], rel=1e-6), name
-        assert budget.peak == pytest.approx(figures["peak"], rel=1e-6), name
+        assert budget.total == pytest.approx(results["light"], rel=1e-6), name
+        assert budget.peak == pytest.approx(results["peak"], rel=1e-6), name
 
 
 def test_a_loop_with_the_output_of_config_show_starts_closed(tmp_path: Path) -> None:

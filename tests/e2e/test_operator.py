@@ -22,7 +22,7 @@ from lowfc.client import Client, running
 from lowfc.client.requests import DECLARED
 from lowfc.contract.errors import CalibrationError, RequestRefusedError
 from lowfc.contract.messages import COMMAND, EVENT, REQUEST, Log, wire
-from lowfc.control.laws.linear_law import integrator_block, of_blocks
+from lowfc.control.laws.linear_law import integrator_block, law_from_blocks
 from lowfc.control.loop.requests import REQUESTS
 from lowfc.control.loop.safety import Limits
 from lowfc.programs.cli.ctl import ctl_app
@@ -44,7 +44,7 @@ class Night:
     process: "Popen[str]"
     name: str = ""
     said: dict[str, str] = field(default_factory=dict)
-    figures: dict[str, object] = field(default_factory=dict)
+    results: dict[str, object] = field(default_factory=dict)
     logs: list[Path] = field(default_factory=list)
 
     def ctl(self, command: str) -> str:
@@ -57,8 +57,8 @@ class Night:
     def end(self) -> None:
         out, complaints = interrupt(self.process)
         assert self.process.returncode == 0, complaints
-        self.figures = json.loads(out)
-        self.logs = [self.folder / name for name in self.figures["logs"]]  # type: ignore[attr-defined]
+        self.results = json.loads(out)
+        self.logs = [self.folder / name for name in self.results["logs"]]  # type: ignore[attr-defined]
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +98,7 @@ def _ready(night: Night) -> None:
     calibration_file.save(calibration, night.folder / "calibration.fits")
     delay = status.settings.delay_frames
     blocks = [integrator_block(0.2, 0.001, "pol", delay)] * len(calibration.noll)
-    law_file.save(of_blocks(blocks, "pol", "leaky", calibration.noll, delay, 200.0), night.folder / "law.fits")
+    law_file.save(law_from_blocks(blocks, "pol", "leaky", calibration.noll, delay, 200.0), night.folder / "law.fits")
     rows, columns = np.indices(calibration.grid)
     np.save(night.folder / "shape.npy", 3.0 * np.sin(rows / 3) * np.cos(columns / 4))
 
@@ -225,8 +225,8 @@ def test_the_programs_of_the_document_run(night: Night) -> None:
 
 
 def test_the_log_has_every_request_and_nothing_was_lost(night: Night) -> None:
-    assert night.figures["messages_lost"] == 0
-    assert night.figures["recording_failure"] is None
+    assert night.results["messages_lost"] == 0
+    assert night.results["recording_failure"] is None
     assert len(night.logs) == 3, "the recording was stopped and started twice"
     messages = [payloads(log) for log in night.logs]
     requests = [wire.Request.FromString(body) for found in messages for body in found.get(f"/{REQUEST.key}", [])]
@@ -276,6 +276,6 @@ def test_the_night_is_replayed_to_the_bit(night: Night) -> None:
         assert found["identical"]
         assert found["largest_difference_nm"] == 0
         commands += found["commands"]
-    frames = night.figures["frames_processed"]
+    frames = night.results["frames_processed"]
     assert isinstance(frames, int)
     assert commands > 0.6 * frames, "all but those before the second log's first state"

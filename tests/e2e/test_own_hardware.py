@@ -105,12 +105,12 @@ def conformance(folder: Path, *commands: str) -> None:
     for line, process in zip(commands, checking, strict=True):
         out, complaints = process.communicate(timeout=60)
         assert process.returncode == 0, f"{line}: {out} {complaints}"
-        figures = json.loads(out)
-        assert f"--run {figures['run']}" in line
-        assert figures["device"] in line or figures["device"] == "mirror-dm"
-        assert figures["counts"]["wrong"] == 0
-        assert {"clear", "relaxing"}.isdisjoint(one["name"] for one in figures["checks"] if one["status"] != "ok")
-        assert figures["counts"]["ok"] >= len(figures["checks"]) - 5  # of a busy host: warnings
+        results = json.loads(out)
+        assert f"--run {results['run']}" in line
+        assert results["device"] in line or results["device"] == "mirror-dm"
+        assert results["counts"]["wrong"] == 0
+        assert {"clear", "relaxing"}.isdisjoint(one["name"] for one in results["checks"] if one["status"] != "ok")
+        assert results["counts"]["ok"] >= len(results["checks"]) - 5  # of a busy host: warnings
 
 
 def test_the_loop_closes_on_a_camera_and_a_mirror_of_ones_own(bench: Path) -> None:
@@ -216,10 +216,10 @@ def test_a_camera_of_another_size_comes_to_a_closed_loop(bench: Path, own: bool)
         assert process.returncode == 0, shown
         for number in range(1, 11):
             assert f"[{number}/10]" in shown
-        figures = json.loads(out)
-        assert figures["recommended"]
-        assert figures["delay_frames"] == pytest.approx(1, abs=0.1)
-        assert figures["measured_error_nm"] == pytest.approx(figures["predicted_error_nm"], rel=0.15)
+        results = json.loads(out)
+        assert results["recommended"]
+        assert results["delay_frames"] == pytest.approx(1, abs=0.1)
+        assert results["measured_error_nm"] == pytest.approx(results["predicted_error_nm"], rel=0.15)
         with Client("bench") as client:
             state = client.status().state
             assert state.mode_cause == "asked to close for lowfc commission"

@@ -44,8 +44,8 @@ main()
 def replayed(folder: Path, *logs: Path) -> dict[str, Any]:
     done = run(folder, "replay", "--json", *map(str, logs))
     assert done.returncode == 0, done.stdout + done.stderr
-    figures: dict[str, Any] = json.loads(done.stdout)
-    return figures
+    results: dict[str, Any] = json.loads(done.stdout)
+    return results
 
 
 class Night:
@@ -113,11 +113,11 @@ def test_operators_a_restart_dropped_frames_and_rotation(night: Night, tmp_path:
     for name in ("camera", "controller", "mirror-dm", "recorder"):  # from the source of the data to its end
         night.end(name)
     logs = sorted((tmp_path / "logs").iterdir())
-    figures = replayed(tmp_path, *logs)
-    assert (figures["identical"], figures["different"], figures["largest_difference_nm"]) == (True, 0, 0.0)
-    assert figures["frames"] + figures["unchecked"] == steps_of(*logs) > 500
-    assert figures["unchecked"] < 5, figures["unchecked_because"]  # what the kill cut off
-    assert figures["requests"] == 4
+    results = replayed(tmp_path, *logs)
+    assert (results["identical"], results["different"], results["largest_difference_nm"]) == (True, 0, 0.0)
+    assert results["frames"] + results["unchecked"] == steps_of(*logs) > 500
+    assert results["unchecked"] < 5, results["unchecked_because"]  # what the kill cut off
+    assert results["requests"] == 4
     events = [message.payload for log in logs for message in LogReader(log, topics=[EVENT])]
     for name in (b"FRAMES_MISSING", b"MIRROR_ADOPTED"):
         assert any(name in payload for payload in events)
@@ -127,9 +127,9 @@ def test_operators_a_restart_dropped_frames_and_rotation(night: Night, tmp_path:
 
 def test_a_minute_at_a_kilohertz_is_lossless_and_identical(tmp_path: Path) -> None:
     words = ("--rate", "1000", "--duration", "60", "--disturbance", "reaction-wheel")
-    figures = loop(tmp_path, *words, timeout_s=200)
-    assert figures["messages_lost"] == 0
-    again = replayed(tmp_path, figures["log"])
+    results = loop(tmp_path, *words, timeout_s=200)
+    assert results["messages_lost"] == 0
+    again = replayed(tmp_path, results["log"])
     assert again["identical"]
-    assert again["frames"] == figures["frames_processed"]
+    assert again["frames"] == results["frames_processed"]
     assert again["unchecked"] == 0

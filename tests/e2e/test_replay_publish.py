@@ -83,12 +83,12 @@ def start(log: Path, run: Run, *options: str) -> "subprocess.Popen[str]":
     return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
-def figures_of(process: "subprocess.Popen[str]", status: int = 0) -> dict[str, Any]:
+def results_of(process: "subprocess.Popen[str]", status: int = 0) -> dict[str, Any]:
     output, complaints = process.communicate(timeout=60)
     assert process.returncode == status, complaints
-    figures: dict[str, Any] = json.loads(output)
-    assert render(figures)
-    return figures
+    results: dict[str, Any] = json.loads(output)
+    assert render(results)
+    return results
 
 
 def test_a_subscriber_receives_the_log_in_order_and_at_its_rate(
@@ -99,7 +99,7 @@ def test_a_subscriber_receives_the_log_in_order_and_at_its_rate(
     until(lambda: tool.heard[FRAME.key] or playing.poll() is not None)
     (calibration,) = tool.bus.get(CALIBRATION.key)
     (camera,) = tool.bus.get(CAMERA_STATE.key)
-    figures = figures_of(playing)
+    results = results_of(playing)
 
     assert calibration.payload == logged[CALIBRATION.key][-1].payload
     assert camera.sequence in [message.sequence for message in logged[CAMERA_STATE.key]]
@@ -120,13 +120,13 @@ def test_a_subscriber_receives_the_log_in_order_and_at_its_rate(
     command = COMMAND.at("dm")
     assert logged[command]
     assert command not in tool.heard
-    assert "allow-commands" in figures["left_out"][command]
+    assert "allow-commands" in results["left_out"][command]
     assert HEALTH.at("recorder") not in tool.heard
     assert HEALTH.at("replay") in tool.heard
-    assert figures["published"][FRAME.key] == len(logged[FRAME.key])
-    assert figures["finished"]
-    assert not figures["interrupted"]
-    assert figures["timing_error_us"]["max"] >= figures["timing_error_us"]["p50"] > 0
+    assert results["published"][FRAME.key] == len(logged[FRAME.key])
+    assert results["finished"]
+    assert not results["interrupted"]
+    assert results["timing_error_us"]["max"] >= results["timing_error_us"]["p50"] > 0
 
 
 def test_a_truncated_log_is_published_faster_and_with_commands(log: Path, run: Run, tool: Tool, tmp_path: Path) -> None:
@@ -137,13 +137,13 @@ def test_a_truncated_log_is_published_faster_and_with_commands(log: Path, run: R
     for message in LogReader(cut):
         there[message.key].append(message.payload)
     assert len(there[COMMAND.at("dm")]) > 20
-    figures = figures_of(start(cut, run, "--speed", "4", "--topics", "/lowfc/mirror/*", "--allow-commands"))
+    results = results_of(start(cut, run, "--speed", "4", "--topics", "/lowfc/mirror/*", "--allow-commands"))
     for key in (COMMAND.at("dm"), MIRROR_STATE.at("dm")):
         assert [sample.payload for sample in tool.heard[key]] == there[key]
     others = {HEALTH.at("replay"), EVENT.key, COMMAND.at("dm"), MIRROR_STATE.at("dm")}
     assert {key for key in tool.heard if tool.heard[key]} <= others
-    assert not figures["finished"]
-    assert figures["took_s"] < figures["span_s"] * 0.9 or figures["messages_behind"]
+    assert not results["finished"]
+    assert results["took_s"] < results["span_s"] * 0.9 or results["messages_behind"]
 
 
 def test_a_live_controller_computes_the_recorded_errors(
@@ -156,11 +156,11 @@ def test_a_live_controller_computes_the_recorded_errors(
     playing = start(log, run, "--speed", "2", "--wait-for", "controller")
     controller = subprocess.Popen([*LOWFC, "controller", "--run", run.run_id, *files], stderr=subprocess.DEVNULL)
     try:
-        figures = figures_of(playing)
+        results = results_of(playing)
     finally:
         controller.terminate()
         controller.wait(10)
-    assert figures["left_out"][STEP.key] == "controller is live"
+    assert results["left_out"][STEP.key] == "controller is live"
 
     recorded = [wire.ControlStep.FromString(message.payload) for message in logged[STEP.key]]
     errors = {step.frame_sequence: list(step.error_nm) for step in recorded}
@@ -179,11 +179,11 @@ def test_ctrl_c_prints_the_summary_and_the_mirrors_role_is_taken_until_then(log:
     with pytest.raises(BusError, match="mirror-dm"):
         ZenohBus(run.links, "mirror-dm", HostClock())
     playing.send_signal(signal.SIGINT)
-    figures = figures_of(playing, INTERRUPTED)
-    assert figures["interrupted"]
-    assert set(figures["published"]) == {FRAME.key}
-    assert 0 < figures["published"][FRAME.key] < 80
-    assert "interrupted" in render(figures)
+    results = results_of(playing, INTERRUPTED)
+    assert results["interrupted"]
+    assert set(results["published"]) == {FRAME.key}
+    assert 0 < results["published"][FRAME.key] < 80
+    assert "interrupted" in render(results)
 
 
 def test_publishing_takes_over_the_roles_of_its_topics_and_with_frames_the_mirrors(run: Run) -> None:

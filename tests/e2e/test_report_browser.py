@@ -51,8 +51,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def figures(folder: Path) -> dict[str, Any]:
-    """Figures of a run with a request and a warning in it, from the command that writes the page too."""
+def results(folder: Path) -> dict[str, Any]:
+    """Results of a run with a request and a warning in it, from the command that writes the page too."""
     night = SyntheticLog()
     night.request("open")
     night.frames(150)
@@ -64,7 +64,7 @@ def figures(folder: Path) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def page(folder: Path, figures: dict[str, Any]) -> Iterator[Page]:
+def page(folder: Path, results: dict[str, Any]) -> Iterator[Page]:
     with browser(folder, (WIDTH, 1000)) as opened:
         opened.open((folder / "report.html").as_uri())
         yield opened
@@ -92,14 +92,14 @@ def test_every_picture_is_drawn_within_the_page(seen: dict[str, Any]) -> None:
     assert seen["overflow"] <= 0
 
 
-def test_the_text_contains_the_figures_of_the_json(seen: dict[str, Any], figures: dict[str, Any]) -> None:
-    text, budget = seen["text"], figures["error_budget"]
+def test_the_text_contains_the_values_of_the_json(seen: dict[str, Any], results: dict[str, Any]) -> None:
+    text, budget = seen["text"], results["error_budget"]
     headings = ("Wavefront", "Timing", "Spectra", "Error budget", "Light", "Mirror", "Events and requests", "What ran")
-    expected = [figures["verdict"]["heading"], *headings, figures["run"]["calibration"]["id"]]
-    expected += [check["text"] for check in figures["verdict"]["checks"]]
-    for mode in figures["residual"]["modes"]:
+    expected = [results["verdict"]["heading"], *headings, results["run"]["calibration"]["id"]]
+    expected += [check["text"] for check in results["verdict"]["checks"]]
+    for mode in results["residual"]["modes"]:
         expected += [f"Z{mode['noll']} {mode['name']}", f"{mode['error_rms_nm']:.3f}"]
-    expected += [f"{stage['p99']:.1f}" for stage in figures["timing"]["latency_us"].values()]
+    expected += [f"{stage['p99']:.1f}" for stage in results["timing"]["latency_us"].values()]
     expected += [term[key] for term in budget["terms"] for key in ("name", "how")]
     expected.append(f"{budget['true_residual']['rms_nm']['all modes']:.3f}")
     expected.append("rate_hz = 250.0")  # the configuration, folded

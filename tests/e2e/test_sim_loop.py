@@ -159,11 +159,11 @@ def test_two_loops_on_one_host_do_not_mix(tmp_path: Path) -> None:
     other = start(
         first, "sim-loop", "--rate", "100", "--duration", "4", "--seed", "1", "--json", "--disturbance", "quiet"
     )
-    figures = loop(second, "--rate", "100", "--duration", "4", "--seed", "2", "--disturbance", "quiet")
+    results = loop(second, "--rate", "100", "--duration", "4", "--seed", "2", "--disturbance", "quiet")
     said, complaints = other.communicate(timeout=60)
     assert other.returncode == 0, complaints
-    assert figures["frames_published"] == 400
-    assert len(payloads(figures["log"])["/lowfc/camera/frame"]) <= 400
+    assert results["frames_published"] == 400
+    assert len(payloads(results["log"])["/lowfc/camera/frame"]) <= 400
     assert '"frames_published": 400' in said
 
 
@@ -180,9 +180,9 @@ def test_a_log_at_the_file_size_limit_does_not_stop_the_loop(tmp_path: Path) -> 
         check=False,
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, small),
     )
-    figures = json.loads(done.stdout)
+    results = json.loads(done.stdout)
     assert done.returncode == 1, done.stderr
-    assert "File too large" in figures["recording_failure"]
-    assert figures["frames_published"] == 200
-    assert figures["frames_processed"] + figures["frames_skipped"] == 200
-    assert sum(figures["lost"].values()) == figures["messages_lost"] > 100
+    assert "File too large" in results["recording_failure"]
+    assert results["frames_published"] == 200
+    assert results["frames_processed"] + results["frames_skipped"] == 200
+    assert sum(results["lost"].values()) == results["messages_lost"] > 100

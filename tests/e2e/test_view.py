@@ -106,9 +106,9 @@ def test_the_loop_continues_when_its_view_is_killed(tmp_path: Path) -> None:
     out, err = process.communicate(timeout=60)
     assert process.returncode == 0, err
     assert "the loop continues without a view" in err
-    figures = json.loads(out)
-    assert figures["frames_processed"] >= 0.98 * figures["frames_published"] > 600
-    assert figures["messages_lost"] == 0
+    results = json.loads(out)
+    assert results["frames_processed"] >= 0.98 * results["frames_published"] > 600
+    assert results["messages_lost"] == 0
 
 
 def test_a_log_without_an_end_is_saved_as_a_valid_rrd_file(tmp_path: Path) -> None:

@@ -9,20 +9,20 @@ FEW, MANY = 8_000, 1_000_000
 
 
 @pytest.fixture(scope="module")
-def every(tmp_path_factory: pytest.TempPathFactory) -> list[Target]:
+def all_targets(tmp_path_factory: pytest.TempPathFactory) -> list[Target]:
     return targets(tmp_path_factory.mktemp("fuzz"))
 
 
-def test_undamaged_inputs_are_read(every: list[Target]) -> None:
+def test_undamaged_inputs_are_read(all_targets: list[Target]) -> None:
     """Otherwise all damaged inputs would be refused for the same trivial reason."""
-    for target in every:
+    for target in all_targets:
         for data in target.corpus:
             target.read(data)
 
 
 @pytest.mark.parametrize(("card", "damage"), [(b"KIND    = '", b"KIND    = &"), (b"XTENSION=", b"XTENSAON=")])
-def test_damaged_header_is_refused(every: list[Target], card: bytes, damage: bytes) -> None:
-    for target in every:
+def test_damaged_header_is_refused(all_targets: list[Target], card: bytes, damage: bytes) -> None:
+    for target in all_targets:
         for data in target.corpus if target.name in ("calibration file", "law file") else ():
             damaged = data.replace(card, damage)
             assert damaged != data
@@ -30,8 +30,8 @@ def test_damaged_header_is_refused(every: list[Target], card: bytes, damage: byt
                 target.read(damaged)
 
 
-def test_inputs_depend_only_on_their_number(every: list[Target]) -> None:
-    for target in every:
+def test_inputs_depend_only_on_their_number(all_targets: list[Target]) -> None:
+    for target in all_targets:
         assert target.input(5) == target.input(5)
         assert len({target.input(number) for number in range(20)}) > 1
 
@@ -50,20 +50,20 @@ def test_crashes_and_hangs_of_a_reader_are_found(monkeypatch: pytest.MonkeyPatch
     assert found["hangs"]
 
 
-def _check(every: list[Target], inputs: int) -> None:
-    counts = shares(every, inputs)
-    for target in every:
+def _check(all_targets: list[Target], inputs: int) -> None:
+    counts = shares(all_targets, inputs)
+    for target in all_targets:
         found = fuzz(target, range(counts[target.name]))
         assert found["crashes"] == [], target.name
         assert found["hangs"] == [], target.name
         assert found["grown_bytes"] < MAX_GROWTH_BYTES, target.name
 
 
-def test_damaged_inputs(every: list[Target]) -> None:
-    _check(every, FEW)
+def test_damaged_inputs(all_targets: list[Target]) -> None:
+    _check(all_targets, FEW)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_a_million_damaged_inputs(every: list[Target]) -> None:
-    _check(every, MANY)
+def test_a_million_damaged_inputs(all_targets: list[Target]) -> None:
+    _check(all_targets, MANY)

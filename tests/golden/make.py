@@ -28,7 +28,7 @@ from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import RequestRefusedError
 from lowfc.contract.messages import CAMERA_STATE, FRAME, MIRROR_STATE, STEP, TRUTH, image, timestamp, wire
 from lowfc.control.calibration.calibration import Calibration
-from lowfc.control.laws.linear_law import LinearLaw, integrator_block, of_blocks
+from lowfc.control.laws.linear_law import LinearLaw, integrator_block, law_from_blocks
 from lowfc.device import DriverOptions
 from lowfc.device.driver import CameraSettings, camera_state
 from lowfc.device.mirror_loop import MirrorLoop
@@ -163,7 +163,7 @@ def law(config: Configuration) -> LinearLaw:
     settings = factory.settings(config)
     delay, gains = settings.delay_frames, settings.integrator(config.noll).gain.astype(float).tolist()
     blocks = [integrator_block(gain, 0.01, "pol", delay) for gain in gains]
-    return of_blocks(blocks, "pol", "golden integrator", config.noll, delay, config.camera.rate_hz)
+    return law_from_blocks(blocks, "pol", "golden integrator", config.noll, delay, config.camera.rate_hz)
 
 
 def main(folder: Path) -> None:

@@ -48,7 +48,7 @@ PURE_MODULES = (
     "sim_camera.wheel",
     "sim_camera.disturbance",
     "sim_camera.faults",
-    "sim_camera.figures",
+    "sim_camera.wavefront_statistics",
 )
 PURE_IMPORTS = (
     *(

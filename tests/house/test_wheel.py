@@ -98,10 +98,10 @@ def test_installed_programs_run_the_loop(installed: Path, tmp_path: Path) -> Non
     assert succeed(installed / "lowfc", "--version", folder=tmp_path).strip() == lowfc.__version__
     assert {"lowfc", "sim-camera", "sim-dm"} <= {path.name for path in installed.iterdir()}
     words = ("sim-loop", "--lockstep", "--duration", "1", "--json")
-    figures = json.loads(succeed(installed / "lowfc", *words, folder=tmp_path))
+    results = json.loads(succeed(installed / "lowfc", *words, folder=tmp_path))
     frames = round(Configuration().camera.rate_hz)
-    assert figures["frames_processed"] == figures["commands_applied"] == frames > 0
-    assert figures["messages_lost"] == 0
+    assert results["frames_processed"] == results["commands_applied"] == frames > 0
+    assert results["messages_lost"] == 0
 
 
 @pytest.mark.slow

@@ -54,10 +54,10 @@ def test_interlocks_with_changing_flooding_and_missing_values(tmp_path: Path) ->
         raise
     out, complaints = interrupt(process)
     assert process.returncode == 0, complaints
-    figures = json.loads(out)
-    assert figures["frames_missing"] == figures["messages_lost"] == 0
-    assert figures["frames_skipped"] <= 3, "a stall of the host skips a few, a flood would skip hundreds"
-    log = tmp_path / figures["log"]
+    results = json.loads(out)
+    assert results["frames_missing"] == results["messages_lost"] == 0
+    assert results["frames_skipped"] <= 3, "a stall of the host skips a few, a flood would skip hundreds"
+    log = tmp_path / results["log"]
     replayed = json.loads(output_of(tmp_path, f"lowfc replay --json {log}"))
     assert replayed["identical"]
     assert replayed["unchecked"] == 0

@@ -97,9 +97,9 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_csv(log: Path, tmp_path: Path) -> None:
-    figures = export_log(log, Format.CSV, tmp_path / "out.csv", console=QUIET)
-    assert figures["files"] == [str(tmp_path / "out.csv")]
-    assert (figures["steps"], figures["modes"], figures["finished"]) == (STEPS, MODES, True)
+    results = export_log(log, Format.CSV, tmp_path / "out.csv", console=QUIET)
+    assert results["files"] == [str(tmp_path / "out.csv")]
+    assert (results["steps"], results["modes"], results["finished"]) == (STEPS, MODES, True)
     with (tmp_path / "out.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert [int(row["sequence"]) for row in rows] == SEQUENCES
@@ -119,9 +119,9 @@ def test_csv(log: Path, tmp_path: Path) -> None:
 
 
 def test_npz(log: Path, tmp_path: Path) -> None:
-    figures = export_log(log, Format.NPZ, tmp_path / "out.npz", frames=True, console=QUIET)
-    assert figures["files"] == [str(tmp_path / "out.npz"), str(tmp_path / "out.frames.npy")]
-    assert figures["frames"] == STEPS
+    results = export_log(log, Format.NPZ, tmp_path / "out.npz", frames=True, console=QUIET)
+    assert results["files"] == [str(tmp_path / "out.npz"), str(tmp_path / "out.frames.npy")]
+    assert results["frames"] == STEPS
     with np.load(tmp_path / "out.npz", allow_pickle=False) as found:
         for name in ("sequence", "frame_sequence"):
             np.testing.assert_array_equal(found[name], SEQUENCES)
@@ -208,11 +208,11 @@ def test_aot(log: Path, tmp_path: Path) -> None:
 def test_a_truncated_log_without_truth_is_exported(tmp_path: Path, to: Format) -> None:
     part = written(tmp_path / "cut.mcap", TRUTH, finish=False)
     part.write_bytes(part.read_bytes()[:-2000])
-    figures = export_log(part, to, console=QUIET)
-    assert figures["files"] == [str(tmp_path / f"cut.{'aot.fits' if to is Format.AOT else to}")]
-    assert 0 < figures["steps"] < STEPS
-    assert not figures["finished"]
-    assert "truncated" in render(figures)
+    results = export_log(part, to, console=QUIET)
+    assert results["files"] == [str(tmp_path / f"cut.{'aot.fits' if to is Format.AOT else to}")]
+    assert 0 < results["steps"] < STEPS
+    assert not results["finished"]
+    assert "truncated" in render(results)
     if to is Format.CSV:
         heading = (tmp_path / "cut.csv").read_text().splitlines()[0]
         assert "error_z2_nm" in heading
@@ -291,12 +291,12 @@ def test_frames_are_not_held_in_memory(tmp_path: Path, to: Format) -> None:
     big = night.write(tmp_path / "big.mcap")
     export_log(big, to, tmp_path / "warm.out", console=QUIET)  # warm up the imports
     tracemalloc.start()
-    figures = export_log(big, to, tmp_path / "out.out", frames=True, console=QUIET)
+    results = export_log(big, to, tmp_path / "out.out", frames=True, console=QUIET)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert figures["frames"] == frames
+    assert results["frames"] == frames
     size = frames * shape[0] * shape[1] * 2
-    assert sum(Path(file).stat().st_size for file in figures["files"]) > size > 2 * peak
+    assert sum(Path(file).stat().st_size for file in results["files"]) > size > 2 * peak
 
 
 def test_a_loop_mode_of_a_newer_version_is_exported_by_its_number(tmp_path: Path) -> None:

@@ -41,21 +41,21 @@ def test_a_replay_is_identical_except_for_rules_that_changed_on_purpose(
     log: Path, frames: int, changed: dict[str, int]
 ) -> None:
     # Linear algebra rounds differently on another processor; on the same one there must be no difference.
-    figures = json_of("replay", log, "--tolerance", 1e-3)
-    assert (figures["frames"], figures["different"], figures["unchecked"]) == (frames, 0, 0)
-    assert {rule.split()[0]: count for rule, count in figures["rules_changed"].items()} == changed
-    if not {"blas", "cpu_features", "numpy"} & figures["host_differs"].keys():
-        assert (figures["identical"], figures["largest_difference_nm"]) == (True, 0.0)
+    results = json_of("replay", log, "--tolerance", 1e-3)
+    assert (results["frames"], results["different"], results["unchecked"]) == (frames, 0, 0)
+    assert {rule.split()[0]: count for rule, count in results["rules_changed"].items()} == changed
+    if not {"blas", "cpu_features", "numpy"} & results["host_differs"].keys():
+        assert (results["identical"], results["largest_difference_nm"]) == (True, 0.0)
 
 
 def test_another_blas_kernel_differs_only_by_rounding() -> None:
     words = [sys.executable, "-m", "lowfc", "replay", str(NIGHT), "--json", "--tolerance", "1e-3"]
     environment = os.environ | {"OPENBLAS_CORETYPE": "Prescott"}  # SSE3: every processor has it
     done = subprocess.run(words, capture_output=True, text=True, env=environment, check=False)
-    figures = json.loads(done.stdout)
-    assert (done.returncode, figures["different"], figures["first_difference"]) == (0, 0, None)
-    if "blas" in figures["host_differs"]:
-        assert 0 < figures["largest_difference_nm"] < 1e-4
+    results = json.loads(done.stdout)
+    assert (done.returncode, results["different"], results["first_difference"]) == (0, 0, None)
+    if "blas" in results["host_differs"]:
+        assert 0 < results["largest_difference_nm"] < 1e-4
 
 
 @pytest.mark.parametrize("log", [NIGHT, KILLED])
@@ -94,14 +94,14 @@ def test_a_log_of_0_1_is_drawn(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "sentence"),
+    ("words", "message"),
     [
         (["tune", NIGHT, "--out", "law.fits"], "tuning requires at least"),
         (["acceptance", "linearity", NIGHT], "no `lowfc acceptance"),
     ],
 )
-def test_commands_that_need_a_longer_log_say_so(words: list[object], sentence: str) -> None:
-    assert sentence in str(lowfc(*words).exception)
+def test_commands_that_need_a_longer_log_say_so(words: list[object], message: str) -> None:
+    assert message in str(lowfc(*words).exception)
 
 
 def test_the_log_of_0_1_has_every_kind_of_input() -> None:

@@ -46,7 +46,7 @@ def test_an_invalid_step_is_left_out_of_every_column(tmp_path: Path, change: Cal
     night.frames(STEPS)
     change_one(night, STEP, change)
     steps = (history := history_of(night, tmp_path / "x.mcap")).steps
-    assert history.left_out == 1
+    assert history.excluded_messages == 1
     assert {len(getattr(steps, column)) for column in steps.__slots__} == {STEPS - 1}
     assert np.isfinite(steps.error_nm).all()
     assert len(history.truths.sequence) == len(history.mirror.sequence) == STEPS
@@ -57,7 +57,7 @@ def test_a_repeated_reason_sets_one_bit(tmp_path: Path) -> None:
     night.frames(STEPS)
     change_one(night, STEP, lambda step: step.reasons.extend([62, 62, 5]))
     history = history_of(night, tmp_path / "x.mcap")
-    assert history.left_out == 0
+    assert history.excluded_messages == 0
     assert history.steps.reasons.max() == 1 << 62 | 1 << 5
 
 
@@ -94,5 +94,5 @@ def test_a_message_with_an_impossible_time_is_left_out(tmp_path: Path) -> None:
     night.frames(STEPS)
     night.put(EVENT, wire.Tick(), late_ns=(1 << 63) - night.now_ns)
     history = history_of(night, tmp_path / "x.mcap")
-    assert history.left_out == 1
+    assert history.excluded_messages == 1
     assert history.span_ns[1] < 1 << 62

@@ -106,7 +106,7 @@ def test_info_reports_what_was_written(log: Path) -> None:
     }
 
 
-def test_the_text_has_the_same_figures(log: Path) -> None:
+def test_the_text_has_the_same_numbers(log: Path) -> None:
     text = lowfc("info", log).stdout
     for words in (
         "complete",

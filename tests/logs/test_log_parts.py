@@ -132,11 +132,11 @@ OF_FILES = {
 }
 
 
-def without_files(figures: Any) -> Any:
-    """Figures without those that depend on the files or on the time taken."""
-    if isinstance(figures, dict):
-        return {key: without_files(value) for key, value in figures.items() if key not in OF_FILES}
-    return figures
+def without_files(results: Any) -> Any:
+    """Results without those that depend on the files or on the time taken."""
+    if isinstance(results, dict):
+        return {key: without_files(value) for key, value in results.items() if key not in OF_FILES}
+    return results
 
 
 @pytest.fixture(scope="module")
@@ -150,16 +150,16 @@ def ten_files_and_one(tmp_path_factory: pytest.TempPathFactory, samples: list[Sa
 
 
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
-def test_every_command_gives_the_same_figures_for_ten_files_as_for_one(
+def test_every_command_gives_the_same_results_for_ten_files_as_for_one(
     ten_files_and_one: Path, monkeypatch: pytest.MonkeyPatch, words: list[str]
 ) -> None:
     monkeypatch.chdir(ten_files_and_one)
-    figures = []
+    results = []
     for log in (LAST, f"one/{LAST}"):
         done = lowfc(words[0], log, *words[1:], "--json")
         assert done.exit_code == 0, (done.output, done.exception)
-        figures.append(without_files(json.loads(done.stdout)))
-    assert figures[0] == figures[1]
+        results.append(without_files(json.loads(done.stdout)))
+    assert results[0] == results[1]
 
 
 def test_acceptance_reads_several_files(folder: Path, samples: list[Sample]) -> None:

@@ -1,4 +1,4 @@
-"""The report of a run: its figures against a log whose content is known, and a page for every kind of log."""
+"""The report of a run: its results against a log whose content is known, and a page for every kind of log."""
 
 import json
 import re
@@ -18,8 +18,8 @@ from lowfc.control.laws.error_budget import sensor_noise
 from lowfc.control.loop.state import State
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.logs.report import closed_loop, drawings
-from lowfc.programs.logs.report.figures import report_of
 from lowfc.programs.logs.report.page import NOT_HERE, page
+from lowfc.programs.logs.report.results import report_of
 from lowfc.programs.logs.report.source import read_run
 from tests.support import report_log
 from tests.support.loops import lowfc
@@ -29,8 +29,8 @@ from tests.support.theory import noise_gain, rejection
 RATE_HZ = 1000.0
 
 
-def figures(log: Path) -> dict[str, Any]:
-    found = report_of(read_run(log)).figures
+def results(log: Path) -> dict[str, Any]:
+    found = report_of(read_run(log)).results
     json.dumps(found, allow_nan=False)
     return found
 
@@ -54,7 +54,7 @@ def eventful(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     counts = [wire.TopicCount(topic=FRAME.key, received=2244, skipped=4, missing=2)]
     night.health("controller", topics=counts, state="stopped")
     night.health("camera", commands_late=3, state="stopped")
-    return figures(night.write(tmp_path_factory.mktemp("eventful") / "night.mcap"))
+    return results(night.write(tmp_path_factory.mktemp("eventful") / "night.mcap"))
 
 
 def test_modes_laws_and_requests_are_listed(eventful: dict[str, Any]) -> None:
@@ -218,17 +218,17 @@ def test_the_state_of_the_log_is_in_the_verdict(
 ) -> None:
     log = make(good, tmp_path)
     made = report_of(read_run(log))
-    check = made.figures["verdict"]["checks"][0]
+    check = made.results["verdict"]["checks"][0]
     assert (check["name"], check["level"], check["text"].partition(", unreadable")[0]) == ("log", level, text)
-    assert (made.figures["log"]["complete"], made.figures["log"]["finished"]) == (complete, make is not cut_off)
-    assert 0 < made.figures["run"]["steps"] <= 1500
-    assert made.figures["verdict"]["level"] == level
-    assert made.figures["verdict"]["because"] == ("" if level == "good" else check["text"])
+    assert (made.results["log"]["complete"], made.results["log"]["finished"]) == (complete, make is not cut_off)
+    assert 0 < made.results["run"]["steps"] <= 1500
+    assert made.results["verdict"]["level"] == level
+    assert made.results["verdict"]["because"] == ("" if level == "good" else check["text"])
 
 
 def test_only_the_end_of_a_very_long_stretch_is_analysed(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(closed_loop, "MAX_STEPS", 400)
-    stretch = figures(good)["closed_stretch"]
+    stretch = results(good)["closed_stretch"]
     assert stretch["frames"] == 400
     assert stretch["steps_settling"] + stretch["steps_earlier"] == 1100
     assert stretch["to_s"] == pytest.approx(1.499)
@@ -240,8 +240,8 @@ def test_a_log_without_a_step_still_has_a_page(tmp_path: Path, empty: bool) -> N
     if empty:
         night.samples.clear()
     made = report_of(read_run(night.write(tmp_path / "x.mcap", config=not empty)))
-    assert made.figures["verdict"]["level"] == "bad"
-    assert made.figures["verdict"]["because"] == "this log has no control steps"
+    assert made.results["verdict"]["level"] == "bad"
+    assert made.results["verdict"]["because"] == "this log has no control steps"
     assert "This log has no control steps" in page(made)
 
 
@@ -249,7 +249,7 @@ def test_a_log_without_a_step_still_has_a_page(tmp_path: Path, empty: bool) -> N
 def test_imperfections_of_the_simulated_world_are_named(tmp_path: Path) -> None:
     night, imperfect = uneventful(SyntheticLog()), {"disturbance.wheel_hz": 40.0, "camera.hot_pixels": 0.01}
     made = report_of(read_run(night.write(tmp_path / "x.mcap", toml=load(None, imperfect).to_toml())))
-    assert made.figures["run"]["imperfections"] == imperfect
+    assert made.results["run"]["imperfections"] == imperfect
     assert "simulated with disturbance.wheel_hz = 40.0, camera.hot_pixels = 0.01;" in page(made)
 
 
@@ -257,7 +257,7 @@ def test_a_loop_in_safe_mode_is_not_a_good_run(tmp_path: Path) -> None:
     night = uneventful(SyntheticLog())
     night.request("safe")
     night.frames(50)
-    found = figures(night.write(tmp_path / "x.mcap"))
+    found = results(night.write(tmp_path / "x.mcap"))
     assert found["verdict"]["level"] == "bad"
     assert {check["name"] for check in found["verdict"]["checks"] if check["level"] == "bad"} == {"loop", "events"}
     assert [event["name"] for event in found["events"] if event["level"] == "error"] == ["SAFED"]
@@ -268,7 +268,7 @@ def test_without_truth_the_terms_that_need_it_are_missing_and_not_zero(
 ) -> None:
     night = SyntheticLog()
     night.samples = [sample for sample in good_night.samples if sample.key != TRUTH.key]
-    found = figures(night.write(tmp_path / "x.mcap"))
+    found = results(night.write(tmp_path / "x.mcap"))
     terms = {term["name"]: term for term in found["error_budget"]["terms"]}
     for name in ("cross-talk and aliasing", "nonlinearity"):
         assert terms[name]["missing"]
@@ -288,7 +288,7 @@ def test_without_truth_the_terms_that_need_it_are_missing_and_not_zero(
 def test_a_log_of_an_open_loop_has_neither_spectra_nor_budget(tmp_path: Path) -> None:
     night = SyntheticLog()
     night.request("open")
-    found = figures(uneventful(night, 300).write(tmp_path / "x.mcap"))
+    found = results(uneventful(night, 300).write(tmp_path / "x.mcap"))
     assert found["closed_stretch"] is None
     assert found["spectra"] == found["error_budget"] == {"why_not": "the loop was not closed in this log"}
     assert found["residual"]["total_rms_nm"]["open_error"] > 5
@@ -301,7 +301,7 @@ def test_a_loop_without_a_calibration_has_no_residual(tmp_path: Path) -> None:
     night.samples = [sample for sample in night.samples if sample.key != CALIBRATION.key]
     night._state = State()
     night.frames(300)
-    found = figures(night.write(tmp_path / "x.mcap"))
+    found = results(night.write(tmp_path / "x.mcap"))
     assert found["mode_steps"] == {"idle": 300}
     check = found["verdict"]["checks"][2]
     assert (check["level"], check["text"]) == ("unknown", "the loop was not closed in this log")
@@ -311,7 +311,7 @@ def test_a_loop_closed_under_an_unknown_law_is_not_called_open(tmp_path: Path) -
     night = SyntheticLog()
     night.frames(300)
     night.samples = [sample for sample in night.samples if sample.key != CONTROLLER_STATE.key]
-    found = figures(night.write(tmp_path / "x.mcap"))
+    found = results(night.write(tmp_path / "x.mcap"))
     assert found["mode_steps"] == {"closed": 300}
     why = "this log does not contain the law with which the loop was closed"
     assert found["spectra"] == found["error_budget"] == {"why_not": why}
@@ -321,7 +321,7 @@ def test_a_loop_closed_under_an_unknown_law_is_not_called_open(tmp_path: Path) -
 def test_a_closed_loop_without_a_good_frame_has_neither_spectra_nor_budget(tmp_path: Path) -> None:
     night = SyntheticLog()
     night.frames(200, dark=range(200))
-    found = figures(night.write(tmp_path / "x.mcap"))
+    found = results(night.write(tmp_path / "x.mcap"))
     assert found["closed_stretch"]["frames"] == 0
     assert "has 0 frames" in found["spectra"]["why_not"]
     assert {term["missing"] for term in found["error_budget"]["terms"]} == {True}
@@ -335,7 +335,7 @@ def test_the_last_frames_may_have_their_command_after_the_log(
 ) -> None:
     night = SyntheticLog()
     night.frames(200, lost=range(200 - lost, 200))
-    found = figures(night.write(tmp_path / "x.mcap"))["timing"]["frames"]
+    found = results(night.write(tmp_path / "x.mcap"))["timing"]["frames"]
     assert (found["without_command"], found["at_the_end"]) == (without, at_the_end)
 
 
@@ -402,7 +402,7 @@ def test_missing_packages_are_reported_before_the_log_is_read(
     assert re.search(r"-m pip install .*'jinja2", str(done.exception))
     monkeypatch.undo()
     monkeypatch.setitem(sys.modules, module, None)
-    assert json.loads(lowfc("report", good, "--json").stdout)["log"]["file"] == "x.mcap", "figures need neither"
+    assert json.loads(lowfc("report", good, "--json").stdout)["log"]["file"] == "x.mcap", "the results need neither"
 
 
 @pytest.mark.parametrize("name", ["night.mcap", "other.mcap.part", "link.html"])

@@ -24,7 +24,7 @@ from lowfc.control.laws.what_if import as_logged, counterfactual, rms
 from lowfc.control.loop.safety import Limit, LoopMode
 from lowfc.optics.chain.added_contrast import contrast_form
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
-from lowfc.programs.cli.contrast import added_contrast, sentence_of
+from lowfc.programs.cli.contrast import added_contrast, added_contrast_in_words
 from lowfc.programs.logs.what_if.compare import LINEAR_WAVES, render, what_if
 from lowfc.programs.logs.what_if.options import WhatIf, requested, user_controller
 from lowfc.programs.logs.what_if.run import LoggedRun
@@ -127,25 +127,25 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, LoggedRun]:
     return made
 
 
-def figures_of(run: LoggedRun, what: WhatIf | None = None) -> dict[str, Any]:
+def results_of(run: LoggedRun, what: WhatIf | None = None) -> dict[str, Any]:
     found = what_if(run, what or WhatIf())
     assert found == json.loads(json.dumps(found))
     return found
 
 
-def column(figures: dict[str, Any], name: str) -> np.ndarray:
-    return np.array([mode[f"{name}_nm"] for mode in figures["modes"]])
+def column(results: dict[str, Any], name: str) -> np.ndarray:
+    return np.array([mode[f"{name}_nm"] for mode in results["modes"]])
 
 
 def test_the_logged_gains_reproduce_the_logged_run(runs: dict[str, LoggedRun]) -> None:
-    figures = figures_of(runs["default"])
-    np.testing.assert_allclose(column(figures, "what_if"), column(figures, "was"), atol=1e-5)
+    results = results_of(runs["default"])
+    np.testing.assert_allclose(column(results, "what_if"), column(results, "was"), atol=1e-5)
     for kind in ("true", "continuous"):
-        np.testing.assert_allclose(column(figures, f"{kind}_what_if"), column(figures, f"{kind}_was"), atol=1e-5)
-    assert (figures["frames"], figures["frames_compared"]) == (FRAMES, FRAMES - SETTLING)
-    assert figures["delay_frames"] == 1
-    assert figures["delay_measured_frames"] == pytest.approx(1, abs=0.01)
-    assert figures["warnings"] == []
+        np.testing.assert_allclose(column(results, f"{kind}_what_if"), column(results, f"{kind}_was"), atol=1e-5)
+    assert (results["frames"], results["frames_compared"]) == (FRAMES, FRAMES - SETTLING)
+    assert results["delay_frames"] == 1
+    assert results["delay_measured_frames"] == pytest.approx(1, abs=0.01)
+    assert results["warnings"] == []
 
 
 def test_added_contrast_of_shaped_pupil_and_lyot_coronagraph() -> None:
@@ -161,7 +161,7 @@ def test_added_contrast_of_shaped_pupil_and_lyot_coronagraph() -> None:
     expected = 0.01 * contrast_form(factory.sensor(Configuration(), print).pupil, (11,), 550.0).item()
     assert (contrast["was"], contrast["what if"], contrast["other"]) == (0, pytest.approx(expected), None)
     assert contrast["by_group"]["what if"]["spherical"] == pytest.approx(expected)
-    assert sentence_of(contrast) == (
+    assert added_contrast_in_words(contrast) == (
         f"added to the dark zone's contrast: was +0.0e+00, what if +{expected:.1e}; spherical contributes most (100 %)"
     )
     assert found(sensor__modes=10) is None
@@ -172,7 +172,7 @@ def test_added_contrast_of_shaped_pupil_and_lyot_coronagraph() -> None:
 
 def test_a_what_if_predicts_the_residual_of_a_run_with_other_gains(runs: dict[str, LoggedRun]) -> None:
     """Measured residuals of two runs are compared mode by mode."""
-    predicted, run = figures_of(runs["default"], requested(OTHER)), figures_of(runs["other"])
+    predicted, run = results_of(runs["default"], requested(OTHER)), results_of(runs["other"])
     np.testing.assert_allclose(column(predicted, "what_if"), column(run, "was"), rtol=0.1)
     np.testing.assert_allclose(column(predicted, "open"), column(run, "open"), rtol=0.1)
     assert np.abs(column(predicted, "was") / column(run, "was") - 1).max() > 0.1
@@ -186,17 +186,17 @@ def test_a_what_if_predicts_the_residual_of_a_run_with_other_gains(runs: dict[st
 
 
 def test_a_wrong_delay_of_the_controller_is_found_and_corrected(runs: dict[str, LoggedRun]) -> None:
-    figures = figures_of(runs["other"])
-    assert (figures["delay_controller_frames"], figures["delay_frames"]) == (2, 1)
-    assert "assumed a delay of 2 frames" in figures["warnings"][0]
-    np.testing.assert_allclose(column(figures, "what_if"), column(figures, "was"), atol=1e-5)
+    results = results_of(runs["other"])
+    assert (results["delay_controller_frames"], results["delay_frames"]) == (2, 1)
+    assert "assumed a delay of 2 frames" in results["warnings"][0]
+    np.testing.assert_allclose(column(results, "what_if"), column(results, "was"), atol=1e-5)
 
 
 def test_a_configuration_file_gives_the_same_as_the_options(runs: dict[str, LoggedRun], tmp_path: Path) -> None:
     path = tmp_path / "other.toml"
     path.write_text("[control]\ntilt_gain=0.2\ngain=0.9\nleak=0.01\ntilt_leak=0.01\n")
-    by_file = figures_of(runs["default"], requested("gain=0.3,tilt_gain=0.2,limit_nm=150,tilt_limit_nm=150", path))
-    assert by_file == figures_of(runs["default"], requested(OTHER + ",limit_nm=150"))
+    by_file = results_of(runs["default"], requested("gain=0.3,tilt_gain=0.2,limit_nm=150,tilt_limit_nm=150", path))
+    assert by_file == results_of(runs["default"], requested(OTHER + ",limit_nm=150"))
     table = render(by_file).splitlines()
     assert sum(" -> " in line for line in table) == len(by_file["modes"])
     assert any("0.4 -> 0.2" in line and "tilt x" in line for line in table)
@@ -205,19 +205,19 @@ def test_a_configuration_file_gives_the_same_as_the_options(runs: dict[str, Logg
 
 def test_another_reconstructor_measures_the_same_frames(runs: dict[str, LoggedRun], tmp_path: Path) -> None:
     """pinv by name and as a file are the same; `weighted` of that file is the logged one."""
-    by_name = figures_of(runs["default"], requested("estimator=pinv"))
+    by_name = results_of(runs["default"], requested("estimator=pinv"))
     assert by_name["estimator"] == "pinv"
     assert by_name["what_if_nm"] != pytest.approx(by_name["was_nm"], rel=1e-3)
-    np.testing.assert_allclose(column(by_name, "open")[:2], column(figures_of(runs["default"]), "open")[:2], rtol=0.1)
+    np.testing.assert_allclose(column(by_name, "open")[:2], column(results_of(runs["default"]), "open")[:2], rtol=0.1)
 
     calibration = toy.calibration()
     I0, H, good = (array.astype(float) for array in (calibration.reference, calibration.response, calibration.good))
     R = reconstructor(I0, H, good, 1.0, 0.0, "pinv").astype(np.float32)
     path = tmp_path / "pinv.fits"
     calibration_file.save(identified(replace(calibration, reconstructor=R, estimator="pinv")), path)
-    by_file = figures_of(runs["default"], requested(calibration=path))
+    by_file = results_of(runs["default"], requested(calibration=path))
     np.testing.assert_allclose(column(by_file, "what_if"), column(by_name, "what_if"), rtol=1e-4)
-    back = figures_of(runs["default"], requested("estimator=weighted", calibration=path))
+    back = results_of(runs["default"], requested("estimator=weighted", calibration=path))
     np.testing.assert_allclose(column(back, "what_if"), column(back, "was"), rtol=1e-2)
 
 
@@ -230,9 +230,9 @@ def test_frames_that_are_not_in_the_log_are_counted(
     np.testing.assert_allclose(found, run.steps.error_nm, atol=1e-4)
     found[1107::20] = np.nan
     monkeypatch.setattr(run, "measured_again", lambda *_: found)
-    figures = what_if(run, requested("estimator=pinv"))
-    assert figures["frames_compared"] == FRAMES - SETTLING - 5
-    assert "the log lacks 5 frames that were used" in figures["warnings"][0]
+    results = what_if(run, requested("estimator=pinv"))
+    assert results["frames_compared"] == FRAMES - SETTLING - 5
+    assert "the log lacks 5 frames that were used" in results["warnings"][0]
 
 
 def test_commands_are_converted_to_modes_of_another_scale(runs: dict[str, LoggedRun], tmp_path: Path) -> None:
@@ -245,18 +245,18 @@ def test_commands_are_converted_to_modes_of_another_scale(runs: dict[str, Logged
         modes_to_actuators=calibration.modes_to_actuators * 2,
     )
     calibration_file.save(identified(twice), tmp_path / "twice.fits")
-    figures = figures_of(runs["default"], requested(calibration=tmp_path / "twice.fits"))
-    np.testing.assert_allclose(column(figures, "what_if"), column(figures, "was") / 2, rtol=1e-4)
+    results = results_of(runs["default"], requested(calibration=tmp_path / "twice.fits"))
+    np.testing.assert_allclose(column(results, "what_if"), column(results, "was") / 2, rtol=1e-4)
 
 
 def test_calibrations_that_do_not_fit_are_refused(runs: dict[str, LoggedRun], tmp_path: Path) -> None:
     path = tmp_path / "other.fits"
     calibration_file.save(identified(replace(toy.calibration(), noll=(2, 3, 11))), path)
     with pytest.raises(CalibrationError, match=r"its noll is \(2, 3, 11\), in the log it is \(2, 3, 4\)"):
-        figures_of(runs["default"], requested(calibration=path))
+        results_of(runs["default"], requested(calibration=path))
     (tmp_path / "shear.toml").write_text('[control]\nnuisance = ["shear"]\n')
     with pytest.raises(ConfigurationError, match=r"weighted\+shear: .* --calibration"):
-        figures_of(runs["default"], requested(config=tmp_path / "shear.toml"))
+        results_of(runs["default"], requested(config=tmp_path / "shear.toml"))
 
 
 INTEGRATOR = """
@@ -285,7 +285,7 @@ def test_a_users_controller_is_run_like_the_integrator(
 ) -> None:
     (tmp_path / "mine.py").write_text(INTEGRATOR)
     where = f"{tmp_path / 'mine.py'}:step"
-    own, ours = figures_of(runs["default"], requested(controller=where)), figures_of(runs["default"], requested(OTHER))
+    own, ours = results_of(runs["default"], requested(controller=where)), results_of(runs["default"], requested(OTHER))
     np.testing.assert_allclose(column(own, "what_if"), column(ours, "what_if"), rtol=1e-4)
     assert own["controller"] == where
     assert "gain" not in own["modes"][0]
@@ -373,7 +373,7 @@ def test_too_few_frames_to_compare_are_an_error() -> None:
         LoggedRun(replace(history(), controllers=[]))
 
 
-def test_warnings_name_what_makes_the_figures_doubtful() -> None:
+def test_warnings_name_what_makes_the_results_doubtful() -> None:
     reasons = np.zeros(40, np.int64)
     reasons[3:7] = 1 << Limit.STROKE | 1 << Limit.SLEW
     pol = np.full((40, 3), 4, np.float32)
@@ -398,10 +398,10 @@ def test_warnings_name_what_makes_the_figures_doubtful() -> None:
 def test_an_open_loop_beyond_the_linear_range_gives_warnings() -> None:
     far = np.full((40, 3), [20.0, -30.0, 12.0], np.float32)
     run = LoggedRun(history(error_nm=far, pol_nm=far.copy(), mode=np.full(40, LoopMode.OPEN, np.uint8)))
-    figures = what_if(run, requested("tilt_gain=2.5"))
-    assert figures["compared"] == "the loop was never closed"
-    assert column(figures, "was").tolist() == column(figures, "open").tolist() == [20, 30, 12]
-    _, linear, unstable, limits = figures["warnings"]
+    results = what_if(run, requested("tilt_gain=2.5"))
+    assert results["compared"] == "the loop was never closed"
+    assert column(results, "was").tolist() == column(results, "open").tolist() == [20, 30, 12]
+    _, linear, unstable, limits = results["warnings"]
     assert pytest.approx(5 * 2.424, abs=0.01) == LINEAR_WAVES * 550
     assert "12.1 nm rms" in linear
     assert "tilt x with " in linear

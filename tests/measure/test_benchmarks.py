@@ -1,4 +1,4 @@
-"""Arithmetic of the benchmarks on synthetic figures, and one small real run of each."""
+"""Arithmetic of the benchmarks on synthetic results, and one small real run of each."""
 
 import json
 import subprocess
@@ -75,13 +75,13 @@ def test_a_step_that_refuses_frames_is_an_error(monkeypatch: pytest.MonkeyPatch)
     saturated = configuration(SMALL, 100.0).model_copy(update={"camera": Camera(full_well_e=500.0)})
     monkeypatch.setattr(curves, "configuration", lambda size, rate_hz: saturated)
     with pytest.raises(RuntimeError, match="SATURATED"):
-        curves.step_figures(SMALL, 0.01)
+        curves.step_times(SMALL, 0.01)
 
 
 @pytest.mark.exclusive
 @pytest.mark.slow
 def test_a_loop_of_any_size_runs_without_an_optical_model() -> None:
-    found = curves.loop_figures(Size(side=32, modes=40, mirror_side=16), 500.0, 0.5)
+    found = curves.loop_latency(Size(side=32, modes=40, mirror_side=16), 500.0, 0.5)
     assert found["frames"] > 200
     assert found["echo_us"]["p50"] > 0
     assert 0 < found["frame_to_command_us"]["p50"] <= found["frame_to_command_us"]["p99"]
@@ -91,11 +91,11 @@ def test_a_loop_of_any_size_runs_without_an_optical_model() -> None:
 
 def repeat(step_us: float, without: int = 0, **more: Any) -> dict[str, Any]:
     alone = {"step_us": step_us, "stream_us": 10.0, "products_us": 15.0}
-    figures: dict[str, Any] = {name: {"p50": us, "p99": 2 * us, "cpu": us} for name, us in alone.items()}
+    results: dict[str, Any] = {name: {"p50": us, "p99": 2 * us, "cpu": us} for name, us in alone.items()}
     if not more:
-        figures |= {"frame_to_command_us": {"p50": 200.0, "p99": 400.0}, "echo_us": {"p50": 50.0, "p99": 60.0}}
-        figures |= {"frames": 100, "frames_without_command": without}
-    return figures | more
+        results |= {"frame_to_command_us": {"p50": 200.0, "p99": 400.0}, "echo_us": {"p50": 50.0, "p99": 60.0}}
+        results |= {"frames": 100, "frames_without_command": without}
+    return results | more
 
 
 def curves_result() -> dict[str, Any]:
@@ -140,9 +140,9 @@ def test_the_curves_of_a_few_sizes_from_the_command_line() -> None:
         "actuators": [],
     }
     for name in ("step_us", "stream_us", "products_us"):
-        figures = found["curves"]["pixels"][0][name]
-        assert 0 < figures["p50"] <= figures["p99"]
-        assert figures["cpu"] > 0
+        results = found["curves"]["pixels"][0][name]
+        assert 0 < results["p50"] <= results["p99"]
+        assert results["cpu"] > 0
     with pytest.raises(ConfigurationError, match="nothing to measure"):
         curves.measure(Namespace(pixels=[], modes=[], actuators=[]), lambda _: None)
 
@@ -269,7 +269,7 @@ def one(p50: float, p99: float, without: int = 0) -> dict[str, Any]:
     return counts | {"frame_to_command": span, "frame_to_mirror": None}
 
 
-def test_the_figures_of_a_run_are_computed_from_its_times(tmp_path: Path) -> None:
+def test_the_statistics_of_a_run_are_computed_from_its_times(tmp_path: Path) -> None:
     comparison.write_shared_files(tmp_path, 6)
     due = np.arange(7) * 1_000_000 + 50_000_000
     published = due + 10_000
@@ -278,7 +278,7 @@ def test_the_figures_of_a_run_are_computed_from_its_times(tmp_path: Path) -> Non
     commanded[4] = received[4] = 0
     for name, times in zip(MARKS, (due, published, commanded, received), strict=True):
         times.astype(np.int64).tofile(tmp_path / name)
-    found = comparison.figures(tmp_path, 2)  # frames 3 to 6
+    found = comparison.run_statistics(tmp_path, 2)  # frames 3 to 6
     assert found["frames"] == 4
     assert found["without_command"] == found["sent_late"] == 1
     assert found["frame_to_command"] == {"p50": 5.0, "p90": 6.0, "p99": 6.0, "p99_9": 6.0, "max": 6.0}
@@ -286,7 +286,7 @@ def test_the_figures_of_a_run_are_computed_from_its_times(tmp_path: Path) -> Non
     assert found["off"] is None
     commanded.fill(1)
     commanded.tofile(tmp_path / "commanded")
-    assert comparison.figures(tmp_path, 2)["off"] == 1  # no actuators were received
+    assert comparison.run_statistics(tmp_path, 2)["off"] == 1  # no actuators were received
 
 
 def test_the_tables_have_ranges_differences_within_a_turn_and_missing_implementations() -> None:

@@ -23,7 +23,7 @@ from lowfc.programs.measure.bench import record as bench_module
 from lowfc.programs.measure.bench.record import render
 from lowfc.programs.measure.control_step import ControlStep, time_alone
 from lowfc.programs.measure.frame_source import Payloads, prepared_frames
-from lowfc.programs.measure.latency.figures import (
+from lowfc.programs.measure.latency.frame_statistics import (
     LOOP_SPANS,
     SPANS,
     STAGES,
@@ -33,10 +33,10 @@ from lowfc.programs.measure.latency.figures import (
     histogram,
     join,
     percentiles,
-    repeat_figures,
+    repeat_statistics,
 )
 from lowfc.programs.measure.latency.stalls import Counted, Trace, signs_of, stalls_of
-from lowfc.programs.measure.latency.summary import compare, of_kernels, ratio, together
+from lowfc.programs.measure.latency.summary import compare, kernel_summary, ratio, together
 from lowfc.programs.measure.latency.text import compared, sparkline, table
 from tests.support.loops import lowfc, until
 from tools.law_bench import calibrated
@@ -103,12 +103,12 @@ def test_timings_and_mirror_states_are_joined_to_their_frames() -> None:
     assert "due_to_command" not in frames(3, scheduled=False).spans_us
 
 
-def test_figures_leave_the_warm_up_out_and_count_missing_commands_and_states() -> None:
+def test_statistics_leave_the_warm_up_out_and_count_missing_commands_and_states() -> None:
     command_us = np.full(1000, 100.0)
     command_us[:500] = 9000  # warm-up
     command_us[700] = np.nan
     command_us[900] = 400
-    found = repeat_figures(frames(command_us=command_us, mirror_lost=(800,)))
+    found = repeat_statistics(frames(command_us=command_us, mirror_lost=(800,)))
     assert (found["frames"], found["warm_up_frames"]) == (500, 500)
     assert (found["frames_without_command"], found["frames_untimed"], found["frames_without_mirror_state"]) == (1, 0, 2)
     assert (found["frames_crowded_out"], found["frames_sent_late"]) == (0, 0)
@@ -126,10 +126,10 @@ def test_frames_without_command_are_counted_as_crowded_out_only_in_a_burst() -> 
     put_ns[801] = put_ns[802] - 1000
     command_us = np.full(1000, 100.0)
     command_us[[600, 800, 801]] = np.nan
-    nothing = repeat_figures(frames(0))
+    nothing = repeat_statistics(frames(0))
     assert (nothing["frames"], nothing["latency_us"]) == (0, {})
-    assert repeat_figures(frames(1, scheduled=False))["frames_sent_late"] is None
-    found = repeat_figures(frames(put_ns, command_us, (put_ns - due_ns) / 1e3))
+    assert repeat_statistics(frames(1, scheduled=False))["frames_sent_late"] is None
+    found = repeat_statistics(frames(put_ns, command_us, (put_ns - due_ns) / 1e3))
     assert (found["frames_without_command"], found["frames_crowded_out"]) == (3, 2)
     assert found["frames_sent_late"] == 1  # one by 2 ms, the other by less than a period
 
@@ -148,7 +148,7 @@ def test_a_histogram_counts_values_beyond_its_edges_in_the_outermost_bins() -> N
 def repeat(command_us: float, echo_us: float = 100, step_us: float = 50, **changes: Any) -> dict[str, Any]:
     """A repeat with constant latencies."""
     names = ("p50", "p90", "p99", "p99_9", "max")
-    figures = repeat_figures(frames(command_us=float(command_us)))
+    results = repeat_statistics(frames(command_us=float(command_us)))
     alone = {
         "echo_us": dict.fromkeys(names, echo_us),
         "step_us": dict.fromkeys(names, step_us),
@@ -156,7 +156,7 @@ def repeat(command_us: float, echo_us: float = 100, step_us: float = 50, **chang
         "timer_us": dict.fromkeys(names, 5.0),
     }
     return (
-        figures | alone | {"echo_lost": 1, "frames_skipped": 2, "frames_missing": 0, "reasons": {"LATE": 1}} | changes
+        results | alone | {"echo_lost": 1, "frames_skipped": 2, "frames_missing": 0, "reasons": {"LATE": 1}} | changes
     )
 
 
@@ -252,13 +252,13 @@ def test_a_stall_has_only_the_counts_of_its_own_time() -> None:
 
 def test_the_ratio_of_two_kernels_is_the_median_over_their_pairs() -> None:
     pairs = [("numpy", 100), ("fused", 80), ("fused", 60), ("numpy", 120), ("numpy", 100), ("fused", 70)]
-    found = of_kernels([repeat(us, kernel=name) for name, us in pairs])
+    found = kernel_summary([repeat(us, kernel=name) for name, us in pairs])
     assert (found["kernel"], found["frames"]) == ("both", 1500)
     assert found["latency_us"]["frame_to_command"]["p50"] == 70
     assert found["kernel_ratio"]["p99"] == pytest.approx(0.7)
     assert found["kernel_ratio_spread"]["p50"] == [0.5, 0.8]
     assert found["numpy_us"]["p50"] == 100
-    alone = of_kernels([repeat(us, kernel="fused") for us in (1, 2)])
+    alone = kernel_summary([repeat(us, kernel="fused") for us in (1, 2)])
     assert (alone["kernel"], "kernel_ratio" in alone) == ("fused", False)
 
 
@@ -337,43 +337,43 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], 
 
 @pytest.mark.exclusive
 def test_every_frame_of_a_real_loop_is_counted(measured: tuple[dict[str, Any], Path]) -> None:
-    figures, folder = measured
-    text = table(figures)
+    results, folder = measured
+    text = table(results)
     for words in ("frame to command", "due to command", "half a bare echo", "timer wake-up", "without a command"):
         assert words in text
     assert (folder / "latency.png").read_bytes().startswith(b"\x89PNG")
     sent = round(RATE_HZ * (SECONDS + WARM_UP_S))
-    assert figures["frames"] + figures["warm_up_frames"] == sent
-    assert figures["frames_untimed"] == figures["frames_missing"] == 0
-    counted = sum(figures["histogram"]["counts"]["frame_to_command"])
-    assert counted == figures["frames"] - figures["frames_without_command"] > 0.5 * figures["frames"]
-    assert set(figures["latency_us"]) >= set(LOOP_SPANS)
+    assert results["frames"] + results["warm_up_frames"] == sent
+    assert results["frames_untimed"] == results["frames_missing"] == 0
+    counted = sum(results["histogram"]["counts"]["frame_to_command"])
+    assert counted == results["frames"] - results["frames_without_command"] > 0.5 * results["frames"]
+    assert set(results["latency_us"]) >= set(LOOP_SPANS)
     for span in (*LOOP_SPANS[:3], "due_to_command", "frame_to_mirror"):
-        values = figures["latency_us"][span]
+        values = results["latency_us"][span]
         assert 0 < values["p50"] <= values["p90"] <= values["p99"] <= values["p99_9"] <= values["max"]
-    assert figures["latency_us"]["due_to_command"]["p50"] > figures["latency_us"]["frame_to_command"]["p50"]
-    for alone in (figures["echo_us"]["round_trip"], figures["step_us"], figures["hot_step_us"], figures["timer_us"]):
+    assert results["latency_us"]["due_to_command"]["p50"] > results["latency_us"]["frame_to_command"]["p50"]
+    for alone in (results["echo_us"]["round_trip"], results["step_us"], results["hot_step_us"], results["timer_us"]):
         assert 0 < alone["p50"] <= alone["max"]
-    reference_us = figures["echo_us"]["round_trip"]["p50"] / 2 + figures["step_us"]["p50"]
-    assert figures["ratio"]["p50"] == pytest.approx(figures["latency_us"]["frame_to_command"]["p50"] / reference_us)
-    assert figures["settings"]["rate_hz"] == RATE_HZ
-    assert figures["host"]["kernel"]
-    assert figures["host"]["clock_source"]
-    assert any("garbage collector off" in measure for measure in figures["host"]["granted"])
+    reference_us = results["echo_us"]["round_trip"]["p50"] / 2 + results["step_us"]["p50"]
+    assert results["ratio"]["p50"] == pytest.approx(results["latency_us"]["frame_to_command"]["p50"] / reference_us)
+    assert results["settings"]["rate_hz"] == RATE_HZ
+    assert results["host"]["kernel"]
+    assert results["host"]["clock_source"]
+    assert any("garbage collector off" in measure for measure in results["host"]["granted"])
 
 
 @pytest.mark.exclusive
 def test_stalls_of_a_real_loop_are_traced_beside_bare_loops(measured: tuple[dict[str, Any], Path]) -> None:
-    figures, _ = measured
-    found = figures["stalls"]
-    assert found["frames"] == figures["frames"]
-    assert figures["frames_without_command"] <= found["stalled"] == len(found["stalls"])
+    results, _ = measured
+    found = results["stalls"]
+    assert found["frames"] == results["frames"]
+    assert results["frames_without_command"] <= found["stalled"] == len(found["stalls"])
     assert found["stalled"] == found["of_host"] + found["of_loop"] + found["unknown"]
     assert [loop["beside"] for loop in found["bare"]] == ["camera", "controller"]
     for loop in found["bare"]:
         assert 0.5 * found["frames"] < loop["wakings"] <= RATE_HZ * (SECONDS + WARM_UP_S)
         assert 0 < loop["late_us"]["p50"] <= loop["late_us"]["max"]
-    assert "bare loop beside the" in table(figures)
+    assert "bare loop beside the" in table(results)
     fault = lowfc("latency", "--trace", "--camera", "simulated").exception
     assert isinstance(fault, ConfigurationError)
 
@@ -458,19 +458,19 @@ def test_the_cost_of_recording_is_measured_at_every_rate(tmp_path: Path) -> None
     done = lowfc("bench", "record", "--seconds", "0.5", *rates, "--folder", tmp_path, "--json")
     assert done.exit_code == 0, done.output
     assert list(tmp_path.iterdir()) == []
-    figures = json.loads(done.stdout)
-    assert [rate["rate_hz"] for rate in figures["rates"]] == list(rates_hz)
-    for rate in figures["rates"]:
+    results = json.loads(done.stdout)
+    assert [rate["rate_hz"] for rate in results["rates"]] == list(rates_hz)
+    for rate in results["rates"]:
         frames = rate["rate_hz"] * (bench_module._WARM_UP_S + 0.5)
         assert rate["messages_lost"] == 0
         assert min(rate["messages_published"], rate["messages_recorded"]) >= 5 * frames
-        assert rate["log_bytes"] > 0.5 * frames * figures["payload_bytes_per_frame"]
-        copying = figures["copy_us_per_frame"] * rate["offered_hz"] / 1e6
+        assert rate["log_bytes"] > 0.5 * frames * results["payload_bytes_per_frame"]
+        copying = results["copy_us_per_frame"] * rate["offered_hz"] / 1e6
         assert 0 < rate["ratio"] == pytest.approx(rate["cpu_share"] / copying)
         assert rate["longest_unflushed_ms"] >= rate["longest_wait_ms"] > 0
         assert rate["longest_write_ms"] > 0
-    assert figures["payload_bytes_per_frame"] > 80 * 80 * 2 + 2 * 34 * 34 * 4
-    title, *lines, note = render(figures).splitlines()
+    assert results["payload_bytes_per_frame"] > 80 * 80 * 2 + 2 * 34 * 34 * 4
+    title, *lines, note = render(results).splitlines()
     assert "processor" in title
     assert "kill -9" in note
     assert [line.split()[1] for line in lines] == ["Hz"] * len(rates_hz)

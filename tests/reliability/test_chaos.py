@@ -262,9 +262,9 @@ def test_a_case_that_the_host_cannot_run_is_skipped_and_not_passed() -> None:
     table = run(*arguments)
     assert table.splitlines()[0].startswith("lacking  skipped: requires a mount (not here) ")
     assert table.endswith("1 passed, 0 failed, 1 skipped, seed 1\n")
-    figures = json.loads(run(*arguments, "--json"))
-    assert (figures["passed"], figures["failed"], figures["skipped"]) == (1, 0, 1)
-    assert [(row["passed"], row["skipped"]) for row in figures["cases"]] == [
+    results = json.loads(run(*arguments, "--json"))
+    assert (results["passed"], results["failed"], results["skipped"]) == (1, 0, 1)
+    assert [(row["passed"], row["skipped"]) for row in results["cases"]] == [
         (False, "requires a mount (not here)"),
         (True, None),
     ]

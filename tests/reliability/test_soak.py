@@ -13,7 +13,14 @@ from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.envelope import sequence_of
 from lowfc.contract.messages import STEP, TIMING, TRUTH, wire
 from lowfc.programs.reliability.chaos.processes import CommandTimes
-from lowfc.programs.reliability.soak.figures import Usage, of_latency, of_process, render, slope, too_short
+from lowfc.programs.reliability.soak.evaluation import (
+    Usage,
+    latency_statistics,
+    process_statistics,
+    render,
+    slope,
+    too_short,
+)
 from lowfc.programs.reliability.soak.run import LogChecker
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 
@@ -43,46 +50,46 @@ def usage(leak_mb_per_hour: float, seed: int = 1, handles_per_hour: float = 0.0)
 
 @pytest.mark.parametrize("seed", range(5))
 def test_noise_and_the_warm_up_do_not_count_as_growth(seed: int) -> None:
-    found = of_process(usage(0.0, seed))
+    found = process_statistics(usage(0.0, seed))
     assert found["grows"] == []
     assert abs(found["memory_mb_per_hour"]) < 4 * found["memory_mb_per_hour_error"] < 4
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_a_memory_leak_is_detected_with_its_rate(seed: int) -> None:
-    found = of_process(usage(20.0, seed))
+    found = process_statistics(usage(20.0, seed))
     assert found["grows"] == ["memory"]
     assert found["memory_mb_per_hour"] == pytest.approx(20, abs=5 * found["memory_mb_per_hour_error"])
 
 
 def test_a_growing_number_of_handles_is_detected() -> None:
-    assert of_process(usage(0.0, handles_per_hour=60))["grows"] == ["handles"]
+    assert process_statistics(usage(0.0, handles_per_hour=60))["grows"] == ["handles"]
 
 
 def test_too_few_samples_are_reported_as_too_short_to_judge() -> None:
     assert slope([0.0, 1.0, 2.0], [1.0, 2.0, 3.0]) is None
     assert slope(range(100), [5.0] * 100) == (0.0, 0.0)
-    processes = {"camera": of_process(usage(0.0)), "recorder": of_process(usage(0.0)[:3])}
-    latency = of_latency([])
+    processes = {"camera": process_statistics(usage(0.0)), "recorder": process_statistics(usage(0.0)[:3])}
+    latency = latency_statistics([])
     assert (processes["camera"]["too_short"], processes["recorder"]["grows"]) == ([], [])
     short = too_short(processes, latency)
     assert short == ["the recorder's memory", "the recorder's handles", "the recorder's threads", "the latency"]
-    figures = {"processes": processes, "latency": latency, **COUNTS, "too_short": short, "why": []}
-    assert json.loads(json.dumps(figures, allow_nan=False)) == figures
-    text = render(figures)
+    results = {"processes": processes, "latency": latency, **COUNTS, "too_short": short, "why": []}
+    assert json.loads(json.dumps(results, allow_nan=False)) == results
+    text = render(results)
     assert "nan" not in text
     assert "too short to judge" in text.splitlines()[2]
     assert "p50 too short to judge; p99 too short to judge" in text
     assert text.endswith(f"too short to judge: {', '.join(short)}")
-    latency = of_latency([(one, 500 + 8 * one / 3600, 900.0) for one in map(float, range(SECONDS))])
-    text = render(figures | {"latency": latency, "why": ["the camera's memory grow"]})
+    latency = latency_statistics([(one, 500 + 8 * one / 3600, 900.0) for one in map(float, range(SECONDS))])
+    text = render(results | {"latency": latency, "why": ["the camera's memory grow"]})
     assert "p50 502 us, +8.0 +- 0.0 us per hour" in text
     assert text.endswith("FAILED: the camera's memory grow")
 
 
 def test_latencies_are_those_of_the_controllers_timing_messages() -> None:
     bus = MemoryBus(MemoryHub(), "launcher", HostClock())
-    times = CommandTimes(SimpleNamespace(bus=bus, outcome=SimpleNamespace(figures={})))
+    times = CommandTimes(SimpleNamespace(bus=bus, outcome=SimpleNamespace(measurements={})))
     bus.publisher(TRUTH).put(wire.Truth(residual_rms_nm=9).SerializeToString())
     bus.publisher(TIMING).put(wire.ControlTiming(frame_to_command_ns=[100_000, 300_000]).SerializeToString())
     assert times.drain() == {"frames": 2, "p50_us": 200.0, "p99_us": 298.0}

@@ -59,9 +59,9 @@ def fuzz(target: Target, numbers: range) -> dict[str, Any]:
     }
 
 
-def shares(every: list[Target], inputs: int) -> dict[str, int]:
+def shares(all_targets: list[Target], inputs: int) -> dict[str, int]:
     """Number of inputs of each target: fewer for slower ones."""
-    weights = {target.name: target.cost**-0.75 for target in every}
+    weights = {target.name: target.cost**-0.75 for target in all_targets}
     total = sum(weights.values())
     return {name: max(1, round(inputs * weight / total)) for name, weight in weights.items()}
 
@@ -93,10 +93,10 @@ def main() -> int:
     options = parser.parse_args()
     begun_s = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
-        every = [one for one in targets(Path(folder)) if not options.only or options.only in one.name]
-        counts = shares(every, options.inputs)
+        all_targets = [one for one in targets(Path(folder)) if not options.only or options.only in one.name]
+        counts = shares(all_targets, options.inputs)
         results = []
-        for target in every:
+        for target in all_targets:
             results.append(fuzz(target, range(options.first, options.first + counts[target.name])))
             found = results[-1]
             line = f"{found['name']:20} {found['inputs']:8} inputs, {found['refused']:8} refused, "

@@ -67,15 +67,15 @@ def output_of(folder: Path, line: str) -> str:
 
 
 def loop(folder: Path, *arguments: str, config: str = "", timeout_s: float = 120) -> dict[str, Any]:
-    """Run `sim-loop`, which must succeed, and return its figures; `log` becomes an absolute path."""
+    """Run `sim-loop`, which must succeed, and return its results; `log` becomes an absolute path."""
     done = run(folder, "sim-loop", "--json", *arguments, config=config, timeout_s=timeout_s)
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
     assert len(lines) == 1, done.stdout
-    figures: dict[str, Any] = json.loads(lines[0])
-    if figures["log"]:
-        figures["log"] = folder / figures["log"]
-    return figures
+    results: dict[str, Any] = json.loads(lines[0])
+    if results["log"]:
+        results["log"] = folder / results["log"]
+    return results
 
 
 def payloads(log: Path) -> dict[str, list[bytes]]:

@@ -87,13 +87,13 @@ def violations(limits: Limits, previous_nm: Single, actuators_nm: Single) -> lis
     if now.shape != before.shape or not np.isfinite(now).all():
         return ["finite"]
     differences = [np.abs(np.diff(now, axis=axis)).max(initial=0) for axis in (0, 1)]
-    figures = {
+    results = {
         "stroke": (np.abs(now).max(), limits.stroke_nm),
         "slew": (np.abs(now - before).max(), limits.slew_nm),
         "neighbours in a column": (differences[0], limits.neighbour_nm),
         "neighbours in a row": (differences[1], limits.neighbour_nm),
     }
-    return [f"{name}: {value} > {bound}" for name, (value, bound) in figures.items() if not value <= bound]
+    return [f"{name}: {value} > {bound}" for name, (value, bound) in results.items() if not value <= bound]
 
 
 def check_kept(limit: Callable[[Limits, Single, Single], Limited], case: Case) -> None:

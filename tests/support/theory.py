@@ -13,7 +13,7 @@ from lowfc.control.laws.linear_law import (
     at_rest,
     integrator,
     integrator_block,
-    of_blocks,
+    law_from_blocks,
     predict_and_update,
     respond,
 )
@@ -55,7 +55,7 @@ def noise_gain(gain: float, leak: float, delay_frames: float) -> float:
 def integrators(modes: Iterable[tuple[float, float]], signal: Signal, delay_frames: float) -> LinearLaw:
     """Integrators with these gains and leaks as a linear law of this signal, at 1 kHz."""
     blocks = [integrator_block(gain, leak, signal, delay_frames) for gain, leak in modes]
-    return of_blocks(blocks, signal, "integrator", tuple(range(2, 2 + len(blocks))), delay_frames, 1000.0)
+    return law_from_blocks(blocks, signal, "integrator", tuple(range(2, 2 + len(blocks))), delay_frames, 1000.0)
 
 
 def run(law: LinearLaw, disturbance_nm: Array, delay_frames: float, limit_nm: float = np.inf) -> tuple[Array, Array]:

@@ -114,15 +114,15 @@ def frame(count: int, modes_nm: npt.ArrayLike = (0, 0, 0), **changes: object) ->
 
 def feed(what: Settings, state: State, *inputs: Input) -> tuple[State, list[Outputs]]:
     """State after these inputs, and the outputs of each."""
-    every = []
+    all_outputs = []
     for taken in inputs:
         state, outputs = advance(what, state, taken)
-        every.append(outputs)
-    return state, every
+        all_outputs.append(outputs)
+    return state, all_outputs
 
 
-def names(every: list[Outputs]) -> list[str]:
-    return [event.name for outputs in every for event in outputs.events]
+def names(all_outputs: list[Outputs]) -> list[str]:
+    return [event.name for outputs in all_outputs for event in outputs.events]
 
 
 def answered(outputs: Outputs, accepted: bool, *words: str) -> None:

@@ -194,6 +194,6 @@ def test_a_view_without_the_log_reports_that_events_are_missing(recorder: wire.H
 
 def test_only_chunks_with_events_are_read(tmp_path: Path) -> None:
     log = night(1000).write(tmp_path / "night.mcap")
-    every, sparse = (LogReader(log, topics=(EVENT,), sparse=sparse) for sparse in (False, True))
-    assert list(every) == list(sparse)
-    assert len(sparse._chunks) < len(every._chunks) / 2
+    complete, sparse = (LogReader(log, topics=(EVENT,), sparse=sparse) for sparse in (False, True))
+    assert list(complete) == list(sparse)
+    assert len(sparse._chunks) < len(complete._chunks) / 2

@@ -23,7 +23,7 @@ from lowfc.contract.messages import (
     timestamp,
     wire,
 )
-from lowfc.control.laws.spectra import pieces, spectrum
+from lowfc.control.laws.spectra import spectrum, time_series
 from lowfc.control.loop.safety import LoopMode
 from lowfc.optics.chain.coronagraph import Coronagraph, Wedge, mean_contrast
 from lowfc.optics.chain.grid import pupil_axis
@@ -341,7 +341,7 @@ def tone() -> tuple[Any, Any]:
 def test_a_tone_has_its_frequency_and_power_in_the_spectrum(tone: tuple[Any, Any]) -> None:
     pol_nm, error_nm = tone
     signals = np.concatenate([error_nm, pol_nm], axis=1).astype(np.float32)
-    found = spectrum(pieces(np.arange(len(signals), dtype=np.uint64), signals), RATE_HZ)
+    found = spectrum(time_series(np.arange(len(signals), dtype=np.uint64), signals), RATE_HZ)
     tilts = np.array(NOLL) <= 3
     hz, (pol, error, theory) = spectra.power_curves(found, tilts, LAW, RATE_HZ)
     tone_at = int(pol.argmax())

@@ -24,12 +24,12 @@ def none_here() -> str:
     if transient:
         return f"{transient[0]}, which is starting or ending: try again in a few seconds"
     origin = f"from {_FOLDER}" if os.environ.get(_FOLDER) else f"{_FOLDER} is not set"
-    sentence = (
+    message = (
         f"no loop of user {_name(os.geteuid())} is running here: {runtime_path()} was searched ({origin}); loops of "
         f"other users, or started with another {_FOLDER}, are not seen"
     )
     more = [f"and {len(found) - _MOST} more"] if len(found) > _MOST else []
-    return "; ".join([sentence, *found[:_MOST], *more])
+    return "; ".join([message, *found[:_MOST], *more])
 
 
 def other_loops() -> Iterator[str]:

@@ -48,16 +48,16 @@ def to_bytes(calibration: Calibration) -> bytes:
     header["FLUX"] = (calibration.flux_dn, "[adu] expected sum of the good pixels")
     header["SATURATE"] = (calibration.saturation_dn, "[adu] highest value of a pixel")
     if (camera := calibration.camera) is not None:
-        for card, attribute, sentence in _CAMERA:
-            header[card] = (getattr(camera, attribute), sentence)
+        for card, attribute, description in _CAMERA:
+            header[card] = (getattr(camera, attribute), description)
         header["CAMROW"] = (camera.region[0], "first row read")
         header["CAMCOL"] = (camera.region[1], "first column read")
     arrays = {name: getattr(calibration, attribute) for name, attribute, _, _ in _EXTENSIONS}
     return fits_file.to_bytes(
         primary,
         [
-            fits_file.extension(name, arrays[name], sentence, unit)
-            for name, _, unit, sentence in _EXTENSIONS
+            fits_file.extension(name, arrays[name], description, unit)
+            for name, _, unit, description in _EXTENSIONS
             if name != _OPTIONAL or arrays[name].size
         ],
     )

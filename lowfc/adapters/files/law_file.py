@@ -13,7 +13,7 @@ from lowfc.control.laws.linear_law import LinearLaw, Signal
 KIND = "lowfc law 2"
 FORMER_KIND = "lowfc law 1"
 
-# Extension, attribute of LinearLaw, sentence.
+# Extension, attribute of LinearLaw, description.
 _EXTENSIONS = (
     ("TRANSITION", "transition", "F of x[k] = F x[k-1] + G y[k] + U c[k-1]"),
     ("MEASUREMENT_GAIN", "measurement_gain", "G, gain of the measured modes"),
@@ -35,7 +35,10 @@ def to_bytes(law: LinearLaw) -> bytes:
     header["RATE"] = (law.rate_hz, "[Hz] frame rate it was made for")
     return fits_file.to_bytes(
         primary,
-        [fits_file.extension(name, getattr(law, attribute), sentence) for name, attribute, sentence in _EXTENSIONS],
+        [
+            fits_file.extension(name, getattr(law, attribute), description)
+            for name, attribute, description in _EXTENSIONS
+        ],
     )
 
 

@@ -215,7 +215,7 @@ class TruthRows(_Rows[Truths]):
         }
 
 
-def of_steps(steps: Iterable[Step], modes: int) -> Steps:
+def steps_as_columns(steps: Iterable[Step], modes: int) -> Steps:
     """Columns of steps from a running loop, as from a log."""
     rows = StepRows(modes)
     for step in steps:

@@ -99,7 +99,8 @@ class History:
         frame_sequence, frame_publish_ns: sequence and publish time of every frame in the log.
         command_publish_ns: publish time of every mirror command in the log.
         stages_ns: (timed steps,) durations of each of `STAGES`, for the frames of `timed_sequence`.
-        left_out: number of steps with another number of modes than the last calibration, or with impossible values.
+        excluded_messages: number of steps with another number of modes than the last calibration, and of messages with
+            impossible values.
         requests: operators' requests, with the answers.
         events: (log time in ns, message) of each event.
         health: last Health of each process, by name.
@@ -122,7 +123,7 @@ class History:
     mirror: MirrorStates = field(default_factory=MirrorStates)
     timed_sequence: Sequences = field(default_factory=_SEQUENCES)
     stages_ns: dict[str, Long] = field(default_factory=dict)
-    left_out: int = 0
+    excluded_messages: int = 0
     requests: list[wire.Request] = field(default_factory=list)
     events: list[tuple[int, Log]] = field(default_factory=list)
     health: dict[str, wire.Health] = field(default_factory=dict)
@@ -212,7 +213,7 @@ class _Rows:
         """Add one message of the log."""
         history = self._history
         if max(message.receive_time_ns, message.publish_time_ns) > _LAST_NS:
-            history.left_out += 1
+            history.excluded_messages += 1
             return
         first_ns, _ = history.span_ns
         history.span_ns = (first_ns or message.receive_time_ns, message.receive_time_ns)
@@ -222,7 +223,7 @@ class _Rows:
         except (KeyError, DecodeError):
             return  # unreadable for the loop as well
         except OverflowError:
-            history.left_out += 1  # valid in protobuf, but never sent by the loop
+            history.excluded_messages += 1  # valid in protobuf, but never sent by the loop
 
     def _decode(self, message: Sample) -> None:
         topic, history = topic_of(message.key), self._history
@@ -236,7 +237,7 @@ class _Rows:
             return
         body = topic.message.FromString(message.payload)
         if isinstance(body, wire.ControlStep):
-            history.left_out += not self._steps.add(body)
+            history.excluded_messages += not self._steps.add(body)
         elif isinstance(body, wire.Truth):
             self._truths.add(body)
         elif isinstance(body, wire.MirrorState):
@@ -276,7 +277,7 @@ class _Rows:
         self._calibration = calibration
         modes = len(calibration.noll)
         if modes != self._steps.modes:
-            self._history.left_out += len(self._steps)
+            self._history.excluded_messages += len(self._steps)
             self._steps, self._truths = StepRows(modes), TruthRows(modes)
 
     def finish(self) -> None:

@@ -39,7 +39,7 @@ class Recovery:
     damage: Sequence[Damage] = ()
 
     @property
-    def figures(self) -> dict[str, Any]:
+    def json_object(self) -> dict[str, Any]:
         """The result as values for JSON."""
         named = {"log": str(self.log), "recovered": None if self.recovered is None else str(self.recovered)}
         return dataclasses.asdict(self) | named

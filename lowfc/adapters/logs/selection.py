@@ -27,20 +27,20 @@ class Selection:
     """Selection of recorded messages.
 
     Attributes:
-        every: frames and mirror states are recorded if their frame number is a multiple of this.
-        left_out: topics that are not recorded; only `optional` ones.
+        interval_frames: frames and mirror states are recorded if their frame number is a multiple of this.
+        excluded: topics that are not recorded; only `optional` ones.
     """
 
-    every: int = 1
-    left_out: frozenset[Topic] = frozenset()
+    interval_frames: int = 1
+    excluded: frozenset[Topic] = frozenset()
 
     @classmethod
     def of(cls, metadata: Mapping[str, Mapping[str, str]]) -> "Selection":
         """Selection of a log from the metadata at its start; everything if they cannot be read."""
         entries = metadata.get(SELECTION, {})
-        every, keys = entries.get("every", ""), entries.get("left_out", "").split()
+        interval, keys = entries.get("every", ""), entries.get("left_out", "").split()
         return cls(
-            max(1, int(every)) if re.fullmatch("[0-9]{1,9}", every) else 1,
+            max(1, int(interval)) if re.fullmatch("[0-9]{1,9}", interval) else 1,
             frozenset(topic for topic in TOPICS if topic.key in keys),
         )
 
@@ -49,58 +49,58 @@ class Selection:
         """Metadata for the start of a log; empty if everything is recorded."""
         if self == EVERYTHING:
             return {}
-        return {SELECTION: {"every": str(self.every), "left_out": " ".join(self._keys)}}
+        return {SELECTION: {"every": str(self.interval_frames), "left_out": " ".join(self._keys)}}
 
     @property
-    def sentence(self) -> str:
+    def description(self) -> str:
         """Description of the selection; empty for everything."""
-        few = [name for topic, name in _DECIMATED.items() if topic not in self.left_out]
-        parts = [f"1 in {self.every} {' and '.join(few)}"] if self.every > 1 and few else []
-        parts += [f"without {', '.join(self._keys)}"] if self.left_out else []
+        few = [name for topic, name in _DECIMATED.items() if topic not in self.excluded]
+        parts = [f"1 in {self.interval_frames} {' and '.join(few)}"] if self.interval_frames > 1 and few else []
+        parts += [f"without {', '.join(self._keys)}"] if self.excluded else []
         return ", ".join(parts)
 
     @property
     def has_every_frame(self) -> bool:
         """Whether every frame is recorded."""
-        return self.every == 1 and FRAME not in self.left_out
+        return self.interval_frames == 1 and FRAME not in self.excluded
 
     def records_all(self, topic: Topic) -> bool:
         """Whether every message of a topic is recorded, so that a gap in its counts is a loss."""
-        return topic not in self.left_out and not (self.every > 1 and topic in _DECIMATED)
+        return topic not in self.excluded and not (self.interval_frames > 1 and topic in _DECIMATED)
 
     def keeps(self, topic: Topic, sequence: int, payload: bytes) -> bool:
         """Whether a message is recorded.
 
         Frames and mirror states are selected by the same frame number, so that they stay paired.
         """
-        if topic in self.left_out:
+        if topic in self.excluded:
             return False
-        if self.every == 1 or topic not in _DECIMATED:
+        if self.interval_frames == 1 or topic not in _DECIMATED:
             return True
         if topic is MIRROR_STATE:
             try:
                 sequence = wire.MirrorState.FromString(payload).frame_sequence
             except DecodeError:
                 return True  # record an unreadable message unchanged
-        return count_of(sequence) % self.every == 0
+        return count_of(sequence) % self.interval_frames == 0
 
     def within(self, other: "Selection") -> "Selection":
         """This selection, applied to a log that was recorded with `other`."""
-        return Selection(math.lcm(self.every, other.every), self.left_out | other.left_out)
+        return Selection(math.lcm(self.interval_frames, other.interval_frames), self.excluded | other.excluded)
 
     @property
     def _keys(self) -> list[str]:
-        return sorted(topic.key for topic in self.left_out)
+        return sorted(topic.key for topic in self.excluded)
 
 
 EVERYTHING = Selection()
 
 
-def selection(every: int = 1, patterns: Iterable[str] = ()) -> Selection:
+def selection(interval_frames: int = 1, patterns: Iterable[str] = ()) -> Selection:
     """Make a selection from options.
 
     Args:
-        every: N to record every Nth frame and mirror state.
+        interval_frames: N to record every Nth frame and mirror state.
         patterns: keys or shell patterns of the optional topics to record; empty: all.
 
     Raises:
@@ -116,4 +116,5 @@ def selection(every: int = 1, patterns: Iterable[str] = ()) -> Selection:
                 "'lowfc/camera/*'"
             )
         chosen |= matching
-    return Selection(every, frozenset(topic for topic in TOPICS if topic.optional and chosen and topic not in chosen))
+    excluded = frozenset(topic for topic in TOPICS if topic.optional and chosen and topic not in chosen)
+    return Selection(interval_frames, excluded)

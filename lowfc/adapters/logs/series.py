@@ -141,7 +141,7 @@ class LogSeries:
         """
         return shortage(self._folder, self._limits.min_free_bytes)
 
-    def end(self, figures: Mapping[str, str], *, wait: bool = True) -> None:
+    def end(self, totals: Mapping[str, str], *, wait: bool = True) -> None:
         """Finish the open file with its "recording" metadata; without `wait`, in parallel with the next one.
 
         Raises:
@@ -151,7 +151,7 @@ class LogSeries:
         if self._log is not None:
             self._log.flush()
             log = self._detach()
-            self._finishing = log, self._finisher.submit(_finish, log, figures)
+            self._finishing = log, self._finisher.submit(_finish, log, totals)
         if wait:
             self._await_finished()
 
@@ -200,10 +200,10 @@ class LogSeries:
         self.files[self.files.index(log.path)] = log.part
 
 
-def _finish(log: LogWriter, figures: Mapping[str, str]) -> int:
+def _finish(log: LogWriter, totals: Mapping[str, str]) -> int:
     """Finish a file; return its growth in bytes."""
     before_bytes = log.bytes_written
-    return log.finish({"recording": figures}).stat().st_size - before_bytes
+    return log.finish({"recording": totals}).stat().st_size - before_bytes
 
 
 def shortage(folder: Path, min_free_bytes: int) -> str:

@@ -50,7 +50,7 @@ class Thinned:
 
 def thinned_path(source: Path, requested: Selection) -> Path:
     """Default path of the thinned copy, next to the log."""
-    return source.with_name(f"{stem_of(source)}-every-{requested.every}.mcap")
+    return source.with_name(f"{stem_of(source)}-every-{requested.interval_frames}.mcap")
 
 
 def thin(log: Parts, out: Path, requested: Selection, progress: Callable[[int, int], None] | None = None) -> Thinned:
@@ -85,7 +85,7 @@ def thin(log: Parts, out: Path, requested: Selection, progress: Callable[[int, i
         copy.finish()
     return Thinned(
         str(out),
-        combined.sentence,
+        combined.description,
         copy.messages,
         out.stat().st_size,
         messages,

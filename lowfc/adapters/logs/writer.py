@@ -228,7 +228,7 @@ class LogWriter:
                 message_encoding="protobuf",
                 schema_id=self._schema(topic),
                 metadata={
-                    "description": topic.sentence,
+                    "description": topic.description,
                     "publisher": ", ".join(sorted(topic.publishers)),
                     START_KEY: str(start_s),
                 },

@@ -125,7 +125,7 @@ def decode_state(
         loop = loop._replace(
             camera=camera_settings(message.camera_expected) if message.HasField("camera_expected") else loop.camera,
             law_runner=law_runner,
-            command_channels=command_channels_of(message, loop.additions(), loop.to_modes, plays),
+            command_channels=command_channels_of(message, loop.channels_or_empty(), loop.to_modes, plays),
             history_nm=tuple(history),
             actuators_nm=actuators,
             automatic=np.array(message.automatic or [False] * len(calibration.noll), bool),

@@ -63,11 +63,11 @@ def _fused(
 ) -> tuple[Single, Single, Single, Single, Single] | None:
     """Error, pseudo-open-loop modes, command (modes,), x (states,) and actuators (rows, columns) of a normal frame.
 
-    None if the frame is not normal: the loop is not closed, its additions change, a law shares the command with the
+    None if the frame is not normal: the loop is not closed, its channels change, a law shares the command with the
     integrator, or a limit acts.
     """
-    additions, law_runner = loop.command_channels, loop.law_runner
-    if state.mode is not LoopMode.CLOSED or state.returning_to_zero or (additions is not None and additions.moving):
+    channels, law_runner = loop.command_channels, loop.law_runner
+    if state.mode is not LoopMode.CLOSED or state.returning_to_zero or (channels is not None and channels.moving):
         return None
     x, law, from_error = tables.no_states, (tables.no_law, tables.no_law), True
     if law_runner is not None:
@@ -77,8 +77,8 @@ def _fused(
         from_error = law_runner.law.signal == "error"
     shift_nm = target_nm = tables.no_modes
     channels_nm = tables.no_channels
-    if additions is not None:
-        shift_nm, target_nm, channels_nm = additions.seen_nm(loop.delay_weights), additions.offset_nm, additions.sum_nm
+    if channels is not None:
+        shift_nm, target_nm, channels_nm = channels.seen_nm(loop.delay_weights), channels.offset_nm, channels.sum_nm
     modes, limits = measured_nm.size, settings.limits
     results = np.empty(3 * modes + x.size, np.float32)
     actuators_nm = np.empty_like(loop.actuators_nm)
@@ -99,12 +99,12 @@ def _pseudo_open_loop(
 
     The channels seen in the exposure are subtracted from both, the loop's target only from the error.
     """
-    additions, error_nm = loop.command_channels, measured_nm
-    if additions is not None:
-        error_nm = measured_nm - additions.seen_nm(loop.delay_weights)
+    channels, error_nm = loop.command_channels, measured_nm
+    if channels is not None:
+        error_nm = measured_nm - channels.seen_nm(loop.delay_weights)
     pol_nm = pol_from_target_nm = error_nm - loop.seen_nm()
-    if additions is not None:
-        target_nm = additions.target_nm(sequence)
+    if channels is not None:
+        target_nm = channels.target_nm(sequence)
         error_nm, pol_from_target_nm = error_nm - target_nm, pol_nm - target_nm
     if loop.law_runner is not None:
         advanced = loop.law_runner.advanced(error_nm, pol_from_target_nm, loop.history_nm[0])
@@ -132,8 +132,8 @@ def _guarded(
     state: State, loop: ActiveLoop, law: LawRunner, guard: LawGuard, error_nm: Single, pol_from_target_nm: Single
 ) -> tuple[LawGuard, list[PendingEvent]]:
     """The guard of a law after a frame, and its events; error and POL (modes,) are relative to the loop's target."""
-    closed, additions = state.mode is LoopMode.CLOSED, loop.command_channels
-    probed = state.returning_to_zero or (additions is not None and additions.play is not None)
+    closed, channels = state.mode is LoopMode.CLOSED, loop.command_channels
+    probed = state.returning_to_zero or (channels is not None and channels.play is not None)
     if probed or not (closed or state.mode is LoopMode.OPEN):
         return guard.at_rest(), []
     if law.frames <= SETTLING_FRAMES or not closed:
@@ -153,10 +153,10 @@ def next_command(
     """The loop with the command after an error (modes,), the limits that acted, and `returning_to_zero` afterwards."""
     if state.mode is LoopMode.SAFE:
         return step_to_flat(settings, loop), (), False
-    additions, returning_to_zero = loop.command_channels, state.returning_to_zero
+    channels, returning_to_zero = loop.command_channels, state.returning_to_zero
     closed = state.mode is LoopMode.CLOSED
     # After a limit acted, the mirror has not reached its target.
-    if not closed and not returning_to_zero and (additions is None or not (additions.moving or state.limits_hit)):
+    if not closed and not returning_to_zero and (channels is None or not (channels.moving or state.limits_hit)):
         return loop.holding_command(1), (), False
     command_nm, clipped = loop.history_nm[0], False
     if returning_to_zero:
@@ -165,11 +165,11 @@ def next_command(
         command_nm, clipped = _law_output(loop, error_nm)
     requested_nm = loop.to_actuators.dot(command_nm).reshape(loop.calibration.grid)
     extra_nm: Single | None = None
-    if additions is not None:
-        additions = additions.moved(sequence, settings.limits.kept_slew_nm / 2, loop.to_modes)
-        loop = loop._replace(command_channels=additions)
-        played_nm = additions.played_nm(sequence)
-        extra_nm = additions.sum_nm if played_nm is None else additions.sum_nm + played_nm
+    if channels is not None:
+        channels = channels.moved(sequence, settings.limits.kept_slew_nm / 2, loop.to_modes)
+        loop = loop._replace(command_channels=channels)
+        played_nm = channels.played_nm(sequence)
+        extra_nm = channels.sum_nm if played_nm is None else channels.sum_nm + played_nm
         requested_nm += extra_nm
     limited = limit(settings.limits, loop.actuators_nm, requested_nm)
     if limited.reasons and (closed or returning_to_zero):  # against wind-up, the modal command becomes the limited one

@@ -14,7 +14,7 @@ from lowfc.control.calibration.calibration import noise_nm
 from lowfc.control.laws.continuous import Timing, mean_over, residual_power
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.margins import noise_gain, noise_transfer, rejection
-from lowfc.control.laws.spectra import Pieces, Spectrum, floor_nm2_hz, spectrum
+from lowfc.control.laws.spectra import Spectrum, TimeSeries, floor_nm2_hz, spectrum
 
 ROWS_PER_REGRESSOR = 10
 """Frames for each regressor below which a fit mostly explains noise."""
@@ -114,7 +114,7 @@ class MeasurementError:
 
 
 def measurement_error(
-    law: LinearLaw, error: Pieces, residual: Pieces, seen: Pieces, noise_nm: Array
+    law: LinearLaw, error: TimeSeries, residual: TimeSeries, seen: TimeSeries, noise_nm: Array
 ) -> MeasurementError | None:
     """Split m = error - residual by a fit, and pass each part through the loop.
 
@@ -145,7 +145,7 @@ def measurement_error(
 
     def spectrum_of(column: Array) -> Spectrum | None:
         ends = np.cumsum([len(piece) for piece in error.values])[:-1]
-        return spectrum(Pieces(tuple(np.split(column, ends)), error.bridged), law.rate_hz)
+        return spectrum(TimeSeries(tuple(np.split(column, ends)), error.bridged), law.rate_hz)
 
     smooth, rough, each = spectrum_of(linear), spectrum_of(rest), spectrum_of(basis)
     if smooth is None or rough is None or each is None:

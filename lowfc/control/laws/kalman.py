@@ -10,7 +10,7 @@ import numpy as np
 
 from lowfc.arrays import Array
 from lowfc.control.laws.continuous import Timing
-from lowfc.control.laws.linear_law import Block, LinearLaw, of_blocks
+from lowfc.control.laws.linear_law import Block, LinearLaw, law_from_blocks
 from lowfc.control.laws.vibration import Model
 
 _DOUBLINGS = 40
@@ -26,7 +26,7 @@ def lqg(models: Sequence[Model], noll: tuple[int, ...], timing: Timing) -> Linea
     if len(rates) != 1:
         raise ValueError(f"the models of a law have one frame rate, got {sorted(rates)}")
     blocks = [lqg_block(model, timing) for model in models]
-    return of_blocks(blocks, "pol", "lqg", noll, timing.delay, rates.pop())
+    return law_from_blocks(blocks, "pol", "lqg", noll, timing.delay, rates.pop())
 
 
 def lqg_block(model: Model, timing: Timing) -> Block:

@@ -131,7 +131,7 @@ class Block(NamedTuple):
     output: Array
 
 
-def of_blocks(
+def law_from_blocks(
     blocks: Sequence[Block], signal: Signal, name: str, noll: tuple[int, ...], delay_frames: float, rate_hz: float
 ) -> LinearLaw:
     """Make a law from one block for each mode.
@@ -185,4 +185,4 @@ def integrator(
     blocks = [
         integrator_block(float(g), float(lost), "error", delay_frames) for g, lost in zip(gain, leak, strict=True)
     ]
-    return of_blocks(blocks, "error", "integrator", noll, delay_frames, rate_hz)
+    return law_from_blocks(blocks, "error", "integrator", noll, delay_frames, rate_hz)

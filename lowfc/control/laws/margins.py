@@ -122,7 +122,7 @@ def check_stable(law: LinearLaw, delay_frames: float) -> None:
                 )
 
 
-def sentence(found: Margins) -> str:
+def margins_in_words(found: Margins) -> str:
     """The smallest margins of all modes in words."""
     return (
         f"gain margin {found.gain_margin.min():.3g}, phase margin {found.phase_margin_deg.min():.0f} deg, "
@@ -261,8 +261,8 @@ def _frequencies(poles: Complex) -> Array:
     gap = np.maximum(np.abs(1 - np.abs(near)), 1e-9)
     around = np.abs(np.angle(near))[:, None] + gap[:, None] * _AROUND_POLE
     grids = (np.linspace(0, np.pi, _GRID), np.geomspace(_LOWEST, np.pi, _GRID), around.ravel())
-    every = np.unique(np.concatenate(grids))
-    return np.asarray(every[(every >= _LOWEST) & (every <= np.pi)])
+    omega = np.unique(np.concatenate(grids))
+    return np.asarray(omega[(omega >= _LOWEST) & (omega <= np.pi)])
 
 
 def _gain_margins(loop: Complex) -> tuple[float, float]:

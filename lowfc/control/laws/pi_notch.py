@@ -7,7 +7,7 @@ import numpy as np
 from scipy.linalg import block_diag, solve_discrete_are
 
 from lowfc.arrays import Array
-from lowfc.control.laws.linear_law import Block, LinearLaw, of_blocks
+from lowfc.control.laws.linear_law import Block, LinearLaw, law_from_blocks
 from lowfc.control.laws.stability import delay_weights
 
 _EXACT = 1e-6  # variance of limited commands relative to the states'; the Riccati equation needs one above 0
@@ -61,7 +61,7 @@ def pi_notch(
     modes = zip(gain.tolist(), proportional.tolist(), leak.tolist(), notches, strict=True)
     blocks = [_block(*of_mode, delay_frames, rate_hz) for of_mode in modes]
     name = "pi-notch" if any(notches) else "pi"
-    return of_blocks(blocks, "error", name, noll, delay_frames, rate_hz)
+    return law_from_blocks(blocks, "error", name, noll, delay_frames, rate_hz)
 
 
 def _block(

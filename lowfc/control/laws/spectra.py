@@ -16,11 +16,11 @@ _SEGMENT_SHARE = 4  # of the longest piece: seven segments of it, each over half
 
 
 @dataclass(frozen=True, slots=True)
-class Pieces:
-    """Evenly sampled pieces of a run.
+class TimeSeries:
+    """Evenly sampled time series of a run, in pieces without gaps.
 
     Attributes:
-        values: (frames, columns) each.
+        values: pieces, (frames, columns) each.
         bridged: number of interpolated frames among them.
     """
 
@@ -32,9 +32,9 @@ class Pieces:
         """Frames of all pieces."""
         return sum(len(piece) for piece in self.values)
 
-    def columns(self, which: slice) -> "Pieces":
+    def columns(self, which: slice) -> "TimeSeries":
         """The same frames, some of the columns."""
-        return Pieces(tuple(piece[:, which] for piece in self.values), self.bridged)
+        return TimeSeries(tuple(piece[:, which] for piece in self.values), self.bridged)
 
     def joined(self) -> Array:
         """All frames (frames, columns), one piece after the other."""
@@ -74,8 +74,8 @@ class Spectrum:
         return np.asarray(np.sqrt(1.5 * squares / self.segments) * self.spacing_hz)
 
 
-def pieces(sequence: Sequences, values: npt.NDArray[np.floating]) -> Pieces:
-    """Cut a run into evenly sampled pieces.
+def time_series(sequence: Sequences, values: npt.NDArray[np.floating]) -> TimeSeries:
+    """Time series of a run, split into evenly sampled pieces at long gaps.
 
     Args:
         sequence: (rows,) sequence of each row's frame; rows that do not increase it are ignored.
@@ -84,7 +84,7 @@ def pieces(sequence: Sequences, values: npt.NDArray[np.floating]) -> Pieces:
     there = np.isfinite(values).all(axis=1)
     sequence, values = sequence[there], values[there].astype(np.float64)
     if not sequence.size:
-        return Pieces((), 0)
+        return TimeSeries((), 0)
     newest = np.maximum.accumulate(sequence)
     newer = np.concatenate([[True], sequence[1:] > newest[:-1]])
     sequence, values = sequence[newer], values[newer]
@@ -94,10 +94,10 @@ def pieces(sequence: Sequences, values: npt.NDArray[np.floating]) -> Pieces:
         _even((numbers - numbers[0]).astype(np.int64), rows)
         for numbers, rows in zip(np.split(sequence, cuts), np.split(values, cuts), strict=True)
     ]
-    return Pieces(tuple(found), int(missing[missing <= MAX_INTERPOLATED_FRAMES].sum()))
+    return TimeSeries(tuple(found), int(missing[missing <= MAX_INTERPOLATED_FRAMES].sum()))
 
 
-def spectrum(run: Pieces, rate_hz: float) -> Spectrum | None:
+def spectrum(run: TimeSeries, rate_hz: float) -> Spectrum | None:
     """Welch's estimate over all pieces longer than a segment; None if there are none.
 
     Segments have Hann's window and no mean; their length, a power of two, follows from the longest piece.

@@ -13,10 +13,10 @@ from lowfc.arrays import Array
 from lowfc.control.laws import margins
 from lowfc.control.laws.continuous import Timing, commanded, held_residual_nm2, residual_spectrum
 from lowfc.control.laws.kalman import lqg_block
-from lowfc.control.laws.linear_law import Block, LinearLaw, integrator, integrator_block, of_blocks
+from lowfc.control.laws.linear_law import Block, LinearLaw, integrator, integrator_block, law_from_blocks
 from lowfc.control.laws.margins import sensitivity
 from lowfc.control.laws.pi_notch import Notch, pi_notch
-from lowfc.control.laws.spectra import Pieces, Spectrum, floor_nm2_hz, spectrum
+from lowfc.control.laws.spectra import Spectrum, TimeSeries, floor_nm2_hz, spectrum
 from lowfc.control.laws.stability import (
     LOWEST_GAIN,
     MIN_GAIN_MARGIN,
@@ -71,7 +71,7 @@ class Gains:
     noise_nm: Array
 
 
-def best_gains(run: Pieces, rate_hz: float, timing: Timing, leak: Array) -> Gains:
+def best_gains(run: TimeSeries, rate_hz: float, timing: Timing, leak: Array) -> Gains:
     """The gain of each mode with the least residual wavefront of an integrator (after Gendron and Lena 1994).
 
     Args:
@@ -116,7 +116,7 @@ def best_gains(run: Pieces, rate_hz: float, timing: Timing, leak: Array) -> Gain
     return Gains(gains, *rms)
 
 
-def identified(run: Pieces, rate_hz: float) -> list[Model]:
+def identified(run: TimeSeries, rate_hz: float) -> list[Model]:
     """A model of each mode of pseudo-open-loop modes (frames, modes).
 
     Raises:
@@ -138,7 +138,7 @@ def tune_integrator(models: Sequence[Model], gains: Gains, noll: tuple[int, ...]
 
 
 def tune_lqg(
-    run: Pieces, models: Sequence[Model], gains: Gains, noll: tuple[int, ...], leak: Array, timing: Timing
+    run: TimeSeries, models: Sequence[Model], gains: Gains, noll: tuple[int, ...], leak: Array, timing: Timing
 ) -> Tuned:
     """LQG for modes in which it beats the best integrator, else that integrator; leaks (modes,) without unit.
 
@@ -151,7 +151,7 @@ def tune_lqg(
     noise_nm2 = np.array([model.noise_nm2 for model in models])
 
     def law_of(blocks: Sequence[Block]) -> LinearLaw:
-        return of_blocks(blocks, "pol", "lqg", noll, timing.delay, rate_hz)
+        return law_from_blocks(blocks, "pol", "lqg", noll, timing.delay, rate_hz)
 
     def residual(blocks: Sequence[Block]) -> Array:
         return simulated_residual_nm2(law_of(blocks), run, noise_nm2, timing)
@@ -242,7 +242,7 @@ def frame_noise_nm2(models: Sequence[Model], noise_nm2: Array) -> Array:
     return np.asarray(noise_nm2 * np.outer(scale, scale))
 
 
-def simulated_residual_nm2(law: LinearLaw, run: Pieces, noise_nm2: Array, timing: Timing) -> Array:
+def simulated_residual_nm2(law: LinearLaw, run: TimeSeries, noise_nm2: Array, timing: Timing) -> Array:
     """Mean square (modes,) residual of the means that a law's commands are to null.
 
     Changes within a command's period, which no law can remove, are not included. Each piece of the run, (frames, modes)
@@ -253,15 +253,15 @@ def simulated_residual_nm2(law: LinearLaw, run: Pieces, noise_nm2: Array, timing
     squares, frames = np.zeros(len(law.noll)), 0
     for piece in run.values:
         skipped = min(_SETTLING_FRAMES, len(piece) // 3)
-        every = np.zeros(len(piece), np.int64)
-        command_nm = counterfactual(driven_by(law), weights, piece.astype(np.float32), every)[1]
+        missing = np.zeros(len(piece), np.int64)
+        command_nm = counterfactual(driven_by(law), weights, piece.astype(np.float32), missing)[1]
         measured_nm, commanded_nm = piece[skipped:].astype(np.float64), command_nm[skipped:].astype(np.float64)
         more, counted = held_residual_nm2(law, measured_nm, commanded_nm, noise_nm2, timing)
         squares, frames = squares + more, frames + counted
     return np.asarray(squares / max(frames, 1))
 
 
-def _whole_spectrum(run: Pieces, rate_hz: float) -> Spectrum | None:
+def _whole_spectrum(run: TimeSeries, rate_hz: float) -> Spectrum | None:
     """The periodogram of the longest piece: coarse segments would lose a slow mode's drift."""
     longest = max(run.values, key=len, default=None)
     if longest is None or len(longest) < FEWEST:
@@ -288,7 +288,7 @@ def within_margins(model: Model, timing: Timing) -> Block | None:
 
     def held(octaves: float) -> Block | None:
         block = lqg_block(replace(model, noise_nm2=2.0**octaves * model.noise_nm2), timing)
-        law = of_blocks([block], "pol", "lqg", (2,), timing.delay, model.rate_hz)  # or any other mode
+        law = law_from_blocks([block], "pol", "lqg", (2,), timing.delay, model.rate_hz)  # or any other mode
         return block if _holds(margins.margins(law, timing.delay)) else None
 
     low = 0.0
@@ -325,5 +325,5 @@ def _fine_frequencies(model: Model) -> Array:
     for line in model.lines:
         width, centre = (2 * np.pi * hz / model.rate_hz for hz in (line.width_hz, line.frequency_hz))
         grids += [centre - width * apart[::-1], np.array([centre]), centre + width * apart]
-    every = np.unique(np.concatenate(grids))
-    return np.asarray(every[(every >= 1e-7) & (every <= np.pi)])
+    omega = np.unique(np.concatenate(grids))
+    return np.asarray(omega[(omega >= 1e-7) & (omega <= np.pi)])

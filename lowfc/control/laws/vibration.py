@@ -12,7 +12,7 @@ from scipy.linalg import block_diag
 from scipy.optimize import minimize
 
 from lowfc.arrays import Array
-from lowfc.control.laws.spectra import Pieces
+from lowfc.control.laws.spectra import TimeSeries
 
 FEWEST = 2048
 """Least frames in a row for a fit."""
@@ -20,7 +20,7 @@ FEWEST = 2048
 _LONGEST = 1 << 16  # frames of a segment
 _MAX_LINES = 12
 _SCALES = (3, 9, 27, 81)  # numbers of frequencies over which lines are searched
-_PENALTY = 2.5  # of a line: log-likelihood per log(frequencies); 1.5 is Schwarz's for 3 figures, 1 for choosing a place
+_PENALTY = 2.5  # of a line: log-likelihood per log(frequencies); 1.5 is Schwarz's for 3 values, 1 for choosing a place
 _SHARE = 0.3
 _HANN = 1.5  # neighbours are correlated: three count as two
 _LOBE = 12  # frequencies on either side of a line into which the window spreads it
@@ -101,7 +101,7 @@ class Model:
         return np.asarray(block_diag(*blocks))
 
 
-def identify(run: Pieces, rate_hz: float) -> Model | None:
+def identify(run: TimeSeries, rate_hz: float) -> Model | None:
     """The model of a mode, from its pseudo-open-loop values (frames, 1) in pieces; None if there are too few.
 
     The log of a closed loop is as good as an open loop's: its pseudo-open-loop modes are also disturbance plus white
@@ -123,7 +123,7 @@ def identify(run: Pieces, rate_hz: float) -> Model | None:
     return replace(model, lowest_hz=rate_hz / max(map(len, run.values)))
 
 
-def resolution_hz(run: Pieces, rate_hz: float) -> float:
+def resolution_hz(run: TimeSeries, rate_hz: float) -> float:
     """Frequency spacing of the periodogram that `identify` fits; 0 if there is none."""
     longest = max((len(piece) for piece in run.values), default=0)
     return rate_hz / min(longest, _LONGEST) if longest >= FEWEST else 0.0
@@ -139,7 +139,7 @@ class _Whittle:
     rate_hz: float
 
     @classmethod
-    def of(cls, run: Pieces, rate_hz: float) -> "_Whittle | None":
+    def of(cls, run: TimeSeries, rate_hz: float) -> "_Whittle | None":
         longest = max((len(piece) for piece in run.values), default=0)
         frames = min(longest, _LONGEST)
         if frames < FEWEST:
@@ -199,17 +199,17 @@ class _Whittle:
         best: tuple[float, Model] | None = None
         for cutoff in (np.inf, 0.03, 0.003):  # cycles per frame to begin with
 
-            def of(figures: Array, cutoff: float = cutoff) -> Model:
-                corner = np.exp(min(figures[2], 0.0)) * self.rate_hz if np.isfinite(cutoff) else np.inf
+            def of(parameters: Array, cutoff: float = cutoff) -> Model:
+                corner = np.exp(min(parameters[2], 0.0)) * self.rate_hz if np.isfinite(cutoff) else np.inf
                 return replace(
                     model,
-                    drift_nm2=max(np.exp(figures[0]), _MIN_DRIFT * np.exp(figures[1])),
-                    noise_nm2=float(np.exp(figures[1])),
+                    drift_nm2=max(np.exp(parameters[0]), _MIN_DRIFT * np.exp(parameters[1])),
+                    noise_nm2=float(np.exp(parameters[1])),
                     cutoff_hz=float(np.clip(corner, self.spacing_hz, self.rate_hz / 2)) if corner < np.inf else corner,
                 )
 
-            def cost(figures: Array) -> float:
-                one = of(figures)
+            def cost(parameters: Array) -> float:
+                one = of(parameters)
                 floor = _drift(omega, one.drift_nm2, one.cutoff_hz / self.rate_hz) + one.noise_nm2
                 return self.misfit(power, floor + known, counts)
 
@@ -249,14 +249,14 @@ class _Whittle:
         omega, power, step = self.omega[near], self.power[near], 2 * np.pi / self.rate_hz
         excess = self.power[max(place - scale, 0) : place + scale + 1].sum() / self.power.size
 
-        def of(figures: Array) -> Line:
-            width = float(np.clip(np.exp(figures[1]), 1e-3, 1e3)) * self.spacing_hz
-            offset = float(np.clip(figures[0], -scale / 3, scale / 3)) * self.spacing_hz
+        def of(parameters: Array) -> Line:
+            width = float(np.clip(np.exp(parameters[1]), 1e-3, 1e3)) * self.spacing_hz
+            offset = float(np.clip(parameters[0], -scale / 3, scale / 3)) * self.spacing_hz
             centre = max(float(self.omega[place]) / step + offset, _LOBE * self.spacing_hz)
-            return Line(centre, width, float(np.exp(figures[2])))
+            return Line(centre, width, float(np.exp(parameters[2])))
 
-        def cost(figures: Array) -> float:
-            return self.misfit(power, known + _line(omega, *_per_frame(of(figures), self.rate_hz)), 1.0)
+        def cost(parameters: Array) -> float:
+            return self.misfit(power, known + _line(omega, *_per_frame(of(parameters), self.rate_hz)), 1.0)
 
         start = np.array([0.0, np.log(0.3 * scale), np.log(excess)])
         return of(minimize(cost, start, method="Nelder-Mead", options={"maxiter": 400, "xatol": 1e-3}).x)
@@ -278,13 +278,13 @@ class _Whittle:
         spacing = self.spacing_hz
         corner = np.isfinite(model.cutoff_hz)
 
-        def figures_of(one: Model) -> Array:
+        def parameters_of(one: Model) -> Array:
             floor = [np.log(one.drift_nm2), np.log(one.noise_nm2)] + ([np.log(one.cutoff_hz)] if corner else [])
             lines = [[0.0, np.log(line.width_hz), np.log(line.variance_nm2)] for line in one.lines]
             return np.concatenate([floor, *lines])
 
-        def of(figures: Array) -> Model:
-            floor, rest = figures[: 2 + corner], figures[2 + corner :].reshape(-1, 3)
+        def of(parameters: Array) -> Model:
+            floor, rest = parameters[: 2 + corner], parameters[2 + corner :].reshape(-1, 3)
             lines = tuple(
                 Line(line.frequency_hz + float(shift) * spacing, float(np.exp(width)), float(np.exp(variance)))
                 for line, (shift, width, variance) in zip(model.lines, rest, strict=True)
@@ -298,11 +298,11 @@ class _Whittle:
                 lines=lines,
             )
 
-        def cost(figures: Array) -> float:
-            one = of(figures)
+        def cost(parameters: Array) -> float:
+            one = of(parameters)
             return self.misfit(power, one.spectrum_nm2(omega) + one.noise_nm2, counts)
 
-        start = figures_of(model)
+        start = parameters_of(model)
         wide = [(value - 3, value + 3) for value in start[: 2 + corner]]
         for line, (_, width, variance) in zip(model.lines, start[2 + corner :].reshape(-1, 3), strict=True):
             reach = max(1.0, line.width_hz / spacing)

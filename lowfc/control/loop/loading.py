@@ -43,7 +43,7 @@ def loaded(
         same = before.calibration.noll == calibration.noll
         if before.command_channels is not None:
             shape_nm = shape_nm - before.command_channels.sum_nm
-            command_channels = loop.additions().at(before.command_channels.channels, loop.to_modes)
+            command_channels = loop.channels_or_empty().at(before.command_channels.channels, loop.to_modes)
             if same:
                 command_channels = command_channels._replace(offset_nm=before.command_channels.offset_nm)
             loop = loop._replace(command_channels=command_channels.settled())
@@ -166,8 +166,8 @@ def mirror_reported(settings: Settings, state: State, shape: MirrorShape) -> tup
     if command_nm.any():
         events.append(PendingEvent("MIRROR_ADOPTED", {"rms_nm": float(np.sqrt(command_nm @ command_nm))}))
     if state.mode is not LoopMode.SAFE:  # in safe mode it relaxes to flat and stays there
-        additions = loop.command_channels  # a mirror that reported late has channels already
-        loop, rest = adopted(loop, shape.actuators_nm if additions is None else shape.actuators_nm - additions.sum_nm)
+        channels = loop.command_channels  # a mirror that reported late has channels already
+        loop, rest = adopted(loop, shape.actuators_nm if channels is None else shape.actuators_nm - channels.sum_nm)
         events += rest
     return state._replace(loop=loop), Outputs(events=events, changed=True)
 
@@ -267,12 +267,12 @@ def adopted(loop: ActiveLoop, shape_nm: Single) -> tuple[ActiveLoop, list[Pendin
     rest_nm -= (loop.to_actuators @ loop.history_nm[0]).reshape(rest_nm.shape)
     if not np.abs(rest_nm).max() > ADOPTED_NM:
         return loop, []
-    additions = loop.additions()
-    before = additions.channel(ADOPTED)
+    channels = loop.channels_or_empty()
+    before = channels.channel(ADOPTED)
     channel_nm = rest_nm if before is None else before.shape_nm + rest_nm
-    additions = additions.having(Channel(ADOPTED, channel_nm, channel_nm), loop.to_modes).settled()
+    channels = channels.having(Channel(ADOPTED, channel_nm, channel_nm), loop.to_modes).settled()
     rms_nm = float(np.sqrt(np.mean(np.square(rest_nm))))
-    loop = loop._replace(command_channels=additions)
+    loop = loop._replace(command_channels=channels)
     return loop, [PendingEvent("SHAPE_ADOPTED", {"rms_nm": rms_nm})]
 
 

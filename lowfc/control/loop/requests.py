@@ -182,12 +182,12 @@ def _law_of_modes(settings: Settings, state: State, request: Request) -> Handled
 
 
 def _offset(settings: Settings, state: State, request: Request) -> Handled:
-    additions = (loop := _calibrated_loop(state)).additions()
+    channels = (loop := _calibrated_loop(state)).channels_or_empty()
     asked = request if request.values else replace(request, values=(0.0,))
-    values = per_mode(loop.calibration.noll, asked, additions.offset_nm)
+    values = per_mode(loop.calibration.noll, asked, channels.offset_nm)
     check_offset(loop, np.abs(values))
     text = " ".join(f"{value:g}" for value in values.tolist())
-    after = _with(state, loop, additions._replace(offset_nm=values))
+    after = _with(state, loop, channels._replace(offset_nm=values))
     return after, f"offset is now {text} nm{offset_remark(loop, values)}"
 
 
@@ -202,14 +202,14 @@ def _channel(settings: Settings, state: State, request: Request) -> Handled:
             raise ValueError(f"a channel has {grid[0]} x {grid[1]} actuators, got {request.actuators_nm.size}")
         shape_nm = request.actuators_nm.reshape(grid)
     _check_shape(None if request.text == EXTERNAL else settings.limits, shape_nm)
-    additions = loop.additions().with_channel(request.text, shape_nm, loop.to_modes)
-    if not request.actuators_nm.size and loop.additions().channel(request.text) is None:
-        names = ", ".join(one.name for one in loop.additions().channels)
+    channels = loop.channels_or_empty().with_channel(request.text, shape_nm, loop.to_modes)
+    if not request.actuators_nm.size and loop.channels_or_empty().channel(request.text) is None:
+        names = ", ".join(one.name for one in loop.channels_or_empty().channels)
         return state, f"there is no channel {request.text!r} to remove; there are {names or 'none'}"
-    commanded = (one.shape_nm for one in additions.channels if one.commanded)
+    commanded = (one.shape_nm for one in channels.channels if one.commanded)
     _check_shape(settings.limits, sum(commanded, np.zeros(grid, np.float32)))
     rms_nm = float(np.sqrt(np.mean(np.square(shape_nm, dtype=np.float64))))
-    return _with(state, loop, additions), f"channel {request.text}: {rms_nm:.3g} nm rms of surface"
+    return _with(state, loop, channels), f"channel {request.text}: {rms_nm:.3g} nm rms of surface"
 
 
 def _play(settings: Settings, state: State, request: Request) -> Handled:
@@ -220,8 +220,8 @@ def _play(settings: Settings, state: State, request: Request) -> Handled:
         raise ValueError("a probe sequence starts at a frame, and no frame has arrived yet")
     if state.conditions.mirror_fault:
         raise ValueError(f"the mirror {state.conditions.mirror_fault}: it would not follow a probe sequence")
-    additions = loop.additions()
-    if additions.play is not None and not additions.play.over(state.frame_sequence + 1):
+    channels = loop.channels_or_empty()
+    if channels.play is not None and not channels.play.over(state.frame_sequence + 1):
         raise ValueError("a probe sequence is being played already: `lowfc ctl stop` ends it")
     table = request.played
     assert table is not None  # noqa: S101  # prepared
@@ -243,9 +243,7 @@ def _play(settings: Settings, state: State, request: Request) -> Handled:
         check_offset(loop, table.largest)
     frames = len(table.rows)
     play = Play(table, state.frame_sequence + 1, frames)
-    return _with(
-        state, loop, additions._replace(play=play)
-    ), f"playing {counted(frames, 'frame')} on the {table.target}"
+    return _with(state, loop, channels._replace(play=play)), f"playing {counted(frames, 'frame')} on the {table.target}"
 
 
 def _stop(settings: Settings, state: State, request: Request) -> Handled:

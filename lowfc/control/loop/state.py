@@ -222,8 +222,8 @@ class ActiveLoop(NamedTuple):
             calibration = replace(calibration, reconstructor=rows)
         return self._replace(weighting=weighting, estimator=Estimator.of(calibration, self.estimator.kernel))
 
-    def additions(self) -> CommandChannels:
-        """Additions to the command; an empty object if there are none."""
+    def channels_or_empty(self) -> CommandChannels:
+        """The command channels; an empty object if there are none."""
         if self.command_channels is not None:
             return self.command_channels
         return CommandChannels.none(self.calibration.grid, len(self.calibration.noll), len(self.history_nm))

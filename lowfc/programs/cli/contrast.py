@@ -1,4 +1,4 @@
-"""Contrast added to the dark zone by the wavefront: figures and text shared by several commands."""
+"""Contrast added to the dark zone by the wavefront: values and text shared by several commands."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -34,9 +34,9 @@ def with_variances(covariance_nm2: Array, rms_nm: Array) -> Array:
     return np.asarray(covariance_nm2 + np.diag(rms_nm**2 - np.diag(covariance_nm2)))
 
 
-def most_of(figures: Mapping[str, Any]) -> tuple[str, float] | None:
-    """The modes that contribute most to the added contrast, from a camera's wavefront figures."""
-    most = figures["costliest_modes"]
+def most_of(known: Mapping[str, Any]) -> tuple[str, float] | None:
+    """The modes that contribute most to the added contrast, from a camera's statistics of the wavefront."""
+    most = known["costliest_modes"]
     return None if most is None else (most["modes"], most["share"])
 
 
@@ -45,7 +45,9 @@ def with_this_mirror(added: Mapping[str, float]) -> dict[str, float | None]:
     return {"flat mirror": added["open"], "residual": added["closed"]}
 
 
-def sentence(added: Mapping[str, float | None], most: tuple[str, float] | None, beyond: Sequence[str] = ()) -> str:
+def contrast_in_words(
+    added: Mapping[str, float | None], most: tuple[str, float] | None, beyond: Sequence[str] = ()
+) -> str:
     """The added contrast of each case, and the modes that contribute most to the last one."""
     cases = ", ".join(f"{name} {one:+.1e}" for name, one in added.items() if one is not None)
     largest = "" if most is None else f"; {most[0]} contributes most ({100 * most[1]:.0f} %)"
@@ -53,8 +55,8 @@ def sentence(added: Mapping[str, float | None], most: tuple[str, float] | None, 
     return f"added to the dark zone's contrast: {cases}{largest}{caveat}"
 
 
-def sentence_of(found: Mapping[str, Any]) -> str:
-    """The sentence of `added_contrast`."""
+def added_contrast_in_words(found: Mapping[str, Any]) -> str:
+    """The result of `added_contrast` in words."""
     groups, beyond = found["by_group"], found["beyond_quadratic"]
     added = {name: one for name, one in found.items() if name not in ("by_group", "beyond_quadratic")}
-    return sentence(added, costliest(next(reversed(groups.values()))), beyond)
+    return contrast_in_words(added, costliest(next(reversed(groups.values()))), beyond)

@@ -110,12 +110,12 @@ def _close(run: AnyRun = None, as_json: Json = False) -> None:
 
 
 def _status(run: AnyRun = None, as_json: Json = False) -> None:
-    from lowfc.programs.cli.status import figures, text
+    from lowfc.programs.cli.status import json_object, text
 
     with _joined(run) as loop:
         state, processes = loop.status().state, loop.processes()
         assert state is not None  # noqa: S101  # a status reply always has one
-    known = figures(state, processes, loop.run_id)
+    known = json_object(state, processes, loop.run_id)
     print_result(known, text(known), as_json=as_json)
 
 
@@ -161,7 +161,7 @@ def bench(name: BenchName, value: BenchValue, run: AnyRun = None, as_json: Json 
 
     Example: lowfc ctl bench mask-moving true
     """
-    from lowfc.programs.cli.status import figures, interlocks
+    from lowfc.programs.cli.status import interlocks, json_object
 
     booleans: dict[str, bool | float | str] = {"true": True, "false": False}
     try:
@@ -173,7 +173,7 @@ def bench(name: BenchName, value: BenchValue, run: AnyRun = None, as_json: Json 
         loop.bench(name, parsed)
         state = loop.status().state
         assert state is not None  # noqa: S101  # a status reply always has one
-    known = figures(state, run=loop.run_id)
+    known = json_object(state, run=loop.run_id)
     names = sorted({one.name for one in state.settings.interlocks})
     unused = "" if name in names else f"; no interlock uses it (they use {', '.join(names)})" if names else ""
     acting = f"interlocks: {interlocks(known)}" if names else "no interlock is configured"
@@ -228,7 +228,7 @@ for _name, _request in BY_NAME.items():
         _command = _recording(_name) if _records else _OWN.get(_name) or _BY_FIELDS[_fields](_name)
         (record_app if _records else ctl_app).command(
             _request.name,
-            help=f"{_request.sentence}\n\nExample: lowfc ctl {_request.example}",
+            help=f"{_request.description}\n\nExample: lowfc ctl {_request.example}",
             context_settings={"ignore_unknown_options": "values" in _fields},  # -5 is a value, not an option
         )(_command)
 ctl_app.command()(bench)

@@ -14,7 +14,7 @@ import typer
 from lowfc.adapters.process.extras import install_advice
 from lowfc.adapters.process.terminal import DEFAULT_RUN, AnyRun, ConfigFile, Json, RunId, configuration
 from lowfc.contract.errors import BusError, ConfigurationError
-from lowfc.programs.cli.result import Result, figure, print_result
+from lowfc.programs.cli.result import Result, print_result, result_field
 
 if TYPE_CHECKING:
     from lowfc.contract.messages import wire
@@ -28,17 +28,17 @@ _POLL_S = 0.1
 class HostProcess(Result):
     """A process and the clock of its host."""
 
-    process: str = figure("process")
-    state: str = figure("state")
-    clock_offset_us: float | None = figure("router's clock minus its own", "us", "+.0f")
-    clock_error_us: float | None = figure("error at most", "us", ".0f")
+    process: str = result_field("process")
+    state: str = result_field("state")
+    clock_offset_us: float | None = result_field("router's clock minus its own", "us", "+.0f")
+    clock_error_us: float | None = result_field("error at most", "us", ".0f")
 
 
 class HostsResult(Result):
     """The processes of a run."""
 
-    run: str = figure("run")
-    processes: list[HostProcess] = figure("processes")
+    run: str = result_field("run")
+    processes: list[HostProcess] = result_field("processes")
 
     def remarks(self) -> list[str]:
         """The reason if no clock is compared."""

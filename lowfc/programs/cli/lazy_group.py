@@ -19,7 +19,7 @@ class Row(NamedTuple):
 
     name: str
     where: str
-    sentence: str
+    description: str
 
 
 class Commands(Mapping[str, Any]):
@@ -37,7 +37,7 @@ class Commands(Mapping[str, Any]):
         else:
             parts = [part for part in self._parts if part.name.startswith(f"{name} ")]
             commands = [part._replace(name=part.name.removeprefix(f"{name} ")) for part in parts]
-            found = lazy_app(f"{row.sentence}\n\nExample: lowfc {parts[0].name}", {"Commands": commands})
+            found = lazy_app(f"{row.description}\n\nExample: lowfc {parts[0].name}", {"Commands": commands})
             found.callback()(lambda: None)
         app = found if isinstance(found, typer.Typer) else new_app("")
         if app is not found:
@@ -72,7 +72,7 @@ def lazy_app(help_text: str, panels: Mapping[str, Sequence[Row]], parts: Sequenc
         def format_commands(self, ctx: Any, formatter: Any) -> None:
             for heading, panel in panels.items():
                 with formatter.section(heading):
-                    formatter.write_dl([(f"{row.name:{wide}}", row.sentence) for row in panel])
+                    formatter.write_dl([(f"{row.name:{wide}}", row.description) for row in panel])
 
     app = new_app(help_text)
     app.info.cls = Group

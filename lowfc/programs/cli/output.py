@@ -8,6 +8,6 @@ from typing import Any
 from lowfc.contract.printable import LINES, printable
 
 
-def print_result(figures: Mapping[str, Any], text: str, *, as_json: bool) -> None:
-    """Print figures as one JSON object, or the text for a person with its control characters escaped."""
-    sys.stdout.write((json.dumps(figures) if as_json else printable(text, keep=LINES)) + "\n")
+def print_result(result: Mapping[str, Any], text: str, *, as_json: bool) -> None:
+    """Print a result as one JSON object, or the text for a person with its control characters escaped."""
+    sys.stdout.write((json.dumps(result) if as_json else printable(text, keep=LINES)) + "\n")

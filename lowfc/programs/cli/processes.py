@@ -107,7 +107,7 @@ def record(
     from lowfc.adapters.bus.run import open_run
     from lowfc.client.runs import waiting_message
     from lowfc.programs.core.recording.process import record as run_recorder
-    from lowfc.programs.core.recording.summary import figures, report
+    from lowfc.programs.core.recording.summary import json_object, report
 
     overrides = {
         "recorder.folder": folder,
@@ -125,6 +125,6 @@ def record(
     if not joined.links.network.router and (nobody := waiting_message(run)):
         typer.echo(f"recorder: {nobody}", err=True)
     done = run_recorder(joined, settings, calibration)
-    typer.echo(json.dumps(figures(done)) if as_json else report(done), err=not as_json)
+    typer.echo(json.dumps(json_object(done)) if as_json else report(done), err=not as_json)
     if done.failure:
         raise typer.Exit(1)

@@ -1,7 +1,7 @@
 """Typed result of a command: the source of both its `--json` object and its text.
 
-`figure` declares a field with label, unit and format. The text has a line for each labelled figure, then a table for
-each list of parts; figures declared as columns have the same length and share one table.
+`result_field` declares a field with label, unit and format. The text has a line for each labelled field, then a table
+for each list of parts; fields declared as columns have the same length and share one table.
 """
 
 from collections.abc import Iterator, Sequence
@@ -15,7 +15,7 @@ from lowfc.programs.cli import output
 _LABEL_WIDTH = 18
 
 
-def figure(label: str = "", unit: str = "", form: str = "", *, column: bool = False, **field: Any) -> Any:
+def result_field(label: str = "", unit: str = "", form: str = "", *, column: bool = False, **field: Any) -> Any:
     """A field of a result.
 
     Without a label it appears only in the JSON. `form` is a format specification, or a format string such as "Z{}". A
@@ -29,7 +29,7 @@ class Result(BaseModel):
 
     model_config = ConfigDict(arbitrary_types_allowed=True, populate_by_name=True)
 
-    def figures(self) -> dict[str, Any]:
+    def json_object(self) -> dict[str, Any]:
         """Object for `--json`; fields that were not set are omitted."""
         return self.model_dump(by_alias=True, exclude_unset=True)
 
@@ -38,11 +38,11 @@ class Result(BaseModel):
         return "\n".join([*self.head(), *self._labelled(), *self._tables(), *self.remarks()])
 
     def head(self) -> Sequence[str]:
-        """Lines before the figures."""
+        """Lines before the fields."""
         return ()
 
     def remarks(self) -> Sequence[str]:
-        """Lines after the figures: conclusions and advice."""
+        """Lines after the fields: conclusions and advice."""
         return ()
 
     def _labelled(self) -> Iterator[str]:
@@ -65,7 +65,7 @@ class Result(BaseModel):
 
 
 def parts_table(parts: Sequence[Result]) -> list[str]:
-    """A row for each part, a column for each of its labelled figures; its remarks follow the row."""
+    """A row for each part, a column for each of its labelled fields; its remarks follow the row."""
     shown = [(name, info) for name, info in type(parts[0]).model_fields.items() if info.description]
     rows = [[formatted(info, getattr(part, name)) for name, info in shown] for part in parts]
     lines = table([_heading(info) for _, info in shown], rows)
@@ -84,7 +84,7 @@ def table(heads: Sequence[str], rows: Any) -> list[str]:
 
 
 def formatted(info: FieldInfo, value: Any, *, with_unit: bool = False) -> str:
-    """A figure as text; a dash for none."""
+    """The value of a field as text; a dash for none."""
     if value is None:
         return "-"
     if isinstance(value, bool):
@@ -98,7 +98,7 @@ def formatted(info: FieldInfo, value: Any, *, with_unit: bool = False) -> str:
 
 def print_result(result: Result, *, as_json: bool) -> None:
     """Print a result: one JSON object, or its text with control characters escaped."""
-    output.print_result(result.figures(), result.text(), as_json=as_json)
+    output.print_result(result.json_object(), result.text(), as_json=as_json)
 
 
 def _heading(info: FieldInfo) -> str:

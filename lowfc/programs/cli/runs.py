@@ -16,8 +16,8 @@ def runs(as_json: Json = False) -> None:
     from lowfc.client.runs import live_runs
 
     rows = [_row(name, roles) for name, roles in live_runs().items()]
-    figures = {"runs": rows, "searched": str(runtime_path())}
-    print_result(figures, "\n".join(_lines(rows)) if rows else none_here(), as_json=as_json)
+    results = {"runs": rows, "searched": str(runtime_path())}
+    print_result(results, "\n".join(_lines(rows)) if rows else none_here(), as_json=as_json)
 
 
 def _row(name: str, roles: set[str]) -> dict[str, Any]:

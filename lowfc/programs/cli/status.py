@@ -1,4 +1,4 @@
-"""State of the controller, as figures and as text."""
+"""State of the controller, as a JSON object and as text."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -13,7 +13,7 @@ from lowfc.contract.messages import FRAME, Role, from_timestamp, wire
 from lowfc.control.loop.safety import REASONS, Rejection, reason_of
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
 from lowfc.control.loop.wording import PAUSED, counted, mode_word
-from lowfc.programs.cli.contrast import most_of, sentence, with_this_mirror
+from lowfc.programs.cli.contrast import contrast_in_words, most_of, with_this_mirror
 from lowfc.programs.launch.watch import mode_name, topic_count, wavefront
 
 NO_HEALTH = wire.Health()
@@ -21,7 +21,7 @@ NO_HEALTH = wire.Health()
 _NO_PROCESSES: Mapping[str, wire.Health] = MappingProxyType({})
 
 
-def figures(
+def json_object(
     state: wire.ControllerState,
     processes: Mapping[str, wire.Health] = _NO_PROCESSES,
     run: str = "",
@@ -124,7 +124,7 @@ def figures(
 
 
 def text(known: dict[str, Any]) -> str:
-    """The figures as text; the first line summarises them."""
+    """The state as text; the first line summarises them."""
     since = "" if known["mode_s"] is None else f" for {known['mode_s']:.0f} s ({known['mode_cause']})"
     opens = f", opens after {counted(known['steps_left'], 'frame')}" if known["steps_left"] else ""
     playing = known["playing"]
@@ -162,7 +162,7 @@ def _contrast(known: dict[str, Any]) -> dict[str, str]:
     if known["added_contrast"] is None:
         return {}
     of = ", estimated from the sensor" if known["added_contrast_estimated"] else ""
-    return {"contrast": sentence(with_this_mirror(known["added_contrast"]), most_of(known)) + of}
+    return {"contrast": contrast_in_words(with_this_mirror(known["added_contrast"]), most_of(known)) + of}
 
 
 def law_in_words(known: dict[str, Any]) -> str:

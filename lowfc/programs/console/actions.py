@@ -33,7 +33,7 @@ class Action(NamedTuple):
 
     key: str
     name: str
-    sentence: str
+    description: str
     fields: tuple[Field, ...] = ()
     ask: Callable[[Client, Values], Answer] | None = None
     task: tuple[str, ...] = ()
@@ -116,7 +116,7 @@ def requested(key: str, name: str, confirm: str = "") -> Action:
     names = sorted((field for field, _ in declared.fields), key=lambda field: field == _LAST_FIELD)
     labels = ((field, _LABELS.get(field) or _LABELS.get(f"{name} {field}")) for field in names)
     fields = tuple(Field(field, label) for field, label in labels if label)
-    return Action(key, name, declared.sentence, fields, ask, confirm=confirm)
+    return Action(key, name, declared.description, fields, ask, confirm=confirm)
 
 
 def _record(loop: Client, values: Values) -> Answer:
@@ -176,7 +176,7 @@ ACTIONS = (
     ),
     requested("a", "load"),
     Action("r", "record", "Start a new log, with a note of target and observer.", _TARGET, _record),
-    Action("v", "end log", BY_NAME["record/stop"].sentence, ask=lambda loop, _: loop.record(False)),
+    Action("v", "end log", BY_NAME["record/stop"].description, ask=lambda loop, _: loop.record(False)),
     requested("n", "note"),
 )
 """Buttons in the order of the screen."""

@@ -51,9 +51,9 @@ _OTHER_KEYS = (
 class Answered(Message):
     """The answer to an action, or the reason why it failed."""
 
-    def __init__(self, action: Action, sentence: str, *, ok: bool) -> None:
+    def __init__(self, action: Action, text: str, *, ok: bool) -> None:
         super().__init__()
-        self.action, self.sentence, self.ok = action, sentence, ok
+        self.action, self.text, self.ok = action, text, ok
 
 
 class Console(OrderedKeys):
@@ -64,7 +64,7 @@ class Console(OrderedKeys):
     #top {{ height: 2; }}
     #verdict {{ width: 1fr; height: 2; padding: 0 1; text-style: bold; }}
     #clock {{ width: 11; height: 2; padding: 0 1; text-style: bold; }}
-    #figures {{ height: 17; }}
+    #readings {{ height: 17; }}
     #left {{ width: {_LEFT}; }}
     #right {{ width: 1fr; padding: 0 0 0 1; }}
     #tiles {{ height: 8; }}
@@ -139,7 +139,7 @@ class Console(OrderedKeys):
         with Horizontal(id="top"):
             yield Static(id="verdict", markup=False)
             yield Static(id="clock", markup=False)
-        with Horizontal(id="figures"):
+        with Horizontal(id="readings"):
             with Vertical(id="left"):
                 for name in ("tiles", "sparks", "modes"):
                     yield Lines(name)
@@ -193,8 +193,8 @@ class Console(OrderedKeys):
     def action_help(self) -> None:
         """Show the keys."""
         rows = [
-            ("s F12", "SAFE", f"At once, in a form with F12: {SAFE.sentence}"),
-            *((one.key, one.name, one.sentence) for one in ACTIONS),
+            ("s F12", "SAFE", f"At once, in a form with F12: {SAFE.description}"),
+            *((one.key, one.name, one.description) for one in ACTIONS),
             *_OTHER_KEYS,
         ]
         self.push_screen(Help(rows))
@@ -230,15 +230,15 @@ class Console(OrderedKeys):
             try:
                 if action.ask is None:
                     tasks.append(Task(action.name, action.command(values, self._run_id)))
-                    sentence = f"{action.name}: started"
+                    text = f"{action.name}: started"
                 else:
                     answer = action.ask(Client(self._run_id, bus=self._bus), values)
                     since = f", from frame {answer.frame} on" if answer.frame else ""
-                    sentence = f"{action.name}: {answer.reply}{since}"
+                    text = f"{action.name}: {answer.reply}{since}"
             except (LowfcError, OSError, ValueError) as fault:
                 self.post_message(Answered(action, phrased(str(fault)), ok=False))
             else:
-                self.post_message(Answered(action, phrased(sentence), ok=True))
+                self.post_message(Answered(action, phrased(text), ok=True))
                 self.call_later(self._tasks.extend, tasks)  # "started" is shown before "done"
 
         self._requesting[action.name] = threading.Thread(target=ask, name=action.name, daemon=True)
@@ -248,7 +248,7 @@ class Console(OrderedKeys):
     def _answered(self, event: Answered) -> None:
         if self._torn_down:
             return
-        self._answer(event.sentence, ok=event.ok)
+        self._answer(event.text, ok=event.ok)
         self.query_one(f"#{_id(event.action)}").set_class(not event.ok, "refused")
         if event.action.name == "gain" and not event.ok:
             self.query_one(Gains).discard_pending()
@@ -257,12 +257,12 @@ class Console(OrderedKeys):
             if event.ok:
                 form.dismiss()
             else:
-                form.refuse(event.sentence)
+                form.refuse(event.text)
 
-    def _answer(self, sentence: str, *, ok: bool) -> None:
+    def _answer(self, text: str, *, ok: bool) -> None:
         answer = self.screen_stack[0].query_one("#answer", Static)
         answer.set_class(not ok, "refused")
-        answer.update(sentence, layout=False)
+        answer.update(text, layout=False)
 
     @property
     def _torn_down(self) -> bool:
@@ -283,11 +283,11 @@ class Console(OrderedKeys):
             self.exit(RESTARTED)
 
     def _show(self, reading: Reading) -> None:
-        level, sentence = panels.verdict(reading, self._run_id)
+        level, headline = panels.verdict(reading, self._run_id)
         self._colour(level)
-        self._show_text("verdict", Text(sentence))
+        self._show_text("verdict", Text(headline))
         self._show_text("clock", Text(f"{panels.clock(reading.state.snapshot.host_ns)}\nUTC"))
-        self.screen_stack[0].query_one("#figures").set_class(not reading.connected, "disconnected")
+        self.screen_stack[0].query_one("#readings").set_class(not reading.connected, "disconnected")
         if reading.connected:
             self._lines("tiles").show(panels.tiles(reading))
             self._lines("sparks").show(panels.sparks(reading))
@@ -309,9 +309,9 @@ class Console(OrderedKeys):
     def _watch_tasks(self) -> None:
         for task in [one for one in self._tasks if one.status is not None]:
             self._tasks.remove(task)
-            self._answer(task.sentence, ok=not task.status)
+            self._answer(task.status_line, ok=not task.status)
         self._static("#tasks").display = bool(self._tasks)
-        self._show_text("tasks", Text("\n".join(task.sentence for task in self._tasks)))
+        self._show_text("tasks", Text("\n".join(task.status_line for task in self._tasks)))
 
     def _colour(self, level: Level) -> None:
         for name in ("#verdict", "#clock"):

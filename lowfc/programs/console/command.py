@@ -10,7 +10,7 @@ from lowfc.contract.errors import ConfigurationError
 def console(run: AnyRun = None) -> None:
     """Operate a running loop from one screen of a terminal, at least 100 x 30 characters.
 
-    It shows the verdict and figures of `lowfc view` and sends the requests of `lowfc ctl`. Key ? shows the keys.
+    It shows the verdict and values of `lowfc view` and sends the requests of `lowfc ctl`. Key ? shows the keys.
 
     Example: lowfc console
     """

@@ -1,4 +1,4 @@
-"""Readings of the run, several times a second: the verdict of the view's tiles, and figures."""
+"""Readings of the run, several times a second: the verdict of the view's tiles, and values."""
 
 import threading
 import time
@@ -32,7 +32,7 @@ TREND_S = 60
 _RING_SIZES = {EVENT: 200, REQUEST: 200, STEP: 4000, TRUTH: 50}  # messages; 50 truths per reading suffice for an rms
 _TOPICS = (*(topic for topic in SHOWN if topic is not SURFACE), REQUEST)
 _PRELOADED, _PRELOAD_S = ("lowfc.control.laws.tuning", "scipy.signal"), 4.0
-"""Slow imports, done in a thread after this time: the first figures do not need them, a later verdict does."""
+"""Slow imports, done in a thread after this time: the first values do not need them, a later verdict does."""
 _QUERY_AGAIN_S = 5.0  # until a controller that did not answer is queried again
 _TREND_STEP_NS = 1_000_000_000
 _HIDDEN_REQUESTS = frozenset(("status", "configuration", "renew"))

@@ -46,7 +46,7 @@ class Form(ModalScreen[None]):
     def compose(self) -> ComposeResult:
         """Lay out the form."""
         with Vertical():
-            yield Static(self.button.confirm or f"{self.button.name}: {self.button.sentence}", markup=False)
+            yield Static(self.button.confirm or f"{self.button.name}: {self.button.description}", markup=False)
             for field in self.button.fields:
                 yield Label(field.label, markup=False)
                 yield Input(field.default(), name=field.name, compact=True)
@@ -84,8 +84,8 @@ class Help(ModalScreen[None]):
     def compose(self) -> ComposeResult:
         """Lay out the help."""
         lines = [
-            Text.assemble((f"{key:6}", "bold"), f"{name:11}", _CLAUSE_END.split(sentence, maxsplit=1)[0].rstrip("."))
-            for key, name, sentence in self._rows
+            Text.assemble((f"{key:6}", "bold"), f"{name:11}", _CLAUSE_END.split(description, maxsplit=1)[0].rstrip("."))
+            for key, name, description in self._rows
         ]
         with Vertical():
             yield Static(HELP, markup=False)

@@ -19,7 +19,7 @@ from lowfc.programs.console.feed import Reading
 from lowfc.programs.console.phrases import phrased
 from lowfc.programs.view.draw.colours import GREY, ORANGE, RED, YELLOW, Colour, Rgb, diverging, sequential
 from lowfc.programs.view.verdicts.run_state import Liveness
-from lowfc.programs.view.verdicts.tile import FILL, INK, WORD, Level, duration, figure, numbers
+from lowfc.programs.view.verdicts.tile import FILL, INK, WORD, Level, duration, numbers, rounded
 from lowfc.programs.view.verdicts.watcher import SILENT_S
 
 _PIXELS = 12
@@ -47,7 +47,7 @@ def verdict(reading: Reading, run: str) -> tuple[Level, str]:
         return Level.WARNING, f"NOT CONNECTED  no message of run {run} yet"
     if not reading.connected:
         return Level.BAD, (
-            f"NOT CONNECTED  no message of run {run} for {duration(reading.silent_s)}: figures are hidden. The run was "
+            f"NOT CONNECTED  no message of run {run} for {duration(reading.silent_s)}: values are hidden. The run was "
             "killed, or this console is disconnected; a running loop goes on by itself."
         )
     return reading.verdict.level, f"{WORD[reading.verdict.level]}  {phrased(reading.verdict.headline)}".strip()
@@ -59,7 +59,7 @@ def clock(host_ns: int) -> str:
 
 
 def tiles(reading: Reading) -> list[Text]:
-    """A line for each tile: title, word or figure, and explanation."""
+    """A line for each tile: title, word or number, and explanation."""
     lines = []
     for tile in reading.verdict.tiles:
         line = Text.assemble((f"{tile.title:10}", DIM), f"{WORD[tile.level]:5} ")
@@ -114,7 +114,7 @@ def sparks(reading: Reading) -> list[Text]:
     """Sparklines of residual and light over the last minute."""
     wavefront, flux = reading.state.wavefront, reading.light[-1] if reading.light else float("nan")
     kind = "true" if reading.state.true else "measured"
-    residual = "?" if wavefront is None else f"{figure(wavefront.residual_nm)} nm {kind}"
+    residual = "?" if wavefront is None else f"{rounded(wavefront.residual_nm)} nm {kind}"
     light = "?" if np.isnan(flux) else f"{100 * flux:.0f} %"
     rows = ("residual", reading.residual_nm, residual), ("light", reading.light, light)
     return [
@@ -151,13 +151,13 @@ def modes(reading: Reading, width: int) -> list[Text]:
 
 
 def _mode(noll: int, command_nm: float, limit_nm: float, width: int) -> Text:
-    figures = f"{command_nm:+6.1f}/{limit_nm:.0f}" if width >= 22 else ""
-    half = max(1, (width - 4 - 11 * bool(figures)) // 2)
+    numbers_text = f"{command_nm:+6.1f}/{limit_nm:.0f}" if width >= 22 else ""
+    half = max(1, (width - 4 - 11 * bool(numbers_text)) // 2)
     share = min(abs(command_nm) / limit_nm, 1.0) if limit_nm else 1.0
     bar = "█" * round(share * half)
     left, right = (f"{bar:>{half}}", " " * half) if command_nm < 0 else (" " * half, f"{bar:{half}}")
     ink = WRONG if share >= _NEAR_LIMIT else style(ORANGE)
-    known = f"{figures:>11}" if figures else ""
+    known = f"{numbers_text:>11}" if numbers_text else ""
     return Text.assemble((f"Z{noll:<3}", DIM), (left, ink), ("│", DIM), (right, ink), known)
 
 

@@ -15,9 +15,9 @@ _NUMBER = r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?"
 _LIST = re.compile(rf"(?<![\w.]){_NUMBER}(?: {_NUMBER}){{3,}}(?![\w.])")
 
 
-def phrased(sentence: str) -> str:
+def phrased(text: str) -> str:
     """A sentence with the console's keys, and short enough for its lines."""
-    return _LIST.sub(lambda found: numbers([float(one) for one in found[0].split()]), _COMMAND.sub(_key, sentence))
+    return _LIST.sub(lambda found: numbers([float(one) for one in found[0].split()]), _COMMAND.sub(_key, text))
 
 
 def _key(found: re.Match[str]) -> str:

@@ -37,7 +37,7 @@ class Task:
         return self._process.poll()
 
     @property
-    def sentence(self) -> str:
+    def status_line(self) -> str:
         """State of the command in one line, with the last line of its output."""
         lines = [line.strip() for line in self._tail().splitlines() if line.strip()]
         last = lines[-1] if lines else ""

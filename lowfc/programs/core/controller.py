@@ -161,7 +161,7 @@ class Controller:
         self._service.finish()
 
     def fill(self, health: wire.Health) -> None:
-        """Add mode, counts, latency and loop figures to a Health."""
+        """Add mode, counts, latency and statistics of the loop to a Health."""
         health.mode = self._state.mode.value  # type: ignore[assignment]  # numbered alike
         health.counts.extend(reason_counts(self._state))
         now_ns = self._service.clock.now_ns()
@@ -169,7 +169,7 @@ class Controller:
         if self._state.mode is LoopMode.CLOSED:
             health.holding = holding(self._state)
         fill_benefit(health, self._gain_watch, self._state)
-        health.last_second.CopyFrom(self._last_second.figures(self._state, self._service.clock.host_ns()))
+        health.last_second.CopyFrom(self._last_second.statistics(self._state, self._service.clock.host_ns()))
         if self._frame_to_command.count:
             health.frame_to_command.CopyFrom(codec.latency(self._frame_to_command))
 

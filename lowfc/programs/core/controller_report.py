@@ -21,7 +21,7 @@ SECOND_NS = 1_000_000_000
 CAUSES_NAMED = 4
 """Number of the most frequent causes of a loop not closed that are listed with their counts."""
 MAX_CAUSES = 20
-"""Number of different causes counted; a cause may contain figures, so that their number has no limit."""
+"""Number of different causes counted; a cause may contain values, so that their number has no limit."""
 
 
 class StageTiming:
@@ -94,8 +94,8 @@ class LastSecond:
             self._rows[self._count % len(self._rows)] = now_ns, step.error_nm @ step.error_nm, step.flux_dn
             self._count += 1
 
-    def figures(self, state: State, now_ns: int) -> wire.LoopFigures:
-        """Figures of the last second; all zero without a frame."""
+    def statistics(self, state: State, now_ns: int) -> wire.LoopFigures:
+        """Statistics of the last second; all zero without a frame."""
         rows = self._rows[: self._count]
         rows = rows[rows[:, 0] > now_ns - SECOND_NS]
         if state.loop is None or not len(rows):

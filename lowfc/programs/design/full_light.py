@@ -13,9 +13,9 @@ from lowfc.adapters.files.whole_file import require_folder, write_whole
 from lowfc.contract.configuration import load
 from lowfc.contract.sections import SensorSection
 from lowfc.design.full_light import Focus, FullLight, sweep
-from lowfc.design.goal import Goal, figures, merit
+from lowfc.design.goal import Goal, merit, predictions
 from lowfc.design.merit import WAVELENGTH_NM
-from lowfc.programs.cli.result import Result, figure
+from lowfc.programs.cli.result import Result, result_field
 from lowfc.programs.design.full_light_request import Sizes
 
 KEYS = {"zwfs": "spot_diameter", "clowfs": "defocus_mm"}
@@ -23,29 +23,29 @@ _POINTS = 21
 
 
 class Point(Result):
-    """Figures of a sensor of one size."""
+    """Predicted performance of a sensor of one size."""
 
-    value: float = figure("size", form=".3f")
-    merit: float = figure("merit", form=".4g")
-    throughput: float = figure("throughput", form=".1%")
-    table3_waves: float = figure("Table 3, n<=4", "waves", ".2e")
-    table4_mas: float = figure("Table 4, 2 modes", "mas", ".3f")
-    condition: float = figure("cond14", form=".0f")
-    noise_nm: float = figure("noise of 14 modes", "nm", ".3g")
-    contrast_noise: float = figure("contrast from noise", form=".2e")
-    quantum_share: float = figure("share of quantum limit", form=".1%")
+    value: float = result_field("size", form=".3f")
+    merit: float = result_field("merit", form=".4g")
+    throughput: float = result_field("throughput", form=".1%")
+    table3_waves: float = result_field("Table 3, n<=4", "waves", ".2e")
+    table4_mas: float = result_field("Table 4, 2 modes", "mas", ".3f")
+    condition: float = result_field("cond14", form=".0f")
+    noise_nm: float = result_field("noise of 14 modes", "nm", ".3g")
+    contrast_noise: float = result_field("contrast from noise", form=".2e")
+    quantum_share: float = result_field("share of quantum limit", form=".1%")
 
 
 class Sweep(Result):
-    """Figures of every size, and the best size."""
+    """Predicted performance of every size, and the best size."""
 
-    key: str = figure("key of [sensor]")
-    merit: str = figure("merit")
-    estimator: str = figure("estimator")
-    best: float = figure("best", form=".3f")
-    file: str = figure("written to")
-    points: list[Point] = figure()
-    figures_of_best: dict[str, Any] = figure()
+    key: str = result_field("key of [sensor]")
+    merit: str = result_field("merit")
+    estimator: str = result_field("estimator")
+    best: float = result_field("best", form=".3f")
+    file: str = result_field("written to")
+    points: list[Point] = result_field()
+    figures_of_best: dict[str, Any] = result_field()
 
 
 def design(sizes: Sizes, goal: Goal, out: Path, plot: Path | None) -> Sweep:
@@ -66,7 +66,7 @@ def design(sizes: Sizes, goal: Goal, out: Path, plot: Path | None) -> Sweep:
         focus = Focus.of(sensor_from(_section(sizes, sizes.low), WAVELENGTH_NM))
         values, best = sweep(merit_of, sizes.low, sizes.high, _POINTS)
         points = [_point(candidate(value), value, merit_of, goal) for value in sorted({*values.tolist(), best})]
-        of_best = figures(candidate(best))
+        of_best = predictions(candidate(best))
     keys = {"kind": f'"{sizes.kind}"', **sizes.others, key: f"{best:.4g}"}
     write_whole(out, "".join(["[sensor]\n", *(f"{name} = {value}\n" for name, value in keys.items())]).encode())
     if plot is not None:
@@ -88,7 +88,7 @@ def _section(sizes: Sizes, value: float) -> SensorSection:
 
 
 def _point(one: FullLight, value: float, merit_of: Callable[[float], float], goal: Goal) -> Point:
-    found = figures(one)
+    found = predictions(one)
     return Point(
         value=value,
         merit=merit_of(value),
@@ -103,7 +103,7 @@ def _point(one: FullLight, value: float, merit_of: Callable[[float], float], goa
 
 
 def _picture(points: list[Point], key: str, goal: Goal) -> bytes:
-    """Figures against size, relative to their minima (PNG)."""
+    """Predictions against size, relative to their minima (PNG)."""
     drawing = figure_class()(figsize=(7.5, 5.0), layout="constrained")
     axes = drawing.subplots()
     values = [point.value for point in points]

@@ -25,7 +25,7 @@ class _Request(ABC):
     """Options common to the searches.
 
     Attributes:
-        merit: Figure to optimise: paper, table3, table4, condition, throughput, pareto or contrast.
+        merit: Figure of merit to optimise: paper, table3, table4, condition, throughput, pareto or contrast.
         estimator: pinv, or weighted for the Cramer-Rao bound.
         modes: Modes in Table 3 and the condition number: 14 or 20.
         weight: Weight of Table 4 in paper and pareto, 0 to 1.

@@ -18,7 +18,7 @@ from lowfc.adapters.files.drawing import figure_class
 from lowfc.adapters.files.sensors import load_pupil
 from lowfc.adapters.process.progress import counting_bar
 from lowfc.contract.errors import ConfigurationError, LowfcError
-from lowfc.design.goal import figures
+from lowfc.design.goal import predictions
 from lowfc.design.paper import TABLE4_MODES
 from lowfc.design.sam_merit import FOCAL_MASKS, Hole, Mask, Optics, Single, build_optics, hole_fields
 from lowfc.design.sam_search import BLOCK, Chain, advance, holes, start
@@ -62,7 +62,7 @@ def design_sam(
     plot_file: Path | None = None,
     console: Console | None = None,
 ) -> dict[str, Any]:
-    """Search, write the best layout or the front, and return their predicted figures; Ctrl-C writes the best so far.
+    """Search, write the best layout or the front, and return their predictions; Ctrl-C writes the best so far.
 
     The chains are advanced in place, and stored in the file `state` until the end.
     """
@@ -161,14 +161,14 @@ def advance_block(search: Search, chain: Chain, pupil: str) -> Chain:
 
 
 def point_of(search: Search, chain: Chain) -> Point:
-    """The best layout of a chain, with its figures."""
+    """The best layout of a chain, with its predictions."""
     found = holes(chain.best, search.bounds.symmetry)
     name = f"{search.name}_{chain.index}" if search.sweeps else search.name
     goal = search.goal_of(chain.index)
     weight = "" if goal.weight is None else f" with weight {goal.weight:g}"
     masks = " and ".join(search.focal_masks)
     purpose = f"{_described(found)}: merit {goal.merit}{weight}, focal-plane mask {masks}"
-    predicted = _figures(search.focal_masks[0], found)
+    predicted = _predictions(search.focal_masks[0], found)
     return Point(
         Layout(name, purpose, found),
         chain.best_merit,
@@ -179,13 +179,13 @@ def point_of(search: Search, chain: Chain) -> Point:
 
 
 def summary(point: Point) -> dict[str, Any]:
-    """A layout and its predicted figures, for JSON."""
+    """A layout and its predictions, for JSON."""
     return {
         "name": point.layout.name,
         "purpose": point.layout.purpose,
         "merit": point.merit,
         "holes": len(point.layout.holes),
-        "focal_masks": {name: _figures(name, point.layout.holes) for name in FOCAL_MASKS},
+        "focal_masks": {name: _predictions(name, point.layout.holes) for name in FOCAL_MASKS},
     }
 
 
@@ -226,7 +226,7 @@ def pupil_digest() -> str:
 
 
 _PUPIL_SAMPLES = 256
-"""One sample for each cell of the package's shaped pupil; the figures of a mask agree with 512 samples to 1e-3."""
+"""One sample for each cell of the package's shaped pupil; the predictions for a mask agree with 512 samples to 1e-3."""
 
 
 @lru_cache(maxsize=4)
@@ -235,14 +235,14 @@ def _optics(focal_masks: tuple[str, ...], band_modes: int = 2) -> Optics:
 
 
 @lru_cache(maxsize=64)
-def _figures(focal_mask: str, holes_: tuple[Hole, ...]) -> dict[str, Any]:
+def _predictions(focal_mask: str, holes_: tuple[Hole, ...]) -> dict[str, Any]:
     optics = _optics((focal_mask,), band_modes=14)
     fields: Single = np.sum([hole_fields(optics, hole) for hole in holes_], axis=0)
-    return figures(Mask(optics, fields))
+    return predictions(Mask(optics, fields))
 
 
 def noise_line(predicted: Mapping[str, Any]) -> str:
-    """Text of the noise figures of a sensor for one exposure of Table 4's star."""
+    """Text of the noise of a sensor for one exposure of Table 4's star."""
     return (
         f"noise of 14 modes {predicted['noise_nm']:.3g} nm, which adds {predicted['contrast_noise']:.2e} to the "
         f"contrast; {predicted['quantum_share']:.1%} of the quantum limit"

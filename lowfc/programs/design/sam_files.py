@@ -24,7 +24,7 @@ UNITS = "pupil diameters, origin at the pupil centre, x to the right (columns), 
 
 @dataclass(frozen=True)
 class Point:
-    """A layout and its predicted figures in Tables 3 and 4."""
+    """A layout and its predictions for Tables 3 and 4."""
 
     layout: Layout
     merit: float

@@ -14,7 +14,7 @@ class Search:
     """The options of `lowfc design sam`, which with the shaped pupil determine the result.
 
     Attributes:
-        merit: Figure to optimise: paper, table3, table4, condition, throughput, pareto or contrast.
+        merit: Figure of merit to optimise: paper, table3, table4, condition, throughput, pareto or contrast.
         estimator: pinv, or weighted for the Cramer-Rao bound. Default: weighted; pinv for the merit paper.
         modes: Modes in Table 3: 14 or 20.
         weight: Weight of Table 4 in paper and pareto, 0 to 1. Default: 0.5; in pareto, a front.

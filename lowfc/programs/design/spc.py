@@ -25,39 +25,39 @@ from lowfc.design.shaped_pupil import (
     Request,
     Round,
     exchange,
-    figures,
     nearest_feasible,
+    properties,
     relative_field,
     stored,
 )
 from lowfc.optics.chain.pupil import from_quarter
-from lowfc.programs.cli.result import Result, figure
+from lowfc.programs.cli.result import Result, result_field
 from lowfc.programs.design.options import command_line
 
 Value = TypeVar("Value")
 
 
 class ShapedPupil(Result):
-    """Figures of the mask found.
+    """Properties of the mask found.
 
     `below_optimum_at_limit_fraction` is the fraction of the circle by which the best mask with `limit` times the
     contrast may be more open; with the contrast itself it may be more.
     """
 
-    open_area_fraction: float = figure("open area", "of the circle", ".2%")
-    energy_fraction: float = figure("throughput", "of the circle's light", ".2%")
-    focal_mask_fraction: float = figure("on the focal mask", "of the light passed", ".2%")
-    focal_mask_radius_lambda_d: float = figure("focal mask radius", "lambda/D", "g")
-    max_contrast: float = figure("largest contrast", form=".2e")
-    mean_contrast: float = figure("mean contrast", form=".2e")
-    contrast_step_lambda_d: float = figure("contrast step", "lambda/D", "g")
-    grey_cells_fraction: float = figure("grey cells", form=".2%")
+    open_area_fraction: float = result_field("open area", "of the circle", ".2%")
+    energy_fraction: float = result_field("throughput", "of the circle's light", ".2%")
+    focal_mask_fraction: float = result_field("on the focal mask", "of the light passed", ".2%")
+    focal_mask_radius_lambda_d: float = result_field("focal mask radius", "lambda/D", "g")
+    max_contrast: float = result_field("largest contrast", form=".2e")
+    mean_contrast: float = result_field("mean contrast", form=".2e")
+    contrast_step_lambda_d: float = result_field("contrast step", "lambda/D", "g")
+    grey_cells_fraction: float = result_field("grey cells", form=".2%")
     below_optimum_at_limit_fraction: float
-    rounds: int = figure("linear programs")
-    points: int = figure("points in the last")
-    file: str = figure("written to")
-    dtype: str = figure("stored as")
-    command: str = figure("reproduced by")
+    rounds: int = result_field("linear programs")
+    points: int = result_field("points in the last")
+    file: str = result_field("written to")
+    dtype: str = result_field("stored as")
+    command: str = result_field("reproduced by")
 
 
 def design_spc(request: Request, out: Path, plot: Path | None, console: Console) -> ShapedPupil:
@@ -88,7 +88,7 @@ def design_spc(request: Request, out: Path, plot: Path | None, console: Console)
     content = io.BytesIO()
     np.savez_compressed(content, allow_pickle=False, quarter=quarter, made_by=made_by)
     write_whole(out, content.getvalue())
-    found = figures(quarter.astype(np.float64), request)
+    found = properties(quarter.astype(np.float64), request)
     if plot is not None:
         write_whole(plot, _picture(quarter.astype(np.float64), request))
     return ShapedPupil(

@@ -27,7 +27,7 @@ BENCH_PERIOD_S = 0.25
 
 
 def epics(run: AnyRun = None, config: ConfigFile = None) -> None:
-    """Serve a run by EPICS PV Access: figures as PVs, requests as puts, and other servers' PVs as bench values.
+    """Serve a run by EPICS PV Access: values as PVs, requests as puts, and other servers' PVs as bench values.
 
     Example: lowfc gateway epics --run bench
     """

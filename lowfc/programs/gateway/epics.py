@@ -50,7 +50,7 @@ class EpicsGateway:
                 self._pvs[one.name] = p4p.server.thread.SharedPV(nt=p4p.nt.NTNDArray(), initial=initial)
                 continue
             nt = p4p.nt.NTScalar(_CODES[one.kind], display=True)
-            described = {"value": _EMPTY[one.kind], "display.description": one.sentence, "display.units": one.unit}
+            described = {"value": _EMPTY[one.kind], "display.description": one.description, "display.units": one.unit}
             handler = {} if one.put is None else {"handler": _PutHandler(one.kind, one.put, ask)}
             self._pvs[one.name] = p4p.server.thread.SharedPV(nt=nt, initial=described, **handler)
         address, port = config.listen, config.port

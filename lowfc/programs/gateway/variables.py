@@ -12,7 +12,7 @@ import numpy as np
 from lowfc.client import Answer, Client
 from lowfc.client.requests import DECLARED, Declaration
 from lowfc.contract.messages import Role, wire
-from lowfc.programs.cli.status import figures, interlocks
+from lowfc.programs.cli.status import interlocks, json_object
 from lowfc.programs.gateway.watch import RunView
 
 
@@ -39,7 +39,7 @@ class Variable(NamedTuple):
     name: str
     kind: Kind
     unit: str
-    sentence: str
+    description: str
     read: Callable[[RunView, dict[str, Any]], Any] | None
     put: Put | None = None
 
@@ -113,7 +113,7 @@ def _request(one: Declaration) -> Variable | None:
         kind, put = Kind.NUMBERS, lambda loop, value: loop.ask(one.name, values=value)
     else:
         kind, put = Kind.BOOLEAN, lambda loop, value: loop.ask(one.name)
-    return Variable(name, kind, "", one.sentence, None, put)
+    return Variable(name, kind, "", one.description, None, put)
 
 
 def variables() -> Iterator[Variable]:
@@ -126,5 +126,5 @@ def variables() -> Iterator[Variable]:
 
 
 def status_of(view: RunView, run: str) -> dict[str, Any]:
-    """The figures of `lowfc ctl status`, from which most variables are read."""
-    return figures(view.state, view.processes, run)
+    """The values of `lowfc ctl status`, from which most variables are read."""
+    return json_object(view.state, view.processes, run)

@@ -62,7 +62,7 @@ def sim_loop(
     if has_screen() and not (view_ or web):
         typer.echo("to view the run: lowfc view", err=True)
     show = Show.NATIVE if view_ else Show.WEB if web else None
-    figures = run(settings, duration, not no_record, show, name)
-    print_result(figures, summary_text(figures), as_json=as_json)
-    if figures["recording_failure"]:
+    results = run(settings, duration, not no_record, show, name)
+    print_result(results, summary_text(results), as_json=as_json)
+    if results["recording_failure"]:
         raise typer.Exit(1)

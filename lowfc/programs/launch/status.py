@@ -13,13 +13,13 @@ from lowfc.contract.events import Level
 from lowfc.contract.messages import COMMAND, FRAME, Role, wire
 from lowfc.contract.printable import printable
 from lowfc.control.loop.wording import counted, mode_word
-from lowfc.programs.cli.contrast import most_of, sentence, with_this_mirror
+from lowfc.programs.cli.contrast import contrast_in_words, most_of, with_this_mirror
 from lowfc.programs.launch.watch import Watch, mode_name, topic_count, wavefront
 
 SILENT_S = 2.0
-"""Time without Health (sent twice a second) after which the figures are no longer shown."""
-_FIGURES_S = 2.5
-"""Span of the recent wavefront figures, plus the delay of their report."""
+"""Time without Health (sent twice a second) after which its values are no longer shown."""
+_RECENT_S = 2.5
+"""Span of the recent wavefront statistics, plus the delay of their report."""
 _EVENTS_SHOWN = 4
 _STYLES = {Level.WARNING: "yellow", Level.ERROR: "red", Level.FATAL: "bold red"}
 
@@ -65,15 +65,15 @@ def status_line(watch: Watch, elapsed_s: float) -> str:
 
 
 def _closed_for(controller: wire.Health, rate_hz: float) -> str:
-    """Time since the loop closed if shorter than the span of the residual figures; otherwise empty."""
+    """Time since the loop closed if shorter than the span of the residual's statistics; otherwise empty."""
     frames = topic_count(controller, FRAME.key).received
     closed_s = frames / rate_hz - controller.not_closed_ns * 1e-9 if rate_hz else 0.0
-    just_closed = controller.mode == wire.LOOP_MODE_CLOSED and 0 < closed_s < _FIGURES_S
+    just_closed = controller.mode == wire.LOOP_MODE_CLOSED and 0 < closed_s < _RECENT_S
     return f" for {closed_s:.1f} s" if just_closed else ""
 
 
 def _silent(watch: Watch) -> str:
-    """A notice if the camera stopped sending Health, so that its figures are out of date; otherwise empty."""
+    """A notice if the camera stopped sending Health, so that its statistics are out of date; otherwise empty."""
     silent_s = watch.silent_s(Role.CAMERA)
     reported = bool(watch.of(Role.CAMERA).process)
     return f"the camera has been silent for {silent_s:.0f} s" if reported and silent_s > SILENT_S else ""
@@ -116,65 +116,65 @@ def recording(recorder: wire.Health) -> str:
     return f"{counted(done.messages, 'message')}, {done.bytes / 1e6:.1f} MB, {done.lost} lost"
 
 
-def _loop(figures: dict[str, Any]) -> str:
-    seconds, cause = f"{figures['not_closed_s']:.1f} s", figures["not_closed_cause"]
-    match figures["mode"]:
+def _loop(results: dict[str, Any]) -> str:
+    seconds, cause = f"{results['not_closed_s']:.1f} s", results["not_closed_cause"]
+    match results["mode"]:
         case None:
             return "no controller reported"
         case "closed":
-            return f"closed; not closed for {seconds} in total: {cause}" if figures["not_closed_s"] else "closed"
+            return f"closed; not closed for {seconds} in total: {cause}" if results["not_closed_s"] else "closed"
         case "safe":
             return f"{mode_word('safe')}, not closed for {seconds}: {cause}"
         case mode:
             return f"{mode} for {seconds}" + (f": {cause}" if cause else "")
 
 
-def _when(figures: dict[str, Any], name: str, of: str = "") -> str:
-    """Text of the times at which a figure of the true wavefront is sampled."""
-    if figures["instants_per_frame"] == 1:
+def _when(results: dict[str, Any], name: str, of: str = "") -> str:
+    """Text of the times at which a statistic of the true wavefront is sampled."""
+    if results["instants_per_frame"] == 1:
         return "sampled at the start of each exposure"
-    return f"continuous ({of}{figures[f'sampled_{name}']:.2f} at exposure start)"
+    return f"continuous ({of}{results[f'sampled_{name}']:.2f} at exposure start)"
 
 
-def _contrast(figures: dict[str, Any]) -> list[str]:
+def _contrast(results: dict[str, Any]) -> list[str]:
     """The line with the contrast added to the dark zone; empty if unknown."""
-    added = figures["added_contrast"]
+    added = results["added_contrast"]
     if added is None:
         return []
-    own = "" if figures["dark_zone_contrast"] is None else f"coronagraph alone {figures['dark_zone_contrast']:.1e}; "
-    beyond = ("residual",) if figures["beyond_quadratic"] else ()
-    return [f"contrast           {own}{sentence(with_this_mirror(added), most_of(figures), beyond)}"]
+    own = "" if results["dark_zone_contrast"] is None else f"coronagraph alone {results['dark_zone_contrast']:.1e}; "
+    beyond = ("residual",) if results["beyond_quadratic"] else ()
+    return [f"contrast           {own}{contrast_in_words(with_this_mirror(added), most_of(results), beyond)}"]
 
 
-def summary_text(figures: dict[str, Any]) -> str:
+def summary_text(results: dict[str, Any]) -> str:
     """The summary of a run as text."""
-    command, mirror = (figures["latency_us"][name] for name in ("frame_to_command", "frame_to_mirror"))
+    command, mirror = (results["latency_us"][name] for name in ("frame_to_command", "frame_to_mirror"))
 
     def percentiles(values: dict[str, float]) -> str:
         return "   ".join(f"{name.replace('_', '.')} {value:.0f} us" for name, value in values.items())
 
     lines = [
-        f"loop               {_loop(figures)}",
-        f"rate               {figures['rate_hz']:.1f} Hz",
-        f"frames             {figures['frames_published']} published, {figures['frames_processed']} processed, "
-        f"{figures['frames_skipped']} skipped, {figures['frames_missing']} missing",
-        f"commands           {figures['commands_applied']} applied, {figures['commands_late']} after the start of the "
+        f"loop               {_loop(results)}",
+        f"rate               {results['rate_hz']:.1f} Hz",
+        f"frames             {results['frames_published']} published, {results['frames_processed']} processed, "
+        f"{results['frames_skipped']} skipped, {results['frames_missing']} missing",
+        f"commands           {results['commands_applied']} applied, {results['commands_late']} after the start of the "
         "next exposure",
-        f"wavefront          residual {figures['residual_rms_nm']:.2f} of {figures['disturbance_rms_nm']:.2f} nm rms "
+        f"wavefront          residual {results['residual_rms_nm']:.2f} of {results['disturbance_rms_nm']:.2f} nm rms "
         "over the open pupil, second half of the run, "
-        + _when(figures, "residual_rms_nm", f"{figures['instants_per_frame']} instants per frame; "),
-        f"tilt per axis      residual {figures['tilt_residual_mas']:.2f} of "
-        f"{figures['tilt_disturbance_mas']:.2f} mas rms, second half, " + _when(figures, "tilt_residual_mas"),
-        *_contrast(figures),
+        + _when(results, "residual_rms_nm", f"{results['instants_per_frame']} instants per frame; "),
+        f"tilt per axis      residual {results['tilt_residual_mas']:.2f} of "
+        f"{results['tilt_disturbance_mas']:.2f} mas rms, second half, " + _when(results, "tilt_residual_mas"),
+        *_contrast(results),
         f"frame to command   {percentiles(command)}",
         f"frame to mirror    {percentiles(mirror)}",
     ]
-    if figures["log"]:
+    if results["log"]:
         lines.append(
-            f"log                {' '.join(figures['logs'])}: {counted(figures['messages_recorded'], 'message')}, "
-            f"{figures['messages_lost']} lost"
+            f"log                {' '.join(results['logs'])}: {counted(results['messages_recorded'], 'message')}, "
+            f"{results['messages_lost']} lost"
         )
-    lines += [f"lost               {count} of {topic}" for topic, count in figures["lost"].items()]
-    if figures["recording_failure"]:
-        lines.append(f"recording stopped  {figures['recording_failure']}")
+    lines += [f"lost               {count} of {topic}" for topic, count in results["lost"].items()]
+    if results["recording_failure"]:
+        lines.append(f"recording stopped  {results['recording_failure']}")
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""The launcher's record of a run, and the summary figures from the last Health of each process."""
+"""The launcher's record of a run, and its summary from the last Health of each process."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -39,10 +39,10 @@ class Watch:
 
 
 def summary(watch: Watch, record: bool, rate_hz: float) -> dict[str, Any]:
-    """Summary figures of a run with this frame rate, from the last Health of each process."""
+    """Summary of a run with this frame rate, from the last Health of each process."""
     camera, controller = watch.of(Role.CAMERA), watch.of(Role.CONTROLLER)
     frames, not_closed_s = topic_count(controller, FRAME.key), controller.not_closed_ns * 1e-9
-    figures: dict[str, Any] = {
+    results: dict[str, Any] = {
         "rate_hz": round(camera.mean_rate_hz, 2),
         "frames_published": topic_count(camera, FRAME.key).published,
         "frames_processed": frames.received - frames.skipped,
@@ -73,10 +73,10 @@ def summary(watch: Watch, record: bool, rate_hz: float) -> dict[str, Any]:
         recording, frames_in_log = recorder.recording, topic_count(recorder, FRAME.key)
         lost = {topic.topic: topic.missing for topic in recorder.topics if topic.missing}
         # Without the camera's last Health, the recorder cannot count frames lost after the last recorded one.
-        uncounted = figures["frames_published"] - frames_in_log.received - frames_in_log.missing
+        uncounted = results["frames_published"] - frames_in_log.received - frames_in_log.missing
         if frames_in_log.received and uncounted > 0:
             lost[FRAME.key] = frames_in_log.missing + uncounted
-        figures |= {
+        results |= {
             "messages_recorded": recording.messages,
             "messages_lost": max(recording.lost, sum(lost.values())),
             "lost": lost,
@@ -84,11 +84,11 @@ def summary(watch: Watch, record: bool, rate_hz: float) -> dict[str, Any]:
             "log": recording.file,
             "logs": list(recording.files),
         }
-    return figures
+    return results
 
 
 def wavefront(known: wire.WavefrontFigures) -> dict[str, Any]:
-    """Figures of the true wavefront: continuous in time if available, and sampled at the exposure starts."""
+    """Statistics of the true wavefront: continuous in time if available, and sampled at the exposure starts."""
     names = ("disturbance_rms_nm", "residual_rms_nm", "tilt_disturbance_mas", "tilt_residual_mas")
     kind = "continuous_" if known.instants else ""
     return {

@@ -42,7 +42,7 @@ def info(
 
 
 def render(found: Mapping[str, Any]) -> str:
-    """The figures of a log as text."""
+    """The summary of a log as text."""
     lines = [f"{name:14}" + value.replace("\n", "\n" + " " * 14) for name, value in _summary(found).items()]
     rows = [
         [

@@ -33,4 +33,4 @@ def recover(
     for log in in_order(logs, out, as_json=as_json):
         with reading_bar(Console(stderr=True)) as count:
             done = run(log, out or recovered_path(log), partial(count, f"recovering {log.name}"))
-        print_result(done.figures, str(done), as_json=as_json)
+        print_result(done.json_object, str(done), as_json=as_json)

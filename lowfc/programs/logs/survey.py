@@ -74,7 +74,7 @@ class Digest:
             found[key] = hashlib.sha256(b"".join([*early[-1:], *later])).hexdigest()
         return dict(sorted(found.items()))
 
-    def of_log(self) -> str:
+    def hexdigest(self) -> str:
         """Hexadecimal digest of the log."""
         lines = [f"{key} {digest}\n" for key, digest in self.by_key().items()]
         return hashlib.sha256("".join(lines).encode()).hexdigest()
@@ -98,7 +98,7 @@ class _Line:
     size: int = 0
     starts: set[tuple[str, int]] = field(default_factory=set)
 
-    def figures(self, missing: int | None) -> dict[str, Any]:
+    def json_object(self, missing: int | None) -> dict[str, Any]:
         length_s = (self.last_ns - self.first_ns) / 1e9
         return {
             "messages": self.messages,
@@ -149,14 +149,14 @@ class _Account:
                     self._events[event.message.partition(" ")[0]] += 1
         line.starts.add((author, start_of(message.sequence)))
 
-    def figures(self) -> dict[str, Any]:
+    def json_object(self) -> dict[str, Any]:
         """The account as a dictionary."""
         missing = self._losses.lost()
         begin = None if self._begin_ns is None else datetime.fromtimestamp(self._begin_ns / 1e9, UTC)
         topics = {}
         for key, line in sorted(self._lines.items()):
             counted = (topic := _topic(key)) is None or self._selection.records_all(topic)
-            topics[key] = line.figures(missing.get(key, 0) if counted else None)
+            topics[key] = line.json_object(missing.get(key, 0) if counted else None)
         return {
             "start": None if begin is None else begin.isoformat(timespec="milliseconds"),
             "duration_s": None if self._begin_ns is None else round((self._end_ns - self._begin_ns) / 1e9, 3),
@@ -172,7 +172,7 @@ class _Account:
 def survey(
     log: LogFiles, progress: Callable[[int, int], None] | None = None, *, digest: bool = False
 ) -> dict[str, Any]:
-    """Figures of a log, complete or not, from all of its messages; optionally with its and each topic's `Digest`."""
+    """Summary of a log, complete or not, from all of its messages; optionally with its and each topic's `Digest`."""
     reader, account, found = WholeLog(log, skip_damaged=True), _Account(), Digest()
     reader.progress = progress
     for number, message in enumerate(reader):
@@ -183,18 +183,18 @@ def survey(
         if digest and topic is not None:
             found.enter(topic, message)
     configuration, remarks = attached_configuration(reader)
-    figures = account.figures()
+    content = account.json_object()
     for key, one in found.by_key().items():
-        figures["topics"][key]["digest"] = one
+        content["topics"][key]["digest"] = one
     return {
         "log": str(reader.path),
         "files": [str(path) for path in reader.paths],
-        **({"digest": found.of_log()} if digest else {}),
+        **({"digest": found.hexdigest()} if digest else {}),
         "lockstep": configuration.lockstep if configuration is not None else None,
-        "selection": reader.selection.sentence,
+        "selection": reader.selection.description,
         "bytes": reader.size,
         "state": _state(reader),
-        **figures,
+        **content,
         "unreadable": reader.unreadable,
         "damage": [dataclasses.asdict(damage) for damage in reader.damage],
         "metadata": reader.metadata,

@@ -25,7 +25,7 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import Role
 from lowfc.programs.measure.frame_source import BEGIN_FILE
-from lowfc.programs.measure.latency.figures import WARM_UP_S
+from lowfc.programs.measure.latency.frame_statistics import WARM_UP_S
 
 PROCESSES_FILE = "processes.json"
 """File in the run's directory: process id of each role."""

@@ -29,7 +29,7 @@ from lowfc.contract.envelope import Envelope
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import COMMAND, FRAME, Role
 from lowfc.programs.measure.frame_source import FRAMES_FILE, Payloads
-from lowfc.programs.measure.latency.figures import WARM_UP_S
+from lowfc.programs.measure.latency.frame_statistics import WARM_UP_S
 
 ECHO_FILE = "echo.npz"
 """File in the run's directory: round_trip_ns of every frame after the warm-up, -1 without an answer."""

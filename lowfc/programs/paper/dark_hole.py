@@ -116,9 +116,9 @@ def _apply_steps(each_nm: float, base_nm: Array) -> tuple[dict[str, list[int]], 
         calibration = loop.calibration()
         used = np.asarray(calibration.actuators_to_modes.any(axis=0)).reshape(calibration.grid)
         shapes = shapes_nm(calibration.grid, each_nm, used)
-        for channel, every, under_nm in ((SHIFTED, 1, 0 * base_nm), (PLAIN, AT_ONCE, base_nm)):
+        for channel, stride, under_nm in ((SHIFTED, 1, 0 * base_nm), (PLAIN, AT_ONCE, base_nm)):
             marks[channel] = []
-            for shape in shapes[every - 1 :: every]:
+            for shape in shapes[stride - 1 :: stride]:
                 marks[channel].append(loop.channel(channel, shape + under_nm).frame_sequence)
                 wait(SETTLE)
             wait(WINDOW)

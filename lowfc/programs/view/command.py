@@ -58,8 +58,8 @@ def view(
     target = Target(native, web, save, headless_screenshot, tab, memory_mb, port or 0, web_port or 0)
     settings = None if config is None else configuration(config)
     if logs:
-        figures = show_logs(in_order(logs), settings, target)
+        results = show_logs(in_order(logs), settings, target)
     else:
-        figures = show_run(the_known_run(run), settings, target, seconds)
+        results = show_run(the_known_run(run), settings, target, seconds)
     if as_json:
-        sys.stdout.write(json.dumps(figures) + "\n")
+        sys.stdout.write(json.dumps(results) + "\n")

@@ -129,7 +129,7 @@ class FoxgloveBridge:
                     ),
                     message_encoding="protobuf",
                     context=self._context,
-                    metadata={"description": topic.sentence},
+                    metadata={"description": topic.description},
                 )
             return self._channels[key]
 

@@ -11,7 +11,7 @@ from lowfc.control.calibration.calibration import noise_nm
 from lowfc.control.laws.continuous import Timing, residual_power
 from lowfc.control.laws.error_budget import Term, lag, lag_under_noise, measurement_error, sensor_noise, white_noise
 from lowfc.control.laws.linear_law import LinearLaw, integrator
-from lowfc.control.laws.spectra import Pieces, spectrum
+from lowfc.control.laws.spectra import TimeSeries, spectrum
 from tests.support.in_process_loop import SMALL_MIRROR, fold
 from tests.support.theory import rejection
 from tools.law_bench import calibrated
@@ -25,8 +25,8 @@ def loop(gain: tuple[float, ...] = (0.5, 0.1), leak: tuple[float, ...] = (0.0, 0
     return integrator(gain, leak, (2, 3), 1.0, RATE_HZ)
 
 
-def one_piece(values: np.ndarray) -> Pieces:
-    return Pieces((values,), 0)
+def one_piece(values: np.ndarray) -> TimeSeries:
+    return TimeSeries((values,), 0)
 
 
 def test_noise_gain_of_a_one_frame_loop_has_a_closed_form() -> None:
@@ -104,7 +104,9 @@ def test_an_undetected_difference_is_an_upper_limit(
     assert term.total(BOTH) == (pytest.approx(expected), detected)
 
 
-def run(measure: Callable[[np.ndarray, int], np.ndarray], frames: int = 8000) -> tuple[Pieces, Pieces, Pieces]:
+def run(
+    measure: Callable[[np.ndarray, int], np.ndarray], frames: int = 8000
+) -> tuple[TimeSeries, TimeSeries, TimeSeries]:
     """Error, residual and seen command of `loop()` with a sensor `measure(residual, frame)`."""
     time_s = np.arange(frames) / RATE_HZ
     waves = np.stack([9 * np.sin(2 * np.pi * 11 * time_s), 4 * np.sin(2 * np.pi * 3 * time_s)], axis=1)
@@ -160,7 +162,7 @@ def test_a_quadratic_response_is_nonlinearity() -> None:
 def test_too_few_frames_give_no_measurement_error() -> None:
     few = [one_piece(part.joined()[:45]) for part in run(lambda residual, index: residual + NOISE[index], 600)]
     assert measurement_error(loop(), *few, np.ones(2)) is None
-    nothing = Pieces((), 0)
+    nothing = TimeSeries((), 0)
     assert measurement_error(loop(), nothing, nothing, nothing, np.ones(2)) is None
 
 

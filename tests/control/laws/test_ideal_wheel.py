@@ -8,7 +8,7 @@ import pytest
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.envelope import count_of
 from lowfc.control.laws.continuous import Timing
-from lowfc.control.laws.spectra import Pieces
+from lowfc.control.laws.spectra import TimeSeries
 from lowfc.control.laws.stability import highest_gain
 from lowfc.control.laws.tuning import best_gains, identified, tune_lqg
 from sim_camera.disturbance import Sampler
@@ -29,7 +29,7 @@ def wheel(**keys: Any) -> tuple[Configuration, Bench]:
     return config, bench
 
 
-def residual_mas(bench: Bench, run: Pieces, timing: Timing, *, continuous: bool = True) -> float:
+def residual_mas(bench: Bench, run: TimeSeries, timing: Timing, *, continuous: bool = True) -> float:
     """Continuous residual, or at the starts of exposures, with the law tuned from a run for a timing, mas."""
     rate_hz, none = bench.config.camera.rate_hz, np.zeros(2)
     gains = best_gains(run, rate_hz, timing, none)

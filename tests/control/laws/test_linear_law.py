@@ -12,10 +12,10 @@ from lowfc.control.laws.margins import (
     MAX_COUPLED_STATES,
     check_stable,
     margins,
+    margins_in_words,
     noise_gain,
     noise_transfer,
     rejection,
-    sentence,
 )
 from lowfc.control.laws.pi_notch import Notch, pi_notch
 from lowfc.control.laws.stability import delay_weights, limiting_gain
@@ -149,7 +149,7 @@ def test_a_pi_law_holds_its_command_while_frames_are_missing() -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "sentence"),
+    ("change", "message"),
     [
         ({"signal": "errors"}, "signal of a law must be one of error, pol"),
         ({"measurement_gain": np.zeros((3, 2))}, r"measurement_gain must have shape \(3, 3\), got \(3, 2\)"),
@@ -160,8 +160,8 @@ def test_a_pi_law_holds_its_command_while_frames_are_missing() -> None:
         ({"noll": (2, 3)}, "gain must have shape"),
     ],
 )
-def test_a_law_with_inconsistent_fields_is_refused(change: dict[str, object], sentence: str) -> None:
-    with pytest.raises(ValueError, match=sentence):
+def test_a_law_with_inconsistent_fields_is_refused(change: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         replace(linear(PLAIN), **change)
 
 
@@ -219,7 +219,7 @@ def test_margins_for_gain_one_half_and_one_frame_of_delay() -> None:
     assert found.phase_margin_deg[0] == pytest.approx(np.degrees(np.pi / 2 - omega / 2), abs=0.05)
     assert found.peak[0] == pytest.approx(1 / (1 - 0.25), rel=1e-4)
     assert found.radius[0] == pytest.approx(0.5)
-    assert sentence(found) == "gain margin 4, phase margin 76 deg, max |S| 1.33"
+    assert margins_in_words(found) == "gain margin 4, phase margin 76 deg, max |S| 1.33"
 
 
 def test_margins_for_a_true_delay_other_than_the_laws() -> None:

@@ -7,9 +7,9 @@ from scipy.signal import welch
 from lowfc.adapters.files.factory import frame_noise_nm
 from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.kalman import lqg_block
-from lowfc.control.laws.linear_law import of_blocks
+from lowfc.control.laws.linear_law import law_from_blocks
 from lowfc.control.laws.margins import margins
-from lowfc.control.laws.spectra import Pieces
+from lowfc.control.laws.spectra import TimeSeries
 from lowfc.control.laws.stability import MIN_GAIN_MARGIN, MIN_PHASE_MARGIN_DEG
 from lowfc.control.laws.tuning import within_margins
 from lowfc.control.laws.vibration import Line, Model
@@ -47,7 +47,9 @@ def test_a_filter_keeps_the_margins_at_any_noise(noise_nm: float, width: float, 
     model = Model(0.02, 2.0, known, noise_nm**2, RATE_HZ)
     block = within_margins(model, timing)
     assert block is not None
-    law, free = (of_blocks([one], "pol", "lqg", (2,), delay, RATE_HZ) for one in (block, lqg_block(model, timing)))
+    law, free = (
+        law_from_blocks([one], "pol", "lqg", (2,), delay, RATE_HZ) for one in (block, lqg_block(model, timing))
+    )
 
     def over(one: object) -> float:
         """Smallest ratio of a margin to its limit."""
@@ -73,7 +75,7 @@ def test_modal_simulation_agrees_with_images() -> None:
     bench.run(lines.FRAMES)
     noise_nm = frame_noise_nm(config, calibration)[:2]
     found = []
-    for pol in (Pieces((bench.pol().values[0][:, :2],), 0), lines.tilts_of(config, noise_nm, lines.FRAMES)):
+    for pol in (TimeSeries((bench.pol().values[0][:, :2],), 0), lines.tilts_of(config, noise_nm, lines.FRAMES)):
         frequency_hz, density = welch(pol.values[0], RATE_HZ, nperseg=2000, axis=0)
         level_nm = np.sqrt(density[(frequency_hz > 400) & (frequency_hz < 490)].mean(axis=0) * RATE_HZ / 2)
         np.testing.assert_allclose(level_nm, noise_nm, rtol=0.1)

@@ -16,11 +16,11 @@ from lowfc.control.laws.spectra import (
     LONGEST,
     MAX_INTERPOLATED_FRAMES,
     SHORTEST,
-    Pieces,
+    TimeSeries,
     floor_nm2_hz,
     in_bins,
-    pieces,
     spectrum,
+    time_series,
 )
 from lowfc.control.laws.stability import delay_weights, settling_frames
 from lowfc.control.laws.transfer_function import departure, measured, seen_of_mirror
@@ -34,8 +34,8 @@ from tests.support.toy import NOLL, calibration, frame, live, loaded, settings
 RATE_HZ = 500.0
 
 
-def one_piece(values: np.ndarray) -> Pieces:
-    return Pieces((values,), 0)
+def one_piece(values: np.ndarray) -> TimeSeries:
+    return TimeSeries((values,), 0)
 
 
 def numbers(count: int, start: int = 1_700_000_000) -> np.ndarray:
@@ -76,7 +76,7 @@ def test_short_gaps_are_interpolated_and_long_gaps_split_the_run() -> None:
     present = np.ones(20, bool)
     present[5 : 5 + MAX_INTERPOLATED_FRAMES] = False
     present[12 : 13 + MAX_INTERPOLATED_FRAMES] = False
-    found = pieces(numbers(20)[present], values[present])
+    found = time_series(numbers(20)[present], values[present])
     assert [len(piece) for piece in found.values] == [12, 20 - 13 - MAX_INTERPOLATED_FRAMES]
     assert found.bridged == MAX_INTERPOLATED_FRAMES
     assert np.array_equal(found.values[0], values[:12])  # interpolation of a straight line is exact
@@ -86,20 +86,20 @@ def test_short_gaps_are_interpolated_and_long_gaps_split_the_run() -> None:
 
 def test_repeated_and_older_frames_are_ignored() -> None:
     order = [0, 1, 2, 2, 1, 3, 4]
-    found = pieces(numbers(5)[order], np.array(order, float)[:, None])
+    found = time_series(numbers(5)[order], np.array(order, float)[:, None])
     assert found.joined().ravel().tolist() == [0, 1, 2, 3, 4]
 
 
 def test_a_camera_restart_starts_a_new_piece() -> None:
     sequence = np.concatenate([numbers(10), numbers(10, 1_700_000_001)])
-    assert [len(piece) for piece in pieces(sequence, np.ones((20, 1))).values] == [10, 10]
+    assert [len(piece) for piece in time_series(sequence, np.ones((20, 1))).values] == [10, 10]
 
 
 def test_empty_and_short_runs_have_no_spectrum() -> None:
-    assert pieces(numbers(0), np.zeros((0, 2))) == Pieces((), 0)
-    assert pieces(numbers(3), np.full((3, 2), np.nan)) == Pieces((), 0)
+    assert time_series(numbers(0), np.zeros((0, 2))) == TimeSeries((), 0)
+    assert time_series(numbers(3), np.full((3, 2), np.nan)) == TimeSeries((), 0)
     noise = np.random.default_rng(1).standard_normal((SHORTEST, 1))
-    found = [spectrum(one, RATE_HZ) for one in (Pieces((), 0), one_piece(noise[1:]), one_piece(noise))]
+    found = [spectrum(one, RATE_HZ) for one in (TimeSeries((), 0), one_piece(noise[1:]), one_piece(noise))]
     assert [one is not None for one in found] == [False, False, True]
 
 
@@ -188,12 +188,12 @@ def test_the_measured_rejection_agrees_with_theory(target: str, delay_frames: fl
 def test_lines_are_odd_ascending_and_not_shared_by_modes() -> None:
     for modes in (1, 2, 3, 14):
         places = lines(15_000, modes, 12, 0.1 / 250, 0.3)
-        every = np.sort(np.concatenate(places))
-        assert every.size == np.unique(every).size == 12 * modes
-        assert (every % 2 == 1).all()
-        assert every[0] >= 0.1 / 250 * 15_000
-        assert every[-1] <= 0.3 * 15_000
-        assert every[-1] > 0.28 * 15_000
+        all_lines = np.sort(np.concatenate(places))
+        assert all_lines.size == np.unique(all_lines).size == 12 * modes
+        assert (all_lines % 2 == 1).all()
+        assert all_lines[0] >= 0.1 / 250 * 15_000
+        assert all_lines[-1] <= 0.3 * 15_000
+        assert all_lines[-1] > 0.28 * 15_000
         for one in places:
             assert (np.diff(one) >= 6).all()
 

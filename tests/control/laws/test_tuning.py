@@ -6,7 +6,7 @@ import pytest
 from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.margins import margins
-from lowfc.control.laws.spectra import Pieces
+from lowfc.control.laws.spectra import TimeSeries
 from lowfc.control.laws.stability import MIN_GAIN_MARGIN, MIN_PHASE_MARGIN_DEG, highest_gain
 from lowfc.control.laws.tuning import (
     best_gains,
@@ -29,14 +29,14 @@ NM_PER_MAS = tilt_nm_per_mas(2.0)
 NONE = np.zeros(2)
 
 
-def wheel(frames: int, seed: int = 1, noise_nm: float = 0.8) -> tuple[Pieces, np.ndarray]:
+def wheel(frames: int, seed: int = 1, noise_nm: float = 0.8) -> tuple[TimeSeries, np.ndarray]:
     """Pseudo-open-loop tilts of the reaction wheel, and the true tilts."""
     truth = modes_nm(preset_disturbance("reaction-wheel", NOLL, seed, NM_PER_MAS, 550.0), 0, frames, RATE_HZ)
     noise = noise_nm * np.random.default_rng(seed).standard_normal(truth.shape)
-    return Pieces((truth + noise,), 0), truth
+    return TimeSeries((truth + noise,), 0), truth
 
 
-def true_mas(law: LinearLaw, pol: Pieces, truth: np.ndarray, delay_frames: float, settled: int = 4000) -> float:
+def true_mas(law: LinearLaw, pol: TimeSeries, truth: np.ndarray, delay_frames: float, settled: int = 4000) -> float:
     errors, _ = run(law, pol.values[0], delay_frames)
     residual = errors - (pol.values[0] - truth)
     return float(np.sqrt(np.mean(residual[settled:] ** 2)) / NM_PER_MAS)
@@ -54,7 +54,7 @@ def test_the_highest_gain_has_exactly_the_least_allowed_margins(delay_frames: fl
 def test_the_best_gain_agrees_with_theory() -> None:
     """A random walk with noise: the minimum of drift |S|^2 + noise |T|^2 over the gains, by a search."""
     model = Model(0.02, np.inf, (), 1.0, RATE_HZ)
-    pol = Pieces((np.hstack([realised(model, 40_000, seed) for seed in (1, 2)]),), 0)
+    pol = TimeSeries((np.hstack([realised(model, 40_000, seed) for seed in (1, 2)]),), 0)
     found = best_gains(pol, RATE_HZ, Timing.sampled(1.0), NONE)
     omega = np.geomspace(1e-4, np.pi, 20_000)
     hz = omega * RATE_HZ / (2 * np.pi)
@@ -73,7 +73,9 @@ def test_the_best_gain_agrees_with_theory() -> None:
 @pytest.mark.parametrize("leak", [0.001, 0.01])
 def test_the_residual_of_a_leaky_integrator_follows_from_the_log(leak: float) -> None:
     """A leak leaves a part of slow disturbances; those below the log's lowest frequency must not be extrapolated."""
-    pol = Pieces((10 + np.hstack([realised(Model(1e-3, np.inf, (), 0.5, RATE_HZ), 6000, seed) for seed in (1, 2)]),), 0)
+    pol = TimeSeries(
+        (10 + np.hstack([realised(Model(1e-3, np.inf, (), 0.5, RATE_HZ), 6000, seed) for seed in (1, 2)]),), 0
+    )
     leaks = np.full(2, leak)
     gains = best_gains(pol, RATE_HZ, Timing.sampled(1.0), leaks)
     best = tune_integrator(identified(pol, RATE_HZ), gains, NOLL, leaks, Timing.sampled(1.0))
@@ -94,7 +96,7 @@ def test_laws_on_the_reaction_wheel_leave_the_predicted_residual(
 ) -> None:
     """LQG leaves less than a notch filter, which leaves less than the integrator."""
     pol, truth = wheel(10_000)
-    later = Pieces((truth + 0.8 * np.random.default_rng(99).standard_normal(truth.shape),), 0)
+    later = TimeSeries((truth + 0.8 * np.random.default_rng(99).standard_normal(truth.shape),), 0)
     models = identified(pol, RATE_HZ)
     timing = Timing.sampled(delay)
     gains = best_gains(pol, RATE_HZ, timing, NONE)
@@ -117,7 +119,7 @@ def test_laws_on_the_reaction_wheel_leave_the_predicted_residual(
 def test_white_noise_gets_a_law_with_a_small_residual() -> None:
     """White noise cannot be predicted: any choice between LQG and integrator leaves a small residual."""
     noise = np.random.default_rng(5).standard_normal((4096, 2))
-    pol = Pieces((noise,), 0)
+    pol = TimeSeries((noise,), 0)
     gains = best_gains(pol, RATE_HZ, Timing.sampled(1.0), NONE)
     best = tune_lqg(pol, identified(pol, RATE_HZ), gains, NOLL, NONE, Timing.sampled(1.0))
     assert set(best.kinds) <= {"integrator", "lqg"}
@@ -128,7 +130,7 @@ def test_white_noise_gets_a_law_with_a_small_residual() -> None:
 
 
 def test_too_few_frames_are_refused() -> None:
-    pol = Pieces((np.zeros((500, 2)),), 0)
+    pol = TimeSeries((np.zeros((500, 2)),), 0)
     with pytest.raises(ValueError, match="at least 2048 frames in a row, the longest run has 500"):
         best_gains(pol, RATE_HZ, Timing.sampled(1.0), NONE)
     with pytest.raises(ValueError, match="at least 2048 frames in a row"):

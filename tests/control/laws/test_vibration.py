@@ -10,7 +10,7 @@ from lowfc.arrays import Array
 from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.kalman import covariance_nm2, lqg
 from lowfc.control.laws.margins import check_stable, rejection
-from lowfc.control.laws.spectra import Pieces
+from lowfc.control.laws.spectra import TimeSeries
 from lowfc.control.laws.tuning import predicted_nm
 from lowfc.control.laws.vibration import FEWEST, Line, Model, identify, resolution_hz
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
@@ -21,11 +21,11 @@ RATE_HZ = 1000.0
 NM_PER_MAS = tilt_nm_per_mas(2.0)
 
 
-def preset(name: str, frames: int, seed: int = 1, noise_nm: float = 0.8) -> Pieces:
+def preset(name: str, frames: int, seed: int = 1, noise_nm: float = 0.8) -> TimeSeries:
     """Tip of a preset, measured with white noise."""
     simulated = preset_disturbance(name, (2, 3, 4), seed, NM_PER_MAS, 550.0)
     noise = noise_nm * np.random.default_rng(seed).standard_normal((frames, 1))
-    return Pieces((modes_nm(simulated, 0, frames, RATE_HZ)[:, :1] + noise,), 0)
+    return TimeSeries((modes_nm(simulated, 0, frames, RATE_HZ)[:, :1] + noise,), 0)
 
 
 def test_the_lines_of_the_reaction_wheel_are_identified() -> None:
@@ -39,7 +39,7 @@ def test_the_lines_of_the_reaction_wheel_are_identified() -> None:
 
 def test_width_and_power_of_damped_lines_are_identified() -> None:
     truth = Model(1e-4, np.inf, (Line(20, 0.8, 25.0), Line(60, 2.5, 9.0)), 0.5, RATE_HZ)
-    model = identify(Pieces((realised(truth, 40_000),), 0), RATE_HZ)
+    model = identify(TimeSeries((realised(truth, 40_000),), 0), RATE_HZ)
     assert [line.frequency_hz for line in model.lines] == pytest.approx([20, 60], rel=0.01)
     assert [line.width_hz for line in model.lines] == pytest.approx([0.8, 2.5], rel=0.35)
     assert [line.variance_nm2 for line in model.lines] == pytest.approx([25, 9], rel=0.35)
@@ -50,7 +50,7 @@ def test_no_line_is_identified_in_noise() -> None:
     """For runs of white noise."""
     for seed in range(5):
         noise = np.random.default_rng(seed).standard_normal((4096, 1))
-        model = identify(Pieces((noise,), 0), RATE_HZ)
+        model = identify(TimeSeries((noise,), 0), RATE_HZ)
         assert model.lines == ()
         assert model.noise_nm2 == pytest.approx(1, rel=0.1)
 
@@ -69,17 +69,17 @@ def test_the_spectrum_of_a_model_agrees_with_its_states() -> None:
 
 def test_pieces_are_identified_like_one_run_and_short_ones_are_not() -> None:
     whole = preset("reaction-wheel-ideal", 12_000).values[0]
-    model = identify(Pieces((whole[:6000], whole[6000:]), 0), RATE_HZ)
+    model = identify(TimeSeries((whole[:6000], whole[6000:]), 0), RATE_HZ)
     assert [round(line.frequency_hz) for line in model.lines] == [6, 18, 37, 71, 117]
-    assert identify(Pieces((whole[: FEWEST - 1],), 0), RATE_HZ) is None
-    assert resolution_hz(Pieces((whole,), 0), RATE_HZ) == RATE_HZ / 12_000
-    assert resolution_hz(Pieces((), 0), RATE_HZ) == 0
+    assert identify(TimeSeries((whole[: FEWEST - 1],), 0), RATE_HZ) is None
+    assert resolution_hz(TimeSeries((whole,), 0), RATE_HZ) == RATE_HZ / 12_000
+    assert resolution_hz(TimeSeries((), 0), RATE_HZ) == 0
 
 
 def test_a_slow_mode_is_identified_as_drift() -> None:
     simulated = preset_disturbance("thermal", (4,), 3, NM_PER_MAS, 550.0)
     run = modes_nm(simulated, 0, 20_000, RATE_HZ) + 0.5 * np.random.default_rng(3).standard_normal((20_000, 1))
-    model = identify(Pieces((run,), 0), RATE_HZ)
+    model = identify(TimeSeries((run,), 0), RATE_HZ)
     assert all(line.frequency_hz < 1 for line in model.lines)
     assert model.drift_nm2 > 0
     assert model.noise_nm2 == pytest.approx(0.25, rel=0.05)
@@ -88,7 +88,7 @@ def test_a_slow_mode_is_identified_as_drift() -> None:
 @pytest.mark.parametrize(("lines", "seed"), [((), 1), (LINES_HZ, 3)])
 def test_a_model_without_noise_still_gives_a_stable_filter(lines: tuple[float, ...], seed: int) -> None:
     truth = Model(1.0, 50.0, tuple(Line(hz, 1e-3, 100.0) for hz in lines), 1e-12, RATE_HZ)
-    model = identify(Pieces((realised(truth, 4096, seed),), 0), RATE_HZ)
+    model = identify(TimeSeries((realised(truth, 4096, seed),), 0), RATE_HZ)
     assert model.noise_nm2 > 1e-8
     check_stable(lqg([model], (2,), SAMPLED), 1.0)
 

@@ -12,7 +12,7 @@ from lowfc.control.calibration.linearity import captured
 from lowfc.control.laws.integrator import TIP_TILT, Integrator
 from lowfc.control.loop.safety import LoopMode
 from lowfc.optics.chain.zernike import mode_name
-from lowfc.programs.cli.result import figure
+from lowfc.programs.cli.result import result_field
 from lowfc.programs.commissioning.acceptance.live import Live
 from lowfc.programs.commissioning.acceptance.probe import (
     AcceptanceError,
@@ -33,17 +33,17 @@ _AVERAGED_PART = 4
 class CaptureMode(ModeResult):
     """Capture range of a mode, nm rms of wavefront."""
 
-    required_nm: float = figure("required", "nm", "g")
-    captured_nm: float = figure("converges from", "nm", "g")
-    lost_nm: float | None = figure("fails from", "nm", "g")
-    limits: list[str] = figure("limits that acted")
+    required_nm: float = result_field("required", "nm", "g")
+    captured_nm: float = result_field("converges from", "nm", "g")
+    lost_nm: float | None = result_field("fails from", "nm", "g")
+    limits: list[str] = result_field("limits that acted")
 
 
 class CaptureResult(AcceptanceResult):
     """Capture range of every mode."""
 
-    trials: int = figure("trials")
-    modes: list[CaptureMode] = figure("modes")
+    trials: int = result_field("trials")
+    modes: list[CaptureMode] = result_field("modes")
 
 
 def play(live: Live, modes: Sequence[int], required: Acceptance) -> list[ProbeResponse]:

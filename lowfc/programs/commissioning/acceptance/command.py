@@ -162,7 +162,7 @@ def _carry_out(
     instrument = (config_in_use, calibration) if by_instrument else ()
     result = test.judge(responses, required or config_in_use.acceptance, *instrument)
     if plot is not None and figure is not None:
-        test.draw(result.figures(), figure)
+        test.draw(result.json_object(), figure)
         figure.suptitle(result.verdict)
         write_whole(plot, png(figure))
     print_result(result, as_json=as_json)

@@ -11,7 +11,7 @@ from lowfc.control.calibration.excitation import build_staircase
 from lowfc.control.calibration.linearity import SURE, gains, levels
 from lowfc.control.loop.safety import LoopMode
 from lowfc.optics.chain.zernike import mode_name
-from lowfc.programs.cli.result import Result, figure
+from lowfc.programs.cli.result import Result, result_field
 from lowfc.programs.commissioning.acceptance.live import Live
 from lowfc.programs.commissioning.acceptance.probe import (
     AcceptanceError,
@@ -40,20 +40,20 @@ class Staircase:
 class Level(Result):
     """Gain of a mode and its largest cross-talk at one amplitude."""
 
-    amplitude_nm: float = figure()
-    gain: float = figure()
-    gain_error: float = figure()
-    crosstalk: float = figure()
-    crosstalk_error: float = figure()
-    crosstalk_noll: int = figure()
-    within: bool | None = figure()
+    amplitude_nm: float = result_field()
+    gain: float = result_field()
+    gain_error: float = result_field()
+    crosstalk: float = result_field()
+    crosstalk_error: float = result_field()
+    crosstalk_noll: int = result_field()
+    within: bool | None = result_field()
 
 
 class LinearityMode(ModeResult):
     """Linear range of a mode, nm rms of wavefront."""
 
-    linear_nm: float = figure("linear to", "nm", ".3g")
-    levels: list[Level] = figure()
+    linear_nm: float = result_field("linear to", "nm", ".3g")
+    levels: list[Level] = result_field()
 
     def remarks(self) -> Sequence[str]:
         """Gain - 1 and cross-talk at each amplitude."""
@@ -68,10 +68,10 @@ class LinearityMode(ModeResult):
 class LinearityResult(AcceptanceResult):
     """Linearity; the row of a mode ends with gain - 1 and the largest cross-talk at each amplitude, nm."""
 
-    required_nm: float = figure("required linear to", "nm", "g")
-    required_gain_error: float = figure("required |gain - 1|", form="g")
-    required_crosstalk: float = figure("required cross-talk", form="g")
-    modes: list[LinearityMode] = figure("modes")
+    required_nm: float = result_field("required linear to", "nm", "g")
+    required_gain_error: float = result_field("required |gain - 1|", form="g")
+    required_crosstalk: float = result_field("required cross-talk", form="g")
+    modes: list[LinearityMode] = result_field("modes")
 
     def remarks(self) -> Sequence[str]:
         """Explain the marks; the verdict."""

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lowfc.adapters.logs.columns import of_steps
+from lowfc.adapters.logs.columns import steps_as_columns
 from lowfc.arrays import Single
 from lowfc.client import Client, Step, configuration_of
 from lowfc.contract.messages import wire
@@ -124,7 +124,7 @@ class Live:
             raise AcceptanceError("gains or control law changed during the measurement: measure again")
         loop = loop_of(before, self.calibration, self.loop.rate_hz, self.client.laws())
         target = "" if not table.shape[1] else MIRROR if basis.size else OFFSET
-        return probe_response(what, loop, target, table, basis, first, of_steps(recorded, modes))
+        return probe_response(what, loop, target, table, basis, first, steps_as_columns(recorded, modes))
 
     def _state(self) -> wire.ControllerState:
         state = self.client.status().state

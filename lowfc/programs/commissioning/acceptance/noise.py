@@ -10,11 +10,11 @@ from lowfc.arrays import Array
 from lowfc.contract.configuration import Acceptance, Configuration
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws import margins
-from lowfc.control.laws.spectra import SHORTEST, Pieces, floor_nm2_hz, spectrum
+from lowfc.control.laws.spectra import SHORTEST, TimeSeries, floor_nm2_hz, spectrum
 from lowfc.control.loop.safety import LoopMode
 from lowfc.optics.chain.zernike import mode_name
-from lowfc.programs.cli.contrast import added_contrast, sentence_of
-from lowfc.programs.cli.result import figure
+from lowfc.programs.cli.contrast import added_contrast, added_contrast_in_words
+from lowfc.programs.cli.result import result_field
 from lowfc.programs.commissioning.acceptance.live import Live
 from lowfc.programs.commissioning.acceptance.probe import (
     AcceptanceError,
@@ -31,26 +31,26 @@ _LOOPS = {"open": LoopMode.OPEN, "closed": LoopMode.CLOSED}
 class NoiseMode(ModeResult):
     """White noise of a mode per frame, and the residual it causes in closed loop, nm rms of wavefront."""
 
-    expected_nm: float = figure("expected", "nm", ".3f")
-    open_nm: float = figure("open", "nm", ".3f")
-    closed_nm: float = figure("closed", "nm", ".3f")
-    residual_floor_nm: float = figure("residual from it", "nm", ".3f")
-    open_rms_nm: float = figure("error open", "nm", ".3f")
-    closed_rms_nm: float = figure("error closed", "nm", ".3f")
+    expected_nm: float = result_field("expected", "nm", ".3f")
+    open_nm: float = result_field("open", "nm", ".3f")
+    closed_nm: float = result_field("closed", "nm", ".3f")
+    residual_floor_nm: float = result_field("residual from it", "nm", ".3f")
+    open_rms_nm: float = result_field("error open", "nm", ".3f")
+    closed_rms_nm: float = result_field("error closed", "nm", ".3f")
 
 
 class NoiseResult(AcceptanceResult):
     """Noise floor of every mode."""
 
-    noise_ratio: float = figure("required ratio", form="g")
-    law: str = figure("law")
-    frames: dict[str, int] = figure()
-    added_contrast: dict[str, Any] | None = figure()
-    modes: list[NoiseMode] = figure("modes")
+    noise_ratio: float = result_field("required ratio", form="g")
+    law: str = result_field("law")
+    frames: dict[str, int] = result_field()
+    added_contrast: dict[str, Any] | None = result_field()
+    modes: list[NoiseMode] = result_field("modes")
 
     def remarks(self) -> Sequence[str]:
         """Added contrast, and the verdict."""
-        contrast = [] if self.added_contrast is None else [sentence_of(self.added_contrast)]
+        contrast = [] if self.added_contrast is None else [added_contrast_in_words(self.added_contrast)]
         return [*contrast, *super().remarks()]
 
 
@@ -123,7 +123,7 @@ def draw(found: dict[str, Any], figure: Any) -> None:
 
 def _floor_nm(response: ProbeResponse) -> Array:
     """White noise (modes,) per frame, nm, from the pseudo-open-loop modes, which the loop does not filter."""
-    power = spectrum(Pieces((response.filled(response.pol_nm),), 0), response.loop.rate_hz)
+    power = spectrum(TimeSeries((response.filled(response.pol_nm),), 0), response.loop.rate_hz)
     if power is None:
         raise AcceptanceError(f"{len(response.pol_nm)} frames are too few for a spectrum, {SHORTEST} are needed")
     return np.asarray(np.sqrt(floor_nm2_hz(power) * response.loop.rate_hz / 2))

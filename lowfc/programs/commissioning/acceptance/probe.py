@@ -24,7 +24,7 @@ from lowfc.control.laws.integrator import Integrator
 from lowfc.control.laws.linear_law import LinearLaw, integrator
 from lowfc.control.laws.stability import settling_frames
 from lowfc.control.loop.safety import Limit, LoopMode, Rejection
-from lowfc.programs.cli.result import Result, figure
+from lowfc.programs.cli.result import Result, result_field
 
 Kind = Literal["rejection", "linearity", "capture-range", "noise-floor"]
 
@@ -46,10 +46,10 @@ class AcceptanceError(LowfcError):
 class ModeResult(Result):
     """A mode, and whether it meets the requirement."""
 
-    noll: int = figure("mode")
-    name: str = figure("name")
-    passed: bool = figure()
-    too_noisy: bool = figure(default=False)
+    noll: int = result_field("mode")
+    name: str = result_field("name")
+    passed: bool = result_field()
+    too_noisy: bool = result_field(default=False)
 
     def remarks(self) -> Sequence[str]:
         """The verdict at the end of the row, unless it passed."""
@@ -59,8 +59,8 @@ class ModeResult(Result):
 class AcceptanceResult(Result):
     """The result of a test; it passed if every mode did."""
 
-    test: str = figure()
-    passed: bool = figure()
+    test: str = result_field()
+    passed: bool = result_field()
 
     @property
     def verdict(self) -> str:

@@ -17,7 +17,7 @@ from lowfc.control.loop.command_channels import MIRROR, OFFSET
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.wording import counted
 from lowfc.optics.chain.zernike import mode_name
-from lowfc.programs.cli.result import Result, figure
+from lowfc.programs.cli.result import Result, result_field
 from lowfc.programs.commissioning.acceptance.live import Live
 from lowfc.programs.commissioning.acceptance.probe import (
     AcceptanceError,
@@ -51,11 +51,11 @@ class Excitation:
 class Comparison(Result):
     """Departure of a mode's transfer function from theory, on the lines that can be judged."""
 
-    within: bool = figure()
-    lines: int = figure()
-    judged: int = figure()
-    largest_departure_db: float | None = figure(form="+.2f")
-    unsure_hz: list[float] = figure()
+    within: bool = result_field()
+    lines: int = result_field()
+    judged: int = result_field()
+    largest_departure_db: float | None = result_field(form="+.2f")
+    unsure_hz: list[float] = result_field()
 
     def __str__(self) -> str:
         worst = "-" if self.largest_departure_db is None else f"{self.largest_departure_db:+.2f}"
@@ -65,28 +65,28 @@ class Comparison(Result):
 class RejectionMode(ModeResult):
     """Departure of a mode's rejection and noise transfer from theory, dB, and the number of lines judged."""
 
-    rejection: Comparison = figure("rejection", "dB on lines")
-    noise_transfer: Comparison = figure("noise transfer", "dB on lines")
+    rejection: Comparison = result_field("rejection", "dB on lines")
+    noise_transfer: Comparison = result_field("noise transfer", "dB on lines")
 
 
 class RejectionResult(AcceptanceResult):
     """Rejection and noise transfer under a multisine; `points` has one entry per line."""
 
-    law: str = figure("law")
-    delay_frames: float = figure("delay", "frames", "g")
-    rate_hz: float = figure("rate", "Hz", ".4g")
-    injected: str = figure("multisine on the")
-    lines: int = figure("lines")
-    lowest_hz: float = figure("lowest", "Hz", ".3g")
-    highest_hz: float = figure("highest", "Hz", ".4g")
-    frames: int = figure("frames")
-    frames_missing: int = figure()
-    tolerance_db: float = figure("tolerance", "dB", "g")
-    lines_judged: int = figure()
-    largest_departure_db: float | None = figure()
-    largest_noise_departure_db: float | None = figure()
-    modes: list[RejectionMode] = figure("modes")
-    points: list[dict[str, Any]] = figure()
+    law: str = result_field("law")
+    delay_frames: float = result_field("delay", "frames", "g")
+    rate_hz: float = result_field("rate", "Hz", ".4g")
+    injected: str = result_field("multisine on the")
+    lines: int = result_field("lines")
+    lowest_hz: float = result_field("lowest", "Hz", ".3g")
+    highest_hz: float = result_field("highest", "Hz", ".4g")
+    frames: int = result_field("frames")
+    frames_missing: int = result_field()
+    tolerance_db: float = result_field("tolerance", "dB", "g")
+    lines_judged: int = result_field()
+    largest_departure_db: float | None = result_field()
+    largest_noise_departure_db: float | None = result_field()
+    modes: list[RejectionMode] = result_field("modes")
+    points: list[dict[str, Any]] = result_field()
 
     def remarks(self) -> Sequence[str]:
         """Lines too noisy to judge, missing frames, and the verdict."""

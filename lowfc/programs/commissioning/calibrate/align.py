@@ -16,7 +16,7 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError
 from lowfc.control.calibration.alignment import Alignment, Geometry, align, onto
 from lowfc.control.calibration.calibration import Calibration, normalise_flux
-from lowfc.programs.cli.result import Result, figure
+from lowfc.programs.cli.result import Result, result_field
 from lowfc.programs.commissioning.analytic import analytic
 from lowfc.programs.commissioning.calibrate.pokes import AMPLITUDE_NM, sequence
 from lowfc.programs.commissioning.calibrate.recording import Player, check_size, watch
@@ -27,17 +27,17 @@ from lowfc.programs.commissioning.calibrate.tasks import reporter, write
 class AlignResult(Result):
     """Geometry of the sensor relative to the computed image."""
 
-    pixels_per_lambda_d: float = figure("scale", "pixels per lambda/D", ".4f")
-    scale: float = figure()
-    row: float = figure("centre, row", form=".2f")
-    column: float = figure("centre, column", form=".2f")
-    rotation_deg: float = figure("rotation", "degrees", ".2f")
-    parity: int = figure("parity, -1 if reflected")
-    flux_dn: float = figure("light", "DN", ".4g")
-    background_dn: float = figure("background", "DN", ".3g")
-    residual: float = figure("residual of the image", form=".1%")
-    other_parity_residual: float = figure("residual, other parity", form=".1%")
-    file: str = figure("written")
+    pixels_per_lambda_d: float = result_field("scale", "pixels per lambda/D", ".4f")
+    scale: float = result_field()
+    row: float = result_field("centre, row", form=".2f")
+    column: float = result_field("centre, column", form=".2f")
+    rotation_deg: float = result_field("rotation", "degrees", ".2f")
+    parity: int = result_field("parity, -1 if reflected")
+    flux_dn: float = result_field("light", "DN", ".4g")
+    background_dn: float = result_field("background", "DN", ".3g")
+    residual: float = result_field("residual of the image", form=".1%")
+    other_parity_residual: float = result_field("residual, other parity", form=".1%")
+    file: str = result_field("written")
 
     def remarks(self) -> Sequence[str]:
         """Confirmation that a poke determined the sign."""

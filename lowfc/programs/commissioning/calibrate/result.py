@@ -1,4 +1,4 @@
-"""The result of a calibration: contents of the file, figures and verdict."""
+"""The result of a calibration: contents of the file, properties and verdict."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,7 +19,7 @@ from lowfc.control.calibration.response_fit import MAX_ELEMENT, MAX_ELEMENT_RMS,
 from lowfc.optics.twin.twin import reference as twin_reference
 from lowfc.optics.twin.twin import response as twin_response
 from lowfc.optics.twin.twin_mirror import wavefront_nm
-from lowfc.programs.cli.result import Result, figure
+from lowfc.programs.cli.result import Result, result_field
 from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest, cycles_for
 from lowfc.programs.commissioning.calibrate.run import CalibrationData, Calibrator
 
@@ -33,46 +33,46 @@ DELAY_TOLERANCE_FRAMES = 0.1
 class Verdict(Result):
     """Verdict on a measured reconstructor; its cross-talk is measured on separate frames."""
 
-    snr: float = figure("signal-to-noise ratio requested", form=".3g")
-    snr_reached: float = figure("signal-to-noise ratio reached", form=".3g")
-    check_cycles: int = figure("check cycles")
-    check_cross_talk_rms: float = figure("check frames: cross-talk, rms", form=".3g")
-    check_cross_talk_max: float = figure("check frames: largest cross-talk, with noise", form=".3g")
-    check_cross_talk_bound: float = figure("limit of the largest, with noise", form=".3g")
-    check_error: float = figure("standard error of an element of R H", form=".2g")
-    promised_cross_talk_rms: float = figure("limit of the cross-talk, rms", form=".3g")
-    promised_cross_talk_max: float = figure("limit of the largest cross-talk", form=".3g")
-    recommended: bool = figure()
-    faults: list[str] = figure()
+    snr: float = result_field("signal-to-noise ratio requested", form=".3g")
+    snr_reached: float = result_field("signal-to-noise ratio reached", form=".3g")
+    check_cycles: int = result_field("check cycles")
+    check_cross_talk_rms: float = result_field("check frames: cross-talk, rms", form=".3g")
+    check_cross_talk_max: float = result_field("check frames: largest cross-talk, with noise", form=".3g")
+    check_cross_talk_bound: float = result_field("limit of the largest, with noise", form=".3g")
+    check_error: float = result_field("standard error of an element of R H", form=".2g")
+    promised_cross_talk_rms: float = result_field("limit of the cross-talk, rms", form=".3g")
+    promised_cross_talk_max: float = result_field("limit of the largest cross-talk", form=".3g")
+    recommended: bool = result_field()
+    faults: list[str] = result_field()
 
 
-class Figures(Result):
-    """Figures of a calibration; figures of each mode are in the order of `noll`."""
+class CalibrationProperties(Result):
+    """Properties of a calibration; lists have one value per mode, in the order of `noll`."""
 
-    method: str = figure("method")
-    modes: int = figure("modes")
-    noll: list[int] = figure("mode", form="Z{}", column=True)
-    condition_number: float = figure("condition number", form=".3g")
-    singular_values: list[float] = figure("singular values", form=".3g")
-    kept: list[float] = figure()
-    delay_frames: float = figure("delay", "frames", ".3f")
-    delay_error_frames: float = figure("standard error of the delay", "frames", ".3f")
-    frame_to_effect_ms: float = figure("frame to effect", "ms", ".3g")
-    noise_gain_nm: list[float] = figure("noise per frame", "nm", ".3g", column=True)
-    computed_noise_nm: list[float] | None = figure("computed", "nm", ".3g", column=True, default=None)
-    bad_pixels: int = figure("bad pixels")
-    flux_dn: float = figure("light", "DN", ".4g")
-    cycles: int = figure("cycles")
-    cross_talk: float | None = figure("largest cross-talk relative to the computed H", form=".4f", default=None)
-    cross_talk_error: float | None = figure("standard error of this cross-talk", form=".4f", default=None)
-    file: str = figure("written")
+    method: str = result_field("method")
+    modes: int = result_field("modes")
+    noll: list[int] = result_field("mode", form="Z{}", column=True)
+    condition_number: float = result_field("condition number", form=".3g")
+    singular_values: list[float] = result_field("singular values", form=".3g")
+    kept: list[float] = result_field()
+    delay_frames: float = result_field("delay", "frames", ".3f")
+    delay_error_frames: float = result_field("standard error of the delay", "frames", ".3f")
+    frame_to_effect_ms: float = result_field("frame to effect", "ms", ".3g")
+    noise_gain_nm: list[float] = result_field("noise per frame", "nm", ".3g", column=True)
+    computed_noise_nm: list[float] | None = result_field("computed", "nm", ".3g", column=True, default=None)
+    bad_pixels: int = result_field("bad pixels")
+    flux_dn: float = result_field("light", "DN", ".4g")
+    cycles: int = result_field("cycles")
+    cross_talk: float | None = result_field("largest cross-talk relative to the computed H", form=".4f", default=None)
+    cross_talk_error: float | None = result_field("standard error of this cross-talk", form=".4f", default=None)
+    file: str = result_field("written")
 
 
-class CalibrationResult(Verdict, Figures):
+class CalibrationResult(Verdict, CalibrationProperties):
     """A measured calibration with its verdict, or a computed one without a verdict."""
 
-    advice: list[str] = figure(exclude=True, default=[])
-    not_loaded: bool = figure(exclude=True, default=False)
+    advice: list[str] = result_field(exclude=True, default=[])
+    not_loaded: bool = result_field(exclude=True, default=False)
 
     def remarks(self) -> Sequence[str]:
         """Advice and verdict."""
@@ -86,18 +86,18 @@ class CalibrationResult(Verdict, Figures):
 
 
 class Comparison(Result):
-    """Differences of two calibrations; figures of each mode are in the order of `noll`."""
+    """Differences of two calibrations; lists have one value per mode, in the order of `noll`."""
 
-    modes: int = figure("modes")
-    noll: list[int] = figure("mode", form="Z{}", column=True)
-    estimators: list[str] = figure("estimators")
-    cross_talk: float = figure("largest cross-talk", form=".4f")
-    gain: list[float] = figure("gain", form=".4f", column=True)
-    reference_shift_nm: list[float] = figure("zero-point shift", "nm", ".3f", column=True)
-    flux_ratio: float = figure("flux ratio", form=".4f")
-    dark_shift_dn: float = figure("shift of the dark", "DN", "+.2f")
-    bad_pixels: list[int] = figure("bad pixels")
-    same_commands: bool = figure("same commands")
+    modes: int = result_field("modes")
+    noll: list[int] = result_field("mode", form="Z{}", column=True)
+    estimators: list[str] = result_field("estimators")
+    cross_talk: float = result_field("largest cross-talk", form=".4f")
+    gain: list[float] = result_field("gain", form=".4f", column=True)
+    reference_shift_nm: list[float] = result_field("zero-point shift", "nm", ".3f", column=True)
+    flux_ratio: float = result_field("flux ratio", form=".4f")
+    dark_shift_dn: float = result_field("shift of the dark", "DN", "+.2f")
+    bad_pixels: list[int] = result_field("bad pixels")
+    same_commands: bool = result_field("same commands")
 
 
 def rejected_path(out: Path) -> Path:
@@ -191,7 +191,7 @@ def result_of(
     computed: Calibration | None = None,
     verdict: Verdict | None = None,
 ) -> CalibrationResult:
-    """The figures of a measured or computed calibration."""
+    """The result of a measured or computed calibration."""
     delay_frames, error_frames = (configured_delay(config), 0.0) if data is None else data.delay[:2]
     optional: dict[str, Any] = {}
     noise = None if computed is None else computed_noise_nm(config, calibration, computed)
@@ -216,7 +216,7 @@ def result_of(
         file=str(file),
         advice=[advice(reconstruction, calibration.noll, config.control.limit_nm)],
         **optional,
-        **({} if verdict is None else verdict.figures()),
+        **({} if verdict is None else verdict.json_object()),
     )
 
 
@@ -276,7 +276,7 @@ def judge(
 
 
 def comparison(one: Calibration, other: Calibration) -> Comparison:
-    """Differences of two calibrations; figures of each mode are in the order of `noll`."""
+    """Differences of two calibrations; lists have one value per mode, in the order of `noll`."""
     if not comparable(one, other):
         raise CalibrationError(
             "calibrations with different sensors or modes cannot be compared: the first has "

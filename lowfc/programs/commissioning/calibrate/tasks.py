@@ -28,7 +28,7 @@ from lowfc.control.loop.wording import counted
 from lowfc.optics.chain.zernike import zernikes
 from lowfc.optics.twin.twin import Twin, node_radii
 from lowfc.optics.twin.twin_mirror import TwinMirror, wavefront_nm
-from lowfc.programs.cli.result import Result, figure
+from lowfc.programs.cli.result import Result, result_field
 from lowfc.programs.commissioning.analytic import Wavefront, analytic
 from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest
 from lowfc.programs.commissioning.calibrate.recording import Report, check_size, watch
@@ -44,23 +44,23 @@ from lowfc.programs.commissioning.calibrate.run import Calibrator, partial_of
 class DarkResult(Result):
     """A dark and its bad pixels."""
 
-    frames: int = figure("frames")
-    dark_dn: float = figure("dark, median", "DN", ".4g")
-    noise_dn: float = figure("noise, median", "DN", ".3g")
-    hot: int = figure("hot pixels")
-    noisy: int = figure("noisy pixels")
-    dead: int = figure("dead pixels")
-    file: str = figure("written")
+    frames: int = result_field("frames")
+    dark_dn: float = result_field("dark, median", "DN", ".4g")
+    noise_dn: float = result_field("noise, median", "DN", ".3g")
+    hot: int = result_field("hot pixels")
+    noisy: int = result_field("noisy pixels")
+    dead: int = result_field("dead pixels")
+    file: str = result_field("written")
 
 
 class ReferenceResult(Result):
     """Shift of the zero point."""
 
-    frames: int = figure("frames")
-    noll: list[int] = figure("mode", form="Z{}", column=True)
-    reference_shift_nm: list[float] = figure("zero point moved by", "nm", "+.2f", column=True)
-    flux_dn: float = figure("light", "DN", ".4g")
-    file: str = figure("written")
+    frames: int = result_field("frames")
+    noll: list[int] = result_field("mode", form="Z{}", column=True)
+    reference_shift_nm: list[float] = result_field("zero point moved by", "nm", "+.2f", column=True)
+    flux_dn: float = result_field("light", "DN", ".4g")
+    file: str = result_field("written")
 
 
 def poked(request: CalibrationRequest, run: str | None, *, load: bool) -> CalibrationResult:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lowfc.adapters.files import calibration_file, factory
-from lowfc.adapters.logs.columns import Steps, of_steps
+from lowfc.adapters.logs.columns import Steps, steps_as_columns
 from lowfc.adapters.process.progress import Counted
 from lowfc.arrays import Single
 from lowfc.client import Client
@@ -84,12 +84,12 @@ class Commissioning:
         """Commission the loop that `loop` is connected to; `computed` is the calibration of the optical model."""
         self._loop, self._config, self._computed, self._options = loop, config, computed, options
         self._report, self._progress, self._confirm = report, progress, confirm
-        self._figures: dict[str, Any] = {}
+        self._results: dict[str, Any] = {}
         self._delay: Delay | None = None
         self._recommended = False
 
     def run(self) -> tuple[dict[str, Any], str]:
-        """Carry out all steps; return the figures, and the text for people."""
+        """Carry out all steps; return the results, and the text for people."""
         options, first_file = self._options, first_of(self._options.out)
         if options.resume and not first_file.is_file():
             if options.out.is_file():
@@ -155,7 +155,7 @@ class Commissioning:
         data = calibrator.run(delay)
         self._step("verdict")
         calibration, result = finish_calibration(calibrator, request, data, self._computed)
-        self._figures |= result.figures()
+        self._results |= result.json_object()
         if not result.recommended:
             raise CalibrationError(
                 f"{result.text()}\nnot loaded: correct this, then repeat the command; --resume keeps these cycles, "
@@ -167,7 +167,7 @@ class Commissioning:
             path.unlink(missing_ok=True)
         self._report(result.text())
         law = factory.settings(config).integrator(calibration.noll)
-        return self._figures, self._close(law, delay.delay_frames)
+        return self._results, self._close(law, delay.delay_frames)
 
     def _request(self, amplitude_nm: float | None = None, *, resume: bool = False) -> CalibrationRequest:
         options = self._options
@@ -215,7 +215,7 @@ class Commissioning:
         player = Player(self._loop, before, self._report)
         self._delay = delay = first_delay(player, self._config)
         self._step("orientation and sign")
-        first = aligned(self._config, self._computed, before, delay, self._report, self._figures)
+        first = aligned(self._config, self._computed, before, delay, self._report, self._results)
         return poked(player, self._config, delay) if first is None else first
 
     def _close(self, law: Integrator, delay_frames: float) -> str:
@@ -231,7 +231,7 @@ class Commissioning:
             predicted = _rms_nm(counterfactual(as_logged(law), weights, opened.pol_nm, missing)[0], settling)
         except ValueError as error:
             raise CalibrationError(f"the residual cannot be predicted: {error}") from None
-        self._figures["predicted_error_nm"] = predicted
+        self._results["predicted_error_nm"] = predicted
         text = f"predicted measured error in closed loop: {predicted:.3g} nm rms, from {frames} open-loop frames"
         if not self._options.close:
             return f"{text}\n`lowfc ctl close` closes it"
@@ -239,7 +239,7 @@ class Commissioning:
         self._loop.close_loop()
         try:
             measured = _rms_nm(self._steps(frames, LoopMode.CLOSED).error_nm, settling)
-            self._figures["measured_error_nm"] = measured
+            self._results["measured_error_nm"] = measured
             if measured > MAX_OF_PREDICTED * predicted:
                 raise CalibrationError(
                     f"the measured error in closed loop is {measured:.3g} nm rms, but {predicted:.3g} was predicted: "
@@ -267,7 +267,7 @@ class Commissioning:
                 break
             if len(steps) % CHECKED == 0:
                 self._loop.check_lease()
-        return of_steps(steps, len(self._computed.noll))
+        return steps_as_columns(steps, len(self._computed.noll))
 
 
 def _rms_nm(error_nm: Single, settling: int) -> float:

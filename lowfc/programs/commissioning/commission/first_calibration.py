@@ -59,11 +59,11 @@ def aligned(
     before: Calibration,
     poke: Delay,
     report: Report,
-    figures: dict[str, Any],
+    results: dict[str, Any],
 ) -> Calibration | None:
     """The computed calibration on the sensor's pixels, with the sign from the poke; None for another sensor.
 
-    The sensor's geometry is added to `figures`.
+    The sensor's geometry is added to `results`.
     """
     image = (before.reference * before.flux_dn).reshape(before.shape).astype(np.float64)
     model = computed.reference.astype(np.float64).reshape(computed.shape)
@@ -83,7 +83,7 @@ def aligned(
     if found.residual > MAX_MISFIT or like < MIN_LIKENESS:
         report("this is not the configured sensor: the response is measured without the optical model")
         return None
-    figures |= {
+    results |= {
         "pixels_per_lambda_d": scale,
         "rotation_deg": found.geometry.rotation_deg,
         "parity": found.geometry.parity,

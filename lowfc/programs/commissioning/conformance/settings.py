@@ -28,7 +28,7 @@ def _settings(camera: Camera) -> Check:
         got = f"{unreadable} of {count} are not a lowfc.v1.CameraState"
         return wrong(got, "encode the message as declared")
     if not count:
-        advice = camera.failing or "publish it: calibration, noise figures and the check for a changed camera use it"
+        advice = camera.failing or "publish it: calibration, noise and the check for a changed camera use it"
         return wrong(f"none in {camera.seconds:g} s", advice)
     if camera.seconds >= 2 and not 1 < count / camera.seconds < 20:
         return warning(f"{count / camera.seconds:.1f} a second", "publish them twice a second")
@@ -135,7 +135,7 @@ class Agreement(NamedTuple):
         key: configuration key of the same value.
         unit: unit in which both are printed.
         tolerance: largest difference, relative to the configured value.
-        needed: whether a difference is wrong for the loop, or only for computed figures (a warning).
+        needed: whether a difference is wrong for the loop, or only for computed values (a warning).
         use: results that depend on it.
     """
 

@@ -75,7 +75,7 @@ def examine(facts: "Facts") -> list[Check]:
 
 
 def measured(facts: "Facts") -> dict[str, Any]:
-    """Figures that `--json` prints besides the checks: wake-up percentiles by scheduling class, and the host."""
+    """Values that `--json` prints besides the checks: wake-up percentiles by scheduling class, and the host."""
     from lowfc.adapters.process.provenance import provenance
     from lowfc.programs.commissioning.doctor.timing import wake_up_us
 

@@ -252,12 +252,12 @@ def _boot_clock(facts: Facts) -> Check:
 )
 def _wake_up(facts: Facts) -> Check:
     """Lateness of a timer wake-up, 1000 times in one second, in both scheduling classes."""
-    figures = wake_up_us(facts.tried)
+    wake_up = wake_up_us(facts.tried)
     detail = "; ".join(
         f"{name}: p50 {one['p50']:.0f} us, p99 {one['p99']:.0f} us, max {one['max']:.0f} us"
-        for name, one in figures.items()
+        for name, one in wake_up.items()
     )
-    best = list(figures.values())[-1]
+    best = list(wake_up.values())[-1]
     period_us = facts.config.period_ns / 1e3
     if best["p99"] <= _PART_OF_PERIOD * period_us and best["max"] <= period_us:
         return ok(detail)

@@ -38,8 +38,8 @@ def tune(
     from lowfc.adapters.logs.parts import WholeLog, the_one
     from lowfc.adapters.process.progress import passing_bar, reading_bar
     from lowfc.client import Client
-    from lowfc.programs.commissioning.tune.data import of_log, of_run
-    from lowfc.programs.commissioning.tune.figures import picture, result_of, tuned
+    from lowfc.programs.commissioning.tune.data import telemetry_from_log, telemetry_from_run
+    from lowfc.programs.commissioning.tune.result import picture, result_of, tuned
     from lowfc.programs.logs.guard import refuse_log
 
     if bool(logs) == (live is not None):
@@ -53,11 +53,11 @@ def tune(
                 refuse_log(file, reader.path)
         with reading_bar(console) as count:
             reader.progress = partial(count, "reading")
-            telemetry = of_log(reader)
+            telemetry = telemetry_from_log(reader)
     else:
         with Client(run) as loop, passing_bar(console) as bar:
             task = bar.add_task("listening", total=live)
-            telemetry = of_run(loop, live or 0.0, lambda passed_s: bar.update(task, completed=passed_s))
+            telemetry = telemetry_from_run(loop, live or 0.0, lambda passed_s: bar.update(task, completed=passed_s))
     with passing_bar(console) as bar:
         bar.add_task(f"tuning {controller}", total=None)
         try:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lowfc.adapters.files.factory import contrast_of, frame_noise_nm2
-from lowfc.adapters.logs.columns import Steps, of_steps
+from lowfc.adapters.logs.columns import Steps, steps_as_columns
 from lowfc.adapters.logs.history import read_history
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.arrays import Array, Mask, Single
@@ -19,7 +19,7 @@ from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.integrator import Integrator
 from lowfc.control.laws.linear_law import LinearLaw
-from lowfc.control.laws.spectra import Pieces, pieces
+from lowfc.control.laws.spectra import TimeSeries, time_series
 from lowfc.control.laws.vibration import FEWEST
 from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import LoopMode
@@ -47,7 +47,7 @@ class Telemetry:
         nm_per_mas: wavefront rms of a tilt of 1 mas; None if the telescope's diameter is unknown.
         contrast: contrast added by the modes, with `noise_nm2`, the computed covariance (modes, modes) of one frame's
             noise; None without a science image.
-        warnings: doubts about the figures.
+        warnings: doubts about the results.
     """
 
     source: str
@@ -57,8 +57,8 @@ class Telemetry:
     law: Integrator
     driving: LinearLaw | None
     closed: bool
-    pol: Pieces
-    error: Pieces
+    pol: TimeSeries
+    error: TimeSeries
     true_nm2: Array | None
     nm_per_mas: float | None
     contrast: ModalContrast | None
@@ -66,7 +66,7 @@ class Telemetry:
     warnings: tuple[str, ...]
 
 
-def of_log(log: LogReader) -> Telemetry:
+def telemetry_from_log(log: LogReader) -> Telemetry:
     """The used closed-loop frames of a log; all used frames if there are too few of them.
 
     Frames with a probe sequence, as in an acceptance test, are excluded: a law must not learn from them.
@@ -102,7 +102,7 @@ def of_log(log: LogReader) -> Telemetry:
     )
 
 
-def of_run(loop: Client, seconds: float, progress: Callable[[float], None] | None = None) -> Telemetry:
+def telemetry_from_run(loop: Client, seconds: float, progress: Callable[[float], None] | None = None) -> Telemetry:
     """The steps of a running loop in the next `seconds`."""
     state = loop.status().state
     calibration = loop.calibration()
@@ -129,7 +129,7 @@ def of_run(loop: Client, seconds: float, progress: Callable[[float], None] | Non
     stream.close()
     if state is None or not state.gain:
         raise DataFileError(f"run {loop.run_id!r} has no calibration: load one with `lowfc ctl load`")
-    columns = of_steps(steps, len(calibration.noll))
+    columns = steps_as_columns(steps, len(calibration.noll))
     period_s = float(np.median(np.diff(columns.time_ns))) * 1e-9 if len(steps) > 1 else 0.0
     rate_hz = 1 / period_s if period_s > 0 else config.camera.rate_hz
     return _telemetry(
@@ -179,10 +179,10 @@ def _telemetry(
     opened = np.flatnonzero(~was_closed)
     frames_closed = index - np.concatenate([[-1], opened])[np.searchsorted(opened, index)]
     closed, rows = True, usable & was_closed & (frames_closed > _SETTLING_S * rate_hz)
-    pol = pieces(steps.sequence[rows], steps.pol_nm[rows])
+    pol = time_series(steps.sequence[rows], steps.pol_nm[rows])
     if _longest(pol) < FEWEST:
         closed, rows = False, usable
-        pol = pieces(steps.sequence[rows], steps.pol_nm[rows])
+        pol = time_series(steps.sequence[rows], steps.pol_nm[rows])
     if _longest(pol) < FEWEST:
         raise DataFileError(
             f"{source}: tuning requires at least {FEWEST} consecutive frames, {FEWEST / rate_hz:.2g} s; the longest "
@@ -199,7 +199,7 @@ def _telemetry(
         driving=laws[1],
         closed=closed,
         pol=pol,
-        error=pieces(steps.sequence[rows], steps.error_nm[rows]),
+        error=time_series(steps.sequence[rows], steps.error_nm[rows]),
         true_nm2=None if used_nm is None else used_nm.T @ used_nm / len(used_nm),
         nm_per_mas=tilt_nm_per_mas(config.star.diameter_m) if config is not None else None,
         contrast=contrast,
@@ -208,5 +208,5 @@ def _telemetry(
     )
 
 
-def _longest(run: Pieces) -> int:
+def _longest(run: TimeSeries) -> int:
     return max((len(piece) for piece in run.values), default=0)

@@ -30,9 +30,9 @@ _OWN = EVENTS["ON_EVENT_FAILED"].name
 class Alarm:
     """Runs a shell command on events of a level, one at a time and not too often."""
 
-    def __init__(self, service: Service, command: str, level: Level, every_s: float) -> None:
+    def __init__(self, service: Service, command: str, level: Level, min_interval_s: float) -> None:
         """Run the command from the next event on; its failure is published as an event that does not trigger it."""
-        self._command, self._level, self._every_s, self._service = command, level, every_s, service
+        self._command, self._level, self._min_interval_s, self._service = command, level, min_interval_s, service
         self._waiting: deque[Log] = deque(maxlen=_MAX_WAITING_EVENTS)
         self._arrived = threading.Event()
         service.bus.subscribe(EVENT, self._receive)
@@ -51,14 +51,14 @@ class Alarm:
             events = [self._waiting.popleft() for _ in range(len(self._waiting))]
             if events:
                 self._run(max(events, key=lambda event: event.level), len(events) - 1)
-                time.sleep(self._every_s)
+                time.sleep(self._min_interval_s)
 
     def _run(self, event: Log, others: int) -> None:
-        name, _, sentence = printable(event.message).partition(" ")
+        name, _, text = printable(event.message).partition(" ")
         arguments = {
             "LOWFC_RUN": self._service.run_id,
             "LOWFC_EVENT": name,
-            "LOWFC_TEXT": sentence,
+            "LOWFC_TEXT": text,
             "LOWFC_LEVEL": _LEVELS.get(event.level, str(event.level)),
             "LOWFC_PROCESS": printable(event.name),
             "LOWFC_TIME": f"{from_timestamp(event.timestamp) * 1e-9:.3f}",

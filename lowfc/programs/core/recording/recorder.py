@@ -27,7 +27,7 @@ from lowfc.contract.errors import BadMessageError, DataFileError
 from lowfc.contract.messages import EVENT, HEALTH, RECORD_KEY, TOPICS, Role, Topic, timestamp, wire
 from lowfc.programs.core.recording.peers import Peers
 from lowfc.programs.core.recording.summary import Summary
-from lowfc.programs.core.recording.volume import growth_sentence
+from lowfc.programs.core.recording.volume import growth_in_words
 
 QUEUE_MESSAGES = 20_000
 """Largest number of messages waiting for the disk: about 4 s of a 1 kHz loop, 90 MB."""
@@ -193,7 +193,7 @@ class Recorder:
                 self._report_losses()
                 self._write_waiting()
                 self._flush()
-                self._series.end(self._figures(), wait=False)
+                self._series.end(self._totals(), wait=False)
                 self._paused = True
                 self._ending = self._ender.submit(self._series.end, {})  # waits until the log is written
             if not self._ending.done():
@@ -283,10 +283,10 @@ class Recorder:
                 return
             if short := self._series.shortage():
                 self._failure = short
-                self._series.end(self._figures() | {"stopped": short})
+                self._series.end(self._totals() | {"stopped": short})
                 self.service.event("RECORDING_FAILED", why=f"{short}; the log is complete")
             elif self._series.full or self._account.starts >= self._most_starts:
-                self._series.end(self._figures(), wait=False)
+                self._series.end(self._totals(), wait=False)
                 self._begin(anew=False)
                 self._peers.query_soon()
         except DataFileError as fault:
@@ -295,7 +295,7 @@ class Recorder:
     def _estimate(self) -> str:
         """Sentence on the disk space used, from the growth so far or as expected; empty if unknown."""
         growth = self._series.bytes_per_s or self._expected_bytes_per_s
-        return growth_sentence(growth, self._folder, self._min_free_bytes) if growth else ""
+        return growth_in_words(growth, self._folder, self._min_free_bytes) if growth else ""
 
     def _flushed(self) -> None:
         self._account.mark_flushed()
@@ -332,7 +332,7 @@ class Recorder:
         self._iterate()
         self._flush()
         try:
-            self._series.end(self._figures())
+            self._series.end(self._totals())
             own = {EVENT.key, HEALTH.at(self.service.name)}
             peers_recorded = self.service.last_health or self._peers.newest or set(self._account.recorded()) - own
             if not (self._failure or peers_recorded):
@@ -349,8 +349,8 @@ class Recorder:
             self._series.longest_write_ns,
         )
 
-    def _figures(self) -> dict[str, str]:
-        """Figures at the end of a log, for all logs so far."""
+    def _totals(self) -> dict[str, str]:
+        """Totals at the end of a log, over all logs so far."""
         lost = self._account.lost()
         return {
             "messages": str(self._series.messages),

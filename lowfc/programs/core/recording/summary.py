@@ -28,7 +28,7 @@ class Summary:
     longest_write_ns: int
 
 
-def figures(summary: Summary) -> dict[str, Any]:
+def json_object(summary: Summary) -> dict[str, Any]:
     """The summary for `--json`."""
     return {
         "messages_recorded": summary.messages,

@@ -46,13 +46,13 @@ def estimate(config: Configuration) -> str:
     """Sentence on the disk space that a recording will use."""
     recorded = configured_selection(config)
     min_free_bytes = config.recorder.min_free_mb * 1e6
-    growth = growth_sentence(bytes_per_s(config, recorded), Path(config.recorder.folder), min_free_bytes)
+    growth = growth_in_words(bytes_per_s(config, recorded), Path(config.recorder.folder), min_free_bytes)
     return f"recording into {config.recorder.folder}: {growth}, at {config.camera.rate_hz:g} Hz" + (
-        f" ({recorded.sentence})" if recorded.sentence else ""
+        f" ({recorded.description})" if recorded.description else ""
     )
 
 
-def growth_sentence(growth_bytes_per_s: float, folder: Path, min_free_bytes: float) -> str:
+def growth_in_words(growth_bytes_per_s: float, folder: Path, min_free_bytes: float) -> str:
     """Growth per hour, and the time until the disk of `folder` has only `min_free_bytes` left."""
     free_bytes = shutil.disk_usage(existing(folder)).free
     lasts_h = max(0.0, free_bytes - min_free_bytes) / growth_bytes_per_s / 3600
@@ -60,10 +60,10 @@ def growth_sentence(growth_bytes_per_s: float, folder: Path, min_free_bytes: flo
 
 
 def _rate_hz(topic: Topic, config: Configuration, recorded: Selection) -> float:
-    if topic in recorded.left_out:
+    if topic in recorded.excluded:
         return 0.0
     rate_hz = config.camera.rate_hz if topic.rate is Rate.LOOP else float(topic.rate)
-    return rate_hz if recorded.records_all(topic) else rate_hz / recorded.every
+    return rate_hz if recorded.records_all(topic) else rate_hz / recorded.interval_frames
 
 
 def _size(count: float) -> str:

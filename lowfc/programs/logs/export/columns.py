@@ -46,7 +46,7 @@ def step_columns(history: History) -> list[Column]:
     """
     steps = history.steps
     if not steps.sequence.size:
-        fitting = f" that fit its calibration ({history.left_out} do not)" if history.left_out else ""
+        fitting = f" that fit its calibration ({history.excluded_messages} do not)" if history.excluded_messages else ""
         raise DataFileError(f"{history.log.path} has no steps{fitting}: there is nothing to export")
 
     def reasons(bits: int) -> str:

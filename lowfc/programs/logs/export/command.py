@@ -81,8 +81,8 @@ def export(
                 done = thin(log, out or thinned_path(log[0], chosen), chosen, partial(count, "copying"))
             print_result(dataclasses.asdict(done), str(done), as_json=as_json)
         else:
-            figures = export_log(log, to or Format.FITS, out, frames=frames, force=force, console=console)
-            print_result(figures, render(figures), as_json=as_json)
+            results = export_log(log, to or Format.FITS, out, frames=frames, force=force, console=console)
+            print_result(results, render(results), as_json=as_json)
 
 
 def export_log(
@@ -94,7 +94,7 @@ def export_log(
     force: bool = False,
     console: "Console",
 ) -> dict[str, Any]:
-    """Export a log; return the figures that `--json` prints."""
+    """Export a log; return the results that `--json` prints."""
     from lowfc.adapters.files.whole_file import being_written
     from lowfc.adapters.logs.history import read_history
     from lowfc.adapters.logs.parts import WholeLog
@@ -127,8 +127,8 @@ def export_log(
         "steps": len(history.steps.sequence),
         "modes": history.steps.error_nm.shape[1],
         "frames": len(history.frame_sequence) if frames else 0,
-        "steps_left_out": history.left_out,
-        "selection": reader.selection.sentence,
+        "steps_left_out": history.excluded_messages,
+        "selection": reader.selection.description,
         "finished": reader.finished,
         "no_end": missing_end_text(reader.paths, finished=reader.finished),
         "damaged": [f"byte {one.position}, {one.why}" for one in reader.damage],
@@ -136,17 +136,17 @@ def export_log(
     }
 
 
-def render(figures: dict[str, Any]) -> str:
+def render(results: dict[str, Any]) -> str:
     """Summary of an export as text."""
     from lowfc.adapters.logs.recovery import faults
 
-    frames = f", {figures['frames']} frames" if figures["frames"] else ""
-    lines = [f"recorded           {figures['selection']}"] if figures["selection"] else []
-    lines += [f"{', '.join(figures['files'])}: {figures['steps']} steps of {figures['modes']} modes{frames}"]
-    if figures["steps_left_out"]:
-        lines.append(f"left out           {figures['steps_left_out']} steps measured with a calibration of other modes")
-    lines += faults(figures["damaged"], figures["no_end"])
-    lines += [f"configuration      {remark}" for remark in figures["remarks"]]
+    frames = f", {results['frames']} frames" if results["frames"] else ""
+    lines = [f"recorded           {results['selection']}"] if results["selection"] else []
+    lines += [f"{', '.join(results['files'])}: {results['steps']} steps of {results['modes']} modes{frames}"]
+    if results["steps_left_out"]:
+        lines.append(f"left out           {results['steps_left_out']} steps measured with a calibration of other modes")
+    lines += faults(results["damaged"], results["no_end"])
+    lines += [f"configuration      {remark}" for remark in results["remarks"]]
     return "\n".join(lines)
 
 

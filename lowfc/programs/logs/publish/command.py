@@ -27,9 +27,9 @@ def publish(
     from lowfc.programs.logs.publish.player import publish as play
     from lowfc.programs.logs.publish.player import render
 
-    figures = play(
+    results = play(
         in_order(logs), run, speed=speed, topics=topics or (), allow_commands=allow_commands, wait_for=wait_for or ()
     )
-    print_result(figures, render(figures), as_json=as_json)
-    if figures["interrupted"]:
+    print_result(results, render(results), as_json=as_json)
+    if results["interrupted"]:
         raise typer.Exit(INTERRUPTED)

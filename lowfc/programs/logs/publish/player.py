@@ -59,7 +59,7 @@ def publish(
         wait_for: roles that must be running and connected before the first message; their topics are not published.
 
     Returns:
-        Figures for `render` and `--json`.
+        Results for `render` and `--json`.
     """
     if not 0 < speed < float("inf"):
         raise ConfigurationError(f"--speed must be above 0 (1: as recorded); got {speed:g}")
@@ -93,7 +93,7 @@ class Player:
         self._selection = selection
         self._speed = speed
         self._publishers: dict[str, Publisher | None] = {}
-        self._left_out: dict[str, str] = {}
+        self._excluded: dict[str, str] = {}
         self._errors = Durations()
         self._behind = 0
         self._first_log_ns = self._last_log_ns = 0
@@ -119,7 +119,7 @@ class Player:
         return {
             "messages": self._errors.count + len(self._initial_keys),
             "published": {key: one.published for key, one in sorted(self._publishers.items()) if one is not None},
-            "left_out": dict(sorted(self._left_out.items())),
+            "left_out": dict(sorted(self._excluded.items())),
             "span_s": (self._last_log_ns - self._first_log_ns) * 1e-9,
             "took_s": (self._sent_ns - self._begun_ns) * 1e-9,
             "timing_error_us": {"p50": p50_ns / 1e3, "p99": p99_ns / 1e3, "max": self._errors.max_ns / 1e3},
@@ -127,7 +127,7 @@ class Player:
             "finished": log.finished,
             "no_end": missing_end_text(log.paths, finished=log.finished),
             "damaged": [f"byte {one.position}, {one.why}" for one in log.damage],
-            "selection": [log.selection.sentence] if log.selection.sentence else [],
+            "selection": [log.selection.description] if log.selection.description else [],
             "interrupted": not self._service.running,
         }
 
@@ -172,29 +172,29 @@ class Player:
         try:
             topic = topic_of(key)
         except KeyError:
-            self._left_out[key] = "unknown to this version"
+            self._excluded[key] = "unknown to this version"
             return None
         if not self._selection.matches(key):
             return None
-        if why := self._selection.why_left_out(key):
-            self._left_out[key] = why
+        if why := self._selection.exclusion_reason(key):
+            self._excluded[key] = why
             return None
         bus = self._buses.get(role_of(key)) or next(iter(self._buses.values()))
         return bus.publisher(topic, name_in(topic, key))
 
 
-def render(figures: dict[str, Any]) -> str:
+def render(results: dict[str, Any]) -> str:
     """Summary as text."""
-    error = ", ".join(f"{name} {value:.0f} us" for name, value in figures["timing_error_us"].items())
+    error = ", ".join(f"{name} {value:.0f} us" for name, value in results["timing_error_us"].items())
     lines = [
-        f"published          {figures['messages']} messages in run {figures['run']!r}: {figures['span_s']:.1f} s of "
-        f"log in {figures['took_s']:.1f} s" + (", interrupted" if figures["interrupted"] else ""),
+        f"published          {results['messages']} messages in run {results['run']!r}: {results['span_s']:.1f} s of "
+        f"log in {results['took_s']:.1f} s" + (", interrupted" if results["interrupted"] else ""),
         f"timing error       {error}",
-        f"behind             {figures['messages_behind']} messages by more than {BEHIND_NS / 1e6:g} ms",
+        f"behind             {results['messages_behind']} messages by more than {BEHIND_NS / 1e6:g} ms",
     ]
-    lines += faults(figures["damaged"], figures["no_end"])
-    lines += [f"the log has        {selection}" for selection in figures["selection"]]
-    lines += [f"left out           {key}: {why}" for key, why in figures["left_out"].items()]
+    lines += faults(results["damaged"], results["no_end"])
+    lines += [f"the log has        {selection}" for selection in results["selection"]]
+    lines += [f"left out           {key}: {why}" for key, why in results["left_out"].items()]
     return "\n".join(lines)
 
 

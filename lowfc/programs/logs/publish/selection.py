@@ -56,7 +56,7 @@ class Selection:
                     f"{role} of {run} is live and publishes {key} itself; stop it, replay into another run (--run), "
                     "or choose topics that it does not publish (--topics)"
                 )
-        roles = [role_of(key) for key in selected if not self.why_left_out(key)]
+        roles = [role_of(key) for key in selected if not self.exclusion_reason(key)]
         if FRAME.key in selected and not allow_commands:  # commands computed from the frames would move a mirror
             roles += links.mirrors
             if mirrors := sorted(self.live.intersection(links.mirrors)):
@@ -70,7 +70,7 @@ class Selection:
         """Whether a key matches the patterns."""
         return not self._patterns or any(fnmatchcase(key, pattern) for pattern in self._patterns)
 
-    def why_left_out(self, key: str) -> str:
+    def exclusion_reason(self, key: str) -> str:
         """Reason why a matching key is left out; empty if it is published."""
         if COMMAND.matches(key) and not self._allow_commands:
             return "commands move a mirror; --allow-commands publishes them"

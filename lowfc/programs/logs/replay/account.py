@@ -87,8 +87,8 @@ class Account(Result):
         self.damaged = sorted({*self.damaged, *later.damaged})
         self.complete, self.runs, self.stopped = later.complete, later.runs, later.stopped
 
-    def figures(self) -> dict[str, Any]:
-        """All figures."""
+    def json_object(self) -> dict[str, Any]:
+        """All fields, whether set or not."""
         return self.model_dump()
 
     def leave_out(self, why: str, steps: int) -> None:

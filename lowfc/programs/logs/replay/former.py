@@ -66,8 +66,8 @@ class FormerVersion:
         descriptor = message.DESCRIPTOR
         known = self._known(descriptor.full_name)
         for field, value in message.ListFields():
-            left_out = field.name in _NOT_COMPARED.get(descriptor.full_name, ())
-            if left_out or (known is not None and field.number not in known):
+            ignored = field.name in _NOT_COMPARED.get(descriptor.full_name, ())
+            if ignored or (known is not None and field.number not in known):
                 message.ClearField(field.name)
             elif field.message_type is not None:
                 for one in value if field.is_repeated else (value,):

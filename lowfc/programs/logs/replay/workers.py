@@ -111,7 +111,7 @@ def _replay_segment(
 def _refuse_thinned(reader: LogReader) -> None:
     if not reader.selection.has_every_frame:
         raise DataFileError(
-            f"{reader.path} cannot be replayed, because it does not have every frame ({reader.selection.sentence}): "
+            f"{reader.path} cannot be replayed, because it does not have every frame ({reader.selection.description}): "
             "steps are recomputed from the frames; use `lowfc what-if` or `lowfc report`"
         )
 

@@ -1,1 +1,1 @@
-"""The report of a run: figures from its log, and the page that shows them."""
+"""The report of a run: results from its log, and the page that shows them."""

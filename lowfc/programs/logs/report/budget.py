@@ -16,7 +16,7 @@ from lowfc.programs.logs.report.closed_loop import (
     noise_of,
     why_none,
 )
-from lowfc.programs.logs.report.source import Figures, Run
+from lowfc.programs.logs.report.source import Results, Run
 
 Masks = dict[str, Mask]
 
@@ -29,8 +29,8 @@ _NO_TRUTH = "the true wavefront, known only in simulation"
 _TOO_SHORT = "a longer stretch with the loop closed"
 
 
-def budget_figures(run: Run, stretch: Stretch | None, spectra: Spectra | None, masks: Masks) -> Figures:
-    """Terms, their sum and the figures to compare it with, in nm rms over each group of modes."""
+def budget_results(run: Run, stretch: Stretch | None, spectra: Spectra | None, masks: Masks) -> Results:
+    """Terms, their sum and the values to compare it with, in nm rms over each group of modes."""
     if stretch is None:
         return {"why_not": why_none(run)}
     noise = noise_of(run.history, stretch.rows)
@@ -112,7 +112,7 @@ def _mean_square(values: Array) -> Term:
     return Term(np.mean(values**2, axis=0))
 
 
-def _columns(term: Term | None, masks: Masks) -> Figures:
+def _columns(term: Term | None, masks: Masks) -> Results:
     """Rms of each group in nm; `upper_limit` names the groups in which it was not detected."""
     if term is None:
         return {"rms_nm": dict.fromkeys(masks), "upper_limit": []}

@@ -11,10 +11,10 @@ from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.error_budget import SensorNoise, sensor_noise
 from lowfc.control.laws.linear_law import LinearLaw, integrator
 from lowfc.control.laws.margins import noise_transfer, rejection
-from lowfc.control.laws.spectra import SHORTEST, Pieces, Spectrum, in_bins, pieces, spectrum
+from lowfc.control.laws.spectra import SHORTEST, Spectrum, TimeSeries, in_bins, spectrum, time_series
 from lowfc.control.laws.stability import settling_frames
 from lowfc.control.loop.safety import LoopMode
-from lowfc.programs.logs.report.source import Figures, InForce, Run
+from lowfc.programs.logs.report.source import InForce, Results, Run
 
 MAX_STEPS = 200_000
 """Only the last steps of a longer stretch are used, to bound the memory."""
@@ -44,7 +44,7 @@ class Stretch:
     in_force: InForce
     law: LinearLaw
     timing: Timing
-    frames: Pieces
+    frames: TimeSeries
     residual_ms_nm2: Array | None
 
     @property
@@ -52,7 +52,7 @@ class Stretch:
         """Whether the true wavefront is known."""
         return self.residual_ms_nm2 is not None
 
-    def signal(self, number: int) -> Pieces:
+    def signal(self, number: int) -> TimeSeries:
         """One of `ERROR`, `POL`, `DISTURBANCE`, `RESIDUAL` and `SENSED`, (frames, modes)."""
         modes = len(self.law.noll)
         return self.frames.columns(slice(number * modes, (number + 1) * modes))
@@ -83,7 +83,7 @@ def longest_stretch(run: Run) -> Stretch | None:
         residual_ms_nm2 = np.nanmean(true.modes_residual_rms_nm[rows].astype(float) ** 2, axis=0)
         if true.continuous and history.exposure_fraction is not None:
             timing = Timing.of(in_force.delay_frames, history.exposure_fraction)
-    found = pieces(steps.sequence[rows], np.hstack(signals))
+    found = time_series(steps.sequence[rows], np.hstack(signals))
     noll = tuple(range(2, 2 + gain.size))
     rate_hz = history.rate_hz or 1.0  # unknown, and unused, for a single step
     law = integrator(gain, leak, noll, in_force.delay_frames, rate_hz)
@@ -97,8 +97,8 @@ def why_none(run: Run) -> str:
     return "the loop was not closed in this log"
 
 
-def stretch_figures(run: Run, stretch: Stretch | None) -> Figures | None:
-    """Figures of the stretch and its law."""
+def stretch_results(run: Run, stretch: Stretch | None) -> Results | None:
+    """Results of the stretch and its law."""
     if stretch is None:
         return None
     steps = run.history.steps
@@ -139,7 +139,7 @@ def spectra_of(stretch: Stretch | None) -> Spectra | None:
     return [one for one in found if one is not None] or None  # all signals are equally long
 
 
-def spectra_figures(run: Run, stretch: Stretch | None, found: Spectra | None) -> Figures:
+def spectra_results(run: Run, stretch: Stretch | None, found: Spectra | None) -> Results:
     """Spectra of tip, tilt and the sum of the others: in bins, by band, and compared with theory."""
     if stretch is None:
         return {"why_not": why_none(run)}
@@ -156,7 +156,7 @@ def spectra_figures(run: Run, stretch: Stretch | None, found: Spectra | None) ->
     }
 
 
-def _group(name: str, modes: Mask, law: LinearLaw, found: Spectra, noise_nm2_hz: Array | None) -> Figures:
+def _group(name: str, modes: Mask, law: LinearLaw, found: Spectra, noise_nm2_hz: Array | None) -> Results:
     """Spectra of one group; modes are summed in power."""
 
     def total(one: Spectrum) -> Array:
@@ -198,7 +198,7 @@ def _group(name: str, modes: Mask, law: LinearLaw, found: Spectra, noise_nm2_hz:
     }
 
 
-def _ratio(measured: Array, theory: Array) -> Figures:
+def _ratio(measured: Array, theory: Array) -> Results:
     """Ratio of measured to theoretical amplitude over all bins: median and the range of 90 % of them."""
     known = (theory > 0) & (measured > 0)
     if not known.any():

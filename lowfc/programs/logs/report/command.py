@@ -23,10 +23,10 @@ def report(
         Path | None, typer.Option(help="The page (HTML). Default: next to the log, with its name.", show_default=False)
     ] = None,
     as_json: Annotated[
-        bool, typer.Option("--json", help="Print the figures as one JSON object; write the page only with --out.")
+        bool, typer.Option("--json", help="Print the results as one JSON object; write the page only with --out.")
     ] = False,
 ) -> None:
-    """Summarise a run from its log as a self-contained HTML page; --json prints the same figures.
+    """Summarise a run from its log as a self-contained HTML page; --json prints the same results.
 
     Example: lowfc report last
     """
@@ -49,8 +49,8 @@ def _report(log: "Parts", out: Path | None, as_json: bool) -> None:
     from lowfc.adapters.logs.writer import stem_of
     from lowfc.adapters.process.progress import counting_bar
     from lowfc.programs.logs.guard import refuse_log
-    from lowfc.programs.logs.report.figures import report_of
     from lowfc.programs.logs.report.page import page, require_page
+    from lowfc.programs.logs.report.results import report_of
     from lowfc.programs.logs.report.source import read_run
 
     target = out if out is not None or as_json else log[0].with_name(f"{stem_of(log[0])}.html")
@@ -68,8 +68,8 @@ def _report(log: "Parts", out: Path | None, as_json: bool) -> None:
         sys.stderr.write(f"warning: {remark}\n")
     if as_json:
         # A log may hold values that JSON cannot represent, such as NaN.
-        sys.stdout.write(to_json(found.figures, inf_nan_mode="null").decode() + "\n")
+        sys.stdout.write(to_json(found.results, inf_nan_mode="null").decode() + "\n")
     else:
-        verdict = found.figures["verdict"]
+        verdict = found.results["verdict"]
         because = f": {verdict['because']}" if verdict["because"] else ""
         sys.stdout.write(printable(f"{verdict['heading']}{because}\n{target}\n", keep=LINES))

@@ -10,13 +10,13 @@ from lowfc.arrays import Long, Single
 from lowfc.contract.events import Level
 from lowfc.contract.messages import wire
 from lowfc.control.loop.safety import Limit
-from lowfc.programs.logs.report.source import Figures, Run
+from lowfc.programs.logs.report.source import Results, Run
 
 _FIRST_LIMIT = Limit.MODAL_LIMIT
 _LEVELS = {level.value: level.name.lower() for level in Level}
 
 
-def mode_spans(run: Run) -> list[Figures]:
+def mode_spans(run: Run) -> list[Results]:
     """Loop modes in order, with start and end in seconds since the first step."""
     mode = run.history.steps.mode
     if not mode.size:
@@ -36,7 +36,7 @@ def mode_steps(history: History) -> dict[str, int]:
     return {mode_name(number): count for number, count in sorted(counted.items())}
 
 
-def events(run: Run) -> list[Figures]:
+def events(run: Run) -> list[Results]:
     """Events in order, with level, process, name and sentence."""
     found = run.history.events
     times_s = run.seconds([time_ns for time_ns, _ in found])
@@ -52,7 +52,7 @@ def events(run: Run) -> list[Figures]:
     ]
 
 
-def requests(run: Run) -> list[Figures]:
+def requests(run: Run) -> list[Results]:
     """Operators' requests and their answers, except for the status."""
     steps = run.history.steps
     found = [request for request in run.history.requests if request.name != "status"]
@@ -70,7 +70,7 @@ def requests(run: Run) -> list[Figures]:
     ]
 
 
-def laws(run: Run) -> list[Figures]:
+def laws(run: Run) -> list[Results]:
     """The laws in force, with their start times."""
     return [
         {
@@ -83,7 +83,7 @@ def laws(run: Run) -> list[Figures]:
     ]
 
 
-def light_figures(history: History) -> Figures:
+def light_results(history: History) -> Results:
     """Flux, saturation, and frames refused by reason."""
     steps = history.steps
     flux = steps.flux_dn[steps.flux_dn > 0]
@@ -101,7 +101,7 @@ def light_figures(history: History) -> Figures:
     }
 
 
-def mirror_figures(history: History) -> Figures:
+def mirror_results(history: History) -> Results:
     """Stroke used, and limits that acted in the controller and in the mirror."""
     mirror, settings = history.mirror, history.controller.settings if history.controller is not None else None
     limit_nm = settings.stroke_nm if settings is not None and settings.stroke_nm else None

@@ -9,8 +9,8 @@ import numpy.typing as npt
 from lowfc.arrays import Array, Long
 from lowfc.contract.printable import printable
 from lowfc.programs.logs.report.course import actuator_extremes_nm
-from lowfc.programs.logs.report.figures import Report
 from lowfc.programs.logs.report.residual import bin_starts, binned_rms
+from lowfc.programs.logs.report.results import Report
 from lowfc.programs.logs.report.svg import COLOURS, svg
 from lowfc.programs.logs.report.timing import intervals_ns, latencies_ns
 
@@ -69,7 +69,7 @@ def _overview(figure: "Figure", report: Report) -> bool:
 def _mode_band(axes: "Axes", report: Report) -> None:
     shown: set[str] = set()
     end_s = max(float(report.run.step_s[-1]), 1e-9)
-    for span in report.figures["mode_spans"]:
+    for span in report.results["mode_spans"]:
         name, width_s = span["mode"], span["to_s"] - span["from_s"]
         axes.broken_barh([(span["from_s"], width_s)], (0, 1), facecolor=_MODES.get(name, FAINT))
         if width_s > 0.06 * end_s:
@@ -119,7 +119,7 @@ def _spread(size: int, most: int = 400) -> Long:
 
 def _residual(figure: "Figure", report: Report) -> bool:
     """Bars of each mode: before and after; true ones filled, measured ones hatched."""
-    modes = report.figures["residual"]["modes"]
+    modes = report.results["residual"]["modes"]
     kinds = (
         ("disturbance", "true disturbance", OPEN, True),
         ("residual", "true residual", CLOSED, True),
@@ -150,7 +150,7 @@ def _residual(figure: "Figure", report: Report) -> bool:
 
 
 def _spectra(figure: "Figure", report: Report) -> bool:
-    groups = report.figures["spectra"].get("groups")
+    groups = report.results["spectra"].get("groups")
     if not groups:
         return False
     grid = figure.subplots(2, len(groups), sharex=True, squeeze=False, height_ratios=(3, 2))
@@ -195,12 +195,12 @@ def _over(one: Array, other: Array) -> Array:
 
 
 def _budget(figure: "Figure", report: Report) -> bool:
-    budget = report.figures["error_budget"]
+    budget = report.results["error_budget"]
     if "why_not" in budget:
         return False
     rows = [(term["name"], term["rms_nm"], term["upper_limit"]) for term in budget["terms"] if not term["missing"]]
     rows.append(("sum of the terms", budget["sum"]["rms_nm"], []))
-    if report.figures["closed_stretch"]["true"]:
+    if report.results["closed_stretch"]["true"]:
         rows.append(("true residual", budget["true_residual"]["rms_nm"], []))
     groups = [name for name in budget["sum"]["rms_nm"] if name != "all modes"]
     panels = figure.subplots(1, len(groups), sharey=True, squeeze=False)[0]
@@ -237,7 +237,7 @@ def _light(figure: "Figure", report: Report) -> bool:
         marks = time_s[refused][bin_starts(int(refused.sum()), _MAX_MARKS)]
         look: dict[str, Any] = {"color": COLOURS["error"], "markersize": 5, "clip_on": False}
         upper.plot(marks, np.zeros(marks.size), "x", label="frame refused", **look)
-    expected = report.figures["light"]["flux_expected_dn"]
+    expected = report.results["light"]["flux_expected_dn"]
     if expected is not None:
         upper.axhline(expected, color=FAINT, linestyle="--", linewidth=1.0, label="expected by the calibration")
     upper.set_ylim(bottom=0)
@@ -251,11 +251,11 @@ def _light(figure: "Figure", report: Report) -> bool:
 
 
 def _timeline(figure: "Figure", report: Report) -> bool:
-    events, requests = report.figures["events"], report.figures["requests"]
-    if not events and not report.figures["mode_spans"]:
+    events, requests = report.results["events"], report.results["requests"]
+    if not events and not report.results["mode_spans"]:
         return False
     band, axes = figure.subplots(2, 1, sharex=True, height_ratios=(1, 4))
-    if report.figures["mode_spans"]:
+    if report.results["mode_spans"]:
         _mode_band(band, report)
     else:
         band.set_axis_off()
@@ -287,18 +287,18 @@ def _stroke(figure: "Figure", report: Report) -> bool:
     time_s = report.run.seconds(mirror.publish_time_ns)
     starts = bin_starts(time_s.size, 600)
     _envelope(plot, time_s[starts], mirror.stroke_nm, starts, CLOSED)
-    figures = report.figures["mirror"]
-    limit_nm, title = figures["stroke_limit_nm"], "over time"
+    results = report.results["mirror"]
+    limit_nm, title = results["stroke_limit_nm"], "over time"
     if limit_nm is not None:
         title += f"; the limit is {limit_nm:g} nm"
-        if figures["stroke_most_share"] > _NEAR:  # otherwise it would flatten the curve
+        if results["stroke_most_share"] > _NEAR:  # otherwise it would flatten the curve
             plot.axhline(limit_nm, color=COLOURS["error"], linestyle="--")
     plot.set(ylabel="largest |actuator|, nm of surface", xlabel=_SECONDS, title=title)
     plot.set_ylim(bottom=0)
     extremes = actuator_extremes_nm(history)
     shown = image.imshow(extremes, cmap="cividis", vmin=0, interpolation="nearest", origin="lower")
     figure.colorbar(shown, ax=image, label="nm of surface")
-    share = f",\nat most {figures['stroke_most_share']:.1%} of the limit" if limit_nm is not None else ""
+    share = f",\nat most {results['stroke_most_share']:.1%} of the limit" if limit_nm is not None else ""
     image.set(title=f"extreme of each actuator{share}", xlabel="column", ylabel="row")
     image.locator_params(integer=True)
     image.grid(visible=False)

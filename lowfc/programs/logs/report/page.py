@@ -1,4 +1,4 @@
-"""The report's self-contained HTML page, made from figures and drawings."""
+"""The report's self-contained HTML page, made from results and drawings."""
 
 from collections.abc import Callable
 from importlib.resources import files
@@ -10,23 +10,23 @@ from lowfc.adapters.files.drawing import figure_class
 from lowfc.adapters.process.extras import install_advice
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.printable import LINES, printable
-from lowfc.programs.cli.contrast import sentence_of
+from lowfc.programs.cli.contrast import added_contrast_in_words
 from lowfc.programs.logs.report.drawings import drawings
-from lowfc.programs.logs.report.figures import Report
+from lowfc.programs.logs.report.results import Report
 
 NOT_HERE = "not in this log"
-"""Text in place of a missing figure."""
+"""Text in place of a missing number."""
 
 
 def page(report: Report, progress: Callable[[str], None] = lambda name: None) -> str:
     """HTML that needs no other file and no network."""
     environment = _environment()
     template = environment.from_string((files("lowfc") / "data" / "report.html").read_text(encoding="utf-8"))
-    configuration = report.figures["run"]["configuration"]
-    added = report.figures["residual"]["added_contrast"]
+    configuration = report.results["run"]["configuration"]
+    added = report.results["residual"]["added_contrast"]
     text: str = template.render(
-        **report.figures,
-        contrast_sentence=sentence_of(added) if added is not None else "",
+        **report.results,
+        contrast_in_words=added_contrast_in_words(added) if added is not None else "",
         drawings=drawings(report, progress),
         toml=tomli_w.dumps(configuration) if configuration is not None else None,
     )
@@ -40,7 +40,7 @@ def require_page() -> None:
 
 
 def number(value: float | str | None, digits: int = 3) -> str:
-    """A figure in running text with this number of significant digits, or `NOT_HERE`."""
+    """A number in running text with this number of significant digits, or `NOT_HERE`."""
     if value is None:
         return NOT_HERE
     if isinstance(value, str | int):
@@ -49,7 +49,7 @@ def number(value: float | str | None, digits: int = 3) -> str:
 
 
 def fixed(value: float | str, decimals: int = 3) -> str:
-    """A figure of a column with this number of decimals; one that rounds to zero is shown as less than the smallest."""
+    """A number in a column with this number of decimals; one that rounds to zero is shown as less than the smallest."""
     if isinstance(value, str | int):
         return str(value)
     least = 10.0**-decimals
@@ -67,7 +67,7 @@ def _environment() -> Any:
     except ImportError as error:
         raise ConfigurationError(
             f"the HTML page requires jinja2, which is missing ({error}); install it with: {install_advice('plots')}, "
-            "or print the figures with --json"
+            "or print the results with --json"
         ) from None
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, finalize=_finalized

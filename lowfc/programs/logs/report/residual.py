@@ -11,10 +11,10 @@ from lowfc.optics.chain.zernike import mode_name
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.cli.contrast import added_contrast, with_variances
 from lowfc.programs.logs.report.closed_loop import Stretch, noise_of
-from lowfc.programs.logs.report.source import Figures, Run
+from lowfc.programs.logs.report.source import Results, Run
 
 
-def residual_figures(run: Run, stretch: Stretch | None) -> Figures:
+def residual_results(run: Run, stretch: Stretch | None) -> Results:
     """Rms in nm of each mode and signal, and of tip and tilt per axis in mas; None for signals not in the log.
 
     Closed loop: the longest stretch under one law, settled, without and with the correction. Open loop: all its steps.
@@ -90,7 +90,7 @@ def bin_starts(rows: int, most: int) -> Whole:
     return np.arange(0, rows, max(1, -(-rows // most)))
 
 
-def _contrast(true: Truths, rows: Whole, config: Configuration | None) -> Figures | None:
+def _contrast(true: Truths, rows: Whole, config: Configuration | None) -> Results | None:
     """Contrast added to the dark zone by the disturbance (open) and by the residual (closed).
 
     None without truth, or for a coronagraph without a science image.
@@ -118,7 +118,7 @@ def _at(values: Array | None, place: int) -> float | None:
     return float(values[place]) if values is not None else None
 
 
-def _tilt_mas(values: Array | None, noll: tuple[int, ...], configuration: Configuration | None) -> Figures | None:
+def _tilt_mas(values: Array | None, noll: tuple[int, ...], configuration: Configuration | None) -> Results | None:
     """Tip, tilt and both per axis, sqrt((x^2 + y^2) / 2); None without telescope or without the two modes."""
     if values is None or configuration is None or not {2, 3} <= set(noll):
         return None

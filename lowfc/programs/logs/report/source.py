@@ -13,7 +13,7 @@ from lowfc.adapters.logs.parts import LogFiles, WholeLog
 from lowfc.arrays import Array, Long
 from lowfc.contract.messages import from_timestamp
 
-Figures = dict[str, Any]
+Results = dict[str, Any]
 """Values that JSON can represent."""
 
 

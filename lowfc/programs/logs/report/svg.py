@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from lowfc.adapters.files.drawing import figure_class, lay_out
-from lowfc.programs.logs.report.figures import Report
+from lowfc.programs.logs.report.results import Report
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

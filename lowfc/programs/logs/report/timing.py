@@ -7,7 +7,7 @@ from lowfc.adapters.logs.history import History
 from lowfc.arrays import Long
 from lowfc.contract.envelope import start_of
 from lowfc.contract.messages import FRAME, Role
-from lowfc.programs.logs.report.source import Figures, Run
+from lowfc.programs.logs.report.source import Results, Run
 
 _END_NS = 50_000_000
 """Time before the last frame in which commands may be missing because the log ends."""
@@ -16,7 +16,7 @@ PERCENTILES = {"p50": 50.0, "p90": 90.0, "p99": 99.0, "p99_9": 99.9}
 FRAME_TO_MIRROR = "frame_to_mirror"
 
 
-def timing_figures(run: Run) -> Figures:
+def timing_results(run: Run) -> Results:
     """Intervals and latencies in microseconds, and counts of frames."""
     history = run.history
     return {
@@ -47,7 +47,7 @@ def latencies_ns(history: History) -> dict[str, Long]:
     return {**{stage: history.stages_ns[stage] for stage in STAGES}, FRAME_TO_MIRROR: to_mirror}
 
 
-def percentiles_us(durations_ns: Long) -> Figures:
+def percentiles_us(durations_ns: Long) -> Results:
     """Count, percentiles and maximum; None for each without durations."""
     if not durations_ns.size:
         return {"count": 0, **dict.fromkeys([*PERCENTILES, "max"])}
@@ -59,7 +59,7 @@ def percentiles_us(durations_ns: Long) -> Figures:
     }
 
 
-def frame_counts(history: History) -> Figures:
+def frame_counts(history: History) -> Results:
     """Frames in the log, frames without a command, and the counts of camera and controller.
 
     Every frame that reaches the controller leads to a step and, with a calibration, to a command; frames that the

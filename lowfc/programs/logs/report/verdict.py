@@ -1,7 +1,7 @@
 """Verdict on a run, in a few lines."""
 
 from lowfc.control.loop.wording import counted
-from lowfc.programs.logs.report.source import Figures
+from lowfc.programs.logs.report.source import Results
 
 GOOD, LOOK, BAD, UNKNOWN = "good", "look", "bad", "unknown"
 
@@ -11,10 +11,10 @@ _MUCH_STROKE = 0.9
 _NO_LOOP = "this log has no control steps"
 
 
-def verdict(figures: Figures) -> Figures:
+def verdict(results: Results) -> Results:
     """Checks, each with a level and a sentence; the overall level is the worst one."""
     parts = (_record, _modes, _residual, _commands, _delay, _frames, _mirror, _events)
-    checks = [part(figures) for part in parts]
+    checks = [part(results) for part in parts]
     order = (GOOD, UNKNOWN, LOOK, BAD)
     level = max((check["level"] for check in checks), key=order.index)
     first = next((check["text"] for check in checks if check["level"] == level), "")
@@ -27,12 +27,12 @@ def verdict(figures: Figures) -> Figures:
     return {"level": level, "heading": heading, "because": first if level != GOOD else "", "checks": checks}
 
 
-def _check(name: str, level: str, text: str) -> Figures:
+def _check(name: str, level: str, text: str) -> Results:
     return {"name": name, "level": level, "text": text}
 
 
-def _record(figures: Figures) -> Figures:
-    log = figures["log"]
+def _record(results: Results) -> Results:
+    log = results["log"]
     faults = [f"recording stopped: {log['stopped']}"] if log["stopped"] else []
     if log["damage"]:
         faults.append(f"{counted(len(log['damage']), 'damaged part')} left out")
@@ -53,8 +53,8 @@ def _record(figures: Figures) -> Figures:
     return _check("log", GOOD, f"complete, no message lost{recorded}")
 
 
-def _modes(figures: Figures) -> Figures:
-    steps = figures["mode_steps"]
+def _modes(results: Results) -> Results:
+    steps = results["mode_steps"]
     total = sum(steps.values())
     if not total:
         return _check("loop", BAD, _NO_LOOP)
@@ -64,20 +64,20 @@ def _modes(figures: Figures) -> Figures:
     return _check("loop", GOOD if steps.get("closed") else UNKNOWN, shares)
 
 
-def _residual(figures: Figures) -> Figures:
+def _residual(results: Results) -> Results:
     """Wavefront before and after: true over the open pupil if the log has truth, otherwise the measured modes."""
-    totals, tilts = figures["residual"]["total_rms_nm"], figures["residual"]["tilt_mas"]
+    totals, tilts = results["residual"]["total_rms_nm"], results["residual"]["tilt_mas"]
     true = totals["residual"] is not None
     before, after = ("disturbance", "residual") if true else ("pseudo_open_loop", "error")
     before_nm, after_nm = totals[before], totals[after]
     over = "in all modes over the circle"
-    open_pupil = figures["residual"]["open_pupil"]
+    open_pupil = results["residual"]["open_pupil"]
     pupil_nm = [open_pupil[f"{name}_open_pupil_rms_nm"] for name in ("disturbance", "residual")]
     if true and all(pupil_nm):
         before_nm, after_nm = pupil_nm
         over = "over the open pupil"
-    if before_nm is None or after_nm is None or not figures["mode_steps"].get("closed"):
-        why = figures["error_budget"].get("why_not", "this log has no good closed-loop frame")
+    if before_nm is None or after_nm is None or not results["mode_steps"].get("closed"):
+        why = results["error_budget"].get("why_not", "this log has no good closed-loop frame")
         return _check("residual", UNKNOWN, why)
     text = f"{before_nm:.3g} nm before, {after_nm:.3g} nm after {over}"
     if tilts[before] and tilts[after]:
@@ -86,8 +86,8 @@ def _residual(figures: Figures) -> Figures:
     return _check("residual", GOOD if after_nm < before_nm else LOOK, text)
 
 
-def _commands(figures: Figures) -> Figures:
-    frames = figures["timing"]["frames"]
+def _commands(results: Results) -> Results:
+    frames = results["timing"]["frames"]
     without, recorded = frames["without_command"], frames["recorded"] - frames["at_the_end"]
     if not recorded:
         return _check("commands", UNKNOWN, "this log has no frames")
@@ -98,9 +98,9 @@ def _commands(figures: Figures) -> Figures:
     return _check("commands", BAD if share >= _MANY_WITHOUT_COMMAND else LOOK, text)
 
 
-def _delay(figures: Figures) -> Figures:
-    frames = figures["timing"]["frames"]
-    late, steps = frames["commands_late"], sum(figures["mode_steps"].values())
+def _delay(results: Results) -> Results:
+    frames = results["timing"]["frames"]
+    late, steps = frames["commands_late"], sum(results["mode_steps"].values())
     if late is None or not steps:
         return _check("delay", UNKNOWN, "this log does not show whether commands were in time")
     if late < _MANY_LATE * steps:
@@ -109,8 +109,8 @@ def _delay(figures: Figures) -> Figures:
     return _check("delay", LOOK, f"{counted(late, 'command')} came {acted}")
 
 
-def _frames(figures: Figures) -> Figures:
-    light = figures["light"]
+def _frames(results: Results) -> Results:
+    light = results["light"]
     faults = []
     if light["frames_refused"]:
         faults.append(f"{counted(light['frames_refused'], 'frame')} refused ({_listed(light['refused'])})")
@@ -119,8 +119,8 @@ def _frames(figures: Figures) -> Figures:
     return _check("light", LOOK if faults else GOOD, "; ".join(faults) or "no frame refused, none saturated")
 
 
-def _mirror(figures: Figures) -> Figures:
-    mirror = figures["mirror"]
+def _mirror(results: Results) -> Results:
+    mirror = results["mirror"]
     limits = {**mirror["limits_at_mirror"], **mirror["limits_at_controller"]}
     if limits:
         return _check("mirror", LOOK, f"limits acted: {_listed(limits)}")
@@ -131,9 +131,9 @@ def _mirror(figures: Figures) -> Figures:
     return _check("mirror", LOOK if share > _MUCH_STROKE else GOOD, text)
 
 
-def _events(figures: Figures) -> Figures:
-    grave = [event for event in figures["events"] if event["level"] in ("error", "fatal")]
-    warned = [event for event in figures["events"] if event["level"] == "warning"]
+def _events(results: Results) -> Results:
+    grave = [event for event in results["events"] if event["level"] in ("error", "fatal")]
+    warned = [event for event in results["events"] if event["level"] == "warning"]
     worst = grave or warned
     if not worst:
         return _check("events", GOOD, "no warning, no error")

@@ -41,5 +41,5 @@ def what_if(
     reader = WholeLog(log := the_one(logs), skip_damaged=True)
     with reading_bar(Console(stderr=True)) as count:
         reader.progress = partial(count, f"reading {titled(log)}")
-        figures = compared(LoggedRun(read_history(reader)), what)
-    print_result(figures, render(figures), as_json=as_json)
+        results = compared(LoggedRun(read_history(reader)), what)
+    print_result(results, render(results), as_json=as_json)

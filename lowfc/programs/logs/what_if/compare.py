@@ -21,7 +21,7 @@ from lowfc.control.loop.safety import Limit
 from lowfc.control.loop.wording import counted
 from lowfc.optics.chain.zernike import mode_name
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
-from lowfc.programs.cli.contrast import added_contrast, sentence_of, with_variances
+from lowfc.programs.cli.contrast import added_contrast, added_contrast_in_words, with_variances
 from lowfc.programs.cli.result import table
 from lowfc.programs.logs.what_if.options import LAW_KEYS, WhatIf, law
 from lowfc.programs.logs.what_if.run import LoggedRun
@@ -42,11 +42,11 @@ _TITLES = {
 
 
 def what_if(run: LoggedRun, what: WhatIf) -> dict[str, Any]:
-    """Figures of the logged run and of the what-if run.
+    """Results of the logged run and of the what-if run.
 
     The what-if loop is closed throughout, starts from a flat mirror, and corrects the pseudo-open-loop modes of every
     used frame; it holds on a refused or missing frame, as the live loop does. Its modal limits act, actuator limits do
-    not. All figures are over the same frames: those with the logged loop closed and both loops settled (all frames, if
+    not. All results are over the same frames: those with the logged loop closed and both loops settled (all frames, if
     it was never closed), without saturated pixels. If the log has truth, the true residual is given too, because the
     measured one is mostly noise for a faint star. For another reconstructor the frames are read in a second pass.
     """
@@ -131,9 +131,9 @@ def _true(run: LoggedRun, rows: Mask, moved_nm: Single) -> tuple[dict[str, Array
     return {name: found[name] for name in _TITLES if name in found}, contrast
 
 
-def render(figures: dict[str, Any]) -> str:
-    """The figures of `what_if` as a table."""
-    columns = [name for name in _TITLES if f"{name}_nm" in figures]
+def render(results: dict[str, Any]) -> str:
+    """The results of `what_if` as a table."""
+    columns = [name for name in _TITLES if f"{name}_nm" in results]
 
     def row(title: str, values: dict[str, Any], key: str, gain: str = "") -> list[str]:
         return [title, *(f"{values[key.format(name)]:.2f}" for name in columns), gain]
@@ -142,23 +142,23 @@ def render(figures: dict[str, Any]) -> str:
         row(f"{mode['noll']:>3} {mode['name']}", mode, "{}_nm", "{gain_was:.3g} -> {gain:.3g}".format(**mode))
         if "gain" in mode  # a user's controller has none
         else row(f"{mode['noll']:>3} {mode['name']}", mode, "{}_nm")
-        for mode in figures["modes"]
+        for mode in results["modes"]
     ]
-    rows = [*modes, row("all modes", figures, "{}_nm")]
-    if "tilt_was_mas" in figures:
-        rows.append(row("tilt per axis, mas", figures, "tilt_{}_mas"))
+    rows = [*modes, row("all modes", results, "{}_nm")]
+    if "tilt_was_mas" in results:
+        rows.append(row("tilt per axis, mas", results, "tilt_{}_mas"))
     lines = [
-        f"{figures['frames_compared']} of {figures['frames']} frames compared: {figures['compared']}, after "
-        f"{figures['settling_s']:.2g} s to settle; {figures['frames_refused']} were refused, "
-        f"{figures['frames_saturated']} saturated, {figures['frames_missing']} missing",
-        f"delay {figures['delay_frames']:.2f} frames, {figures['estimator']} reconstructor, {figures['controller']}",
+        f"{results['frames_compared']} of {results['frames']} frames compared: {results['compared']}, after "
+        f"{results['settling_s']:.2g} s to settle; {results['frames_refused']} were refused, "
+        f"{results['frames_saturated']} saturated, {results['frames_missing']} missing",
+        f"delay {results['delay_frames']:.2f} frames, {results['estimator']} reconstructor, {results['controller']}",
         "",
         *table(["residual, nm rms", *(_TITLES[name] for name in columns), "gain"], rows),
         "",
-        "measured figures include sensor noise; true: at the start of each exposure; continuous: also between these "
+        "measured values include sensor noise; true: at the start of each exposure; continuous: also between these "
         "instants, while the mirror holds; assumes a linear sensor and no actuator limits",
-        *([] if figures["added_contrast"] is None else [sentence_of(figures["added_contrast"])]),
-        *(f"warning: {warning}" for warning in figures["warnings"]),
+        *([] if results["added_contrast"] is None else [added_contrast_in_words(results["added_contrast"])]),
+        *(f"warning: {warning}" for warning in results["warnings"]),
     ]
     return "\n".join(lines)
 
@@ -251,7 +251,9 @@ def _log_warnings(run: LoggedRun) -> list[str]:
         found.append(f"limits acted in the logged run ({', '.join(acted)}); in the what-if only modal limits act")
     count = np.count_nonzero(run.history.mirror.limits)
     if count:
-        few = "" if log.selection.records_all(MIRROR_STATE) else f" (recorded mirror states: {log.selection.sentence})"
+        few = (
+            "" if log.selection.records_all(MIRROR_STATE) else f" (recorded mirror states: {log.selection.description})"
+        )
         found.append(
             f"the mirror's own limits acted on {counted(int(count), 'command')}{few}: pseudo-open-loop modes are wrong "
             "there"
@@ -279,7 +281,7 @@ def _range_warnings(calibration: Calibration, columns: dict[str, Array]) -> list
     if not beyond:
         return []
     return [
-        f"beyond the sensor's linear range of {limit_nm:.1f} nm rms per mode: {', '.join(beyond)}; the figures are "
+        f"beyond the sensor's linear range of {limit_nm:.1f} nm rms per mode: {', '.join(beyond)}; the results are "
         "only approximate"
     ]
 

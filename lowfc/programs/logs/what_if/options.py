@@ -27,7 +27,7 @@ class WhatIf:
     """Changes with respect to the logged run; by default none.
 
     Attributes:
-        figures: gain, leak and limit_nm of all modes; tilt_gain, tilt_leak and tilt_limit_nm of tip and tilt over them.
+        overrides: gain, leak and limit_nm of all modes; tilt_gain, tilt_leak and tilt_limit_nm of tip and tilt only.
         estimator: another reconstructor made from the same calibration.
         config: its [control] section sets gains, leaks, limits and, without `calibration`, the estimator; the other
             attributes take precedence.
@@ -35,7 +35,7 @@ class WhatIf:
         controller: name of `step`, which replaces the integrator and its limits.
     """
 
-    figures: Mapping[str, float] = field(default_factory=dict)
+    overrides: Mapping[str, float] = field(default_factory=dict)
     estimator: str | None = None
     config: Configuration | None = None
     calibration: Path | None = None
@@ -71,9 +71,9 @@ def requested(
         raise ConfigurationError(f"--set: estimator must be {' or '.join(ESTIMATORS)}, got {estimator!r}")
     if controller is not None and values:
         raise ConfigurationError(f"--set: {', '.join(values)} apply to the integrator, not to your own controller")
-    figures = {key: _number(key, value) for key, value in values.items()}
+    overrides = {key: _number(key, value) for key, value in values.items()}
     return WhatIf(
-        figures,
+        overrides,
         estimator,
         None if config is None else load(config),
         calibration,
@@ -89,8 +89,8 @@ def law(what: WhatIf, noll: tuple[int, ...], logged: Integrator) -> Integrator:
     changed = []
     for key in LAW_KEYS:
         values: Single = getattr(base, key).copy()
-        values[:] = what.figures.get(key, values)
-        values[tilts] = what.figures.get(f"tilt_{key}", values[tilts])
+        values[:] = what.overrides.get(key, values)
+        values[tilts] = what.overrides.get(f"tilt_{key}", values[tilts])
         changed.append(values)
     try:
         gain, leak, limit_nm = changed
@@ -100,7 +100,7 @@ def law(what: WhatIf, noll: tuple[int, ...], logged: Integrator) -> Integrator:
 
 
 def user_controller(where: str) -> Controller:
-    """The function at FILE.py:NAME; its output goes to standard error, because standard output is for the figures."""
+    """The function at FILE.py:NAME; its output goes to standard error, because standard output is for the results."""
     file, _, name = where.rpartition(":")
     if not file.endswith(".py") or not Path(file).is_file():
         raise ConfigurationError(f"--controller must be FILE.py:NAME of an existing file, got {where!r}")

@@ -123,8 +123,8 @@ class LoggedRun:
         steps, log = self.steps, self.history.log
         if not log.selection.has_every_frame:
             raise DataFileError(
-                f"{log.path}: it does not have every frame ({log.selection.sentence}): another reconstructor cannot be "
-                "tried, other gains, leaks and limits can"
+                f"{log.path}: it does not have every frame ({log.selection.description}): another reconstructor "
+                "cannot be tried, other gains, leaks and limits can"
             )
         error_nm = np.full_like(steps.error_nm, np.nan)
         estimator = Estimator.of(calibration)

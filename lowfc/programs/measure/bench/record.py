@@ -26,14 +26,14 @@ _POLL_S = 0.5
 _WARM_UP_S = 0.5
 _COPY_S = 0.5
 _COPY_BYTES = 256 * 1024
-_RECORDER_FIGURES = (
+_RECORDER_KEYS = (
     "messages_recorded",
     "messages_lost",
     "longest_wait_ms",
     "longest_unflushed_ms",
     "longest_write_ms",
 )
-"""Figures that the recorder prints at its end."""
+"""Values that the recorder prints at its end."""
 
 
 def bench_record(
@@ -57,11 +57,11 @@ def bench_record(
     Example: lowfc bench record --seconds 5 --json
     """
     try:
-        figures = measure(tuple(rate or RATES_HZ), seconds, folder)
+        results = measure(tuple(rate or RATES_HZ), seconds, folder)
     except OSError as fault:
         where = folder or tempfile.gettempdir()
         raise DataFileError(f"{where} cannot be written: {fault.strerror or fault}") from fault
-    print_result(figures, render(figures), as_json=as_json)
+    print_result(results, render(results), as_json=as_json)
 
 
 def measure(rates_hz: tuple[float, ...], seconds: float, folder: Path | None = None) -> dict[str, Any]:
@@ -88,8 +88,8 @@ def measure(rates_hz: tuple[float, ...], seconds: float, folder: Path | None = N
             task = bar.add_task("recording", total=len(rates_hz))
             for rate_hz in rates_hz:
                 bar.update(task, description=f"recording at {rate_hz:g} Hz")
-                figures = _one_rate(rate_hz, seconds, Path(name))
-                rates.append(figures | {"ratio": figures["cpu_share"] / (copy_us * 1e-6 * figures["offered_hz"])})
+                results = _one_rate(rate_hz, seconds, Path(name))
+                rates.append(results | {"ratio": results["cpu_share"] / (copy_us * 1e-6 * results["offered_hz"])})
                 bar.advance(task)
     return {
         "rates": rates,
@@ -99,7 +99,7 @@ def measure(rates_hz: tuple[float, ...], seconds: float, folder: Path | None = N
     }
 
 
-def render(figures: dict[str, Any]) -> str:
+def render(results: dict[str, Any]) -> str:
     """The result of `measure` as a table."""
     lines = [f"{'loop':>8} {'processor':>10} {'of copying':>11} {'messages':>9} {'lost':>6} {'longest wait':>13} "
              f"{'unflushed':>10} {'write':>9}"]  # fmt: skip
@@ -107,11 +107,11 @@ def render(figures: dict[str, Any]) -> str:
         f"{rate['offered_hz']:>5.0f} Hz {100 * rate['cpu_share']:>8.1f} % {rate['ratio']:>9.1f} x "
         f"{rate['messages_published']:>9} {rate['messages_lost']:>6} {rate['longest_wait_ms']:>10.0f} ms "
         f"{rate['longest_unflushed_ms']:>7.0f} ms {rate['longest_write_ms']:>6.1f} ms"
-        for rate in figures["rates"]
+        for rate in results["rates"]
     ]
     lines.append(
         f"processor: all threads of the recorder, share of one processor; copying a frame's "
-        f"{figures['payload_bytes_per_frame']:.0f} bytes to the same disk takes {figures['copy_us_per_frame']:.1f} us. "
+        f"{results['payload_bytes_per_frame']:.0f} bytes to the same disk takes {results['copy_us_per_frame']:.1f} us. "
         "Longest wait: from a message's arrival until it is written; unflushed: until it survives a kill -9; write: "
         "one write to the disk."
     )
@@ -160,7 +160,7 @@ def _one_rate(rate_hz: float, seconds: float, folder: Path) -> dict[str, Any]:
         "publisher_cpu_share": own_s / elapsed_s,
         "messages_published": traffic.messages,
         "log_bytes": size,
-        **{name: done[name] for name in _RECORDER_FIGURES},
+        **{name: done[name] for name in _RECORDER_KEYS},
     }
 
 

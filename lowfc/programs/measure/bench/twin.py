@@ -30,12 +30,12 @@ def twin(as_json: Json = False) -> None:
 
     Example: lowfc bench twin --json
     """
-    figures = bench_twin()
-    print_result(figures, render(figures), as_json=as_json)
+    results = bench_twin()
+    print_result(results, render(results), as_json=as_json)
 
 
 def bench_twin(seconds: float = 1.0, cache_dir: Path | None = None) -> dict[str, Any]:
-    """Measure the three twins; the figures of the live loop's default are also at the top level.
+    """Measure the three twins; the results of the live loop's default are also at the top level.
 
     Times are medians of one frame, from the phase to the binned image, with the two models in turn. `relative_l2` is
     the worst of 20 random wavefronts of radial degrees 1 to 5 within the bounds of Subedi et al. 2015, Sect. 3.1.

@@ -86,7 +86,7 @@ def latency(
 
         figure_class()  # fail before the work if it is missing
     if logs:
-        figures = _of_log(logs)
+        results = _of_log(logs)
     else:
         settings = _configuration(config, rate, camera, plain=plain_scheduling)
         from lowfc.adapters.process import compiled
@@ -99,10 +99,10 @@ def latency(
             raise ConfigurationError(compiled.missing())
         if trace and simulated:
             raise ConfigurationError("--trace requires prepared frames: omit --trace or --camera simulated")
-        figures = _measure(LatencyOptions(settings, duration, repeats, simulated, record, view, kernels, trace))
+        results = _measure(LatencyOptions(settings, duration, repeats, simulated, record, view, kernels, trace))
     if plot is not None:
-        write_whole(plot, picture(figures))
-    print_result(figures, table(figures), as_json=as_json)
+        write_whole(plot, picture(results))
+    print_result(results, table(results), as_json=as_json)
 
 
 def _configuration(file: Path | None, rate: float | None, camera: Camera, *, plain: bool) -> "Configuration":
@@ -128,7 +128,7 @@ def _measure(options: "LatencyOptions") -> dict[str, Any]:
     from lowfc.adapters.process.progress import passing_bar
     from lowfc.adapters.process.provenance import provenance
     from lowfc.programs.measure.latency.run import prepared, run_repeats
-    from lowfc.programs.measure.latency.summary import of_kernels
+    from lowfc.programs.measure.latency.summary import kernel_summary
 
     host: dict[str, Any] = {**provenance(), "clock_source": "", "load": os.getloadavg()[0]}
     with contextlib.suppress(OSError):
@@ -137,7 +137,7 @@ def _measure(options: "LatencyOptions") -> dict[str, Any]:
     with prepared(options.config) as run, passing_bar(Console(stderr=True)) as bar:
         task = bar.add_task("starting", total=1 + 2 * options.repeats * max(1, len(options.kernels)))
         done = run_repeats(options, run, lambda what: bar.update(task, description=what, advance=1))
-    return of_kernels(done) | {
+    return kernel_summary(done) | {
         "settings": {
             "rate_hz": options.config.camera.rate_hz,
             **{name: getattr(options, name) for name in ("duration_s", "repeats", "record", "view", "trace")},
@@ -156,13 +156,13 @@ def _of_log(names: list[Path]) -> dict[str, Any]:
 
     from lowfc.adapters.logs.parts import the_one, titled
     from lowfc.adapters.process.progress import reading_bar
-    from lowfc.programs.measure.latency.log import log_figures
+    from lowfc.programs.measure.latency.log import log_statistics
     from lowfc.programs.measure.latency.summary import together
 
     log = the_one(names)
     with reading_bar(Console(stderr=True)) as count:
-        figures, host = log_figures(log, partial(count, f"reading {titled(log)}"))
-    return together([figures]) | {"settings": {"log": str(log[0])}, "host": host}
+        results, host = log_statistics(log, partial(count, f"reading {titled(log)}"))
+    return together([results]) | {"settings": {"log": str(log[0])}, "host": host}
 
 
 def _compare(files: tuple[Path, Path]) -> dict[str, Any]:

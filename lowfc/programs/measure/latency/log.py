@@ -9,13 +9,13 @@ from lowfc.adapters.logs.history import read_history
 from lowfc.adapters.logs.parts import LogFiles, WholeLog
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import HEALTH, Role, wire
-from lowfc.programs.measure.latency.figures import controller_counts, join, repeat_figures
+from lowfc.programs.measure.latency.frame_statistics import controller_counts, join, repeat_statistics
 
 _LOOP = frozenset({Role.CAMERA, Role.CONTROLLER, Role.MIRROR})
 
 
-def log_figures(files: LogFiles, progress: Callable[[int, int], None]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Latency figures of a log, as of one repeat of a benchmark, and the host that its metadata describes.
+def log_statistics(files: LogFiles, progress: Callable[[int, int], None]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Latency statistics of a log, as of one repeat of a benchmark, and the host that its metadata describes.
 
     For a loop on several hosts, `clock_error_us` is the largest error of a latency between two hosts.
     """
@@ -24,8 +24,8 @@ def log_figures(files: LogFiles, progress: Callable[[int, int], None]) -> tuple[
     history = read_history(log)
     mirror = history.mirror.sequence, history.mirror.publish_time_ns
     timing = history.timed_sequence, history.stages_ns
-    figures = repeat_figures(join(history.frame_sequence, history.frame_publish_ns, None, timing, mirror))
-    if "frame_to_command" not in figures["latency_us"]:
+    statistics = repeat_statistics(join(history.frame_sequence, history.frame_publish_ns, None, timing, mirror))
+    if "frame_to_command" not in statistics["latency_us"]:
         raise DataFileError(
             f"{log.path} has no controller timing after its first 0.5 s: it is too short, or not the log of a loop"
         )
@@ -39,4 +39,4 @@ def log_figures(files: LogFiles, progress: Callable[[int, int], None]) -> tuple[
                 trip_ns = wire.Health.FromString(message.payload).router_round_trip_ns
                 round_trips_ns[name] = max(round_trips_ns[name], trip_ns)
         host["clock_error_us"] = sum(sorted(round_trips_ns.values())[-2:]) / 2e3
-    return figures | controller_counts(controller), host
+    return statistics | controller_counts(controller), host

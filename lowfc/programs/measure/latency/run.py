@@ -33,12 +33,12 @@ from lowfc.programs.launch.watch import Watch
 from lowfc.programs.measure import bare_loop, echo
 from lowfc.programs.measure.bare_loop import PROCESSES_FILE, TRACED, trace_file
 from lowfc.programs.measure.frame_source import BEGIN_FILE, FRAMES_FILE, SENT_FILE, prepared_frames
-from lowfc.programs.measure.latency.figures import (
+from lowfc.programs.measure.latency.frame_statistics import (
     WARM_UP_S,
     controller_counts,
     join,
     percentiles,
-    repeat_figures,
+    repeat_statistics,
 )
 from lowfc.programs.measure.latency.stalls import Trace, stalls_of
 
@@ -81,7 +81,7 @@ def prepared(config: Configuration, fill: Callable[[Configuration, Run], None] =
 
 
 def run_repeats(options: LatencyOptions, run: Run, progress: Callable[[str], None]) -> list[dict[str, Any]]:
-    """Figures of each repeat and kernel: those of `one_loop`, and percentiles of echo, step and timer."""
+    """Statistics of each repeat and kernel: those of `one_loop`, and percentiles of echo, step and timer."""
     repeats, kernels = [], options.kernels or (options.config.realtime.kernel,)
     for number in range(options.repeats):
         for kernel in kernels[:: -1 if number % 2 else 1]:
@@ -96,7 +96,7 @@ def run_repeats(options: LatencyOptions, run: Run, progress: Callable[[str], Non
 
 
 def one_loop(options: LatencyOptions, run: Run, children: list[Child] | None = None) -> dict[str, Any]:
-    """One repeat of the loop alone: figures of its frames, and the last reports of its processes.
+    """One repeat of the loop alone: statistics of its frames, and the last reports of its processes.
 
     This process is woken only ten times a second and by Health; frames and mirror states wait in rings.
 
@@ -145,11 +145,11 @@ def one_loop(options: LatencyOptions, run: Run, children: list[Child] | None = N
     else:
         with np.load(run.path / SENT_FILE) as sent:
             joined = join(sent["sequence"], sent["put_ns"], sent["due_ns"], *received)
-    figures = repeat_figures(joined)
+    statistics = repeat_statistics(joined)
     if traced:
         traces: dict[str, Trace] = {role: Trace(*np.load(run.path / trace_file(role)).T) for role in traced}
-        figures["stalls"] = stalls_of(joined, options.config.period_ns, traces)
-    if "frame_to_command" not in figures["latency_us"]:
+        statistics["stalls"] = stalls_of(joined, options.config.period_ns, traces)
+    if "frame_to_command" not in statistics["latency_us"]:
         raise BusError("the controller reported no timing after the warm-up: use a longer --duration")
     controller, recording = watch.of(Role.CONTROLLER), watch.of(Role.RECORDER).recording
     if recording.failure:
@@ -163,7 +163,7 @@ def one_loop(options: LatencyOptions, run: Run, children: list[Child] | None = N
         "messages_lost": recording.lost if options.record else None,
         "commands_late": watch.of(Role.CAMERA).commands_late if options.simulated else None,
     }
-    return figures | controller_counts(controller) | reports
+    return statistics | controller_counts(controller) | reports
 
 
 def _children(options: LatencyOptions, run: Run) -> list[Child]:

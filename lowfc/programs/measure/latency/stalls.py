@@ -11,8 +11,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from lowfc.arrays import Array, Long
-from lowfc.programs.cli.result import Result, figure
-from lowfc.programs.measure.latency.figures import WARM_UP_S, Frames, percentiles
+from lowfc.programs.cli.result import Result, result_field
+from lowfc.programs.measure.latency.frame_statistics import WARM_UP_S, Frames, percentiles
 
 Cause = Literal["host", "loop", "unknown"]
 """Cause of a stall: the loop if one of its processes waited for a processor or pages, and no bare loop did."""
@@ -56,35 +56,37 @@ class Counted(Result):
 class Stall(Result):
     """One frame that stalled; `counted` by process."""
 
-    second: float = figure("at, s", form=".3f")
-    frame_to_command_us: float | None = figure("frame to command, us", form=".0f")
-    longest: str = figure("longest in")
-    held_up_by: Cause = figure("cause")
-    signs: str = figure("evidence")
-    counted: dict[str, Counted] = figure()
+    second: float = result_field("at, s", form=".3f")
+    frame_to_command_us: float | None = result_field("frame to command, us", form=".0f")
+    longest: str = result_field("longest in")
+    held_up_by: Cause = result_field("cause")
+    signs: str = result_field("evidence")
+    counted: dict[str, Counted] = result_field()
 
 
 class BareLoop(Result):
     """An idle loop beside a process of the control loop; `stalled` counts its wakings more than a period late."""
 
-    beside: str = figure("bare loop beside the")
-    wakings: int = figure("wakings")
-    stalled: int = figure("stalled")
-    late_us: dict[str, float] | None = figure()
+    beside: str = result_field("bare loop beside the")
+    wakings: int = result_field("wakings")
+    stalled: int = result_field("stalled")
+    late_us: dict[str, float] | None = result_field()
 
 
 class Stalls(Result):
     """The stalls of a run."""
 
-    frames: int = figure()
-    stalled: int = figure("stalled", "frames: no command, or more than a period from frame to command")
-    of_host: int = figure(
+    frames: int = result_field()
+    stalled: int = result_field("stalled", "frames: no command, or more than a period from frame to command")
+    of_host: int = result_field(
         "  by the host", "frames: a bare loop was delayed too, processor time was stolen, or a quota used up"
     )
-    of_loop: int = figure("  by the loop", "frames: a process waited for a processor or for pages, no bare loop did")
-    unknown: int = figure("  unknown", "frames: no counter explains them")
-    bare: list[BareLoop] = figure()
-    stalls: list[Stall] = figure()
+    of_loop: int = result_field(
+        "  by the loop", "frames: a process waited for a processor or for pages, no bare loop did"
+    )
+    unknown: int = result_field("  unknown", "frames: no counter explains them")
+    bare: list[BareLoop] = result_field()
+    stalls: list[Stall] = result_field()
 
     def text(self) -> str:
         """Counts, the bare loops, and the first stalls."""

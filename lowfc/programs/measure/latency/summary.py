@@ -7,7 +7,7 @@ import numpy as np
 
 from lowfc.control.kernel.tables import KERNELS
 from lowfc.programs.measure.latency import stalls
-from lowfc.programs.measure.latency.figures import ALONE, COUNTS, RATIOS, RATIOS_AT, edges_us
+from lowfc.programs.measure.latency.frame_statistics import ALONE, COUNTS, RATIOS, RATIOS_AT, edges_us
 
 OVER = "over_echo_and_step"
 COMPARED = ("p50", "p99", "p99_9")
@@ -16,7 +16,7 @@ Repeats = Sequence[Mapping[str, Any]]
 
 
 def together(repeats: Repeats) -> dict[str, Any]:
-    """Figures of all repeats.
+    """Results of all repeats.
 
     Returns:
         latency_us and spread_us by span: for each percentile the median (max: the largest), and the lowest and highest
@@ -50,11 +50,11 @@ def together(repeats: Repeats) -> dict[str, Any]:
     if memory := [one["memory_mb"] for one in repeats if "memory_mb" in one]:
         found["memory_mb"] = {name: max(one[name] for one in memory) for name in memory[0]}
     if traced := [one["stalls"] for one in repeats if "stalls" in one]:
-        found["stalls"] = stalls.together(traced).figures()
+        found["stalls"] = stalls.together(traced).json_object()
     return found
 
 
-def of_kernels(repeats: Repeats) -> dict[str, Any]:
+def kernel_summary(repeats: Repeats) -> dict[str, Any]:
     """`together` of the repeats if they have one kernel; otherwise that of the fused step, compared with numpy's.
 
     Returns:
@@ -114,8 +114,8 @@ def compare(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, An
     }
 
 
-def _row(name: str, at: str, unit: str, figures: list[tuple[float, list[float]]], *, single: bool) -> dict[str, Any]:
-    (a, a_spread), (b, b_spread) = figures
+def _row(name: str, at: str, unit: str, values: list[tuple[float, list[float]]], *, single: bool) -> dict[str, Any]:
+    (a, a_spread), (b, b_spread) = values
     spread = None if single else max(high - low for low, high in (a_spread, b_spread))
     return {
         "name": name,

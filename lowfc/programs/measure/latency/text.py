@@ -1,11 +1,11 @@
-"""The figures of `lowfc latency` as text and as a picture."""
+"""The results of `lowfc latency` as text and as a picture."""
 
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lowfc.programs.measure.latency.figures import ALONE, COUNTS, LOOP_SPANS, PERCENTILES, RATIOS, SPANS
+from lowfc.programs.measure.latency.frame_statistics import ALONE, COUNTS, LOOP_SPANS, PERCENTILES, RATIOS, SPANS
 from lowfc.programs.measure.latency.stalls import Stalls
 from lowfc.programs.measure.latency.summary import OVER
 
@@ -18,23 +18,23 @@ _LINE = 32
 """Characters of a histogram in the table."""
 
 
-def table(figures: Mapping[str, Any]) -> str:
+def table(results: Mapping[str, Any]) -> str:
     """The result as text."""
     title = f"{'us':<22}" + "".join(f"{name.replace('_', '.'):>9}" for name in PERCENTILES)
-    edges = figures["histogram"]["edges_us"]
+    edges = results["histogram"]["edges_us"]
     lines = [f"{title}   log counts, {edges[0]:.0f} to {edges[-1]:.0f} us"]
-    for span, values in figures["latency_us"].items():
+    for span, values in results["latency_us"].items():
         if span == "due_to_frame":
             lines.append("from the time the frame was due instead of the time it was published:")
-        bars = sparkline(figures["histogram"]["counts"][span])
+        bars = sparkline(results["histogram"]["counts"][span])
         lines.append(f"{_row(SPANS[span], values)}   {bars}")
     for name, label in ALONE.items():
-        values = figures[name]
+        values = results[name]
         if name == "echo_us" and values:
             values = {at: value / 2 for at, value in values["round_trip"].items()}
         if values:
             lines.append(_row(label, values))
-    return "\n".join([*lines, *_remarks(figures)])
+    return "\n".join([*lines, *_remarks(results)])
 
 
 def compared(comparison: Mapping[str, Any]) -> str:
@@ -63,20 +63,20 @@ def sparkline(counts: Sequence[int]) -> str:
     return "".join(_BLOCKS[math.ceil(math.log1p(one) / highest * (len(_BLOCKS) - 1))] for one in sums).rstrip()
 
 
-def picture(figures: Mapping[str, Any]) -> bytes:
+def picture(results: Mapping[str, Any]) -> bytes:
     """PNG: a histogram of each span, and frame to command against time."""
     from lowfc.adapters.files.drawing import figure_class, png
 
     figure = figure_class()(figsize=(9, 8), layout="constrained")
     counted, timed = figure.subplots(2, 1)
-    edges = figures["histogram"]["edges_us"]
+    edges = results["histogram"]["edges_us"]
     for span in LOOP_SPANS:
-        if span in figures["latency_us"]:
-            counted.stairs(figures["histogram"]["counts"][span], edges, label=SPANS[span])
-    counted.set(xscale="log", yscale="log", xlabel="us", ylabel="frames", title=_what(figures))
+        if span in results["latency_us"]:
+            counted.stairs(results["histogram"]["counts"][span], edges, label=SPANS[span])
+    counted.set(xscale="log", yscale="log", xlabel="us", ylabel="frames", title=_what(results))
     counted.legend()
     begun_s = 0.0
-    for number, repeat in enumerate(figures["over_time"]):
+    for number, repeat in enumerate(results["over_time"]):
         seconds = [begun_s + second for second in repeat["seconds"]]
         labels = ("largest", "median") if number == 0 else (None, None)
         timed.plot(seconds, repeat["max_us"], ".", color="tab:red", markersize=3, label=labels[0])
@@ -95,35 +95,35 @@ def _ratio(value: float) -> str:
     return f"{value:.2f}" if value >= 0.01 else f"{value:.1g}"
 
 
-def _remarks(figures: Mapping[str, Any]) -> list[str]:
+def _remarks(results: Mapping[str, Any]) -> list[str]:
     lines = []
     for name, (_, suffix) in RATIOS.items():
-        if figures[name]:
-            spread = figures[f"{name}_spread"]
+        if results[name]:
+            spread = results[f"{name}_spread"]
             parts = [
-                f"{at} {_ratio(figures[name][at])} ({_ratio(low)} to {_ratio(high)})"
+                f"{at} {_ratio(results[name][at])} ({_ratio(low)} to {_ratio(high)})"
                 for at, (low, high) in spread.items()
             ]
             lines.append(f"frame to command over half a bare echo and one control step{suffix}: {', '.join(parts)}")
-    if figures.get("kernel_ratio"):
-        spread, numpy_us = figures["kernel_ratio_spread"], figures["numpy_us"]
+    if results.get("kernel_ratio"):
+        spread, numpy_us = results["kernel_ratio_spread"], results["numpy_us"]
         parts = [
-            f"{at} {figures['kernel_ratio'][at]:.2f} ({low:.2f} to {high:.2f}) of {numpy_us[at]:.1f} us"
+            f"{at} {results['kernel_ratio'][at]:.2f} ({low:.2f} to {high:.2f}) of {numpy_us[at]:.1f} us"
             for at, (low, high) in spread.items()
         ]
-        lines.append(f"all figures: fused step; ratio of its frame to command to numpy's, in turns: {', '.join(parts)}")
-    counts = {name: figures.get(name) for name in COUNTS}
+        lines.append(f"all results: fused step; ratio of its frame to command to numpy's, in turns: {', '.join(parts)}")
+    counts = {name: results.get(name) for name in COUNTS}
     shown = [name for name, count in counts.items() if count or (name in _ALWAYS and count is not None)]
     lines.append(", ".join(f"{counts[name]} {COUNTS[name]}" for name in shown))
-    if figures["reasons"]:
-        reasons = ", ".join(f"{name} {count}" for name, count in figures["reasons"].items())
+    if results["reasons"]:
+        reasons = ", ".join(f"{name} {count}" for name, count in results["reasons"].items())
         lines.append(f"frames refused or limited, including the warm-up: {reasons}")
-    if "stalls" in figures:
-        lines.append(Stalls.model_validate(figures["stalls"]).text())
-    if figures.get("memory_mb"):
-        lines.append("memory: " + ", ".join(f"{name} {mb:.0f} MB" for name, mb in figures["memory_mb"].items()))
-    lines.append(_what(figures))
-    host = figures["host"]
+    if "stalls" in results:
+        lines.append(Stalls.model_validate(results["stalls"]).text())
+    if results.get("memory_mb"):
+        lines.append("memory: " + ", ".join(f"{name} {mb:.0f} MB" for name, mb in results["memory_mb"].items()))
+    lines.append(_what(results))
+    host = results["host"]
     lines.append(", ".join(f"{name} {host[name]}" for name in _HOST if host.get(name)))
     if "clock_error_us" in host:
         lines.append(
@@ -133,11 +133,11 @@ def _remarks(figures: Mapping[str, Any]) -> list[str]:
     return lines + [f"{word}: {', '.join(host[word])}" for word in ("granted", "refused") if host.get(word)]
 
 
-def _what(figures: Mapping[str, Any]) -> str:
-    settings, count = figures["settings"], len(figures["repeats"])
+def _what(results: Mapping[str, Any]) -> str:
+    settings, count = results["settings"], len(results["repeats"])
     if settings.get("log"):
-        return f"{Path(settings['log']).name}, {figures['rate_hz']:.1f} Hz"
+        return f"{Path(settings['log']).name}, {results['rate_hz']:.1f} Hz"
     also = "".join(f", with --{name}" for name in ("record", "view", "trace") if settings.get(name))
     times = f"medians over {count} times {settings['duration_s']:g} s" if count > 1 else f"{settings['duration_s']:g} s"
-    reached = f"{settings['rate_hz']:g} Hz ({figures['rate_hz']:.1f} Hz reached)"
+    reached = f"{settings['rate_hz']:g} Hz ({results['rate_hz']:.1f} Hz reached)"
     return f"{reached}, {settings['camera']} frames{also}, {times}"

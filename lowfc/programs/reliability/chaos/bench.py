@@ -76,7 +76,7 @@ class Outcome:
         lost: messages that the last recorder reports as lost, by key.
         failure: why the recording failed; empty if it did not.
         residuals_nm: true residuals of the last second, nm rms of wavefront.
-        figures: figures of the case for `--json`.
+        measurements: values measured by the case, for `--json`.
         notes: errors while the case ran.
     """
 
@@ -90,7 +90,7 @@ class Outcome:
     lost: dict[str, int] = field(default_factory=dict)
     failure: str = ""
     residuals_nm: deque[float] = field(default_factory=lambda: deque(maxlen=_QUIET_FRAMES))
-    figures: dict[str, Any] = field(default_factory=dict)
+    measurements: dict[str, Any] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
 

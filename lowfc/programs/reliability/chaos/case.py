@@ -22,7 +22,7 @@ class Case:
 
     Attributes:
         name: name for `--case`.
-        sentence: description of the fault.
+        description: description of the fault.
         act: function that injects the fault.
         fault: kind of the fault of the camera's frames, present from the start of the camera.
         config: keys that differ from those of other cases.
@@ -36,7 +36,7 @@ class Case:
     """
 
     name: str
-    sentence: str
+    description: str
     act: Act
     fault: str = ""
     config: Mapping[str, Any] = field(default_factory=dict)
@@ -60,11 +60,11 @@ class Case:
 REGISTERED: dict[str, Case] = {}
 
 
-def case(name: str, sentence: str, **more: Any) -> Callable[[Act], Act]:
+def case(name: str, description: str, **more: Any) -> Callable[[Act], Act]:
     """Register a function as the `act` of a case; `more` are the case's other attributes."""
 
     def register(act: Act) -> Act:
-        REGISTERED[name] = Case(name, sentence, act, **more)
+        REGISTERED[name] = Case(name, description, act, **more)
         return act
 
     return register

@@ -52,28 +52,28 @@ def chaos(
     names = list(CASES) if all_ else case or []
     if not names:
         width = max(map(len, CASES))
-        sys.stdout.write("".join(f"{one.name:{width}}  {one.sentence}\n" for one in CASES.values()))
+        sys.stdout.write("".join(f"{one.name:{width}}  {one.description}\n" for one in CASES.values()))
         return
     rows: list[dict[str, Any]] = []
     interrupted = False
     try:
         for number, name in enumerate(names, 1):
-            sys.stderr.write(f"{number} of {len(names)}: {name}: {CASES[name].sentence}\n")
+            sys.stderr.write(f"{number} of {len(names)}: {name}: {CASES[name].description}\n")
             rows.append(run_case(CASES[name], seed, keep))
             sys.stderr.write(f"    {_result(rows[-1])} in {rows[-1]['seconds']:.0f} s\n")
     except KeyboardInterrupt:
         interrupted = True  # the results so far are printed
-    figures = {"seed": seed, "asked": len(names), **counts(rows), "cases": rows}
-    print_result(figures, render(figures), as_json=as_json)
+    results = {"seed": seed, "asked": len(names), **counts(rows), "cases": rows}
+    print_result(results, render(results), as_json=as_json)
     if interrupted:
         raise typer.Exit(INTERRUPTED)
-    if figures["failed"]:
+    if results["failed"]:
         raise typer.Exit(1)
 
 
 def run_case(case: "Case", seed: int, keep: Path | None) -> dict[str, Any]:
     """Run one case in its own folder, and judge it; without `keep`, only the log of a failed case is kept."""
-    row: dict[str, Any] = {"name": case.name, "sentence": case.sentence, "seconds": 0.0}
+    row: dict[str, Any] = {"name": case.name, "sentence": case.description, "seconds": 0.0}
     row |= {"passed": False, "skipped": case.lacks() or None, "findings": {}, "figures": {}}
     if row["skipped"]:
         return row
@@ -97,15 +97,15 @@ def _judged(outcome: "Outcome", case: "Case") -> dict[str, Any]:
     from lowfc.programs.reliability.chaos.rules import judge, recovered_s, restart_steps_nm
 
     evidence = read(outcome.folder)
-    findings, figures = judge(case, outcome, evidence), dict(outcome.figures)
+    findings, measurements = judge(case, outcome, evidence), dict(outcome.measurements)
     if steps_nm := restart_steps_nm(evidence):
-        figures["restart_step_nm"] = round(max(steps_nm), 3)
+        measurements["restart_step_nm"] = round(max(steps_nm), 3)
     if (seconds := recovered_s(outcome, evidence)) is not None:
-        figures["recovered_s"] = round(seconds, 3)
+        measurements["recovered_s"] = round(seconds, 3)
     return {
         "passed": all(finding.held for finding in findings),
         "findings": {one.rule: {"held": one.held, "found": one.found} for one in findings},
-        "figures": figures,
+        "figures": measurements,
     }
 
 
@@ -158,19 +158,19 @@ def _result(row: dict[str, Any]) -> str:
     return f"skipped: {row['skipped']}" if row["skipped"] else "passed" if row["passed"] else "FAILED"
 
 
-def render(figures: dict[str, Any]) -> str:
+def render(results: dict[str, Any]) -> str:
     """The results as text: a line for each case, and below it the rules that did not hold."""
     lines = []
-    width = max((len(row["name"]) for row in figures["cases"]), default=0)
-    for row in figures["cases"]:
+    width = max((len(row["name"]) for row in results["cases"]), default=0)
+    for row in results["cases"]:
         recovery = row["findings"].get("recovery", {}).get("found", "")
         lines.append(f"{row['name']:{width}}  {_result(row):6}  {row['seconds']:5.1f} s  {recovery}")
         lines += [f"    {rule}: {one['found']}" for rule, one in row["findings"].items() if not one["held"]]
         lines += [f"    {name}: {value}" for name, value in row["figures"].items()]
-    totals = [f"{figures['passed']} passed", f"{figures['failed']} failed"]
-    if figures["skipped"]:
-        totals.append(f"{figures['skipped']} skipped")
-    if not_run := figures["asked"] - len(figures["cases"]):
+    totals = [f"{results['passed']} passed", f"{results['failed']} failed"]
+    if results["skipped"]:
+        totals.append(f"{results['skipped']} skipped")
+    if not_run := results["asked"] - len(results["cases"]):
         totals.append(f"{not_run} not run")
-    lines.append(f"{', '.join(totals)}, seed {figures['seed']}")
+    lines.append(f"{', '.join(totals)}, seed {results['seed']}")
     return "\n".join(lines)

@@ -34,11 +34,11 @@ def _wait_for_last(bench: ChaosBench) -> None:
     bench.wait(lambda: bench.newest_frame & 0xFFFFFFFF >= last, f"frame {last}")
 
 
-for _kind, _sentence, _reason, _used, _lost in _KINDS:
+for _kind, _description, _reason, _used, _lost in _KINDS:
     _event = _reason if _reason in ("", "FRAMES_MISSING") else f"FRAMES_REFUSED frames refused: {_reason}"
     case(
         f"frames-{_kind}",
-        _sentence,
+        _description,
         fault=_kind,
         expected=(_event,) if _event else (),
         allowed=LOST if _lost else (),

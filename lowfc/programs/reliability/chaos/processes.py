@@ -96,14 +96,14 @@ def _stalled_viewer(bench: ChaosBench) -> None:
 
 
 class CommandTimes:
-    """Frame-to-command latencies of a bench that has begun; those of `measure` are figures of its case."""
+    """Frame-to-command latencies of a bench that has begun; those of `measure` are measurements of its case."""
 
     def __init__(self, bench: ChaosBench) -> None:
         assert bench.bus is not None  # noqa: S101  # the bench has begun
         self.found: dict[str, dict[str, float]] = {}
         self._latencies_ns: list[int] = []
         bench.bus.subscribe(TIMING, self._receive)
-        bench.outcome.figures["frame_to_command"] = self.found
+        bench.outcome.measurements["frame_to_command"] = self.found
 
     def drain(self) -> dict[str, float]:
         """Number of frames timed since the last call, their p50 and p99; empty without frames."""
@@ -126,7 +126,7 @@ class CommandTimes:
 
 
 def compare(bench: ChaosBench, stall: Callable[[], contextlib.AbstractContextManager[None]]) -> None:
-    """Add frame-to-command latencies before, during and after a stall to the case's figures, with ratios of p99."""
+    """Measure frame to command before, during and after a stall, and the ratios of its p99, for the case's report."""
     times = CommandTimes(bench)
     times.measure("before", CALM_S)
     with stall():
@@ -134,5 +134,5 @@ def compare(bench: ChaosBench, stall: Callable[[], contextlib.AbstractContextMan
     times.measure("after", CALM_S)
     if len(times.found) == 3:
         before, during, after = (one["p99_us"] for one in times.found.values())
-        bench.outcome.figures["p99_during_over_calm"] = round(during / ((before + after) / 2), 2)
-        bench.outcome.figures["p99_after_over_before"] = round(after / before, 2)
+        bench.outcome.measurements["p99_during_over_calm"] = round(during / ((before + after) / 2), 2)
+        bench.outcome.measurements["p99_after_over_before"] = round(after / before, 2)

@@ -26,14 +26,14 @@ def soak(
 
     from lowfc.adapters.process.progress import passing_bar
     from lowfc.adapters.process.realtime import spread
-    from lowfc.programs.reliability.soak.figures import render
+    from lowfc.programs.reliability.soak.evaluation import render
     from lowfc.programs.reliability.soak.run import soak_loop
 
     overrides = {"recorder.largest_mb": 200.0}
     settings = configuration(config, overrides, {"control.start_mode": "closed", **spread(os.sched_getaffinity(0))})
     with passing_bar(Console(stderr=True)) as bar:
         task = bar.add_task("soaking", total=hours * 3600)
-        figures = soak_loop(settings, hours * 3600, lambda elapsed_s: bar.update(task, completed=elapsed_s))
-    print_result(figures, render(figures), as_json=as_json)
-    if not figures["passed"]:
+        results = soak_loop(settings, hours * 3600, lambda elapsed_s: bar.update(task, completed=elapsed_s))
+    print_result(results, render(results), as_json=as_json)
+    if not results["passed"]:
         raise typer.Exit(1)

@@ -19,7 +19,7 @@ from lowfc.programs.launch.sim_loop import check
 from lowfc.programs.launch.watch import topic_count
 from lowfc.programs.reliability.chaos.bench import ChaosBench
 from lowfc.programs.reliability.chaos.processes import CommandTimes
-from lowfc.programs.reliability.soak.figures import Usage, of_latency, of_process, too_short
+from lowfc.programs.reliability.soak.evaluation import Usage, latency_statistics, process_statistics, too_short
 
 SAMPLE_S = 1.0
 _PATIENCE_S = 10.0
@@ -77,13 +77,13 @@ class _Soak:
             self.latency.append((now_s, timed["p50_us"], timed["p99_us"]))
         self.checker.check()
 
-    def figures(self, seconds: float, stopped_s: float, unfinished: list[str]) -> dict[str, Any]:
-        """The figures that `lowfc soak --json` prints."""
+    def results(self, seconds: float, stopped_s: float, unfinished: list[str]) -> dict[str, Any]:
+        """The results that `lowfc soak --json` prints."""
         controller, recorder, camera = (
             self.bench.health.get(role, wire.Health()) for role in (Role.CONTROLLER, Role.RECORDER, Role.CAMERA)
         )
         frames, recording = topic_count(controller, FRAME.key), recorder.recording
-        processes = {name: of_process(samples) for name, samples in self.usage.items()}
+        processes = {name: process_statistics(samples) for name, samples in self.usage.items()}
         found: dict[str, Any] = {
             "hours": seconds / 3600,
             "rate_hz": round(camera.mean_rate_hz, 2),
@@ -96,7 +96,7 @@ class _Soak:
             "gaps": self.checker.gaps,
             "stopped_within_s": round(stopped_s, 2),
             "processes": processes,
-            "latency": of_latency(self.latency),
+            "latency": latency_statistics(self.latency),
         }
         why = [f"the {name}'s {what} grow" for name, one in processes.items() for what in one["grows"]]
         why += [f"{found[key]} {text}" for key, text in _MUST_BE_ZERO.items() if found[key]]
@@ -108,7 +108,7 @@ class _Soak:
 
 
 def soak_loop(config: Configuration, seconds: float, progress: Callable[[float], None]) -> dict[str, Any]:
-    """Run the loop for this time; the figures that `lowfc soak --json` prints."""
+    """Run the loop for this time; the results that `lowfc soak --json` prints."""
     with tempfile.TemporaryDirectory(prefix="lowfc-soak-") as name:
         logged = config.model_copy(update={"recorder": config.recorder.model_copy(update={"folder": name})})
         bench = ChaosBench(logged, Path(name), random.Random(), None)  # noqa: S311  # nothing secret
@@ -126,4 +126,4 @@ def soak_loop(config: Configuration, seconds: float, progress: Callable[[float],
             stopped_s = time.monotonic() - begun_s
         soak.checker.check()
         unfinished = [path.name for path in Path(name).glob("*.part")]
-    return soak.figures(seconds, stopped_s, unfinished)
+    return soak.results(seconds, stopped_s, unfinished)

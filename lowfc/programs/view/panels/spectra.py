@@ -9,7 +9,7 @@ from lowfc.adapters.logs.columns import frame_rate_hz
 from lowfc.arrays import Array, Mask
 from lowfc.control.laws.linear_law import integrator
 from lowfc.control.laws.margins import rejection
-from lowfc.control.laws.spectra import Spectrum, in_bins, pieces, spectrum
+from lowfc.control.laws.spectra import Spectrum, in_bins, spectrum, time_series
 from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.view.draw.colours import GREEN, GREY, YELLOW
 from lowfc.programs.view.draw.plots import BOX_HEIGHT, Axes, at, labels
@@ -53,7 +53,7 @@ class Spectra(Panel):
         if not steady.feed(snapshot) or calibration is None or not self.due(snapshot):
             return
         rate_hz = frame_rate_hz(snapshot.camera, snapshot.steps)
-        run = pieces(*steady.rows())
+        run = time_series(*steady.rows())
         found = spectrum(run, rate_hz) if rate_hz else None
         noll = np.array(calibration.noll)
         law = steady.law if steady.mode == LoopMode.CLOSED else None

@@ -26,7 +26,7 @@ WIDTH, HEIGHT = 1760, 256
 GROUND: Colour = (13, 16, 17)
 """Rerun's background, so that only the tiles are visible."""
 MIN_PERIOD_NS = 250_000_000
-"""Shortest time between pictures with another word or colour. If only figures differ, there is one picture per second:
+"""Shortest time between pictures with another word or colour. If only numbers differ, there is one picture per second:
 more cannot be read, and each stays in the viewer's memory."""
 
 _GAP, _INSET, _BAND, _CLOCK = 6, 9, 46, 190  # gap of boxes, inset of text, height of headline, width of clock, px
@@ -102,8 +102,8 @@ def _parts(verdict: Verdict, time_ns: int) -> Iterator[tuple[Box, Level, tuple[T
     headline, *boxes = tile_boxes(len(verdict.tiles))
     word, top, bottom = WORD[verdict.level].upper(), _INSET // 2, _BAND - _INSET // 2
     left = _INSET + round(_width(word, 30)) + (_INSET if word else 0)
-    sentence = ((left, top, WIDTH - _CLOCK - _INSET, bottom), verdict.headline, 27)
-    yield headline, verdict.level, (((_INSET, top, left, bottom), word, 30), sentence)
+    summary = ((left, top, WIDTH - _CLOCK - _INSET, bottom), verdict.headline, 27)
+    yield headline, verdict.level, (((_INSET, top, left, bottom), word, 30), summary)
     clock = f"{datetime.fromtimestamp(time_ns // 10**9, UTC):%H:%M:%S} UTC"
     clock_box = (WIDTH - _CLOCK, 0, WIDTH, _BAND)
     yield clock_box, verdict.level, (((_INSET, top, _CLOCK - _INSET, bottom), clock, 27),)

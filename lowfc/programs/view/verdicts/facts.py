@@ -8,7 +8,7 @@ from lowfc.contract.messages import Role, from_timestamp, wire
 from lowfc.contract.printable import printable
 from lowfc.control.loop.wording import counted
 from lowfc.optics.chain.zernike import mode_name
-from lowfc.programs.cli.status import channels_in_words, figures, law_in_words
+from lowfc.programs.cli.status import channels_in_words, json_object, law_in_words
 from lowfc.programs.view.snapshot import Snapshot
 from lowfc.programs.view.verdicts.run_state import RunState
 from lowfc.programs.view.verdicts.tile import numbers, short
@@ -25,7 +25,7 @@ def facts(state: RunState) -> dict[str, str]:
         note = f"{clock:%H:%M} {short(printable(state.note.message.partition(' ')[2]))}"
     law = shapes = "not known"
     if snapshot.controller is not None:
-        known = figures(snapshot.controller)
+        known = json_object(snapshot.controller)
         law = short(printable(law_in_words(known)))
         if not snapshot.controller.HasField("law"):
             leak = f", leak {numbers(known['leak'])}" if any(known["leak"]) else ""

@@ -15,7 +15,7 @@ from lowfc.programs.view.verdicts.camera_verdict import DIM, FEW, REFUSED
 from lowfc.programs.view.verdicts.facts import facts
 from lowfc.programs.view.verdicts.run_state import RunState
 from lowfc.programs.view.verdicts.span_means import SpanMeans
-from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict, duration, figure, worst_of
+from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict, duration, rounded, worst_of
 from lowfc.programs.view.verdicts.verdict import LIMITS, stroke, stroke_used_nm
 from lowfc.programs.view.verdicts.wavefront_verdict import GOOD_FACTOR
 
@@ -98,12 +98,12 @@ class LogVerdict:
         worst_nm = float(np.nanmax(self._means.wavefront()[1][:, 0], initial=0.0))
         factor = flat_nm / residual_nm if residual_nm else 1.0
         detail = (
-            f"while closed, {factor:.1f} x better than {figure(flat_nm)} nm with a flat mirror; "
-            f"worst {self._span}: {figure(worst_nm)} nm; {'true' if self._means.true else 'measured, with noise'}"
+            f"while closed, {factor:.1f} x better than {rounded(flat_nm)} nm with a flat mirror; "
+            f"worst {self._span}: {rounded(worst_nm)} nm; {'true' if self._means.true else 'measured, with noise'}"
         )
         level = Level.GOOD if factor >= GOOD_FACTOR else Level.NEUTRAL
-        value = f"{figure(residual_nm)} nm rms"
-        return Tile("WAVEFRONT", value, detail, level, f"residual {value}, {figure(flat_nm)} nm with a flat mirror")
+        value = f"{rounded(residual_nm)} nm rms"
+        return Tile("WAVEFRONT", value, detail, level, f"residual {value}, {rounded(flat_nm)} nm with a flat mirror")
 
     @property
     def _span(self) -> str:
@@ -132,7 +132,7 @@ class LogVerdict:
     def _timing(self, state: RunState) -> Tile:
         if not self._latency.count:
             return Tile("LATENCY", "?", "not measured")
-        p50, p99, most = (f"{figure(ns / 1e3)} us" for ns in self._latency.percentiles_ns(0.5, 0.99, 1.0))
+        p50, p99, most = (f"{rounded(ns / 1e3)} us" for ns in self._latency.percentiles_ns(0.5, 0.99, 1.0))
         detail = f"frame to command; 1 in 100 over {p99}, at most {most}"
         if state.simulated:
             return Tile("LATENCY", p50, f"{detail}; without effect in simulated time")

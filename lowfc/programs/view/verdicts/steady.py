@@ -10,7 +10,7 @@ from lowfc.arrays import Sequences, Single
 from lowfc.contract.codecs.law_codec import overruled
 from lowfc.contract.messages import wire
 from lowfc.control.laws.continuous import Timing
-from lowfc.control.laws.spectra import pieces
+from lowfc.control.laws.spectra import time_series
 from lowfc.control.laws.stability import settling_frames
 from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.view.snapshot import Snapshot
@@ -55,9 +55,9 @@ class Steady:
             if law is not None and self.mode == LoopMode.CLOSED:
                 self._settling = min(settling_frames(np.array(law.gain), np.array(law.leak)), FRAMES)
         signals = np.concatenate([steps.error_nm, steps.pol_nm], axis=1)
-        left_out = min(self._settling, len(signals) - first)
-        self._settling -= left_out
-        self._kept.append((steps.sequence[first + left_out :], signals[first + left_out :]))
+        excluded = min(self._settling, len(signals) - first)
+        self._settling -= excluded
+        self._kept.append((steps.sequence[first + excluded :], signals[first + excluded :]))
         kept = sum(len(sequence) for sequence, _ in self._kept)
         while kept - len(self._kept[0][0]) >= FRAMES:
             kept -= len(self._kept.popleft()[0])
@@ -90,7 +90,7 @@ def attained(steady: Steady, rate_hz: float, camera: wire.CameraState | None) ->
     sequence, signals = steady.rows()
     try:
         timing = Timing.of(law.delay_frames, exposure_fraction(camera) or 0.0)
-        best = best_gains(pieces(sequence, signals[:, modes:]), rate_hz, timing, np.array(law.leak))
+        best = best_gains(time_series(sequence, signals[:, modes:]), rate_hz, timing, np.array(law.leak))
     except ValueError:
         return None  # too few frames in a row
     error_nm = signals[np.isfinite(signals).all(axis=1), :modes].astype(np.float64)

@@ -1,4 +1,4 @@
-"""Tiles of the verdict, and the format of the figures on them."""
+"""Tiles of the verdict, and the format of the numbers on them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -38,7 +38,7 @@ WORD: dict[Level, str] = {Level.NEUTRAL: "", Level.GOOD: "ok", Level.WARNING: "C
 
 @dataclass(frozen=True, slots=True)
 class Tile:
-    """One tile of the annunciator: a word or figure, its explanation, and the advice for the headline."""
+    """One tile of the annunciator: a word or number, its explanation, and the advice for the headline."""
 
     title: str
     value: str
@@ -62,7 +62,7 @@ def worst_of(tiles: Sequence[Tile]) -> Tile:
     return max(tiles, key=lambda tile: tile.level)
 
 
-def figure(value: float) -> str:
+def rounded(value: float) -> str:
     """Text of a number with two or three digits, readable at a glance."""
     return f"{value:.0f}" if value >= 100 else f"{value:.1f}" if value >= 1 else f"{value:.2f}"
 

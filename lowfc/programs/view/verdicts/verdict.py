@@ -17,7 +17,7 @@ from lowfc.control.loop.wording import counted
 from lowfc.programs.view.verdicts.camera_verdict import LATELY, all_refused, frames, star
 from lowfc.programs.view.verdicts.facts import facts
 from lowfc.programs.view.verdicts.run_state import RECENT_S, Liveness, RunState
-from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict, absent, duration, figure, short, worst_of
+from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict, absent, duration, rounded, short, worst_of
 from lowfc.programs.view.verdicts.wavefront_verdict import WORSE, contrast, wavefront
 
 NEAR_STROKE = 0.9
@@ -46,8 +46,8 @@ def judge(state: RunState, nm_per_mas: float | None = None) -> Verdict:
     tiles = [loop, residual, frames(state), star(state), _mirror(state), _latency(state), _recorder(state)]
     reported = (state.snapshot.health.get(role) for role in (Role.CAMERA, Role.CONTROLLER))
     known = (one.health.recent_wavefront for one in reported if one is not None)
-    if figures := next((one for one in known if one.costliest_modes), None):
-        tiles.insert(2, contrast(figures, now=state.wavefront is not None))
+    if recent := next((one for one in known if one.costliest_modes), None):
+        tiles.insert(2, contrast(recent, now=state.wavefront is not None))
     if state.snapshot.behind_s > BEHIND_S:
         tiles.append(_view(state.snapshot.behind_s))
     worst = worst_of(tiles)
@@ -180,7 +180,7 @@ def _latency(state: RunState) -> Tile:
     tile = partial(Tile, "LATENCY")
     if state.latency_us is None:
         return tile("?", "not measured now")
-    p50, p99 = map(figure, state.latency_us)
+    p50, p99 = map(rounded, state.latency_us)
     value, detail = f"{p50} us", f"frame to command; 1 in 100 over {p99} us"
     late, share = state.recent["late"], state.recent["late"] / max(1, state.recent["steps"])
     if state.controller.life is Liveness.STOPPED:

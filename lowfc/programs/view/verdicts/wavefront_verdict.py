@@ -7,7 +7,7 @@ from lowfc.contract.messages import wire
 from lowfc.control.loop.command_channels import FLAT
 from lowfc.programs.view.verdicts.run_state import RunState
 from lowfc.programs.view.verdicts.steady import Attained
-from lowfc.programs.view.verdicts.tile import Level, Tile, figure
+from lowfc.programs.view.verdicts.tile import Level, Tile, rounded
 
 WORSE = 1.1
 """Residual over open wavefront above which a closed loop does harm; the rms of a second scatters less."""
@@ -28,12 +28,12 @@ def wavefront(state: RunState, nm_per_mas: float | None, loop: Tile) -> Tile:
     tile, found, attained = partial(Tile, "WAVEFRONT"), state.wavefront, state.attained
     if found is None:
         return tile("?", "not measured now")
-    residual = figure(found.residual_nm)
-    value, flat, more = f"{residual} nm rms", f"{figure(found.open_nm)} nm with a flat mirror", "true"
+    residual = rounded(found.residual_nm)
+    value, flat, more = f"{residual} nm rms", f"{rounded(found.open_nm)} nm with a flat mirror", "true"
     if not state.true:
         more = f"measured, {_without_noise(found.residual_nm, attained)}" if attained else "measured, with noise"
     if nm_per_mas and found.tilt_open_nm:
-        tilt, before = (figure(one / nm_per_mas) for one in (found.tilt_residual_nm, found.tilt_open_nm))
+        tilt, before = (rounded(one / nm_per_mas) for one in (found.tilt_residual_nm, found.tilt_open_nm))
         more = f"tilt {tilt} of {before} mas per axis; {more}"
     if loop.value == "ENDED":
         return tile(f"last: {residual} nm", f"of {flat}; {more}")
@@ -89,4 +89,4 @@ def _shaped(state: wire.ControllerState | None) -> bool:
 
 def _without_noise(residual_nm: float, attained: Attained) -> str:
     residual_nm, least_nm = sqrt(max(residual_nm**2 - attained.noise_nm**2, 0.0)), NOISE_FLOOR * attained.noise_nm
-    return f"{figure(residual_nm) if residual_nm > least_nm else f'below {figure(least_nm)}'} nm without noise"
+    return f"{rounded(residual_nm) if residual_nm > least_nm else f'below {rounded(least_nm)}'} nm without noise"

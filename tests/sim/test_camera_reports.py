@@ -1,4 +1,4 @@
-"""Reports of the simulated camera: figures of the wavefront, habitually late commands, and the readout region."""
+"""Reports of the simulated camera: statistics of the wavefront, habitually late commands, and the readout region."""
 
 from types import SimpleNamespace
 from typing import cast
@@ -13,16 +13,16 @@ from lowfc.contract.messages import EVENT, MIRROR_STATE, Log, wire
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from sim_camera.driver import SimulatedCamera
-from sim_camera.figures import BLOCK, MAX_BLOCKS, Figures, WavefrontFigures
 from sim_camera.lateness import WINDOW, Lateness
 from sim_camera.scene import Scene, Truth, Wavefront
+from sim_camera.wavefront_statistics import BLOCK, MAX_BLOCKS, WavefrontAccumulator, WavefrontStatistics
 
 NOLL = (2, 3, 4)
 
 
-def figures(*residuals_nm: float, nm_per_mas: float = 1.0, recent: int = 1) -> Figures:
-    """Figures of frames with this residual in every mode and over the pupil, and a disturbance twice as large."""
-    found = Figures(NOLL, nm_per_mas, recent)
+def statistics(*residuals_nm: float, nm_per_mas: float = 1.0, recent: int = 1) -> WavefrontAccumulator:
+    """Statistics of frames with this residual in every mode and over the pupil, and a disturbance twice as large."""
+    found = WavefrontAccumulator(NOLL, nm_per_mas, recent)
     for residual_nm in residuals_nm:
         modes = np.full(len(NOLL), residual_nm, np.float32)
         found.add(
@@ -39,26 +39,26 @@ def figures(*residuals_nm: float, nm_per_mas: float = 1.0, recent: int = 1) -> F
 
 
 @pytest.mark.parametrize("blocks", [2, MAX_BLOCKS - 1, MAX_BLOCKS, MAX_BLOCKS + 2, 2 * MAX_BLOCKS + 4])
-def test_figures_cover_the_second_half_of_a_run_of_any_length(monkeypatch: pytest.MonkeyPatch, blocks: int) -> None:
-    monkeypatch.setattr("sim_camera.figures.BLOCK", 2)
+def test_statistics_cover_the_second_half_of_a_run_of_any_length(monkeypatch: pytest.MonkeyPatch, blocks: int) -> None:
+    monkeypatch.setattr("sim_camera.wavefront_statistics.BLOCK", 2)
     half = blocks // 2 * 2
-    run = figures(*[5.0] * half, *[3.0] * (2 * blocks - half))
+    run = statistics(*[5.0] * half, *[3.0] * (2 * blocks - half))
     found = run.wavefront()
     assert (found.residual_rms_nm, found.tilt_disturbance_mas) == pytest.approx((3.0, 6.0), rel=0.05)
     assert len(run._blocks) < MAX_BLOCKS
 
 
-def test_figures_before_the_first_block_cover_all_frames() -> None:
-    assert figures().wavefront() is None
-    found = figures(*[3.0, 5.0] * (BLOCK // 4), nm_per_mas=2.0).wavefront()
+def test_statistics_before_the_first_block_cover_all_frames() -> None:
+    assert statistics().wavefront() is None
+    found = statistics(*[3.0, 5.0] * (BLOCK // 4), nm_per_mas=2.0).wavefront()
     assert found is not None
     rms_nm = np.sqrt((3**2 + 5**2) / 2)
-    assert found == WavefrontFigures(*(pytest.approx(value * rms_nm) for value in (2, 1, 1, 0.5))), "tilts per axis"
+    assert found == WavefrontStatistics(*(pytest.approx(value * rms_nm) for value in (2, 1, 1, 0.5))), "tilts per axis"
 
 
-def test_recent_figures_cover_only_recent_frames() -> None:
-    assert figures(recent=100).recent() is None
-    run = figures(*[50.0] * BLOCK, *[2.0] * 100, recent=100)
+def test_recent_statistics_cover_only_recent_frames() -> None:
+    assert statistics(recent=100).recent() is None
+    run = statistics(*[50.0] * BLOCK, *[2.0] * 100, recent=100)
     found, whole = run.recent(), run.wavefront()
     assert (found.residual_rms_nm, found.tilt_disturbance_mas) == pytest.approx((2.0, 4.0))
     assert whole.residual_rms_nm > 40.0, "includes the frames before"

@@ -17,7 +17,7 @@ MAX_BLOCKS = 256
 
 
 @dataclass(frozen=True, slots=True)
-class WavefrontFigures:
+class WavefrontStatistics:
     """Root mean squares over frames: nm over the open pupil, mas per axis.
 
     The first four are taken at the starts of exposures; the continuous ones over all time, from `instants` samples
@@ -39,7 +39,7 @@ class WavefrontFigures:
     costliest_share: float = 0.0
 
 
-class Figures:
+class WavefrontAccumulator:
     """Block sums over frames of the contrast added by each mode, and of the squared wavefront."""
 
     def __init__(self, noll: tuple[int, ...], nm_per_mas: float, recent: int = 1, instants: int = 0) -> None:
@@ -48,7 +48,7 @@ class Figures:
         Args:
             noll: Noll index of each mode of the truths.
             nm_per_mas: wavefront rms of a milliarcsecond of tilt.
-            recent: number of frames in the recent figures.
+            recent: number of frames in the recent statistics.
             instants: samples of each period in the continuous truth; 0 if it is not computed.
         """
         self._noll, self._instants = noll, instants
@@ -80,8 +80,8 @@ class Figures:
             self._blocks = [[one + other for one, other in zip(*pair, strict=True)] for pair in pairs]
             self._block *= 2
 
-    def wavefront(self) -> WavefrontFigures | None:
-        """Figures over the second half of the complete blocks, or over all frames before the first is complete.
+    def wavefront(self) -> WavefrontStatistics | None:
+        """Statistics over the second half of the complete blocks, or over all frames before the first is complete.
 
         Returns:
             None before the first frame.
@@ -93,23 +93,23 @@ class Figures:
             mean = np.array(self._sums) / self._count
         else:
             return None
-        return self._figures(mean)
+        return self._statistics(mean)
 
-    def recent(self) -> WavefrontFigures | None:
-        """Figures over the most recent frames; None before the first frame."""
+    def recent(self) -> WavefrontStatistics | None:
+        """Statistics over the most recent frames; None before the first frame."""
         found = self._recent[: self._frames]
-        return self._figures(found.mean(axis=0)) if len(found) else None
+        return self._statistics(found.mean(axis=0)) if len(found) else None
 
     def _squares(self, wavefront: Wavefront) -> tuple[float, ...]:
         disturbance_nm, residual_nm = wavefront.disturbance_nm[self._tilts], wavefront.residual_nm[self._tilts]
         pupil_nm2 = wavefront.disturbance_rms_nm**2, wavefront.residual_rms_nm**2
         return (*pupil_nm2, float(disturbance_nm @ disturbance_nm), float(residual_nm @ residual_nm))
 
-    def _figures(self, mean: npt.NDArray[np.float64]) -> WavefrontFigures:
+    def _statistics(self, mean: npt.NDArray[np.float64]) -> WavefrontStatistics:
         flat, added, squares = mean[0], mean[1 : 1 + len(self._noll)], mean[1 + len(self._noll) :]
         per = np.array([1, 1, *[2 * self._nm_per_mas**2] * 2])
         rms = np.sqrt(squares.reshape(-1, 4) / per).ravel().tolist()
         costliest_modes = costliest(by_group(self._noll, added)) if flat else ("", 0.0)
         contrast = float(flat), float(added.sum()), *costliest_modes
-        figures = [*rms[:4], self._instants, *(rms[4:] or [0.0] * 4), *contrast]
-        return WavefrontFigures(**dict(zip(WavefrontFigures.__annotations__, figures, strict=True)))
+        values = [*rms[:4], self._instants, *(rms[4:] or [0.0] * 4), *contrast]
+        return WavefrontStatistics(**dict(zip(WavefrontStatistics.__annotations__, values, strict=True)))

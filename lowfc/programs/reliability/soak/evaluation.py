@@ -46,8 +46,8 @@ def _grew(counts: Sequence[int]) -> bool:
     return bool(np.median(counts[-quarter:]) > np.median(counts[quarter : 2 * quarter]))
 
 
-def of_process(samples: Sequence[Usage]) -> dict[str, Any]:
-    """Figures of one process."""
+def process_statistics(samples: Sequence[Usage]) -> dict[str, Any]:
+    """Statistics of one process."""
     times_s, memory_bytes, handles, threads = zip(*samples, strict=True)
     memory_mb = [one / 1e6 for one in memory_bytes]
     memory = slope(times_s, memory_mb)
@@ -66,7 +66,7 @@ def of_process(samples: Sequence[Usage]) -> dict[str, Any]:
     return {**ends, **_per_hour("memory_mb", memory), "grows": grows, "too_short": too_short}
 
 
-def of_latency(samples: Sequence[tuple[float, float, float]]) -> dict[str, float | None]:
+def latency_statistics(samples: Sequence[tuple[float, float, float]]) -> dict[str, float | None]:
     """Median and drift of the latency, from samples of time, s, and p50 and p99 since the previous sample, us."""
     times_s, *each = zip(*samples, strict=True) if samples else ((), (), ())
     found: dict[str, float | None] = {}
@@ -88,11 +88,11 @@ def too_short(processes: Mapping[str, Mapping[str, Any]], latency: Mapping[str, 
     return found + ["the latency"] * (latency["p50_us_per_hour"] is None)
 
 
-def verdict(figures: Mapping[str, Any]) -> str:
+def verdict(results: Mapping[str, Any]) -> str:
     """Text of the verdict: passed, failed with the reasons, or too short to judge with the checks concerned."""
-    if figures["why"]:
-        return "FAILED: " + "; ".join(figures["why"])
-    return f"{TOO_SHORT}: {', '.join(figures['too_short'])}" if figures["too_short"] else "passed"
+    if results["why"]:
+        return "FAILED: " + "; ".join(results["why"])
+    return f"{TOO_SHORT}: {', '.join(results['too_short'])}" if results["too_short"] else "passed"
 
 
 def latency_in_words(latency: Mapping[str, float | None]) -> str:
@@ -109,7 +109,7 @@ def _change(per_hour: float | None, error: float | None, form: str, unit: str = 
     return TOO_SHORT if per_hour is None else f"{per_hour:{form}} +- {error:{form.removeprefix('+')}}{unit}"
 
 
-def render(figures: dict[str, Any]) -> str:
+def render(results: dict[str, Any]) -> str:
     """The results as text."""
     rows = [
         (
@@ -118,15 +118,15 @@ def render(figures: dict[str, Any]) -> str:
             _change(one["memory_mb_per_hour"], one["memory_mb_per_hour_error"], ".2f"),
             *(f"{one[f'{what}_first']} -> {one[f'{what}_last']}" for what in ("handles", "threads")),
         )
-        for name, one in figures["processes"].items()
+        for name, one in results["processes"].items()
     ]
     return "\n".join(
         [
             *table(("process", "memory, MB", "MB per hour", "handles", "threads"), rows),
-            f"frame to command: {latency_in_words(figures['latency'])}",
-            f"{counted(figures['frames_published'], 'frame')}, {figures['frames_skipped']} skipped, "
-            f"{figures['frames_missing']} missing; {counted(figures['messages_recorded'], 'message')} in "
-            f"{counted(figures['logs'], 'log')}, {figures['messages_lost']} lost, {figures['gaps']} gaps",
-            verdict(figures),
+            f"frame to command: {latency_in_words(results['latency'])}",
+            f"{counted(results['frames_published'], 'frame')}, {results['frames_skipped']} skipped, "
+            f"{results['frames_missing']} missing; {counted(results['messages_recorded'], 'message')} in "
+            f"{counted(results['logs'], 'log')}, {results['messages_lost']} lost, {results['gaps']} gaps",
+            verdict(results),
         ]
     )

@@ -26,8 +26,8 @@ from lowfc.control.laws.tuning import (
 from lowfc.control.laws.vibration import Model
 from lowfc.control.loop.wording import counted
 from lowfc.optics.chain.zernike import mode_name
-from lowfc.programs.cli.contrast import added_contrast, sentence_of, with_variances
-from lowfc.programs.cli.result import Result, figure
+from lowfc.programs.cli.contrast import added_contrast, added_contrast_in_words, with_variances
+from lowfc.programs.cli.result import Result, result_field
 from lowfc.programs.commissioning.tune.data import Telemetry
 
 OPTICAL_GAIN_MAS = 10.0
@@ -56,20 +56,20 @@ def present_law(run: Telemetry) -> LinearLaw:
 class TunedMode(Result):
     """A mode: residual now and with the tuned law, nm rms of wavefront, and the margins of the tuned law."""
 
-    noll: int = figure("mode", form="Z{}")
-    name: str = figure("name")
-    gain_now: float | None = figure("gain now", form=".3g")
-    gain_best: float = figure("best", form=".2f")
-    achieved_nm: float | None = figure("achieved", "nm", ".3f")
-    predicted_now_nm: float | None = figure("theory", "nm", ".3f")
-    kind: str = figure("tuned to")
-    predicted_nm: float = figure("predicted", "nm", ".3f")
-    integrator_predicted_nm: float = figure()
-    noise_nm: float = figure()
-    gain_margin: float | None = figure("gain margin", form=".2f")
-    phase_margin_deg: float = figure("phase margin", "deg", ".0f")
-    max_rejection: float = figure("max |S|", form=".2f")
-    lines: list[dict[str, float]] = figure()
+    noll: int = result_field("mode", form="Z{}")
+    name: str = result_field("name")
+    gain_now: float | None = result_field("gain now", form=".3g")
+    gain_best: float = result_field("best", form=".2f")
+    achieved_nm: float | None = result_field("achieved", "nm", ".3f")
+    predicted_now_nm: float | None = result_field("theory", "nm", ".3f")
+    kind: str = result_field("tuned to")
+    predicted_nm: float = result_field("predicted", "nm", ".3f")
+    integrator_predicted_nm: float = result_field()
+    noise_nm: float = result_field()
+    gain_margin: float | None = result_field("gain margin", form=".2f")
+    phase_margin_deg: float = result_field("phase margin", "deg", ".0f")
+    max_rejection: float = result_field("max |S|", form=".2f")
+    lines: list[dict[str, float]] = result_field()
 
     def remarks(self) -> Sequence[str]:
         """The detected lines, after the row."""
@@ -80,23 +80,23 @@ class TunedMode(Result):
 class TuneResult(Result):
     """The best law of a kind for a run, and its predicted residual."""
 
-    source: str = figure()
-    controller: str = figure()
-    law_now: str = figure()
-    rate_hz: float = figure()
-    delay_frames: float = figure()
-    closed: bool = figure()
-    frames: int = figure()
-    achieved_from: str | None = figure()
-    tilt_mas: dict[str, float | None] = figure()
-    added_contrast: dict[str, Any] | None = figure()
-    gain_margin: float | None = figure()
-    phase_margin_deg: float = figure()
-    max_rejection: float = figure()
-    modes: list[TunedMode] = figure()
-    warnings: list[str] = figure()
-    files: list[str] = figure(default=[])
-    applied: str | None = figure(default=None)
+    source: str = result_field()
+    controller: str = result_field()
+    law_now: str = result_field()
+    rate_hz: float = result_field()
+    delay_frames: float = result_field()
+    closed: bool = result_field()
+    frames: int = result_field()
+    achieved_from: str | None = result_field()
+    tilt_mas: dict[str, float | None] = result_field()
+    added_contrast: dict[str, Any] | None = result_field()
+    gain_margin: float | None = result_field()
+    phase_margin_deg: float = result_field()
+    max_rejection: float = result_field()
+    modes: list[TunedMode] = result_field()
+    warnings: list[str] = result_field()
+    files: list[str] = result_field(default=[])
+    applied: str | None = result_field(default=None)
 
     def head(self) -> Sequence[str]:
         """Source of the tuning data."""
@@ -112,7 +112,7 @@ class TuneResult(Result):
         cases = ", ".join(f"{names.get(name, name)} {rms:.2f}" for name, rms in tilt.items())
         return [
             *([f"tilt per axis, mas rms: {cases}"] if tilt else []),
-            *([] if self.added_contrast is None else [sentence_of(self.added_contrast)]),
+            *([] if self.added_contrast is None else [added_contrast_in_words(self.added_contrast)]),
             *(f"warning: {warning}" for warning in self.warnings),
             *(f"written: {file}" for file in self.files),
             *([] if self.applied is None else [self.applied]),

@@ -1,4 +1,4 @@
-"""All figures of a report, as one object for JSON."""
+"""All results of a report, as one object for JSON."""
 
 import re
 from dataclasses import dataclass
@@ -7,17 +7,17 @@ from datetime import UTC, datetime
 import numpy as np
 
 from lowfc.programs.logs.report import course
-from lowfc.programs.logs.report.budget import budget_figures
+from lowfc.programs.logs.report.budget import budget_results
 from lowfc.programs.logs.report.closed_loop import (
     groups_of,
     longest_stretch,
-    spectra_figures,
     spectra_of,
-    stretch_figures,
+    spectra_results,
+    stretch_results,
 )
-from lowfc.programs.logs.report.residual import residual_figures
-from lowfc.programs.logs.report.source import Figures, Run
-from lowfc.programs.logs.report.timing import timing_figures
+from lowfc.programs.logs.report.residual import residual_results
+from lowfc.programs.logs.report.source import Results, Run
+from lowfc.programs.logs.report.timing import timing_results
 from lowfc.programs.logs.report.verdict import verdict
 from lowfc.programs.logs.survey import recovery_in_words
 
@@ -26,46 +26,46 @@ _OTHER_KEYS = ("host", "kernel", "processor", "processors", "cpu_features", "bla
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """A run and its figures."""
+    """A run and its results."""
 
     run: Run
-    figures: Figures
+    results: Results
 
 
 def report_of(run: Run) -> Report:
-    """Compute all figures."""
+    """Compute all results."""
     history = run.history
     stretch = longest_stretch(run)
     spectra = spectra_of(stretch)
     noll = history.calibration.noll if history.calibration is not None else ()
     masks = groups_of(noll) | {"all modes": np.ones(len(noll), bool)}
-    figures: Figures = {
+    results: Results = {
         "log": _log(run),
         "run": _run(run),
         "mode_steps": course.mode_steps(history),
         "mode_spans": course.mode_spans(run),
         "laws": course.laws(run),
-        "closed_stretch": stretch_figures(run, stretch),
-        "timing": timing_figures(run),
-        "residual": residual_figures(run, stretch),
-        "spectra": spectra_figures(run, stretch, spectra),
-        "error_budget": budget_figures(run, stretch, spectra, masks),
-        "light": course.light_figures(history),
-        "mirror": course.mirror_figures(history),
+        "closed_stretch": stretch_results(run, stretch),
+        "timing": timing_results(run),
+        "residual": residual_results(run, stretch),
+        "spectra": spectra_results(run, stretch, spectra),
+        "error_budget": budget_results(run, stretch, spectra, masks),
+        "light": course.light_results(history),
+        "mirror": course.mirror_results(history),
         "events": course.events(run),
         "requests": course.requests(run),
     }
-    return Report(run, {"verdict": verdict(figures)} | figures)
+    return Report(run, {"verdict": verdict(results)} | results)
 
 
-def _log(run: Run) -> Figures:
+def _log(run: Run) -> Results:
     log = run.history.log
     account = log.metadata.get("recording", {})
     lost = {name.removeprefix("lost "): _count(text) for name, text in account.items() if name.startswith("lost ")}
     return {
         "file": log.path.name,
         "files": [path.name for path in log.paths],
-        "selection": log.selection.sentence,
+        "selection": log.selection.description,
         "bytes": log.size,
         "finished": log.finished,
         "complete": log.complete and not log.damage,
@@ -78,7 +78,7 @@ def _log(run: Run) -> Figures:
         "messages_lost": _count(account.get("messages_lost", "")),
         "lost_by_topic": {name: count for name, count in lost.items() if count is not None},
         "messages_unreadable": log.unreadable,
-        "steps_left_out": run.history.left_out,
+        "steps_left_out": run.history.excluded_messages,
     }
 
 
@@ -86,7 +86,7 @@ def _count(text: str) -> int | None:
     return int(text) if re.fullmatch("[0-9]{1,20}", text) else None  # the log may have any text
 
 
-def _run(run: Run) -> Figures:
+def _run(run: Run) -> Results:
     history = run.history
     about = history.log.metadata.get("lowfc", {})
     first_ns, last_ns = history.span_ns

@@ -1,4 +1,4 @@
-"""Latencies of frames as columns, and the figures of one repeat: percentiles, histograms, counts."""
+"""Latencies of frames as columns, and the statistics of one repeat: percentiles, histograms, counts."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -42,7 +42,7 @@ ALONE = {
     "hot_step_us": "  back to back",
     "timer_us": "timer wake-up",
 }
-"""Names and labels of the host's reference figures."""
+"""Names and labels of the host's reference times."""
 RATIOS = {"ratio": ("step_us", ""), "ratio_hot": ("hot_step_us", " of those back to back")}
 """Ratios of frame to command to half an echo plus the step named here, and what is added to the step's label."""
 RATIOS_AT = ("p50", "p99")
@@ -143,8 +143,8 @@ def histogram(values_us: Array) -> Long:
     return np.histogram(np.clip(known, edges[0], edges[-1]), edges)[0].astype(np.int64)
 
 
-def repeat_figures(frames: Frames) -> dict[str, Any]:
-    """Figures of one repeat, the warm-up left out.
+def repeat_statistics(frames: Frames) -> dict[str, Any]:
+    """Statistics of one repeat, the warm-up left out.
 
     A frame without a command counts as crowded out (superseded) if the next frame was published within half the mean
     period. Untimed frames have a command but no timing.
@@ -158,7 +158,7 @@ def repeat_figures(frames: Frames) -> dict[str, Any]:
     next_ns = np.append(np.diff(put_ns), np.iinfo(np.int64).max)
     found = {span: percentiles(values) for span, values in spans.items()}
     return {
-        "latency_us": {span: figures for span, figures in found.items() if figures is not None},
+        "latency_us": {span: values for span, values in found.items() if values is not None},
         "histogram": {span: histogram(values).tolist() for span, values in spans.items()},
         "over_time": _over_time(put_ns, spans["frame_to_command"]),
         "rate_hz": round(1e9 / period_ns, 3) if period_ns else 0.0,
