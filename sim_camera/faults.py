@@ -58,23 +58,12 @@ class Fault:
 
     def sent(self, index: int) -> tuple[int, ...]:
         """Indices of the frames that are published at the end of exposure `index`, the newest first."""
-        late = MAX_FRAMES_LATE if self.kind is Kind.LATE else 1
         return tuple(
-            frame for frame in range(index, max(index - late, 0) - 1, -1) for when in self._due(frame) if when == index
+            frame
+            for frame in range(index, max(index - MAX_FRAMES_LATE, 0) - 1, -1)
+            for when in _due(self, frame)
+            if when == index
         )
-
-    def _due(self, frame: int) -> tuple[int, ...]:
-        """Indices of the exposures at whose end a frame is published."""
-        match self.kind_at(frame):
-            case Kind.LOST if self.random(frame).random() < LOST_SHARE:
-                return ()
-            case Kind.DUPLICATED:
-                return frame, frame
-            case Kind.REORDERED:  # in pairs, the second one first
-                return (frame + 1 - (frame - self.first) % 2,)
-            case Kind.LATE:
-                return (frame + _delay(self, frame),)
-        return (frame,)
 
     def pixels(self, index: int, frame: Frame, before: Frame, dark: int, highest: int) -> Frame:
         """Detector output (rows, columns) in place of a frame.
@@ -113,10 +102,19 @@ class Fault:
         return message
 
 
-@lru_cache(maxsize=2 * MAX_FRAMES_LATE)
-def _delay(fault: Fault, frame: int) -> int:
-    """Frames by which a late frame is delayed."""
-    return int(fault.random(frame).integers(1, MAX_FRAMES_LATE + 1))
+@lru_cache(maxsize=2 * MAX_FRAMES_LATE)  # each exposure asks for all frames that may still be due
+def _due(fault: Fault, frame: int) -> tuple[int, ...]:
+    """Indices of the exposures at whose end a frame is published."""
+    match fault.kind_at(frame):
+        case Kind.LOST if fault.random(frame).random() < LOST_SHARE:
+            return ()
+        case Kind.DUPLICATED:
+            return frame, frame
+        case Kind.REORDERED:  # in pairs, the second one first
+            return (frame + 1 - (frame - fault.first) % 2,)
+        case Kind.LATE:
+            return (frame + int(fault.random(frame).integers(1, MAX_FRAMES_LATE + 1)),)
+    return (frame,)
 
 
 def _with_track(frame: Frame, rng: np.random.Generator, highest: int) -> Frame:
