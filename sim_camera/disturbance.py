@@ -267,14 +267,14 @@ class _Lines:
 
     def _advance(self, count: int) -> Complex:
         """Vectors (count, lines, moved) of the next `count` frames."""
-        found: Complex = np.empty((count + 1, *self._vector.shape), complex)
-        found[0], step, rows = self._vector, self._step[:, None], list(found)
         drawn = self._draw(count) * np.sqrt(1 - np.abs(self._step) ** 2)[:, None]
-        for before, after, new in zip(rows, rows[1:], drawn, strict=False):
-            np.multiply(step, before, after)
-            np.add(after, new, after)
-        self._next, self._vector = self._next + count, rows[-1].copy()
-        return found[:-1]
+        found: Complex = np.empty_like(drawn)
+        vector, step = self._vector, self._step[:, None]
+        for row in range(count):
+            found[row] = vector
+            vector = step * vector + drawn[row]
+        self._next, self._vector = self._next + count, vector
+        return found
 
 
 class Sampler:
