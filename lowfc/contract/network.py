@@ -2,8 +2,8 @@
 
 import ast
 import inspect
+from collections.abc import Iterator
 from itertools import pairwise
-from textwrap import dedent
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -15,14 +15,28 @@ class Section(BaseModel):
 
     @classmethod
     def descriptions(cls) -> dict[str, str]:
-        """Description of each key: the docstring below it. Only help asks; pydantic would read the source at import."""
-        found = {}
-        for section in reversed([one for one in cls.__mro__ if issubclass(one, Section)]):
-            for statement, below in pairwise(ast.parse(dedent(inspect.getsource(section))).body[0].body):  # type: ignore[attr-defined]
-                match statement, below:
-                    case ast.AnnAssign(target=ast.Name(id=key)), ast.Expr(value=ast.Constant(value=str(text))):
-                        found[key] = inspect.cleandoc(text)
+        """Description of each key: the docstring below it, empty without source.
+
+        Only help needs them: pydantic's `use_attribute_docstrings` would read the source at every import.
+        """
+        sections = [one for one in reversed(cls.__mro__) if issubclass(one, Section)]
+        found = {key: text for section in sections for key, text in _docstrings(section)}
         return {key: info.description or found.get(key, "") for key, info in cls.model_fields.items()}
+
+
+def _docstrings(section: type[Section]) -> Iterator[tuple[str, str]]:
+    """Keys of a class, with the docstrings below them; none if it has no source, as when a program made it."""
+    try:
+        source = inspect.getsource(section)
+    except (OSError, TypeError):
+        return
+    # Below a condition, the indentation of a class within a class is valid.
+    tree = ast.parse(f"if True:\n{source}" if source[0].isspace() else source)
+    declared = next(node for node in ast.walk(tree) if isinstance(node, ast.ClassDef))
+    for statement, below in pairwise(declared.body):
+        match statement, below:
+            case ast.AnnAssign(target=ast.Name(id=key)), ast.Expr(value=ast.Constant(value=str(text))):
+                yield key, inspect.cleandoc(text)
 
 
 class Network(Section):

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import tomli_w
+from pydantic import Field, create_model
 
 from lowfc.adapters.files.factory import detector, mirror, mirror_limits, settings
 from lowfc.contract.configuration import Configuration, keys, load
@@ -49,6 +50,22 @@ def test_every_key_has_a_description() -> None:
         assert found.keys() == section.model_fields.keys()
         subsections = {key for key, info in section.model_fields.items() if isinstance(info.default, Section)}
         assert [key for key, text in found.items() if not text.endswith(".") and key not in subsections] == []
+
+
+class Outer:
+    class Options(InterlockSection):
+        first: int = 1
+        """One line,
+and one at the margin."""
+        second: int = Field(2, description="Declared.")
+
+
+def test_descriptions_of_a_class_within_a_class_and_of_one_without_source() -> None:
+    inherited = InterlockSection.descriptions()
+    own = {"first": "One line,\nand one at the margin.", "second": "Declared."}
+    assert Outer.Options.descriptions() == inherited | own
+    made = create_model("Made", __base__=InterlockSection, third=(int, 3))
+    assert made.descriptions() == inherited | {"third": ""}
 
 
 def test_a_configuration_round_trips_through_toml(tmp_path: Path) -> None:
