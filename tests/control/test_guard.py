@@ -249,7 +249,7 @@ def test_with_shifted_lines_the_residual_is_at_most_the_integrators(short_settli
 
 
 def test_steps_of_the_disturbance_do_not_overrule_the_law(short_settling: None) -> None:
-    assert undisturbed(case("reaction-wheel", known=True), 1, minutes=0.06) == 0
+    assert undisturbed(case("reaction-wheel", known=True), 1, minutes=0.07) == 0
 
 
 def test_a_wrong_delay_is_detected_as_amplification() -> None:
