@@ -2,6 +2,8 @@
 
 import json
 import tempfile
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -98,9 +100,24 @@ def night() -> SyntheticLog:
     return night_
 
 
+@pytest.fixture(scope="module")
+def written(night: SyntheticLog, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], bytes]:
+    """Return a function from a configuration to the content of the log with it."""
+    return cache(lambda toml: night.write(tmp_path_factory.mktemp("night") / "night.mcap", toml=toml).read_bytes())
+
+
 @pytest.fixture
-def log(tmp_path: Path, night: SyntheticLog) -> Path:
-    return night.write(tmp_path / "night.mcap", toml=OTHER)
+def log_with(tmp_path: Path, written: Callable[[str], bytes]) -> Callable[[str], Path]:
+    def made(toml: str) -> Path:
+        (path := tmp_path / "night.mcap").write_bytes(written(toml))
+        return path
+
+    return made
+
+
+@pytest.fixture
+def log(log_with: Callable[[str], Path]) -> Path:
+    return log_with(OTHER)
 
 
 @pytest.mark.usefixtures("without_drawings")
@@ -147,9 +164,9 @@ def test_a_replay_does_not_depend_on_the_configuration(log: Path) -> None:
 
 @pytest.mark.parametrize(("toml", "rate_hz"), [(OTHER, 300.0), ("[camera", Configuration().camera.rate_hz)])
 def test_a_view_uses_the_recorded_or_the_default_configuration(
-    tmp_path: Path, night: SyntheticLog, toml: str, rate_hz: float
+    log_with: Callable[[str], Path], toml: str, rate_hz: float
 ) -> None:
-    log, tape = night.write(tmp_path / "night.mcap", toml=toml), Tape()
+    log, tape = log_with(toml), Tape()
     used: list[Configuration] = []
     drawn = draw_logs([log], None, lambda config: used.append(config) or Renderer(config, tape))  # type: ignore[arg-type]
     assert [config.camera.rate_hz for config in used] == [rate_hz]
@@ -157,8 +174,8 @@ def test_a_view_uses_the_recorded_or_the_default_configuration(
     assert toml != OTHER or drawn.remarks == attached_configuration_of(log)
 
 
-def test_an_acceptance_test_needs_a_configuration(tmp_path: Path, night: SyntheticLog) -> None:
-    log = night.write(tmp_path / "night.mcap", toml="[camera")
+def test_an_acceptance_test_needs_a_configuration(log_with: Callable[[str], Path]) -> None:
+    log = log_with("[camera")
     done = lowfc("acceptance", "noise-floor", log)
     assert isinstance(done.exception, DataFileError)
     assert "no configuration" in str(done.exception)

@@ -242,7 +242,7 @@ def test_several_threads_give_the_same_bytes(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_the_fused_step_agrees_on_random_frames_and_states(monkeypatch: pytest.MonkeyPatch) -> None:
-    counts, _ = compared(6_000, 500, monkeypatch)
+    counts, _ = compared(4_000, 500, monkeypatch)
     assert counts["fused"] > 1000
     assert counts["limits that only one saw"] <= 2
     for reason in (Rejection.SATURATED, Rejection.DARK, Rejection.STUCK, Limit.SLEW, Limit.MODAL_LIMIT, Limit.STROKE):

@@ -54,6 +54,7 @@ from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from sim_camera.driver import scene as configured_scene
 from sim_camera.scene import Scene, Wavefront
 from sim_dm.driver import SimulatedMirror
+from tests.support.in_process_loop import SMALL_MIRROR
 from tests.support.loops import until
 from tools.law_bench import calibrated
 
@@ -63,10 +64,13 @@ START_NS = 1_767_225_600_000_000_000
 
 def configured(**overrides: object) -> Configuration:
     bright = {"disturbance.preset": "quiet", "star.magnitude": -2.0, "lockstep": True, "mirror.settling_us": 0.0}
-    return load(None, FIXED_GAINS | bright | {key.replace("__", "."): value for key, value in overrides.items()})
+    return load(
+        None, FIXED_GAINS | SMALL_MIRROR | bright | {key.replace("__", "."): value for key, value in overrides.items()}
+    )
 
 
 CONFIG, CLOSED = configured(), configured(control__start_mode="closed")
+GRID = CONFIG.mirror.rows, CONFIG.mirror.columns
 
 
 class Rig:
@@ -75,7 +79,7 @@ class Rig:
     def __init__(self, config: Configuration, calibration: Calibration, scene: Scene) -> None:
         self.config, self.calibration, self.scene, self.hub = config, calibration, scene, MemoryHub()
         self.received: dict[str, list[Any]] = {}
-        self.offset_nm = np.zeros((34, 34), np.float32)
+        self.offset_nm = np.zeros(GRID, np.float32)
         self._index = 0
         self._newest = threading.Condition()
         self.operator = self.bus("operator")
@@ -138,7 +142,7 @@ class Rig:
     def inject(self, modes_nm: npt.ArrayLike) -> None:
         """Add modes to the wavefront, by a second mirror in the same place."""
         shape = self.calibration.modes_to_actuators @ np.asarray(modes_nm, np.float32)
-        self.offset_nm = shape.reshape(34, 34)
+        self.offset_nm = shape.reshape(GRID)
 
     def ask(self, name: str, *values: float, modes: tuple[int, ...] = ()) -> wire.Request:
         payload = wire.Request(modes=modes, values=values).SerializeToString()
@@ -444,7 +448,7 @@ def test_of_frames_that_waited_only_the_newest_is_integrated(calibration: Calibr
     assert used[0].command_nm[3] == pytest.approx(-config.control.gain * used[0].error_nm[3], rel=1e-3)
 
 
-NOT_FINITE = np.full((34, 34), np.nan, np.float32).tobytes()
+NOT_FINITE = np.full(GRID, np.nan, np.float32).tobytes()
 
 
 @pytest.mark.parametrize("actuators", [b"", NOT_FINITE])
@@ -457,7 +461,7 @@ def test_refused_commands_do_not_reset_the_command_timeout(
         rig.threads[1].join(PATIENCE_S)
         other = rig.bus("other").publisher(COMMAND, "dm")
         nonsense = wire.MirrorCommand(
-            rows=34, columns=34, actuators=actuators, frame_sequence=2**63, valid_for_ns=10**9
+            rows=GRID[0], columns=GRID[1], actuators=actuators, frame_sequence=2**63, valid_for_ns=10**9
         )
 
         def expired() -> bool:
