@@ -62,10 +62,10 @@ def few():
 
 
 def agree(measured, reference):
-    """Assert that the figures of two rows agree: to 1 %, or to five standard errors if they have one."""
-    for figure in ("paper", "predicted", "limit", "measured"):
-        found, expected = measured[figure], reference[figure]
-        if isinstance(expected, (int, float)) and figure == "measured" and reference["error"] is not None:
+    """Assert that the values of two rows agree: to 1 %, or to five standard errors if they have one."""
+    for column in ("paper", "predicted", "limit", "measured"):
+        found, expected = measured[column], reference[column]
+        if isinstance(expected, (int, float)) and column == "measured" and reference["error"] is not None:
             # The committed standard error is of many trials; scale it to few.
             allowed = 5.0 * reference["error"] * (1.0 + reference["trials"] / measured["trials"]) ** 0.5
         elif isinstance(expected, (int, float)):
@@ -74,9 +74,9 @@ def agree(measured, reference):
             if expected > 1e12:  # singular: rounding errors
                 allowed = float("inf") if found > 1e12 else 0.0
         else:
-            assert found == expected, (key(reference), figure)
+            assert found == expected, (key(reference), column)
             continue
-        assert found == pytest.approx(expected, abs=allowed), (key(reference), figure)
+        assert found == pytest.approx(expected, abs=allowed), (key(reference), column)
 
 
 def compare(found, committed):
@@ -307,7 +307,7 @@ TOLERANCE = {
     **{("fig6", quantity): _unexplained for quantity in ("R^2", "least R^2", "mean R^2")},
     **{("fig9", quantity): _a_fifth for quantity in ("least residual rms", "largest residual rms")},
 }
-"""Tolerance of ten trials for figures that depend on the draw and have no standard error."""
+"""Tolerance of ten trials for values that depend on the draw and have no standard error."""
 
 
 TABLE3 = {

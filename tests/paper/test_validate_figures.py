@@ -43,8 +43,8 @@ def test_every_row_is_finite_and_states_its_assumptions(tables, figure):
     for row in rows:
         assert row.assumption
         assert row.name.startswith("sam")
-        for figures in (row.measured, row.error, row.limit):
-            assert figures is None or isinstance(figures, str) or np.isfinite(figures)
+        for value in (row.measured, row.error, row.limit):
+            assert value is None or isinstance(value, str) or np.isfinite(value)
         if row.estimator is not None:
             assert row.modes == 14
         if isinstance(row.measured, str):
@@ -76,7 +76,7 @@ def test_masks_and_throughputs_are_those_of_the_sensors(tables):
     assert (
         light["reflected by the focal-plane mask / light on it"] == values(tables["fig3"], "reflected / light on it")[0]
     )
-    assert all(0 < part < 1 for part in light.values())
+    assert all(0 < fraction < 1 for fraction in light.values())
 
 
 def test_estimates_agree_with_true_coefficients(tables):
@@ -160,7 +160,7 @@ def test_the_linear_range_ends_at_a_deviation_of_ten_per_cent():
 
 
 @pytest.mark.slow
-def test_hundred_trials_reach_the_papers_figures():
+def test_hundred_trials_reach_the_papers_values():
     many = Context(trials=100, seed=1, jobs=2)
     fig6 = FIGURES["fig6"].run(many)
     assert values(fig6, "least R^2", "pinv", "sam")[0] > 0.95

@@ -171,14 +171,14 @@ def prepared(name: str) -> Prepared:
 
 @dataclass(frozen=True)
 class Row:
-    """One figure of a table.
+    """One value of a table.
 
     Attributes:
         name: Object of the measurement: a sensor, a mode, an element.
         quantity: Measured quantity.
         unit: Unit of all numbers; "" if they have none.
-        measured: Our figure.
-        paper: The paper's figure; None if it has none.
+        measured: Our value.
+        paper: The paper's value; None if it has none.
         error: Standard error of `measured` if it is a mean or scatter over trials; None if it is deterministic.
         predicted: Theoretical prediction of `measured`; None if not computed.
         limit: The Cramer-Rao bound, or another limit described in the assumption; None if there is none.
@@ -235,7 +235,7 @@ class Context:
     Attributes:
         trials: Number of wavefronts and noise realisations.
         seed: Seed of all random numbers.
-        jobs: Number of threads; the figures do not depend on it.
+        jobs: Number of threads; the results do not depend on it.
         sensors: Sensors that replace the table's own, if it has a choice.
         progress: Called with a description, the number of steps done, and the total.
     """

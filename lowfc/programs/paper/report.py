@@ -79,7 +79,7 @@ H. Subedi, N. T. Zimmerman, N. J. Kasdin, K. Cavanagh, A. J. E. Riggs, "Coronagr
 a sparse aperture mask", J. Astron. Telesc. Instrum. Syst. 1(3), 039001 (2015), figure by figure, with our masks.
 `{COMMAND}` generates this page.
 
-*lowfc* is our figure (`measured` in the JSON), with its standard error if it is a mean or a scatter over trials;
+*lowfc* is our value (`measured` in the JSON), with its standard error if it is a mean or a scatter over trials;
 *predicted* is its theoretical value; *limit* is the Cramer-Rao bound unless the assumption says otherwise. The paper's
 shaped pupil and sparse aperture mask are not published, so agreement to a few per cent is not expected: the
 assumptions, numbered below each table, give our choices where the paper is silent or contradicts itself.
@@ -87,7 +87,7 @@ assumptions, numbered below each table, give our choices where the paper is sile
 Three notes. Table 3 gives every sensor 40,000 e- in its brightest pixel, which rewards a mask that wastes light;
 Table 4 gives every sensor the same star, and there the Zernike sensor, which uses all of the light, beats every sparse
 aperture. In Table 3 the sparse aperture wins by its linearity, until the estimate is iterated on the full model: then
-CLOWFS wins. The scatter over 100 realisations has an uncertainty of 7 %: if a figure is near the paper's, compare
+CLOWFS wins. The scatter over 100 realisations has an uncertainty of 7 %: if a value is near the paper's, compare
 *predicted*.
 """
 
@@ -199,7 +199,7 @@ def _markdown(header: list[str], body: list[list[str]]) -> str:
 
 
 def _one_row_to_a_line(tables: Sequence[Table]) -> str:
-    """JSON with one row per line, so that a change of one figure is a change of one line."""
+    """JSON with one row per line, so that a change of one value is a change of one line."""
     parts = []
     for table in tables:
         rows = ",\n".join(json.dumps(row, allow_nan=False) for row in table["rows"])

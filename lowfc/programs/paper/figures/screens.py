@@ -65,21 +65,21 @@ def fig9(context: Context) -> list[Row]:
     rows = []
     for name in context.names("sam"):
         ready = prepared(name)
-        for width, how in WIDTHS.items():
+        for width, extent in WIDTHS.items():
             screens = _screens(context, name, width)
             values = {
                 key: np.array([_rms_waves(ready, each, key) for each in screens]) for key in (*_ESTIMATORS, _BEST)
             }
-            for k, part in enumerate(("reconstructed", "residual")):
-                limit = float(values[_BEST][:, k].mean()) if part == "residual" else None
-                paper = _PAPER_WAVES[part] if name.startswith("sam") else None
+            for k, quantity in enumerate(("reconstructed", "residual")):
+                limit = float(values[_BEST][:, k].mean()) if quantity == "residual" else None
+                paper = _PAPER_WAVES[quantity] if name.startswith("sam") else None
                 for key in (*_ESTIMATORS, _BEST):
                     mean, error = mean_and_error(values[key][:, k])
-                    fitted = partial(Row, f"{name}, {how}", modes=MODES, estimator=key)
-                    rows.append(fitted(f"{part} rms", "waves", mean, paper, error, limit=limit))
-                    if part == "residual" and key == PINV:
-                        rows.append(fitted(f"least {part} rms", "waves", float(values[key][:, k].min())))
-                        rows.append(fitted(f"largest {part} rms", "waves", float(values[key][:, k].max())))
+                    fitted = partial(Row, f"{name}, {extent}", modes=MODES, estimator=key)
+                    rows.append(fitted(f"{quantity} rms", "waves", mean, paper, error, limit=limit))
+                    if quantity == "residual" and key == PINV:
+                        rows.append(fitted(f"least {quantity} rms", "waves", float(values[key][:, k].min())))
+                        rows.append(fitted(f"largest {quantity} rms", "waves", float(values[key][:, k].max())))
     return assuming(
         rows,
         f"At most {SCREENS} screens of power law -11/3, scaled to {_INPUT_WAVES} waves rms over the open pupil; "

@@ -1,4 +1,4 @@
-"""Published figures of other systems, and lowfc's by the same definitions, with the assumptions."""
+"""Published results of other systems, and lowfc's by the same definitions, with the assumptions."""
 
 import json
 import subprocess
@@ -43,9 +43,9 @@ AVERAGED_S = 100.0
 DRIFT_PM = 20.0
 REACHED, NOT_REACHED = "reached", "not reached"
 
-ABOUT = """An anchor is a published figure and lowfc's figure by the same definition. *paper* is the published figure,
+ABOUT = """An anchor is a published value and lowfc's value by the same definition. *paper* is the published value,
 *limit* lowfc's with the noise of the quantum limit of the light. Loops are the real processes in lockstep, judged by
-the true wavefront in continuous time, over the second half of a run. A verdict compares lowfc's figure (the predicted
+the true wavefront in continuous time, over the second half of a run. A verdict compares lowfc's value (the predicted
 one, if theory gives one) with the published one.
 """
 LOOP = (
@@ -80,7 +80,7 @@ AGAINST_V = (
 
 
 def anchors(context: Context) -> list[Row]:
-    """Rows of every anchor, with a verdict if there is a published figure."""
+    """Rows of every anchor, with a verdict if there is a published value."""
     names = context.names(*LOOP_SENSORS)
     rows = [row for found in map(partial(_pointing, context), names) for row in found]
     rows += _hicat(context)
@@ -90,7 +90,7 @@ def anchors(context: Context) -> list[Row]:
 
 
 def _with_verdict(row: Row, allowed: float | None = None) -> list[Row]:
-    """A row and its verdict against the published or the allowed figure; by `predicted` if there is one."""
+    """A row and its verdict against the published or the allowed value; by `predicted` if there is one."""
     best, ours = row.paper if allowed is None else allowed, row.measured if row.predicted is None else row.predicted
     assert isinstance(ours, float)  # noqa: S101  # these are
     assert isinstance(best, float)  # noqa: S101

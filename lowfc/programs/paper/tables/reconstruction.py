@@ -158,11 +158,11 @@ def table3(context: Context) -> list[Row]:
 
 def _input_rows(sensor: Prepared, modes: int, wavefronts: Input, found: Ensemble) -> Iterator[Row]:
     drawn = partial(Row, f"input, pupil of {sensor.name}", modes=modes, assumption=wavefronts.assumption)
-    for figure, paper, (mean, error) in (
+    for statistic, paper, (mean, error) in (
         ("RMS", TABLE3_INPUT_WAVES, _rms(sensor, found.truth_nm)),
         ("P-V", INPUT_PV_WAVES, _pv(sensor, found.truth_nm)),
     ):
-        yield drawn(f"{figure}, {wavefronts.name} input", "waves", mean, paper[modes], error)
+        yield drawn(f"{statistic}, {wavefronts.name} input", "waves", mean, paper[modes], error)
 
 
 def _residual_rows(sensor: Prepared, modes: int, wavefronts: Input, found: Ensemble) -> Iterator[Row]:
@@ -172,11 +172,11 @@ def _residual_rows(sensor: Prepared, modes: int, wavefronts: Input, found: Ensem
         residuals_nm = found.truth_nm - estimates_nm
         assumption = "\n".join((wavefronts.assumption, NOISE, *((EVEN,) if estimator == WITH_NUISANCES else ())))
         fitted = partial(Row, sensor.name, unit="waves", modes=modes, estimator=estimator, assumption=assumption)
-        for figure, value, limit, (mean, error) in (
+        for statistic, value, limit, (mean, error) in (
             ("RMS", paper[0], found.bound_nm / sensor.sensor.wavelength_nm, _rms(sensor, residuals_nm)),
             ("P-V", paper[1], None, _pv(sensor, residuals_nm)),
         ):
-            what = f"{figure} residual, {wavefronts.name} input"
+            what = f"{statistic} residual, {wavefronts.name} input"
             yield fitted(what, measured=mean, paper=value, error=error, limit=limit)
 
 

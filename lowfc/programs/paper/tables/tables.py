@@ -87,7 +87,7 @@ TABLES: dict[str, Case] = {
 }
 
 ADDITIONAL: dict[str, Case] = {
-    "anchors": Case("Anchors: published figures and lowfc's", anchors.anchors, anchors.plot, None, anchors.ABOUT),
+    "anchors": Case("Anchors: published values and lowfc's", anchors.anchors, anchors.plot, None, anchors.ABOUT),
     "tolerance": Case(
         "Tolerated drift and lines", tolerance.tolerance, tolerance.plot, tolerance.in_text, tolerance.ABOUT
     ),
