@@ -43,7 +43,7 @@ test-all: $(VENV)/.tests node lint types  ## everything, the slow tests and thos
 	$(INSTALL) --editable '.[test,epics-test,basler]'
 	$(BIN)/python -m pytest
 
-bench: $(VENV)/.installed  ## time the loop beside the last release's figures; STORE=1 keeps them as this release's
+bench: $(VENV)/.installed  ## time the loop beside the last release's results; STORE=1 keeps them as this release's
 	@today=$$(mktemp); stored=benchmarks/history/$$($(BIN)/lowfc --version).json; \
 	test -z "$(STORE)" -o ! -e $$stored || { echo "$$stored is there already: remove it first" >&2; exit 1; }; \
 	$(BIN)/lowfc latency --json >$$today && \

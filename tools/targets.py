@@ -9,14 +9,14 @@ from lowfc.control.kernel.tables import KERNELS
 from tools.shared import Figures, markdown
 
 NUMPY = f"lowfc, {KERNELS[0]}"
-HEAD = ("figure", "target", "reached", "met", "lower bound", "what takes the time")
+HEAD = ("quantity", "target", "reached", "met", "lower bound", "what takes the time")
 
 
 class Target(NamedTuple):
-    """A target for one figure.
+    """A target for one quantity.
 
     Attributes:
-        what: the figure.
+        what: the quantity.
         most: largest value that meets the target.
         values: measured, one for each turn.
         form: format of a value.
