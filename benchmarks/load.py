@@ -106,15 +106,15 @@ def role_of(words: Sequence[str]) -> str | None:
 def run_lowfc(words: Sequence[str], seconds: float) -> dict[str, Any]:
     """JSON of `lowfc` with these arguments, and usage (`shares`); or failure: its last line of standard error."""
     command = [sys.executable, "-P", "-m", "lowfc", *words, "--duration", f"{seconds:g}", "--json"]
-    patience_s = _START_S + _SLOWEST * seconds
+    timeout_s = _START_S + _SLOWEST * seconds
     with tempfile.TemporaryDirectory() as folder, watched() as moments:
         where: dict[str, Any] = {"cwd": folder, "env": os.environ | {"XDG_RUNTIME_DIR": folder}}
         try:
             done = subprocess.run(  # noqa: S603  # our own
-                command, **where, capture_output=True, text=True, timeout=patience_s, check=False
+                command, **where, capture_output=True, text=True, timeout=timeout_s, check=False
             )
         except subprocess.TimeoutExpired:
-            return {"failure": f"not done after {patience_s:g} s"}
+            return {"failure": f"not done after {timeout_s:g} s"}
     if done.returncode:
         return {"failure": "; ".join(done.stderr.strip().splitlines()[-1:]) or f"exit status {done.returncode}"}
     found: dict[str, Any] = json.loads(done.stdout)

@@ -350,8 +350,8 @@ class Client:
             raise RequestRefusedError(
                 f"{name} refused: at most {most_bytes(name):,} bytes, got {len(payload):,}: send it in parts"
             )
-        patience_s = SLOW_ANSWER_S if len(payload) > LARGE_BYTES else ANSWER_S
-        return self._answer(name, self._get(REQUEST_KEY.format(name=name), payload, patience_s))
+        timeout_s = SLOW_ANSWER_S if len(payload) > LARGE_BYTES else ANSWER_S
+        return self._answer(name, self._get(REQUEST_KEY.format(name=name), payload, timeout_s))
 
     def _get(self, key: str, payload: bytes, answer_s: float, role: Role = Role.CONTROLLER) -> Sample:
         """Query one process; retry for a second while a new link has not found it yet."""

@@ -166,7 +166,7 @@ class CameraLoop:
             self._states.put(camera_state(settings, time_ns).SerializeToString())
             self._settings, self._due_ns = settings, time_ns + SETTINGS_NS
             self._simulated = settings.clock == "run"
-            self.watch.patience_s = max(PATIENCE_S, 3e-9 * settings.period_ns)
+            self.watch.timeout_s = max(PATIENCE_S, 3e-9 * settings.period_ns)
         return settings
 
     def _fill(self, health: wire.Health) -> None:

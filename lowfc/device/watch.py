@@ -49,11 +49,11 @@ class DriverWatch:
         retry_ns: time before which the driver is not called, ns of the host's clock.
     """
 
-    def __init__(self, service: Service, patience_s: float, hanging: Callable[[], None] = lambda: None) -> None:
+    def __init__(self, service: Service, timeout_s: float, hanging: Callable[[], None] = lambda: None) -> None:
         """Set the timeout of a call, after which `hanging` is called on another thread."""
         self.failures = self.failed_ns = self.retry_ns = 0
         self.hangs = False
-        self.patience_s = patience_s
+        self.timeout_s = timeout_s
         self._service = service
         self._hanging = hanging
         self._calls = self._checked_call = self._checks = self._consecutive = self._series = 0
@@ -112,7 +112,7 @@ class DriverWatch:
             self._checked_call, self._checks = self._calls, 0
             return
         self._checks += 1
-        if self._checks * CHECK_S >= self.patience_s and not self.hangs:
+        if self._checks * CHECK_S >= self.timeout_s and not self.hangs:
             self.hangs = True
             self._count()
             self._service.event("DRIVER_HANGS", hangs_s=self._checks * CHECK_S)

@@ -66,7 +66,7 @@ def test_every_panel_of_every_tab_shows_the_live_loop(live: str, artefacts: Path
             stream = target.stream(viewer, live, LIVE_WINDOW_S)
             stream.send_blueprint(blueprint)
             stream.disconnect()
-            picture = viewer.screenshot(artefacts / f"live-{tab}.png", patience_s=6)
+            picture = viewer.screenshot(artefacts / f"live-{tab}.png", timeout_s=6)
             assert pixels(picture).shape == (1000, 1600, 3)
             shown = {view.name: _shades(viewer, view.id) for view in _views(blueprint.root_container.contents[number])}
             assert len(shown) > 4

@@ -65,14 +65,14 @@ class Child:
         """Exit status; None while it runs, negative if a signal ended it."""
         return self.process.poll() if self.process is not None else None
 
-    def stop(self, patience_s: float) -> None:
+    def stop(self, timeout_s: float) -> None:
         """Send SIGTERM, wait, then SIGKILL if it is still running."""
         if self.process is None:
             return
         if self.status is None:
             self.process.send_signal(signal.SIGTERM)
             with contextlib.suppress(subprocess.TimeoutExpired):
-                self.process.wait(patience_s)
+                self.process.wait(timeout_s)
         if self.status is None:
             self.process.kill()
             self.process.wait()

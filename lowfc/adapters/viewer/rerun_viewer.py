@@ -134,11 +134,11 @@ class RerunViewer:
         """Whether its process exists; a hanging one does."""
         return self._child.process is not None and self._child.status is None
 
-    def answers(self, patience_s: float = 1.0) -> bool:
+    def answers(self, timeout_s: float = 1.0) -> bool:
         """Whether its server answers a new connection; a hanging one does not, although the kernel accepts it."""
         try:
-            with socket.create_connection((HOST, self.port), patience_s) as link:
-                link.settimeout(patience_s)
+            with socket.create_connection((HOST, self.port), timeout_s) as link:
+                link.settimeout(timeout_s)
                 link.sendall(_HTTP2_HELLO)
                 return bool(link.recv(9))
         except OSError:
@@ -165,22 +165,22 @@ class RerunViewer:
         self._failure()  # read for the last time
         self._stderr.close()
 
-    def screenshot(self, path: Path | None = None, patience_s: float = 20.0) -> bytes:
+    def screenshot(self, path: Path | None = None, timeout_s: float = 20.0) -> bytes:
         """PNG of the whole viewer once it has loaded and its image is constant, or after the timeout of either.
 
         Raises:
             ViewerError: the viewer does not answer, or has loaded nothing.
             DataFileError: the file cannot be written.
         """
-        deadline_s = time.monotonic() + patience_s
+        deadline_s = time.monotonic() + timeout_s
         while not ((state := self.state()).recordings and state.views and not state.loading):
             if time.monotonic() > deadline_s:
                 raise ViewerError(
                     f"the viewer has {len(state.recordings)} recordings, {len(state.views)} views and "
-                    f"{len(state.loading)} still to load after {patience_s:g} s; is anything sent to {self.url}?"
+                    f"{len(state.loading)} still to load after {timeout_s:g} s; is anything sent to {self.url}?"
                 )
             time.sleep(_POLL_S)
-        deadline_s = time.monotonic() + patience_s
+        deadline_s = time.monotonic() + timeout_s
         picture = before = b""
         while not picture or (picture != before and time.monotonic() < deadline_s):
             if picture:

@@ -41,9 +41,9 @@ class MirrorReports:
         """Whether a check is due."""
         return self._service.clock.host_ns() >= self._due_ns
 
-    def first(self, patience_s: float = 0.0) -> MirrorShape | None:
+    def first(self, timeout_s: float = 0.0) -> MirrorShape | None:
         """The first shape that the mirror reports; None without one, and later."""
-        sample = None if self._reported else self._states.take(patience_s)
+        sample = None if self._reported else self._states.take(timeout_s)
         try:
             shape = codec.decode_mirror(sample.payload) if sample is not None else None
         except BadMessageError as fault:

@@ -22,7 +22,7 @@ def start_all(children: list[Child]) -> None:
         raise
 
 
-def stop_all(children: list[Child], patience_s: float = 5.0) -> None:
+def stop_all(children: list[Child], timeout_s: float = 5.0) -> None:
     """Stop all, one after the other, in the order of the list."""
     for child in children:
-        child.stop(patience_s)
+        child.stop(timeout_s)

@@ -161,7 +161,7 @@ def _supervise(
         if not interrupted():
             check(children)
         if interrupted():
-            camera.stop(patience_s=5.0)
+            camera.stop(timeout_s=5.0)
         time.sleep(SETTLE_S)
         stop_all([*children[1:], camera])
         time.sleep(SHOW_S)  # for the last Health to arrive

@@ -207,7 +207,7 @@ class ChaosBench:
             raise CaseFailedError(f"{name} should have ended with exit status {status}, got {child.status}")
         return child.stderr_tail()
 
-    def end(self, patience_s: float = PATIENCE_S) -> None:
+    def end(self, timeout_s: float = PATIENCE_S) -> None:
         """Stop all processes; afterwards the outcome is complete."""
         self.mark("end")
         try:
@@ -215,7 +215,7 @@ class ChaosBench:
             rank = {str(name): number for number, name in enumerate(order)}
             for child in sorted(self._started, key=lambda one: rank[one.name]):
                 begun_s, running = time.monotonic(), child.status is None
-                child.stop(patience_s)
+                child.stop(timeout_s)
                 self._record_end(child, time.monotonic() - begun_s, requested=running)
             time.sleep(_LAST_HEALTH_S)
             last = self.health.get(Role.RECORDER, wire.Health())

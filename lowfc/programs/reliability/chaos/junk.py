@@ -54,9 +54,9 @@ class Intruder:
         self._publishers[topic].put(payload, self._clock.host_ns(), sequence_of(FORGED_S, self._counts[topic]))
         self._counts[topic] += 1
 
-    def ask(self, name: str, payload: bytes, patience_s: float) -> int:
+    def ask(self, name: str, payload: bytes, timeout_s: float) -> int:
         """Send a request to the controller; the number of answers."""
-        return len(self._bus.get(REQUEST_KEY.format(name=name), payload, patience_s))
+        return len(self._bus.get(REQUEST_KEY.format(name=name), payload, timeout_s))
 
 
 @case("junk", "random bytes on every topic, 2,000 a second", allowed=LOST, noisy=True)
