@@ -12,11 +12,6 @@ from lowfc.control.loop.wording import counted
 from lowfc.programs.cli.result import Result
 from lowfc.programs.logs.replay.difference import Difference
 
-_SUMS = (
-    *("frames", "commands", "states", "requests", "steps", "unchecked_because", "rules_changed", "log_s"),
-    *("inputs_missing", "commands_missing", "different"),
-)
-
 
 class Account(Result):
     """Result of a replay, and the state of the logs.
@@ -79,8 +74,9 @@ class Account(Result):
 
     def add(self, later: "Account") -> None:
         """Add the account of the next segment, whose worker has read the logs further."""
-        for name in _SUMS:
-            setattr(self, name, getattr(self, name) + getattr(later, name))
+        for name, field in type(self).model_fields.items():
+            if field.annotation in (int, Counter[str]) or name == "log_s":
+                setattr(self, name, getattr(self, name) + getattr(later, name))
         self.first_difference = self.first_difference or later.first_difference
         self.other_kernel = self.other_kernel or later.other_kernel
         self.largest_difference_nm = max(self.largest_difference_nm, later.largest_difference_nm)
