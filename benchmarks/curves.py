@@ -33,11 +33,11 @@ from lowfc.programs.measure.frame_source import Payloads
 from lowfc.programs.measure.latency.frame_statistics import WARM_UP_S
 
 AXES = {
-    "pixels": ((32, 48, 64, 80, 128, 192, 256, 384, 512), "side", "pixels across the frame"),
-    "modes": ((5, 10, 20, 50, 100, 200, 500), "modes", "number of modes"),
-    "actuators": ((10, 16, 23, 34, 48, 64), "mirror_side", "actuators across the mirror"),
+    "pixels": ((32, 48, 64, 80, 128, 192, 256, 384, 512), "side", "sides of square frames: 80 is 80 x 80 pixels"),
+    "modes": ((5, 10, 20, 50, 100, 200, 500), "modes", "numbers of modes"),
+    "actuators": ((10, 16, 23, 34, 48, 64), "mirror_side", "sides of square mirrors: 34 is 34 x 34 actuators"),
 }
-"""Sizes of each curve, their field of `Size`, and its description."""
+"""Sizes of each curve, their field of `Size`, and their description."""
 RATE_HZ = 250.0
 
 _STEP = ("step_us", "stream_us", "products_us")
@@ -113,7 +113,8 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rate", type=float, default=RATE_HZ, help="frames per second of the loop (%(default)g)")
     parser.add_argument("--loop", action=argparse.BooleanOptionalAction, default=True, help="measure the loop too")
     for name, (sizes, _, what) in AXES.items():
-        parser.add_argument(f"--{name}", type=int, nargs="*", default=sizes, metavar="N", help=f"{what} (%(default)s)")
+        known = f"{what}; none: no such curve (default: {' '.join(map(str, sizes))})"
+        parser.add_argument(f"--{name}", type=int, nargs="*", default=sizes, metavar="N", help=known)
 
 
 def measure(options: argparse.Namespace, tell: Tell) -> Result:
