@@ -38,9 +38,9 @@ def test_a_running_loop_is_calibrated_interrupted_and_gone_on_with(tmp_path: Pat
         until(running)
         calibrating = start(tmp_path, "calibrate", "--cycles", "400", "--out", "night.fits")
         until((tmp_path / "night.fits.part.npz").exists, timeout_s=90)
-        _, said = interrupt(calibrating)
+        _, stderr = interrupt(calibrating)
         assert calibrating.returncode == 130
-        assert "kept in night.fits.part.npz: " in said
+        assert "kept in night.fits.part.npz: " in stderr
         with Client() as client:
             until(lambda: flat(client))
         done = run(tmp_path, "calibrate", "--cycles", "5", "--resume", "--out", "night.fits", "--json")
@@ -98,8 +98,8 @@ def test_rejection_of_a_running_loop_and_of_its_log(tmp_path: Path) -> None:
         until(lambda: recorded_bytes(tmp_path) > 4_000_000)
         done = run(tmp_path, "acceptance", "rejection", *words)
     finally:
-        _, said = interrupt(running)
-    assert done.returncode == 0, done.stdout + done.stderr + said
+        _, stderr = interrupt(running)
+    assert done.returncode == 0, done.stdout + done.stderr + stderr
     live = json.loads(done.stdout)
     assert live["passed"]
     assert live["rate_hz"] == pytest.approx(250, rel=0.01)

@@ -37,7 +37,7 @@ def night(tmp_path_factory: pytest.TempPathFactory) -> Night:
 
 
 @pytest.fixture(scope="module")
-def said(night: Night) -> dict[str, list[bytes]]:
+def logged(night: Night) -> dict[str, list[bytes]]:
     return payloads(night.log)
 
 
@@ -61,21 +61,21 @@ def test_the_residual_is_as_small_as_before(night: Night) -> None:
     assert after_nm < 1.2 * before_nm
 
 
-def test_commands_contain_the_flat_map_and_leave_dead_actuators_at_zero(said: dict[str, list[bytes]]) -> None:
-    calibration = decode_calibration(wire.Calibration.FromString(said[f"/{CALIBRATION.key}"][0]))
+def test_commands_contain_the_flat_map_and_leave_dead_actuators_at_zero(logged: dict[str, list[bytes]]) -> None:
+    calibration = decode_calibration(wire.Calibration.FromString(logged[f"/{CALIBRATION.key}"][0]))
     expected = flat_nm().reshape(-1)
     expected[list(DEAD)] = 0
-    messages = [wire.MirrorCommand.FromString(body) for body in said[f"/{COMMAND.at('dm')}"][:300]]
+    messages = [wire.MirrorCommand.FromString(body) for body in logged[f"/{COMMAND.at('dm')}"][:300]]
     for message in messages:
         beside = np.frombuffer(message.actuators, "<f4") - calibration.modes_to_actuators @ message.command_nm
         assert not np.frombuffer(message.actuators, "<f4")[list(DEAD)].any()
         np.testing.assert_allclose(beside, expected, atol=1e-3)
 
 
-def test_the_mean_command_is_published_once_a_second(said: dict[str, list[bytes]]) -> None:
+def test_the_mean_command_is_published_once_a_second(logged: dict[str, list[bytes]]) -> None:
     """By counting frames, at 1000 Hz: for another adaptive-optics system to take over."""
-    steps = [wire.ControlStep.FromString(body) for body in said[f"/{STEP.key}"]]
-    offloads = [wire.ModalOffload.FromString(body) for body in said[f"/{OFFLOAD.key}"]]
+    steps = [wire.ControlStep.FromString(body) for body in logged[f"/{STEP.key}"]]
+    offloads = [wire.ModalOffload.FromString(body) for body in logged[f"/{OFFLOAD.key}"]]
     assert len(offloads) == len(steps) // 1000 > 2
     commands = {step.frame_sequence: step.command_nm for step in steps}
     for offload in offloads:

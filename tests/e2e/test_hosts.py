@@ -97,7 +97,7 @@ class Bench:
         return [*words, "--run", RUN, "--config", str(host.folder / "lowfc.toml")]
 
     def seen(self) -> list[dict[str, Any]]:
-        """Everything the observer said so far."""
+        """Everything that the observer printed so far."""
         lines = self.lab.middle.stderr("observer").splitlines()
         found = []
         for line in lines:
@@ -120,13 +120,13 @@ class Bench:
             time.sleep(0.05)
 
     def settled(self, timeout_s: float = 40) -> None:
-        """Twenty good frames in a row and the mirror at them, all heard from now on."""
+        """Twenty good frames in a row and the mirror at them, all received from now on."""
         start = len(self.seen())
 
         def good() -> bool:
             new = self.seen()[start:]
-            heard = all(sum(one[what] for one in new) > 30 for what in ("steps", "states"))
-            return heard and new[-1]["good"] > 20 and new[-1]["following"] > 20
+            received = all(sum(one[what] for one in new) > 30 for what in ("steps", "states"))
+            return received and new[-1]["good"] > 20 and new[-1]["following"] > 20
 
         self.wait(good, "a closed loop", timeout_s)
 
@@ -159,9 +159,9 @@ def clock_offset_ns(host: Host) -> int:
 def test_clocks_are_known_and_the_operators_hand_and_a_view_reach_the_loop_from_the_desk(bench: Bench) -> None:
     bench.settled()
     desk = bench.lab["desk"]
-    told = desk.run("-m", "lowfc", "hosts", "--run", RUN, "--json")
-    assert told.returncode == 0, told.stderr
-    rows = {row["process"]: row for row in json.loads(told.stdout)["processes"]}
+    done = desk.run("-m", "lowfc", "hosts", "--run", RUN, "--json")
+    assert done.returncode == 0, done.stderr
+    rows = {row["process"]: row for row in json.loads(done.stdout)["processes"]}
     assert {*PLACES, ROUTER} <= set(rows)
     for process, place in PLACES.items():
         truth_us = (clock_offset_ns(bench.lab.middle) - clock_offset_ns(bench.lab[place])) / 1e3
@@ -183,9 +183,9 @@ def test_a_log_of_several_hosts_says_how_far_its_latencies_can_be_trusted(bench:
     done = desk.run("-m", "lowfc", "ctl", "record", "stop", "--run", RUN)
     assert done.returncode == 0, done.stderr
     log = next(path for path in (desk.folder / "logs").iterdir() if path.suffix == ".mcap")
-    told = desk.run("-m", "lowfc", "latency", str(log), "--json", timeout_s=90)
-    assert told.returncode == 0, told.stderr
-    results = json.loads(told.stdout)
+    done = desk.run("-m", "lowfc", "latency", str(log), "--json", timeout_s=90)
+    assert done.returncode == 0, done.stderr
+    results = json.loads(done.stdout)
     bound_us = results["host"]["clock_error_us"]
     assert bound_us > 0
     # by the hosts' own clocks, frames would come 287 ms before they are sent, and the mirror 3 s after them
@@ -274,10 +274,10 @@ try:
 except zenoh.ZError:
     print("not let in")
     sys.exit()
-heard, answers = set(), set()
+received, answers = set(), set()
 for key in ("**", "lowfc/**", "lowfc/mirror/dm/command", "lowfc/camera/frame", "lowfc/control/step", "lowfc/event"):
     session.declare_subscriber(
-        key, lambda sample: heard.add(str(sample.key_expr)), allowed_origin=zenoh.Locality.REMOTE
+        key, lambda sample: received.add(str(sample.key_expr)), allowed_origin=zenoh.Locality.REMOTE
     )
 command = wire.MirrorCommand(
     timestamp=timestamp(time.time_ns()), frame_sequence=2**62, channel="forged", valid_for_ns=10**9, rows=34,
@@ -289,7 +289,7 @@ for _ in range(100):
     time.sleep(0.01)
 for key in ("lowfc/request/status", "lowfc/request/safe", "lowfc/record/stop", "@/*/router/**"):
     answers |= {str(reply.ok.key_expr) for reply in session.get(key, timeout=1.0) if reply.ok is not None}
-print(sorted(heard), sorted(answers))
+print(sorted(received), sorted(answers))
 session.close()
 """
 

@@ -88,14 +88,14 @@ def test_an_invalid_calibration_is_refused(tmp_path: Path) -> None:
 def test_a_port_in_use_is_named(tmp_path: Path) -> None:
     held = open_run("mistakes-port")
     try:
-        with socket.socket() as taken:
-            taken.bind(("127.0.0.1", held.links.ports["recorder"]))
-            taken.listen()
+        with socket.socket() as busy:
+            busy.bind(("127.0.0.1", held.links.ports["recorder"]))
+            busy.listen()
             port = str(held.links.ports["recorder"])
-            said = _refused(tmp_path, "record", "--run", "mistakes-port", expected=port)
-        assert "Address already in use" in said
-        assert ".rs" not in said
-        assert "cargo" not in said
+            stderr = _refused(tmp_path, "record", "--run", "mistakes-port", expected=port)
+        assert "Address already in use" in stderr
+        assert ".rs" not in stderr
+        assert "cargo" not in stderr
     finally:
         held.remove()
 

@@ -43,7 +43,7 @@ class Night:
     folder: Path
     process: "Popen[str]"
     name: str = ""
-    said: dict[str, str] = field(default_factory=dict)
+    outputs: dict[str, str] = field(default_factory=dict)
     results: dict[str, object] = field(default_factory=dict)
     logs: list[Path] = field(default_factory=list)
 
@@ -51,7 +51,7 @@ class Night:
         words = [str(self.folder / word) if (self.folder / word).is_file() else word for word in shlex.split(command)]
         done = CliRunner().invoke(ctl_app, [*words[2:], "--run", self.name], catch_exceptions=False)
         assert done.exit_code == 0, done.output
-        self.said[command] = done.stdout
+        self.outputs[command] = done.stdout
         return done.stdout
 
     def end(self) -> None:
@@ -63,7 +63,7 @@ class Night:
 
 @pytest.fixture(scope="module")
 def night(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Night]:
-    """All of it is done once; the tests look at what it said and left."""
+    """All of it is done once; the tests look at what it printed and left."""
     folder = tmp_path_factory.mktemp("night")
     before = set(running())
     (folder / "test.toml").write_text(FIXED)
@@ -78,7 +78,7 @@ def night(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Night]:
         for command in COMMANDS:
             made.ctl(command)
         for number, program in enumerate(PROGRAMS):
-            made.said[f"program {number}"] = _program(made, program)
+            made.outputs[f"program {number}"] = _program(made, program)
         _the_rest(made)
         made.end()
         yield made
@@ -105,12 +105,12 @@ def _ready(night: Night) -> None:
 
 def _program(night: Night, program: str) -> str:
     """A program of the document, in this process; only the run has another name."""
-    said = io.StringIO()
+    printed = io.StringIO()
     words = program.replace('"bench"', repr(night.name)).replace("Client()", f"Client({night.name!r})")
     words = words.replace('"lowfc", "config"', f"{sys.executable!r}, '-m', 'lowfc', 'config'")
-    with contextlib.redirect_stdout(said):
+    with contextlib.redirect_stdout(printed):
         exec(compile(words, DOCUMENT.name, "exec"), {"__name__": "example"})  # noqa: S102  # our own document's
-    return said.getvalue()
+    return printed.getvalue()
 
 
 def _the_rest(night: Night) -> None:
@@ -122,7 +122,7 @@ def _the_rest(night: Night) -> None:
         shapes[0, 10:20, 10:20], shapes[1, 5:9, 20:30] = 2.0, -3.0
         steps = loop.steps(60)
         first = loop.play(shapes, np.ones((20, 2))).frame_sequence
-        night.said["played"] = json.dumps([len(list(steps)), steps.lost])
+        night.outputs["played"] = json.dumps([len(list(steps)), steps.lost])
         until(lambda: not loop.status().state.HasField("play"))  # type: ignore[union-attr]
         loop.step(5)
         until(lambda: loop.status().reply == "open")
@@ -143,7 +143,7 @@ def _the_rest(night: Night) -> None:
         with loop.reserved("a test", 30.0), Client(night.name) as other:
             with pytest.raises(RequestRefusedError, match=r"reserved for a test by .*, about \d+ s to go"):
                 other.gain(0.1)
-            night.said["while reserved"] = night.ctl("lowfc ctl status")
+            night.outputs["while reserved"] = night.ctl("lowfc ctl status")
             loop.gain(0.05)
             loop.check_lease()
             other.open_loop()
@@ -151,19 +151,19 @@ def _the_rest(night: Night) -> None:
                 loop.check_lease()
         loop.close_loop()
         loop.pause()
-        night.said["while paused"] = night.ctl("lowfc ctl status --json")
+        night.outputs["while paused"] = night.ctl("lowfc ctl status --json")
         loop.close_loop()
         loop.record(False)
-        night.said["while stopped"] = night.ctl("lowfc ctl status --json")
+        night.outputs["while stopped"] = night.ctl("lowfc ctl status --json")
         loop.record(True)
         until(lambda: loop.processes()["controller"].mode == wire.LOOP_MODE_CLOSED)
         until(lambda: not loop.processes()["recorder"].recording.stopped)
     words = (("ctl", "note", "here", "--run", night.name[:-1]), ("runs", "--json"), ("hosts",))
-    for name, said in zip(("beginning", "runs", "hosts"), words, strict=True):
-        night.said[name] = lowfc(*said).stdout
+    for name, arguments in zip(("beginning", "runs", "hosts"), words, strict=True):
+        night.outputs[name] = lowfc(*arguments).stdout
     for command in ("lowfc ctl status --json", "lowfc ctl note once --json", "lowfc ctl configuration --json"):
         night.ctl(command)
-    night.said["refused"] = str(lowfc("ctl", "gain", "-0.1", "--modes", "2", "--run", night.name).exception)
+    night.outputs["refused"] = str(lowfc("ctl", "gain", "-0.1", "--modes", "2", "--run", night.name).exception)
     with Client(night.name) as loop:
         list(loop.steps(250))  # so that the last log holds the controller's state, which comes once a second
 
@@ -174,54 +174,54 @@ def test_every_request_is_made_by_a_command_of_the_document() -> None:
 
 
 def test_the_commands_say_what_they_did(night: Night) -> None:
-    said = night.said
+    outputs = night.outputs
     well = (
         r"closed · residual [\d.]+ nm rms, noise included( \(true [\d.]+\))? · light \d+ % · "
         r"\d+ frames? lost · recording "
     )
-    assert re.match(well, said["lowfc ctl status"])
-    assert "loop           closed" in said["lowfc ctl status"]
-    assert 'preset = "bench"' in said["lowfc ctl configuration"]
-    assert "loop closed for 50 frames, from frame" in said["lowfc ctl step 50"]
-    assert "gain is now 0.4 0.4 0.05" in said["lowfc ctl gain 0.4 --modes 2,3"]
-    assert "leak is now 0 0 0.001 0.001" in said["lowfc ctl leak 0.001 --modes 4-11"]
-    assert "offset is now 0 0 5 0" in said["lowfc ctl offset 5 -3 --modes 4,11"]
-    assert "channel dark-hole: 1.47 nm rms of surface" in said["lowfc ctl channel dark-hole shape.npy"]
-    assert "mask-moving is true; no interlock is configured (run" in said["lowfc ctl bench mask-moving true"]
-    assert "'leaky' takes over" in said["lowfc ctl law law.fits"]
-    assert [re.split("[,;]", said[f"lowfc ctl {name}"])[0] for name in ("safe", "clear", "pause", "close")] == [
+    assert re.match(well, outputs["lowfc ctl status"])
+    assert "loop           closed" in outputs["lowfc ctl status"]
+    assert 'preset = "bench"' in outputs["lowfc ctl configuration"]
+    assert "loop closed for 50 frames, from frame" in outputs["lowfc ctl step 50"]
+    assert "gain is now 0.4 0.4 0.05" in outputs["lowfc ctl gain 0.4 --modes 2,3"]
+    assert "leak is now 0 0 0.001 0.001" in outputs["lowfc ctl leak 0.001 --modes 4-11"]
+    assert "offset is now 0 0 5 0" in outputs["lowfc ctl offset 5 -3 --modes 4,11"]
+    assert "channel dark-hole: 1.47 nm rms of surface" in outputs["lowfc ctl channel dark-hole shape.npy"]
+    assert "mask-moving is true; no interlock is configured (run" in outputs["lowfc ctl bench mask-moving true"]
+    assert "'leaky' takes over" in outputs["lowfc ctl law law.fits"]
+    assert [re.split("[,;]", outputs[f"lowfc ctl {name}"])[0] for name in ("safe", "clear", "pause", "close")] == [
         "loop in safe mode",
         "loop open",
         "loop paused: the command is held until `lowfc ctl close`",
         "loop closed",
     ]
-    assert all(f"run {night.name}" in said[command] for command in COMMANDS), "every answer names its run"
-    status = json.loads(said["lowfc ctl status --json"])
+    assert all(f"run {night.name}" in outputs[command] for command in COMMANDS), "every answer names its run"
+    status = json.loads(outputs["lowfc ctl status --json"])
     assert (status["mode"], status["law"]["name"], status["offset_rms_nm"]) == ("closed", "integrator", 0.0)
     assert (status["run"], status["paused"], status["recording"]) == (night.name, False, "recording")
-    paused, stopped = json.loads(said["while paused"]), json.loads(said["while stopped"])
+    paused, stopped = json.loads(outputs["while paused"]), json.loads(outputs["while stopped"])
     assert (paused["mode"], paused["paused"], stopped["recording"]) == ("open", True, "stopped")
-    (run,) = json.loads(said["runs"])["runs"]
+    (run,) = json.loads(outputs["runs"])["runs"]
     assert (run["run"], run["mode"], run["holding"], run["recording"]) == (night.name, "closed", None, "recording")
     assert run.keys() == {"run", "mode", "holding", "rate_hz", "uptime_s", "processes", "recording", "log"}
     processes = [(one["process"], one["state"]) for one in run["processes"]]
     names = ("camera", "controller", "mirror-dm", "recorder")
     assert [name for name, _ in processes] == list(names)
-    assert all(name in said["hosts"] for name in names)
-    assert said["hosts"].endswith("no clock is compared: the run has no router, or its router reports no clock\n")
-    assert f"run {night.name}" in said["beginning"]
+    assert all(name in outputs["hosts"] for name in names)
+    assert outputs["hosts"].endswith("no clock is compared: the run has no router, or its router reports no clock\n")
+    assert f"run {night.name}" in outputs["beginning"]
     assert status["channels"] == []
-    assert json.loads(said["lowfc ctl note once --json"])["reply"] == "noted"
-    assert json.loads(said["lowfc ctl configuration --json"])["camera"]["rate_hz"] == 200.0
-    assert said["refused"].startswith("gain refused: gain must be at least 0")
+    assert json.loads(outputs["lowfc ctl note once --json"])["reply"] == "noted"
+    assert json.loads(outputs["lowfc ctl configuration --json"])["camera"]["rate_hz"] == 200.0
+    assert outputs["refused"].startswith("gain refused: gain must be at least 0")
 
 
 def test_the_programs_of_the_document_run(night: Night) -> None:
-    assert "frames lost on their way: 0" in night.said["program 0"]
-    assert "mean image (" in night.said["program 0"]
-    assert night.said["program 1"].startswith("True gain is now 0.3 0.3")
-    assert json.loads(night.said["played"]) == [60, 0]
-    assert "reserved       for a test by " in night.said["while reserved"]
+    assert "frames lost on their way: 0" in night.outputs["program 0"]
+    assert "mean image (" in night.outputs["program 0"]
+    assert night.outputs["program 1"].startswith("True gain is now 0.3 0.3")
+    assert json.loads(night.outputs["played"]) == [60, 0]
+    assert "reserved       for a test by " in night.outputs["while reserved"]
 
 
 def test_the_log_has_every_request_and_nothing_was_lost(night: Night) -> None:
@@ -244,8 +244,8 @@ def test_the_log_has_every_request_and_nothing_was_lost(night: Night) -> None:
     commanded = Counter(command.split()[2] for command in COMMANDS)
     for name, count in commanded.items():
         assert name in ("record", "bench") or sum(counts[name, good] for good in (True, False)) >= count
-    taken = [request.input_number for request in requests if request.input_number]
-    assert taken == sorted(taken)
+    input_numbers = [request.input_number for request in requests if request.input_number]
+    assert input_numbers == sorted(input_numbers)
     events = [Log.FromString(body).message for found in messages for body in found[f"/{EVENT.key}"]]
     for expected in (
         "RECORDING_STOPPED recording stopped: operator asked",

@@ -65,10 +65,10 @@ class Tool:
     """A user's own program: it is a role without a port, and has no health."""
 
     def __init__(self, run: Run, *topics: Topic) -> None:
-        self.heard: dict[str, list[Sample]] = defaultdict(list)
+        self.received: dict[str, list[Sample]] = defaultdict(list)
         self.bus = ZenohBus(run.links, "operator", HostClock())
         for topic in topics:
-            self.bus.subscribe(topic, lambda sample: self.heard[sample.key].append(sample))
+            self.bus.subscribe(topic, lambda sample: self.received[sample.key].append(sample))
 
 
 @pytest.fixture
@@ -96,7 +96,7 @@ def test_a_subscriber_receives_the_log_in_order_and_at_its_rate(
 ) -> None:
     begun_ns = tool.bus.clock.host_ns()
     playing = start(log, run, "--speed", "2")
-    until(lambda: tool.heard[FRAME.key] or playing.poll() is not None)
+    until(lambda: tool.received[FRAME.key] or playing.poll() is not None)
     (calibration,) = tool.bus.get(CALIBRATION.key)
     (camera,) = tool.bus.get(CAMERA_STATE.key)
     results = results_of(playing)
@@ -104,25 +104,25 @@ def test_a_subscriber_receives_the_log_in_order_and_at_its_rate(
     assert calibration.payload == logged[CALIBRATION.key][-1].payload
     assert camera.sequence in [message.sequence for message in logged[CAMERA_STATE.key]]
     for key in (FRAME.key, STEP.key, MIRROR_STATE.at("dm"), HEALTH.at("camera")):
-        heard, sent = tool.heard[key], logged[key]
-        assert [sample.payload for sample in heard] == [message.payload for message in sent], key
-        assert [sample.sequence for sample in heard] == [message.sequence for message in sent], key
-        times = [sample.publish_time_ns for sample in heard]
+        received, sent = tool.received[key], logged[key]
+        assert [sample.payload for sample in received] == [message.payload for message in sent], key
+        assert [sample.sequence for sample in received] == [message.sequence for message in sent], key
+        times = [sample.publish_time_ns for sample in received]
         assert times == sorted(times)
         assert times[0] > begun_ns, "the time of publication is that of today"
         span_ns = sent[-1].receive_time_ns - sent[0].receive_time_ns
         assert times[-1] - times[0] > 0.9 * span_ns / 2, "played in its own time, twice as fast"
-    frames = {sample.sequence for sample in tool.heard[FRAME.key]}
-    joined = {wire.ControlStep.FromString(sample.payload).frame_sequence for sample in tool.heard[STEP.key]}
+    frames = {sample.sequence for sample in tool.received[FRAME.key]}
+    joined = {wire.ControlStep.FromString(sample.payload).frame_sequence for sample in tool.received[STEP.key]}
     assert joined
     assert joined <= frames
 
     command = COMMAND.at("dm")
     assert logged[command]
-    assert command not in tool.heard
+    assert command not in tool.received
     assert "allow-commands" in results["left_out"][command]
-    assert HEALTH.at("recorder") not in tool.heard
-    assert HEALTH.at("replay") in tool.heard
+    assert HEALTH.at("recorder") not in tool.received
+    assert HEALTH.at("replay") in tool.received
     assert results["published"][FRAME.key] == len(logged[FRAME.key])
     assert results["finished"]
     assert not results["interrupted"]
@@ -139,9 +139,9 @@ def test_a_truncated_log_is_published_faster_and_with_commands(log: Path, run: R
     assert len(there[COMMAND.at("dm")]) > 20
     results = results_of(start(cut, run, "--speed", "4", "--topics", "/lowfc/mirror/*", "--allow-commands"))
     for key in (COMMAND.at("dm"), MIRROR_STATE.at("dm")):
-        assert [sample.payload for sample in tool.heard[key]] == there[key]
+        assert [sample.payload for sample in tool.received[key]] == there[key]
     others = {HEALTH.at("replay"), EVENT.key, COMMAND.at("dm"), MIRROR_STATE.at("dm")}
-    assert {key for key in tool.heard if tool.heard[key]} <= others
+    assert {key for key in tool.received if tool.received[key]} <= others
     assert not results["finished"]
     assert results["took_s"] < results["span_s"] * 0.9 or results["messages_behind"]
 
@@ -164,18 +164,18 @@ def test_a_live_controller_computes_the_recorded_errors(
 
     recorded = [wire.ControlStep.FromString(message.payload) for message in logged[STEP.key]]
     errors = {step.frame_sequence: list(step.error_nm) for step in recorded}
-    steps = [wire.ControlStep.FromString(sample.payload) for sample in tool.heard[STEP.key]]
+    steps = [wire.ControlStep.FromString(sample.payload) for sample in tool.received[STEP.key]]
     assert {step.frame_sequence for step in steps} <= {message.sequence for message in logged[FRAME.key]}
     measured = [step for step in steps if step.error_nm and errors.get(step.frame_sequence)]
     assert len(measured) > len(errors) / 2
     for step in measured:  # the same frame through the same calibration, by another process on another day
         assert list(step.error_nm) == errors[step.frame_sequence]
-    assert len(tool.heard[COMMAND.at("dm")]) >= len(steps)
+    assert len(tool.received[COMMAND.at("dm")]) >= len(steps)
 
 
 def test_ctrl_c_prints_the_summary_and_the_mirrors_role_is_taken_until_then(log: Path, run: Run, tool: Tool) -> None:
     playing = start(log, run, "--speed", "0.05", "--topics", FRAME.key)
-    until(lambda: tool.heard[FRAME.key] or playing.poll() is not None)
+    until(lambda: tool.received[FRAME.key] or playing.poll() is not None)
     with pytest.raises(BusError, match="mirror-dm"):
         ZenohBus(run.links, "mirror-dm", HostClock())
     playing.send_signal(signal.SIGINT)
@@ -225,8 +225,8 @@ def test_invalid_options_are_refused(log: Path, run: Run, options: dict[str, Any
     ],
 )
 def test_a_live_process_is_not_mixed_with_a_log(log: Path, run: Run, live: str, options: dict[str, Any]) -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", run.links.ports[live]))
-        taken.listen()
+    with socket.socket() as busy:
+        busy.bind(("127.0.0.1", run.links.ports[live]))
+        busy.listen()
         with pytest.raises(BusError, match=f"{live} of run '{run.run_id}' is live"):
             publish([log], run.run_id, **options)

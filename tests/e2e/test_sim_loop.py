@@ -138,9 +138,9 @@ def test_a_signal_makes_the_loop_safe_and_a_process_that_dies_is_named(tmp_path:
     os.kill(controller, signal.SIGUSR1)
     until(lambda: "in safe mode" in lowfc("ctl", "status").stdout)
     os.kill(children(process.pid)["sim_dm"], signal.SIGKILL)
-    said, complaints = process.communicate(timeout=30)
+    stdout, complaints = process.communicate(timeout=30)
     assert process.returncode == 1
-    assert not said
+    assert not stdout
     assert "mirror-dm was killed by SIGKILL" in complaints
     assert "Traceback" not in complaints
     (log,) = (tmp_path / "logs").glob("*.mcap")  # it is finished all the same
@@ -160,11 +160,11 @@ def test_two_loops_on_one_host_do_not_mix(tmp_path: Path) -> None:
         first, "sim-loop", "--rate", "100", "--duration", "4", "--seed", "1", "--json", "--disturbance", "quiet"
     )
     results = loop(second, "--rate", "100", "--duration", "4", "--seed", "2", "--disturbance", "quiet")
-    said, complaints = other.communicate(timeout=60)
+    stdout, complaints = other.communicate(timeout=60)
     assert other.returncode == 0, complaints
     assert results["frames_published"] == 400
     assert len(payloads(results["log"])["/lowfc/camera/frame"]) <= 400
-    assert '"frames_published": 400' in said
+    assert '"frames_published": 400' in stdout
 
 
 @pytest.mark.slow

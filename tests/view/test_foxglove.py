@@ -197,12 +197,12 @@ def test_the_port_is_on_loopback_only_and_errors_have_one_line(
     bridge: FoxgloveBridge, bus: MemoryBus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert {host for host, port in listening(os.getpid()) if port == bridge.port} == {"127.0.0.1"}
-    with pytest.raises(BusError, match=f"127.0.0.1:{bridge.port} .*--port") as taken:
+    with pytest.raises(BusError, match=f"127.0.0.1:{bridge.port} .*--port") as in_use:
         FoxgloveBridge(bus, bus.clock, "test", bridge.port)
     monkeypatch.setitem(sys.modules, "foxglove", None)
     with pytest.raises(ConfigurationError, match=r"pip install '?foxglove-sdk") as missing:
         FoxgloveBridge(bus, bus.clock, "test", 0)
-    assert "\n" not in f"{taken.value}{missing.value}"
+    assert "\n" not in f"{in_use.value}{missing.value}"
 
 
 @pytest.mark.exclusive
