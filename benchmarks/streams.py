@@ -68,9 +68,9 @@ def one_run(rate_hz: float, seconds: float, name: str) -> Result:
     driver = stream_ends.__name__
     config = configuration(SIZE, rate_hz).model_copy(update={"drivers": {driver: {"stream": FRAMES}}})
     by_streams = name != DIRECT
-    asked = LatencyOptions(config, seconds, 1)
+    options = LatencyOptions(config, seconds, 1)
     with prepared_run(SIZE, config) as run, tempfile.TemporaryDirectory(prefix="lowfc-streams-", dir=_MEMORY) as folder:
-        found = one_loop(asked, run, _loop(asked, run, Path(folder), name) if by_streams else None)
+        found = one_loop(options, run, _loop(options, run, Path(folder), name) if by_streams else None)
     start = "due" if by_streams else "frame"
     spans_us = {f"frame_to_{end}": found["latency_us"][f"{start}_to_{end}"] for end in ("command", "mirror")}
     if by_streams:
@@ -78,9 +78,9 @@ def one_run(rate_hz: float, seconds: float, name: str) -> Result:
     return spans_us | {"frames": found["frames"], "without_command": found["frames_without_command"]}
 
 
-def _loop(asked: LatencyOptions, run: Run, folder: Path, name: str) -> list[Child]:
+def _loop(options: LatencyOptions, run: Run, folder: Path, name: str) -> list[Child]:
     """Processes of a loop whose streams are in a folder; the first is the program that writes the frames."""
-    config, seconds = asked.config, WARM_UP_S + asked.duration_s
+    config, seconds = options.config, WARM_UP_S + options.duration_s
     Stream.create(folder / stream_path(FRAMES).name, (SIZE.side, SIZE.side), np.uint16)
     role = mirror_role(config.mirror.name)
     shared = ["--run", run.run_id, "--config", str(run.path / "config.toml")]

@@ -181,17 +181,17 @@ def test_the_noise_floor_matches_photon_and_read_noise() -> None:
 
 
 def test_a_note_announces_the_probe_sequences_of_a_test_in_a_log() -> None:
-    def asked(name: str, text: str, accepted: bool = True) -> wire.Request:
+    def recorded(name: str, text: str, accepted: bool = True) -> wire.Request:
         return wire.Request(name=name, text=text, accepted=accepted, frame_sequence=5)
 
     requests = [
-        asked("note", "acceptance is due"),
-        asked("play", "offset"),
-        asked("note", 'acceptance {"test": "rejection", "period_frames": 10, "frames": 12}'),
-        asked("play", "mirror", accepted=False),
-        asked("play", "offset"),
-        asked("play", "offset"),
-        asked("note", 'acceptance {"test": "noise-floor", "loop": "open", "frames": 9}'),
+        recorded("note", "acceptance is due"),
+        recorded("play", "offset"),
+        recorded("note", 'acceptance {"test": "rejection", "period_frames": 10, "frames": 12}'),
+        recorded("play", "mirror", accepted=False),
+        recorded("play", "offset"),
+        recorded("play", "offset"),
+        recorded("note", 'acceptance {"test": "noise-floor", "loop": "open", "frames": 9}'),
     ]
     assert [(what, request.text) for what, request in _announced(requests, "rejection")] == [
         ({"period_frames": 10, "frames": 12}, "offset")

@@ -52,8 +52,8 @@ class ToyLoop:
 
     def ask(self, name: str, **fields: object) -> Reply:
         """Send a request as an operator: encoded and decoded."""
-        asked = Request(0, name, **fields)  # type: ignore[arg-type]
-        payload = encode_request(asked, Reply(False, "", 0), 0, None)
+        request = Request(0, name, **fields)  # type: ignore[arg-type]
+        payload = encode_request(request, Reply(False, "", 0), 0, None)
         return self.take(decode_request(payload, name, 0)).reply
 
     @property
@@ -373,8 +373,8 @@ def test_an_offset_moves_the_loop_but_not_the_pseudo_open_loop_modes(signal: Sig
     if signal is not None:  # a law equal to the integrator, or one that removes the smoothed disturbance
         smooth = LinearLaw("pol", 0.6 * unit, 0.4 * unit, 0 * unit, unit, -unit, "smooth", NOLL, 1.0, 1000.0)
         assert loop.ask("law", law=linear(law_of(0.4)) if signal == "error" else smooth).accepted
-    for asked, expected in ((target, target), ((), (0, 0, 0))):
-        assert loop.ask("offset", values=asked).accepted
+    for values, expected in ((target, target), ((), (0, 0, 0))):
+        assert loop.ask("offset", values=values).accepted
         loop.run(SETTLING_FRAMES + FADING_FRAMES + 50)
         assert np.allclose(loop.wavefronts[-1], expected, atol=0.1)
         assert np.allclose(loop.outputs[-1].step.pol_nm, DISTURBED, atol=0.1)
@@ -401,12 +401,12 @@ def test_loading_another_calibration_moves_nothing() -> None:
     loop = ToyLoop()
     loop.ask("channel", text="dark-hole", actuators_nm=dark_hole(20.0).reshape(-1))
     loop.run(60)
-    asked = Request(0, "load", calibration=replace(calibration(scale=1.01), id="other"))
-    refused = loop.take(asked).reply
+    request = Request(0, "load", calibration=replace(calibration(scale=1.01), id="other"))
+    refused = loop.take(request).reply
     assert not refused.accepted  # while the loop is closed
     loop.ask("open")
     before = loop.surfaces[-1]
-    loaded_now = loop.take(asked)
+    loaded_now = loop.take(request)
     assert loaded_now.reply.accepted
     assert "CALIBRATION_LOADED" in [event.name for event in loaded_now.events]
     loop.run(5)

@@ -180,8 +180,8 @@ def test_probe_sequences_resets_and_limits_suspend_the_comparison() -> None:
     assert (guard.frames, guard.groups[0].blocks) == (50, 1)
     play = Request(0, "play", text="offset", table=np.zeros((5, len(NOLL)), np.float32))
     for request in (play, Request(0, "reset")):
-        asked, _ = advance(SETUP, state, request)
-        after = run(asked, 1, first)[1].loop.law_runner.guard
+        requested, _ = advance(SETUP, state, request)
+        after = run(requested, 1, first)[1].loop.law_runner.guard
         assert (after.frames, after.virtual_nm, after.groups[0].blocks) == (0, (), 0)
     limited = state._replace(limits_hit=(Limit.SLEW,))
     after = run(limited, 1, first)[1].loop.law_runner.guard

@@ -32,7 +32,7 @@ def running(setup: Settings, frames: int = 5) -> State:
     return feed(setup, loaded(setup), mask(quiet), *(frame(count, SOME) for count in range(1, frames + 1)))[0]
 
 
-def asked(setup: Settings, state: State, name: str, **fields: object) -> tuple[State, Outputs]:
+def applied(setup: Settings, state: State, name: str, **fields: object) -> tuple[State, Outputs]:
     return advance(setup, state, Request(0, name, **fields))
 
 
@@ -108,18 +108,18 @@ def test_each_action_and_that_clearing_the_interlock_undoes_nothing(action: Acti
     assert state.mode is mode
     changed = ["MODE_CHANGED"] if mode is not LoopMode.CLOSED else []
     assert names(all_outputs) == ["INTERLOCK_ACTS", *changed, *(["SAFED"] if mode is LoopMode.SAFE else [])]
-    state, _ = asked(setup, state, "open") if mode is LoopMode.CLOSED else (state, None)
+    state, _ = applied(setup, state, "open") if mode is LoopMode.CLOSED else (state, None)
     refused, clears = action is not Action.WARN, mode is LoopMode.SAFE
     for name, values in (("close", ()), ("step", (3.0,))):
-        _, outputs = asked(setup, state, name, values=values)
+        _, outputs = applied(setup, state, name, values=values)
         answered(outputs, not refused, *(["mask is true"] if refused and not clears else []))
     if clears:
-        _, outputs = asked(setup, state, "clear")
+        _, outputs = applied(setup, state, "clear")
         answered(outputs, False, "an interlock acts: mask is true")
     after, all_outputs = feed(setup, state, mask(False))
     assert names(all_outputs) == ["INTERLOCK_CLEARED"]
     assert after.mode is state.mode
-    after, outputs = asked(setup, after, "clear" if clears else "close")
+    after, outputs = applied(setup, after, "clear" if clears else "close")
     answered(outputs, True)
 
 
@@ -157,7 +157,7 @@ def test_a_value_that_is_too_old_acts_as_configured() -> None:
 
 def test_a_hold_does_not_stop_measurements_in_open_loop() -> None:
     setup = under(Action.HOLD)
-    state, _ = asked(setup, running(setup), "open")
+    state, _ = applied(setup, running(setup), "open")
     _, all_outputs = feed(setup, state, mask(True), frame(6, SOME))
     assert all_outputs[-1].step.error_nm is not None
 
@@ -167,7 +167,7 @@ def test_a_hold_does_not_stop_measurements_in_open_loop() -> None:
 
 def permit(setup: Settings, state: State, seconds: float = 0.0, **fields: object) -> tuple[State, Outputs]:
     values = (seconds,) if seconds else ()
-    return asked(setup, state, "permit", text="moving the mask", values=values, lease_id=MOVER, **fields)
+    return applied(setup, state, "permit", text="moving the mask", values=values, lease_id=MOVER, **fields)
 
 
 def test_a_permit_holds_a_closed_loop_for_its_duration() -> None:
@@ -187,31 +187,31 @@ def test_a_permit_holds_a_closed_loop_for_its_duration() -> None:
 def test_a_permit_can_be_released_and_ended_by_open() -> None:
     setup = under(Action.WARN)
     held, _ = permit(setup, running(setup), 5.0)
-    _, outputs = asked(setup, held, "gain", values=(0.1,))
+    _, outputs = applied(setup, held, "gain", values=(0.1,))
     answered(outputs, False, "reserved for moving the mask")
-    state, outputs = asked(setup, held, "release", lease_id=MOVER)
+    state, outputs = applied(setup, held, "release", lease_id=MOVER)
     _, all_outputs = feed(setup, state, frame(6, SOME))
     assert all_outputs[-1].step.reasons == ()
-    state, outputs = asked(setup, held, "open")
+    state, outputs = applied(setup, held, "open")
     answered(outputs, True, "this ended the reservation for moving the mask")
 
 
 def test_a_permit_is_granted_unless_the_loop_is_closed() -> None:
     setup = under(Action.WARN)
     for name in ("open", "safe"):
-        state, _ = asked(setup, running(setup), name)
+        state, _ = applied(setup, running(setup), name)
         for seconds in (0.0, 5.0):
             after, outputs = permit(setup, state, seconds)
             answered(outputs, True, f"the loop is {state.mode.in_words}")
-        _, outputs = asked(setup, after, "close" if name == "open" else "clear")
+        _, outputs = applied(setup, after, "close" if name == "open" else "clear")
         answered(outputs, False, "reserved for moving the mask")
 
 
 def test_a_permit_is_refused_during_a_lease_or_a_probe_sequence() -> None:
     setup = under(Action.WARN)
-    reserved, _ = asked(setup, running(setup), "lease", text="a calibration", values=(10.0,), lease_id=3)
+    reserved, _ = applied(setup, running(setup), "lease", text="a calibration", values=(10.0,), lease_id=3)
     shape, table = np.full(GRID, 3, np.float32).reshape(-1), np.ones((50, 1), np.float32)
-    played, outputs = asked(setup, running(setup), "play", text=MIRROR, actuators_nm=shape, table=table)
+    played, outputs = applied(setup, running(setup), "play", text=MIRROR, actuators_nm=shape, table=table)
     answered(outputs, True)
     for state, why in ((reserved, "a calibration"), (played, "a probe sequence is being played")):
         for seconds in (0.0, 5.0):
@@ -225,6 +225,6 @@ def test_a_permit_is_refused_during_a_lease_or_a_probe_sequence() -> None:
 def test_a_renewed_permit_still_holds() -> None:
     setup = under(Action.WARN)
     state, _ = permit(setup, running(setup), 5.0)
-    state, outputs = asked(setup, state, "renew", text="moving the mask", values=(5.0,), lease_id=MOVER)
+    state, outputs = applied(setup, state, "renew", text="moving the mask", values=(5.0,), lease_id=MOVER)
     answered(outputs, True)
     assert feed(setup, state, frame(6, SOME))[1][-1].step.reasons == (Rejection.HELD,)

@@ -24,13 +24,13 @@ MINE, S = 11, 1_000_000_000
 def held(seconds: float = 10.0, frames: int = 3) -> State:
     """A closed loop that is reserved from time 0."""
     state, _ = feed(DEFAULTS, loaded(DEFAULTS), *(frame(count, SOME) for count in range(1, frames + 1)))
-    state, reply = asked(state, Request(0, "lease", values=(seconds,), text=HOLDER, lease_id=MINE))
+    state, reply = applied(state, Request(0, "lease", values=(seconds,), text=HOLDER, lease_id=MINE))
     assert reply.reply.accepted
     assert names([reply]) == ["LEASE_TAKEN"]
     return state
 
 
-def asked(state: State, request: Request) -> tuple[State, Outputs]:
+def applied(state: State, request: Request) -> tuple[State, Outputs]:
     return advance(DEFAULTS, state, request)
 
 
@@ -39,7 +39,7 @@ def played(state: State, frames: int = 500, lease_id: int = MINE) -> State:
     shape = np.full(GRID, 3, np.float32).reshape(-1)
     table = np.ones((frames, 1), np.float32)
     request = Request(0, "play", text=MIRROR, actuators_nm=shape, table=table, lease_id=lease_id)
-    state, outputs = asked(state, request)
+    state, outputs = applied(state, request)
     answered(outputs, True)
     return state
 
@@ -55,78 +55,78 @@ GRANTED = {"safe", "open", "pause", "stop", "status", "note", "lease", "renew", 
 @pytest.mark.parametrize("name", sorted({*REQUESTS} - GRANTED))
 def test_requests_of_other_clients_are_refused_with_the_holders_name(name: str) -> None:
     state = held()
-    after, outputs = asked(state, Request(4 * S, name))
+    after, outputs = applied(state, Request(4 * S, name))
     answered(outputs, False, HOLDER, "6 s", "lowfc ctl open")
     assert all(now is was for now, was in zip(after[:-1], state[:-1], strict=True))
 
 
 def test_the_holders_requests_are_granted() -> None:
-    state, outputs = asked(held(), Request(S, "gain", values=(0.3,), lease_id=MINE))
+    state, outputs = applied(held(), Request(S, "gain", values=(0.3,), lease_id=MINE))
     answered(outputs, True)
-    state, outputs = asked(state, Request(S, "open", lease_id=MINE))
+    state, outputs = applied(state, Request(S, "open", lease_id=MINE))
     assert state.mode is LoopMode.OPEN
-    state, outputs = asked(state, Request(2 * S, "renew", values=(10.0,), text=HOLDER, lease_id=MINE))
+    state, outputs = applied(state, Request(2 * S, "renew", values=(10.0,), text=HOLDER, lease_id=MINE))
     answered(outputs, True)
 
 
 @pytest.mark.parametrize("name", ["safe", "open", "pause", "stop"])
 def test_safe_open_pause_and_stop_end_any_lease_and_its_probe_sequence(name: str) -> None:
-    state, outputs = asked(played(held()), Request(S, name))
+    state, outputs = applied(played(held()), Request(S, name))
     answered(outputs, True)
     assert "LEASE_ENDED" in names([outputs])
     assert not remaining_rows(state)
-    state, outputs = asked(state, Request(2 * S, "renew", values=(10.0,), text=HOLDER, lease_id=MINE))
+    state, outputs = applied(state, Request(2 * S, "renew", values=(10.0,), text=HOLDER, lease_id=MINE))
     assert outputs.reply.text == f"the lease ended: operator asked to {name}"
 
 
 def test_the_end_of_a_lease_names_its_holder_without_the_remaining_time() -> None:
     request = Request(0, "lease", values=(10.0,), text=f"{HOLDER}, about 33 s to go", lease_id=MINE)
-    state, _ = asked(loaded(DEFAULTS), request)
-    _, outputs = asked(state, Request(S, "stop"))
+    state, _ = applied(loaded(DEFAULTS), request)
+    _, outputs = applied(state, Request(S, "stop"))
     assert [event.details["holder"] for event in outputs.events if event.name == "LEASE_ENDED"] == [HOLDER]
     assert outputs.reply.text.endswith(f"; this ended the reservation for {HOLDER}")
 
 
 def test_close_reports_whether_the_loop_was_closed_already() -> None:
-    state, outputs = asked(loaded(DEFAULTS), Request(0, "close"))
+    state, outputs = applied(loaded(DEFAULTS), Request(0, "close"))
     assert outputs.reply.text == "the loop stays closed"
-    state, _ = asked(state, Request(1, "step", values=(5.0,)))
-    assert asked(state, Request(2, "close"))[1].reply.text == "loop closed"
+    state, _ = applied(state, Request(1, "step", values=(5.0,)))
+    assert applied(state, Request(2, "close"))[1].reply.text == "loop closed"
 
 
 @pytest.mark.parametrize("name", ["close", "gain", "play", "load"])
 @pytest.mark.parametrize("ended", [True, False])
 def test_a_former_holder_is_refused_with_the_reason(name: str, ended: bool) -> None:
-    state = asked(held(), Request(S, "pause"))[0] if ended else loaded(DEFAULTS)
-    _, outputs = asked(state, Request(2 * S, name, values=(0.1,), lease_id=MINE))
+    state = applied(held(), Request(S, "pause"))[0] if ended else loaded(DEFAULTS)
+    _, outputs = applied(state, Request(2 * S, name, values=(0.1,), lease_id=MINE))
     answered(outputs, False, ("operator asked to pause" if ended else "did the controller restart"))
 
 
 def test_safe_mode_ends_and_refuses_a_lease() -> None:
-    state, outputs = asked(held(), Request(S, "safe", lease_id=MINE))
+    state, outputs = applied(held(), Request(S, "safe", lease_id=MINE))
     assert outputs.reply.text == f"loop in safe mode; this ended the reservation for {HOLDER}"
-    _, outputs = asked(state, Request(S, "lease", values=(5.0,), text=HOLDER, lease_id=12))
+    _, outputs = applied(state, Request(S, "lease", values=(5.0,), text=HOLDER, lease_id=12))
     assert "safe mode" in outputs.reply.text
-    _, outputs = asked(state, Request(S, "clear"))
+    _, outputs = applied(state, Request(S, "clear"))
     answered(outputs, True)
 
 
 @pytest.mark.parametrize("name", ["status", "note"])
 def test_status_and_note_do_not_end_a_lease(name: str) -> None:
-    state, outputs = asked(held(), Request(S, name, text="cloud"))
+    state, outputs = applied(held(), Request(S, name, text="cloud"))
     answered(outputs, True)
     assert not state.conditions.lease.ended
 
 
 def test_a_lease_has_one_holder_who_alone_can_release_it() -> None:
     state = held()
-    after, outputs = asked(state, Request(S, "lease", values=(5.0,), text="somebody", lease_id=12))
+    after, outputs = applied(state, Request(S, "lease", values=(5.0,), text="somebody", lease_id=12))
     answered(outputs, False)
-    after, outputs = asked(after, Request(S, "release", lease_id=12))
+    after, outputs = applied(after, Request(S, "release", lease_id=12))
     assert after.conditions == state.conditions
-    after, outputs = asked(after, Request(S, "release", lease_id=MINE))
+    after, outputs = applied(after, Request(S, "release", lease_id=MINE))
     assert names([outputs]) == ["LEASE_RELEASED"]
-    after, outputs = asked(after, Request(S, "gain", values=(0.2,)))
+    after, outputs = applied(after, Request(S, "gain", values=(0.2,)))
     answered(outputs, True)
 
 
@@ -145,7 +145,7 @@ def test_a_lease_has_one_holder_who_alone_can_release_it() -> None:
 )
 def test_an_incomplete_lease_is_refused(fields: dict[str, object], why: str) -> None:
     request = Request(0, "lease", values=(5.0,), text=HOLDER, lease_id=MINE)
-    _, outputs = asked(loaded(DEFAULTS), replace(request, **fields))  # type: ignore[arg-type]  # each of its own type
+    _, outputs = applied(loaded(DEFAULTS), replace(request, **fields))  # type: ignore[arg-type]  # each of its own type
     answered(outputs, False, why)
 
 
@@ -167,7 +167,7 @@ def test_without_frames_a_lease_ends_by_the_clock() -> None:
 
 
 def test_an_expired_lease_ends_before_the_next_request() -> None:
-    _state, outputs = asked(held(1.0), Request(S + 1, "gain", values=(0.3,)))
+    _state, outputs = applied(held(1.0), Request(S + 1, "gain", values=(0.3,)))
     answered(outputs, True)
     assert names([outputs]) == ["LEASE_ENDED"]
 
@@ -180,7 +180,7 @@ def test_a_lease_outlives_a_camera_restart() -> None:
 def replied(
     state: State, name: str, *values: float, modes: tuple[int, ...] = (), text: str = ""
 ) -> tuple[State, Reply]:
-    after, outputs = asked(state, Request(1, name, modes, values, text))
+    after, outputs = applied(state, Request(1, name, modes, values, text))
     return after, outputs.reply
 
 

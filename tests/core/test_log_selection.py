@@ -64,12 +64,12 @@ def of(messages: list[Sample], topic: Topic) -> list[Sample]:
 
 
 def test_steps_and_commands_are_never_left_out() -> None:
-    asked = selection(1, ["lowfc/sim/*"])
-    assert asked.excluded == {FRAME, MIRROR_STATE, SURFACE, TIMING}
-    assert {topic.key for topic in TOPICS if topic.optional} == {topic.key for topic in (*asked.excluded, TRUTH)}
+    chosen = selection(1, ["lowfc/sim/*"])
+    assert chosen.excluded == {FRAME, MIRROR_STATE, SURFACE, TIMING}
+    assert {topic.key for topic in TOPICS if topic.optional} == {topic.key for topic in (*chosen.excluded, TRUTH)}
     assert selection() == EVERYTHING == selection(1, ["lowfc/*"])
     assert selection(1, ["/lowfc/mirror/dm/state"]).excluded == {FRAME, SURFACE, TIMING, TRUTH}
-    assert Selection.of(asked.metadata) == asked
+    assert Selection.of(chosen.metadata) == chosen
     assert Selection.of({"selection": {"every": "-3", "left_out": "nothing"}}) == EVERYTHING
     with pytest.raises(ConfigurationError, match="did you mean 'lowfc/camera/frame'"):
         selection(1, ["lowfc/camera/frames"])
@@ -145,8 +145,8 @@ def test_replay_needs_frames_but_no_other_optional_topic(whole: Path) -> None:
 
 
 def test_what_if_gives_the_same_result_from_a_smaller_copy(whole: Path, small: Path, tmp_path: Path) -> None:
-    asked = requested("gain=0.3", None, None, None)
-    found = [what_if(LoggedRun(read_history(LogReader(log))), asked) for log in (whole, small)]
+    changes = requested("gain=0.3", None, None, None)
+    found = [what_if(LoggedRun(read_history(LogReader(log))), changes) for log in (whole, small)]
     for results in found:
         del results["log"]
     assert found[0] == found[1]

@@ -55,9 +55,9 @@ def test_two_runs_with_one_seed_write_the_same_bytes_and_have_one_digest(tmp_pat
     for topic, values in one.items():
         assert values == two[topic], topic
     assert one["/lowfc/camera/frame"][:50] != other["/lowfc/camera/frame"]
-    asked = [wire.Request.FromString(payload) for payload in one["/lowfc/control/request"]]
-    assert [(request.name, request.accepted) for request in asked[:2]] == [("gain", True), ("close", True)]
-    assert {request.requester for request in asked[:2]} == {"automatic gains"}
+    requests = [wire.Request.FromString(payload) for payload in one["/lowfc/control/request"]]
+    assert [(request.name, request.accepted) for request in requests[:2]] == [("gain", True), ("close", True)]
+    assert {request.requester for request in requests[:2]} == {"automatic gains"}
     assert json.loads(output_of(tmp_path / "one", "lowfc replay last --json"))["identical"] is True
 
 

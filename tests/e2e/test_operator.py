@@ -38,7 +38,7 @@ PROGRAMS = re.findall(r"^```python\n(.*?)^```$", DOCUMENT.read_text(), flags=re.
 
 @dataclass
 class Night:
-    """A running loop, what was asked of it, and what it came to."""
+    """A running loop, the requests sent to it, and their results."""
 
     folder: Path
     process: "Popen[str]"
@@ -170,7 +170,7 @@ def _the_rest(night: Night) -> None:
 
 def test_every_request_is_made_by_a_command_of_the_document() -> None:
     names = {command.split()[2] for command in COMMANDS} - {"bench"}  # which is a value and no request
-    assert names == {asked.example.split()[0] for asked in DECLARED if asked.example}
+    assert names == {one.example.split()[0] for one in DECLARED if one.example}
 
 
 def test_the_commands_say_what_they_did(night: Night) -> None:

@@ -147,8 +147,8 @@ def test_a_signal_makes_the_loop_safe_and_a_process_that_dies_is_named(tmp_path:
     assert complaints.endswith(f"recorded until then: logs/{log.name}\n")
     recorded = payloads(log)
     assert recorded["/lowfc/camera/frame"]
-    asked = [wire.Request.FromString(payload) for payload in recorded["/lowfc/control/request"]]
-    assert [(one.name, one.text, one.accepted) for one in asked if one.name == "safe"] == [("safe", "SIGUSR1", True)]
+    requests = [wire.Request.FromString(payload) for payload in recorded["/lowfc/control/request"]]
+    assert [(one.name, one.text, one.accepted) for one in requests if one.name == "safe"] == [("safe", "SIGUSR1", True)]
 
 
 @pytest.mark.slow

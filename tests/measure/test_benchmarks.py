@@ -350,10 +350,10 @@ def test_the_step_is_an_integrator_with_a_leak(tmp_path: Path) -> None:
 def test_a_real_run_of_an_implementation(chosen: implementations.Implementation) -> None:
     """The C chain if ISIO_DIR is a checkout of ImageStreamIO, pyrtcao if PYRTCAO_PYTHON has it."""
     seconds, rate_hz = 0.5, 200.0
-    asked = rules("--seconds", str(seconds), "--rate", str(rate_hz), "--warm-up", "10")
-    if why := implementations.missing(chosen, asked):
+    options = rules("--seconds", str(seconds), "--rate", str(rate_hz), "--warm-up", "10")
+    if why := implementations.missing(chosen, options):
         pytest.skip(why)
-    found = comparison.one_run(chosen, asked, 0)
+    found = comparison.one_run(chosen, options, 0)
     assert found["frames"] == pytest.approx(seconds * rate_hz, abs=10)  # lowfc warms up by time
     assert found["without_command"] < found["frames"]
     to_command, to_mirror = found["frame_to_command"], found["frame_to_mirror"]

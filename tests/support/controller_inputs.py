@@ -27,7 +27,7 @@ TIGHT = {
 @st.composite
 def inputs(draw: st.DrawFn) -> list[Input]:
     """Draw good and bad frames, gaps, ticks, requests, states of devices and bench values."""
-    taken: list[Input] = []
+    drawn: list[Input] = []
     count = 0
     for kind in draw(st.lists(st.sampled_from("fffffbltrmcsvp"), min_size=1, max_size=40)):
         seed = draw(st.integers(0, 1 << 16))
@@ -35,32 +35,32 @@ def inputs(draw: st.DrawFn) -> list[Input]:
         match kind:
             case "f":
                 count += 1 + (seed % 7 == 0) * 3
-                taken.append(frame(count, rng.normal(0, 20, len(NOLL))))
+                drawn.append(frame(count, rng.normal(0, 20, len(NOLL))))
             case "b":
                 bad: dict[str, object] = {"pixels": None} if seed % 2 else {"sequence": 5}
                 count += 1
-                taken.append(frame(count, **bad))
+                drawn.append(frame(count, **bad))
             case "l":
                 count += 1
-                taken.append(frame(count, age_ns=10**9))
+                drawn.append(frame(count, age_ns=10**9))
             case "t":
-                taken.append(Tick(seed, seed * 2_000))
+                drawn.append(Tick(seed, seed * 2_000))
             case "r":
                 name = ("gain", "leak", "status", "open", "safe", "clear", "nonsense")[seed % 7]
-                taken.append(Request(seed, name, (), (float(np.float32(rng.uniform(0, 1))),)))
+                drawn.append(Request(seed, name, (), (float(np.float32(rng.uniform(0, 1))),)))
             case "m":
                 shape = rng.normal(0, 30, CALIBRATION.grid).astype(np.float32)
-                taken.append(MirrorShape(seed, shape, rng.normal(0, 5, 3).astype(np.float32)))
+                drawn.append(MirrorShape(seed, shape, rng.normal(0, 5, 3).astype(np.float32)))
             case "c":
-                taken.append(CameraSettings(seed, CALIBRATION.shape, 7.0, CALIBRATION.saturation_dn))
+                drawn.append(CameraSettings(seed, CALIBRATION.shape, 7.0, CALIBRATION.saturation_dn))
             case "v":
                 value = (True, False, "parked", "away", None)[seed % 5]
-                taken.append(BenchReport(seed, "mask", value, 0 if value is None else seed % 3000))
+                drawn.append(BenchReport(seed, "mask", value, 0 if value is None else seed % 3000))
                 if seed % 11 == 0:
-                    taken.append(BenchReport(seed, "pressure", seed / 10_000))
+                    drawn.append(BenchReport(seed, "pressure", seed / 10_000))
             case "p":
                 text, values = "moving the mask", (2**-8,) if seed % 2 else ()
-                taken.append(Request(seed, "permit", (), values, text, lease_id=1 + seed % 3))
+                drawn.append(Request(seed, "permit", (), values, text, lease_id=1 + seed % 3))
             case "s":
-                taken += [Request(seed, "clear"), Request(seed, "close")]
-    return taken
+                drawn += [Request(seed, "clear"), Request(seed, "close")]
+    return drawn

@@ -107,8 +107,8 @@ class SyntheticLog:
                 )
                 self.put(TRUTH, truth)
             if index not in lost:
-                taken = Frame(sequence, self.now_ns, 100_000, frame)
-                self._take(advance(self.settings, self._state, taken), DELAY_NS + 1000 * (self._count % 50))
+                exposed = Frame(sequence, self.now_ns, 100_000, frame)
+                self._take(advance(self.settings, self._state, exposed), DELAY_NS + 1000 * (self._count % 50))
 
     def request(self, name: str, values: tuple[float, ...] = (), modes: tuple[int, ...] = (), **fields: Any) -> None:
         request = Request(self.now_ns, name, modes, values, **fields)

@@ -93,9 +93,9 @@ class Loop:
         self.state = loaded(NORMAL)
         self.count = 0
 
-    def take(self, taken: Input) -> None:
+    def take(self, input_: Input) -> None:
         before = self.state.loop.actuators_nm if self.state.loop is not None else np.zeros(GRID, np.float32)
-        self.state, outputs = advance(NORMAL, self.state, taken)
+        self.state, outputs = advance(NORMAL, self.state, input_)
         if outputs.step is not None:
             codec.encode_step(outputs.step, self.state.input_number)
         if outputs.command is not None:
@@ -110,9 +110,9 @@ class Loop:
         self.take(codec.decode_frame(payload[16:], sequence, -time_ns))
 
     def request(self, name: str, payload: bytes) -> None:
-        asked = codec.decode_request(payload, name, 0)
-        self.take(asked)
-        codec.encode_request(asked, codec.Reply(True, "", 0), 1, None)
+        request = codec.decode_request(payload, name, 0)
+        self.take(request)
+        codec.encode_request(request, codec.Reply(True, "", 0), 1, None)
         self.count += 1
         self.take(frame(self.count))
 
@@ -258,16 +258,16 @@ def _camera(loop: Loop, data: bytes) -> None:
 
 @cache
 def _arrays() -> tuple[dict[str, LinearLaw], dict[str, PlayTable]]:
-    asked = [prepared(NORMAL, codec.request(one, one.name, 0)) for one in _valid_requests()]
-    laws = {one.law.id: one.law for one in asked if one.law is not None}
-    return laws, {one.played.id: one.played for one in asked if one.played is not None}
+    requests = [prepared(NORMAL, codec.request(one, one.name, 0)) for one in _valid_requests()]
+    laws = {one.law.id: one.law for one in requests if one.law is not None}
+    return laws, {one.played.id: one.played for one in requests if one.played is not None}
 
 
 def _busy(state: State) -> wire.ControllerState:
     state, _ = advance(NORMAL, state, BenchReport(0, "mask", None))
-    for asked in _valid_requests():
-        if asked.name in ("channel", "offset", "law", "play"):
-            state, _ = advance(NORMAL, state, codec.request(asked, asked.name, 0))
+    for request in _valid_requests():
+        if request.name in ("channel", "offset", "law", "play"):
+            state, _ = advance(NORMAL, state, codec.request(request, request.name, 0))
     return controller_state(state, NORMAL, 0)
 
 
@@ -314,9 +314,9 @@ def _valid_requests() -> list[wire.Request]:
 
 def _requests() -> list[Target]:
     found = []
-    for asked in _valid_requests():
-        read = partial(Loop().request, asked.name)
-        name, corpus = f"request {asked.name}", (asked.SerializeToString(),)
+    for request in _valid_requests():
+        read = partial(Loop().request, request.name)
+        name, corpus = f"request {request.name}", (request.SerializeToString(),)
         found.append(Target(name, corpus, read, (ValueError,), wire.Request, 10))
     return found
 

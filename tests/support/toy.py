@@ -115,8 +115,8 @@ def frame(count: int, modes_nm: npt.ArrayLike = (0, 0, 0), **changes: object) ->
 def feed(what: Settings, state: State, *inputs: Input) -> tuple[State, list[Outputs]]:
     """State after these inputs, and the outputs of each."""
     all_outputs = []
-    for taken in inputs:
-        state, outputs = advance(what, state, taken)
+    for input_ in inputs:
+        state, outputs = advance(what, state, input_)
         all_outputs.append(outputs)
     return state, all_outputs
 

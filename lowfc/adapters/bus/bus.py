@@ -183,8 +183,8 @@ class Faults:
     def take_unreadable(self) -> dict[str, tuple[int, object]]:
         """Return and reset the number of unreadable messages and the last reason, by key."""
         with self._lock:
-            taken, self.unreadable = self.unreadable, {}
-        return taken
+            unreadable, self.unreadable = self.unreadable, {}
+        return unreadable
 
 
 def name_in(topic: Topic, key: str) -> str:

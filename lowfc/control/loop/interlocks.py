@@ -109,9 +109,9 @@ def judged(interlocks: tuple[Interlock, ...], acting: tuple[Acting, ...], report
     return acting if after == before else tuple(after[number] for number in sorted(after))
 
 
-def refusal(acting: tuple[Acting, ...], asked: str) -> str:
+def refusal(acting: tuple[Acting, ...], name: str) -> str:
     """Why acting interlocks refuse to `close` the loop or `clear` safe mode; empty if they do not."""
-    refusing = (Action.SAFE,) if asked == "clear" else _AGAINST_CLOSING if asked == "close" else ()
+    refusing = (Action.SAFE,) if name == "clear" else _AGAINST_CLOSING if name == "close" else ()
     return "; ".join(f"an interlock acts: {one.why}" for one in acting if one.action in refusing)
 
 

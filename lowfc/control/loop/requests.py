@@ -93,8 +93,8 @@ def _status(settings: Settings, state: State, request: Request) -> Handled:
 
 def _mode(settings: Settings, state: State, request: Request) -> Handled:
     """open, close, safe, clear, pause; a paused loop is open and holds its command until it is closed again."""
-    asked = "open" if request.name == "pause" else request.name
-    after = _granted(state, asked)
+    name = "open" if request.name == "pause" else request.name
+    after = _granted(state, name)
     if request.name == "clear":  # the sequences of the camera and the mirror may restart, too
         conditions = state.conditions._replace(clear_id=request.time_ns)
         state = state._replace(frame_sequence=0, conditions=conditions)
@@ -117,12 +117,12 @@ def _mode(settings: Settings, state: State, request: Request) -> Handled:
     return in_mode(state, after, request.time_ns, cause), reply
 
 
-def _granted(state: State, asked: str) -> LoopMode:
+def _granted(state: State, name: str) -> LoopMode:
     """The mode after a request; ValueError with the reason if it is refused."""
     missing = uncalibrated(state)
-    after, why = request_mode(state.mode, asked, calibrated=not missing)
-    if why := why or interlocks.refusal(state.conditions.acting, asked):
-        raise ValueError(missing if asked == "close" and missing else why)
+    after, why = request_mode(state.mode, name, calibrated=not missing)
+    if why := why or interlocks.refusal(state.conditions.acting, name):
+        raise ValueError(missing if name == "close" and missing else why)
     if after is LoopMode.CLOSED:
         _check_closable(state)
     return after
@@ -183,8 +183,8 @@ def _law_of_modes(settings: Settings, state: State, request: Request) -> Handled
 
 def _offset(settings: Settings, state: State, request: Request) -> Handled:
     channels = (loop := _calibrated_loop(state)).channels_or_empty()
-    asked = request if request.values else replace(request, values=(0.0,))
-    values = per_mode(loop.calibration.noll, asked, channels.offset_nm)
+    or_zero = request if request.values else replace(request, values=(0.0,))
+    values = per_mode(loop.calibration.noll, or_zero, channels.offset_nm)
     check_offset(loop, np.abs(values))
     text = " ".join(f"{value:g}" for value in values.tolist())
     after = _with(state, loop, channels._replace(offset_nm=values))

@@ -295,5 +295,5 @@ class GainWatch:
         if event.name != "LOOP_HARMS" or self._on_harm == "warn":
             return []
         law = state.loop is not None and state.loop.law_runner is not None
-        asked = Request(step.time_ns, "open", text=f"{AUTO}: the loop made it worse", requester=REQUESTER)
-        return [replace(asked, name="law")] if law and self._on_harm == "integrator" else [asked]
+        opening = Request(step.time_ns, "open", text=f"{AUTO}: the loop made it worse", requester=REQUESTER)
+        return [replace(opening, name="law")] if law and self._on_harm == "integrator" else [opening]
