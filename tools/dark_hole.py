@@ -7,20 +7,20 @@ import numpy as np
 from rich.progress import track
 
 from lowfc.programs.paper.dark_hole import AT_ONCE, COMMAND, PLAIN, SETTLE, SHIFTED, STEPS, dark_hole
-from tools.shared import Figures, markdown
+from tools.shared import Results, markdown
 
 STEP_RMS_NM = (1.0, 2.0, 5.0)
 
 __all__ = ["COMMAND", "measure", "render"]
 
 
-def measure() -> Figures:
+def measure() -> Results:
     """Fractions undone of small and of large steps."""
     runs = {}
     for each_nm in track(STEP_RMS_NM, "dark holes"):
         with tempfile.TemporaryDirectory() as folder:
             night = dark_hole(Path(folder), each_nm)
-        run: Figures = {"together_nm": each_nm * STEPS**0.5}
+        run: Results = {"together_nm": each_nm * STEPS**0.5}
         for name, channel in night.channels.items():
             undone, error = channel.undone()
             run[name] = {"undone": undone, "error": error, "left_nm": channel.residual_nm.tolist()}
@@ -29,7 +29,7 @@ def measure() -> Figures:
     return {"runs": runs}
 
 
-def render(figures: Figures) -> str:
+def render(results: Results) -> str:
     """A row for each size of the steps."""
     head = (
         *("each step, nm rms of surface", "sum of the steps, nm rms of surface"),
@@ -44,7 +44,7 @@ def render(figures: Figures) -> str:
             *(f"{100 * run[name]['undone']:.2f} +- {100 * run[name]['error']:.2f}" for name in (SHIFTED, PLAIN)),
             " -> ".join(f"{left:.2f}" for left in run[SHIFTED]["left_nm"]),
         )
-        for each, run in figures["runs"].items()
+        for each, run in results["runs"].items()
     ]
     return (
         f"{markdown(head, rows)}\n{STEPS} random steps, {SETTLE} frames apart, each added to those before it; "

@@ -26,7 +26,7 @@ from sim_camera.disturbance import LINE_WIDTH, LINES_HZ, LINES_MAS
 from sim_camera.driver import disturbance_of
 from tools.law_bench import RATE_HZ, calibrated, configured, timing_of, tuned
 from tools.modal_bench import ModalBench
-from tools.shared import Figures, columns
+from tools.shared import Results, columns
 
 SEEDS = tuple(range(1, 21))
 MOVED = (("reaction-wheel-ideal", 1.02), ("reaction-wheel", 1.05), ("reaction-wheel", 1.10))
@@ -115,8 +115,8 @@ def undisturbed(case: Case, seed: int, minutes: float = MINUTES) -> int:
     return sum(event.name == "LAW_OVERRULED" for _, event in bench.events)
 
 
-def measure() -> Figures:
-    """Figures of all cases and seeds."""
+def measure() -> Results:
+    """Results of all cases and seeds."""
     with threadpool_limits(1):
         cases = {preset: Case(preset, 0.0) for preset, _ in MOVED}
         rows = [_row(cases[preset], preset, factor) for preset, factor in track(MOVED, "moved lines")]
@@ -142,7 +142,7 @@ def cost_us(law: LinearLaw) -> dict[str, float]:
     return found
 
 
-def _row(case: Case, preset: str, factor: float) -> Figures:
+def _row(case: Case, preset: str, factor: float) -> Results:
     guarded = [moved(case, factor, seed) for seed in SEEDS]
     alone = np.array([moved(case, factor, seed, guard=False)[0] for seed in SEEDS])
     integrator = np.array([moved(case, factor, seed, law=False)[0] for seed in SEEDS])
@@ -161,7 +161,7 @@ def _row(case: Case, preset: str, factor: float) -> Figures:
     }
 
 
-def render(figures: Figures) -> str:
+def render(results: Results) -> str:
     """A row for each case, and the result for good laws."""
     rows = columns(
         {
@@ -173,17 +173,17 @@ def render(figures: Figures) -> str:
             "overruled": "{overruled} of {seeds}",
             "after at most": "{after}",
         },
-        [row | {"after": "" if row["latest_s"] is None else f"{row['latest_s']:.2f} s"} for row in figures["moved"]],
+        [row | {"after": "" if row["latest_s"] is None else f"{row['latest_s']:.2f} s"} for row in results["moved"]],
     )
     good = "; ".join(
         f"V = {magnitude}: {sum(found)} times in {counted(len(found), 'run')}"
-        for magnitude, found in figures["good"].items()
+        for magnitude, found in results["good"].items()
     )
-    cost = figures["cost_us"]
+    cost = results["cost_us"]
     return (
         f"{rows}\nTrue tilt from 1 s to 3 s after the lines moved, V = 0, 1 kHz. Laws are LQG, "
         f"identified from {_IDENTIFY / RATE_HZ:g} s of the closed loop; the integrator has the best gains for the same "
-        f"frames. Good laws, for {figures['minutes']:g} minutes each, with unmodelled steps of {2 * STEPS_MAS:g} mas "
+        f"frames. Good laws, for {results['minutes']:g} minutes each, with unmodelled steps of {2 * STEPS_MAS:g} mas "
         f"every 2 s, were overruled: {good}. With a law of 14 modes the guard adds {cost['driving']:.1f} us "
         f"to a frame while the law drives, {cost['virtual']:.1f} us while it does not. Modes pass through the live "
         "loop's own `advance`, with noise of the images' covariance."

@@ -21,7 +21,7 @@ from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from sim_camera.disturbance import variances_nm2
 from sim_camera.driver import disturbance_of
 from tools.law_bench import RATE_HZ, Bench, calibrated, configured, timing_of, tuned, with_lines_moved
-from tools.shared import Figures, markdown
+from tools.shared import Results, markdown
 
 CASES: dict[str, dict[str, Any]] = {
     "`sam27d10_bal14`, 14 modes": {},
@@ -43,13 +43,13 @@ The highest corners are far above half the frame rate: there the walk has no low
 """
 
 
-def measure() -> Figures:
-    """Figures of every case."""
+def measure() -> Results:
+    """Results of every case."""
     with threadpool_limits(1):
         return {"cases": {name: case(configured(**CASES[name])) for name in track(CASES, "laws")}}
 
 
-def case(config: Configuration) -> Figures:
+def case(config: Configuration) -> Results:
     """Residual of the reaction wheel with each law, mas rms per axis, and its theory."""
     calibration = calibrated(config)
     bench = Bench(config, calibration)
@@ -57,12 +57,12 @@ def case(config: Configuration) -> Figures:
         bench.ask("gain", modes=(2, 3), values=(0.3,))
     bench.settle(SETTLE)
     bench.run(IDENTIFY)
-    figures: Figures = {"identified_under_mas": bench.tilt_mas(IDENTIFY), "laws": {}}
+    results: Results = {"identified_under_mas": bench.tilt_mas(IDENTIFY), "laws": {}}
     noise_nm = frame_noise_nm(config, calibration)[:2]
-    figures["noise_mas"] = float(np.sqrt(np.mean(noise_nm**2)) / bench.nm_per_mas)
+    results["noise_mas"] = float(np.sqrt(np.mean(noise_nm**2)) / bench.nm_per_mas)
     run = bench.pol()
     laws = tuned(run, config, KINDS)
-    figures["theory_by_frames_mas"] = {
+    results["theory_by_frames_mas"] = {
         str(frames): float(np.hypot(*theory_mas(config, calibration, tuned(tilts(run, frames), config)["lqg"].law)))
         for frames in SHORTER
     }
@@ -71,7 +71,7 @@ def case(config: Configuration) -> Figures:
         bench.new_record()
         bench.run(SETTLE + MEASURE)
         S, T = theory_mas(config, calibration, one.law)
-        figures["laws"][kind] = {
+        results["laws"][kind] = {
             "got_mas": bench.tilt_mas(MEASURE),
             "predicted_mas": float(np.sqrt(np.mean(one.predicted_nm[:2] ** 2)) / bench.nm_per_mas),
             "disturbance_mas": S,
@@ -79,9 +79,9 @@ def case(config: Configuration) -> Figures:
             "gain_margin": float(one.margins.gain_margin[:2].min()),
             "phase_margin_deg": float(one.margins.phase_margin_deg[:2].min()),
         }
-    figures["optimum_mas"] = optimum_mas(config, calibration)
-    figures["moved"] = moved(config, calibration, laws["lqg"].law)
-    return figures
+    results["optimum_mas"] = optimum_mas(config, calibration)
+    results["moved"] = moved(config, calibration, laws["lqg"].law)
+    return results
 
 
 def tilts(run: TimeSeries, frames: int) -> TimeSeries:
@@ -153,14 +153,14 @@ def optimum_mas(config: Configuration, calibration: Calibration, *, robust: bool
     return float(np.sqrt(np.mean(best)) / tilt_nm_per_mas(config.star.diameter_m))
 
 
-def render(figures: Figures) -> str:
+def render(results: Results) -> str:
     """A row for each case and law, and a note for each case."""
     head = (
         *("sensor", "law", "residual tilt, mas rms per axis", "predicted from the log"),
         *("disturbance and noise parts (theory)", "gain margin", "phase margin, deg"),
     )
     rows, notes = [], []
-    for name, one in figures["cases"].items():
+    for name, one in results["cases"].items():
         for kind, law in one["laws"].items():
             theory = f"{law['disturbance_mas']:.3f}, {law['noise_mas']:.3f}"
             margins = f"{law['gain_margin']:.1f}", f"{law['phase_margin_deg']:.0f}"

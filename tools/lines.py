@@ -12,13 +12,13 @@ from sim_camera.driver import disturbance_of
 from sim_camera.scene import GAUSS_LEGENDRE
 from tools.law_bench import RATE_HZ, calibrated, configured, tuned
 from tools.laws import optimum_mas, theory_mas
-from tools.shared import Figures
+from tools.shared import Results
 
 WIDTHS, MAGNITUDES, DELAYS, SEEDS = (0.001, 0.005, 0.02), (0.0, 2.0, 5.0), (1.0, 2.0), 10
 FRAMES = 16_000
 
 
-def case(width: float, magnitude: float, delay: float, seeds: int = SEEDS) -> Figures:
+def case(width: float, magnitude: float, delay: float, seeds: int = SEEDS) -> Results:
     """Theoretical residuals of laws for lines of this relative width, mas rms per axis.
 
     Laws are identified without images, from means over the exposures with the noise of the twin's images

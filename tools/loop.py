@@ -9,7 +9,7 @@ from pathlib import Path
 
 from lowfc.contract.configuration import load
 from sim_camera.prediction import tilt_residual_mas
-from tools.shared import Figures, columns, json_of
+from tools.shared import Results, columns, json_of
 
 LOOP = "lowfc sim-loop --disturbance reaction-wheel --star-magnitude 2 --sensor sam27d10_bal14 --duration 20"
 KEYS = {"disturbance.preset": "reaction-wheel", "star.magnitude": 2.0, "sensor.sam": "sam27d10_bal14"}
@@ -28,7 +28,7 @@ RECORDED = "lowfc sim-loop --rate 1000 --disturbance reaction-wheel --duration"
 LOG_COMMANDS = (*(f"{RECORDED} {seconds}" for seconds in RECORDED_S), "lowfc replay", "lowfc bench record")
 
 
-def measure() -> Figures:
+def measure() -> Results:
     """Run the loop once at each rate and in each scheduling class."""
     runs = {}
     for name, rate_hz, more, toml in RUNS:
@@ -73,20 +73,20 @@ drawn frame by frame, so its realisation differs between rates. [Performance](do
 runs and the method."""
 
 
-def short(figures: Figures) -> str:
+def short(results: Results) -> str:
     """Rate, latency and residual of the runs with real-time scheduling."""
-    runs = figures["runs"].items()
+    runs = results["runs"].items()
     rows = (run | {"name": name.partition(",")[0]} for name, run in runs if "SCHED_FIFO" in name)
     return f"{columns(SHORT_COLUMNS, rows)}\n{SHORT_NOTE}\n"
 
 
-def render(figures: Figures) -> str:
+def render(results: Results) -> str:
     """A row for each run."""
     rows = (
         run
         | {"name": name, "dropped": run["frames_skipped"] + run["frames_missing"]}
         | {"messages": run["messages_lost"] + run["messages_recorded"]}
-        for name, run in figures["runs"].items()
+        for name, run in results["runs"].items()
     )
     return (
         f"{columns(LOOP_COLUMNS, rows)}\nThe rate is by the host's clock. Latencies are p50 / p99 / p99.9. Frame to "
@@ -96,12 +96,12 @@ def render(figures: Figures) -> str:
     )
 
 
-def measure_logs() -> Figures:
+def measure_logs() -> Results:
     """Record at several rates; record one and ten minutes, and replay them in one process and on all processors.
 
     It takes 15 minutes and 10 GB.
     """
-    logs: Figures = {}
+    logs: Results = {}
     with tempfile.TemporaryDirectory() as folder:
         recording = json_of("lowfc bench record", folder)
         for seconds in RECORDED_S:
@@ -123,7 +123,7 @@ def measure_logs() -> Figures:
     return {"recording": recording, "logs": logs}
 
 
-def _with_memory(folder: str, words: str) -> tuple[Figures, int]:
+def _with_memory(folder: str, words: str) -> tuple[Results, int]:
     """JSON printed by a command with --json, and its peak memory, bytes."""
     process = subprocess.Popen(
         [sys.executable, "-m", "lowfc", *words.split()], cwd=folder, stdout=subprocess.PIPE, text=True
@@ -159,13 +159,13 @@ RECORDER_COLUMNS = {
 }
 
 
-def render_logs(figures: Figures) -> str:
+def render_logs(results: Results) -> str:
     """A row for each log, and one for each rate of messages to the recorder."""
     logs = (
         log | {"seconds": seconds, "log_mb": log["log_bytes"] / 1e6, "replay_mb": log["replay_bytes"] / 1e6}
-        for seconds, log in figures["logs"].items()
+        for seconds, log in results["logs"].items()
     )
-    rates = (rate | {"cpu_percent": 100 * rate["cpu_share"]} for rate in figures["recording"]["rates"])
+    rates = (rate | {"cpu_percent": 100 * rate["cpu_share"]} for rate in results["recording"]["rates"])
     return (
         f"{columns(LOG_COLUMNS, logs)}\n{columns(RECORDER_COLUMNS, rates)}\n"
         "Replay speed is relative to real time. The recorder's processor time is of one processor, all its threads; "

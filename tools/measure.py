@@ -38,7 +38,7 @@ from tools import (
     world,
 )
 from tools.declared import DECLARED
-from tools.shared import ROOT, Figures, host, json_of, where
+from tools.shared import ROOT, Results, host, json_of, where
 
 MEASURED = ROOT / "tools" / "measured"
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
@@ -50,25 +50,25 @@ class Measurement(NamedTuple):
 
     Attributes:
         commands: commands that the measurement runs, as printed under the table.
-        measure: returns its figures.
-        render: returns the table of the figures.
+        measure: returns its results.
+        render: returns the table of the results.
         has_provenance: whether the table includes date, host and method.
     """
 
     commands: tuple[str, ...]
-    measure: Callable[[], Figures]
-    render: Callable[[Figures], str]
+    measure: Callable[[], Results]
+    render: Callable[[Results], str]
     has_provenance: bool = False
 
 
-def _command_measurement(command: str, render: Callable[[Figures], str], has_provenance: bool = False) -> Measurement:
+def _command_measurement(command: str, render: Callable[[Results], str], has_provenance: bool = False) -> Measurement:
     """The measurement made by one command."""
     return Measurement((command,), partial(json_of, command), render, has_provenance)
 
 
 def _latency(command: str) -> Measurement:
     return _command_measurement(
-        command, lambda figures: f"```\n$ {command}\n{latency_text.table(figures)}\n```\n", has_provenance=True
+        command, lambda results: f"```\n$ {command}\n{latency_text.table(results)}\n```\n", has_provenance=True
     )
 
 
@@ -114,18 +114,18 @@ def table(name: str) -> str:
         return DECLARED[name]()
     if name in COMPOSED:
         return COMPOSED[name]()
-    one, figures = MEASUREMENTS[name], measured(name)
-    text = one.render(figures)
+    one, results = MEASUREMENTS[name], measured(name)
+    text = one.render(results)
     if one.has_provenance:
         return text
     between = "" if text.endswith("\n") else " "
-    return f"{text}{between}{where(name, figures)}\n"
+    return f"{text}{between}{where(name, results)}\n"
 
 
-def measured(name: str) -> Figures:
-    """Figures of the last measurement."""
-    figures: Figures = json.loads((MEASURED / f"{name}.json").read_text())
-    return figures
+def measured(name: str) -> Results:
+    """Results of the last measurement."""
+    results: Results = json.loads((MEASURED / f"{name}.json").read_text())
+    return results
 
 
 def generated(page: Path) -> str:
@@ -152,8 +152,8 @@ def main() -> None:
             made[name]()
         else:
             about = {"host": host(), "commands": MEASUREMENTS[name].commands}
-            figures = about | MEASUREMENTS[name].measure()
-            (MEASURED / f"{name}.json").write_text(json.dumps(figures, indent=1) + "\n")
+            results = about | MEASUREMENTS[name].measure()
+            (MEASURED / f"{name}.json").write_text(json.dumps(results, indent=1) + "\n")
     for page in PAGES:
         page.write_text(generated(page))
     COST_CURVES.write_bytes(curves.picture(measured("curves")))

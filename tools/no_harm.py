@@ -15,7 +15,7 @@ from lowfc.contract.configuration import FIXED_GAINS, Configuration
 from lowfc.contract.errors import CalibrationError
 from tools.law_bench import Bench, calibrated, configured
 from tools.modal_bench import ModalBench
-from tools.shared import Figures, columns
+from tools.shared import Results, columns
 
 PRESETS = ("bench", "thermal", "reaction-wheel", "quiet")
 MAGNITUDES = tuple(range(-1, 9))
@@ -72,7 +72,7 @@ def _modal(sensor: str, preset: str, magnitude: float, seed: int, gains: dict[st
     return _residual_nm2(ModalBench(_configured(sensor, preset, magnitude, seed, gains), _noise(sensor, magnitude)))
 
 
-def of_modes(case: tuple[str, str, float]) -> Figures:
+def of_modes(case: tuple[str, str, float]) -> Results:
     """Contrast, closed minus open, of one sensor, preset and star, by modes; for bright stars also fixed gains."""
     sensor, preset, magnitude = case
     form, own = _contrast(sensor)
@@ -95,7 +95,7 @@ def of_modes(case: tuple[str, str, float]) -> Figures:
     return found
 
 
-def of_images(case: tuple[str, str, float]) -> Figures:
+def of_images(case: tuple[str, str, float]) -> Results:
     """As `of_modes`, with every image simulated."""
     sensor, preset, magnitude = case
     form, own = _contrast(sensor)
@@ -115,7 +115,7 @@ def of_images(case: tuple[str, str, float]) -> Figures:
     return _row(case, np.array(changes), own, open_nm, np.array(left)) | {"images": True}
 
 
-def _row(case: tuple[str, str, float], change: Array, own: float, open_nm: float, residual_nm2: Array) -> Figures:
+def _row(case: tuple[str, str, float], change: Array, own: float, open_nm: float, residual_nm2: Array) -> Results:
     sensor, preset, magnitude = case
     error = float(change.std(ddof=1) / np.sqrt(len(change)))
     return {
@@ -130,7 +130,7 @@ def _row(case: tuple[str, str, float], change: Array, own: float, open_nm: float
     }
 
 
-def harms(row: Figures) -> bool:
+def harms(row: Results) -> bool:
     """Whether closing the loop adds more contrast than tolerated."""
     errors = 0 if row["preset"] == "quiet" else 3
     return bool(row["change"] > errors * row["error"] + OF_DARK_ZONE * row["own"])
@@ -138,7 +138,7 @@ def harms(row: Figures) -> bool:
 
 def measure(
     sensors: Sequence[str] = MODAL, magnitudes: Sequence[float] = MAGNITUDES, imaged: Sequence[str] = IMAGED
-) -> Figures:
+) -> Results:
     """All cases."""
     modes = [(one, preset, star) for one in sensors for preset in PRESETS for star in magnitudes]
     images = [(one, preset, star) for one in imaged for preset in PRESETS for star in IMAGED_MAGNITUDES]
@@ -148,9 +148,9 @@ def measure(
     return {"rows": rows, "seeds": len(SEEDS), "rate_hz": RATE_HZ, "seconds": SECONDS}
 
 
-def render(figures: Figures) -> str:
+def render(results: Results) -> str:
     """A row for each sensor and star: wavefront open and closed by preset, and cases in which closing harms."""
-    rows = [row for row in figures["rows"] if "saturates" not in row]
+    rows = [row for row in results["rows"] if "saturates" not in row]
     modal = [row for row in rows if "images" not in row]
     table = []
     for sensor, magnitude in dict.fromkeys((row["sensor"], row["magnitude"]) for row in modal):
@@ -173,7 +173,7 @@ def render(figures: Figures) -> str:
     }
     return (
         f"{columns(heads, table)}\nTrue wavefront, open to closed with automatic gains, nm rms over the second half "
-        f"of {figures['seconds']:g} s at {figures['rate_hz']:g} Hz, mean of {figures['seeds']} seeds. "
+        f"of {results['seconds']:g} s at {results['rate_hz']:g} Hz, mean of {results['seeds']} seeds. "
         f"Number of cases: {len(rows)} (V = {stars}; these presets and `quiet`; {len(rows) - len(modal)} of them "
         "with every image simulated). Cases in which "
         f"closing adds more than {100 * OF_DARK_ZONE:g} % of the dark zone's own contrast plus three standard errors "
@@ -183,6 +183,6 @@ def render(figures: Figures) -> str:
     )
 
 
-def _listed(rows: list[Figures]) -> str:
+def _listed(rows: list[Results]) -> str:
     """The magnitudes of rows."""
     return ", ".join(f"{one:g}" for one in sorted({row["magnitude"] for row in rows}))

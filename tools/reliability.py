@@ -15,7 +15,7 @@ from lowfc.control.loop.wording import counted
 from lowfc.programs.reliability.chaos.cases import CASES
 from lowfc.programs.reliability.chaos.command import counts
 from lowfc.programs.reliability.soak.evaluation import TOO_SHORT, latency_in_words, verdict
-from tools.shared import ROOT, Figures, columns, host, host_in_words, json_of, markdown
+from tools.shared import ROOT, Results, columns, host, host_in_words, json_of, markdown
 
 CHAOS = "lowfc chaos --all --seed N"
 SEEDS = (1, 2, 3, 4, 5)
@@ -30,34 +30,34 @@ _PHASES = {
 """Phases of the case `console`, as the page names them."""
 
 
-def chaos() -> Figures:
+def chaos() -> Results:
     """Every case once with every seed."""
     return {"runs": [{"seed": seed, **_run("--all", seed)} for seed in SEEDS]}
 
 
-def _run(cases: str, seed: int) -> Figures:
+def _run(cases: str, seed: int) -> Results:
     with TemporaryDirectory() as folder:
         rows = json_of(f"lowfc chaos {cases} --seed {seed}", folder)["cases"]
     return {**counts(rows), "cases": rows}
 
 
-def measure_again(figures: Figures, seed: int, names: Sequence[str]) -> None:
+def measure_again(results: Results, seed: int, names: Sequence[str]) -> None:
     """Run cases of a seed and store their results: those named, or those without a result."""
-    run = next(one for one in figures["runs"] if one["seed"] == seed)
+    run = next(one for one in results["runs"] if one["seed"] == seed)
     kept = {case["name"]: case for case in run["cases"] if case["name"] in CASES}
     if missing := list(names) or [name for name in CASES if name not in kept]:
         about = host()
         found = _run(" ".join(f"--case {name}" for name in missing), seed)["cases"]
-        figures.setdefault("later", {}).update(dict.fromkeys((case["name"] for case in found), about))
+        results.setdefault("later", {}).update(dict.fromkeys((case["name"] for case in found), about))
         kept |= {case["name"]: case for case in found}
     run["cases"] = list(kept.values())
     run |= counts(run["cases"])
 
 
-def render_chaos(figures: Figures) -> str:
+def render_chaos(results: Results) -> str:
     """A row for each case, over all seeds; latencies during stalls and with a console."""
-    runs = figures["runs"]
-    by_name: dict[str, list[Figures]] = {}
+    runs = results["runs"]
+    by_name: dict[str, list[Results]] = {}
     for case in (case for run in runs for case in run["cases"]):
         by_name.setdefault(case["name"], []).append(case)
     passed, failed, skipped = (sum(run[name] for run in runs) for name in ("passed", "failed", "skipped"))
@@ -76,22 +76,22 @@ def render_chaos(figures: Figures) -> str:
     ]
     if failures:
         parts.append("\n".join(["What failed:", "", *failures, ""]))
-    if steps_nm := _figures(by_name, "restart_step_nm"):
+    if steps_nm := _measurements(by_name, "restart_step_nm"):
         parts.append(
             f"The first command of a restarted controller moved an actuator by at most {max(steps_nm):.1f} nm of "
             f"surface ({len(steps_nm)} restarts).\n"
         )
-    if recovered_s := _figures({"": by_name.get("kill-controller", [])}, "recovered_s"):
+    if recovered_s := _measurements({"": by_name.get("kill-controller", [])}, "recovered_s"):
         parts.append(
             "After a kill and restart in closed loop, the residual (rms over 50 frames) was within the recovery limit "
             f"{1e3 * max(recovered_s):.0f} ms after the controller's first used frame or earlier "
             f"({counted(len(recovered_s), 'restart')}).\n"
         )
     parts += [*_stalls(by_name), *_consoles(by_name.get("console", []))]
-    again = ", ".join(f"`{name}`" for name in figures.get("measured_again", ()))
+    again = ", ".join(f"`{name}`" for name in results.get("measured_again", ()))
     parts.append(f"Measured again after a change of the case itself: {again}." if again else "")
     hosts: dict[str, list[str]] = {}
-    for name, about in figures.get("later", {}).items():
+    for name, about in results.get("later", {}).items():
         hosts.setdefault(host_in_words(about), []).append(f"`{name}`")
     parts += [
         f"Measured {about} by `python -m tools.reliability`: {', '.join(names)}." for about, names in hosts.items()
@@ -104,7 +104,7 @@ def _recovery(found: str) -> str:
     return found.removeprefix("residual ").split(" nm,")[0].replace("safed", "safe")
 
 
-def _rows(by_name: dict[str, list[Figures]]) -> list[Sequence[object]]:
+def _rows(by_name: dict[str, list[Results]]) -> list[Sequence[object]]:
     rows: list[Sequence[object]] = []
     for name, cases in by_name.items():
         ended = counts(cases)
@@ -116,11 +116,11 @@ def _rows(by_name: dict[str, list[Figures]]) -> list[Sequence[object]]:
     return rows
 
 
-def _figures(by_name: dict[str, list[Figures]], name: str) -> list[Any]:
+def _measurements(by_name: dict[str, list[Results]], name: str) -> list[Any]:
     return [case["figures"][name] for cases in by_name.values() for case in cases if name in case["figures"]]
 
 
-def _stalls(by_name: dict[str, list[Figures]]) -> list[str]:
+def _stalls(by_name: dict[str, list[Results]]) -> list[str]:
     rows = []
     for name, cases in by_name.items():
         for each in (case["figures"] for case in cases if name.startswith("stall-")):
@@ -130,7 +130,7 @@ def _stalls(by_name: dict[str, list[Figures]]) -> list[str]:
     return [markdown(head, rows)] if rows else []
 
 
-def _consoles(cases: Sequence[Figures]) -> list[str]:
+def _consoles(cases: Sequence[Results]) -> list[str]:
     """Latencies with a console, in the phases of its case, and the console's share of a processor."""
     each = [case["figures"] for case in cases if "console" in case["figures"]]
     if not each:
@@ -159,32 +159,32 @@ SOAK_COLUMNS = {
 GROWTH = "{memory_mb_per_hour:+.2f} +- {memory_mb_per_hour_error:.2f}"
 
 
-def render_soak(figures: Figures) -> str:
+def render_soak(results: Results) -> str:
     """A row for each process."""
     rows = (
         one | {"name": name, "growth": TOO_SHORT if one["memory_mb_per_hour"] is None else GROWTH.format(**one)}
-        for name, one in figures["processes"].items()
+        for name, one in results["processes"].items()
     )
-    ended = "No growth beyond the limits below, no loss." if figures["passed"] else f"{verdict(figures)}."
+    ended = "No growth beyond the limits below, no loss." if results["passed"] else f"{verdict(results)}."
     return (
-        f"{ended} {figures['hours']:g} h at {figures['rate_hz']:.0f} Hz: {figures['frames_published']} frames, "
-        f"{figures['frames_skipped']} skipped, {figures['frames_missing']} missing; {figures['messages_recorded']} "
-        f"messages in {figures['logs']} logs, {figures['messages_lost']} lost, {figures['gaps']} gaps. "
-        f"Frame to command: {latency_in_words(figures['latency'])}.\n\n{columns(SOAK_COLUMNS, rows)}\n"
+        f"{ended} {results['hours']:g} h at {results['rate_hz']:.0f} Hz: {results['frames_published']} frames, "
+        f"{results['frames_skipped']} skipped, {results['frames_missing']} missing; {results['messages_recorded']} "
+        f"messages in {results['logs']} logs, {results['messages_lost']} lost, {results['gaps']} gaps. "
+        f"Frame to command: {latency_in_words(results['latency'])}.\n\n{columns(SOAK_COLUMNS, rows)}\n"
     )
 
 
-def render_fuzz(figures: Figures) -> str:
+def render_fuzz(results: Results) -> str:
     """A row for each decoder and reader."""
     head = ("reader", "inputs", "error raised", "crashes", "hangs", "memory growth, MB")
     rows, totals = [], [0, 0, 0]
-    for one in figures["targets"]:
+    for one in results["targets"]:
         counted = one["inputs"], len(one["crashes"]), len(one["hangs"])
         totals = [total + more for total, more in zip(totals, counted, strict=True)]
         rows.append((one["name"], counted[0], one["refused"], *counted[1:], f"{one['grown_bytes'] / 1e6:.0f}"))
     inputs, crashes, hangs = totals
     return (
-        f"{inputs} inputs, {crashes} crashes, {hangs} hangs, in {figures['seconds'] / 60:.0f} minutes.\n\n"
+        f"{inputs} inputs, {crashes} crashes, {hangs} hangs, in {results['seconds'] / 60:.0f} minutes.\n\n"
         f"{markdown(head, rows)}\nReaders with 0 errors refuse damaged input with a reason or an event, or return "
         "the readable part.\n"
     )
@@ -196,9 +196,9 @@ def main() -> None:
     parser.add_argument("names", nargs="*", metavar="CASE", help="case of `lowfc chaos`; default: all without a result")
     parser.add_argument("--seed", type=int, choices=SEEDS, required=True)
     options = parser.parse_args()
-    figures = json.loads(CASES_FILE.read_text())
-    measure_again(figures, options.seed, options.names)
-    CASES_FILE.write_text(json.dumps(figures, indent=1) + "\n")
+    results = json.loads(CASES_FILE.read_text())
+    measure_again(results, options.seed, options.names)
+    CASES_FILE.write_text(json.dumps(results, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from lowfc.optics.chain.sensor import light_budget, pupil_radii, reference, resp
 from lowfc.optics.chain.zernike import zernikes
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.optics.twin.twin import Evaluator
-from tools.shared import Figures, json_of, markdown
+from tools.shared import Results, json_of, markdown
 
 LAYOUTS = ("sam18_sized", "sam27d07_bal14", "sam27d10_bal14", "sam27_crb20")
 NAMES = (*(name for name in SENSORS if name != "open"), *LAYOUTS, "open")
@@ -39,7 +39,7 @@ def configured(name: str, **changed: Any) -> Configuration:
     return load(None, keys | {"camera.rate_hz": RATE_HZ} | changed)
 
 
-def measure() -> Figures:
+def measure() -> Results:
     """Measure every sensor, alone and in the loop."""
     with threadpool_limits(1):
         found = {name: alone(name) for name in track(NAMES, "sensors alone")}
@@ -48,7 +48,7 @@ def measure() -> Figures:
     return {"sensors": found}
 
 
-def alone(name: str) -> Figures:
+def alone(name: str) -> Results:
     """Light, condition and noise of a sensor, and the speed of its twin."""
     config = configured(name)
     optics = factory.sensor(config, sys.exit)
@@ -61,7 +61,7 @@ def alone(name: str) -> Figures:
         begin = time.perf_counter()
         evaluator.image(flat)
         times_s.append(time.perf_counter() - begin)
-    figures: Figures = {
+    results: Results = {
         "light": budget.total,
         "peak": budget.peak,
         "cond14": float(np.linalg.cond(response(optics, modes))),
@@ -71,22 +71,22 @@ def alone(name: str) -> Figures:
         on_nodes = factory.mirror_on_twin(config, twin, sys.exit)
         plain = factory.analytic_calibration(config, twin, on_nodes)
         beside_shear = configured(name, **{"control.nuisance": ["shear"]})
-        figures["noise_mas"] = tilt_noise_mas(config, plain)
-        figures["noise_with_shear_mas"] = tilt_noise_mas(
+        results["noise_mas"] = tilt_noise_mas(config, plain)
+        results["noise_with_shear_mas"] = tilt_noise_mas(
             beside_shear, factory.analytic_calibration(beside_shear, twin, on_nodes)
         )
         in_band = configured(name, **{"sensor.wavelengths": 4})
         band_twin = factory.twin(in_band, None, sys.exit)
         of_band = factory.analytic_calibration(in_band, band_twin, factory.mirror_on_twin(in_band, band_twin, sys.exit))
-        figures["noise_in_band_mas"] = tilt_noise_mas(in_band, of_band)
+        results["noise_in_band_mas"] = tilt_noise_mas(in_band, of_band)
         light = reference(optics).ravel()
         bound = cramer_rao(response(optics, modes), variance_e(light, 0.0))
         limit = np.linalg.inv(quantum_information(optics.pupil, modes, optics.wavelength_nm))
-        figures["quantum_share"] = float(np.median(np.diag(limit) / np.diag(bound)))
+        results["quantum_share"] = float(np.median(np.diag(limit) / np.diag(bound)))
         slopes = normalise_flux(light, shear_response(optics), np.ones(light.size))[1]
         mistaken_nm = SHEAR * np.linalg.norm(plain.reconstructor @ slopes, axis=0)
-        figures["shear_taken_for_nm"] = float(np.sqrt(np.mean(mistaken_nm**2)))
-    return figures
+        results["shear_taken_for_nm"] = float(np.sqrt(np.mean(mistaken_nm**2)))
+    return results
 
 
 def tilt_noise_mas(config: Configuration, calibration: Calibration) -> float:
@@ -104,7 +104,7 @@ def in_the_loop(name: str, preset: str) -> dict[str, float]:
     return {key: run[key] for key in keys}
 
 
-def render(figures: Figures) -> str:
+def render(results: Results) -> str:
     """A row for each sensor."""
     head = [
         *("`--sensor`", "light, %", "peak, %", "cond14", "quantum, %", "tilt noise, mas"),
@@ -112,7 +112,7 @@ def render(figures: Figures) -> str:
         *(column for preset in PRESETS for column in (f"`{preset}`: nm rms", "mas per axis")),
     ]
     rows = []
-    for name, sensor in figures["sensors"].items():
+    for name, sensor in results["sensors"].items():
         keys = ("noise_mas", "noise_in_band_mas", "noise_with_shear_mas", "shear_taken_for_nm")
         cells = [name, f"{100 * sensor['light']:.2f}", f"{100 * sensor['peak']:.2f}"]
         cells.append(f"{sensor['cond14']:.0f}" if sensor["cond14"] < 1e6 else f"{sensor['cond14']:.0e}")

@@ -13,11 +13,11 @@ from typing import Any
 from lowfc.adapters.process.provenance import provenance
 
 ROOT = Path(__file__).parents[1]
-Figures = dict[str, Any]
+Results = dict[str, Any]
 
 
 def host() -> dict[str, Any]:
-    """Properties of the host that the figures depend on."""
+    """Properties of the host that the results depend on."""
     known = provenance()
     return {
         "processor": known["processor"],
@@ -29,7 +29,7 @@ def host() -> dict[str, Any]:
     }
 
 
-def json_of(command: str, folder: Path | str = ROOT) -> Figures:
+def json_of(command: str, folder: Path | str = ROOT) -> Results:
     """JSON that a command prints with `--json`, at any exit status: a failed case is a result too.
 
     Args:
@@ -45,7 +45,7 @@ def json_of(command: str, folder: Path | str = ROOT) -> Figures:
     )
     if not done.stdout:
         raise RuntimeError(f"`{command}` ended with {done.returncode} and printed nothing")
-    found: Figures = json.loads(done.stdout)
+    found: Results = json.loads(done.stdout)
     return found
 
 
@@ -55,20 +55,20 @@ def markdown(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     return f"{first}{'|---' * len(head)}|\n{''.join(lines)}"
 
 
-def columns(formats: dict[str, str], rows: Iterable[Figures]) -> str:
-    """A table in Markdown: heading of each column, and the format of its cells from the figures of a row."""
+def columns(formats: dict[str, str], rows: Iterable[Results]) -> str:
+    """A table in Markdown: heading of each column, and the format of its cells from the results of a row."""
     return markdown([*formats], ([cell.format(**row) for cell in formats.values()] for row in rows))
 
 
-def where(name: str, figures: Figures) -> str:
+def where(name: str, results: Results) -> str:
     """Date, host and commands of a measurement, as a sentence."""
-    about = figures["host"]
-    *most, last = [f"`{command}`" for command in figures["commands"]] or [""]
+    about = results["host"]
+    *most, last = [f"`{command}`" for command in results["commands"]] or [""]
     runs = f", which runs {', '.join(most)}{' and ' if most else ''}{last}" if last else ""
     return f"Measured {host_in_words(about)} by `python -m tools.measure {name}`{runs}."
 
 
-def host_in_words(about: Figures) -> str:
+def host_in_words(about: Results) -> str:
     """Date and host, from the result of `host`."""
     return (
         f"{about['date']} on {about['processors']} cores of {about['processor']} (a virtual machine, Linux "

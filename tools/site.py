@@ -110,11 +110,11 @@ def json_objects() -> str:
     rows = []
     for one in sorted(_subclasses(Result), key=lambda each: f"{each.__module__}.{each.__name__}"):
         command = " ".join(one.__module__.removeprefix("lowfc.programs.").split(".")[-2:])
-        rows.append(f"### {one.__name__}\n\n{one_line(one.__doc__)}. Printed by `{command}`.\n\n{_figures(one)}")
+        rows.append(f"### {one.__name__}\n\n{one_line(one.__doc__)}. Printed by `{command}`.\n\n{_field_table(one)}")
     return "\n".join(rows)
 
 
-def _figures(result: type[Result]) -> str:
+def _field_table(result: type[Result]) -> str:
     rows = []
     for name, info in result.model_fields.items():
         extra = info.json_schema_extra if isinstance(info.json_schema_extra, dict) else {}

@@ -13,7 +13,7 @@ from lowfc.control.calibration.calibration import Calibration
 from lowfc.design.fisher import cramer_rao, variance_e
 from lowfc.optics.chain.zernike import mode_name
 from tools.law_bench import Bench, calibrated, configured
-from tools.shared import Figures, markdown
+from tools.shared import Results, markdown
 
 WINDOWS, WINDOW_S, SETTLE_S = 10, 100.0, 20.0
 TARGET_PM = 20.0
@@ -31,14 +31,14 @@ KEYS: dict[str, Any] = {
 }
 
 
-def measure() -> Figures:
-    """Figures of every case."""
+def measure() -> Results:
+    """Results of every case."""
     configurations = {f"{part:g}": configured(**KEYS | {"camera.exposure_fraction": part}) for part in EXPOSED}
     with threadpool_limits(1):
         return {"cases": {name: case(config) for name, config in configurations.items()}}
 
 
-def case(config: Configuration) -> Figures:
+def case(config: Configuration) -> Results:
     """Mean residual of each mode over windows, rms over the windows, and the bounds by light and camera."""
     calibration = calibrated(config)
     bench = Bench(config, calibration)
@@ -85,9 +85,9 @@ def _rms(windows: Array) -> Array:
     return np.asarray(np.sqrt(np.mean(windows**2, axis=0)))
 
 
-def render(figures: Figures) -> str:
+def render(results: Results) -> str:
     """A row for each mode."""
-    cases = figures["cases"]
+    cases = results["cases"]
     first, *_ = cases.values()
     head = ["mode", "drift, nm rms"]
     for name in cases:

@@ -1,4 +1,4 @@
-"""Targets of the fused step and of the loop around it, and the measured figures."""
+"""Targets of the fused step and of the loop around it, and the measured results."""
 
 from collections.abc import Callable, Iterator
 from statistics import median
@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from benchmarks.peers.implementations import FUSED
 from lowfc.control.kernel.tables import KERNELS
-from tools.shared import Figures, markdown
+from tools.shared import Results, markdown
 
 NUMPY = f"lowfc, {KERNELS[0]}"
 HEAD = ("quantity", "target", "reached", "met", "lower bound", "what takes the time")
@@ -48,14 +48,14 @@ class Target(NamedTuple):
 OBJECTS = "decoding and encoding by protobuf, new Python objects for the state, calls of compiled code"
 
 
-def render(measured: Callable[[str], Figures]) -> str:
-    """The table; `measured` gives the figures of a measurement by its name."""
+def render(measured: Callable[[str], Results]) -> str:
+    """The table; `measured` gives the results of a measurement by its name."""
     targets = [*_steps(measured("kernels")), *_comparison(measured("peers")), *_stalls(measured("stalls"))]
     return markdown(HEAD, [target.row() for target in targets])
 
 
-def _steps(figures: Figures) -> Iterator[Target]:
-    for size, (other, most) in zip(figures["sizes"], (("product", 2.4), ("memory", 1.4), ("memory", 1.3)), strict=True):
+def _steps(results: Results) -> Iterator[Target]:
+    for size, (other, most) in zip(results["sizes"], (("product", 2.4), ("memory", 1.4), ("memory", 1.3)), strict=True):
         side = round(size["pixels"] ** 0.5)
         unit = "products R x" if other == "product" else "reads of its bytes"
         where = OBJECTS if other == "product" else "two copies of the frame's bytes by protobuf; " + OBJECTS
@@ -63,8 +63,8 @@ def _steps(figures: Figures) -> Iterator[Target]:
         yield Target(f"step, fused, {side} x {side}, in {unit}", most, ratios, "{:.2f}", "1", where)
 
 
-def _comparison(figures: Figures) -> Iterator[Target]:
-    runs = figures["runs"]
+def _comparison(results: Results) -> Iterator[Target]:
+    runs = results["runs"]
 
     def pairs(other: str, at: str) -> list[tuple[float, float]]:
         both = zip(runs[FUSED], runs[other], strict=True)
@@ -83,18 +83,18 @@ def _comparison(figures: Figures) -> Iterator[Target]:
             yield Target(what, most, differences, "{:+.0f}", "0 for the same work in C", where)
 
 
-def _stalls(figures: Figures) -> Iterator[Target]:
-    found = figures["stalls"]
+def _stalls(results: Results) -> Iterator[Target]:
+    found = results["stalls"]
     bare = ", ".join(f"{one['stalled']} next to the {one['beside']}" for one in found["bare"])
     yield Target(
         f"frames without a command, of {found['frames']}",
         0,
-        [float(figures["frames_without_command"])],
+        [float(results["frames_without_command"])],
         "{:.0f}",
         f"{bare}: wake-ups of the bare loops more than a period late",
         f"the host caused {found['of_host']} of the {found['stalled']} stalls",
     )
-    for name, mb in figures["memory_mb"].items():
+    for name, mb in results["memory_mb"].items():
         process = "source of frames" if name == "camera" else name
         where = "Python, numpy, zenoh, protobuf" + ("; numba and LLVM" if name == "controller" else "")
         yield Target(f"memory of the {process}, locked, MB", 200, [mb], "{:.0f}", "", where)

@@ -13,7 +13,7 @@ from lowfc.contract.configuration import Configuration
 from lowfc.control.calibration.calibration import Calibration
 from sim_camera.driver import scene
 from tools.law_bench import Bench, calibrated, configured
-from tools.shared import Figures, markdown
+from tools.shared import Results, markdown
 
 SENSORS, MAGNITUDES = ("sam27d10_bal14", "zwfs"), (2, 5)
 PRESET, RATE_HZ, SECONDS = "bench", 500.0, 4.0
@@ -46,7 +46,7 @@ CALIBRATED = ("hot pixels", "nonlinear pixel response", "pixel gain errors")
 """Cases that are repeated with dark and reference image measured on that detector."""
 
 
-def measure(sensors: tuple[str, ...] = SENSORS, seconds: float = SECONDS) -> Figures:
+def measure(sensors: tuple[str, ...] = SENSORS, seconds: float = SECONDS) -> Results:
     """Measure every case with each sensor and star."""
     rows = []
     with threadpool_limits(1):
@@ -78,7 +78,7 @@ def _gains(sensor: str, magnitude: float) -> tuple[float, ...]:
     return tuple(bench.state.loop.integrator.gain.tolist())
 
 
-def _residual(sensor: str, magnitude: float, keys: dict[str, Any], seconds: float, again: bool) -> Figures:
+def _residual(sensor: str, magnitude: float, keys: dict[str, Any], seconds: float, again: bool) -> Results:
     """Residual wavefront over the open pupil and added contrast, continuous, over the second half of the run."""
     config = _configured(sensor, magnitude, keys)
     calibration = calibrated(config)
@@ -112,9 +112,9 @@ def _measured(config: Configuration, calibration: Calibration) -> Calibration:
     return replace(calibration, dark=means[0].astype(np.float32), reference=reference.astype(np.float32))
 
 
-def render(figures: Figures) -> str:
+def render(results: Results) -> str:
     """A row for each case."""
-    rows = figures["rows"]
+    rows = results["rows"]
     head = ["imperfection", "keys"]
     for sensor, magnitude in (one["of"] for one in rows[0]["figures"]):
         head += [f"`{sensor}`, V = {magnitude}: nm rms", "added contrast"]
@@ -127,7 +127,7 @@ def render(figures: Figures) -> str:
     return (
         f"{markdown(head, lines)}\nTrue residual wavefront over the open pupil in continuous time, and mean "
         "contrast that the modes add to the dark zone (quadratic form), over the second half of "
-        f"{figures['seconds']:g} s at {RATE_HZ:g} Hz, disturbance `{PRESET}`, one seed, with the automatic gains "
+        f"{results['seconds']:g} s at {RATE_HZ:g} Hz, disturbance `{PRESET}`, one seed, with the automatic gains "
         "of the loop without imperfections. Sensor images pass through the live loop's own `advance` and the simulated "
         "mirror. The calibration is analytic and includes no imperfection except dark current, or has dark and "
         "reference image measured on that detector."

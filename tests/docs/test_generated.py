@@ -21,9 +21,9 @@ def test_every_table_is_on_exactly_one_page():
 
 @pytest.mark.parametrize("name", MEASUREMENTS)
 def test_stored_measurements_were_made_by_the_current_commands(name):
-    figures, (commands, *_) = measured(name), MEASUREMENTS[name]
+    results, (commands, *_) = measured(name), MEASUREMENTS[name]
     if MEASUREMENTS[name].has_provenance:
-        command = figures.get("command", figures.get("command_line"))
+        command = results.get("command", results.get("command_line"))
         assert command is None or command.replace("benchmarks.", "benchmarks ").startswith(commands[0])
     else:
-        assert figures["commands"] == [*commands]
+        assert results["commands"] == [*commands]

@@ -70,7 +70,7 @@ def test_tuned_law(tmp_path: Path) -> None:
     computed, integrator, tuned, law = followed(tmp_path, "tuned_law").values()
     assert "computed.fits" in computed
     assert "written: lqg.fits" in tuned
-    assert (tilt_mas(integrator), tilt_mas(law)) == pytest.approx((3.1, 1.2), rel=0.15), "the page's figures"
+    assert (tilt_mas(integrator), tilt_mas(law)) == pytest.approx((3.1, 1.2), rel=0.15), "the page's numbers"
 
 
 @pytest.mark.slow
