@@ -15,11 +15,11 @@ from lowfc.optics.chain.mirror import Mirror, influence_factors, modes_to_actuat
 from lowfc.optics.chain.sensor import image, response
 from lowfc.optics.chain.zernike import NOLLS_20, zernikes
 from lowfc.optics.twin.nodes import interpolation, node_axis
-from lowfc.optics.twin.twin import ACCURATE, FAST, Evaluator, TwinSpec, node_radii, wavefront_rms_nm
+from lowfc.optics.twin.twin import ACCURATE, FAST, Evaluator, TwinSpec, node_radii, projected_response, wavefront_rms_nm
 from lowfc.optics.twin.twin import reference as twin_reference
 from lowfc.optics.twin.twin import response as twin_response
 from lowfc.optics.twin.twin_build import build
-from lowfc.optics.twin.twin_mirror import twin_mirror, wavefront_nm
+from lowfc.optics.twin.twin_mirror import poke_wavefronts_nm, twin_mirror, wavefront_nm
 from lowfc.programs.measure.bench.twin import bench_twin, render
 
 
@@ -124,6 +124,17 @@ def test_twin_response_is_the_derivative_of_the_evaluator(name, request):
     assert relative_l2(evaluator.image(np.zeros(twin.used.size, np.float32)), twin_reference(twin)) < 2e-6
 
 
+@pytest.mark.parametrize("name", ["fast", "broadband", "zwfs"])
+@pytest.mark.parametrize("tilt_nm", [None, 20.0])
+def test_projected_response_is_the_projection_of_the_response(name, tilt_nm, request):
+    twin = fast_twin(name)[1] if name == "zwfs" else request.getfixturevalue(name)
+    rng = np.random.default_rng(1)
+    opd_nm = None if tilt_nm is None else tilt_nm * zernikes([2], *node_radii(twin))[0]
+    shapes, projections = rng.normal(size=(5, twin.used.size)), rng.normal(size=(3, len(twin.to_pixels) ** 2))
+    expected = projections @ twin_response(twin, shapes, opd_nm)
+    np.testing.assert_allclose(projected_response(twin, projections, opd_nm) @ shapes.T, expected, rtol=1e-9)
+
+
 @pytest.mark.parametrize("name", ["accurate", "broadband", "clowfs", "zwfs"])
 def test_tilt_of_the_mirror_is_accurate_to_1e_4(name, request, sensor, tilts_nm):
     band = gauss_legendre(550.0) if name == "broadband" else None
@@ -140,6 +151,9 @@ def test_mirror_on_the_nodes_gives_the_commanded_wavefront(sensor, fast):
     for command, mode in zip(commands.T, zernikes(NOLLS_20, *node_radii(fast)), strict=True):
         error = wavefront_nm(on_nodes, 10.0 * command.reshape(34, 34)) - 10.0 * mode
         assert wavefront_rms_nm(fast, error) < 0.35  # fit errors of the full surface reach 0.15 nm
+    pokes_nm = poke_wavefronts_nm(on_nodes) @ commands
+    for command, wavefront in zip(commands.T, pokes_nm.T, strict=True):
+        np.testing.assert_allclose(wavefront, wavefront_nm(on_nodes, command.reshape(34, 34)), atol=1e-5)
 
 
 def test_rms_is_taken_over_the_open_pupil_without_piston(sensor, modes, fast):

@@ -18,8 +18,13 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError, ConfigurationError
 from lowfc.contract.messages import fields_of
 from lowfc.contract.sections import InterlockSection, SensorSection
-from lowfc.control.calibration.actuator_response import actuators_to_modes
-from lowfc.control.calibration.calibration import Calibration, noise_nm2, normalise_flux, reconstructor
+from lowfc.control.calibration.calibration import (
+    Calibration,
+    noise_nm2,
+    normalise_flux,
+    reconstructor,
+    unnormalised,
+)
 from lowfc.control.loop.camera import CameraSettings
 from lowfc.control.loop.interlocks import Action, Interlock
 from lowfc.control.loop.safety import Limits, LoopMode
@@ -31,8 +36,8 @@ from lowfc.optics.chain.sensor import Sensor, shear_response
 from lowfc.optics.chain.zernike import zernikes
 from lowfc.optics.detector.detector import Detector, saturation_dn
 from lowfc.optics.detector.photometry import Photometry, electrons
-from lowfc.optics.twin.twin import ACCURATE, FAST, Twin, node_radii, reference, response
-from lowfc.optics.twin.twin_mirror import TwinMirror, wavefront_nm
+from lowfc.optics.twin.twin import ACCURATE, FAST, Twin, node_radii, projected_response, reference, response
+from lowfc.optics.twin.twin_mirror import TwinMirror, poke_wavefronts_nm
 
 Progress = Callable[[int, int], None]
 
@@ -220,10 +225,7 @@ def analytic_calibration(
         commands = modes_to_actuators(mirror(config), nolls, active)
     except ValueError as error:
         raise ConfigurationError(f"mirror: {error}") from None
-    actuators = config.mirror.rows * config.mirror.columns
-    pokes = np.eye(actuators, dtype=np.float32).reshape(actuators, config.mirror.rows, config.mirror.columns)
-    wavefronts = np.array([wavefront_nm(on_nodes, poke) for poke in pokes])
-    sensed = actuators_to_modes(R, light, good, lambda shapes: response(optics, shapes, opd_nm), wavefronts)
+    sensed = actuators_to_modes(unnormalised(R, light, good), optics, on_nodes, opd_nm)
     if active is not None:
         sensed[:, ~active.reshape(-1)] = 0
     commands = commands @ np.linalg.inv(sensed @ commands)
@@ -250,6 +252,18 @@ def analytic_calibration(
             camera=CameraSettings(0, (shape[0], shape[1]), saturation_dn=highest_dn, **fields_of(camera, _SHARED)),
         )
     )
+
+
+def actuators_to_modes(reconstructor: Array, optics: Twin, on_nodes: TwinMirror, opd_nm: Array | None = None) -> Array:
+    """Z (modes, actuators) = R H: nm of wavefront that R measures per nm of surface of each actuator.
+
+    Args:
+        reconstructor: (modes, pixels) R for responses that are not normalised (`unnormalised`).
+        optics: Digital twin of the sensor.
+        on_nodes: The mirror on the twin's nodes.
+        opd_nm: Wavefront at the twin's used nodes at which R was computed; flat when None.
+    """
+    return np.asarray(projected_response(optics, reconstructor, opd_nm) @ poke_wavefronts_nm(on_nodes))
 
 
 def frame_noise_nm(config: Configuration, calibration: Calibration) -> Array:

@@ -130,6 +130,12 @@ def normalise_flux(reference: Array, response: Array, good: Array) -> tuple[Arra
     return fraction, response / flux - np.outer(fraction, change)
 
 
+def unnormalised(reconstructor: Array, reference: Array, good: Array) -> Array:
+    """R' (modes, pixels) with R' H = R N for responses H per nm in the unit of I0; `normalise_flux` makes N of H."""
+    flux = float(reference @ good)
+    return np.asarray((reconstructor - np.outer(reconstructor @ reference / flux, good)) / flux)
+
+
 def reconstructor(
     reference: Array,
     response: Array,

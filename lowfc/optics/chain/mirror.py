@@ -96,8 +96,6 @@ def modes_to_actuators(mirror: Mirror, nolls: Sequence[int], usable: Mask | None
     Raises:
         ValueError: Fewer usable actuators than modes.
     """
-    import scipy.linalg  # slow to import, and most processes load a stored result
-
     u = pupil_axis(int(np.ceil(4.0 * mirror.pitches_per_pupil)))
     inside = (np.hypot(u[:, None], u) <= 0.5).astype(np.float64)
     y_factors = influence_factors(mirror, u, mirror.rows)
@@ -116,7 +114,7 @@ def modes_to_actuators(mirror: Mirror, nolls: Sequence[int], usable: Mask | None
     normal = normal[np.ix_(active, active)]
     normal.flat[:: active.size + 1] += _TIKHONOV * np.trace(normal) / active.size
     commands = np.zeros((actuators, len(nolls)))
-    commands[active] = scipy.linalg.solve(normal, projected[:, active].T, assume_a="pos")
+    commands[active] = np.linalg.solve(normal, projected[:, active].T)
     return commands
 
 

@@ -139,6 +139,30 @@ def response(twin: Twin, basis: NDArray[np.floating], opd_nm: Array | None = Non
     return H
 
 
+def projected_response(twin: Twin, projections: Array, opd_nm: Array | None = None) -> Array:
+    """Products (projections, used) of projections of the image with its slope per nm of wavefront at each node.
+
+    They are `projections @ response(twin, eye)`, computed from the pixels back to the nodes: the cost depends on the
+    number of projections, not on that of nodes.
+
+    Args:
+        twin: The twin.
+        projections: (projections, pixels squared) weights of the pixels, such as a reconstructor.
+        opd_nm: Reference wavefront (used,); flat when None.
+    """
+    pixels = twin.to_pixels.shape[0]
+    found = np.zeros((len(projections), twin.used.size))
+    for operator in twin.operators:
+        phasor = _phasor(twin, operator, opd_nm)
+        scale = operator.weight * 4.0 * np.pi / operator.wavelength_nm
+        slope = 1j * scale * np.conj(_field(operator, phasor))
+        for k, projection in enumerate(projections):
+            at_points = slope * (twin.to_pixels.T @ projection.reshape(pixels, pixels) @ twin.to_pixels)
+            coefficients = (operator.basis.T @ at_points @ operator.basis).ravel()
+            found[k] += ((coefficients @ operator.to_coefficients @ operator.to_modes) * phasor).real
+    return found
+
+
 def _phasor(twin: Twin, operator: Operator, opd_nm: Array | None) -> Array | Complex:
     """exp(i phi) (used,) of a wavefront in nm; real ones for None."""
     if opd_nm is None:

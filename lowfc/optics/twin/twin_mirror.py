@@ -60,8 +60,7 @@ def twin_mirror(sensor: Sensor, twin: Twin, mirror: Mirror) -> TwinMirror:
     to_field = operator.modes.T @ field_operator(sensor, scale, functions, y_full, x_full, actuators)
     fit = np.linalg.pinv(interpolation(u.size, twin.spec.nodes, twin.spec.order), _MIN_WEIGHT)
     y_factors, x_factors = fit @ y_full, fit @ x_full
-    rows, columns = np.divmod(twin.used, twin.axis.size)
-    sampled = (y_factors[rows][:, :, None] * x_factors[columns][:, None, :]).reshape(twin.used.size, -1)
+    sampled = _at_nodes(twin.used, y_factors, x_factors)
     left, values, right = np.linalg.svd(operator.to_modes, full_matrices=False)
     significant = values > _MIN_SINGULAR_VALUE * values[0]
     missing = left[:, significant].T @ (to_field - operator.to_modes @ sampled) / values[significant, None]
@@ -85,3 +84,15 @@ def wavefront_nm(mirror: TwinMirror, actuators_nm: NDArray[np.floating]) -> Sing
     wavefront = (mirror.y_factors @ twice @ mirror.x_factors.T).take(mirror.used)
     wavefront += mirror.expand @ (mirror.reduce @ twice.ravel())
     return np.asarray(wavefront)
+
+
+def poke_wavefronts_nm(mirror: TwinMirror) -> Single:
+    """Wavefronts (used, actuators) at the twin's nodes of a poke of each actuator by 1 nm of surface."""
+    surfaces = _at_nodes(mirror.used, mirror.y_factors, mirror.x_factors) + mirror.expand @ mirror.reduce
+    return np.asarray(2 * surfaces)
+
+
+def _at_nodes(used: Whole, y_factors: NDArray[np.floating], x_factors: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Influence functions (used, actuators) at the nodes of a square grid, from their factors along y and x."""
+    rows, columns = np.divmod(used, len(y_factors))
+    return (y_factors[rows][:, :, None] * x_factors[columns][:, None, :]).reshape(used.size, -1)

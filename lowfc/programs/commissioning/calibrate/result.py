@@ -12,13 +12,10 @@ from lowfc.arrays import Array, single
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError
-from lowfc.control.calibration.actuator_response import actuators_to_modes
-from lowfc.control.calibration.calibration import Calibration, comparable
+from lowfc.control.calibration.calibration import Calibration, comparable, unnormalised
 from lowfc.control.calibration.regularised import Reconstruction, advice, reconstruct
 from lowfc.control.calibration.response_fit import MAX_ELEMENT, MAX_ELEMENT_RMS, Check, Measured, cross_talk
 from lowfc.optics.twin.twin import reference as twin_reference
-from lowfc.optics.twin.twin import response as twin_response
-from lowfc.optics.twin.twin_mirror import wavefront_nm
 from lowfc.programs.cli.result import Result, result_field
 from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest, cycles_for
 from lowfc.programs.commissioning.calibrate.run import CalibrationData, Calibrator
@@ -311,12 +308,8 @@ def _actuators_to_modes(config: Configuration, before: Calibration, matrix: Arra
     if light.shape != before.shape:
         return measured
     on_nodes = factory.mirror_on_twin(config, optics, lambda _: None)
-    pokes = np.eye(len(commands), dtype=np.float32).reshape(-1, *before.grid)
-    wavefronts = np.array([wavefront_nm(on_nodes, poke) for poke in pokes])
-    good = before.good.astype(np.float64)
-    modelled = actuators_to_modes(
-        matrix, light.reshape(-1), good, lambda shapes: twin_response(optics, shapes), wavefronts
-    )
+    raw = unnormalised(matrix, light.reshape(-1), before.good.astype(np.float64))
+    modelled = factory.actuators_to_modes(raw, optics, on_nodes)
     if before.actuators_to_modes.size:
         modelled[:, ~before.actuators_to_modes.any(axis=0)] = 0  # actuators that are not active
     return np.asarray(measured + modelled - (modelled @ commands) @ measured)
