@@ -177,7 +177,8 @@ def render(results: Results) -> str:
         f"Number of cases: {len(rows)} (V = {stars}; these presets and `quiet`; {len(rows) - len(modal)} of them "
         "with every image simulated). Cases in which "
         f"closing adds more than {100 * OF_DARK_ZONE:g} % of the dark zone's own contrast plus three standard errors "
-        f"(for `quiet`, without the standard errors), with that ratio: {names or 'none'}. On bright stars "
+        f"(`quiet`: {100 * OF_DARK_ZONE:g} % alone), each with the contrast added over the dark zone's own: "
+        f"{names or 'none'}. On bright stars "
         f"(V = {_listed(bright)}) the residual with automatic gains is {min(compared):.2f} to {max(compared):.2f} "
         "times that of the best fixed gains, chosen afterwards."
     )

@@ -1,4 +1,4 @@
-"""Slow drifts of each mode in the simulated loop: the table of slow modes in docs/howto/tuning.md."""
+"""Mean residual of each mode over long windows of the simulated loop: the slow modes of docs/howto/tuning.md."""
 
 from typing import Any
 
@@ -18,9 +18,10 @@ from tools.shared import Results, markdown
 WINDOWS, WINDOW_S, SETTLE_S = 10, 100.0, 20.0
 TARGET_PM = 20.0
 RATE_HZ = 250.0
-"""The default; only photons per second matter, and the drift is a thousand times slower."""
+"""Frame rate, the default. The result depends on the light per second, not on the rate, because the drift is a thousand
+times slower than the frames."""
 EXPOSED = (0.5, 0.9)
-"""Exposures as fractions of a period: the default, and what the loop's latency permits of 4 ms."""
+"""Exposures as fractions of a period: the default, and one that leaves the loop 0.4 ms of the 4 ms period."""
 KEYS: dict[str, Any] = {
     "camera.rate_hz": RATE_HZ,
     "camera.read_noise_e": 1.0,
@@ -45,7 +46,7 @@ def case(config: Configuration) -> Results:
     frames = round(WINDOW_S * RATE_HZ)
     left_nm, drift_nm, other_nm = (np.zeros((WINDOWS, len(config.noll))) for _ in range(3))
     bench.run(round(SETTLE_S * RATE_HZ))
-    for window in track(range(WINDOWS), f"exposed for {config.camera.exposure_fraction:g} of a frame"):
+    for window in track(range(WINDOWS), f"exposure {config.camera.exposure_fraction:g} of the period"):
         bench.new_record()
         bench.run(frames)
         left_nm[window] = bench.residual_nm(continuous=False).mean(axis=0)
@@ -91,9 +92,9 @@ def render(results: Results) -> str:
     first, *_ = cases.values()
     head = ["mode", "drift, nm rms"]
     for name in cases:
-        head += [f"light for {name} of a frame: residual, pm rms", "photon-noise bound, pm"]
+        head += [f"exposure {name} of the period: residual, pm rms", "photon-noise bound, pm"]
         head += ["photon and read noise through R, pm", f"below {TARGET_PM:g} pm"]
-    head.append("mirror's part, pm rms")
+    head.append(f"mirror's part, exposure {next(iter(cases))} of the period, pm rms")
     rows = []
     for mode, one in first["modes"].items():
         cells = [mode, f"{one['drift_nm']:.2f}"]
@@ -102,7 +103,7 @@ def render(results: Results) -> str:
             cells += [f"**{of['left_pm']:.1f}**", f"{of['photon_bound_pm']:.1f}", f"{of['noise_pm']:.1f}", verdict]
         rows.append([*cells, f"{one['mirror_pm']:.1f}"])
     passed = ". ".join(
-        f"Light for {name} of a frame, {found['light_e_per_s']:.3g} electrons a second: "
+        f"Exposure {name} of the period, {found['light_e_per_s']:.3g} electrons a second: "
         f"{sum(one['left_pm'] < TARGET_PM for one in found['modes'].values())} of {len(found['modes'])} modes below "
         f"{TARGET_PM:g} pm, {found['frames_refused']} frames refused"
         for name, found in cases.items()
@@ -112,6 +113,6 @@ def render(results: Results) -> str:
         f"V = {KEYS['star.magnitude']:g}, {KEYS['camera.read_noise_e']:g} e- of read noise, {RATE_HZ:g} Hz; sensor "
         "images through the live loop's own `advance` and the simulated mirror, as in lockstep; integrator with gains "
         f"of {first['tilt_gain']:g} (tilt) and {first['gain']:g}. Means of the true residual over windows of "
-        f"{WINDOW_S:g} s, rms about zero over {WINDOWS} windows after {SETTLE_S:g} s; drift is the same for the "
-        "disturbance."
+        f"{WINDOW_S:g} s, rms about zero over {WINDOWS} windows after {SETTLE_S:g} s; the column drift is the "
+        "same statistic of the disturbance."
     )

@@ -105,7 +105,9 @@ EVENTS: dict[str, Event] = {
         Event("INTERLOCK_CLEARED", Level.INFO, "interlock no longer acts: {why}"),
         Event("LOOP_STEPPED", Level.INFO, "the loop opened after its last step"),
         Event(
-            "MIRROR_LOST", Level.ERROR, "the mirror {fault}: a closed loop holds its command until the mirror follows"
+            "MIRROR_LOST",
+            Level.ERROR,
+            "the mirror {fault}: until it follows, a closed loop returns to the mirror's last shape and holds it",
         ),
         Event("MIRROR_BACK", Level.INFO, "the mirror follows again"),
         Event("MIRROR_REFUSED", Level.WARNING, "the mirror's shape is not adopted: {why}"),

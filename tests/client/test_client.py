@@ -587,7 +587,7 @@ def test_the_status_shows_the_whole_state() -> None:
         "integrator only",
     ):
         assert words in text(json_object(state))
-    assert text(json_object(state)).splitlines()[-1].endswith("abc, provisional: from the first step of commissioning")
+    assert text(json_object(state)).splitlines()[-1].endswith("abc, provisional: from the first steps of commissioning")
     assert json_object(wire.ControllerState())["mode"] == "starting"
     assert "without a verdict" not in text(json_object(wire.ControllerState(calibration_id="abc")))
 

@@ -58,7 +58,9 @@ def _warn(text: str) -> None:
 
 
 def run_app(app: Callable[[], object]) -> NoReturn:
-    """Run a command line; a user's error gives one message and exit status 2, never a traceback.
+    """Run a command line; a user's error gives one message and the error's exit status, never a traceback.
+
+    The status is 2 unless the error's class sets another.
 
     SIGTERM ends a command as Ctrl-C does; the processes of a loop catch both themselves.
     """

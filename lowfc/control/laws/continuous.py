@@ -145,7 +145,7 @@ def held_residual_nm2(
 ) -> tuple[Array, int]:
     """Sum of squares (modes,) of the residuals of the means that commands were to null, and the number of frames.
 
-    The means are those of `ahead_of`; the contribution of the measurements' noise (modes,) is subtracted.
+    The means are those of `means_while_applied`; the contribution of the measurements' noise (modes,) is subtracted.
     """
     ahead_nm, response = means_while_applied(measured_nm, timing)
     rows = np.isfinite(ahead_nm).all(axis=1)

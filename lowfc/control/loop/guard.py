@@ -259,7 +259,7 @@ def _events(law: str, judged: Sequence[tuple[Group, str]]) -> list[PendingEvent]
         elif why:
             wait_s = BETTER_S * 2 ** (group.takeovers - 1)
             until = (
-                "until the law is loaded again"
+                "until the law is loaded again or the loop is closed again"
                 if group.final
                 else f"until the law would be far better for {wait_s:g} s"
             )

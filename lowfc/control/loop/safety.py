@@ -17,7 +17,8 @@ from lowfc.control.loop.wording import mode_word
 Actuators = npt.NDArray[np.float32]
 
 MARGIN_NM = 1e-3
-"""Least distance kept from every limit, so that float32 rounding (6e-5 nm at 750 nm) cannot cross it."""
+"""Least distance kept from stroke and slew limit, and half of it from the neighbour limit, so that float32 rounding
+(6e-5 nm at 750 nm) cannot cross them."""
 
 
 class LoopMode(IntEnum):
@@ -86,7 +87,8 @@ class Limits:
         stroke_nm: largest deviation of an actuator from flat, either way.
         slew_nm: largest change of an actuator from one command to the next.
         neighbour_nm: largest difference between actuators side by side.
-        margin_nm: distance kept from each limit: 1e-3 nm, or sixteen roundings of float32 for a long stroke.
+        margin_nm: distance kept from stroke and slew limit, half of it from the neighbour limit: 1e-3 nm, or sixteen
+            roundings of float32 for a long stroke.
         kept_stroke_nm: stroke minus the margin, a float32, so that a command clipped to it is not clipped again.
         kept_slew_nm: slew minus the margin, likewise.
     """

@@ -153,7 +153,7 @@ def text(known: dict[str, Any]) -> str:
         "counted": ", ".join(_counted(name, count) for name, count in known["counts"].items()) or "nothing refused",
         "delay": counted(float(known["delay_frames"]), "frame"),
         "calibration": (known["calibration_id"][:12] or "none")
-        + (", provisional: from the first step of commissioning" if known["calibration_provisional"] else ""),
+        + (", provisional: from the first steps of commissioning" if known["calibration_provisional"] else ""),
     }
     return "\n".join([_in_short(known), *(f"{name:14} {value}" for name, value in rows.items())])
 
