@@ -21,10 +21,10 @@ from lowfc.client import running
 from lowfc.contract.configuration import load
 from lowfc.contract.errors import LowfcError
 from lowfc.contract.messages import Role
-from lowfc.programs.view.bridge import Bridge
 from lowfc.programs.view.command import view
 from lowfc.programs.view.draw.tabs import Tab
 from lowfc.programs.view.layout import LIVE_WINDOW_S, layout
+from lowfc.programs.view.live_view import LiveView
 from lowfc.programs.view.panels.tiles import FILL
 from lowfc.programs.view.target import Target
 from lowfc.programs.view.verdicts.tile import Level
@@ -56,11 +56,11 @@ def test_every_panel_of_every_tab_shows_the_live_loop(live: str, artefacts: Path
     clock = clock_of(config)
     bus = ZenohBus(joined.links, Role.VIEWER, clock)
     target = Target(picture=Path("a.png"))
-    bridge = Bridge(config, live, clock, bus, target)
+    live_view = LiveView(config, live, clock, bus, target)
     try:
-        bridge.run(5.0)
-        assert bridge.renewals == 0
-        viewer = bridge.viewer
+        live_view.run(5.0)
+        assert live_view.renewals == 0
+        viewer = live_view.viewer
         for number, tab in enumerate(Tab):
             blueprint = layout(tab)
             stream = target.stream(viewer, live, LIVE_WINDOW_S)
@@ -73,7 +73,7 @@ def test_every_panel_of_every_tab_shows_the_live_loop(live: str, artefacts: Path
             assert {name: shades for name, shades in shown.items() if shades < MIN_SHADES} == {}, tab
         assert complaints(viewer) == []
     finally:
-        bridge.close()
+        live_view.close()
         bus.close()
 
 

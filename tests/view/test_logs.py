@@ -11,8 +11,8 @@ from lowfc.adapters.logs.reader import LogReader
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import EVENT, SURFACE, TRUTH, Log, image, wire
-from lowfc.programs.view.bridge import earlier_events
 from lowfc.programs.view.layout import layout
+from lowfc.programs.view.live_view import earlier_events
 from lowfc.programs.view.panels import mirror, pointing, sensor, tiles, trend, wavefront
 from lowfc.programs.view.recorded import Drawn, draw_logs
 from lowfc.programs.view.renderer import Renderer

@@ -127,7 +127,7 @@ class RenderThread(threading.Thread):
         """Draw until abandoned."""
         try:
             self._draw()
-        except Exception as fault:  # the bridge restarts the view and reports the reason
+        except Exception as fault:  # the live view restarts the viewer and reports the reason
             self.fault = fault
 
     def _draw(self) -> None:

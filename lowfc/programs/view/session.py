@@ -18,7 +18,7 @@ from lowfc.adapters.process.progress import passing_bar
 from lowfc.adapters.viewer.rerun_viewer import RerunViewer
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.messages import Role
-from lowfc.programs.view.bridge import Bridge, ViewError
+from lowfc.programs.view.live_view import LiveView, ViewError
 from lowfc.programs.view.recorded import Drawn, draw_logs
 from lowfc.programs.view.renderer import Renderer
 from lowfc.programs.view.target import Target
@@ -45,28 +45,28 @@ def show_run(run_id: str, config: Configuration | None, target: Target, seconds:
             target.part = stack.enter_context(being_written(target.save))
         bus = ZenohBus(run.links, Role.VIEWER, clock, monitor=True)
         stack.callback(bus.close)
-        bridge = Bridge(config, run_id, clock, bus, target)
-        stack.callback(bridge.close)
-        bridge.service.catch_signals()
-        bridge.service.announces = True
-        bridge.service.awaited = lambda: "" if bridge.service.last_health else "any other process"
+        view = LiveView(config, run_id, clock, bus, target)
+        stack.callback(view.close)
+        view.service.catch_signals()
+        view.service.announces = True
+        view.service.awaited = lambda: "" if view.service.last_health else "any other process"
         duration_s = seconds if seconds is not None or target.picture is None else PICTURE_AFTER_S
         try:
-            bridge.run(duration_s, lambda: target.print_address(bridge.viewer))
+            view.run(duration_s, lambda: target.print_address(view.viewer))
         except ViewError as error:
             if target.part is None:
                 raise
             rest = target.part.replace(f"{target.save}.part")
             raise ViewError(f"{error}; the part written so far is in {rest}") from error
-        if not bridge.service.last_health and target.written is not None:
+        if not view.service.last_health and target.written is not None:
             raise ViewError(f"no message of run {run_id!r} has arrived: nothing is written")
-        if target.picture is not None and bridge.viewer is not None:
-            bridge.viewer.screenshot(target.picture)
+        if target.picture is not None and view.viewer is not None:
+            view.viewer.screenshot(target.picture)
     return {
         "run": run_id,
-        "moments": bridge.snapshots,
-        "renewals": bridge.renewals,
-        "memory_mb": round(bridge.most_bytes / 1e6, 1),
+        "moments": view.snapshots,
+        "renewals": view.renewals,
+        "memory_mb": round(view.most_bytes / 1e6, 1),
         "file": _written(target),
     }
 

@@ -31,13 +31,14 @@ from lowfc.programs.view.verdicts.run_state import NOW_S, RECENT_S, Counts, Live
 from lowfc.programs.view.verdicts.steady import Attained, Steady, attained
 
 LATEST_S = 0.3
-"""End of the last second, by which a loop that has just closed, or caught up, has improved."""
+"""Time at the end of the last second over which `latest` is computed: it shows the improvement of a loop that has just
+closed or recovered."""
 SILENT_S = 2.0
-"""A process sends Health twice a second; four are not lost by chance."""
+"""Time without a message after which a process counts as silent: four Healths, which are sent twice a second."""
 FRAMES_SILENT_S = 1.0
-"""A camera without a frame for this time, and for `PERIODS` frame periods, is not merely slow."""
+"""Time without a frame after which the camera counts as silent, but at least `PERIODS` frame periods."""
 PERIODS = 10
-"""Frame periods that "now" spans for a slow camera."""
+"""Minimum length of every time span here, in frame periods, for slow cameras."""
 ATTAINED_NS = 30_000_000_000
 """Time between two computations of the best gains, which take 0.3 s for 14 modes."""
 _SAMPLES = 1000
@@ -52,7 +53,12 @@ _COUNTERS: dict[str, tuple[Role, Callable[[wire.Health], int]]] = {
 
 
 class _Sample(NamedTuple):
-    """Rows and counts of a snapshot; `squares`: of truth and measurement, a count and the sums of squares of `Rms`."""
+    """Rows and counts of a snapshot.
+
+    Attributes:
+        squares: for the true and for the measured wavefront, the number of rows and the sum of squares of each field of
+            `Rms`.
+    """
 
     host_ns: int
     counts: Counts
@@ -182,7 +188,10 @@ class Watcher:
         self._mode = _MODES.get(int(mode), self._mode)
 
     def _update_events(self, events: Iterable[Log]) -> None:
-        """Keep the newest note and cause: events from before the view arrive after its own."""
+        """Keep the newest note and the newest cause of a mode change, by their times.
+
+        Events from before the view arrive after the live ones.
+        """
         for event in events:
             time_ns = from_timestamp(event.timestamp)
             if event.message.startswith("MODE_CHANGED") and time_ns >= self._why_ns:
@@ -207,7 +216,10 @@ class Watcher:
         if not self._steady.feed(snapshot):
             return
         if before != (self._steady.mode, self._steady.law):
-            self._attained, self._attained_ns = None, snapshot.time_ns  # it was of another law
+            self._attained, self._attained_ns = (
+                None,
+                snapshot.time_ns,
+            )  # the last result was for another law or loop mode
         if snapshot.time_ns - self._attained_ns >= ATTAINED_NS:
             self._attained_ns = snapshot.time_ns
             rate_hz = frame_rate_hz(snapshot.camera, snapshot.steps)
@@ -258,7 +270,10 @@ def _rate_hz(samples: list[_Sample]) -> float | None:
 
 
 def _squares(snapshot: Snapshot, wavefronts: Wavefronts) -> Array:
-    """Count of rows, and sums of squares of `Rms`; tip and tilt only if the calibration has as many modes."""
+    """Number of rows, and sums of squares of `Rms`.
+
+    Tip and tilt are 0 if the calibration's modes are not those of the rows.
+    """
     noll = snapshot.noll if len(snapshot.noll) == wavefronts.residual_nm.shape[1] else ()
     tilts = [place for place, index in enumerate(noll) if index in TIP_TILT]
     tilt_nm2 = [

@@ -1,4 +1,4 @@
-"""The bridge draws the messages of the bus, restarts failed viewers and never blocks the bus."""
+"""The live view draws the messages of the bus, restarts failed viewers and never blocks the bus."""
 
 import contextlib
 import threading
@@ -15,9 +15,9 @@ from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.viewer.rerun_viewer import Show
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.messages import CALIBRATION, EVENT, FRAME, HEALTH, STEP, Log, topic_of, wire
-from lowfc.programs.view import bridge as bridges
+from lowfc.programs.view import live_view
 from lowfc.programs.view import renderer as render_threads
-from lowfc.programs.view.bridge import Bridge, ViewError
+from lowfc.programs.view.live_view import LiveView, ViewError
 from lowfc.programs.view.panels import wavefront
 from lowfc.programs.view.renderer import RenderThread
 from lowfc.programs.view.snapshot import Snapshot
@@ -59,7 +59,7 @@ class FakeViewer:
 
 
 class Scene:
-    """A bridge on an in-memory bus, in a thread, and a run that started before it; the first `stuck` viewers hang."""
+    """A live view on an in-memory bus, in a thread, of a run that started before it; the first `stuck` viewers hang."""
 
     memory_mb = 100.0
 
@@ -77,7 +77,7 @@ class Scene:
         self.publish()
         self.viewers: list[FakeViewer] = []
         self.show, self.stuck = show, stuck
-        self.bridge = Bridge(Configuration(), "night", self.clock, MemoryBus(self.hub, "viewer", self.clock), self)
+        self.view = LiveView(Configuration(), "night", self.clock, MemoryBus(self.hub, "viewer", self.clock), self)
         self.failure: Exception | None = None
         self.thread = threading.Thread(target=self._run, daemon=True)
         self.thread.start()
@@ -101,24 +101,24 @@ class Scene:
         return len(self.viewers) == number and wavefront.ERROR.path in self.viewers[-1].tape.rows
 
     def end(self) -> None:
-        self.bridge.service.stop("the test is over")
+        self.view.service.stop("the test is over")
         self.thread.join(PATIENCE_S)
-        self.bridge.close()
+        self.view.close()
         assert not self.thread.is_alive()
 
     def _run(self) -> None:
         try:
-            self.bridge.run()
+            self.view.run()
         except Exception as failure:
             self.failure = failure
 
 
 @pytest.fixture(autouse=True)
 def _quickly(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bridges, "_CHECK_S", 0.05)
-    monkeypatch.setattr(bridges, "_POLL_S", 0.02)
+    monkeypatch.setattr(live_view, "_CHECK_S", 0.05)
+    monkeypatch.setattr(live_view, "_POLL_S", 0.02)
     monkeypatch.setattr(render_threads, "PICTURES_HZ", 100.0)
-    monkeypatch.setattr(bridges, "resident_bytes", lambda: 0)  # the memory of the test process is not that of a view
+    monkeypatch.setattr(live_view, "resident_bytes", lambda: 0)  # the memory of the test process is not that of a view
 
 
 Scenes = Callable[..., Scene]
@@ -174,7 +174,7 @@ def test_a_late_view_shows_earlier_events_once(scenes: Scenes, tmp_path: Path) -
 def test_without_a_recorder_a_line_reports_that_earlier_events_are_missing(
     scenes: Scenes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bridges, "_RECORDER_S", 0.0)
+    monkeypatch.setattr(live_view, "_RECORDER_S", 0.0)
     scene = scenes()
     until(lambda: scene.viewers[0].tape.logged["log/view"])
 
@@ -184,19 +184,19 @@ def viewer_dies(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def reads_nothing(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bridges, "STUCK_S", 0.1)
+    monkeypatch.setattr(live_view, "STUCK_S", 0.1)
 
 
 def viewer_grows(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene.viewers[0].memory_bytes = 100_000_000 + bridges.VIEWER_SPARE_BYTES - 1
+    scene.viewers[0].memory_bytes = 100_000_000 + live_view.VIEWER_SPARE_BYTES - 1
     time.sleep(0.1)
     assert len(scene.viewers) == 1
     scene.viewers[0].memory_bytes += 2
 
 
-def bridge_grows(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    held = [bridges.OWN_BYTES + 1]
-    monkeypatch.setattr(bridges, "resident_bytes", lambda: held.pop() if held else 0)
+def view_grows(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    held = [live_view.OWN_BYTES + 1]
+    monkeypatch.setattr(live_view, "resident_bytes", lambda: held.pop() if held else 0)
 
 
 @pytest.mark.parametrize(
@@ -205,7 +205,7 @@ def bridge_grows(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
         (viewer_dies, 0, "the viewer was killed"),
         (reads_nothing, 1, "read nothing for"),
         (viewer_grows, 0, "the viewer uses 16"),
-        (bridge_grows, 0, "the bridge uses 512 MB"),
+        (view_grows, 0, "the view uses 512 MB"),
     ],
 )
 def test_a_failed_viewer_is_restarted_and_shows_everything(
@@ -227,20 +227,20 @@ def test_closing_the_window_ends_the_view(scenes: Scenes) -> None:
     scene = scenes(Show.NATIVE)
     scene.viewers[0].alive = False
     scene.thread.join(PATIENCE_S)
-    assert (scene.failure, scene.bridge.renewals) == (None, 0)
+    assert (scene.failure, scene.view.renewals) == (None, 0)
 
 
 def test_a_hung_window_is_not_restarted_and_memory_stays_bounded(
     scenes: Scenes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bridges, "STUCK_S", 0.1)
+    monkeypatch.setattr(live_view, "STUCK_S", 0.1)
     scene = scenes(Show.NATIVE, stuck=1)
     until(lambda: scene.viewers[0].blocked.is_set())
     for _ in range(100):
         scene.publish()
-    waiting = {topic: len(ring.waiting) for topic, ring in scene.bridge._rings.items()}
-    assert (waiting[STEP], waiting[FRAME]) == (bridges.WAITING[STEP], 1)
-    assert all(count <= bridges.WAITING[topic] for topic, count in waiting.items())
+    waiting = {topic: len(ring.waiting) for topic, ring in scene.view._rings.items()}
+    assert (waiting[STEP], waiting[FRAME]) == (live_view.RING_LENGTHS[STEP], 1)
+    assert all(count <= live_view.RING_LENGTHS[topic] for topic, count in waiting.items())
     until(lambda: any("VIEW_STUCK" in event for event in scene.events))
     time.sleep(0.2)
     assert sum("VIEW_STUCK" in event for event in scene.events) == 1
@@ -251,7 +251,7 @@ def test_a_hung_window_is_not_restarted_and_memory_stays_bounded(
 
 def test_memory_above_the_limit_after_a_restart_ends_the_view(scenes: Scenes, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = scenes()
-    monkeypatch.setattr(bridges, "resident_bytes", lambda: bridges.OWN_BYTES + 1)
+    monkeypatch.setattr(live_view, "resident_bytes", lambda: live_view.OWN_BYTES + 1)
     assert "even after a restart" in failed(scene)
 
 

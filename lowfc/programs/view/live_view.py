@@ -1,7 +1,9 @@
-"""Bridge from a run to a viewer, which may start, hang, die and restart without any effect on the loop.
+"""Live view of a run. The viewer may start, hang, die and restart without any effect on the loop.
 
 Messages wait in ring buffers that keep the newest. A render thread draws them; the main thread monitors that thread,
-the viewer's process and the memory of both. After a failure the view restarts, with an event that gives the reason.
+the viewer's process, and the memory of this process and of the viewer. After a failure the viewer restarts, with an
+event that gives the reason; a hung window is only reported, a closed one ends the view, and a failed file ends it with
+an error.
 """
 
 import platform
@@ -27,10 +29,12 @@ from lowfc.programs.view.renderer import RenderThread
 from lowfc.programs.view.snapshot import SHOWN
 from lowfc.programs.view.target import Target
 
-WAITING = {topic: 1 if topic.latest_only else 100 for topic in SHOWN} | {STEP: 2000, TRUTH: 2000}
-"""Lengths of the ring buffers: the newest picture, two seconds of rows at 1 kHz; a message may have 16 kB."""
+RING_LENGTHS = {topic: 1 if topic.latest_only else 100 for topic in SHOWN} | {STEP: 2000, TRUTH: 2000}
+"""Messages kept by each ring buffer: 1 for pictures, 2000 (two seconds at 1 kHz) for steps and truths, 100 for the
+others. A message may have 16 kB."""
 OWN_BYTES = 512_000_000
-"""Memory of this process above which the view restarts; 160 MB, 80 MB of ring buffers and 150 MB unsent are less."""
+"""Memory of this process above which the view restarts. Normal use stays below it: 160 MB, up to 80 MB in ring buffers,
+and up to 150 MB that the viewer has not read."""
 VIEWER_SPARE_BYTES = 1_500_000_000
 """Memory granted to a viewer for textures, plots and window, beyond its limit for the stream."""
 STUCK_S = 10.0
@@ -52,8 +56,8 @@ class ViewError(LowfcError):
     exit_status = 1
 
 
-class Bridge:
-    """One live view of a run; `renewals` counts its restarts, `most_bytes` is its peak memory."""
+class LiveView:
+    """One live view of a run; `renewals` counts its restarts, `most_bytes` is the peak memory of this process."""
 
     def __init__(self, config: Configuration, run_id: str, clock: Clock, bus: Bus, target: Target) -> None:
         """Subscribe to everything that is shown; drawing starts with `run`."""
@@ -67,14 +71,15 @@ class Bridge:
         self._renewed_s: deque[float] = deque(maxlen=_MAX_RENEWALS)
         self._stuck = self._past_known = False
         self._awake_s = self._began_s = time.monotonic()
-        self._rings = {topic: bus.ring(topic, WAITING[topic]) for topic in SHOWN}
+        self._rings = {topic: bus.ring(topic, RING_LENGTHS[topic]) for topic in SHOWN}
         self.service = Service(Role.VIEWER, run_id, clock, bus)
 
     def run(self, duration_s: float | None = None, ready: Callable[[], None] = lambda: None) -> None:
         """Show the run until stopped, the window is closed or `duration_s` is over; call `ready` once the viewer runs.
 
         Raises:
-            ViewerError, ViewError: no viewer starts, it fails repeatedly, or memory stays above its limit.
+            ViewerError, ViewError: no viewer starts, it fails repeatedly, memory stays above its limit, or writing the
+                view to a file fails.
         """
         try:
             self._begin()
@@ -156,13 +161,13 @@ class Bridge:
                 self._renew(viewer.exit_description())
         elif render.fault is not None:
             self._renew(f"drawing failed: {render.fault!r}")
-        elif self._stuck:  # a window belongs to its user and is not restarted
+        elif self._stuck:  # a hung window is reported, not restarted: it belongs to its user
             if not stuck:
                 self.service.event("VIEW_STUCK", stuck_s=stuck_s)
         elif stuck_s > STUCK_S:
             self._renew(f"the viewer read nothing for {stuck_s:.0f} s")
         elif own_bytes > OWN_BYTES:
-            self._renew(f"the bridge uses {own_bytes / 1e6:.0f} MB, more than {OWN_BYTES / 1e6:.0f} MB")
+            self._renew(f"the view uses {own_bytes / 1e6:.0f} MB, more than {OWN_BYTES / 1e6:.0f} MB")
             if resident_bytes() > OWN_BYTES:
                 raise ViewError(
                     f"the view uses more than {OWN_BYTES / 1e6:.0f} MB even after a restart; start it again"
@@ -212,7 +217,7 @@ def earlier_events(recorder: wire.Health | None, now_ns: int) -> list[Sample]:
             )
             found[:0] = log
         except DataFileError as fault:
-            missing.append(_line(f"earlier events are missing here: {fault}", now_ns))
+            missing.append(_line(f"some earlier events are missing: {fault}", now_ns))
         if len(found) >= MAX_EARLIER_EVENTS:
             break
     return [*found[-MAX_EARLIER_EVENTS:], *missing]
