@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.load import shares, watched
-from benchmarks.runner import Lines, Result, Tell, add_times, ranged, us
+from benchmarks.runner import Lines, Report, Result, add_times, ranged, us
 from benchmarks.sizes import FRAMES, Size, configuration, random_calibration, run_loop
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.realtime import set_up
@@ -117,7 +117,7 @@ def options(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(f"--{name}", type=int, nargs="*", default=sizes, metavar="N", help=known)
 
 
-def measure(options: argparse.Namespace, tell: Tell) -> Result:
+def measure(options: argparse.Namespace, report: Report) -> Result:
     """Measure every point of every curve once in each repeat; rate_hz is None without the loop."""
     curves = {name: [Size(**{field: n}) for n in getattr(options, name)] for name, (_, field, _) in AXES.items()}
     sizes = list(dict.fromkeys(size for curve in curves.values() for size in curve))
@@ -127,7 +127,9 @@ def measure(options: argparse.Namespace, tell: Tell) -> Result:
     found: dict[Size, list[Result]] = {size: [] for size in sizes}
     for number in range(1, options.repeats + 1):
         for size in sizes:
-            tell(f"{number} of {options.repeats}: {size.pixels} pixels, {size.modes} modes, {size.actuators} actuators")
+            report(
+                f"{number} of {options.repeats}: {size.pixels} pixels, {size.modes} modes, {size.actuators} actuators"
+            )
             times = step_times(size, options.seconds)
             found[size].append(times | (loop_latency(size, options.rate, options.seconds) if options.loop else {}))
     return {

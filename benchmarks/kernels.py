@@ -15,7 +15,7 @@ from statistics import median
 import numpy as np
 
 from benchmarks.curves import RATE_HZ, timed
-from benchmarks.runner import Lines, Result, Tell, add_times, ranged
+from benchmarks.runner import Lines, Report, Result, add_times, ranged
 from benchmarks.sizes import FRAMES, Size, configuration, random_calibration
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.realtime import set_up
@@ -35,7 +35,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def measure(options: argparse.Namespace, tell: Tell) -> Result:
+def measure(options: argparse.Namespace, report: Report) -> Result:
     """Measure each size in turns: p50 of numpy, fused, product and memory in us, and their ratios."""
     set_up(None, None, lock_memory=False, disable_cpu_idle=False)
     found = []
@@ -44,7 +44,7 @@ def measure(options: argparse.Namespace, tell: Tell) -> Result:
         calls = _timed_calls(size)
         turns = []
         for number in range(options.repeats):
-            tell(f"{size.pixels} pixels, {number + 1} of {options.repeats}")
+            report(f"{size.pixels} pixels, {number + 1} of {options.repeats}")
             turns.append({name: timed(call, options.seconds)["p50"] for name, call in calls.items()})
         pairs = [(kernel, other) for kernel in KERNELS for other in (PRODUCT, MEMORY)]
         ratios = {

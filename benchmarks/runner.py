@@ -16,7 +16,7 @@ from tools.shared import host, markdown
 Result = dict[str, Any]
 Lines = Sequence[Sequence[str]]
 """A table, its headings first."""
-Tell = Callable[[str], None]
+Report = Callable[[str], None]
 """Displays what is being measured."""
 
 
@@ -26,7 +26,7 @@ class Benchmark(Protocol):
     def options(self, parser: argparse.ArgumentParser) -> None:
         """Add its own options."""
 
-    def measure(self, options: argparse.Namespace, tell: Tell) -> Result:
+    def measure(self, options: argparse.Namespace, report: Report) -> Result:
         """Measure, and return the object that `--json` prints; a `failed` that is not empty makes the exit status 1."""
 
     def tables(self, result: Result) -> Sequence[Lines]:

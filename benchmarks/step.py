@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.runner import Lines, Result, Tell, add_times
+from benchmarks.runner import Lines, Report, Result, add_times
 from benchmarks.sizes import Size, configuration, random_calibration
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.realtime import set_up
@@ -52,7 +52,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     add_times(parser, seconds=5.0)
 
 
-def measure(options: argparse.Namespace, tell: Tell) -> Result:
+def measure(options: argparse.Namespace, report: Report) -> Result:
     """Time the stages: percentiles by stage, and the whole step over the product; back to back and paced."""
     size = Size()
     config = configuration(size, RATE_HZ)
@@ -64,7 +64,7 @@ def measure(options: argparse.Namespace, tell: Tell) -> Result:
     x = np.random.default_rng(1).standard_normal(size.pixels, np.float32)
     found: Result = {}
     for name, period_ns in (("hot_us", None), ("paced_us", config.period_ns)):
-        tell(name)
+        report(name)
         durations = _timed(step, payloads, lambda _: calibration.reconstructor @ x, options.seconds, period_ns)
         found[name] = {stage: percentiles(each / 1e3) for stage, each in durations.items()}
     if step.state.mode is not LoopMode.CLOSED or step.state.counts:

@@ -1,8 +1,8 @@
 """Frame to command over ImageStreamIO and over the direct link: same controller, frames and processors, in turns.
 
-Over ImageStreamIO a program writes each frame into a stream, `lowfc camera isio` or the controller itself reads it
-(`lowfc controller --camera isio`), and `lowfc mirror isio` writes the command into a channel. Over the direct link
-the source of frames and the mirror are those of `lowfc latency`.
+Over ImageStreamIO a program writes each frame into a stream, a camera process or the controller itself (`--camera`)
+reads it with the driver `isio`, extended by time stamps (`stream_ends.TimedCamera`), and `lowfc mirror isio` writes the
+command into a channel. Over the direct link the source of frames and the mirror are those of `lowfc latency`.
 
 Example:
     python -m benchmarks streams --seconds 5 --repeats 9
@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks import stream_ends
-from benchmarks.runner import Lines, Result, Tell, add_times, ranged
+from benchmarks.runner import Lines, Report, Result, add_times, ranged
 from benchmarks.sizes import Size, configuration, prepared_run
 from lowfc.adapters.bus.run import Run, mirror_role
 from lowfc.adapters.image_stream.stream import Stream, stream_path
@@ -43,7 +43,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rate", dest="rate_hz", type=float, default=1000.0, help="frames per second (%(default)g)")
 
 
-def measure(options: argparse.Namespace, tell: Tell) -> Result:
+def measure(options: argparse.Namespace, report: Report) -> Result:
     """Run the loops in turns, every other time in the opposite order.
 
     Returns:
@@ -53,7 +53,7 @@ def measure(options: argparse.Namespace, tell: Tell) -> Result:
     for number in range(options.repeats):
         turns.append({})
         for name in (DIRECT, BETWEEN, READ)[:: -1 if number % 2 else 1]:
-            tell(f"turn {number + 1} of {options.repeats}: {name}")
+            report(f"turn {number + 1} of {options.repeats}: {name}")
             turns[-1][name] = one_run(options.rate_hz, options.seconds, name)
     return {"turns": turns, "seconds": options.seconds, "rate_hz": options.rate_hz}
 
@@ -128,6 +128,6 @@ def about(result: Result) -> str:
         f"Hz; {SIZE.side} x {SIZE.side} pixels, {SIZE.modes} modes, {SIZE.actuators} actuators. Latency "
         "begins just before the writer sets the stream's write flag, or just before the frame is sent over the direct "
         "link; it ends just after the controller's send, or just before the mirror publishes its state. Over "
-        f"ImageStreamIO {before} us (p50) of it pass until the camera process publishes the frame; {read} us until the "
-        "controller has read it."
+        f"ImageStreamIO, {before} us (p50) of the latency pass before the camera process publishes the frame; if the "
+        f"controller reads the stream itself, {read} us before it has the frame."
     )

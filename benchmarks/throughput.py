@@ -16,7 +16,7 @@ import shlex
 from collections.abc import Callable, Sequence
 
 from benchmarks.load import run_lowfc
-from benchmarks.runner import Lines, Result, Tell, add_times
+from benchmarks.runner import Lines, Report, Result, add_times
 from lowfc.contract.errors import ConfigurationError
 
 LOOPS = {
@@ -43,22 +43,23 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--loop", action="append", choices=LOOPS, help="only this one; repeat")
 
 
-def measure(options: argparse.Namespace, tell: Tell) -> Result:
+def measure(options: argparse.Namespace, report: Report) -> Result:
     """Find the highest rate of each loop: loops (results of `find`), seconds and rates_hz."""
     if not (0 < options.lowest <= options.highest and options.step > 1):
         raise ConfigurationError("--lowest must be above 0 and at most --highest, and --step above 1")
     rates = grid(options.lowest, options.highest, options.step)
     loops = {}
     for name in options.loop or LOOPS:
-        tell(name)
-        loops[name] = find(LOOPS[name], rates, options.seconds, tell)
+        report(name)
+        loops[name] = find(LOOPS[name], rates, options.seconds, report)
     return {"loops": loops, "seconds": options.seconds, "rates_hz": rates}
 
 
 def run_once(words: Sequence[str], rate_hz: float, seconds: float) -> Result:
     """Run a loop once with these options of `lowfc latency`; `failure` has its last line if it failed.
 
-    messages_lost is None without a recorder, commands_late the part of all commands, of a simulated camera alone.
+    messages_lost is None without a recorder. commands_late is the number of late commands over the number of frames,
+    warm-up included; only with a simulated camera.
     """
     found = run_lowfc(["latency", *words, "--rate", f"{rate_hz:g}"], seconds)
     if "failure" in found:
@@ -108,17 +109,17 @@ def search(sustains: Callable[[int], bool], count: int) -> int:
     return low
 
 
-def find(words: Sequence[str], rates: Sequence[float], seconds: float, tell: Tell) -> Result:
-    """Find the highest rate of one loop; None if not even the lowest is sustained.
+def find(words: Sequence[str], rates: Sequence[float], seconds: float, report: Report) -> Result:
+    """Find the highest rate of one loop.
 
-    run: a sustained run at that rate; above: a run one step faster that was not (None at the end of the grid);
-    compared: a run at `COMPARED_HZ`.
+    highest_hz: None if not even the lowest is sustained; run: a sustained run at that rate; above: a run one step
+    faster that was not (None at the end of the grid); compared: a run at `COMPARED_HZ`.
     """
     command = shlex.join(["lowfc", "latency", *words])
     runs: list[Result] = []
 
     def sustains(index: int) -> bool:
-        tell(f"{command}: {rates[index]:g} Hz")
+        report(f"{command}: {rates[index]:g} Hz")
         runs.append(run_once(words, rates[index], seconds))
         return not complaints(runs[-1])
 
@@ -127,7 +128,7 @@ def find(words: Sequence[str], rates: Sequence[float], seconds: float, tell: Tel
         return next((run for run in found if sustained is not bool(complaints(run))), None) if index >= 0 else None
 
     index = search(sustains, len(rates))
-    tell(f"{command}: {COMPARED_HZ:g} Hz")
+    report(f"{command}: {COMPARED_HZ:g} Hz")
     return {
         "command": command,
         "highest_hz": rates[index] if index >= 0 else None,

@@ -19,9 +19,9 @@ def measure() -> Results:
     runs = {}
     for each_nm in track(STEP_RMS_NM, "dark holes"):
         with tempfile.TemporaryDirectory() as folder:
-            night = dark_hole(Path(folder), each_nm)
+            found = dark_hole(Path(folder), each_nm)
         run: Results = {"together_nm": each_nm * STEPS**0.5}
-        for name, channel in night.channels.items():
+        for name, channel in found.channels.items():
             undone, error = channel.undone()
             run[name] = {"undone": undone, "error": error, "left_nm": channel.residual_nm.tolist()}
             run["seen_nm"] = float(np.linalg.norm(channel.channel_nm[-1]))

@@ -97,7 +97,7 @@ static const struct role {
     const char *name, *reads, *writes;
     uint8_t type;
     uint32_t size[2];
-    const char *marks;
+    const char *time_stamps;
     void (*step)(void);
 } ROLES[] = {
     {"source", NULL, "camera", _DATATYPE_UINT16, {SIDE, SIDE}, "published", NULL},
@@ -127,7 +127,7 @@ static void send_frames(double rate_hz, long count, int64_t *published)
     usleep(50000); /* wait for the last command */
 }
 
-static void answer(const struct role *role, int semaphore, int64_t *marks)
+static void answer(const struct role *role, int semaphore, int64_t *time_stamps)
 {
     for (;;) {
         while (ImageStreamIO_semwait(&input, semaphore) != 0)
@@ -140,8 +140,8 @@ static void answer(const struct role *role, int semaphore, int64_t *marks)
             output.md->cnt1 = number;
             ImageStreamIO_UpdateIm(&output);
         }
-        if (marks)
-            marks[number] = now_ns();
+        if (time_stamps)
+            time_stamps[number] = now_ns();
     }
 }
 
@@ -164,7 +164,7 @@ int main(int count, char **words)
     R = shared_file("R");
     to_actuators = shared_file("to_actuators");
     last_actuators = shared_file("actuators");
-    int64_t *marks = role->marks ? shared_file(role->marks) : NULL;
+    int64_t *time_stamps = role->time_stamps ? shared_file(role->time_stamps) : NULL;
     int semaphore = 0;
     uint32_t size[2] = {role->size[0], role->size[1]};
     if (role->writes)
@@ -178,8 +178,8 @@ int main(int count, char **words)
     snprintf(ready, sizeof ready, "ready-%s", role->name);
     check(creat(ready, 0600) >= 0, ready);
     if (role->reads)
-        answer(role, semaphore, marks);
+        answer(role, semaphore, time_stamps);
     else
-        send_frames(atof(words[3]), atol(words[4]), marks);
+        send_frames(atof(words[3]), atol(words[4]), time_stamps);
     return 0;
 }

@@ -1,4 +1,4 @@
-"""Comparison of lowfc with other implementations of the same loop: same frames, sizes and processors, in turns.
+"""Comparison of lowfc with other implementations of the same loop: same frames and sizes, in turns.
 
 All use SCHED_FIFO if the host grants it, and the normal scheduling class otherwise. CPU idle states are disabled for
 all if permitted.
@@ -35,8 +35,8 @@ from benchmarks.peers.implementations import (
     versions,
 )
 from benchmarks.peers.plain_zenoh import PORTS
-from benchmarks.peers.shared import ACTUATORS, LAST, MARKS, MIRROR_SIDE, MODES, SIDE, NumpyStep, Problem
-from benchmarks.runner import Lines, Result, Tell, add_times, ranged
+from benchmarks.peers.shared import ACTUATORS, LAST, MIRROR_SIDE, MODES, SIDE, TIME_STAMPS, NumpyStep, Problem
+from benchmarks.runner import Lines, Report, Result, add_times, ranged
 from benchmarks.sizes import Size, configuration, prepared_run, random_calibration
 from lowfc.adapters.bus.run import free_ports
 from lowfc.adapters.process.child import Child
@@ -62,12 +62,13 @@ DEFINITIONS = {
     "to the mirror": "from t0 until the actuators are in the mirror's process; for lowfc until just before it "
     "publishes its state",
     "clock": "CLOCK_MONOTONIC, one host",
-    "pacing": "the source sleeps until absolute times; a late frame is sent at once, with that time as t0; no frame is "
-    "skipped",
+    "pacing": "the source sleeps until absolute times; a late frame is sent at once, and its t0 is the actual time of "
+    "sending; no frame is skipped",
     "cells": "us, median (lowest to highest) over the turns; in every turn each implementation runs once, and every "
     "other turn in the opposite order",
     "without a command": "measured frames that led to no command, in all turns",
-    "pinning": "source and mirror on the first processor, all else on the second",
+    "pinning": "source and mirror on the first processor, all else on the second; with three or more processors "
+    "lowfc's mirror on the third",
     "memory": "lowfc's processes lock theirs (`realtime.lock_memory`), the others do not",
     "threads": "BLAS and numba 1; garbage collection off everywhere; chain.c by cc -O3 -march=native -ffast-math",
 }
@@ -91,7 +92,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def measure(options: argparse.Namespace, tell: Tell) -> Result:
+def measure(options: argparse.Namespace, report: Report) -> Result:
     """Run all implementations in turns: statistics of each turn (None if it failed), and reasons for missing ones."""
     chosen = [one for one in IMPLEMENTATIONS if any(word in one.name for word in options.only or [""])]
     if not chosen:
@@ -104,7 +105,7 @@ def measure(options: argparse.Namespace, tell: Tell) -> Result:
     failed = []
     for turn in range(options.repeats):
         for one in present[:: -1 if turn % 2 else 1]:
-            tell(f"turn {turn + 1} of {options.repeats}: {one.name}")
+            report(f"turn {turn + 1} of {options.repeats}: {one.name}")
             try:
                 runs[one.name].append(one_run(one, options, priority))
             except (ComparisonError, LowfcError) as fault:
@@ -153,7 +154,7 @@ def run_statistics(folder: Path, warm_up: int) -> dict[str, Any]:
     off: largest difference of the last actuators from those of numpy, relative to the largest actuator; None if a
     command is missing.
     """
-    due, published, commanded, received = (np.fromfile(folder / name, np.int64)[1:] for name in MARKS)
+    due, published, commanded, received = (np.fromfile(folder / name, np.int64)[1:] for name in TIME_STAMPS)
     command_error = _command_error(folder, commanded.size) if commanded.all() and received[-1] else None
     due, published, commanded, received = (times[warm_up:] for times in (due, published, commanded, received))
     period_ns = np.diff(due).mean() if due.size > 1 else np.inf
@@ -197,7 +198,7 @@ def write_shared_files(folder: Path, frames: int) -> None:
     (calibration.dark + calibration.flux_dn * calibration.reference).tofile(folder / "I0")
     (calibration.reconstructor / calibration.flux_dn).tofile(folder / "R")
     calibration.modes_to_actuators.tofile(folder / "to_actuators")
-    for name in MARKS:
+    for name in TIME_STAMPS:
         (folder / name).write_bytes(bytes(8 * (frames + 1)))
     (folder / LAST).write_bytes(bytes(4 * ACTUATORS))
     (folder / PORTS).write_text(json.dumps(dict(zip(("camera", "controller"), free_ports(2), strict=True))))
@@ -252,7 +253,7 @@ def _processes(
 
 
 PERCENTILES = {"p50": "p50", "p99": "p99", "p99_9": "p99.9", "max": "max"}
-HEADINGS = ["implementation", *PERCENTILES.values(), "without a command", "to the mirror p50", "p99"]
+HEADINGS = ["implementation", *PERCENTILES.values(), "without a command", "to the mirror p50", "to the mirror p99"]
 
 
 def tables(result: Result) -> list[Lines]:
@@ -268,7 +269,7 @@ def tables(result: Result) -> list[Lines]:
     return [
         latencies,
         [
-            [f"{FUSED}, minus", "p50", "p99", "turns with lower p50", "turns with lower p99"],
+            [f"{FUSED} minus this implementation, us", "p50", "p99", "turns with lower p50", "turns with lower p99"],
             *(_difference(runs, name) for name in others),
         ],
         [["implementation", "processes", "log", "safety", "other machines"], *features],

@@ -14,7 +14,7 @@ import numpy as np
 import zenoh
 from zenoh.handlers import Callback
 
-from benchmarks.peers.shared import NumpyStep, Part, Problem
+from benchmarks.peers.shared import NumpyStep, Problem, RoleProcess
 from lowfc.adapters.bus.run import Links
 from lowfc.adapters.bus.zenoh_session import session_config
 from lowfc.contract.messages import COMMAND, FRAME, Role
@@ -29,7 +29,7 @@ Message = Callable[[int, bytes], None]
 """Receives or sends a message: frame number, payload."""
 
 
-def join(part: Part, receive: Message) -> Message:
+def join(part: RoleProcess, receive: Message) -> Message:
     """Join a run with a session set up as lowfc's; returns the function that sends."""
     ports = json.loads((part.folder / PORTS).read_text())
     links = Links("peers", ports, "lowfc", part.folder / "credentials")
@@ -52,9 +52,9 @@ def join(part: Part, receive: Message) -> Message:
     return put
 
 
-def source(part: Part) -> None:
+def source(part: RoleProcess) -> None:
     """Send the frames, and record when their commands arrive."""
-    received, published, now_ns = part.marks("received"), part.marks("published"), time.monotonic_ns
+    received, published, now_ns = part.time_stamps("received"), part.time_stamps("published"), time.monotonic_ns
     last = part.last_actuators()
 
     def back(number: int, payload: bytes) -> None:
@@ -68,9 +68,9 @@ def source(part: Part) -> None:
         put(number, payloads[number % len(payloads)])
 
 
-def controller(part: Part) -> None:
+def controller(part: RoleProcess) -> None:
     """Answer frames until the process is killed."""
-    commanded, step = part.marks("commanded"), NumpyStep(Problem(part.folder))
+    commanded, step = part.time_stamps("commanded"), NumpyStep(Problem(part.folder))
 
     def answer(number: int, payload: bytes) -> None:
         put(number, step.command(payload))
@@ -82,6 +82,6 @@ def controller(part: Part) -> None:
 
 
 if __name__ == "__main__":
-    own = Part(sys.argv[1:])
-    own.settle()
+    own = RoleProcess(sys.argv[1:])
+    own.set_up_realtime()
     {"source": source, "controller": controller}[own.role](own)

@@ -24,7 +24,7 @@ from pyrtc.utils import set_affinity_and_priority
 from pyrtc.wavefront_corrector import WavefrontCorrector
 from pyrtc.wavefront_sensor import WavefrontSensor
 
-from benchmarks.peers.shared import ACTUATORS, GAIN, LEAK, LIMIT_NM, MODES, PIXELS, SIDE, Part, Problem
+from benchmarks.peers.shared import ACTUATORS, GAIN, LEAK, LIMIT_NM, MODES, PIXELS, SIDE, Problem, RoleProcess
 
 Array = npt.NDArray[np.float32]
 
@@ -34,11 +34,11 @@ _STREAMS = ("wfs_raw", "wfs", "signal", "wfc")
 class Sensor(WavefrontSensor):
     """Publishes the frames at their scheduled times."""
 
-    part: Part
+    part: RoleProcess
 
     def run(self) -> None:
         """Publish all frames of a run, then end the process."""
-        problem, published = Problem(self.part.folder), self.part.marks("published")
+        problem, published = Problem(self.part.folder), self.part.time_stamps("published")
         for number in self.part.frames():
             self.data = problem.frame(number)
             published[number] = time.monotonic_ns()
@@ -141,16 +141,16 @@ class FusedMirror(StockMirror):
         return actuators
 
 
-def clear(part: Part) -> None:
+def clear(part: RoleProcess) -> None:
     """Remove a run's streams from shared memory."""
     clear_shms([_name(part, stream) for stream in _STREAMS])
 
 
-def _name(part: Part, stream: str) -> str:
+def _name(part: RoleProcess, stream: str) -> str:
     return f"{part.folder.name}_{stream}"
 
 
-def _configuration(part: Part, function: str) -> dict[str, Any]:
+def _configuration(part: RoleProcess, function: str) -> dict[str, Any]:
     streams = {stream: _name(part, stream) for stream in _STREAMS}
     return {
         "affinity": part.cpu,
@@ -161,7 +161,7 @@ def _configuration(part: Part, function: str) -> dict[str, Any]:
     }
 
 
-def _component(part: Part) -> Component:
+def _component(part: RoleProcess) -> Component:
     problem = Problem(part.folder)
     if part.role == "source":
         sensor = Sensor(_configuration(part, "run") | {"name": "wfs", "width": SIDE, "height": SIDE})
@@ -170,12 +170,12 @@ def _component(part: Part) -> Component:
     if part.role == "signal":
         return PixelSignal(_configuration(part, "compute_signal"), problem)
     if part.role == "fused":
-        return FusedLoop(_configuration(part, "step"), problem, part.marks("commanded"))
+        return FusedLoop(_configuration(part, "step"), problem, part.time_stamps("commanded"))
     if part.role == "loop":
         loop = StockLoop(_configuration(part, "leaky_integrator") | {"leaky_gain": LEAK})
         loop.cm = problem.R.copy()
         loop.gain = GAIN
-        loop.commanded = part.marks("commanded")
+        loop.commanded = part.time_stamps("commanded")
         return loop
     fused = part.role == "mirror"
     matrix = part.folder / "m2c.npy"
@@ -183,12 +183,12 @@ def _component(part: Part) -> Component:
     own_options = {"name": "wfc", "num_actuators": ACTUATORS, "m2c_file": str(matrix)}
     own_options["num_modes"] = ACTUATORS if fused else MODES
     corrector = (FusedMirror if fused else StockMirror)(_configuration(part, "send_to_hardware") | own_options)
-    corrector.received, corrector.last = part.marks("received"), part.last_actuators()
+    corrector.received, corrector.last = part.time_stamps("received"), part.last_actuators()
     return corrector
 
 
 if __name__ == "__main__":
-    own = Part(sys.argv[1:])
+    own = RoleProcess(sys.argv[1:])
     if own.role == "clear":  # after a failed run
         clear(own)
         sys.exit()

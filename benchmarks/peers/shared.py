@@ -22,7 +22,7 @@ SIDE, MODES, MIRROR_SIDE = 80, 20, 34
 PIXELS, ACTUATORS = SIDE**2, MIRROR_SIDE**2
 GAIN, LEAK, LIMIT_NM = 0.3, 0.01, 100.0
 
-MARKS = ("due", "published", "commanded", "received")
+TIME_STAMPS = ("due", "published", "commanded", "received")
 """Files of int64 times in ns for each frame: scheduled, sent, its command sent, its command at the mirror."""
 
 LAST = "actuators"
@@ -34,7 +34,7 @@ _LOOK_S = 0.02
 _LAST_COMMAND_S = 0.05
 
 
-class Part:
+class RoleProcess:
     """A role of a run, in its own process."""
 
     def __init__(self, words: Sequence[str]) -> None:
@@ -43,7 +43,7 @@ class Part:
         self.rate_hz, self.count = float(rate_hz), int(frames)
         self.cpu, self.priority = int(cpu), int(priority)
 
-    def settle(self) -> None:
+    def set_up_realtime(self) -> None:
         """Set processor, scheduling class, timer slack and garbage collection, for later threads too."""
         os.sched_setaffinity(0, {self.cpu})
         policy = os.SCHED_FIFO if self.priority else os.SCHED_OTHER
@@ -57,7 +57,7 @@ class Part:
         gc.freeze()
         gc.disable()
 
-    def marks(self, name: str) -> memoryview:
+    def time_stamps(self, name: str) -> memoryview:
         """Times of one kind, indexed by the frame's number; 0 for none."""
         with (self.folder / name).open("r+b") as file:
             return memoryview(mmap.mmap(file.fileno(), 0)).cast("q")
@@ -78,7 +78,7 @@ class Part:
         self.ready()
         while not (self.folder / _GO).exists():
             time.sleep(_LOOK_S)
-        due = self.marks("due")
+        due = self.time_stamps("due")
         begun_ns, now_ns = time.monotonic_ns(), time.monotonic_ns
         for number in range(1, self.count + 1):
             due[number] = due_ns = begun_ns + round(number * 1e9 / self.rate_hz)
@@ -99,7 +99,7 @@ def go(folder: Path) -> None:
 
 
 class Problem:
-    """Frames and matrices from frames to actuators, each a file of a run's folder.
+    """The frames of a run, and the matrices that map a frame to actuators; each is a file in the run's folder.
 
     frames (frames, 80, 80) uint16 and I0 (6400,), dark included: DN; R (20, 6400): nm per DN; to_actuators (1156, 20):
     nm of surface per nm of wavefront.

@@ -8,7 +8,7 @@ import pytest
 from lowfc.arrays import Array
 from lowfc.contract.codecs.calibration_codec import decode_calibration
 from lowfc.contract.messages import CALIBRATION, COMMAND, OFFLOAD, STEP, wire
-from lowfc.programs.paper.dark_hole import PLAIN, SHIFTED, STEPS, Night, dark_hole
+from lowfc.programs.paper.dark_hole import PLAIN, SHIFTED, STEPS, DarkHoleRun, dark_hole
 from tests.support.loops import payloads, run
 
 pytestmark = pytest.mark.slow
@@ -25,8 +25,8 @@ def flat_nm() -> Array:
 
 
 @pytest.fixture(scope="module")
-def night(tmp_path_factory: pytest.TempPathFactory) -> Night:
-    """Twenty steps with the zero point taken along, then without; on a mirror with a flat map and dead actuators."""
+def dark_hole_run(tmp_path_factory: pytest.TempPathFactory) -> DarkHoleRun:
+    """Twenty steps with the shift of the zero point, then without; on a mirror with a flat map and dead actuators."""
     folder = tmp_path_factory.mktemp("dark_hole")
     active = np.ones(GRID)
     active.flat[list(DEAD)] = 0
@@ -37,12 +37,12 @@ def night(tmp_path_factory: pytest.TempPathFactory) -> Night:
 
 
 @pytest.fixture(scope="module")
-def logged(night: Night) -> dict[str, list[bytes]]:
-    return payloads(night.log)
+def logged(dark_hole_run: DarkHoleRun) -> dict[str, list[bytes]]:
+    return payloads(dark_hole_run.log)
 
 
-def test_the_loop_does_not_undo_the_steps(night: Night) -> None:
-    channel = night.channels[SHIFTED]
+def test_the_loop_does_not_undo_the_steps(dark_hole_run: DarkHoleRun) -> None:
+    channel = dark_hole_run.channels[SHIFTED]
     assert len(channel.channel_nm) == STEPS + 1
     assert np.linalg.norm(channel.channel_nm[-1]) > 15, "nm of wavefront that a loop without the shift would take away"
     undone, error = channel.undone()
@@ -50,13 +50,13 @@ def test_the_loop_does_not_undo_the_steps(night: Night) -> None:
     assert error < 0.005
 
 
-def test_without_the_shift_the_loop_undoes_the_steps(night: Night) -> None:
-    undone, _ = night.channels[PLAIN].undone()
+def test_without_the_shift_the_loop_undoes_the_steps(dark_hole_run: DarkHoleRun) -> None:
+    undone, _ = dark_hole_run.channels[PLAIN].undone()
     assert undone == pytest.approx(1, abs=0.1)
 
 
-def test_the_residual_is_as_small_as_before(night: Night) -> None:
-    before_nm, after_nm = night.channels[SHIFTED].residual_nm
+def test_the_residual_is_as_small_as_before(dark_hole_run: DarkHoleRun) -> None:
+    before_nm, after_nm = dark_hole_run.channels[SHIFTED].residual_nm
     assert before_nm < 3
     assert after_nm < 1.2 * before_nm
 
@@ -88,8 +88,8 @@ def test_the_mean_command_is_published_once_a_second(logged: dict[str, list[byte
     assert np.diff(times_ns) == pytest.approx(1e9)
 
 
-def test_the_night_is_replayed_to_the_bit(night: Night) -> None:
-    done = run(night.log.parent, "replay", "--json", str(night.log))
+def test_the_run_is_replayed_to_the_bit(dark_hole_run: DarkHoleRun) -> None:
+    done = run(dark_hole_run.log.parent, "replay", "--json", str(dark_hole_run.log))
     assert done.returncode == 0, done.stdout + done.stderr
     found = json.loads(done.stdout)
     assert found["identical"]

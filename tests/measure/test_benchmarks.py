@@ -14,7 +14,7 @@ import pytest
 from benchmarks import curves, kernels, load, runner, step, streams, throughput
 from benchmarks.peers import comparison, implementations
 from benchmarks.peers.implementations import FUSED, IMPLEMENTATIONS
-from benchmarks.peers.shared import ACTUATORS, MARKS, NumpyStep, Problem
+from benchmarks.peers.shared import ACTUATORS, TIME_STAMPS, NumpyStep, Problem
 from benchmarks.sizes import Size, configuration, random_calibration
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.sections import Camera
@@ -276,7 +276,7 @@ def test_the_statistics_of_a_run_are_computed_from_its_times(tmp_path: Path) -> 
     published[5] += 1_200_000
     commanded, received = published + np.arange(7) * 1000, published + 50_000
     commanded[4] = received[4] = 0
-    for name, times in zip(MARKS, (due, published, commanded, received), strict=True):
+    for name, times in zip(TIME_STAMPS, (due, published, commanded, received), strict=True):
         times.astype(np.int64).tofile(tmp_path / name)
     found = comparison.run_statistics(tmp_path, 2)  # frames 3 to 6
     assert found["frames"] == 4
@@ -397,8 +397,8 @@ def test_streams_and_the_direct_link_are_compared_turn_by_turn(monkeypatch: pyte
     assert found_p50[3:] == ["1.42 (0.83 to 2.00)", "1.83 (0.67 to 3.00)"]
     _, between, _, ratio, _ = by_heading(lines)
     assert (between["without a command"], ratio["frame to command, us: p99"]) == ("2 of 1000", "1.00 (1.00 to 1.00)")
-    assert "350 (200 to 500) us (p50)" in streams.about(found)
-    assert "350 (300 to 400) us until the controller" in streams.about(found)
+    assert "ImageStreamIO, 350 (200 to 500) us (p50)" in streams.about(found)
+    assert "reads the stream itself, 350 (300 to 400) us" in streams.about(found)
 
 
 @pytest.mark.exclusive

@@ -21,7 +21,7 @@ from lowfc.control.loop.command_channels import FLAT
 STEPS = 20
 SEED = 5
 SETTLE, WINDOW = 100, 300
-"""Frames after each step, and after the last step and after its removal."""
+"""`SETTLE`: frames after each step. `WINDOW`: further frames after the last step, and after the shape is removed."""
 AT_ONCE = 5
 """Steps combined into one on the channel that does not shift the zero point, where the loop undoes a large fraction."""
 SHIFTED, PLAIN = "dark-hole", FLAT
@@ -34,13 +34,14 @@ PATIENCE_S = 60.0
 
 
 @dataclass(frozen=True)
-class Channel:
+class ChannelResult:
     """Result of a channel; arrays (1 + changes, modes), nm rms of wavefront, the first row before all changes.
 
     Attributes:
         channel_nm: modes of the channel's shape as the sensor sees them.
         reaction_nm: the loop's command minus the part that cancels the disturbance, mean of each step's last frames.
-        residual_nm: (2,) rms of the true residual about its mean, before the steps and after them.
+        residual_nm: (2,) rms of the true residual about its mean, before the first step, and after the last one
+            while the shape is applied.
     """
 
     channel_nm: Array
@@ -57,10 +58,10 @@ class Channel:
 
 
 @dataclass(frozen=True)
-class Night:
+class DarkHoleRun:
     """Results of a run: its channels, and the path of its log."""
 
-    channels: dict[str, Channel]
+    channels: dict[str, ChannelResult]
     log: Path
 
 
@@ -72,18 +73,18 @@ def shapes_nm(grid: tuple[int, int], each_nm: float, usable: Mask | None = None)
 
 def dark_hole(
     folder: Path, each_nm: float, toml: str = "", base_nm: npt.ArrayLike = 0.0, seed: int | None = None
-) -> Night:
+) -> DarkHoleRun:
     """Apply the steps on one channel, remove them, and apply them on the other, in one run of the processes.
 
     Args:
         folder: folder of the log.
-        each_nm: rms of each step.
+        each_nm: rms of each step, nm of surface.
         toml: configuration.
         base_nm: (rows, columns) nm, constant shape on the channel without a zero-point shift.
         seed: seed of the simulation; the configuration's if None.
     """
-    (folder / "night.toml").write_text(f"{GAINS}{toml}")
-    words = [sys.executable, "-m", *COMMAND.split(), "--run", RUN, "--config", "night.toml", "--json"]
+    (folder / "run.toml").write_text(f"{GAINS}{toml}")
+    words = [sys.executable, "-m", *COMMAND.split(), "--run", RUN, "--config", "run.toml", "--json"]
     words += [] if seed is None else ["--seed", str(seed)]
     pipe = subprocess.PIPE
     with subprocess.Popen(words, cwd=folder, text=True, stdout=pipe, stderr=pipe) as process:  # noqa: S603  # our own
@@ -100,7 +101,7 @@ def dark_hole(
     if process.returncode:
         raise RuntimeError(complaints)
     log = folder / json.loads(out)["log"]
-    return Night(_channels(log, marks, steps_nm), log)
+    return DarkHoleRun(_channels(log, marks, steps_nm), log)
 
 
 def _apply_steps(each_nm: float, base_nm: Array) -> tuple[dict[str, list[int]], Array]:
@@ -128,7 +129,7 @@ def _apply_steps(each_nm: float, base_nm: Array) -> tuple[dict[str, list[int]], 
     return marks, np.vstack([np.zeros(steps_nm.shape[1]), steps_nm])
 
 
-def _channels(log: Path, marks: dict[str, list[int]], steps_nm: Array) -> dict[str, Channel]:
+def _channels(log: Path, marks: dict[str, list[int]], steps_nm: Array) -> dict[str, ChannelResult]:
     history = read_history(LogReader(log))
     truths = history.true
     if truths is None:
@@ -148,5 +149,5 @@ def _channels(log: Path, marks: dict[str, list[int]], steps_nm: Array) -> dict[s
             np.sqrt(truths.residual_nm[until(end, WINDOW)].var(axis=0, dtype=np.float64).sum())
             for end in (changed_at[0], changed_at[-1])
         ]
-        found[name] = Channel(steps_nm[:: STEPS // (len(changed_at) - 1)], reaction, np.array(residual_nm))
+        found[name] = ChannelResult(steps_nm[:: STEPS // (len(changed_at) - 1)], reaction, np.array(residual_nm))
     return found
