@@ -28,7 +28,7 @@ ELSEWHERE = {
     "lowfc doctor": "tests/commissioning/test_doctor.py",
     "lowfc gateway epics": "tests/interlocks/test_gateway.py",
     "rerun $(ls -t logs/*.mcap | head -1)": "tests/e2e/test_rerun_viewer.py",
-    ROUTE: "tests/design/test_layout_files.py",
+    ROUTE: "tests/view/test_viewer_layouts.py",
 }
 SHORTENED_OPTIONS = {
     "--duration 20": "--duration 2",

@@ -1,4 +1,4 @@
-"""The packaged viewer layouts: every message path in them is a field of the message on that topic.
+"""The viewer layouts in deploy/layouts: every message path in them is a field of the message on that topic.
 
 A renamed field or topic fails here rather than during operation.
 """

@@ -50,7 +50,7 @@ from lowfc.programs.core.controller_report import (
     NotClosed,
     Offload,
     StageTiming,
-    fill_benefit,
+    fill_harm_and_contrast,
 )
 from lowfc.programs.core.gain_watch import GainWatch
 from lowfc.programs.core.mirror_reports import MirrorReports
@@ -168,7 +168,7 @@ class Controller:
         health.not_closed_ns, health.not_closed_cause = self._not_closed.note(self._state, now_ns)
         if self._state.mode is LoopMode.CLOSED:
             health.holding = holding(self._state)
-        fill_benefit(health, self._gain_watch, self._state)
+        fill_harm_and_contrast(health, self._gain_watch, self._state)
         health.last_second.CopyFrom(self._last_second.statistics(self._state, self._service.clock.host_ns()))
         if self._frame_to_command.count:
             health.frame_to_command.CopyFrom(codec.latency(self._frame_to_command))

@@ -105,7 +105,7 @@ class LastSecond:
         return wire.LoopFigures(frames=len(rows), residual_rms_nm=square_nm2**0.5, flux_fraction=fraction)
 
 
-def fill_benefit(health: wire.Health, watch: GainWatch, state: State) -> None:
+def fill_harm_and_contrast(health: wire.Health, watch: GainWatch, state: State) -> None:
     """Add the harm that closing would do, and the measured added contrast, to a Health."""
     health.closing_harm = watch.closing_harm
     measured = watch.added_contrast()

@@ -15,7 +15,7 @@ from lowfc.contract.errors import ConfigurationError
 DASK_TIMEOUT_S = 10.0
 
 
-class Here(Executor):
+class InProcessExecutor(Executor):
     """Runs submitted calls immediately in this process."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -35,7 +35,7 @@ def open_executor(jobs: int, scheduler: str | None) -> Iterator[Executor]:
         with _dask(scheduler) as executor:
             yield executor
     elif jobs == 1:
-        yield Here()
+        yield InProcessExecutor()
     else:
         context = multiprocessing.get_context("spawn")
         pool = ProcessPoolExecutor(jobs, context, signal.signal, (signal.SIGINT, signal.SIG_IGN))
