@@ -61,7 +61,7 @@ class Control(Section):
     nuisance: list[Literal["background", "shear"]] = Field(default_factory=list)
     """Nuisance parameters fitted together with the modes: uniform background light, shear of the beam."""
     tilt_gain: Gain | Literal["auto"] = "auto"
-    """Integrator gain of tip and tilt; auto: optimised per mode for the least residual, 0 if any gain would harm."""
+    """Integrator gain of tip and tilt; auto: optimised per mode for the least residual, 0 if every gain would harm."""
     gain: Gain | Literal["auto"] = "auto"
     """Integrator gain of the other modes."""
     on_harm: Literal["warn", "open", "integrator"] = "warn"
