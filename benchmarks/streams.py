@@ -1,4 +1,4 @@
-"""Frame to command over ImageStreamIO and over the direct link: same controller, frames and processors, in turns.
+"""Frame to command over ImageStreamIO and over the direct link: same controller and frames, in turns.
 
 Over ImageStreamIO a program writes each frame into a stream, a camera process or the controller itself (`--camera`)
 reads it with the driver `isio`, extended by time stamps (`stream_ends.TimedCamera`), and `lowfc mirror isio` writes the

@@ -156,8 +156,8 @@ ADVICE: dict[str, Advice] = {
         "make the directory named in the event writable; safe mode itself is in force.",
     ),
     "COMMANDS_LATE": Advice(
-        "more than a quarter of the last 500 commands were applied after the next exposure had begun, so the "
-        "delay is a frame longer than configured.",
+        "in the simulated camera, more than a quarter of the last 500 commands were applied after the next exposure "
+        "had begun, so the delay is a frame longer than configured.",
         "lower `camera.rate_hz`, or give the loop its processors and real-time rights (`lowfc doctor`); if the bench "
         "cannot be faster, set `control.delay_frames` to the measured delay.",
     ),

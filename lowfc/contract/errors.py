@@ -1,6 +1,6 @@
 """The exceptions that a user may see.
 
-    LowfcError              anything that the user can correct; one line, exit status 2
+    LowfcError              anything that the user can correct; one line, exit status 2 unless its class sets another
     ├── ConfigurationError  a key, a value or a combination of values
     ├── DataFileError       a file that is missing, damaged or of the wrong kind
     ├── CalibrationError    a calibration that does not fit the instrument

@@ -32,7 +32,7 @@ def show_run(run_id: str, config: Configuration | None, target: Target, seconds:
     """Show a running loop until stopped, until the window is closed, or for some seconds.
 
     Raises:
-        ViewerError, ViewError: no viewer starts, or it fails repeatedly.
+        ViewerError, ViewError: no viewer starts, it fails repeatedly, memory stays above its limit, or writing fails.
         DataFileError: a file cannot be written.
     """
     require_folder(target.written)
