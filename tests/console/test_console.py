@@ -43,6 +43,7 @@ def _no_wait_for_idle(monkeypatch: pytest.MonkeyPatch) -> None:
 
     for module in ("app", "pilot"):
         monkeypatch.setattr(f"textual.{module}.wait_for_idle", pause)
+    monkeypatch.setattr("textual.screen.UPDATE_PERIOD", 0.1)  # paint seldom: the tests read texts, not the picture
     monkeypatch.setattr("lowfc.programs.console.app.READ_PERIOD_S", 0.05)
     monkeypatch.setattr("lowfc.programs.console.feed.DISCONNECTED_S", 0.4)
 
@@ -199,7 +200,7 @@ def test_safe_is_requested_by_s_by_its_button_and_by_f12_in_a_form(run: LiveRun)
         await screen.until(lambda: [one.name for one in run.requests[before:]] == ["safe"])
         await screen.until(lambda: screen.app.screen.query_one("Input").value == "s")
         await screen.pilot.press("escape", "k", "enter")
-        await screen.until(lambda: run.requests[-1].name == "clear")
+        await screen.until(lambda: run.requests[-1].name == "clear" and len(screen.app.screen_stack) == 1)
         await screen.pilot.click("#close")
         await screen.until(lambda: run.requests[-1].name == "close")
 
