@@ -11,7 +11,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates, spline_filter
 from scipy.optimize import least_squares
 
-from lowfc.arrays import Array
+from lowfc.arrays import Array, Complex
 
 _ANGLES = 72
 """Number of initial rotations, spread over 180 degrees."""
@@ -94,11 +94,12 @@ def align(real: Array, computed: Array) -> Alignment:
         _size(light) / _size(np.asarray(computed, np.float64)),
         1.0,
     }  # a detector region may cut off the image's wings
+    spectrum = np.fft.rfft2(light, _doubled(light.shape))
     fits = []
     for parity in (1, -1):
         guesses = []
         for scale, angle in product(scales, np.arange(_ANGLES) * 180.0 / _ANGLES):
-            guess = _placed(spline, Geometry(scale, 0.0, 0.0, float(angle), parity), light)
+            guess = _placed(spline, Geometry(scale, 0.0, 0.0, float(angle), parity), light.shape, spectrum)
             guesses.append((_residual(_sample(spline, guess, real.shape), real)[0], guess))
         guesses.sort(key=lambda each: each[0])
         fits.append(min((_refine(spline, guess, real) for _, guess in guesses[:3]), key=lambda each: each[0]))
@@ -114,12 +115,24 @@ def align(real: Array, computed: Array) -> Alignment:
     return Alignment(replace(best, rotation_deg=rotation), flux, background, residual, other)
 
 
-def _placed(spline: Array, geometry: Geometry, light: Array) -> Geometry:
-    """The geometry with the centre at which the model best matches the light, to a pixel."""
-    rows, columns = light.shape
+def _doubled(shape: tuple[int, ...]) -> tuple[int, int]:
+    """Twice the rows and columns: large enough for a correlation at any offset."""
+    return 2 * shape[0], 2 * shape[1]
+
+
+def _placed(spline: Array, geometry: Geometry, shape: tuple[int, ...], spectrum: Complex) -> Geometry:
+    """The geometry with the centre at which the model best matches an image, to a pixel.
+
+    Args:
+        spline: Spline of the computed image.
+        geometry: Scale, rotation and parity.
+        shape: Rows and columns of the image.
+        spectrum: Fourier transform of the image, padded to twice its rows and columns.
+    """
+    rows, columns = shape
     middle = replace(geometry, row=rows // 2, column=columns // 2)
-    model = _sample(spline, middle, (2 * rows, 2 * columns))  # large enough for any offset
-    correlation = np.fft.irfft2(np.fft.rfft2(light, model.shape) * np.fft.rfft2(model).conj(), model.shape)
+    model = _sample(spline, middle, _doubled(shape))
+    correlation = np.fft.irfft2(spectrum * np.fft.rfft2(model).conj(), model.shape)
     row, column = np.unravel_index(int(correlation.argmax()), model.shape)
     down, across = (int(row) + rows) % (2 * rows) - rows, (int(column) + columns) % (2 * columns) - columns
     return replace(middle, row=float(middle.row + down), column=float(middle.column + across))
@@ -127,8 +140,8 @@ def _placed(spline: Array, geometry: Geometry, light: Array) -> Geometry:
 
 def _sample(spline: Array, geometry: Geometry, shape: tuple[int, ...]) -> Array:
     angle = np.deg2rad(geometry.rotation_deg)
-    rows, columns = np.indices(shape, dtype=np.float64)
-    down, across = (rows - geometry.row) / geometry.scale, (columns - geometry.column) / geometry.scale
+    down = (np.arange(shape[0])[:, None] - geometry.row) / geometry.scale
+    across = (np.arange(shape[1]) - geometry.column) / geometry.scale
     x = geometry.parity * (np.cos(angle) * across + np.sin(angle) * down)
     y = np.cos(angle) * down - np.sin(angle) * across
     at = np.array([y + (spline.shape[0] - 1) / 2, x + (spline.shape[1] - 1) / 2])
@@ -138,10 +151,11 @@ def _sample(spline: Array, geometry: Geometry, shape: tuple[int, ...]) -> Array:
 
 def _residual(model: Array, real: Array) -> tuple[float, float, float]:
     """Relative residual after a fit of flux and background, and these two."""
-    columns = np.stack([model.ravel(), np.ones(model.size)], axis=1)
-    (flux, background), *_ = np.linalg.lstsq(columns, real.ravel(), rcond=None)
-    rest = real.ravel() - columns @ (flux, background)
-    return float(np.sqrt(np.mean(rest**2)) / real.std()), float(flux), float(background)
+    shape, light = model - model.mean(), real - real.mean()
+    square = float(np.vdot(shape, shape))
+    flux = float(np.vdot(shape, light)) / square if square else 0.0
+    rest = light - flux * shape
+    return float(np.sqrt(np.mean(rest**2)) / real.std()), flux, float(real.mean() - flux * model.mean())
 
 
 def _refine(spline: Array, guess: Geometry, real: Array) -> tuple[float, Geometry]:
