@@ -136,7 +136,8 @@ def means_while_applied(measured_nm: Array, timing: Timing) -> tuple[Array, Arra
     found = np.full(measured_nm.shape, np.nan)
     rows = np.arange(max(0, -lags[0]), len(measured_nm) - max(0, lags[-1]))
     if rows.size:
-        found[rows] = sum(tap * measured_nm[rows + lag] for tap, lag in zip(taps, lags, strict=True))
+        for found_mode, mode_nm in zip(found.T, measured_nm.T, strict=True):
+            found_mode[rows] = np.correlate(mode_nm, taps, "valid")
     return found, np.asarray(np.exp(1j * np.outer(_FILTER_OMEGA, lags)) @ taps)
 
 
