@@ -50,7 +50,7 @@ def tune(*words: object) -> dict[str, Any]:
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     night = SyntheticLog()
     night.request("close")
-    night.frames(4000)
+    night.frames(3000)
     return night.write(tmp_path_factory.mktemp("night") / "night.mcap")
 
 
@@ -97,20 +97,20 @@ def test_probe_sequences_affect_neither_the_tuning_nor_the_delay(tmp_path: Path)
     night.request("close")
     night.frames(100)
     shape = night.calibration.modes_to_actuators[:, 0]
-    table = 20 * np.sin(2 * np.pi * 31 * np.arange(1000) * PERIOD_NS * 1e-9).astype(np.float32)[:, None]
+    table = 20 * np.sin(2 * np.pi * 31 * np.arange(500) * PERIOD_NS * 1e-9).astype(np.float32)[:, None]
     night.request("play", text="mirror", actuators_nm=shape, table=table)
-    night.frames(3800)
+    night.frames(2900)
     found = tune(night.write(tmp_path / "played.mcap"))
     assert found["delay_frames"] == 1.0
     assert found["warnings"] == []
-    assert found["frames"] < 3800
+    assert found["frames"] < 2900
     assert [line["frequency_hz"] for line in found["modes"][0]["lines"]] == pytest.approx([7.0], abs=0.05)
 
 
 def test_an_open_loop_with_much_tilt_is_flagged(tmp_path: Path) -> None:
     night = SyntheticLog()
     night.request("open")
-    night.frames(2300)
+    night.frames(2150)
     path = night.write(tmp_path / "open.mcap")
     found = tune(path)
     assert not found["closed"]
