@@ -55,7 +55,9 @@ def tilt_mas(summary: str) -> float:
 
 
 @pytest.mark.parametrize("shorter", [True, pytest.param(False, marks=pytest.mark.slow)])
-def test_first_loop(tmp_path: Path, shorter: bool) -> None:
+def test_first_loop(tmp_path: Path, shorter: bool, request: pytest.FixtureRequest) -> None:
+    if shorter:
+        request.getfixturevalue("without_drawings")
     first, info, report, replay, what_if, digest = followed(tmp_path, "first_loop", shorter=shorter).values()
     assert "frame to command" in first
     assert "lowfc/camera/frame" in info
@@ -81,6 +83,7 @@ def test_design_mask(tmp_path: Path) -> None:
     assert all("frame to command" in one for one in loops)
 
 
+@pytest.mark.usefixtures("without_drawings")  # `test_golden` has those of this log
 def test_bad_night(tmp_path: Path) -> None:
     shutil.copytree(ROOT / "tests" / "golden", tmp_path / "tests" / "golden")
     info, report, replay, killed, recovered, whole = followed(tmp_path, "bad_night").values()
