@@ -115,8 +115,11 @@ def _noise_rows(mask: Prepared, light_e: float) -> Iterator[Row]:
     )
     bounded = partial(Row, mask.name, modes=14, estimator="Cramer-Rao bound")
     modes, band = mask.modes[:14], gauss_legendre(mask.sensor.wavelength_nm, count=4)
-    in_band = reference(mask.sensor, band).ravel(), response(mask.sensor, modes, band)
-    for quantity, (I0, H) in {"noise": (mask.I0, mask.H[:, :14]), "noise, 20 % band": in_band}.items():
+    for quantity in ("noise", "noise, 20 % band"):
+        if quantity == "noise":
+            I0, H = mask.I0, mask.H[:, :14]
+        else:  # not computed for a mask that cannot distinguish the modes at the central wavelength
+            I0, H = reference(mask.sensor, band).ravel(), response(mask.sensor, modes, band)
         try:
             bound = np.diag(cramer_rao(H * light_e, variance_e(I0 * light_e, 0.0)))
         except ValueError:

@@ -2,13 +2,14 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 from scipy.optimize import brentq
 
 from lowfc.arrays import Array
 from lowfc.contract.sections import SensorSection
+from lowfc.design.estimators import fit
 from lowfc.design.fisher import covariance, variance_e
 from lowfc.design.paper import (
     STAR,
@@ -17,6 +18,7 @@ from lowfc.design.paper import (
     TABLE3_WAVES,
     TABLE4_EXPOSURE_S,
     TABLE4_MAS,
+    TABLE4_READ_NOISE_E,
 )
 from lowfc.design.trials import bounds_waves, expected_r_squared, expected_rms
 from lowfc.optics.chain.relay import Defocus, fresnel_distance
@@ -31,7 +33,6 @@ from lowfc.programs.paper.tables.pointing import (
     PAPER_PUPIL,
     PAPER_RELAY_MASK,
     exposures,
-    fits,
     paper_count_e,
     predicted_mas,
 )
@@ -75,8 +76,9 @@ def _throughputs(sam: Prepared, clowfs: Prepared) -> Iterator[Row]:
         )
 
 
-def tilt_signal(sensor: Prepared, axis: int = 0) -> Array:
-    """Change (pixels,) of the image in the band by 1 mas of tilt along x, or along y for axis 1."""
+@lru_cache(maxsize=8)
+def tilt_signal(sensor: Prepared, axis: int) -> Array:
+    """Change (pixels,) of the image in the band by 1 mas of tilt along x (axis 0) or y (axis 1)."""
     tilt_nm = np.zeros(2)
     tilt_nm[axis] = NM_PER_MAS
     return sensor.image(tilt_nm, sensor.band) - sensor.band_I0
@@ -102,7 +104,7 @@ def _signals(sensor: Prepared) -> Iterator[Row]:
 
 
 def _ratios(sam: Prepared, clowfs: Prepared) -> Iterator[Row]:
-    own, paper = np.ptp(tilt_signal(clowfs)) / np.ptp(tilt_signal(sam)), PAPER_SIGNAL_RATIO
+    own, paper = np.ptp(tilt_signal(clowfs, 0)) / np.ptp(tilt_signal(sam, 0)), PAPER_SIGNAL_RATIO
     for k, light in enumerate(("own photometry", "paper's electrons")):
         counts = [float(paper_count_e(each) / each.band_I0.sum()) if k else 1.0 for each in (clowfs, sam)]
         what, ratio = f"P-V of the signal of 1 mas in electrons, {light}", float(own * counts[0] / counts[1])
@@ -111,8 +113,8 @@ def _ratios(sam: Prepared, clowfs: Prepared) -> Iterator[Row]:
     for k, light in enumerate(("paper's electrons", "own photometry")):
         scatter = []
         for sensor in (sam, clowfs):
-            exposure = exposures(sensor)[k]
-            linear = fits(sensor, exposure, 1)[2, "pinv"]
+            scale_e = exposures(sensor)[k].scale_e
+            linear = fit(NOLLS_14[:2], sensor.band_I0, sensor.band_tilt_H, scale_e, TABLE4_READ_NOISE_E, "pinv")
             scatter.append(float(predicted_mas(linear, linear.reference_e)[0]))
         fitted = partial(Row, "sam / clowfs", modes=2, estimator="pinv", assumption=predicted)
         yield fitted(f"std of x tilt, {light}", "", scatter[0] / scatter[1], PAPER_SCATTER_RATIO)
