@@ -65,6 +65,9 @@ def build(
     operators = []
     for scale, weight in zip(scales, band.weights, strict=True):
         functions = sensor_functions(sensor, scale, spec.guards)
+        rows = functions.shape[1] ** 2 if isinstance(sensor.relay, ApertureMask) else np.count_nonzero(mask)
+        if not 0 < rank <= min(rows, used.size):
+            raise ValueError(f"the rank must lie between 1 and {min(rows, used.size)}, got {rank}")
         matrix = field_operator(sensor, scale, functions, to_samples, to_samples, used, advance)
         modes = _leading_modes(matrix, rank)
         operators.append(
@@ -107,8 +110,6 @@ def _leading_modes(matrix: Array, rank: int) -> Array:
     import scipy.linalg
 
     size = min(matrix.shape)
-    if not 0 < rank <= size:
-        raise ValueError(f"the rank must lie between 1 and {size}, got {rank}")
     subset = (size - rank, size - 1)
     if len(matrix) == size:
         _, vectors = scipy.linalg.eigh(matrix @ matrix.T, subset_by_index=subset)
