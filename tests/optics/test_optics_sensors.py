@@ -70,7 +70,7 @@ def test_the_chain_agrees_with_prysm(prysm, sensor, opd_nm):
 
 
 def test_broadband_images_and_responses_are_weighted_sums(sensor, modes, opd_nm):
-    band = gauss_legendre(550.0)
+    band = gauss_legendre(550.0, count=2)
     each = [monochromatic(nm) for nm in band.wavelengths_nm]
     images = sum(w * image(sensor, opd_nm, one) for w, one in zip(band.weights, each, strict=True))
     np.testing.assert_allclose(image(sensor, opd_nm, band), images, rtol=1e-12)
@@ -155,7 +155,7 @@ def test_six_millimetres_are_3_4_waves_of_defocus():
     assert fresnel_distance(6.0, 20.0, 550.0) / 8 == pytest.approx(3.41, abs=0.01)  # z / (8 lambda F^2), peak to valley
 
 
-@pytest.mark.parametrize("wavelength_nm", [550.0, 500.0])
+@pytest.mark.parametrize("wavelength_nm", [550.0, pytest.param(500.0, marks=pytest.mark.slow)])
 def test_the_defocused_image_agrees_with_hcipy(hcipy, opd_nm, wavelength_nm):
     """hcipy's window is periodic, which changes the scale by up to 1e-3; lengths in lambda0/D, small wavelength."""
     optics = sensor_named("clowfs")
@@ -307,7 +307,7 @@ def test_unresolved_defocus_is_refused():
 def test_behind_an_aperture_mask_modes_are_odd_and_shear_and_flux_even(name, modes):
     """With symmetric real masks, phases change the image by odd functions, and amplitudes by even ones."""
     optics = sensor_named(name)
-    H, slopes = response(optics, modes[:14]), shear_response(optics)
+    H, slopes = response(optics, modes[:14:2]), shear_response(optics)
     # Reversing the order of pixels is a point reflection through the centre.
     assert np.abs(H + H[::-1]).max() < 1e-9 * np.abs(H).max()
     assert np.abs(slopes - slopes[::-1]).max() < 1e-9 * np.abs(slopes).max()
