@@ -141,13 +141,13 @@ def test_mask_is_stored_in_the_shortest_type_that_meets_the_contrast():
 
 def test_infeasible_request_reports_the_nearest_feasible_one(tmp_path):
     path = tmp_path / "spc.npz"
-    arguments = ["spc", "--inner", "2.5", "--outer", "8", "--cells", "16", "--out", str(path)]
+    arguments = ["spc", "--inner", "2.5", "--outer", "5", "--cells", "16", "--out", str(path)]
     error = lowfc("design", *arguments).exception
     assert isinstance(error, ConfigurationError)
     assert "inner angle 2.5 lambda/D at 1e-09 is infeasible" in str(error)
     nearest = r"nearest feasible inner angle is (\S+) \(same contrast\), or contrast is (\S+) \(same angle\)"
     inner, contrast = map(float, re.search(nearest, str(error)).groups())
-    request = replace(SMALL, inner=2.5)
+    request = replace(SMALL, inner=2.5, outer=5.0)
     assert is_feasible(replace(request, inner=inner))
     assert not is_feasible(replace(request, inner=inner - 0.1))
     assert is_feasible(replace(request, contrast=contrast))
@@ -204,7 +204,7 @@ def test_unwritable_file_is_reported_before_the_design(tmp_path):
 
 def test_ctrl_c_stops_within_a_program_and_leaves_no_file(tmp_path):
     source = "from lowfc.adapters.process.terminal import run_app; from lowfc.programs.design.command import design_app"
-    command = [sys.executable, "-c", f"{source}; run_app(design_app)", "spc", "--outer", "12"]
+    command = [sys.executable, "-c", f"{source}; run_app(design_app)", "spc", "--outer", "8"]
     command += ["--out", str(tmp_path / "spc.npz")]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         assert "cells, program  1" in process.stderr.readline()
