@@ -6,7 +6,7 @@ for each candidate.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -106,11 +106,11 @@ class FullLight:
 
     def nonlinearity_waves(self, modes: int) -> float:
         """Mean residual rms over the open pupil of random wavefronts without noise, by the plain pseudo-inverse."""
-        signal, truth = self.central(), self.focus.wavefronts_nm[modes]
-        R = reconstructor(signal.I0, signal.H[:, :modes], np.ones_like(signal.I0), 1.0, 0.0, "pinv")
-        images = [self._intensity(self._on_sensor(field, WAVELENGTH_NM)) for field in self.focus.aberrated[modes]]
-        residuals = truth - (np.array(images) - signal.I0) @ R.T
-        return float(residual_rms(self.forms.gram[:modes, :modes], residuals).mean()) / WAVELENGTH_NM
+        return _nonlinearity_waves(self, modes)
+
+    def image(self, focal: Complex) -> Array:
+        """Image (pixels,) at the central wavelength of a field on the focal-plane mask."""
+        return self._intensity(self._on_sensor(focal, WAVELENGTH_NM))
 
     def _signal(self, band: Band) -> Signal:
         pixels = self.sensor.pixels**2
@@ -127,6 +127,15 @@ class FullLight:
 
     def _intensity(self, field: Complex) -> Array:
         return pixel_sums(self.sensor, field.real**2 + field.imag**2).ravel()
+
+
+@lru_cache(maxsize=8)
+def _nonlinearity_waves(one: FullLight, modes: int) -> float:
+    signal, truth = one.central(), one.focus.wavefronts_nm[modes]
+    R = reconstructor(signal.I0, signal.H[:, :modes], np.ones_like(signal.I0), 1.0, 0.0, "pinv")
+    images = [one.image(field) for field in one.focus.aberrated[modes]]
+    residuals = truth - (np.array(images) - signal.I0) @ R.T
+    return float(residual_rms(one.forms.gram[:modes, :modes], residuals).mean()) / WAVELENGTH_NM
 
 
 def sweep(merit_of: Callable[[float], float], low: float, high: float, count: int) -> tuple[Array, float]:

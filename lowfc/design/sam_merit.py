@@ -111,7 +111,8 @@ def build_optics(
     samples = IMAGE_WIDTH * samples_per
 
     def group(scale: float, names: tuple[str, ...], count: int) -> Group:
-        relay = [_relay(field, name, relay_samples, scale) for name in names for field in amplitudes[:count]]
+        masks = [FOCAL_MASKS[name](FOCAL_SAMPLES_PER) for name in names]
+        relay = [_relay(field, mask, relay_samples, scale) for mask in masks for field in amplitudes[:count]]
         to_sensor = kernel(samples, samples_per, relay_samples, scale)
         return Group(
             np.stack(relay).astype(np.complex64), (to_sensor * scale**0.5 / relay_samples).astype(np.complex64)
@@ -216,8 +217,7 @@ class Mask:
         return TABLE3_NONLINEARITY_WAVES[modes]
 
 
-def _relay(amplitude: Complex, focal_mask: str, samples: int, scale: float) -> Complex:
-    mask = FOCAL_MASKS[focal_mask](FOCAL_SAMPLES_PER)
+def _relay(amplitude: Complex, mask: Array, samples: int, scale: float) -> Complex:
     focal = to_image(amplitude, len(mask), FOCAL_SAMPLES_PER, scale)
     return to_pupil(focal * mask, samples, FOCAL_SAMPLES_PER, scale)
 

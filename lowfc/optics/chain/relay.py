@@ -1,6 +1,7 @@
 """The optics between the focal-plane mask and the detector, which distinguish the sensors."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -76,10 +77,11 @@ def pitch(relay: Relay, samples: int, samples_per: int) -> float:
     return relay.width / samples if isinstance(relay, PupilImage) else 1.0 / samples_per
 
 
+@lru_cache(maxsize=16)
 def direct_kernel(
     relay: Defocus | PupilImage, samples: int, focal_samples: int, samples_per: int, scale: float
 ) -> Complex:
-    """Kernel (samples, focal_samples) of one axis from the focal-plane mask to the detector; conserves energy.
+    """Kernel (samples, focal_samples), read-only, of one axis from focal-plane mask to detector; conserves energy.
 
     For a `Defocus`, the Fresnel integral of eq. (13), exp(i pi (x' - x)^2 scale / distance), exact as long as the chirp
     is resolved; for a `PupilImage`, the transform to the relay pupil.
@@ -94,10 +96,15 @@ def direct_kernel(
     if isinstance(relay, PupilImage):
         # The pupil's samples are spaced by width / samples, not by 1 / samples as in `kernel`.
         stretch = scale * relay.width
-        return np.asarray(np.sqrt(scale) / samples_per * kernel(focal_samples, samples_per, samples, stretch).conj().T)
-    x = image_axis(focal_samples, samples_per)
-    chirp = np.exp(1j * np.pi * scale / relay.distance * (image_axis(samples, samples_per)[:, None] - x) ** 2)
-    return np.asarray(np.sqrt(scale / (1j * relay.distance)) / samples_per * chirp)
+        matrix = np.asarray(
+            np.sqrt(scale) / samples_per * kernel(focal_samples, samples_per, samples, stretch).conj().T
+        )
+    else:
+        x = image_axis(focal_samples, samples_per)
+        chirp = np.exp(1j * np.pi * scale / relay.distance * (image_axis(samples, samples_per)[:, None] - x) ** 2)
+        matrix = np.asarray(np.sqrt(scale / (1j * relay.distance)) / samples_per * chirp)
+    matrix.flags.writeable = False
+    return matrix
 
 
 def half_band(relay: Relay, width: float, mask_radius: float, scale: float) -> float:

@@ -1,6 +1,5 @@
 """`lowfc design zwfs` and `lowfc design clowfs`: optimisation of one dimension of a sensor without a relay mask."""
 
-from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -65,8 +64,8 @@ def design(sizes: Sizes, goal: Goal, out: Path, plot: Path | None) -> Sweep:
     with threadpool_limits(1):
         focus = Focus.of(sensor_from(_section(sizes, sizes.low), WAVELENGTH_NM))
         values, best = sweep(merit_of, sizes.low, sizes.high, _POINTS)
-        points = [_point(candidate(value), value, merit_of, goal) for value in sorted({*values.tolist(), best})]
-        of_best = predictions(candidate(best))
+        found = {value: predictions(candidate(value)) for value in sorted({*values.tolist(), best})}
+        points = [_point(found[value], value, merit_of(value), goal) for value in found]
     keys = {"kind": f'"{sizes.kind}"', **sizes.others, key: f"{best:.4g}"}
     write_whole(out, "".join(["[sensor]\n", *(f"{name} = {value}\n" for name, value in keys.items())]).encode())
     if plot is not None:
@@ -78,7 +77,7 @@ def design(sizes: Sizes, goal: Goal, out: Path, plot: Path | None) -> Sweep:
         best=best,
         file=str(out),
         points=points,
-        figures_of_best=of_best,
+        figures_of_best=found[best],
     )
 
 
@@ -87,11 +86,10 @@ def _section(sizes: Sizes, value: float) -> SensorSection:
     return load(None, {f"sensor.{name}": one for name, one in keys.items()}).sensor
 
 
-def _point(one: FullLight, value: float, merit_of: Callable[[float], float], goal: Goal) -> Point:
-    found = predictions(one)
+def _point(found: dict[str, Any], value: float, merit_of_value: float, goal: Goal) -> Point:
     return Point(
         value=value,
-        merit=merit_of(value),
+        merit=merit_of_value,
         throughput=found["throughput"],
         table3_waves=found["table3_waves"][goal.estimator]["14"],
         table4_mas=max(found["table4_mas"][goal.estimator]["2"]),
