@@ -1,6 +1,7 @@
 """Former names occur only in the table of former names."""
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,8 @@ IDENTIFIERS = {
     *("when_we_die", "last_words", "newest_only", "timeless", "stay_awake", "SAFED"),
     *("late_ms", "hold_ms", "valid_ms", "most_alike", "most_saturated", "least_flux", "PixelLaws", "pixel_laws"),
 }
+WORD = re.compile(rf"\b(?:{'|'.join(IDENTIFIERS)})\b")
+"""A former name anywhere, also in a text or a comment: only sources that have one are parsed."""
 FOLDERS = ("lowfc", "sim_camera", "sim_dm", "tests", "benchmarks", "tools", "examples")
 SOURCES = [path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py") if path != Path(__file__)]
 
@@ -31,7 +34,8 @@ def identifiers(source: str) -> set[str]:
 
 
 def test_no_source_uses_a_former_identifier() -> None:
-    found = {path: identifiers(path.read_text(encoding="utf-8")) & IDENTIFIERS for path in SOURCES}
+    sources = {path: path.read_text(encoding="utf-8") for path in SOURCES}
+    found = {path: identifiers(text) & IDENTIFIERS for path, text in sources.items() if WORD.search(text)}
     assert {str(path.relative_to(ROOT)): names for path, names in found.items() if names} == {}
     assert len(SOURCES) > 400
 
@@ -54,4 +58,5 @@ def test_no_key_or_extension_uses_a_former_name() -> None:
     "source", ["class Drive: ...", "x = state.hopeful", "def obey(): ...", "f(late_ms=1)", "from a import Lane"]
 )
 def test_former_identifiers_are_found(source: str) -> None:
+    assert WORD.search(source)
     assert identifiers(source) & IDENTIFIERS

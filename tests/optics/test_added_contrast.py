@@ -1,5 +1,7 @@
 """Contrast added by a wavefront: the quadratic form against full science images, and its range of validity."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -25,10 +27,15 @@ def form(pupil: Array) -> Array:
     return contrast_form(pupil, NOLL, WAVELENGTH_NM)
 
 
+@cache
+def modes_at(samples: int) -> Array:
+    """The modes (modes, samples, samples) of a pupil."""
+    radius = 2 * pupil_axis(samples)
+    return zernikes(NOLL, radius, radius[:, None])
+
+
 def by_image(pupil: Array, modes_nm: Array) -> float:
-    radius = 2 * pupil_axis(len(pupil))
-    x, y = np.meshgrid(radius, radius)
-    shapes = zernikes(NOLL, x.ravel(), y.ravel()).reshape(-1, *pupil.shape)
+    shapes = modes_at(len(pupil))
     flat, aberrated = (
         mean_contrast(pupil, np.tensordot(one, shapes, 1), WAVELENGTH_NM, DARK_ZONE, 2)
         for one in (0 * modes_nm, modes_nm)
