@@ -96,7 +96,7 @@ def assert_accurate(found: Outcome, snr: float) -> None:
 def test_a_calibration_with_few_cycles_has_the_requested_accuracy(
     method: str, modes: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pokes, "PIECE", 512)
+    monkeypatch.setattr(pokes, "PIECE", 256)
     found = outcome(method, "bench", 1, 20.0, tmp_path, modes)
     assert not found.verdict.faults
     assert_accurate(found, 20.0)
