@@ -307,7 +307,7 @@ def test_unresolved_defocus_is_refused():
 def test_behind_an_aperture_mask_modes_are_odd_and_shear_and_flux_even(name, modes):
     """With symmetric real masks, phases change the image by odd functions, and amplitudes by even ones."""
     optics = sensor_named(name)
-    H, slopes = response(optics, modes[:14:2]), shear_response(optics)
+    H, slopes = response(optics, modes[:14]), shear_response(optics)
     # Reversing the order of pixels is a point reflection through the centre.
     assert np.abs(H + H[::-1]).max() < 1e-9 * np.abs(H).max()
     assert np.abs(slopes - slopes[::-1]).max() < 1e-9 * np.abs(slopes).max()
