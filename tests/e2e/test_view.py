@@ -39,7 +39,7 @@ TITLE_ROWS = 30
 @pytest.fixture(scope="module")
 def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Name of a run whose loop is closed."""
-    process = start(tmp_path_factory.mktemp("loop"), "sim-loop", "--rate", "250", "--no-record")
+    process = start(tmp_path_factory.mktemp("loop"), "sim-loop", "--rate", "100", "--no-record")
     try:
         until(lambda: running() or process.poll() is not None)
         yield running()[0]
@@ -86,7 +86,7 @@ def test_the_web_view_shows_the_live_loop_and_fetches_from_this_host_only(live: 
         address = re.search(r"http://127\.0\.0\.1:\S+", page_of.stderr.readline())
         picture = artefacts / "live-browser.png"
         good = FILL[Level.GOOD]
-        page = browser_screenshot(address.group(), picture, 60, lambda shown: share_of(shown, good) > 0.01, (1000, 625))
+        page = browser_screenshot(address.group(), picture, 120, lambda shown: share_of(shown, good) > 0.01, (800, 500))
         assert share_of(pixels(picture.read_bytes()), good) > 0.01, "no tile says that something is well"
         assert all(url.startswith(("http://127.0.0.1", "data:", "blob:")) for url in page.fetched.values())
     finally:
