@@ -157,7 +157,7 @@ ADVICE: dict[str, Advice] = {
     ),
     "COMMANDS_LATE": Advice(
         "in the simulated camera, more than a quarter of the last 500 commands were applied after the next exposure "
-        "had begun, so the delay is a frame longer than configured.",
+        "had begun, and act a frame late.",
         "lower `camera.rate_hz`, or give the loop its processors and real-time rights (`lowfc doctor`); if the bench "
         "cannot be faster, set `control.delay_frames` to the measured delay.",
     ),

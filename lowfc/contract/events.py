@@ -130,8 +130,8 @@ EVENTS: dict[str, Event] = {
         Event(
             "COMMANDS_LATE",
             Level.WARNING,
-            "{percent:.0f} % of the commands came after the start of the next exposure: the delay is one frame longer "
-            "than control.delay_frames, and the highest stable gain lower; reduce the frame rate or set the delay",
+            "{percent:.0f} % of the commands came after the start of the next exposure and act a frame late, which "
+            "lowers the highest stable gain; reduce the frame rate or set control.delay_frames",
         ),
         Event("COMMANDS_IN_TIME", Level.INFO, "commands are in time again: {percent:.0f} % late"),
         Event("FRAMES_LOST", Level.WARNING, "{count:frame} lost by the camera"),
