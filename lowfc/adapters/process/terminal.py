@@ -1,4 +1,4 @@
-"""Command lines: display of users' errors, and options common to all processes of a run."""
+"""Command lines: display of users' errors, and the options and arguments that several commands share."""
 
 import errno
 import os

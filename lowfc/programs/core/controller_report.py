@@ -19,9 +19,10 @@ from lowfc.programs.core.gain_watch import GainWatch
 TIMING_PERIOD_NS = 100_000_000
 SECOND_NS = 1_000_000_000
 CAUSES_NAMED = 4
-"""Number of the most frequent causes of a loop not closed that are listed with their counts."""
+"""Number of causes that are listed with their counts, the most frequent first."""
 MAX_CAUSES = 20
-"""Number of different causes counted; a cause may contain values, so that their number has no limit."""
+"""Largest number of different causes counted. Without it their number would have no limit, because a cause may contain
+values."""
 
 
 class StageTiming:
@@ -55,7 +56,10 @@ class StageTiming:
 
 
 class Offload:
-    """The mean modal command, published once per `frames` frames: a count, not a clock, for reproducible runs."""
+    """The mean modal command, published once per `frames` frames.
+
+    Frames are counted, and no clock is read, so that runs are reproducible.
+    """
 
     def __init__(self, publisher: Publisher, frames: int) -> None:
         self._publisher = publisher
@@ -134,7 +138,7 @@ class Arrays:
             self._plays.put(wire_play(request.played, request.time_ns).SerializeToString())
 
     def publish_in_use(self, refused: Request, state: State) -> None:
-        """Publish again the arrays in use after a refused request, so that the last published ones are in use."""
+        """Publish the arrays in use again after a refused request, because those of the request were published last."""
         loop = state.loop
         if loop is None:
             return
@@ -150,7 +154,7 @@ class Arrays:
 
 
 class NotClosed:
-    """Time for which the loop has not been closed since its first frame, and the causes."""
+    """Total time, counted from the first frame, for which the loop was not closed, and the causes."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()

@@ -23,7 +23,8 @@ SEED = 5
 SETTLE, WINDOW = 100, 300
 """`SETTLE`: frames after each step. `WINDOW`: further frames after the last step, and after the shape is removed."""
 AT_ONCE = 5
-"""Steps combined into one on the channel that does not shift the zero point, where the loop undoes a large fraction."""
+"""Number of steps combined into one on the channel that does not shift the zero point; the loop undoes a large fraction
+of these."""
 SHIFTED, PLAIN = "dark-hole", FLAT
 """Channels that shift the sensor's zero point, and that do not."""
 GAINS = "[control]\ntilt_gain = 0.5\ngain = 0.05\n"
@@ -66,7 +67,10 @@ class DarkHoleRun:
 
 
 def shapes_nm(grid: tuple[int, int], each_nm: float, usable: Mask | None = None) -> Array:
-    """The channel (steps, rows, columns) after each step, which adds a random shape, nm rms of surface."""
+    """Shapes (steps, rows, columns) of the channel after each step, nm of surface.
+
+    Each step adds a random shape of `each_nm` rms.
+    """
     steps = each_nm * np.random.default_rng(SEED).standard_normal((STEPS, *grid))
     return np.asarray(np.cumsum(steps if usable is None else steps * usable, axis=0))
 
@@ -105,7 +109,10 @@ def dark_hole(
 
 
 def _apply_steps(each_nm: float, base_nm: Array) -> tuple[dict[str, list[int]], Array]:
-    """First frame of each step and of the removal, by channel, and the modes of the steps as the sensor sees them."""
+    """First frame of each step and of the removal, by channel, and the modes of the channel's shape without `base_nm`.
+
+    The modes (1 + steps, modes) are as the sensor sees them: before the first step, then after each.
+    """
     marks: dict[str, list[int]] = {}
     with Client(RUN) as loop:
 

@@ -33,8 +33,8 @@ RING_LENGTHS = {topic: 1 if topic.latest_only else 100 for topic in SHOWN} | {ST
 """Messages kept by each ring buffer: 1 for pictures, 2000 (two seconds at 1 kHz) for steps and truths, 100 for the
 others. A message may have 16 kB."""
 OWN_BYTES = 512_000_000
-"""Memory of this process above which the view restarts. Normal use stays below it: 160 MB, up to 80 MB in ring buffers,
-and up to 150 MB that the viewer has not read."""
+"""Memory of this process above which the view restarts. Normal use is at most 390 MB: 160 MB for the process itself, 80
+MB in ring buffers, and 150 MB that the viewer has not read."""
 VIEWER_SPARE_BYTES = 1_500_000_000
 """Memory granted to a viewer for textures, plots and window, beyond its limit for the stream."""
 STUCK_S = 10.0

@@ -31,12 +31,12 @@ from lowfc.programs.view.verdicts.run_state import NOW_S, RECENT_S, Counts, Live
 from lowfc.programs.view.verdicts.steady import Attained, Steady, attained
 
 LATEST_S = 0.3
-"""Time at the end of the last second over which `latest` is computed: it shows the improvement of a loop that has just
-closed or recovered."""
+"""Length of the interval, up to the last snapshot, over which `latest` is computed; it is short, to show the
+improvement of a loop that has just closed or recovered."""
 SILENT_S = 2.0
 """Time without a message after which a process counts as silent: four Healths, which are sent twice a second."""
 FRAMES_SILENT_S = 1.0
-"""Time without a frame after which the camera counts as silent, but at least `PERIODS` frame periods."""
+"""Time without a frame or a step after which it is reported as missing, but at least `PERIODS` frame periods."""
 PERIODS = 10
 """Minimum length of every time span here, in frame periods, for slow cameras."""
 ATTAINED_NS = 30_000_000_000
