@@ -1,7 +1,7 @@
 """Frame to command over ImageStreamIO and over the direct link: same controller and frames, in turns.
 
-Over ImageStreamIO a program writes each frame into a stream, a camera process or the controller itself (`--camera`)
-reads it with the driver `isio`, extended by time stamps (`stream_ends.TimedCamera`), and `lowfc mirror isio` writes the
+Over ImageStreamIO a program writes each frame into a stream. A camera process, or the controller itself (`--camera`),
+reads it with the driver `isio`, extended by time stamps (`stream_ends.TimedCamera`). `lowfc mirror isio` writes the
 command into a channel. Over the direct link the source of frames and the mirror are those of `lowfc latency`.
 
 Example:

@@ -40,7 +40,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--lowest", type=float, default=500.0, help="rate of the grid, Hz (%(default)g)")
     parser.add_argument("--highest", type=float, default=10_000.0, help="rate of the grid, Hz (%(default)g)")
     parser.add_argument("--step", type=float, default=1.1, help="ratio of one rate to the one before (%(default)g)")
-    parser.add_argument("--loop", action="append", choices=LOOPS, help="only this one; repeat")
+    parser.add_argument("--loop", action="append", choices=LOOPS, help="only this one; the option may be repeated")
 
 
 def measure(options: argparse.Namespace, report: Report) -> Result:
@@ -56,10 +56,11 @@ def measure(options: argparse.Namespace, report: Report) -> Result:
 
 
 def run_once(words: Sequence[str], rate_hz: float, seconds: float) -> Result:
-    """Run a loop once with these options of `lowfc latency`; `failure` has its last line if it failed.
+    """Run a loop once with these options of `lowfc latency`.
 
-    messages_lost is None without a recorder. commands_late is the number of late commands over the number of frames,
-    warm-up included; only with a simulated camera.
+    `failure` has the last line of its standard error, or the timeout, if it failed. messages_lost is None without a
+    recorder. commands_late is the number of late commands over the number of frames, warm-up included; only with a
+    simulated camera.
     """
     found = run_lowfc(["latency", *words, "--rate", f"{rate_hz:g}"], seconds)
     if "failure" in found:
@@ -180,9 +181,9 @@ def about(result: Result) -> str:
     return (
         f"Sustained over {result['seconds']:g} s: at most {100 * MAX_WITHOUT_COMMAND:g} % of the frames without a "
         f"command, no message lost by the recorder, the rate within {100 * RATE_WITHIN:g} % of the requested one; "
-        f"{runs} runs on a grid of {len(rates)} rates from {rates[0]:g} to {rates[-1]:g} Hz. Latencies are of one run "
-        "at that rate. A command is late if it arrives after the start of the next exposure (known for the simulated "
-        "camera). Processor time is a percentage of one processor, all threads of the process, over the last four "
-        "fifths of a run; in brackets the processors that it may run on; last the sum of the processes bound to one "
+        f"{runs} runs on a grid of {len(rates)} rates from {rates[0]:g} to {rates[-1]:g} Hz. Latencies are of one "
+        "sustained run at the highest rate. A command is late if it arrives after the start of the next exposure "
+        "(known for the simulated camera). Processor time is a percentage of one processor, all threads of the "
+        "process, over the last four fifths of a run; in brackets the processors that it may run on; last the sum of the processes bound to one "
         "processor."
     )

@@ -185,6 +185,7 @@ def render(results: Results) -> str:
         f"identified from {_IDENTIFY / RATE_HZ:g} s of the closed loop; the integrator has the best gains for the same "
         f"frames. Good laws, for {results['minutes']:g} minutes each, with unmodelled steps of {2 * STEPS_MAS:g} mas "
         f"every 2 s, were overruled: {good}. With a law of 14 modes the guard adds {cost['driving']:.1f} us "
-        f"to a frame while the law drives, {cost['virtual']:.1f} us while it does not. Modes pass through the live "
-        "loop's own `advance`, with noise of the images' covariance."
+        f"to a frame while the law drives, {cost['virtual']:.1f} us while it does not. Modes, with noise "
+        "of the covariance that R gives for the images, pass through the live loop's own `advance`; no images are "
+        "simulated."
     )

@@ -64,8 +64,8 @@ DEFINITIONS = {
     "clock": "CLOCK_MONOTONIC, one host",
     "pacing": "the source sleeps until absolute times; a late frame is sent at once, and its t0 is the actual time of "
     "sending; no frame is skipped",
-    "cells": "us, median (lowest to highest) over the turns; in every turn each implementation runs once, and every "
-    "other turn in the opposite order",
+    "cells": "t1 - t0 (p50 to max) or the time to the mirror, us, median (lowest to highest) over the turns; in every "
+    "turn each implementation runs once, and every other turn in the opposite order",
     "without a command": "measured frames that led to no command, in all turns",
     "pinning": "source and mirror on the first processor, all else on the second; with three or more processors "
     "lowfc's mirror on the third",
@@ -80,7 +80,10 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--warm-up", type=int, default=500, help="warm-up frames (%(default)s)")
     parser.add_argument("--rate", dest="rate_hz", type=float, default=1000.0, help="frames per second (%(default)g)")
     parser.add_argument(
-        "--only", action="append", metavar="WORD", help="implementations with this in their name; repeat"
+        "--only",
+        action="append",
+        metavar="WORD",
+        help="implementations with this in their name; the option may be repeated",
     )
     isio = os.environ.get("ISIO_DIR")
     parser.add_argument(
