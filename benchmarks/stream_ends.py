@@ -24,7 +24,7 @@ from lowfc.programs.measure.frame_source import FRAMES_FILE, SENT_FILE
 GO_FILE = "go"
 """File in the run's directory that starts the writer."""
 
-_LOOK_S = 0.02
+_POLL_S = 0.02
 _LEAD_NS, _WARM_UP_NS = 10_000_000, 150_000
 _LAST_COMMAND_S = 0.1
 
@@ -82,7 +82,7 @@ def main() -> None:
     prepare(config, config.realtime.camera_cpus)
     clock = HostClock()
     while not (folder / GO_FILE).exists():
-        time.sleep(_LOOK_S)
+        time.sleep(_POLL_S)
     due_ns = clock.now_ns() + _LEAD_NS
     for index in range(count):
         frame = frames[index % len(frames)]

@@ -29,9 +29,13 @@ from lowfc.programs.measure.latency.run import LatencyOptions, one_loop
 
 ROOT = Path(__file__).parents[1]
 SIZE = Size()
-DIRECT, BETWEEN, READ = "direct link", "ImageStreamIO, camera process", "ImageStreamIO, read by the controller"
+DIRECT, CAMERA_PROCESS, IN_CONTROLLER = (
+    "direct link",
+    "ImageStreamIO, camera process",
+    "ImageStreamIO, read by the controller",
+)
 SPANS = {"frame_to_command": "frame to command", "frame_to_mirror": "frame to mirror"}
-AT = {"p50": "p50", "p99": "p99", "p99_9": "p99.9"}
+PERCENTILES = {"p50": "p50", "p99": "p99", "p99_9": "p99.9"}
 FRAMES, CHANNEL = "lowfs", "dm00disp03"
 
 _MEMORY = Path("/dev/shm")  # noqa: S108  # a private folder is created in it
@@ -52,7 +56,7 @@ def measure(options: argparse.Namespace, report: Report) -> Result:
     turns: list[dict[str, Result]] = []
     for number in range(options.repeats):
         turns.append({})
-        for name in (DIRECT, BETWEEN, READ)[:: -1 if number % 2 else 1]:
+        for name in (DIRECT, CAMERA_PROCESS, IN_CONTROLLER)[:: -1 if number % 2 else 1]:
             report(f"turn {number + 1} of {options.repeats}: {name}")
             turns[-1][name] = one_run(options.rate_hz, options.seconds, name)
     return {"turns": turns, "seconds": options.seconds, "rate_hz": options.rate_hz}
@@ -90,12 +94,12 @@ def _loop(options: LatencyOptions, run: Run, folder: Path, name: str) -> list[Ch
         "source": ["-m", writer, str(run.path), FRAMES, str(round(seconds * config.camera.rate_hz))],
         role: ["-m", "lowfc", "mirror", "isio", *shared, "--stream", CHANNEL],
     }
-    if name == BETWEEN:
+    if name == CAMERA_PROCESS:
         waits = ["--wait-for", str(Role.CONTROLLER), *mirror_there]
         commands[str(Role.CAMERA)] = ["-m", "lowfc", "camera", driver, *shared, *waits]
     children = [program(role, words, run.path / f"{role}.stderr") for role, words in commands.items()]
     (controller,) = (one for one in children_of(config, run, seconds, record=False) if one.name == Role.CONTROLLER)
-    if name == READ:
+    if name == IN_CONTROLLER:
         controller.command += ["--camera", driver, *mirror_there]
     children.append(controller)
     for child in children:
@@ -106,14 +110,18 @@ def _loop(options: LatencyOptions, run: Run, folder: Path, name: str) -> list[Ch
 def tables(result: Result) -> list[Lines]:
     """Latencies of each loop, and their ratios turn by turn."""
     turns = result["turns"]
-    lines = [["", *(f"{words}, us: {at}" for words in SPANS.values() for at in AT.values()), "without a command"]]
-    for name in (DIRECT, BETWEEN, READ):
+    lines = [
+        ["", *(f"{words}, us: {at}" for words in SPANS.values() for at in PERCENTILES.values()), "without a command"]
+    ]
+    for name in (DIRECT, CAMERA_PROCESS, IN_CONTROLLER):
         each = [turn[name] for turn in turns]
-        cells = [ranged([one[span][at] for one in each]) for span in SPANS for at in AT]
+        cells = [ranged([one[span][at] for one in each]) for span in SPANS for at in PERCENTILES]
         without, frames = (sum(one[key] for one in each) for key in ("without_command", "frames"))
         lines.append([name, *cells, f"{without} of {frames}"])
-    for name in (BETWEEN, READ):
-        each = [[turn[name][span][at] / turn[DIRECT][span][at] for turn in turns] for span in SPANS for at in AT]
+    for name in (CAMERA_PROCESS, IN_CONTROLLER):
+        each = [
+            [turn[name][span][at] / turn[DIRECT][span][at] for turn in turns] for span in SPANS for at in PERCENTILES
+        ]
         ratios = [ranged(one, "{:.2f}".format) for one in each]
         lines.append([f"{name}: over {DIRECT}, turn by turn", *ratios, ""])
     return [lines]
@@ -122,7 +130,9 @@ def tables(result: Result) -> list[Lines]:
 def about(result: Result) -> str:
     """Definitions of the measured quantities."""
     turns = result["turns"]
-    before, read = (ranged([turn[name]["stream_to_camera"]["p50"] for turn in turns]) for name in (BETWEEN, READ))
+    before, read = (
+        ranged([turn[name]["stream_to_camera"]["p50"] for turn in turns]) for name in (CAMERA_PROCESS, IN_CONTROLLER)
+    )
     return (
         f"Medians (lowest to highest) over {len(turns)} turns of {result['seconds']:g} s each at {result['rate_hz']:g} "
         f"Hz; {SIZE.side} x {SIZE.side} pixels, {SIZE.modes} modes, {SIZE.actuators} actuators. Latency "

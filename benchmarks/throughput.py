@@ -184,6 +184,6 @@ def about(result: Result) -> str:
         f"{runs} runs on a grid of {len(rates)} rates from {rates[0]:g} to {rates[-1]:g} Hz. Latencies are of one "
         "sustained run at the highest rate. A command is late if it arrives after the start of the next exposure "
         "(known for the simulated camera). Processor time is a percentage of one processor, all threads of the "
-        "process, over the last four fifths of a run; in brackets the processors that it may run on; last the sum of the processes bound to one "
-        "processor."
+        "process, over the last four fifths of a run; in brackets the processors that it may run on; last the sum of "
+        "the processes bound to one processor."
     )

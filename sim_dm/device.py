@@ -7,11 +7,11 @@ from math import expm1
 import numpy as np
 
 from lowfc.arrays import Single, Whole
-from lowfc.device.guard import MirrorGuard, Status
+from lowfc.device.mirror_protection import MirrorProtection, Status
 
 
 @dataclass(frozen=True)
-class Device(MirrorGuard):
+class Device(MirrorProtection):
     """Properties of the mirror in addition to those of its protection.
 
     Attributes:

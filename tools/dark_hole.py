@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from rich.progress import track
 
-from lowfc.programs.paper.dark_hole import AT_ONCE, COMMAND, PLAIN, SETTLE, SHIFTED, STEPS, dark_hole
+from lowfc.programs.paper.dark_hole import COMMAND, PLAIN, SETTLE, SHIFTED, STEPS, STEPS_COMBINED, dark_hole
 from tools.shared import Results, markdown
 
 STEP_RMS_NM = (1.0, 2.0, 5.0)
@@ -17,15 +17,15 @@ __all__ = ["COMMAND", "measure", "render"]
 def measure() -> Results:
     """Fractions undone of small and of large steps."""
     runs = {}
-    for each_nm in track(STEP_RMS_NM, "dark holes"):
+    for step_rms_nm in track(STEP_RMS_NM, "dark holes"):
         with tempfile.TemporaryDirectory() as folder:
-            found = dark_hole(Path(folder), each_nm)
-        run: Results = {"together_nm": each_nm * STEPS**0.5}
+            found = dark_hole(Path(folder), step_rms_nm)
+        run: Results = {"together_nm": step_rms_nm * STEPS**0.5}
         for name, channel in found.channels.items():
             undone, error = channel.undone()
             run[name] = {"undone": undone, "error": error, "left_nm": channel.residual_nm.tolist()}
             run["seen_nm"] = float(np.linalg.norm(channel.channel_nm[-1]))
-        runs[f"{each_nm:g}"] = run
+        runs[f"{step_rms_nm:g}"] = run
     return {"runs": runs}
 
 
@@ -48,9 +48,9 @@ def render(results: Results) -> str:
     ]
     return (
         f"{markdown(head, rows)}\n{STEPS} random steps, {SETTLE} frames apart, each added to those before it; "
-        f"without the shift, {AT_ONCE} steps at a time. Undone: the fraction of the channel's shape, as seen by the "
-        "sensor, that the loop removes. It is the slope of (command + disturbance) against the channel's modes, sign "
-        "reversed; least squares over all steps and modes, with its standard error. A negative value means "
+        f"without the shift, {STEPS_COMBINED} steps at a time. Undone: the fraction of the channel's shape, as seen by "
+        "the sensor, that the loop removes. It is the slope of (command + disturbance) against the channel's modes, "
+        "sign reversed; least squares over all steps and modes, with its standard error. A negative value means "
         "that the loop adds to the steps. The true residual is the rms of all modes about their mean, over the circle, "
         "before the first step and after the last."
     )

@@ -21,7 +21,7 @@ from lowfc.control.loop.inputs import Command as Commanded
 from lowfc.control.loop.inputs import Frame, Input, Load, Outputs, PendingEvent, Request, Step
 from lowfc.control.loop.state import Settings, State
 from lowfc.device import DriverOptions
-from lowfc.device.guard import Command, apply_command
+from lowfc.device.mirror_protection import Command, apply_command
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.core.gain_watch import GainWatch
 from sim_camera.disturbance import LINES_HZ, Disturbance
@@ -101,7 +101,7 @@ class Bench:
         self.events: list[tuple[int, PendingEvent]] = []
         begin = Load(0, first, "bench") if isinstance(first, Calibration) else first
         self._state = advance(self._settings, State(), begin)[0]
-        self._guard = device(self.world)
+        self._protection = device(self.world)
         self.start_mirror()
         self._weights = delay_weights(self.world.camera.delay_frames).astype(np.float32)
         self._shapes = [self._status.surface_nm] * len(self._weights)
@@ -111,7 +111,7 @@ class Bench:
 
     def start_mirror(self) -> None:
         """Replace the mirror by a new, flat one."""
-        self._mirror, self._status = SimulatedMirror(DriverOptions(), self.world), initial(self._guard)
+        self._mirror, self._status = SimulatedMirror(DriverOptions(), self.world), initial(self._protection)
 
     def new_record(self) -> None:
         """Begin a new record."""
@@ -179,7 +179,9 @@ class Bench:
     def follow(self, frame: Frame, command: Commanded) -> None:
         """Move the mirror by the command for a frame; ValueError if it refuses."""
         received = Command("lowfc", frame.sequence, frame.time_ns, 10**9, command.actuators_nm, command.command_nm)
-        self._status, refused = apply_command(self._guard, self._status, received, frame.time_ns, self._mirror.settle)
+        self._status, refused = apply_command(
+            self._protection, self._status, received, frame.time_ns, self._mirror.settle
+        )
         if refused is not None:
             raise ValueError(f"the mirror refused a command: {refused.name}")
         self._path.applied(self._index, self._status.surface_nm)

@@ -20,7 +20,7 @@ TARGET_PM = 20.0
 RATE_HZ = 250.0
 """Frame rate, the default. The result depends on the light per second, not on the rate, because the drift is a thousand
 times slower than the frames."""
-EXPOSED = (0.5, 0.9)
+EXPOSURE_FRACTIONS = (0.5, 0.9)
 """Exposures as fractions of a period: the default, and one that leaves the loop 0.4 ms of the 4 ms period."""
 KEYS: dict[str, Any] = {
     "camera.rate_hz": RATE_HZ,
@@ -34,7 +34,9 @@ KEYS: dict[str, Any] = {
 
 def measure() -> Results:
     """Results of every case."""
-    configurations = {f"{part:g}": configured(**KEYS | {"camera.exposure_fraction": part}) for part in EXPOSED}
+    configurations = {
+        f"{part:g}": configured(**KEYS | {"camera.exposure_fraction": part}) for part in EXPOSURE_FRACTIONS
+    }
     with threadpool_limits(1):
         return {"cases": {name: case(config) for name, config in configurations.items()}}
 
@@ -44,24 +46,24 @@ def case(config: Configuration) -> Results:
     calibration = calibrated(config)
     bench = Bench(config, calibration)
     frames = round(WINDOW_S * RATE_HZ)
-    left_nm, drift_nm, other_nm = (np.zeros((WINDOWS, len(config.noll))) for _ in range(3))
+    residual_nm, drift_nm, mirror_nm = (np.zeros((WINDOWS, len(config.noll))) for _ in range(3))
     bench.run(round(SETTLE_S * RATE_HZ))
     for window in track(range(WINDOWS), f"exposure {config.camera.exposure_fraction:g} of the period"):
         bench.new_record()
         bench.run(frames)
-        left_nm[window] = bench.residual_nm(continuous=False).mean(axis=0)
+        residual_nm[window] = bench.residual_nm(continuous=False).mean(axis=0)
         drift_nm[window] = np.mean([truth.sampled.disturbance_nm for truth in bench.truths], axis=0, dtype=np.float64)
         command_nm = np.mean([step.command_nm for step in bench.steps], axis=0, dtype=np.float64)
-        other_nm[window] = left_nm[window] - drift_nm[window] - command_nm
+        mirror_nm[window] = residual_nm[window] - drift_nm[window] - command_nm
     light_e = calibration.flux_dn * config.camera.gain_e_per_dn
     bound_nm = photon_bound_nm(calibration, light_e * frames)
     noise_nm = frame_noise_nm(config, calibration) / np.sqrt(frames)
     columns = {
         "drift_nm": _rms(drift_nm),
-        "left_pm": 1e3 * _rms(left_nm),
+        "left_pm": 1e3 * _rms(residual_nm),
         "photon_bound_pm": 1e3 * bound_nm,
         "noise_pm": 1e3 * noise_nm,
-        "mirror_pm": 1e3 * _rms(other_nm),
+        "mirror_pm": 1e3 * _rms(mirror_nm),
     }
     return {
         "light_e_per_s": light_e * RATE_HZ,

@@ -102,7 +102,7 @@ def measure(options: argparse.Namespace, report: Report) -> Result:
         raise ConfigurationError(f"--only: none of {'; '.join(one.name for one in IMPLEMENTATIONS)}")
     absent = {one.name: why for one in chosen if (why := missing(one, options))}
     present = [one for one in chosen if one.name not in absent]
-    awake = set_up(None, None, lock_memory=False, disable_cpu_idle=True)  # for all, as long as this process lives
+    realtime = set_up(None, None, lock_memory=False, disable_cpu_idle=True)  # for all, as long as this process lives
     priority = PRIORITY if fifo_granted() else 0
     runs: dict[str, list[Any]] = {one.name: [] for one in chosen}
     failed = []
@@ -119,8 +119,8 @@ def measure(options: argparse.Namespace, report: Report) -> Result:
         "missing": absent,
         "rules": {name: getattr(options, name) for name in ("repeats", "seconds", "warm_up", "rate_hz")},
         "priority": priority,
-        "granted": awake.granted,
-        "refused": [name for name, _ in awake.refused],
+        "granted": realtime.granted,
+        "refused": [name for name, _ in realtime.refused],
         "pinned_to": processors(),
         "versions": versions(options),
         "failed": failed,
@@ -138,12 +138,12 @@ def one_run(implementation: Implementation, rules: argparse.Namespace, priority:
         with _processes(implementation, rules, folder, [str(rules.rate_hz), str(frames)], priority) as children:
             time.sleep(_SETTLE_S)
             shared.go(folder)
-            pacer = children["source"]
+            source = children["source"]
             deadline_s = time.monotonic() + frames / rules.rate_hz + _DEADLINE_MARGIN_S
-            while pacer.status is None and time.monotonic() < deadline_s:
+            while source.status is None and time.monotonic() < deadline_s:
                 time.sleep(_POLL_S)
-            if pacer.status != 0:
-                raise ComparisonError(f"the source of frames did not end: {pacer.stderr_tail()}")
+            if source.status != 0:
+                raise ComparisonError(f"the source of frames did not end: {source.stderr_tail()}")
             words = "\n".join(child.stderr_tail() for child in children.values())
         found = run_statistics(folder, rules.warm_up)
         if found["frame_to_command"] is None:

@@ -193,7 +193,7 @@ if __name__ == "__main__":
         clear(own)
         sys.exit()
     set_affinity_and_priority(own.role, own.cpu, own.priority)  # as pyrtcao's launcher does
-    own.quiet()
+    own.reduce_jitter()
     component = _component(own)
     component.start()
     if own.role != "source":  # the source reports ready in `frames`

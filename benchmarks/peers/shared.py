@@ -30,7 +30,7 @@ LAST = "actuators"
 
 _PR_SET_TIMERSLACK = 29
 _GO = "go"
-_LOOK_S = 0.02
+_POLL_S = 0.02
 _LAST_COMMAND_S = 0.05
 
 
@@ -48,10 +48,10 @@ class RoleProcess:
         os.sched_setaffinity(0, {self.cpu})
         policy = os.SCHED_FIFO if self.priority else os.SCHED_OTHER
         os.sched_setscheduler(0, policy, os.sched_param(self.priority))
-        self.quiet()
+        self.reduce_jitter()
 
     @staticmethod
-    def quiet() -> None:
+    def reduce_jitter() -> None:
         """Set the timer slack to 1 ns and switch garbage collection off."""
         ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
         gc.freeze()
@@ -77,7 +77,7 @@ class RoleProcess:
         """
         self.ready()
         while not (self.folder / _GO).exists():
-            time.sleep(_LOOK_S)
+            time.sleep(_POLL_S)
         due = self.time_stamps("due")
         begun_ns, now_ns = time.monotonic_ns(), time.monotonic_ns
         for number in range(1, self.count + 1):

@@ -29,7 +29,7 @@ from lowfc.contract.messages import (
 )
 from lowfc.control.loop.safety import Limits, Reason, Rejection
 from lowfc.device.driver import Mirror, MirrorExtras, geometry
-from lowfc.device.guard import Command, MirrorGuard, Status, apply_command, tick
+from lowfc.device.mirror_protection import Command, MirrorProtection, Status, apply_command, tick
 from lowfc.device.watch import DriverWatch
 from lowfc.optics.chain.grid import pupil_axis
 from lowfc.optics.chain.mirror import influence_factors
@@ -50,7 +50,7 @@ _NO_EXTRAS = MirrorExtras()
 _NONE: Single = np.zeros(0, np.float32)
 
 
-def guard_of(driver: Mirror, config: Configuration) -> MirrorGuard:
+def protection_of(driver: Mirror, config: Configuration) -> MirrorProtection:
     """Limits of a mirror: the tighter of its driver's and those of [mirror].
 
     ConfigurationError if its grid is not that of [mirror].
@@ -66,7 +66,7 @@ def guard_of(driver: Mirror, config: Configuration) -> MirrorGuard:
         min(own.slew_nm, configured.slew_nm),
         min(own.neighbour_nm, configured.neighbour_nm),
     )
-    return MirrorGuard((own.rows, own.columns), limits, own.step_nm, config.mirror.on_command_timeout == "flat")
+    return MirrorProtection((own.rows, own.columns), limits, own.step_nm, config.mirror.on_command_timeout == "flat")
 
 
 class MirrorLoop:
@@ -77,7 +77,7 @@ class MirrorLoop:
         name = config.mirror.name
         self._driver = driver
         self._service = service
-        self._guard = guard_of(driver, config)
+        self._protection = protection_of(driver, config)
         self._settle = getattr(driver, "settle", None)
         self._beside = getattr(driver, "beside", _NO_EXTRAS.beside)
         getattr(driver, "join", _NO_EXTRAS.join)(service)
@@ -100,7 +100,7 @@ class MirrorLoop:
             config.control.max_start_ahead_h,
             lambda start, here: service.event("START_AHEAD", what="commands", start=start, here=here),
         )
-        flat_nm = np.zeros(self._guard.grid, np.float32)
+        flat_nm = np.zeros(self._protection.grid, np.float32)
         self._status = Status(flat_nm, flat_nm)
         self._known = self._returning = False
         self._driven_nm: Single | None = None
@@ -160,7 +160,7 @@ class MirrorLoop:
         if not self._returning:
             with contextlib.suppress(_LostError):
                 self._status, refused = apply_command(
-                    self._guard, before, command, clock.now_ns(), self._drive, self._beside()
+                    self._protection, before, command, clock.now_ns(), self._drive, self._beside()
                 )
         self._refused = refused
         self._publish(self._status.time_ns or clock.now_ns())
@@ -201,8 +201,10 @@ class MirrorLoop:
             found_nm = method(*arguments)
             if found_nm is not None:
                 flat = found_nm.reshape(-1)
-                if found_nm.shape != self._guard.grid or not np.isfinite(np.vdot(flat, flat)):
-                    raise ValueError(f"it is at {found_nm.shape} actuators, expected {self._guard.grid} of finite nm")
+                if found_nm.shape != self._protection.grid or not np.isfinite(np.vdot(flat, flat)):
+                    raise ValueError(
+                        f"it is at {found_nm.shape} actuators, expected {self._protection.grid} of finite nm"
+                    )
             if self.watch.returned():
                 self.watch.worked()
                 return found_nm
@@ -223,9 +225,9 @@ class MirrorLoop:
             return
         if self._driven_nm is None and (held_nm := self._read_shape()) is not None:
             self._status = self._status._replace(driven_nm=held_nm)
-        self._status = tick(self._guard, self._status, self._service.clock.now_ns(), self._drive)
+        self._status = tick(self._protection, self._status, self._service.clock.now_ns(), self._drive)
         self._known = True
-        self._returning = self._guard.flatten and bool(self._status.driven_nm.any())
+        self._returning = self._protection.flatten and bool(self._status.driven_nm.any())
         if not self._returning:
             self._refused = None
 
@@ -236,9 +238,9 @@ class MirrorLoop:
             if self._returning:
                 self._return()
             else:
-                self._status = tick(self._guard, before, now_ns, self._drive)
+                self._status = tick(self._protection, before, now_ns, self._drive)
         if before.following and not self._status.following and not self._returning:
-            action = "relaxing to flat" if self._guard.flatten else "holding the shape"
+            action = "relaxing to flat" if self._protection.flatten else "holding the shape"
             self._service.event("COMMAND_EXPIRED", command_timeout_ms=before.valid_for_ns / 1e6, action=action)
         moved = (
             self._status.surface_nm is not before.surface_nm and (self._status.surface_nm != before.surface_nm).any()

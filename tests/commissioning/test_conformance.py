@@ -33,8 +33,8 @@ from lowfc.contract.messages import (
 )
 from lowfc.control.loop.safety import Limits
 from lowfc.device.driver import CameraSettings, camera_state
-from lowfc.device.guard import Command, Status
 from lowfc.device.mirror_loop import command_of, state_of
+from lowfc.device.mirror_protection import Command, Status
 from lowfc.programs.commissioning.checks import Check, put
 from lowfc.programs.commissioning.conformance import command as conformance
 from lowfc.programs.commissioning.conformance.camera import watch

@@ -209,7 +209,7 @@ def test_the_dead_man_expires_just_after_what_was_promised(age_ns: int, valid_fo
 
 @pytest.mark.parametrize("mode", list(LoopMode))
 @pytest.mark.parametrize("calibrated", [True, False])
-def test_clear_leaves_only_safed_and_never_for_closed(mode: LoopMode, calibrated: bool) -> None:
+def test_clear_leaves_only_safe_mode_and_never_closes_the_loop(mode: LoopMode, calibrated: bool) -> None:
     safed, rest = mode is LoopMode.SAFE, LoopMode.OPEN if calibrated else LoopMode.IDLE
     assert request_mode(mode, "safe", calibrated) == (LoopMode.SAFE, "")
     after, refusal = request_mode(mode, "clear", calibrated)

@@ -24,7 +24,7 @@ from lowfc.device import (
     run_camera,
 )
 from lowfc.device.camera_loop import CameraLoop
-from lowfc.device.mirror_loop import MirrorLoop, guard_of
+from lowfc.device.mirror_loop import MirrorLoop, protection_of
 from lowfc.device.run import camera_beside
 from lowfc.programs.commissioning.doctor.devices import device_checks
 from lowfc.testing.clock import FakeClock
@@ -117,9 +117,9 @@ def test_commands_are_limited_and_the_mirror_goes_flat_after_the_command_timeout
 
 def test_the_tighter_of_driver_and_configured_limits_applies() -> None:
     driver = Follower(DriverOptions(), load(None, {"mirror.rows": 4, "mirror.columns": 5, "mirror.slew_nm": 30.0}))
-    assert guard_of(driver, CONFIG).limits.slew_nm == 30.0
+    assert protection_of(driver, CONFIG).limits.slew_nm == 30.0
     with pytest.raises(ConfigurationError, match=r"4 x 5 actuators; .* say 34 x 34"):
-        guard_of(driver, Configuration())
+        protection_of(driver, Configuration())
 
 
 def test_options_come_from_configuration_and_command_line() -> None:

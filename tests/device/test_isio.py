@@ -16,8 +16,8 @@ from lowfc.control.loop.safety import Limit
 from lowfc.device.drivers.isio import mirror as mirror_module
 from lowfc.device.drivers.isio.camera import IsioCamera
 from lowfc.device.drivers.isio.mirror import IsioMirror
-from lowfc.device.guard import Command, Status, apply_command
-from lowfc.device.mirror_loop import guard_of
+from lowfc.device.mirror_loop import protection_of
+from lowfc.device.mirror_protection import Command, Status, apply_command
 from lowfc.device.plugins import options
 from tests.support.image_streams.plain import PlainStream
 
@@ -227,12 +227,12 @@ def test_the_reached_position_comes_from_the_sum_of_channels(folder: Path, monke
 
 
 def test_the_stroke_limit_applies_to_the_sum_of_channels() -> None:
-    guard = guard_of(mirror()[0], CONFIG)
+    protection = protection_of(mirror()[0], CONFIG)
     flat, beside, target = (np.zeros(GRID, np.float32) for _ in range(3))
     beside[2, 2], beside[4, 4], beside[6, 6], beside[8, 8] = 700, 900, -900, 700
     target[2, 2], target[4, 4], target[6, 6], target[8, 8], target[9, 9] = 100, 100, 100, -100, 100
     command = Command("lowfc", 1, AT_NS, 10**9, target, np.ones(2, np.float32))
-    status, reason = apply_command(guard, Status(flat, flat), command, AT_NS, lambda shape, _: shape, beside)
+    status, reason = apply_command(protection, Status(flat, flat), command, AT_NS, lambda shape, _: shape, beside)
     assert reason is None
     assert status.limits_hit == (Limit.STROKE,)
     assert not status.command_nm.size
@@ -241,6 +241,6 @@ def test_the_stroke_limit_applies_to_the_sum_of_channels() -> None:
     assert reached[4, 4] == 0  # the other channels already exceed the stroke: no further
     assert (reached[6, 6], reached[8, 8], reached[9, 9]) == (100, -100, 100)
     assert np.abs(reached + beside)[2, 2] < CONFIG.mirror.stroke_nm / 2
-    status, _ = apply_command(guard, Status(flat, flat), command, AT_NS, lambda shape, _: shape, flat)
+    status, _ = apply_command(protection, Status(flat, flat), command, AT_NS, lambda shape, _: shape, flat)
     assert np.array_equal(status.surface_nm, target)
     assert not status.limits_hit

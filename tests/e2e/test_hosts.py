@@ -156,7 +156,7 @@ def clock_offset_ns(host: Host) -> int:
     return int(next((host.folder / "runtime" / "lowfc").glob("clock-*")).read_text())
 
 
-def test_clocks_are_known_and_the_operators_hand_and_a_view_reach_the_loop_from_the_desk(bench: Bench) -> None:
+def test_clock_offsets_are_measured_and_requests_and_a_view_work_from_another_host(bench: Bench) -> None:
     bench.settled()
     desk = bench.lab["desk"]
     done = desk.run("-m", "lowfc", "hosts", "--run", RUN, "--json")

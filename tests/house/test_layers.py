@@ -39,7 +39,7 @@ BELOW_ALL = "lowfc.arrays"
 
 PURE_LAYERS = ("lowfc.arrays", "lowfc.optics", "lowfc.control", "lowfc.design")
 PURE_MODULES = (
-    "lowfc.device.guard",
+    "lowfc.device.mirror_protection",
     "sim_dm.device",
     "sim_dm.actuators",
     "sim_camera.path",

@@ -390,7 +390,7 @@ def test_streams_and_the_direct_link_are_compared_turn_by_turn(monkeypatch: pyte
 
     monkeypatch.setattr(streams, "one_run", one_run)
     found = streams.measure(Namespace(repeats=2, rate_hz=1000.0, seconds=1.0), lambda _: None)
-    assert order[:3] == order[:2:-1] == [streams.DIRECT, streams.BETWEEN, streams.READ]
+    assert order[:3] == order[:2:-1] == [streams.DIRECT, streams.CAMERA_PROCESS, streams.IN_CONTROLLER]
     (lines,) = streams.tables(json.loads(json.dumps(found)))
     found_p50 = [line["frame to mirror, us: p50"] for line in by_heading(lines)]
     assert found_p50[:3] == ["350 (100 to 600)", "350 (200 to 500)", "350 (300 to 400)"]
@@ -403,7 +403,7 @@ def test_streams_and_the_direct_link_are_compared_turn_by_turn(monkeypatch: pyte
 
 @pytest.mark.exclusive
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [streams.BETWEEN, streams.READ])
+@pytest.mark.parametrize("name", [streams.CAMERA_PROCESS, streams.IN_CONTROLLER])
 def test_a_real_loop_over_streams_is_measured(name: str) -> None:
     found = streams.one_run(200.0, 1.0, name)
     assert found["frames"] == pytest.approx(200, abs=10)

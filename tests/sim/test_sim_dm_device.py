@@ -11,7 +11,7 @@ from hypothesis.extra import numpy as hnp
 from lowfc.arrays import Single
 from lowfc.contract.configuration import load
 from lowfc.control.loop.safety import Limit, Limits, Reason, Rejection, neighbour_difference_nm
-from lowfc.device.guard import MAX_VALID_NS, Command, Status
+from lowfc.device.mirror_protection import MAX_VALID_NS, Command, Status
 from sim_dm.device import Device, initial
 from sim_dm.driver import device as device_of
 from tests.support.safety_checks import apply_command, tick, violations

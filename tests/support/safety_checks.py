@@ -1,4 +1,4 @@
-"""Properties of `limit`, hand-chosen cases, and the simulated mirror behind its guard as pure functions."""
+"""Properties of `limit`, hand-chosen cases, and the simulated mirror behind its protection as pure functions."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -7,8 +7,8 @@ import numpy as np
 
 from lowfc.arrays import Single
 from lowfc.control.loop.safety import Limited, Limits, Reason
-from lowfc.device import guard
-from lowfc.device.guard import Command, Move, Status
+from lowfc.device import mirror_protection
+from lowfc.device.mirror_protection import Command, Move, Status
 from sim_dm.device import Device, responded, rounded
 
 LIMITS = Limits(stroke_nm=700.0, slew_nm=100.0, neighbour_nm=400.0)
@@ -117,11 +117,11 @@ def check_kept(limit: Callable[[Limits, Single, Single], Limited], case: Case) -
 
 
 def apply_command(device: Device, status: Status, command: Command, now_ns: int) -> tuple[Status, Reason | None]:
-    return guard.apply_command(device, status, command, now_ns, _move(device, status))
+    return mirror_protection.apply_command(device, status, command, now_ns, _move(device, status))
 
 
 def tick(device: Device, status: Status, now_ns: int) -> Status:
-    return guard.tick(device, status, now_ns, _move(device, status))
+    return mirror_protection.tick(device, status, now_ns, _move(device, status))
 
 
 def _move(device: Device, status: Status) -> Move:

@@ -16,7 +16,7 @@ from lowfc.programs.view.panels.tiles import FILL, GROUND, HEIGHT, TILES, WIDTH,
 from lowfc.programs.view.snapshot import Accumulator
 from lowfc.programs.view.verdicts.facts import facts
 from lowfc.programs.view.verdicts.run_state import RunState
-from lowfc.programs.view.verdicts.steady import Attained
+from lowfc.programs.view.verdicts.steady import ResidualComparison
 from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict
 from lowfc.programs.view.verdicts.verdict import judge
 from lowfc.programs.view.verdicts.watcher import Watcher
@@ -245,20 +245,20 @@ def test_a_view_that_is_behind_does_not_report_the_run_as_dead() -> None:
 
 
 @pytest.mark.parametrize(
-    ("better", "attained", "level"),
+    ("better", "comparison", "level"),
     [
         (1.5, None, Level.NEUTRAL),
         (2.5, None, Level.GOOD),
-        (2.5, Attained(2.0, 1.9, 0.5), Level.GOOD),
-        (2.5, Attained(4.0, 1.9, 0.5), Level.NEUTRAL),  # the best gains would leave half
-        (1.5, Attained(2.0, 1.9, 0.5), Level.NEUTRAL),
-        (5.0, Attained(2.0, 1.0, 8.0), Level.GOOD),  # within the uncertainty of the noise
+        (2.5, ResidualComparison(2.0, 1.9, 0.5), Level.GOOD),
+        (2.5, ResidualComparison(4.0, 1.9, 0.5), Level.NEUTRAL),  # the best gains would leave half
+        (1.5, ResidualComparison(2.0, 1.9, 0.5), Level.NEUTRAL),
+        (5.0, ResidualComparison(2.0, 1.0, 8.0), Level.GOOD),  # within the uncertainty of the noise
     ],
 )
 def test_a_loop_is_good_if_it_corrects_and_other_gains_would_not_do_better(
-    better: float, attained: Attained | None, level: Level
+    better: float, comparison: ResidualComparison | None, level: Level
 ) -> None:
-    assert merit(better, attained)[0] is level
+    assert merit(better, comparison)[0] is level
 
 
 def test_noise_is_subtracted_before_a_measured_wavefront_is_judged() -> None:
@@ -277,7 +277,7 @@ def test_a_loop_that_corrects_little_is_neutral_and_so_is_its_headline() -> None
 
 
 def test_the_residual_of_the_best_gains_is_computed_from_the_measured_loop(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("lowfc.programs.view.verdicts.watcher.ATTAINED_NS", 1_000_000_000)
+    monkeypatch.setattr("lowfc.programs.view.verdicts.watcher.COMPARISON_PERIOD_NS", 1_000_000_000)
     night = SyntheticLog(truth=False)
     night.frames(3000)
     accumulator, watcher = Accumulator(), Watcher()
@@ -285,7 +285,7 @@ def test_the_residual_of_the_best_gains_is_computed_from_the_measured_loop(monke
         accumulator.add(one)
         if number % 2500 == 0 or number == len(night.samples):
             watcher.feed(accumulator.snapshot(one.publish_time_ns))
-    found = watcher.state().attained
+    found = watcher.state().comparison
     assert 0 < found.best_nm <= 1.05 * found.residual_nm
     assert found.noise_nm > 0
     assert tile(judge(watcher.state()), "WAVEFRONT").detail.endswith("without noise")

@@ -162,7 +162,7 @@ class NotClosed:
         self._since_ns: int | None = None
         self._cause = ""
         self._causes: Counter[str] = Counter()
-        self._times = 0
+        self._occurrences = 0
 
     def note(self, state: State, now_ns: int) -> tuple[int, str]:
         """Note the loop mode; return the time not closed, ns, and the causes, most frequent first."""
@@ -175,7 +175,7 @@ class NotClosed:
             if state.mode is not LoopMode.CLOSED:
                 cause, self._since_ns = state.conditions.mode_cause, now_ns
                 if cause and (before_ns is None or cause != self._cause):
-                    self._times += 1
+                    self._occurrences += 1
                     if cause in self._causes or len(self._causes) < MAX_CAUSES:
                         self._causes[cause] += 1
                 self._cause = cause
@@ -185,7 +185,7 @@ class NotClosed:
         if len(self._causes) < 2:
             return "".join(self._causes)
         named = dict(self._causes.most_common(CAUSES_NAMED))
-        if others := self._times - sum(named.values()):
+        if others := self._occurrences - sum(named.values()):
             named["other causes"] = others
         return "; ".join(f"{cause} ({counted(times, 'time')})" for cause, times in named.items())
 

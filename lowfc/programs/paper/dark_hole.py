@@ -22,7 +22,7 @@ STEPS = 20
 SEED = 5
 SETTLE, WINDOW = 100, 300
 """`SETTLE`: frames after each step. `WINDOW`: further frames after the last step, and after the shape is removed."""
-AT_ONCE = 5
+STEPS_COMBINED = 5
 """Number of steps combined into one on the channel that does not shift the zero point; the loop undoes a large fraction
 of these."""
 SHIFTED, PLAIN = "dark-hole", FLAT
@@ -66,23 +66,23 @@ class DarkHoleRun:
     log: Path
 
 
-def shapes_nm(grid: tuple[int, int], each_nm: float, usable: Mask | None = None) -> Array:
+def shapes_nm(grid: tuple[int, int], step_rms_nm: float, usable: Mask | None = None) -> Array:
     """Shapes (steps, rows, columns) of the channel after each step, nm of surface.
 
-    Each step adds a random shape of `each_nm` rms.
+    Each step adds a random shape of `step_rms_nm` rms.
     """
-    steps = each_nm * np.random.default_rng(SEED).standard_normal((STEPS, *grid))
+    steps = step_rms_nm * np.random.default_rng(SEED).standard_normal((STEPS, *grid))
     return np.asarray(np.cumsum(steps if usable is None else steps * usable, axis=0))
 
 
 def dark_hole(
-    folder: Path, each_nm: float, toml: str = "", base_nm: npt.ArrayLike = 0.0, seed: int | None = None
+    folder: Path, step_rms_nm: float, toml: str = "", base_nm: npt.ArrayLike = 0.0, seed: int | None = None
 ) -> DarkHoleRun:
     """Apply the steps on one channel, remove them, and apply them on the other, in one run of the processes.
 
     Args:
         folder: folder of the log.
-        each_nm: rms of each step, nm of surface.
+        step_rms_nm: rms of each step, nm of surface.
         toml: configuration.
         base_nm: (rows, columns) nm, constant shape on the channel without a zero-point shift.
         seed: seed of the simulation; the configuration's if None.
@@ -96,7 +96,7 @@ def dark_hole(
             deadline_s = time.monotonic() + PATIENCE_S
             while RUN not in running() and time.monotonic() < deadline_s and process.poll() is None:
                 time.sleep(0.05)
-            marks, steps_nm = _apply_steps(each_nm, np.asarray(base_nm))
+            marks, channel_modes_nm = _apply_steps(step_rms_nm, np.asarray(base_nm))
         except BusError as error:
             process.send_signal(signal.SIGINT)
             raise RuntimeError(f"{error}; output of the loop: {process.communicate(timeout=PATIENCE_S)}") from error
@@ -105,10 +105,10 @@ def dark_hole(
     if process.returncode:
         raise RuntimeError(complaints)
     log = folder / json.loads(out)["log"]
-    return DarkHoleRun(_channels(log, marks, steps_nm), log)
+    return DarkHoleRun(_channels(log, marks, channel_modes_nm), log)
 
 
-def _apply_steps(each_nm: float, base_nm: Array) -> tuple[dict[str, list[int]], Array]:
+def _apply_steps(step_rms_nm: float, base_nm: Array) -> tuple[dict[str, list[int]], Array]:
     """First frame of each step and of the removal, by channel, and the modes of the channel's shape without `base_nm`.
 
     The modes (1 + steps, modes) are as the sensor sees them: before the first step, then after each.
@@ -123,20 +123,20 @@ def _apply_steps(each_nm: float, base_nm: Array) -> tuple[dict[str, list[int]], 
         wait(2 * WINDOW)
         calibration = loop.calibration()
         used = np.asarray(calibration.actuators_to_modes.any(axis=0)).reshape(calibration.grid)
-        shapes = shapes_nm(calibration.grid, each_nm, used)
-        for channel, stride, under_nm in ((SHIFTED, 1, 0 * base_nm), (PLAIN, AT_ONCE, base_nm)):
+        shapes = shapes_nm(calibration.grid, step_rms_nm, used)
+        for channel, stride, channel_base_nm in ((SHIFTED, 1, 0 * base_nm), (PLAIN, STEPS_COMBINED, base_nm)):
             marks[channel] = []
             for shape in shapes[stride - 1 :: stride]:
-                marks[channel].append(loop.channel(channel, shape + under_nm).frame_sequence)
+                marks[channel].append(loop.channel(channel, shape + channel_base_nm).frame_sequence)
                 wait(SETTLE)
             wait(WINDOW)
-            marks[channel].append(loop.channel(channel, np.zeros(calibration.grid) + under_nm).frame_sequence)
+            marks[channel].append(loop.channel(channel, np.zeros(calibration.grid) + channel_base_nm).frame_sequence)
             wait(WINDOW)
-    steps_nm = shapes.reshape(STEPS, -1) @ calibration.actuators_to_modes.T.astype(np.float64)
-    return marks, np.vstack([np.zeros(steps_nm.shape[1]), steps_nm])
+    channel_modes_nm = shapes.reshape(STEPS, -1) @ calibration.actuators_to_modes.T.astype(np.float64)
+    return marks, np.vstack([np.zeros(channel_modes_nm.shape[1]), channel_modes_nm])
 
 
-def _channels(log: Path, marks: dict[str, list[int]], steps_nm: Array) -> dict[str, ChannelResult]:
+def _channels(log: Path, marks: dict[str, list[int]], channel_modes_nm: Array) -> dict[str, ChannelResult]:
     history = read_history(LogReader(log))
     truths = history.true
     if truths is None:
@@ -156,5 +156,7 @@ def _channels(log: Path, marks: dict[str, list[int]], steps_nm: Array) -> dict[s
             np.sqrt(truths.residual_nm[until(end, WINDOW)].var(axis=0, dtype=np.float64).sum())
             for end in (changed_at[0], changed_at[-1])
         ]
-        found[name] = ChannelResult(steps_nm[:: STEPS // (len(changed_at) - 1)], reaction, np.array(residual_nm))
+        found[name] = ChannelResult(
+            channel_modes_nm[:: STEPS // (len(changed_at) - 1)], reaction, np.array(residual_nm)
+        )
     return found

@@ -57,7 +57,7 @@ class ViewError(LowfcError):
 
 
 class LiveView:
-    """One live view of a run; `renewals` counts its restarts, `most_bytes` is the peak memory of this process."""
+    """One live view of a run; `renewals` counts its restarts, `peak_bytes` is the peak memory of this process."""
 
     def __init__(self, config: Configuration, run_id: str, clock: Clock, bus: Bus, target: Target) -> None:
         """Subscribe to everything that is shown; drawing starts with `run`."""
@@ -67,9 +67,9 @@ class LiveView:
         self._target = target
         self.viewer: RerunViewer | None = None
         self._render: RenderThread | None = None
-        self._drawn = self.renewals = self.most_bytes = 0
+        self._drawn = self.renewals = self.peak_bytes = 0
         self._renewed_s: deque[float] = deque(maxlen=_MAX_RENEWALS)
-        self._stuck = self._past_known = False
+        self._stuck = self._earlier_events_requested = False
         self._awake_s = self._began_s = time.monotonic()
         self._rings = {topic: bus.ring(topic, RING_LENGTHS[topic]) for topic in SHOWN}
         self.service = Service(Role.VIEWER, run_id, clock, bus)
@@ -118,7 +118,7 @@ class LiveView:
         self._render = RenderThread(self._config, self._clock, self._rings, make_stream)
         self._render.start()
         self._began_s = time.monotonic()
-        self._past_known = self._stuck = False
+        self._earlier_events_requested = self._stuck = False
         self._add_earlier(self._render)
 
     def _end_render(self) -> None:
@@ -131,8 +131,10 @@ class LiveView:
     def _add_earlier(self, render: RenderThread) -> None:
         """Add messages from before this view; in a thread, because a frozen peer answers late."""
         recorder = self.service.last_health.get(Role.RECORDER)
-        events_due = not self._past_known and (recorder is not None or self._recorder_absent(time.monotonic()))
-        self._past_known |= events_due
+        events_due = not self._earlier_events_requested and (
+            recorder is not None or self._recorder_absent(time.monotonic())
+        )
+        self._earlier_events_requested |= events_due
 
         def add() -> None:
             render.add_earlier(sample for _, sample in states(self._bus, SHOWN))
@@ -147,11 +149,11 @@ class LiveView:
     def _check(self, now_s: float) -> None:
         render, viewer = self._render, self.viewer
         assert render is not None  # noqa: S101  # `_begin` made it
-        if self.service.newcomers() or (not self._past_known and self._recorder_absent(now_s)):
+        if self.service.newcomers() or (not self._earlier_events_requested and self._recorder_absent(now_s)):
             self._add_earlier(render)
         own_bytes, stuck_s = resident_bytes(), now_s - max(render.drawn_s, self._awake_s)
         viewer_bytes = viewer.resident_bytes() if viewer is not None else 0
-        self.most_bytes = max(self.most_bytes, own_bytes)
+        self.peak_bytes = max(self.peak_bytes, own_bytes)
         native = viewer is not None and viewer.show is Show.NATIVE
         stuck, self._stuck = self._stuck, native and stuck_s > STUCK_S
         if viewer is not None and not viewer.alive:

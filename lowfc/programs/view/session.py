@@ -66,7 +66,7 @@ def show_run(run_id: str, config: Configuration | None, target: Target, seconds:
         "run": run_id,
         "moments": view.snapshots,
         "renewals": view.renewals,
-        "memory_mb": round(view.most_bytes / 1e6, 1),
+        "memory_mb": round(view.peak_bytes / 1e6, 1),
         "file": _written(target),
     }
 

@@ -134,7 +134,7 @@ def _carry_out(
     from lowfc.client import Client
     from lowfc.programs.commissioning.acceptance.live import Live
     from lowfc.programs.commissioning.acceptance.probe import logged_responses
-    from lowfc.programs.logs.guard import refuse_log
+    from lowfc.programs.logs.overwrite_check import refuse_log
 
     required = configuration(config).acceptance if config is not None else None
     require_folder(plot)

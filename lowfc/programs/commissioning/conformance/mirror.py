@@ -7,7 +7,7 @@ import numpy as np
 
 from lowfc.arrays import Mask, Single
 from lowfc.contract.messages import from_timestamp, wire
-from lowfc.device.guard import MAX_VALID_NS
+from lowfc.device.mirror_protection import MAX_VALID_NS
 from lowfc.programs.commissioning.checks import Check, Status, judged, ok, warning, wrong
 from lowfc.programs.commissioning.conformance.dialogue import ANSWER_S, MODAL_NM, Dialogue, Show
 from lowfc.programs.commissioning.conformance.line import NS

@@ -40,7 +40,7 @@ def tune(
     from lowfc.client import Client
     from lowfc.programs.commissioning.tune.data import telemetry_from_log, telemetry_from_run
     from lowfc.programs.commissioning.tune.result import picture, result_of, tuned
-    from lowfc.programs.logs.guard import refuse_log
+    from lowfc.programs.logs.overwrite_check import refuse_log
 
     if bool(logs) == (live is not None):
         raise ConfigurationError("give one LOG, or observe a running loop with --live SECONDS")

@@ -101,7 +101,7 @@ def export_log(
     from lowfc.adapters.logs.recovery import missing_end_text
     from lowfc.adapters.logs.writer import stem_of
     from lowfc.adapters.process.progress import reading_bar
-    from lowfc.programs.logs.guard import refuse_log
+    from lowfc.programs.logs.overwrite_check import refuse_log
 
     if frames and to is Format.CSV:
         raise ConfigurationError("a CSV file cannot hold frames: use --to npz, fits or aot, or omit --frames")

@@ -48,7 +48,7 @@ def _report(log: "Parts", out: Path | None, as_json: bool) -> None:
     from lowfc.adapters.logs.parts import titled
     from lowfc.adapters.logs.writer import stem_of
     from lowfc.adapters.process.progress import counting_bar
-    from lowfc.programs.logs.guard import refuse_log
+    from lowfc.programs.logs.overwrite_check import refuse_log
     from lowfc.programs.logs.report.page import page, require_page
     from lowfc.programs.logs.report.results import report_of
     from lowfc.programs.logs.report.source import read_run

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from lowfc.contract.messages import Log, wire
 from lowfc.control.loop.safety import LoopMode, Reason
 from lowfc.programs.view.snapshot import Accumulator, Snapshot
-from lowfc.programs.view.verdicts.steady import Attained
+from lowfc.programs.view.verdicts.steady import ResidualComparison
 
 NOW_S = 1.0
 """Length of "now": long enough for an rms of vibrations, short enough to show the effect of an operator's action."""
@@ -69,7 +69,7 @@ class RunState:
         saturated: number of good pixels at full well in the newest frame.
         wavefront: rms of the last second; once the controller was stopped, of its last second with a step. `latest` is
             the rms of the end of that second. Both are `true` in a simulation, otherwise measured.
-        attained: residual of the loop, and of the best gains.
+        comparison: residual of the loop, and of the best gains.
         latency_us: p50 and p99 from frame to command in the same second.
         mirror_state: last state of the mirror; None before the first.
         note: last note of the operator.
@@ -94,7 +94,7 @@ class RunState:
     wavefront: Rms | None = None
     latest: Rms | None = None
     true: bool = False
-    attained: Attained | None = None
+    comparison: ResidualComparison | None = None
     latency_us: tuple[float, float] | None = None
     mirror_state: wire.MirrorState | None = None
     note: Log | None = None

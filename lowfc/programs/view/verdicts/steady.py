@@ -69,7 +69,7 @@ class Steady:
         return sequence, signals
 
 
-class Attained(NamedTuple):
+class ResidualComparison(NamedTuple):
     """Residual of a law, and of integrators with the best gains: rms of all modes without noise, nm.
 
     `noise_nm` is the sensor's noise in one frame.
@@ -80,7 +80,9 @@ class Attained(NamedTuple):
     noise_nm: float
 
 
-def attained(steady: Steady, rate_hz: float, camera: wire.CameraState | None) -> Attained | None:
+def compare_with_best_gains(
+    steady: Steady, rate_hz: float, camera: wire.CameraState | None
+) -> ResidualComparison | None:
     """Evaluate the last frames; None if the loop is open, its law unknown, or one law has too few frames."""
     law, modes = steady.law, len(steady.law.gain) if steady.law is not None else 0
     if law is None or steady.mode != LoopMode.CLOSED or not rate_hz:
@@ -96,7 +98,7 @@ def attained(steady: Steady, rate_hz: float, camera: wire.CameraState | None) ->
     error_nm = signals[np.isfinite(signals).all(axis=1), :modes].astype(np.float64)
     noise_nm2 = float(np.sum(best.noise_nm**2))
     residual_nm2 = max(float(np.mean(np.sum(error_nm**2, axis=1))) - noise_nm2, 0.0)
-    return Attained(residual_nm2**0.5, float(np.linalg.norm(best.sensed_nm)), noise_nm2**0.5)
+    return ResidualComparison(residual_nm2**0.5, float(np.linalg.norm(best.sensed_nm)), noise_nm2**0.5)
 
 
 def _law_of(state: wire.ControllerState | None, modes: int) -> LawInForce | None:

@@ -28,7 +28,7 @@ from lowfc.control.loop.safety import LoopMode
 from lowfc.programs.launch.watch import topic_count
 from lowfc.programs.view.snapshot import Accumulator, Snapshot, Wavefronts
 from lowfc.programs.view.verdicts.run_state import NOW_S, RECENT_S, Counts, Liveness, Process, Rms, RunState
-from lowfc.programs.view.verdicts.steady import Attained, Steady, attained
+from lowfc.programs.view.verdicts.steady import ResidualComparison, Steady, compare_with_best_gains
 
 LATEST_S = 0.3
 """Length of the interval, up to the last snapshot, over which `latest` is computed; it is short, to show the
@@ -39,7 +39,7 @@ FRAMES_SILENT_S = 1.0
 """Time without a frame or a step after which it is reported as missing, but at least `PERIODS` frame periods."""
 PERIODS = 10
 """Minimum length of every time span here, in frame periods, for slow cameras."""
-ATTAINED_NS = 30_000_000_000
+COMPARISON_PERIOD_NS = 30_000_000_000
 """Time between two computations of the best gains, which take 0.3 s for 14 modes."""
 _SAMPLES = 1000
 _MODES: dict[int, LoopMode] = {mode.value: mode for mode in LoopMode}
@@ -81,8 +81,8 @@ class Watcher:
         self._begun_ns = 0
         self._note: Log | None = None
         self._totals: Counts = Counter()
-        self._steady, self._attained_ns = Steady(), 0
-        self._attained: Attained | None = None
+        self._steady, self._compared_ns = Steady(), 0
+        self._comparison: ResidualComparison | None = None
         self._samples: deque[_Sample] = deque(maxlen=_SAMPLES)
         self._last_counts: dict[str, tuple[int, int]] = {}
         self._last_active: list[_Sample] = []
@@ -95,7 +95,7 @@ class Watcher:
         self._update_mode(snapshot)
         self._update_events(snapshot.events)
         self._update_light(snapshot)
-        self._update_attained(snapshot)
+        self._update_comparison(snapshot)
         self._mirror = snapshot.mirror or self._mirror
         self._samples.append(self._sample(snapshot))
         self._totals.update(self._samples[-1].counts)
@@ -134,7 +134,7 @@ class Watcher:
             wavefront=wavefront,
             latest=_rms(self._last(LATEST_S))[0],
             true=true,
-            attained=self._attained,
+            comparison=self._comparison,
             latency_us=tuple(np.percentile(durations_us, [50, 99]).tolist()) if durations_us.size else None,
             mirror_state=self._mirror,
             note=self._note,
@@ -211,19 +211,19 @@ class Watcher:
         self._flux = float((pixels - calibration.dark) @ calibration.good) / calibration.flux_dn
         self._saturated = saturated_pixels(calibration, pixels)
 
-    def _update_attained(self, snapshot: Snapshot) -> None:
+    def _update_comparison(self, snapshot: Snapshot) -> None:
         before = self._steady.mode, self._steady.law
         if not self._steady.feed(snapshot):
             return
         if before != (self._steady.mode, self._steady.law):
-            self._attained, self._attained_ns = (
+            self._comparison, self._compared_ns = (
                 None,
                 snapshot.time_ns,
             )  # the last result was for another law or loop mode
-        if snapshot.time_ns - self._attained_ns >= ATTAINED_NS:
-            self._attained_ns = snapshot.time_ns
+        if snapshot.time_ns - self._compared_ns >= COMPARISON_PERIOD_NS:
+            self._compared_ns = snapshot.time_ns
             rate_hz = frame_rate_hz(snapshot.camera, snapshot.steps)
-            self._attained = attained(self._steady, rate_hz, snapshot.camera)
+            self._comparison = compare_with_best_gains(self._steady, rate_hz, snapshot.camera)
 
     def _sample(self, snapshot: Snapshot) -> _Sample:
         steps = snapshot.steps

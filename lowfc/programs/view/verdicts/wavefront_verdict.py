@@ -6,7 +6,7 @@ from math import hypot, sqrt
 from lowfc.contract.messages import wire
 from lowfc.control.loop.command_channels import FLAT
 from lowfc.programs.view.verdicts.run_state import RunState
-from lowfc.programs.view.verdicts.steady import Attained
+from lowfc.programs.view.verdicts.steady import ResidualComparison
 from lowfc.programs.view.verdicts.tile import Level, Tile, rounded
 
 WORSE = 1.1
@@ -25,13 +25,13 @@ UNCORRECTED = ("OPEN", "SAFE", "DEAD")
 
 def wavefront(state: RunState, nm_per_mas: float | None, loop: Tile) -> Tile:
     """Tile WAVEFRONT: the residual, compared with a flat mirror."""
-    tile, found, attained = partial(Tile, "WAVEFRONT"), state.wavefront, state.attained
+    tile, found, comparison = partial(Tile, "WAVEFRONT"), state.wavefront, state.comparison
     if found is None:
         return tile("?", "not measured now")
     residual = rounded(found.residual_nm)
     value, flat, more = f"{residual} nm rms", f"{rounded(found.open_nm)} nm with a flat mirror", "true"
     if not state.true:
-        more = f"measured, {_without_noise(found.residual_nm, attained)}" if attained else "measured, with noise"
+        more = f"measured, {_without_noise(found.residual_nm, comparison)}" if comparison else "measured, with noise"
     if nm_per_mas and found.tilt_open_nm:
         tilt, before = (rounded(one / nm_per_mas) for one in (found.tilt_residual_nm, found.tilt_open_nm))
         more = f"tilt {tilt} of {before} mas per axis; {more}"
@@ -47,8 +47,8 @@ def wavefront(state: RunState, nm_per_mas: float | None, loop: Tile) -> Tile:
         level = Level.BAD if raw < 1 / DIVERGING else Level.WARNING
         advice = f"The loop does harm: {residual} nm rms, {flat}. Lower the gain or open the loop."
         return tile(value, f"worse than {flat}; {more}", level, advice)
-    noise_nm = attained.noise_nm if attained is not None and not state.true else 0.0
-    level, why = merit(factor(found.residual_nm, found.open_nm, noise_nm), attained)
+    noise_nm = comparison.noise_nm if comparison is not None and not state.true else 0.0
+    level, why = merit(factor(found.residual_nm, found.open_nm, noise_nm), comparison)
     compared = f"{raw:.1f} x better than" if raw >= 1 else "of"
     return tile(value, f"{compared} {flat}; {more}", level, f"The residual is {value}, compared with {flat}{why}.")
 
@@ -69,16 +69,16 @@ def factor(residual_nm: float, open_nm: float, noise_nm: float) -> float:
     return open_nm / residual_nm
 
 
-def merit(reduction: float, attained: Attained | None) -> tuple[Level, str]:
+def merit(reduction: float, comparison: ResidualComparison | None) -> tuple[Level, str]:
     """Level of a closed loop that does no harm, and the reason if it is not good."""
-    if attained is None:
+    if comparison is None:
         return (Level.GOOD, "") if reduction >= GOOD_FACTOR else (Level.NEUTRAL, ": little is corrected")
-    if attained.residual_nm > hypot(NEAR_BEST * attained.best_nm, NOISE_FLOOR * attained.noise_nm):
-        times = attained.residual_nm / max(attained.best_nm, 1e-9)
+    if comparison.residual_nm > hypot(NEAR_BEST * comparison.best_nm, NOISE_FLOOR * comparison.noise_nm):
+        times = comparison.residual_nm / max(comparison.best_nm, 1e-9)
         return Level.NEUTRAL, f", {times:.1f} x the residual of the best gains: run `lowfc tune`"
     if reduction >= GOOD_FACTOR:
         return Level.GOOD, ""
-    best = attained.residual_nm <= NEAR_BEST * attained.best_nm
+    best = comparison.residual_nm <= NEAR_BEST * comparison.best_nm
     return Level.NEUTRAL, ": little is corrected" + (", and other gains would not correct more" if best else "")
 
 
@@ -87,6 +87,6 @@ def _shaped(state: wire.ControllerState | None) -> bool:
     return state is not None and (any(state.offset_nm) or any(one.name != FLAT for one in state.channels))
 
 
-def _without_noise(residual_nm: float, attained: Attained) -> str:
-    residual_nm, least_nm = sqrt(max(residual_nm**2 - attained.noise_nm**2, 0.0)), NOISE_FLOOR * attained.noise_nm
+def _without_noise(residual_nm: float, comparison: ResidualComparison) -> str:
+    residual_nm, least_nm = sqrt(max(residual_nm**2 - comparison.noise_nm**2, 0.0)), NOISE_FLOOR * comparison.noise_nm
     return f"{rounded(residual_nm) if residual_nm > least_nm else f'below {rounded(least_nm)}'} nm without noise"

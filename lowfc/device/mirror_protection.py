@@ -29,7 +29,7 @@ is the run's time since the last call, ns."""
 
 
 @dataclass(frozen=True)
-class MirrorGuard:
+class MirrorProtection:
     """Limits of a mirror, and its action on the command timeout: flat if `flatten`, otherwise hold the shape.
 
     The limits apply after the driver has rounded to `step_nm`.
@@ -103,13 +103,18 @@ class Status(NamedTuple):
 
 
 def apply_command(
-    guard: MirrorGuard, status: Status, command: Command, now_ns: int, move: Move, others_nm: Single | None = None
+    protection: MirrorProtection,
+    status: Status,
+    command: Command,
+    now_ns: int,
+    move: Move,
+    others_nm: Single | None = None,
 ) -> tuple[Status, Reason | None]:
     """Apply a command received at `now_ns`; a refused command changes nothing, and its reason is returned.
 
     `others_nm` (rows, columns) is the shape of other programs on the mirror; it uses part of the stroke.
     """
-    reason = _refusal(guard, status, command)
+    reason = _refusal(protection, status, command)
     if reason is not None:
         return status, reason
     assert command.actuators_nm is not None  # noqa: S101  # _refusal
@@ -117,8 +122,8 @@ def apply_command(
     target_nm = command.actuators_nm
     if len(channels) > 1:
         with np.errstate(over="ignore", invalid="ignore"):  # a sum that is not finite is refused by `limit`
-            target_nm = sum(channels.values(), np.zeros(guard.grid, np.float32))
-    limited = _limited(guard, status.driven_nm, target_nm, others_nm)
+            target_nm = sum(channels.values(), np.zeros(protection.grid, np.float32))
+    limited = _limited(protection, status.driven_nm, target_nm, others_nm)
     # From frame to frame, not from the last tick: ticks use the mirror's own clock, which is ahead of a frame's time.
     elapsed_ns = command.time_ns - status.commanded_ns if status.commanded_ns else np.inf
     if elapsed_ns <= 0:  # a command repeated for the same frame: only the mirror's own clock has advanced
@@ -141,23 +146,23 @@ def apply_command(
     return applied, None
 
 
-def _limited(guard: MirrorGuard, previous_nm: Single, target_nm: Single, others_nm: Single | None) -> Limited:
+def _limited(protection: MirrorProtection, previous_nm: Single, target_nm: Single, others_nm: Single | None) -> Limited:
     """Limit the command so that its sum with other programs' shape is within the stroke, or exceeds it no further."""
     if others_nm is None or not others_nm.any() or not np.isfinite(target_nm).all():
-        return limit(guard.tighter, previous_nm, target_nm)
-    stroke_nm = np.float32(guard.tighter.kept_stroke_nm)
+        return limit(protection.tighter, previous_nm, target_nm)
+    stroke_nm = np.float32(protection.tighter.kept_stroke_nm)
     room_nm = np.clip(target_nm, np.minimum(-stroke_nm - others_nm, 0), np.maximum(stroke_nm - others_nm, 0))
-    limited = limit(guard.tighter, previous_nm, room_nm)
+    limited = limit(protection.tighter, previous_nm, room_nm)
     clipped = Limit.STROKE not in limited.reasons and not np.array_equal(room_nm, target_nm)
     return limited._replace(reasons=(Limit.STROKE, *limited.reasons)) if clipped else limited
 
 
-def tick(guard: MirrorGuard, status: Status, now_ns: int, move: Move) -> Status:
+def tick(protection: MirrorProtection, status: Status, now_ns: int, move: Move) -> Status:
     """Advance the mirror without a new command: let it settle, and apply the command timeout."""
     if status.following and expired(now_ns - status.received_ns, status.valid_for_ns):
         status = status._replace(following=False, channels={})
-    if not status.following and guard.flatten and status.driven_nm.any():
-        flat = limit(guard.tighter, status.driven_nm, np.zeros(guard.grid, np.float32)).actuators_nm
+    if not status.following and protection.flatten and status.driven_nm.any():
+        flat = limit(protection.tighter, status.driven_nm, np.zeros(protection.grid, np.float32)).actuators_nm
         status = status._replace(driven_nm=flat, limits_hit=(), command_nm=_NONE, channels={})
     known = status.time_ns and status.time_ns - now_ns < AHEAD_NS
     time_ns = max(now_ns, status.time_ns) if known else now_ns
@@ -165,8 +170,8 @@ def tick(guard: MirrorGuard, status: Status, now_ns: int, move: Move) -> Status:
     return status._replace(surface_nm=move(status.driven_nm, elapsed_ns), time_ns=time_ns)
 
 
-def _refusal(guard: MirrorGuard, status: Status, command: Command) -> Reason | None:
-    if command.actuators_nm is None or command.actuators_nm.shape != guard.grid:
+def _refusal(protection: MirrorProtection, status: Status, command: Command) -> Reason | None:
+    if command.actuators_nm is None or command.actuators_nm.shape != protection.grid:
         return Limit.WRONG_GRID
     if not (np.isfinite(command.actuators_nm).all() and np.isfinite(command.command_nm).all()):
         return Limit.NOT_FINITE
