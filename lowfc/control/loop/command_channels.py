@@ -1,8 +1,8 @@
 """Additions to the loop's command: static channels, an offset of its target, a table played frame by frame.
 
 A channel is a mirror shape set by another user, such as a dark hole. The sensor sees it, so its zero point shifts
-with it (Subedi et al. 2015, Sect. 1 and 4), after the delay of a command, and the loop does not remove it. A probe
-sequence ("play") is for calibration and tests and shifts nothing.
+with it (Subedi et al. 2015, Sect. 1 and 4), after the delay of a command, and the loop does not remove it; only `FLAT`
+shifts nothing. A probe sequence ("play") is for calibration and tests and shifts nothing.
 """
 
 from typing import NamedTuple
