@@ -203,7 +203,7 @@ def test_limits_that_limit_nothing_are_refused(name: str, value: float) -> None:
     ("age_ns", "valid_for_ns", "answer"),
     [(0, 0, False), (1, 0, True), (200, 200, False), (201, 200, True), (-1, 200, True)],
 )
-def test_the_dead_man_expires_just_after_what_was_promised(age_ns: int, valid_for_ns: int, answer: bool) -> None:
+def test_the_command_timeout_expires_just_after_its_validity(age_ns: int, valid_for_ns: int, answer: bool) -> None:
     assert expired(age_ns, valid_for_ns) is answer
 
 

@@ -213,7 +213,7 @@ def test_without_the_cameras_link_the_command_is_held_and_repeated(bench: Bench)
     assert bench.events("controller FRAMES_BACK") > 0
 
 
-def test_without_the_mirrors_link_its_dead_man_acts(bench: Bench) -> None:
+def test_without_the_mirrors_link_its_command_timeout_acts(bench: Bench) -> None:
     bench.settled()
     mirror = bench.lab["mirror"]
     before = mirror.stderr("mirror-dm").count("COMMAND_EXPIRED")
