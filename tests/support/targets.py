@@ -164,7 +164,7 @@ class Processes:
             service.health().SerializeToString()
         driven_nm = self.mirror._status.driven_nm
         assert np.isfinite(driven_nm).all()
-        assert violations(self.mirror._guard.limits, driven_nm, driven_nm) == []
+        assert violations(self.mirror._protection.limits, driven_nm, driven_nm) == []
 
 
 ROLES = ("controller", "mirror-dm")
