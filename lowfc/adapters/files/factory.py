@@ -225,7 +225,7 @@ def analytic_calibration(
         commands = modes_to_actuators(mirror(config), nolls, active)
     except ValueError as error:
         raise ConfigurationError(f"mirror: {error}") from None
-    sensed = actuators_to_modes(unnormalised(R, light, good), optics, on_nodes, opd_nm)
+    sensed = actuators_to_modes(R, light, good, optics, on_nodes, opd_nm)
     if active is not None:
         sensed[:, ~active.reshape(-1)] = 0
     commands = commands @ np.linalg.inv(sensed @ commands)
@@ -254,16 +254,26 @@ def analytic_calibration(
     )
 
 
-def actuators_to_modes(reconstructor: Array, optics: Twin, on_nodes: TwinMirror, opd_nm: Array | None = None) -> Array:
+def actuators_to_modes(
+    reconstructor: Array,
+    reference: Array,
+    good: Array,
+    optics: Twin,
+    on_nodes: TwinMirror,
+    opd_nm: Array | None = None,
+) -> Array:
     """Z (modes, actuators) = R H: nm of wavefront that R measures per nm of surface of each actuator.
 
     Args:
-        reconstructor: (modes, pixels) R for responses that are not normalised (`unnormalised`).
+        reconstructor: (modes, pixels) R, nm per flux fraction.
+        reference: (pixels,) I0 of the twin.
+        good: (pixels,) 1 for a used pixel, else 0.
         optics: Digital twin of the sensor.
         on_nodes: The mirror on the twin's nodes.
         opd_nm: Wavefront at the twin's used nodes at which R was computed; flat when None.
     """
-    return np.asarray(projected_response(optics, reconstructor, opd_nm) @ poke_wavefronts_nm(on_nodes))
+    sensed = projected_response(optics, unnormalised(reconstructor, reference, good), opd_nm)
+    return np.asarray(sensed @ poke_wavefronts_nm(on_nodes))
 
 
 def frame_noise_nm(config: Configuration, calibration: Calibration) -> Array:

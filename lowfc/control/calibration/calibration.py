@@ -122,9 +122,7 @@ def normalise_flux(reference: Array, response: Array, good: Array) -> tuple[Arra
 
     Returns I0 in flux fractions and the derivative of I/sum(I) with respect to each mode, in flux fractions per nm.
     """
-    flux = float(reference @ good)
-    if not flux > 0:
-        raise ValueError(f"the reference image has no light on the good pixels (sum {flux})")
+    flux = _flux(reference, good)
     fraction = reference / flux
     change = good @ response / flux
     return fraction, response / flux - np.outer(fraction, change)
@@ -132,8 +130,15 @@ def normalise_flux(reference: Array, response: Array, good: Array) -> tuple[Arra
 
 def unnormalised(reconstructor: Array, reference: Array, good: Array) -> Array:
     """R' (modes, pixels) with R' H = R N for responses H per nm in the unit of I0; `normalise_flux` makes N of H."""
-    flux = float(reference @ good)
+    flux = _flux(reference, good)
     return np.asarray((reconstructor - np.outer(reconstructor @ reference / flux, good)) / flux)
+
+
+def _flux(reference: Array, good: Array) -> float:
+    flux = float(reference @ good)
+    if not flux > 0:
+        raise ValueError(f"the reference image has no light on the good pixels (sum {flux})")
+    return flux
 
 
 def reconstructor(

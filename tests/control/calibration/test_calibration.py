@@ -7,7 +7,14 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from lowfc.control.calibration.alignment import Geometry, align, onto
-from lowfc.control.calibration.calibration import ESTIMATORS, condition_number, noise_nm, normalise_flux, reconstructor
+from lowfc.control.calibration.calibration import (
+    ESTIMATORS,
+    condition_number,
+    noise_nm,
+    normalise_flux,
+    reconstructor,
+    unnormalised,
+)
 from lowfc.control.loop.estimator import Estimator, difference, saturated_pixels
 from tests.support.toy import TOY, calibration
 
@@ -37,6 +44,14 @@ def test_the_normalised_response_is_the_derivative_of_the_normalised_image(good:
 def test_an_image_without_light_cannot_be_normalised() -> None:
     with pytest.raises(ValueError, match="no light"):
         normalise_flux(np.zeros(PIXELS), RESPONSE, GOOD)
+    with pytest.raises(ValueError, match="no light"):
+        unnormalised(RESPONSE.T, np.zeros(PIXELS), GOOD)
+
+
+def test_an_unnormalised_reconstructor_gives_the_modes_of_responses_that_are_not_normalised() -> None:
+    I0, H = normalise_flux(TOY.reference, RESPONSE, SOME_BAD)
+    R = reconstructor(I0, H, SOME_BAD, 1e5, 2.0)
+    np.testing.assert_allclose(unnormalised(R, TOY.reference, SOME_BAD) @ RESPONSE, R @ H, atol=1e-12)
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)

@@ -12,7 +12,7 @@ from lowfc.arrays import Array, single
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError
-from lowfc.control.calibration.calibration import Calibration, comparable, unnormalised
+from lowfc.control.calibration.calibration import Calibration, comparable
 from lowfc.control.calibration.regularised import Reconstruction, advice, reconstruct
 from lowfc.control.calibration.response_fit import MAX_ELEMENT, MAX_ELEMENT_RMS, Check, Measured, cross_talk
 from lowfc.optics.twin.twin import reference as twin_reference
@@ -308,8 +308,8 @@ def _actuators_to_modes(config: Configuration, before: Calibration, matrix: Arra
     if light.shape != before.shape:
         return measured
     on_nodes = factory.mirror_on_twin(config, optics, lambda _: None)
-    raw = unnormalised(matrix, light.reshape(-1), before.good.astype(np.float64))
-    modelled = factory.actuators_to_modes(raw, optics, on_nodes)
+    good = before.good.astype(np.float64)
+    modelled = factory.actuators_to_modes(matrix, light.reshape(-1), good, optics, on_nodes)
     if before.actuators_to_modes.size:
         modelled[:, ~before.actuators_to_modes.any(axis=0)] = 0  # actuators that are not active
     return np.asarray(measured + modelled - (modelled @ commands) @ measured)
