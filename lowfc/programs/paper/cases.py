@@ -85,7 +85,7 @@ class Prepared:
     @cached_property
     def band_H(self) -> Array:
         """`H` over the band."""
-        return response(self.sensor, self.modes, self.band)
+        return np.hstack([self.band_tilt_H, response(self.sensor, self.modes[2:], self.band)])
 
     @cached_property
     def band_tilt_H(self) -> Array:
@@ -125,7 +125,10 @@ class Prepared:
         nuisance: Array | None = None,
     ) -> Fit:
         """A linear estimator of the first modes, at the central wavelength or over the band."""
-        I0, H = (self.band_I0, self.band_H) if in_band else (self.I0, self.H)
+        if in_band:
+            I0, H = self.band_I0, self.band_tilt_H if modes <= 2 else self.band_H
+        else:
+            I0, H = self.I0, self.H
         try:
             return fit(NOLLS_20[:modes], I0, H[:, :modes], scale_e, read_noise_e, kind, nuisance)
         except ValueError as error:

@@ -9,7 +9,6 @@ from scipy.optimize import brentq
 
 from lowfc.arrays import Array
 from lowfc.contract.sections import SensorSection
-from lowfc.design.estimators import fit
 from lowfc.design.fisher import covariance, variance_e
 from lowfc.design.paper import (
     STAR,
@@ -113,8 +112,7 @@ def _ratios(sam: Prepared, clowfs: Prepared) -> Iterator[Row]:
     for k, light in enumerate(("paper's electrons", "own photometry")):
         scatter = []
         for sensor in (sam, clowfs):
-            scale_e = exposures(sensor)[k].scale_e
-            linear = fit(NOLLS_14[:2], sensor.band_I0, sensor.band_tilt_H, scale_e, TABLE4_READ_NOISE_E, "pinv")
+            linear = sensor.fit(2, exposures(sensor)[k].scale_e, TABLE4_READ_NOISE_E, "pinv", in_band=True)
             scatter.append(float(predicted_mas(linear, linear.reference_e)[0]))
         fitted = partial(Row, "sam / clowfs", modes=2, estimator="pinv", assumption=predicted)
         yield fitted(f"std of x tilt, {light}", "", scatter[0] / scatter[1], PAPER_SCATTER_RATIO)
