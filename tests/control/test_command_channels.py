@@ -366,6 +366,18 @@ def test_in_safe_mode_no_shape_of_the_mirror_is_adopted() -> None:
     assert not loop.surfaces[-1].any()
 
 
+def test_safe_mode_of_a_mirror_that_reports_late_removes_the_channels() -> None:
+    loop = ToyLoop()
+    assert loop.ask("channel", text="dark-hole", actuators_nm=dark_hole().reshape(-1)).accepted
+    loop.take(MirrorShape(0, np.zeros(GRID, np.float32), np.zeros(0, np.float32), safe=True))
+    assert loop.state.mode is LoopMode.SAFE
+    loop.run(10, np.zeros(3))
+    assert loop.ask("clear").accepted
+    loop.run(10, np.zeros(3))
+    assert not loop.surfaces[-1].any()
+    assert not loop.state.loop.command_channels.channels
+
+
 @pytest.mark.parametrize("signal", [None, "error", "pol"])
 def test_an_offset_moves_the_loop_but_not_the_pseudo_open_loop_modes(signal: Signal | None) -> None:
     """For the integrator, and for laws of the error and of pseudo-open-loop modes."""

@@ -155,6 +155,7 @@ def mirror_reported(settings: Settings, state: State, shape: MirrorShape) -> tup
         safe = safe or (LATCHED if settings.start_mode is LoopMode.SAFE else "")
     if safe:
         state = _changed(state, LoopMode.SAFE, shape.time_ns, safe, events)
+        loop = state.loop or loop  # without the channels that safe mode removes
     if shape.actuators_nm.shape != loop.calibration.grid or not np.isfinite(shape.actuators_nm).all():
         why = f"the mirror has a grid of {shape.actuators_nm.shape}, the calibration {loop.calibration.grid}"
         events.append(PendingEvent("MIRROR_REFUSED", {"why": why}))
