@@ -350,11 +350,18 @@ def test_an_implausible_modal_command_is_not_adopted(reported_nm: float) -> None
     assert state.loop.history_nm[0] == pytest.approx(before.history_nm[0], abs=1e-3)
 
 
-@pytest.mark.parametrize("shape", [np.zeros((5, 4), np.float32), np.full(GRID, np.nan, np.float32)])
-def test_a_shape_of_another_mirror_is_not_adopted(shape: np.ndarray) -> None:
+@pytest.mark.parametrize(
+    ("shape", "why"),
+    [
+        (np.zeros((5, 4), np.float32), "the mirror has a grid of (5, 4), the calibration (4, 5)"),
+        (np.full(GRID, np.nan, np.float32), "20 of its 20 actuators have no finite position"),
+    ],
+)
+def test_a_shape_of_another_mirror_is_not_adopted(shape: np.ndarray, why: str) -> None:
     state = loaded(DEFAULTS)
     after, (outputs,) = feed(DEFAULTS, state, MirrorShape(0, shape, np.zeros(3, np.float32)))
     assert names([outputs]) == ["MIRROR_REFUSED"]
+    assert outputs.events[0].details["why"] == why
     assert after.loop is state.loop
 
 

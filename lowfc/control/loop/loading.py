@@ -156,9 +156,12 @@ def mirror_reported(settings: Settings, state: State, shape: MirrorShape) -> tup
     if safe:
         state = _changed(state, LoopMode.SAFE, shape.time_ns, safe, events)
         loop = state.loop or loop  # without the channels that safe mode removes
-    if shape.actuators_nm.shape != loop.calibration.grid or not np.isfinite(shape.actuators_nm).all():
-        why = f"the mirror has a grid of {shape.actuators_nm.shape}, the calibration {loop.calibration.grid}"
-        events.append(PendingEvent("MIRROR_REFUSED", {"why": why}))
+    grid, finite = loop.calibration.grid, np.isfinite(shape.actuators_nm)
+    wrong = "" if finite.all() else f"{np.sum(~finite)} of its {finite.size} actuators have no finite position"
+    if shape.actuators_nm.shape != grid:
+        wrong = f"the mirror has a grid of {shape.actuators_nm.shape}, the calibration {grid}"
+    if wrong:
+        events.append(PendingEvent("MIRROR_REFUSED", {"why": wrong}))
         return state, Outputs(events=events, changed=bool(safe))
     limit_nm = loop.integrator.limit_nm
     plausible = shape.command_nm.shape == limit_nm.shape and (np.abs(shape.command_nm) <= limit_nm).all()
