@@ -121,7 +121,7 @@ def held(state: State) -> str:
 def bench_reported(settings: Settings, state: State, report: BenchReport) -> tuple[State, Outputs]:
     """Evaluate the interlocks on a bench value; one that begins to act makes the loop safer, and none closes it.
 
-    A loop that started closed is opened by any interlock that would have refused to close it.
+    Before the first used frame, `refuse_close` opens the loop too: it started closed. `hold` holds it.
     """
     before = state.conditions.acting
     after = judged(settings.interlocks, before, report)
@@ -132,7 +132,7 @@ def bench_reported(settings: Settings, state: State, report: BenchReport) -> tup
     still = {one.number for one in after}
     events += [PendingEvent("INTERLOCK_CLEARED", {"why": one.why}) for one in before if one.number not in still]
     state = state._replace(conditions=state.conditions._replace(acting=after))
-    opening = (Action.OPEN, Action.SAFE) if state.frames_used else (Action.OPEN, Action.SAFE, Action.REFUSE_CLOSE)
+    opening = (Action.OPEN,) if state.frames_used else (Action.OPEN, Action.REFUSE_CLOSE)
     for one in begun:
         mode, cause = state.mode, f"an interlock acts: {one.why}"
         if one.action is Action.SAFE:
