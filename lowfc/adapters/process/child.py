@@ -8,9 +8,8 @@ import signal
 import subprocess
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
 
 _TAIL_LINES = 6
 _WRAPPER = """
@@ -37,7 +36,6 @@ class Child:
     environment: Mapping[str, str] | None = None
     death_signal: signal.Signals = signal.SIGTERM
     process: "subprocess.Popen[bytes] | None" = None
-    _stream: "IO[bytes] | None" = field(default=None, repr=False)
 
     def start(self) -> None:
         """Start the process in its own session, so that Ctrl-C reaches only the parent.
@@ -50,15 +48,15 @@ class Child:
         if shutil.which(self.command[0], path=(self.environment or os.environ).get("PATH")) is None:
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), self.command[0])
         death = [sys.executable, "-I", "-S", "-c", _WRAPPER, str(self.death_signal.value), str(os.getpid())]
-        self._stream = self.stderr_path.open("wb")
-        self.process = subprocess.Popen(  # noqa: S603  # our own programs, and the viewer's
-            [*death, *self.command],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=self._stream,
-            env=self.environment,
-            start_new_session=True,
-        )
+        with self.stderr_path.open("wb") as stream:
+            self.process = subprocess.Popen(  # noqa: S603  # our own programs, and the viewer's
+                [*death, *self.command],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=stream,
+                env=self.environment,
+                start_new_session=True,
+            )
 
     @property
     def status(self) -> int | None:
@@ -76,8 +74,6 @@ class Child:
         if self.status is None:
             self.process.kill()
             self.process.wait()
-        if self._stream is not None:
-            self._stream.close()
 
     def stderr_tail(self) -> str:
         """Last lines of the child's standard error."""
