@@ -287,7 +287,7 @@ def waiting(topic: Topic, size: int) -> tuple[Topic, Sample]:
 
 
 def test_the_backlog_is_bounded_by_number_and_size() -> None:
-    backlog = Backlog(most_messages=3, most_bytes=1000)
+    backlog = Backlog(max_messages=3, max_bytes=1000)
     for size in (400, 400, 400, 200, 0):
         backlog.put(*waiting(FRAME, size))
     assert [len(backlog.take()[1].payload) for _ in range(len(backlog))] == [400, 400, 200]

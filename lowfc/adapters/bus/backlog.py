@@ -14,9 +14,9 @@ class Backlog:
     always fit: they are few and needed to interpret the rest.
     """
 
-    def __init__(self, most_messages: int, most_bytes: int) -> None:
-        self._most_messages = most_messages
-        self._most_bytes = most_bytes
+    def __init__(self, max_messages: int, max_bytes: int) -> None:
+        self._max_messages = max_messages
+        self._max_bytes = max_bytes
         self._bytes = 0
         self._waiting: deque[tuple[Topic, Sample]] = deque()
         self._lock = threading.Lock()
@@ -28,7 +28,7 @@ class Backlog:
         """Append a message, or drop it if the queue is full."""
         size = len(sample.payload)
         with self._lock:
-            fits = len(self._waiting) < self._most_messages and self._bytes + size <= self._most_bytes
+            fits = len(self._waiting) < self._max_messages and self._bytes + size <= self._max_bytes
             if fits or topic.queryable or topic.rate is Rate.EVENT:
                 self._waiting.append((topic, sample))
                 self._bytes += size

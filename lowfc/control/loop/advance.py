@@ -32,8 +32,8 @@ from lowfc.control.loop.loading import (
     bench_reported,
     camera_reported,
     end_probe,
-    held,
     in_mode,
+    interlock_or_permit_cause,
     loaded,
     mirror_judged,
     mirror_reported,
@@ -179,7 +179,7 @@ def _measure(
         return Rejection.CAMERA_UNKNOWN
     if state.conditions.mirror_fault and state.mode is LoopMode.CLOSED:
         return Rejection.NO_MIRROR
-    if state.mode is LoopMode.CLOSED and held(state):
+    if state.mode is LoopMode.CLOSED and interlock_or_permit_cause(state):
         return Rejection.HELD
     if frame.pixels is None or frame.pixels.shape != calibration.shape:
         return Rejection.WRONG_SIZE
@@ -216,7 +216,7 @@ def _refuse(
     if reason is not state.refused:
         events.append(PendingEvent("FRAMES_REFUSED", {"reason": reason.name}))
     loop, returning_to_zero, hit = state.loop, state.returning_to_zero, state.limits_hit
-    held = np.zeros(0, np.float32)
+    held_nm = np.zeros(0, np.float32)
     reasons: tuple[Reason, ...] = (reason,)
     if loop is not None:
         if state.mode is LoopMode.SAFE:
@@ -231,7 +231,7 @@ def _refuse(
             reasons = (reason, *hit)
         elif reason not in (Rejection.REPEATED, Rejection.OUT_OF_ORDER, Rejection.AHEAD):  # these are not new exposures
             loop = loop.missed(1)
-        held = loop.history_nm[0]
+        held_nm = loop.history_nm[0]
     state = state._replace(
         loop=loop,
         refused=reason,
@@ -242,11 +242,11 @@ def _refuse(
         counts=_counted(state.counts, reasons),
         input_number=state.input_number + 1,
     )
-    step = Step(frame.sequence, frame.time_ns, state.mode, held, reasons)
+    step = Step(frame.sequence, frame.time_ns, state.mode, held_nm, reasons)
     if loop is None or not state.commanded:
         return state, Outputs(step=step, events=events)
     # With the newest frame's sequence even if this frame is older: the mirror refuses older commands.
-    return state, Outputs(step=step, command=_command_message(state, loop, held), events=events)
+    return state, Outputs(step=step, command=_command_message(state, loop, held_nm), events=events)
 
 
 def _tick(settings: Settings, state: State, tick: Tick) -> tuple[State, Outputs]:

@@ -28,7 +28,8 @@ def loaded(
     """The state with another calibration, and the events.
 
     If the mirror has the same grid, it keeps its shape: the channels stay, the rest becomes a command of the new modes,
-    and the part outside the modes becomes a channel. Offset, play and a law of other modes are dropped.
+    and the part outside the modes becomes a channel. A probe sequence ends; offset and law are kept only for the
+    same modes.
     """
     loop, before = ActiveLoop.at_rest(settings, calibration), state.loop
     details: dict[str, object] = {
@@ -97,20 +98,20 @@ def uncalibrated(state: State) -> str:
     return f"the computed calibration is for frames of {rows} x {columns} pixels, the camera's are {frames}{hint}"
 
 
-def holding(state: State) -> str:
+def holding_cause(state: State) -> str:
     """Why a closed loop would hold its command at present; empty if it would correct."""
     if state.conditions.mirror_fault:
         return f"the mirror {state.conditions.mirror_fault}"
     if state.frame_timeout:
         return "no frame comes"
-    if why := held(state):
+    if why := interlock_or_permit_cause(state):
         return why
     if state.refused is not None and state.refused_count >= REFUSED_IN_A_ROW:
         return f"frames are refused as {state.refused.name}"
     return ""
 
 
-def held(state: State) -> str:
+def interlock_or_permit_cause(state: State) -> str:
     """Interlock or permit that holds the command of a closed loop; empty if there is none."""
     acting, lease = state.conditions.acting, state.conditions.lease
     if lease is not None and lease.holds and not lease.ended:

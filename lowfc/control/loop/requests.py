@@ -16,7 +16,7 @@ from lowfc.control.loop.command_channels import EXTERNAL, FLAT, MIRROR, CommandC
 from lowfc.control.loop.gains import changed_integrator, check_offset, offset_remark, per_mode
 from lowfc.control.loop.inputs import Outputs, PendingEvent, Reply, Request
 from lowfc.control.loop.lease import ENDED_BY, Lease, asked_by, refusal
-from lowfc.control.loop.loading import holding, in_mode, loaded, misfit, mode_event, uncalibrated
+from lowfc.control.loop.loading import holding_cause, in_mode, loaded, misfit, mode_event, uncalibrated
 from lowfc.control.loop.reservation import lease, lease_checked, lease_ended, permit, release, renew
 from lowfc.control.loop.safety import Limits, LoopMode, Rejection, neighbour_difference_nm, request_mode
 from lowfc.control.loop.state import ActiveLoop, LawRunner, Settings, State
@@ -31,17 +31,19 @@ def answer(settings: Settings, state: State, request: Request) -> tuple[State, O
     """The state after a request, and its reply; a refused request changes nothing but is counted."""
     request = prepared(settings, request)
     now, ended = lease_checked(state, request.time_ns, 0)
-    held = now.conditions.lease
+    lease_before = now.conditions.lease
     try:
-        after, text, *events = _handler(request, held)(settings, now, request)
+        after, text, *events = _handler(request, lease_before)(settings, now, request)
     except ValueError as error:
         return state._replace(), Outputs(reply=Reply(False, _short(str(error)), state.frame_sequence + 1))
-    if request.name == "safe" or (request.name in ENDED_BY and held is not None and held.id != request.lease_id):
-        after, others = lease_ended(after, asked_by(held, request))
+    if request.name == "safe" or (
+        request.name in ENDED_BY and lease_before is not None and lease_before.id != request.lease_id
+    ):
+        after, others = lease_ended(after, asked_by(lease_before, request))
         events += others
         text += "".join(f"; this ended the reservation for {event.details['holder']}" for event in others)
     if after.mode is not state.mode:
-        why = asked_by(held, request)
+        why = asked_by(lease_before, request)
         events.append(mode_event(state.mode, after.mode, why))
         if after.mode is LoopMode.SAFE:
             events.append(PendingEvent("SAFED", {"why": why}))
@@ -50,11 +52,11 @@ def answer(settings: Settings, state: State, request: Request) -> tuple[State, O
     return after if changed else state._replace(), Outputs(reply=reply, events=(*ended, *events), changed=changed)
 
 
-def _handler(request: Request, held: Lease | None) -> "Handler":
+def _handler(request: Request, lease_before: Lease | None) -> "Handler":
     """Handler of a request; ValueError with the reason if it is refused in any state of the loop."""
     if request.name not in _HANDLERS:
         raise ValueError(f"unknown request {request.name[:40]!r}; there are {', '.join(REQUESTS)}")
-    refused = refusal(held, request.name, request.lease_id, request.time_ns) or request.refusal
+    refused = refusal(lease_before, request.name, request.lease_id, request.time_ns) or request.refusal
     if refused:
         raise ValueError(refused)
     return _HANDLERS[request.name]
@@ -140,7 +142,7 @@ _REPLIES = {
 def _check_closable(state: State) -> None:
     """Refuse to close a loop that would only hold its command."""
     _check_camera(state)
-    why = holding(state)
+    why = holding_cause(state)
     if why and state.refused in (Rejection.OUT_OF_ORDER, Rejection.REPEATED):
         why += " (`lowfc ctl safe` and then `lowfc ctl clear` reset the newest sequence)"
     if why:

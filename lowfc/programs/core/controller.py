@@ -37,7 +37,7 @@ from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.durations import Durations
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.inputs import Input, Load, MirrorReport, Outputs, Reply, Report, Request, Tick
-from lowfc.control.loop.loading import holding, misfit
+from lowfc.control.loop.loading import holding_cause, misfit
 from lowfc.control.loop.requests import CONFIGURATION, MAX_REPLY_LENGTH, prepared
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import State
@@ -167,7 +167,7 @@ class Controller:
         now_ns = self._service.clock.now_ns()
         health.not_closed_ns, health.not_closed_cause = self._not_closed.note(self._state, now_ns)
         if self._state.mode is LoopMode.CLOSED:
-            health.holding = holding(self._state)
+            health.holding = holding_cause(self._state)
         fill_harm_and_contrast(health, self._gain_watch, self._state)
         health.last_second.CopyFrom(self._last_second.statistics(self._state, self._service.clock.host_ns()))
         if self._frame_to_command.count:

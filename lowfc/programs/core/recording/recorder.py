@@ -82,7 +82,7 @@ class Recorder:
         self._ending: Future[None] | None = None
         self._skip_drain = False
         self._failure = ""
-        self._flush_due_ns = self._most_starts = 0
+        self._flush_due_ns = self._max_starts = 0
         self._begun_ns = self._oldest_ns = 0
         self._longest_wait_ns = self._longest_unflushed_ns = self._slowest_ns = 0
         # Before the service subscribes to Health: a peer that knows of this subscription knows of all others.
@@ -139,7 +139,7 @@ class Recorder:
     def _begin(self, *, anew: bool = True) -> None:
         """Begin a log, or unless `anew` its next part, with the calibration and states that its messages depend on."""
         self._series.begin(self._peers.newest.values(), new_recording=anew)
-        self._most_starts = self._account.starts + MAX_CHANNELS
+        self._max_starts = self._account.starts + MAX_CHANNELS
         self.service.event("RECORDING")
 
     def _iterate(self) -> None:
@@ -285,7 +285,7 @@ class Recorder:
                 self._failure = short
                 self._series.end(self._totals() | {"stopped": short})
                 self.service.event("RECORDING_FAILED", why=f"{short}; the log is complete")
-            elif self._series.full or self._account.starts >= self._most_starts:
+            elif self._series.full or self._account.starts >= self._max_starts:
                 self._series.end(self._totals(), wait=False)
                 self._begin(anew=False)
                 self._peers.query_soon()
