@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lowfc.adapters.image_stream.channels import OtherChannels, channel_names
 from lowfc.adapters.image_stream.stream import StreamError
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import ConfigurationError
@@ -224,6 +225,28 @@ def test_the_reached_position_comes_from_the_sum_of_channels(folder: Path, monke
     time.sleep(0.02)
     with pytest.raises(RuntimeError, match="'dm00disp' has not followed 'dm00disp03'"):
         driver.apply(shape_nm(1))
+
+
+def test_a_channel_whose_writer_died_meanwhile_stays_in_the_sum(folder: Path) -> None:
+    dark_hole, turbulence, begun = (channel(folder, f"dm00disp0{index}", make=True) for index in range(3))
+    dark_hole.write(shape_nm(1) / 1000)
+    begun.begin(shape_nm(2) / 1000)
+    others = OtherChannels(channel_names("dm00disp03"), GRID)
+    assert np.allclose(1000 * others.sum(), shape_nm(1) + shape_nm(2), atol=1e-3)
+    dark_hole.begin(shape_nm(3) / 1000)
+    turbulence.write(shape_nm(4) / 1000)
+    assert np.allclose(1000 * others.sum(), shape_nm(1) + shape_nm(2) + shape_nm(4), atol=1e-3)
+    dark_hole.write(np.full(GRID, np.nan))
+    assert np.allclose(1000 * others.sum(), shape_nm(2) + shape_nm(4), atol=1e-3)
+
+
+def test_the_position_of_a_channel_whose_writer_died_is_what_it_holds(folder: Path) -> None:
+    channel(folder, make=True).begin(shape_nm(1) / 1000)
+    driver, _ = mirror()
+    assert np.allclose(driver.position(), shape_nm(1), atol=1e-3)
+    channel(folder).write(np.full(GRID, np.nan))
+    with pytest.raises(RuntimeError, match="stream 'dm00disp03' holds values that are not finite: write zeros to it"):
+        driver.position()
 
 
 def test_the_stroke_limit_applies_to_the_sum_of_channels() -> None:

@@ -31,7 +31,8 @@ def channel_names(channel: str) -> tuple[str, ...]:
 class OtherChannels:
     """Sum of a mirror's channels except one, in the unit of the streams.
 
-    Unusable channels are left out: another grid, another layout, or a value that is not finite.
+    Unusable channels are left out: another grid, another layout, or a value that is not finite. A channel that is being
+    written, or whose writer died meanwhile, counts with its last complete shape.
     """
 
     def __init__(self, names: Iterable[str], grid: tuple[int, int]) -> None:
@@ -41,6 +42,7 @@ class OtherChannels:
         self._streams: dict[Path, Stream] = {}
         self._searched_s = -_SEARCH_S
         self._counts: dict[Path, tuple[tuple[int, int, int], int]] = {}
+        self._shapes: dict[Stream, Single | None] = {}
         self._sum: Single = np.zeros(grid, np.float32)
 
     @property
@@ -59,7 +61,11 @@ class OtherChannels:
                     self._streams[path] = stream
         counts = {path: (stream.identity, stream.count) for path, stream in self._streams.items()}
         if counts != self._counts:
-            shapes = [shape for stream in self._streams.values() if (shape := whole(stream)) is not None]
+            self._shapes = {
+                stream: whole(stream, self._shapes.get(stream, stream.data[0].astype(np.float32)))
+                for stream in self._streams.values()
+            }
+            shapes = [shape for shape in self._shapes.values() if shape is not None]
             self._counts, self._sum = counts, np.sum([np.zeros(self._grid, np.float32), *shapes], axis=0)
         return self._sum
 
@@ -78,13 +84,18 @@ def fits(stream: Stream, grid: tuple[int, int]) -> bool:
     return stream.layout.dtype == np.float32 and stream.layout.shape == (1, *grid)
 
 
-def whole(stream: Stream) -> Single | None:
-    """Copy the shape in a stream; None while it is being written, or if it is not finite."""
+def whole(stream: Stream, otherwise: Single | None = None) -> Single | None:
+    """Copy the shape in a stream; None if it is not finite.
+
+    While the stream is being written, or if its writer died meanwhile, the shape is `otherwise`.
+    """
     for _ in range(_ATTEMPTS):
         count, shape = stream.count, stream.data[0].astype(np.float32)
         if stream.count == count and not stream.writing:
-            return shape if np.isfinite(shape).all() else None
-    return None
+            break
+    else:
+        shape = otherwise
+    return shape if shape is not None and np.isfinite(shape).all() else None
 
 
 def channel_of(name: str, grid: tuple[int, int]) -> Stream:

@@ -62,9 +62,11 @@ class IsioMirror:
         self._service = service
 
     def position(self) -> Single:
-        """Present shape of the channel."""
-        shape = whole(self._channel)
-        return np.zeros(self._grid, np.float32) if shape is None else shape * np.float32(self._options.nm_per_unit)
+        """Present shape of the channel, as far as written if its writer died; RuntimeError if it is not finite."""
+        shape = whole(self._channel, self._channel.data[0].astype(np.float32))
+        if shape is None:
+            raise RuntimeError(f"stream {self._channel.name!r} holds values that are not finite: write zeros to it")
+        return shape * np.float32(self._options.nm_per_unit)
 
     def beside(self) -> Single:
         """Sum of the other channels, without piston; the sum stream includes it."""
