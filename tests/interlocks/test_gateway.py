@@ -11,11 +11,16 @@ from unittest.mock import Mock
 
 import pytest
 
+from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.bus.run import free_ports
 from lowfc.client import running
 from lowfc.client.requests import DECLARED
 from lowfc.contract.errors import ConfigurationError
+from lowfc.contract.messages import CONTROLLER_STATE, HEALTH, STEP, wire
 from lowfc.programs.gateway.variables import Kind, variables
+from lowfc.programs.gateway.watch import Watch
+from lowfc.testing.clock import FakeClock
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from tests.support.loops import interrupt, lowfc, start, until
 
 Process = subprocess.Popen[str]
@@ -108,6 +113,43 @@ def test_missing_p4p_is_reported_with_install_advice(monkeypatch: pytest.MonkeyP
     assert isinstance(fault, ConfigurationError)
     assert "needs p4p" in str(fault)
     assert "pip install" in str(fault)
+
+
+class DeafBus(MemoryBus):
+    """A bus whose queries time out at first."""
+
+    deaf = True
+
+    def get(self, key: str, payload: bytes = b"", timeout_s: float = 1.0) -> list[Sample]:
+        return [] if self.deaf else super().get(key, payload, timeout_s)
+
+
+def test_states_that_were_not_received_are_queried_again() -> None:
+    hub, clock = MemoryHub(), FakeClock()
+    controller, own = MemoryBus(hub, "controller", clock), DeafBus(hub, "operator", clock)
+    controller.publisher(CONTROLLER_STATE).put(wire.ControllerState(calibration_id="night").SerializeToString())
+    watch = Watch(own, clock)
+    controller.publisher(HEALTH, "controller").put(wire.Health(process="controller", pid=7).SerializeToString())
+    watch.update()
+    own.deaf = False
+    assert [watch.update().state.calibration_id for _ in range(2)] == ["", ""], "at most one query in 5 s"
+    clock.advance(6_000_000_000)
+    assert [watch.update().state.calibration_id for _ in range(2)] == ["", "night"]
+
+
+def test_an_unreadable_step_leaves_the_one_before() -> None:
+    hub, clock = MemoryHub(), FakeClock()
+    steps = MemoryBus(hub, "controller", clock).publisher(STEP)
+    watch = Watch(MemoryBus(hub, "operator", clock), clock)
+    error = {one.name: one for one in variables()}["error"].read
+    assert error is not None
+    assert error(watch.update(), {}).tolist() == []
+    steps.put(wire.ControlStep(mode=wire.LOOP_MODE_CLOSED, error_nm=[1, 2]).SerializeToString())
+    assert error(watch.update(), {}).tolist() == [1, 2]
+    steps.put(b"\xff")
+    assert error(watch.update(), {}).tolist() == [1, 2]
+    steps.put(wire.ControlStep(mode=wire.LOOP_MODE_CLOSED, command_nm=[1, 2]).SerializeToString())
+    assert error(watch.update(), {}).tolist() == []
 
 
 @pytest.fixture

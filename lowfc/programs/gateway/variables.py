@@ -57,7 +57,11 @@ def _latency(percentile: str) -> Callable[[RunView, dict[str, Any]], Any]:
 
 
 def _step(field: str) -> Callable[[RunView, dict[str, Any]], Any]:
-    return lambda view, status: np.zeros(0) if view.step is None else np.array(getattr(view.step, field), float)
+    def read(view: RunView, status: dict[str, Any]) -> Any:
+        values = getattr(view.step, field, None)
+        return np.zeros(0) if values is None else np.array(values, float)
+
+    return read
 
 
 READINGS = (

@@ -5,7 +5,9 @@ from typing import NamedTuple
 from lowfc.adapters.bus.bus import Bus, states
 from lowfc.adapters.process.clock import Clock
 from lowfc.arrays import Pixels
+from lowfc.client.stream import step_of
 from lowfc.contract.messages import STEP, Role, wire
+from lowfc.control.loop.inputs import Step
 from lowfc.programs.view.snapshot import SHOWN, Accumulator
 from lowfc.programs.view.verdicts.tile import Verdict
 from lowfc.programs.view.verdicts.verdict import judge
@@ -15,6 +17,7 @@ SILENT_NS = 2_000_000_000
 """Longest time without a Health of the controller, which is sent twice a second."""
 _WAITING = 2000
 _PATIENCE_S = 0.2
+_QUERY_AGAIN_NS = 5_000_000_000  # until a controller that did not answer is queried again
 
 
 class RunView(NamedTuple):
@@ -24,7 +27,7 @@ class RunView(NamedTuple):
     state: wire.ControllerState
     processes: dict[str, wire.Health]
     verdict: Verdict
-    step: wire.ControlStep | None
+    step: Step | None
     frame: Pixels | None
 
 
@@ -36,7 +39,8 @@ class Watch:
         self._rings = {topic: bus.ring(topic, 1 if topic.latest_only else _WAITING) for topic in SHOWN}
         self._accumulator, self._watcher = Accumulator(clock.now_ns() if clock.lockstep else None), Watcher()
         self._known: set[tuple[str, int]] = set()
-        self._step: wire.ControlStep | None = None
+        self._queried_ns = 0
+        self._step: Step | None = None
 
     def update(self) -> RunView:
         """Process the messages since the last call."""
@@ -46,11 +50,12 @@ class Watch:
             for sample in samples:
                 add(sample)
             if topic is STEP and samples:
-                self._step = wire.ControlStep.FromString(samples[-1].payload)
+                self._step = step_of(samples[-1]) or self._step
         snapshot = self._accumulator.snapshot(now_ns)
         there = {(name, one.health.pid) for name, one in snapshot.health.items()}
-        if not there <= self._known:
-            self._known = there
+        incomplete = Role.CONTROLLER in snapshot.health and None in (snapshot.calibration, snapshot.controller)
+        if not there <= self._known or (incomplete and now_ns - self._queried_ns > _QUERY_AGAIN_NS):
+            self._known, self._queried_ns = there, now_ns
             for _, sample in states(self._bus, SHOWN, _PATIENCE_S):
                 add(sample)
         self._watcher.feed(snapshot)
