@@ -82,8 +82,10 @@ def test_even_symmetric_mask_gives_a_warning(tmp_path):
     assert warnings == []
 
 
-def test_layouts_from_files(tmp_path):
+def test_layouts_from_files(tmp_path, monkeypatch):
     alone = load_layout(str(written(tmp_path, TWO)))
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert load_layout("~/mask.json") == alone
     assert alone == Layout("mask", "two holes", ((0.1, 0.2, 0.1), (-0.3, 0.0, 0.1)))
     one = written(tmp_path, {"layouts": {"x": TWO}}, "one.json")
     assert load_layout(str(one)) == load_layout(f"{one}:x")
@@ -105,6 +107,7 @@ def test_layouts_from_files(tmp_path):
         ({"layouts": {"x": {**TWO, "holes": [[0, 0, 0, 0]]}}}, "pairs"),
         ({"layouts": {"x": {**TWO, "holes": [[0, 0], [0.05, 0]]}}}, "overlap"),
         ({"layouts": {"x": {**TWO, "holes": [[0.49, 0]]}}}, "outside"),
+        ({"layouts": {"x": {**TWO, "holes": [[10**400, 0]]}}}, "OverflowError: 'int too large"),
         ({"layouts": {"x": 3}}, "layout x"),
     ],
 )

@@ -34,7 +34,7 @@ def load_layout(name: str) -> sams.Layout:
         DataFileError: The file is missing, damaged, or its holes overlap or leave the pupil.
     """
     in_file = re.fullmatch(r"(.*\.json)(?::(.*))?", name)
-    file: Traversable = Path(in_file[1]) if in_file else SHIPPED
+    file: Traversable = Path(in_file[1]).expanduser() if in_file else SHIPPED
     layouts = _read_layouts(file)
     chosen = (in_file[2] or "") if in_file else name
     if not chosen and len(layouts) == 1:
@@ -63,7 +63,7 @@ def parse_layout(file: Traversable, name: str, entry: Any) -> sams.Layout:
     try:
         holes = tuple(_hole(hole, entry) for hole in entry["holes"])
         layout = sams.Layout(name, str(entry.get("purpose", "")), holes)
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
         raise DataFileError(
             f'{file}: layout {name} must have "hole_diameter" and "holes" as pairs [x, y], or as [x, y, diameter], in '
             f"pupil diameters ({type(error).__name__}: {brief(str(error))})"
