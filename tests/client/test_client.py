@@ -324,31 +324,35 @@ def test_an_unambiguous_beginning_of_a_name_selects_a_run(listen: Callable[..., 
 
 
 def test_a_loop_outside_this_runtime_directory_is_reported(own_runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With owner, process and, if readable, runtime directory; a loop in this directory is reported as starting."""
+    """With owner, process and, if readable, runtime directory; a user's own loop in this directory as starting."""
     name = f"night-{os.getpid()}"
     words = [sys.executable, "-c", "print(flush=True); input()", "lowfc", "controller", "--run", name]
     wrapped = ["/bin/sh", "-c", 'echo; read end; "$@"', *words[3:]]
     parent = [*words[:1], "-c", "import subprocess, sys; subprocess.run(sys.argv[3:])", "lowfc", "sim-loop", *words]
-    for there, words_there, found in (
-        ("/run/elsewhere", words, ", with XDG_RUNTIME_DIR=/run/elsewhere"),
-        (str(own_runtime), words, ", starting or ending"),
-        (str(own_runtime), wrapped, ""),
-        ("/run/elsewhere", parent, ", with XDG_RUNTIME_DIR=/run/elsewhere"),
+    for there, words_there in (
+        ("/run/elsewhere", words),
+        ("", words),
+        (str(own_runtime), [*words[:-2], f"--run={name}"]),
+        (str(own_runtime), wrapped),
+        ("/run/elsewhere", parent),
     ):
         environment = os.environ | {"XDG_RUNTIME_DIR": there}
         with subprocess.Popen(words_there, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment) as process:
             process.stdout.readline()
-            ours = [one for one in other_loops() if f"(process {process.pid})" in one or name in one]
+            ours = [one for one in other_loops() if f"(process {process.pid})" in one[0] or name in one[0]]
             message = none_here()
             with monkeypatch.context() as patch:
                 patch.setattr(os, "geteuid", lambda: 4_000_000_000)
+                patch.setenv("XDG_RUNTIME_DIR", there)
                 theirs = list(other_loops())
             process.communicate(b"\n")
         program = "sim-loop" if words_there is parent else "controller"
-        where = f"`lowfc {program} --run {name}` (process {process.pid}){found}"
-        assert ours == [f"you run {where}"] * bool(found)
-        assert (f"user {own_runtime.owner()} runs {where}" in theirs) == bool(found)
-        assert message.endswith("starting or ending: try again in a few seconds") == ("starting" in found)
+        loop = f"`lowfc {program} --run {name}` (process {process.pid})"
+        where = f", with XDG_RUNTIME_DIR={there}" if there else ", without XDG_RUNTIME_DIR"
+        found, starting = words_there is not wrapped, there == str(own_runtime)
+        assert ours == [(f"you run {loop}{'' if starting else where}", starting)] * found
+        assert ((f"user {own_runtime.owner()} runs {loop}{where}", False) in theirs) == found
+        assert message.endswith("starting or ending: try again in a few seconds") == (found and starting)
 
 
 # The mirror.

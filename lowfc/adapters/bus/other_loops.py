@@ -4,6 +4,7 @@ import contextlib
 import itertools
 import os
 import pwd
+import re
 from collections.abc import Iterator, Sequence
 
 import psutil
@@ -14,14 +15,12 @@ _PROGRAMS = ("controller", "sim-loop")
 _MOST = 3
 _LONGEST = 48  # characters of a run's name
 _FOLDER = "XDG_RUNTIME_DIR"
-_STARTING = ", starting or ending"
 
 
 def none_here() -> str:
     """Sentence for an error when no loop is found: the folder that was searched, and other loops on this host."""
     found = list(other_loops())
-    transient = [each.removesuffix(_STARTING) for each in found if each.endswith(_STARTING)]
-    if transient:
+    if transient := [text for text, starting in found if starting]:
         return f"{transient[0]}, which is starting or ending: try again in a few seconds"
     origin = f"from {_FOLDER}" if os.environ.get(_FOLDER) else f"{_FOLDER} is not set"
     message = (
@@ -29,11 +28,14 @@ def none_here() -> str:
         f"other users, or started with another {_FOLDER}, are not seen"
     )
     more = [f"and {len(found) - _MOST} more"] if len(found) > _MOST else []
-    return "; ".join([message, *found[:_MOST], *more])
+    return "; ".join([message, *(text for text, _ in found[:_MOST]), *more])
 
 
-def other_loops() -> Iterator[str]:
-    """Yield a sentence for each simulated loop and each separate controller on this host, of any user."""
+def other_loops() -> Iterator[tuple[str, bool]]:
+    """Yield a sentence for each simulated loop and each separate controller on this host, of any user.
+
+    And whether it is a loop of this user in this runtime directory, which is then starting or ending.
+    """
     for process in psutil.process_iter():
         with contextlib.suppress(psutil.Error):  # it has ended, or is not readable
             program = _program(process.cmdline())
@@ -41,7 +43,8 @@ def other_loops() -> Iterator[str]:
             if program and process.pid != os.getpid() and not (above and _program(above.cmdline())):
                 owner = process.uids().effective
                 who = "you run" if owner == os.geteuid() else f"user {_name(owner)} runs"
-                yield f"{who} `{program}` (process {process.pid}){_where(process)}"
+                where, starting = _where(process, owner)
+                yield f"{who} `{program}` (process {process.pid}){where}", starting
 
 
 def _program(words: Sequence[str]) -> str:
@@ -50,20 +53,23 @@ def _program(words: Sequence[str]) -> str:
         return ""
     for before, word in itertools.pairwise(words):
         if before.rpartition("/")[2] == "lowfc" and word in _PROGRAMS:
-            name = words[words.index("--run") + 1 :][:1] if "--run" in words else []
-            return " ".join(["lowfc", word, *(f"--run {one[:_LONGEST]}" for one in name)])
+            name = re.search(r" --run[ =](\S+)", " ".join(words))
+            return f"lowfc {word}" + (f" --run {name[1][:_LONGEST]}" if name else "")
     return ""
 
 
-def _where(process: psutil.Process) -> str:
-    """Clause on the runtime directory of a process; empty for another user's process, which is not readable."""
+def _where(process: psutil.Process, owner: int) -> tuple[str, bool]:
+    """Clause on the runtime directory of a process, and whether it is this user's own, which needs no clause.
+
+    The clause is also empty for another user's process that is not readable.
+    """
     try:
         there = process.environ().get(_FOLDER, "")
     except psutil.Error:
-        return ""
-    if there == os.environ.get(_FOLDER, ""):
-        return _STARTING
-    return f", with {_FOLDER}={there}" if there else f", without {_FOLDER}"
+        return "", False
+    if owner == os.geteuid() and there == os.environ.get(_FOLDER, ""):
+        return "", True
+    return f", with {_FOLDER}={there}" if there else f", without {_FOLDER}", False
 
 
 def _name(user: int) -> str:
