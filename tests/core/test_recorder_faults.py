@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from lowfc.adapters.bus.backlog import Backlog
-from lowfc.adapters.bus.bus import Publisher, Sample
+from lowfc.adapters.bus.bus import Publisher, Query, Sample
 from lowfc.adapters.bus.names import MAX_NAMES
 from lowfc.adapters.logs import writer
 from lowfc.adapters.logs.reader import LogReader
@@ -233,6 +233,28 @@ def test_a_recorder_stopped_while_a_log_is_finished_completes_the_log(
     until(lambda: bench.recorder.service.state == "stopping")
     release.set()
     (log,) = bench.stop().files
+    assert not log.name.endswith(UNFINISHED)
+
+
+def test_a_stop_requested_while_the_recorder_ends_is_answered_with_the_complete_log(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.start()
+    recorder, answers = bench.recorder, list[bytes]()
+    queries = [Query(RECORD_KEY.format(name="stop"), b"", answers.append)]
+    report = recorder._report_losses
+
+    def report_and_ask() -> None:
+        report()
+        if not recorder.service.running and queries:
+            recorder._queries.append(queries.pop())
+
+    monkeypatch.setattr(recorder, "_drain", lambda: None)  # the request arrives after it
+    monkeypatch.setattr(recorder, "_report_losses", report_and_ask)
+    _, release = slow_disk(monkeypatch, refuses=False)
+    threading.Timer(0.2, release.set).start()
+    (log,) = bench.stop().files
+    assert [wire.Request.FromString(one).text for one in answers] == [str(log)]
     assert not log.name.endswith(UNFINISHED)
 
 

@@ -93,6 +93,11 @@ class LogSeries:
             or time.monotonic() - self._opened_s >= self._limits.longest_s
         )
 
+    @property
+    def finishing(self) -> bool:
+        """Whether a file is being finished in parallel."""
+        return self._finishing is not None and not self._finishing[1].done()
+
     def begin(self, first: Iterable[Sample], *, new_recording: bool = True) -> None:
         """Begin a file of a new or of the present recording with the messages `first`, on which later ones depend.
 

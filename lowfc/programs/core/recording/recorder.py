@@ -9,7 +9,6 @@ import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from collections.abc import Set as AbstractSet
-from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -77,10 +76,7 @@ class Recorder:
         self._expected_bytes_per_s = expected_bytes_per_s
         self._series = LogSeries(folder, clock, {**metadata, **selection.metadata}, attachments, limits)
         self._peers = Peers(bus)
-        self._paused = False
-        self._ender = ThreadPoolExecutor(1, "end-log")
-        self._ending: Future[None] | None = None
-        self._skip_drain = False
+        self._paused = self._stopping = self._skip_drain = False
         self._failure = ""
         self._flush_due_ns = self._max_starts = 0
         self._begun_ns = self._oldest_ns = 0
@@ -186,7 +182,7 @@ class Recorder:
     def _pause(self) -> str | None:
         """Finish the log; return None until it is on the disk, then the reason of a failure or an empty text."""
         try:
-            if self._ending is None:
+            if not self._stopping:
                 if self._failure or self._paused:
                     return self._failure or "nothing is being recorded"
                 self.service.event("RECORDING_STOPPED", why="operator asked")
@@ -194,15 +190,13 @@ class Recorder:
                 self._write_waiting()
                 self._flush()
                 self._series.end(self._totals(), wait=False)
-                self._paused = True
-                self._ending = self._ender.submit(self._series.end, {})  # waits until the log is written
-            if not self._ending.done():
+                self._paused = self._stopping = True
+            if self._series.finishing:
                 return None
-            ending, self._ending = self._ending, None
-            ending.result()
+            self._series.end({})  # raises the fault of finishing
         except DataFileError as fault:
             self._fail(fault)
-        self._paused = not self._failure
+        self._paused, self._stopping = not self._failure, False
         self.service.state = "ready"  # publishes Health, so that the next `status` is current
         return self._failure
 
@@ -276,8 +270,7 @@ class Recorder:
     def _flush(self) -> None:
         """Flush; begin the next log if this one is full, and end the recording if the disk is nearly full."""
         try:
-            if self._ending is None:
-                self._series.flush()
+            self._series.flush()
             self._flushed()
             if self._failure or self._paused:
                 return
@@ -325,11 +318,11 @@ class Recorder:
             time.sleep(_ITERATION_S)
 
     def _close(self) -> Summary:
-        while self._ending is not None:
-            self._iterate()
-            time.sleep(_ITERATION_S)
         self._report_losses()
         self._iterate()
+        while self._stopping:  # an operator's request is answered
+            time.sleep(_ITERATION_S)
+            self._iterate()
         self._flush()
         try:
             self._series.end(self._totals())
