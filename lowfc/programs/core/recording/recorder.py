@@ -100,8 +100,7 @@ class Recorder:
     def run(self) -> Summary:
         """Record until stopped; DataFileError if the first log cannot be opened."""
         self._settle()
-        for sample in self._peers.query():
-            self._write(sample)
+        self._peers.query()  # fills `newest`, with which the log begins
         self._begin()
         self._begun_ns = self._clock.host_ns()
         self.service.awaited = lambda: "" if self.service.last_health else "any other process"
