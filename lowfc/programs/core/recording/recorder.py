@@ -63,8 +63,8 @@ class Recorder:
     ) -> None:
         """Subscribe to everything; `run` starts the recording. Each log starts with `metadata` and `attachments`.
 
-        Recording starts once each of the `awaited` processes, by default all on the bus, has sent Health, or after a
-        timeout.
+        Recording starts once each of the `awaited` processes has sent Health, or after a timeout. By default these are
+        all on the bus; across hosts it is any one, because the bus counts only the router.
         """
         self._awaited = awaited
         self._bus = bus
