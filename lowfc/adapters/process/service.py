@@ -193,7 +193,7 @@ class Service:
     def beat(self, *, alive: bool = True) -> None:
         """Publish Health when due, twice a second, and send the watchdog signal to the service manager if `alive`.
 
-        Call it in every iteration of the process's main loop, and nowhere else.
+        Call it often, and only on the process's main thread: the watchdog must notice that this thread hangs.
         """
         now_ns = self.clock.host_ns()
         if alive:

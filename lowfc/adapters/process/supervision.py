@@ -39,7 +39,7 @@ class Supervisor:
         self._once("STOPPING=1")
 
     def alive(self, now_ns: int) -> None:
-        """Send the watchdog signal if due; to be called from the main loop only."""
+        """Send the watchdog signal if due; to be called on the main thread only."""
         if self.period_ns is not None and now_ns >= self._due_ns:
             self._due_ns = now_ns + self.period_ns
             self._send("WATCHDOG=1")
