@@ -16,8 +16,8 @@ class StartCheck:
     def __init__(self, clock: Clock, max_ahead_h: float, refused: Callable[[str, str], None]) -> None:
         """Refuse starts more than `max_ahead_h` hours ahead of `clock`; 0 or a simulated clock disables the check.
 
-        `refused` is called with the start and this host's time, both UTC, once for each refused start, at most once a
-        second.
+        `refused` is called with the start and this host's time, both UTC, when the refused start changes, at most once
+        a second.
         """
         self._clock = clock
         self._ahead_s = round(max_ahead_h * _HOUR_S)
