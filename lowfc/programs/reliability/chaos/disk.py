@@ -70,14 +70,14 @@ def _read_only(bench: ChaosBench) -> None:
     bench.restart(Role.RECORDER, [*normal, "--folder", str(bench.folder)])
 
 
-@case("disk-slow", "each write takes 3 s", expected=("DISK_SLOW",), allowed=LOST)
+@case("disk-slow", "two writes take 3 s each", expected=("DISK_SLOW",), allowed=LOST)
 def _slow(bench: ChaosBench) -> None:
     _on_slow_disk(bench, SLOW_S, 8, 2)
     bench.wait(lambda: bench.health[Role.RECORDER].recording.messages > 0, "a recording")
-    bench.frames(1000)  # longer than the two slow writes
+    bench.frames(2000)  # longer than the two slow writes
 
 
-@case("stall-disk", "a write blocks for 10 s", allowed=LOST)
+@case("stall-disk", "a write blocks for 12 s", allowed=LOST)
 def _stalled(bench: ChaosBench) -> None:
     @contextlib.contextmanager
     def stall() -> Iterator[None]:
