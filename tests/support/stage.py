@@ -129,7 +129,7 @@ class Stage:
         if self._runs("camera") and self._runs("controller"):
             step = wire.ControlStep(**frame, mode=self.mode.value, command_nm=[0.0] * 3)
             step.reasons.extend(reason.value for reason in self.reasons)
-            if not any(reason <= Rejection.DARK for reason in self.reasons):
+            if not any(isinstance(reason, Rejection) for reason in self.reasons):
                 step.error_nm.extend(residual_nm)
                 step.pol_nm.extend(open_nm)
             self.send(STEP, step)

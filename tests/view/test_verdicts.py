@@ -14,6 +14,7 @@ from lowfc.contract.messages import CONTROLLER_STATE, EVENT, FRAME, wire
 from lowfc.control.loop.safety import Limit, LoopMode, Rejection
 from lowfc.programs.view.panels.tiles import FILL, GROUND, HEIGHT, TILES, WIDTH, Tiles, picture, png, tile_boxes
 from lowfc.programs.view.snapshot import Accumulator
+from lowfc.programs.view.verdicts.camera_verdict import REFUSED
 from lowfc.programs.view.verdicts.facts import facts
 from lowfc.programs.view.verdicts.run_state import RunState
 from lowfc.programs.view.verdicts.steady import ResidualComparison
@@ -77,6 +78,15 @@ def opened_by_itself(stage: Stage) -> None:
     stage.send(EVENT, EVENTS["MODE_CHANGED"].log("controller", stage.data_ns, **details))
 
 
+def holding(reason: Rejection, **state: object) -> Callable[[Stage], None]:
+    def change(stage: Stage) -> None:
+        stage.reasons = (reason,)
+        stage.send(CONTROLLER_STATE, wire.ControllerState(mode=stage.mode.value, **state))
+
+    return change
+
+
+LEASE = wire.Lease(holds=True, holder="calibrate")
 ALL_PROCESSES = ("camera", "controller", "mirror-dm", "recorder")
 HARMFUL = "worse than a flat mirror: `lowfc ctl safe` flattens it"
 STATES: dict[str, tuple[Callable[[Stage], object], str, str]] = {
@@ -99,6 +109,11 @@ STATES: dict[str, tuple[Callable[[Stage], object], str, str]] = {
     "missing": (counting(missing=90), "FRAMES 90 LOST BAD", "90 never arrived"),
     "late frames": (setting(reasons=(Rejection.LATE,)), "FRAMES REFUSED BAD", "too late"),
     "wrong size": (setting(reasons=(Rejection.WRONG_SIZE,)), "FRAMES REFUSED BAD", "wrong size"),
+    "frames ahead": (setting(reasons=(Rejection.AHEAD,)), "FRAMES REFUSED BAD", "clock"),
+    "camera unknown": (setting(reasons=(Rejection.CAMERA_UNKNOWN,)), "FRAMES REFUSED BAD", "settings"),
+    "mirror lost": (holding(Rejection.NO_MIRROR, mirror_fault="is silent"), "LOOP HOLDING WARNING", "mirror is silent"),
+    "reserved": (holding(Rejection.HELD, lease=LEASE), "LOOP HOLDING WARNING", "reserved for calibrate"),
+    "held, no state": (setting(reasons=(Rejection.HELD,)), "LOOP HOLDING WARNING", "Every frame is refused"),
     "saturated": (
         setting(reasons=(Rejection.SATURATED,), full=20),
         "STAR SATURATED BAD",
@@ -146,6 +161,17 @@ def test_no_two_states_have_the_same_headline(verdicts: dict[str, Verdict]) -> N
 
 def test_a_closed_loop_without_usable_frames_is_shown_as_holding(verdicts: dict[str, Verdict]) -> None:
     assert tile(verdicts["camera dead"], "LOOP").value == tile(verdicts["star gone"], "LOOP").value == "HOLDING"
+
+
+def test_every_reason_to_refuse_a_frame_is_counted() -> None:
+    assert REFUSED.keys() == set(Rejection) - {Rejection.NO_FRAME}
+
+
+@pytest.mark.parametrize("name", ["mirror lost", "reserved", "held, no state"])
+def test_a_loop_that_holds_raises_no_second_alarm_about_its_frames(verdicts: dict[str, Verdict], name: str) -> None:
+    frames = tile(verdicts[name], "FRAMES")
+    assert (frames.value, frames.level) == ("50 Hz", Level.GOOD)
+    assert frames.detail.endswith("frames refused in the last 5 s")
 
 
 @pytest.mark.parametrize("name", ["open", "safe", "controller dead", "star gone", "ended"])

@@ -1,5 +1,6 @@
 """Verdict on the camera: whether frames arrive and are used, and how much light there is."""
 
+from collections.abc import Iterable
 from functools import partial
 
 from lowfc.control.loop.safety import Reason, Rejection
@@ -29,8 +30,14 @@ REFUSED: dict[Reason, tuple[str, str]] = {
     Rejection.STUCK: ("stuck", "the camera repeats one image; restart it"),
     Rejection.REPEATED: ("repeated", "the camera sends a frame twice; restart it"),
     Rejection.OUT_OF_ORDER: ("out of order", "there may be a second camera on the bus; stop one"),
+    Rejection.AHEAD: ("camera clock ahead", "set the clocks of both hosts and restart the camera"),
+    Rejection.CAMERA_UNKNOWN: ("camera settings unknown", "the camera restarted and sends no settings; restart it"),
+    Rejection.NO_MIRROR: ("no mirror", "the mirror does not follow; check it"),
+    Rejection.HELD: ("loop held", "an interlock or a lease holds the loop"),
 }
 """Reasons for refusing a frame: text and advice."""
+_OF_FRAMES = [reason for reason in REFUSED if reason not in (Rejection.NO_MIRROR, Rejection.HELD)]
+"""Reasons for an alarm of the tile FRAMES; the others are those of the tile LOOP."""
 
 
 def frames(state: RunState) -> Tile:
@@ -47,15 +54,14 @@ def frames(state: RunState) -> Tile:
         since = duration(silent_s)
         advice = f"No frame for {since}, {who}: the loop holds. Check the camera's last output and restart it."
         return tile("NO FRAMES", f"for {since}: {who}", Level.BAD, advice)
-    refused = sum(state.recent[reason] for reason in REFUSED)
     lost = state.recent["skipped"] + state.recent["missing"]
     period_ns = state.snapshot.period_ns
     nominal_hz = 1e9 / period_ns if period_ns else 0.0
     due = max(state.recent["steps"] + lost, RECENT_S * nominal_hz, 1)
-    return worst_of((_rate(state, refused, nominal_hz), _lost(state, lost, due), _refused(state, refused, due)))
+    return worst_of((_rate(state, nominal_hz), _lost(state, lost, due), _refused(state, due)))
 
 
-def _rate(state: RunState, refused: int, nominal_hz: float) -> Tile:
+def _rate(state: RunState, nominal_hz: float) -> Tile:
     tile, rate_hz = partial(Tile, "FRAMES"), state.rate_hz
     if rate_hz is None:
         if state.now["steps"]:
@@ -65,7 +71,8 @@ def _rate(state: RunState, refused: int, nominal_hz: float) -> Tile:
     if rate_hz < SLOW * nominal_hz:
         advice = f"The camera runs at {rate_hz:.3g} Hz, not at {nominal_hz:.3g} Hz: the host does not keep up."
         return tile(value, f"slow: nominal {nominal_hz:.3g} Hz", Level.WARNING, advice)
-    unused = {"skipped": state.recent["skipped"], "never arrived": state.recent["missing"], "refused": refused}
+    unused = {"skipped": state.recent["skipped"], "never arrived": state.recent["missing"]}
+    unused["refused"] = sum(state.recent[reason] for reason in REFUSED)
     few = ", ".join(f"{counted(count, 'frame')} {what}" for what, count in unused.items() if count)
     detail = f"{few} {LATELY}" if few else "none lost, none refused"
     return tile(value, f"{detail}{', simulated time' if state.simulated else ''}", Level.GOOD)
@@ -80,9 +87,9 @@ def _lost(state: RunState, lost: int, due: float) -> Tile:
     return Tile("FRAMES", f"{lost} LOST", f"{named}, {LATELY}", level, advice)
 
 
-def _refused(state: RunState, refused: int, due: float) -> Tile:
-    all_are = all_refused(state)
-    most = max(REFUSED, key=lambda reason: (state.now if all_are else state.recent)[reason])
+def _refused(state: RunState, due: float) -> Tile:
+    all_are, refused = all_refused(state, _OF_FRAMES), sum(state.recent[reason] for reason in _OF_FRAMES)
+    most = max(_OF_FRAMES, key=lambda reason: (state.now if all_are else state.recent)[reason])
     word, advised = REFUSED[most]
     if all_are:
         advice = f"Every frame is refused, {word}: {advised}. The mirror holds."
@@ -116,7 +123,7 @@ def star(state: RunState) -> Tile:
     return tile(value, f"{detail}, no pixel saturated", Level.GOOD)
 
 
-def all_refused(state: RunState) -> bool:
-    """Whether all frames of the last second were refused."""
+def all_refused(state: RunState, reasons: Iterable[Reason] = REFUSED) -> bool:
+    """Whether all frames of the last second were refused, for any of these reasons."""
     steps = state.now["steps"]
-    return steps > 0 and sum(state.now[reason] for reason in REFUSED) >= steps
+    return steps > 0 and sum(state.now[reason] for reason in reasons) >= steps

@@ -85,7 +85,8 @@ def _loop(state: RunState) -> Tile:
     if Liveness.STARTING in (controller.life, camera.life) or camera.life is Liveness.NEVER:
         return tile("WAITING", "closed, no frame yet", advice="Waiting for the first frame.")
     if held := _held(reported):
-        return tile("HOLDING", f"closed, but {held}: command held", Level.WARNING)
+        advice = f"The loop is closed and holds its command: {held}."
+        return tile("HOLDING", f"closed, but {held}: command held", Level.WARNING, advice)
     if mirror.life is Liveness.SILENT:  # logs of version 0.1 do not report it
         return tile("CLOSED", "but the mirror is silent", Level.WARNING)
     if camera.life is Liveness.STOPPED:
@@ -97,7 +98,8 @@ def _loop(state: RunState) -> Tile:
         advice = "The controller processes no frames: the mirror holds or relaxes by itself. Check its last output."
         return tile("HOLDING", "closed, but no step in the last second", Level.WARNING, advice)
     if all_refused(state):
-        return tile("HOLDING", "closed, but every frame is refused: command held", Level.WARNING)
+        advice = "Every frame is refused: the loop is closed and holds its command."
+        return tile("HOLDING", "closed, but every frame is refused: command held", Level.WARNING, advice)
     if state.now[Limit.LAW_OVERRULED]:
         advice = "The law leaves more than the integrator, which has taken over. Tune again: `lowfc tune --live`."
         return tile("CLOSED", "the integrator in place of the law", Level.WARNING, advice)
