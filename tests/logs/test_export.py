@@ -17,6 +17,8 @@ from astropy.io import fits
 from astropy.table import Table
 from rich.console import Console
 
+from lowfc.adapters.logs.reader import LogReader
+from lowfc.adapters.logs.recovery import in_words
 from lowfc.arrays import Array
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.codecs.codec import decode_frame
@@ -217,6 +219,20 @@ def test_a_truncated_log_without_truth_is_exported(tmp_path: Path, to: Format) -
         heading = (tmp_path / "cut.csv").read_text().splitlines()[0]
         assert "error_z2_nm" in heading
         assert "true" not in heading
+
+
+def test_damage_is_reported_with_its_place_and_reason(tmp_path: Path) -> None:
+    night = SyntheticLog()
+    night.frames(1500)
+    log = night.write(tmp_path / "night.mcap")
+    content = bytearray(log.read_bytes())
+    content[len(content) // 3] ^= 0xFF
+    log.write_bytes(content)
+    results = export_log(log, Format.NPZ, tmp_path / "out.npz", console=QUIET)
+    reader = LogReader(log, skip_damaged=True)
+    assert sum(1 for _ in reader)
+    assert results["damaged"] == [in_words(reader.damage[0])]
+    assert f"left out: at byte {reader.damage[0].position}, " in render(results)
 
 
 def test_a_log_without_steps_is_refused(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Drawing of a log: the verdict on all of it, the trend, and the events from before the start of a view."""
 
 import platform
+import re
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 import rerun.blueprint as rrb
 
 from lowfc.adapters.logs.reader import LogReader
+from lowfc.adapters.logs.records import LogFile
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import EVENT, SURFACE, TRUTH, Log, image, wire
@@ -147,6 +149,19 @@ def test_every_view_of_the_layout_has_data_and_the_plots_span_the_whole_log(tmp_
 
 def views(part: rrb.Container | rrb.View) -> list[rrb.View]:
     return [part] if isinstance(part, rrb.View) else [view for one in part.contents for view in views(one)]
+
+
+def test_a_damaged_log_is_drawn_and_the_remark_names_the_place_the_reason_and_the_lost_time(tmp_path: Path) -> None:
+    log = night(1500).write(tmp_path / "night.mcap")
+    content = bytearray(log.read_bytes())
+    with LogFile(log) as file:
+        _, chunk, *_ = file.index()
+    content[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 0xFF
+    log.write_bytes(content)
+    [remark] = drawn(log)[0].remarks
+    place = rf"left out at byte {chunk.chunk_start_offset}, \d+ bytes"
+    reason = "(the checksum of a chunk is wrong|a chunk cannot be decompressed)"
+    assert re.fullmatch(rf"night\.mcap: {place}: {reason}; 0\.\d+ s between the messages around it", remark)
 
 
 def test_logs_of_two_runs_are_not_drawn_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

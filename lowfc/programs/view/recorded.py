@@ -6,7 +6,7 @@ from pathlib import Path
 
 from lowfc.adapters.logs.history import attached_configuration
 from lowfc.adapters.logs.reader import LogReader
-from lowfc.adapters.logs.recovery import missing_end_text
+from lowfc.adapters.logs.recovery import in_words, missing_end_text
 from lowfc.adapters.process.clock import SimulatedClock
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
@@ -80,7 +80,7 @@ def draw_logs(
                 progress(earlier_bytes + reader.position)
         earlier_bytes += reader.size
         complete &= reader.complete
-        drawn.remarks += [f"{log.name}: {damage}" for damage in reader.damage]
+        drawn.remarks += [f"{log.name}: left out {in_words(damage)}" for damage in reader.damage]
         if not reader.complete and not reader.damage:
             drawn.remarks.append(f"{log.name}: {missing_end_text([log], finished=False)}")
     if renderer is None:

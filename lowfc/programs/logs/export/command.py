@@ -98,7 +98,7 @@ def export_log(
     from lowfc.adapters.files.whole_file import being_written
     from lowfc.adapters.logs.history import read_history
     from lowfc.adapters.logs.parts import WholeLog
-    from lowfc.adapters.logs.recovery import missing_end_text
+    from lowfc.adapters.logs.recovery import in_words, missing_end_text
     from lowfc.adapters.logs.writer import stem_of
     from lowfc.adapters.process.progress import reading_bar
     from lowfc.programs.logs.overwrite_check import refuse_log
@@ -131,7 +131,7 @@ def export_log(
         "selection": reader.selection.description,
         "finished": reader.finished,
         "no_end": missing_end_text(reader.paths, finished=reader.finished),
-        "damaged": [f"byte {one.position}, {one.why}" for one in reader.damage],
+        "damaged": [in_words(one) for one in reader.damage],
         "remarks": history.remarks,
     }
 

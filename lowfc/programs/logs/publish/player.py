@@ -18,7 +18,7 @@ from lowfc.adapters.bus.run import Run, open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.logs.parts import WholeLog, titled
 from lowfc.adapters.logs.reader import LogReader
-from lowfc.adapters.logs.recovery import faults, missing_end_text
+from lowfc.adapters.logs.recovery import faults, in_words, missing_end_text
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.progress import passing_bar
 from lowfc.adapters.process.realtime import Granted, set_up
@@ -126,7 +126,7 @@ class Player:
             "messages_behind": self._behind,
             "finished": log.finished,
             "no_end": missing_end_text(log.paths, finished=log.finished),
-            "damaged": [f"byte {one.position}, {one.why}" for one in log.damage],
+            "damaged": [in_words(one) for one in log.damage],
             "selection": [log.selection.description] if log.selection.description else [],
             "interrupted": not self._service.running,
         }
