@@ -164,6 +164,14 @@ def test_a_damaged_log_is_drawn_and_the_remark_names_the_place_the_reason_and_th
     assert re.fullmatch(rf"night\.mcap: {place}: {reason}; 0\.\d+ s between the messages around it", remark)
 
 
+def test_a_log_of_a_simulated_run_is_drawn_without_a_runtime_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "missing"))
+    done, _ = drawn(night(120).write(tmp_path / "night.mcap"), config=Configuration(lockstep=True))
+    assert done.snapshots > 0
+
+
 def test_logs_of_two_runs_are_not_drawn_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     logs = [night(120).write(tmp_path / f"{name}.mcap") for name in "ab"]
     assert drawn(*logs)[0].snapshots > 0

@@ -7,7 +7,7 @@ from pathlib import Path
 from lowfc.adapters.logs.history import attached_configuration
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.recovery import in_words, missing_end_text
-from lowfc.adapters.process.clock import SimulatedClock
+from lowfc.adapters.process.clock import SIMULATED_START_NS
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
 from lowfc.control.loop.wording import counted
@@ -58,7 +58,7 @@ def draw_logs(
                 drawn.remarks += remarks
                 own = found or Configuration()
                 renderer = make_renderer(own)
-                accumulator = Accumulator(SimulatedClock().now_ns() if own.lockstep else None)
+                accumulator = Accumulator(SIMULATED_START_NS if own.lockstep else None)
                 first_ns = message.receive_time_ns
             if number == 0:
                 recorded = reader.metadata.get("lowfc", {})
