@@ -15,6 +15,7 @@ from lowfc.control.loop.command_channels import MIRROR
 from lowfc.control.loop.inputs import Frame, Input, Load, MirrorShape, Outputs, Reply, Request, Tick
 from lowfc.control.loop.safety import Limit, LoopMode, Rejection
 from lowfc.control.loop.state import State
+from lowfc.control.loop.wording import CAMERA_MISFIT
 from tests.support.safety_checks import violations
 from tests.support.theory import linear
 from tests.support.toy import (
@@ -57,7 +58,7 @@ def test_changed_camera_settings_open_the_loop() -> None:
     state, all_outputs = feed(DEFAULTS, state, WRONG)
     assert (state.mode, names(all_outputs)) == (LoopMode.OPEN, ["CAMERA_CHANGED", "MODE_CHANGED"])
     assert "bias_dn" in str(all_outputs[0].events[0].details["what"])
-    assert state.conditions.mode_cause.startswith("the camera does not fit the calibration")
+    assert state.conditions.mode_cause.startswith(f"{CAMERA_MISFIT}: ")
 
 
 @pytest.mark.parametrize("name", ["close", "step", "law"])

@@ -12,6 +12,7 @@ from PIL import Image
 from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import CONTROLLER_STATE, EVENT, FRAME, wire
 from lowfc.control.loop.safety import Limit, LoopMode, Rejection
+from lowfc.control.loop.wording import CAMERA_MISFIT
 from lowfc.programs.view.panels.tiles import FILL, GROUND, HEIGHT, TILES, WIDTH, Tiles, picture, png, tile_boxes
 from lowfc.programs.view.snapshot import Accumulator
 from lowfc.programs.view.verdicts.camera_verdict import REFUSED
@@ -72,10 +73,13 @@ def counting(**counts: int) -> Callable[[Stage], None]:
     return health("controller", topics=[wire.TopicCount(topic=FRAME.key, **counts)])
 
 
-def opened_by_itself(stage: Stage) -> None:
-    stage.mode = LoopMode.OPEN
-    details = {"before": "closed", "after": "open", "why": "the camera changed"}
-    stage.send(EVENT, EVENTS["MODE_CHANGED"].log("controller", stage.data_ns, **details))
+def opened(why: str) -> Callable[[Stage], None]:
+    def change(stage: Stage) -> None:
+        stage.mode = LoopMode.OPEN
+        details = {"before": "closed", "after": "open", "why": why}
+        stage.send(EVENT, EVENTS["MODE_CHANGED"].log("controller", stage.data_ns, **details))
+
+    return change
 
 
 def holding(reason: Rejection, **state: object) -> Callable[[Stage], None]:
@@ -94,7 +98,7 @@ STATES: dict[str, tuple[Callable[[Stage], object], str, str]] = {
     "healthy": (setting(), "LOOP CLOSED GOOD", "nothing is wrong"),
     "open": (setting(mode=LoopMode.OPEN), "LOOP OPEN NEUTRAL", "lowfc ctl close"),
     "open, worse than flat": (setting(mode=LoopMode.OPEN, residual_nm=60.0), "LOOP OPEN NEUTRAL", HARMFUL),
-    "camera changed": (opened_by_itself, "LOOP OPEN WARNING", "opened by itself"),
+    "camera changed": (opened(f"{CAMERA_MISFIT}: bias_dn is 260"), "LOOP OPEN WARNING", "opened by itself"),
     "safe": (setting(mode=LoopMode.SAFE), "LOOP SAFE BAD", "lowfc ctl clear"),
     "idle": (setting(mode=LoopMode.IDLE, reasons=(Rejection.NO_CALIBRATION,)), "FRAMES REFUSED BAD", "no calibration"),
     "controller dead": (silence("controller"), "LOOP DEAD BAD", "Controller silent for 4 s"),
@@ -325,6 +329,15 @@ def test_a_shape_held_on_purpose_is_not_reported_as_harm() -> None:
     verdict = stage.run(4)
     assert verdict.level is Level.NEUTRAL
     assert "including the shapes of offset and channels" in verdict.headline
+
+
+@pytest.mark.parametrize(
+    "why", ["the camera's frames fit the calibration", "an interlock acts: camera_temp is 41", "camera exchange"]
+)
+def test_a_loop_that_opened_for_another_reason_is_not_blamed_on_the_camera(why: str) -> None:
+    verdict = staged(opened(why), 2)
+    assert tile(verdict, "LOOP").detail.startswith(why)
+    assert (tile(verdict, "LOOP").level, verdict.level) == (Level.NEUTRAL, Level.NEUTRAL)
 
 
 def test_past_refusals_are_reported_as_ended() -> None:

@@ -12,7 +12,7 @@ from lowfc.control.loop.inputs import MirrorReport, MirrorShape, Outputs, Pendin
 from lowfc.control.loop.interlocks import IN_WORDS, Action, BenchReport, judged, refusal
 from lowfc.control.loop.safety import LoopMode, limit
 from lowfc.control.loop.state import ActiveLoop, Conditions, Settings, State
-from lowfc.control.loop.wording import MEASURED_FIRST
+from lowfc.control.loop.wording import CAMERA_MISFIT, MEASURED_FIRST
 
 ADOPTED_NM = 1.0
 """Deviation of an actuator from the modal command above which a mirror's shape is adopted as a channel, nm."""
@@ -68,7 +68,7 @@ def loaded(
     if mode is not LoopMode.SAFE and (wrong := uncalibrated(state)):
         mode, cause = LoopMode.IDLE, wrong
     elif mode is LoopMode.CLOSED and (wrong := misfit(state)):
-        mode, cause = LoopMode.OPEN, f"the camera does not fit the calibration: {wrong}"
+        mode, cause = LoopMode.OPEN, f"{CAMERA_MISFIT}: {wrong}"
     elif mode is LoopMode.CLOSED and (wrong := refusal(state.conditions.acting, "close")):
         mode, cause = LoopMode.OPEN, wrong
     if mode is not before_mode:
@@ -230,7 +230,7 @@ def camera_reported(settings: Settings, state: State, camera: CameraSettings) ->
     mode, cause = after.mode, "the camera's frames fit the calibration"
     if wrong and wrong != misfit(state):
         events.append(PendingEvent("CAMERA_CHANGED", {"what": wrong}))
-        cause = f"the camera does not fit the calibration: {wrong}"
+        cause = f"{CAMERA_MISFIT}: {wrong}"
     if mode is not LoopMode.SAFE and uncalibrated(after) and not after.frames_used:
         mode = LoopMode.IDLE
     elif (mode is LoopMode.CLOSED and wrong) or (mode is LoopMode.IDLE and not uncalibrated(after)):

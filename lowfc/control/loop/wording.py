@@ -6,6 +6,8 @@ AUTO = "auto"
 """Text of a request for automatic gains, and the prefix of the text of those not made by a person."""
 MEASURED_FIRST = "the gains are measured before the loop closes"
 """Cause of the open mode in which a loop with automatic gains begins."""
+CAMERA_MISFIT = "the camera does not fit the calibration"
+"""Beginning of the cause of the open mode in which its settings differ from the calibration's."""
 MAX_NOTE_LENGTH = 10_000
 """Most characters of a note."""
 

@@ -13,7 +13,7 @@ from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.messages import Role, from_timestamp, wire
 from lowfc.contract.printable import printable
 from lowfc.control.loop.safety import Limit, LoopMode, Reason
-from lowfc.control.loop.wording import counted
+from lowfc.control.loop.wording import CAMERA_MISFIT, counted
 from lowfc.programs.view.verdicts.camera_verdict import LATELY, all_refused, frames, star
 from lowfc.programs.view.verdicts.facts import facts
 from lowfc.programs.view.verdicts.run_state import RECENT_S, Liveness, RunState
@@ -129,9 +129,9 @@ def _open(state: RunState) -> Tile:
     if found is not None and found.residual_nm > WORSE * found.open_nm:
         shape += ", worse than a flat mirror: `lowfc ctl safe` flattens it"
     level, advice = Level.NEUTRAL, "The loop is open: nothing is corrected, `lowfc ctl close` closes it."
-    if "camera" in state.why:
+    if state.why.startswith(CAMERA_MISFIT):
         level = Level.WARNING
-        advice = "The loop opened by itself, as the camera changed: restore it or calibrate, then `lowfc ctl close`."
+        advice = f"The loop opened by itself, as {CAMERA_MISFIT}: restore it or calibrate, then `lowfc ctl close`."
     return Tile("LOOP", "OPEN", f"{state.why or 'measuring only'}; {shape}", level, f"{advice} The {shape}.")
 
 
