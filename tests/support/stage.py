@@ -75,7 +75,7 @@ class Stage:
         self.truth, self.residual_nm, self.open_nm = True, 5.0, 40.0
         self.flux, self.full = 1.0, 0
         self.stroke_nm, self.latency_us = 100.0, 500
-        self.status = wire.MIRROR_STATUS_FOLLOWING
+        self.status, self.limits_hit = wire.MIRROR_STATUS_FOLLOWING, ()
         self.frames, self.start_s = 0, START
         self.behind_s = 0.0
 
@@ -125,7 +125,9 @@ class Stage:
                 self.send(TRUTH, truth)
         if self._runs("mirror-dm"):
             shape = np.full(4, self.stroke_nm, "<f4").tobytes()
-            self.send(MIRROR_STATE, wire.MirrorState(status=self.status, rows=2, columns=2, actuators=shape))
+            state = wire.MirrorState(status=self.status, rows=2, columns=2, actuators=shape)
+            state.limits_hit.extend(self.limits_hit)
+            self.send(MIRROR_STATE, state)
         if self._runs("camera") and self._runs("controller"):
             step = wire.ControlStep(**frame, mode=self.mode.value, command_nm=[0.0] * 3)
             step.reasons.extend(reason.value for reason in self.reasons)

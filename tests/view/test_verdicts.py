@@ -73,10 +73,10 @@ def counting(**counts: int) -> Callable[[Stage], None]:
     return health("controller", topics=[wire.TopicCount(topic=FRAME.key, **counts)])
 
 
-def opened(why: str) -> Callable[[Stage], None]:
+def changed(mode: LoopMode, why: str) -> Callable[[Stage], None]:
     def change(stage: Stage) -> None:
-        stage.mode = LoopMode.OPEN
-        details = {"before": "closed", "after": "open", "why": why}
+        stage.mode = mode
+        details = {"before": "closed", "after": mode.in_words, "why": why}
         stage.send(EVENT, EVENTS["MODE_CHANGED"].log("controller", stage.data_ns, **details))
 
     return change
@@ -90,6 +90,8 @@ def holding(reason: Rejection, **state: object) -> Callable[[Stage], None]:
     return change
 
 
+MISFIT = f"{CAMERA_MISFIT}: bias_dn is 260"
+OTHER_SIZE = "the computed calibration is for frames of 32 x 32 pixels, the camera's are 64 x 64"
 LEASE = wire.Lease(holds=True, holder="calibrate")
 ALL_PROCESSES = ("camera", "controller", "mirror-dm", "recorder")
 HARMFUL = "worse than a flat mirror: `lowfc ctl safe` flattens it"
@@ -98,9 +100,10 @@ STATES: dict[str, tuple[Callable[[Stage], object], str, str]] = {
     "healthy": (setting(), "LOOP CLOSED GOOD", "nothing is wrong"),
     "open": (setting(mode=LoopMode.OPEN), "LOOP OPEN NEUTRAL", "lowfc ctl close"),
     "open, worse than flat": (setting(mode=LoopMode.OPEN, residual_nm=60.0), "LOOP OPEN NEUTRAL", HARMFUL),
-    "camera changed": (opened(f"{CAMERA_MISFIT}: bias_dn is 260"), "LOOP OPEN WARNING", "opened by itself"),
+    "camera changed": (changed(LoopMode.OPEN, MISFIT), "LOOP OPEN WARNING", "opened by itself"),
     "safe": (setting(mode=LoopMode.SAFE), "LOOP SAFE BAD", "lowfc ctl clear"),
     "idle": (setting(mode=LoopMode.IDLE, reasons=(Rejection.NO_CALIBRATION,)), "FRAMES REFUSED BAD", "no calibration"),
+    "idle, other size": (changed(LoopMode.IDLE, OTHER_SIZE), "LOOP IDLE WARNING", "no calibration for these frames"),
     "controller dead": (silence("controller"), "LOOP DEAD BAD", "Controller silent for 4 s"),
     "camera dead": (silence("camera"), "FRAMES NO FRAMES BAD", "No frame for 4 s, camera silent"),
     "mirror dead": (silence("mirror-dm"), "MIRROR DEAD BAD", "Mirror silent for 4 s"),
@@ -127,6 +130,7 @@ STATES: dict[str, tuple[Callable[[Stage], object], str, str]] = {
     "star gone": (setting(reasons=(Rejection.DARK,), flux=0.01), "STAR GONE BAD", "the star is gone"),
     "dim": (setting(flux=0.4), "STAR 40 % WARNING", "The star is dim"),
     "stroke": (setting(reasons=(Limit.STROKE,)), "MIRROR AT LIMIT BAD", "actuator stroke"),
+    "mirror's limit": (setting(limits_hit=(Limit.SLEW,)), "MIRROR AT LIMIT WARNING", "slew), by its own limits:"),
     "law overruled": (setting(reasons=(Limit.LAW_OVERRULED,)), "LOOP CLOSED WARNING", "Tune again"),
     "modal limit": (setting(reasons=(Limit.MODAL_LIMIT,)), "MIRROR AT LIMIT BAD", "modal limit"),
     "little stroke left": (setting(stroke_nm=650.0), "MIRROR 93 % WARNING", "little is left"),
@@ -331,11 +335,16 @@ def test_a_shape_held_on_purpose_is_not_reported_as_harm() -> None:
     assert "including the shapes of offset and channels" in verdict.headline
 
 
+def test_an_idle_loop_names_the_cause(verdicts: dict[str, Verdict]) -> None:
+    assert tile(verdicts["idle, other size"], "LOOP").detail == OTHER_SIZE
+    assert tile(verdicts["idle"], "LOOP").detail == "no calibration"
+
+
 @pytest.mark.parametrize(
     "why", ["the camera's frames fit the calibration", "an interlock acts: camera_temp is 41", "camera exchange"]
 )
 def test_a_loop_that_opened_for_another_reason_is_not_blamed_on_the_camera(why: str) -> None:
-    verdict = staged(opened(why), 2)
+    verdict = staged(changed(LoopMode.OPEN, why), 2)
     assert tile(verdict, "LOOP").detail.startswith(why)
     assert (tile(verdict, "LOOP").level, verdict.level) == (Level.NEUTRAL, Level.NEUTRAL)
 

@@ -78,8 +78,8 @@ def _loop(state: RunState) -> Tile:
         advice = "Loop in safe mode: the mirror stays flat until `lowfc ctl clear`; do that when it is safe."
         return tile("SAFE", state.why or "mirror flat, latched", Level.BAD, advice)
     if mode is LoopMode.IDLE:
-        advice = "The controller has no calibration: it refuses every frame. Load one."
-        return tile("IDLE", "no calibration", Level.WARNING, advice)
+        advice = "There is no calibration for these frames: the controller refuses every one. Load or measure one."
+        return tile("IDLE", state.why or "no calibration", Level.WARNING, advice)
     if mode is LoopMode.OPEN:
         return _open(state)
     if Liveness.STARTING in (controller.life, camera.life) or camera.life is Liveness.NEVER:
@@ -151,14 +151,14 @@ def _mirror(state: RunState) -> Tile:
     acting = {words: state.recent[reason] for reason, words in LIMITS.items() if state.recent[reason]}
     own = [words for reason, words in LIMITS.items() if reason.value in reported.limits_hit]
     if acting or own:
-        words, times = ", ".join(acting or own), counted(max(acting.values(), default=0), "time")
+        words = ", ".join(acting or own)
+        how = f"{counted(max(acting.values()), 'time')} {LATELY}" if acting else "by its own limits"
         often = max(state.now[reason] for reason in LIMITS) > LIMITED * max(1, state.now["steps"])
         advice = (
-            f"The mirror is at a limit ({words}), {times} {LATELY}: the disturbance is too large or the gain too high. "
+            f"The mirror is at a limit ({words}), {how}: the disturbance is too large or the gain too high. "
             "Lower the gain, offload, or raise the limit."
         )
-        detail = f"{words}: {times} in {RECENT_S:g} s; {value} {of}"
-        return tile("AT LIMIT", detail, Level.BAD if often else Level.WARNING, advice)
+        return tile("AT LIMIT", f"{words}: {how}; {value} {of}", Level.BAD if often else Level.WARNING, advice)
     if limit_nm and used_nm > NEAR_STROKE * limit_nm:
         advice = f"The mirror has used {value} of its stroke: little is left. Offload the slow part of it."
         return tile(value, f"{of}: nearly all", Level.WARNING, advice)
