@@ -26,6 +26,7 @@ from lowfc.contract.messages import (
     TOPICS,
     TRUTH,
     Topic,
+    topic_of,
     wire,
 )
 from lowfc.programs.core.recording.volume import bytes_per_s, configured_selection, estimate
@@ -126,6 +127,20 @@ def test_a_smaller_copy_has_the_same_steps(whole: Path, small: Path) -> None:
     assert len(of(list(LogReader(path)), FRAME)) == FRAMES // 20
     with pytest.raises(DataFileError, match="already exists"):
         thin((whole,), small, Selection(2))
+
+
+def test_a_smaller_copy_has_all_messages_of_an_unknown_topic(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    night, newer = SyntheticLog(), "lowfc/newer/state"
+    for _ in range(3):
+        night.frames(10)
+        night.samples.append(night.samples[-1]._replace(key=newer, payload=b"newer"))
+    with monkeypatch.context() as patch:
+        patch.setattr("lowfc.adapters.logs.writer.topic_of", lambda key: STEP if key == newer else topic_of(key))
+        log = night.write(tmp_path / "night.mcap")
+    done = thin((log,), tmp_path / "small.mcap", Selection(EVERY))
+    messages = list(LogReader(Path(done.file)))
+    assert [one.payload for one in messages if one.key == newer] == [b"newer"] * 3
+    assert len(of(messages, FRAME)) == 3
 
 
 def test_replay_refuses_a_log_without_all_frames_in_one_sentence(small: Path) -> None:

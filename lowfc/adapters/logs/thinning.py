@@ -67,7 +67,10 @@ def thin(log: Parts, out: Path, requested: Selection, progress: Callable[[int, i
     def include(message: Sample) -> bool:
         nonlocal messages
         messages += 1
-        return combined.keeps(topic_of(message.key), message.sequence, message.payload)
+        try:
+            return combined.keeps(topic_of(message.key), message.sequence, message.payload)
+        except KeyError:
+            return True  # a topic unknown to this version
 
     def include_record(record: Metadata | Attachment) -> bool:
         """Whether to copy a record; of a later file only its account, which replaces the previous one."""
