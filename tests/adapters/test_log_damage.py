@@ -188,6 +188,28 @@ def test_only_the_damaged_chunk_of_a_rewritten_log_is_lost(
     assert identity(list(LogReader(done.recovered))) == read
 
 
+@pytest.mark.parametrize(
+    ("opcode", "at", "new"),
+    [
+        (Opcode.SCHEMA, 1, (1 << 40).to_bytes(8, "little")),
+        (Opcode.SCHEMA, 1, (1 << 63).to_bytes(8, "little")),
+        (Opcode.CHUNK_INDEX, 1, (1 << 40).to_bytes(8, "little")),
+        (Opcode.CHUNK_INDEX, 41, b"\xff" * 4),  # size of its list of message indexes
+    ],
+)
+def test_a_summary_without_checksum_is_used_up_to_a_damaged_record(
+    tmp_path: Path, source: Path, opcode: Opcode, at: int, new: bytes
+) -> None:
+    path = rewritten(source, tmp_path / "rewritten.mcap", NO_CRCS)
+    data = bytearray(path.read_bytes())
+    begin = next(one for one in boundaries(data) if data[one] == opcode)
+    data[begin + at : begin + at + len(new)] = new
+    path.write_bytes(data)
+    assert sorted(identity(list(LogReader(path)))) == sorted(SENT)
+    with LogFile(path) as file:
+        assert list(file.index()) == []
+
+
 def test_unchunked_messages_are_covered_by_the_data_checksum_and_read_up_to_a_truncation(
     tmp_path: Path, source: Path
 ) -> None:

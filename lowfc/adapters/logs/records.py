@@ -5,6 +5,7 @@ DataEnd has that of the data section, the footer that of the summary. A log rewr
 and chunks; a missing checksum is not checked.
 """
 
+import contextlib
 import io
 import struct
 import zlib
@@ -112,9 +113,10 @@ class LogFile:
         return Chunk(self._summary, len(content), zlib.crc32(content), content)
 
     def index(self) -> Iterator[ChunkIndex]:
-        """Index of each chunk from the summary, in file order; nothing without a valid summary."""
-        for record in self._in_summary(Opcode.CHUNK_INDEX):
-            yield parsed(ChunkIndex, record[HEAD.size :])
+        """Index of each chunk from the summary, in file order, up to a damaged one."""
+        with contextlib.suppress(UnsoundError):
+            for record in self._in_summary(Opcode.CHUNK_INDEX):
+                yield parsed(ChunkIndex, record[HEAD.size :])
 
     def parts(
         self, needed: Callable[[int, Collection[int]], bool] | None = None
@@ -291,10 +293,12 @@ class LogFile:
         return self._read(at, end - at)
 
     def _in_summary(self, *opcodes: Opcode) -> Iterator[bytes]:
-        """Records of some kinds in the summary; nothing without a valid summary."""
-        at = self.size if self._summary is None else self._summary
-        while at < self.size - _FOOTER_BYTES:
+        """Records of some kinds in the summary, up to an impossible length; nothing without a valid summary."""
+        at, end = self.size if self._summary is None else self._summary, self.size - _FOOTER_BYTES
+        while at < end:
             opcode, length = HEAD.unpack(self._read(at, HEAD.size))
+            if length > min(MAX_BYTES, end - at - HEAD.size):
+                return
             if opcode in opcodes:
                 yield self._read(at, HEAD.size + length)
             at += HEAD.size + length
