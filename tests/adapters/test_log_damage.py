@@ -21,6 +21,7 @@ from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.records import LogFile
 from lowfc.adapters.logs.recovery import recover
 from lowfc.contract.errors import DataFileError
+from lowfc.contract.messages import STEP
 from lowfc.programs.logs.survey import survey
 from tests.support.mutated_logs import (
     ATTACHMENTS,
@@ -208,6 +209,16 @@ def test_a_summary_without_checksum_is_used_up_to_a_damaged_record(
     assert sorted(identity(list(LogReader(path)))) == sorted(SENT)
     with LogFile(path) as file:
         assert list(file.index()) == []
+
+
+def test_a_message_index_of_an_impossible_length_is_damage_for_a_sparse_reader_too(source: Path) -> None:
+    data = bytearray(source.read_bytes())
+    begin = next(one for one in boundaries(data) if data[one] == Opcode.MESSAGE_INDEX)
+    data[begin + 1 : begin + 9] = (1 << 63).to_bytes(8, "little")
+    source.write_bytes(data)
+    reader = LogReader(source, topics=(STEP,), sparse=True, skip_damaged=True)
+    assert sum(1 for _ in reader)
+    assert [one.why for one in reader.damage] == ["a record has an impossible length"]
 
 
 def test_unchunked_messages_are_covered_by_the_data_checksum_and_read_up_to_a_truncation(

@@ -194,7 +194,7 @@ class LogFile:
         found = []
         while len(head := self._read(at, HEAD.size + 2)) == HEAD.size + 2:
             opcode, length = HEAD.unpack_from(head)
-            if opcode != Opcode.MESSAGE_INDEX:
+            if opcode != Opcode.MESSAGE_INDEX or at + HEAD.size + length > self.size:
                 break
             found.append(int.from_bytes(head[HEAD.size :], "little"))
             at += HEAD.size + length
