@@ -138,10 +138,9 @@ class LogFile:
             opcode, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, self.size)
             end = at + HEAD.size + length
             if needed and opcode == Opcode.CHUNK and end <= self.size:
-                intact = False  # the checksum of the data section needs all of it
                 end_ns = int.from_bytes(self._read(at + HEAD.size + 8, 8), "little")
                 if (there := self._channels_after(end)) and not needed(end_ns, there):
-                    at = end
+                    at, intact = end, False  # the checksum of the data section needs all of it
                     continue
             try:
                 if opcode in _OF_CHUNKS and self._unchunked and (content := self._loose(at)):
