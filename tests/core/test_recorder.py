@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.bus.names import MAX_HEALTH_LOGS, Names
 from lowfc.adapters.logs.loss_account import LossAccount
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.process.clock import HostClock
@@ -77,6 +78,15 @@ def test_a_log_of_a_run_without_other_processes_is_removed(tmp_path: Path, camer
     thread.join(PATIENCE_S)
     assert len(list((tmp_path / "logs").iterdir())) == camera_present
     assert len(recorder.service.health().recording.files) == camera_present
+
+
+def test_the_health_of_a_recorder_of_many_logs_names_the_newest_ones_and_is_accepted(tmp_path: Path) -> None:
+    hub, clock = MemoryHub(), HostClock()
+    recorder = Recorder(MemoryBus(hub, "recorder", clock), clock, "bnch", tmp_path / "logs", metadata={})
+    recorder._series.files += [tmp_path / "logs" / f"20260101T000000Z-{number}.mcap" for number in range(5000)]
+    _, health = Names().health(HEALTH.at("recorder"), recorder.service.health().SerializeToString())
+    assert list(health.recording.files) == [str(path) for path in recorder._series.files[-MAX_HEALTH_LOGS:]]
+    assert health.recording.file == str(recorder._series.files[-1])
 
 
 def test_states_published_before_the_recorder_started_are_first_in_the_log_and_once(bench: Bench) -> None:

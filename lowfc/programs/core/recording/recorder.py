@@ -15,6 +15,7 @@ from types import FrameType
 
 from lowfc.adapters.bus.backlog import Backlog
 from lowfc.adapters.bus.bus import ALL, UNREADABLE, Bus, Query, Sample
+from lowfc.adapters.bus.names import MAX_HEALTH_LOGS
 from lowfc.adapters.logs.loss_account import LossAccount
 from lowfc.adapters.logs.selection import EVERYTHING, Selection
 from lowfc.adapters.logs.series import STANDARD, Limits, LogSeries
@@ -352,7 +353,7 @@ class Recorder:
 
     def _fill(self, health: wire.Health) -> None:
         lost = self._account.lost()
-        health.recording.files.extend(map(str, self._series.files))
+        health.recording.files.extend(map(str, self._series.files[-MAX_HEALTH_LOGS:]))
         health.recording.file = health.recording.files[-1] if health.recording.files else ""
         health.recording.folder = str(Path.cwd())
         health.recording.messages = self._series.messages
