@@ -44,6 +44,7 @@ def eventful(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     night.request("close")
     night.frames(1500, lost={200, 201, 202, 203, 204, 700}, dark={800})
     night.request("gain", (0.2,))
+    night.put(REQUEST, wire.Request(name="renew", accepted=True))
     night.frames(200)
     night.request("gain", (9.0,))
     night.frames(100)
@@ -389,6 +390,16 @@ def test_text_of_a_log_is_escaped(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     for name in ("host", "kernel", "processor", "lowfc"):
         assert f"{name} &lt;script&gt;" in text
     assert text.count("3 $x^2$") == 2, "in the drawing and in the table"
+
+
+def test_the_timeline_has_requests_of_the_whole_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    night = uneventful(SyntheticLog(), 3)
+    for number in range(601):
+        night.put(REQUEST, wire.Request(name="gain", values=[number], accepted=True))
+    monkeypatch.setattr(drawings, "_DRAWINGS", {"timeline": drawings._DRAWINGS["timeline"]})
+    drawn = drawings.drawings(report_of(read_run(night.write(tmp_path / "x.mcap"))))["timeline"]
+    shown = [int(number) for number in re.findall(r">\s*gain (\d+)<", drawn)]
+    assert shown == list(range(0, 601, 3))
 
 
 @pytest.mark.parametrize("module", ["jinja2", "matplotlib.figure"])

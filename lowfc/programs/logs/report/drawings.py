@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 from lowfc.arrays import Array, Long
 from lowfc.contract.printable import printable
+from lowfc.control.loop.safety import Limit
 from lowfc.programs.logs.report.course import actuator_extremes_nm
 from lowfc.programs.logs.report.residual import bin_starts, binned_rms
 from lowfc.programs.logs.report.results import Report
@@ -232,7 +233,7 @@ def _light(figure: "Figure", report: Report) -> bool:
     starts = bin_starts(time_s.size, 600)
     flux = np.where(steps.flux_dn > 0, steps.flux_dn, np.nan)
     _envelope(upper, time_s[starts], flux, starts, INK)
-    refused = (steps.reasons & ((1 << 20) - 1)) != 0
+    refused = (steps.reasons & ((1 << Limit.MODAL_LIMIT) - 1)) != 0
     if refused.any():
         marks = time_s[refused][bin_starts(int(refused.sum()), _MAX_MARKS)]
         look: dict[str, Any] = {"color": COLOURS["error"], "markersize": 5, "clip_on": False}
@@ -266,7 +267,8 @@ def _timeline(figure: "Figure", report: Report) -> bool:
         times_s = np.array(found)[bin_starts(len(found), _MAX_MARKS)]
         place = np.full(times_s.size, levels.index(level))
         axes.plot(times_s, place, marker, markeredgecolor=edge, markerfacecolor=face, markersize=7, linestyle="none")
-    for number, request in enumerate(requests[:_MAX_MARKS]):
+    shown = [requests[place] for place in bin_starts(len(requests), _MAX_MARKS)]
+    for number, request in enumerate(shown):
         axes.axvline(request["time_s"], color=FAINT, linewidth=0.8, linestyle=":")
         values = " ".join(f"{value:g}" for value in request["values"][:2])
         text = f"{printable(request['name'])} {values}{'' if request['accepted'] else ' refused'}".strip()
