@@ -95,6 +95,16 @@ class LogCopy:
         self.messages += 1
 
 
+def refuse_existing(path: Path) -> None:
+    """Refuse to write a log to a file that exists.
+
+    Raises:
+        DataFileError: the file exists.
+    """
+    if path.exists():
+        raise DataFileError(f"{path} already exists; a log is never overwritten; name another one with --out")
+
+
 @contextlib.contextmanager
 def new_log(path: Path, source: Path) -> Iterator[IO[bytes]]:
     """Yield a file with the permissions of `source` that is renamed to `path` on success and removed on failure.
@@ -102,13 +112,10 @@ def new_log(path: Path, source: Path) -> Iterator[IO[bytes]]:
     Raises:
         DataFileError: the file exists already, or cannot be written.
     """
-    exists = f"{path} already exists; a log is never overwritten; name another one with --out"
-    if path.exists():
-        raise DataFileError(exists)
+    refuse_existing(path)
     with being_written(path, source) as part, part.open("wb") as file:
         yield file
         file.flush()
         os.fsync(file.fileno())
-        if path.exists():  # created by another process meanwhile
-            raise DataFileError(exists)
+        refuse_existing(path)  # created by another process meanwhile
     path.chmod(source.stat().st_mode & 0o666)

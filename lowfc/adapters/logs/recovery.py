@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lowfc.adapters.logs.log_copy import LogCopy, new_log
+from lowfc.adapters.logs.log_copy import LogCopy, new_log, refuse_existing
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.records import Damage
 from lowfc.adapters.logs.writer import UNFINISHED, being_recorded, stem_of
@@ -78,8 +78,7 @@ def recover(source: Path, out: Path, progress: Callable[[int, int], None] | None
     """
     if source.exists() and being_recorded(source):
         raise DataFileError(f"{source} is being recorded, and nothing is lost: `lowfc ctl record stop` finishes it")
-    if out.exists():
-        raise DataFileError(f"{out} already exists; a log is never overwritten; name another one with --out")
+    refuse_existing(out)
     reader = LogReader(source, topics=(), skip_damaged=True)
     for _ in reader:
         pass
