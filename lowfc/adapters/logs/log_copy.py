@@ -34,16 +34,6 @@ class LogCopy:
         )
         self._writer.start(profile="", library=f"lowfc {__version__}")
 
-    def describe(self, records: Sequence[Metadata | Attachment]) -> None:
-        """Copy metadata and attachments."""
-        for record in records:
-            if isinstance(record, Metadata):
-                self._writer.add_metadata(record.name, record.metadata)
-            else:
-                self._writer.add_attachment(
-                    record.create_time, record.log_time, record.name, record.media_type, record.data
-                )
-
     def note(self, name: str, entries: dict[str, str]) -> None:
         """Add metadata."""
         self._writer.add_metadata(name, entries)
@@ -64,15 +54,27 @@ class LogCopy:
         """
         done = 0
         for message in reader:
-            self.describe(list(filter(include_record, reader.described[done:])))
+            self._describe(reader.described[done:], include_record)
             done = len(reader.described)
             if include(message):
                 self._add(reader, message)
-        self.describe(list(filter(include_record, reader.described[done:])))
+        self._describe(reader.described[done:], include_record)
 
     def finish(self) -> None:
         """Write the index."""
         self._writer.finish()  # type: ignore[no-untyped-call]
+
+    def _describe(
+        self, records: Sequence[Metadata | Attachment], include_record: Callable[[Metadata | Attachment], bool]
+    ) -> None:
+        """Copy metadata and attachments."""
+        for record in filter(include_record, records):
+            if isinstance(record, Metadata):
+                self._writer.add_metadata(record.name, record.metadata)
+            else:
+                self._writer.add_attachment(
+                    record.create_time, record.log_time, record.name, record.media_type, record.data
+                )
 
     def _add(self, reader: LogReader, message: Sample) -> None:
         name = message.key, start_of(message.sequence)
