@@ -25,7 +25,7 @@ class Thinned:
         messages, bytes: number of messages and size of the copy.
         messages_before, bytes_before: number of messages and size of the log.
         finished: whether the log had been finished.
-        no_end: reason why it had not.
+        no_end: why the log has no end; empty if finished.
         damaged: descriptions of the parts of the log that could not be read.
     """
 
@@ -62,7 +62,7 @@ def thin(log: Parts, out: Path, requested: Selection, progress: Callable[[int, i
     combined = Selection.of(metadata_at_start(log[0])).within(requested)
     reader, messages = WholeLog(log, skip_damaged=True), 0
     reader.progress = progress
-    described: set[str] = {PART, SELECTION}  # the copy has its own
+    copied_names = {PART, SELECTION}  # the copy has its own
 
     def include(message: Sample) -> bool:
         nonlocal messages
@@ -74,8 +74,8 @@ def thin(log: Parts, out: Path, requested: Selection, progress: Callable[[int, i
 
     def include_record(record: Metadata | Attachment) -> bool:
         """Whether to copy a record; of a later file only its account, which replaces the previous one."""
-        known = record.name in described and record.name not in ("recording", RECOVERY)
-        described.add(record.name)
+        known = record.name in copied_names and record.name not in ("recording", RECOVERY)
+        copied_names.add(record.name)
         return not known
 
     with new_log(out, log[0]) as file:
