@@ -61,7 +61,6 @@ class Publisher(Protocol):
         published: number of messages so far, including `skipped`.
         skipped: number of sequences without a message: frames that the camera lost.
         handed_ns: time at which the last message was handed to the direct link, otherwise to the bus, host clock.
-        last: last message and envelope of a queryable topic.
     """
 
     topic: Topic
@@ -69,7 +68,6 @@ class Publisher(Protocol):
     published: int
     skipped: int
     handed_ns: int
-    last: tuple[bytes, Envelope] | None
 
     def put(self, payload: bytes, publish_time_ns: int | None = None, sequence: int | None = None) -> Envelope:
         """Send `payload`, by default with the present time and the next sequence; never waits for a reader.
