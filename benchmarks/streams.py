@@ -36,7 +36,7 @@ DIRECT, CAMERA_PROCESS, IN_CONTROLLER = (
 )
 SPANS = {"frame_to_command": "frame to command", "frame_to_mirror": "frame to mirror"}
 PERCENTILES = {"p50": "p50", "p99": "p99", "p99_9": "p99.9"}
-FRAMES, CHANNEL = "lowfs", "dm00disp03"
+FRAME_STREAM, CHANNEL = "lowfs", "dm00disp03"
 
 _MEMORY = Path("/dev/shm")  # noqa: S108  # a private folder is created in it
 
@@ -70,7 +70,7 @@ def one_run(rate_hz: float, seconds: float, name: str) -> Result:
         stream_to_camera: from just before a frame is written until just before the camera publishes it.
     """
     driver = stream_ends.__name__
-    config = configuration(SIZE, rate_hz).model_copy(update={"drivers": {driver: {"stream": FRAMES}}})
+    config = configuration(SIZE, rate_hz).model_copy(update={"drivers": {driver: {"stream": FRAME_STREAM}}})
     by_streams = name != DIRECT
     options = LatencyOptions(config, seconds, 1)
     with prepared_run(SIZE, config) as run, tempfile.TemporaryDirectory(prefix="lowfc-streams-", dir=_MEMORY) as folder:
@@ -85,13 +85,13 @@ def one_run(rate_hz: float, seconds: float, name: str) -> Result:
 def _loop(options: LatencyOptions, run: Run, folder: Path, name: str) -> list[Child]:
     """Processes of a loop whose streams are in a folder; the first is the program that writes the frames."""
     config, seconds = options.config, WARM_UP_S + options.duration_s
-    Stream.create(folder / stream_path(FRAMES).name, (SIZE.side, SIZE.side), np.uint16)
+    Stream.create(folder / stream_path(FRAME_STREAM).name, (SIZE.side, SIZE.side), np.uint16)
     role = mirror_role(config.mirror.name)
     shared = ["--run", run.run_id, "--config", str(run.path / "config.toml")]
     writer, mirror_there = stream_ends.__name__, ["--wait-for", role]
     driver = f"{writer}:{stream_ends.TimedCamera.__name__}"
     commands = {
-        "source": ["-m", writer, str(run.path), FRAMES, str(round(seconds * config.camera.rate_hz))],
+        "source": ["-m", writer, str(run.path), FRAME_STREAM, str(round(seconds * config.camera.rate_hz))],
         role: ["-m", "lowfc", "mirror", "isio", *shared, "--stream", CHANNEL],
     }
     if name == CAMERA_PROCESS:

@@ -59,14 +59,14 @@ def run_once(words: Sequence[str], rate_hz: float, seconds: float) -> Result:
     """Run a loop once with these options of `lowfc latency`.
 
     `failure` has the last line of its standard error, or the timeout, if it failed. messages_lost is None without a
-    recorder. commands_late is the number of late commands over the number of frames, warm-up included; only with a
-    simulated camera.
+    recorder. commands_late_fraction is the number of late commands over the number of frames, warm-up included; only
+    with a simulated camera.
     """
     found = run_lowfc(["latency", *words, "--rate", f"{rate_hz:g}"], seconds)
     if "failure" in found:
-        return {"asked_hz": rate_hz, "failure": found["failure"]}
+        return {"requested_hz": rate_hz, "failure": found["failure"]}
     own = {
-        "asked_hz": rate_hz,
+        "requested_hz": rate_hz,
         "rate_hz": found["rate_hz"],
         "frames": found["frames"],
         "without_command": found["frames_without_command"],
@@ -75,7 +75,7 @@ def run_once(words: Sequence[str], rate_hz: float, seconds: float) -> Result:
         "usage": found["usage"],
     }
     if found["commands_late"] is not None:
-        own["commands_late"] = found["commands_late"] / (found["frames"] + found["warm_up_frames"])
+        own["commands_late_fraction"] = found["commands_late"] / (found["frames"] + found["warm_up_frames"])
     return own
 
 
@@ -84,7 +84,7 @@ def complaints(run: Result) -> list[str]:
     if "failure" in run:
         return [run["failure"]]
     found = []
-    if abs(run["rate_hz"] - run["asked_hz"]) > RATE_WITHIN * run["asked_hz"]:
+    if abs(run["rate_hz"] - run["requested_hz"]) > RATE_WITHIN * run["requested_hz"]:
         found.append(f"{run['rate_hz']:.0f} frames a second")
     if run["without_command"] > MAX_WITHOUT_COMMAND * run["frames"]:
         found.append(f"{100 * run['without_command'] / run['frames']:.2g} % of the frames without a command")
@@ -125,7 +125,7 @@ def find(words: Sequence[str], rates: Sequence[float], seconds: float, report: R
         return not complaints(runs[-1])
 
     def one_at(index: int, *, sustained: bool) -> Result | None:
-        found = (run for run in runs if run["asked_hz"] in rates[index : index + 1])
+        found = (run for run in runs if run["requested_hz"] in rates[index : index + 1])
         return next((run for run in found if sustained is not bool(complaints(run))), None) if index >= 0 else None
 
     index = search(sustains, len(rates))
@@ -149,7 +149,7 @@ def tables(result: Result) -> list[Lines]:
     rates, use = [list(HEADINGS)], [list(USE_HEADINGS)]
     for name, loop in result["loops"].items():
         run, above = loop["run"], loop["above"]
-        why = "not tried" if above is None else f"{above['asked_hz']:g} Hz: {', '.join(complaints(above))}"
+        why = "not tried" if above is None else f"{above['requested_hz']:g} Hz: {', '.join(complaints(above))}"
         rates.append([name, "none" if run is None else f"{loop['highest_hz']:g}", *_latency(run), why])
         use += [_use(name, one) for one in (run, loop["compared"]) if one is not None]
     return [rates, use]
@@ -158,7 +158,7 @@ def tables(result: Result) -> list[Lines]:
 def _latency(run: Result | None) -> list[str]:
     if run is None:
         return [""] * 3
-    late = f"{100 * run['commands_late']:.3g} %" if "commands_late" in run else ""
+    late = f"{100 * run['commands_late_fraction']:.3g} %" if "commands_late_fraction" in run else ""
     return [*(f"{run['frame_to_command_us'][name]:.0f}" for name in ("p50", "p99")), late]
 
 
@@ -171,7 +171,7 @@ def _use(name: str, run: Result) -> list[str]:
     each = [used.get(role) for role in _ROLES]
     cells = [f"{100 * one['share']:.0f} % ({one['processors']})" if one else "" for one in each]
     sums = ", ".join(f"{where}: {share:.0f} %" for where, share in sorted(together.items()))
-    return [name, f"{run['asked_hz']:.0f}", *cells, sums]
+    return [name, f"{run['requested_hz']:.0f}", *cells, sums]
 
 
 def about(result: Result) -> str:

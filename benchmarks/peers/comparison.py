@@ -35,7 +35,7 @@ from benchmarks.peers.implementations import (
     versions,
 )
 from benchmarks.peers.plain_zenoh import PORTS
-from benchmarks.peers.shared import ACTUATORS, LAST, MIRROR_SIDE, MODES, SIDE, TIME_STAMPS, NumpyStep, Problem
+from benchmarks.peers.shared import ACTUATORS, LAST, MIRROR_SIDE, MODES, SIDE, TIME_STAMPS, NumpyStep, RunData
 from benchmarks.runner import Lines, Report, Result, add_times, ranged
 from benchmarks.sizes import Size, configuration, prepared_run, random_calibration
 from lowfc.adapters.bus.run import free_ports
@@ -154,8 +154,8 @@ def one_run(implementation: Implementation, rules: argparse.Namespace, priority:
 def run_statistics(folder: Path, warm_up: int) -> dict[str, Any]:
     """Statistics of a run without its first `warm_up` frames; percentiles in us, None without any command.
 
-    off: largest difference of the last actuators from those of numpy, relative to the largest actuator; None if a
-    command is missing.
+    command_error: largest difference of the last actuators from those of numpy, relative to the largest actuator; None
+    if a command is missing.
     """
     due, published, commanded, received = (np.fromfile(folder / name, np.int64)[1:] for name in TIME_STAMPS)
     command_error = _command_error(folder, commanded.size) if commanded.all() and received[-1] else None
@@ -167,15 +167,15 @@ def run_statistics(folder: Path, warm_up: int) -> dict[str, Any]:
         "sent_late": int((published - due > period_ns).sum()),
         "frame_to_command": percentiles((commanded - published)[commanded > 0] / 1e3),
         "frame_to_mirror": percentiles((received - published)[received > 0] / 1e3),
-        "off": command_error,
+        "command_error": command_error,
     }
 
 
 def _command_error(folder: Path, frames: int) -> float:
-    problem = Problem(folder)
-    step, payload = NumpyStep(problem), b""
+    run_data = RunData(folder)
+    step, payload = NumpyStep(run_data), b""
     for number in range(1, frames + 1):
-        payload = step.command(problem.frame(number).tobytes())
+        payload = step.command(run_data.frame(number).tobytes())
     expected, found = np.frombuffer(payload, np.float32), np.fromfile(folder / LAST, np.float32)
     return float(np.abs(found - expected).max() / np.abs(expected).max())
 
@@ -190,7 +190,7 @@ def _lowfc(kernel: str, rules: argparse.Namespace, priority: int) -> dict[str, A
         "without_command": found["frames_without_command"],
         "sent_late": found["frames_sent_late"],
         **{span: found["latency_us"][span] for span in ("frame_to_command", "frame_to_mirror")},
-        "off": None,
+        "command_error": None,
     }
 
 
@@ -317,7 +317,7 @@ def about(result: Result) -> str:
     done = [turn for turns in runs.values() for turn in turns if turn is not None]
     late, sent = (sum(turn[name] for turn in done) for name in ("sent_late", "frames"))
     lines.append(f"{late} of all {sent} frames were sent more than a period late.")
-    if command_errors := [turn["off"] for turn in done if turn["off"] is not None]:
+    if command_errors := [turn["command_error"] for turn in done if turn["command_error"] is not None]:
         lines.append(
             f"In the {len(command_errors)} runs with a command for every frame, the final mirror command agrees with "
             f"the numpy reference within {max(command_errors):.1g} of its largest actuator; lowfc is left out, because "

@@ -14,7 +14,7 @@ import numpy as np
 import zenoh
 from zenoh.handlers import Callback
 
-from benchmarks.peers.shared import NumpyStep, Problem, RoleProcess
+from benchmarks.peers.shared import NumpyStep, RoleProcess, RunData
 from lowfc.adapters.bus.run import Links
 from lowfc.adapters.bus.zenoh_session import session_config
 from lowfc.contract.messages import COMMAND, FRAME, Role
@@ -61,7 +61,7 @@ def source(part: RoleProcess) -> None:
         received[number] = now_ns()
         last[:] = np.frombuffer(payload, np.float32)
 
-    payloads = [pixels.tobytes() for pixels in Problem(part.folder).frames]
+    payloads = [pixels.tobytes() for pixels in RunData(part.folder).frames]
     put = join(part, back)
     for number in part.frames():
         published[number] = now_ns()
@@ -70,7 +70,7 @@ def source(part: RoleProcess) -> None:
 
 def controller(part: RoleProcess) -> None:
     """Answer frames until the process is killed."""
-    commanded, step = part.time_stamps("commanded"), NumpyStep(Problem(part.folder))
+    commanded, step = part.time_stamps("commanded"), NumpyStep(RunData(part.folder))
 
     def answer(number: int, payload: bytes) -> None:
         put(number, step.command(payload))

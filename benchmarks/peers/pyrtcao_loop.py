@@ -24,7 +24,7 @@ from pyrtc.utils import set_affinity_and_priority
 from pyrtc.wavefront_corrector import WavefrontCorrector
 from pyrtc.wavefront_sensor import WavefrontSensor
 
-from benchmarks.peers.shared import ACTUATORS, GAIN, LEAK, LIMIT_NM, MODES, PIXELS, SIDE, Problem, RoleProcess
+from benchmarks.peers.shared import ACTUATORS, GAIN, LEAK, LIMIT_NM, MODES, PIXELS, SIDE, RoleProcess, RunData
 
 Array = npt.NDArray[np.float32]
 
@@ -38,9 +38,9 @@ class Sensor(WavefrontSensor):
 
     def run(self) -> None:
         """Publish all frames of a run, then end the process."""
-        problem, published = Problem(self.part.folder), self.part.time_stamps("published")
+        run_data, published = RunData(self.part.folder), self.part.time_stamps("published")
         for number in self.part.frames():
-            self.data = problem.frame(number)
+            self.data = run_data.frame(number)
             published[number] = time.monotonic_ns()
             self.expose()  # pyrtcao numbers frames from 1, too
         clear(self.part)
@@ -50,9 +50,9 @@ class Sensor(WavefrontSensor):
 class PixelSignal(Component):
     """The signal: pixels minus reference image."""
 
-    def __init__(self, conf: dict[str, Any], problem: Problem) -> None:
+    def __init__(self, conf: dict[str, Any], run_data: RunData) -> None:
         super().__init__(conf)
-        self._reference = problem.I0.reshape(SIDE, SIDE)
+        self._reference = run_data.I0.reshape(SIDE, SIDE)
         self._image = np.empty((SIDE, SIDE), np.int32)
         self._signal = np.empty((SIDE, SIDE), np.float32)
         self.register_input_stream("wfs", open_stream(self.input_stream_name("wfs")))
@@ -80,9 +80,9 @@ class StockLoop(Loop):
 class FusedLoop(Component):
     """The whole step from frame to actuators."""
 
-    def __init__(self, conf: dict[str, Any], problem: Problem, commanded: memoryview) -> None:
+    def __init__(self, conf: dict[str, Any], run_data: RunData, commanded: memoryview) -> None:
         super().__init__(conf)
-        self._arrays = (problem.I0, problem.R, problem.to_actuators)
+        self._arrays = (run_data.I0, run_data.R, run_data.to_actuators)
         self._image = np.empty((SIDE, SIDE), np.int32)
         self._difference = np.empty(PIXELS, np.float32)
         self._command = np.zeros(MODES, np.float32)
@@ -162,24 +162,24 @@ def _configuration(part: RoleProcess, function: str) -> dict[str, Any]:
 
 
 def _component(part: RoleProcess) -> Component:
-    problem = Problem(part.folder)
+    run_data = RunData(part.folder)
     if part.role == "source":
         sensor = Sensor(_configuration(part, "run") | {"name": "wfs", "width": SIDE, "height": SIDE})
         sensor.part = part
         return sensor
     if part.role == "signal":
-        return PixelSignal(_configuration(part, "compute_signal"), problem)
+        return PixelSignal(_configuration(part, "compute_signal"), run_data)
     if part.role == "fused":
-        return FusedLoop(_configuration(part, "step"), problem, part.time_stamps("commanded"))
+        return FusedLoop(_configuration(part, "step"), run_data, part.time_stamps("commanded"))
     if part.role == "loop":
         loop = StockLoop(_configuration(part, "leaky_integrator") | {"leaky_gain": LEAK})
-        loop.cm = problem.R.copy()
+        loop.cm = run_data.R.copy()
         loop.gain = GAIN
         loop.commanded = part.time_stamps("commanded")
         return loop
     fused = part.role == "mirror"
     matrix = part.folder / "m2c.npy"
-    np.save(matrix, np.eye(ACTUATORS, dtype=np.float32) if fused else problem.to_actuators)
+    np.save(matrix, np.eye(ACTUATORS, dtype=np.float32) if fused else run_data.to_actuators)
     own_options = {"name": "wfc", "num_actuators": ACTUATORS, "m2c_file": str(matrix)}
     own_options["num_modes"] = ACTUATORS if fused else MODES
     corrector = (FusedMirror if fused else StockMirror)(_configuration(part, "send_to_hardware") | own_options)

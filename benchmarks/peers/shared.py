@@ -98,7 +98,7 @@ def go(folder: Path) -> None:
     (folder / _GO).touch()
 
 
-class Problem:
+class RunData:
     """The frames of a run, and the matrices that map a frame to actuators; each is a file in the run's folder.
 
     frames (frames, 80, 80) uint16 and I0 (6400,), dark included: DN; R (20, 6400): nm per DN; to_actuators (1156, 20):
@@ -123,8 +123,8 @@ class NumpyStep:
     y = R (I - I0); command = (1 - leak) command - gain y, cut to the limit; actuators of the command.
     """
 
-    def __init__(self, problem: Problem) -> None:
-        self._problem = problem
+    def __init__(self, run_data: RunData) -> None:
+        self._run_data = run_data
         self._difference = np.empty(PIXELS, np.float32)
         self._error = np.empty(MODES, np.float32)
         self._command = np.zeros(MODES, np.float32)
@@ -132,12 +132,12 @@ class NumpyStep:
 
     def command(self, payload: bytes) -> bytes:
         """The actuators for a frame."""
-        problem, command = self._problem, self._command
-        np.subtract(np.frombuffer(payload, np.uint16), problem.I0, out=self._difference)
-        np.matmul(problem.R, self._difference, out=self._error)
+        run_data, command = self._run_data, self._command
+        np.subtract(np.frombuffer(payload, np.uint16), run_data.I0, out=self._difference)
+        np.matmul(run_data.R, self._difference, out=self._error)
         command *= np.float32(1 - LEAK)
         self._error *= np.float32(GAIN)
         command -= self._error
         np.clip(command, -LIMIT_NM, LIMIT_NM, out=command)
-        np.matmul(problem.to_actuators, command, out=self._actuators)
+        np.matmul(run_data.to_actuators, command, out=self._actuators)
         return self._actuators.tobytes()

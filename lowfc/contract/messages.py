@@ -38,7 +38,7 @@ class Role(StrEnum):
 
 
 EVERYBODY = frozenset(Role)
-_MONITORS = frozenset({Role.RECORDER, Role.VIEWER})
+_OUTSIDE_LOOP = frozenset({Role.RECORDER, Role.VIEWER})
 _CAMERA, _MIRROR, _CONTROLLER = frozenset({Role.CAMERA}), frozenset({Role.MIRROR}), frozenset({Role.CONTROLLER})
 
 
@@ -74,7 +74,7 @@ class Topic:
     rate: Rate | float
     publishers: frozenset[Role]
     description: str
-    subscribers: frozenset[Role] = _MONITORS
+    subscribers: frozenset[Role] = _OUTSIDE_LOOP
     deterministic: bool = True
     queryable: bool = False
     latest_only: bool = False
@@ -105,7 +105,7 @@ FRAME = Topic(
     Rate.LOOP,
     _CAMERA,
     "Sensor image, mono16, DN; its time is the end of the exposure.",
-    subscribers=_CONTROLLER | _MONITORS,
+    subscribers=_CONTROLLER | _OUTSIDE_LOOP,
     latest_only=True,
     direct_subscriber=Role.CONTROLLER,
     optional=True,
@@ -161,7 +161,7 @@ MIRROR_STATE = Topic(
     Rate.LOOP,
     _MIRROR,
     "The shape of the mirror.",
-    subscribers=_CONTROLLER | _CAMERA | _MONITORS,
+    subscribers=_CONTROLLER | _CAMERA | _OUTSIDE_LOOP,
     latest_only=True,
     optional=True,
 )
@@ -219,7 +219,7 @@ BENCH = Topic(
     Rate.EVENT,
     frozenset({Role.BENCH, Role.OPERATOR}),
     "A value of another device on the bench, for interlocks; the controller subscribes to the configured names.",
-    subscribers=_CONTROLLER | _MONITORS,
+    subscribers=_CONTROLLER | _OUTSIDE_LOOP,
     deterministic=False,
     queryable=True,
 )

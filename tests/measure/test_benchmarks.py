@@ -14,7 +14,7 @@ import pytest
 from benchmarks import curves, kernels, load, runner, step, streams, throughput
 from benchmarks.peers import comparison, implementations
 from benchmarks.peers.implementations import FUSED, IMPLEMENTATIONS
-from benchmarks.peers.shared import ACTUATORS, TIME_STAMPS, NumpyStep, Problem
+from benchmarks.peers.shared import ACTUATORS, TIME_STAMPS, NumpyStep, RunData
 from benchmarks.sizes import Size, configuration, random_calibration
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.sections import Camera
@@ -172,7 +172,7 @@ def test_the_search_finds_the_highest_sustained_rate_despite_one_wrong_result(ed
 
 def good(**changed: Any) -> dict[str, Any]:
     latency_us = {"p50": 200.0, "p99": 400.0}
-    one = {"asked_hz": 1000.0, "rate_hz": 995.0, "frames": 10_000, "without_command": 10, "messages_lost": 0}
+    one = {"requested_hz": 1000.0, "rate_hz": 995.0, "frames": 10_000, "without_command": 10, "messages_lost": 0}
     return one | {"frame_to_command_us": latency_us, "usage": {}} | changed
 
 
@@ -184,7 +184,7 @@ def good(**changed: Any) -> dict[str, Any]:
         (good(rate_hz=989.0), ["989 frames a second"]),
         (good(without_command=11), ["0.11 % of the frames without a command"]),
         (good(messages_lost=1), ["1 messages lost"]),
-        ({"asked_hz": 1000.0, "failure": "it fell"}, ["it fell"]),
+        ({"requested_hz": 1000.0, "failure": "it fell"}, ["it fell"]),
     ],
 )
 def test_a_rate_is_sustained_if_there_is_no_complaint(one: dict[str, Any], complaints: list[str]) -> None:
@@ -197,12 +197,12 @@ def test_a_loop_has_its_highest_rate_and_the_reason_for_its_limit(monkeypatch: p
 
     def run_once(words: Sequence[str], rate_hz: float, seconds: float) -> dict[str, Any]:
         lost = 0 if rate_hz <= 1300 else 7
-        return good(asked_hz=rate_hz, rate_hz=rate_hz, messages_lost=lost, usage=usage, commands_late=0.25)
+        return good(requested_hz=rate_hz, rate_hz=rate_hz, messages_lost=lost, usage=usage, commands_late_fraction=0.25)
 
     monkeypatch.setattr(throughput, "run_once", run_once)
     rates = throughput.grid(1000, 2000, 1.1)
     loop = throughput.find([], rates, 1.0, lambda _: None)
-    assert (loop["highest_hz"], loop["run"]["rate_hz"], loop["above"]["asked_hz"]) == (1210, 1210, 1331)
+    assert (loop["highest_hz"], loop["run"]["rate_hz"], loop["above"]["requested_hz"]) == (1210, 1210, 1331)
     none = throughput.find([], [1400.0], 1.0, lambda _: None)
     assert none["highest_hz"] is None
     result = {"loops": {"simulated": loop, "none": none}, "seconds": 1.0, "rates_hz": rates}
@@ -220,7 +220,7 @@ def test_a_real_loop_with_the_simulated_camera_is_measured() -> None:
     one = throughput.run_once(throughput.LOOPS["simulated camera, recorder"], 100.0, 1.5)
     assert 0 < one["frames"] <= 151
     assert one["messages_lost"] is not None
-    assert 0 <= one["commands_late"] <= 1
+    assert 0 <= one["commands_late_fraction"] <= 1
     assert set(one["usage"]) == {*load.LOOP, "recorder"}
 
 
@@ -265,7 +265,7 @@ def rules(*words: str | Path) -> Namespace:
 
 def one(p50: float, p99: float, without: int = 0) -> dict[str, Any]:
     span = {"p50": p50, "p99": p99, "p99_9": 2 * p99, "max": 3 * p99}
-    counts = {"frames": 1000, "without_command": without, "sent_late": 0, "off": 1e-6}
+    counts = {"frames": 1000, "without_command": without, "sent_late": 0, "command_error": 1e-6}
     return counts | {"frame_to_command": span, "frame_to_mirror": None}
 
 
@@ -283,10 +283,10 @@ def test_the_statistics_of_a_run_are_computed_from_its_times(tmp_path: Path) -> 
     assert found["without_command"] == found["sent_late"] == 1
     assert found["frame_to_command"] == {"p50": 5.0, "p90": 6.0, "p99": 6.0, "p99_9": 6.0, "max": 6.0}
     assert set(found["frame_to_mirror"].values()) == {50.0}
-    assert found["off"] is None
+    assert found["command_error"] is None
     commanded.fill(1)
     commanded.tofile(tmp_path / "commanded")
-    assert comparison.run_statistics(tmp_path, 2)["off"] == 1  # no actuators were received
+    assert comparison.run_statistics(tmp_path, 2)["command_error"] == 1  # no actuators were received
 
 
 def test_the_tables_have_ranges_differences_within_a_turn_and_missing_implementations() -> None:
@@ -334,13 +334,13 @@ def test_a_missing_implementation_is_reported_with_a_remedy(tmp_path: Path, monk
 
 def test_the_step_is_an_integrator_with_a_leak(tmp_path: Path) -> None:
     comparison.write_shared_files(tmp_path, 1)
-    problem = Problem(tmp_path)
-    plain_step, pixels = NumpyStep(problem), problem.frame(0)
-    error_nm = problem.R @ (pixels.ravel() - problem.I0)
+    run_data = RunData(tmp_path)
+    plain_step, pixels = NumpyStep(run_data), run_data.frame(0)
+    error_nm = run_data.R @ (pixels.ravel() - run_data.I0)
     for command_nm in (-0.3 * error_nm, -0.3 * 1.99 * error_nm):
         actuators = np.frombuffer(plain_step.command(pixels.tobytes()), np.float32)
         assert actuators.shape == (ACTUATORS,)
-        np.testing.assert_allclose(actuators, problem.to_actuators @ command_nm, rtol=1e-3, atol=1e-3)
+        np.testing.assert_allclose(actuators, run_data.to_actuators @ command_nm, rtol=1e-3, atol=1e-3)
 
 
 @pytest.mark.exclusive
@@ -359,7 +359,7 @@ def test_a_real_run_of_an_implementation(chosen: implementations.Implementation)
     to_command, to_mirror = found["frame_to_command"], found["frame_to_mirror"]
     assert 0 < to_command["p50"] <= to_command["p99"] <= to_command["max"]
     assert to_mirror["max"] > to_command["p50"]
-    assert (found["off"] or 0) < 1e-4  # None if a frame has no command
+    assert (found["command_error"] or 0) < 1e-4  # None if a frame has no command
 
 
 # Kernels
