@@ -88,7 +88,10 @@ def run_app(app: Callable[[], object]) -> NoReturn:
 def configuration(
     file: Path | None, overrides: dict[str, Any] | None = None, defaults: dict[str, Any] | None = None
 ) -> "Configuration":
-    """Configuration from a file; command-line options that are not None override it, it overrides the defaults."""
+    """Load the configuration.
+
+    Command-line options that are not None override the file; the file overrides the defaults.
+    """
     from lowfc.contract.configuration import load
 
     overriding = {key: value for key, value in (overrides or {}).items() if value is not None}

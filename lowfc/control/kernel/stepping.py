@@ -63,8 +63,8 @@ def _fused(
 ) -> tuple[Single, Single, Single, Single, Single] | None:
     """Error, pseudo-open-loop modes, command (modes,), x (states,) and actuators (rows, columns) of a normal frame.
 
-    None if the frame is not normal: the loop is not closed, its channels change, a law shares the command with the
-    integrator, or a limit acts.
+    None if the frame is not normal: the loop is not closed, its command returns to zero, a channel moves or a probe
+    sequence is played, a law does not drive it alone, or a limit acts.
     """
     channels, law_runner = loop.command_channels, loop.law_runner
     if state.mode is not LoopMode.CLOSED or state.returning_to_zero or (channels is not None and channels.moving):

@@ -1,7 +1,7 @@
 """A mode's disturbance model of drift, lines and white noise, fitted to the spectrum of pseudo-open-loop modes.
 
-The fit is Whittle's: it minimises the sum of log S + I / S over frequencies, with I the periodogram (Hann's window) and
-S the model's spectrum. A further line must raise the likelihood by more than chance does among all frequencies.
+The fit is Whittle's: it minimises the sum of log P + J / P over frequencies, with J the periodogram (Hann's window) and
+P the model's spectrum. A further line must raise the likelihood by more than chance does among all frequencies.
 """
 
 from dataclasses import dataclass, replace

@@ -34,7 +34,13 @@ class StageTiming:
         self._due_ns = 0
 
     def add(self, frame_sequence: int, published_ns: int, times_ns: tuple[int, int, int, int]) -> None:
-        """Add a step: when its frame was published; when it was received, started, computed and its command sent."""
+        """Add a step.
+
+        Args:
+            frame_sequence: sequence of its frame.
+            published_ns: time at which the frame was published.
+            times_ns: times at which it was received, the step began and was computed, and its command was sent.
+        """
         received_ns, start_ns, ready_ns, sent_ns = times_ns
         message = self._message
         message.frame_sequence.append(frame_sequence)

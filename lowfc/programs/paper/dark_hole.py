@@ -23,8 +23,8 @@ SEED = 5
 SETTLE, WINDOW = 100, 300
 """`SETTLE`: frames after each step. `WINDOW`: further frames after the last step, and after the shape is removed."""
 STEPS_COMBINED = 5
-"""Number of steps combined into one on the channel that does not shift the zero point; the loop undoes a large fraction
-of these."""
+"""Number of steps combined into one on the channel that does not shift the zero point. The loop undoes nearly all of
+its shape, so fewer steps suffice to measure that fraction."""
 SHIFTED, PLAIN = "dark-hole", FLAT
 """Channels that shift the sensor's zero point, and that do not."""
 GAINS = "[control]\ntilt_gain = 0.5\ngain = 0.05\n"

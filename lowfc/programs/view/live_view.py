@@ -2,8 +2,8 @@
 
 Messages wait in ring buffers that keep the newest. A render thread draws them; the main thread monitors that thread,
 the viewer's process, and the memory of this process and of the viewer. After a failure the viewer restarts, with an
-event that gives the reason; a hung window is only reported, a closed one ends the view, and a failed file ends it with
-an error.
+event that gives the reason; a hung window is only reported, a closed one ends the view, and a failure to
+write the file ends it with an error.
 """
 
 import platform
@@ -30,8 +30,8 @@ from lowfc.programs.view.snapshot import SHOWN
 from lowfc.programs.view.target import Target
 
 RING_LENGTHS = {topic: 1 if topic.latest_only else 100 for topic in SHOWN} | {STEP: 2000, TRUTH: 2000}
-"""Messages kept by each ring buffer: 1 for pictures, 2000 (two seconds at 1 kHz) for steps and truths, 100 for the
-others. A message may have 16 kB."""
+"""Messages kept by each ring buffer: 1 of images and mirror states, 2000 (two seconds at 1 kHz) of steps and truths,
+100 of the others. Each kept message holds its receive buffer of 16 kB."""
 OWN_BYTES = 512_000_000
 """Memory of this process above which the view restarts. Normal use is at most 390 MB: 160 MB for the process itself, 80
 MB in ring buffers, and 150 MB that the viewer has not read."""

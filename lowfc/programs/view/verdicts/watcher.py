@@ -38,7 +38,8 @@ SILENT_S = 2.0
 FRAMES_SILENT_S = 1.0
 """Time without a frame or a step after which it is reported as missing, but at least `PERIODS` frame periods."""
 PERIODS = 10
-"""Minimum length of every time span here, in frame periods, for slow cameras."""
+"""Minimum length of the time spans above and of `NOW_S`, in frame periods, for slow cameras; samples are kept for
+`RECENT_S` and this number of periods."""
 COMPARISON_PERIOD_NS = 30_000_000_000
 """Time between two computations of the best gains, which take 0.3 s for 14 modes."""
 _SAMPLES = 1000
