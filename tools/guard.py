@@ -180,11 +180,13 @@ def render(results: Results) -> str:
         for magnitude, found in results["good"].items()
     )
     cost = results["cost_us"]
+    complete = all(len(found) == len(SEEDS) for found in results["good"].values())
+    partly = "" if complete else f" The command makes {len(SEEDS)} runs for each V, of which these are stored."
     return (
         f"{rows}\nTrue tilt from 1 s to 3 s after the lines moved, V = 0, 1 kHz. Laws are LQG, "
         f"identified from {_IDENTIFY / RATE_HZ:g} s of the closed loop; the integrator has the best gains for the same "
         f"frames. Good laws, for {results['minutes']:g} minutes each, with unmodelled steps of {2 * STEPS_MAS:g} mas "
-        f"every 2 s, were overruled: {good}. With a law of 14 modes the guard adds {cost['driving']:.1f} us "
+        f"every 2 s, were overruled: {good}.{partly} With a law of 14 modes the guard adds {cost['driving']:.1f} us "
         f"to a frame while the law drives, {cost['virtual']:.1f} us while it does not. Modes, with noise "
         "of the covariance that R gives for the images, pass through the live loop's own `advance`; no images are "
         "simulated."

@@ -12,9 +12,9 @@ from lowfc.arrays import Array, Single
 from lowfc.contract.codecs.state_codec import controller_state, decode_state
 from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
 from lowfc.control.calibration.calibration import Calibration
-from lowfc.control.calibration.map_reconstructor import noise_covariance_nm2
+from lowfc.control.calibration.map_reconstructor import map_reconstructor, noise_covariance_nm2
 from lowfc.control.laws.automatic_gain import GainBank, TiltCrossTalk
-from lowfc.control.laws.integrator import RELAXING
+from lowfc.control.laws.integrator import RELAXING, TIP_TILT
 from lowfc.control.loop.safety import LoopMode
 from tests.support.in_process_loop import SMALL_MIRROR
 from tools.law_bench import Bench, calibrated, configured
@@ -116,6 +116,20 @@ def test_automatic_gains_leave_at_most_ten_percent_more_residual_than_fixed_gain
         loop.run(frames // 3)
         residual_nm.append(rms_nm(loop, frames // 3)[0])
     assert residual_nm[0] < 1.1 * residual_nm[1]
+
+
+def test_the_noise_of_tip_falls_to_a_quarter_if_only_tip_and_tilt_are_corrected() -> None:
+    """Default sensor, V = 5, 1 kHz; each uncorrected mode has 1 nm rms."""
+    config = load(None, {"star.magnitude": 5.0, "camera.rate_hz": 1000.0})
+    known = calibrated(config)
+    prior_nm2 = 1.0 - np.isin(config.noll, TIP_TILT)
+    rows = map_reconstructor(known, prior_nm2, known.flux_dn, known.camera)
+    noise_nm = [
+        float(np.sqrt(noise_covariance_nm2(one, known.flux_dn, known.camera)[0, 0]))
+        for one in (known, replace(known, reconstructor=rows))
+    ]
+    assert len(config.noll) == 14
+    assert noise_nm == pytest.approx([42, 10], rel=0.02)
 
 
 def test_modes_not_corrected_reduce_the_noise_of_the_others(faint: Bench) -> None:
