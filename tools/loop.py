@@ -14,7 +14,7 @@ from tools.shared import Results, columns, json_of
 LOOP = "lowfc sim-loop --disturbance reaction-wheel --star-magnitude 2 --sensor sam27d10_bal14 --duration 20"
 KEYS = {"disturbance.preset": "reaction-wheel", "star.magnitude": 2.0, "sensor.sam": "sam27d10_bal14"}
 """The configuration behind `LOOP`."""
-NORMAL = "[realtime]\npriority = 0\nlock_memory = false\nstay_awake = false\n"
+NORMAL = "[realtime]\npriority = 0\nlock_memory = false\ndisable_cpu_idle = false\n"
 RUNS = (
     ("250 Hz, SCHED_FIFO", 250, "", ""),
     ("250 Hz, normal scheduling", 250, "", NORMAL),
@@ -67,10 +67,10 @@ SHORT_COLUMNS = {
 }
 
 
-SHORT_NOTE = """\
-The star has V = 2. Latency is from sending the frame to sending the command; read-out is not included. The jitter is
-drawn frame by frame, so its realisation differs between rates. [Performance](docs/measured/performance.md) has all
-runs and the method."""
+SHORT_NOTE = f"""\
+The sensor is `{KEYS["sensor.sam"]}`; the star has V = {KEYS["star.magnitude"]:g}. Latency is from sending the frame
+to sending the command; read-out is not included. The jitter is drawn frame by frame, so its realisation differs
+between rates. [Performance](docs/measured/performance.md) has all runs and the method."""
 
 
 def short(results: Results) -> str:
