@@ -39,7 +39,7 @@ TITLE_ROWS = 30
 @pytest.fixture(scope="module")
 def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Name of a run whose loop is closed."""
-    process = start(tmp_path_factory.mktemp("loop"), "sim-loop", "--rate", "100", "--no-record")
+    process = start(tmp_path_factory.mktemp("loop"), "sim-loop", "--rate", "50", "--no-record")
     try:
         until(lambda: running() or process.poll() is not None)
         yield running()[0]
