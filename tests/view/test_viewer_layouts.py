@@ -154,8 +154,8 @@ def rerun_layout(path: Path) -> tuple[str, Counter[str], set[tuple[str, str]]]:
 def test_rerun_layouts_are_up_to_date(tmp_path: Path) -> None:
     layouts.make(tmp_path)
     for name in ("lowfc.rbl", "log.rbl"):
-        up_to_date = rerun_layout(LAYOUTS / name) == rerun_layout(tmp_path / name)
-        assert up_to_date, f"{name} is out of date: regenerate it with `python -m tools.measure layouts`"
+        remedy = f"{name} is out of date: regenerate it with `python -m tools.measure layouts`"
+        assert rerun_layout(LAYOUTS / name) == rerun_layout(tmp_path / name), remedy
     _, names, mappings = rerun_layout(LAYOUTS / "log.rbl")
     assert names[f"ViewBlueprint:space_origin /{TRUTH.key}"] == 2
     assert len(mappings) == 15

@@ -88,10 +88,7 @@ def run_app(app: Callable[[], object]) -> NoReturn:
 def configuration(
     file: Path | None, overrides: dict[str, Any] | None = None, defaults: dict[str, Any] | None = None
 ) -> "Configuration":
-    """Load the configuration.
-
-    Command-line options that are not None override the file; the file overrides the defaults.
-    """
+    """Load the configuration: options that are not None override the file, and the file overrides the defaults."""
     from lowfc.contract.configuration import load
 
     overriding = {key: value for key, value in (overrides or {}).items() if value is not None}
