@@ -378,6 +378,19 @@ def test_safe_mode_of_a_mirror_that_reports_late_removes_the_channels() -> None:
     assert not loop.state.loop.command_channels.channels
 
 
+def test_a_calibration_loaded_in_safe_mode_leaves_nothing_on_the_mirror() -> None:
+    loop = ToyLoop(replace(DEFAULTS, limits=Limits(700.0, 10.0, 400.0)))
+    assert loop.ask("channel", text="dark-hole", actuators_nm=dark_hole(60.0).reshape(-1)).accepted
+    loop.run(60)
+    assert loop.ask("safe").accepted
+    assert loop.take(Request(0, "load", calibration=replace(calibration(scale=1.01), id="other"))).reply.accepted
+    assert loop.surfaces[-1].any(), "it has not reached flat yet"
+    loop.run(60)
+    assert loop.ask("clear").accepted
+    loop.run(60)
+    assert not loop.surfaces[-1].any()
+
+
 @pytest.mark.parametrize("signal", [None, "error", "pol"])
 def test_an_offset_moves_the_loop_but_not_the_pseudo_open_loop_modes(signal: Signal | None) -> None:
     """For the integrator, and for laws of the error and of pseudo-open-loop modes."""

@@ -7,11 +7,12 @@ from lowfc.contract.codecs import codec
 from lowfc.contract.messages import wire
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.command_channels import MIRROR
-from lowfc.control.loop.inputs import Outputs, Request
+from lowfc.control.loop.inputs import Load, Outputs, Request
 from lowfc.control.loop.interlocks import Action, BenchReport, Interlock, Value
+from lowfc.control.loop.loading import holding_cause
 from lowfc.control.loop.safety import LoopMode, Rejection
 from lowfc.control.loop.state import Settings, State
-from tests.support.toy import GRID, SOME, answered, feed, frame, loaded, names, settings
+from tests.support.toy import GRID, SOME, answered, calibration, feed, frame, loaded, names, settings
 
 S = 1_000_000_000
 MOVER = 7
@@ -129,6 +130,15 @@ def test_an_interlock_that_refuses_to_close_opens_a_loop_that_starts_closed(acti
     for value in (None, True):
         state, _ = feed(setup, loaded(setup), mask(value))
         assert state.mode is (LoopMode.SAFE if action is Action.SAFE else LoopMode.OPEN)
+
+
+def test_a_loop_that_starts_closed_is_held_by_a_hold_that_acts_before_or_after_it_loads() -> None:
+    setup = under(Action.HOLD)
+    before, _ = feed(setup, State(), mask(True), Load(0, calibration(), "test"))
+    after, _ = feed(setup, loaded(setup), mask(True))
+    for state in (before, after):
+        assert state.mode is LoopMode.CLOSED
+        assert holding_cause(state) == "an interlock acts: mask is true"
 
 
 def test_only_a_change_of_the_condition_is_a_logged_input() -> None:

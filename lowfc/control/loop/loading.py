@@ -28,8 +28,8 @@ def loaded(
     """The state with another calibration, and the events.
 
     If the mirror has the same grid, it keeps its shape: the channels stay, the rest becomes a command of the new modes,
-    and the part outside the modes becomes a channel. A probe sequence ends; offset and law are kept only for the
-    same modes.
+    and the part outside the modes becomes a channel (not in safe mode). A probe sequence ends; offset and law are kept
+    only for the same modes.
     """
     loop, before = ActiveLoop.at_rest(settings, calibration), state.loop
     details: dict[str, object] = {
@@ -56,8 +56,9 @@ def loaded(
             actuators_nm=before.actuators_nm,
             history_nm=(command_nm,) * len(loop.history_nm),
         )
-        loop, rest = adopted(loop, shape_nm)
-        events += rest
+        if state.mode is not LoopMode.SAFE:  # in safe mode it relaxes to flat and stays there
+            loop, rest = adopted(loop, shape_nm)
+            events += rest
     before_mode, cause = state.mode, "a calibration was loaded"
     mode = settings.start_mode if before_mode is LoopMode.IDLE else before_mode
     if mode is LoopMode.SAFE:
@@ -65,11 +66,12 @@ def loaded(
     elif before_mode is LoopMode.IDLE and mode is LoopMode.CLOSED and loop.automatic.any():
         mode, cause = LoopMode.OPEN, MEASURED_FIRST
     state = state._replace(loop=loop)
+    opening = tuple(one for one in state.conditions.acting if one.action is not Action.HOLD)  # which holds the loop
     if mode is not LoopMode.SAFE and (wrong := uncalibrated(state)):
         mode, cause = LoopMode.IDLE, wrong
     elif mode is LoopMode.CLOSED and (wrong := misfit(state)):
         mode, cause = LoopMode.OPEN, f"{CAMERA_MISFIT}: {wrong}"
-    elif mode is LoopMode.CLOSED and (wrong := refusal(state.conditions.acting, "close")):
+    elif mode is LoopMode.CLOSED and (wrong := refusal(opening, "close")):
         mode, cause = LoopMode.OPEN, wrong
     if mode is not before_mode:
         events.append(mode_event(before_mode, mode, cause))
