@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lowfc.contract.codecs.codec import decode_mirror
 from lowfc.contract.configuration import load
 from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.errors import ConfigurationError
@@ -247,6 +248,16 @@ def test_a_failed_mirror_goes_flat_before_it_follows_commands_again(bad: Any, me
     assert len(failed) == 1
     assert message in failed[0]
     assert bench.service.health().driver_failures == 2
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.int32])
+def test_positions_of_any_number_type_are_reported_as_float32(dtype: type) -> None:
+    mirror = Mirror()
+    bench = Bench(mirror)
+    mirror.plan = [lambda commanded: (commanded - 40).astype(dtype)]
+    shape = decode_mirror(bench.command(140.0).SerializeToString())
+    assert shape is not None
+    assert (shape.actuators_nm == 100).all()
 
 
 def test_a_hanging_mirror_reports_no_position_and_goes_flat_before_the_next_command() -> None:
