@@ -29,7 +29,8 @@ class MirrorWatch:
         self.applied: deque[tuple[int, int]] = deque(maxlen=WAITING)
         self._events: Ring = bus.ring(EVENT, WAITING)
         self._states: Ring = bus.ring(MIRROR_STATE, WAITING)
-        self._mirrors: dict[str, tuple[int, int]] = {}  # by name: start of its process, frame of its command
+        # by name: start of its process, frame of its command, whether it follows commands
+        self._mirrors: dict[str, tuple[int, int, bool]] = {}
         deadline_s = time.monotonic() + SILENT_S
         self.read()
         while not self._mirrors:
@@ -41,7 +42,7 @@ class MirrorWatch:
     @property
     def frame_sequence(self) -> int:
         """See the class."""
-        return min(sequence for _, sequence in self._mirrors.values())
+        return min(sequence for _, sequence, _ in self._mirrors.values())
 
     def read(self) -> None:
         """Process the messages received since the last call, without blocking."""
@@ -51,11 +52,17 @@ class MirrorWatch:
                 state = wire.MirrorState.FromString(sample.payload)
             except DecodeError:
                 continue
-            if self._mirrors.get(name, (start_s, 0))[0] != start_s:
+            known_start_s, frame_sequence, followed = self._mirrors.get(name, (start_s, 0, False))
+            if known_start_s != start_s:
                 self.interruption = f"the mirror {name!r} restarted"
-            if state.frame_sequence > self._mirrors.get(name, (start_s, 0))[1]:
+            elif state.refused == wire.REASON_NO_MIRROR:
+                self.interruption = f"the mirror {name!r} did not follow commands, because its driver failed"
+            elif followed and state.status == wire.MIRROR_STATUS_EXPIRED:
+                self.interruption = f"the mirror {name!r} did not follow commands, because the last one expired"
+            if state.frame_sequence > frame_sequence:
                 self.applied.append((state.frame_sequence, sample.publish_time_ns))
-            self._mirrors[name] = start_s, state.frame_sequence
+            follows = state.status == wire.MIRROR_STATUS_FOLLOWING
+            self._mirrors[name] = start_s, state.frame_sequence, follows
         for sample in self._events.drain():
             try:
                 event = Log.FromString(sample.payload)

@@ -49,7 +49,7 @@ from lowfc.control.laws.linear_law import integrator_block, law_from_blocks
 from lowfc.control.loop.inputs import Reply, Request, Step
 from lowfc.control.loop.interlocks import Value
 from lowfc.control.loop.requests import REQUESTS
-from lowfc.control.loop.safety import Limit, LoopMode
+from lowfc.control.loop.safety import Limit, LoopMode, Rejection
 from lowfc.programs.cli.modes import noll_of
 from lowfc.programs.cli.status import json_object, text
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub, MemoryRing
@@ -383,6 +383,24 @@ def test_mirror_watch_reports_restarts_and_expired_commands_and_ignores_damaged_
     bus.publisher(EVENT).put(expired.SerializeToString())
     watch.read()
     assert watch.interruption.startswith("mirror-slow was without commands for too long (COMMAND_EXPIRED ")
+
+
+@pytest.mark.parametrize(("refused", "why"), [(Rejection.NO_MIRROR, "its driver failed"), (0, "the last one expired")])
+def test_mirror_watch_reports_a_mirror_that_stopped_following(refused: int, why: str) -> None:
+    hub = MemoryHub()
+    states = MemoryBus(hub, "mirror-dm", HostClock()).publisher(MIRROR_STATE, "dm")
+
+    def report(status: int, refused: int = 0) -> None:
+        states.put(wire.MirrorState(status=status, refused=refused).SerializeToString())
+
+    watch = Client(bus=Announced(hub, lambda: report(wire.MIRROR_STATUS_EXPIRED))).mirror_watch()
+    report(wire.MIRROR_STATUS_FOLLOWING)
+    watch.read()
+    assert watch.interruption == "", "it did not follow before"
+    report(wire.MIRROR_STATUS_EXPIRED, refused)
+    report(wire.MIRROR_STATUS_FOLLOWING)
+    watch.read()
+    assert watch.interruption == f"the mirror 'dm' did not follow commands, because {why}"
 
 
 class Announced(MemoryBus):
