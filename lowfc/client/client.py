@@ -1,7 +1,6 @@
 """An operator's requests to a running loop, from Python."""
 
 import contextlib
-import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -20,20 +19,21 @@ from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.host import by_this_process, program_name
 from lowfc.client.answer import Answer
+from lowfc.client.bench import bench_message
 from lowfc.client.lease import Lease, new_identity
 from lowfc.client.mirror_watch import MirrorWatch
 from lowfc.client.requests import BY_NAME
 from lowfc.client.runs import starting, the_run
 from lowfc.client.stream import SILENT_S, WAITING, Frame, Stream, frame_of, step_of
-from lowfc.contract.codecs.bench_codec import encode_bench_value
 from lowfc.contract.codecs.calibration_codec import camera_settings, decode_calibration, encode_calibration
 from lowfc.contract.codecs.codec import most_bytes
 from lowfc.contract.codecs.law_codec import wire_law
-from lowfc.contract.errors import BadMessageError, BusError, ConfigurationError, LowfcError, RequestRefusedError
+from lowfc.contract.errors import BusError, LowfcError, RequestRefusedError
 from lowfc.contract.messages import (
     BENCH,
     CALIBRATION,
     CAMERA_STATE,
+    CONTROLLER_STATE,
     FRAME,
     HEALTH,
     LAW,
@@ -45,7 +45,6 @@ from lowfc.contract.messages import (
     wire,
 )
 from lowfc.contract.published import Published
-from lowfc.contract.sections import BENCH_NAME
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.loop.camera import CameraSettings
@@ -239,12 +238,7 @@ class Client:
         Raises:
             ConfigurationError: the name or the value is invalid.
         """
-        if not re.fullmatch(BENCH_NAME, name):
-            raise ConfigurationError(f"a bench value's name has up to 64 of A-Z, a-z, 0-9, _ and -, got {name[:80]!r}")
-        try:
-            message = encode_bench_value(float(value) if type(value) is int else value, HostClock().now_ns())
-        except BadMessageError as fault:
-            raise ConfigurationError(f"bench value {name}: {fault}") from None
+        message = bench_message(name, value, HostClock().now_ns())
         if name not in self._bench:
             self._bench[name] = self._bus.publisher(BENCH, name)
         self._bench[name].put(message)
@@ -264,10 +258,16 @@ class Client:
 
     def calibration(self) -> Calibration:
         """The calibration in use; BusError if there is none, or the answer is not a calibration."""
-        message = self._get_message(CALIBRATION, wire.Calibration, Role.CONTROLLER)
         try:
-            return decode_calibration(message)
-        except ValueError as fault:
+            sample = self._get(CALIBRATION.key, b"", ANSWER_S)
+        except BusError:
+            if self._get_message(CONTROLLER_STATE, wire.ControllerState, Role.CONTROLLER).calibration_id:
+                raise
+            remedy = "`lowfc ctl load FILE` loads one, `lowfc commission` measures one"
+            raise BusError(f"no calibration is loaded in run {self.run_id!r}: {remedy}") from None
+        try:
+            return decode_calibration(wire.Calibration.FromString(sample.payload))
+        except (DecodeError, ValueError) as fault:
             raise BusError(f"the answer to {CALIBRATION.key} is not a calibration: {fault}") from None
 
     def camera(self) -> CameraSettings | None:
@@ -391,7 +391,9 @@ class Client:
 
     def _mirror_grid(self) -> tuple[int, int]:
         if self._grid is None:  # the grid is fixed within a run
-            self._grid = self.calibration().grid
+            state = self._get_message(CONTROLLER_STATE, wire.ControllerState, Role.CONTROLLER)
+            uncalibrated = state.mirror_rows, state.mirror_columns
+            self._grid = uncalibrated if state.mirror_rows else self.calibration().grid
         return self._grid
 
 

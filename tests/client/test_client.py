@@ -34,6 +34,7 @@ from lowfc.contract.messages import (
     BENCH,
     CALIBRATION,
     CAMERA_STATE,
+    CONTROLLER_STATE,
     EVENT,
     FRAME,
     MIRROR_STATE,
@@ -72,6 +73,8 @@ class FakeController:
         self.bus.queryable(REQUEST_KEY.format(name="*"), self._answer)
         self.calibrations = self.bus.publisher(CALIBRATION)
         self.calibrations.put(encode_calibration(KNOWN, 0))
+        self.states = self.bus.publisher(CONTROLLER_STATE)
+        self.states.put(wire.ControllerState(calibration_id=KNOWN.id).SerializeToString())
         self.requests: list[Request] = []
         self.reply = Reply(True, "done", 77)
         self.silent = False
@@ -245,6 +248,18 @@ def test_an_absent_and_a_silent_controller_give_different_errors(controller: Fak
             BusError, match="no controller is there in run 'default': start one, as with `lowfc controller`"
         ):
             ask()
+
+
+def test_a_controller_without_a_calibration_accepts_a_channel_of_the_mirrors_grid(controller: FakeController) -> None:
+    controller.calibrations.last = None
+    controller.states.put(wire.ControllerState(mirror_rows=4, mirror_columns=5).SerializeToString())
+    loop = controller.join()
+    loop.channel("flat", SHAPE)
+    assert [one.text for one in controller.requests] == ["flat"]
+    with pytest.raises(RequestRefusedError, match=r"the mirror has actuators of shape \(4, 5\)"):
+        loop.channel("flat", SHAPE.T)
+    with pytest.raises(BusError, match=r"^no calibration is loaded in run 'default': `lowfc ctl load FILE` loads one"):
+        loop.calibration()
 
 
 def test_the_configuration_of_a_loop_is_read_and_another_versions_is_refused(

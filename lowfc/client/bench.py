@@ -1,0 +1,18 @@
+"""Values of other devices on the bench, for interlocks."""
+
+import re
+
+from lowfc.contract.codecs.bench_codec import encode_bench_value
+from lowfc.contract.errors import BadMessageError, ConfigurationError
+from lowfc.contract.sections import BENCH_NAME
+from lowfc.control.loop.interlocks import Value
+
+
+def bench_message(name: str, value: Value, time_ns: int) -> bytes:
+    """BenchValue of a device's value at this time; ConfigurationError if its name or the value is invalid."""
+    if not re.fullmatch(BENCH_NAME, name):
+        raise ConfigurationError(f"a bench value's name has up to 64 of A-Z, a-z, 0-9, _ and -, got {name[:80]!r}")
+    try:
+        return encode_bench_value(float(value) if type(value) is int else value, time_ns)
+    except BadMessageError as fault:
+        raise ConfigurationError(f"bench value {name}: {fault}") from None
