@@ -187,6 +187,20 @@ def test_a_refused_request_shows_its_reason_and_turns_its_button_red(run: LiveRu
     operate(run, scenario)
 
 
+def test_auto_is_for_gains_only(run: LiveRun) -> None:
+    async def scenario(screen: Screen) -> None:
+        before = len(run.requests)
+        for key, values in (("l", ("auto", "")), ("t", ("auto",))):
+            await screen.pilot.press(key)
+            await screen.fill(*values)
+            await screen.until(lambda: "'auto': write numbers" in str(screen.app.screen.query_one("#refusal").render()))
+            await screen.pilot.press("escape")
+            await screen.until(lambda: len(screen.app.screen_stack) == 1)
+        assert len(run.requests) == before
+
+    operate(run, scenario)
+
+
 def test_safe_is_requested_by_s_by_its_button_and_by_f12_in_a_form(run: LiveRun) -> None:
     async def scenario(screen: Screen) -> None:
         for press in (lambda: screen.pilot.press("S"), lambda: screen.pilot.click("#safe")):

@@ -106,7 +106,7 @@ def requested(key: str, name: str, confirm: str = "") -> Action:
     declared = BY_NAME[name]
 
     def ask(loop: Client, values: Values) -> Answer:
-        if values.get("values") == AUTO:
+        if name == "gain" and values["values"] == AUTO:
             return loop.automatic_gain(_READERS["modes"][1](values["modes"]))
         read = {_READERS[field][0]: _READERS[field][1](text) for field, text in values.items()}
         if name == "channel":  # this method of the client checks the shape against the mirror's grid
