@@ -14,6 +14,7 @@ from textual.events import Key
 from lowfc.adapters.files import calibration_file, law_file
 from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import EVENT, wire
 from lowfc.control.laws.linear_law import integrator_block, law_from_blocks
@@ -308,6 +309,16 @@ def test_tasks_are_commands_with_the_options_of_their_form(run: LiveRun, monkeyp
             assert command.endswith(f".fits --load --run {RUN}")
 
     operate(run, scenario)
+
+
+def test_load_in_the_form_of_a_task_is_yes_or_no() -> None:
+    from lowfc.programs.console.actions import ALL_ACTIONS
+
+    dark = ALL_ACTIONS["dark"]
+    for answer, expected in (("y", ["--load"]), ("Yes", ["--load"]), ("n", []), ("NO", []), ("", [])):
+        assert dark.command({"load": answer}, RUN) == [*dark.task, *expected, "--run", RUN]
+    with pytest.raises(ConfigurationError, match="load is yes or no, got 'yep': write yes, y, no or n"):
+        dark.command({"load": "yep"}, RUN)
 
 
 class FinishedTask:

@@ -42,7 +42,10 @@ class Action(NamedTuple):
     def command(self, values: Values, run: str) -> list[str]:
         """Arguments of `lowfc` for the task."""
         options = [word for name, value in values.items() if value and name != LOAD for word in (f"--{name}", value)]
-        load = ["--load"] if values.get(LOAD, "").lower() in ("y", "yes") else []
+        answer = values.get(LOAD, "").lower()
+        if answer not in ("y", "yes", "n", "no", ""):
+            raise ConfigurationError(f"load is yes or no, got {answer!r}: write yes, y, no or n; empty is no")
+        load = ["--load"] if answer in ("y", "yes") else []
         return [*self.task, *options, *load, "--run", run]
 
 
