@@ -13,6 +13,7 @@ from textual.events import Key
 
 from lowfc.adapters.files import calibration_file, law_file
 from lowfc.adapters.process.clock import HostClock
+from lowfc.client import Answer
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.events import EVENTS
@@ -184,6 +185,35 @@ def test_a_refused_request_shows_its_reason_and_turns_its_button_red(run: LiveRu
         await screen.pilot.press("g")
         await screen.fill("0.1", "")
         await screen.until(lambda: not button.has_class("refused"))
+
+    operate(run, scenario)
+
+
+def test_a_form_stays_open_at_the_answer_to_an_earlier_request_of_its_button(
+    run: LiveRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from lowfc.programs.console.actions import ALL_ACTIONS
+
+    answered = threading.Event()
+
+    def slow(*_: object) -> Answer:
+        answered.wait(TIMEOUT_S)
+        return Answer(True, "noted", 0)
+
+    monkeypatch.setitem(ALL_ACTIONS, "note", ALL_ACTIONS["note"]._replace(ask=slow))
+
+    async def scenario(screen: Screen) -> None:
+        await screen.pilot.press("n")
+        await screen.fill("the first")
+        await screen.pilot.press("escape")
+        await screen.until(lambda: len(screen.app.screen_stack) == 1)
+        await screen.pilot.press("n")
+        await screen.until(lambda: len(screen.app.screen_stack) == 2)
+        answered.set()
+        await screen.until(lambda: screen.text("answer") == "note: noted")
+        assert len(screen.app.screen_stack) == 2
+        await screen.fill("the second")
+        await screen.until(lambda: len(screen.app.screen_stack) == 1)
 
     operate(run, scenario)
 

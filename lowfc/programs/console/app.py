@@ -49,11 +49,11 @@ _OTHER_KEYS = (
 
 
 class Answered(Message):
-    """The answer to an action, or the reason why it failed."""
+    """The answer to an action, or the reason why it failed; with the form that requested it, if there was one."""
 
-    def __init__(self, action: Action, text: str, *, ok: bool) -> None:
+    def __init__(self, action: Action, form: Form | None, text: str, *, ok: bool) -> None:
         super().__init__()
-        self.action, self.text, self.ok = action, text, ok
+        self.action, self.form, self.text, self.ok = action, form, text, ok
 
 
 class Console(OrderedKeys):
@@ -208,14 +208,14 @@ class Console(OrderedKeys):
 
     @on(Form.Filled)
     def _filled(self, event: Form.Filled) -> None:
-        self._do(event.action, event.values)
+        self._do(event.form.button, event.values, event.form)
 
     @on(Gains.Turned)
     def _turned(self, event: Gains.Turned) -> None:
         modes, values = ",".join(map(str, event.modes)), " ".join(map(str, event.values))
         self._do(ALL_ACTIONS["gain"], {"modes": modes, "values": values or AUTO})
 
-    def _do(self, action: Action, values: Values) -> None:
+    def _do(self, action: Action, values: Values, form: Form | None = None) -> None:
         """Start a task, or send a request in its own thread.
 
         Requests of the same button wait for each other's answers, except those of SAFE.
@@ -236,9 +236,9 @@ class Console(OrderedKeys):
                     since = f", from frame {answer.frame} on" if answer.frame else ""
                     text = f"{action.name}: {answer.reply}{since}"
             except (LowfcError, OSError, ValueError) as fault:
-                self.post_message(Answered(action, phrased(str(fault)), ok=False))
+                self.post_message(Answered(action, form, phrased(str(fault)), ok=False))
             else:
-                self.post_message(Answered(action, phrased(text), ok=True))
+                self.post_message(Answered(action, form, phrased(text), ok=True))
                 self.call_later(self._tasks.extend, tasks)  # "started" is shown before "done"
 
         self._requesting[action.name] = threading.Thread(target=ask, name=action.name, daemon=True)
@@ -252,12 +252,11 @@ class Console(OrderedKeys):
         self.query_one(f"#{_id(event.action)}").set_class(not event.ok, "refused")
         if event.action.name == "gain" and not event.ok:
             self.query_one(Gains).discard_pending()
-        form = self.screen
-        if isinstance(form, Form) and form.button is event.action:
+        if event.form is self.screen:  # otherwise the operator left it
             if event.ok:
-                form.dismiss()
+                event.form.dismiss()
             else:
-                form.refuse(event.text)
+                event.form.refuse(event.text)
 
     def _answer(self, text: str, *, ok: bool) -> None:
         answer = self.screen_stack[0].query_one("#answer", Static)

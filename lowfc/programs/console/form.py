@@ -35,9 +35,9 @@ class Form(ModalScreen[None]):
     class Filled(Message):
         """The operator pressed OK."""
 
-        def __init__(self, action: Action, values: dict[str, str]) -> None:
+        def __init__(self, form: "Form", values: dict[str, str]) -> None:
             super().__init__()
-            self.action, self.values = action, values
+            self.form, self.values = form, values
 
     def __init__(self, button: Action) -> None:
         super().__init__()
@@ -63,7 +63,7 @@ class Form(ModalScreen[None]):
     @on(Button.Pressed, "#ok")
     def _filled(self) -> None:
         self.refuse("requested, waiting for the answer")
-        self.post_message(self.Filled(self.button, {one.name or "": one.value.strip() for one in self.query(Input)}))
+        self.post_message(self.Filled(self, {one.name or "": one.value.strip() for one in self.query(Input)}))
 
     @on(Button.Pressed, "#leave")
     def _leave(self) -> None:
