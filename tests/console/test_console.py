@@ -6,6 +6,7 @@ import os
 import threading
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -282,6 +283,25 @@ def test_a_gain_knob_scales_the_gains_of_all_modes_or_of_one_radial_order(run: L
         await screen.until(lambda: "auto" not in screen.text("gains"))
 
     operate(run, scenario)
+
+
+def test_a_calibration_with_fewer_modes_leaves_a_knob_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+    from lowfc.programs.console.gains import Gains
+
+    turned: list[Gains.Turned] = []
+    knobs = Gains()
+    monkeypatch.setattr(knobs, "post_message", turned.append)
+
+    def update(*noll: int) -> None:
+        snapshot = SimpleNamespace(controller=wire.ControllerState(gain=[0.5] * len(noll)), noll=noll)
+        knobs.update(SimpleNamespace(state=SimpleNamespace(snapshot=snapshot)))
+
+    update(2, 3, 4, 5, 6, 7)
+    knobs.choose(-1)
+    update(2, 3)
+    knobs.turn(1)
+    knobs.automatic()
+    assert [one.modes for one in turned] == [(2, 3), (2, 3)]
 
 
 def test_keys_typed_while_a_form_opens_are_entered_in_it(run: LiveRun) -> None:

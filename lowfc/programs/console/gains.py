@@ -50,6 +50,7 @@ class Gains(Lines):
         else:
             self._noll, self._gain = noll, np.array(state.gain, np.float32)
             self._automatic = np.array(state.automatic or [False] * len(state.gain), bool)
+            self._chosen = min(self._chosen, max(0, len(groups(noll)) - 1))
         self._draw()
 
     def choose(self, by: int) -> None:
