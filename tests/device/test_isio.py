@@ -4,6 +4,7 @@ import os
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 from lowfc.adapters.image_stream.channels import OtherChannels, channel_names
 from lowfc.adapters.image_stream.stream import StreamError
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.errors import ConfigurationError
+from lowfc.contract.errors import ConfigurationError, RequestRefusedError
 from lowfc.control.loop.safety import Limit
 from lowfc.device.drivers.isio import mirror as mirror_module
 from lowfc.device.drivers.isio.camera import IsioCamera
@@ -20,6 +21,9 @@ from lowfc.device.drivers.isio.mirror import IsioMirror
 from lowfc.device.mirror_loop import protection_of
 from lowfc.device.mirror_protection import Command, Status, apply_command
 from lowfc.device.plugins import options
+from lowfc.programs.bridge import isio as bridge
+from lowfc.testing.clock import FakeClock
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from tests.support.image_streams.plain import PlainStream
 
 CONFIG = Configuration()
@@ -267,3 +271,27 @@ def test_the_stroke_limit_applies_to_the_sum_of_channels() -> None:
     status, _ = apply_command(protection, Status(flat, flat), command, AT_NS, lambda shape, _: shape, flat)
     assert np.array_equal(status.surface_nm, target)
     assert not status.limits_hit
+
+
+def test_a_refused_report_of_other_channels_is_repeated_every_two_seconds(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked_s: list[float] = []
+    refused_until_s = 5.0
+
+    def ask(name: str, shape_nm: np.ndarray) -> None:
+        asked_s.append(round(now_s, 1))
+        assert (name, shape_nm.max()) == ("external", 40)
+        if now_s < refused_until_s:
+            raise RequestRefusedError("reserved by a calibration")
+
+    now_s = 0.0
+    monkeypatch.setattr(bridge, "time", SimpleNamespace(monotonic=lambda: now_s))
+    client: Any = SimpleNamespace(calibration=lambda: SimpleNamespace(grid=GRID), channel=ask)
+    bus = MemoryBus(MemoryHub(), "operator", FakeClock())
+    channel(folder, "dm00disp01", make=True).write(np.full(GRID, 0.04, np.float32))
+    others = bridge.ExternalChannels(client, bus, ["dm00disp01"], 1000.0)
+    for tick in range(100):
+        now_s = tick * 0.1
+        others.pass_on()
+    assert asked_s == [0.0, 2.0, 4.0, 6.0]

@@ -31,6 +31,8 @@ WAITING = 2000
 _POLL_S = 0.005
 _REQUESTS_S = 0.1
 """Shortest time between two requests for a channel that changes continuously."""
+_REFUSED_S = 2.0
+"""Time from a refusal to the next request: each one is in the log."""
 
 
 def bridge_isio(
@@ -114,7 +116,7 @@ class ExternalChannels:
         self._shape: Single | None = None
         self._requested = b""
         self._known: bytes | None = None  # the controller's channel as last reported; None if unknown
-        self._request_time_s = -_REQUESTS_S
+        self._next_request_s = 0.0
         self._fault = ""
 
     def pass_on(self) -> None:
@@ -126,15 +128,15 @@ class ExternalChannels:
         shape, now_s = self._others.sum(), time.monotonic()
         if shape is not self._shape:
             self._shape, self._requested = shape, (shape * self._nm_per_unit).tobytes() if shape.any() else b""
-        if self._requested == self._known or now_s - self._request_time_s < _REQUESTS_S:
+        if self._requested == self._known or now_s < self._next_request_s:
             return
-        self._request_time_s, fault = now_s, ""
+        self._next_request_s, fault = now_s + _REQUESTS_S, ""
         shape_nm = np.frombuffer(self._requested, np.float32).reshape(shape.shape) if self._requested else None
         try:
             self._client.channel(EXTERNAL, shape_nm)
             self._known = self._requested
         except LowfcError as error:
-            fault = str(error)
+            self._next_request_s, fault = now_s + _REFUSED_S, str(error)
         if fault and fault != self._fault:
             names = ", ".join(self._others.names)
             sys.stderr.write(f"{names} not reported to the loop: {printable(fault)}\n")
