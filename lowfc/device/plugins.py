@@ -31,6 +31,12 @@ def load(kind: Kind, name: str) -> Any:
     if colon:
         if module.endswith(".py") and not Path(module).is_file():
             raise ConfigurationError(f"the driver {name!r} cannot be loaded: there is no file {module}")
+        names = [section(name)] if module.endswith(".py") else module.split(".")
+        if not all(one.isidentifier() for one in (*names, *attribute.split("."))):
+            raise ConfigurationError(
+                f"the driver {name!r} cannot be loaded: file and class have names of letters, digits and _, as in "
+                "folder/my_camera.py:MyCamera: rename the file or the class"
+            )
         # `python -P` excludes the current folder
         sys.path.insert(0, str(Path(module).resolve().parent if module.endswith(".py") else Path.cwd()))
         point = EntryPoint(name, f"{section(name)}:{attribute}", f"lowfc.{kind}s")
@@ -41,10 +47,8 @@ def load(kind: Kind, name: str) -> Any:
             f"no driver of a {kind} is called {name!r}{nearest(name, known)}; there are {', '.join(sorted(known))}, or "
             "write module:Class or file.py:Class"
         )
-    try:
+    with opening(f"the driver {name!r} cannot be loaded"):
         driver = point.load()
-    except (ImportError, AttributeError) as fault:
-        raise ConfigurationError(f"the driver {name!r} cannot be loaded: {fault}") from None
     missing = [method for method in METHODS[kind] if isinstance(driver, type) and not hasattr(driver, method)]
     if missing:
         raise ConfigurationError(f"the driver {name!r} is no {kind}: it has no {' and no '.join(missing)}")

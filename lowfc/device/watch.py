@@ -22,7 +22,11 @@ _HERE = Path(__file__).parent
 
 def described(fault: Exception) -> str:
     """Describe an exception of a driver, with the line of the driver that raised it."""
-    frames = [frame for frame in traceback.extract_tb(fault.__traceback__) if Path(frame.filename).parent != _HERE]
+    frames = [
+        frame
+        for frame in traceback.extract_tb(fault.__traceback__)
+        if Path(frame.filename).parent != _HERE and "importlib" not in frame.filename
+    ]
     its_own = [frame for frame in frames if frame.filename == frames[0].filename]
     where = f" ({Path(its_own[-1].filename).name}, line {its_own[-1].lineno})" if its_own else ""
     return f"{type(fault).__name__}: {fault}"[:300] + where

@@ -157,6 +157,29 @@ def test_a_driver_is_found_by_entry_point_or_by_module_and_class(
             plugins.load("camera", name)
 
 
+@pytest.mark.parametrize(
+    ("file", "text", "message"),
+    [
+        (
+            "own_cdll.py",
+            "import ctypes\n\nctypes.CDLL('libvendor.so')\n",
+            r"OSError: libvendor.* \(own_cdll.py, line 3\)$",
+        ),
+        ("own_syntax.py", "x = 1\nclass\n", r"SyntaxError: invalid syntax \(own_syntax.py, line 2\)$"),
+        ("own_import.py", "import no_vendor\n", r"No module named 'no_vendor' \(own_import.py, line 1\)$"),
+        ("own-name.py", "class Own: ...\n", "letters, digits and _, as in .*: rename the file"),
+        ("own.name.py", "class Own: ...\n", "letters, digits and _, as in .*: rename the file"),
+    ],
+)
+def test_a_driver_that_cannot_be_imported_gives_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file: str, text: str, message: str
+) -> None:
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    (tmp_path / file).write_text(text)
+    with pytest.raises(ConfigurationError, match=f"^the driver '.*' cannot be loaded: .*{message}"):
+        plugins.load("camera", f"{tmp_path / file}:Own")
+
+
 def test_driver_sections_of_a_configuration_are_checked(tmp_path: Path) -> None:
     (tmp_path / "mine.py").touch()
     good = {"drivers.sim": {"camera": {"fault": ""}}, "drivers.json": {"any": 1}, "drivers.mine.level": 1}
