@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -178,3 +179,11 @@ def test_the_provenance_identifies_processor_and_blas() -> None:
     import scipy.linalg  # noqa: F401  # loads a BLAS of its own, which the loop does not use
 
     assert provenance() == {key: value for key, value in found.items() if key not in ("run", "seed")}
+
+
+def test_the_provenance_has_no_commit_if_git_is_slow(monkeypatch: pytest.MonkeyPatch) -> None:
+    def slow(command: list[str], *, timeout: float, **_: object) -> None:
+        raise subprocess.TimeoutExpired(command, timeout)
+
+    monkeypatch.setattr(subprocess, "run", slow)
+    assert "git" not in provenance()

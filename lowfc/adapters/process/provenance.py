@@ -81,11 +81,14 @@ def _commit() -> str:
     git = shutil.which("git")
     if git is None or not (checkout / ".git").exists():
         return ""
-    done = subprocess.run(  # noqa: S603  # a fixed command
-        [git, "-C", str(checkout), "describe", "--always", "--dirty", "--tags"],
-        capture_output=True,
-        text=True,
-        timeout=5,
-        check=False,
-    )
+    try:
+        done = subprocess.run(  # noqa: S603  # a fixed command
+            [git, "-C", str(checkout), "describe", "--always", "--dirty", "--tags"],
+            capture_output=True,
+            text=True,
+            timeout=5,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired):  # a slow disk must not keep the recorder from starting
+        return ""
     return done.stdout.strip()
