@@ -15,8 +15,12 @@ from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.map_reconstructor import map_reconstructor, noise_covariance_nm2
 from lowfc.control.laws.automatic_gain import GainBank, TiltCrossTalk
 from lowfc.control.laws.integrator import RELAXING, TIP_TILT
+from lowfc.control.loop.advance import advance
+from lowfc.control.loop.inputs import Input, Request
 from lowfc.control.loop.safety import LoopMode
+from lowfc.programs.core.gain_watch import MIN_FRAMES, GainWatch
 from tests.support.in_process_loop import SMALL_MIRROR
+from tests.support.toy import frame, frame_sequence, loaded, settings
 from tools.law_bench import Bench, calibrated, configured
 from tools.modal_bench import ModalBench
 
@@ -300,6 +304,32 @@ def test_a_mode_can_have_a_manual_gain_and_return_to_automatic() -> None:
     assert not active_loop.automatic[2]
     loop.ask("gain", text="auto", modes=(4,))
     assert loop.state.loop.automatic.all()
+
+
+def watched(*inputs: Input) -> list[str]:
+    """Names of the requests of the gain watch for these inputs to a toy loop with automatic gains."""
+    what = settings(auto_gain=(True, True), start_mode=LoopMode.OPEN)
+    watch, state, found = GainWatch(what, "warn"), loaded(what), []
+    for input_ in inputs:
+        state, outputs = advance(what, state, input_)
+        if outputs.step is not None:
+            found += [request.name for request in watch.observe(outputs.step, state).requests]
+    return found
+
+
+@pytest.mark.parametrize(
+    "between",
+    [
+        [frame(1 << 30, ahead=True)],
+        [frame(5)],
+        [frame(0, sequence=2 * frame_sequence(0)), Request(0, "safe"), Request(1, "clear"), Request(2, "open")],
+    ],
+    ids=["ahead", "out of order", "a clear for a camera that starts lower"],
+)
+def test_gains_are_measured_after_another_sequence(between: list[Input]) -> None:
+    first = [frame(count) for count in range(1, 11)]
+    later = [frame(count) for count in range(11, 11 + MIN_FRAMES)]
+    assert "gain" in watched(*first, *between, *later)
 
 
 def test_another_star_lowers_the_gains_and_restarts_their_measurement() -> None:

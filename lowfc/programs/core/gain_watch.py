@@ -92,12 +92,12 @@ class GainWatch:
             response = single(loop.estimator.rows[:-1] @ loop.calibration.response)
             for group in self._groups:
                 group.bank.use_reconstructor(response[np.ix_(group.mask, group.mask)])
-        missing = step.frame_sequence - self._newest - 1
-        if missing < 0:  # an old frame
+        newest, before = state.frame_sequence, self._newest
+        if step.frame_sequence != newest or newest == before:  # not a new exposure
             return NOTHING
-        same_camera = step.frame_sequence >> COUNT_BITS == self._newest >> COUNT_BITS
-        self._newest = step.frame_sequence
-        held = missing if same_camera else 0
+        self._newest = newest
+        same_camera = newest >> COUNT_BITS == before >> COUNT_BITS
+        held = newest - before - 1 if same_camera and newest > before else 0  # lower after a clear
         added = loop.command_channels
         playing = added is not None and added.play is not None
         if step.error_nm is None or playing:
