@@ -21,7 +21,7 @@ from lowfc.contract.messages import wire
 from lowfc.control.calibration.calibration import reconstructor
 from lowfc.control.laws.stability import delay_weights, limiting_gain
 from lowfc.control.laws.what_if import as_logged, counterfactual, rms
-from lowfc.control.loop.safety import Limit, LoopMode
+from lowfc.control.loop.safety import Limit, LoopMode, Rejection
 from lowfc.optics.chain.added_contrast import contrast_form
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.cli.contrast import added_contrast, added_contrast_in_words
@@ -339,6 +339,15 @@ def test_an_offset_is_not_reported_as_a_missing_command() -> None:
     run = LoggedRun(known)
     assert not run.torn.any()
     np.testing.assert_array_equal(run.seen_nm, 0)
+
+
+def test_a_frame_ahead_and_a_clear_for_a_lower_start_do_not_cut_the_run() -> None:
+    sequence, reasons = history().steps.sequence, np.zeros(40, np.int64)
+    sequence[10], reasons[10] = toy.frame_sequence(0, 2 * toy.START), 1 << Rejection.AHEAD
+    sequence[30:] -= np.uint64(1 << 32)
+    run = LoggedRun(history(sequence=sequence, reasons=reasons))
+    assert len(run.steps.sequence) == 39
+    assert run.missing.tolist() == [0] * 10 + [1] + [0] * 28
 
 
 def test_which_rows_are_compared() -> None:

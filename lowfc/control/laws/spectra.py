@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lowfc.arrays import Array, Sequences, Whole
+from lowfc.control.loop.inputs import COUNT_BITS
 
 MAX_INTERPOLATED_FRAMES = 3
 """Longest gap, in frames, that is interpolated; a longer one starts a new piece."""
@@ -78,13 +79,17 @@ def time_series(sequence: Sequences, values: npt.NDArray[np.floating]) -> TimeSe
     """Time series of a run, split into evenly sampled pieces at long gaps.
 
     Args:
-        sequence: (rows,) sequence of each row's frame; rows that do not increase it are ignored.
+        sequence: (rows,) sequence of each row's frame; rows that do not increase it are ignored, except for another
+            start of the camera, which may be lower after a clear.
         values: (rows, columns); a row with a NaN is a missing frame.
     """
     there = np.isfinite(values).all(axis=1)
     sequence, values = sequence[there], values[there].astype(np.float64)
     if not sequence.size:
         return TimeSeries((), 0)
+    start, count = np.divmod(sequence, np.uint64(1 << COUNT_BITS))
+    starts = np.cumsum(np.diff(start, prepend=start[:1]) != 0).astype(np.uint64)
+    sequence = (starts << np.uint64(COUNT_BITS)) + count
     newest = np.maximum.accumulate(sequence)
     newer = np.concatenate([[True], sequence[1:] > newest[:-1]])
     sequence, values = sequence[newer], values[newer]

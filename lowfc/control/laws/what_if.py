@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.arrays import Array, Mask, Sequences, Single, Whole
+from lowfc.arrays import Array, Long, Mask, Sequences, Single, Whole
 from lowfc.control.laws.integrator import Integrator
 from lowfc.control.laws.linear_law import LinearLaw, at_rest, integrator, predict_and_update, respond
 from lowfc.control.laws.stability import delay_weights
 from lowfc.control.loop.inputs import COUNT_BITS
+from lowfc.control.loop.safety import Rejection
 
 Controller = Callable[[Any, Single, Single], tuple[Any, Single]]
 """(state, error_nm, pol_nm) to (state, command_nm); the state is None at first, the arrays are (modes,) float32."""
@@ -23,6 +24,7 @@ MAX_DELAY_FRAMES = 5
 """Longest plausible delay of a working loop, frames."""
 _STILL_NM = 0.01
 _FEWEST = 20
+_NOT_NEW = 1 << Rejection.REPEATED | 1 << Rejection.OUT_OF_ORDER | 1 << Rejection.AHEAD
 
 
 def driven_by(law: LinearLaw, limit_nm: Single | None = None) -> Controller:
@@ -45,16 +47,16 @@ def as_logged(law: Integrator) -> Controller:
     return driven_by(integrator(law.gain, law.leak, noll, 1.0, 1.0), law.limit_nm)
 
 
-def exposed(sequence: Sequences) -> Mask:
-    """Mask of the steps (steps,) with a new exposure, not a repeated or out-of-order frame."""
-    newest: Sequences = np.maximum.accumulate(sequence)
-    return np.concatenate([np.ones(min(1, len(sequence)), bool), sequence[1:] > newest[:-1]])
+def exposed(reasons: Long) -> Mask:
+    """Mask of the steps with a new exposure, from the bits `1 << reason` (steps,) of their reasons, without unit."""
+    return np.asarray((reasons & _NOT_NEW) == 0)
 
 
 def missing_before(sequence: Sequences) -> Whole:
-    """Exposures (steps,) without a step between each step and the one before; `sequence` ascends."""
+    """Exposures (steps,) without a step between each step and the one before; `sequence` falls only after a clear."""
     same_start = sequence[1:] >> np.uint64(COUNT_BITS) == sequence[:-1] >> np.uint64(COUNT_BITS)
-    between = np.where(same_start, sequence[1:] - sequence[:-1] - np.uint64(1), np.uint64(0))
+    follows = same_start & (sequence[1:] > sequence[:-1])
+    between = np.where(follows, sequence[1:] - sequence[:-1] - np.uint64(1), np.uint64(0))
     return np.concatenate([np.zeros(min(1, len(sequence)), np.int64), between.astype(np.int64)])
 
 

@@ -15,7 +15,7 @@ from lowfc.control.laws.what_if import (
     seen_nm,
 )
 from lowfc.control.loop.inputs import Step
-from lowfc.control.loop.safety import Limits
+from lowfc.control.loop.safety import Limits, Rejection
 from lowfc.control.loop.state import Settings
 from tests.support.theory import law_of
 from tests.support.toy import frame_sequence, live, settings
@@ -115,9 +115,15 @@ def test_commands_seen_by_exposures() -> None:
 def test_repeated_and_late_frames_are_not_exposures() -> None:
     counts = [5, 6, 6, 4, 9, 8]
     sequence = np.array([*map(frame_sequence, counts), frame_sequence(1, 1_800_000_000)], np.uint64)
-    rows = exposed(sequence)
+    repeated, late = 1 << Rejection.REPEATED, 1 << Rejection.OUT_OF_ORDER
+    rows = exposed(np.array([0, 0, repeated, late, 0, late, 0]))
     assert rows.tolist() == [True, True, False, False, True, False, True]
     assert missing_before(sequence[rows]).tolist() == [0, 0, 2, 0]
+
+
+def test_no_frames_are_missing_where_a_clear_lowers_the_sequence() -> None:
+    sequence = np.array([*map(frame_sequence, [5, 9, 2, 3]), frame_sequence(7, 1_600_000_000)], np.uint64)
+    assert missing_before(sequence).tolist() == [0, 3, 0, 0, 0]
 
 
 @pytest.mark.parametrize("delay", [1.0, 1.4, 2.0, 2.7, 3.0])

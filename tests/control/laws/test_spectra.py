@@ -93,6 +93,8 @@ def test_repeated_and_older_frames_are_ignored() -> None:
 def test_a_camera_restart_starts_a_new_piece() -> None:
     sequence = np.concatenate([numbers(10), numbers(10, 1_700_000_001)])
     assert [len(piece) for piece in time_series(sequence, np.ones((20, 1))).values] == [10, 10]
+    lower_after_a_clear = np.roll(sequence, 10)
+    assert [len(piece) for piece in time_series(lower_after_a_clear, np.ones((20, 1))).values] == [10, 10]
 
 
 def test_empty_and_short_runs_have_no_spectrum() -> None:

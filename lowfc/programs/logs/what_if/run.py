@@ -55,7 +55,7 @@ class LoggedRun:
     def __init__(self, history: History) -> None:
         """Extract the run from a history."""
         self.history = history
-        rows = exposed(history.steps.sequence)
+        rows = exposed(history.steps.reasons)
         used = rows & np.isfinite(history.steps.error_nm).all(axis=1)
         if history.calibration is None or not used.any() or not history.rate_hz:
             raise DataFileError(f"{history.log.path}: it has too few frames used by a calibrated controller")
