@@ -17,7 +17,7 @@ from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
 from lowfc.contract.errors import CalibrationError, ConfigurationError, DataFileError
 from lowfc.control.calibration.alignment import Geometry, align, onto
-from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.calibration.calibration import Calibration, normalise_flux
 from lowfc.control.calibration.response_fit import cross_talk
 from lowfc.control.loop.camera import CameraSettings
 from lowfc.optics.chain.zernike import zernikes
@@ -273,6 +273,18 @@ def test_a_computed_calibration_may_truncate_singular_values(loop: InProcessLoop
     assert np.linalg.matrix_rank(other.reconstructor) == 2
     done = CliRunner().invoke(calibrate_app, ["--method", "analytic", "--config", config, "--out", "all.fits"])
     assert "no regularisation needed" in done.stdout
+
+
+def test_a_truncation_keeps_the_fit_of_a_background(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    fitted = load(None, {"sensor.kind": "zwfs", "control.nuisance": ["background"]} | SMALL_MIRROR)
+    json_of("--method", "analytic", "--config", toml(fitted), "--out", "few.fits", "--truncate", "0.3")
+    made = calibration_file.load(Path("few.fits"))
+    assert made.estimator == "weighted+background+regularised"
+    assert np.linalg.matrix_rank(made.reconstructor) < len(made.noll)
+    I0, good = made.reference.astype(float), made.good.astype(float)
+    background = normalise_flux(I0, np.full((I0.size, 1), 1 / I0.size), good)[1]
+    assert np.abs(made.reconstructor @ background).max() < 1e-3
 
 
 def test_a_calibration_can_be_computed_at_another_wavefront(loop: InProcessLoop) -> None:

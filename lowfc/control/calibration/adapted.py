@@ -5,11 +5,9 @@ from dataclasses import replace
 import numpy as np
 
 from lowfc.arrays import Array, single
-from lowfc.control.calibration.calibration import Calibration, normalise_flux
+from lowfc.control.calibration.calibration import ESTIMATORS, Calibration, normalise_flux
 from lowfc.control.calibration.regularised import reconstruct
 
-MEASURED = frozenset(("poke", "hadamard", "in-loop"))
-"""Parts of `Calibration.estimator` that name a method to measure H."""
 _MIN_RESPONSE = 1e-3
 """Singular value of R H, relative to the largest, below which a combination of modes counts as not measured."""
 
@@ -17,8 +15,8 @@ _MIN_RESPONSE = 1e-3
 def with_dark(calibration: Calibration, dark_dn: Array, good: Array, read_noise_e: float, gain_e: float) -> Calibration:
     """The calibration with another dark (pixels,), DN, and only the pixels (pixels,) that are 1 in `good`.
 
-    Pixels that were bad stay bad. I0 and H are normalised to the flux on the remaining pixels, and R is recomputed from
-    them, for this read noise of a pixel and electrons per DN.
+    Pixels that were bad stay bad. I0 and H are normalised to the flux on the remaining pixels. A plain R is recomputed
+    from them, for this read noise of a pixel and electrons per DN; any other keeps its response to the modes.
 
     Raises:
         ValueError: the remaining pixels do not tell the modes apart.
@@ -35,9 +33,9 @@ def with_dark(calibration: Calibration, dark_dn: Array, good: Array, read_noise_
         dark=single(dark_dn),
         flux_dn=calibration.flux_dn * share,
     )
-    if is_measured(calibration):
-        return replace(changed, reconstructor=single(_same_response(calibration, changed)), operator_hash="", id="")
-    return _reconstructed(changed, read_noise_e, gain_e)
+    if _is_plain(calibration):
+        return _reconstructed(changed, read_noise_e, gain_e)
+    return replace(changed, reconstructor=single(_same_response(calibration, changed)), operator_hash="", id="")
 
 
 def with_reference(
@@ -50,14 +48,18 @@ def with_reference(
     """
     I0, _ = normalise_flux(reference, calibration.response.astype(np.float64), calibration.good.astype(np.float64))
     changed = replace(calibration, reference=single(I0), flux_dn=flux_dn)
-    if is_measured(calibration):
-        return replace(changed, operator_hash="", id="")
-    return _reconstructed(changed, read_noise_e, gain_e)
+    if _is_plain(calibration):
+        return _reconstructed(changed, read_noise_e, gain_e)
+    return replace(changed, operator_hash="", id="")
 
 
-def is_measured(calibration: Calibration) -> bool:
-    """Whether H was measured: its noise must not enter R (see `regularised`)."""
-    return not MEASURED.isdisjoint(calibration.estimator.split("+"))
+def _is_plain(calibration: Calibration) -> bool:
+    """Whether R follows from I0 and H.
+
+    It does not if nuisance parameters are fitted or R is regularised, and the noise of a measured H must not enter R
+    (see `regularised`).
+    """
+    return calibration.estimator in ESTIMATORS
 
 
 def _same_response(before: Calibration, changed: Calibration) -> Array:
@@ -76,7 +78,6 @@ def _same_response(before: Calibration, changed: Calibration) -> Array:
 
 def _reconstructed(calibration: Calibration, read_noise_e: float, gain_e: float) -> Calibration:
     """Recompute R from I0 and H, with the weights of its estimator."""
-    estimator = calibration.estimator.partition("+")[0]
     made = reconstruct(
         calibration.reference.astype(np.float64),
         calibration.response.astype(np.float64),
@@ -84,6 +85,6 @@ def _reconstructed(calibration: Calibration, read_noise_e: float, gain_e: float)
         calibration.good.astype(np.float64),
         calibration.flux_dn * gain_e,
         read_noise_e,
-        estimator,
+        calibration.estimator,
     )
     return replace(calibration, reconstructor=single(made.matrix), operator_hash="", id="")

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lowfc.arrays import single
 from lowfc.control.calibration.adapted import with_dark, with_reference
 from lowfc.control.calibration.calibration import normalise_flux, reconstructor
 from lowfc.control.calibration.dark_frames import light_in, measure_dark
@@ -350,6 +351,27 @@ def test_a_new_dark_mask_or_reference_keeps_the_response_to_the_modes() -> None:
     assert moved.flux_dn == 2 * before.flux_dn
     assert (before.reconstructor @ (moved.reference - before.reference))[0] == pytest.approx(0.5, abs=0.02)
     assert moved.response is before.response
+
+
+def test_a_new_dark_or_reference_keeps_a_fitted_background_and_a_truncation() -> None:
+    before = calibration()
+    I0, H, good = (getattr(before, name).astype(float) for name in ("reference", "response", "good"))
+    background = normalise_flux(I0, np.ones((I0.size, 1)), good)[1]
+    rows = single(reconstructor(I0, H, good, 1e5, 1.0, nuisance=background))
+    fitted = replace(before, reconstructor=rows, estimator="weighted+background")
+    truncated = replace(
+        before, reconstructor=before.reconstructor * single([[1], [1], [0]]), estimator="pinv+regularised"
+    )
+    for known in (fitted, truncated):
+        dark = with_dark(known, np.full(good.size, 7.0), good, 1.0, 1.0)
+        moved = with_reference(known, I0, 2 * before.flux_dn, 1.0, 1.0)
+        for changed in (dark, moved):
+            np.testing.assert_allclose(changed.reconstructor, known.reconstructor, atol=1e-3)
+    good[3] = 0
+    masked, plain = (with_dark(known, np.zeros(good.size), good, 1.0, 1.0) for known in (fitted, before))
+    background = normalise_flux(masked.reference.astype(float), np.ones((I0.size, 1)), good)[1]
+    errors_nm = [np.abs(known.reconstructor @ background).max() for known in (masked, plain)]
+    assert errors_nm[0] < 0.3 * errors_nm[1]  # one pixel of 42
 
 
 def test_r_of_a_measured_calibration_is_not_recomputed_from_noisy_h() -> None:

@@ -115,7 +115,7 @@ def computed(
         config,
         calibration.reference.astype(np.float64),
         calibration.response.astype(np.float64),
-        None,
+        calibration.reconstructor.astype(np.float64) if config.control.nuisance else None,
         calibration.good.astype(np.float64),
         calibration.flux_dn,
         estimator=config.control.estimator,
