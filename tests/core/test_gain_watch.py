@@ -15,6 +15,7 @@ from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.map_reconstructor import map_reconstructor, noise_covariance_nm2
 from lowfc.control.laws.automatic_gain import GainBank, TiltCrossTalk
 from lowfc.control.laws.integrator import RELAXING, TIP_TILT
+from lowfc.control.laws.linear_law import integrator
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.inputs import Input, Request
 from lowfc.control.loop.safety import LoopMode
@@ -282,6 +283,34 @@ def test_a_harmful_loop_opens_if_configured() -> None:
     loop.run(1)
     assert loop.steps[-1].mode is LoopMode.OPEN
     assert named(loop, "MODE_CHANGED")[-1]["why"] == "auto: the loop made it worse"
+
+
+def harmful() -> ModalBench:
+    """A closed loop that increases the residual; three windows end after 1150 frames."""
+    config = configuration(6.5, **FIXED_GAINS | {"control.on_harm": "integrator"})
+    return ModalBench(config, factory.frame_noise_nm2(config, calibration(6.5, "sam")))
+
+
+def test_a_harmful_loop_without_a_law_opens_if_the_integrator_should_take_over() -> None:
+    loop = harmful()
+    loop.run(1150)
+    assert [one["action"] for one in named(loop, "LOOP_HARMS")] == ["the loop opens"]
+    assert loop.state.mode is LoopMode.OPEN
+
+
+def test_the_integrator_takes_over_from_a_harmful_law_once_the_loop_is_not_reserved() -> None:
+    loop = harmful()
+    law = loop.settings.integrator(loop.config.noll)
+    loop.load(integrator(law.gain, law.leak, loop.config.noll, loop.settings.delay_frames, 250.0))
+    loop.run(100)
+    loop.take(Request(loop.steps[-1].time_ns, "lease", (), (60.0,), "another client", lease_id=1))
+    loop.run(1000)
+    assert [one["action"] for one in named(loop, "LOOP_HARMS")] == ["the integrator takes over"]
+    assert loop.state.loop.law_runner is not None  # refused
+    loop.ask("release", lease_id=1)
+    loop.run(700)
+    assert loop.state.loop.law_runner is None
+    assert loop.state.mode is LoopMode.CLOSED
 
 
 @pytest.mark.parametrize("request_name", ["open", "pause"])

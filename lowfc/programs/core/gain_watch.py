@@ -1,6 +1,5 @@
 """Automatic gains: requests optimal gains from measurements, and reports if the closed loop does harm."""
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +28,8 @@ CAUTIOUS_GAIN = 0.05
 MIN_FRAMES = 50
 """Smallest number of frames in a window."""
 REQUESTER = "automatic gains"
+_ACTIONS = {"": "nothing is done", "open": "the loop opens", "law": "the integrator takes over"}
+"""What follows from harm, by the name of the request."""
 
 
 class Actions(NamedTuple):
@@ -220,7 +221,10 @@ class GainWatch:
             requests.append(
                 Request(step.time_ns, "close", text=f"{AUTO}: the gains were measured", requester=REQUESTER)
             )
-        requests += [request for event in events for request in self._reaction(event, step, state)]
+        if events and (reaction := self._reaction(loop)):
+            requests.append(
+                Request(step.time_ns, reaction, text=f"{AUTO}: the loop made it worse", requester=REQUESTER)
+            )
         return Actions(tuple(requests), tuple(events))
 
     def _closing_harm(self, gain: Single, loop: ActiveLoop) -> str:
@@ -276,6 +280,9 @@ class GainWatch:
         group.harmful = group.harmful + 1 if worse > 3 * error else 0
         if group.harmful != HARMFUL_WINDOWS:
             return []
+        reaction = self._reaction(loop)
+        if reaction == "law":  # repeated if refused; if not, the integrator is judged anew
+            group.harmful = 0
         noise_nm2 = self._noise_nm2(loop)
         noise = 0.0 if noise_nm2 is None else float(noise_nm2[group.mask].sum())
         open_nm2 = max(float(verdict.power_nm2.sum()) - noise, 0.0)
@@ -285,15 +292,12 @@ class GainWatch:
             "modes": ", ".join(f"Z{index}" for index in noll[culprits]),
             "closed_nm": float(np.sqrt(open_nm2 + worse)),
             "open_nm": float(np.sqrt(open_nm2)),
-            "action": {"warn": "nothing is done", "open": "the loop opens"}.get(
-                self._on_harm, "the integrator takes over"
-            ),
+            "action": _ACTIONS[reaction],
         }
         return [PendingEvent("LOOP_HARMS", details)]
 
-    def _reaction(self, event: PendingEvent, step: Step, state: State) -> list[Request]:
-        if event.name != "LOOP_HARMS" or self._on_harm == "warn":
-            return []
-        law = state.loop is not None and state.loop.law_runner is not None
-        opening = Request(step.time_ns, "open", text=f"{AUTO}: the loop made it worse", requester=REQUESTER)
-        return [replace(opening, name="law")] if law and self._on_harm == "integrator" else [opening]
+    def _reaction(self, loop: ActiveLoop) -> str:
+        """Name of the request if the loop does harm; empty for none."""
+        if self._on_harm == "integrator" and loop.law_runner is not None:
+            return "law"
+        return "" if self._on_harm == "warn" else "open"
