@@ -70,9 +70,17 @@ def _listed(values: Single) -> str:
 
 
 def _chosen(loop: ActiveLoop, request: Request) -> Mask:
-    """The modes (modes,) of a request."""
+    """The modes (modes,) of a request; ValueError if one is not controlled."""
     noll = loop.calibration.noll
-    return np.isin(noll, request.modes or noll)
+    return np.isin(noll, _modes(noll, request))
+
+
+def _modes(noll: tuple[int, ...], request: Request) -> tuple[int, ...]:
+    modes = request.modes or noll
+    unknown = sorted(set(modes) - set(noll))
+    if unknown:
+        raise ValueError(f"Noll modes {unknown} are not controlled; there are {noll[0]} to {noll[-1]}")
+    return modes
 
 
 def per_mode(noll: tuple[int, ...], request: Request, before: Single) -> Single:
@@ -81,10 +89,7 @@ def per_mode(noll: tuple[int, ...], request: Request, before: Single) -> Single:
     Raises:
         ValueError: what is wrong with the request.
     """
-    modes = request.modes or noll
-    unknown = sorted(set(modes) - set(noll))
-    if unknown:
-        raise ValueError(f"Noll modes {unknown} are not controlled; there are {noll[0]} to {noll[-1]}")
+    modes = _modes(noll, request)
     if len(request.values) not in (1, len(modes)):
         raise ValueError(f"give one value, or one for each of the {len(modes)} modes; got {len(request.values)}")
     if not np.isfinite(request.values).all():
