@@ -300,6 +300,19 @@ def test_an_unstable_gain_is_refused_for_the_configured_delay(delay: float) -> N
     assert [outputs.reply.accepted for outputs in all_outputs if outputs.reply] == [True, False, False]
 
 
+def test_gain_and_leak_are_refused_if_unstable_together() -> None:
+    """With a delay of 1 frame the pole is 1 - leak - gain."""
+    setup = settings(gain=(0.5, 0.1))
+    above, below, leaky = ask("gain", 1.9, modes=(2,)), ask("gain", 1.7, modes=(2,)), ask("leak", 0.2)
+    for requests in ([above, leaky], [leaky, above]):
+        _, (one, other) = feed(setup, loaded(setup), *requests)
+        assert one.reply.accepted
+        answered(other, False, "below 1.8", "a delay of 1 frame and a leak of 0.2 becomes unstable; got 1.9")
+    for requests in ([below, leaky], [leaky, below], [above, ask("leak", 0.2, modes=(3, 4))]):
+        _, all_outputs = feed(setup, loaded(setup), *requests)
+        assert all(outputs.reply.accepted for outputs in all_outputs)
+
+
 def test_the_first_step_after_closing_is_gain_times_error() -> None:
     state, _ = feed(DEFAULTS, running(), ask("open"), *(frame(count, SOME) for count in range(6, 20)), ask("close"))
     before = state.loop.history_nm[0]

@@ -104,19 +104,42 @@ def _changed(integrator: Integrator, noll: tuple[int, ...], delay_frames: float,
     attribute = _ATTRIBUTES[request.name]
     values = per_mode(noll, request, getattr(integrator, attribute))
     lowest, highest = min(request.values), max(request.values)
-    if request.name == "gain":
-        limiting = limiting_gain(delay_frames)
-        if not (lowest >= 0 and highest < limiting):
-            raise ValueError(
-                f"gain must be at least 0 and below {limiting:.3g}, where a loop with a delay of "
-                f"{counted(float(delay_frames), 'frame')} becomes unstable; got {max(request.values, key=abs):g}"
-            )
-    elif request.name == "leak" and not (lowest >= 0 and highest <= 1):
+    if request.name == "leak" and not (lowest >= 0 and highest <= 1):
         raise ValueError(f"leak must be between 0 and 1, got {max(request.values, key=abs):g}")
-    elif lowest < 0:
+    if request.name == "limit" and lowest < 0:
         raise ValueError(f"limit must be at least 0 nm, got {lowest:g}")
+    chosen = np.isin(noll, _modes(noll, request))
+    if request.name == "gain":
+        _check_stable(values[chosen], integrator.leak[chosen], delay_frames)
+    if request.name == "leak":
+        _check_stable(integrator.gain[chosen], values[chosen], delay_frames)
     changed: dict[str, Any] = {attribute: values}
     return replace(integrator, **changed)
+
+
+def _check_stable(gains: Single, leaks: Single, delay_frames: float) -> None:
+    """Refuse gains (modes,) that are negative, or with which the loop is unstable at these leaks (modes,).
+
+    Raises:
+        ValueError: a gain is refused.
+    """
+    for gain, leak in zip(gains.tolist(), leaks.tolist(), strict=True):
+        limiting = limiting_gain(delay_frames, leak)
+        if not 0 <= gain < np.float32(limiting):
+            with_leak = f" and a leak of {leak:g}" if leak else ""
+            raise ValueError(
+                f"gain must be at least 0 and below {limiting:.3g}, where a loop with a delay of "
+                f"{counted(float(delay_frames), 'frame')}{with_leak} becomes unstable; got {gain:g}"
+            )
+
+
+def prepare_gains(settings: Settings, request: Request) -> None:
+    """Cache what a reply to a request for gains or leaks needs, so that no frame waits for it."""
+    highest_gain(settings.delay_frames)
+    leaks = request.values if request.name == "leak" else settings.leak
+    for leak in leaks:
+        if 0 <= leak <= 1:
+            limiting_gain(settings.delay_frames, float(np.float32(leak)))
 
 
 def remark(settings: Settings, loop: ActiveLoop, request: Request) -> str:

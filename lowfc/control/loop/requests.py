@@ -10,10 +10,9 @@ import numpy as np
 
 from lowfc.arrays import Single
 from lowfc.control.laws.margins import check_law
-from lowfc.control.laws.stability import highest_gain
 from lowfc.control.loop import interlocks
 from lowfc.control.loop.command_channels import EXTERNAL, FLAT, MIRROR, CommandChannels, Play, play_table
-from lowfc.control.loop.gains import changed_integrator, check_offset, offset_remark, per_mode
+from lowfc.control.loop.gains import changed_integrator, check_offset, offset_remark, per_mode, prepare_gains
 from lowfc.control.loop.inputs import Outputs, PendingEvent, Reply, Request
 from lowfc.control.loop.lease import ENDED_BY, Lease, asked_by, refusal
 from lowfc.control.loop.loading import holding_cause, in_mode, loaded, misfit, mode_event, uncalibrated
@@ -72,8 +71,8 @@ def prepared(settings: Settings, request: Request) -> Request:
     try:
         if request.law is not None:
             check_law(request.law, settings.delay_frames, settings.rate_hz)
-        if request.name == "gain":
-            highest_gain(settings.delay_frames)  # cached for the reply, so that no frame waits for it
+        if request.name in ("gain", "leak"):
+            prepare_gains(settings, request)
         if request.name == "play":
             request = replace(request, played=play_table(request.text, request.table, request.actuators_nm.reshape(-1)))
     except ValueError as error:
