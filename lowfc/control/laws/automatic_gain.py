@@ -103,7 +103,7 @@ class GainBank:
         """Restart, as for another star."""
         self._loops = self._at_rest
         self._cross_talk = TiltCrossTalk(self._at_rest.kept.size)
-        self._before_nm = np.zeros_like(self._at_rest.kept)
+        self._before_nm: Single | None = None
         self.begin_first_window()
 
     def use_reconstructor(self, of_own: Array | Single) -> None:
@@ -128,7 +128,9 @@ class GainBank:
         self._loops, errors_nm = self._loops.advanced(open_nm)
         squares = np.square(errors_nm)
         self._power += squares[0]
-        self._changes += np.square(errors_nm[0] - self._before_nm) / 2
+        if self._before_nm is not None:
+            self._changes += np.square(errors_nm[0] - self._before_nm) / 2
+            self._changes_counted += 1
         self._before_nm = errors_nm[0]
         self._mean += errors_nm[0]
         squares -= squares[0].copy()
@@ -144,7 +146,7 @@ class GainBank:
             return False
         self._blocks.append(self._sums / self._frames)
         self._powers.append(self._power / self._frames)
-        self._changed.append(self._changes / self._frames)
+        self._changed.append(self._changes / max(self._changes_counted, 1))
         self._means.append(self._mean / self._frames)
         self._tilts.append(self._tilt / self._frames)
         self._spreads.append(self._spread / self._frames)
@@ -177,8 +179,8 @@ class GainBank:
         return np.where(absent, 0, gain).astype(np.float32)
 
     def held(self, frames: int) -> None:
-        """Advance by frames without measurements."""
-        self._loops = self._loops.held(frames)
+        """Advance by frames without measurements: changes across them are not used."""
+        self._loops, self._before_nm = self._loops.held(frames), None
         self._cross_talk.held()
 
     def verdict(self, gain: Single, noise_nm2: Array | None) -> Verdict:
@@ -286,7 +288,7 @@ class GainBank:
         self._begin_block()
 
     def _begin_block(self) -> None:
-        self._frames = 0
+        self._frames = self._changes_counted = 0
         self._sums = np.zeros((self.rows.size + 1, self._at_rest.kept.size))
         self._spread = np.zeros((self.rows.size, self._at_rest.kept.size))
         self._power, self._changes, self._mean = np.zeros((3, self._at_rest.kept.size))

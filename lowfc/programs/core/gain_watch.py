@@ -101,11 +101,6 @@ class GainWatch:
         held = newest - before - 1 if same_camera and newest > before else 0  # lower after a clear
         added = loop.command_channels
         playing = added is not None and added.play is not None
-        if step.error_nm is None or playing:
-            held += 1
-        if held:
-            for group in self._groups:
-                group.bank.held(held)
         if (
             step.error_nm is None
             or step.pol_nm is None
@@ -113,7 +108,10 @@ class GainWatch:
             or playing
             or state.mode not in (LoopMode.OPEN, LoopMode.CLOSED)
         ):
+            self._hold(held + 1)
             return NOTHING
+        if held:
+            self._hold(held)
         open_nm = step.pol_nm if added is None else step.pol_nm - added.offset_nm
         closed = step.mode is LoopMode.CLOSED and not state.returning_to_zero
         star = self._star(step.flux_dn)
@@ -138,6 +136,10 @@ class GainWatch:
             return Actions(events=events) if events else NOTHING
         found = self._judge(judged, step, state, loop)
         return found._replace(events=(*events, *found.events))
+
+    def _hold(self, frames: int) -> None:
+        for group in self._groups:
+            group.bank.held(frames)
 
     def added_contrast(self) -> tuple[float, Array] | None:
         """Added contrast in open loop, and of each mode now (modes,); None until measured."""

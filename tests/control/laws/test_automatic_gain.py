@@ -90,6 +90,14 @@ def test_a_gain_changes_by_at_most_two_unless_open_loop_is_better() -> None:
     assert (down.gain < high / 8).mean() > 0.9
 
 
+def test_a_static_aberration_and_a_jump_across_lost_frames_are_not_noise() -> None:
+    bank_, zero_gain = bank(windows=(500, 500)), np.zeros(MODES, np.float32)
+    verdicts(bank_, 100 + drift(220, 0.0, 1.0, 13), zero_gain, 0.0)
+    bank_.held(3)
+    [found] = verdicts(bank_, 300 + drift(280, 0.0, 1.0, 14), zero_gain, 0.0)
+    np.testing.assert_allclose(found.noise_nm2, 1, rtol=0.3)
+
+
 def test_a_window_without_a_decision_grows() -> None:
     bank_, rng = bank(windows=(100, 100)), np.random.default_rng(6)
     gain = np.zeros(MODES, np.float32)
