@@ -126,6 +126,22 @@ def test_settings_come_from_options_keywords_and_configuration(folder: Path) -> 
         driver.settings()
 
 
+@pytest.mark.parametrize(
+    ("options", "expected_dn"),
+    [
+        ({}, 40_100),
+        ({"bit_depth": 12}, 4095),
+        ({"bit_depth": 16}, 40_100),
+        ({"bit_depth": 12, "saturation_dn": 3000}, 3000),
+    ],
+)
+def test_no_pixel_exceeds_the_bits_of_the_converter(
+    folder: Path, options: dict[str, float], expected_dn: float
+) -> None:
+    PlainStream.make(folder / "camnsv.im.shm", COLUMNS, ROWS, UINT16)
+    assert camera(**options)[0].settings().saturation_dn == expected_dn
+
+
 def test_a_silent_or_recreated_stream_is_reported_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lowfc.device.drivers.isio.camera._WAIT_S", 0.01)
     with pytest.raises(StreamError, match="there is no stream 'camnsv'"):

@@ -45,7 +45,7 @@ class IsioCamera:
         read_noise_e: float | None = Field(default=None, ge=0)
         """Read noise of one pixel."""
         saturation_dn: float | None = Field(default=None, gt=0)
-        """Highest value of a pixel, bias included."""
+        """Highest value of a pixel, bias included; default: the configured one, at most the converter's."""
         bit_depth: int | None = Field(default=None, ge=1, le=16)
         """Bits of the converter."""
         em_gain: float | None = Field(default=None, ge=1)
@@ -70,7 +70,11 @@ class IsioCamera:
         settings = options.model_dump(include={one.name for one in fields(CameraSettings)}, exclude_none=True)
         if options.exposure_us is not None:
             settings["exposure_ns"] = round(options.exposure_us * 1e3)
-        self._settings = replace(CameraSettings.configured(config, *shape), clock="realtime", **settings)
+        configured = CameraSettings.configured(config, *shape)
+        if options.bit_depth is not None:
+            full_dn = 2**options.bit_depth - 1
+            settings.setdefault("saturation_dn", min(configured.saturation_dn or full_dn, full_dn))
+        self._settings = replace(configured, clock="realtime", **settings)
         self._generation = self._reader.generation
         self._silent = False
 
