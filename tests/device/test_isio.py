@@ -247,6 +247,38 @@ def test_the_reached_position_comes_from_the_sum_of_channels(folder: Path, monke
         driver.apply(shape_nm(1))
 
 
+def test_a_sum_that_is_absent_although_expected_counts_as_not_following(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mirror_module, "SUM_SILENT_S", 0.01)
+    monkeypatch.setattr(mirror_module, "_SEARCH_S", 0.0)
+
+    def absent_for_a_while(driver: IsioMirror, name: str) -> None:
+        assert driver.apply(shape_nm(1)) is None
+        time.sleep(0.02)
+        with pytest.raises(RuntimeError, match=f"no stream '{name}' of {GRID[1]} x {GRID[0]} float32 pixels"):
+            driver.apply(shape_nm(1))
+
+    driver, _ = mirror(total="dm99disp")
+    absent_for_a_while(driver, "dm99disp")
+    for total in (None, ""):  # the default name is read if it exists; an empty one is not read
+        driver, _ = mirror(total=total)
+        assert driver.apply(shape_nm(1)) is None
+        time.sleep(0.02)
+        assert driver.apply(shape_nm(1)) is None
+    monkeypatch.setattr(mirror_module, "SUM_WAIT_S", 2.0)
+    driver, _ = mirror()
+    summing = Sum(folder, 0.5)
+    assert driver.apply(shape_nm(1)) is None
+    (folder / "dm00disp.im.shm").unlink()
+    absent_for_a_while(driver, "dm00disp")
+    summing.total = channel(folder, "dm00disp", make=True)
+    assert driver.apply(shape_nm(1)) is None, "it follows again"
+    assert summing.total.count
+    summing.running = False
+    summing.join()
+
+
 def test_a_channel_whose_writer_died_meanwhile_stays_in_the_sum(folder: Path) -> None:
     dark_hole, turbulence, begun = (channel(folder, f"dm00disp0{index}", make=True) for index in range(3))
     dark_hole.write(shape_nm(1) / 1000)

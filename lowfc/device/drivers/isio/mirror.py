@@ -27,7 +27,8 @@ SUM_SILENT_S = 0.5
 SAME_NM = 0.05
 """Largest difference between commanded and reached shape, nm, that float32 rounding in micrometres explains."""
 _POLL_S = 50e-6
-_SEARCH_S = 1.0
+_SEARCH_S = 0.1
+"""Period of the search for an absent sum; a recreated one must be found well within `SUM_SILENT_S`."""
 
 
 class IsioMirror:
@@ -41,7 +42,7 @@ class IsioMirror:
         nm_per_unit: float = Field(default=1000.0, gt=0)
         """Surface per unit of the stream, nm; CACAO's unit is the micrometre."""
         total: str | None = None
-        """Name of the stream with the sum of all channels, read if it exists; default: dm00disp for dm00disp03."""
+        """Name of the stream with the sum of all channels; default: dm00disp for dm00disp03, read once it exists."""
 
     def __init__(self, options: Options, config: Configuration) -> None:
         """Open the channel, or create it."""
@@ -54,6 +55,7 @@ class IsioMirror:
         self._total_name = sum_name(options.stream) if options.total is None else options.total
         self._beside: tuple[Single | None, Single] = None, np.zeros(self._grid, np.float32)
         self._total: Stream | None = None
+        self._total_expected = bool(options.total)
         self._searched_s = -_SEARCH_S
         self._unanswered_s = math.inf
 
@@ -81,8 +83,13 @@ class IsioMirror:
         total = self._current_total()
         before = 0 if total is None else total.count
         self._channel.put(actuators_nm / np.float32(self._options.nm_per_unit))
-        self._count = self._channel.count
-        return None if total is None or not self._updated(total, before) else self._reached(total, actuators_nm)
+        self._count, written_s = self._channel.count, time.monotonic()
+        if total is not None and self._updated(total, before):
+            self._unanswered_s = math.inf
+            return self._reached(total, actuators_nm)
+        if self._total_expected:
+            self._check_silence(total, written_s)
+        return None
 
     def close(self) -> None:
         """Do nothing: the channel keeps its shape, and a writer holds no semaphore."""
@@ -100,33 +107,38 @@ class IsioMirror:
             raise RuntimeError(f"{f'process {pid}' if pid else 'another process'} writes stream {self._channel.name!r}")
 
     def _current_total(self) -> Stream | None:
-        """Stream of the sum, if it exists; searched once a second."""
+        """Stream of the sum, if it exists; once found, it is expected from then on."""
         if self._total is not None and self._total.current():
             return self._total
         self._total, now_s = None, time.monotonic()
         if self._total_name and now_s - self._searched_s >= _SEARCH_S:
             self._searched_s = now_s
             self._total = opened(stream_path(self._total_name), self._grid)
+            self._total_expected |= self._total is not None
         return self._total
 
     def _updated(self, total: Stream, before: int) -> bool:
-        """Whether the sum was updated after the channel, within `SUM_WAIT_S`.
-
-        RuntimeError if it has not been for `SUM_SILENT_S`, so that the mirror counts as not following.
-        """
-        written_s = time.monotonic()
-        while (now_s := time.monotonic()) - written_s < SUM_WAIT_S and total.count == before:
+        """Whether the sum is updated after the channel, within `SUM_WAIT_S`."""
+        end_s = time.monotonic() + SUM_WAIT_S
+        while total.count == before and time.monotonic() < end_s:
             time.sleep(_POLL_S)
-        if total.count != before:
-            self._unanswered_s = math.inf
-            return True
+        return total.count != before
+
+    def _check_silence(self, total: Stream | None, written_s: float) -> None:
+        """RuntimeError if the sum has not followed for `SUM_SILENT_S`, so that the mirror counts as not following."""
         self._unanswered_s = min(self._unanswered_s, written_s)
-        if now_s - self._unanswered_s > SUM_SILENT_S:
+        if time.monotonic() - self._unanswered_s <= SUM_SILENT_S:
+            return
+        if total is None:
+            rows, columns = self._grid
             raise RuntimeError(
-                f"stream {total.name!r} has not followed {self._channel.name!r} for {SUM_SILENT_S:g} s: the process "
-                "that sums the channels is not running"
+                f"there is no stream {self._total_name!r} of {columns} x {rows} float32 pixels for the sum of the "
+                "channels: start the process that sums them, or correct the option `total`"
             )
-        return False
+        raise RuntimeError(
+            f"stream {total.name!r} has not followed {self._channel.name!r} for {SUM_SILENT_S:g} s: the process "
+            "that sums the channels is not running"
+        )
 
     def _reached(self, total: Stream, actuators_nm: Single) -> Single | None:
         """This channel's part of the sum, with its piston ignored; None if it is as written."""
