@@ -204,6 +204,40 @@ def test_a_recreated_channel_is_adopted(folder: Path) -> None:
     assert events.names == ["STREAM_RENEWED"]
 
 
+def test_a_channel_that_is_being_created_is_awaited(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = folder / "dm00disp03.im.shm"
+    driver, events = mirror()
+    path.write_bytes(b"")
+    with pytest.raises(StreamError, match="stream 'dm00disp03' is being created"):
+        mirror()
+    with pytest.raises(RuntimeError, match="stream 'dm00disp03' is being created"):
+        driver.apply(shape_nm(1))
+    monkeypatch.setattr("lowfc.adapters.image_stream.channels._CREATION_S", 10.0)
+    channel(folder, "complete", make=True)
+    creation = threading.Timer(0.05, lambda: (folder / "complete.im.shm").rename(path))
+    creation.start()
+    driver.apply(shape_nm(1))
+    creation.join()
+    assert channel(folder).count == 1
+    assert events.names == ["STREAM_RENEWED"]
+
+
+def test_a_recreated_channel_that_cannot_be_used_fails_commands_until_it_can(folder: Path) -> None:
+    driver, events = mirror()
+    PlainStream.make(folder / "dm00disp03.im.shm", GRID[1] + 1, GRID[0], FLOAT32)
+    with pytest.raises(RuntimeError, match=f"{GRID[1] + 1} x {GRID[0]} pixels of float32"):
+        driver.apply(shape_nm(1))
+    other = channel(folder, make=True)
+    other.write(np.zeros(GRID))
+    other.pack("<i", other.writers, os.getppid())
+    with pytest.raises(RuntimeError, match=f"process {os.getppid()} writes stream 'dm00disp03'"):
+        driver.apply(shape_nm(1))
+    again = channel(folder, make=True)
+    driver.apply(shape_nm(1))
+    assert again.count == 1
+    assert events.names == ["STREAM_RENEWED"]
+
+
 class Sum(threading.Thread):
     """Stand-in for the process that sums the channels: clips the sum, then subtracts its mean."""
 

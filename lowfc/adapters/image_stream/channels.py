@@ -14,6 +14,9 @@ CHANNELS = 12
 _SEARCH_S = 1.0
 """Period of the search for channels that appeared, disappeared or were recreated."""
 _ATTEMPTS = 3
+_CREATION_S = 0.02
+"""Time in which another program finishes creating a stream."""
+_POLL_S = 0.001
 
 
 def sum_name(channel: str) -> str:
@@ -101,13 +104,9 @@ def whole(stream: Stream, otherwise: Single | None = None) -> Single | None:
 def channel_of(name: str, grid: tuple[int, int]) -> Stream:
     """Open a channel for writing, or create it with zeros.
 
-    StreamError if it has another grid, or another process writes it.
+    StreamError if it has another grid, another process writes it, or another program does not finish creating it.
     """
-    path = stream_path(name)
-    try:
-        stream = Stream(path)
-    except StreamAbsentError:
-        stream = Stream.create(path, grid, np.float32)
+    stream = _opened_or_created(stream_path(name), grid)
     if not fits(stream, grid):
         planes, rows, columns = stream.layout.shape
         depth = f" x {planes}" if planes > 1 else ""
@@ -118,3 +117,15 @@ def channel_of(name: str, grid: tuple[int, int]) -> Stream:
     if pid := stream.other_writer():
         raise StreamError(f"process {pid} writes stream {name!r}: stop it first, or choose a channel of your own")
     return stream
+
+
+def _opened_or_created(path: Path, grid: tuple[int, int]) -> Stream:
+    end_s = time.monotonic() + _CREATION_S
+    while path.exists():
+        try:
+            return Stream(path)
+        except StreamAbsentError as fault:
+            if time.monotonic() > end_s:
+                raise StreamError(f"{fault}; if no program is creating it, delete {path}") from None
+        time.sleep(_POLL_S)
+    return Stream.create(path, grid, np.float32)

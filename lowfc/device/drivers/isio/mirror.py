@@ -14,7 +14,7 @@ from lowfc.adapters.image_stream.channels import (
     sum_name,
     whole,
 )
-from lowfc.adapters.image_stream.stream import Stream, stream_path
+from lowfc.adapters.image_stream.stream import Stream, StreamError, stream_path
 from lowfc.adapters.process.service import Service
 from lowfc.arrays import Single
 from lowfc.contract.configuration import Configuration
@@ -95,9 +95,12 @@ class IsioMirror:
         """Do nothing: the channel keeps its shape, and a writer holds no semaphore."""
 
     def _check_channel(self) -> None:
-        """Reopen the channel if it was recreated; RuntimeError if another process writes it."""
+        """Reopen the channel if it was recreated; RuntimeError if it is unusable or another process writes it."""
         if not self._channel.current():
-            self._channel = channel_of(self._options.stream, self._grid)
+            try:
+                self._channel = channel_of(self._options.stream, self._grid)
+            except StreamError as fault:  # a LowfcError ends the process; another exception is retried
+                raise RuntimeError(str(fault)) from fault
             self._count = self._channel.count
             rows, columns = self._grid
             self._service.event("STREAM_RENEWED", stream=self._options.stream, columns=columns, rows=rows)
