@@ -326,6 +326,24 @@ def test_a_channel_whose_writer_died_meanwhile_stays_in_the_sum(folder: Path) ->
     assert np.allclose(1000 * others.sum(), shape_nm(2) + shape_nm(4), atol=1e-3)
 
 
+def test_a_shrunk_channel_is_no_longer_read(folder: Path) -> None:
+    dark_hole, turbulence = (channel(folder, f"dm00disp0{index}", make=True) for index in (0, 4))
+    driver, _ = mirror()
+    dark_hole.write(shape_nm(1) / 1000)
+    turbulence.write(shape_nm(2) / 1000)
+    others = OtherChannels(channel_names("dm00disp03"), GRID)
+    assert np.allclose(1000 * others.sum(), shape_nm(1) + shape_nm(2), atol=1e-3)
+    os.truncate(folder / "dm00disp04.im.shm", 0)
+    assert np.allclose(1000 * others.sum(), shape_nm(1), atol=1e-3)
+    channel(folder, "dm00disp00", make=True).write(shape_nm(3) / 1000)
+    assert np.allclose(1000 * others.sum(), shape_nm(3), atol=1e-3), "a recreated one is found at once"
+    os.truncate(folder / "dm00disp03.im.shm", 0)
+    with pytest.raises(RuntimeError, match="stream 'dm00disp03' is being created"):
+        driver.position()
+    channel(folder, make=True).write(shape_nm(1) / 1000)
+    assert np.allclose(driver.position(), shape_nm(1), atol=1e-3)
+
+
 def test_the_position_of_a_channel_whose_writer_died_is_what_it_holds(folder: Path) -> None:
     channel(folder, make=True).begin(shape_nm(1) / 1000)
     driver, _ = mirror()

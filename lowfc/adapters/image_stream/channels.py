@@ -12,7 +12,7 @@ from lowfc.arrays import Single
 
 CHANNELS = 12
 _SEARCH_S = 1.0
-"""Period of the search for channels that appeared, disappeared or were recreated."""
+"""Period of the search for channels that appeared."""
 _ATTEMPTS = 3
 _CREATION_S = 0.02
 """Time in which another program finishes creating a stream."""
@@ -56,12 +56,13 @@ class OtherChannels:
     def sum(self) -> Single:
         """Sum of the channels (rows, columns); the same array object until a channel is written."""
         now_s = time.monotonic()
-        if now_s - self._searched_s >= _SEARCH_S:
+        current = {path: stream for path, stream in self._streams.items() if stream.current()}
+        if len(current) < len(self._streams) or now_s - self._searched_s >= _SEARCH_S:
             self._searched_s = now_s
-            self._streams = {path: stream for path, stream in self._streams.items() if stream.current()}
             for path in self._paths:
-                if path not in self._streams and (stream := opened(path, self._grid)) is not None:
-                    self._streams[path] = stream
+                if path not in current and (stream := opened(path, self._grid)) is not None:
+                    current[path] = stream
+        self._streams = current
         counts = {path: (stream.identity, stream.count) for path, stream in self._streams.items()}
         if counts != self._counts:
             self._shapes = {

@@ -65,6 +65,7 @@ class IsioMirror:
 
     def position(self) -> Single:
         """Present shape of the channel, as far as written if its writer died; RuntimeError if it is not finite."""
+        self._reopen()
         shape = whole(self._channel, self._channel.data[0].astype(np.float32))
         if shape is None:
             raise RuntimeError(f"stream {self._channel.name!r} holds values that are not finite: write zeros to it")
@@ -79,7 +80,8 @@ class IsioMirror:
 
     def apply(self, actuators_nm: Single) -> Single | None:
         """Write the channel (rows, columns); once the sum is updated, return this channel's part of it."""
-        self._check_channel()
+        self._reopen()
+        self._check_writer()
         total = self._current_total()
         before = 0 if total is None else total.count
         self._channel.put(actuators_nm / np.float32(self._options.nm_per_unit))
@@ -94,16 +96,20 @@ class IsioMirror:
     def close(self) -> None:
         """Do nothing: the channel keeps its shape, and a writer holds no semaphore."""
 
-    def _check_channel(self) -> None:
-        """Reopen the channel if it was recreated; RuntimeError if it is unusable or another process writes it."""
-        if not self._channel.current():
-            try:
-                self._channel = channel_of(self._options.stream, self._grid)
-            except StreamError as fault:  # a LowfcError ends the process; another exception is retried
-                raise RuntimeError(str(fault)) from fault
-            self._count = self._channel.count
-            rows, columns = self._grid
-            self._service.event("STREAM_RENEWED", stream=self._options.stream, columns=columns, rows=rows)
+    def _reopen(self) -> None:
+        """Reopen the channel if it was recreated; RuntimeError if it is unusable."""
+        if self._channel.current():
+            return
+        try:
+            self._channel = channel_of(self._options.stream, self._grid)
+        except StreamError as fault:  # a LowfcError ends the process; another exception is retried
+            raise RuntimeError(str(fault)) from fault
+        self._count = self._channel.count
+        rows, columns = self._grid
+        self._service.event("STREAM_RENEWED", stream=self._options.stream, columns=columns, rows=rows)
+
+    def _check_writer(self) -> None:
+        """RuntimeError if another process writes the channel."""
         if self._channel.count != self._count:
             self._count = self._channel.count
             pid = self._channel.other_writer()
