@@ -14,15 +14,17 @@ from lowfc.adapters.image_stream.channels import OtherChannels, channel_names
 from lowfc.adapters.image_stream.stream import StreamError
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import ConfigurationError, RequestRefusedError
+from lowfc.contract.messages import COMMAND, MIRROR_STATE, wire
 from lowfc.control.loop.safety import Limit
 from lowfc.device.drivers.isio import mirror as mirror_module
 from lowfc.device.drivers.isio.camera import IsioCamera
 from lowfc.device.drivers.isio.mirror import IsioMirror
-from lowfc.device.mirror_loop import protection_of
+from lowfc.device.mirror_loop import MirrorLoop, protection_of
 from lowfc.device.mirror_protection import Command, Status, apply_command
 from lowfc.device.plugins import options
 from lowfc.programs.bridge import isio as bridge
 from lowfc.testing.clock import FakeClock
+from lowfc.testing.listener import Listener
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from tests.support.image_streams.plain import PlainStream
 
@@ -349,8 +351,34 @@ def test_the_position_of_a_channel_whose_writer_died_is_what_it_holds(folder: Pa
     driver, _ = mirror()
     assert np.allclose(driver.position(), shape_nm(1), atol=1e-3)
     channel(folder).write(np.full(GRID, np.nan))
-    with pytest.raises(RuntimeError, match="stream 'dm00disp03' holds values that are not finite: write zeros to it"):
-        driver.position()
+    assert driver.position() is None
+
+
+def test_the_mirror_writes_zeros_over_a_channel_that_is_not_finite(folder: Path) -> None:
+    def poisoned() -> PlainStream:
+        stream = channel(folder)
+        stream.write(np.full(GRID, np.nan))
+        return stream
+
+    channel(folder, make=True)
+    stream, hub, clock = poisoned(), MemoryHub(), FakeClock()
+    listener = Listener(hub, clock, MIRROR_STATE)
+    loop = MirrorLoop(mirror()[0], listener.service("mirror-dm"), CONFIG)
+    assert not stream.pixels.any(), "at the start"
+    command = wire.MirrorCommand(frame_sequence=1, rows=GRID[0], columns=GRID[1], valid_for_ns=10**9)
+    command.actuators = shape_nm(1).tobytes()
+    commands = MemoryBus(hub, "controller", clock).publisher(COMMAND, "dm")
+    commands.put(command.SerializeToString())
+    assert stream.pixels.any()
+    poisoned()
+    commands.put(command.SerializeToString())
+    clock.advance(10_000_000)
+    loop._idle()
+    assert not stream.pixels.any(), "after another process wrote it"
+    (failed,) = listener.event_texts("DRIVER_FAILED")
+    assert "another process writes stream 'dm00disp03'" in failed
+    commands.put(command.SerializeToString())
+    assert np.allclose(stream.pixels[0] * 1000, shape_nm(1), atol=1e-3)
 
 
 def test_the_stroke_limit_applies_to_the_sum_of_channels() -> None:

@@ -63,13 +63,14 @@ class IsioMirror:
         """Keep the process's service for events."""
         self._service = service
 
-    def position(self) -> Single:
-        """Present shape of the channel, as far as written if its writer died; RuntimeError if it is not finite."""
+    def position(self) -> Single | None:
+        """Present shape of the channel, as far as written if its writer died.
+
+        None if it is not finite: the mirror's process then writes zeros.
+        """
         self._reopen()
         shape = whole(self._channel, self._channel.data[0].astype(np.float32))
-        if shape is None:
-            raise RuntimeError(f"stream {self._channel.name!r} holds values that are not finite: write zeros to it")
-        return shape * np.float32(self._options.nm_per_unit)
+        return None if shape is None else shape * np.float32(self._options.nm_per_unit)
 
     def beside(self) -> Single:
         """Sum of the other channels, without piston; the sum stream includes it."""
