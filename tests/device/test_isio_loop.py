@@ -183,7 +183,7 @@ def _a_stopped_reader_resumes_with_the_newest_image(bench: Bench) -> None:
 def _other_channels_are_not_undone(bench: Bench) -> None:
     with going_on(bench.folder, BRIDGE), Client("bench") as client:
         calibration = client.calibration()
-        until(lambda: file_of(bench.folder, "lowfc_flux").exists())
+        until(lambda: all(file_of(bench.folder, f"lowfc_{name}").exists() for name in ("flux", "error")))
         error = PlainStream(file_of(bench.folder, "lowfc_error"), len(calibration.noll), 1, 9)
         until(lambda: error.count > 20)
         dark_hole = np.random.default_rng(3).standard_normal(GRID) * 0.02
