@@ -209,8 +209,9 @@ def test_ctrl_c_stops_within_a_program_and_leaves_no_file(tmp_path):
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         assert "cells, program  1" in process.stderr.readline()
         process.send_signal(signal.SIGINT)
-        process.communicate()
+        _, rest = process.communicate()
     assert process.returncode == 130
+    assert rest.endswith("interrupted\n")
     assert list(tmp_path.iterdir()) == []
 
 

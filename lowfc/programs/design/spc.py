@@ -1,7 +1,9 @@
 """The command `lowfc design spc`: progress, mask file and plot around `lowfc.design.shaped_pupil`."""
 
+import atexit
 import io
 import json
+import os
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import asdict
@@ -15,6 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from lowfc.adapters.files.drawing import figure_class, png
 from lowfc.adapters.files.whole_file import require_folder, write_whole
+from lowfc.adapters.process.terminal import INTERRUPTED
 from lowfc.arrays import Array
 from lowfc.contract.errors import ConfigurationError
 from lowfc.design.dark_zone import FINE_STEP, fine_grid
@@ -143,6 +146,10 @@ def _interruptibly(work: Callable[[], Value]) -> Value:
     Thread(target=run, daemon=True).start()
     try:
         return future.result()
+    except KeyboardInterrupt:
+        # Python's usual end would unwind the thread within the solver, which aborts the process.
+        atexit.register(os._exit, INTERRUPTED)
+        raise
     except NotSolvedError as error:
         raise ConfigurationError(str(error)) from error
 
