@@ -237,10 +237,10 @@ class MirrorExtras:
     def join(self, service: Service) -> None:
         """Called when the process has joined its run; `service` has its clock, publishers, bus and events."""
 
-    def position(self) -> Single:
+    def position(self) -> Single | None:
         """Read back the shape (rows, columns), nm of surface; called at the start and after a fault.
 
-        Without this method the mirror is driven to flat at once.
+        Without this method, or if it returns None, the mirror is driven to flat at once.
         """
         raise NotImplementedError
 
