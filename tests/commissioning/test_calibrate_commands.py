@@ -249,7 +249,7 @@ def test_the_computed_calibration_is_resampled_to_a_scaled_and_rotated_sensor(lo
     zeros = np.zeros((90 * 96, len(before.noll)), np.float32)
     blank = {"dark": zeros[:, 0], "reference": zeros[:, 0], "response": zeros, "reconstructor": zeros.T}
     real = replace(before, shape=shape, good=zeros[:, 0] + 1, **blank)
-    made = on_sensor(loop.config, before, found.geometry, found.flux, real)
+    made = on_sensor(loop.config, before, found.geometry, float(light.sum()), real)
     H = onto(before.response.astype(float).reshape(80, 80, -1), geometry, shape).reshape(90 * 96, -1)
     assert np.abs(cross_talk(made.reconstructor, H)).max() < 0.03
 
@@ -259,6 +259,20 @@ def test_a_poke_resolves_the_rotation_by_180_degrees(noiseless_loop: InProcessLo
     assert (found["pixels_per_lambda_d"], found["parity"]) == (pytest.approx(4, rel=0.003), 1)
     made = calibration_file.load(Path("aligned.fits"))
     assert np.abs(cross_talk(made.reconstructor, noiseless_loop.calibration().response)).max() < 0.05
+
+
+def test_an_aligned_calibration_expects_the_light_of_the_good_pixels(
+    noiseless_loop: InProcessLoop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loop, before = noiseless_loop, noiseless_loop.calibration()
+    good = before.good.reshape(80, 80).copy()
+    good[:36] = 0
+    monkeypatch.setattr(loop, "calibration", lambda: replace(before, good=good.reshape(-1)))
+    found = json_of("align", "--out", "aligned.fits", "--frames", "16")
+    light_dn = (next(loop.frames(1)).pixels.reshape(-1) - before.dark) @ good.reshape(-1)
+    assert light_dn < 0.9 * before.flux_dn
+    assert calibration_file.load(Path("aligned.fits")).flux_dn == pytest.approx(light_dn, rel=0.01)
+    assert found["flux_dn"] == pytest.approx(light_dn, rel=0.01)
 
 
 def test_a_computed_calibration_may_truncate_singular_values(loop: InProcessLoop) -> None:

@@ -52,23 +52,24 @@ def aligned(out: Path, run: str | None, frames: int, *, load: bool) -> AlignResu
         config, before = configuration_of(loop), replace(loop.calibration(), camera=loop.camera())
         pixels = watch(loop, frames)
         check_size(pixels.shape[1:], before)
-        dark = before.dark.reshape(before.shape).astype(np.float64)
+        light_dn = pixels.mean(axis=0) - before.dark.reshape(before.shape).astype(np.float64)
+        flux_dn = float(light_dn.reshape(-1) @ before.good)
         computed = analytic(config, console)
         try:
-            found = align(pixels.mean(axis=0) - dark, computed.reference.astype(np.float64).reshape(computed.shape))
+            found = align(light_dn, computed.reference.astype(np.float64).reshape(computed.shape))
         except ValueError as error:
             raise CalibrationError(str(error)) from None
-        calibration = on_sensor(config, computed, found.geometry, found.flux, before)
+        calibration = on_sensor(config, computed, found.geometry, flux_dn, before)
         mode = int(np.argmax(np.linalg.norm(calibration.response, axis=0)))
         poke = Player(loop, calibration, reporter(console)).first_poke(mode, sequence(AMPLITUDE_NM["poke"]))
         if poke.response @ calibration.response[:, mode] < 0:
             found = replace(found, geometry=found.geometry.rotated_180())
-            calibration = on_sensor(config, computed, found.geometry, found.flux, before)
+            calibration = on_sensor(config, computed, found.geometry, flux_dn, before)
         write(calibration, out, loop if load else None)
     return AlignResult(
         **asdict(found.geometry),
         pixels_per_lambda_d=found.geometry.scale * computed_scale(config),
-        flux_dn=found.flux,
+        flux_dn=flux_dn,
         background_dn=found.background,
         residual=found.residual,
         other_parity_residual=found.other_parity,
@@ -77,16 +78,19 @@ def aligned(out: Path, run: str | None, frames: int, *, load: bool) -> AlignResu
 
 
 def on_sensor(
-    config: Configuration, computed: Calibration, geometry: Geometry, flux: float, before: Calibration
+    config: Configuration, computed: Calibration, geometry: Geometry, flux_dn: float, before: Calibration
 ) -> Calibration:
-    """The computed calibration on the pixels of a real sensor, with the dark and mask of the calibration in use."""
+    """The computed calibration on the pixels of a real sensor, with the dark and mask of the calibration in use.
+
+    `flux_dn` is the sum of the good pixels without the dark, DN.
+    """
     own, pixels = (*computed.shape, -1), before.good.size
     I0 = onto(computed.reference.astype(np.float64).reshape(computed.shape), geometry, before.shape).reshape(-1)
     H = onto(computed.response.astype(np.float64).reshape(own), geometry, before.shape).reshape(pixels, -1)
     good = before.good.astype(np.float64)
     try:
         I0, H = normalise_flux(np.maximum(I0, 0), H, good)
-        reconstruction = compute_reconstructor(config, I0, H, None, good, flux, estimator=config.control.estimator)
+        reconstruction = compute_reconstructor(config, I0, H, None, good, flux_dn, estimator=config.control.estimator)
     except (ValueError, CalibrationError) as error:
         raise CalibrationError(f"too little of the image falls on the sensor: {error}") from None
     return identified(
@@ -98,7 +102,7 @@ def on_sensor(
             good=before.good,
             dark=before.dark,
             shape=before.shape,
-            flux_dn=flux,
+            flux_dn=flux_dn,
             saturation_dn=before.saturation_dn,
             estimator=f"{config.control.estimator}+aligned",
             operator_hash="",
