@@ -66,7 +66,7 @@ class Bench:
                 action()
 
     def steps(self, *, model: Configuration | None = None, **options: Any) -> Commissioning:
-        defaults = {"dark": None, "no_dark": True, "frames": 100, "snr": 30.0, "cycles": 4, "resume": False}
+        defaults = {"dark": None, "no_dark": True, "frames": 100, "snr": None, "cycles": 4, "resume": False}
         return Commissioning(
             self.loop,
             self.config,
@@ -145,12 +145,23 @@ def test_without_close_the_residual_is_only_predicted(commissioned: tuple[Bench,
     assert bench.loop.status().state.mode == wire.LOOP_MODE_OPEN
 
 
+@pytest.mark.parametrize(
+    ("snr", "cycles", "required"), [(None, None, 50.0), (None, 6, 20.0), (40.0, None, 40.0), (40.0, 6, 40.0)]
+)
+def test_a_given_number_of_cycles_changes_only_the_default_signal_to_noise_ratio(
+    commissioned: tuple[Bench, dict[str, Any]], snr: float | None, cycles: int | None, required: float
+) -> None:
+    bench, _ = commissioned
+    request = bench.steps(snr=snr, cycles=cycles)._request()
+    assert (request.snr, request.cycles) == (required, cycles)
+
+
 @pytest.mark.slow
 def test_a_sensor_unlike_the_configured_one_is_measured_without_the_model(tmp_path: Path) -> None:
     """The optical model of another sensor provides only the modes and the mirror's commands."""
     other = Configuration.model_validate({**tomllib.loads(TOML), "sensor": {"kind": "clowfs"}})
     bench = Bench(tmp_path, CONFIG)
-    results = bench.commission(model=other, close=False, cycles=None)
+    results = bench.commission(model=other, close=False, snr=30.0, cycles=None)
     assert "without the optical model" in bench.shown or "cannot be compared" in bench.shown
     assert results["recommended"]
 

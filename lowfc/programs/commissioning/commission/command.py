@@ -10,7 +10,7 @@ from lowfc.adapters.process.terminal import AnyRun, Json
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.control.calibration.response_fit import MIN_CYCLES
 from lowfc.programs.cli.output import print_result
-from lowfc.programs.commissioning.calibrate.command import Out, Resume, Snr
+from lowfc.programs.commissioning.calibrate.command import Out, Resume
 
 
 def commission(
@@ -23,11 +23,13 @@ def commission(
     no_dark: Annotated[
         bool, typer.Option("--no-dark", help="Use the camera's bias as the dark, and all pixels.")
     ] = False,
-    snr: Snr = 50.0,
-    cycles: Annotated[
-        int | None,
-        typer.Option(min=MIN_CYCLES, help="Cycles of the response; --snr is then 20 by default."),
+    snr: Annotated[
+        float | None,
+        typer.Option(
+            min=1, max=1e4, help="Signal-to-noise ratio to reach in the noisiest mode; default: 50, with --cycles 20."
+        ),
     ] = None,
+    cycles: Annotated[int | None, typer.Option(min=MIN_CYCLES, help="Cycles of the response.")] = None,
     resume: Resume = False,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
     close: Annotated[bool, typer.Option("--close", help="Close the loop at the end.")] = False,

@@ -37,6 +37,8 @@ from lowfc.programs.commissioning.commission.first_light import (
 )
 
 METHOD = "hadamard"
+DEFAULT_SNR = 50.0
+"""Signal-to-noise ratio required of the noisiest mode, unless the number of cycles is given."""
 LOOKED_AT = 32
 """Frames for determining size, rate and flux."""
 MAX_OF_PREDICTED = 1.5
@@ -57,7 +59,7 @@ class Commission:
     frames: int
     dark: Path | None
     no_dark: bool
-    snr: float
+    snr: float | None
     cycles: int | None
     resume: bool
     close: bool
@@ -171,7 +173,7 @@ class Commissioning:
 
     def _request(self, amplitude_nm: float | None = None, *, resume: bool = False) -> CalibrationRequest:
         options = self._options
-        snr = options.snr if options.cycles is None else MIN_SNR
+        snr = options.snr or (DEFAULT_SNR if options.cycles is None else MIN_SNR)
         return CalibrationRequest(METHOD, options.out, snr, options.cycles, amplitude_nm, resume)
 
     def _step(self, name: str) -> None:
