@@ -2,6 +2,7 @@
 
 import tomllib
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lowfc.adapters.files import calibration_file, factory
+from lowfc.adapters.files import calibration_file
+from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import Configuration, Control
 from lowfc.contract.errors import BusError, CalibrationError, DataFileError, RequestRefusedError
 from lowfc.contract.messages import wire
@@ -24,6 +26,7 @@ from lowfc.programs.commissioning.commission.first_calibration import linear_nm
 from lowfc.programs.commissioning.conformance.settings import AGREEMENTS, Agreement, agreement_checks
 from tests.support.in_process_loop import InProcessLoop, computed
 from tests.support.loops import lowfc
+from tests.support.theory import LAWS
 
 TOML = """
 [star]
@@ -107,6 +110,8 @@ def test_commissioning_closes_a_loop_with_another_frame_size(commissioned: tuple
     assert results["measured_error_nm"] == pytest.approx(results["predicted_error_nm"], rel=0.15)
     state = bench.loop.status().state
     assert state.mode == wire.LOOP_MODE_CLOSED
+    assert list(state.gain) == pytest.approx([0.1, 0.1, 0.2])
+    assert list(state.automatic) == [True, True, False]
     made = calibration_file.load(bench.out)
     assert made.shape == (64, 64)
     assert made.saturation_dn == 2**14 - 1
@@ -137,12 +142,57 @@ def test_the_loop_holds_the_wavefront_of_the_reference_image(commissioned: tuple
 
 
 def test_without_close_the_residual_is_only_predicted(commissioned: tuple[Bench, dict[str, Any]]) -> None:
+    bench, results = commissioned
+    bench.loop.open_loop()
+    before = bench.loop.status().state
+    text = bench.steps(close=False)._close(1.0)
+    assert "predicted measured error in closed loop, at a gain of 0.1 in place of automatic gains: " in text
+    assert "`lowfc ctl close` closes it" in text
+    after = bench.loop.status().state
+    assert (after.mode, after.gain, after.automatic) == (wire.LOOP_MODE_OPEN, before.gain, before.automatic)
+    open_nm = np.array([step.pol_nm for step in bench.loop.steps(300)])
+    assert results["predicted_error_nm"] < 0.7 * np.sqrt(np.square(open_nm).sum(axis=1).mean())
+
+
+@pytest.mark.parametrize("reversed_modes", [[0], [0, 1, 2]])
+def test_a_wrong_sign_fails_the_check_with_automatic_gains(
+    commissioned: tuple[Bench, dict[str, Any]], reversed_modes: list[int]
+) -> None:
     bench, _ = commissioned
     bench.loop.open_loop()
-    text = bench.steps(close=False)._close(factory.settings(bench.config).integrator(bench.config.noll), 1.0)
-    assert "predicted measured error" in text
-    assert "`lowfc ctl close` closes it" in text
-    assert bench.loop.status().state.mode == wire.LOOP_MODE_OPEN
+    good = bench.loop.calibration()
+    R = good.reconstructor.copy()
+    R[reversed_modes] *= -1
+    bench.loop.load(identified(replace(good, reconstructor=R)))
+    steps = bench.steps()
+    with bench.loop.reserved("a test"), pytest.raises(CalibrationError, match=r"nm rms, but .* was predicted"):
+        steps._close(1.0)
+    advice = steps._how_to_continue(None, first_of(bench.out))
+    assert "is saved in" in advice
+    assert "the closed loop did not behave as predicted: check the sign" in advice
+    assert "`lowfc ctl reset` removes its command from the mirror" in advice
+    state = bench.loop.status().state
+    assert (state.mode, list(state.automatic)) == (wire.LOOP_MODE_OPEN, [True, True, False])
+    bench.loop.load(good)
+    bench.loop.reset()
+    bench.loop.run(20)
+
+
+def test_with_a_linear_law_its_own_residual_is_predicted(commissioned: tuple[Bench, dict[str, Any]]) -> None:
+    bench, results = commissioned
+    bench.loop.open_loop()
+    law = replace(LAWS["pi"], rate_hz=100.0)
+    bench.loop.law(law)
+    before = bench.loop.status().state
+    steps = bench.steps()
+    with bench.loop.reserved("a test"):
+        steps._close(1.0)
+    assert steps._results["measured_error_nm"] == pytest.approx(steps._results["predicted_error_nm"], rel=0.15)
+    assert steps._results["predicted_error_nm"] < 0.9 * results["predicted_error_nm"]
+    after = bench.loop.status().state
+    assert (after.law.id, after.gain, after.automatic) == (law.id, before.gain, before.automatic)
+    bench.loop.open_loop()
+    bench.loop.law(None)
 
 
 @pytest.mark.parametrize(
@@ -198,6 +248,7 @@ def test_a_resumed_commissioning_continues_and_reports_an_operator_who_opens_the
     assert "[1/10]" not in bench.shown
     assert "continuing after" in bench.shown
     assert "the calibration is good" in bench.shown
+    assert "`lowfc ctl gain auto --modes 2,3` makes them automatic again" in bench.shown
     state = bench.loop.status().state
     assert (state.mode, state.calibration_id) == (wire.LOOP_MODE_OPEN, calibration_file.load(bench.out).id)
 

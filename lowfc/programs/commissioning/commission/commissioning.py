@@ -1,8 +1,8 @@
 """The steps from a running camera and mirror to a calibration in use and a closed loop."""
 
 import contextlib
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +13,18 @@ from lowfc.adapters.logs.columns import Steps, steps_as_columns
 from lowfc.adapters.process.progress import Counted
 from lowfc.arrays import Single
 from lowfc.client import Client
+from lowfc.contract.codecs.law_codec import driving, gains_of
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import CalibrationError, LowfcError
 from lowfc.contract.messages import wire
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.delay_fit import Delay
-from lowfc.control.laws.integrator import Integrator
 from lowfc.control.laws.stability import delay_weights, settling_frames
-from lowfc.control.laws.what_if import as_logged, counterfactual, missing_before, rms
+from lowfc.control.laws.what_if import Controller, as_logged, counterfactual, driven_by, missing_before, rms
 from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import LoopMode
+from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
+from lowfc.programs.commissioning.acceptance.probe import Loop
 from lowfc.programs.commissioning.calibrate.pokes import MIN_SNR, CalibrationRequest, Pokes
 from lowfc.programs.commissioning.calibrate.recording import CHECKED, Player, Report, watch
 from lowfc.programs.commissioning.calibrate.result import finish_calibration
@@ -41,6 +43,11 @@ DEFAULT_SNR = 50.0
 """Signal-to-noise ratio required of the noisiest mode, unless the number of cycles is given."""
 LOOKED_AT = 32
 """Frames for determining size, rate and flux."""
+CHECK_GAIN = 0.1
+"""Gain of the closed-loop check in place of automatic gains, which are 0 before they are measured.
+
+It is stable at any usual delay; with a wrong sign the error grows tenfold in 25 frames.
+"""
 MAX_OF_PREDICTED = 1.5
 """Largest ratio of measured to predicted error in the closed loop."""
 MIN_PREDICTED = 1000
@@ -88,7 +95,7 @@ class Commissioning:
         self._report, self._progress, self._confirm = report, progress, confirm
         self._results: dict[str, Any] = {}
         self._delay: Delay | None = None
-        self._recommended = False
+        self._advice = ""  # after an early end, once the calibration is loaded
 
     def run(self) -> tuple[dict[str, Any], str]:
         """Carry out all steps; return the results, and the text for people."""
@@ -109,10 +116,8 @@ class Commissioning:
 
     def _how_to_continue(self, before: Calibration | None, first_file: Path) -> str:
         """Text after a commissioning that ended early: the calibration in use, and how to continue."""
-        if self._recommended:
-            return (
-                f"the calibration is good, saved in {self._options.out} and loaded: `lowfc ctl close` closes the loop"
-            )
+        if self._advice:
+            return self._advice
         if not first_file.is_file():
             return "no calibration was changed"
         text = f"the completed steps are kept in {first_file}: the same command with --resume continues"
@@ -164,12 +169,11 @@ class Commissioning:
                 "for example to add more (--cycles)"
             )
         self._loop.load(calibration)
-        self._recommended = True
+        self._advice = f"the calibration is good, saved in {options.out} and loaded: `lowfc ctl close` closes the loop"
         for path in (first_file, partial_of(options.out)):
             path.unlink(missing_ok=True)
         self._report(result.text())
-        law = factory.settings(config).integrator(calibration.noll)
-        return self._results, self._close(law, delay.delay_frames)
+        return self._results, self._close(delay.delay_frames)
 
     def _request(self, amplitude_nm: float | None = None, *, resume: bool = False) -> CalibrationRequest:
         options = self._options
@@ -181,9 +185,7 @@ class Commissioning:
 
     def _open(self) -> Calibration | None:
         """Check the mirror and open the loop unless idle; return the calibration in use, if any."""
-        state = self._loop.status().state
-        if state is None:
-            raise CalibrationError("the controller did not report its state")
+        state = self._state()
         if state.mode == wire.LOOP_MODE_SAFE:
             raise CalibrationError("the loop is in safe mode: `lowfc ctl clear` first, when it is safe")
         grid = (state.mirror_rows, state.mirror_columns)
@@ -196,6 +198,12 @@ class Commissioning:
             self._report("the loop is opened")
             self._loop.open_loop()
         return self._loop.calibration() if state.calibration_id and state.mode != wire.LOOP_MODE_IDLE else None
+
+    def _state(self) -> wire.ControllerState:
+        state = self._loop.status().state
+        if state is None:
+            raise CalibrationError("the controller did not report its state")
+        return state
 
     def _first(self) -> Calibration:
         self._step("camera")
@@ -220,32 +228,77 @@ class Commissioning:
         first = aligned(self._config, self._computed, before, delay, self._report, self._results)
         return poked(player, self._config, delay) if first is None else first
 
-    def _close(self, law: Integrator, delay_frames: float) -> str:
+    def _close(self, delay_frames: float) -> str:
         """Predict the residual; if requested, close the loop and compare."""
-        rate_hz = self._config.camera.rate_hz
-        settling = settling_frames(law.gain, law.leak, rate_hz)
+        controller, settling, automatic = self._law_of_check()
         frames = settling + max(MIN_PREDICTED, settling)
         self._step("prediction")
         try:
             opened = self._steps(frames)
             weights = delay_weights(max(delay_frames, 1.0)).astype(np.float32)
             missing = missing_before(opened.sequence)
-            predicted = _rms_nm(counterfactual(as_logged(law), weights, opened.pol_nm, missing)[0], settling)
+            predicted = _rms_nm(counterfactual(controller, weights, opened.pol_nm, missing)[0], settling)
         except ValueError as error:
             raise CalibrationError(f"the residual cannot be predicted: {error}") from None
         self._results["predicted_error_nm"] = predicted
-        text = f"predicted measured error in closed loop: {predicted:.3g} nm rms, from {frames} open-loop frames"
+        gain = f", at a gain of {CHECK_GAIN:g} in place of automatic gains" if automatic else ""
+        text = f"predicted measured error in closed loop{gain}: {predicted:.3g} nm rms, from {frames} open-loop frames"
         if not self._options.close:
             return f"{text}\n`lowfc ctl close` closes it"
         self._step("closed loop")
+        with self._fixed_gains(automatic):
+            measured = self._measured_nm(frames, settling, predicted)
+        return f"{text}\nmeasured in closed loop: {measured:.3g} nm rms, {measured / predicted:.2f} of the prediction"
+
+    def _law_of_check(self) -> tuple[Controller, int, list[int]]:
+        """Controller of the closed-loop check, its settling time in frames, and the modes with automatic gains.
+
+        A linear law in force stays in force.
+        """
+        state, noll, rate_hz = self._state(), self._computed.noll, self._config.camera.rate_hz
+        integrator, law = gains_of(state), driving(state, self._loop.laws())
+        if law is not None:
+            settling = SETTLING_FRAMES + FADING_FRAMES + Loop(law, noll, state.delay_frames, rate_hz).settling_frames()
+            return driven_by(law, integrator.limit_nm), settling, []
+        automatic = np.array(state.automatic or [False] * len(noll), bool)
+        integrator = replace(integrator, gain=np.where(automatic, np.float32(CHECK_GAIN), integrator.gain))
+        settling = settling_frames(integrator.gain, integrator.leak, rate_hz)
+        return as_logged(integrator), settling, np.array(noll)[automatic].tolist()
+
+    @contextlib.contextmanager
+    def _fixed_gains(self, modes: list[int]) -> Iterator[None]:
+        """Context with the gain of the check in these modes; their gains are automatic again afterwards."""
+        if not modes:
+            yield
+            return
+        try:
+            self._loop.gain(CHECK_GAIN, modes)
+            yield
+        finally:
+            try:
+                self._loop.automatic_gain(modes)
+            except LowfcError as fault:  # an error in the block is the one that is raised
+                self._report(
+                    f"warning: {fault}: the gains of the check stay; `lowfc ctl gain auto --modes "
+                    f"{','.join(map(str, modes))}` makes them automatic again"
+                )
+
+    def _measured_nm(self, frames: int, settling: int, predicted: float) -> float:
+        """Close the loop and measure its error, nm rms; after any failure the loop is open."""
         self._loop.close_loop()
         try:
-            measured = _rms_nm(self._steps(frames, LoopMode.CLOSED).error_nm, settling)
+            closed = self._steps(frames, LoopMode.CLOSED)
+            self._advice = (
+                f"the calibration is saved in {self._options.out} and loaded, but the closed loop did not behave as "
+                "predicted: check the sign of the mirror, the delay and the disturbance before you close it; "
+                "`lowfc ctl reset` removes its command from the mirror"
+            )
+            measured = _rms_nm(closed.error_nm, settling)
             self._results["measured_error_nm"] = measured
             if measured > MAX_OF_PREDICTED * predicted:
                 raise CalibrationError(
                     f"the measured error in closed loop is {measured:.3g} nm rms, but {predicted:.3g} was predicted: "
-                    "is the delay right, did the disturbance change? The loop is opened"
+                    "are sign and delay right, did the disturbance change? The loop is opened"
                 )
         except BaseException as error:
             with contextlib.suppress(LowfcError):
@@ -254,7 +307,7 @@ class Commissioning:
             if isinstance(error, ValueError):
                 raise CalibrationError(f"the residual cannot be measured: {error}") from None
             raise
-        return f"{text}\nmeasured in closed loop: {measured:.3g} nm rms, {measured / predicted:.2f} of the prediction"
+        return measured
 
     def _steps(self, frames: int, mode: LoopMode = LoopMode.OPEN) -> Steps:
         steps: list[Step] = []
