@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,8 @@ from lowfc.adapters.files import calibration_file, factory
 from lowfc.adapters.process.progress import spoken
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
-from lowfc.contract.errors import CalibrationError, ConfigurationError, DataFileError
+from lowfc.contract.errors import CalibrationError, ConfigurationError, DataFileError, RequestRefusedError
+from lowfc.contract.messages import wire
 from lowfc.control.calibration.alignment import Geometry, align, onto
 from lowfc.control.calibration.calibration import Calibration, normalise_flux
 from lowfc.control.calibration.response_fit import cross_talk
@@ -24,7 +26,7 @@ from lowfc.optics.chain.zernike import zernikes
 from lowfc.optics.twin.twin import Twin, node_radii, reference, response
 from lowfc.programs.commissioning.analytic import analytic
 from lowfc.programs.commissioning.calibrate import align as calibrate_align
-from lowfc.programs.commissioning.calibrate import pokes
+from lowfc.programs.commissioning.calibrate import command, pokes
 from lowfc.programs.commissioning.calibrate import tasks as calibrate_commands
 from lowfc.programs.commissioning.calibrate.align import on_sensor
 from lowfc.programs.commissioning.calibrate.command import calibrate_app
@@ -135,6 +137,55 @@ def test_a_resumed_calibration_is_written_loaded_and_reported_when_complete(
     assert same["reference_shift_nm"] == [0.0] * 3
     done = CliRunner().invoke(calibrate_app, ["--compare", "night.fits", "night.fits"])
     assert "largest cross-talk" in done.stdout
+
+
+def test_a_calibration_in_closed_loop_is_loaded_and_the_loop_closed_again(
+    noiseless_loop: InProcessLoop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loop, before = noiseless_loop, noiseless_loop.calibration()
+    made = identified(replace(before, reference=before.reference * np.float32(1.001)))
+    part = Path("night.fits.part.npz")
+    refuse = False
+
+    def run(self: Calibrator) -> None:
+        part.touch()
+        self.completed = 4
+
+    def load_calibration(calibration: Calibration) -> Any:
+        if refuse:
+            raise RequestRefusedError("load refused: a test")
+        return InProcessLoop.load(loop, calibration)
+
+    result = SimpleNamespace(recommended=True, not_loaded=False)
+    monkeypatch.setattr(Calibrator, "run", run)
+    monkeypatch.setattr(calibrate_commands, "finish_calibration", lambda *_: (made, result))
+    monkeypatch.setattr(loop, "load", load_calibration)
+    monkeypatch.setattr(command, "print_result", lambda *_, **__: None)
+    loop.close_loop()
+    words = ["--method", "in-loop", "--out", "night.fits", "--load"]
+    done = CliRunner().invoke(calibrate_app, words, catch_exceptions=False)
+    assert "the loop is opened to load the calibration and closed again afterwards" in done.stderr
+    assert (loop.calibration().id, loop.status().state.mode) == (made.id, wire.LOOP_MODE_CLOSED)
+    assert not part.exists()
+    refuse = True
+    done = CliRunner().invoke(calibrate_app, words)
+    assert "load refused" in str(done.exception)
+    assert "kept in night.fits.part.npz: 4 cycles" in done.stderr
+    assert part.exists()
+    assert loop.status().state.mode == wire.LOOP_MODE_CLOSED
+
+
+def test_cycles_that_are_not_kept_are_not_reported(
+    noiseless_loop: InProcessLoop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run(self: Calibrator) -> None:
+        self.completed = 4
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Calibrator, "run", run)
+    done = CliRunner().invoke(calibrate_app, ["--out", "night.fits"])
+    assert done.exit_code == 130
+    assert "kept in" not in done.stderr
 
 
 def test_a_calibration_that_is_not_recommended_is_written_but_not_loaded(

@@ -54,7 +54,14 @@ def calibrate(
             show_default=False,
         ),
     ] = None,
-    load: Load = False,
+    load: Annotated[
+        bool,
+        typer.Option(
+            "--load",
+            help="Load the result into the loop. A closed loop is opened for it and closed again; with --method "
+            "analytic it must be open.",
+        ),
+    ] = False,
     compare: Annotated[tuple[Path, Path] | None, typer.Option(help="Only compare two calibration files.")] = None,
     as_json: Json = False,
 ) -> None:

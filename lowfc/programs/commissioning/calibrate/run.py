@@ -102,18 +102,23 @@ class Calibrator:
     @contextlib.contextmanager
     def required_mode(self) -> Iterator[None]:
         """Context with the loop in the mode that the method requires; restores the mode at the end."""
-        state = self._loop.status().state
-        mode = state.mode if state is not None else wire.LOOP_MODE_OPEN
+        mode = self._mode()
         if mode not in (wire.LOOP_MODE_OPEN, wire.LOOP_MODE_CLOSED):
             raise CalibrationError("the loop must be open or closed: `lowfc ctl clear` leaves safe mode")
         if self._closed and mode != wire.LOOP_MODE_CLOSED:
             raise CalibrationError(
                 "--method in-loop requires a closed loop, but the loop is open: `lowfc ctl close` first"
             )
-        if self._closed or mode != wire.LOOP_MODE_CLOSED:
+        with contextlib.nullcontext() if self._closed else self.opened("for the calibration"):
+            yield
+
+    @contextlib.contextmanager
+    def opened(self, purpose: str) -> Iterator[None]:
+        """Context with the loop open; a closed loop is closed again at the end."""
+        if self._mode() != wire.LOOP_MODE_CLOSED:
             yield
             return
-        self._report("the loop is opened for the calibration and closed again afterwards")
+        self._report(f"the loop is opened {purpose} and closed again afterwards")
         self._loop.open_loop()
         try:
             yield
@@ -125,6 +130,10 @@ class Calibrator:
                 self._report(f"warning: the loop was not closed again: {fault}")
             raise
         self._loop.close_loop()
+
+    def _mode(self) -> int:
+        state = self._loop.status().state
+        return state.mode if state is not None else wire.LOOP_MODE_OPEN
 
     def run(self, delay: Delay | None = None) -> CalibrationData:
         """Measure the delay unless known, which checks that pokes are detected, then the response."""

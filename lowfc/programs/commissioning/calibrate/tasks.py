@@ -79,11 +79,12 @@ def poked(request: CalibrationRequest, run: str | None, *, load: bool) -> Calibr
             with calibrator.required_mode():
                 calibration, result = finish_calibration(calibrator, request, calibrator.run(), computed)
                 if result.recommended:
-                    partial_of(request.out).unlink(missing_ok=True)
                     if load:
-                        loop.load(calibration)
+                        with calibrator.opened("to load the calibration"):
+                            loop.load(calibration)
+                    partial_of(request.out).unlink(missing_ok=True)
         except BaseException:
-            if calibrator.completed:
+            if calibrator.completed and partial_of(request.out).is_file():
                 cycles = counted(calibrator.completed, "cycle")
                 report(
                     f"kept in {partial_of(request.out)}: {cycles}; the same command with --resume continues with them"
