@@ -18,6 +18,7 @@ from lowfc.client import Answer
 from lowfc.contract.codecs.law_codec import driving
 from lowfc.contract.configuration import load
 from lowfc.contract.errors import BusError, ConfigurationError, DataFileError, RequestRefusedError
+from lowfc.contract.messages import wire
 from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.margins import check_stable
@@ -190,6 +191,67 @@ class ReportingLoop(StreamedLoop):
 def test_the_mirrors_reports_give_the_time_of_application() -> None:
     run = telemetry_from_run(ReportingLoop(CONFIG), 60.0)
     assert (run.timing.delay, run.timing.applied) == (1.0, pytest.approx(0.7, abs=1e-3))
+
+
+PROBE = wire.Play(first_sequence=frame_sequence(3050), frames=100, id="probe")
+
+
+class SteppedLoop(StreamedLoop):
+    """A loop with these steps, whose mirror reports each command so many periods after the end of the exposure.
+
+    Its state has the probe sequence once, when it is requested after 3100 steps.
+    """
+
+    def __init__(self, steps: list[Step], report_periods: float = 0.2, *, probed: bool = False) -> None:
+        super().__init__(CONFIG)
+        self.recorded, self.report_ns, self.probed = steps, round(report_periods * PERIOD_NS), probed
+        self.requested = 0
+
+    def steps(self, count: int | None = None, patience_s: float = 0.0) -> StepStream:
+        stream = StepStream(0)
+        stream.lost, stream.steps = 0, iter(self.recorded)
+        return stream
+
+    def status(self) -> Answer:
+        answer = super().status()
+        self.requested += 1
+        if self.probed and self.requested == 1 + 31:
+            answer.state.play.CopyFrom(PROBE)
+        return answer
+
+    def mirror_watch(self) -> Any:
+        applied = [(step.frame_sequence, step.time_ns + self.report_ns) for step in self.recorded[-1024:]]
+        return SimpleNamespace(applied=applied, read=lambda: None)
+
+
+def closed_loop(disturbance_nm: np.ndarray, delay_frames: int) -> list[Step]:
+    """Steps of a controller that assumes a delay of one frame, with commands of noise."""
+    command_nm = np.random.default_rng(7).standard_normal(disturbance_nm.shape).astype(np.float32)
+    error_nm = disturbance_nm + np.concatenate([np.zeros((delay_frames, 3), np.float32), command_nm[:-delay_frames]])
+    pol_nm = error_nm - np.concatenate([np.zeros((1, 3), np.float32), command_nm[:-1]])
+    return [
+        Step(frame_sequence(index), index * PERIOD_NS, LoopMode.CLOSED, command_nm[index], (), error, pol)
+        for index, (error, pol) in enumerate(zip(error_nm, pol_nm, strict=True))
+    ]
+
+
+@pytest.mark.parametrize(("report_periods", "delay_frames"), [(0.2, 1), (1.2, 2)])
+def test_a_longer_delay_is_measured_on_a_running_loop(report_periods: float, delay_frames: int) -> None:
+    disturbance_nm = np.random.default_rng(5).standard_normal((4000, 3)).astype(np.float32)
+    run = telemetry_from_run(SteppedLoop(closed_loop(disturbance_nm, delay_frames), report_periods), 60.0)
+    assert run.timing.delay == delay_frames
+    assert run.pol.joined() == pytest.approx(disturbance_nm[-run.pol.frames :], abs=1e-4)
+    warned = "the controller assumed a delay of 1 frames, but measured from the times of frames and mirror it is 2.00"
+    assert [warning.startswith(warned) for warning in run.warnings] == [True] * (delay_frames - 1)
+
+
+def test_probe_sequences_on_a_running_loop_are_excluded() -> None:
+    """The loop settles for half a second again after the sequence."""
+    disturbance_nm = np.random.default_rng(5).standard_normal((6000, 3)).astype(np.float32)
+    disturbance_nm[3050 : 3050 + PROBE.frames] += 100
+    run = telemetry_from_run(SteppedLoop(closed_loop(disturbance_nm, 1), probed=True), 60.0)
+    assert run.pol.frames == pytest.approx(6000 - 500 - PROBE.frames - 500, abs=10)
+    assert np.abs(run.pol.joined()).max() < 20
 
 
 def test_a_too_short_live_time_is_refused_at_once() -> None:

@@ -15,20 +15,23 @@ from lowfc.client import Client, MirrorWatch, configuration_of
 from lowfc.contract.codecs.law_codec import driving, gains_of
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BusError, DataFileError
+from lowfc.contract.messages import wire
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.integrator import Integrator
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.spectra import TimeSeries, time_series
 from lowfc.control.laws.vibration import FEWEST
+from lowfc.control.laws.what_if import delay_from_times, exposed, missing_before
 from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.wording import counted
 from lowfc.optics.chain.added_contrast import ModalContrast
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
-from lowfc.programs.logs.what_if.run import LoggedRun
+from lowfc.programs.logs.what_if.run import LoggedRun, SeenCommands, during_probe
 
 _SETTLING_S = 0.5  # time excluded after the loop was closed
+_POLLED = 100  # frames between two requests for the state of a running loop
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,18 +76,11 @@ def telemetry_from_log(log: LogReader) -> Telemetry:
     """
     history = read_history(log)
     run = LoggedRun(history)
-    steps = run.steps
-    same = run.delay_frames == run.controller_delay
-    pol_nm = steps.pol_nm if same else steps.error_nm - run.seen_nm
-    usable = run.used & np.isfinite(pol_nm).all(axis=1) & ~run.torn & ~run.played & (steps.saturated_pixels == 0)
-    mode = np.where(run.played, np.uint8(0), steps.mode)  # the loop also settles after a probe sequence
-    warnings = list(history.remarks)
-    if not same:
-        warnings.append(
-            f"the controller assumed a delay of {run.controller_delay:g} frames, but measured from "
-            f"{run.measured_from} it is {run.measured_delay:.2f}: the law is made for {run.delay_frames:g} frames; set "
-            "control.delay_frames"
-        )
+    steps, usable = _without_probes(run.steps, run.seen, run.controller_delay, run.played)
+    warnings = [
+        *history.remarks,
+        *_delay_warnings(run.controller_delay, run.seen, run.measured_delay, run.measured_from),
+    ]
     if log.damage:
         warnings.append("the log is damaged; unreadable parts are left out")
     config = history.configuration
@@ -93,7 +89,7 @@ def telemetry_from_log(log: LogReader) -> Telemetry:
         history.rate_hz,
         run.timing,
         (run.law, driving(history.controller, history.published.laws)),
-        replace(steps, pol_nm=pol_nm, mode=mode),
+        steps,
         usable,
         None if run.true_nm is None else run.true_nm[1],
         config,
@@ -103,8 +99,12 @@ def telemetry_from_log(log: LogReader) -> Telemetry:
 
 
 def telemetry_from_run(loop: Client, seconds: float, progress: Callable[[float], None] | None = None) -> Telemetry:
-    """The steps of a running loop in the next `seconds`."""
-    state = loop.status().state
+    """The steps of a running loop in the next `seconds`.
+
+    Frames with a probe sequence are excluded. The state is requested every `_POLLED` frames: a shorter sequence may not
+    be noticed.
+    """
+    states = [_state(loop)]
     calibration = loop.calibration()
     config = configuration_of(loop)
     if seconds * config.camera.rate_hz < FEWEST:
@@ -115,35 +115,86 @@ def telemetry_from_run(loop: Client, seconds: float, progress: Callable[[float],
         )
     watch = _watched(loop)
     begun_s = time.monotonic()
-    steps: list[Step] = []
+    received: list[Step] = []
     stream = loop.steps()
     for step in stream:
-        steps.append(step)
+        received.append(step)
         passed_s = time.monotonic() - begun_s
-        if len(steps) % 100 == 0 and progress is not None:
-            progress(passed_s)
-        if len(steps) % 100 == 0 and watch is not None:
-            watch.read()
+        if len(received) % _POLLED == 0:
+            states.append(_state(loop))
+            if progress is not None:
+                progress(passed_s)
+            if watch is not None:
+                watch.read()
         if passed_s >= seconds:
             break
     stream.close()
-    if state is None or not state.gain:
-        raise DataFileError(f"run {loop.run_id!r} has no calibration: load one with `lowfc ctl load`")
-    columns = steps_as_columns(steps, len(calibration.noll))
-    period_s = float(np.median(np.diff(columns.time_ns))) * 1e-9 if len(steps) > 1 else 0.0
+    states.append(_state(loop))
+    steps = _from_first_used(steps_as_columns(received, len(calibration.noll)))
+    period_s = float(np.median(np.diff(steps.time_ns))) * 1e-9 if len(steps.time_ns) > 1 else 0.0
     rate_hz = 1 / period_s if period_s > 0 else config.camera.rate_hz
+    assumed, measured = float(states[0].delay_frames), _measured_delay(steps, watch, config)
+    if measured is not None and measured < assumed:  # a delay after the mirror's report is not in these times
+        measured = None
+    seen = SeenCommands.of(steps, missing_before(steps.sequence), states, assumed, measured)
+    played = np.zeros(steps.sequence.shape, np.bool_)
+    for state in states:
+        if state.HasField("play"):
+            played |= during_probe(steps.sequence, state.play.first_sequence, state.play.frames)
+    steps, usable = _without_probes(steps, seen, assumed, played)
+    lost = [f"{counted(stream.lost, 'step')} lost on the way to this command"] if stream.lost else []
     return _telemetry(
         loop.run_id,
         rate_hz,
-        _timing(float(state.delay_frames), config.camera.exposure_fraction, columns, watch, rate_hz),
-        (gains_of(state), driving(state, loop.laws())),
-        columns,
-        np.isfinite(columns.pol_nm).all(axis=1) & (columns.saturated_pixels == 0),
+        _timing(seen.delay_frames, config.camera.exposure_fraction, steps, watch, rate_hz),
+        (gains_of(states[0]), driving(states[0], loop.laws())),
+        steps,
+        usable,
         None,
         config,
         calibration,
-        [f"{counted(stream.lost, 'step')} lost on the way to this command"] if stream.lost else [],
+        [*_delay_warnings(assumed, seen, measured, "the times of frames and mirror"), *lost],
     )
+
+
+def _state(loop: Client) -> wire.ControllerState:
+    state = loop.status().state
+    if state is None or not state.gain:
+        raise DataFileError(f"run {loop.run_id!r} has no calibration: load one with `lowfc ctl load`")
+    return state
+
+
+def _from_first_used(steps: Steps) -> Steps:
+    rows = exposed(steps.sequence)
+    rows[: int(np.argmax(np.isfinite(steps.error_nm).all(axis=1)))] = False
+    return steps.at(rows)
+
+
+def _without_probes(steps: Steps, seen: SeenCommands, assumed: float, played: Mask) -> tuple[Steps, Mask]:
+    """The steps with pseudo-open-loop modes for the measured delay, and the usable ones (steps,).
+
+    The loop is not closed in those with a probe sequence (`played`), so that it also settles after one.
+    """
+    pol_nm = steps.pol_nm if seen.delay_frames == assumed else steps.error_nm - seen.seen_nm
+    usable = np.isfinite(pol_nm).all(axis=1) & ~seen.torn & ~played & (steps.saturated_pixels == 0)
+    return replace(steps, pol_nm=pol_nm, mode=np.where(played, np.uint8(0), steps.mode)), usable
+
+
+def _delay_warnings(assumed: float, seen: SeenCommands, measured: float | None, source: str) -> list[str]:
+    if seen.delay_frames == assumed:
+        return []
+    return [
+        f"the controller assumed a delay of {assumed:g} frames, but measured from {source} it is {measured:.2f}: the "
+        f"law is made for {seen.delay_frames:g} frames; set control.delay_frames"
+    ]
+
+
+def _measured_delay(steps: Steps, watch: MirrorWatch | None, config: Configuration) -> float | None:
+    """Delay in frames from the mirror's latest reports; None without them, and in simulated time."""
+    if watch is None or config.lockstep or not watch.applied:
+        return None
+    applied, applied_ns = np.array(watch.applied, np.int64).T
+    return delay_from_times(steps.sequence, steps.time_ns - config.exposure_ns, applied.astype(np.uint64), applied_ns)
 
 
 def _watched(loop: Client) -> MirrorWatch | None:

@@ -1,13 +1,14 @@
 """Input of a what-if: exposures of the logged run, the measured delay, and the command seen by each exposure."""
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from lowfc.adapters.files.factory import settings
-from lowfc.adapters.logs.columns import rows_of
+from lowfc.adapters.logs.columns import Steps, rows_of
 from lowfc.adapters.logs.history import History
-from lowfc.arrays import Mask, Sequences, Single
+from lowfc.arrays import Mask, Sequences, Single, Whole
 from lowfc.contract.codecs.codec import decode_frame
 from lowfc.contract.codecs.law_codec import gains_of
 from lowfc.contract.configuration import Configuration
@@ -35,6 +36,44 @@ DELAY_DIFFERS = 0.05
 _TORN_NM = 0.01  # difference of the command seen from the logged commands that shows a missing one
 
 
+class SeenCommands(NamedTuple):
+    """Commands seen by the exposures of consecutive steps.
+
+    Attributes:
+        delay_frames: the measured delay if it differs from the controller's, else the controller's; with `weights`.
+        seen_nm: (steps, modes); NaN where a frame was not used and the delay is the controller's.
+        torn: (steps,) True where the command seen is not one of the steps', because a message was not received.
+    """
+
+    delay_frames: float
+    weights: Single
+    seen_nm: Single
+    torn: Mask
+
+    @classmethod
+    def of(
+        cls,
+        steps: Steps,
+        missing: Whole,
+        states: Sequence[wire.ControllerState],
+        controller_delay: float,
+        measured_delay: float | None,
+    ) -> "SeenCommands":
+        """Commands of these steps, the first of which is used; the controller's states give the loop's target."""
+        weights = delay_weights(controller_delay).astype(np.float32)
+        target_nm = _target_nm(states, steps.sequence, steps.error_nm.shape[1])
+        assumed_nm = steps.error_nm + target_nm - steps.pol_nm
+        computed_nm = seen_nm(weights, steps.command_nm, missing, assumed_nm[0])
+        torn: Mask = np.abs(computed_nm - assumed_nm).max(axis=1) > _TORN_NM
+        if measured_delay is None or abs(measured_delay - controller_delay) <= DELAY_DIFFERS:
+            return cls(controller_delay, weights, assumed_nm, torn)
+        whole = round(measured_delay)
+        near = abs(measured_delay - whole) <= DELAY_DIFFERS
+        delay_frames = float(whole) if near else measured_delay
+        weights = delay_weights(delay_frames).astype(np.float32)
+        return cls(delay_frames, weights, seen_nm(weights, steps.command_nm, missing, assumed_nm[0]), torn)
+
+
 class LoggedRun:
     """Steps of a log with distinct exposures, from the first used one.
 
@@ -46,10 +85,8 @@ class LoggedRun:
         law: last law of the run.
         controller_delay: delay assumed by the controller, frames; `measured_delay`, from `measured_from`, is None if
             it cannot be measured; the comparison uses `delay_frames`, with `weights`.
-        seen_nm: (steps, modes) commands seen by the exposures; NaN where a frame was not used and the delay is the
-            controller's.
         played: (steps,) True during a probe sequence, which moves the mirror in addition to the commands.
-        torn: (steps,) True where the command seen is not in the log, because a message was not recorded.
+        seen: commands seen by the exposures; `seen_nm` and `torn` are its own.
     """
 
     def __init__(self, history: History) -> None:
@@ -69,20 +106,11 @@ class LoggedRun:
         self.played = _played(self.steps.sequence, history.requests, history.published.plays)
         self.law, self.controller_delay = _law_and_delay(history, self.calibration)
 
-        weights = delay_weights(self.controller_delay).astype(np.float32)
-        target_nm = _target_nm(history.controllers, self.steps.sequence, len(self.calibration.noll))
-        assumed_nm = self.steps.error_nm + target_nm - self.steps.pol_nm
-        computed_nm = seen_nm(weights, self.steps.command_nm, self.missing, assumed_nm[0])
-        self.torn: Mask = np.abs(computed_nm - assumed_nm).max(axis=1) > _TORN_NM
-
         self.measured_delay, self.measured_from = self._measured_delay()
-        self.delay_frames, self.weights, self.seen_nm = self.controller_delay, weights, assumed_nm
-        if self.measured_delay is not None and abs(self.measured_delay - self.controller_delay) > DELAY_DIFFERS:
-            whole = round(self.measured_delay)
-            near = abs(self.measured_delay - whole) <= DELAY_DIFFERS
-            self.delay_frames = float(whole) if near else self.measured_delay
-            self.weights = delay_weights(self.delay_frames).astype(np.float32)
-            self.seen_nm = seen_nm(self.weights, self.steps.command_nm, self.missing, assumed_nm[0])
+        self.seen = SeenCommands.of(
+            self.steps, self.missing, history.controllers, self.controller_delay, self.measured_delay
+        )
+        self.delay_frames, self.weights, self.seen_nm, self.torn = self.seen
 
     @property
     def timing(self) -> Timing:
@@ -160,9 +188,13 @@ def _played(sequence: Sequences, requests: Sequence[wire.Request], plays: Mappin
             first = request.frame_sequence
             known = plays.get(request.play_id)
             table = floats(request.table, -1, request.columns or 1) if known is None else known.rows
-            last = first + len(table) + MAX_DELAY_FRAMES
-            rows |= (sequence >= first) & (sequence < last)
+            rows |= during_probe(sequence, first, len(table))
     return rows
+
+
+def during_probe(sequence: Sequences, first: int, frames: int) -> Mask:
+    """Steps (steps,) whose exposure may have seen a probe sequence of `frames` rows from the frame `first` on."""
+    return (sequence >= first) & (sequence < first + frames + MAX_DELAY_FRAMES)
 
 
 def _target_nm(states: Sequence[wire.ControllerState], sequence: Sequences, modes: int) -> Single:
