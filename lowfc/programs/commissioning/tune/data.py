@@ -165,7 +165,7 @@ def _state(loop: Client) -> wire.ControllerState:
 
 
 def _from_first_used(steps: Steps) -> Steps:
-    rows = exposed(steps.sequence)
+    rows = exposed(steps.reasons)
     rows[: int(np.argmax(np.isfinite(steps.error_nm).all(axis=1)))] = False
     return steps.at(rows)
 
