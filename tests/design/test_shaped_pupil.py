@@ -13,8 +13,9 @@ import pytest
 from scipy.optimize import linprog
 from scipy.special import j0, j1
 
-from lowfc.adapters.files.sensors import load_pupil
+from lowfc.adapters.files.sensors import coronagraph_from, load_pupil
 from lowfc.contract.errors import ConfigurationError, DataFileError
+from lowfc.contract.sections import SensorSection
 from lowfc.design import shaped_pupil
 from lowfc.design.linear_program import NotSolvedError
 from lowfc.design.shaped_pupil import (
@@ -25,9 +26,11 @@ from lowfc.design.shaped_pupil import (
     relative_field,
     stored,
 )
+from lowfc.optics.chain.added_contrast import ModalContrast
 from lowfc.optics.chain.fourier import to_image
 from lowfc.optics.chain.grid import OPEN_AREA, SAMPLES, image_axis, pupil_axis
 from lowfc.optics.chain.pupil import circle, from_quarter
+from lowfc.optics.chain.zernike import NOLLS_14
 from tests.support.loops import lowfc
 
 SMALL = Request(outer=8.0, cells=16)
@@ -117,6 +120,9 @@ def test_command_writes_a_mask_that_meets_the_contrast_between_the_points(tmp_pa
     zone = in_zone(request, axis)
     assert (np.abs(field[zone]) ** 2).max() < 1.1 * request.contrast
     assert (np.abs(field[zone]) ** 2).mean() == pytest.approx(result["mean_contrast"], rel=0.05)
+    modal = ModalContrast(coronagraph_from(SensorSection(pupil=str(path))), NOLLS_14, 550.0)
+    assert modal.by_image(np.zeros(14)) == pytest.approx(result["mean_contrast"], rel=0.2)
+    assert (np.diag(modal.form) > 0).all()
 
 
 def test_design_is_reproducible():

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from lowfc.adapters.files.layouts import layout_names, layout_warnings, load_layout
-from lowfc.adapters.files.sensors import load_pupil, sensor_from
+from lowfc.adapters.files.sensors import coronagraph_from, load_pupil, sensor_from
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.sections import SensorSection
+from lowfc.optics.chain.coronagraph import DARK_ZONE, Wedge
 from lowfc.optics.chain.sam import Layout, check, equal_holes, is_even_symmetric, transmission
 
 TWO = {"purpose": "two holes", "hole_diameter": 0.1, "holes": [[0.1, 0.2], [-0.3, 0.0]]}
@@ -129,6 +130,24 @@ def test_missing_files_and_misspelt_names():
         sensor_from(SensorSection(kind="clowfs", inner_radius=4.0))
     with pytest.raises(ConfigurationError, match="wavelength"):
         sensor_from(wavelength_nm=-1.0)
+
+
+def test_the_dark_zone_of_a_pupil_file_is_that_of_its_request(tmp_path):
+    path = tmp_path / "pupil.npz"
+    section, quarter = SensorSection(pupil=str(path)), np.ones((4, 4))
+    np.savez(path, quarter=quarter, made_by=json.dumps({"inner": 3.0, "outer": 8.0, "half_angle_deg": 30.0}))
+    assert coronagraph_from(section).dark_zone == Wedge(3.0, 8.0, 30.0)
+    np.savez(path, quarter=quarter)
+    assert coronagraph_from(section).dark_zone == DARK_ZONE
+    for made_by, message in (
+        ("another program", "inner"),
+        ('{"inner": 4, "outer": 8}', "half_angle_deg"),
+        ('{"inner": 8, "outer": 4, "half_angle_deg": 30}', "inner < outer"),
+        ('{"inner": 4, "outer": 1e9, "half_angle_deg": 30}', "256 lambda/D"),
+    ):
+        np.savez(path, quarter=quarter, made_by=made_by)
+        with pytest.raises(DataFileError, match=message):
+            coronagraph_from(section)
 
 
 def test_damaged_pupil_files_are_named(tmp_path):

@@ -1,5 +1,6 @@
 """Load pupils from files, and build a sensor from the names of its masks."""
 
+import json
 import logging
 from collections.abc import Callable
 from importlib import resources
@@ -15,7 +16,7 @@ from lowfc.contract.codecs import input_file
 from lowfc.contract.errors import ConfigurationError, DataFileError, nearest
 from lowfc.contract.sections import SENSORS, SensorSection, sensor_keys
 from lowfc.optics.chain import sam as sams
-from lowfc.optics.chain.coronagraph import Coronagraph, LyotStop, Wedge
+from lowfc.optics.chain.coronagraph import DARK_ZONE, Coronagraph, LyotStop, Wedge
 from lowfc.optics.chain.focal_mask import bowtie, disk, phase_spot
 from lowfc.optics.chain.grid import SAMPLES, pupil_axis
 from lowfc.optics.chain.pupil import circle, circle_with_bar, from_quarter, prolate
@@ -41,14 +42,7 @@ def load_pupil(samples: int = SAMPLES, file: Traversable = _DATA / "spc_quarter1
         DataFileError: The file is missing, damaged or holds no such quadrant.
         ConfigurationError: The quadrant does not divide `samples`.
     """
-    try:
-        opened = input_file.opened(file, _MAX_BYTES) if isinstance(file, Path) else file.open("rb")
-        with opened as stream, np.load(stream, allow_pickle=False) as arrays:
-            quarter = np.asarray(arrays["quarter"])
-    except FileNotFoundError:
-        raise DataFileError(f"there is no pupil file {file}") from None
-    except Exception as error:  # zipfile, zlib and numpy each raise their own on a damaged file
-        raise DataFileError(f"{file} is damaged, or not a pupil file with an array `quarter`: {error}") from error
+    quarter, _ = _stored(file)
     try:
         from_quarter(quarter, 2 * max(len(np.atleast_1d(quarter)), 1))
     except ValueError as error:
@@ -57,6 +51,28 @@ def load_pupil(samples: int = SAMPLES, file: Traversable = _DATA / "spc_quarter1
         return from_quarter(quarter, samples)
     except ValueError as error:
         raise ConfigurationError(f"pupil sampling: {error}") from error
+
+
+def load_dark_zone(file: Traversable) -> Wedge:
+    """Load the dark zone for which `lowfc design spc` made a pupil file; without `made_by`, the packaged pupil's.
+
+    Raises:
+        DataFileError: The file is missing or damaged, or its request has no such zone.
+    """
+    _, made_by = _stored(file)
+    if not made_by:
+        return DARK_ZONE
+    try:
+        request = json.loads(made_by)
+        zone = Wedge(*(float(request[key]) for key in ("inner", "outer", "half_angle_deg")))
+        if zone.outer > SAMPLES / 2:
+            raise ValueError(f"the outer radius must be at most {SAMPLES // 2} lambda/D, got {zone.outer:g}")
+    except Exception as error:  # any JSON may be stored here
+        raise DataFileError(
+            f"{file}: `made_by` must be the request of `lowfc design spc`, with `inner`, `outer` and `half_angle_deg` "
+            f"of its dark zone, or be omitted: {error!r}"
+        ) from error
+    return zone
 
 
 def sensor_from(
@@ -110,11 +126,23 @@ def coronagraph_from(section: SensorSection) -> Coronagraph:
     """
     pupil = _pupil(section)
     if section.pupil not in _WITH_LYOT_STOP:
-        return Coronagraph(pupil)
+        return Coronagraph(pupil, DARK_ZONE if section.pupil == "shaped" else load_dark_zone(Path(section.pupil)))
     u = pupil_axis(len(pupil))
     stop = (np.hypot(u[:, None], u) <= section.lyot_stop / 2.0).astype(np.float64)
     zone = Wedge(section.focal_radius, _LYOT_OUTER, 90.0)
     return Coronagraph(pupil, zone, LyotStop(disk(radius=section.focal_radius), stop))
+
+
+def _stored(file: Traversable) -> tuple[NDArray[np.generic], str]:
+    """`quarter` and `made_by` of a pupil file; the latter is empty if the file has none."""
+    try:
+        opened = input_file.opened(file, _MAX_BYTES) if isinstance(file, Path) else file.open("rb")
+        with opened as stream, np.load(stream, allow_pickle=False) as arrays:
+            return np.asarray(arrays["quarter"]), str(arrays["made_by"]) if "made_by" in arrays else ""
+    except FileNotFoundError:
+        raise DataFileError(f"there is no pupil file {file}") from None
+    except Exception as error:  # zipfile, zlib and numpy each raise their own on a damaged file
+        raise DataFileError(f"{file} is damaged, or not a pupil file with an array `quarter`: {error}") from error
 
 
 def _layout(name: str) -> sams.Layout:

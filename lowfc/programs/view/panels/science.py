@@ -49,7 +49,7 @@ class Science(Panel):
     def __init__(self, coronagraph: Coronagraph, wavelength_nm: float) -> None:
         self._coronagraph = coronagraph
         zone = coronagraph.dark_zone
-        self._wedge = Wedge(zone.inner, zone.inner + _WIDE, zone.half_opening_deg)
+        self._wedge = Wedge(zone.inner, min(zone.inner + _WIDE, zone.outer), zone.half_opening_deg)
         self._wavelength_nm = wavelength_nm
         self._noll: tuple[int, ...] = ()
         self._camera: ScienceCamera | None = None
