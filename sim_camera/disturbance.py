@@ -11,7 +11,7 @@ import numpy as np
 
 from lowfc.arrays import Array, Complex, Single
 from lowfc.control.laws.integrator import TIP_TILT
-from sim_camera.wheel import Wheel, walk
+from sim_camera.wheel import ORDERS, Wheel, walk
 
 BLOCK = 8
 """Frames computed at once: enough to be efficient, few enough not to delay a frame."""
@@ -194,6 +194,13 @@ def shear_at(disturbance: Disturbance, time_s: float) -> Array:
 def speeds_hz(disturbance: Disturbance, time_s: float) -> Array:
     """Speed of each wheel, revolutions per second."""
     return np.array([wheel.speed_hz(np.array([time_s]))[0] for wheel in disturbance.wheels])
+
+
+def highest_hz(disturbance: Disturbance) -> float:
+    """Highest frequency of the waves, the damped lines and, at time 0, the wheels' harmonics, Hz."""
+    lines = [line.frequency_hz for line in disturbance.lines]
+    harmonics = [max(ORDERS) * abs(wheel.start_hz) for wheel in disturbance.wheels]
+    return float(max([0.0, *disturbance.frequency_hz, *lines, *harmonics]))
 
 
 def modes_nm(disturbance: Disturbance, first: int, count: int, rate_hz: float) -> Array:

@@ -14,12 +14,13 @@ from lowfc.optics.chain.zernike import zernikes
 from lowfc.optics.detector.detector import Detector, expose, noise_table_of, saturation_dn
 from lowfc.optics.twin.twin import Evaluator, Twin, node_radii, wavefront_rms_nm
 from lowfc.optics.twin.twin_mirror import TwinMirror, wavefront_nm
-from sim_camera.disturbance import Disturbance, Sampler, screen, shear_at, speeds_hz
+from sim_camera.disturbance import Disturbance, Sampler, highest_hz, screen, shear_at, speeds_hz
 from sim_camera.pixels import PixelErrors
 
 GAUSS_LEGENDRE = (1 + np.array([-1, 1]) / np.sqrt(3)) / 2
 """The two Gauss-Legendre nodes in [0, 1], in exposure times: their mean is exact to third order in time."""
-_FOUR_NODES, _FOUR_WEIGHTS = np.polynomial.legendre.leggauss(4)  # in [-1, 1]
+_MAX_NODES = 256
+"""Limit of the time for a frame, and for the nodes themselves; reached below 1 Hz."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +52,21 @@ class Truth:
     instants_nm: Single
     wheel_speed_hz: Array
     shear: Array
+
+
+def exposure_nodes(cycles: float) -> tuple[Array, Array]:
+    """Nodes in [0, 1], in exposure times, and weights of the mean over an exposure.
+
+    The mean of a wave is exact to 0.5 % of its amplitude, up to 127 cycles.
+
+    Args:
+        cycles: Cycles of the fastest wave in an exposure.
+    """
+    if cycles <= 0.25:
+        return GAUSS_LEGENDRE, np.full(2, 0.5)
+    count = 4 + 2 * int(np.ceil(max(0.0, cycles - 1.2)))
+    nodes, weights = np.polynomial.legendre.leggauss(min(count, _MAX_NODES))
+    return (1 + nodes) / 2, weights / 2
 
 
 class Scene:
@@ -106,11 +122,9 @@ class Scene:
         self._screen_modes = np.asarray(self._project(self._screen), dtype=np.float32)
         self._mirror_to_modes = self._mirror_projection()
         self.instants = (np.arange(instants) + 0.5) / instants if instants > 1 else np.zeros(0)
-        nodes, weights = GAUSS_LEGENDRE, np.full(2, 0.5)
-        if instants == 1:
-            nodes, weights = np.zeros(0), np.ones(1)
-        elif disturbance.frequency_hz.max(initial=0) > rate_hz / 2:
-            nodes, weights = (1 + _FOUR_NODES) / 2, _FOUR_WEIGHTS / 2
+        nodes, weights = np.zeros(0), np.ones(1)
+        if instants > 1:
+            nodes, weights = exposure_nodes(highest_hz(disturbance) * exposure / rate_hz)
         self._image_weights = weights.astype(np.float32)
         self._wavefronts: list[tuple[Single, Single]] = []
         self._sampler = Sampler(disturbance, np.concatenate([[0.0], exposure * nodes, self.instants]), rate_hz)

@@ -17,10 +17,10 @@ from lowfc.control.loop.estimator import Estimator
 from lowfc.optics.chain.sensor import image, pupil_radii
 from lowfc.optics.chain.zernike import zernikes
 from lowfc.optics.twin.twin import Evaluator
-from sim_camera.disturbance import BLOCK, _sum_of_waves
+from sim_camera.disturbance import BLOCK, Sampler, _sum_of_waves
 from sim_camera.driver import disturbance_of
 from sim_camera.driver import scene as scene_of
-from sim_camera.scene import Scene
+from sim_camera.scene import Scene, exposure_nodes
 
 GRID, MODES = (34, 34), 14
 FLAT = np.zeros(GRID, np.float32)
@@ -135,6 +135,29 @@ def test_image_is_the_mean_over_its_exposure(exposure: float) -> None:
         worst = max(worst, float(np.abs(found - mean).max() / mean.max()))
     rounding = 0.5 * FINE_E_PER_DN / mean.max()
     assert worst < 1e-5 + rounding
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [{"disturbance__preset": "reaction-wheel"}, {"disturbance__wheel_hz": 40.0}],
+    ids=["damped lines", "wheel"],
+)
+@pytest.mark.parametrize("rate_hz", [100.0, 20.0])
+def test_vibrations_faster_than_the_exposure_are_averaged(keys: dict[str, object], rate_hz: float) -> None:
+    """The sensed wavefront is the mean over 1000 times, to 0.05 nm of lines of 5 nm and more."""
+    config = configured(camera__rate_hz=rate_hz, camera__exposure_fraction=1.0, **keys)
+    truth = scene_of(config).truth(3, FLAT)
+    expected = Sampler(disturbance_of(config), (np.arange(1000) + 0.5) / 1000, rate_hz).at(3).mean(axis=0)
+    assert truth.sensed_nm - truth.sampled.residual_nm + truth.sampled.disturbance_nm == pytest.approx(
+        expected, abs=0.05
+    )
+
+
+def test_slow_vibrations_need_two_nodes_of_the_exposure() -> None:
+    assert len(exposure_nodes(0.25)[0]) == 2
+    for cycles in (0.2, 0.9, 1.2, 3.0, 58.0):
+        nodes, weights = exposure_nodes(cycles)
+        assert np.cos(2 * np.pi * cycles * (nodes - 0.5)) @ weights == pytest.approx(np.sinc(cycles), abs=0.005)
 
 
 @pytest.mark.slow
