@@ -207,8 +207,11 @@ class Scene:
         return np.maximum(np.square(from_mean) @ self._area, 0)  # guard nodes of the interpolation have weights < 0
 
     def _noiseless(self, electrons: Single) -> npt.NDArray[np.uint16]:
-        values = electrons / self._detector.gain_e_per_dn + self._detector.bias_dn
-        return np.asarray(np.rint(np.clip(values, 0, saturation_dn(self._detector))), dtype=np.uint16)
+        """A frame (rows, columns) in DN, as by `expose` but without noise."""
+        detector = self._detector
+        charge_e = (np.maximum(electrons, 0) + detector.clock_induced_charge_e) * detector.em_gain
+        values = np.minimum(charge_e, detector.full_well_e) / detector.gain_e_per_dn + detector.bias_dn
+        return np.asarray(np.rint(np.clip(values, 0, saturation_dn(detector))), dtype=np.uint16)
 
     def _static_screen(self, rms_nm: float, seed: int) -> Single:
         """The preset's screen at the nodes, scaled to this rms over the open pupil, piston removed."""

@@ -107,6 +107,15 @@ def test_noise_depends_on_the_seed_and_flux_matches_the_calibration(noisy: Scene
     assert frames[0].shape == noisy.shape == calibration.shape
 
 
+def test_frames_without_noise_have_the_flux_and_dark_of_the_calibration() -> None:
+    keys = {"camera__em_gain": 100.0, "camera__dark_current_e_s": 20.0, "camera__clock_induced_charge_e": 0.02}
+    config = configured(camera__noise=False, camera__full_well_e=600_000.0, camera__gain_e_per_dn=10.0, **keys)
+    optics = twin(config, None, print)
+    calibration = analytic_calibration(config, optics, mirror_on_twin(config, optics, print))
+    light_dn = scene_of(config).expose(0, FLAT).reshape(-1) - calibration.dark
+    assert light_dn.sum() == pytest.approx(calibration.flux_dn, rel=0.01)
+
+
 def test_frames_do_not_depend_on_the_order_of_exposure() -> None:
     indices = [0, 1, BLOCK - 1, BLOCK, BLOCK + 1, 3 * BLOCK + 7]
     scene = scene_of(configured(camera__noise=False, disturbance__preset="reaction-wheel"))
