@@ -13,6 +13,7 @@ from lowfc.design.paper import STAR, TABLE4_EXPOSURE_S
 from lowfc.optics.chain.grid import pupil_axis
 from lowfc.optics.detector.photometry import electrons
 from lowfc.programs.paper.cases import Context, prepared
+from lowfc.programs.paper.figures import aberration
 from lowfc.programs.paper.figures.exposure import ESTIMATORS
 from lowfc.programs.paper.figures.modes import AMPLITUDES, deviations, linear_range
 from lowfc.programs.paper.report import FIGURES
@@ -80,6 +81,15 @@ def test_correction_restores_the_contrast(tables):
     assert min(values(rows, "aberrated over flat")) > 20
     for estimator in ("pinv", "weighted + 1 iteration", "weighted + 2 iterations"):
         assert max(values(rows, "corrected over flat", estimator)) < 2
+
+
+def test_the_contrast_of_a_lyot_coronagraph_is_that_behind_its_stop():
+    ready = prepared("aplc")
+    flat = aberration._contrast(ready, np.zeros(14))
+    assert flat < 1e-10
+    curve = aberration._curve(ready, np.zeros(14))
+    assert curve[9] == pytest.approx(flat, rel=0.3)  # 4.75 to 5.25 lambda/D
+    assert aberration._between_samples(ready)[0].measured < 1e-8
 
 
 def test_masks_and_throughputs_are_those_of_the_sensors(tables):

@@ -136,23 +136,30 @@ def mean_contrast(
 
 
 def contrast_curve(
-    pupil: Array, opd_nm: Array, wavelength_nm: float, edges: Array, wedge: Wedge = DARK_ZONE, samples_per: int = 4
+    pupil: Array,
+    opd_nm: Array,
+    wavelength_nm: float,
+    edges: Array,
+    wedge: Wedge = DARK_ZONE,
+    samples_per: int = 4,
+    lyot: LyotStop | None = None,
 ) -> Array:
     """Contrast (rings,) averaged in azimuth within a wedge's opening, Fig. 1(c); other arguments as for `contrast`.
 
     Args:
-        pupil: The shaped pupil.
+        pupil: Amplitude transmission.
         opd_nm: Wavefront.
         wavelength_nm: The wavelength.
         edges: (rings + 1,) radii between the rings, in lambda / D, spaced by at least one sample.
         wedge: Only its opening is used.
         samples_per: Samples per lambda / D.
+        lyot: Mask and stop of a Lyot coronagraph; None for a shaped pupil alone.
     """
     sector = Wedge(0.0, float(edges[-1]), wedge.half_opening_deg)
     columns, rows = _extent(sector, samples_per)
     inside = wedge_samples(sector, columns, rows, samples_per)
     radius = np.hypot(image_axis(rows, samples_per)[:, None], image_axis(columns, samples_per))[inside]
-    values = contrast(pupil, opd_nm, wavelength_nm, columns, rows, samples_per)[inside]
+    values = contrast(pupil, opd_nm, wavelength_nm, columns, rows, samples_per, lyot)[inside]
     count, _ = np.histogram(radius, edges)
     total, _ = np.histogram(radius, edges, weights=values)
     return np.asarray(total / count)

@@ -13,14 +13,15 @@ from typing import Any, TypeVar
 import numpy as np
 
 from lowfc.adapters.files.layouts import layout_names
-from lowfc.adapters.files.sensors import sensor_from, sensor_named
+from lowfc.adapters.files.sensors import coronagraph_from, sensor_from, sensor_named
 from lowfc.adapters.files.twin_cache import load_or_build
 from lowfc.arrays import Array, Mask
 from lowfc.contract.errors import ConfigurationError
-from lowfc.contract.sections import SensorSection
+from lowfc.contract.sections import SENSORS, SensorSection
 from lowfc.design.estimators import Fit, fit
 from lowfc.design.trials import gram
 from lowfc.optics.chain.band import Band, uniform
+from lowfc.optics.chain.coronagraph import Coronagraph
 from lowfc.optics.chain.grid import pupil_axis
 from lowfc.optics.chain.sensor import LightBudget, Sensor, image, light_budget, reference, response, shear_response
 from lowfc.optics.chain.zernike import NOLLS_20, zernikes
@@ -101,6 +102,11 @@ class Prepared:
     def budget(self) -> LightBudget:
         """Throughput of each element."""
         return light_budget(self.sensor)
+
+    @cached_property
+    def coronagraph(self) -> Coronagraph:
+        """Optics of the science image; a sensor that is not one of `SENSORS` is behind the shaped pupil."""
+        return coronagraph_from(SensorSection.model_validate(SENSORS.get(self.name, {})))
 
     @cached_property
     def twin(self) -> Twin:

@@ -8,7 +8,7 @@ import numpy as np
 
 from lowfc.arrays import Array
 from lowfc.design.trials import residual_pv
-from lowfc.optics.chain.coronagraph import DARK_ZONE, Wedge, contrast, contrast_curve, mean_contrast, wedge_samples
+from lowfc.optics.chain.coronagraph import Wedge, contrast, contrast_curve, mean_contrast, wedge_samples
 from lowfc.optics.chain.zernike import NOLLS_14
 from lowfc.programs.paper import plots
 from lowfc.programs.paper.cases import Case, Context, Prepared, Row, assuming, prepared
@@ -94,10 +94,9 @@ def fig1(context: Context) -> list[Row]:
 
 def _between_samples(ready: Prepared) -> list[Row]:
     """Contrast with a flat wavefront on a finer grid than that of the pupil's design."""
-    pupil, wavelength_nm = ready.sensor.pupil, ready.sensor.wavelength_nm
     columns = 2 * _VIEW * _FINE_SAMPLES_PER
-    image = contrast(pupil, np.zeros_like(pupil), wavelength_nm, columns, samples_per=_FINE_SAMPLES_PER)
-    zone = image[wedge_samples(DARK_ZONE, columns, columns, _FINE_SAMPLES_PER)]
+    image = _image(ready, np.zeros(MODES), _FINE_SAMPLES_PER)
+    zone = image[wedge_samples(ready.coronagraph.dark_zone, columns, columns, _FINE_SAMPLES_PER)]
     what = f"{ready.name}, dark zone, {_FINE_SAMPLES_PER} samples per lambda/D"
     return [
         Row(what, "largest contrast, flat wavefront", "", float(zone.max()), _PAPER_GOAL),
@@ -112,10 +111,8 @@ def plot_fig1(context: Context, path: Path) -> None:
     for coma in COMAS:
         case = _aberrated(context, name, coma)
         flat_nm = 0.0 * case.truth_nm
-        optics = case.ready.sensor
         for title, modes_nm in (("flat wavefront", flat_nm), (f"$\\lambda$/30 of Z4 and of Z{coma}", case.truth_nm)):
-            opd_nm, columns = case.ready.opd_nm(modes_nm), 2 * _VIEW * _VIEW_SAMPLES_PER
-            image = contrast(optics.pupil, opd_nm, optics.wavelength_nm, columns, samples_per=_VIEW_SAMPLES_PER)
+            image = _image(case.ready, modes_nm, _VIEW_SAMPLES_PER)
             panels.append(plots.picture(image, title, plots.SKY, _VIEW, (1e-11, 1.0), "contrast", "log"))
         middles = (_CURVE_EDGES[1:] + _CURVE_EDGES[:-1]) / 2.0
         wavefronts = {"flat": flat_nm, "aberrated": case.truth_nm}
@@ -124,10 +121,11 @@ def plot_fig1(context: Context, path: Path) -> None:
         panels.append(
             plots.curves(lines, f"Z{coma}, corrected by {name}", f"radius, {plots.SKY_UNIT}", "contrast", "log")
         )
+    pupil = "shaped pupil" if prepared(name).coronagraph.lyot is None else "Lyot coronagraph"
     plots.draw(
         path,
         panels,
-        "Fig. 1. The star behind the shaped pupil, and the contrast averaged in azimuth within 42.5 degrees of the x "
+        f"Fig. 1. The star behind the {pupil}, and the contrast averaged in azimuth within 42.5 degrees of the x "
         f"axis; each correction is one estimate. {BRIGHT}",
     )
 
@@ -175,12 +173,20 @@ def plot_fig7(context: Context, path: Path) -> None:
     plots.draw(path, panels, f"Fig. 7. One estimate of {name}. {BRIGHT}", columns=4)
 
 
+def _image(ready: Prepared, modes_nm: Array, samples_per: int) -> Array:
+    optics, columns = ready.coronagraph, 2 * _VIEW * samples_per
+    opd_nm, wavelength_nm = ready.opd_nm(modes_nm), ready.sensor.wavelength_nm
+    return contrast(optics.pupil, opd_nm, wavelength_nm, columns, samples_per=samples_per, lyot=optics.lyot)
+
+
 def _contrast(ready: Prepared, modes_nm: Array) -> float:
-    return mean_contrast(ready.sensor.pupil, ready.opd_nm(modes_nm), ready.sensor.wavelength_nm, _RING)
+    optics, opd_nm = ready.coronagraph, ready.opd_nm(modes_nm)
+    return mean_contrast(optics.pupil, opd_nm, ready.sensor.wavelength_nm, _RING, lyot=optics.lyot)
 
 
 def _curve(ready: Prepared, modes_nm: Array) -> Array:
-    return contrast_curve(ready.sensor.pupil, ready.opd_nm(modes_nm), ready.sensor.wavelength_nm, _CURVE_EDGES)
+    optics, opd_nm = ready.coronagraph, ready.opd_nm(modes_nm)
+    return contrast_curve(optics.pupil, opd_nm, ready.sensor.wavelength_nm, _CURVE_EDGES, lyot=optics.lyot)
 
 
 CASES = {
