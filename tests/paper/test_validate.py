@@ -25,7 +25,7 @@ from lowfc.programs.paper.report import (
     to_text,
     write_document,
 )
-from lowfc.programs.paper.tables import conditioning
+from lowfc.programs.paper.tables import anchors, conditioning
 from lowfc.programs.paper.tables.reconstruction import ESTIMATORS, WITH_NUISANCES
 from lowfc.programs.paper.tables.tables import TABLES
 from tests.support.loops import lowfc
@@ -190,6 +190,7 @@ def test_the_command_prints_one_json_object():
         (("photometry", "--sensor", "nonsense"), "called 'nonsense'"),
         (("table3", "--sensor", "open", "--trials", "2"), "table3: sensor open, 14 modes: the sensor cannot tell"),
         (("fig5", "--sensor", "open", "--trials", "2"), "fig5: sensor open, 14 modes: the sensor cannot tell"),
+        (("tolerance", "--sensor", "open"), "tolerance: sensor open, 14 modes: the sensor cannot tell"),
         (("table1", "--docs", "."), "use it with all"),
         (("all", "--docs", ".", "--sensor", "sam"), "use it with all"),
     ],
@@ -199,6 +200,11 @@ def test_user_errors_are_one_line(words, message):
     assert isinstance(error, ConfigurationError)
     assert message in str(error)
     assert "\n" not in str(error)
+
+
+def test_a_sensor_that_cannot_tell_modes_apart_is_a_user_error_in_every_table():
+    with pytest.raises(ConfigurationError, match="sensor open, 14 modes: the sensor cannot tell"):
+        next(anchors._hundred_seconds(Context(), "open"))
 
 
 def test_a_programming_error_is_not_reported_as_a_user_error(monkeypatch):

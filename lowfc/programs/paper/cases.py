@@ -2,8 +2,9 @@
 
 import threading
 import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, lru_cache
 from math import isfinite
@@ -18,6 +19,7 @@ from lowfc.adapters.files.twin_cache import load_or_build
 from lowfc.arrays import Array, Mask
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.sections import SENSORS, SensorSection
+from lowfc.control.calibration.calibration import normalise_flux, reconstructor
 from lowfc.design.estimators import Fit, fit
 from lowfc.design.trials import gram
 from lowfc.optics.chain.band import Band, uniform
@@ -135,8 +137,22 @@ class Prepared:
             I0, H = self.band_I0, self.band_tilt_H if modes <= 2 else self.band_H
         else:
             I0, H = self.I0, self.H
-        try:
+        with self._fitting(modes):
             return fit(NOLLS_20[:modes], I0, H[:, :modes], scale_e, read_noise_e, kind, nuisance)
+
+    def loop_fit(self, I0: Array, H: Array, light_e: float, read_noise_e: float) -> tuple[Array, Array]:
+        """Normalised I0 (pixels,) and weighted R (modes, pixels) of a loop; `light_e` is the open circle's light."""
+        good = np.ones(I0.size)
+        I0_normalised, H_normalised = normalise_flux(I0, H, good)
+        flux_e = light_e * float(I0.sum())
+        with self._fitting(H.shape[1]):
+            return I0_normalised, reconstructor(I0_normalised, H_normalised, good, flux_e, read_noise_e)
+
+    @contextmanager
+    def _fitting(self, modes: int) -> Iterator[None]:
+        """Raise ConfigurationError for modes that the sensor cannot tell apart."""
+        try:
+            yield
         except ValueError as error:
             raise ConfigurationError(f"sensor {self.name}, {modes} modes: {error}") from error
 

@@ -16,7 +16,6 @@ from lowfc.adapters.logs.history import History, read_history
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.arrays import Array
 from lowfc.contract.errors import LowfcError
-from lowfc.control.calibration.calibration import normalise_flux, reconstructor
 from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.kalman import lqg
 from lowfc.control.laws.spectra import time_series
@@ -199,9 +198,7 @@ def _hundred_seconds(context: Context, name: str) -> Iterator[Row]:
     """Noise of each mode's mean over `AVERAGED_S`, as one exposure of all the light with all the read noise."""
     frames = AVERAGED_S * tolerance.RATE_HZ
     sensor, light_e = prepared(name), tolerance.light_e(MAGNITUDE)
-    good, H = np.ones(sensor.I0.size), sensor.H[:, : len(NOLLS_14)]
-    normalised_I0, normalised_H = normalise_flux(sensor.I0, H, good)
-    R = reconstructor(normalised_I0, normalised_H, good, light_e * float(sensor.I0.sum()), tolerance.READ_NOISE_E)
+    normalised_I0, R = sensor.loop_fit(sensor.I0, sensor.H[:, : len(NOLLS_14)], light_e, tolerance.READ_NOISE_E)
 
     def trial(i: int) -> Array:
         rng = context.rng("anchors", name, i)

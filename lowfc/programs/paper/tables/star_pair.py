@@ -6,7 +6,6 @@ from functools import lru_cache, partial
 import numpy as np
 
 from lowfc.arrays import Array, Mask
-from lowfc.control.calibration.calibration import normalise_flux, reconstructor
 from lowfc.design.tolerance import best_gain, drift_residual_nm2
 from lowfc.optics.chain.band import Band, gauss_legendre
 from lowfc.optics.chain.coronagraph import DARK_ZONE, contrast, wedge_samples
@@ -61,10 +60,7 @@ def zero_point_nm(name: str) -> Array:
     sensor = prepared(name)
     reference_star, target = (coloured(kelvin) for _, kelvin in STARS.values())
     I0, H = reference(sensor.sensor, reference_star).ravel(), response(sensor.sensor, sensor.modes[:14], reference_star)
-    good = np.ones(I0.size)
-    normalised_I0, normalised_H = normalise_flux(I0, H, good)
-    flux_e = tolerance.light_e(STARS["reference"][0]) * float(I0.sum())
-    R = reconstructor(normalised_I0, normalised_H, good, flux_e, tolerance.READ_NOISE_E)
+    normalised_I0, R = sensor.loop_fit(I0, H, tolerance.light_e(STARS["reference"][0]), tolerance.READ_NOISE_E)
     target_I0 = reference(sensor.sensor, target).ravel()
     return np.asarray(-R @ (target_I0 / target_I0.sum() - normalised_I0))
 

@@ -13,7 +13,7 @@ from lowfc.adapters.files.sensors import coronagraph_from
 from lowfc.arrays import Array
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.sections import SENSORS, SensorSection, sensor_keys
-from lowfc.control.calibration.calibration import noise_nm2, normalise_flux, reconstructor
+from lowfc.control.calibration.calibration import noise_nm2
 from lowfc.control.laws.vibration import Line
 from lowfc.design.drift_trial import DriftTrial
 from lowfc.design.fisher import quantum_information
@@ -117,10 +117,8 @@ def light_e(magnitude: float) -> float:
 def frame_noise_nm2(name: str, magnitude: float) -> Array:
     """Noise covariance (14, 14) of a loop's modes in a frame, at the central wavelength."""
     sensor = prepared(name)
-    good = np.ones(sensor.I0.size)
-    I0, H = normalise_flux(sensor.I0, sensor.H[:, : len(NOLLS_14)], good)
-    flux_e = light_e(magnitude) * float(sensor.I0.sum())
-    return noise_nm2(reconstructor(I0, H, good, flux_e, READ_NOISE_E), I0, flux_e, READ_NOISE_E)
+    I0, R = sensor.loop_fit(sensor.I0, sensor.H[:, : len(NOLLS_14)], light_e(magnitude), READ_NOISE_E)
+    return noise_nm2(R, I0, light_e(magnitude) * float(sensor.I0.sum()), READ_NOISE_E)
 
 
 def quantum_noise_nm2(sensor: Prepared, magnitude: float) -> Array:
