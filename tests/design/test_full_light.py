@@ -11,6 +11,7 @@ from lowfc.adapters.files.layouts import load_layout
 from lowfc.adapters.files.sensors import sensor_from, sensor_named
 from lowfc.adapters.process.terminal import new_app
 from lowfc.contract.configuration import load
+from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.sections import SensorSection
 from lowfc.design.fisher import cramer_rao, quantum_information, variance_e
 from lowfc.design.full_light import Focus, FullLight, sweep
@@ -117,6 +118,14 @@ def test_the_command_writes_the_keys_of_the_best(tmp_path, monkeypatch):
     wrong = CliRunner().invoke(app, ["design", "zwfs", "--spot", "0:1"])
     assert wrong.exit_code
     assert "spot_diameter" in str(wrong.exception)
+
+
+@pytest.mark.parametrize("words", [("zwfs", "--spot", "3:0.5"), ("clowfs", "--defocus", "8:1.5")])
+def test_a_reversed_range_is_refused_before_the_search(words, monkeypatch):
+    monkeypatch.setattr("lowfc.programs.design.full_light.sweep", None)
+    error = CliRunner().invoke(design_app, words).exception
+    assert isinstance(error, ConfigurationError)
+    assert "in order" in str(error)
 
 
 def test_sampling_of_the_holes_changes_the_image_by_under_1_percent():

@@ -37,7 +37,12 @@ class _Request(ABC):
     weight: float = 0.5
 
     def __post_init__(self) -> None:
-        _ = self.goal, self.sizes  # validated here
+        _ = self.goal  # validated here
+        low, high = self.sizes.low, self.sizes.high
+        if low > high:
+            raise ValueError(
+                f"the sizes must be in order, SMALLEST:LARGEST, got {low:g}:{high:g}; use {high:g}:{low:g}"
+            )
 
     @cached_property
     def goal(self) -> Goal:
