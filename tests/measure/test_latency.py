@@ -451,6 +451,14 @@ def test_an_interrupted_or_failed_measurement_removes_its_run(
     assert runs() == before
 
 
+def test_every_log_of_a_measured_recording_counts_and_is_removed(tmp_path: Path) -> None:
+    logs = [tmp_path / "1.mcap", tmp_path / "2.mcap"]
+    for log in logs:
+        log.write_bytes(b"1234")
+    assert bench_module._removed(logs) == 8
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.exclusive
 def test_the_cost_of_recording_is_measured_at_every_rate(tmp_path: Path) -> None:
     rates_hz = (100, 200)

@@ -149,9 +149,6 @@ def _one_rate(rate_hz: float, seconds: float, folder: Path) -> dict[str, Any]:
         if process.returncode:
             raise BusError(f"the recorder failed: {error.strip()[-500:]}")
     done = json.loads(out)
-    (log,) = map(Path, done["logs"])
-    size = log.stat().st_size
-    log.unlink()
     return {
         "rate_hz": rate_hz,
         "offered_hz": (traffic.frames - first_frame) / elapsed_s,
@@ -159,9 +156,17 @@ def _one_rate(rate_hz: float, seconds: float, folder: Path) -> dict[str, Any]:
         "cpu_share": (after.user + after.system - before.user - before.system) / elapsed_s,
         "publisher_cpu_share": own_s / elapsed_s,
         "messages_published": traffic.messages,
-        "log_bytes": size,
+        "log_bytes": _removed([Path(log) for log in done["logs"]]),
         **{name: done[name] for name in _RECORDER_KEYS},
     }
+
+
+def _removed(logs: list[Path]) -> int:
+    """Remove logs, of which a long or fast recording has several; their size in bytes."""
+    size = sum(log.stat().st_size for log in logs)
+    for log in logs:
+        log.unlink()
+    return size
 
 
 def _copying(folder: Path) -> tuple[float, float]:
