@@ -3,12 +3,14 @@
 import re
 import subprocess
 import sys
+from typing import Any
 
 import click
 import pytest
 import typer
 from typer.testing import CliRunner
 
+from lowfc.programs.cli.ctl import ctl_app
 from lowfc.programs.cli.main import COMMANDS, app
 from lowfc.programs.cli.result import Result, result_field
 
@@ -50,6 +52,22 @@ def test_the_error_of_an_unknown_command_suggests_the_nearest() -> None:
     group = typer.main.get_command(app)
     with pytest.raises(Exception, match="Did you mean 'sim-loop'"), group.make_context("lowfc", ["sim-lop"]) as context:
         group.resolve_command(context, ["sim-lop"])  # type: ignore[attr-defined]
+
+
+def test_a_run_named_before_the_request_is_the_run_of_every_command_of_ctl() -> None:
+    group: Any = typer.main.get_command(ctl_app)
+    with group.make_context("ctl", ["--run", "other", "status"]) as context:
+        context.invoke(group.callback, **context.params)
+    waiting = [(context, group)]
+    runs: dict[str, str | None] = {}
+    for above, parent in waiting:
+        for name, command in parent.commands.items():
+            here = click.Context(command, parent=above, info_name=name)
+            runs[here.command_path] = here.lookup_default("run")
+            if hasattr(command, "commands"):
+                waiting.append((here, command))
+    assert {"ctl bench", "ctl dark", "ctl safe", "ctl record stop"} <= runs.keys()
+    assert [path for path, run in runs.items() if run != "other"] == []
 
 
 class Mode(Result):

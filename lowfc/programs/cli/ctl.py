@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer.core import TyperGroup
 
 from lowfc.adapters.process.terminal import AnyRun, Json, new_app
 from lowfc.client.requests import BY_NAME
@@ -239,9 +240,9 @@ for _measurement in (dark, reference):
 @ctl_app.callback()
 def _of_run(context: typer.Context, run: AnyRun = None) -> None:
     """Accept --run before the request, too."""
-    defaults = {"run": run}
-    names = [*BY_NAME, "record", dark.__name__, reference.__name__]
-    context.default_map = {name: {**defaults, "start": defaults, "stop": defaults} for name in names}
+    defaults, group = {"run": run}, context.command
+    assert isinstance(group, TyperGroup)  # noqa: S101  # of `ctl_app`
+    context.default_map = {name: {**defaults, "start": defaults, "stop": defaults} for name in group.commands}
 
 
 def _joined(run: str | None) -> "Client":
