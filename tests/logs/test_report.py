@@ -39,6 +39,7 @@ def results(log: Path) -> dict[str, Any]:
 def eventful(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """A log with the loop open and closed, frames lost and dark, gains changed, controller and camera restarted."""
     night = SyntheticLog()
+    night.health("camera", commands_late=40, state="ready")
     night.request("open")
     night.frames(300)
     night.request("close")
@@ -54,7 +55,7 @@ def eventful(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     night.frames(100)
     counts = [wire.TopicCount(topic=FRAME.key, received=2244, skipped=4, missing=2)]
     night.health("controller", topics=counts, state="stopped")
-    night.health("camera", commands_late=3, state="stopped")
+    night.health("camera", commands_late=43, state="stopped")
     return results(night.write(tmp_path_factory.mktemp("eventful") / "night.mcap"))
 
 
@@ -88,6 +89,13 @@ def test_frames_are_accounted_for(eventful: dict[str, Any]) -> None:
     }
     assert eventful["light"]["refused"] == {"dark": 1}
     assert eventful["timing"]["rate_hz"] == RATE_HZ
+
+
+def test_commands_of_a_camera_that_does_not_count_late_ones_are_not_called_in_time(tmp_path: Path) -> None:
+    found = results(uneventful(SyntheticLog(truth=False)).write(tmp_path / "log.mcap"))
+    assert found["timing"]["frames"]["commands_late"] is None
+    delay = next(check for check in found["verdict"]["checks"] if check["name"] == "delay")
+    assert delay["level"] == "unknown"
 
 
 def test_latencies_are_those_of_the_messages(eventful: dict[str, Any]) -> None:
@@ -167,6 +175,7 @@ def test_the_verdict_names_what_was_wrong(eventful: dict[str, Any]) -> None:
 
 
 def uneventful(night: SyntheticLog, number: int = 300) -> SyntheticLog:
+    night.health("camera", state="ready")
     night.frames(number)
     night.health("camera", state="stopped")
     return night

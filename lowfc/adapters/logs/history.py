@@ -32,6 +32,7 @@ from lowfc.arrays import Long, Sequences, Single
 from lowfc.contract.codecs.calibration_codec import decode_calibration
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.configuration import Configuration
+from lowfc.contract.envelope import start_of
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.messages import (
     CALIBRATION,
@@ -49,6 +50,7 @@ from lowfc.contract.messages import (
     TIMING,
     TRUTH,
     Log,
+    Role,
     Topic,
     topic_of,
     wire,
@@ -104,6 +106,8 @@ class History:
         requests: operators' requests, with the answers.
         events: (log time in ns, message) of each event.
         health: last Health of each process, by name.
+        commands_late: commands that the camera counted as late from its first Health in the log to its last, over all
+            of its starts; None without two Healths of one start.
         counts: number of messages, by topic key.
         published: laws and played tables, by identity.
         span_ns: log times of the first and the last message; (0, 0) without messages.
@@ -127,6 +131,7 @@ class History:
     requests: list[wire.Request] = field(default_factory=list)
     events: list[tuple[int, Log]] = field(default_factory=list)
     health: dict[str, wire.Health] = field(default_factory=dict)
+    commands_late: int | None = None
     counts: Counter[str] = field(default_factory=Counter)
     published: Published = field(default_factory=Published)
     span_ns: tuple[int, int] = (0, 0)
@@ -208,6 +213,7 @@ class _Rows:
         self._timings = TimingRows()
         self._mirror = Columns(sequence="Q", publish_time_ns="q", stroke_nm="f", limits="q")
         self._steps, self._truths = StepRows(0), TruthRows(0)
+        self._late = (-1, 0)
 
     def take(self, message: Sample) -> None:
         """Add one message of the log."""
@@ -254,6 +260,8 @@ class _Rows:
             history.requests.append(body)
         elif isinstance(body, wire.Health):
             history.health[name_in(HEALTH, message.key)] = body
+            if name_in(HEALTH, message.key) == Role.CAMERA:
+                self._count_late(start_of(message.sequence), body.commands_late)
         elif isinstance(body, Log):
             history.events.append((message.receive_time_ns, body))
 
@@ -279,6 +287,13 @@ class _Rows:
         if modes != self._steps.modes:
             self._history.excluded_messages += len(self._steps)
             self._steps, self._truths = StepRows(modes), TruthRows(modes)
+
+    def _count_late(self, start_s: int, count: int) -> None:
+        """Add the camera's late commands since its previous Health; its count begins at its start."""
+        before_s, before = self._late
+        if start_s == before_s:
+            self._history.commands_late = (self._history.commands_late or 0) + max(0, count - before)
+        self._late = start_s, count
 
     def finish(self) -> None:
         """Convert all columns to arrays."""

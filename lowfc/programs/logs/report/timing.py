@@ -64,8 +64,8 @@ def frame_counts(history: History) -> Results:
 
     Every frame that reaches the controller leads to a step and, with a calibration, to a command; frames that the
     controller skipped (a newer one arrived first) or missed (never arrived) have neither. The last frames, whose
-    commands may be after the end of the log, are counted separately. The processes' own counts begin at their start,
-    which may be before the start of the log.
+    commands may be after the end of the log, are counted separately. The controller's own counts begin at its start,
+    which may be before the start of the log. Only the simulated camera counts late commands.
     """
     frames, rows = np.unique(history.frame_sequence, return_index=True)
     without = rows_of(frames, history.steps.sequence) < 0
@@ -79,13 +79,12 @@ def frame_counts(history: History) -> Results:
         for topic in controller.topics:
             if topic.topic == FRAME.key:
                 counted = {"skipped": topic.skipped, "missing": topic.missing}
-    camera = history.health.get(Role.CAMERA)
     return {
         "recorded": int(frames.size),
         "without_command": int((without & ~at_the_end).sum()),
         "at_the_end": int(at_the_end.sum()),
         "skipped_by_controller": counted["skipped"],
         "missing_at_controller": counted["missing"],
-        "commands_late": camera.commands_late if camera is not None else None,
+        "commands_late": history.commands_late if history.truths.sequence.size else None,
         "camera_starts": len({start_of(int(sequence)) for sequence in frames}),
     }
