@@ -203,6 +203,25 @@ def test_a_configuration_file_gives_the_same_as_the_options(runs: dict[str, Logg
     assert any(f"{by_file['tilt_what_if_mas']:.2f}" in line and "mas" in line for line in table)
 
 
+def test_automatic_gains_of_a_configuration_file_are_the_logged_ones(
+    runs: dict[str, LoggedRun], tmp_path: Path
+) -> None:
+    path = tmp_path / "automatic.toml"
+    path.write_text('[control]\ntilt_gain="auto"\ngain="auto"\nleak=0.02\n')
+    for given, gains, kept in (
+        (None, [0.4, 0.4, 0.2], "those of tilt x, tilt y, focus are the logged ones"),
+        ("tilt_gain=0.3", [0.3, 0.3, 0.2], "those of focus are the logged ones"),
+        ("gain=0.3", [0.3, 0.3, 0.3], ""),
+    ):
+        found = results_of(runs["default"], requested(given, path))
+        assert [mode["gain"] for mode in found["modes"]] == pytest.approx(gains)
+        warnings = [one for one in found["warnings"] if "automatic" in one]
+        assert len(warnings) == bool(kept)
+        assert kept in "".join(warnings)
+    with pytest.raises(DataFileError, match="its gains are unknown: they are automatic"):
+        LoggedRun(replace(history(), controllers=[], configuration=Configuration()))
+
+
 def test_another_reconstructor_measures_the_same_frames(runs: dict[str, LoggedRun], tmp_path: Path) -> None:
     """pinv by name and as a file are the same; `weighted` of that file is the logged one."""
     by_name = results_of(runs["default"], requested("estimator=pinv"))

@@ -23,7 +23,7 @@ from lowfc.optics.chain.zernike import mode_name
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.cli.contrast import added_contrast, added_contrast_in_words, with_variances
 from lowfc.programs.cli.result import table
-from lowfc.programs.logs.what_if.options import LAW_KEYS, WhatIf, law
+from lowfc.programs.logs.what_if.options import LAW_KEYS, WhatIf, law, logged_gains
 from lowfc.programs.logs.what_if.run import LoggedRun
 
 LINEAR_WAVES = 5 * tilt_nm_per_mas(2.0) / 550
@@ -101,6 +101,7 @@ def what_if(run: LoggedRun, what: WhatIf) -> dict[str, Any]:
             *_log_warnings(run),
             *([f"the log lacks {counted(int(lost), 'frame')} that were used: the what-if holds there"] if lost else []),
             *_range_warnings(run.calibration, columns),
+            *([] if user_step else _automatic_warnings(what, noll)),
             *([] if user_step else _law_warnings(run, new_law, command_nm[rows])),
         ],
     }
@@ -284,6 +285,14 @@ def _range_warnings(calibration: Calibration, columns: dict[str, Array]) -> list
         f"beyond the sensor's linear range of {limit_nm:.1f} nm rms per mode: {', '.join(beyond)}; the results are "
         "only approximate"
     ]
+
+
+def _automatic_warnings(what: WhatIf, noll: tuple[int, ...]) -> list[str]:
+    kept = logged_gains(what, noll)
+    if not kept.any():
+        return []
+    names = ", ".join(mode_name(index) for index in np.array(noll)[kept].tolist())
+    return [f"automatic gains of --config are not computed: those of {names} are the logged ones; give --set gain=..."]
 
 
 def _law_warnings(run: LoggedRun, law: Integrator, command_nm: Single) -> list[str]:

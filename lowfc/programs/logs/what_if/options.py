@@ -3,7 +3,7 @@
 import contextlib
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from runpy import run_path
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lowfc.adapters.files.factory import settings
-from lowfc.arrays import Single
+from lowfc.arrays import Mask, Single
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import ConfigurationError, nearest
 from lowfc.control.calibration.calibration import ESTIMATORS
@@ -84,7 +84,10 @@ def requested(
 
 def law(what: WhatIf, noll: tuple[int, ...], logged: Integrator) -> Integrator:
     """The law of the what-if: the logged or the configured one, with the given values replaced."""
-    base = settings(what.config).integrator(noll) if what.config is not None else logged
+    base = logged
+    if what.config is not None:
+        base = settings(what.config).integrator(noll)
+        base = replace(base, gain=np.where(logged_gains(what, noll), logged.gain, base.gain))
     tilts = np.isin(noll, TIP_TILT)
     changed = []
     for key in LAW_KEYS:
@@ -97,6 +100,14 @@ def law(what: WhatIf, noll: tuple[int, ...], logged: Integrator) -> Integrator:
         return Integrator(gain, leak, limit_nm)
     except ValueError as error:
         raise ConfigurationError(f"--set: {error}") from None
+
+
+def logged_gains(what: WhatIf, noll: tuple[int, ...]) -> Mask:
+    """Modes (modes,) that keep the logged gain, because theirs is automatic in the file and given by no option."""
+    if what.config is None or "gain" in what.overrides:
+        return np.zeros(len(noll), np.bool_)
+    automatic = settings(what.config).automatic(noll)
+    return automatic & ~np.isin(noll, TIP_TILT) if "tilt_gain" in what.overrides else automatic
 
 
 def user_controller(where: str) -> Controller:

@@ -218,4 +218,9 @@ def _law_and_delay(history: History, calibration: Calibration) -> tuple[Integrat
     if history.configuration is None:
         raise DataFileError(f"{history.log.path}: its gains and delay are unknown: it has no controller state")
     known = settings(history.configuration)
+    if any(known.auto_gain):
+        raise DataFileError(
+            f"{history.log.path}: its gains are unknown: they are automatic in its configuration, and it has no "
+            "controller state"
+        )
     return known.integrator(calibration.noll), known.delay_frames
