@@ -20,7 +20,7 @@ from lowfc.contract.codecs.calibration_codec import encode_calibration
 from lowfc.contract.codecs.law_codec import wire_law, wire_play
 from lowfc.contract.codecs.state_codec import controller_state
 from lowfc.contract.envelope import sequence_of
-from lowfc.contract.errors import DataFileError
+from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.messages import (
     CALIBRATION,
     COMMAND,
@@ -411,6 +411,21 @@ def test_several_processes_give_the_account_of_one(log: Path, monkeypatch: pytes
     assert one.identical
     one.log_s = two.log_s = 0.0
     assert one == two
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_logs_in_another_order_than_recorded_are_refused(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, jobs: int
+) -> None:
+    monkeypatch.setattr(workers, "_WORTH_BYTES", 1)
+    later = report_log.SyntheticLog()
+    later.samples[0] = later.samples[0]._replace(receive_time_ns=1)  # a state at the log's start is older than the log
+    later.now_ns += 3600 * 10**9
+    later.frames(20)
+    newer = later.write(tmp_path / "newer.mcap")
+    assert workers.replay_files([log, newer], 0.0, 1, lambda done: None).frames == STEPS + 20
+    with pytest.raises(ConfigurationError, match=r"night\.mcap begins 3600\.0 s before .*; name the logs"):
+        workers.replay_files([newer, log], 0.0, jobs, lambda done: None)
 
 
 def test_a_damaged_log_is_replayed_except_for_the_damage(log: Path, tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.records import LogFile
 from lowfc.contract import published
 from lowfc.contract.errors import ConfigurationError, DataFileError
+from lowfc.contract.messages import FRAME
 from lowfc.programs.logs.replay.account import Account
 from lowfc.programs.logs.replay.controller_replay import PATIENCE_NS, WHOLE, Segment
 from lowfc.programs.logs.replay.fold import TOPICS, Replay
@@ -38,9 +39,12 @@ def replay_files(
 
     `progress` is called with the bytes replayed so far.
     """
-    ends_ns = [one for path in paths for one in _chunk_ends_ns(path)]
+    chunk_ends_ns = [_chunk_ends_ns(path) for path in paths]
+    ends_ns = [one for ends in chunk_ends_ns for one in ends]
     if len({path.resolve() for path in paths}) < len(paths):
         raise ConfigurationError("a log is named twice; name each once, in the order they were recorded")
+    if len(paths) > 1:
+        _refuse_disorder(paths, chunk_ends_ns)
     size = sum(path.stat().st_size for path in paths)
     jobs = jobs or len(os.sched_getaffinity(0))
     count = min(_SEGMENTS_PER_JOB * jobs, size // _WORTH_BYTES) if ends_ns and jobs > 1 else 1
@@ -68,6 +72,21 @@ def _chunk_ends_ns(path: Path) -> list[int]:
     """Log times at which the chunks of a log end, by its summary; none for an unfinished log."""
     with LogFile(path) as file:
         return [chunk.message_end_time for chunk in file.index()]
+
+
+def _refuse_disorder(paths: Sequence[Path], chunk_ends_ns: Sequence[Sequence[int]]) -> None:
+    """Raise ConfigurationError if a log's first frame is before the end of the previous log."""
+    end_ns, previous = 0, paths[0]
+    for path, ends_ns in zip(paths, chunk_ends_ns, strict=True):
+        frames = WholeLog(path, topics=(FRAME,), skip_damaged=True)  # the states at its start may be old
+        with contextlib.closing(iter(frames)) as messages:
+            begin_ns = next((frame.receive_time_ns for frame in messages), None)
+        if begin_ns is not None and begin_ns < end_ns - PATIENCE_NS:
+            raise ConfigurationError(
+                f"{path} begins {(end_ns - begin_ns) / 1e9:.1f} s before {previous} ends; "
+                "name the logs in the order they were recorded, and replay those of one time one by one"
+            )
+        end_ns, previous = max([end_ns, begin_ns or 0, *ends_ns]), path
 
 
 def _replay_segment(
