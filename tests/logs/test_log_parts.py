@@ -18,10 +18,12 @@ from lowfc.adapters.logs.series import STANDARD, LogSeries
 from lowfc.adapters.logs.writer import Attachment, LogWriter
 from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.configuration import Configuration
+from lowfc.contract.envelope import sequence_of
 from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError
-from lowfc.contract.messages import CALIBRATION, CONTROLLER_STATE, FRAME, topic_of
+from lowfc.contract.messages import BENCH, CALIBRATION, CONTROLLER_STATE, FRAME, topic_of, wire
 from tests.support.loops import lowfc
 from tests.support.report_log import METADATA, SyntheticLog
+from tests.support.toy import START
 
 FRAMES = 2200
 TOML = [Attachment("config.toml", "application/toml", Configuration().to_toml().encode())]
@@ -115,6 +117,15 @@ def test_the_files_of_a_log_are_read_as_one(folder: Path, samples: list[Sample])
     log = WholeLog(files, topics=[FRAME], skip_damaged=True)
     assert len(list(log)) == FRAMES
     assert not log.complete
+
+
+def test_bench_values_of_every_publisher_are_read_from_every_file(folder: Path) -> None:
+    night = SyntheticLog()
+    for count in range(4):
+        for start in (START, START + 60):
+            night.put(BENCH, wire.BenchValue(number=count), sequence_of(start, count), name="mask")
+    read = [one for one in WholeLog(recorded(folder, night.samples, 2)) if BENCH.matches(one.key)]
+    assert [one.sequence for one in read] == [one.sequence for one in night.samples if BENCH.matches(one.key)]
 
 
 COMMANDS = [

@@ -14,6 +14,7 @@ from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.records import LogFile
 from lowfc.adapters.logs.writer import PART
 from lowfc.contract.configuration import Recorder
+from lowfc.contract.envelope import start_of
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.messages import topic_of
 
@@ -32,8 +33,8 @@ class Repeated:
     """Detects messages that a file of a log repeats from the previous one at its start: calibrations and states."""
 
     def __init__(self) -> None:
-        self._newest: dict[str, int] = {}
-        self._before: dict[str, int] = {}
+        self._newest: dict[tuple[str, int], int] = {}
+        self._before: dict[tuple[str, int], int] = {}
 
     def next_file(self) -> None:
         """Begin the next file."""
@@ -43,9 +44,10 @@ class Repeated:
         """Whether this message was in a previous file."""
         with contextlib.suppress(KeyError):
             if topic_of(message.key).queryable:
-                if message.sequence <= self._before.get(message.key, -1):
+                publisher = message.key, start_of(message.sequence)  # a topic may have several publishers
+                if message.sequence <= self._before.get(publisher, -1):
                     return True
-                self._newest[message.key] = max(message.sequence, self._newest.get(message.key, -1))
+                self._newest[publisher] = max(message.sequence, self._newest.get(publisher, -1))
         return False
 
 
