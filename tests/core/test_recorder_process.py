@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from lowfc.adapters.bus.run import new_run_id, open_run
+from lowfc.adapters.bus.run import Run, new_run_id, open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.writer import UNFINISHED
@@ -18,7 +18,9 @@ from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.provenance import provenance
 from lowfc.adapters.process.realtime import NOTHING
 from lowfc.adapters.process.service import Service
-from lowfc.contract.messages import FRAME, STEP, Topic
+from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.messages import FRAME, STEP, Role, Topic
+from lowfc.programs.core.recording.summary import Summary
 from lowfc.programs.launch.watch import topic_count
 from tests.support.loops import lowfc, start, until
 from tests.support.recording import PATIENCE_S, bodies_of
@@ -164,6 +166,32 @@ def test_an_impossible_recording_is_refused_before_any_file_is_created(
     done = lowfc("record", "--run", new_run_id(), *(str(option).format(tmp_path) for option in options))
     assert (done.exception.exit_status, complaint in str(done.exception)) == (2, True)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.usefixtures("own_runtime")
+def test_a_recording_has_the_configuration_of_its_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recorded: list[tuple[float, int]] = []
+
+    def record(run: Run, config: Configuration, calibration: Path | None) -> Summary:
+        recorded.append((config.star.magnitude, config.recorder.every))
+        return Summary((), 0, {}, "", 0, 0, 0)
+
+    monkeypatch.setattr("lowfc.programs.core.recording.process.record", record)
+    of_launcher = open_run("launched", listeners=(Role.LAUNCHER,)).path / "config.toml"
+    of_launcher.write_text(load(None, {"star.magnitude": 3.0}).to_toml())
+    other = tmp_path / "other.toml"
+    other.write_text("[star]\nmagnitude = 4.0\n")
+    for options in (
+        ("launched", "--every", 5),
+        ("launched", "--config", other),
+        ("by-hand",),
+        ("by-hand", "--every", 5, "--config", other),
+        ("by-hand",),
+    ):
+        assert lowfc("record", "--run", *options).exit_code == 0
+    default = Configuration().star.magnitude
+    assert recorded == [(3.0, 5), (4.0, 1), (default, 1), (4.0, 5), (4.0, 1)]
+    assert load(of_launcher).star.magnitude == 3.0
 
 
 def test_the_provenance_identifies_processor_and_blas() -> None:

@@ -102,10 +102,15 @@ def record(
 ) -> None:
     """Record the messages of a run in MCAP logs until Ctrl-C or SIGTERM.
 
+    Without --config the configuration is the one in the run's directory, if there is one.
+
     Example: lowfc record --run bench --folder logs --longest-s 600 --min-free-mb 2000
     """
-    from lowfc.adapters.bus.run import open_run
+    from lowfc.adapters.bus.run import open_run, runtime_base
+    from lowfc.adapters.files.whole_file import write_whole
     from lowfc.client.runs import waiting_message
+    from lowfc.contract.configuration import load
+    from lowfc.contract.messages import Role
     from lowfc.programs.core.recording.process import record as run_recorder
     from lowfc.programs.core.recording.summary import json_object, report
 
@@ -120,8 +125,11 @@ def record(
     if words:
         hint = f"; `lowfc ctl record {words[0]}` controls a running recorder" if words[0] in ("start", "stop") else ""
         raise ConfigurationError(f"lowfc record takes options only, got {' '.join(words)!r}{hint}")
-    settings = configuration(config, overrides)
+    of_run = runtime_base() / run / "config.toml"
+    settings = configuration(of_run if config is None and of_run.exists() else config, overrides)
     joined = open_run(run, (settings.mirror.name,), network=settings.network)
+    if config is not None and Role.LAUNCHER not in joined.links.ports:
+        write_whole(of_run, load(config).to_toml().encode())  # for the others, without the options of this recording
     if not joined.links.network.router and (nobody := waiting_message(run)):
         typer.echo(f"recorder: {nobody}", err=True)
     done = run_recorder(joined, settings, calibration)

@@ -6,7 +6,6 @@ from pathlib import Path
 
 from lowfc.adapters.bus.run import Run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
-from lowfc.adapters.files.whole_file import write_whole
 from lowfc.adapters.logs.series import Limits, shortage
 from lowfc.adapters.logs.writer import Attachment
 from lowfc.adapters.process.join import clock_of
@@ -26,7 +25,7 @@ _MAX_ATTACHMENT_BYTES = 1 << 28
 
 
 def record(run: Run, config: Configuration, calibration: Path | None) -> Summary:
-    """Record a run until SIGTERM or SIGINT; its configuration and the calibration (FITS) are attached to each log.
+    """Record a run until SIGTERM or SIGINT; the configuration and the calibration (FITS) are attached to each log.
 
     Raises:
         BusError: another recorder is recording this run.
@@ -37,9 +36,8 @@ def record(run: Run, config: Configuration, calibration: Path | None) -> Summary
     if short := shortage(Path(log.folder), limits.min_free_bytes):
         raise DataFileError(short)
     sys.stderr.write(f"{estimate(config)}\n")
-    complete = run.path / "config.toml"  # every value, also the defaults that a user's file omits
-    write_whole(complete, config.to_toml().encode())
-    attachments = [_attached(complete, "application/toml")]
+    # Every value, also the defaults that a user's file omits.
+    attachments = [Attachment("config.toml", "application/toml", config.to_toml().encode())]
     attachments += [] if calibration is None else [_attached(calibration, "application/fits")]
     granted = step_back((realtime.priority and realtime.recorder_priority) or None, set(realtime.recorder_cpus) or None)
     clock = clock_of(config)
