@@ -676,7 +676,12 @@ def test_a_recording_is_stopped_and_restarted(bench: Bench) -> None:
     assert bodies_of(read, FRAME) == second[:5] + second[6:]
     assert "RECORDING recording" in [Log.FromString(body).message for body in bodies_of(read, EVENT)]
     assert (summary.lost, summary.failure) == ({FRAME.key: 2}, ""), "messages while stopped do not count as lost"
-    assert summary.messages == sum(len(list(LogReader(path))) for path in summary.files)
+    logs = [LogReader(path) for path in summary.files]
+    counts = [len(list(log)) for log in logs]
+    assert summary.messages == sum(counts)
+    for log, count in zip(logs, counts, strict=True):
+        account = {"messages": str(count), "messages_lost": "1", f"lost {FRAME.key}": "1"}
+        assert log.metadata["recording"] == account, "of this recording, not of the recorder"
 
 
 def test_a_log_that_cannot_be_created_is_refused_and_can_be_requested_again(bench: Bench) -> None:

@@ -81,6 +81,7 @@ class Recorder:
         self._failure = ""
         self._flush_due_ns = self._max_starts = 0
         self._begun_ns = self._oldest_ns = 0
+        self._messages_before, self._lost_before = 0, dict[str, int]()  # of earlier recordings
         self._longest_wait_ns = self._longest_unflushed_ns = self._slowest_ns = 0
         # Before the service subscribes to Health: a peer that knows of this subscription knows of all others.
         for topic in TOPICS:
@@ -134,6 +135,8 @@ class Recorder:
 
     def _begin(self, *, anew: bool = True) -> None:
         """Begin a log, or unless `anew` its next part, with the calibration and states that its messages depend on."""
+        if anew:
+            self._messages_before, self._lost_before = self._series.messages, self._account.lost()
         self._series.begin(self._peers.newest.values(), new_recording=anew)
         self._max_starts = self._account.starts + MAX_CHANNELS
         self.service.event("RECORDING")
@@ -343,10 +346,11 @@ class Recorder:
         )
 
     def _totals(self) -> dict[str, str]:
-        """Totals at the end of a log, over all logs so far."""
-        lost = self._account.lost()
+        """Totals at the end of a log, over all files of its recording so far."""
+        since = {key: count - self._lost_before.get(key, 0) for key, count in self._account.lost().items()}
+        lost = {key: count for key, count in since.items() if count > 0}
         return {
-            "messages": str(self._series.messages),
+            "messages": str(self._series.messages - self._messages_before),
             "messages_lost": str(sum(lost.values())),
             **{f"lost {key}": str(count) for key, count in lost.items()},
         }
