@@ -1,5 +1,6 @@
 """Replay confirms identical results, reports differences, and counts the steps that it cannot check."""
 
+import json
 from collections import Counter
 from itertools import pairwise
 from pathlib import Path
@@ -445,6 +446,15 @@ def test_a_damaged_log_is_replayed_except_for_the_damage(log: Path, tmp_path: Pa
     text = lowfc("replay", tmp_path / "damaged.mcap").stdout
     assert "unchecked" in text
     assert "damaged" in text
+
+
+def test_a_finished_log_with_a_damaged_summary_is_not_called_cut_off(log: Path, tmp_path: Path) -> None:
+    content = bytearray(log.read_bytes())
+    content[-100] ^= 0x40
+    (tmp_path / "night.mcap").write_bytes(content)
+    found = json.loads(lowfc("replay", tmp_path / "night.mcap", "--json").stdout)
+    assert (found["identical"], found["frames"]) == (True, STEPS)
+    assert (found["complete"], found["no_end"]) == (False, "")
 
 
 def test_a_forged_command_and_another_host_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -28,7 +28,8 @@ class Account(Result):
         rules_changed: number of inputs that this version handles differently on purpose, by rule.
         version: lowfc version of the first log; `host_differs` has the versions and processor features that differ.
         log_s: time from the first frame to the last; `speed` is `log_s` over the time of the replay.
-        complete: whether every log has its end; `no_end` is the reason if not, `damaged` lists the parts left out.
+        complete: whether every log has its end and summary; `finished` is whether its recorder ended it, `no_end` the
+            reason if not, `damaged` lists the parts left out.
         runs: names of the runs in the logs.
         stopped: reasons why a recording ended early.
         recorded_on: versions and host in the first log.
@@ -58,6 +59,7 @@ class Account(Result):
     stopped: list[str] = Field([])
     host_differs: dict[str, tuple[str, str]] = Field({})
     recorded_on: dict[str, str] = Field({}, exclude=True)
+    finished: bool = Field(True, exclude=True)
 
     @computed_field  # type: ignore[prop-decorator]
     @property
@@ -81,7 +83,8 @@ class Account(Result):
         self.other_kernel = self.other_kernel or later.other_kernel
         self.largest_difference_nm = max(self.largest_difference_nm, later.largest_difference_nm)
         self.damaged = sorted({*self.damaged, *later.damaged})
-        self.complete, self.runs, self.stopped = later.complete, later.runs, later.stopped
+        self.complete, self.finished = later.complete, later.finished
+        self.runs, self.stopped = later.runs, later.stopped
 
     def json_object(self) -> dict[str, Any]:
         """All fields, whether set or not."""

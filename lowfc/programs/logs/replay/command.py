@@ -58,7 +58,7 @@ def replay_log(
     found.speed = round(found.log_s / (time.monotonic() - begun_s), 2)
     found.log_s = round(found.log_s, 3)
     found.version, found.tolerance_nm = found.recorded_on.get("lowfc", ""), tolerance
-    found.no_end = missing_end_text(files, finished=found.complete)
+    found.no_end = missing_end_text(files, finished=found.finished)
     found.host_differs = _host_differs(found.recorded_on)
     print_result(found, as_json=as_json)
     if not found.identical:

@@ -120,6 +120,7 @@ def _replay_segment(
         gc.enable()
     about = [(part.path.name, part.metadata) for part in log.parts]
     account.complete, account.log_s, account.recorded_on = log.complete, run.duration_s, about[0][1].get("lowfc", {})
+    account.finished = log.finished
     account.damaged = [f"byte {one.position}: {one.why}" for one in log.damage]
     account.runs = sorted({metadata.get("lowfc", {}).get("run", "?") for _, metadata in about})
     stopped = [(name, metadata.get("recording", {}).get("stopped")) for name, metadata in about]
