@@ -56,6 +56,8 @@ def a_night() -> SyntheticLog:
     night.request("close")
     night.frames(STEPS // 2 - 1, dark={REFUSED - 1})
     night.start_camera()
+    night.request("gain", (9.0,))  # refused
+    night.request("leak", (0.0,))
     night.frames(STEPS // 2)
     for topic, number in ((COMMAND, WITHOUT_COMMAND), (TRUTH, WITHOUT_TRUTH)):
         del night.samples[[place for place, one in enumerate(night.samples) if topic.matches(one.key)][number]]
@@ -203,6 +205,7 @@ def test_aot(log: Path, tmp_path: Path) -> None:
     assert system.main_telescope.enclosing_diameter == 2.0
     metadata = {one.key: one.value for one in system.metadata}
     assert (metadata["CALID"], metadata["RUN"], metadata["EPERADU"]) == (calibration.id, "night", 1.0)
+    assert metadata["GAINSETS"] == 1
     assert json.loads(system.config) == Configuration().model_dump()
 
 

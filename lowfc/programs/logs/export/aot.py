@@ -191,7 +191,10 @@ class _System:
             "VERSION": (recorded.get("lowfc", ""), "lowfc version that recorded the log"),
             "FLUX": (calibration.flux_dn, "[adu] expected sum of the good pixels"),
             "CLOSED": (closed, "fraction of the steps with the loop closed"),
-            "GAINSETS": (sum(one.name in ("gain", "leak") for one in history.requests), "changes of gain or leak"),
+            "GAINSETS": (
+                sum(one.accepted and one.name in ("gain", "leak") for one in history.requests),
+                "changes of gain or leak",
+            ),
         }
         if history.camera is not None:
             found |= {
