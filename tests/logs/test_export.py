@@ -209,6 +209,14 @@ def test_aot(log: Path, tmp_path: Path) -> None:
     assert json.loads(system.config) == Configuration().model_dump()
 
 
+def test_the_gains_of_an_integrator_that_a_linear_law_replaces_are_not_in_aot(tmp_path: Path) -> None:
+    night = a_night()
+    night.law(0.1)
+    export_log(night.write(tmp_path / "x.mcap"), Format.AOT, path := tmp_path / "x.fits", frames=False, console=QUIET)
+    (loop,) = aotpy.AOSystem.read_from_file(path).loops
+    assert (loop.delay, loop.time_filter_num, loop.time_filter_den) == (1.25, None, None)
+
+
 @pytest.mark.parametrize("to", list(Format))
 def test_a_truncated_log_without_truth_is_exported(tmp_path: Path, to: Format) -> None:
     part = written(tmp_path / "cut.mcap", TRUTH, finish=False)

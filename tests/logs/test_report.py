@@ -339,6 +339,27 @@ def test_a_closed_loop_without_a_good_frame_has_neither_spectra_nor_budget(tmp_p
     assert found["verdict"]["checks"][2]["level"] == "look"  # the true wavefront is uncorrected
 
 
+@pytest.mark.parametrize("logged", [True, False])
+def test_theory_is_that_of_the_linear_law_in_use(tmp_path: Path, logged: bool) -> None:
+    night = SyntheticLog()
+    night.frames(300)
+    night.law(0.05, logged=logged)
+    night.frames(2000)
+    made = report_of(read_run(night.write(tmp_path / "x.mcap")))
+    assert [(one["law"], one["from_s"]) for one in made.results["laws"]] == [
+        ("integrator", 0.0),
+        ("pi", pytest.approx(0.3)),
+    ]
+    stretch = made.results["closed_stretch"]
+    assert stretch["law"] == ("pi" if logged else "integrator")
+    assert stretch["to_s"] == pytest.approx(2.299 if logged else 0.299)
+    if logged:
+        assert (stretch["steps_settling"], stretch["frames"]) == (200, 1800)
+        tip = made.results["spectra"]["groups"][0]
+        assert tip["measured_over_theory"]["median"] == pytest.approx(1, abs=0.03)
+        assert "linear law pi" in page(made)
+
+
 @pytest.mark.parametrize(("lost", "without", "at_the_end"), [(1, 0, 1), (50, 0, 50), (80, 30, 50)])
 def test_the_last_frames_may_have_their_command_after_the_log(
     tmp_path: Path, lost: int, without: int, at_the_end: int

@@ -408,6 +408,7 @@ def test_warnings_name_what_makes_the_results_doubtful() -> None:
     pol[20] -= 1
     known = replace(history(reasons=reasons, pol_nm=pol), requests=[wire.Request(name="gain", accepted=True)])
     known.mirror.limits = np.array([0, 1, 1])
+    known.controllers[0].law.name = "lqg"
     known.log.finished = False
     known.log.damage.append(Damage(77, 5, "the checksum of a chunk is wrong"))
     warnings = "\n".join(what_if(LoggedRun(known), WhatIf())["warnings"])
@@ -419,6 +420,7 @@ def test_warnings_name_what_makes_the_results_doubtful() -> None:
         "left out: byte 77, the checksum of a chunk is wrong",
         "the log has no end",
         "lacks some commands: 1 frame exposed with a missing",
+        "a linear law (lqg) was in use",
     ):
         assert words in warnings
 

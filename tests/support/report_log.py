@@ -1,6 +1,7 @@
 """A log of the toy's loop, with the messages of the real controller's `advance`, without processes."""
 
 from collections.abc import Collection
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from lowfc.adapters.logs.writer import Attachment, LogWriter
 from lowfc.arrays import Pixels, Single
 from lowfc.contract.codecs import codec
 from lowfc.contract.codecs.calibration_codec import encode_calibration, identified
+from lowfc.contract.codecs.law_codec import wire_law
 from lowfc.contract.codecs.state_codec import controller_state
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.envelope import sequence_of
@@ -23,6 +25,7 @@ from lowfc.contract.messages import (
     EVENT,
     FRAME,
     HEALTH,
+    LAW,
     MIRROR_STATE,
     REQUEST,
     STEP,
@@ -35,6 +38,7 @@ from lowfc.contract.messages import (
     wire,
 )
 from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.laws.linear_law import integrator
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.inputs import Frame, Load, Outputs, Request
 from lowfc.control.loop.state import State
@@ -117,6 +121,13 @@ class SyntheticLog:
         assert outputs.reply is not None
         self.put(REQUEST, codec.encode_request(request, outputs.reply, after.input_number, None))
         self._take((after, outputs))
+
+    def law(self, gain: float, *, logged: bool = True) -> None:
+        """Load an integrator of one gain as a linear law named pi; its matrices are in the log only if `logged`."""
+        law = replace(integrator([gain] * len(NOLL), [0.0] * len(NOLL), NOLL, 1.0, 1e9 / PERIOD_NS), name="pi")
+        if logged:
+            self.put(LAW, wire_law(law))
+        self.request("law", law=law)
 
     def event(self, name: str, **details: object) -> None:
         self.put(EVENT, EVENTS[name].log("controller", self.now_ns, **details))

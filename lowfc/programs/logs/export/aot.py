@@ -172,11 +172,12 @@ class _System:
         if any(COMMAND.matches(key) for key in self._history.counts):
             loop.commands = aotpy.Image(_COMMANDS, np.zeros((1, 1), np.float32), "m", time=clock)
         if state is not None and len(state.gain) == len(calibration.noll):
-            gain, leak = np.array(state.gain, np.float32), np.array(state.leak, np.float32)
             exposure = self._history.exposure_fraction
             loop.delay = state.delay_frames + (0.0 if exposure is None else (1 - exposure) / 2)
-            loop.time_filter_num = aotpy.Image("TIME FILTER NUM", gain[:, None])
-            loop.time_filter_den = aotpy.Image("TIME FILTER DEN", np.stack([leak - 1, np.ones_like(leak)], axis=1))
+            if not state.HasField("law"):  # a linear law is not a filter of each mode
+                gain, leak = np.array(state.gain, np.float32), np.array(state.leak, np.float32)
+                loop.time_filter_num = aotpy.Image("TIME FILTER NUM", gain[:, None])
+                loop.time_filter_den = aotpy.Image("TIME FILTER DEN", np.stack([leak - 1, np.ones_like(leak)], axis=1))
         return loop
 
     def _metadata(self) -> list[aotpy.Metadatum]:

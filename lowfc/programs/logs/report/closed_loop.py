@@ -1,6 +1,6 @@
 """The longest stretch of a run with the loop closed under one law: spectra, theory and budget."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -14,6 +14,7 @@ from lowfc.control.laws.margins import noise_transfer, rejection
 from lowfc.control.laws.spectra import SHORTEST, Spectrum, TimeSeries, in_bins, spectrum, time_series
 from lowfc.control.laws.stability import settling_frames
 from lowfc.control.loop.safety import LoopMode
+from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
 from lowfc.programs.logs.report.source import InForce, Results, Run
 
 MAX_STEPS = 200_000
@@ -65,7 +66,8 @@ def longest_stretch(run: Run) -> Stretch | None:
     """The longest stretch; None if the loop was never closed, or the log does not contain the law."""
     history, laws = run.history, run.law_rows()
     steps = history.steps
-    closed = (steps.mode == LoopMode.CLOSED) & (laws >= 0)
+    known = np.array([*(law.known for law in run.laws), False])  # the last for steps before the first law
+    closed = (steps.mode == LoopMode.CLOSED) & known[laws]
     edges = np.flatnonzero(np.diff(np.where(closed, laws, -1), prepend=-1, append=-1))
     spans = [(first, last) for first, last in pairwise(edges.tolist()) if closed[first]]
     if not spans:
@@ -73,7 +75,8 @@ def longest_stretch(run: Run) -> Stretch | None:
     first, last = max(spans, key=lambda span: int(np.isfinite(steps.error_nm[span[0] : span[1], :1]).sum()))
     in_force = run.laws[laws[first]]
     gain, leak = np.array(in_force.gain, float), np.array(in_force.leak, float)
-    settling = min(settling_frames(gain, leak), (last - first) // 10)
+    settling = settling_frames(gain, leak) if in_force.linear is None else SETTLING_FRAMES + FADING_FRAMES
+    settling = min(settling, (last - first) // 10)
     rows = slice(max(first + settling, last - MAX_STEPS), last)
     earlier = rows.start - first - settling
     signals = [steps.error_nm[rows], steps.pol_nm[rows]]
@@ -86,7 +89,10 @@ def longest_stretch(run: Run) -> Stretch | None:
     found = time_series(steps.sequence[rows], np.hstack(signals))
     noll = tuple(range(2, 2 + gain.size))
     rate_hz = history.rate_hz or 1.0  # unknown, and unused, for a single step
-    law = integrator(gain, leak, noll, in_force.delay_frames, rate_hz)
+    if in_force.linear is None:
+        law = integrator(gain, leak, noll, in_force.delay_frames, rate_hz)
+    else:
+        law = replace(in_force.linear, delay_frames=in_force.delay_frames, rate_hz=rate_hz)
     return Stretch(rows, settling, earlier, in_force, law, timing, found, residual_ms_nm2)
 
 
@@ -114,6 +120,7 @@ def stretch_results(run: Run, stretch: Stretch | None) -> Results | None:
         "steps_settling": stretch.settling,
         "steps_earlier": stretch.earlier,
         "steps_limited": int(limited.sum()),
+        "law": stretch.in_force.law_name,
         "gain": list(stretch.in_force.gain),
         "leak": list(stretch.in_force.leak),
         "delay_frames": stretch.law.delay_frames,

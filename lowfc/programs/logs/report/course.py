@@ -71,10 +71,11 @@ def requests(run: Run) -> list[Results]:
 
 
 def laws(run: Run) -> list[Results]:
-    """The laws in force, with their start times."""
+    """The laws in force, with their start times; gain and leak are those of the integrator."""
     return [
         {
             "from_s": float(run.step_s[law.first]),
+            "law": law.law_name,
             "gain": list(law.gain),
             "leak": list(law.leak),
             "delay_frames": law.delay_frames,

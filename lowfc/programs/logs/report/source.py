@@ -1,7 +1,8 @@
 """Input of a report: the history of a run, and the law in force at each step."""
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+import contextlib
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,9 @@ from lowfc.adapters.logs.columns import rows_of
 from lowfc.adapters.logs.history import History, read_history
 from lowfc.adapters.logs.parts import LogFiles, WholeLog
 from lowfc.arrays import Array, Long
-from lowfc.contract.messages import from_timestamp
+from lowfc.contract.codecs.law_codec import driving, overruled
+from lowfc.contract.messages import from_timestamp, wire
+from lowfc.control.laws.linear_law import LinearLaw
 
 Results = dict[str, Any]
 """Values that JSON can represent."""
@@ -19,12 +22,28 @@ Results = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class InForce:
-    """A law: gain and leak (modes,), delay; in force from step `first` on, which comparisons ignore."""
+    """A controller: gain and leak (modes,) of the integrator, delay, and the linear law in use instead of it.
+
+    Attributes:
+        first: step from which on it is in force; comparisons ignore it.
+        law_id, law_name: identity and name of the linear law; without one, empty and "integrator".
+        overruled: groups of modes that the integrator drives instead of the law.
+        linear: the linear law; None for the integrator, if it is not in the log, or if it is overruled.
+    """
 
     first: int = field(compare=False)
     gain: tuple[float, ...]
     leak: tuple[float, ...]
     delay_frames: float
+    law_id: str = ""
+    law_name: str = "integrator"
+    overruled: tuple[str, ...] = ()
+    linear: LinearLaw | None = field(default=None, compare=False)
+
+    @property
+    def known(self) -> bool:
+        """Whether `linear`, or without it the integrator, describes the whole controller."""
+        return not self.law_id or self.linear is not None
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,11 +111,23 @@ def _laws(history: History) -> tuple[InForce, ...]:
             later = steps.time_ns > from_timestamp(state.timestamp)
         first = int(np.argmax(later)) if later.any() else int(steps.sequence.size)
         law = InForce(first, _shortest(state.gain), _shortest(state.leak), _shortest([state.delay_frames])[0])
+        if state.HasField("law"):
+            law = _with_linear_law(law, state, history.published.laws)
         while found and found[-1].first >= first:
             found.pop()
         if not found or found[-1] != law:
             found.append(law)
     return tuple(law for law in found if law.first < steps.sequence.size)
+
+
+def _with_linear_law(found: InForce, state: wire.ControllerState, laws: Mapping[str, LinearLaw]) -> InForce:
+    groups, linear = tuple(overruled(state)), None
+    with contextlib.suppress(ValueError):  # the log does not contain it
+        linear = driving(state, laws)
+    law_id = state.law.id if linear is None else linear.id
+    if linear is not None and (groups or len(linear.noll) != len(found.gain)):
+        linear = None
+    return replace(found, law_id=law_id or "unknown", law_name=state.law.name, overruled=groups, linear=linear)
 
 
 def _shortest(singles: Iterable[float]) -> tuple[float, ...]:

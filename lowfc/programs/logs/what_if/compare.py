@@ -262,6 +262,12 @@ def _log_warnings(run: LoggedRun) -> list[str]:
     changes = sum(one.accepted and one.name in LAW_KEYS for one in run.history.requests)
     if changes:
         found.append(f"gain or leak was changed {counted(changes, 'time')} in the logged run; the last ones are shown")
+    laws = sorted({state.law.name for state in run.history.controllers if state.HasField("law")})
+    if laws:
+        found.append(
+            f"a linear law ({', '.join(laws)}) was in use in the logged run: gains and settling time as logged are "
+            "those of the integrator in reserve"
+        )
     torn = np.count_nonzero(run.torn)
     if torn:
         found.append(
