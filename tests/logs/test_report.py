@@ -4,6 +4,7 @@ import json
 import re
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from lowfc.adapters.logs.recovery import recover
+from lowfc.contract.codecs.calibration_codec import encode_calibration, identified
 from lowfc.contract.configuration import load
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.messages import CALIBRATION, CONTROLLER_STATE, EVENT, FRAME, REQUEST, TRUTH, Log, wire
@@ -23,7 +25,7 @@ from lowfc.programs.logs.report.results import report_of
 from lowfc.programs.logs.report.source import read_run
 from tests.support import report_log
 from tests.support.loops import lowfc
-from tests.support.report_log import READ_NOISE_E, SyntheticLog
+from tests.support.report_log import READ_NOISE_E, TOYS, SyntheticLog
 from tests.support.theory import noise_gain, rejection
 
 RATE_HZ = 1000.0
@@ -315,6 +317,29 @@ def test_a_loop_without_a_calibration_has_no_residual(tmp_path: Path) -> None:
     assert found["mode_steps"] == {"idle": 300}
     check = found["verdict"]["checks"][2]
     assert (check["level"], check["text"]) == ("unknown", "the loop was not closed in this log")
+    check = found["verdict"]["checks"][3]
+    assert (check["name"], check["level"]) == ("commands", "unknown")
+
+
+def test_frames_before_a_calibration_of_other_modes_led_to_commands_too(tmp_path: Path) -> None:
+    night = SyntheticLog()
+    night.frames(100)
+    night.put(CALIBRATION, wire.Calibration(noll=[2, 3]))  # refused, so that the one in use is published again
+    night.put(CALIBRATION, encode_calibration(night.calibration, night.now_ns))
+    night.frames(100)
+    found = results(night.write(tmp_path / "x.mcap"))
+    assert (found["run"]["steps"], found["log"]["steps_left_out"]) == (100, 100)
+    assert found["timing"]["frames"]["without_command"] == 0
+
+
+def test_the_stretch_is_of_the_last_calibration_loaded(tmp_path: Path) -> None:
+    night, other = SyntheticLog(), replace(TOYS, reconstructor=0.9 * TOYS.reconstructor)
+    night.frames(550)
+    night.load(identified(other))
+    night.frames(300)
+    stretch = results(night.write(tmp_path / "x.mcap"))["closed_stretch"]
+    assert stretch["from_s"] > 0.549
+    assert stretch["frames"] + stretch["steps_settling"] == 300
 
 
 def test_a_loop_closed_under_an_unknown_law_is_not_called_open(tmp_path: Path) -> None:

@@ -390,6 +390,16 @@ def test_which_rows_are_compared() -> None:
     assert len(LoggedRun(history(error_nm=error, pol_nm=error.copy())).steps.sequence) == 34
 
 
+def test_steps_under_another_calibration_give_a_warning() -> None:
+    known = history()
+    [ends] = known.controllers
+    first, loaded = wire.ControllerState(calibration_id="another"), wire.ControllerState()
+    loaded.frame_sequence = toy.frame_sequence(14)
+    known.controllers = [first, loaded, ends]
+    warnings = "\n".join(what_if(LoggedRun(known), WhatIf())["warnings"])
+    assert "another calibration was in use for 15 steps" in warnings
+
+
 def test_too_few_frames_to_compare_are_an_error() -> None:
     with pytest.raises(DataFileError, match="no frame is left to compare: of 40, 0 were refused and 40 have saturated"):
         rows_compared(LoggedRun(history(saturated_pixels=np.ones(40, np.int64))))

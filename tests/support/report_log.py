@@ -85,6 +85,11 @@ class SyntheticLog:
         self._state = State()
         self._take(advance(self.settings, self._state, Load(self.now_ns, self.calibration, "test")))
 
+    def load(self, calibration: Calibration) -> None:
+        """Load another calibration; the pixels remain those of the first one."""
+        self.put(CALIBRATION, encode_calibration(calibration, self.now_ns))
+        self._take(advance(self.settings, self._state, Load(self.now_ns, calibration, "test")))
+
     def start_camera(self) -> None:
         self._camera_start += 60
         self._count = 0

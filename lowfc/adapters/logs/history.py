@@ -28,7 +28,7 @@ from lowfc.adapters.logs.columns import (
 )
 from lowfc.adapters.logs.parts import WholeLog
 from lowfc.adapters.logs.reader import LogReader
-from lowfc.arrays import Long, Sequences, Single
+from lowfc.arrays import Long, Mask, Sequences, Single
 from lowfc.contract.codecs.calibration_codec import decode_calibration
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.configuration import Configuration
@@ -100,6 +100,7 @@ class History:
         controllers: states of the controllers, in order.
         frame_sequence, frame_publish_ns: sequence and publish time of every frame in the log.
         command_publish_ns: publish time of every mirror command in the log.
+        stepped_sequence: frame sequence of every step in the log, also of those that `steps` leaves out.
         stages_ns: (timed steps,) durations of each of `STAGES`, for the frames of `timed_sequence`.
         excluded_messages: number of steps with another number of modes than the last calibration, and of messages with
             impossible values.
@@ -122,6 +123,7 @@ class History:
     frame_sequence: Sequences = field(default_factory=_SEQUENCES)
     frame_publish_ns: Long = field(default_factory=_INTEGERS)
     command_publish_ns: Long = field(default_factory=_INTEGERS)
+    stepped_sequence: Sequences = field(default_factory=_SEQUENCES)
     steps: Steps = field(default_factory=lambda: StepRows(0).values())
     truths: Truths = field(default_factory=lambda: TruthRows(0).values())
     mirror: MirrorStates = field(default_factory=MirrorStates)
@@ -150,6 +152,17 @@ class History:
     def exposure_fraction(self) -> float | None:
         """See `columns.exposure_fraction`."""
         return exposure_fraction(self.camera)
+
+    @property
+    def under_calibration(self) -> Mask:
+        """Steps (steps,) after the last load of another calibration than the log's last one."""
+        steps, states = self.steps, self.controllers
+        own = ("", self.calibration.id if self.calibration is not None else "")
+        others = [number for number, state in enumerate(states) if state.calibration_id not in own]
+        if not others:
+            return np.ones(steps.sequence.shape, np.bool_)
+        around = states[others[-1] : others[-1] + 2]  # a state is published at every change
+        return steps.sequence > max(state.frame_sequence for state in around)
 
     @cached_property
     def true(self) -> Truths | None:
@@ -210,6 +223,7 @@ class _Rows:
         self._calibration: wire.Calibration | None = None
         self._frames = Columns(sequence="Q", publish_ns="q")
         self._commands = Columns(publish_ns="q")
+        self._stepped = Columns(sequence="Q")
         self._timings = TimingRows()
         self._mirror = Columns(sequence="Q", publish_time_ns="q", stroke_nm="f", limits="q")
         self._steps, self._truths = StepRows(0), TruthRows(0)
@@ -244,6 +258,7 @@ class _Rows:
         body = topic.message.FromString(message.payload)
         if isinstance(body, wire.ControlStep):
             history.excluded_messages += not self._steps.add(body)
+            self._stepped.add(sequence=body.frame_sequence)
         elif isinstance(body, wire.Truth):
             self._truths.add(body)
         elif isinstance(body, wire.MirrorState):
@@ -300,6 +315,7 @@ class _Rows:
         history = self._history
         history.frame_sequence, history.frame_publish_ns = map(self._frames.values, ("sequence", "publish_ns"))
         history.command_publish_ns = self._commands.values("publish_ns")
+        history.stepped_sequence = self._stepped.values("sequence")
         history.steps, history.truths = self._steps.values(), self._truths.values()
         for name in ("sequence", "publish_time_ns", "stroke_nm", "limits"):
             setattr(history.mirror, name, self._mirror.values(name))

@@ -67,7 +67,7 @@ def longest_stretch(run: Run) -> Stretch | None:
     history, laws = run.history, run.law_rows()
     steps = history.steps
     known = np.array([*(law.known for law in run.laws), False])  # the last for steps before the first law
-    closed = (steps.mode == LoopMode.CLOSED) & known[laws]
+    closed = (steps.mode == LoopMode.CLOSED) & known[laws] & history.under_calibration
     edges = np.flatnonzero(np.diff(np.where(closed, laws, -1), prepend=-1, append=-1))
     spans = [(first, last) for first, last in pairwise(edges.tolist()) if closed[first]]
     if not spans:

@@ -68,11 +68,11 @@ def frame_counts(history: History) -> Results:
     which may be before the start of the log. Only the simulated camera counts late commands.
     """
     frames, rows = np.unique(history.frame_sequence, return_index=True)
-    without = rows_of(frames, history.steps.sequence) < 0
+    without = rows_of(frames, history.stepped_sequence) < 0
     at_the_end = np.zeros_like(without)
     if not without.all():
         published_ns = history.frame_publish_ns[rows]
-        at_the_end = (frames > history.steps.sequence.max()) & (published_ns > published_ns[-1] - _END_NS)
+        at_the_end = (frames > history.stepped_sequence.max()) & (published_ns > published_ns[-1] - _END_NS)
     counted: dict[str, int | None] = {"skipped": None, "missing": None}
     controller = history.health.get(Role.CONTROLLER)
     if controller is not None:

@@ -91,6 +91,8 @@ def _commands(results: Results) -> Results:
     without, recorded = frames["without_command"], frames["recorded"] - frames["at_the_end"]
     if not recorded:
         return _check("commands", UNKNOWN, "this log has no frames")
+    if results["run"]["calibration"] is None:
+        return _check("commands", UNKNOWN, "this log has no calibration, without which frames lead to no command")
     if not without:
         return _check("commands", GOOD, f"all {recorded} frames led to a command")
     share = without / recorded

@@ -268,6 +268,11 @@ def _log_warnings(run: LoggedRun) -> list[str]:
             f"a linear law ({', '.join(laws)}) was in use in the logged run: gains and settling time as logged are "
             "those of the integrator in reserve"
         )
+    before = np.count_nonzero(~run.history.under_calibration)
+    if before:
+        found.append(
+            f"another calibration was in use for {counted(int(before), 'step')}: the modes shown are those of the last"
+        )
     torn = np.count_nonzero(run.torn)
     if torn:
         found.append(
