@@ -9,7 +9,7 @@ import pytest
 
 from lowfc.adapters.logs.history import History, read_history
 from lowfc.adapters.logs.reader import LogReader
-from lowfc.contract.messages import EVENT, MIRROR_STATE, STEP, TIMING, TRUTH, Message, Topic, wire
+from lowfc.contract.messages import CAMERA_STATE, EVENT, MIRROR_STATE, STEP, TIMING, TRUTH, Message, Topic, wire
 from tests.support.report_log import SyntheticLog
 
 STEPS = 20
@@ -96,3 +96,13 @@ def test_a_message_with_an_impossible_time_is_left_out(tmp_path: Path) -> None:
     history = history_of(night, tmp_path / "x.mcap")
     assert history.excluded_messages == 1
     assert history.span_ns[1] < 1 << 62
+
+
+def test_a_log_begins_with_its_first_message_that_is_no_older_state(tmp_path: Path) -> None:
+    night = SyntheticLog()
+    state = next(sample for sample in night.samples if CAMERA_STATE.matches(sample.key))
+    night.samples = []
+    night.frames(STEPS)
+    first_ns, last_ns = night.samples[0].receive_time_ns, max(sample.receive_time_ns for sample in night.samples)
+    night.samples.insert(0, state._replace(receive_time_ns=first_ns - 3600 * 10**9))
+    assert history_of(night, tmp_path / "x.mcap").span_ns == (first_ns, last_ns)

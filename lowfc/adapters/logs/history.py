@@ -111,7 +111,7 @@ class History:
             of its starts; None without two Healths of one start.
         counts: number of messages, by topic key.
         published: laws and played tables, by identity.
-        span_ns: log times of the first and the last message; (0, 0) without messages.
+        span_ns: log times of the first message that is no state, and of the last; (0, 0) without one.
     """
 
     log: LogReader
@@ -235,8 +235,6 @@ class _Rows:
         if max(message.receive_time_ns, message.publish_time_ns) > _LAST_NS:
             history.excluded_messages += 1
             return
-        first_ns, _ = history.span_ns
-        history.span_ns = (first_ns or message.receive_time_ns, message.receive_time_ns)
         history.counts[message.key] += 1
         try:
             self._decode(message)
@@ -247,6 +245,9 @@ class _Rows:
 
     def _decode(self, message: Sample) -> None:
         topic, history = topic_of(message.key), self._history
+        first_ns, last_ns = history.span_ns
+        if first_ns or not topic.queryable:  # states requested at the log's start may be hours old
+            history.span_ns = (first_ns or message.receive_time_ns, max(last_ns, message.receive_time_ns))
         if topic is FRAME:
             self._frames.add(sequence=message.sequence, publish_ns=message.publish_time_ns)
         elif topic is COMMAND:
