@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,8 +11,10 @@ import pytest
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.logs.writer import LogWriter
 from lowfc.adapters.process.clock import HostClock
+from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.envelope import sequence_of
 from lowfc.contract.messages import STEP, TIMING, TRUTH, wire
+from lowfc.programs.reliability.chaos.bench import ChaosBench
 from lowfc.programs.reliability.chaos.processes import CommandTimes
 from lowfc.programs.reliability.soak.evaluation import (
     Usage,
@@ -23,6 +26,7 @@ from lowfc.programs.reliability.soak.evaluation import (
 )
 from lowfc.programs.reliability.soak.run import LogChecker
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
+from tests.support.loops import lowfc
 
 SECONDS = 1800
 START_S = 1_800_000_000
@@ -94,6 +98,29 @@ def test_latencies_are_those_of_the_controllers_timing_messages() -> None:
     bus.publisher(TIMING).put(wire.ControlTiming(frame_to_command_ns=[100_000, 300_000]).SerializeToString())
     assert times.drain() == {"frames": 2, "p50_us": 200.0, "p99_us": 298.0}
     assert times.drain() == {}
+
+
+def test_a_slow_loop_has_time_to_settle() -> None:
+    """250 frames at 2 Hz need 125 s, more than the minute that a fast loop has."""
+    waited_s: list[float] = []
+    config = load(None, {"camera.rate_hz": 2.0})
+    bench: Any = SimpleNamespace(config=config, wait=lambda _, __, timeout_s: waited_s.append(timeout_s))
+    ChaosBench.settled(bench, 250)
+    assert waited_s == [185.0]
+
+
+def test_a_soak_closes_the_loop_whatever_the_file_starts_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    used: list[Configuration] = []
+    monkeypatch.setattr(
+        "lowfc.programs.reliability.soak.run.soak_loop",
+        lambda settings, *_: used.append(settings) or {"passed": True},
+    )
+    monkeypatch.setattr("lowfc.programs.reliability.soak.evaluation.render", lambda _: "passed")
+    file = tmp_path / "open.toml"
+    file.write_text('[control]\nstart_mode = "open"\n')
+    done = lowfc("soak", "--hours", "0.01", "--config", file)
+    assert done.exit_code == 0, done.output
+    assert used[0].control.start_mode == "closed"
 
 
 def log(folder: Path, name: str, counts: dict[str, list[int]]) -> None:

@@ -148,7 +148,8 @@ class ChaosBench:
     def settled(self, frames: int = SETTLED_FRAMES) -> None:
         """Wait until this many frames were used with the loop closed, from now or the next closing."""
         self._closed_frames = 0
-        self.wait(lambda: self._closed_frames >= frames, f"{frames} good frames with the loop closed")
+        timeout_s = WAIT_S + frames / self.config.camera.rate_hz
+        self.wait(lambda: self._closed_frames >= frames, f"{frames} good frames with the loop closed", timeout_s)
 
     def wait(self, condition: Callable[[], bool], what: str, timeout_s: float = WAIT_S) -> None:
         """Wait for a condition; CaseFailedError after the timeout."""

@@ -29,8 +29,8 @@ def soak(
     from lowfc.programs.reliability.soak.evaluation import render
     from lowfc.programs.reliability.soak.run import soak_loop
 
-    overrides = {"recorder.largest_mb": 200.0}
-    settings = configuration(config, overrides, {"control.start_mode": "closed", **spread(os.sched_getaffinity(0))})
+    overrides = {"recorder.largest_mb": 200.0, "control.start_mode": "closed"}
+    settings = configuration(config, overrides, spread(os.sched_getaffinity(0)))
     with passing_bar(Console(stderr=True)) as bar:
         task = bar.add_task("soaking", total=hours * 3600)
         results = soak_loop(settings, hours * 3600, lambda elapsed_s: bar.update(task, completed=elapsed_s))
