@@ -16,6 +16,7 @@ from lowfc.contract.envelope import sequence_of
 from lowfc.contract.messages import STEP, TIMING, TRUTH, wire
 from lowfc.programs.reliability.chaos.bench import ChaosBench
 from lowfc.programs.reliability.chaos.processes import CommandTimes
+from lowfc.programs.reliability.soak import run
 from lowfc.programs.reliability.soak.evaluation import (
     Usage,
     latency_statistics,
@@ -98,6 +99,16 @@ def test_latencies_are_those_of_the_controllers_timing_messages() -> None:
     bus.publisher(TIMING).put(wire.ControlTiming(frame_to_command_ns=[100_000, 300_000]).SerializeToString())
     assert times.drain() == {"frames": 2, "p50_us": 200.0, "p99_us": 298.0}
     assert times.drain() == {}
+
+
+def test_a_loop_that_is_not_closed_at_the_end_fails(tmp_path: Path) -> None:
+    outcome = SimpleNamespace(mode=wire.LOOP_MODE_CLOSED, measurements={})
+    bus = MemoryBus(MemoryHub(), "launcher", HostClock())
+    stub: Any = SimpleNamespace(bus=bus, outcome=outcome, folder=tmp_path, health={}, children={})
+    soak = run._Soak(stub)
+    assert soak.results(60.0, 1.0, [])["why"] == []
+    soak.mode = wire.LOOP_MODE_OPEN
+    assert soak.results(60.0, 1.0, [])["why"] == ["the loop should be closed at the end, its mode is open"]
 
 
 def test_a_slow_loop_has_time_to_settle() -> None:

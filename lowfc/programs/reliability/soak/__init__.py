@@ -1,1 +1,1 @@
-"""`lowfc soak`: run the simulated loop for hours; check memory growth, drift of the latency and lost messages."""
+"""`lowfc soak`: run the simulated loop for hours; check for growth of memory and for lost messages."""

@@ -1,4 +1,4 @@
-"""The command `lowfc soak`: check for growth, drift and losses over hours."""
+"""The command `lowfc soak`: check for growth and losses over hours."""
 
 from typing import Annotated
 
@@ -13,10 +13,11 @@ def soak(
     config: ConfigFile = None,
     as_json: Json = False,
 ) -> None:
-    """Run the simulated loop for hours and check memory, handles, threads, latency and losses; exit status 1 on growth.
+    """Run the simulated loop for hours and check memory, handles, threads and losses; exit status 1 on growth or loss.
 
     Finished logs are checked for gaps and removed. Slopes are fitted to the last three quarters of the time, with
-    standard errors; memory grows if its slope exceeds three of them. If the time is too short for a check, it fails.
+    standard errors; memory grows if its slope exceeds three of them. The latency's slope is reported, not judged. The
+    loop must be closed at the end. If the time is too short for a slope, the soak does not pass.
 
     Example: lowfc soak --hours 0.5
     """

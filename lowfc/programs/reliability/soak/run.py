@@ -61,6 +61,7 @@ class _Soak:
         self.checker = LogChecker(bench.folder)
         self.usage: dict[str, list[Usage]] = {}
         self.latency: list[tuple[float, float, float]] = []
+        self.mode = bench.outcome.mode
         self._times = CommandTimes(bench)
 
     def sample(self, now_s: float) -> None:
@@ -101,6 +102,9 @@ class _Soak:
         why = [f"the {name}'s {what} grow" for name, one in processes.items() for what in one["grows"]]
         why += [f"{found[key]} {text}" for key, text in _MUST_BE_ZERO.items() if found[key]]
         why += [f"{name} was not finished" for name in unfinished]
+        if self.mode != wire.LOOP_MODE_CLOSED:
+            mode = wire.LoopMode.Name(self.mode).removeprefix("LOOP_MODE_").lower()
+            why.append(f"the loop should be closed at the end, its mode is {mode}")
         if recording.messages != self.checker.messages:
             why.append(f"the recorder reports {recording.messages} messages, the logs have {self.checker.messages}")
         unjudged = too_short(processes, found["latency"])
@@ -120,6 +124,7 @@ def soak_loop(config: Configuration, seconds: float, progress: Callable[[float],
                 soak.sample(elapsed_s)
                 progress(elapsed_s)
                 time.sleep(max(0.0, SAMPLE_S - (time.monotonic() - begun_s - elapsed_s)))
+            soak.mode = bench.outcome.mode  # before the processes are stopped
         finally:
             begun_s = time.monotonic()
             bench.end(_PATIENCE_S)
