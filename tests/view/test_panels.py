@@ -99,7 +99,7 @@ def test_pictures_show_the_newest_frame() -> None:
     tape = rendered(snapshot)
     frame, calibration = snapshot.frame, snapshot.calibration
     brightness = pixels(tape, sensor.FRAME).sum(axis=2).astype(float)
-    order = np.argsort(frame.ravel(), kind="stable")
+    order = np.argsort(frame.ravel(), kind="stable")  # the dark is the same in every pixel
     assert np.all(np.diff(brightness.ravel()[order]) >= 0), "more light is never darker"
     change = (frame.ravel() - calibration.dark) / FLUX_DN - calibration.reference
     shown = pixels(tape, sensor.DIFFERENCE).reshape(-1, 3).astype(int)
@@ -107,6 +107,16 @@ def test_pictures_show_the_newest_frame() -> None:
     assert strong.sum() > 2
     assert np.all((shown[strong, 0] > shown[strong, 2]) == (change[strong] > 0)), "orange above zero, blue below"
     assert values_of(tape.last(sensor.RAW).format)[0]["width"] == frame.shape[1]
+
+
+def test_a_hot_pixel_of_the_dark_does_not_darken_the_picture() -> None:
+    snapshot = snapshot_of(night().samples)
+    dark = snapshot.calibration.dark.copy()
+    dark[0] += 10_000
+    hot = dataclasses.replace(snapshot, calibration=dataclasses.replace(snapshot.calibration, dark=dark))
+    expected, shown = (pixels(rendered(each), sensor.FRAME).reshape(-1, 3) for each in (snapshot, hot))
+    assert (shown[1:] == expected[1:]).all()
+    assert shown[0].sum() <= expected[0].sum()
 
 
 def test_actuators_at_their_limit_are_marked() -> None:

@@ -40,14 +40,13 @@ class Sensor(Panel):
             self._reference.show(stream, snapshot.time_ns, _log_stretched(expected_dn, limit_dn), caption)
         if frame is None:
             return
-        dark_dn = 0
+        light_dn = frame.astype(np.float32)
         if calibration is not None and calibration.shape == frame.shape:
-            dark_dn = round(float(calibration.dark[0]))
+            light_dn = np.maximum(light_dn - calibration.dark.reshape(frame.shape), 0)
             # Without light the difference is undefined; zero is shown.
             flux_dn = difference(calibration, frame.ravel(), 0.0, self._difference) or 0.0
             change_dn = self._difference * flux_dn * calibration.good if flux_dn else np.zeros(frame.size)
             self._change.show_values(stream, time_ns, change_dn.reshape(frame.shape))
-        light_dn = np.maximum(frame, dark_dn) - np.float32(dark_dn)
         self._brightest.fit(light_dn, time_ns)
         limit_dn = self._brightest.limit
         caption = f"0 to {limit_dn:g} DN, logarithmic"
