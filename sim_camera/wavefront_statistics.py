@@ -107,7 +107,7 @@ class WavefrontAccumulator:
 
     def _statistics(self, mean: npt.NDArray[np.float64]) -> WavefrontStatistics:
         flat, added, squares = mean[0], mean[1 : 1 + len(self._noll)], mean[1 + len(self._noll) :]
-        per = np.array([1, 1, *[2 * self._nm_per_mas**2] * 2])
+        per = np.array([1, 1, *[self._tilts.stop * self._nm_per_mas**2] * 2])
         rms = np.sqrt(squares.reshape(-1, 4) / per).ravel().tolist()
         costliest_modes = costliest(by_group(self._noll, added)) if flat else ("", 0.0)
         contrast = float(flat), float(added.sum()), *costliest_modes

@@ -20,11 +20,13 @@ from sim_camera.wavefront_statistics import BLOCK, MAX_BLOCKS, WavefrontAccumula
 NOLL = (2, 3, 4)
 
 
-def statistics(*residuals_nm: float, nm_per_mas: float = 1.0, recent: int = 1) -> WavefrontAccumulator:
+def statistics(
+    *residuals_nm: float, nm_per_mas: float = 1.0, recent: int = 1, noll: tuple[int, ...] = NOLL
+) -> WavefrontAccumulator:
     """Statistics of frames with this residual in every mode and over the pupil, and a disturbance twice as large."""
-    found = WavefrontAccumulator(NOLL, nm_per_mas, recent)
+    found = WavefrontAccumulator(noll, nm_per_mas, recent)
     for residual_nm in residuals_nm:
-        modes = np.full(len(NOLL), residual_nm, np.float32)
+        modes = np.full(len(noll), residual_nm, np.float32)
         found.add(
             Truth(
                 Wavefront(2 * modes, modes, 2 * residual_nm, residual_nm),
@@ -54,6 +56,12 @@ def test_statistics_before_the_first_block_cover_all_frames() -> None:
     assert found is not None
     rms_nm = np.sqrt((3**2 + 5**2) / 2)
     assert found == WavefrontStatistics(*(pytest.approx(value * rms_nm) for value in (2, 1, 1, 0.5))), "tilts per axis"
+
+
+def test_tilt_per_axis_is_that_of_the_axes_among_the_modes() -> None:
+    found = statistics(3.0, nm_per_mas=2.0, noll=(2,)).wavefront()
+    assert found is not None
+    assert (found.tilt_disturbance_mas, found.tilt_residual_mas) == pytest.approx((3.0, 1.5))
 
 
 def test_recent_statistics_cover_only_recent_frames() -> None:
