@@ -313,6 +313,13 @@ def test_gain_and_leak_are_refused_if_unstable_together() -> None:
         assert all(outputs.reply.accepted for outputs in all_outputs)
 
 
+def test_a_request_with_more_leaks_than_modes_is_refused_without_computing_their_gains() -> None:
+    before = limiting_gain.cache_info().misses
+    _, outputs = feed(DEFAULTS, loaded(DEFAULTS), ask("leak", *np.linspace(0.01, 0.9, 900).tolist()))
+    answered(outputs[0], False, "give one value, or one for each of the 3 modes; got 900")
+    assert limiting_gain.cache_info().misses == before
+
+
 def test_the_first_step_after_closing_is_gain_times_error() -> None:
     state, _ = feed(DEFAULTS, running(), ask("open"), *(frame(count, SOME) for count in range(6, 20)), ask("close"))
     before = state.loop.history_nm[0]

@@ -55,7 +55,7 @@ def open_loop(omega: Array | float, gain: float, leak: float, delay_frames: floa
     return np.asarray(gain * seen / (z - (1 - leak)))
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=256)
 def limiting_gain(delay_frames: float, leak: float = 0.0) -> float:
     """Gain at which the loop starts to oscillate; 2 sin(pi / (2 (2d - 1))) for a whole delay d without leak."""
 

@@ -19,6 +19,9 @@ from lowfc.control.loop.inputs import PendingEvent, Request
 from lowfc.control.loop.state import ActiveLoop, Settings, Weighting
 from lowfc.control.loop.wording import AUTO, counted
 
+_MAX_PREPARED = 64
+"""Most leaks of a request that are prepared; a request with more has more than any calibration has modes."""
+
 Changed = tuple[ActiveLoop, str, *tuple[PendingEvent, ...]]
 
 
@@ -135,11 +138,12 @@ def _check_stable(gains: Single, leaks: Single, delay_frames: float) -> None:
 
 def prepare_gains(settings: Settings, request: Request) -> None:
     """Cache what a reply to a request for gains or leaks needs, so that no frame waits for it."""
-    highest_gain(settings.delay_frames)
-    leaks = request.values if request.name == "leak" else settings.leak
-    for leak in leaks:
-        if 0 <= leak <= 1:
-            limiting_gain(settings.delay_frames, float(np.float32(leak)))
+    if request.name == "gain":
+        highest_gain(settings.delay_frames)
+    leaks = np.unique(np.array(request.values if request.name == "leak" else settings.leak, np.float32))
+    if leaks.size <= _MAX_PREPARED:
+        for leak in leaks[(leaks >= 0) & (leaks <= 1)].tolist():
+            limiting_gain(settings.delay_frames, leak)
 
 
 def remark(settings: Settings, loop: ActiveLoop, request: Request) -> str:
