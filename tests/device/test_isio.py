@@ -287,7 +287,8 @@ def test_a_sum_that_is_absent_although_expected_counts_as_not_following(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(mirror_module, "SUM_SILENT_S", 0.01)
-    monkeypatch.setattr(mirror_module, "_SEARCH_S", 0.0)
+    for period in ("_SEARCH_S", "_EXPECTED_SEARCH_S"):
+        monkeypatch.setattr(mirror_module, period, 0.0)
 
     def absent_for_a_while(driver: IsioMirror, name: str) -> None:
         assert driver.apply(shape_nm(1)) is None
@@ -326,6 +327,17 @@ def test_a_channel_whose_writer_died_meanwhile_stays_in_the_sum(folder: Path) ->
     assert np.allclose(1000 * others.sum(), shape_nm(1) + shape_nm(2) + shape_nm(4), atol=1e-3)
     dark_hole.write(np.full(GRID, np.nan))
     assert np.allclose(1000 * others.sum(), shape_nm(2) + shape_nm(4), atol=1e-3)
+
+
+def test_a_channel_read_between_its_counter_and_its_flag_is_read_again(folder: Path) -> None:
+    dark_hole = channel(folder, "dm00disp00", make=True)
+    others = OtherChannels(channel_names("dm00disp03"), GRID)
+    assert not others.sum().any()
+    dark_hole.begin(shape_nm(1) / 1000)
+    dark_hole.pack("<Q", 264, dark_hole.count + 1)
+    assert not others.sum().any()
+    dark_hole.pack("B", 288, 0)
+    assert np.allclose(1000 * others.sum(), shape_nm(1), atol=1e-3)
 
 
 def test_a_shrunk_channel_is_no_longer_read(folder: Path) -> None:

@@ -63,7 +63,7 @@ class OtherChannels:
                 if path not in current and (stream := opened(path, self._grid)) is not None:
                     current[path] = stream
         self._streams = current
-        counts = {path: (stream.identity, stream.count) for path, stream in self._streams.items()}
+        counts = {path: (stream.identity, _complete_count(stream)) for path, stream in self._streams.items()}
         if counts != self._counts:
             self._shapes = {
                 stream: whole(stream, self._shapes.get(stream, stream.data[0].astype(np.float32)))
@@ -86,6 +86,12 @@ def opened(path: Path, grid: tuple[int, int]) -> Stream | None:
 def fits(stream: Stream, grid: tuple[int, int]) -> bool:
     """Whether a stream holds float32 shapes (rows, columns)."""
     return stream.layout.dtype == np.float32 and stream.layout.shape == (1, *grid)
+
+
+def _complete_count(stream: Stream) -> int:
+    """Number of images written; -1 while one is being written, whose shape is read once it is complete."""
+    count = stream.count
+    return -1 if stream.writing else count
 
 
 def whole(stream: Stream, otherwise: Single | None = None) -> Single | None:
