@@ -19,6 +19,9 @@ SAME_RATE = 0.01
 MAX_COUPLED_STATES = 100
 """Most coupled states: computing the poles of this many takes 30 ms, during which no frame is processed."""
 
+MAX_SETTLING_FRAMES = 4000
+"""Upper limit of a law's settling time, frames."""
+
 _GRID = 2048
 _AROUND_POLE = np.concatenate([-np.geomspace(1e-2, 1e2, 33)[::-1], [0.0], np.geomspace(1e-2, 1e2, 33)])
 _LOWEST = 1e-6  # rad per frame: an integrator has no value at 0 Hz
@@ -68,6 +71,12 @@ def margins(law: LinearLaw, delay_frames: float) -> Margins:
             found.gain_margin[mode], found.gain_reduction[mode] = _gain_margins(loop)
             found.phase_margin_deg[mode] = _phase_margin_deg(loop)
     return found
+
+
+def settling_frames(law: LinearLaw, delay_frames: float) -> int:
+    """Five time constants of the slowest closed-loop pole at this delay, frames, at most `MAX_SETTLING_FRAMES`."""
+    radius = float(margins(law, delay_frames).radius.max())
+    return int(min(5 / max(1 - radius, 1e-9), MAX_SETTLING_FRAMES)) + 1
 
 
 def check_law(law: LinearLaw, delay_frames: float, rate_hz: float) -> None:

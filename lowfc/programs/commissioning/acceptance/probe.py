@@ -31,8 +31,6 @@ Kind = Literal["rejection", "linearity", "capture-range", "noise-floor"]
 LIMITS = (Limit.MODAL_LIMIT, Limit.STROKE, Limit.SLEW, Limit.NEIGHBOUR)
 MAX_MISSING = 0.01
 """Largest fraction of the frames that may be missing or refused."""
-MAX_SETTLING_FRAMES = 4000
-"""Upper limit of a linear law's settling time, frames."""
 
 ANNOUNCEMENT = "acceptance "
 """First word of a note that announces a test; its parameters follow as JSON."""
@@ -92,8 +90,7 @@ class Loop:
         """Settling time, frames."""
         if isinstance(self.law, Integrator):
             return settling_frames(self.law.gain, self.law.leak)
-        radius = float(margins.margins(self.law, self.delay_frames).radius.max())
-        return int(min(5 / max(1 - radius, 1e-9), MAX_SETTLING_FRAMES)) + 1
+        return margins.settling_frames(self.law, self.delay_frames)
 
     @property
     def name(self) -> str:

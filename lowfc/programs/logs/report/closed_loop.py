@@ -7,6 +7,7 @@ import numpy as np
 
 from lowfc.adapters.logs.history import History
 from lowfc.arrays import Array, Mask
+from lowfc.control.laws import margins
 from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.error_budget import SensorNoise, sensor_noise
 from lowfc.control.laws.linear_law import LinearLaw, integrator
@@ -75,7 +76,10 @@ def longest_stretch(run: Run) -> Stretch | None:
     first, last = max(spans, key=lambda span: int(np.isfinite(steps.error_nm[span[0] : span[1], :1]).sum()))
     in_force = run.laws[laws[first]]
     gain, leak = np.array(in_force.gain, float), np.array(in_force.leak, float)
-    settling = settling_frames(gain, leak) if in_force.linear is None else SETTLING_FRAMES + FADING_FRAMES
+    if in_force.linear is None:
+        settling = settling_frames(gain, leak)
+    else:
+        settling = SETTLING_FRAMES + FADING_FRAMES + margins.settling_frames(in_force.linear, in_force.delay_frames)
     settling = min(settling, (last - first) // 10)
     rows = slice(max(first + settling, last - MAX_STEPS), last)
     earlier = rows.start - first - settling
