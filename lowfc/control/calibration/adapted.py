@@ -59,7 +59,8 @@ def _is_plain(calibration: Calibration) -> bool:
     It does not if nuisance parameters are fitted or R is regularised, and the noise of a measured H must not enter R
     (see `regularised`).
     """
-    return calibration.estimator in ESTIMATORS
+    estimator, *parts = calibration.estimator.split("+")
+    return estimator in ESTIMATORS and all(part in ("aligned", "first") or part.startswith("at ") for part in parts)
 
 
 def _same_response(before: Calibration, changed: Calibration) -> Array:
@@ -85,6 +86,6 @@ def _reconstructed(calibration: Calibration, read_noise_e: float, gain_e: float)
         calibration.good.astype(np.float64),
         calibration.flux_dn * gain_e,
         read_noise_e,
-        calibration.estimator,
+        calibration.estimator.partition("+")[0],
     )
     return replace(calibration, reconstructor=single(made.matrix), operator_hash="", id="")
