@@ -21,7 +21,7 @@ from lowfc.arrays import Single
 from lowfc.client import Client
 from lowfc.client.runs import the_known_run
 from lowfc.client.stream import step_of
-from lowfc.contract.errors import ConfigurationError, LowfcError
+from lowfc.contract.errors import ConfigurationError, LowfcError, RequestRefusedError
 from lowfc.contract.messages import CONTROLLER_STATE, STEP, Role, wire
 from lowfc.contract.printable import printable
 from lowfc.control.loop.command_channels import EXTERNAL
@@ -136,7 +136,9 @@ class ExternalChannels:
             self._client.channel(EXTERNAL, shape_nm)
             self._known = self._requested
         except LowfcError as error:
-            self._next_request_s, fault = now_s + _REFUSED_S, str(error)
+            fault = str(error)
+            if isinstance(error, RequestRefusedError):
+                self._next_request_s = now_s + _REFUSED_S
         if fault and fault != self._fault:
             names = ", ".join(self._others.names)
             sys.stderr.write(f"{names} not reported to the loop: {printable(fault)}\n")

@@ -284,7 +284,8 @@ class GainWatch:
             return []
         reaction = self._reaction(loop)
         if reaction == "law":  # repeated if refused; if not, the integrator is judged anew
-            group.harmful = 0
+            for one in self._groups:
+                one.harmful = 0
         noise_nm2 = self._noise_nm2(loop)
         noise = 0.0 if noise_nm2 is None else float(noise_nm2[group.mask].sum())
         open_nm2 = max(float(verdict.power_nm2.sum()) - noise, 0.0)

@@ -130,7 +130,7 @@ def telemetry_from_run(loop: Client, seconds: float, progress: Callable[[float],
             break
     stream.close()
     states.append(_state(loop))
-    steps = _from_first_used(steps_as_columns(received, len(calibration.noll)))
+    steps = _from_first_used(loop.run_id, steps_as_columns(received, len(calibration.noll)))
     period_s = float(np.median(np.diff(steps.time_ns))) * 1e-9 if len(steps.time_ns) > 1 else 0.0
     rate_hz = 1 / period_s if period_s > 0 else config.camera.rate_hz
     assumed, measured = float(states[0].delay_frames), _measured_delay(steps, watch, config)
@@ -164,9 +164,12 @@ def _state(loop: Client) -> wire.ControllerState:
     return state
 
 
-def _from_first_used(steps: Steps) -> Steps:
+def _from_first_used(run_id: str, steps: Steps) -> Steps:
     rows = exposed(steps.reasons)
-    rows[: int(np.argmax(np.isfinite(steps.error_nm).all(axis=1)))] = False
+    used = rows & np.isfinite(steps.error_nm).all(axis=1)
+    if not used.any():
+        raise DataFileError(f"run {run_id!r}: no frame was used; `lowfc ctl status` gives the reason")
+    rows[: int(np.argmax(used))] = False
     return steps.at(rows)
 
 
