@@ -28,10 +28,9 @@ sim-loop: $(VENV)/.installed  ## install, then run the simulated loop for 20 s
 	$(BIN)/lowfc sim-loop --duration 20
 
 test: $(VENV)/.tests lint  ## install, then lint, types and tests
-	$(BIN)/mypy & types=$$!; \
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m 'not slow and not exclusive and not basler and not aravis' -n auto --dist loadfile --no-loadscope-reorder && \
+	nice -n 19 $(BIN)/mypy & types=$$!; \
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m 'not slow and not basler and not aravis' -n auto --dist loadgroup --no-loadscope-reorder && \
 	wait $$types
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m 'exclusive and not slow'
 
 test-all: $(VENV)/.tests node lint types  ## everything, the slow tests and those that need node, chromium and a graphics driver too
 	@ls /usr/share/vulkan/icd.d/*.json >/dev/null 2>&1 || { test "$$(id -u)" = 0 && apt-get install --yes mesa-vulkan-drivers libvulkan1; } || \

@@ -5,18 +5,48 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from xdist.remote import Producer
+from xdist.scheduler import LoadGroupScheduling
 
 NO_SKIPS = os.environ.get("LOWFC_NO_SKIPS") == "1"
-LONGEST = (
-    *("test_lockstep", "test_gain_watch", "test_calibrate", "test_optics_twin", "test_tutorials", "test_validate"),
-    *("test_commission", "test_calibrate_commands", "test_validate_figures", "test_what_if", "test_guard", "test_site"),
-)
-"""Test files that are started first, so that no worker runs one of them alone at the end."""
+ROOT = Path(__file__).parent
+FIRST = frozenset(ROOT / name for name in ("optics", "control", "paper", "design", "contract", "sim"))
+"""Folders whose tests wait for no other process: they run beside the exclusive tests."""
+LONGEST = ("test_lockstep", "test_gain_watch", "test_calibrate", "test_tutorials", "test_commission", "test_what_if")
+"""Test files that are started next, so that no worker runs one of them alone at the end."""
 
 
+@pytest.hookimpl(tryfirst=True)  # xdist appends the groups to the names
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    order = {name: number for number, name in enumerate(LONGEST)}
-    items.sort(key=lambda item: order.get(item.path.stem, len(LONGEST)))
+    def turn(item: pytest.Item) -> tuple[bool, bool, int]:
+        longest = LONGEST.index(item.path.stem) if item.path.stem in LONGEST else len(LONGEST)
+        return not _exclusive(item), FIRST.isdisjoint(item.path.parents), longest
+
+    for item in items:
+        if _exclusive(item):
+            item.add_marker(pytest.mark.xdist_group("exclusive"))
+    items.sort(key=turn)
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> LoadGroupScheduling:
+    return _Scheduling(config, log)
+
+
+class _Scheduling(LoadGroupScheduling):
+    """One worker runs the exclusive tests, one after another; each file of others is run by one worker."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        return super()._split_scope(nodeid).split("::", maxsplit=1)[0]
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Leave the processors to an exclusive test on another worker."""
+    if "PYTEST_XDIST_WORKER" in os.environ and not _exclusive(item):
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+
+
+def _exclusive(item: pytest.Item) -> bool:
+    return item.get_closest_marker("exclusive") is not None
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -168,7 +168,7 @@ def test_set_up_changes_only_blas_threads_and_garbage_collection_by_default() ->
     found = report("set_up(None, None, lock_memory=False, disable_cpu_idle=False)")
     assert found["granted"] == ["one BLAS thread", "garbage collector off"]
     assert found["refused"] == []
-    assert (found["policy"], found["cpus"]) == (os.SCHED_OTHER, sorted(os.sched_getaffinity(0)))
+    assert (found["policy"], found["cpus"]) == (os.sched_getscheduler(0), sorted(os.sched_getaffinity(0)))
     assert (found["collects"], found["locked_kb"]) == (False, 0)
     assert found["frozen"] > 0
     assert set(found["blas"]) == {1}
@@ -185,8 +185,15 @@ def test_refused_measures_are_reported_with_their_cost() -> None:
     ]
     assert "64 kB" in measures[1]
     assert all(len(cost) > 30 for _, cost in found["refused"])
-    assert (found["policy"], found["locked_kb"]) == (os.SCHED_OTHER, 0)
+    assert (found["policy"], found["locked_kb"]) == (os.sched_getscheduler(0), 0)
     assert found["granted"] == ["one BLAS thread", "garbage collector off"]
+
+
+def test_a_class_below_the_normal_one_stays() -> None:
+    found = report(
+        "step_back(None, None)", f"os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0)); {UNPRIVILEGED}"
+    )
+    assert found["policy"] == os.SCHED_IDLE
 
 
 def test_locking_memory_does_not_allocate_reserved_memory() -> None:
@@ -221,10 +228,10 @@ def test_cpu_idle_stays_disabled_while_the_process_lives() -> None:
 
 
 def test_the_recorder_leaves_its_parents_scheduling_class() -> None:
-    limits = "os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))" if fifo_permitted() else ""
-    cpu = min(os.sched_getaffinity(0))
+    real_time, cpu = fifo_permitted(), min(os.sched_getaffinity(0))
+    limits = "os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))" if real_time else ""
     found = report(f"step_back(None, {{{cpu}}})", limits)
-    assert (found["policy"], found["cpus"]) == (os.SCHED_OTHER, [cpu])
+    assert (found["policy"], found["cpus"]) == (os.SCHED_OTHER if real_time else os.sched_getscheduler(0), [cpu])
     assert found["granted"] == ["normal scheduling class", f"processors [{cpu}]"]
 
 

@@ -105,7 +105,7 @@ def step_back(priority: int | None, cpus: set[int] | None = None) -> Granted:
     Its SCHED_FIFO priority, if granted, is below the loop's and above everything else: in the normal class on a busy
     host, a recorder loses messages of a 1 kHz loop.
     """
-    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # do not inherit the class of a parent in the loop
+    leave_real_time()
     measures = _processors(cpus, "the recorder may get in the loop's way")
     measures += _scheduling(priority, "on a busy host the recorder loses messages")
     return _ask([] if priority is not None else ["normal scheduling class"], measures)
@@ -125,9 +125,15 @@ def let_send() -> None:
 
 def lower_priority() -> None:
     """Lower this process's priority below the loop and its recorder; for a monitor, which may be late."""
-    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # do not inherit the class of a parent in the loop
+    leave_real_time()
     os.nice(_MONITOR_NICE)
     threadpool_limits(limits=1)
+
+
+def leave_real_time() -> None:
+    """Leave the real-time class of a parent in the loop; a class below the normal one, which a person chose, stays."""
+    if os.sched_getscheduler(0) in (os.SCHED_FIFO, os.SCHED_RR):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 def _ask(in_force: list[str], measures: Iterable[_Measure]) -> Granted:

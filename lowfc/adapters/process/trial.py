@@ -9,7 +9,7 @@ from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from multiprocessing import get_context
 from typing import NamedTuple
 
-from lowfc.adapters.process.realtime import set_up
+from lowfc.adapters.process.realtime import leave_real_time, set_up
 from lowfc.contract.configuration import Realtime
 
 RATE_HZ = 1000
@@ -61,7 +61,7 @@ def lateness_ns(wake_ups: int, period_ns: int = 1_000_000_000 // RATE_HZ) -> lis
 
 
 def _try(requested: Realtime, cpus: set[int], seconds: float) -> Trial:
-    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # do not inherit the parent's class
+    leave_real_time()
     wake_ups = max(1, round(seconds * RATE_HZ))
     inherited = os.sched_getaffinity(0)
     os.sched_setaffinity(0, range(_CPUS))
