@@ -15,8 +15,15 @@ M = TypeVar("M", bound=Message)
 CAMERA_RULE = "the camera's settings are compared with the calibration's, not its bias with the dark"
 CLOSE_RULE = "the loop is not closed while frames are refused, or on a camera that does not fit the calibration"
 CLEAR_RULE = "clear forgets the newest frame sequence"
+GAIN_RULE = "gain and leak of a mode are checked together, and only controlled modes have automatic gains"
+LOAD_RULE = "a calibration loaded in safe mode adopts nothing"
 
-_REQUEST_RULES = {"close": CLOSE_RULE, "step": CLOSE_RULE, "law": CLOSE_RULE, "clear": CLEAR_RULE}
+_REQUEST_RULES = {
+    **dict.fromkeys(("close", "step", "law"), CLOSE_RULE),
+    **dict.fromkeys(("gain", "leak"), GAIN_RULE),
+    "clear": CLEAR_RULE,
+    "load": LOAD_RULE,
+}
 # Not compared: the inputs that a request contains, and the wording of its reply, which may change.
 _NOT_COMPARED = {"lowfc.v1.Request": ("reply", "law", "table", "columns", "actuators", "calibration", "play_id")}
 
