@@ -257,7 +257,7 @@ def test_a_mirror_receives_each_command_once_and_the_controllers_over_the_direct
     last = mirror.controller.published - 1, mirror.operator.published - 1
 
     def all_received() -> bool:
-        return {(one.payload, count_of(one.sequence)) for one in mirror.received[-20:]} >= {
+        return {(one.payload, count_of(one.sequence)) for one in mirror.received[begun:]} >= {
             (b"controller", last[0]),
             (b"operator", last[1]),
         }
