@@ -1,0 +1,47 @@
+"""Chaos cases in one process and in simulated time, judged by the rules that judge those on the real processes."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lowfc.client import client
+from lowfc.programs.reliability.chaos import bench, case, console, control, junk, processes
+from lowfc.programs.reliability.chaos.cases import CASES
+from lowfc.programs.reliability.chaos.command import run_case
+from tests.reliability.toy_bench import TOY_KEYS, ToyBench
+
+CONTROL = (
+    *("gain", "law-that-fails", "interlock", "safed-restart", "safe-without-directory"),
+    *("reversed-calibration", "foreign-calibration", "damaged-calibration"),
+)
+JUNK = ("junk", "forged-commands", "forged-frames", "malformed-requests", "concurrent-requests")
+
+
+@pytest.fixture
+def in_simulated_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let every bench be a toy's, in whose time cases wait and intruders send."""
+
+    def begun(*arguments: Any) -> ToyBench:
+        made = ToyBench(*arguments)
+        for module in (control, junk, processes):
+            made.replace_time(module, monkeypatch.setattr)
+        for module in (client, junk, console):
+            monkeypatch.setattr(module, "HostClock", lambda: made.clock)
+        monkeypatch.setattr(junk, "ZenohBus", lambda _, role, __: made.connection(role))
+        return made
+
+    monkeypatch.setattr(bench, "ChaosBench", begun)
+    monkeypatch.setattr(case, "WHILE_FRAMES", 100)
+    monkeypatch.setattr(control, "WHILE_FRAMES", 100)
+    monkeypatch.setattr(junk, "FLOOD_S", 0.3)
+    monkeypatch.setattr(junk, "FORGED", 60)
+    monkeypatch.setattr(control, "FLOOD", 600)
+
+
+@pytest.mark.usefixtures("in_simulated_time")
+@pytest.mark.parametrize("name", [*CONTROL, *JUNK])
+def test_the_loop_withstands_a_case(name: str, tmp_path: Path) -> None:
+    row = run_case(replace(CASES[name], config=dict(CASES[name].config) | TOY_KEYS), 2, tmp_path)
+    assert row["passed"], row["findings"]
