@@ -1,0 +1,171 @@
+"""The bench of a chaos case with processes that only sleep, and the console in a terminal of its own."""
+
+import json
+import os
+import random
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import psutil
+import pytest
+
+from lowfc.adapters.process.child import Child
+from lowfc.contract.configuration import load
+from lowfc.contract.messages import TIMING, Role, wire
+from lowfc.programs.reliability.chaos import bench, console, processes
+from lowfc.programs.reliability.chaos.bench import CaseFailedError, ChaosBench, Ended
+from lowfc.programs.reliability.chaos.cases import CASES
+from lowfc.programs.reliability.chaos.console import TerminalConsole
+from lowfc.testing.clock import FakeClock
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub
+from tests.support.loops import until
+
+SLEEP = ["sleep", "60"]
+
+
+@pytest.fixture
+def sleeping(own_runtime: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ChaosBench:
+    """A bench whose processes sleep, with a fault of the camera's frames; none has been started."""
+    monkeypatch.setattr(bench, "_POLL_S", 0.001)
+    monkeypatch.setattr(bench, "_LAST_HEALTH_S", 0.0)
+    monkeypatch.setattr(bench, "prepare", lambda *_: None)
+    names = (Role.CAMERA, Role.CONTROLLER, Role.RECORDER)
+    children = [Child(name, [*SLEEP], tmp_path / name) for name in names]
+    monkeypatch.setattr(bench, "children_of", lambda *_, **__: children)
+    return ChaosBench(load(None), tmp_path, random.Random(1), {"kind": "dark"})  # noqa: S311
+
+
+def status_of(child: Child) -> str:
+    assert child.process is not None
+    return psutil.Process(child.process.pid).status()
+
+
+def test_how_each_process_ended_is_recorded(sleeping: ChaosBench) -> None:
+    *_, option, file = sleeping.children[Role.CAMERA].command
+    assert (option, json.loads(Path(file).read_text())) == ("--fault", {"kind": "dark"})
+    for name in (Role.CONTROLLER, Role.RECORDER):
+        sleeping.restart(name, ready=False)
+    with sleeping.stopped(Role.CONTROLLER):
+        until(lambda: status_of(sleeping.children[Role.CONTROLLER]) == psutil.STATUS_STOPPED)
+    until(lambda: status_of(sleeping.children[Role.CONTROLLER]) != psutil.STATUS_STOPPED)
+    sleeping.kill(Role.RECORDER)
+    sleeping.restart(Role.RECORDER, ["sh", "-c", "echo no disk >&2; exit 2"], ready=False)
+    assert sleeping.await_end(Role.RECORDER, 2) == "no disk"
+    sleeping.restart(Role.CAMERA, ["sh", "-c", "exit 3"], ready=False)
+    with pytest.raises(CaseFailedError, match="camera should have ended with exit status 2, got 3"):
+        sleeping.await_end(Role.CAMERA, 2)
+    sleeping.end()
+    found = [(one.name, one.status, one.requested) for one in sleeping.outcome.ended]
+    assert found == [
+        ("recorder", -signal.SIGKILL, True),
+        ("recorder", 2, True),
+        ("camera", 3, True),
+        ("controller", -signal.SIGTERM, True),
+    ]
+    assert len(sleeping.outcome.killed_ns) == 1
+    assert sleeping.outcome.alive == []
+    assert not sleeping.run.path.exists()
+
+
+def test_a_process_that_a_process_leaves_behind_is_reported(sleeping: ChaosBench) -> None:
+    sleeping.restart(Role.CAMERA, ["sh", "-c", "sleep 60 & exit 0"], ready=False)
+    until(lambda: sleeping.children[Role.CAMERA].status == 0)
+    sleeping.end()
+    assert sleeping.outcome.ended == [Ended("camera", 0, sleeping.outcome.ended[0].after_s, requested=False)]
+    (left,) = sleeping.outcome.alive
+    assert left.startswith("sleep (")
+    os.kill(int(left.split("(")[1].split(",")[0]), signal.SIGKILL)
+
+
+def test_every_killed_or_stopped_process_continues_in_the_random_case() -> None:
+    done: list[tuple[str, str]] = []
+
+    def noted(what: str) -> Callable[[str], None]:
+        return lambda name: done.append((what, name))
+
+    class Stopped:
+        def __init__(self, name: str) -> None:
+            self.name = name
+
+        def __enter__(self) -> None:
+            done.append(("stop", self.name))
+
+        def __exit__(self, *_: object) -> None:
+            done.append(("continue", self.name))
+
+    stub: Any = SimpleNamespace(
+        rng=random.Random(3),  # noqa: S311
+        process=str,
+        pause=lambda *_: None,
+        kill=noted("kill"),
+        restart=noted("restart"),
+        stopped=Stopped,
+    )
+    CASES["random"].act(stub)
+    begun, ended = done[::2], done[1::2]
+    assert len(begun) == len(ended) == processes.RANDOM_FAULTS
+    follows = {"kill": "restart", "stop": "continue"}
+    assert [(follows[what], name) for what, name in begun] == ended
+    assert {what for what, _ in begun} == {"kill", "stop"}
+
+
+def test_a_stall_is_compared_with_the_time_before_and_after(monkeypatch: pytest.MonkeyPatch) -> None:
+    bus, measurements = MemoryBus(MemoryHub(), "launcher", FakeClock()), dict[str, Any]()
+    timings, latency_us = bus.publisher(TIMING), {"now": 0}
+
+    def pass_time(seconds: float) -> None:
+        """Frames of the present phase arrive; those of a short wait belong to none."""
+        latency = latency_us["now"] if seconds > 1 else 9_000
+        timings.put(wire.ControlTiming(frame_to_command_ns=[1000 * latency] * 3).SerializeToString())
+
+    class Stall:
+        def __enter__(self) -> None:
+            latency_us["now"] = 300
+
+        def __exit__(self, *_: object) -> None:
+            latency_us["now"] = 200
+
+    monkeypatch.setattr(processes, "time", SimpleNamespace(sleep=pass_time))
+    latency_us["now"] = 100
+    stub: Any = SimpleNamespace(bus=bus, outcome=SimpleNamespace(measurements=measurements), stopped=lambda _: Stall())
+    CASES["stall-recorder"].act(stub)
+    each = {name: {"frames": 3, "p50_us": us, "p99_us": us} for name, us in (("before", 100.0), ("during", 300.0))}
+    each["after"] = {"frames": 3, "p50_us": 200.0, "p99_us": 200.0}
+    assert measurements == {"frame_to_command": each, "p99_during_over_calm": 2.0, "p99_after_over_before": 2.0}
+
+
+@pytest.fixture
+def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+    """Function that replaces `lowfc console` by a shell script."""
+    script = tmp_path / "program"
+
+    def write(text: str) -> None:
+        script.write_text(f"#!/bin/sh\n{text}\n")
+        script.chmod(0o700)
+
+    monkeypatch.setattr(console, "sys", SimpleNamespace(executable=str(script)))
+    monkeypatch.setattr(console, "_STEP_S", 0.001)
+    return write
+
+
+def test_a_console_has_its_own_terminal_until_it_is_closed(program: Callable[[str], None]) -> None:
+    program('stty size; echo "loop CLOSED in $4 of $TERM"; read line; echo "[$line]"; exec sleep 60')
+    with TerminalConsole("bench") as shown:
+        until(lambda: shown.drew(rb"30 100\s+loop CLOSED in --run of xterm-256color"))
+        shown.press(b"gain\n")
+        until(lambda: shown.drew(rb"\[gain\]"))
+        assert 0 <= shown.cpu_s() < 1
+    assert shown.process.returncode == -signal.SIGKILL
+
+
+def test_a_console_that_never_shows_the_loop_is_a_failure(
+    program: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(console, "START_S", 0.0)
+    program("exec sleep 60")
+    with pytest.raises(CaseFailedError, match="did not show the loop"):
+        TerminalConsole("bench")
+    assert not [one for one in psutil.Process().children() if one.name() == "sleep"]
