@@ -1,8 +1,11 @@
 """Chaos cases in one process and in simulated time, judged by the rules that judge those on the real processes."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -25,7 +28,7 @@ def in_simulated_time(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def begun(*arguments: Any) -> ToyBench:
         made = ToyBench(*arguments)
-        for module in (control, junk, processes):
+        for module in (control, junk, processes, console):
             made.replace_time(module, monkeypatch.setattr)
         for module in (client, junk, console):
             monkeypatch.setattr(module, "HostClock", lambda: made.clock)
@@ -45,3 +48,18 @@ def in_simulated_time(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_loop_withstands_a_case(name: str, tmp_path: Path) -> None:
     row = run_case(replace(CASES[name], config=dict(CASES[name].config) | TOY_KEYS), 2, tmp_path)
     assert row["passed"], row["findings"]
+
+
+@pytest.mark.usefixtures("in_simulated_time")
+def test_a_console_is_measured_in_every_phase(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    process = Mock()
+    shown = nullcontext(SimpleNamespace(process=process, start_s=0.5, cpu_s=lambda: 2.0))
+    monkeypatch.setattr(console, "TerminalConsole", lambda run: shown)
+    monkeypatch.setattr(console, "SPAN_S", 0.5)
+    monkeypatch.setattr(processes, "_SETTLE_S", 0.1)
+    row = run_case(replace(CASES["console"], config=TOY_KEYS), 2, tmp_path)
+    assert row["passed"], row["findings"]
+    phases = ("without", "open", "flooded", "flooded and frozen", "frozen", "killed", "flood without")
+    assert tuple(row["figures"]["frame_to_command"]) == phases
+    assert row["figures"]["console"] == {"start_s": 0.5, "share": 0.0}
+    assert [call[0] for call in process.method_calls] == ["send_signal", "kill"]

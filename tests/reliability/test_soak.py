@@ -1,17 +1,19 @@
 """Evaluation of a soak's samples: growth is detected, noise is not taken for growth, gaps are counted."""
 
 import json
+from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.logs.writer import LogWriter
 from lowfc.adapters.process.clock import HostClock
-from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
 from lowfc.contract.envelope import sequence_of
 from lowfc.contract.messages import STEP, TIMING, TRUTH, wire
 from lowfc.programs.reliability.chaos.bench import ChaosBench
@@ -27,6 +29,7 @@ from lowfc.programs.reliability.soak.evaluation import (
 )
 from lowfc.programs.reliability.soak.run import LogChecker
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
+from tests.reliability.toy_bench import CAMERA_PID, TOY_KEYS, ToyBench
 from tests.support.loops import lowfc
 
 SECONDS = 1800
@@ -151,3 +154,31 @@ def test_missing_messages_are_counted_within_logs_and_between_them(tmp_path: Pat
     log(tmp_path, "2", {STEP.key: [4, 5], TRUTH.key: [9]})
     checker.check()
     assert (checker.logs, checker.messages, checker.gaps) == (2, 8, 3)
+
+
+def test_a_soak_finds_the_process_whose_memory_grows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In simulated time, with a toy's loop that loses nothing."""
+
+    def begun(*arguments: Any) -> ToyBench:
+        made = ToyBench(*arguments)
+        made.replace_time(run, monkeypatch.setattr)
+        return made
+
+    samples = Counter[int]()
+
+    def process(pid: int) -> Any:
+        samples[pid] += 1
+        memory = SimpleNamespace(rss=10**8 + (pid == CAMERA_PID) * 10**6 * samples[pid])
+        return SimpleNamespace(memory_info=lambda: memory, num_fds=lambda: 20, num_threads=lambda: 5)
+
+    monkeypatch.setattr(run, "ChaosBench", begun)
+    monkeypatch.setattr(run, "psutil", SimpleNamespace(Error=psutil.Error, Process=process))
+    elapsed_s: list[float] = []
+    config = load(None, FIXED_GAINS | TOY_KEYS | {"control.start_mode": "closed", "camera.rate_hz": 20.0})
+    found = run.soak_loop(config, 33.0, elapsed_s.append)
+    assert elapsed_s == pytest.approx(list(range(33)), abs=0.2)
+    assert found["frames_published"] >= 33 * 20
+    assert (found["logs"], found["gaps"], found["frames_missing"], found["messages_lost"]) == (1, 0, 0, 0)
+    assert found["processes"]["controller"]["memory_last_mb"] == 100
+    assert found["why"] == ["the camera's memory grow"]
+    assert not found["passed"]

@@ -43,7 +43,8 @@ DRIFT_NM, DRIFT_HZ = np.array([20.0, -12.0, 8.0]), 0.3
 """Amplitude and frequency of the disturbance of each mode."""
 TO_MODES = np.linalg.pinv(TOY.modes_to_actuators)
 QUIET_FRAMES = 150
-PATIENCE_FRAMES = 30_000
+CAMERA_PID = 1
+PATIENCE_FRAMES = 3000
 
 
 class Answering(Controller):
@@ -62,10 +63,11 @@ class Recorder(MemoryBus):
 
     def __init__(self, hub: MemoryHub, clock: FakeClock, log: LogWriter) -> None:
         super().__init__(hub, Role.RECORDER, clock)
-        self._log, self._turn = log, threading.Lock()
+        self._log, self._turn, self.messages = log, threading.Lock(), 0
 
     def deliver(self, key: str, payload: bytes, envelope: Envelope) -> None:
         with self._turn:
+            self.messages += 1
             self._log.write(Sample(key, payload, *envelope, self.clock.host_ns()))
 
 
@@ -74,8 +76,9 @@ class ToyBench(ChaosBench):
 
     def __init__(self, config: Configuration, folder: Path, rng: random.Random, fault: dict[str, Any] | None) -> None:
         self.config, self.folder, self.rng, self.outcome = config, folder, rng, Outcome(folder, config)
-        self.mirror, self.newest_frame, self.health = mirror_role(config.mirror.name), 0, {}
+        self.mirror, self.newest_frame, self.health = mirror_role(config.mirror.name), 0, dict[str, wire.Health]()
         self._steps = self._closed_frames = self._index = 0
+        self._services: dict[str, Service] = {}
         self.hub, self.clock = MemoryHub(), FakeClock()
         self._fault, self._noise = "", np.random.default_rng(rng.getrandbits(32))
         path = folder / "run"
@@ -83,9 +86,15 @@ class ToyBench(ChaosBench):
         self.run: Any = SimpleNamespace(path=path, run_id="toy", links=None, remove=lambda: None)
         file = path / "calibration.fits"
         calibration_file.save(identified(calibration()), file)
-        self.children: Any = {Role.CONTROLLER: SimpleNamespace(command=["lowfc", "controller", str(file)])}
+        pids = {Role.CAMERA: CAMERA_PID, Role.CONTROLLER: CAMERA_PID + 1}
+        self.children: Any = {
+            name: SimpleNamespace(
+                name=name, command=["lowfc", name, str(file)], status=None, process=SimpleNamespace(pid=pid)
+            )
+            for name, pid in pids.items()
+        }
         self._log = LogWriter(folder / "toy.mcap", self.clock.now_ns(), {})
-        Recorder(self.hub, self.clock, self._log)
+        self._recorder = Recorder(self.hub, self.clock, self._log)
 
     def connection(self, role: str) -> MemoryBus:
         return MemoryBus(self.hub, role, self.clock)
@@ -98,16 +107,11 @@ class ToyBench(ChaosBench):
         self.bus: Any = self.connection(Role.LAUNCHER)
         for topic in (HEALTH, STEP, TRUTH):
             self.bus.subscribe(topic, self._receive)
-        camera = self.connection(Role.CAMERA)
+        camera, mirror = self._service(Role.CAMERA), self._service(self.mirror)
         self._frames, self._truths = camera.publisher(FRAME), camera.publisher(TRUTH)
         settings = replace(CameraSettings.configured(self.config, *SHAPE), saturation_dn=SATURATION_DN)
         camera.publisher(CAMERA_STATE).put(camera_state(settings, self.clock.now_ns()).SerializeToString())
-        service = Service(self.mirror, "toy", self.clock, self.connection(self.mirror))
-        self._mirror, self._services = (
-            MirrorLoop(SimulatedMirror(DriverOptions(), self.config), service, self.config),
-            {},
-        )
-        self._services[self.mirror] = service
+        self._mirror = MirrorLoop(SimulatedMirror(DriverOptions(), self.config), mirror, self.config)
         self.restart(Role.CONTROLLER)
         self.settled()
         self.mark("quiet")
@@ -140,7 +144,7 @@ class ToyBench(ChaosBench):
         except LowfcError as fault:
             self._fault = str(fault)
             return
-        service = self._services[name] = Service(name, "toy", self.clock, self.connection(name))
+        service = self._service(name)
         self._latch = Latch([self.run.path / NAME], lambda why: service.event("LATCH_FAILED", why=why))
         self._controller = Answering(self.config, service, found, "a test", self._latch)
         service.fill = self._controller.fill
@@ -162,6 +166,7 @@ class ToyBench(ChaosBench):
             self.outcome.ended.append(Ended(name, 0, 0.0, True))
         self._latch.close()
         self._log.finish({})
+        self.health[Role.RECORDER] = wire.Health(recording=wire.Recording(messages=self._recorder.messages))
 
     def expose(self) -> None:
         """One frame, the command from it, and what the processes do between two frames."""
@@ -179,6 +184,10 @@ class ToyBench(ChaosBench):
         for service in self._services.values():
             assert service.running, service.why
             service.beat()
+
+    def _service(self, name: str) -> Service:
+        self._services[name] = Service(name, "toy", self.clock, self.connection(name))
+        return self._services[name]
 
     def _sleep(self, seconds: float) -> None:
         if threading.current_thread() is threading.main_thread():
