@@ -181,6 +181,8 @@ class ToyBench(ChaosBench):
         self._mirror._idle()
         if Role.CONTROLLER in self._services:
             self._controller._between_frames(self._controller._camera.wait(0))
+            while self._controller._gain_requests:
+                self._controller._carry_out_internal(self._controller._gain_requests.popleft())
         for service in self._services.values():
             assert service.running, service.why
             service.beat()
