@@ -1,5 +1,6 @@
 """Reference star and target of different colour and roll: change of the dark zone after subtraction."""
 
+from bisect import bisect_left
 from collections.abc import Iterator
 from functools import lru_cache, partial
 
@@ -22,6 +23,7 @@ ROLL_NM, ROLLED = 1.0, 1e-11
 """Step of every mode by a roll of the telescope, and the contrast to which it must decay."""
 _SAMPLES_PER, _SMALL_NM = 2, 0.3  # samples per lambda/D, and amplitude of the second-order maps
 _PLANCK_NM_K = 1.438777e7
+_LONGEST_FRAMES = 1 << 20
 
 ASSUMPTION = (
     f"Every mode drifts by {DRIFT_PM:g} pm/sqrt(s), best gain of each mode for each star, {tolerance.RATE_HZ:g} "
@@ -92,13 +94,13 @@ def pair_rows(name: str) -> Iterator[Row]:
             measured=float(np.sqrt(np.mean(change[zone] ** 2))),
             assumption=f"{ASSUMPTION}\n{MAP}",
         )
-    frames = np.arange(1, 1 << 20)
     form = tolerance.contrasts_of(name).form
-    added = sum(
-        ROLL_NM**2 * q * (1.0 - g) ** (2.0 * frames) for q, g in zip(form.tolist(), gains.tolist(), strict=True)
-    )
+
+    def decayed(frames: int) -> bool:
+        return float(ROLL_NM**2 * form @ (1.0 - gains) ** (2.0 * frames)) <= ROLLED
+
     yield made(
         f"time for a roll's step of {ROLL_NM:g} nm in every mode to decay to {ROLLED:g}, target",
         unit="s",
-        measured=float((1 + np.count_nonzero(added > ROLLED)) / tolerance.RATE_HZ),
+        measured=float((1 + bisect_left(range(1, _LONGEST_FRAMES), True, key=decayed)) / tolerance.RATE_HZ),
     )
