@@ -2,17 +2,24 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from lowfc.adapters.process.terminal import new_app
-from lowfc.programs.paper.cases import Context, plain
+from lowfc.design.tolerance import KINDS
+from lowfc.optics.detector.photometry import tilt_nm_per_mas
+from lowfc.programs.paper.cases import Context, Row, plain
 from lowfc.programs.paper.commands import ADDITIONAL, validate
+from lowfc.programs.paper.dark_hole import SHIFTED, ChannelResult
 from lowfc.programs.paper.report import CASES, PICTURES, to_page, to_text
-from lowfc.programs.paper.tables import anchors
+from lowfc.programs.paper.tables import anchors, star_pair, tolerance
 
 DOCS = Path(__file__).parents[2] / "docs" / "measured"
+LIGHT = "zwfs_tuned"
+"""The sensor with the fewest pixels."""
 
 
 def committed(name: str) -> dict:
@@ -63,6 +70,117 @@ def test_docs_is_refused_for_parts_of_a_page(tmp_path):
         ran = CliRunner().invoke(app, ["validate", *words, "--docs", str(tmp_path)])
         assert ran.exit_code
         assert "--docs writes complete pages" in str(ran.exception)
+
+
+def agree(rows: list[Row], name: str) -> int:
+    """Assert that rows in a committed table have its values, up to rounding errors; returns how many there are."""
+    references = {(row["name"], row["estimator"], row["quantity"]): row for row in committed(name)["rows"]}
+    found = [row for row in map(plain, rows) if (row["name"], row["estimator"], row["quantity"]) in references]
+    for row in found:
+        reference = references[row["name"], row["estimator"], row["quantity"]]
+        for column in ("measured", "predicted", "limit", "error"):
+            expected = reference[column]
+            assert row[column] == (expected if expected is None else pytest.approx(expected, rel=1e-3)), row
+    return len(found)
+
+
+def test_tolerances_of_a_sensor_have_the_committed_values(monkeypatch):
+    for module, name in ((tolerance, "_checked"), (star_pair, "pair_rows")):  # have tests of their own
+        monkeypatch.setattr(module, name, lambda argument: [])
+    rows = tolerance.tolerance(Context(sensors=(LIGHT,)))
+    assert len(rows) == len(tolerance.MAGNITUDES) * 14 * len(tolerance.ALLOWED) * 2 * len(KINDS)
+    shown = [row for row in rows if tolerance.in_text(plain(row))]
+    assert agree(shown, "tolerance") == len(shown) == 4 * 2 * 2
+
+
+def test_a_pair_of_stars_has_the_committed_values():
+    rows = list(star_pair.pair_rows(LIGHT))
+    assert agree(rows, "tolerance") == len(rows) == 8
+
+
+def test_anchors_without_a_loop_have_the_committed_values():
+    rows = [*anchors._hundred_seconds(Context(), LIGHT), *anchors._against_magnitude(LIGHT)]
+    assert agree(rows, "anchors") == len(rows) == 14 + len(tolerance.MAGNITUDES)
+
+
+@pytest.mark.parametrize(("table", "limit_is_above"), [(anchors, False), (tolerance, True)])
+def test_curves_against_magnitude_approach_but_do_not_cross_the_quantum_limit(table, limit_is_above, monkeypatch):
+    panels = []
+    monkeypatch.setattr(table, "draw", lambda path, drawn, *_, **__: panels.extend(drawn))
+    monkeypatch.setattr(table, "curves", lambda lines, *_, **__: lines)
+    table.plot(Context(sensors=(LIGHT,)), Path("unused"))
+    assert panels
+    for sensor, limit in panels:
+        assert (sensor.name, limit.name) == (LIGHT, "quantum limit")
+        gain = limit.y / sensor.y if limit_is_above else sensor.y / limit.y
+        assert 1 <= gain[0] < gain[-1]  # read noise matters for faint stars
+        assert (np.diff(sensor.y) < 0).all() == limit_is_above
+
+
+def test_the_fourth_table_gives_the_rows_of_two_modes_with_the_papers_other_sensor(monkeypatch):
+    rows = [row for row in committed("anchors")["rows"] if "std of x tilt" in row["quantity"]]
+    of_table4 = [Row(**row | {"paper": 0.36}) for row in rows if row["unit"]]
+    others = [Row("sam", of_table4[0].quantity, "mas", 0.1, modes=14, estimator="weighted"), Row("sam", "other", "", 1)]
+    monkeypatch.setattr(anchors.pointing, "table4", lambda context: [*others, *of_table4])
+    assert list(map(plain, anchors._table4(Context()))) == rows
+
+
+@pytest.mark.parametrize(("undone", "verdict"), [(0.004, anchors.REACHED), (-0.03, anchors.NOT_REACHED)])
+def test_the_part_of_a_dark_hole_that_the_loop_undoes_is_judged(undone, verdict, monkeypatch):
+    steps = np.random.default_rng(3).standard_normal((5, 14)).cumsum(axis=0)
+    channel = ChannelResult(steps, 3.0 - undone * steps, np.ones(2))
+    monkeypatch.setattr(anchors, "dark_hole", lambda *_, **__: SimpleNamespace(channels={SHIFTED: channel}))
+    row, judged = anchors._hicat(Context())
+    assert row.measured == pytest.approx(100 * abs(undone))
+    assert row.error == pytest.approx(0, abs=1e-6)
+    assert judged.measured == verdict
+
+
+class Loops:
+    """Stand-in for the commands that run a loop and tune a law: the tilt has a line and noise, and is corrected."""
+
+    residual_mas = 0.3
+
+    def __init__(self):
+        self.commands = []
+
+    def command(self, folder, name, *words):
+        settings = (folder / words[words.index("--config") + 1]).read_text() if "--config" in words else ""
+        preset = words[words.index("--disturbance") + 1] if "--disturbance" in words else ""
+        self.commands.append((name, preset, "law" in settings))
+        return {"log": "a.mcap", "tilt_disturbance_mas": 14.0, "tilt_residual_mas": self.residual_mas}
+
+    def history(self, log):
+        rng, frames = np.random.default_rng(4), round(24 * anchors.RATE_HZ)
+        seconds = np.arange(frames)[:, None] / anchors.RATE_HZ
+        pol_nm = 20.0 * np.sin(2 * np.pi * 29.0 * seconds + [0, 1]) + 0.1 * rng.standard_normal((frames, 2))
+        level_mas = (
+            0.1 * (np.floor(seconds / anchors.MEAN_S) % 2 - 0.5) * [1, 1]
+        )  # of opposite sign in every second mean
+        steps = SimpleNamespace(sequence=np.arange(frames), pol_nm=pol_nm)
+        true = SimpleNamespace(residual_nm=np.hstack([level_mas, level_mas]) * tilt_nm_per_mas(2.0))
+        return SimpleNamespace(log=SimpleNamespace(path=log), true=true, steps=steps)
+
+
+def test_loops_are_judged_by_the_published_pointing(monkeypatch):
+    loops = Loops()
+    monkeypatch.setattr(anchors, "_lowfc", loops.command)
+    monkeypatch.setattr(anchors, "_history", loops.history)
+    rows = {row.quantity: row for row in anchors._pointing(Context(), LIGHT)}
+    for preset in ("reaction-wheel", "reaction-wheel-ideal"):
+        row = rows[f"tilt, {preset}"]
+        assert (row.measured, row.paper) == (0.3, anchors.ROMAN_MAS)
+        assert rows[f"verdict, tilt, {preset}"].measured == anchors.REACHED
+        assert 0 < row.limit * tilt_nm_per_mas(2.0) < 2.0, "of a line of 14 nm rms that the law has in its model"
+    for where, verdict in (("sky", anchors.REACHED), ("laboratory", anchors.NOT_REACHED)):
+        row = rows[f"std of means over 2 s, {where}"]
+        assert row.measured == pytest.approx(0.05 * np.sqrt(10 / 9))
+        assert rows[f"verdict, {row.quantity}"].measured == verdict
+    driven = [
+        [("sim-loop", preset, False), ("tune", "", False), ("sim-loop", preset, True)]
+        for preset in ("reaction-wheel", "reaction-wheel-ideal")
+    ]
+    assert loops.commands == [*driven[0], *driven[1], ("sim-loop", "bench", False)]
 
 
 @pytest.mark.slow

@@ -170,7 +170,7 @@ def _quantum_pointing_nm(history: History, name: str) -> float:
     steps = history.steps
     models = identified(time_series(steps.sequence, steps.pol_nm[:, :2]), RATE_HZ)
     scale = (EXPOSURE / RATE_HZ) / (tolerance.EXPOSURE / tolerance.RATE_HZ)
-    noise = tolerance.quantum_noise_nm2(prepared(name), MAGNITUDE)[:2] / scale
+    noise = tolerance.quantum_noise_nm2(name, MAGNITUDE)[:2] / scale
     models = [replace(model, noise_nm2=float(n)) for model, n in zip(models, noise, strict=True)]
     timing = Timing.of(1.0, EXPOSURE)
     return float(np.sqrt(np.mean(predicted_nm(lqg(models, NOLLS_14[:2], timing), models, timing) ** 2)))
@@ -207,7 +207,7 @@ def _hundred_seconds(context: Context, name: str) -> Iterator[Row]:
 
     found = np.array(context.map(f"anchors {name}, 100 s", trial, range(context.trials))).std(axis=0, ddof=1)
     predicted = np.sqrt(np.diag(tolerance.frame_noise_nm2(name, MAGNITUDE)) / frames)
-    limit = np.sqrt(tolerance.quantum_noise_nm2(sensor, MAGNITUDE) / frames)
+    limit = np.sqrt(tolerance.quantum_noise_nm2(name, MAGNITUDE) / frames)
     for mode, noll in enumerate(NOLLS_14):
         pm = 1e3 * np.array([found[mode], predicted[mode], limit[mode]])
         yield Row(
@@ -226,8 +226,8 @@ def _hundred_seconds(context: Context, name: str) -> Iterator[Row]:
 
 def added_contrast(name: str, magnitude: float, quantum: bool = False) -> float:
     """Contrast that drift and noise add behind integrators of the best gains."""
-    noise = np.diag(tolerance.frame_noise_nm2(name, magnitude))
-    noise = tolerance.quantum_noise_nm2(prepared(name), magnitude) if quantum else noise
+    of_frame = np.diag(tolerance.frame_noise_nm2(name, magnitude))
+    noise = tolerance.quantum_noise_nm2(name, magnitude) if quantum else of_frame
     step = (DRIFT_PM / 1e3) ** 2 / tolerance.RATE_HZ
     residual_nm2 = [
         drift_residual_nm2(step, n, tolerance.EXPOSURE, best_gain(step, n, tolerance.EXPOSURE)) for n in noise.tolist()

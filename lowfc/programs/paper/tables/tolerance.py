@@ -21,7 +21,7 @@ from lowfc.design.tolerance import KINDS, Kind, tolerated_drift, tolerated_lines
 from lowfc.optics.chain.added_contrast import ModalContrast
 from lowfc.optics.chain.zernike import NOLLS_14, mode_name
 from lowfc.optics.detector.photometry import Photometry, electrons
-from lowfc.programs.paper.cases import Context, Prepared, Row, prepared
+from lowfc.programs.paper.cases import Context, Row, prepared
 from lowfc.programs.paper.plots import Line as Curve
 from lowfc.programs.paper.plots import curves, draw
 
@@ -121,10 +121,16 @@ def frame_noise_nm2(name: str, magnitude: float) -> Array:
     return noise_nm2(R, I0, light_e(magnitude) * float(sensor.I0.sum()), READ_NOISE_E)
 
 
-def quantum_noise_nm2(sensor: Prepared, magnitude: float) -> Array:
-    """Variance (14,) of each mode at the quantum limit, with all modes fitted."""
-    modes = sensor.modes[: len(NOLLS_14)]
-    information = quantum_information(sensor.sensor.pupil, modes, sensor.sensor.wavelength_nm, light_e(magnitude))
+def quantum_noise_nm2(name: str, magnitude: float) -> Array:
+    """Variance (14,) of each mode in a frame at the quantum limit, with all modes fitted."""
+    return _quantum_noise_of_one_nm2(name) / light_e(magnitude)
+
+
+@lru_cache(maxsize=16)
+def _quantum_noise_of_one_nm2(name: str) -> Array:
+    """Quantum limit (14,) for the light of one electron."""
+    sensor = prepared(name)
+    information = quantum_information(sensor.sensor.pupil, sensor.modes[: len(NOLLS_14)], sensor.sensor.wavelength_nm)
     return np.asarray(np.diag(np.linalg.inv(information)))
 
 
@@ -146,7 +152,7 @@ def tolerance(context: Context) -> list[Row]:
 def _tolerated(name: str, lines: dict[Kind, Callable[[Array], Array]]) -> Iterator[Row]:
     of_contrast = contrasts_of(name)
     for magnitude in MAGNITUDES:
-        noise, quantum = np.diag(frame_noise_nm2(name, magnitude)), quantum_noise_nm2(prepared(name), magnitude)
+        noise, quantum = np.diag(frame_noise_nm2(name, magnitude)), quantum_noise_nm2(name, magnitude)
         for mode, noll in enumerate(NOLLS_14):
             for allowed in ALLOWED:
                 residual_nm2 = of_contrast.variance_nm2(mode, allowed)
@@ -223,8 +229,7 @@ def plot(context: Context, path: Path) -> None:
         residual_nm2 = contrasts_of(name).variance_nm2(mode, SHOWN_CONTRAST)
         found = []
         for magnitude in magnitudes.tolist():
-            of_frame = np.diag(frame_noise_nm2(name, magnitude))
-            noise = quantum_noise_nm2(prepared(name), magnitude) if quantum else of_frame
+            noise = quantum_noise_nm2(name, magnitude) if quantum else np.diag(frame_noise_nm2(name, magnitude))
             drift = tolerated_drift(residual_nm2, float(noise[mode]), EXPOSURE, "lqg")
             found.append(1e3 * np.sqrt(drift.step_nm2 * RATE_HZ))
         return np.array(found)
