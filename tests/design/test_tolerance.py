@@ -6,6 +6,7 @@ import pytest
 from lowfc.control.laws.continuous import Timing, residual_power
 from lowfc.control.laws.linear_law import integrator
 from lowfc.control.laws.margins import noise_gain
+from lowfc.control.laws.stability import highest_gain
 from lowfc.control.laws.vibration import Line
 from lowfc.design.tolerance import (
     best_gain,
@@ -14,7 +15,13 @@ from lowfc.design.tolerance import (
     tolerated_lines,
     tolerated_variance,
 )
-from lowfc.programs.paper.cases import Context
+from lowfc.optics.chain.focal_mask import phase_spot
+from lowfc.optics.chain.pupil import circle
+from lowfc.optics.chain.relay import PupilImage
+from lowfc.optics.chain.sensor import Sensor
+from lowfc.optics.twin.twin import TwinSpec
+from lowfc.optics.twin.twin_build import build
+from lowfc.programs.paper.cases import Context, Prepared
 from lowfc.programs.paper.tables import tolerance
 from lowfc.programs.paper.tables.star_pair import zero_point_nm
 
@@ -37,6 +44,13 @@ def test_tolerated_drift_leaves_the_allowed_residual_at_the_best_gain(noise):
     best = best_gain(found.step_nm2, noise, EXPOSURE)
     assert found.gain == pytest.approx(best)
     assert min(drift_residual_nm2(found.step_nm2, noise, EXPOSURE, best * f) for f in (0.9, 1.1)) > 0.5
+
+
+def test_margins_bound_the_gain_of_an_integrator_if_frames_are_exposed_all_the_time():
+    bounded, best = (tolerated_drift(0.5, 1e-3, 1.0, kind) for kind in ("integrator", "lqg"))
+    assert bounded.gain == highest_gain(1.0) < best.gain
+    assert bounded.step_nm2 < best.step_nm2
+    assert drift_residual_nm2(bounded.step_nm2, 1e-3, 1.0, bounded.gain) == pytest.approx(0.5)
 
 
 def test_residual_of_a_slow_loop_is_the_root_of_drift_times_noise():
@@ -63,6 +77,27 @@ def test_quartic_term_limits_a_mode_with_a_small_quadratic_term():
 @pytest.mark.slow
 def test_star_colour_does_not_shift_the_zero_point_of_an_aperture_mask():
     assert np.linalg.norm(zero_point_nm("sam")) < 1e-9
+
+
+@pytest.fixture
+def coarse(monkeypatch):
+    """Make one Zernike sensor of 16 x 16 pixels the only one of the check by simulation."""
+    sensor = Sensor(circle(64), phase_spot(samples_per=4), PupilImage(), samples_per=4, pixels=16)
+    made = Prepared("coarse", sensor)
+    made.twin = build(sensor, TwinSpec(nodes=24, order=6, rank=40, guards=4))
+    monkeypatch.setattr(tolerance, "prepared", lambda name: made)
+    monkeypatch.setattr(tolerance, "CHECKED_SENSORS", ("coarse",))
+    monkeypatch.setattr(tolerance, "CHECKED_MAGNITUDES", (2.0,))
+    monkeypatch.setattr(tolerance, "CHECKED_MODES", (4, 8))
+
+
+@pytest.mark.usefixtures("coarse")
+def test_simulation_of_a_small_sensor_agrees_with_the_closed_form():
+    rows = tolerance._checked(Context(trials=30, seed=3))
+    assert len(rows) == 2
+    for row in rows:
+        assert row.error < 0.06 * row.predicted
+        assert row.measured == pytest.approx(row.predicted, abs=4 * row.error), row
 
 
 @pytest.mark.slow
