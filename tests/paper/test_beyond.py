@@ -1,6 +1,7 @@
 """The tables `tolerance` and `anchors`, which are not the paper's, and their pages."""
 
 import json
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -9,6 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from lowfc.adapters.process.terminal import new_app
+from lowfc.contract.errors import LowfcError
 from lowfc.design.tolerance import KINDS
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.paper.cases import Context, Row, plain
@@ -144,11 +146,14 @@ class Loops:
     def __init__(self):
         self.commands = []
 
-    def command(self, folder, name, *words):
-        settings = (folder / words[words.index("--config") + 1]).read_text() if "--config" in words else ""
-        preset = words[words.index("--disturbance") + 1] if "--disturbance" in words else ""
-        self.commands.append((name, preset, "law" in settings))
-        return {"log": "a.mcap", "tilt_disturbance_mas": 14.0, "tilt_residual_mas": self.residual_mas}
+    def run(self, command, cwd, **_):
+        (*_, lowfc), (name, *words, as_json) = command[:3], command[3:]
+        assert (lowfc, as_json) == ("lowfc", "--json")
+        options = dict(pairwise(words))
+        settings = (cwd / options["--config"]).read_text() if "--config" in options else ""
+        self.commands.append((name, options.get("--disturbance", ""), "law" in settings))
+        found = {"log": "a.mcap", "tilt_disturbance_mas": 14.0, "tilt_residual_mas": self.residual_mas}
+        return SimpleNamespace(returncode=0, stdout=json.dumps(found))
 
     def history(self, log):
         rng, frames = np.random.default_rng(4), round(24 * anchors.RATE_HZ)
@@ -164,7 +169,7 @@ class Loops:
 
 def test_loops_are_judged_by_the_published_pointing(monkeypatch):
     loops = Loops()
-    monkeypatch.setattr(anchors, "_lowfc", loops.command)
+    monkeypatch.setattr(anchors.subprocess, "run", loops.run)
     monkeypatch.setattr(anchors, "_history", loops.history)
     rows = {row.quantity: row for row in anchors._pointing(Context(), LIGHT)}
     for preset in ("reaction-wheel", "reaction-wheel-ideal"):
@@ -181,6 +186,13 @@ def test_loops_are_judged_by_the_published_pointing(monkeypatch):
         for preset in ("reaction-wheel", "reaction-wheel-ideal")
     ]
     assert loops.commands == [*driven[0], *driven[1], ("sim-loop", "bench", False)]
+
+
+def test_a_loop_that_fails_is_an_error_with_its_reason(monkeypatch, tmp_path):
+    failed = SimpleNamespace(returncode=2, stderr="error: no such sensor\n")
+    monkeypatch.setattr(anchors.subprocess, "run", lambda *_, **__: failed)
+    with pytest.raises(LowfcError, match=r"`lowfc sim-loop .*--sensor sam .*` ended with 2: error: no such sensor$"):
+        anchors._sim_loop("sam", "bench", tmp_path, "gains.toml", 1.0, 1)
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from lowfc.adapters.logs.history import read_history
+from lowfc.adapters.logs.history import History, read_history
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.arrays import Array, Mask
 from lowfc.client import Client, running
@@ -66,15 +66,6 @@ class DarkHoleRun:
     log: Path
 
 
-def shapes_nm(grid: tuple[int, int], step_rms_nm: float, usable: Mask | None = None) -> Array:
-    """Shapes (steps, rows, columns) of the channel after each step, nm of surface.
-
-    Each step adds a random shape of `step_rms_nm` rms.
-    """
-    steps = step_rms_nm * np.random.default_rng(SEED).standard_normal((STEPS, *grid))
-    return np.asarray(np.cumsum(steps if usable is None else steps * usable, axis=0))
-
-
 def dark_hole(
     folder: Path, step_rms_nm: float, toml: str = "", base_nm: npt.ArrayLike = 0.0, seed: int | None = None
 ) -> DarkHoleRun:
@@ -96,7 +87,8 @@ def dark_hole(
             deadline_s = time.monotonic() + PATIENCE_S
             while RUN not in running() and time.monotonic() < deadline_s and process.poll() is None:
                 time.sleep(0.05)
-            marks, channel_modes_nm = _apply_steps(step_rms_nm, np.asarray(base_nm))
+            with Client(RUN) as loop:
+                marks, channel_modes_nm = apply_steps(loop, step_rms_nm, np.asarray(base_nm))
         except BusError as error:
             process.send_signal(signal.SIGINT)
             raise RuntimeError(f"{error}; output of the loop: {process.communicate(timeout=PATIENCE_S)}") from error
@@ -105,42 +97,41 @@ def dark_hole(
     if process.returncode:
         raise RuntimeError(complaints)
     log = folder / json.loads(out)["log"]
-    return DarkHoleRun(_channels(log, marks, channel_modes_nm), log)
+    return DarkHoleRun(channel_results(read_history(LogReader(log)), marks, channel_modes_nm), log)
 
 
-def _apply_steps(step_rms_nm: float, base_nm: Array) -> tuple[dict[str, list[int]], Array]:
+def apply_steps(loop: Client, step_rms_nm: float, base_nm: Array) -> tuple[dict[str, list[int]], Array]:
     """First frame of each step and of the removal, by channel, and the modes of the channel's shape without `base_nm`.
 
     The modes (1 + steps, modes) are as the sensor sees them: before the first step, then after each.
     """
     marks: dict[str, list[int]] = {}
-    with Client(RUN) as loop:
 
-        def wait(frames: int) -> None:
-            for _ in loop.steps(frames, patience_s=PATIENCE_S):
-                pass
+    def wait(frames: int) -> None:
+        for _ in loop.steps(frames, patience_s=PATIENCE_S):
+            pass
 
-        wait(2 * WINDOW)
-        calibration = loop.calibration()
-        used = np.asarray(calibration.actuators_to_modes.any(axis=0)).reshape(calibration.grid)
-        shapes = shapes_nm(calibration.grid, step_rms_nm, used)
-        for channel, stride, channel_base_nm in ((SHIFTED, 1, 0 * base_nm), (PLAIN, STEPS_COMBINED, base_nm)):
-            marks[channel] = []
-            for shape in shapes[stride - 1 :: stride]:
-                marks[channel].append(loop.channel(channel, shape + channel_base_nm).frame_sequence)
-                wait(SETTLE)
-            wait(WINDOW)
-            marks[channel].append(loop.channel(channel, np.zeros(calibration.grid) + channel_base_nm).frame_sequence)
-            wait(WINDOW)
+    wait(2 * WINDOW)
+    calibration = loop.calibration()
+    used = np.asarray(calibration.actuators_to_modes.any(axis=0)).reshape(calibration.grid)
+    steps = step_rms_nm * np.random.default_rng(SEED).standard_normal((STEPS, *calibration.grid))
+    shapes = np.cumsum(steps * used, axis=0)
+    for channel, stride, channel_base_nm in ((SHIFTED, 1, 0 * base_nm), (PLAIN, STEPS_COMBINED, base_nm)):
+        marks[channel] = []
+        for shape in shapes[stride - 1 :: stride]:
+            marks[channel].append(loop.channel(channel, shape + channel_base_nm).frame_sequence)
+            wait(SETTLE)
+        wait(WINDOW)
+        marks[channel].append(loop.channel(channel, np.zeros(calibration.grid) + channel_base_nm).frame_sequence)
+        wait(WINDOW)
     channel_modes_nm = shapes.reshape(STEPS, -1) @ calibration.actuators_to_modes.T.astype(np.float64)
     return marks, np.vstack([np.zeros(channel_modes_nm.shape[1]), channel_modes_nm])
 
 
-def _channels(log: Path, marks: dict[str, list[int]], channel_modes_nm: Array) -> dict[str, ChannelResult]:
-    history = read_history(LogReader(log))
+def channel_results(history: History, marks: dict[str, list[int]], channel_modes_nm: Array) -> dict[str, ChannelResult]:
+    """Results of the channels, from the history of a simulated run and what `apply_steps` returned."""
     truths = history.true
-    if truths is None:
-        raise RuntimeError(f"{log} has no truth")
+    assert truths is not None  # noqa: S101  # a simulated loop's
     sequences, command = history.steps.sequence, history.steps.command_nm
     known = np.isfinite(truths.disturbance_nm[:, 0])
 
