@@ -1,0 +1,133 @@
+"""`lowfc bridge isio` in this process: steps in streams for an independent reader, other channels in the loop."""
+
+import os
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lowfc.adapters.bus.bus import Query
+from lowfc.adapters.image_stream.stream import StreamError
+from lowfc.contract.codecs.calibration_codec import encode_calibration, identified
+from lowfc.contract.errors import BusError, ConfigurationError
+from lowfc.contract.messages import CALIBRATION, CONTROLLER_STATE, REQUEST_KEY, STEP, wire
+from lowfc.programs.bridge import isio as bridge
+from lowfc.testing.clock import FakeClock
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub
+from tests.support.image_streams.plain import PlainStream
+from tests.support.loops import lowfc
+from tests.support.toy import GRID, calibration
+
+FLOAT32 = 9
+AT_NS = 1_700_000_000_000_000_000
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("MILK_SHM_DIR", str(tmp_path))
+    return tmp_path
+
+
+def stream(folder: Path, name: str, columns: int, rows: int = 1, *, make: bool = False) -> PlainStream:
+    made = PlainStream.make if make else PlainStream
+    return made(folder / f"{name}.im.shm", columns, rows, FLOAT32)
+
+
+class Run:
+    """Bus of a run, with a publisher of steps and the bridge's streams."""
+
+    def __init__(self) -> None:
+        self.hub, self.clock = MemoryHub(), FakeClock(AT_NS)
+        self.steps = MemoryBus(self.hub, "controller", self.clock).publisher(STEP)
+        self.streams = bridge.StepStreams(MemoryBus(self.hub, "operator", self.clock), self.clock, "night")
+
+    def step(self, **fields: Any) -> None:
+        message = wire.ControlStep(mode=wire.LOOP_MODE_CLOSED, **fields)
+        message.timestamp.FromNanoseconds(AT_NS)
+        self.steps.put(message.SerializeToString())
+        self.streams.pass_on()
+
+
+def test_each_step_is_an_image_of_one_row(folder: Path) -> None:
+    run = Run()
+    run.step(error_nm=[3, -4], command_nm=[1, 2], flux_dn=500)
+    error, command = (stream(folder, f"night_{name}", 2) for name in ("error", "command"))
+    residual, flux = (stream(folder, f"night_{name}", 1) for name in ("residual", "flux"))
+    assert [one.pixels.ravel().tolist() for one in (error, command, residual, flux)] == [[3, -4], [1, 2], [5], [500]]
+    run.step(command_nm=[1, 3], flux_dn=0)  # a refused frame has no error
+    run.steps.put(b"\xff")
+    run.streams.pass_on()
+    assert [one.count for one in (error, command, residual, flux)] == [1, 2, 1, 2]
+    assert command.pixels.ravel().tolist() == [1, 3]
+    run.step(error_nm=[1, 2, 2], command_nm=[0, 0, 0], flux_dn=1)  # another calibration: the stream is created again
+    again = stream(folder, "night_error", 3)
+    assert (again.count, again.pixels.ravel().tolist(), error.count) == (1, [1, 2, 2], 1)
+
+
+def test_an_existing_stream_is_adopted_unless_another_process_writes_it(folder: Path) -> None:
+    command = stream(folder, "night_command", 2, make=True)
+    stream(folder, "night_flux", 7, make=True)
+    run = Run()
+    run.step(command_nm=[1, 2], flux_dn=500)
+    assert command.pixels.ravel().tolist() == [1, 2]
+    assert stream(folder, "night_flux", 1).pixels.ravel().tolist() == [500]
+    command.pack("<i", command.writers, os.getppid())
+    with pytest.raises(StreamError, match=f"process {os.getppid()} writes stream 'night_command'"):
+        Run().step(command_nm=[1, 2])
+
+
+@pytest.mark.parametrize("busy", [False, True])
+def test_other_channels_are_reported_to_the_loop(busy: bool, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The bridge is interrupted after ten rounds; a busy controller answers from the sixth on."""
+    hub, clock, received = MemoryHub(), FakeClock(AT_NS), list[wire.Request]()
+    controller = MemoryBus(hub, "controller", clock)
+    controller.publisher(CALIBRATION).put(encode_calibration(identified(calibration()), 0))
+    states = controller.publisher(CONTROLLER_STATE)
+    states.put(wire.ControllerState(mirror_rows=GRID[0], mirror_columns=GRID[1]).SerializeToString())
+
+    def answer(query: Query) -> None:
+        received.append(wire.Request.FromString(query.payload))
+        query.reply(wire.Request(accepted=True).SerializeToString())
+
+    controller.queryable(REQUEST_KEY.format(name="*"), answer)
+    turbulence = stream(folder, "dm00disp01", GRID[1], GRID[0], make=True)
+    turbulence.write(np.full(GRID, 0.02, np.float32))
+    stream(folder, "dm00disp03", GRID[1], GRID[0], make=True).write(np.full(GRID, 9, np.float32))  # the loop's own
+    plain, rounds = bridge.Client.channel, 0
+
+    def channel(client: bridge.Client, name: str, shape_nm: Any) -> Any:
+        if busy and rounds < 5:
+            raise BusError("busy")
+        return plain(client, name, shape_nm)
+
+    def pause(seconds: float) -> None:
+        nonlocal rounds
+        rounds += 1
+        clock.advance(10**9)
+        if rounds == 7:
+            states.put(b"\xff")
+            turbulence.write(np.zeros(GRID, np.float32))
+        if rounds == 10:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(bridge.Client, "channel", channel)
+    monkeypatch.setattr(bridge, "time", SimpleNamespace(monotonic=lambda: clock.now_ns() * 1e-9, sleep=pause))
+    monkeypatch.setattr(bridge, "the_known_run", lambda run: run)
+    monkeypatch.setattr(bridge, "open_run", lambda *_: SimpleNamespace(links=None))
+    monkeypatch.setattr(bridge, "ZenohBus", lambda _, role, clock, **__: MemoryBus(hub, role, clock))
+    monkeypatch.setattr(bridge, "lower_priority", lambda: None)
+    done = lowfc("bridge", "isio", "--run", "bench", "--beside", "dm00disp03", "--nm-per-unit", "2000")
+    assert done.exit_code == 0, done.output
+    shapes = [np.frombuffer(request.actuators, np.float32) for request in received]
+    assert [request.text for request in received] == ["external", "external"]
+    assert shapes[0] == pytest.approx(np.full(GRID[0] * GRID[1], 40.0))
+    assert shapes[1].size == 0
+    assert done.stderr.count("dm00disp01 not reported to the loop: busy") == busy
+
+
+def test_the_loops_own_channel_must_have_a_number() -> None:
+    fault = lowfc("bridge", "isio", "--beside", "dm00").exception
+    assert isinstance(fault, ConfigurationError)
+    assert "--external" in str(fault)
