@@ -1,0 +1,255 @@
+"""`lowfc gateway epics` in this process: what it posts, requests and publishes, with a stand-in for p4p."""
+
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.process.clock import HostClock
+from lowfc.client import Answer, Client
+from lowfc.contract.codecs.bench_codec import decode_bench_value
+from lowfc.contract.errors import BusError, RequestRefusedError
+from lowfc.contract.messages import BENCH, CONTROLLER_STATE, FRAME, HEALTH, image, wire
+from lowfc.contract.sections import Gateway
+from lowfc.programs.gateway import command
+from lowfc.programs.gateway.epics import EpicsGateway
+from lowfc.programs.gateway.variables import Kind, Put, Variable
+from lowfc.testing.memory_bus import MemoryBus, MemoryHub
+from tests.support.loops import lowfc
+
+CONFIG = Gateway(prefix="night:", port=5075, bench={"mask": "BENCH:MASK"})
+
+
+class Variables(dict[str, "Variables.Shared"]):
+    """Stand-in for p4p: a server's variables by name, and the monitors of other servers' variables.
+
+    Attributes:
+        monitors: callbacks by variable.
+        closed: what was closed or stopped, in order.
+        busy: whether the port is in use.
+    """
+
+    class Shared:
+        def __init__(self, nt: Any, initial: Any, handler: Any = None) -> None:
+            self.nt, self.initial, self.handler = nt, initial, handler
+            self.posts: list[tuple[Any, int, str]] = []
+
+        def post(self, value: Any, timestamp: float, severity: int = 0, message: str = "") -> None:
+            self.posts.append((np.asarray(value).tolist(), severity, message))
+
+    def __init__(self) -> None:
+        self.monitors: dict[str, Callable[[Any], None]] = {}
+        self.closed: list[str] = []
+        self.conf: dict[str, str] = {}
+        self.busy = False
+
+    def server(self, providers: list[dict[str, Any]], conf: dict[str, str], useenv: bool) -> SimpleNamespace:
+        if self.busy:
+            raise RuntimeError("address in use")
+        (offered,) = providers
+        self.update(offered)
+        self.conf = conf
+        return SimpleNamespace(conf=lambda: conf, stop=lambda: self.closed.append("server"))
+
+    def context(self, provider: str, conf: dict[str, str], useenv: bool) -> SimpleNamespace:
+        def monitor(name: str, callback: Callable[[Any], None], notify_disconnect: bool) -> SimpleNamespace:
+            self.monitors[name] = callback
+            return SimpleNamespace(close=lambda: self.closed.append(name))
+
+        return SimpleNamespace(monitor=monitor, close=lambda: self.closed.append("context"))
+
+
+@pytest.fixture
+def pvs(monkeypatch: pytest.MonkeyPatch) -> Variables:
+    found = Variables()
+    modules = {
+        "p4p.client": {},
+        "p4p.client.thread": {"Context": found.context},
+        "p4p.nt": {"NTScalar": lambda code, display: code, "NTNDArray": lambda: "image"},
+        "p4p.server": {"Server": found.server},
+        "p4p.server.thread": {"SharedPV": found.Shared},
+    }
+    for name, content in {"p4p": {}, **modules}.items():
+        module = ModuleType(name)
+        vars(module).update(content)
+        monkeypatch.setitem(sys.modules, name, module)
+        parent, _, child = name.rpartition(".")
+        if parent:
+            setattr(sys.modules[parent], child, module)
+    return found
+
+
+def received(value: Any, kind: str = "epics:nt/NTScalar:1.0", severity: int = 0, **fields: Any) -> Any:
+    """Update of a monitor."""
+
+    class Raw(dict[str, Any]):
+        def getID(self) -> str:
+            return kind
+
+    return SimpleNamespace(raw=Raw({"value": value, **fields}), severity=severity)
+
+
+def choice(index: int) -> Any:
+    fields = {"value.choices": ["parked", "moving"], "value.index": index}
+    return received(None, "epics:nt/NTEnum:1.0", **fields)
+
+
+def variable(name: str, kind: Kind, put: Put | None = None) -> Variable:
+    return Variable(name, kind, "", name, None, put)
+
+
+class Operation:
+    """A client's put, and how it ended: "" if it succeeded."""
+
+    def __init__(self, value: Any) -> None:
+        self.value = lambda: value
+        self.ended: list[str] = []
+
+    def done(self, error: str = "") -> None:
+        self.ended.append(error)
+
+
+def gateway(offered: tuple[Variable, ...] = (), ask: Callable[[Put, Any], object] = print) -> EpicsGateway:
+    return EpicsGateway(CONFIG, offered, ask, lambda: None)
+
+
+def test_a_variable_is_posted_when_it_changes_and_is_invalid_with_a_fault(pvs: Variables) -> None:
+    kinds = {"mode": Kind.TEXT, "rate": Kind.NUMBER, "error": Kind.NUMBERS, "close": Kind.BOOLEAN, "frame": Kind.IMAGE}
+    served = gateway(tuple(variable(name, kind) for name, kind in kinds.items()))
+    assert served.port == 5075
+    assert pvs.conf["EPICS_PVAS_INTF_ADDR_LIST"] == "127.0.0.1"
+    assert {name: pv.nt for name, pv in pvs.items()} == {
+        "night:mode": "s",
+        "night:rate": "d",
+        "night:error": "ad",
+        "night:close": "?",
+        "night:frame": "image",
+    }
+    values = {"mode": "closed", "rate": 1000.0, "error": np.array([1.0, 2.0])}
+    served.update(values, "")
+    served.update(values | {"rate": 999.0, "frame": np.ones((1, 2))}, "")
+    served.update({}, "the controller does not answer")
+    fault = (3, "the controller does not answer")
+    assert {name: pv.posts for name, pv in pvs.items()} == {
+        "night:mode": [("closed", 0, ""), ("", *fault)],
+        "night:rate": [(1000.0, 0, ""), (999.0, 0, ""), (0.0, *fault)],
+        "night:error": [([1.0, 2.0], 0, ""), ([], *fault)],
+        "night:close": [(False, 0, ""), (False, *fault)],
+        "night:frame": [([[1.0, 1.0]], 0, "")],
+    }
+    served.close()
+    assert pvs.closed == ["BENCH:MASK", "context", "server"]
+
+
+def test_a_put_is_a_request_and_fails_with_its_refusal(pvs: Variables) -> None:
+    asked: list[tuple[Any, Any]] = []
+
+    def ask(put: Put, value: Any) -> None:
+        asked.append((put, value))
+        if value == [9.0]:
+            raise RequestRefusedError("gain refused: unstable")
+
+    def put(loop: Client, value: Any) -> Answer:
+        raise AssertionError("only `ask` requests")
+
+    gateway(
+        (variable("gain", Kind.NUMBERS, put), variable("close", Kind.BOOLEAN, put), variable("mode", Kind.TEXT)), ask
+    )
+    assert pvs["night:mode"].handler is None
+    ended = []
+    for name, value in (("gain", np.array([0.2])), ("gain", np.array([9.0])), ("close", True), ("close", False)):
+        operation = Operation(value)
+        pvs[f"night:{name}"].handler.put(pvs[f"night:{name}"], operation)
+        ended += operation.ended
+    assert asked == [(put, [0.2]), (put, [9.0]), (put, True)], "a display writes False to reset a button"
+    assert ended == ["", "gain refused: unstable", "", ""]
+
+
+@pytest.mark.parametrize(
+    ("update", "value"),
+    [
+        (received(True), True),
+        (received(2), 2.0),
+        (received("parked"), "parked"),
+        (choice(1), "moving"),
+        (choice(2), None),
+        (received(np.nan), None),
+        (received([1, 2]), None),
+        (received(2.0, severity=3), None),
+        (TimeoutError("disconnected"), None),
+    ],
+)
+def test_a_monitored_variable_is_a_bench_value_while_it_is_valid(update: Any, value: Any, pvs: Variables) -> None:
+    changes: list[dict[str, Any]] = []
+    served = EpicsGateway(CONFIG, (), print, lambda: changes.append(dict(served.bench)))
+    pvs.monitors["BENCH:MASK"](received("before"))
+    pvs.monitors["BENCH:MASK"](update)
+    assert changes == [{"mask": "before"}, {} if value is None else {"mask": value}]
+    assert [type(one) for one in served.bench.values()] == ([] if value is None else [type(value)])
+
+
+def test_a_port_in_use_is_an_error_with_the_address(pvs: Variables) -> None:
+    pvs.busy = True
+    with pytest.raises(BusError, match=r"127\.0\.0\.1:5075: address in use"):
+        gateway()
+
+
+@pytest.fixture
+def signals() -> Iterator[None]:
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.usefixtures("signals")
+def test_the_command_serves_a_run_until_it_is_stopped(
+    pvs: Variables, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Stopped by SIGTERM when the first frame is posted."""
+    hub, bench, plain = MemoryHub(), list[Sample](), pvs.Shared.post
+    controller = MemoryBus(hub, "controller", HostClock())
+    controller.subscribe(BENCH, bench.append)
+    states = controller.publisher(CONTROLLER_STATE)
+    health, frames = controller.publisher(HEALTH, "controller"), controller.publisher(FRAME)
+
+    def make_bus(links: object, role: str, clock: HostClock, *, monitor: bool) -> MemoryBus:
+        assert monitor
+        return MemoryBus(hub, role, clock)
+
+    def watch(*arguments: Any) -> Any:
+        made = command_watch(*arguments)
+        states.put(wire.ControllerState(mode=wire.LOOP_MODE_CLOSED).SerializeToString())
+        health.put(wire.Health(process="controller", pid=7, rate_hz=250).SerializeToString())
+        frames.put(image(np.ones((2, 3), np.uint16), 1, "toy").SerializeToString())
+        pvs.monitors["BENCH:MASK"](received(True))
+        return made
+
+    def post(pv: Variables.Shared, value: Any, **more: Any) -> None:
+        plain(pv, value, **more)
+        if pv.nt == "image":
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    (tmp_path / "config.toml").write_text('[gateway]\nbench = { mask = "BENCH:MASK" }\n')
+    command_watch = command.Watch
+    monkeypatch.setattr(command, "Watch", watch)
+    monkeypatch.setattr(pvs.Shared, "post", post)
+    monkeypatch.setattr(command, "ZenohBus", make_bus)
+    monkeypatch.setattr(command, "the_run", lambda run: run)
+    monkeypatch.setattr(
+        command, "open_run", lambda *_: SimpleNamespace(path=tmp_path, links=SimpleNamespace(run_id="bench"))
+    )
+    done = lowfc("gateway", "epics", "--run", "bench")
+    assert done.exit_code == 0, done.output
+    assert pvs["lowfc:mode"].posts == [("closed", 0, "")]
+    assert pvs["lowfc:rate"].posts == [(250.0, 0, "")]
+    assert pvs["lowfc:frame"].posts == [([[1] * 3] * 2, 0, "")]
+    assert [(one.key, decode_bench_value(one.payload)) for one in bench] == [("lowfc/bench/mask", True)]
+    assert pvs.closed == ["BENCH:MASK", "context", "server"]
