@@ -131,14 +131,6 @@ def check_stable(law: LinearLaw, delay_frames: float) -> None:
                 )
 
 
-def margins_in_words(found: Margins) -> str:
-    """The smallest margins of all modes in words."""
-    return (
-        f"gain margin {found.gain_margin.min():.3g}, phase margin {found.phase_margin_deg.min():.0f} deg, "
-        f"max |S| {found.peak.max():.3g}"
-    )
-
-
 def rejection(law: LinearLaw, frequency_hz: Array, delay_frames: float | None = None) -> Array:
     """`|S|` (frequencies, modes) at frequencies in Hz: true residual over disturbance.
 
