@@ -11,7 +11,9 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.logs.sequence_gaps import Gaps
+from lowfc.adapters.logs.writer import LogWriter
 from lowfc.adapters.process.terminal import INTERRUPTED
 from lowfc.contract.configuration import load
 from lowfc.contract.envelope import sequence_of
@@ -22,7 +24,7 @@ from lowfc.programs.reliability.chaos.bench import PATIENCE_S, Ended, Outcome
 from lowfc.programs.reliability.chaos.case import Case, lacking
 from lowfc.programs.reliability.chaos.cases import CASES
 from lowfc.programs.reliability.chaos.command import chaos, configured
-from lowfc.programs.reliability.chaos.evidence import FORGED_S, Entry, Evidence
+from lowfc.programs.reliability.chaos.evidence import FORGED_S, Entry, Evidence, read
 from lowfc.programs.reliability.chaos.frames import FAULTY_FRAMES, FIRST
 from lowfc.programs.reliability.chaos.rules import FLOOR_NM, WITHIN, Finding, judge, recovered_s, restart_steps_nm
 from sim_camera.faults import Kind
@@ -204,6 +206,36 @@ def test_the_time_to_recover_starts_with_the_first_frame_of_the_new_controller(
     assert recovered_s(outcome, evidence) == pytest.approx(50 * 0.004, abs=0.01)
     evidence.entries[TRUTH][600:] = [truth(index, 40.0) for index in range(600, FRAMES)]
     assert recovered_s(outcome, evidence) is None
+
+
+def test_logs_are_read_with_their_losses_and_what_cannot_be_read(tmp_path: Path) -> None:
+    def log(name: str, finished: bool, *samples: tuple[Topic, bytes]) -> None:
+        writer = LogWriter(tmp_path / name, 0, {})
+        for number, (topic, payload) in enumerate(samples):
+            writer.write(Sample(topic.at("dm"), payload, sequence_of(START_S, number), ns(number), ns(number)))
+        if finished:
+            writer.finish({"recording": {f"lost {STEP.key}": "3", "messages": "2"}})
+        else:
+            writer.flush()
+            writer.abandon()
+
+    log(
+        "1.mcap",
+        True,
+        (COMMAND, shape(1, 5.0).message.SerializeToString()),
+        (STEP, step(1).message.SerializeToString()),
+    )
+    log("2.mcap", True, (TRUTH, b"\xff"))
+    log("3.mcap", False, (TRUTH, truth(1, 2.0).message.SerializeToString()))
+    (tmp_path / "4.mcap").write_bytes(b"damaged")
+    found = read(tmp_path)
+    assert [len(found.entries[topic]) for topic in (COMMAND, STEP, TRUTH)] == [0, 1, 1]  # the command has no actuators
+    assert found.lost == {STEP.key: 6}
+    assert [finished for _, finished in found.last_ns] == [True, True, False, False]
+    assert found.messages == 4
+    undecodable, damaged = found.unreadable
+    assert TRUTH.key in undecodable
+    assert "4.mcap" in damaged
 
 
 def test_every_case_has_a_valid_configuration_and_known_events(tmp_path: Path) -> None:

@@ -3,20 +3,26 @@
 import json
 import os
 import random
+import resource
 import signal
+import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock, call
 
 import psutil
 import pytest
 
+from lowfc.adapters.logs import writer
 from lowfc.adapters.process.child import Child
 from lowfc.contract.configuration import load
 from lowfc.contract.messages import TIMING, Role, wire
-from lowfc.programs.reliability.chaos import bench, console, processes
+from lowfc.programs.reliability.chaos import bench, console, disk, processes
 from lowfc.programs.reliability.chaos.bench import CaseFailedError, ChaosBench, Ended
+from lowfc.programs.reliability.chaos.case import WHILE_FRAMES
 from lowfc.programs.reliability.chaos.cases import CASES
 from lowfc.programs.reliability.chaos.console import TerminalConsole
 from lowfc.testing.clock import FakeClock
@@ -76,8 +82,57 @@ def test_a_process_that_a_process_leaves_behind_is_reported(sleeping: ChaosBench
     sleeping.end()
     assert sleeping.outcome.ended == [Ended("camera", 0, sleeping.outcome.ended[0].after_s, requested=False)]
     (left,) = sleeping.outcome.alive
-    assert left.startswith("sleep (")
     os.kill(int(left.split("(")[1].split(",")[0]), signal.SIGKILL)
+
+
+def test_a_disk_fills_up_by_a_limit_of_the_recorders_files(sleeping: ChaosBench) -> None:
+    sleeping.restart(Role.RECORDER, ready=False)
+    (sleeping.folder / "a.mcap.part").write_bytes(bytes(500))
+    sleeping.health[Role.RECORDER] = wire.Health(recording=wire.Recording(failure="no space left"))
+    CASES["disk-full"].act(sleeping)
+    process = sleeping.children[Role.RECORDER].process
+    assert process is not None
+    assert resource.prlimit(process.pid, resource.RLIMIT_FSIZE) == (500 + disk.ROOM_BYTES,) * 2
+    sleeping.end()
+
+
+def test_a_recorder_on_a_slow_disk_writes_late_where_it_should(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The program that replaces the recorder is executed here; instead of recording it writes ten times."""
+    started = Mock(
+        spec=ChaosBench, children={Role.RECORDER: SimpleNamespace(command=["python", "-m", "lowfc", "record"])}
+    )
+    disk._on_slow_disk(started, 3.0, 4, 2)
+    assert started.method_calls[:2] == [call.signal(Role.RECORDER, signal.SIGTERM), call.await_end(Role.RECORDER, 0)]
+    (_, (python, option, program, *arguments)), ready = started.restart.call_args
+    assert (python, option, arguments, ready) == ("python", "-c", ["3.0", "4", "2", "record"], {"ready": True})
+
+    waited: list[tuple[int, float]] = []
+
+    def record() -> None:
+        assert sys.argv == ["lowfc", "record"]
+        for _ in range(10):
+            file.write(b"abc")
+
+    monkeypatch.setattr(writer._File, "write", writer._File.write)  # restored afterwards
+    monkeypatch.setattr("lowfc.programs.cli.main.main", record)
+    monkeypatch.setattr(sys, "argv", ["-c", *arguments])
+    monkeypatch.setattr(time, "sleep", lambda seconds: waited.append((file.size, seconds)))
+    with writer._File(tmp_path / "log", 0o600) as file:
+        exec(program, {})  # noqa: S102  # our own
+    assert waited == [(12, 3.0), (15, 3.0)]
+    assert file.size == 30
+
+
+def test_a_camera_with_another_clock_is_replaced_by_one_with_the_hosts() -> None:
+    bench = Mock(spec=ChaosBench, children={Role.CAMERA: SimpleNamespace(command=["sim-camera"])})
+    CASES["clock-behind"].act(bench)
+    assert bench.method_calls == [
+        call.kill(Role.CAMERA),
+        call.restart(Role.CAMERA, ["unshare", "--time", "--monotonic", "-3600", "sim-camera"]),
+        call.frames(WHILE_FRAMES),
+        call.kill(Role.CAMERA),
+        call.restart(Role.CAMERA, ["sim-camera"]),
+    ]
 
 
 def test_every_killed_or_stopped_process_continues_in_the_random_case() -> None:
