@@ -80,7 +80,7 @@ def test_an_existing_stream_is_adopted_unless_another_process_writes_it(folder: 
 
 @pytest.mark.parametrize("busy", [False, True])
 def test_other_channels_are_reported_to_the_loop(busy: bool, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The bridge ends after ten rounds; a busy controller answers from the sixth on; another one starts in the fourth."""
+    """It ends after ten rounds; a busy controller answers from the sixth on, another one starts in the fourth."""
     hub, clock, received = MemoryHub(), FakeClock(AT_NS), list[wire.Request]()
     controller = MemoryBus(hub, "controller", clock)
     controller.publisher(CALIBRATION).put(encode_calibration(identified(calibration()), 0))
