@@ -7,7 +7,7 @@ import stat
 from collections.abc import Iterator
 from pathlib import Path
 
-from lowfc.contract.errors import DataFileError
+from lowfc.contract.errors import ConfigurationError, DataFileError
 
 
 @contextlib.contextmanager
@@ -50,7 +50,11 @@ def require_folder(*files: Path | None) -> None:
 
     Raises:
         DataFileError: A file's folder does not exist.
+        ConfigurationError: Two files are the same.
     """
-    for file in files:
-        if file is not None and not file.parent.is_dir():
+    written = [file for file in files if file is not None]
+    for file in written:
+        if not file.parent.is_dir():
             raise DataFileError(f"{file} cannot be written: there is no directory {file.parent}")
+    if len({file.resolve() for file in written}) < len(written):
+        raise ConfigurationError(f"these must be different files: {', '.join(map(str, written))}")

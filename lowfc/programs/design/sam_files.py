@@ -47,10 +47,7 @@ def check_files(out: Path, resume: Path | None, *others: Path | None) -> Path:
     if out.suffix != ".json":
         raise ConfigurationError(f"--out must end in .json, the only type read as a layout file; got {out}")
     state = resume if resume is not None else out.with_name(f"{out.name}.state.json")
-    files = [file for file in (out, state, *others) if file is not None]
-    require_folder(*files)
-    if len({file.resolve() for file in files}) < len(files):
-        raise ConfigurationError(f"these must be different files: {', '.join(map(str, files))}")
+    require_folder(out, state, *others)
     if resume is None and state.exists():
         raise ConfigurationError(f"{state} holds an interrupted search: continue with --resume {state}, or delete it")
     return state
