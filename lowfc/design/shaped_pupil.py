@@ -65,10 +65,11 @@ class Request:
     def __post_init__(self) -> None:
         if self.cells < 8 or SAMPLES // 2 % self.cells:
             raise ValueError(f"cells must be 8, 16, 32, 64, 128 or 256 in half the diameter, got {self.cells}")
-        if not 0 < self.inner < self.outer <= self.cells:
+        if not 0 < self.inner <= _last_inner(self.outer) or self.outer > self.cells:
             raise ValueError(
-                "the dark zone must begin above 0 and end above that, by the number of cells in half the diameter "
-                f"({self.cells} lambda/D) at most; got {self.inner:g} to {self.outer:g} lambda/D"
+                f"the dark zone must begin above 0 and end at least {FINE_STEP:g} lambda/D above that, by the number "
+                f"of cells in half the diameter ({self.cells} lambda/D) at most; got {self.inner:g} to "
+                f"{self.outer:g} lambda/D"
             )
         if not 0 < self.half_angle_deg <= 90:
             raise ValueError(f"the half-angle must be above 0 and at most 90 degrees, got {self.half_angle_deg:g}")
@@ -230,7 +231,7 @@ def nearest_feasible(request: Request) -> tuple[float | None, float | None]:
     inners = [round(v, 6) for v in request.inner + 0.1 * np.arange(1, round(10 * request.inner) + 1)]
     contrasts = [float(f"{request.contrast * 10 ** (k / 10):.1e}") for k in range(1, 51)]
     return (
-        _first([v for v in inners if v < request.outer], lambda v: is_feasible(replace(coarse, inner=v))),
+        _first([v for v in inners if v <= _last_inner(request.outer)], lambda v: is_feasible(replace(coarse, inner=v))),
         _first([v for v in contrasts if v < 1], lambda v: is_feasible(replace(coarse, contrast=v))),
     )
 
@@ -238,6 +239,11 @@ def nearest_feasible(request: Request) -> tuple[float | None, float | None]:
 def is_feasible(request: Request) -> bool:
     """Whether a mask that is not closed meets the contrast."""
     return [found.contrast <= request.contrast for found in exchange(request)][-1]
+
+
+def _last_inner(outer: float) -> float:
+    """Largest inner radius of a zone with a point of the fine grid, in lambda/D; 1e-9 for rounding."""
+    return outer - FINE_STEP + 1e-9
 
 
 def _first(candidates: Sequence[float], feasible: Callable[[float], bool]) -> float | None:
