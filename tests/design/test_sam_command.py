@@ -244,6 +244,7 @@ def test_command_is_recorded_and_reproduces_the_layout(tmp_path, monkeypatch):
         (("--focal-mask", "square"), "--focal-mask must be"),
         (("--holes", "many"), "--holes must be a number"),
         (("--holes", "9:4"), "number of holes"),
+        (("--holes", "8:"), "--holes must be a number"),
         (("--holes", "2.5"), "--holes must be in steps of 1,"),
         (("--diameter", "0.0705"), "--diameter must be in steps of 0.001"),
         (("--diameter", "2"), "hole diameters"),

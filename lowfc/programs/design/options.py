@@ -27,9 +27,9 @@ def command_line(command: str, request: Any) -> str:
 
 def span(option: str, text: str) -> tuple[float, float]:
     """Parse LOW:HIGH, or one value for both; ValueError if it is neither, or not finite."""
-    low, _, high = text.partition(":")
+    low, colon, high = text.partition(":")
     try:
-        found = float(low), float(high or low)
+        found = float(low), float(high if colon else low)
     except ValueError:
         found = nan, nan
     if not all(map(isfinite, found)):
