@@ -24,6 +24,7 @@ from lowfc.optics.chain.sensor import pupil_radii, reference, response
 from lowfc.optics.chain.zernike import NOLLS_14, NOLLS_20, zernikes
 from lowfc.optics.detector.photometry import electrons
 from lowfc.programs.design.command import design_app
+from lowfc.programs.design.full_light_request import Spot
 
 LIGHT_E = electrons(STAR, TABLE4_EXPOSURE_S)
 # Noise of 14 modes in nm, and the share of the quantum limit, from an independent calculation.
@@ -120,12 +121,29 @@ def test_the_command_writes_the_keys_of_the_best(tmp_path, monkeypatch):
     assert "spot_diameter" in str(wrong.exception)
 
 
-@pytest.mark.parametrize("words", [("zwfs", "--spot", "3:0.5"), ("clowfs", "--defocus", "8:1.5")])
-def test_a_reversed_range_is_refused_before_the_search(words, monkeypatch):
-    monkeypatch.setattr("lowfc.programs.design.full_light.sweep", None)
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("zwfs", "--spot", "3:0.5"), "in order"),
+        (("clowfs", "--defocus", "8:1.5"), "in order"),
+        (("zwfs", "--spot", "1:100"), "spot_diameter = 100.0: must be less than or equal to 8"),
+        (("zwfs", "--spot", "1:"), "--spot must be a number or LOW:HIGH, got '1:'"),
+        (
+            ("zwfs", "--weight", "0.3"),
+            "a weight, 0 to 1, belongs to the merits paper and pareto; got 0.3 with 'contrast'",
+        ),
+        (("zwfs", "--out", "a.toml", "--plot", "./a.toml"), "must be different files"),
+    ],
+)
+def test_impossible_options_are_refused_before_the_search(words, message, monkeypatch):
+    monkeypatch.setattr("lowfc.programs.design.full_light.Focus", None)
     error = CliRunner().invoke(design_app, words).exception
     assert isinstance(error, ConfigurationError)
-    assert "in order" in str(error)
+    assert message in str(error)
+
+
+def test_the_default_weight_is_one_half():
+    assert [Spot(merit=name).goal.weight for name in ("paper", "pareto", "contrast")] == [0.5, 0.5, None]
 
 
 def test_sampling_of_the_holes_changes_the_image_by_under_1_percent():

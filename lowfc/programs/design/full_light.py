@@ -52,6 +52,8 @@ def design(sizes: Sizes, goal: Goal, out: Path, plot: Path | None) -> Sweep:
     if plot is not None:
         figure_class()
     require_folder(out, plot)
+    for end in (sizes.low, sizes.high):
+        _section(sizes, end)  # refuses a size that the configuration does not allow
     key = KEYS[sizes.kind]
 
     @cache

@@ -28,13 +28,13 @@ class _Request(ABC):
         merit: Figure of merit to optimise: paper, table3, table4, condition, throughput, pareto or contrast.
         estimator: pinv, or weighted for the Cramer-Rao bound.
         modes: Modes in Table 3 and the condition number: 14 or 20.
-        weight: Weight of Table 4 in paper and pareto, 0 to 1.
+        weight: Weight of Table 4 in paper and pareto, 0 to 1. Default: 0.5.
     """
 
     merit: str = "contrast"
     estimator: str = "weighted"
     modes: int = 14
-    weight: float = 0.5
+    weight: float | None = None
 
     def __post_init__(self) -> None:
         _ = self.goal  # validated here
@@ -47,7 +47,8 @@ class _Request(ABC):
     @cached_property
     def goal(self) -> Goal:
         """The figure of merit to minimise."""
-        return Goal(self.merit, self.estimator, self.modes, self.weight if self.merit in WEIGHTED else None)
+        weight = 0.5 if self.weight is None and self.merit in WEIGHTED else self.weight
+        return Goal(self.merit, self.estimator, self.modes, weight)
 
     @property
     @abstractmethod
