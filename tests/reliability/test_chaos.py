@@ -1,6 +1,7 @@
 """The rules of the chaos cases: each holds in a run without a fault, and detects its own kind of fault."""
 
 import json
+import random
 import signal
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,18 +13,19 @@ import typer
 from typer.testing import CliRunner
 
 from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.bus.run import runtime_base
 from lowfc.adapters.logs.sequence_gaps import Gaps
 from lowfc.adapters.logs.writer import LogWriter
 from lowfc.adapters.process.terminal import INTERRUPTED
 from lowfc.contract.configuration import load
 from lowfc.contract.envelope import sequence_of
-from lowfc.contract.errors import ConfigurationError, LowfcError
+from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError
 from lowfc.contract.events import EVENTS, Level
 from lowfc.contract.messages import COMMAND, EVENT, FRAME, MIRROR_STATE, STEP, TRUTH, Log, Topic, wire
 from lowfc.programs.reliability.chaos.bench import PATIENCE_S, Ended, Outcome
 from lowfc.programs.reliability.chaos.case import Case, lacking
 from lowfc.programs.reliability.chaos.cases import CASES
-from lowfc.programs.reliability.chaos.command import chaos, configured
+from lowfc.programs.reliability.chaos.command import _run, chaos, configured
 from lowfc.programs.reliability.chaos.evidence import FORGED_S, Entry, Evidence, read
 from lowfc.programs.reliability.chaos.frames import FAULTY_FRAMES, FIRST
 from lowfc.programs.reliability.chaos.rules import FLOOR_NM, WITHIN, Finding, judge, recovered_s, restart_steps_nm
@@ -331,7 +333,30 @@ def test_the_reason_why_a_command_fails_is_given() -> None:
     assert lacking("requires it", "/not/there") == "requires it (/not/there: No such file or directory)"
 
 
+@pytest.mark.usefixtures("without_loop")
+def test_a_folder_that_cannot_hold_logs_is_refused_before_the_first_case(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for folder in ("file", "file/logs"):
+        with pytest.raises(DataFileError, match="no logs can be kept in file"):
+            run("--case", "stopped", "--keep", folder)
+    Path("chaos-logs").touch()
+    with pytest.raises(DataFileError, match="name another with --keep"):
+        run("--case", "stopped")
+
+
+@pytest.mark.usefixtures("own_runtime")
+def test_an_interrupt_while_a_case_is_prepared_leaves_no_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("lowfc.programs.reliability.chaos.bench.prepare", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        _run(CASE, tmp_path, random.Random(1))  # noqa: S311  # nothing secret
+    assert [path for path in runtime_base().iterdir() if path.is_dir()] == []
+
+
 def test_without_a_case_all_are_listed_and_the_error_of_an_unknown_one_suggests_a_name() -> None:
     assert all(name in run() for name in CASES)
+    assert [one["name"] for one in json.loads(run("--json"))["cases"]] == list(CASES)
     with pytest.raises(ConfigurationError, match="frames-dark"):
         run("--case", "frame-dark")

@@ -98,7 +98,7 @@ class ChaosBench:
     """A simulated loop with injected faults; `children` and `health` are those of the present process of each role."""
 
     def __init__(self, config: Configuration, folder: Path, rng: random.Random, fault: dict[str, Any] | None) -> None:
-        """Prepare a run in its own folder; `fault` is injected into the camera's frames."""
+        """Open a run with its own folder; `fault` is injected into the camera's frames."""
         self.config = config
         self.folder = folder
         self.rng = rng
@@ -109,7 +109,6 @@ class ChaosBench:
         self._steps = self._closed_frames = 0
         self._numbers = itertools.count(1)
         self.run = open_run(new_run_id(), (config.mirror.name,), listeners=(Role.LAUNCHER,))
-        prepare(config, self.run, Console(stderr=True, quiet=True))
         self.children = {child.name: child for child in children_of(config, self.run, None, record=True)}
         if fault is not None:
             file = folder / "fault.json"
@@ -122,7 +121,8 @@ class ChaosBench:
         self.bus: ZenohBus | None = None
 
     def begin(self) -> None:
-        """Start the processes, and wait until the loop has settled."""
+        """Write the run's files, start the processes, and wait until the loop has settled."""
+        prepare(self.config, self.run, Console(stderr=True, quiet=True))
         self._started += self.children.values()
         start_all(self._started)
         self.bus = ZenohBus(self.run.links, Role.LAUNCHER, HostClock())

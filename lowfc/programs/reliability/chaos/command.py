@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from lowfc.adapters.logs.series import existing
 from lowfc.adapters.process.terminal import INTERRUPTED, Json
-from lowfc.contract.errors import ConfigurationError, LowfcError, nearest
+from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError, nearest
 from lowfc.programs.cli.output import print_result
 
 if TYPE_CHECKING:
@@ -52,8 +53,11 @@ def chaos(
     names = list(CASES) if all_ else case or []
     if not names:
         width = max(map(len, CASES))
-        sys.stdout.write("".join(f"{one.name:{width}}  {one.description}\n" for one in CASES.values()))
+        table = "\n".join(f"{one.name:{width}}  {one.description}" for one in CASES.values())
+        listed = [{"name": one.name, "sentence": one.description} for one in CASES.values()]
+        print_result({"cases": listed}, table, as_json=as_json)
         return
+    _require_writable(keep or FAILED_LOGS)
     rows: list[dict[str, Any]] = []
     interrupted = False
     try:
@@ -69,6 +73,13 @@ def chaos(
         raise typer.Exit(INTERRUPTED)
     if results["failed"]:
         raise typer.Exit(1)
+
+
+def _require_writable(folder: Path) -> None:
+    """Check before the first case that logs can be kept in a folder, which may not exist yet."""
+    there = existing(folder)
+    if not there.is_dir() or not os.access(there, os.W_OK):
+        raise DataFileError(f"no logs can be kept in {folder}: {there} is no writable folder; name another with --keep")
 
 
 def run_case(case: "Case", seed: int, keep: Path | None) -> dict[str, Any]:
