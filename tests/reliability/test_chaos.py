@@ -316,6 +316,13 @@ def test_an_unexpected_error_fails_only_its_case_and_its_traceback_is_kept() -> 
     assert "    error: KeyError: 'odd'\n" in table
     assert table.endswith("2 passed, 1 failed, seed 1\n")
     assert 'raise KeyError("odd")' in Path("chaos-logs/odd-1/error.txt").read_text()
+    assert "    logs: chaos-logs/odd-1\n" in table
+    rows = json.loads(run("--case", "good", "--case", "odd", "--case", "lacking", "--json", status=1))["cases"]
+    assert [(row["detail"], row["log"]) for row in rows] == [
+        ("", None),
+        ("error: KeyError: 'odd'", "chaos-logs/odd-1"),
+        ("requires a mount (not here)", None),
+    ]
 
 
 @pytest.mark.usefixtures("without_loop")

@@ -85,9 +85,9 @@ def _require_writable(folder: Path) -> None:
 def run_case(case: "Case", seed: int, keep: Path | None) -> dict[str, Any]:
     """Run one case in its own folder, and judge it; without `keep`, only the log of a failed case is kept."""
     row: dict[str, Any] = {"name": case.name, "sentence": case.description, "seconds": 0.0}
-    row |= {"passed": False, "skipped": case.lacks() or None, "findings": {}, "figures": {}}
+    row |= {"passed": False, "skipped": case.lacks() or None, "log": None, "findings": {}, "figures": {}}
     if row["skipped"]:
-        return row
+        return row | {"detail": row["skipped"]}
     begun_s, folder = time.monotonic(), Path(tempfile.mkdtemp(prefix=f"lowfc-chaos-{case.name}-"))
     try:
         row |= _judged(_run(case, folder, random.Random(f"{seed} {case.name}")), case)  # noqa: S311  # nothing secret
@@ -99,8 +99,18 @@ def run_case(case: "Case", seed: int, keep: Path | None) -> dict[str, Any]:
             kept.parent.mkdir(parents=True, exist_ok=True)
             shutil.rmtree(kept, ignore_errors=True)
             shutil.move(folder, kept)
+            row["log"] = str(kept)
         shutil.rmtree(folder, ignore_errors=True)
-    return row | {"seconds": time.monotonic() - begun_s}
+    return row | {"seconds": time.monotonic() - begun_s, "detail": "; ".join(_wrong(row)) or _recovery(row)}
+
+
+def _wrong(row: dict[str, Any]) -> list[str]:
+    """The rules that did not hold, and what was found."""
+    return [f"{rule}: {one['found']}" for rule, one in row["findings"].items() if not one["held"]]
+
+
+def _recovery(row: dict[str, Any]) -> str:
+    return str(row["findings"].get("recovery", {}).get("found", ""))
 
 
 def _judged(outcome: "Outcome", case: "Case") -> dict[str, Any]:
@@ -174,10 +184,10 @@ def render(results: dict[str, Any]) -> str:
     lines = []
     width = max((len(row["name"]) for row in results["cases"]), default=0)
     for row in results["cases"]:
-        recovery = row["findings"].get("recovery", {}).get("found", "")
-        lines.append(f"{row['name']:{width}}  {_result(row):6}  {row['seconds']:5.1f} s  {recovery}")
-        lines += [f"    {rule}: {one['found']}" for rule, one in row["findings"].items() if not one["held"]]
+        lines.append(f"{row['name']:{width}}  {_result(row):6}  {row['seconds']:5.1f} s  {_recovery(row)}")
+        lines += [f"    {wrong}" for wrong in _wrong(row)]
         lines += [f"    {name}: {value}" for name, value in row["figures"].items()]
+        lines += [f"    logs: {row['log']}"] * (row["log"] is not None)
     totals = [f"{results['passed']} passed", f"{results['failed']} failed"]
     if results["skipped"]:
         totals.append(f"{results['skipped']} skipped")
