@@ -2,6 +2,7 @@
 
 import json
 from collections import Counter
+import signal
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -127,7 +128,7 @@ def test_a_soak_closes_the_loop_whatever_the_file_starts_with(tmp_path: Path, mo
     used: list[Configuration] = []
     monkeypatch.setattr(
         "lowfc.programs.reliability.soak.run.soak_loop",
-        lambda settings, *_: used.append(settings) or {"passed": True},
+        lambda settings, *_: used.append(settings) or {"passed": True, "interrupted": False},
     )
     monkeypatch.setattr("lowfc.programs.reliability.soak.evaluation.render", lambda _: "passed")
     file = tmp_path / "open.toml"
@@ -135,6 +136,25 @@ def test_a_soak_closes_the_loop_whatever_the_file_starts_with(tmp_path: Path, mo
     done = lowfc("soak", "--hours", "0.01", "--config", file)
     assert done.exit_code == 0, done.output
     assert used[0].control.start_mode == "closed"
+
+
+def test_an_interrupted_soak_has_the_results_so_far(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ended: list[float] = []
+    stub: Any = SimpleNamespace(
+        bus=MemoryBus(MemoryHub(), "launcher", HostClock()),
+        outcome=SimpleNamespace(mode=wire.LOOP_MODE_CLOSED, measurements={}),
+        folder=tmp_path,
+        health={},
+        children={},
+        begin=lambda: None,
+        end=ended.append,
+    )
+    monkeypatch.setattr(run, "ChaosBench", lambda *_: stub)
+    monkeypatch.setattr(run, "SAMPLE_S", 0.01)
+    found = run.soak_loop(load(None), 3600.0, lambda _: signal.raise_signal(signal.SIGINT))
+    assert found["interrupted"]
+    assert found["hours"] < 0.01
+    assert len(ended) == 1
 
 
 def log(folder: Path, name: str, counts: dict[str, list[int]]) -> None:

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from lowfc.adapters.process.terminal import ConfigFile, Json, configuration
+from lowfc.adapters.process.terminal import INTERRUPTED, ConfigFile, Json, configuration
 from lowfc.programs.cli.output import print_result
 
 
@@ -17,7 +17,8 @@ def soak(
 
     Finished logs are checked for gaps and removed. Slopes are fitted to the last three quarters of the time, with
     standard errors; memory grows if its slope exceeds three of them. The latency's slope is reported, not judged. The
-    loop must be closed at the end. If the time is too short for a slope, the soak does not pass.
+    loop must be closed at the end. If the time is too short for a slope, the soak does not pass. Ctrl-C ends it early:
+    the results so far are printed, with exit status 130.
 
     Example: lowfc soak --hours 0.5
     """
@@ -36,5 +37,7 @@ def soak(
         task = bar.add_task("soaking", total=hours * 3600)
         results = soak_loop(settings, hours * 3600, lambda elapsed_s: bar.update(task, completed=elapsed_s))
     print_result(results, render(results), as_json=as_json)
+    if results["interrupted"]:
+        raise typer.Exit(INTERRUPTED)
     if not results["passed"]:
         raise typer.Exit(1)

@@ -15,7 +15,7 @@ from lowfc.adapters.logs.sequence_gaps import Gaps
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.messages import EVENT, FRAME, Role, wire
-from lowfc.programs.launch.sim_loop import check
+from lowfc.programs.launch.sim_loop import check, deferred_signals
 from lowfc.programs.launch.watch import topic_count
 from lowfc.programs.reliability.chaos.bench import ChaosBench
 from lowfc.programs.reliability.chaos.processes import CommandTimes
@@ -99,7 +99,7 @@ class _Soak:
             "processes": processes,
             "latency": latency_statistics(self.latency),
         }
-        why = [f"the {name}'s {what} grow" for name, one in processes.items() for what in one["grows"]]
+        why = [f"growth of the {name}'s {what}" for name, one in processes.items() for what in one["grows"]]
         why += [f"{found[key]} {text}" for key, text in _MUST_BE_ZERO.items() if found[key]]
         why += [f"{name} was not finished" for name in unfinished]
         if self.mode != wire.LOOP_MODE_CLOSED:
@@ -112,7 +112,7 @@ class _Soak:
 
 
 def soak_loop(config: Configuration, seconds: float, progress: Callable[[float], None]) -> dict[str, Any]:
-    """Run the loop for this time; the results that `lowfc soak --json` prints."""
+    """Run the loop for this time, or until Ctrl-C; the results that `lowfc soak --json` prints."""
     with tempfile.TemporaryDirectory(prefix="lowfc-soak-") as name:
         logged = config.model_copy(update={"recorder": config.recorder.model_copy(update={"folder": name})})
         bench = ChaosBench(logged, Path(name), random.Random(), None)  # noqa: S311  # nothing secret
@@ -120,10 +120,11 @@ def soak_loop(config: Configuration, seconds: float, progress: Callable[[float],
             bench.begin()
             soak = _Soak(bench)
             begun_s = time.monotonic()
-            while (elapsed_s := time.monotonic() - begun_s) < seconds:
-                soak.sample(elapsed_s)
-                progress(elapsed_s)
-                time.sleep(max(0.0, SAMPLE_S - (time.monotonic() - begun_s - elapsed_s)))
+            with deferred_signals() as interrupted:
+                while (elapsed_s := time.monotonic() - begun_s) < seconds and not interrupted():
+                    soak.sample(elapsed_s)
+                    progress(elapsed_s)
+                    time.sleep(max(0.0, SAMPLE_S - (time.monotonic() - begun_s - elapsed_s)))
             soak.mode = bench.outcome.mode  # before the processes are stopped
         finally:
             begun_s = time.monotonic()
@@ -131,4 +132,4 @@ def soak_loop(config: Configuration, seconds: float, progress: Callable[[float],
             stopped_s = time.monotonic() - begun_s
         soak.checker.check()
         unfinished = [path.name for path in Path(name).glob("*.part")]
-    return soak.results(seconds, stopped_s, unfinished)
+    return soak.results(min(elapsed_s, seconds), stopped_s, unfinished) | {"interrupted": interrupted()}
