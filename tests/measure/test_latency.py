@@ -410,6 +410,20 @@ def test_files_that_are_no_results_or_logs_are_errors(tmp_path: Path) -> None:
     assert isinstance(lowfc("latency", tmp_path / "none.mcap").exception, DataFileError)
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--compare", "a.json", "b.json", "--plot", "c.png"), "--plot has no effect with --compare: omit it"),
+        (("--compare", "a.json", "b.json", "log.mcap"), "logs has no effect with --compare"),
+        (("log.mcap", "--trace"), "--trace has no effect with logs"),
+        (("log.mcap", "--duration", "10", "--json"), "--duration has no effect with logs"),
+    ],
+)
+def test_options_without_effect_are_refused(words: tuple[str, ...], message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message):
+        raise lowfc("latency", *words).exception
+
+
 LATENCY_PROGRAM = (
     "from lowfc.adapters.process.terminal import *; from lowfc.programs.measure.latency.command import latency; "
     "app = new_app(''); app.command()(latency); run_app(app)"

@@ -85,6 +85,15 @@ def run_app(app: Callable[[], object]) -> NoReturn:
     sys.exit(0)
 
 
+def given(context: typer.Context) -> list[str]:
+    """Options (such as --out) and arguments (such as logs) that the command line sets."""
+    return [
+        parameter.opts[0]
+        for parameter in context.command.params
+        if parameter.name and str(context.get_parameter_source(parameter.name)).endswith("COMMANDLINE")
+    ]
+
+
 def configuration(
     file: Path | None, overrides: dict[str, Any] | None = None, defaults: dict[str, Any] | None = None
 ) -> "Configuration":

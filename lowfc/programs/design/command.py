@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from lowfc.adapters.process.terminal import INTERRUPTED, Json, new_app
+from lowfc.adapters.process.terminal import INTERRUPTED, Json, given, new_app
 from lowfc.contract.errors import ConfigurationError
 from lowfc.design.shaped_pupil import Request
 from lowfc.programs.cli.output import print_result
@@ -62,11 +62,13 @@ def sam(
     from lowfc.programs.design.sam_executors import open_executor
     from lowfc.programs.design.sam_files import check_files
 
+    if jobs is not None and scheduler is not None:
+        raise ConfigurationError("--jobs and --scheduler exclude each other: use one")
     if resume is not None:
-        names = [field.name for field in fields(Search)]
-        given = [name for name in names if str(context.get_parameter_source(name)).endswith("COMMANDLINE")]
-        if given:
-            raise ConfigurationError(f"--resume continues the search of {resume}: omit {flag(given[0])}")
+        of_search = {flag(field.name) for field in fields(Search)}
+        for option in given(context):
+            if option in of_search:
+                raise ConfigurationError(f"--resume continues the search of {resume}: omit {option}")
         search, found = resumed(resume)
     else:
         found = begin(search)

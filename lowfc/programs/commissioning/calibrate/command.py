@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from lowfc.adapters.process.terminal import AnyRun, ConfigFile, Json, new_app
+from lowfc.adapters.process.terminal import AnyRun, ConfigFile, Json, given, new_app
 from lowfc.contract.errors import ConfigurationError
 from lowfc.programs.cli.result import print_result
 
@@ -74,14 +74,10 @@ def calibrate(
 
     Example: lowfc calibrate --method poke --snr 300 --out night.fits
     """
-    given = [
-        parameter.opts[0]
-        for parameter in context.command.params
-        if parameter.name and str(context.get_parameter_source(parameter.name)).endswith("COMMANDLINE")
-    ]
+    options = given(context)
     if context.invoked_subcommand is not None:
-        if given:
-            raise ConfigurationError(f"{given[0]} is before `{context.invoked_subcommand}`: put the options after it")
+        if options:
+            raise ConfigurationError(f"{options[0]} is before `{context.invoked_subcommand}`: put the options after it")
         return
     from lowfc.adapters.files.calibration_file import load as read
     from lowfc.programs.commissioning.calibrate import tasks
@@ -91,14 +87,14 @@ def calibrate(
     if compare is not None:
         print_result(comparison(*map(read, compare)), as_json=as_json)
         return
-    if cycles is not None and "--snr" not in given:
+    if cycles is not None and "--snr" not in options:
         snr = MIN_SNR
     request = CalibrationRequest(method, out, snr, cycles, amplitude, resume, truncate, tikhonov)
     if method == "analytic":
         print_result(tasks.computed(config, request, at, run if load else None, load=load), as_json=as_json)
         return
     for option in ("--config", "--at"):
-        if option in given:
+        if option in options:
             raise ConfigurationError(
                 f"{option} requires --method analytic: a running loop is measured at its present wavefront and with "
                 "its own configuration"

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lowfc.adapters.files.whole_file import require_folder, write_whole
-from lowfc.adapters.process.terminal import ConfigFile, Json, LogsOrMeasure, configuration
+from lowfc.adapters.process.terminal import ConfigFile, Json, LogsOrMeasure, configuration, given
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.programs.cli.output import print_result
 
@@ -42,6 +42,7 @@ class Camera(StrEnum):
 
 
 def latency(
+    context: typer.Context,
     logs: LogsOrMeasure = None,
     duration: Annotated[float, typer.Option(min=0.5, max=1e5, help="Duration of each repeat, seconds.")] = 10.0,
     rate: Annotated[float | None, typer.Option(help="Frames per second; default: the file's, or 1000.")] = None,
@@ -77,9 +78,12 @@ def latency(
     from lowfc.programs.measure.latency.text import compared, picture, table
 
     if compare is not None:
+        _refuse_others(context, "--compare", "--json")
         found = _compare(compare)
         print_result(found, compared(found), as_json=as_json)
         return
+    if logs:
+        _refuse_others(context, "logs", "--plot", "--json")
     require_folder(plot)
     if plot is not None:
         from lowfc.adapters.files.drawing import figure_class
@@ -103,6 +107,13 @@ def latency(
     if plot is not None:
         write_whole(plot, picture(results))
     print_result(results, table(results), as_json=as_json)
+
+
+def _refuse_others(context: typer.Context, what: str, *used: str) -> None:
+    """Refuse the options that have no effect with `--compare` or with logs."""
+    for option in given(context):
+        if option not in (what, *used):
+            raise ConfigurationError(f"{option} has no effect with {what}: omit it")
 
 
 def _configuration(file: Path | None, rate: float | None, camera: Camera, *, plain: bool) -> "Configuration":
