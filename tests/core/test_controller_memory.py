@@ -224,6 +224,14 @@ def test_closing_the_loop_corrects_every_mode(rig: Rig) -> None:
     assert (np.abs(pol - injected) < allowed).all()
 
 
+def test_the_time_not_closed_is_counted_from_the_first_frame(rig: Rig) -> None:
+    rig.expose(20)
+    rig.steps(1)
+    health = wire.Health()
+    rig.controller.fill(health)
+    assert health.not_closed_ns == 19 * CONFIG.period_ns
+
+
 def test_a_reply_names_the_first_frame_that_the_request_affects(rig: Rig) -> None:
     rig.expose(5)
     newest = rig.steps(1)[0].frame_sequence

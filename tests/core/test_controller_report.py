@@ -74,12 +74,24 @@ def test_every_cause_of_a_loop_that_was_not_closed_is_named() -> None:
     assert cause.endswith("; other causes (48 times)")
 
 
+@pytest.mark.parametrize(("not_closed_s", "fraction"), [(0, 1.0), (3, 0.7), (10, 0.0)])
+def test_the_closed_fraction_is_that_of_the_time_between_first_and_last_frame(
+    not_closed_s: int, fraction: float
+) -> None:
+    received = wire.TopicCount(topic=FRAME.key, received=1001)
+    controller = wire.Health(topics=[received], not_closed_ns=not_closed_s * SECOND)
+    camera = wire.Health(mean_rate_hz=100.0)
+    assert summary(Watch({"controller": controller, "camera": camera}, []), False)["closed_fraction"] == fraction
+    camera.mean_rate_hz = 30.0  # in lockstep, that of the real time
+    assert summary(Watch({"controller": controller, "camera": camera}, []), False, 100.0)["closed_fraction"] == fraction
+
+
 def test_summary_and_status_show_the_time_not_closed() -> None:
     def first(**health: Any) -> str:
         watch = Watch({"controller": wire.Health(**health)}, [])
-        return summary_text(summary(watch, record=False, rate_hz=250.0)).splitlines()[0].split(maxsplit=1)[1]
+        return summary_text(summary(watch, record=False)).splitlines()[0].split(maxsplit=1)[1]
 
-    results = summary(Watch({}, []), record=False, rate_hz=250.0)
+    results = summary(Watch({}, []), record=False)
     assert "over the open pupil, second half of the run" in summary_text(results)
     not_closed = {"not_closed_ns": 3 * SECOND, "not_closed_cause": "the camera does not fit"}
     assert first(mode=wire.LOOP_MODE_CLOSED) == "closed"
@@ -149,7 +161,7 @@ def test_added_contrast_is_shown_for_a_flat_mirror_and_the_present_one() -> None
     watch = Watch({"camera": camera}, [])
     expected = "added to the dark zone's contrast: flat mirror +7.0e-10, residual -4.0e-11"
     assert expected in status.text(status.json_object(message, {"camera": camera}))
-    assert expected in summary_text(summary(watch, record=False, rate_hz=250.0))
+    assert expected in summary_text(summary(watch, record=False))
     assert "  contrast -4.0e-11 of +7.0e-10  " in status_line(watch, 5.0)
 
 
@@ -198,7 +210,7 @@ def test_frames_published_after_the_last_received_one_count_as_lost(received: in
         topics=[wire.TopicCount(topic=FRAME.key, received=received, missing=missing)],
     )
     camera = wire.Health(topics=[wire.TopicCount(topic=FRAME.key, published=500)])
-    results = summary(Watch({"recorder": recorder, "camera": camera}, []), record=True, rate_hz=250.0)
+    results = summary(Watch({"recorder": recorder, "camera": camera}, []), record=True)
     assert (results["messages_lost"], results["lost"].get(FRAME.key, 0)) == (lost, lost)
 
 

@@ -210,10 +210,11 @@ class Controller:
         self._watch_gains(outputs)
         if self._state.frame_sequence != newest:  # an old frame does not show that the camera is alive
             self._last_frame_ns = start_ns
+        if not newest:  # the first frame
+            self._not_closed.note(self._state, clock.now_ns())
         self._service.work += 1
         self._frame_to_command.add(sent_ns - sample.publish_time_ns)
-        times_ns = sample.receive_time_ns, start_ns, ready_ns, sent_ns
-        self._timing.add(sample.sequence, sample.publish_time_ns, times_ns)
+        self._timing.add(sample.sequence, sample.publish_time_ns, (sample.receive_time_ns, start_ns, ready_ns, sent_ns))
         if clock.now_ns() >= self._state_due_ns:  # not the frame's time: the camera may have another clock
             self._publish_state(frame.time_ns)
         if self._warmup is not None:

@@ -73,7 +73,7 @@ def sim_loop(
         bus.close()
         stop_all(children)
         run.remove()
-    return {"run": run.run_id} | summary(watch, record, config.camera.rate_hz)
+    return {"run": run.run_id} | summary(watch, record, config.camera.rate_hz if config.lockstep else None)
 
 
 def _new_run(config: Configuration, name: str | None) -> Run:

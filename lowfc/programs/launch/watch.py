@@ -38,10 +38,12 @@ class Watch:
         del self.events[:-100]
 
 
-def summary(watch: Watch, record: bool, rate_hz: float) -> dict[str, Any]:
-    """Summary of a run with this frame rate, from the last Health of each process."""
+def summary(watch: Watch, record: bool, lockstep_hz: float | None = None) -> dict[str, Any]:
+    """Summary of a run, from the last Health of each process; `lockstep_hz` is the frame rate in simulated time."""
     camera, controller = watch.of(Role.CAMERA), watch.of(Role.CONTROLLER)
     frames, not_closed_s = topic_count(controller, FRAME.key), controller.not_closed_ns * 1e-9
+    periods = frames.received - 1  # from the first frame to the last
+    rate_hz = camera.mean_rate_hz if lockstep_hz is None else lockstep_hz
     results: dict[str, Any] = {
         "rate_hz": round(camera.mean_rate_hz, 2),
         "frames_published": topic_count(camera, FRAME.key).published,
@@ -51,7 +53,7 @@ def summary(watch: Watch, record: bool, rate_hz: float) -> dict[str, Any]:
         "commands_applied": camera.frame_to_mirror.count,
         "commands_late": camera.commands_late,
         "mode": mode_name(controller.mode),
-        "closed_fraction": round(max(0.0, 1 - not_closed_s * rate_hz / frames.received), 4) if frames.received else 0.0,
+        "closed_fraction": round(max(0.0, 1 - not_closed_s * rate_hz / periods), 4) if periods > 0 else 0.0,
         "not_closed_s": round(not_closed_s, 3),
         "not_closed_cause": controller.not_closed_cause,
         "messages_recorded": None,
