@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 from lowfc.adapters.files.sensors import sensor_named
 from lowfc.adapters.files.twin_cache import load_or_build
 from lowfc.adapters.process.terminal import Json
-from lowfc.arrays import Array
+from lowfc.design.trials import LITERAL_WAVES, bounds_waves
 from lowfc.optics.chain.band import gauss_legendre, monochromatic
 from lowfc.optics.chain.sensor import image, pupil_radii
 from lowfc.optics.chain.zernike import NOLLS_20, zernikes
@@ -47,7 +47,8 @@ def bench_twin(seconds: float = 1.0, cache_dir: Path | None = None) -> dict[str,
         ("monochromatic, rank 80", ACCURATE, monochromatic(nm)),
         ("20 % band in 3 wavelengths, rank 60", FAST, gauss_legendre(nm)),
     )
-    coefficients_nm = nm * random_coefficients_waves(np.random.default_rng(1), WAVEFRONTS)
+    uniform = np.random.default_rng(1).uniform(-1.0, 1.0, (WAVEFRONTS, len(NOLLS_20)))
+    coefficients_nm = nm * uniform * bounds_waves(NOLLS_20, *LITERAL_WAVES)
     opds_nm = np.tensordot(coefficients_nm, zernikes(NOLLS_20, *pupil_radii(optics)), 1)
     results = []
     with threadpool_limits(1):
@@ -79,12 +80,6 @@ def bench_twin(seconds: float = 1.0, cache_dir: Path | None = None) -> dict[str,
     top = {key: results[0][key] for key in ("twin_us", "full_us", "ratio", "relative_l2", "rank")}
     host = {"machine": platform.machine(), "python": platform.python_version(), "numpy": np.__version__}
     return {**top, "sensor": SENSOR, "wavefronts": WAVEFRONTS, "cases": results, "host": host}
-
-
-def random_coefficients_waves(rng: np.random.Generator, count: int) -> Array:
-    """Random wavefronts (count, 20), Noll 2 to 21, uniform within 0.04 waves rms for n = 1, 2 and 0.016 above."""
-    bounds = np.where(np.array(NOLLS_20) <= 6, 0.04, 0.016)
-    return np.asarray(rng.uniform(-1.0, 1.0, (count, bounds.size)) * bounds)
 
 
 def render(result: dict[str, Any]) -> str:
