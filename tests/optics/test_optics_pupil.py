@@ -183,6 +183,7 @@ def test_misspelt_sensor_name_gets_a_suggestion():
     ("keys", "complaint"),
     [
         ({"kind": "clowfs", "inner_radius": 5.0}, "inner_radius, 5.0"),
+        ({"kind": "clowfs", "inner_radius": 3.9999}, "thinner than the sampling"),
         ({"kind": "clowfs", "defocus_mm": 1.0, "focal_ratio": 100.0}, "increase the distance"),
         ({"kind": "clowfs", "inner_radius": 1.0, "focal_mask": "bowtie"}, "bowtie has neither"),
         ({"kind": "zwfs", "focal_mask": "bowtie"}, "bowtie has neither"),

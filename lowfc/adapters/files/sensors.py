@@ -184,5 +184,11 @@ def _focal_mask(section: SensorSection) -> NDArray[np.inexact]:
             raise ValueError(
                 f"inner_radius, {section.inner_radius} lambda/D, must be below focal_radius, {section.focal_radius}"
             )
-        return disk(radius=section.focal_radius, inner_radius=section.inner_radius)
+        annulus = disk(radius=section.focal_radius, inner_radius=section.inner_radius)
+        if not annulus.any():
+            raise ValueError(
+                f"the annulus of {section.inner_radius} to {section.focal_radius} lambda/D is thinner than the "
+                "sampling of the focal plane: reduce inner_radius"
+            )
+        return annulus
     return disk(radius=section.focal_radius)
