@@ -97,6 +97,7 @@ def test_interrupted_search_writes_its_best_and_resumes(uninterrupted, tmp_path)
     load_layout(str(out))
     text = program.render(result)
     assert f"--resume {result['resume']}" in text
+    assert "reproduced" not in text
     search, chains = program.resumed(tmp_path / "state.json")
     assert search == search_with()
     again, out = run(search, tmp_path, InProcessExecutor(), chains)

@@ -206,10 +206,11 @@ def render(result: dict[str, Any]) -> str:
     lines.append(
         "predicted; in Table 4 the weighted estimator attains the Cramer-Rao bound, 'bound' is that of Table 3"
     )
-    lines.append(f"written to {result['file']}; reproduced on the same kind of processor by: {result['command']}")
-    if result["interrupted"]:
+    if not result["interrupted"]:
+        lines.append(f"written to {result['file']}; reproduced on the same kind of processor by: {result['command']}")
+    else:
         resume = shlex.join(["lowfc", "design", "sam", "--resume", result["resume"], "--out", result["file"]])
-        lines.append(f"interrupted after {result['steps']} steps; continue with: {resume}")
+        lines.append(f"written to {result['file']} after {result['steps']} steps; continue with: {resume}")
     return "\n".join(lines)
 
 
