@@ -5,17 +5,19 @@ a mirror symmetry a chain moves orbits: a hole on the axis, or a hole together w
 """
 
 from dataclasses import dataclass, replace
-from math import exp, hypot, inf, log
+from math import ceil, exp, hypot, inf, log
 
 import numpy as np
 
 from lowfc.design.goal import Goal, merit
-from lowfc.design.sam_merit import Mask, Optics, Single, hole_fields
+from lowfc.design.sam_merit import RELAY_SAMPLES, Mask, Optics, Single, hole_fields
 
 Orbit = tuple[int, int, int]
 """Centre x, y and diameter of a hole, in thousandths of the pupil's diameter."""
 
 UNIT = 1000
+SMALLEST = ceil(UNIT / RELAY_SAMPLES)
+"""Smallest diameter of a hole: one sample of the relay pupil, since a smaller hole may cover none."""
 SYMMETRIES = ("none", "x", "y")
 BLOCK = 200
 """Steps between two states of a chain that can be stored."""
@@ -47,10 +49,10 @@ class Bounds:
     def __post_init__(self) -> None:
         if not 1 <= self.count[0] <= self.count[1]:
             raise ValueError(f"the number of holes must be at least 1 and in order, got {self.count}")
-        if not 2 <= self.diameter[0] <= self.diameter[1] <= UNIT - 2 * self.edge:
+        if not SMALLEST <= self.diameter[0] <= self.diameter[1] <= UNIT - 2 * self.edge:
             raise ValueError(
-                "hole diameters must be in order and lie between 0.002 and 1 pupil diameter less the edge, got "
-                f"{self.diameter[0] / UNIT} to {self.diameter[1] / UNIT}"
+                f"hole diameters must be in order and lie between {SMALLEST / UNIT} and 1 pupil diameter less the "
+                f"edge, got {self.diameter[0] / UNIT} to {self.diameter[1] / UNIT}"
             )
         if self.gap < 0 or self.edge < 0:
             raise ValueError(f"gaps must not be negative, got {self.gap / UNIT} and {self.edge / UNIT}")

@@ -249,6 +249,7 @@ def test_command_is_recorded_and_reproduces_the_layout(tmp_path, monkeypatch):
         (("--holes", "2.5"), "--holes must be in steps of 1,"),
         (("--diameter", "0.0705"), "--diameter must be in steps of 0.001"),
         (("--diameter", "2"), "hole diameters"),
+        (("--diameter", "0.007", "--holes", "1"), "between 0.008 and 1"),
         (("--diameter", "nan"), "--diameter must be a number"),
         (("--gap", "-0.1"), "gaps must not be negative"),
         (("--symmetry", "z"), "symmetry must be one of"),
