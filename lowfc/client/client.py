@@ -155,11 +155,9 @@ class Client:
         The sensor's zero point shifts with it, so that the loop does not undo it, except for the channel "flat".
         """
         shape = np.zeros(0, np.float32) if actuators_nm is None else np.asarray(actuators_nm, np.float32)
-        if shape.size and shape.shape != self._mirror_grid():
-            raise RequestRefusedError(
-                f"channel refused: the mirror has actuators of shape {self._mirror_grid()}, got an array of shape "
-                f"{shape.shape}"
-            )
+        if shape.size and shape.shape != self.mirror_grid():
+            got = f"got an array of shape {shape.shape}"
+            raise RequestRefusedError(f"channel refused: the mirror has actuators of shape {self.mirror_grid()}, {got}")
         return self.ask("channel", text=name, actuators_nm=shape)
 
     def play(self, basis_nm: npt.ArrayLike, table: npt.ArrayLike) -> Answer:
@@ -269,6 +267,13 @@ class Client:
             return decode_calibration(wire.Calibration.FromString(sample.payload))
         except (DecodeError, ValueError) as fault:
             raise BusError(f"the answer to {CALIBRATION.key} is not a calibration: {fault}") from None
+
+    def mirror_grid(self) -> tuple[int, int]:
+        """Rows and columns of the mirror's actuators, also without a calibration; BusError if no controller answers."""
+        if self._grid is None:  # fixed within a run
+            state = self._get_message(CONTROLLER_STATE, wire.ControllerState, Role.CONTROLLER)
+            self._grid = (state.mirror_rows, state.mirror_columns) if state.mirror_rows else self.calibration().grid
+        return self._grid
 
     def camera(self) -> CameraSettings | None:
         """Camera settings as the controller last received them, to store with a measurement."""
@@ -388,13 +393,6 @@ class Client:
             raise RequestRefusedError(f"{name} refused: {message.reply} (run {self.run_id})")
         state = message.state if message.HasField("state") else None
         return Answer(True, message.reply, message.frame_sequence, message.text, state, self.run_id)
-
-    def _mirror_grid(self) -> tuple[int, int]:
-        if self._grid is None:  # the grid is fixed within a run
-            state = self._get_message(CONTROLLER_STATE, wire.ControllerState, Role.CONTROLLER)
-            uncalibrated = state.mirror_rows, state.mirror_columns
-            self._grid = uncalibrated if state.mirror_rows else self.calibration().grid
-        return self._grid
 
 
 _COMMANDS = {Role.CONTROLLER: "lowfc controller", Role.RECORDER: "lowfc record", Role.CAMERA: "sim-camera"}

@@ -254,6 +254,7 @@ def test_a_controller_without_a_calibration_accepts_a_channel_of_the_mirrors_gri
     controller.calibrations.last = None
     controller.states.put(wire.ControllerState(mirror_rows=4, mirror_columns=5).SerializeToString())
     loop = controller.join()
+    assert loop.mirror_grid() == (4, 5)
     loop.channel("flat", SHAPE)
     assert [one.text for one in controller.requests] == ["flat"]
     with pytest.raises(RequestRefusedError, match=r"the mirror has actuators of shape \(4, 5\)"):

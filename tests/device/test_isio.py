@@ -427,7 +427,7 @@ def test_a_refused_report_of_other_channels_is_repeated_every_two_seconds(
 
     now_s = 0.0
     monkeypatch.setattr(bridge, "time", SimpleNamespace(monotonic=lambda: now_s))
-    client: Any = SimpleNamespace(calibration=lambda: SimpleNamespace(grid=GRID), channel=ask)
+    client: Any = SimpleNamespace(mirror_grid=lambda: GRID, channel=ask)
     bus = MemoryBus(MemoryHub(), "operator", FakeClock())
     channel(folder, "dm00disp01", make=True).write(np.full(GRID, 0.04, np.float32))
     others = bridge.ExternalChannels(client, bus, ["dm00disp01"], 1000.0)

@@ -112,7 +112,7 @@ class ExternalChannels:
         self._client = client
         self._states = bus.ring(CONTROLLER_STATE, 1)
         self._nm_per_unit = np.float32(nm_per_unit)
-        self._others = OtherChannels(names, client.calibration().grid)
+        self._others = OtherChannels(names, client.mirror_grid())
         self._shape: Single | None = None
         self._requested = b""
         self._known: bytes | None = None  # the controller's channel as last reported; None if unknown
