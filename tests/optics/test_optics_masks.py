@@ -144,6 +144,7 @@ def test_the_dark_zone_of_a_pupil_file_is_that_of_its_request(tmp_path):
         ('{"inner": 4, "outer": 8}', "half_angle_deg"),
         ('{"inner": 8, "outer": 4, "half_angle_deg": 30}', "inner < outer"),
         ('{"inner": 4, "outer": 1e9, "half_angle_deg": 30}', "256 lambda/D"),
+        (np.array("{}", dtype=object), "`made_by` must be the request of `lowfc design spc`, a text .*Object arrays"),
     ):
         np.savez(path, quarter=quarter, made_by=made_by)
         with pytest.raises(DataFileError, match=message):

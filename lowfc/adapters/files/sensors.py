@@ -1,8 +1,9 @@
 """Load pupils from files, and build a sensor from the names of its masks."""
 
+import contextlib
 import json
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -42,7 +43,8 @@ def load_pupil(samples: int = SAMPLES, file: Traversable = _DATA / "spc_quarter1
         DataFileError: The file is missing, damaged or holds no such quadrant.
         ConfigurationError: The quadrant does not divide `samples`.
     """
-    quarter, _ = _stored(file)
+    with _opened(file) as arrays:
+        quarter = np.asarray(arrays["quarter"])
     try:
         from_quarter(quarter, 2 * max(len(np.atleast_1d(quarter)), 1))
     except ValueError as error:
@@ -59,19 +61,19 @@ def load_dark_zone(file: Traversable) -> Wedge:
     Raises:
         DataFileError: The file is missing or damaged, or its request has no such zone.
     """
-    _, made_by = _stored(file)
-    if not made_by:
-        return DARK_ZONE
-    try:
-        request = json.loads(made_by)
-        zone = Wedge(*(float(request[key]) for key in ("inner", "outer", "half_angle_deg")))
-        if zone.outer > SAMPLES / 2:
-            raise ValueError(f"the outer radius must be at most {SAMPLES // 2} lambda/D, got {zone.outer:g}")
-    except Exception as error:  # any JSON may be stored here
-        raise DataFileError(
-            f"{file}: `made_by` must be the request of `lowfc design spc`, with `inner`, `outer` and `half_angle_deg` "
-            f"of its dark zone, or be omitted: {error!r}"
-        ) from error
+    with _opened(file) as arrays:
+        if "made_by" not in arrays:
+            return DARK_ZONE
+        try:
+            request = json.loads(str(arrays["made_by"]))
+            zone = Wedge(*(float(request[key]) for key in ("inner", "outer", "half_angle_deg")))
+            if zone.outer > SAMPLES / 2:
+                raise ValueError(f"the outer radius must be at most {SAMPLES // 2} lambda/D, got {zone.outer:g}")
+        except Exception as error:  # anything may be stored here
+            raise DataFileError(
+                f"{file}: `made_by` must be the request of `lowfc design spc`, a text with `inner`, `outer` and "
+                f"`half_angle_deg` of its dark zone, or be omitted: {error!r}"
+            ) from error
     return zone
 
 
@@ -133,12 +135,15 @@ def coronagraph_from(section: SensorSection) -> Coronagraph:
     return Coronagraph(pupil, zone, LyotStop(disk(radius=section.focal_radius), stop))
 
 
-def _stored(file: Traversable) -> tuple[NDArray[np.generic], str]:
-    """`quarter` and `made_by` of a pupil file; the latter is empty if the file has none."""
+@contextlib.contextmanager
+def _opened(file: Traversable) -> Iterator[Mapping[str, NDArray[np.generic]]]:
+    """Open a pupil file; each of its arrays is read when it is looked up."""
     try:
         opened = input_file.opened(file, _MAX_BYTES) if isinstance(file, Path) else file.open("rb")
         with opened as stream, np.load(stream, allow_pickle=False) as arrays:
-            return np.asarray(arrays["quarter"]), str(arrays["made_by"]) if "made_by" in arrays else ""
+            yield arrays
+    except DataFileError:
+        raise
     except FileNotFoundError:
         raise DataFileError(f"there is no pupil file {file}") from None
     except Exception as error:  # zipfile, zlib and numpy each raise their own on a damaged file
