@@ -231,7 +231,7 @@ def test_unreadable_data_gives_a_note(tmp_path: Path) -> None:
 def test_the_check_of_the_disk_uses_the_recorders_volume(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     usage = SimpleNamespace(free=0)
     monkeypatch.setattr(host_module.psutil, "disk_usage", lambda path: usage)
-    keys = {"recorder.folder": "/not/yet", "recorder.min_free_mb": 500, "camera.rate_hz": 1000}
+    keys = {"recorder.folder": "~/not/yet", "recorder.min_free_mb": 500, "camera.rate_hz": 1000}
     of_disk = facts(tmp_path, config=load(None, {**keys, "mirror.rows": 10, "mirror.columns": 10}))
     assert of_disk.bytes_per_s == 1000 * (80 * 80 * 2 + 2 * 100 * 4)
     growth = bytes_per_s(of_disk.config, EVERYTHING)
@@ -240,6 +240,7 @@ def test_the_check_of_the_disk_uses_the_recorders_volume(tmp_path: Path, monkeyp
         usage.free = free
         found = examine(of_disk)["disk"]
         assert found.status == status
+        assert found.got.startswith(f"{Path.home()}/not/yet: ")
         assert (f"1.0 h of {growth * 3600 / 1e9:.1f} GB an hour at 1000 Hz" in found.got) == (free > 10**9)
     monkeypatch.setattr(host_module.os, "access", lambda path, mode: False)
     usage.free = an_hour
@@ -259,10 +260,13 @@ def test_a_wrong_boot_clock_is_a_warning(own_runtime: Path, behind_ms: int, stat
     assert "not known" in examine(facts(own_runtime))["boot's clock"].got
 
 
-def test_expiring_certificates_are_a_warning(tmp_path: Path) -> None:
+def test_expiring_or_absent_certificates_are_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     certificates = pytest.importorskip("lowfc.adapters.bus.certificates")
     folder = tmp_path / "certs"
-    routed = load(None, {"network.router": "tls/bench:7447", "network.certificates": str(folder), **NAMED})
+    monkeypatch.setenv("HOME", str(tmp_path))
+    routed = load(None, {"network.router": "tls/bench:7447", "network.certificates": "~/certs", **NAMED})
+    absent = examine(facts(tmp_path, config=routed))["certificates"]
+    assert (absent.status, f"{folder} has no certificate" in absent.got) == ("warning", True)
     certificates.make_certificates(folder, ("camera",), [])
     assert examine(facts(tmp_path))["certificates"].status == "ok"
     assert examine(facts(tmp_path, config=routed))["certificates"].status == "ok"

@@ -161,6 +161,20 @@ def test_fits_images_and_pupils_with_a_huge_header_are_refused(tmp_path: Path) -
         assert str(path) in error_of(lambda path=path, key=key: check_files(load(None, {key: str(path)})))
 
 
+@pytest.mark.parametrize(
+    ("key", "file"),
+    [
+        *((key, "x.fits") for key in ("mirror.flat", "mirror.active", "control.law")),
+        *(("sensor.sam", "x.json"), ("sensor.pupil", "x.npz")),
+    ],
+)
+def test_a_file_of_an_unknown_user_does_not_exist(key: str, file: str) -> None:
+    path = f"~no-such-user/{file}"
+    text = error_of(lambda: check_files(load(None, {key: path})))
+    assert path in text
+    assert "there is no" in text
+
+
 @pytest.mark.parametrize("content", [b"[" * 100_000, b'{"holes": ' + b"[" * 900 + b"]" * 900 + b"}", b"9" * 100_000])
 def test_a_hostile_layout_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "hostile.json"

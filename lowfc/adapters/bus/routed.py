@@ -14,6 +14,7 @@ import zenoh
 from lowfc.adapters.bus.access import ROUTER, access_control
 from lowfc.adapters.bus.own_certificate import WARN_DAYS, read_certificate
 from lowfc.adapters.bus.zenoh_fault import plain
+from lowfc.contract.codecs.input_file import user_path
 from lowfc.contract.errors import BusError, DataFileError
 from lowfc.contract.network import Network
 
@@ -173,7 +174,7 @@ class RouterWatch:
 
 def certificate_files(network: Network, role: str) -> tuple[Path, Path, Path]:
     """Files of the authority, of a role's certificate and of its key."""
-    folder = Path(network.certificates)
+    folder = user_path(network.certificates)
     return folder / CA, folder / f"{role}.pem", folder / f"{role}.key"
 
 
@@ -201,12 +202,11 @@ def require_certificate(network: Network, role: str) -> None:
 
 
 def ending_certificates(network: Network, now: datetime.datetime) -> list[str]:
-    """Warnings about certificates in this host's folder that are invalid or end within `WARN_DAYS`."""
-    warnings = []
-    for key in sorted(Path(network.certificates).glob("*.key")):
-        role = key.stem
-        if key.name == CA_KEY:
-            continue
+    """Warnings about certificates in this host's folder that are absent, invalid or end within `WARN_DAYS`."""
+    folder = user_path(network.certificates)
+    roles = sorted(key.stem for key in folder.glob("*.key") if key.name != CA_KEY)
+    warnings = [] if roles else [f"{folder} has no certificate with its key, ROLE.pem and ROLE.key"]
+    for role in roles:
         try:
             found = read_certificate(*certificate_files(network, role), server=role == ROUTER)
         except DataFileError as fault:

@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from lowfc.adapters.bus import DEFAULT_RUN as DEFAULT_RUN
+from lowfc.contract.codecs.input_file import user_path
 from lowfc.contract.errors import BusError, DataFileError
 from lowfc.contract.messages import Role
 from lowfc.contract.network import Network
@@ -248,7 +249,7 @@ def _absolute(network: Network) -> Network:
     """Network with absolute paths, so that it is the same in any working directory."""
     if not network.router:
         return Network()
-    return network.model_copy(update={"certificates": str(Path(network.certificates).expanduser().absolute())})
+    return network.model_copy(update={"certificates": str(user_path(network.certificates).absolute())})
 
 
 def _make(path: Path, mirrors: tuple[str, ...], listeners: tuple[str, ...], network: Network) -> None:

@@ -34,7 +34,7 @@ def load_layout(name: str) -> sams.Layout:
         DataFileError: The file is missing, damaged, or its holes overlap or leave the pupil.
     """
     in_file = re.fullmatch(r"(.*\.json)(?::(.*))?", name)
-    file: Traversable = Path(in_file[1]).expanduser() if in_file else SHIPPED
+    file: Traversable = input_file.user_path(in_file[1]) if in_file else SHIPPED
     layouts = _read_layouts(file)
     chosen = (in_file[2] or "") if in_file else name
     if not chosen and len(layouts) == 1:

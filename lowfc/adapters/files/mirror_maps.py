@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from lowfc.arrays import Mask, Single, single
+from lowfc.contract.codecs.input_file import user_path
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import ConfigurationError, DataFileError
 
@@ -57,7 +58,7 @@ def shape_of(config: Configuration, key: str, file: str) -> Single:
         ConfigurationError: the file is missing, damaged or does not fit the mirror.
     """
     try:
-        found = read_shape(Path(file).expanduser())
+        found = read_shape(user_path(file))
     except DataFileError as fault:
         raise ConfigurationError(f"{key}: {fault}") from None
     grid = (config.mirror.rows, config.mirror.columns)

@@ -128,7 +128,9 @@ def coronagraph_from(section: SensorSection) -> Coronagraph:
     """
     pupil = _pupil(section)
     if section.pupil not in _WITH_LYOT_STOP:
-        return Coronagraph(pupil, DARK_ZONE if section.pupil == "shaped" else load_dark_zone(Path(section.pupil)))
+        return Coronagraph(
+            pupil, DARK_ZONE if section.pupil == "shaped" else load_dark_zone(input_file.user_path(section.pupil))
+        )
     u = pupil_axis(len(pupil))
     stop = (np.hypot(u[:, None], u) <= section.lyot_stop / 2.0).astype(np.float64)
     zone = Wedge(section.focal_radius, _LYOT_OUTER, 90.0)
@@ -170,7 +172,7 @@ def _pupil(section: SensorSection) -> Array:
         case "prolate":
             return prolate(SAMPLES, section.focal_radius)
     if section.pupil.endswith(".npz"):
-        return load_pupil(file=Path(section.pupil))
+        return load_pupil(file=input_file.user_path(section.pupil))
     slip = nearest(section.pupil, ("shaped", "circle", "prolate"))
     raise ConfigurationError(
         f"sensor.pupil = {section.pupil!r}: no such pupil{slip}; shaped, circle, prolate, or FILE.npz"

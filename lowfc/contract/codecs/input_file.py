@@ -1,4 +1,4 @@
-"""Open files that a user names: only regular files of a bounded size, no device, pipe or directory."""
+"""Find and open files that a user names: only regular files of a bounded size, no device, pipe or directory."""
 
 import errno
 import os
@@ -8,6 +8,11 @@ from typing import BinaryIO
 
 UNBOUNDED = (1 << 63) - 1
 """Size limit of a file that is read piece by piece."""
+
+
+def user_path(text: str) -> Path:
+    """Path that a user wrote, with "~" and "~name" replaced by a home directory; unchanged without such a user."""
+    return Path(os.path.expanduser(text))  # noqa: PTH111  # Path.expanduser raises RuntimeError
 
 
 def opened(path: Path, largest_bytes: int) -> BinaryIO:

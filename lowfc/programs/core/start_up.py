@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from lowfc.adapters.files.mirror_maps import active_actuators, flat_nm
 from lowfc.adapters.process import compiled
 from lowfc.adapters.process.latch import Latch
 from lowfc.arrays import Single
+from lowfc.contract.codecs.input_file import user_path
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError
 from lowfc.control.kernel.tables import NUMPY
@@ -51,7 +51,7 @@ def law(config: Configuration) -> LinearLaw | None:
     if not file:
         return None
     try:
-        found = law_file.load(Path(file).expanduser())
+        found = law_file.load(user_path(file))
         settings = factory.settings(config)
         check_law(found, settings.delay_frames, settings.rate_hz)
     except DataFileError as fault:

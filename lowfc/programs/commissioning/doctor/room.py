@@ -1,7 +1,6 @@
 """Checks of resources: memory, sockets, files, disk, libraries, the viewer."""
 
 import datetime
-from pathlib import Path
 
 import numpy as np
 from threadpoolctl import threadpool_info, threadpool_limits
@@ -9,6 +8,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from lowfc.adapters.bus.own_certificate import WARN_DAYS
 from lowfc.adapters.bus.routed import ending_certificates
 from lowfc.adapters.process import compiled
+from lowfc.contract.codecs.input_file import user_path
 from lowfc.control.kernel.tables import FUSED
 from lowfc.programs.commissioning.checks import Check, Table, note, ok, warning
 from lowfc.programs.commissioning.doctor.facts import Facts
@@ -113,7 +113,7 @@ def _socket_buffers(facts: Facts) -> Check:
 def _disk(facts: Facts) -> Check:
     """Free space in `recorder.folder`, and how long it lasts at `camera.rate_hz` by the recorder's estimate."""
     section, rate_hz = facts.config.recorder, facts.config.camera.rate_hz
-    folder = Path(section.folder)
+    folder = user_path(section.folder)
     free_bytes, writable = facts.host.disk(folder)
     growth = bytes_per_s(facts.config, configured_selection(facts.config))
     lasts_s = max(0.0, free_bytes - section.min_free_mb * 1e6) / growth

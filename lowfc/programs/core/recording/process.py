@@ -12,6 +12,7 @@ from lowfc.adapters.process.join import clock_of
 from lowfc.adapters.process.provenance import provenance
 from lowfc.adapters.process.realtime import step_back
 from lowfc.contract.codecs import input_file
+from lowfc.contract.codecs.input_file import user_path
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.events import Level
@@ -33,7 +34,7 @@ def record(run: Run, config: Configuration, calibration: Path | None) -> Summary
     """
     log, realtime = config.recorder, config.realtime
     limits, selection = log_limits(config), configured_selection(config)
-    if short := shortage(Path(log.folder), limits.min_free_bytes):
+    if short := shortage(user_path(log.folder), limits.min_free_bytes):
         raise DataFileError(short)
     sys.stderr.write(f"{estimate(config)}\n")
     # Every value, also the defaults that a user's file omits.
@@ -48,7 +49,7 @@ def record(run: Run, config: Configuration, calibration: Path | None) -> Summary
             bus,
             clock,
             run.run_id,
-            Path(log.folder),
+            user_path(log.folder),
             metadata={"lowfc": origin},
             attachments=attachments,
             limits=limits,

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from lowfc.adapters.logs.selection import Selection, selection
 from lowfc.adapters.logs.series import existing
+from lowfc.contract.codecs.input_file import user_path
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.messages import COMMAND, FRAME, MIRROR_STATE, STEP, SURFACE, TRUTH, Rate, Topic
 from lowfc.optics.chain.sensor import Sensor
@@ -46,7 +47,7 @@ def estimate(config: Configuration) -> str:
     """Sentence on the disk space that a recording will use."""
     recorded = configured_selection(config)
     min_free_bytes = config.recorder.min_free_mb * 1e6
-    growth = growth_in_words(bytes_per_s(config, recorded), Path(config.recorder.folder), min_free_bytes)
+    growth = growth_in_words(bytes_per_s(config, recorded), user_path(config.recorder.folder), min_free_bytes)
     return f"recording into {config.recorder.folder}: {growth}, at {config.camera.rate_hz:g} Hz" + (
         f" ({recorded.description})" if recorded.description else ""
     )
