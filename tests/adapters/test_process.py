@@ -27,9 +27,10 @@ def test_simultaneous_calls_get_the_same_clock_offset(tmp_path: Path) -> None:
         assert len(set(pool.map(boot_offset_ns, [tmp_path] * 8))) == 1
     (file,) = tmp_path.iterdir()
     assert file.stat().st_mode & 0o777 == 0o600
-    file.write_text("noon")
-    with pytest.raises(DataFileError, match="offset in ns, got 'noon'"):
-        boot_offset_ns(tmp_path)
+    for damaged, got in ((b"noon", "noon"), (b"\xff", "\N{REPLACEMENT CHARACTER}")):
+        file.write_bytes(damaged)
+        with pytest.raises(DataFileError, match=f"offset in ns, got '{got}'"):
+            boot_offset_ns(tmp_path)
 
 
 def test_the_clock_does_not_step_with_the_wall_clock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,6 +6,7 @@ import socket
 import subprocess
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -63,18 +64,38 @@ def test_a_mirror_that_the_run_does_not_have_is_refused() -> None:
 @pytest.mark.parametrize(
     ("name", "text"),
     [
-        *(("links.json", text) for text in (None, "", "{}", "[]", '{"run_id": "night", "ports": {"camera": 0}}')),
+        *(
+            ("links.json", text)
+            for text in (None, "", "{}", "[]", "\xff", '{"run_id": "night", "ports": {"camera": 0}}')
+        ),
         ("links.json", '{"run_id": "day", "ports": {}, "user": "lowfc"}'),
-        *(("credentials", text) for text in (None, "", "lowfc", "somebody:else")),
+        *(("credentials", text) for text in (None, "", "lowfc", "\xff", "somebody:else")),
     ],
 )
 def test_damaged_files_of_a_run_are_an_error(name: str, text: str | None) -> None:
     file = open_run("night").path / name
     file.unlink()
     if text is not None:
-        file.write_text(text)
+        file.write_text(text, encoding="latin-1")  # of which some are not UTF-8
     with pytest.raises(DataFileError, match=name):
         _ = open_run("night").links.secret
+
+
+def test_a_run_that_cannot_be_made_is_an_error_and_leaves_nothing(
+    own_runtime: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    base = runtime_base()
+    (base / "taken").touch()
+    with pytest.raises(DataFileError, match=r"taken cannot be made: Not a directory"):
+        open_run("taken")
+    full = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(DataFileError, match=r"night cannot be made: No space left on device"):
+        open_run("night")
+    assert [path.name for path in base.iterdir()] == ["taken"]
+    monkeypatch.setattr(os, "link", full)
+    with pytest.raises(DataFileError, match=r"clock-.* cannot be read or made: No space left on device"):
+        HostClock()
 
 
 def test_foreign_public_and_linked_directories_are_refused(own_runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:

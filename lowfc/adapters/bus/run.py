@@ -59,7 +59,7 @@ class Links:
     def secret(self) -> str:
         """The run's password; DataFileError if its file is missing or damaged."""
         try:
-            user, _, secret = self.secret_file.read_text().strip().partition(":")
+            user, _, secret = self.secret_file.read_text(errors="replace").strip().partition(":")
         except OSError as fault:
             raise DataFileError(f"{self.secret_file} cannot be read ({fault.strerror}); {_ADVICE}") from fault
         if user != self.user or not secret:
@@ -163,7 +163,7 @@ def open_run(
 
     Raises:
         BusError: the name is invalid, or the run exists without one of `mirrors`, or with another network.
-        DataFileError: the run's directory is damaged.
+        DataFileError: the run's directory is damaged, or cannot be made.
     """
     if not _RUN_ID.fullmatch(run_id):
         raise BusError(
@@ -171,7 +171,10 @@ def open_run(
         )
     path = (runtime_base() if base is None else base) / run_id
     if not path.is_dir():
-        _make(path, mirrors, listeners, _absolute(network or Network()))
+        try:
+            _make(path, mirrors, listeners, _absolute(network or Network()))
+        except OSError as fault:
+            raise DataFileError(f"{path} cannot be made: {fault.strerror}") from fault
     own_directory(path)
     links = _read(path)
     if (
@@ -236,13 +239,13 @@ def own_directory(path: Path) -> Path:
 def write_once(path: Path, text: str) -> str:
     """Write a file unless it exists, and return its text; simultaneous writers get the same text."""
     with contextlib.suppress(FileNotFoundError):
-        return path.read_text()
+        return path.read_text(errors="replace")
     with tempfile.NamedTemporaryFile("w", prefix=f".{path.name}-", dir=path.parent) as draft:  # mode 0600
         draft.write(text)
         draft.flush()
         with contextlib.suppress(FileExistsError):
             os.link(draft.name, path)
-    return path.read_text()
+    return path.read_text(errors="replace")
 
 
 def _absolute(network: Network) -> Network:
@@ -256,17 +259,17 @@ def _make(path: Path, mirrors: tuple[str, ...], listeners: tuple[str, ...], netw
     """Create the directory under another name and rename it; a later process uses the first one's directory."""
     # Monitors connect and do not listen: there may be several, and no other process connects to them.
     roles = [Role.CAMERA, Role.CONTROLLER, *map(mirror_role, mirrors), Role.RECORDER, *listeners]
-    draft = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))  # mode 0700
     links = {
         "run_id": path.name,
         "user": _USER,
         "ports": dict(zip(map(str, roles), free_ports(len(roles)), strict=True)),
         **({"network": network.model_dump()} if network.router else {}),
     }
-    for name, text in ((_LINKS, json.dumps(links, indent=2)), (_CREDENTIALS, f"{_USER}:{secrets.token_hex(32)}\n")):
-        (draft / name).touch(mode=0o600)
-        (draft / name).write_text(text)
+    draft = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))  # mode 0700
     try:
+        for name, text in ((_LINKS, json.dumps(links, indent=2)), (_CREDENTIALS, f"{_USER}:{secrets.token_hex(32)}\n")):
+            (draft / name).touch(mode=0o600)
+            (draft / name).write_text(text)
         draft.rename(path)
     except OSError:
         shutil.rmtree(draft)

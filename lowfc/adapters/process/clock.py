@@ -108,10 +108,13 @@ def boot_file(base: Path | None = None) -> Path:
 def boot_offset_ns(base: Path) -> int:
     """Offset of CLOCK_MONOTONIC from the epoch, ns; the first call since the boot fixes it.
 
-    DataFileError if its file in `base` is damaged.
+    DataFileError if its file in `base` is damaged, or cannot be read or made.
     """
     path = boot_file(base)
-    text = write_once(path, str(time.time_ns() - time.monotonic_ns()))
+    try:
+        text = write_once(path, str(time.time_ns() - time.monotonic_ns()))
+    except OSError as fault:
+        raise DataFileError(f"{path} cannot be read or made: {fault.strerror}") from fault
     try:
         return int(text)
     except ValueError:
