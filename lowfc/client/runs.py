@@ -1,7 +1,7 @@
 """Find the runs on this host."""
 
 from lowfc.adapters.bus.other_loops import none_here
-from lowfc.adapters.bus.run import open_run, runtime_base
+from lowfc.adapters.bus.run import open_run, run_path, runtime_base
 from lowfc.contract.errors import BusError, DataFileError, nearest
 from lowfc.contract.messages import Role
 
@@ -36,7 +36,7 @@ def the_run(name: str | None) -> str:
 
 def the_known_run(name: str | None) -> str:
     """Find the run of that name, even if none of its processes is running; otherwise as `the_run`."""
-    return name if name is not None and (runtime_base() / name).is_dir() else the_run(name)
+    return name if name is not None and run_path(name).is_dir() else the_run(name)
 
 
 def waiting_message(name: str) -> str:

@@ -9,6 +9,8 @@ from lowfc.contract.network import Section as Section
 Preset = Literal["quiet", "bench", "thermal", "reaction-wheel", "reaction-wheel-ideal", "step", "kolmogorov"]
 PRESETS: tuple[str, ...] = get_args(Preset)
 
+MIRROR_NAME = r"^[a-z][a-z0-9_]{0,49}$"
+"""Regular expression for the name of a mirror; its role, "mirror-NAME", fits a certificate."""
 BENCH_NAME = r"^[A-Za-z][A-Za-z0-9_-]{0,63}$"
 """Regular expression for the name of a bench value."""
 Positive = Annotated[float, Field(gt=0)]
@@ -225,7 +227,7 @@ IMPERFECTIONS = (
 class Mirror(Section):
     """The deformable mirror."""
 
-    name: str = Field("dm", pattern=r"^[a-z][a-z0-9_]*$")
+    name: str = Field("dm", pattern=MIRROR_NAME)
     """Its name in the topics."""
     rows: int = Field(34, ge=2, le=128)
     """Rows of actuators."""

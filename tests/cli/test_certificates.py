@@ -167,6 +167,8 @@ def test_errors_name_the_file_or_option_at_fault(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match=r"without port; got 'host:7447'"):
         make(tmp_path / "none", (ROUTER,), ["host:7447"])
     assert not (tmp_path / "none").exists()
+    with pytest.raises(DataFileError, match=r"no certificates can be written in .*xxx: File name too long"):
+        make(tmp_path / ("x" * 300), ("camera",), [])
     make(tmp_path / "half", ("camera",), [])
     (tmp_path / "half" / "ca.key").unlink()
     with pytest.raises(DataFileError, match=r"has no ca\.key: make certificates where the authority's key is"):
@@ -182,6 +184,14 @@ def test_errors_name_the_file_or_option_at_fault(tmp_path: Path) -> None:
     (tmp_path / "one" / "ca.key").write_bytes(b"nonsense")
     with pytest.raises(DataFileError, match="are not an authority's key and certificate"):
         make(tmp_path / "one", ("viewer",), [])
+
+
+@pytest.mark.parametrize("name", ["x" * 51, "../x", "Tip", ""])
+def test_a_name_that_no_mirror_can_have_is_refused(tmp_path: Path, name: str) -> None:
+    done = lowfc("certs", tmp_path / "certs", "--router", "localhost", "--mirror", name)
+    assert isinstance(done.exception, ConfigurationError)
+    assert f"mirror.name = {name!r}" in str(done.exception)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_command_makes_a_certificate_for_every_role(tmp_path: Path) -> None:

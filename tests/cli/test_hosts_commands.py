@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from lowfc.adapters.bus import certificates, routed
-from lowfc.adapters.bus.run import runtime_base
+from lowfc.adapters.bus.run import open_run, runtime_base
 from lowfc.adapters.process.clock_offset import AT_ONCE, PERIOD_S, RECENT
 from lowfc.contract.configuration import Network
 from lowfc.contract.errors import BusError
@@ -44,6 +44,28 @@ def test_a_missing_run_is_created_only_with_make() -> None:
     assert made.exit_code == 0
     assert runs() == ["tpyo"]
     assert lowfc(*show_zenoh).stdout == made.stdout
+
+
+@pytest.mark.usefixtures("toml")
+def test_a_run_is_made_with_the_mirror_of_the_role() -> None:
+    for role in ("mirror-tt", "camera"):  # the run exists already for the second
+        done = lowfc("config", "zenoh", "--role", role, "--make")
+        assert done.exit_code == 0, done.exception
+    assert set(open_run("default", ()).links.ports) == {"camera", "controller", "mirror-tt", "recorder"}
+    assert "mirror.name = 'Tip Tilt'" in str(
+        lowfc("config", "zenoh", "--role", "mirror-Tip Tilt", "--run", "x", "--make").exception
+    )
+    assert "run 'default' has no role 'cam'" in str(lowfc("config", "zenoh", "--role", "cam", "--make").exception)
+    assert runs() == ["default"]
+
+
+@pytest.mark.usefixtures("toml")
+@pytest.mark.parametrize("words", [("record",), ("config", "zenoh", "--role", "camera"), ("sim-loop",)], ids=" ".join)
+def test_too_long_a_name_of_a_run_is_refused(words: tuple[str, ...]) -> None:
+    fault = lowfc(*words, "--run", "x" * 300).exception
+    assert isinstance(fault, BusError)
+    assert len(str(fault)) < 300
+    assert "a run's name is up to 48 of" in str(fault)
 
 
 def test_the_configuration_of_the_router_is_shown_without_creating_its_run(toml: Path) -> None:

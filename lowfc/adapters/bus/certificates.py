@@ -52,11 +52,13 @@ def make_certificates(
         ConfigurationError: there is no address for the router's certificate, or an invalid one.
         DataFileError: the folder holds other files, or cannot be written.
     """
-    missing = [role for role in roles if renew or not (folder / f"{role}.pem").exists()]
     names = [_general_name(address) for address in addresses]
-    if ROUTER in missing and not names:
-        raise ConfigurationError("the router's certificate needs its address: give the name by which others reach it")
     try:
+        missing = [role for role in roles if renew or not (folder / f"{role}.pem").exists()]
+        if ROUTER in missing and not names:
+            raise ConfigurationError(
+                "the router's certificate needs its address: give the name by which others reach it"
+            )
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         key, authority = _authority(folder)
         for role in missing:

@@ -21,7 +21,7 @@ from pathlib import Path
 
 from lowfc.adapters.bus import DEFAULT_RUN as DEFAULT_RUN
 from lowfc.contract.codecs.input_file import user_path
-from lowfc.contract.errors import BusError, DataFileError
+from lowfc.contract.errors import BusError, DataFileError, brief
 from lowfc.contract.messages import Role
 from lowfc.contract.network import Network
 
@@ -165,11 +165,7 @@ def open_run(
         BusError: the name is invalid, or the run exists without one of `mirrors`, or with another network.
         DataFileError: the run's directory is damaged, or cannot be made.
     """
-    if not _RUN_ID.fullmatch(run_id):
-        raise BusError(
-            f"a run's name is up to 48 of a-z, 0-9, '.', '_', '-' and begins with a letter or digit; got {run_id!r}"
-        )
-    path = (runtime_base() if base is None else base) / run_id
+    path = run_path(run_id, base)
     if not path.is_dir():
         try:
             _make(path, mirrors, listeners, _absolute(network or Network()))
@@ -195,6 +191,16 @@ def open_run(
                 "start another run, or stop this one and start it with that mirror"
             )
     return Run(run_id, path, links)
+
+
+def run_path(run_id: str, base: Path | None = None) -> Path:
+    """Directory of a run below `base`, which may not exist; BusError if the name is invalid. See `open_run`."""
+    if not _RUN_ID.fullmatch(run_id):
+        raise BusError(
+            "a run's name is up to 48 of a-z, 0-9, '.', '_', '-' and begins with a letter or digit; got "
+            f"{brief(run_id)}"
+        )
+    return (runtime_base() if base is None else base) / run_id
 
 
 def mirror_role(name: str) -> str:

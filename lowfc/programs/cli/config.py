@@ -8,13 +8,14 @@ from typing import Annotated
 import tomli_w
 import typer
 
-from lowfc.adapters.bus.run import DEFAULT_RUN, open_run
+from lowfc.adapters.bus.run import DEFAULT_RUN, open_run, run_path
 from lowfc.adapters.bus.zenoh_session import session_config
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.terminal import AnyRun, ConfigFile, configuration
 from lowfc.client.runs import the_known_run
-from lowfc.contract.configuration import Configuration
+from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import BusError, ConfigurationError
+from lowfc.contract.messages import Role
 from lowfc.contract.network import Section
 
 _HEADER = (
@@ -93,12 +94,16 @@ def config_zenoh(
 
     Example: lowfc config zenoh --role camera --run bench
     """
+    if make and not run_path(run or DEFAULT_RUN).is_dir():
+        part, _, mirror = role.partition("-")
+        keys = {"mirror.name": mirror} if part == Role.MIRROR and mirror else {}
+        open_run(run or DEFAULT_RUN, (load(None, keys).mirror.name,))
     try:
-        joined = open_run(run or DEFAULT_RUN if make else the_known_run(run))
+        joined = open_run(run or DEFAULT_RUN if make else the_known_run(run), ())
     except BusError as fault:
         raise fault if make else BusError(f"{fault}; --make creates a run that does not exist") from None
     known = sorted({*joined.links.ports, "bench", "operator", "launcher"})
     if role not in known:
-        raise BusError(f"run {run!r} has no role {role!r}; its roles are {', '.join(known)}")
+        raise BusError(f"run {joined.run_id!r} has no role {role!r}; its roles are {', '.join(known)}")
     HostClock()  # writes the file that the zenoh configuration refers to
     typer.echo(json.dumps(session_config(joined.links, role), indent=2))

@@ -63,6 +63,7 @@ def certs(
     """
     from lowfc.adapters.bus.access import ROUTER, roles
     from lowfc.adapters.bus.run import mirror_role
+    from lowfc.contract.configuration import load
 
     try:
         from lowfc.adapters.bus.certificates import make_certificates
@@ -71,7 +72,8 @@ def certs(
             f"making certificates requires the package cryptography, which is missing ({fault}): "
             f"{install_advice('deploy')}"
         ) from None
-    names = (ROUTER, *roles(map(mirror_role, mirror or ["dm"])))
+    mirrors = [load(None, {"mirror.name": name}).mirror.name for name in mirror or ["dm"]]
+    names = (ROUTER, *roles(map(mirror_role, mirrors)))
     made = make_certificates(folder, names, router or [], days, renew=renew)
     for file in made:
         sys.stdout.write(f"{file}\n")

@@ -106,7 +106,7 @@ def record(
 
     Example: lowfc record --run bench --folder logs --longest-s 600 --min-free-mb 2000
     """
-    from lowfc.adapters.bus.run import open_run, runtime_base
+    from lowfc.adapters.bus.run import open_run, run_path
     from lowfc.adapters.files.whole_file import write_whole
     from lowfc.client.runs import waiting_message
     from lowfc.contract.configuration import load
@@ -125,7 +125,7 @@ def record(
     if words:
         hint = f"; `lowfc ctl record {words[0]}` controls a running recorder" if words[0] in ("start", "stop") else ""
         raise ConfigurationError(f"lowfc record takes options only, got {' '.join(words)!r}{hint}")
-    of_run = runtime_base() / run / "config.toml"
+    of_run = run_path(run) / "config.toml"
     settings = configuration(of_run if config is None and of_run.exists() else config, overrides)
     joined = open_run(run, (settings.mirror.name,), network=settings.network)
     if config is not None and Role.LAUNCHER not in joined.links.ports:
