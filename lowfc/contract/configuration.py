@@ -27,7 +27,6 @@ from lowfc.contract.sections import (
     Gateway,
     InterlockSection,
     Mirror,
-    NotNegative,
     Positive,
     Section,
     SensorSection,
@@ -43,6 +42,8 @@ _MAX_KEY_LENGTH = 100  # characters of an unknown key that are compared with the
 _ALTERNATIVE = re.compile(r"\.(?:constrained-\w+|literal\[[^]]*\])")  # appended by pydantic to a key of two types
 
 
+Milliseconds = Annotated[float, Field(ge=0, le=1e9)]
+Cpus = list[Annotated[int, Field(ge=0, lt=8192)]]  # the kernel's largest number of processors
 Gain = Annotated[float, Field(ge=0, le=4)]
 FIXED_GAINS = {"control.tilt_gain": 0.5, "control.gain": 0.05}
 """For runs that must not depend on automatic gains, such as timing measurements."""
@@ -75,13 +76,13 @@ class Control(Section):
     """Largest modal command of tip and tilt, wavefront rms."""
     limit_nm: Positive = 50.0
     """Largest modal command of the other modes, wavefront rms."""
-    max_frame_age_ms: NotNegative = 0.0
+    max_frame_age_ms: Milliseconds = 0.0
     """Age above which a frame is refused; 0: 20 ms or two frame periods, whichever is longer."""
-    frame_timeout_ms: NotNegative = 0.0
+    frame_timeout_ms: Milliseconds = 0.0
     """Time without a frame after which an event is raised; 0: 50 ms or five frame periods, whichever is longer."""
     on_frame_timeout: Literal["hold", "flat"] = "hold"
     """Action after a frame timeout: hold the command, or relax the mirror to flat."""
-    command_timeout_ms: Positive = 200.0
+    command_timeout_ms: float = Field(200.0, gt=0, le=1e9)
     """Time without a new command after which the mirror's last command expires."""
     max_start_ahead_h: float = Field(24.0, ge=0)
     """Hours by which a start time in the sequence of a camera or controller may be ahead of this host's clock; 0: no
@@ -177,13 +178,13 @@ class Realtime(Section):
     threads: int = Field(1, ge=1, le=8)
     """Threads of the fused step for large frames (R of 8 MB or more); each needs a processor of controller_cpus to
     itself."""
-    camera_cpus: list[int] = Field(default_factory=list)
+    camera_cpus: Cpus = Field(default_factory=list)
     """Processors of the camera; empty for all. By default, sim-loop gives the controller a processor of its own."""
-    controller_cpus: list[int] = Field(default_factory=list)
+    controller_cpus: Cpus = Field(default_factory=list)
     """Processors of the controller; empty for all."""
-    mirror_cpus: list[int] = Field(default_factory=list)
+    mirror_cpus: Cpus = Field(default_factory=list)
     """Processors of the mirror; empty for all."""
-    recorder_cpus: list[int] = Field(default_factory=list)
+    recorder_cpus: Cpus = Field(default_factory=list)
     """Processors of the recorder; empty for all. sim-loop keeps it off the controller's."""
 
 

@@ -50,13 +50,25 @@ class Network(Section):
     """Address on which the router listens, if it differs from `router`."""
 
     @model_validator(mode="after")
-    def _both(self) -> "Network":
+    def _valid(self) -> "Network":
         if self.router and not self.certificates:
             raise ValueError("certificates: a folder is needed, because the router requires a certificate of each peer")
+        for key, (host, port) in {"router": _address(self.router), "listen": _address(self.listen)}.items():
+            if port >= 1 << 16:
+                raise ValueError(f"{key}: the highest port is 65535, got {port}")
+            try:
+                host.encode("idna")
+            except UnicodeError:
+                raise ValueError(f"{key}: {host!r} is not the name or address of a host") from None
         return self
 
     @property
     def address(self) -> tuple[str, int]:
         """Host and port of the router."""
-        host, _, port = self.router.partition("/")[2].rpartition(":")
-        return host.strip("[]"), int(port)
+        return _address(self.router)
+
+
+def _address(endpoint: str) -> tuple[str, int]:
+    """Host and port of an endpoint such as "tls/bench:7447"; no host and port 0 without one."""
+    host, _, port = endpoint.partition("/")[2].rpartition(":")
+    return host.strip("[]"), int(port or 0)

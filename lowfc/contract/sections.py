@@ -136,7 +136,7 @@ def sensor_keys(name: str) -> dict[str, Any]:
 class Camera(Section):
     """The sensor camera."""
 
-    rate_hz: float = Field(250.0, gt=0, le=20_000)
+    rate_hz: float = Field(250.0, ge=0.001, le=20_000)
     """Frames per second."""
     exposure_fraction: float = Field(0.5, gt=0, le=1)
     """Exposure time as a fraction of the frame period; the loop reacts in the rest."""

@@ -107,6 +107,12 @@ def test_an_unknown_key_is_refused_with_the_nearest_known_one(
     [
         ("camera.rate_hz", 0),
         ("camera.rate_hz", float("nan")),
+        ("camera.rate_hz", 1e-15),
+        ("control.max_frame_age_ms", 1e10),
+        ("control.frame_timeout_ms", 1e10),
+        ("control.command_timeout_ms", 1e10),
+        ("realtime.camera_cpus", [10**20]),
+        ("realtime.controller_cpus", [-1]),
         ("camera.rate_hz", "250"),
         ("camera.bit_depth", 17),
         ("camera.bit_depth", 14.0),
@@ -126,6 +132,20 @@ def test_an_invalid_value_is_reported_in_one_line_with_key_and_value(tmp_path: P
     assert message.startswith(f"{key}")
     assert repr(value) in message or repr(value)[1:-1] in message
     assert "\n" not in message
+
+
+@pytest.mark.parametrize("key", ["router", "listen"])
+@pytest.mark.parametrize(
+    ("address", "message"),
+    [
+        ("tls/bench:99999", "the highest port is 65535, got 99999"),
+        ("tls/a..b:7447", "'a..b' is not the name or address"),
+    ],
+)
+def test_an_impossible_address_of_the_router_is_refused(key: str, address: str, message: str) -> None:
+    keys = {"network.router": "tls/[::1]:7447", "network.certificates": "certs"}
+    assert load(None, keys).network.address == ("::1", 7447)
+    assert f"{key}: {message}" in error_of(None, {**keys, f"network.{key}": address})
 
 
 def test_config_show_sets_only_keys_that_were_set(tmp_path: Path) -> None:
