@@ -218,16 +218,16 @@ def test_the_gains_of_an_integrator_that_a_linear_law_replaces_are_not_in_aot(tm
 
 
 @pytest.mark.parametrize("to", list(Format))
-def test_a_truncated_log_without_truth_is_exported(tmp_path: Path, to: Format) -> None:
-    part = written(tmp_path / "cut.mcap", TRUTH, finish=False)
+def test_a_truncated_log_without_truth_and_with_an_accent_in_its_name_is_exported(tmp_path: Path, to: Format) -> None:
+    part = written(tmp_path / "coupé.mcap", TRUTH, finish=False)
     part.write_bytes(part.read_bytes()[:-2000])
     results = export_log(part, to, console=QUIET)
-    assert results["files"] == [str(tmp_path / f"cut.{'aot.fits' if to is Format.AOT else to}")]
+    assert results["files"] == [str(tmp_path / f"coupé.{'aot.fits' if to is Format.AOT else to}")]
     assert 0 < results["steps"] < STEPS
     assert not results["finished"]
     assert "truncated" in render(results)
     if to is Format.CSV:
-        heading = (tmp_path / "cut.csv").read_text().splitlines()[0]
+        heading = (tmp_path / "coupé.csv").read_text().splitlines()[0]
         assert "error_z2_nm" in heading
         assert "true" not in heading
 

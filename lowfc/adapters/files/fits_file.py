@@ -15,6 +15,7 @@ from astropy.utils.exceptions import AstropyWarning
 from lowfc.arrays import Single
 from lowfc.contract.codecs import input_file
 from lowfc.contract.errors import DataFileError
+from lowfc.contract.printable import printable
 
 T = TypeVar("T")
 
@@ -25,6 +26,11 @@ DAMAGED = (
     *(AstropyWarning, fits.VerifyError),
 )
 """Exceptions that reading a damaged or unrelated file may raise."""
+
+
+def header_text(text: str) -> str:
+    """Text for a header, which holds printable ASCII only: other characters as escapes of a Python string."""
+    return printable(text).encode("ascii", "backslashreplace").decode()
 
 
 def primary_hdu(kind: str) -> fits.PrimaryHDU:

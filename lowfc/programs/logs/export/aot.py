@@ -37,6 +37,7 @@ from astropy.io import fits
 from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus.bus import name_in
+from lowfc.adapters.files.fits_file import header_text
 from lowfc.adapters.logs.history import History
 from lowfc.arrays import Single
 from lowfc.contract.codecs.codec import actuators
@@ -207,7 +208,10 @@ class _System:
         if history.configuration is not None:
             found["STARMAG"] = (history.configuration.star.magnitude, "V magnitude of the star")
             found["SENSOR"] = (history.configuration.sensor.kind, "kind of wavefront sensor (not a pyramid)")
-        return [aotpy.Metadatum(key, value, comment) for key, (value, comment) in found.items()]
+        return [
+            aotpy.Metadatum(key, header_text(value) if isinstance(value, str) else value, comment)
+            for key, (value, comment) in found.items()
+        ]
 
 
 def _copy_commands(path: Path, image: fits.ImageHDU, history: History, calibration: Calibration) -> None:

@@ -12,6 +12,7 @@ from astropy.io import fits
 from astropy.table import Column as TableColumn
 from astropy.table import Table
 
+from lowfc.adapters.files.fits_file import extension, header_text, primary_hdu
 from lowfc.adapters.logs.history import History
 from lowfc.programs.logs.export.columns import Column, calibration_columns, step_columns
 from lowfc.programs.logs.export.cubes import copy_frames_to_fits, copy_frames_to_npy
@@ -63,12 +64,12 @@ def write_npz(files: list[Path], history: History) -> None:
 
 def write_fits(files: list[Path], history: History, *, with_frames: bool) -> None:
     """Write the steps as binary table STEPS, each array of the calibration as an image, the frames as cube FRAMES."""
-    units = [_primary(history), _table("STEPS", step_columns(history))]
-    for column in calibration_columns(history.calibration) if history.calibration is not None else ():
-        image = fits.ImageHDU(column.values, name=column.name)
-        image.header["BUNIT"] = column.unit
-        image.header["CONTENT"] = column.description
-        units.append(image)
+    arrays = calibration_columns(history.calibration) if history.calibration is not None else ()
+    units = [
+        _primary(history),
+        _table("STEPS", step_columns(history)),
+        *(extension(one.name, one.values, one.description, one.unit or None) for one in arrays),
+    ]
     fits.HDUList(units).writeto(files[0], overwrite=True, checksum=True)
     if not with_frames:
         return
@@ -95,10 +96,9 @@ def _cells(values: npt.NDArray[Any]) -> npt.NDArray[np.str_]:
 
 
 def _primary(history: History) -> fits.PrimaryHDU:
-    primary = fits.PrimaryHDU()
+    primary = primary_hdu(KIND)
     header = primary.header
-    header["KIND"] = (KIND, "what this file is")
-    header["LOG"] = history.log.path.name
+    header["LOG"] = header_text(history.log.path.name)
     header["RATE"] = (history.rate_hz, "[Hz] frame rate")
     if history.calibration is not None:
         header["CALID"] = history.calibration.id
@@ -109,7 +109,7 @@ def _primary(history: History) -> fits.PrimaryHDU:
     if history.configuration is not None:
         lines += ["configuration:", *history.configuration.to_toml().splitlines()]
     for line in lines:
-        header.add_comment(line.encode("ascii", "backslashreplace").decode())
+        header.add_comment(header_text(line))
     return primary
 
 
