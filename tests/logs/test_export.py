@@ -26,6 +26,7 @@ from lowfc.contract.configuration import Configuration
 from lowfc.contract.envelope import count_of
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.messages import (
+    CALIBRATION,
     COMMAND,
     FRAME,
     MIRROR_STATE,
@@ -246,12 +247,16 @@ def test_damage_is_reported_with_its_place_and_reason(tmp_path: Path) -> None:
     assert f"left out: at byte {reader.damage[0].position}, " in render(results)
 
 
-def test_a_log_without_steps_is_refused(tmp_path: Path) -> None:
-    empty = written(tmp_path / "empty.mcap", STEP)
+@pytest.mark.parametrize(
+    ("topic", "reason"),
+    [(STEP, "has no steps: there is nothing"), (CALIBRATION, f"has no calibration.* its {STEPS} steps")],
+)
+def test_a_log_without_steps_or_calibration_is_refused(tmp_path: Path, topic: Topic, reason: str) -> None:
+    log = written(tmp_path / "night.mcap", topic)
     for to in Format:
-        with pytest.raises(DataFileError, match="no steps"):
-            export_log(empty, to, console=QUIET)
-    assert list(tmp_path.iterdir()) == [empty]
+        with pytest.raises(DataFileError, match=reason):
+            export_log(log, to, console=QUIET)
+    assert list(tmp_path.iterdir()) == [log]
 
 
 @pytest.mark.parametrize("to", [Format.NPZ, Format.FITS, Format.AOT])

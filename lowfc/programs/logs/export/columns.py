@@ -46,8 +46,11 @@ def step_columns(history: History) -> list[Column]:
     """
     steps = history.steps
     if not steps.sequence.size:
-        fitting = f" that fit its calibration ({history.excluded_messages} do not)" if history.excluded_messages else ""
-        raise DataFileError(f"{history.log.path} has no steps{fitting}: there is nothing to export")
+        path, excluded = history.log.path, history.excluded_messages
+        if history.calibration is None and (count := history.stepped_sequence.size):
+            raise DataFileError(f"{path} has no calibration, which the export of its {count} steps requires")
+        fitting = f" that fit its calibration ({excluded} do not)" if excluded else ""
+        raise DataFileError(f"{path} has no steps{fitting}: there is nothing to export")
 
     def reasons(bits: int) -> str:
         return " ".join(reason.name.lower() for reason in REASONS if bits >> reason & 1)
