@@ -215,6 +215,17 @@ def test_an_older_state_does_not_replace_a_newer_one() -> None:
     assert accumulated([new, old]).snapshot(0).controller == wire.ControllerState()
 
 
+def test_a_complete_snapshot_has_every_picture_since_the_previous_complete_one() -> None:
+    accumulator = accumulated(night().samples)
+    incomplete = accumulator.snapshot(0, complete=False)
+    assert incomplete.frame is not None
+    assert accumulator.snapshot(0, complete=False).frame is None
+    complete = accumulator.snapshot(0)
+    np.testing.assert_array_equal(complete.frame, incomplete.frame)
+    assert (complete.frame_ns, complete.mirror) == (incomplete.frame_ns, incomplete.mirror)
+    assert accumulator.snapshot(0).frame is None
+
+
 def test_a_malformed_step_is_left_out_and_counted() -> None:
     steps = [one for one in night().samples if one.key == STEP.key]
     malformed = wire.ControlStep.FromString(steps[0].payload)

@@ -91,8 +91,8 @@ class Snapshot:
         time_ns: time on the timeline: that of the newest data plus the time since. In lockstep it is simulated time.
         host_ns: time of the host clock, as are `sent_ns` (last message of each topic) and `LastHealth`.
         steps, truths, timings, events: new rows and events; timings are the durations of the controller's stages.
-        frame, mirror, surface: newest frame (DN, at `frame_ns`), state and surface over the pupil (nm); None if not
-            new.
+        frame, mirror, surface: newest frame (DN, at `frame_ns`), state and surface over the pupil (nm); None without a
+            new one since the last snapshot, or since the last complete one if this is `complete`.
         calibration, camera, controller, health: the latest of each; None before the first.
         complete: whether all new data are included; otherwise only the newest pictures, and rows and events wait.
         behind_s: delay of this snapshot.
@@ -161,6 +161,7 @@ class Accumulator:
         self.unreadable = 0
         self._steps, self._truths, self._timings = StepRows(0), TruthRows(0), TimingRows()
         self._newest: dict[Topic, bytes] = {}
+        self._decoded: dict[Topic, Any] = {}
         self._events: list[Log] = []
         self._known_events: dict[tuple[int, bytes], None] = {}
         self._states: dict[Topic, Any] = {}
@@ -194,7 +195,7 @@ class Accumulator:
         self, host_ns: int, *, complete: bool = True, behind_s: float = 0.0, ended: LogEnd | None = None
     ) -> Snapshot:
         """Return the data since the last snapshot; `host_ns` is the present host time. See `Snapshot`."""
-        frame: Frame | None = self._newest_of(FRAME, _frame)
+        frame: Frame | None = self._newest_of(FRAME, _frame, complete=complete)
         if frame is not None:
             self._set_data_time(frame.time_ns, self._sent_ns[FRAME])
         new = StepRows(0), TruthRows(0), TimingRows(), list[Log]()
@@ -211,8 +212,8 @@ class Accumulator:
             timings=timings.values()[1],
             frame=frame.pixels if frame is not None else None,
             frame_ns=frame.time_ns if frame is not None else 0,
-            mirror=self._newest_of(MIRROR_STATE, wire.MirrorState.FromString),
-            surface=self._newest_of(SURFACE, _surface),
+            mirror=self._newest_of(MIRROR_STATE, wire.MirrorState.FromString, complete=complete),
+            surface=self._newest_of(SURFACE, _surface, complete=complete),
             events=events,
             calibration=self._states.get(CALIBRATION),
             camera=self._states.get(CAMERA_STATE),
@@ -265,14 +266,18 @@ class Accumulator:
         if data_ns >= self._data_ns:
             self._data_ns, self._data_host_ns = data_ns, publish_time_ns
 
-    def _newest_of(self, topic: Topic, decode: Callable[[bytes], Any]) -> Any:
-        """The newest message of a topic, decoded; None without a new one that can be read."""
-        payload = self._newest.pop(topic, None)
-        try:
-            return None if payload is None else decode(payload)
-        except _UNREADABLE:
-            self.unreadable += 1
-            return None
+    def _newest_of(self, topic: Topic, decode: Callable[[bytes], Any], *, complete: bool) -> Any:
+        """The newest message of a topic, decoded; None without a new one that can be read.
+
+        Between two complete snapshots a slow camera may send a single frame: the second one has it again.
+        """
+        found = None
+        if (payload := self._newest.pop(topic, None)) is not None:
+            try:
+                found = self._decoded[topic] = decode(payload)
+            except _UNREADABLE:
+                self.unreadable += 1
+        return self._decoded.pop(topic, None) if complete else found
 
 
 def _added(rows: Any, message: Message) -> Any:
