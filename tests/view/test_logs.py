@@ -87,6 +87,15 @@ def test_the_final_verdict_covers_the_whole_log(tmp_path: Path, shown: Shown) ->
     truths = [wire.Truth.FromString(one.payload) for one in made.samples if one.key == TRUTH.key][:800]
     rms_nm = float(np.sqrt(np.mean([one.residual_rms_nm**2 for one in truths])))
     assert float(tile(end, "WAVEFRONT").value.split()[0]) == pytest.approx(rms_nm, rel=0.05)
+    assert f"worst 1 s: {tile(end, 'WAVEFRONT').value.split()[0]} nm" in tile(end, "WAVEFRONT").detail
+
+
+def test_a_log_of_a_loop_that_did_harm_needs_attention(tmp_path: Path, shown: Shown) -> None:
+    made = SyntheticLog(gain=(1.95, 1.95))
+    made.frames(300)
+    drawn(made.write(tmp_path / "night.mcap"))
+    assert shown[-1].level is tile(shown[-1], "WAVEFRONT").level is Level.WARNING
+    assert re.search(r"residual \S+ nm rms, worse than \S+ nm with a flat mirror", shown[-1].headline)
 
 
 def test_a_log_without_steps_has_no_verdict_on_the_loop(tmp_path: Path, shown: Shown) -> None:

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from datetime import UTC, datetime
+from math import isnan
 
 import numpy as np
 
@@ -10,14 +11,14 @@ from lowfc.contract.messages import Role
 from lowfc.control.durations import Durations
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.wording import counted
-from lowfc.programs.view.snapshot import LogEnd, Snapshot
+from lowfc.programs.view.snapshot import LogEnd, Snapshot, Wavefronts
 from lowfc.programs.view.verdicts.camera_verdict import DIM, FEW, REFUSED
 from lowfc.programs.view.verdicts.facts import facts
 from lowfc.programs.view.verdicts.run_state import RunState
 from lowfc.programs.view.verdicts.span_means import SpanMeans
 from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict, duration, rounded, worst_of
 from lowfc.programs.view.verdicts.verdict import LIMITS, stroke, stroke_used_nm
-from lowfc.programs.view.verdicts.wavefront_verdict import GOOD_FACTOR
+from lowfc.programs.view.verdicts.wavefront_verdict import GOOD_FACTOR, WORSE, shaped
 
 _MAX_STEP_NS = 1_000_000_000
 """A longer gap between two steps counts as time without steps."""
@@ -30,12 +31,13 @@ class LogVerdict:
 
     def __init__(self) -> None:
         self._means = SpanMeans()
-        self._closed = np.zeros(3)  # while closed: rows, sums of squares of residual and open
+        self._closed = SpanMeans()
         self._mode_ns: Counter[LoopMode | None] = Counter()
         self._first_ns = self._last_ns = 0
         self._latency = Durations()
         self._stroke_nm = 0.0
         self._lost = 0
+        self._shaped = False
 
     def feed(self, snapshot: Snapshot) -> None:
         """Add a snapshot."""
@@ -44,9 +46,10 @@ class LogVerdict:
         if steps.time_ns.size:
             self._add_modes(steps)
             closed = np.isin(wavefronts.sequence, steps.sequence[steps.mode == LoopMode.CLOSED.value])
-            self._closed += (closed.sum(), *np.sum(wavefronts.rms_nm[closed].astype(float) ** 2, axis=0))
+            self._closed.add_wavefronts(Wavefronts(*(one[closed] for one in wavefronts)), true=self._means.true)
         for duration_ns in snapshot.timings["frame_to_command"].tolist():
             self._latency.add(duration_ns)
+        self._shaped |= shaped(snapshot.controller)
         self._stroke_nm = max(self._stroke_nm, stroke_used_nm(snapshot.mirror))
         if (recorder := snapshot.health.get(Role.RECORDER)) is not None:
             self._lost = max(self._lost, recorder.health.recording.lost)
@@ -91,23 +94,21 @@ class LogVerdict:
         return Tile("LOOP", value, detail, Level.GOOD if closed_ns > 0.5 * total_ns else Level.NEUTRAL)
 
     def _wavefront(self) -> Tile:
-        count, residual_nm2, flat_nm2 = self._closed
-        if not count:
+        residual_nm, flat_nm = self._closed.rms_nm()
+        if isnan(residual_nm):
             return Tile("WAVEFRONT", "?", "never measured with the loop closed")
-        residual_nm, flat_nm = float(np.sqrt(residual_nm2 / count)), float(np.sqrt(flat_nm2 / count))
-        worst_nm = float(np.nanmax(self._means.wavefront()[1][:, 0], initial=0.0))
+        worst_nm = float(np.nanmax(self._closed.wavefront()[1][:, 0]))
         factor = flat_nm / residual_nm if residual_nm else 1.0
+        compared = f"{factor:.1f} x better" if factor >= 1 else "worse"
         detail = (
-            f"while closed, {factor:.1f} x better than {rounded(flat_nm)} nm with a flat mirror; "
-            f"worst {self._span}: {rounded(worst_nm)} nm; {'true' if self._means.true else 'measured, with noise'}"
+            f"while closed, {compared} than {rounded(flat_nm)} nm with a flat mirror; worst "
+            f"{_span(self._closed)}: {rounded(worst_nm)} nm; {'true' if self._closed.true else 'measured, with noise'}"
         )
-        level = Level.GOOD if factor >= GOOD_FACTOR else Level.NEUTRAL
+        harmful = factor < 1 / WORSE and not (self._closed.true and self._shaped)
+        level = Level.WARNING if harmful else Level.GOOD if factor >= GOOD_FACTOR else Level.NEUTRAL
         value = f"{rounded(residual_nm)} nm rms"
-        return Tile("WAVEFRONT", value, detail, level, f"residual {value}, {rounded(flat_nm)} nm with a flat mirror")
-
-    @property
-    def _span(self) -> str:
-        return duration(self._means.span_ns * 1e-9)
+        advice = f"residual {value}, {'worse than ' if harmful else ''}{rounded(flat_nm)} nm with a flat mirror"
+        return Tile("WAVEFRONT", value, detail, level, advice)
 
     def _star(self) -> Tile:
         light = 100 * self._means.light()
@@ -115,7 +116,7 @@ class LogVerdict:
         if not light.size:
             return Tile("STAR", "?", "no frame was used")
         value, dimmest = f"{np.median(light):.0f} %", f"{light.min():.0f}"
-        detail = f"of the expected light; means over {self._span}: {dimmest} to {light.max():.0f} %"
+        detail = f"of the expected light; means over {_span(self._means)}: {dimmest} to {light.max():.0f} %"
         if light.min() < 100 * DIM:
             return Tile("STAR", value, detail, Level.WARNING, f"The star was dim, down to {dimmest} %.")
         return Tile("STAR", value, detail, Level.GOOD)
@@ -147,6 +148,10 @@ class LogVerdict:
             advice = f"The recorder lost {lost}: disk or processor was too slow."
             return Tile("LOG", "FINISHED", detail, Level.WARNING, advice)
         return Tile("LOG", "FINISHED", detail, Level.GOOD)
+
+
+def _span(means: SpanMeans) -> str:
+    return duration(means.span_ns * 1e-9)
 
 
 def _frames(state: RunState) -> Tile:

@@ -4,7 +4,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lowfc.arrays import Array, Long
-from lowfc.programs.view.snapshot import Snapshot
+from lowfc.programs.view.snapshot import Snapshot, Wavefronts
 
 MOST = 600
 """Largest number of spans: beyond it, pairs are merged, so that a night needs no more memory than ten minutes."""
@@ -28,21 +28,29 @@ class SpanMeans:
 
     def feed(self, snapshot: Snapshot) -> None:
         """Add the steps and truths of a snapshot."""
-        for true, columns in ((True, _TRUE), (False, _MEASURED)):
-            wavefronts = snapshot.wavefronts(true=true)
-            self.true |= true and wavefronts.time_ns.size > 0
-            self.add(wavefronts.time_ns, columns, wavefronts.rms_nm.astype(float) ** 2)
+        for true in (True, False):
+            self.add_wavefronts(snapshot.wavefronts(true=true), true=true)
         if snapshot.calibration is not None:
             steps, used = snapshot.steps, snapshot.used
             self.add(steps.time_ns[used], _LIGHT, steps.flux_dn[used, None] / snapshot.calibration.flux_dn)
+
+    def add_wavefronts(self, wavefronts: Wavefronts, *, true: bool) -> None:
+        """Add true or measured wavefronts."""
+        self.true |= true and wavefronts.time_ns.size > 0
+        self.add(wavefronts.time_ns, _TRUE if true else _MEASURED, wavefronts.rms_nm.astype(float) ** 2)
 
     def wavefront(self) -> tuple[Array, Array]:
         """Middle of each span (spans,), ns after `begin_ns`, and rms nm (spans, 2): residual, with a flat mirror.
 
         A span without a frame that was used is NaN.
         """
-        sums = self._sums[:, _TRUE if self.true else _MEASURED]
+        sums = self._wavefront
         return np.asarray((np.arange(len(sums)) + 0.5) * self.span_ns, np.float64), np.asarray(np.sqrt(_means(sums)))
+
+    def rms_nm(self) -> tuple[float, float]:
+        """Rms of all wavefronts: residual, with a flat mirror; NaN without one."""
+        residual_nm, flat_nm = np.sqrt(_means(self._wavefront.sum(axis=0, keepdims=True)))[0].tolist()
+        return residual_nm, flat_nm
 
     def light(self) -> Array:
         """Light (spans,) of used frames as a fraction of the calibration's; NaN in a span without one."""
@@ -64,6 +72,10 @@ class SpanMeans:
         if last >= len(self._sums):
             self._sums = np.pad(self._sums, ((0, last + 1 - len(self._sums)), (0, 0)))
         np.add.at(self._sums[:, where], after_ns // self.span_ns, np.pad(values, ((0, 0), (1, 0)), constant_values=1))
+
+    @property
+    def _wavefront(self) -> Array:
+        return self._sums[:, _TRUE if self.true else _MEASURED]
 
 
 def _means(sums: Array) -> Array:

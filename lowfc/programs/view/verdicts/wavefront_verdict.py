@@ -39,7 +39,7 @@ def wavefront(state: RunState, nm_per_mas: float | None, loop: Tile) -> Tile:
         return tile(f"last: {residual} nm", f"of {flat}; {more}")
     if loop.level is not Level.GOOD:
         return tile(value, f"{'not corrected;' if loop.value in UNCORRECTED else 'of'} {flat}; {more}")
-    if state.true and _shaped(state.snapshot.controller):
+    if state.true and shaped(state.snapshot.controller):
         why = f"The wavefront is {value}, including the shapes of offset and channels; {flat}."
         return tile(value, f"with offset and channels; {flat}; {more}", advice=why)
     raw, latest = found.open_nm / found.residual_nm if found.residual_nm else 1.0, state.latest
@@ -82,7 +82,7 @@ def merit(reduction: float, comparison: ResidualComparison | None) -> tuple[Leve
     return Level.NEUTRAL, ": little is corrected" + (", and other gains would not correct more" if best else "")
 
 
-def _shaped(state: wire.ControllerState | None) -> bool:
+def shaped(state: wire.ControllerState | None) -> bool:
     """Whether the loop holds a shape on purpose, so that the true wavefront is not its residual."""
     return state is not None and (any(state.offset_nm) or any(one.name != FLAT for one in state.channels))
 
