@@ -71,6 +71,11 @@ def test_the_final_verdict_is_on_the_log_and_not_on_a_recording(
     assert [one.title for one in end.tiles if "RECORD" in one.value] == []
 
 
+def test_messages_that_the_recorder_counted_as_lost_at_its_end_are_in_the_verdict(tmp_path: Path, shown: Shown) -> None:
+    drawn(night(100).write(tmp_path / "night.mcap", messages_lost="3"))
+    assert (tile(shown[-1], "LOG").detail, tile(shown[-1], "LOG").level) == ("night, 3 messages lost", Level.WARNING)
+
+
 def test_the_final_verdict_covers_the_whole_log(tmp_path: Path, shown: Shown) -> None:
     made = night(750)
     made.frames(50, dark=range(50))
@@ -160,7 +165,9 @@ def views(part: rrb.Container | rrb.View) -> list[rrb.View]:
     return [part] if isinstance(part, rrb.View) else [view for one in part.contents for view in views(one)]
 
 
-def test_a_damaged_log_is_drawn_and_the_remark_names_the_place_the_reason_and_the_lost_time(tmp_path: Path) -> None:
+def test_a_damaged_log_is_drawn_and_the_remark_names_the_place_the_reason_and_the_lost_time(
+    tmp_path: Path, shown: Shown
+) -> None:
     log = night(1500).write(tmp_path / "night.mcap")
     content = bytearray(log.read_bytes())
     with LogFile(log) as file:
@@ -168,6 +175,7 @@ def test_a_damaged_log_is_drawn_and_the_remark_names_the_place_the_reason_and_th
     content[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 0xFF
     log.write_bytes(content)
     [remark] = drawn(log)[0].remarks
+    assert (tile(shown[-1], "LOG").value, tile(shown[-1], "LOG").level) == ("DAMAGED", Level.WARNING)
     place = rf"left out at byte {chunk.chunk_start_offset}, \d+ bytes"
     reason = "(the checksum of a chunk is wrong|a chunk cannot be decompressed)"
     assert re.fullmatch(rf"night\.mcap: {place}: {reason}; 0\.\d+ s between the messages around it", remark)

@@ -1,5 +1,6 @@
 """Draw a log as the live view draws a run."""
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -45,7 +46,7 @@ def draw_logs(
     drawn, accumulator = Drawn(), Accumulator()
     renderer: Renderer | None = None
     due_ns = first_ns = last_ns = earlier_bytes = 0
-    complete, run, host = True, "", ""
+    damaged, lost, no_end, run, host = 0, 0, "", "", ""
     for log in logs:
         reader = LogReader(log, topics=SHOWN, skip_damaged=True)
         for number, message in enumerate(reader):
@@ -79,13 +80,16 @@ def draw_logs(
             if number % _STRIDE == 0:
                 progress(earlier_bytes + reader.position)
         earlier_bytes += reader.size
-        complete &= reader.complete
+        damaged += len(reader.damage)
         drawn.remarks += [f"{log.name}: left out {in_words(damage)}" for damage in reader.damage]
-        if not reader.complete and not reader.damage:
-            drawn.remarks.append(f"{log.name}: {missing_end_text([log], finished=False)}")
+        if missing := missing_end_text([log], finished=reader.finished):
+            no_end = missing
+            drawn.remarks.append(f"{log.name}: {missing}")
+        counted_lost = reader.metadata.get("recording", {}).get("messages_lost", "")
+        lost = max(lost, int(counted_lost) if re.fullmatch("[0-9]{1,18}", counted_lost) else 0)
     if renderer is None:
         raise DataFileError(f"nothing to show in {', '.join(map(str, logs))}: no message that a view shows")
-    ended = LogEnd(logs[-1].name.partition(".")[0], complete, run, host, missing_end_text(logs, finished=complete))
+    ended = LogEnd(logs[-1].name.partition(".")[0], run, host, no_end, damaged, lost)
     renderer.draw(accumulator.snapshot(last_ns, ended=ended))
     if accumulator.unreadable:
         drawn.remarks.append(f"{counted(accumulator.unreadable, 'message')} could not be read")

@@ -74,13 +74,22 @@ class LastHealth(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class LogEnd:
-    """End of the logs shown; `no_end` is the reason if they are not `complete`."""
+    """End of the logs shown.
+
+    Attributes:
+        name: name of the last one.
+        run, host: name of their run, and host of the recorder.
+        no_end: why one of them has no end; empty if all were finished.
+        damaged: number of damaged stretches that were left out.
+        lost: number of messages that the recorder counted as lost.
+    """
 
     name: str
-    complete: bool
     run: str
     host: str
-    no_end: str = "the log has no end"
+    no_end: str
+    damaged: int
+    lost: int
 
 
 @dataclass(frozen=True, slots=True)

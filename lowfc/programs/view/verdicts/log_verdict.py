@@ -140,11 +140,15 @@ class LogVerdict:
         return Tile("LATENCY", p50, detail, Level.GOOD)
 
     def _log(self, ended: LogEnd) -> Tile:
-        lost = counted(self._lost, "message")
-        detail = f"{ended.name}, {f'{lost} lost' if self._lost else 'nothing lost'}"
-        if not ended.complete:
+        messages = max(self._lost, ended.lost)
+        lost, parts = counted(messages, "message"), counted(ended.damaged, "part")
+        detail = f"{ended.name}, {f'{lost} lost' if messages else 'nothing lost'}"
+        if ended.damaged:
+            advice = f"The log is damaged, {parts} left out: see `lowfc info`."
+            return Tile("LOG", "DAMAGED", f"{parts} left out; {detail}", Level.WARNING, advice)
+        if ended.no_end:
             return Tile("LOG", "NO END", f"{detail} up to here", Level.WARNING, f"{ended.no_end.capitalize()}.")
-        if self._lost:
+        if messages:
             advice = f"The recorder lost {lost}: disk or processor was too slow."
             return Tile("LOG", "FINISHED", detail, Level.WARNING, advice)
         return Tile("LOG", "FINISHED", detail, Level.GOOD)
