@@ -12,7 +12,8 @@ from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.records import LogFile
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
-from lowfc.contract.messages import EVENT, SURFACE, TRUTH, Log, image, wire
+from lowfc.contract.messages import EVENT, STEP, SURFACE, TRUTH, Log, image, timestamp, wire
+from lowfc.control.loop.safety import Rejection
 from lowfc.programs.view.layout import layout
 from lowfc.programs.view.live_view import earlier_events
 from lowfc.programs.view.panels import mirror, pointing, sensor, tiles, trend, wavefront
@@ -101,6 +102,47 @@ def test_a_log_of_a_loop_that_did_harm_needs_attention(tmp_path: Path, shown: Sh
     drawn(made.write(tmp_path / "night.mcap"))
     assert shown[-1].level is tile(shown[-1], "WAVEFRONT").level is Level.WARNING
     assert re.search(r"residual \S+ nm rms, worse than \S+ nm with a flat mirror", shown[-1].headline)
+
+
+def test_the_time_of_a_slow_loop_and_of_a_frame_with_a_wrong_clock_is_counted(
+    tmp_path: Path, shown: Shown, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(report_log, "PERIOD_NS", 2_000_000_000)
+    made = night(10)
+    step = next(wire.ControlStep.FromString(one.payload) for one in made.samples if one.key == STEP.key)
+    step.timestamp.CopyFrom(timestamp(0))
+    step.reasons.append(Rejection.OUT_OF_ORDER.value)
+    made.put(STEP, step)
+    made.frames(10)
+    drawn(made.write(tmp_path / "night.mcap"))
+    assert (tile(shown[-1], "LOOP").value, tile(shown[-1], "LOOP").detail) == ("CLOSED", "closed 38 s")
+    assert tile(shown[-1], "FRAMES").detail == "of 21 frames: 0 lost, 1 refused (1 out of order)"
+    made = SyntheticLog()
+    made.frames(1)
+    drawn(made.write(tmp_path / "frame.mcap"))
+    assert tile(shown[-1], "FRAMES").value == "0.5 Hz"
+
+
+@pytest.mark.parametrize(
+    ("delay_ns", "late", "value", "advice"),
+    [
+        (300_000, 4, "324 us", ""),
+        (2_000_000, 0, "2043 us", "us, longer than a frame"),
+        (300_000, 40, "40 LATE", "40 commands, 6.7 %, came after the start of the next exposure"),
+    ],
+)
+def test_a_log_with_late_or_slow_commands_needs_attention(
+    tmp_path: Path, shown: Shown, monkeypatch: pytest.MonkeyPatch, delay_ns: int, late: int, value: str, advice: str
+) -> None:
+    monkeypatch.setattr(report_log, "DELAY_NS", delay_ns)
+    made = SyntheticLog()
+    for count in (0, late):
+        made.health("camera", state="running", pid=7, commands_late=count)
+        made.frames(300)
+    drawn(made.write(tmp_path / "night.mcap"))
+    latency = tile(shown[-1], "LATENCY")
+    assert (latency.value, latency.level) == (value, Level.WARNING if advice else Level.GOOD)
+    assert advice in latency.advice
 
 
 def test_a_log_without_steps_has_no_verdict_on_the_loop(tmp_path: Path, shown: Shown) -> None:

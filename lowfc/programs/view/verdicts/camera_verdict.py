@@ -6,7 +6,7 @@ from functools import partial
 from lowfc.control.loop.safety import Reason, Rejection
 from lowfc.control.loop.wording import counted
 from lowfc.programs.view.verdicts.run_state import RECENT_S, Liveness, RunState
-from lowfc.programs.view.verdicts.tile import Level, Tile, absent, duration, worst_of
+from lowfc.programs.view.verdicts.tile import Level, Tile, absent, duration, hertz, worst_of
 
 SLOW = 0.9
 """Fraction of the camera's nominal rate below which camera or host does not keep up."""
@@ -67,7 +67,7 @@ def _rate(state: RunState, nominal_hz: float) -> Tile:
         if state.now["steps"]:
             return tile("STARTING", "too few frames for a rate")
         return tile("UNUSED", "frames arrive, but no controller uses them")
-    value = f"{rate_hz:.0f} Hz" if rate_hz >= 10 else f"{rate_hz:.2g} Hz"
+    value = hertz(rate_hz)
     if rate_hz < SLOW * nominal_hz:
         advice = f"The camera runs at {rate_hz:.3g} Hz, not at {nominal_hz:.3g} Hz: the host does not keep up."
         return tile(value, f"slow: nominal {nominal_hz:.3g} Hz", Level.WARNING, advice)

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from datetime import UTC, datetime
+from functools import partial
 from math import isnan
 
 import numpy as np
@@ -9,19 +10,20 @@ import numpy as np
 from lowfc.adapters.logs.columns import Steps
 from lowfc.contract.messages import Role
 from lowfc.control.durations import Durations
-from lowfc.control.loop.safety import LoopMode
+from lowfc.control.loop.safety import LoopMode, Rejection
 from lowfc.control.loop.wording import counted
 from lowfc.programs.view.snapshot import LogEnd, Snapshot, Wavefronts
 from lowfc.programs.view.verdicts.camera_verdict import DIM, FEW, REFUSED
 from lowfc.programs.view.verdicts.facts import facts
 from lowfc.programs.view.verdicts.run_state import RunState
 from lowfc.programs.view.verdicts.span_means import SpanMeans
-from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict, duration, rounded, worst_of
-from lowfc.programs.view.verdicts.verdict import LIMITS, stroke, stroke_used_nm
+from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict, duration, hertz, rounded, worst_of
+from lowfc.programs.view.verdicts.verdict import LIMITS, MANY_LATE, stroke, stroke_used_nm
+from lowfc.programs.view.verdicts.watcher import FRAMES_SILENT_S, PERIODS
 from lowfc.programs.view.verdicts.wavefront_verdict import GOOD_FACTOR, WORSE, shaped
 
-_MAX_STEP_NS = 1_000_000_000
-"""A longer gap between two steps counts as time without steps."""
+_WITH_WRONG_TIME = sum(1 << reason for reason in (Rejection.OUT_OF_ORDER, Rejection.REPEATED, Rejection.AHEAD))
+"""Bits of the reasons for refusing a frame whose time is not that of its exposure, or not in order."""
 _MODES = {mode.value: mode for mode in LoopMode}
 _NAMES = {LoopMode.OPEN: "open", LoopMode.SAFE: "safe", LoopMode.IDLE: "idle", None: "without frames"}
 
@@ -44,7 +46,7 @@ class LogVerdict:
         self._means.feed(snapshot)
         steps, wavefronts = snapshot.steps, snapshot.wavefronts(true=self._means.true)
         if steps.time_ns.size:
-            self._add_modes(steps)
+            self._add_modes(steps.at(steps.reasons & _WITH_WRONG_TIME == 0), snapshot.period_ns)
             closed = np.isin(wavefronts.sequence, steps.sequence[steps.mode == LoopMode.CLOSED.value])
             self._closed.add_wavefronts(Wavefronts(*(one[closed] for one in wavefronts)), true=self._means.true)
         for duration_ns in snapshot.timings["frame_to_command"].tolist():
@@ -71,11 +73,14 @@ class LogVerdict:
         advice = f" {worst.advice}" if worst.advice and worst is not wavefront else ""
         return Verdict(f"{headline}.{advice}", level, tiles, facts(state))
 
-    def _add_modes(self, steps: Steps) -> None:
+    def _add_modes(self, steps: Steps, period_ns: int) -> None:
+        """Add the time from step to step; a gap as long as in the live view counts as time without frames."""
         time_ns = steps.time_ns
+        if not time_ns.size:
+            return
         self._first_ns = self._first_ns or int(time_ns[0])
         after_ns = np.diff(time_ns, prepend=self._last_ns or time_ns[0])
-        with_steps = (after_ns >= 0) & (after_ns <= _MAX_STEP_NS)
+        with_steps = (after_ns >= 0) & (after_ns <= max(FRAMES_SILENT_S * 1e9, PERIODS * period_ns))
         self._mode_ns[None] += int(after_ns[~with_steps & (after_ns > 0)].sum())
         for value in np.unique(steps.mode):
             self._mode_ns[_MODES.get(int(value))] += int(after_ns[with_steps & (steps.mode == value)].sum())
@@ -133,11 +138,19 @@ class LogVerdict:
     def _timing(self, state: RunState) -> Tile:
         if not self._latency.count:
             return Tile("LATENCY", "?", "not measured")
-        p50, p99, most = (f"{rounded(ns / 1e3)} us" for ns in self._latency.percentiles_ns(0.5, 0.99, 1.0))
+        tile, durations_ns = partial(Tile, "LATENCY"), self._latency.percentiles_ns(0.5, 0.99, 1.0)
+        p50, p99, most = (f"{rounded(ns / 1e3)} us" for ns in durations_ns)
         detail = f"frame to command; 1 in 100 over {p99}, at most {most}"
         if state.simulated:
-            return Tile("LATENCY", p50, f"{detail}; without effect in simulated time")
-        return Tile("LATENCY", p50, detail, Level.GOOD)
+            return tile(p50, f"{detail}; without effect in simulated time")
+        late, share = state.totals["late"], state.totals["late"] / max(1, state.totals["steps"])
+        if share > MANY_LATE:
+            advice = f"{counted(late, 'command')}, {100 * share:.2g} %, came after the start of the next exposure."
+            return tile(f"{late} LATE", f"{100 * share:.2g} %; {p50}, {detail}", Level.WARNING, advice)
+        if 0 < state.snapshot.period_ns < durations_ns[1]:
+            advice = f"1 command in 100 took over {p99}, longer than a frame."
+            return tile(p50, f"slow: {detail}", Level.WARNING, advice)
+        return tile(p50, detail, Level.GOOD)
 
     def _log(self, ended: LogEnd) -> Tile:
         messages = max(self._lost, ended.lost)
@@ -168,5 +181,5 @@ def _frames(state: RunState) -> Tile:
     if unused >= FEW * max(steps, 1):
         advice = f"{counted(lost, 'frame')} lost, {refused.total()} refused: see the events."
         return Tile("FRAMES", f"{unused} UNUSED", detail, Level.WARNING, advice)
-    rate = f"{1e9 / state.snapshot.period_ns:.0f} Hz" if state.snapshot.period_ns else f"{steps}"
+    rate = hertz(1e9 / state.snapshot.period_ns) if state.snapshot.period_ns else f"{steps}"
     return Tile("FRAMES", rate, detail, Level.GOOD if steps else Level.NEUTRAL)
