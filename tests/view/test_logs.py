@@ -12,7 +12,7 @@ from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.records import LogFile
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
-from lowfc.contract.messages import EVENT, STEP, SURFACE, TRUTH, Log, image, timestamp, wire
+from lowfc.contract.messages import CALIBRATION, EVENT, STEP, SURFACE, TRUTH, Log, image, timestamp, wire
 from lowfc.control.loop.safety import Rejection
 from lowfc.programs.view.layout import layout
 from lowfc.programs.view.live_view import earlier_events
@@ -221,6 +221,16 @@ def test_a_damaged_log_is_drawn_and_the_remark_names_the_place_the_reason_and_th
     place = rf"left out at byte {chunk.chunk_start_offset}, \d+ bytes"
     reason = "(the checksum of a chunk is wrong|a chunk cannot be decompressed)"
     assert re.fullmatch(rf"night\.mcap: {place}: {reason}; 0\.\d+ s between the messages around it", remark)
+
+
+def test_a_log_begins_with_its_first_frame_and_not_with_an_older_calibration(tmp_path: Path, shown: Shown) -> None:
+    made = night(100)
+    calibration = next(one for one in made.samples if one.key == CALIBRATION.key)
+    earlier_ns = calibration.receive_time_ns - 3600 * 10**9
+    made.samples = [calibration._replace(receive_time_ns=earlier_ns), *made.samples]
+    done, tape = drawn(made.write(tmp_path / "night.mcap"))
+    assert done.log_s == pytest.approx(0.1, abs=0.01)
+    assert min(tape.logged[tiles.TILES])[0] > earlier_ns + 3599 * 10**9
 
 
 def test_a_log_of_a_simulated_run_is_drawn_without_a_runtime_directory(

@@ -11,6 +11,7 @@ from lowfc.adapters.logs.recovery import in_words, missing_end_text
 from lowfc.adapters.process.clock import SIMULATED_START_NS
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
+from lowfc.contract.messages import topic_of
 from lowfc.control.loop.wording import counted
 from lowfc.programs.view.renderer import Renderer
 from lowfc.programs.view.snapshot import PICTURES_HZ, PICTURES_PER_COMPLETE, SHOWN, Accumulator, LogEnd
@@ -54,13 +55,12 @@ def draw_logs(
                 found, remarks = (config, []) if config else attached_configuration(reader)
                 if found is None:
                     remarks.append(
-                        "the default configuration is used for pupil and telescope, because the log has none"
+                        "the default configuration is used for pupil and telescope, because the log has no readable one"
                     )
                 drawn.remarks += remarks
                 own = found or Configuration()
                 renderer = make_renderer(own)
                 accumulator = Accumulator(SIMULATED_START_NS if own.lockstep else None)
-                first_ns = message.receive_time_ns
             if number == 0:
                 recorded = reader.metadata.get("lowfc", {})
                 previous_run, run, host = run, recorded.get("run", "") or run, host or recorded.get("host", "")
@@ -68,9 +68,11 @@ def draw_logs(
                     raise DataFileError(
                         f"{log} is of run {run!r}, and the log before it of {previous_run!r}: show one run at a time"
                     )
-            last_ns = message.receive_time_ns
             accumulator.add(message)
-            if last_ns >= due_ns:
+            if first_ns or not topic_of(message.key).queryable:  # states requested at the log's start may be hours old
+                last_ns = max(last_ns, message.receive_time_ns)
+                first_ns = first_ns or last_ns
+            if first_ns and last_ns >= due_ns:
                 snapshot = accumulator.snapshot(last_ns, complete=drawn.snapshots % PICTURES_PER_COMPLETE == 0)
                 renderer.draw(snapshot)
                 if snapshot.frame is not None:
