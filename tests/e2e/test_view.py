@@ -129,6 +129,10 @@ def test_a_log_without_an_end_is_saved_as_a_valid_rrd_file(tmp_path: Path) -> No
     [
         ({"web": True, "native": True}, "use one"),
         ({"foxglove": True, "web": True}, "--foxglove"),
+        ({"foxglove": True, "web_port": 15999}, "--foxglove"),
+        ({"foxglove": True, "tab": Tab.OPTICS}, "--foxglove"),
+        ({"native": True, "web_port": 15999}, "add --web"),
+        ({"logs": [Path("nothing.mcap")], "save": Path("x.rrd"), "port": 15999}, "--save writes a file"),
         ({"run": "nosuch", "web": True}, "there is no run"),
         ({"logs": [Path("nothing.mcap")], "save": Path("x.rrd")}, "nothing.mcap"),
         ({"logs": [Path("nothing.mcap")], "save": Path("nowhere/x.rrd")}, "nowhere"),

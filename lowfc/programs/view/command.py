@@ -11,6 +11,8 @@ from lowfc.adapters.process.terminal import ConfigFile, LogsIfAny, configuration
 from lowfc.contract.errors import ConfigurationError
 from lowfc.programs.view.draw.tabs import Tab
 
+_MEMORY_MB = 512.0
+
 
 def view(
     logs: LogsIfAny = None,
@@ -25,7 +27,7 @@ def view(
     ] = None,
     run: Annotated[str | None, typer.Option("--run", help="Name of the run; default: the only one.")] = None,
     config: ConfigFile = None,
-    memory_mb: Annotated[float, typer.Option(min=16, help="Memory of the viewer for past data, MB.")] = 512.0,
+    memory_mb: Annotated[float, typer.Option(min=16, help="Memory of the viewer for past data, MB.")] = _MEMORY_MB,
     port: Annotated[int | None, typer.Option(min=0, max=65535, help="TCP port of the stream, or of Foxglove.")] = None,
     web_port: Annotated[int | None, typer.Option(min=1, max=65535, help="TCP port of the page.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object at the end.")] = False,
@@ -41,7 +43,8 @@ def view(
 
     lower_priority()
     if foxglove:
-        if logs or native or web or save or headless_screenshot or seconds or config or as_json:
+        others = logs, native, web, save, headless_screenshot, seconds, config, as_json, web_port
+        if any(others) or tab != Tab.OPERATOR or memory_mb != _MEMORY_MB:
             raise ConfigurationError("--foxglove serves a running loop until Ctrl-C, with --run and --port alone")
         from lowfc.adapters.bus.run import open_run
         from lowfc.adapters.process.clock import HostClock

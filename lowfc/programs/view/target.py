@@ -34,7 +34,7 @@ class Target:
         """Check the target, and choose the ports.
 
         Raises:
-            ConfigurationError: two targets, a wrong file name, or equal ports.
+            ConfigurationError: two targets, a wrong file name, equal ports, or a port that the target does not have.
         """
         files = {"--save": (self.save, ".rrd"), "--headless-screenshot": (self.picture, ".png")}
         options = {"--native": self.native, "--web": self.web} | {option: file for option, (file, _) in files.items()}
@@ -46,6 +46,10 @@ class Target:
                 raise ConfigurationError(f"{option} requires a file name that ends in {suffix}; got {file}")
         if self.port and self.port == self.web_port:
             raise ConfigurationError(f"--port and --web-port must differ; both are {self.port}")
+        if self.port and self.show is None:
+            raise ConfigurationError("--port is the port of a viewer: --save writes a file")
+        if self.web_port and self.show is not Show.WEB:
+            raise ConfigurationError("--web-port is the port of a page: add --web")
         free = free_ports(2)  # now, so that a restarted viewer has the same ports
         self.port, self.web_port = self.port or free[0], self.web_port or free[1]
 
