@@ -12,7 +12,7 @@ from lowfc.contract.messages import Role
 from lowfc.control.durations import Durations
 from lowfc.control.loop.safety import LoopMode, Rejection
 from lowfc.control.loop.wording import counted
-from lowfc.programs.view.snapshot import LogEnd, Snapshot, Wavefronts
+from lowfc.programs.view.snapshot import LogEnd, Snapshot
 from lowfc.programs.view.verdicts.camera_verdict import DIM, FEW, REFUSED
 from lowfc.programs.view.verdicts.facts import facts
 from lowfc.programs.view.verdicts.run_state import RunState
@@ -48,7 +48,7 @@ class LogVerdict:
         if steps.time_ns.size:
             self._add_modes(steps.at(steps.reasons & _WITH_WRONG_TIME == 0), snapshot.period_ns)
             closed = np.isin(wavefronts.sequence, steps.sequence[steps.mode == LoopMode.CLOSED.value])
-            self._closed.add_wavefronts(Wavefronts(*(one[closed] for one in wavefronts)), true=self._means.true)
+            self._closed.add_wavefronts(wavefronts.at(closed), true=self._means.true)
         for duration_ns in snapshot.timings["frame_to_command"].tolist():
             self._latency.add(duration_ns)
         self._shaped |= shaped(snapshot.controller)
