@@ -108,7 +108,9 @@ def test_a_disk_error_ends_the_recording_but_not_the_process(
     put_until(frames, lambda: log.messages_written > 20)
     fault(bench)
     put_until(frames, lambda: event_published(bench, "RECORDING_FAILED"))
+    time.sleep(0.6)  # longer than two flushes
     assert bench.thread.is_alive()
+    assert not event_published(bench, "MESSAGES_LOST"), "one event per topic and flush for the rest of the night"
     summary = bench.stop()
     assert why in summary.failure
     if not bench.folder.exists():

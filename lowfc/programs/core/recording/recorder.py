@@ -224,7 +224,8 @@ class Recorder:
         """Flush, begin the next log if it is due, report losses, publish Health."""
         self._flush()
         self._flush_due_ns = self._clock.host_ns() + _FLUSH_NS
-        self._report_losses()
+        if not self._failure:  # otherwise every message is lost, which is reported at the end
+            self._report_losses()
         if self._series.longest_write_ns > max(_SLOW_NS, self._slowest_ns):
             self._slowest_ns = self._series.longest_write_ns
             self.service.event("DISK_SLOW", stall_s=self._slowest_ns * 1e-9, waiting=len(self._backlog))
