@@ -76,6 +76,7 @@ class Stage:
         self.flux, self.full = 1.0, 0
         self.stroke_nm, self.latency_us = 100.0, 500
         self.status, self.limits_hit = wire.MIRROR_STATUS_FOLLOWING, ()
+        self.refused = 0
         self.frames, self.start_s = 0, START
         self.behind_s = 0.0
 
@@ -127,6 +128,7 @@ class Stage:
             shape = np.full(4, self.stroke_nm, "<f4").tobytes()
             state = wire.MirrorState(status=self.status, rows=2, columns=2, actuators=shape)
             state.limits_hit.extend(self.limits_hit)
+            state.refused = self.refused
             self.send(MIRROR_STATE, state)
         if self._runs("camera") and self._runs("controller"):
             step = wire.ControlStep(**frame, mode=self.mode.value, command_nm=[0.0] * 3)

@@ -135,6 +135,16 @@ STATES: dict[str, tuple[Callable[[Stage], object], str, str]] = {
     "modal limit": (setting(reasons=(Limit.MODAL_LIMIT,)), "MIRROR AT LIMIT BAD", "modal limit"),
     "little stroke left": (setting(stroke_nm=650.0), "MIRROR 93 % WARNING", "little is left"),
     "expired": (setting(status=wire.MIRROR_STATUS_EXPIRED), "MIRROR EXPIRED BAD", "receives no commands"),
+    "refusing": (
+        setting(status=wire.MIRROR_STATUS_EXPIRED, refused=Rejection.AHEAD),
+        "MIRROR REFUSES BAD",
+        "refuses the commands (AHEAD)",
+    ),
+    "never followed": (
+        setting(status=wire.MIRROR_STATUS_WAITING, refused=Limit.WRONG_GRID),
+        "MIRROR REFUSES BAD",
+        "refuses the commands (WRONG_GRID)",
+    ),
     "harmful": (setting(residual_nm=60.0), "WAVEFRONT 60.0 nm rms WARNING", "The loop does harm"),
     "diverging": (setting(residual_nm=400.0), "WAVEFRONT 400 nm rms BAD", "40.0 nm with a flat mirror"),
     "late commands": (health("camera", commands_late=80), "LATENCY 80 LATE WARNING", "80 commands, "),

@@ -12,7 +12,7 @@ import numpy as np
 from lowfc.contract.codecs.codec import actuators
 from lowfc.contract.messages import Role, from_timestamp, wire
 from lowfc.contract.printable import printable
-from lowfc.control.loop.safety import Limit, LoopMode, Reason
+from lowfc.control.loop.safety import REASONS, Limit, LoopMode, Reason
 from lowfc.control.loop.wording import CAMERA_MISFIT, counted
 from lowfc.programs.view.verdicts.camera_verdict import LATELY, all_refused, frames, star
 from lowfc.programs.view.verdicts.facts import facts
@@ -140,6 +140,10 @@ def _mirror(state: RunState) -> Tile:
     gone = absent("MIRROR", "mirror", state.mirror, state.running_s, "commands have no effect")
     if gone is not None:
         return gone
+    if reported is not None and reported.refused and reported.status != wire.MIRROR_STATUS_FOLLOWING:
+        why = next((reason.name for reason in REASONS if reason == reported.refused), f"reason {reported.refused}")
+        advice = f"The mirror refuses the commands ({why}): it holds or relaxes by itself. "
+        return tile("REFUSES", f"the commands: {why}", Level.BAD, f"{advice}Check its grid and its clock.")
     if reported is None or reported.status == wire.MIRROR_STATUS_WAITING:
         return tile("WAITING", "no command yet")
     if reported.status == wire.MIRROR_STATUS_EXPIRED and state.controller.life is not Liveness.STARTING:
