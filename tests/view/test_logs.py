@@ -150,7 +150,7 @@ def test_a_log_without_steps_has_no_verdict_on_the_loop(tmp_path: Path, shown: S
     made.health("recorder", state="running", recording=wire.Recording(lost=3))
     drawn(made.write(tmp_path / "night.mcap"))
     assert shown[-1].headline.startswith("Log without a step of the controller. The recorder lost 3 messages")
-    assert [one.value for one in shown[-1].tiles] == ["NOT CLOSED", "?", "1000 Hz", "?", "0 %", "?", "FINISHED"]
+    assert [one.value for one in shown[-1].tiles] == ["NOT CLOSED", "?", "1000 Hz", "?", "?", "?", "FINISHED"]
 
 
 def test_the_trend_of_a_night_has_a_limited_number_of_spans() -> None:

@@ -52,7 +52,8 @@ class LogVerdict:
         for duration_ns in snapshot.timings["frame_to_command"].tolist():
             self._latency.add(duration_ns)
         self._shaped |= shaped(snapshot.controller)
-        self._stroke_nm = max(self._stroke_nm, stroke_used_nm(snapshot.mirror))
+        if snapshot.mirror is not None:
+            self._stroke_nm = max(self._stroke_nm, stroke_used_nm(snapshot.mirror))
         if (recorder := snapshot.health.get(Role.RECORDER)) is not None:
             self._lost = max(self._lost, recorder.health.recording.lost)
 
@@ -128,12 +129,15 @@ class LogVerdict:
 
     def _mirror(self, state: RunState) -> Tile:
         value, of = stroke(self._stroke_nm, state.snapshot.stroke_nm)
+        used = f"{value} {of} at most" if state.mirror_state is not None else "stroke not known"
         acted = {words: state.totals[reason] for reason, words in LIMITS.items() if state.totals[reason]}
+        if not acted and state.mirror_state is None:
+            return Tile("MIRROR", "?", f"{used}, no limit acted")
         if not acted:
             return Tile("MIRROR", value, f"{of} at most, no limit acted", Level.GOOD)
         named = ", ".join(f"{words}: {counted(count, 'time')}" for words, count in acted.items())
         advice = f"The mirror was at a limit ({named}): the disturbance was larger than it can correct."
-        return Tile("MIRROR", "AT LIMIT", f"{named}; {value} {of} at most", Level.WARNING, advice)
+        return Tile("MIRROR", "AT LIMIT", f"{named}; {used}", Level.WARNING, advice)
 
     def _timing(self, state: RunState) -> Tile:
         if not self._latency.count:

@@ -140,11 +140,13 @@ def _mirror(state: RunState) -> Tile:
     gone = absent("MIRROR", "mirror", state.mirror, state.running_s, "commands have no effect")
     if gone is not None:
         return gone
-    if reported is not None and reported.refused and reported.status != wire.MIRROR_STATUS_FOLLOWING:
+    if reported is None:
+        return tile("?", "no state of it is known")
+    if reported.refused and reported.status != wire.MIRROR_STATUS_FOLLOWING:
         why = next((reason.name for reason in REASONS if reason == reported.refused), f"reason {reported.refused}")
         advice = f"The mirror refuses the commands ({why}): it holds or relaxes by itself. "
         return tile("REFUSES", f"the commands: {why}", Level.BAD, f"{advice}Check its grid and its clock.")
-    if reported is None or reported.status == wire.MIRROR_STATUS_WAITING:
+    if reported.status == wire.MIRROR_STATUS_WAITING:
         return tile("WAITING", "no command yet")
     if reported.status == wire.MIRROR_STATUS_EXPIRED and state.controller.life is not Liveness.STARTING:
         level = Level.NEUTRAL if state.controller.life is Liveness.STOPPED else Level.BAD
@@ -169,9 +171,9 @@ def _mirror(state: RunState) -> Tile:
     return tile(value, f"{of}, no limit acts", Level.GOOD)
 
 
-def stroke_used_nm(mirror: wire.MirrorState | None) -> float:
-    """Largest deviation of an actuator from flat; 0 if unknown."""
-    surface_nm = actuators(mirror) if mirror is not None else None
+def stroke_used_nm(mirror: wire.MirrorState) -> float:
+    """Largest deviation of an actuator from flat; 0 if its message cannot be read."""
+    surface_nm = actuators(mirror)
     return float(np.abs(surface_nm).max(initial=0.0)) if surface_nm is not None else 0.0
 
 
