@@ -164,6 +164,10 @@ def test_the_trend_of_a_night_has_a_limited_number_of_spans() -> None:
     assert span_means.MOST / 2 <= len(after_ns) <= span_means.MOST
     np.testing.assert_allclose(rms_nm[0], np.sqrt(squares.mean(axis=0)), rtol=1e-6)
     assert np.isnan(rms_nm[1:-1]).all()  # nothing in between: a gap
+    for days in (6, 12, 100):  # a view may run for weeks; the last is an error of the clock
+        averages.add(np.array([averages.begin_ns + days * 86_400 * 10**9]), slice(0, 3), np.ones((1, 2)))
+    after_ns, _ = averages.wavefront()
+    assert after_ns[-1] == pytest.approx(12 * 86_400e9, rel=0.02)
 
 
 def test_a_log_larger_than_the_memory_of_the_viewer_gives_a_remark() -> None:

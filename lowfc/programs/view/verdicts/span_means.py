@@ -24,6 +24,7 @@ class SpanMeans:
         self.begin_ns: int | None = None
         self.span_ns = _FIRST_NS
         self.true = False
+        self._last_ns = 0  # after `begin_ns`
         self._sums = np.zeros((0, _COLUMNS))
 
     def feed(self, snapshot: Snapshot) -> None:
@@ -61,11 +62,12 @@ class SpanMeans:
         if self.begin_ns is None and time_ns.size:
             self.begin_ns = int(time_ns.min())
         after_ns = time_ns - (self.begin_ns or 0)
-        valid = (after_ns >= 0) & (after_ns < _FARTHEST_NS)
+        valid = (after_ns >= 0) & (after_ns < self._last_ns + _FARTHEST_NS)
         after_ns, values = after_ns[valid], values[valid]
         if not after_ns.size:
             return
-        while (last := int(after_ns.max()) // self.span_ns) >= MOST:
+        self._last_ns = max(self._last_ns, int(after_ns.max()))
+        while (last := self._last_ns // self.span_ns) >= MOST:
             self.span_ns *= 2
             self._sums = np.pad(self._sums, ((0, len(self._sums) % 2), (0, 0)))
             self._sums = self._sums[0::2] + self._sums[1::2]

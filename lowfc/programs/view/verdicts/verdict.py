@@ -143,7 +143,9 @@ def _mirror(state: RunState) -> Tile:
     if reported is None:
         return tile("?", "no state of it is known")
     if reported.refused and reported.status != wire.MIRROR_STATUS_FOLLOWING:
-        why = next((reason.name for reason in REASONS if reason == reported.refused), f"reason {reported.refused}")
+        why = next(
+            (reason.name for reason in REASONS if reason.value == reported.refused), f"reason {reported.refused}"
+        )
         advice = f"The mirror refuses the commands ({why}): it holds or relaxes by itself. "
         return tile("REFUSES", f"the commands: {why}", Level.BAD, f"{advice}Check its grid and its clock.")
     if reported.status == wire.MIRROR_STATUS_WAITING:
