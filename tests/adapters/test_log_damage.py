@@ -211,6 +211,17 @@ def test_a_summary_without_checksum_is_used_up_to_a_damaged_record(
         assert list(file.index()) == []
 
 
+def test_of_two_files_in_one_the_first_is_read_and_the_second_reported(source: Path) -> None:
+    size = source.stat().st_size
+    source.write_bytes(2 * source.read_bytes())
+    reader = LogReader(source, skip_damaged=True)
+    assert identity(list(reader)) == SENT
+    (damage,) = reader.damage
+    assert damage.position + damage.length == 2 * size
+    assert damage.length > size
+    assert damage.why.endswith("another file was appended")
+
+
 def test_a_message_index_of_an_impossible_length_is_damage_for_a_sparse_reader_too(source: Path) -> None:
     data = bytearray(source.read_bytes())
     begin = next(one for one in boundaries(data) if data[one] == Opcode.MESSAGE_INDEX)

@@ -154,7 +154,7 @@ class LogFile:
                     if intact and int.from_bytes(body, "little") not in (0, crc):
                         yield Damage(at, 0, _CHANGED)
                     if self.finished and self._summary is None:
-                        yield Damage(end, self.size - end, "the summary is damaged")
+                        yield Damage(end, self.size - end, "the summary is damaged, or another file was appended")
                     self.complete = self._summary is not None
                     return
                 crc = zlib.crc32(body, zlib.crc32(head, crc))
