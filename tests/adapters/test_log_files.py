@@ -1,4 +1,5 @@
 import dataclasses
+import errno
 import tracemalloc
 import zlib
 from itertools import pairwise
@@ -18,6 +19,7 @@ from mcap.writer import CompressionType, Writer
 from mcap_protobuf.decoder import DecoderFactory
 
 from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.logs import writer
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.writer import UNFINISHED, LogWriter, log_path
 from lowfc.contract.envelope import sequence_of, start_of
@@ -375,6 +377,16 @@ def test_a_log_is_never_overwritten(tmp_path: Path) -> None:
     for name in (paths[0].name, "b.mcap"):
         with pytest.raises(DataFileError, match="never overwritten"):
             LogWriter(tmp_path / name, START_NS, {})
+
+
+def test_a_log_that_cannot_be_begun_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(file: object, data: bytes) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(writer._File, "write", refuse)
+    with pytest.raises(DataFileError, match=r"No space left on device\) after 0 bytes; .*; the file was removed"):
+        LogWriter(tmp_path / "a.mcap", START_NS, {})
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_log_finished_meanwhile_keeps_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -193,10 +193,12 @@ class LogWriter:
         return self.path
 
     def abandon(self) -> None:
-        """Close the log unfinished, truncated to its last flush."""
+        """Close the log unfinished, truncated to its last flush; remove it if nothing was flushed."""
         if not self._raw.closed:
             with contextlib.suppress(OSError):
                 self._raw.truncate(self.bytes_written)
+                if not self.bytes_written:
+                    self.part.unlink()
             self._raw.close()
 
     def _describe(self, metadata: Mapping[str, Mapping[str, str]]) -> None:
