@@ -237,6 +237,13 @@ def test_a_log_begins_with_its_first_frame_and_not_with_an_older_calibration(tmp
     assert min(tape.logged[tiles.TILES])[0] > earlier_ns + 3599 * 10**9
 
 
+def test_a_message_of_an_impossible_time_is_left_out(tmp_path: Path) -> None:
+    made = night(10)
+    made.samples.append(made.samples[-1]._replace(receive_time_ns=1 << 63))
+    done, _ = drawn(made.write(tmp_path / "night.mcap"))
+    assert (done.remarks, done.log_s < 1) == (["1 message could not be read"], True)
+
+
 def test_a_log_of_a_simulated_run_is_drawn_without_a_runtime_directory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -59,7 +59,8 @@ from lowfc.contract.published import Published
 from lowfc.contract.recorded_configuration import recorded
 from lowfc.control.calibration.calibration import Calibration
 
-_LAST_NS = (1 << 63) - 1
+LAST_NS = (1 << 63) - 1
+"""Latest time of a message that is read, in the year 2262; a later one does not fit an array of times."""
 _DECODED = {STEP, TRUTH, MIRROR_STATE, TIMING, CALIBRATION, CONTROLLER_STATE, CAMERA_STATE, REQUEST, HEALTH, EVENT}
 
 
@@ -232,7 +233,7 @@ class _Rows:
     def take(self, message: Sample) -> None:
         """Add one message of the log."""
         history = self._history
-        if max(message.receive_time_ns, message.publish_time_ns) > _LAST_NS:
+        if max(message.receive_time_ns, message.publish_time_ns) > LAST_NS:
             history.excluded_messages += 1
             return
         history.counts[message.key] += 1

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from lowfc.adapters.logs.history import attached_configuration
+from lowfc.adapters.logs.history import LAST_NS, attached_configuration
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.recovery import in_words, missing_end_text
 from lowfc.adapters.process.clock import SIMULATED_START_NS
@@ -68,6 +68,9 @@ def draw_logs(
                     raise DataFileError(
                         f"{log} is of run {run!r}, and the log before it of {previous_run!r}: show one run at a time"
                     )
+            if message.receive_time_ns > LAST_NS:
+                accumulator.unreadable += 1
+                continue
             accumulator.add(message)
             if first_ns or not topic_of(message.key).queryable:  # states requested at the log's start may be hours old
                 last_ns = max(last_ns, message.receive_time_ns)
