@@ -7,9 +7,11 @@ import subprocess
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from rich.console import Console
 
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.bus.run import Run, new_run_id, open_run
@@ -30,7 +32,7 @@ from lowfc.contract.messages import (
     Topic,
     wire,
 )
-from lowfc.programs.logs.publish.player import publish, render
+from lowfc.programs.logs.publish.player import Player, publish, render
 from lowfc.programs.logs.publish.selection import Selection
 from tests.support.loops import FIXED, LOWFC, loop, until
 
@@ -197,6 +199,13 @@ def test_publishing_takes_over_the_roles_of_its_topics_and_with_frames_the_mirro
 def test_a_log_without_the_selected_topics_is_an_error(log: Path, run: Run) -> None:
     with pytest.raises(DataFileError, match="no message of the selected topics"):
         publish([log], run.run_id, topics=["lowfc/control/request"])
+
+
+def test_a_log_with_only_topics_of_a_live_controller_is_an_error_that_says_so(log: Path, run: Run) -> None:
+    service = SimpleNamespace(running=True, clock=HostClock(), beat=lambda: None)
+    selection = Selection(run.links, ["lowfc/control/ste*"], {"controller"})
+    with pytest.raises(DataFileError, match=rf"selected topics but {STEP.key} \(controller is live\)"):
+        Player(service, {}, selection, 1.0).play([log], Console(quiet=True))
 
 
 @pytest.mark.parametrize(

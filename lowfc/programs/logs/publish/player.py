@@ -114,7 +114,9 @@ class Player:
                     self._service.beat()
                     bar.update(task, completed=log.position, total=log.size, description=_utc(message.receive_time_ns))
         if self._service.running and not self._initial_keys and not self._errors.count:
-            raise DataFileError(f"{titled(log.paths)}: no message of the selected topics")
+            left_out = ", ".join(f"{key} ({why})" for key, why in sorted(self._excluded.items()))
+            rest = f" but {left_out}" if left_out else ""
+            raise DataFileError(f"{titled(log.paths)}: no message of the selected topics{rest}")
         p50_ns, p99_ns = self._errors.percentiles_ns(0.5, 0.99)
         return {
             "messages": self._errors.count + len(self._initial_keys),
