@@ -1,8 +1,8 @@
 """Evaluation of a soak's samples: growth is detected, noise is not taken for growth, gaps are counted."""
 
 import json
-from collections import Counter
 import signal
+from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -200,5 +200,5 @@ def test_a_soak_finds_the_process_whose_memory_grows(monkeypatch: pytest.MonkeyP
     assert found["frames_published"] >= 33 * 10
     assert (found["logs"], found["gaps"], found["frames_missing"], found["messages_lost"]) == (1, 0, 0, 0)
     assert found["processes"]["controller"]["memory_last_mb"] == 100
-    assert found["why"] == ["the camera's memory grow"]
+    assert found["why"] == ["growth of the camera's memory"]
     assert not found["passed"]
