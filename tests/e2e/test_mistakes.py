@@ -6,7 +6,6 @@ import os
 import signal
 import socket
 import subprocess
-import time
 from pathlib import Path
 
 import pytest
@@ -21,7 +20,7 @@ from lowfc.contract.errors import BusError, LowfcError
 from lowfc.contract.messages import Role
 from lowfc.programs.launch import sim_loop
 from tests.support.in_process_loop import SMALL_MIRROR
-from tests.support.loops import LOWFC, lowfc, run
+from tests.support.loops import LOWFC, lowfc, run, until
 from tools.law_bench import calibrated
 
 SHORT = ["sim-loop", "--duration", "0.1"]
@@ -148,7 +147,7 @@ def test_a_full_disk_on_standard_output_is_one_line(tmp_path: Path) -> None:
 
 def test_ctrl_c_during_startup_prints_no_traceback(tmp_path: Path) -> None:
     process = subprocess.Popen([*LOWFC, "config", "show"], cwd=tmp_path, stderr=subprocess.PIPE, text=True)
-    time.sleep(0.15)
+    until(lambda: "pydantic_core" in Path(f"/proc/{process.pid}/maps").read_text(), 20)  # in the middle of the imports
     process.send_signal(signal.SIGINT)
     _, complaints = process.communicate(timeout=20)
     assert "Traceback" not in complaints
