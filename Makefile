@@ -29,7 +29,7 @@ sim-loop: $(VENV)/.installed  ## install, then run the simulated loop for 20 s
 
 test: $(VENV)/.tests lint  ## install, then lint, types and tests
 	nice -n 19 $(BIN)/mypy & types=$$!; \
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m 'not slow and not basler and not aravis' -n auto --dist loadgroup --no-loadscope-reorder && \
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m 'not slow and not basler and not aravis' -n auto --dist loadfile --no-loadscope-reorder && \
 	wait $$types
 
 test-all: $(VENV)/.tests node lint types  ## everything, the slow tests and those that need node, chromium and a graphics driver too

@@ -2,11 +2,12 @@
 
 import os
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
 from xdist.remote import Producer
-from xdist.scheduler import LoadGroupScheduling
+from xdist.scheduler import LoadFileScheduling
 
 NO_SKIPS = os.environ.get("LOWFC_NO_SKIPS") == "1"
 ROOT = Path(__file__).parent
@@ -16,15 +17,13 @@ LONGEST = ("test_lockstep", "test_gain_watch", "test_calibrate", "test_tutorials
 """Test files that are started next, so that no worker runs one of them alone at the end."""
 
 
-@pytest.hookimpl(tryfirst=True)  # xdist appends the groups to the names
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     def turn(item: pytest.Item) -> tuple[bool, bool, int]:
         longest = LONGEST.index(item.path.stem) if item.path.stem in LONGEST else len(LONGEST)
-        return not _exclusive(item), FIRST.isdisjoint(item.path.parents), longest
+        exclusive = _exclusive(item.path)
+        assert exclusive or item.get_closest_marker("exclusive") is None, item.nodeid
+        return not exclusive, FIRST.isdisjoint(item.path.parents), longest
 
-    for item in items:
-        if _exclusive(item):
-            item.add_marker(pytest.mark.xdist_group("exclusive"))
     items.sort(key=turn)
 
 
@@ -33,25 +32,29 @@ def pytest_xdist_auto_num_workers() -> int:
     return len(os.sched_getaffinity(0)) + 1
 
 
-def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> LoadGroupScheduling:
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> LoadFileScheduling:
     return _Scheduling(config, log)
 
 
-class _Scheduling(LoadGroupScheduling):
-    """One worker runs the exclusive tests, one after another; each file of others is run by one worker."""
+class _Scheduling(LoadFileScheduling):
+    """One worker runs all files with exclusive tests, one after another; each other file is run by one worker."""
 
     def _split_scope(self, nodeid: str) -> str:
-        return super()._split_scope(nodeid).split("::", maxsplit=1)[0]
+        file = super()._split_scope(nodeid)
+        return "exclusive" if _exclusive(ROOT.parent / file) else file
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Leave the processors to an exclusive test on another worker."""
-    if "PYTEST_XDIST_WORKER" in os.environ and not _exclusive(item):
+    if "PYTEST_XDIST_WORKER" in os.environ and not _exclusive(item.path):
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
 
 
-def _exclusive(item: pytest.Item) -> bool:
-    return item.get_closest_marker("exclusive") is not None
+@cache
+def _exclusive(file: Path) -> bool:
+    """Whether a file has an exclusive test; xdist distributes names of tests, without their markers."""
+    text = file.read_text()
+    return "pytest.mark.exclusive" in text or "@on_screen" in text
 
 
 @pytest.fixture(scope="session", autouse=True)
