@@ -72,9 +72,20 @@ def test_the_final_verdict_is_on_the_log_and_not_on_a_recording(
     assert [one.title for one in end.tiles if "RECORD" in one.value] == []
 
 
-def test_messages_that_the_recorder_counted_as_lost_at_its_end_are_in_the_verdict(tmp_path: Path, shown: Shown) -> None:
-    drawn(night(100).write(tmp_path / "night.mcap", messages_lost="3"))
-    assert (tile(shown[-1], "LOG").detail, tile(shown[-1], "LOG").level) == ("night, 3 messages lost", Level.WARNING)
+@pytest.mark.parametrize(
+    ("in_health", "at_the_end", "detail"),
+    [((0, 0), 3, "night, 3 messages lost"), ((2, 2), 0, "night, nothing lost"), ((2, 7), 0, "night, 5 messages lost")],
+)
+def test_the_verdict_has_the_losses_of_the_log_and_not_of_earlier_ones(
+    tmp_path: Path, shown: Shown, in_health: tuple[int, int], at_the_end: int, detail: str
+) -> None:
+    made = SyntheticLog()
+    for lost in in_health:
+        made.frames(300)
+        made.health("recorder", state="running", pid=7, recording=wire.Recording(lost=lost))
+    drawn(made.write(tmp_path / "night.mcap", messages_lost=str(at_the_end)))
+    log = tile(shown[-1], "LOG")
+    assert (log.detail, log.level) == (detail, Level.GOOD if "nothing" in detail else Level.WARNING)
 
 
 def test_the_final_verdict_covers_the_whole_log(tmp_path: Path, shown: Shown) -> None:
@@ -147,8 +158,8 @@ def test_a_log_with_late_or_slow_commands_needs_attention(
 
 def test_a_log_without_steps_has_no_verdict_on_the_loop(tmp_path: Path, shown: Shown) -> None:
     made = SyntheticLog()
-    made.health("recorder", state="running", recording=wire.Recording(lost=3))
-    drawn(made.write(tmp_path / "night.mcap"))
+    made.health("recorder", state="running")
+    drawn(made.write(tmp_path / "night.mcap", messages_lost="3"))
     assert shown[-1].headline.startswith("Log without a step of the controller. The recorder lost 3 messages")
     assert [one.value for one in shown[-1].tiles] == ["NOT CLOSED", "?", "1000 Hz", "?", "?", "?", "FINISHED"]
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from lowfc.adapters.logs.history import LAST_NS, attached_configuration
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.recovery import in_words, missing_end_text
+from lowfc.adapters.logs.writer import PART
 from lowfc.adapters.process.clock import SIMULATED_START_NS
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
@@ -47,7 +48,8 @@ def draw_logs(
     drawn, accumulator = Drawn(), Accumulator()
     renderer: Renderer | None = None
     due_ns = first_ns = last_ns = earlier_bytes = 0
-    damaged, lost, no_end, run, host = 0, 0, "", "", ""
+    damaged, no_end, run, host = 0, "", "", ""
+    lost: dict[str, int] = {}  # by recording; the account of its last file is that of all
     for log in logs:
         reader = LogReader(log, topics=SHOWN, skip_damaged=True)
         for number, message in enumerate(reader):
@@ -90,11 +92,11 @@ def draw_logs(
         if missing := missing_end_text([log], finished=reader.finished):
             no_end = missing
             drawn.remarks.append(f"{log.name}: {missing}")
-        counted_lost = reader.metadata.get("recording", {}).get("messages_lost", "")
-        lost = max(lost, int(counted_lost) if re.fullmatch("[0-9]{1,18}", counted_lost) else 0)
+        if re.fullmatch("[0-9]{1,18}", account := reader.metadata.get("recording", {}).get("messages_lost", "")):
+            lost[reader.metadata.get(PART, {}).get("of", log.name)] = int(account)
     if renderer is None:
         raise DataFileError(f"nothing to show in {', '.join(map(str, logs))}: no message that a view shows")
-    ended = LogEnd(logs[-1].name.partition(".")[0], run, host, no_end, damaged, lost)
+    ended = LogEnd(logs[-1].name.partition(".")[0], run, host, no_end, damaged, sum(lost.values()))
     renderer.draw(accumulator.snapshot(last_ns, ended=ended))
     if accumulator.unreadable:
         drawn.remarks.append(f"{counted(accumulator.unreadable, 'message')} could not be read")

@@ -85,7 +85,7 @@ class LogEnd:
         run, host: name of their run, and host of the recorder.
         no_end: why one of them has no end; empty if all were finished.
         damaged: number of damaged stretches that were left out.
-        lost: number of messages that the recorder counted as lost.
+        lost: number of messages lost, from the recorder's accounts at the end of its recordings.
     """
 
     name: str

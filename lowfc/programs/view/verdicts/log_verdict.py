@@ -8,7 +8,6 @@ from math import isnan
 import numpy as np
 
 from lowfc.adapters.logs.columns import Steps
-from lowfc.contract.messages import Role
 from lowfc.control.durations import Durations
 from lowfc.control.loop.safety import LoopMode, Rejection
 from lowfc.control.loop.wording import counted
@@ -38,7 +37,6 @@ class LogVerdict:
         self._first_ns = self._last_ns = 0
         self._latency = Durations()
         self._stroke_nm = 0.0
-        self._lost = 0
         self._shaped = False
 
     def feed(self, snapshot: Snapshot) -> None:
@@ -54,13 +52,11 @@ class LogVerdict:
         self._shaped |= shaped(snapshot.controller)
         if snapshot.mirror is not None:
             self._stroke_nm = max(self._stroke_nm, stroke_used_nm(snapshot.mirror))
-        if (recorder := snapshot.health.get(Role.RECORDER)) is not None:
-            self._lost = max(self._lost, recorder.health.recording.lost)
 
     def verdict(self, state: RunState, ended: LogEnd) -> Verdict:
         """Tiles of the whole log, and a headline, with the advice of the worst tile if it needs attention."""
         loop, wavefront = self._loop(), self._wavefront()
-        others = _frames(state), self._star(), self._mirror(state), self._timing(state), self._log(ended)
+        others = _frames(state), self._star(), self._mirror(state), self._timing(state), _log(state, ended)
         tiles = (loop, wavefront, *others)
         worst = worst_of(tiles)
         level = worst.level if worst.level >= Level.WARNING else min(loop.level, wavefront.level)
@@ -156,20 +152,6 @@ class LogVerdict:
             return tile(p50, f"slow: {detail}", Level.WARNING, advice)
         return tile(p50, detail, Level.GOOD)
 
-    def _log(self, ended: LogEnd) -> Tile:
-        messages = max(self._lost, ended.lost)
-        lost, parts = counted(messages, "message"), counted(ended.damaged, "part")
-        detail = f"{ended.name}, {f'{lost} lost' if messages else 'nothing lost'}"
-        if ended.damaged:
-            advice = f"The log is damaged, {parts} left out: see `lowfc info`."
-            return Tile("LOG", "DAMAGED", f"{parts} left out; {detail}", Level.WARNING, advice)
-        if ended.no_end:
-            return Tile("LOG", "NO END", f"{detail} up to here", Level.WARNING, f"{ended.no_end.capitalize()}.")
-        if messages:
-            advice = f"The recorder lost {lost}: disk or processor was too slow."
-            return Tile("LOG", "FINISHED", detail, Level.WARNING, advice)
-        return Tile("LOG", "FINISHED", detail, Level.GOOD)
-
 
 def _span(means: SpanMeans) -> str:
     return duration(means.span_ns * 1e-9)
@@ -187,3 +169,18 @@ def _frames(state: RunState) -> Tile:
         return Tile("FRAMES", f"{unused} UNUSED", detail, Level.WARNING, advice)
     rate = hertz(1e9 / state.snapshot.period_ns) if state.snapshot.period_ns else f"{steps}"
     return Tile("FRAMES", rate, detail, Level.GOOD if steps else Level.NEUTRAL)
+
+
+def _log(state: RunState, ended: LogEnd) -> Tile:
+    messages = max(state.totals["lost"], ended.lost)  # the first up to the recorder's last Health
+    lost, parts = counted(messages, "message"), counted(ended.damaged, "part")
+    detail = f"{ended.name}, {f'{lost} lost' if messages else 'nothing lost'}"
+    if ended.damaged:
+        advice = f"The log is damaged, {parts} left out: see `lowfc info`."
+        return Tile("LOG", "DAMAGED", f"{parts} left out; {detail}", Level.WARNING, advice)
+    if ended.no_end:
+        return Tile("LOG", "NO END", f"{detail} up to here", Level.WARNING, f"{ended.no_end.capitalize()}.")
+    if messages:
+        advice = f"The recorder lost {lost}: disk or processor was too slow."
+        return Tile("LOG", "FINISHED", detail, Level.WARNING, advice)
+    return Tile("LOG", "FINISHED", detail, Level.GOOD)
