@@ -12,15 +12,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rerun.blueprint as rrb
+from rich.console import Console
 
 from lowfc.adapters.bus.run import open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.process.join import clock_of
-from lowfc.adapters.viewer.rerun_viewer import RerunViewer
+from lowfc.adapters.viewer.rerun_viewer import RerunViewer, Show
 from lowfc.client import running
 from lowfc.contract.configuration import load
 from lowfc.contract.errors import LowfcError
 from lowfc.contract.messages import Role
+from lowfc.programs.launch import sim_loop
 from lowfc.programs.view.command import view
 from lowfc.programs.view.draw.tabs import Tab
 from lowfc.programs.view.layout import LIVE_WINDOW_S, layout
@@ -155,6 +157,13 @@ def test_invalid_view_options_are_one_line_errors(
         view(**given)  # type: ignore[arg-type]
     assert len(str(raised.value).splitlines()) == 1
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("show", "expected"), [(Show.NATIVE, False), (Show.WEB, True)])
+def test_sim_loop_starts_a_view_with_the_ports_of_its_target(show: Show, expected: bool) -> None:
+    command = sim_loop._view(open_run("shown"), show, Console(quiet=True)).command
+    assert f"--{show}" in command
+    assert ("--web-port" in command) == expected
 
 
 def _shades(viewer: RerunViewer, view_id: object) -> int:

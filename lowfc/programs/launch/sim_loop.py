@@ -119,20 +119,10 @@ def children_of(config: Configuration, run: Run, duration_s: float | None, recor
 def _view(run: Run, show: Show, console: Console) -> Child:
     """The view's process; prints its address for a browser."""
     port, web_port = free_ports(2)
+    arguments = ["-m", "lowfc", "view", "--run", run.run_id, f"--{show}", "--port", str(port)]
     if show is Show.WEB:
+        arguments += ["--web-port", str(web_port)]
         console.print(f"view: {web_address(stream_url(port), web_port)}", soft_wrap=True, highlight=False)
-    arguments = [
-        "-m",
-        "lowfc",
-        "view",
-        "--run",
-        run.run_id,
-        f"--{show}",
-        "--port",
-        str(port),
-        "--web-port",
-        str(web_port),
-    ]
     return program(str(Role.VIEWER), arguments, run.path / f"{Role.VIEWER}.stderr")
 
 
