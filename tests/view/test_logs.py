@@ -12,7 +12,7 @@ from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.records import LogFile
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
-from lowfc.contract.messages import CALIBRATION, EVENT, STEP, SURFACE, TRUTH, Log, image, timestamp, wire
+from lowfc.contract.messages import CALIBRATION, EVENT, FRAME, STEP, SURFACE, TRUTH, Log, image, timestamp, wire
 from lowfc.control.loop.safety import Rejection
 from lowfc.programs.view.layout import layout
 from lowfc.programs.view.live_view import earlier_events
@@ -246,6 +246,20 @@ def test_a_log_begins_with_its_first_frame_and_not_with_an_older_calibration(tmp
     done, tape = drawn(made.write(tmp_path / "night.mcap"))
     assert done.log_s == pytest.approx(0.1, abs=0.01)
     assert min(tape.logged[tiles.TILES])[0] > earlier_ns + 3599 * 10**9
+
+
+def test_a_frame_of_a_camera_whose_clock_is_ahead_does_not_move_the_time_line(tmp_path: Path) -> None:
+    made = night(300)
+    ahead_ns = made.now_ns + 3600 * 10**9
+    step = next(wire.ControlStep.FromString(one.payload) for one in made.samples if one.key == STEP.key)
+    step.timestamp.CopyFrom(timestamp(ahead_ns))
+    step.reasons.append(Rejection.AHEAD.value)
+    made.put(FRAME, image(np.zeros((8, 8), np.uint16), ahead_ns, "sensor"))
+    made.put(STEP, step)
+    made.frames(300)
+    done, _ = drawn(made.write(tmp_path / "night.mcap"))
+    begin_ns, end_ns = done.span_ns
+    assert (end_ns - begin_ns) * 1e-9 == pytest.approx(done.log_s, abs=0.1)
 
 
 def test_a_message_of_an_impossible_time_is_left_out(tmp_path: Path) -> None:

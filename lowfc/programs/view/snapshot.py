@@ -37,6 +37,7 @@ from lowfc.contract.messages import (
 )
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.loop.inputs import Frame
+from lowfc.control.loop.safety import Rejection
 
 SHOWN = (FRAME, STEP, TRUTH, TIMING, MIRROR_STATE, SURFACE, CALIBRATION, CAMERA_STATE, CONTROLLER_STATE, EVENT, HEALTH)
 """Topics that a view shows."""
@@ -44,6 +45,9 @@ SHOWN = (FRAME, STEP, TRUTH, TIMING, MIRROR_STATE, SURFACE, CALIBRATION, CAMERA_
 PICTURES_HZ = 30.0
 PICTURES_PER_COMPLETE = 8
 """Snapshots per complete one. Curves grow four times a second, because many rows cost hardly more than one."""
+
+WRONG_TIME = frozenset((Rejection.OUT_OF_ORDER.value, Rejection.REPEATED.value, Rejection.AHEAD.value))
+"""Numbers of the reasons for refusing a frame whose time is not that of its exposure, or not in order."""
 
 _KNOWN_EVENTS = 5000
 _UNREADABLE = (BadMessageError, DecodeError, KeyError, OverflowError, ValueError)
@@ -101,7 +105,8 @@ class Snapshot:
     """New data, and the latest states.
 
     Attributes:
-        time_ns: time on the timeline: that of the newest data plus the time since. In lockstep it is simulated time.
+        time_ns: time on the timeline: that of the newest step, or frame without a controller, plus the time since. In
+            lockstep it is simulated time.
         host_ns: time of the host clock, as are `sent_ns` (last message of each topic) and `LastHealth`.
         steps, truths, timings, events: new rows and events; timings are the durations of the controller's stages.
         frame, mirror, surface: newest frame (DN, at `frame_ns`), state and surface over the pupil (nm); None without a
@@ -209,7 +214,7 @@ class Accumulator:
     ) -> Snapshot:
         """Return the data since the last snapshot; `host_ns` is the present host time. See `Snapshot`."""
         frame: Frame | None = self._newest_of(FRAME, _frame, complete=complete)
-        if frame is not None:
+        if frame is not None and STEP not in self._sent_ns:
             self._set_data_time(frame.time_ns, self._sent_ns[FRAME])
         new = StepRows(0), TruthRows(0), TimingRows(), list[Log]()
         if complete:
@@ -259,7 +264,8 @@ class Accumulator:
             step = wire.ControlStep.FromString(payload)
             if not self._steps.add(step):
                 self._steps = _added(StepRows(len(step.command_nm)), step)
-            self._set_data_time(from_timestamp(step.timestamp), publish_time_ns)
+            if WRONG_TIME.isdisjoint(step.reasons):
+                self._set_data_time(from_timestamp(step.timestamp), publish_time_ns)
         elif topic is TRUTH:
             truth = wire.Truth.FromString(payload)
             if not self._truths.add(truth):

@@ -7,11 +7,11 @@ from math import isnan
 
 import numpy as np
 
-from lowfc.adapters.logs.columns import Steps
+from lowfc.adapters.logs.columns import Steps, bits_of
 from lowfc.control.durations import Durations
-from lowfc.control.loop.safety import LoopMode, Rejection
+from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.wording import counted
-from lowfc.programs.view.snapshot import LogEnd, Snapshot
+from lowfc.programs.view.snapshot import WRONG_TIME, LogEnd, Snapshot
 from lowfc.programs.view.verdicts.camera_verdict import DIM, FEW, REFUSED
 from lowfc.programs.view.verdicts.facts import facts
 from lowfc.programs.view.verdicts.run_state import RunState
@@ -21,8 +21,7 @@ from lowfc.programs.view.verdicts.verdict import LIMITS, MANY_LATE, stroke, stro
 from lowfc.programs.view.verdicts.watcher import FRAMES_SILENT_S, PERIODS
 from lowfc.programs.view.verdicts.wavefront_verdict import GOOD_FACTOR, WORSE, shaped
 
-_WITH_WRONG_TIME = sum(1 << reason for reason in (Rejection.OUT_OF_ORDER, Rejection.REPEATED, Rejection.AHEAD))
-"""Bits of the reasons for refusing a frame whose time is not that of its exposure, or not in order."""
+_WITH_WRONG_TIME = bits_of(WRONG_TIME)
 _MODES = {mode.value: mode for mode in LoopMode}
 _NAMES = {LoopMode.OPEN: "open", LoopMode.SAFE: "safe", LoopMode.IDLE: "idle", None: "without frames"}
 
