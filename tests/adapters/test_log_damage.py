@@ -166,6 +166,22 @@ def test_a_rewritten_log_is_read_as_the_original(tmp_path: Path, source: Path, o
     assert recover(path, tmp_path / "recovered.mcap").recovered is None
 
 
+def test_a_channel_that_another_tool_added_without_a_schema_is_read_and_copied(tmp_path: Path) -> None:
+    path = tmp_path / "merged.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(library="another tool")
+        channel = writer.register_channel("/diagnostics", "json", 0)
+        writer.add_message(channel, 5, b"{}", 5)
+        writer.finish()
+    path.write_bytes(path.read_bytes()[:-1])  # unfinished
+    copied = recover(path, tmp_path / "copied.mcap").recovered
+    for log in (path, copied):
+        (message,) = (reader := LogReader(log))
+        assert (message.key, message.payload, reader.schema_of(message)) == ("diagnostics", b"{}", "")
+    assert survey(copied)["state"] == "complete"
+
+
 @pytest.mark.parametrize("compression", CompressionType)
 @pytest.mark.parametrize("at", [8, 60])  # of a chunk: its length, and its content
 @pytest.mark.parametrize("finished", [True, False])

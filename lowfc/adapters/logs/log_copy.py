@@ -80,12 +80,15 @@ class LogCopy:
         name = message.key, start_of(message.sequence)
         if name not in self._channels:
             channel = reader.channels[name]
-            schema = reader.schemas[channel.schema_id]
-            known = schema.name, schema.data
-            if known not in self._schemas:
-                self._schemas[known] = self._writer.register_schema(schema.name, schema.encoding, schema.data)
+            schema_id = 0  # a channel of another tool may have no schema
+            if channel.schema_id:
+                schema = reader.schemas[channel.schema_id]
+                known = schema.name, schema.data
+                if known not in self._schemas:
+                    self._schemas[known] = self._writer.register_schema(schema.name, schema.encoding, schema.data)
+                schema_id = self._schemas[known]
             self._channels[name] = self._writer.register_channel(
-                channel.topic, channel.message_encoding, self._schemas[known], channel.metadata
+                channel.topic, channel.message_encoding, schema_id, channel.metadata
             )
         self._writer.add_message(
             channel_id=self._channels[name],

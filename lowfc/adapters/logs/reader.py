@@ -200,7 +200,7 @@ class LogReader:
     def _declare_channel(self, channel: Channel) -> None:
         if self._declared.setdefault(channel.id, channel) != channel:
             raise UnsoundError(f"channel {channel.id} is declared a second time, differently")
-        if channel.schema_id not in self.schemas:
+        if channel.schema_id and channel.schema_id not in self.schemas:
             return  # the schema's declaration was in a damaged chunk: its messages are unreadable
         start = channel.metadata.get(START_KEY, "0")
         start_s = int(start) if re.fullmatch("[0-9]{1,10}", start) else -1
@@ -212,8 +212,9 @@ class LogReader:
         self._delivered[channel.id] = (key, sequence_of(start_s, 0)) if selected else None
 
     def schema_of(self, message: Sample) -> str:
-        """Full name of the protobuf type of a delivered message."""
-        return self.schemas[self.channels[message.key, start_of(message.sequence)].schema_id].name
+        """Full name of the protobuf type of a delivered message; empty if another tool wrote it without a schema."""
+        schema_id = self.channels[message.key, start_of(message.sequence)].schema_id
+        return self.schemas[schema_id].name if schema_id else ""
 
     def _leave_out(self, damage: Damage) -> None:
         if not self._skip_damaged:
