@@ -33,6 +33,7 @@ from lowfc.contract.messages import (
     STEP,
     TIMING,
     TRUTH,
+    Message,
     Topic,
     from_timestamp,
     image,
@@ -260,15 +261,23 @@ def test_a_log_without_steps_or_calibration_is_refused(tmp_path: Path, topic: To
 
 
 @pytest.mark.parametrize("to", [Format.NPZ, Format.FITS, Format.AOT])
-@pytest.mark.parametrize("mixed_sizes", [True, False])
-def test_a_failed_export_leaves_no_file(tmp_path: Path, to: Format, mixed_sizes: bool) -> None:
-    """Frames of several sizes, or none at all."""
+@pytest.mark.parametrize(
+    ("frame", "reason"),
+    [
+        (image(np.zeros((3, 3), np.uint16), 0, "sensor"), r"has shape \(3, 3\), but earlier frames have"),
+        (image(np.zeros((3, 3), np.float32), 0, "sensor"), "is not a complete image of 16-bit pixels"),
+        (image(np.zeros((3, 3), np.uint16), 1 << 63, "sensor"), "cannot be read: its time is"),
+        (None, "has no frames"),
+    ],
+)
+def test_a_failed_export_leaves_no_file(tmp_path: Path, to: Format, frame: Message | None, reason: str) -> None:
+    """Frames of several sizes, an image of another kind, or no frames at all."""
     night = a_night()
-    night.samples = [one for one in night.samples if mixed_sizes or one.key != FRAME.key]
-    if mixed_sizes:
-        night.put(FRAME, image(np.zeros((3, 3), np.uint16), 0, "sensor"))
-    path = night.write(tmp_path / "mixed_sizes.mcap")
-    with pytest.raises(DataFileError, match="export without --frames"):
+    night.samples = [one for one in night.samples if frame is not None or one.key != FRAME.key]
+    if frame is not None:
+        night.put(FRAME, frame)
+    path = night.write(tmp_path / "night.mcap")
+    with pytest.raises(DataFileError, match=f"{reason}.*; export without --frames"):
         export_log(path, to, frames=True, console=QUIET)
     assert list(tmp_path.iterdir()) == [path]
 

@@ -13,7 +13,8 @@ import numpy.typing as npt
 from lowfc.adapters.logs.history import History
 from lowfc.arrays import Pixels
 from lowfc.contract.codecs.codec import decode_frame
-from lowfc.contract.errors import DataFileError
+from lowfc.contract.envelope import count_of
+from lowfc.contract.errors import BadMessageError, DataFileError
 from lowfc.contract.messages import FRAME
 
 if TYPE_CHECKING:
@@ -84,13 +85,20 @@ def _copy_frames(
     shape: tuple[int, ...] | None = None
     row = -1
     for row, message in enumerate(itertools.islice(history.again(FRAME), count)):
-        frame = decode_frame(message.payload, message.sequence, 0)
-        frame_shape = None if frame.pixels is None else frame.pixels.shape
-        if shape is None and frame_shape is not None:
-            write_header((count, *(shape := frame_shape)))
-        if frame.pixels is None or frame_shape != shape:
+        number = count_of(message.sequence)
+        try:
+            frame = decode_frame(message.payload, message.sequence, 0)
+        except BadMessageError as fault:
+            raise DataFileError(f"{path}: frame {number} cannot be read: {fault}; export without --frames") from None
+        if frame.pixels is None:
             raise DataFileError(
-                f"{path}: frame {frame.sequence} has shape {frame_shape}, but earlier frames have {shape}; "
+                f"{path}: frame {number} is not a complete image of 16-bit pixels; export without --frames"
+            )
+        if shape is None:
+            write_header((count, *(shape := frame.pixels.shape)))
+        if frame.pixels.shape != shape:
+            raise DataFileError(
+                f"{path}: frame {number} has shape {frame.pixels.shape}, but earlier frames have {shape}; "
                 "export without --frames"
             )
         stream.write(encode(frame.pixels).tobytes())
