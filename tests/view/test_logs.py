@@ -181,6 +181,16 @@ def test_the_trend_of_a_night_has_a_limited_number_of_spans() -> None:
     assert after_ns[-1] == pytest.approx(12 * 86_400e9, rel=0.02)
 
 
+@pytest.mark.parametrize(
+    ("days", "labels"),
+    [(0.2, ["23:00", "00:00", "01:00"]), (3, ["11-15", "11-16", "11-17"]), (12, ["11-15", "11-17", "11-19"])],
+)
+def test_the_trend_of_days_has_dates(days: float, labels: list[str]) -> None:
+    ticks = [label for _, label in trend._clock_ticks(1_700_000_000 * 10**9, days * 86_400)]
+    assert ticks[:3] == labels
+    assert len(ticks) <= 7
+
+
 def test_a_log_larger_than_the_memory_of_the_viewer_gives_a_remark() -> None:
     target = Target(picture=Path("night.png"))
     assert memory_remarks(511_000_000, target) == []

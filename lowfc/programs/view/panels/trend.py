@@ -21,7 +21,7 @@ WIDTH = 200.0
 
 _FIRST_SPAN_S, _LONGER = 60.0, 1.4
 """First span of the time axis, and the factor by which it grows when it is full."""
-_TICKS_S = (10, 30, 60, 120, 300, 600, 1800, 3600, 7200, 10_800, 21_600, 86_400)
+_TICKS_S = (10, 30, 60, 120, 300, 600, 1800, 3600, 7200, 10_800, 21_600, 86_400, 172_800, 604_800, 2_592_000)
 _MAX_TICKS = 6
 
 
@@ -69,9 +69,9 @@ def _nm_ticks(least: float, most: float) -> list[tuple[float, str]]:
 
 
 def _clock_ticks(begin_ns: int, span_s: float) -> Ticks:
-    """Ticks at round times of day, UTC, in seconds since `begin_ns`."""
+    """Ticks at round times of day or, of a longer trend, on days, UTC, in seconds since `begin_ns`."""
     step_s = next((one for one in _TICKS_S if span_s / one <= (_MAX_TICKS if one >= 60 else 3)), _TICKS_S[-1])
-    form = "%H:%M" if step_s >= 60 else "%H:%M:%S"
+    form = "%m-%d" if step_s >= 86_400 else "%H:%M" if step_s >= 60 else "%H:%M:%S"
     first_s = -(-begin_ns // (step_s * 10**9)) * step_s
     times_s = range(first_s, int(begin_ns * 1e-9 + span_s) + 1, step_s)
     return [(one - begin_ns * 1e-9, f"{datetime.fromtimestamp(one, UTC):{form}}") for one in times_s]
