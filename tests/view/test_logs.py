@@ -12,7 +12,19 @@ from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.records import LogFile
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
-from lowfc.contract.messages import CALIBRATION, EVENT, FRAME, STEP, SURFACE, TRUTH, Log, image, timestamp, wire
+from lowfc.contract.messages import (
+    CALIBRATION,
+    EVENT,
+    FRAME,
+    MIRROR_STATE,
+    STEP,
+    SURFACE,
+    TRUTH,
+    Log,
+    image,
+    timestamp,
+    wire,
+)
 from lowfc.control.loop.safety import Rejection
 from lowfc.programs.view.layout import layout
 from lowfc.programs.view.live_view import earlier_events
@@ -270,6 +282,16 @@ def test_a_frame_of_a_camera_whose_clock_is_ahead_does_not_move_the_time_line(tm
     done, _ = drawn(made.write(tmp_path / "night.mcap"))
     begin_ns, end_ns = done.span_ns
     assert (end_ns - begin_ns) * 1e-9 == pytest.approx(done.log_s, abs=0.1)
+
+
+def test_the_largest_stroke_of_a_log_is_that_of_every_mirror_state(tmp_path: Path, shown: Shown) -> None:
+    made = night(300)
+    number = [place for place, one in enumerate(made.samples) if MIRROR_STATE.matches(one.key)][101]
+    state = wire.MirrorState.FromString(made.samples[number].payload)
+    state.actuators = np.full(state.rows * state.columns, -350, "<f4").tobytes()
+    made.samples[number] = made.samples[number]._replace(payload=state.SerializeToString())
+    drawn(made.write(tmp_path / "night.mcap"))
+    assert tile(shown[-1], "MIRROR").value == "50 %"
 
 
 def test_a_message_of_an_impossible_time_is_left_out(tmp_path: Path) -> None:

@@ -1,9 +1,12 @@
 """Draw a log as the live view draws a run."""
 
+import contextlib
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+
+from google.protobuf.message import DecodeError
 
 from lowfc.adapters.logs.history import LAST_NS, attached_configuration
 from lowfc.adapters.logs.reader import LogReader
@@ -12,10 +15,11 @@ from lowfc.adapters.logs.writer import PART
 from lowfc.adapters.process.clock import SIMULATED_START_NS
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
-from lowfc.contract.messages import topic_of
+from lowfc.contract.messages import MIRROR_STATE, topic_of, wire
 from lowfc.control.loop.wording import counted
 from lowfc.programs.view.renderer import Renderer
 from lowfc.programs.view.snapshot import PICTURES_HZ, PICTURES_PER_COMPLETE, SHOWN, Accumulator, LogEnd
+from lowfc.programs.view.verdicts.verdict import stroke_used_nm
 
 _PERIOD_NS = round(1e9 / PICTURES_HZ)
 _STRIDE = 500  # messages between progress reports
@@ -49,6 +53,7 @@ def draw_logs(
     renderer: Renderer | None = None
     due_ns = first_ns = last_ns = earlier_bytes = 0
     damaged, no_end, run, host = 0, "", "", ""
+    stroke_nm: float | None = None
     lost: dict[str, int] = {}  # by recording; the account of its last file is that of all
     for log in logs:
         reader = LogReader(log, topics=SHOWN, skip_damaged=True)
@@ -74,7 +79,12 @@ def draw_logs(
                 accumulator.unreadable += 1
                 continue
             accumulator.add(message)
-            if first_ns or not topic_of(message.key).queryable:  # states requested at the log's start may be hours old
+            topic = topic_of(message.key)
+            if topic is MIRROR_STATE:
+                with contextlib.suppress(DecodeError):
+                    used_nm = stroke_used_nm(wire.MirrorState.FromString(message.payload))
+                    stroke_nm = used_nm if stroke_nm is None else max(stroke_nm, used_nm)
+            if first_ns or not topic.queryable:  # states requested at the log's start may be hours old
                 last_ns = max(last_ns, message.receive_time_ns)
                 first_ns = first_ns or last_ns
             if first_ns and last_ns >= due_ns:
@@ -96,7 +106,7 @@ def draw_logs(
             lost[reader.metadata.get(PART, {}).get("of", log.name)] = int(account)
     if renderer is None:
         raise DataFileError(f"nothing to show in {', '.join(map(str, logs))}: no message that a view shows")
-    ended = LogEnd(logs[-1].name.partition(".")[0], run, host, no_end, damaged, sum(lost.values()))
+    ended = LogEnd(logs[-1].name.partition(".")[0], run, host, no_end, damaged, sum(lost.values()), stroke_nm)
     renderer.draw(accumulator.snapshot(last_ns, ended=ended))
     if accumulator.unreadable:
         drawn.remarks.append(f"{counted(accumulator.unreadable, 'message')} could not be read")

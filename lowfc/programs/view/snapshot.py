@@ -90,6 +90,7 @@ class LogEnd:
         no_end: why one of them has no end; empty if all were finished.
         damaged: number of damaged stretches that were left out.
         lost: number of messages lost, from the recorder's accounts at the end of its recordings.
+        stroke_nm: largest deviation of an actuator from flat in any mirror state; None without one.
     """
 
     name: str
@@ -98,6 +99,7 @@ class LogEnd:
     no_end: str
     damaged: int
     lost: int
+    stroke_nm: float | None
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,7 @@ from lowfc.programs.view.verdicts.facts import facts
 from lowfc.programs.view.verdicts.run_state import RunState
 from lowfc.programs.view.verdicts.span_means import SpanMeans
 from lowfc.programs.view.verdicts.tile import Level, Tile, Verdict, duration, hertz, rounded, worst_of
-from lowfc.programs.view.verdicts.verdict import LIMITS, MANY_LATE, stroke, stroke_used_nm
+from lowfc.programs.view.verdicts.verdict import LIMITS, MANY_LATE, stroke
 from lowfc.programs.view.verdicts.watcher import FRAMES_SILENT_S, PERIODS
 from lowfc.programs.view.verdicts.wavefront_verdict import GOOD_FACTOR, WORSE, shaped
 
@@ -35,7 +35,6 @@ class LogVerdict:
         self._mode_ns: Counter[LoopMode | None] = Counter()
         self._first_ns = self._last_ns = 0
         self._latency = Durations()
-        self._stroke_nm = 0.0
         self._shaped = False
 
     def feed(self, snapshot: Snapshot) -> None:
@@ -49,13 +48,11 @@ class LogVerdict:
         for duration_ns in snapshot.timings["frame_to_command"].tolist():
             self._latency.add(duration_ns)
         self._shaped |= shaped(snapshot.controller)
-        if snapshot.mirror is not None:
-            self._stroke_nm = max(self._stroke_nm, stroke_used_nm(snapshot.mirror))
 
     def verdict(self, state: RunState, ended: LogEnd) -> Verdict:
         """Tiles of the whole log, and a headline, with the advice of the worst tile if it needs attention."""
         loop, wavefront = self._loop(), self._wavefront()
-        others = _frames(state), self._star(), self._mirror(state), self._timing(state), _log(state, ended)
+        others = _frames(state), self._star(), _mirror(state, ended), self._timing(state), _log(state, ended)
         tiles = (loop, wavefront, *others)
         worst = worst_of(tiles)
         level = worst.level if worst.level >= Level.WARNING else min(loop.level, wavefront.level)
@@ -122,18 +119,6 @@ class LogVerdict:
             return Tile("STAR", value, detail, Level.WARNING, f"The star was dim, down to {dimmest} %.")
         return Tile("STAR", value, detail, Level.GOOD)
 
-    def _mirror(self, state: RunState) -> Tile:
-        value, of = stroke(self._stroke_nm, state.snapshot.stroke_nm)
-        used = f"{value} {of} at most" if state.mirror_state is not None else "stroke not known"
-        acted = {words: state.totals[reason] for reason, words in LIMITS.items() if state.totals[reason]}
-        if not acted and state.mirror_state is None:
-            return Tile("MIRROR", "?", f"{used}, no limit acted")
-        if not acted:
-            return Tile("MIRROR", value, f"{of} at most, no limit acted", Level.GOOD)
-        named = ", ".join(f"{words}: {counted(count, 'time')}" for words, count in acted.items())
-        advice = f"The mirror was at a limit ({named}): the disturbance was larger than it can correct."
-        return Tile("MIRROR", "AT LIMIT", f"{named}; {used}", Level.WARNING, advice)
-
     def _timing(self, state: RunState) -> Tile:
         if not self._latency.count:
             return Tile("LATENCY", "?", "not measured")
@@ -168,6 +153,19 @@ def _frames(state: RunState) -> Tile:
         return Tile("FRAMES", f"{unused} UNUSED", detail, Level.WARNING, advice)
     rate = hertz(1e9 / state.snapshot.period_ns) if state.snapshot.period_ns else f"{steps}"
     return Tile("FRAMES", rate, detail, Level.GOOD if steps else Level.NEUTRAL)
+
+
+def _mirror(state: RunState, ended: LogEnd) -> Tile:
+    value, of = stroke(ended.stroke_nm or 0.0, state.snapshot.stroke_nm)
+    used = f"{value} {of} at most" if ended.stroke_nm is not None else "stroke not known"
+    acted = {words: state.totals[reason] for reason, words in LIMITS.items() if state.totals[reason]}
+    if acted:
+        named = ", ".join(f"{words}: {counted(count, 'time')}" for words, count in acted.items())
+        advice = f"The mirror was at a limit ({named}): the disturbance was larger than it can correct."
+        return Tile("MIRROR", "AT LIMIT", f"{named}; {used}", Level.WARNING, advice)
+    if ended.stroke_nm is None:
+        return Tile("MIRROR", "?", f"{used}, no limit acted")
+    return Tile("MIRROR", value, f"{of} at most, no limit acted", Level.GOOD)
 
 
 def _log(state: RunState, ended: LogEnd) -> Tile:
