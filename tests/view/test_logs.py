@@ -173,6 +173,9 @@ def test_a_log_without_steps_has_no_verdict_on_the_loop(tmp_path: Path, shown: S
     made.health("recorder", state="running")
     drawn(made.write(tmp_path / "night.mcap", messages_lost="3"))
     assert shown[-1].headline.startswith("Log without a step of the controller. The recorder lost 3 messages")
+    made.samples = [one for one in made.samples if one.key != EVENT.key]
+    done, tape = drawn(made.write(tmp_path / "states.mcap"))
+    assert (done.log_s, tape.logged[tiles.TILES][-1][0]) == (0, made.samples[-1].receive_time_ns)
     assert [one.value for one in shown[-1].tiles] == ["NOT CLOSED", "?", "1000 Hz", "?", "?", "?", "FINISHED"]
 
 

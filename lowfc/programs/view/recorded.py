@@ -84,8 +84,8 @@ def draw_logs(
                 with contextlib.suppress(DecodeError):
                     used_nm = stroke_used_nm(wire.MirrorState.FromString(message.payload))
                     stroke_nm = used_nm if stroke_nm is None else max(stroke_nm, used_nm)
-            if first_ns or not topic.queryable:  # states requested at the log's start may be hours old
-                last_ns = max(last_ns, message.receive_time_ns)
+            last_ns = max(last_ns, message.receive_time_ns)
+            if not topic.queryable:  # states requested at the log's start may be hours old
                 first_ns = first_ns or last_ns
             if first_ns and last_ns >= due_ns:
                 snapshot = accumulator.snapshot(last_ns, complete=drawn.snapshots % PICTURES_PER_COMPLETE == 0)
@@ -110,5 +110,5 @@ def draw_logs(
     renderer.draw(accumulator.snapshot(last_ns, ended=ended))
     if accumulator.unreadable:
         drawn.remarks.append(f"{counted(accumulator.unreadable, 'message')} could not be read")
-    drawn.log_s = (last_ns - first_ns) * 1e-9
+    drawn.log_s = (last_ns - (first_ns or last_ns)) * 1e-9
     return drawn
