@@ -144,6 +144,10 @@ def test_the_time_of_a_slow_loop_and_of_a_frame_with_a_wrong_clock_is_counted(
     made.frames(1)
     drawn(made.write(tmp_path / "frame.mcap"))
     assert tile(shown[-1], "FRAMES").value == "0.5 Hz"
+    made = SyntheticLog()
+    made.put(STEP, step)
+    drawn(made.write(tmp_path / "step.mcap"))
+    assert shown[-1].headline.startswith("Log without a step of the controller at a valid time")
 
 
 @pytest.mark.parametrize(

@@ -56,7 +56,7 @@ class LogVerdict:
         tiles = (loop, wavefront, *others)
         worst = worst_of(tiles)
         level = worst.level if worst.level >= Level.WARNING else min(loop.level, wavefront.level)
-        headline = "Log without a step of the controller"
+        headline = f"Log without a step of the controller{' at a valid time' if state.totals['steps'] else ''}"
         if self._first_ns:
             begin = datetime.fromtimestamp(self._first_ns * 1e-9, UTC)
             span = duration((self._last_ns - self._first_ns) * 1e-9)
