@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from lowfc.contract.codecs.state_codec import controller_state
-from lowfc.contract.configuration import Configuration
+from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.messages import FRAME, timestamp, wire
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.camera import CameraSettings
@@ -199,8 +199,10 @@ def test_the_status_line_shows_recent_statistics_and_none_before_the_first_frame
         health.timestamp.FromSeconds(seconds)
     assert status_line(watch, 17.0) == "   17 s  closed  the camera has been silent for 7 s"
     with Console(width=120, file=io.StringIO(), record=True) as console:
-        console.print(screen(watch, Configuration(), None, 17.0))
-    assert "2.20" not in console.export_text(), "statistics seven seconds old are not shown"
+        console.print(screen(watch, load(None, {"sensor.kind": "zwfs"}), None, 17.0))
+    shown = console.export_text()
+    assert "2.20" not in shown, "statistics seven seconds old are not shown"
+    assert "bench, V = 2, zwfs; 17 s" in shown
 
 
 @pytest.mark.parametrize(("received", "missing", "lost"), [(500, 0, 0), (371, 129, 129), (309, 0, 191), (0, 0, 0)])

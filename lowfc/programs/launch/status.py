@@ -44,7 +44,8 @@ def screen(watch: Watch, config: Configuration, duration_s: float | None, elapse
     for log in watch.events[-_EVENTS_SHOWN:]:
         table.add_row(Text(printable(log.name)), Text(printable(log.message), style=_STYLES.get(Level(log.level), "")))
     left = f" of {duration_s:g} s" if duration_s is not None else ", Ctrl-C ends it"
-    scene = f"{config.disturbance.preset}, V = {config.star.magnitude:g}, {config.sensor.sam}"
+    sensor = config.sensor.sam if config.sensor.kind == "sam" else config.sensor.kind
+    scene = f"{config.disturbance.preset}, V = {config.star.magnitude:g}, {sensor}"
     return Panel(Group(table), title="lowfc", subtitle=f"{scene}; {elapsed_s:.0f} s{left}", expand=False)
 
 
