@@ -277,6 +277,9 @@ def test_a_difference_is_compared_with_the_spread() -> None:
     single = compare(before, together([repeat(10)]))["rows"]
     assert {row["spread"] for row in single} == {None}
     assert "within the spread" in compared({"a": "a.json", "b": "b.json"} | compare(before, after))
+    for values in (before["latency_us"], before["spread_us"]):
+        values["span_of_a_later_release"] = values["frame_to_command"]
+    assert "span_of_a_later_release" in compared({"a": "a.json", "b": "b.json"} | compare(before, before))
 
 
 def test_the_results_of_every_release_can_be_compared_with_present_ones() -> None:
@@ -402,7 +405,13 @@ def test_the_log_of_the_run_gives_the_same_latencies(measured: tuple[dict[str, A
 
 def test_files_that_are_no_results_or_logs_are_errors(tmp_path: Path) -> None:
     other = tmp_path / "other.json"
-    for content, expected in (("{", "not JSON"), ("[]", "no latency_us"), ('{"latency_us": {}}', "ratio")):
+    listed = '{"latency_us": [1], "ratio": null, "repeats": []}'
+    for content, expected in (
+        ("{", "not JSON"),
+        ("[]", "no latency_us"),
+        ('{"latency_us": {}}', "ratio"),
+        (listed, "at least one is not"),
+    ):
         other.write_text(content)
         fault = lowfc("latency", "--compare", other, other).exception
         assert isinstance(fault, DataFileError)

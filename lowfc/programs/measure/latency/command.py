@@ -182,9 +182,9 @@ def _compare(files: tuple[Path, Path]) -> dict[str, Any]:
 
     try:
         found = compare(*(_result(file) for file in files))
-    except (KeyError, TypeError) as fault:
+    except (LookupError, TypeError, AttributeError) as fault:
         raise DataFileError(
-            f"{files[0]} and {files[1]} must be results of `lowfc latency --json`: {fault!r} is missing"
+            f"{files[0]} and {files[1]} must be results of `lowfc latency --json`, but at least one is not: {fault!r}"
         ) from None
     return dict(zip("ab", map(str, files), strict=True)) | found
 

@@ -45,9 +45,10 @@ def compared(comparison: Mapping[str, Any]) -> str:
         digits = 1 if row["unit"] else 3
         spread = "-" if row["spread"] is None else f"{row['spread']:.{digits}f}"
         verdict = row["better"] if row["beyond_spread"] is not False else f"{row['better']}, within the spread"
+        label = _COMPARED.get(row["name"], row["name"]).strip()
         over = "-" if row["ratio"] is None else f"{row['ratio']:.3f}"
         lines.append(
-            f"{_COMPARED[row['name']].strip():<22}{row['at'].replace('_', '.'):>7}{row['a']:>10.{digits}f}"
+            f"{label:<22}{row['at'].replace('_', '.'):>7}{row['a']:>10.{digits}f}"
             f"{row['b']:>10.{digits}f}{over:>8}{row['difference']:>+10.{digits}f}{spread:>10}   {verdict}"
         )
     lines += [f"{COUNTS[name]}: a {a}, b {b}" for name, (a, b) in comparison["counts"].items() if a or b]
