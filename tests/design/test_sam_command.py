@@ -4,6 +4,8 @@ import io
 import json
 import os
 import shlex
+import signal
+import subprocess
 import sys
 from collections.abc import Iterator
 from concurrent.futures import Executor, Future
@@ -11,6 +13,7 @@ from concurrent.futures.process import BrokenProcessPool
 from itertools import pairwise
 
 import numpy as np
+import psutil
 import pytest
 from rich.console import Console
 from typer.testing import CliRunner
@@ -27,6 +30,7 @@ from lowfc.programs.design.command import design_app
 from lowfc.programs.design.sam_executors import InProcessExecutor, open_executor
 from lowfc.programs.design.sam_files import read_state
 from lowfc.programs.design.sam_request import Search
+from tests.support.loops import until
 
 RECORDED = {
     name: entry["command"] for name, entry in json.loads(SHIPPED.read_text())["layouts"].items() if "command" in entry
@@ -139,6 +143,29 @@ def test_lost_workers_are_reported_and_the_search_resumes(uninterrupted, tmp_pat
     search, chains = program.resumed(tmp_path / "state.json")
     _, out = run(search, tmp_path, InProcessExecutor(), chains)
     assert out.read_text() == uninterrupted[1]
+
+
+KILLED = """
+import os, signal
+from lowfc.programs.design.sam_executors import open_executor
+with open_executor(2, None) as pool:
+    print(pool.submit(os.getpid).result(), flush=True)
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_a_worker_ends_with_a_search_that_is_killed(tmp_path):
+    with (tmp_path / "worker").open("w") as output:
+        assert subprocess.run([sys.executable, "-c", KILLED], stdout=output, check=False).returncode == -signal.SIGKILL
+    worker = int((tmp_path / "worker").read_text())
+    until(lambda: not runs(worker))
+
+
+def runs(pid):
+    try:
+        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
 
 
 def test_dead_processes_are_distinguished_from_errors_in_the_search(tmp_path, monkeypatch):
