@@ -113,6 +113,13 @@ def test_a_child_is_the_program_itself_in_its_own_session(tmp_path: Path) -> Non
     child.stop(PATIENCE_S)
 
 
+def test_the_output_of_a_child_is_kept_if_it_has_a_file(tmp_path: Path) -> None:
+    child = Child("one", ["echo", "done"], tmp_path / "stderr", stdout_path=tmp_path / "stdout")
+    child.start()
+    child.process.wait(PATIENCE_S)
+    assert (tmp_path / "stdout").read_text() == "done\n"
+
+
 def test_the_end_of_a_child_and_a_missing_program_are_reported(tmp_path: Path) -> None:
     child = Child("one", ["sleep", "600"], tmp_path / "stderr")
     child.start()

@@ -24,7 +24,7 @@ if os.getppid() == parent:  # the parent is still alive
 
 @dataclass(slots=True)
 class Child:
-    """A child process whose standard error goes to a file; `name` is its name in Health or in messages.
+    """A child process whose standard error and output go to files; `name` is its name in Health or in messages.
 
     `environment` defaults to this process's. The child gets `death_signal` when its parent dies; only SIGKILL ends a
     process suspended by SIGSTOP.
@@ -35,6 +35,7 @@ class Child:
     stderr_path: Path
     environment: Mapping[str, str] | None = None
     death_signal: signal.Signals = signal.SIGTERM
+    stdout_path: Path = Path(os.devnull)
     process: "subprocess.Popen[bytes] | None" = None
 
     def start(self) -> None:
@@ -48,12 +49,12 @@ class Child:
         if shutil.which(self.command[0], path=(self.environment or os.environ).get("PATH")) is None:
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), self.command[0])
         death = [sys.executable, "-I", "-S", "-c", _WRAPPER, str(self.death_signal.value), str(os.getpid())]
-        with self.stderr_path.open("wb") as stream:
+        with self.stderr_path.open("wb") as errors, self.stdout_path.open("wb") as output:
             self.process = subprocess.Popen(  # noqa: S603  # our own programs, and the viewer's
                 [*death, *self.command],
                 stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=stream,
+                stdout=output,
+                stderr=errors,
                 env=self.environment,
                 start_new_session=True,
             )

@@ -4,9 +4,6 @@ import contextlib
 import json
 import os
 import platform
-import signal
-import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -22,6 +19,7 @@ from lowfc.programs.cli.output import print_result
 RATES_HZ = (1000.0, 2000.0, 5000.0)
 
 _READY_S = 30.0
+_PATIENCE_S = 60.0
 _POLL_S = 0.5
 _WARM_UP_S = 0.5
 _COPY_S = 0.5
@@ -120,35 +118,35 @@ def render(results: dict[str, Any]) -> str:
 
 def _one_rate(rate_hz: float, seconds: float, folder: Path) -> dict[str, Any]:
     from lowfc.adapters.bus.run import new_run_id, open_run
+    from lowfc.programs.launch.processes import program
     from lowfc.programs.measure.traffic import Traffic
 
     run = open_run(new_run_id())
-    words = [sys.executable, "-P", "-m", "lowfc", "record", "--run", run.run_id, "--folder", str(folder), "--json"]
-    pipes: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    arguments = ["-m", "lowfc", "record", "--run", run.run_id, "--folder", str(folder), "--json"]
+    recorder = program("recorder", arguments, folder / "recorder.stderr")
+    recorder.stdout_path = folder / "recorder.json"
     with contextlib.ExitStack() as stack:
         stack.callback(run.remove)
-        process = stack.enter_context(
-            subprocess.Popen(words, **pipes, text=True, start_new_session=True)  # noqa: S603  # our own program
-        )
-        stack.callback(process.kill)  # no effect if it has ended
+        recorder.start()
+        stack.callback(recorder.stop, _PATIENCE_S)  # no effect if it has ended
         traffic = stack.enter_context(contextlib.closing(Traffic(run, rate_hz)))
         deadline_s = time.monotonic() + _READY_S
         while not traffic.wait_for("recorder", _POLL_S):
-            if process.poll() is not None or time.monotonic() > deadline_s:
-                process.kill()
-                raise BusError(f"the recorder did not become ready: {process.communicate()[1].strip()[-500:]}")
+            if recorder.status is not None or time.monotonic() > deadline_s:
+                raise BusError(f"the recorder did not become ready: {recorder.stderr_tail()}")
         traffic.run(_WARM_UP_S)
+        assert recorder.process is not None  # noqa: S101  # it was started
+        process = psutil.Process(recorder.process.pid)
         begun_s, first_frame = time.monotonic(), traffic.frames
-        own_s, before = time.process_time(), psutil.Process(process.pid).cpu_times()
+        own_s, before = time.process_time(), process.cpu_times()
         traffic.run(seconds)
         elapsed_s = time.monotonic() - begun_s
-        own_s, after = time.process_time() - own_s, psutil.Process(process.pid).cpu_times()
+        own_s, after = time.process_time() - own_s, process.cpu_times()
         traffic.finish()
-        process.send_signal(signal.SIGTERM)
-        out, error = process.communicate()
-        if process.returncode:
-            raise BusError(f"the recorder failed: {error.strip()[-500:]}")
-    done = json.loads(out)
+        recorder.stop(_PATIENCE_S)
+        if recorder.status:
+            raise BusError(f"the recorder failed: {recorder.exit_description()}; {recorder.stderr_tail()}")
+    done = json.loads(recorder.stdout_path.read_bytes())
     return {
         "rate_hz": rate_hz,
         "offered_hz": (traffic.frames - first_frame) / elapsed_s,
