@@ -185,7 +185,7 @@ def test_too_few_rounds_give_advice(tmp_path):
     arguments = ["spc", "--outer", "8", "--cells", "16", "--rounds", "1", "--out", str(tmp_path / "spc.npz")]
     error = lowfc("design", *arguments).exception
     assert isinstance(error, ConfigurationError)
-    assert "after 1 programs with 16 cells the contrast is" in str(error)
+    assert "after 1 program with 16 cells the contrast is" in str(error)
     assert list(tmp_path.iterdir()) == []
 
 

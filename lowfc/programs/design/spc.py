@@ -20,6 +20,7 @@ from lowfc.adapters.files.whole_file import require_folder, write_whole
 from lowfc.adapters.process.terminal import INTERRUPTED
 from lowfc.arrays import Array
 from lowfc.contract.errors import ConfigurationError
+from lowfc.control.loop.wording import counted
 from lowfc.design.dark_zone import FINE_STEP, fine_grid
 from lowfc.design.linear_program import NotSolvedError
 from lowfc.design.shaped_pupil import (
@@ -83,8 +84,8 @@ def design_spc(request: Request, out: Path, plot: Path | None, console: Console)
             raise ConfigurationError(_infeasible(request, *_interruptibly(lambda: nearest_feasible(request))))
     if last.contrast > request.contrast:
         raise ConfigurationError(
-            f"after {last.number} programs with {request.cells} cells the contrast is {last.contrast:.2e}, not "
-            f"{request.contrast:g}: allow more --rounds, or a lower --limit than {request.limit:g}"
+            f"after {counted(last.number, 'program')} with {request.cells} cells the contrast is {last.contrast:.2e}, "
+            f"not {request.contrast:g}: allow more --rounds, or a lower --limit than {request.limit:g}"
         )
     quarter = stored(last.quarter, request)
     made_by = np.array(json.dumps(asdict(request)))
