@@ -180,7 +180,7 @@ def reconstructor(
     if not condition_number(scaled) < SINGULAR:
         raise ValueError(
             f"the sensor cannot tell the modes apart (condition number above {SINGULAR:.0e}): "
-            "an even-symmetric aperture mask cannot sense even modes; use another mask or fewer modes"
+            "use another sensor or fewer modes; an even-symmetric aperture mask gives no signal of even modes"
         )
     if nuisance is None:
         return np.asarray(np.linalg.pinv(scaled) * root.T)

@@ -68,7 +68,7 @@ def design(sizes: Sizes, goal: Goal, out: Path, plot: Path | None) -> Sweep:
         values, best = sweep(merit_of, sizes.low, sizes.high, _POINTS)
         found = {value: predictions(candidate(value)) for value in sorted({*values.tolist(), best})}
         points = [_point(found[value], value, merit_of(value), goal) for value in found]
-    keys = {"kind": f'"{sizes.kind}"', **sizes.others, key: f"{best:.4g}"}
+    keys = {"kind": f'"{sizes.kind}"', **sizes.others, key: f"{best:.6g}"}
     write_whole(out, "".join(["[sensor]\n", *(f"{name} = {value}\n" for name, value in keys.items())]).encode())
     if plot is not None:
         write_whole(plot, _picture(points, key, goal))

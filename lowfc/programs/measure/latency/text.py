@@ -140,5 +140,5 @@ def _what(results: Mapping[str, Any]) -> str:
         return f"{Path(settings['log']).name}, {results['rate_hz']:.1f} Hz"
     also = "".join(f", with --{name}" for name in ("record", "view", "trace") if settings.get(name))
     times = f"medians over {count} times {settings['duration_s']:g} s" if count > 1 else f"{settings['duration_s']:g} s"
-    reached = f"{settings['rate_hz']:g} Hz ({results['rate_hz']:.1f} Hz reached)"
-    return f"{reached}, {settings['camera']} frames{also}, {times}"
+    reached = f" ({results['rate_hz']:.1f} Hz reached)" if results["rate_hz"] else ""  # 0: of a single frame
+    return f"{settings['rate_hz']:g} Hz{reached}, {settings['camera']} frames{also}, {times}"
