@@ -71,6 +71,8 @@ def test_descriptions_of_a_class_within_a_class_and_of_one_without_source() -> N
 def test_a_configuration_round_trips_through_toml(tmp_path: Path) -> None:
     config = load(None, {"seed": 7, "mirror.stuck_nm": {"3": 25.0}, "mirror.dead": [1, 2], "camera.delay_frames": 1.5})
     assert load(write(tmp_path, config.to_toml())) == config
+    many = load(None, {"mirror.stuck_nm": {str(actuator): 0.5 for actuator in range(150)}})
+    assert load(write(tmp_path, commented(many))) == many, "also 150 numbers with a dot in one line"
     written = tomllib.loads(config.to_toml())
     for key in KEYS:
         *sections, last = key.split(".")
