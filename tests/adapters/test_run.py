@@ -279,6 +279,11 @@ def test_a_failed_write_leaves_the_old_file_only(tmp_path: Path, monkeypatch) ->
     path = tmp_path / "file"
     for content in (b"former", b"first"):
         write_whole(path, content)
+    os.mkfifo(tmp_path / "pipe")
+    for special in (tmp_path / "pipe", Path(), Path("/"), tmp_path):
+        with pytest.raises(DataFileError, match=f"^{special} cannot be written: not a regular file"):
+            write_whole(special, b"")
+    (tmp_path / "pipe").unlink()
     with pytest.raises(DataFileError, match="nowhere/file cannot be written: No such file"):
         write_whole(tmp_path / "nowhere" / "file", b"")
 

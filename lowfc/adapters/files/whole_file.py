@@ -1,6 +1,7 @@
 """Atomic writing of files: complete or absent."""
 
 import contextlib
+import errno
 import os
 import secrets
 import stat
@@ -14,12 +15,15 @@ from lowfc.contract.errors import ConfigurationError, DataFileError
 def being_written(path: Path, source: Path | None = None, mode: int = 0o666) -> Iterator[Path]:
     """Yield a temporary file that is renamed to `path` on success and removed on failure.
 
-    Its permissions are `mode` without the umask's bits, and at most those of `source`, its origin.
+    A directory, device or pipe at `path` is not replaced. The permissions are `mode` without the umask's bits, and at
+    most those of `source`, its origin.
 
     Raises:
         DataFileError: the file cannot be written.
     """
     try:
+        if not path.name or (path.exists() and not path.is_file()):
+            raise OSError(errno.EINVAL, "not a regular file")
         most = source.stat().st_mode & mode if source is not None and source.exists() else mode
         part = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
         descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, most)
