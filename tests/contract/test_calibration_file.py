@@ -67,6 +67,10 @@ def test_a_damaged_file_is_refused(tmp_path: Path) -> None:
         units["DARK"].data[3] += 1
     with pytest.raises(DataFileError, match="damaged: the identity of its content"):
         load(path)
+    card = b"ROWS    ="
+    path.write_bytes(content.replace(card + b" " * 20 + b"6", card + b" " * 16 + b"1E400"))
+    with pytest.raises(DataFileError, match="cannot convert float infinity to integer"):
+        load(path)
     path.write_bytes(content[: len(content) // 2])
     with pytest.raises(DataFileError, match=r"night\.fits"):
         load(path)

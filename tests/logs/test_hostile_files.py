@@ -1,12 +1,16 @@
 """Hostile files: any file named on a command line or in a configuration leads to a one-line error."""
 
+import io
+import lzma
 import os
 import struct
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
+from astropy.io import fits
 
 from lowfc.adapters.files import calibration_file, law_file
 from lowfc.adapters.files.array_file import read_array
@@ -150,15 +154,43 @@ def test_an_array_with_a_hostile_header_is_refused(tmp_path: Path, content: byte
     assert text.startswith(f"{key}: {path}: neither a FITS image nor a numpy array")
 
 
+def npz() -> bytes:
+    content = io.BytesIO()
+    np.savez(content, np.ones((34, 34)))
+    return content.getvalue()
+
+
+def xz_damaged_in_the_middle() -> bytes:
+    content = io.BytesIO()
+    fits.PrimaryHDU(np.random.default_rng(1).normal(size=(34, 34))).writeto(content)
+    damaged = bytearray(lzma.compress(content.getvalue()))
+    damaged[len(damaged) // 2] ^= 0xFF
+    return bytes(damaged)
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (npz(), "it is a zip archive, such as .npz"),
+        (b"\x1f\x8b\x08" + bytes(7) + b"\xff" * 50, "invalid block type"),
+        (xz_damaged_in_the_middle(), "Internal error"),
+    ],
+)
+def test_archives_and_damaged_compressed_files_are_refused(tmp_path: Path, content: bytes, expected: str) -> None:
+    path = tmp_path / "flat.fits"
+    path.write_bytes(content)
+    assert expected in error_of(lambda: check_files(load(None, {"mirror.flat": str(path)})))
+
+
 def test_fits_images_and_pupils_with_a_huge_header_are_refused(tmp_path: Path) -> None:
     cards = ("SIMPLE  = T", "BITPIX  = -32", "NAXIS   = 2", "NAXIS1  = 4000000", "NAXIS2  = 4000000", "END")
     fields = (card.partition(" = ") for card in cards)
     header = "".join(f"{name}{equals}{value:>20}".ljust(80) for name, equals, value in fields)
-    fits, npz = tmp_path / "hostile.fits", tmp_path / "hostile.npz"
-    fits.write_bytes(header.ljust(2880).encode() + bytes(2880))
-    with zipfile.ZipFile(npz, "w") as archive:
+    image, pupil = tmp_path / "hostile.fits", tmp_path / "hostile.npz"
+    image.write_bytes(header.ljust(2880).encode() + bytes(2880))
+    with zipfile.ZipFile(pupil, "w") as archive:
         archive.writestr("quarter.npy", HUGE_ARRAY)
-    for path, key in ((fits, "mirror.flat"), (fits, "control.law"), (npz, "sensor.pupil")):
+    for path, key in ((image, "mirror.flat"), (image, "control.law"), (pupil, "sensor.pupil")):
         assert str(path) in error_of(lambda path=path, key=key: check_files(load(None, {key: str(path)})))
 
 

@@ -2,7 +2,9 @@
 
 import contextlib
 import io
+import lzma
 import warnings
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TypeVar
@@ -22,8 +24,8 @@ T = TypeVar("T")
 MAX_BYTES = 1 << 33
 """Largest size of a file of arrays."""
 DAMAGED = (
-    *(OSError, KeyError, TypeError, ValueError, EOFError, MemoryError, RecursionError),
-    *(AstropyWarning, fits.VerifyError),
+    *(OSError, KeyError, TypeError, ValueError, OverflowError, EOFError, MemoryError, RecursionError),
+    *(AstropyWarning, fits.VerifyError, zlib.error, lzma.LZMAError),
 )
 """Exceptions that reading a damaged or unrelated file may raise."""
 
@@ -64,6 +66,9 @@ def opened(path: Path) -> Iterator[fits.HDUList]:
         input_file.opened(path, MAX_BYTES) as stream,  # closes the file if astropy raises
     ):
         warnings.simplefilter("error", AstropyWarning)  # astropy only warns of a truncated file
+        if stream.read(2) == b"PK":  # astropy raises AttributeError
+            raise ValueError("it is a zip archive, such as .npz, and not a FITS file")
+        stream.seek(0)
         with fits.open(stream, mode="readonly", memmap=False) as hdus:
             yield hdus
 
