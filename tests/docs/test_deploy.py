@@ -355,6 +355,14 @@ def test_the_loop_does_not_wait_for_a_manager_that_does_not_read() -> None:
         assert manager.recv(4096) == b"WATCHDOG=1"
 
 
+def test_a_managers_socket_may_have_an_at_sign_in_its_name(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(tmp_path / "user@1.sock"))
+        manager.setblocking(False)
+        Supervisor({"NOTIFY_SOCKET": manager.getsockname()}).ready()
+        assert manager.recv(4096) == b"READY=1"
+
+
 def test_a_status_is_one_line() -> None:
     health = wire.Health(state="ready", rate_hz=3.2, recording=wire.Recording(failure="disk full\nREADY=1"))
     assert status_line(health) == "ready, 3 Hz, recording failed: disk full READY=1"

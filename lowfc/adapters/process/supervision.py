@@ -22,7 +22,8 @@ class Supervisor:
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
         """Read the manager's socket and its timeout from the environment."""
         self.period_ns: int | None = None
-        self._address = environment.get("NOTIFY_SOCKET", "").replace("@", "\0", 1)
+        address = environment.get("NOTIFY_SOCKET", "")
+        self._address = f"\0{address[1:]}" if address.startswith("@") else address  # @: in the abstract namespace
         self._due_ns = 0
         self._sent: set[str] = set()
         wait_us = environment.get("WATCHDOG_USEC", "")
