@@ -20,6 +20,8 @@ import pytest
 import typer
 import yaml
 
+from lowfc.adapters.bus.run import DEFAULT_RUN, open_run
+from lowfc.adapters.process.latch import latch_files
 from lowfc.adapters.process.realtime import _LATENCY_DEVICE
 from lowfc.adapters.process.supervision import Supervisor, status_line
 from lowfc.contract.configuration import Configuration, load
@@ -150,6 +152,8 @@ def test_the_units_match_the_programs_and_the_configuration() -> None:
         unit = settings(name)
         assert unit["Type"] == ["notify"]
         assert unit["Restart"] == ["on-failure"]
+        controls = command(name)[:2] == ["lowfc", "controller"]  # compiles the fused step, if configured
+        assert ("MemoryDenyWriteExecute" in unit) != controls
         assert unit["WantedBy"] == unit["PartOf"] == ["lowfc.target"]
         priority = {"lowfc-recorder.service": realtime.recorder_priority, "lowfc-viewer.service": 0}.get(
             name, realtime.priority
@@ -164,6 +168,17 @@ def test_the_units_match_the_programs_and_the_configuration() -> None:
     # Operations that may take this long do not trigger the watchdog.
     assert float(settings("lowfc-controller.service")["WatchdogSec"][0]) > MIRROR_PATIENCE_S
     assert float(settings("lowfc-sim-camera.service")["WatchdogSec"][0]) > PATIENCE_S
+
+
+def test_the_document_names_the_files_of_the_latch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    runtime, state = tmp_path / "run", tmp_path / "state"
+    runtime.mkdir(mode=0o700)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
+    monkeypatch.setenv("STATE_DIRECTORY", str(state))  # as systemd sets it for the controller
+    first, second = latch_files(open_run(DEFAULT_RUN))
+    text = (DEPLOY / "README.md").read_text()
+    assert f"`/run/lowfc/{first.relative_to(runtime)}`" in text
+    assert f"`/var/lib/lowfc/{second.relative_to(state)}`" in text
 
 
 def test_the_documented_commands_install_every_file(tmp_path: Path) -> None:
