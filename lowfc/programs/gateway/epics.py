@@ -9,7 +9,7 @@ import numpy as np
 from lowfc.adapters.process.extras import install_advice
 from lowfc.contract.errors import BusError, ConfigurationError, LowfcError
 from lowfc.contract.sections import Gateway
-from lowfc.control.loop.interlocks import Value
+from lowfc.control.loop.interlocks import MAX_TEXT_LENGTH, Value
 from lowfc.programs.gateway.variables import Kind, Put, Variable
 
 _CODES = {Kind.BOOLEAN: "?", Kind.NUMBER: "d", Kind.TEXT: "s", Kind.NUMBERS: "ad"}
@@ -130,14 +130,18 @@ class _PutHandler:
 
 
 def _value_of(value: Any) -> Value | None:
-    """The bench value of a monitor's update; None if the PV is disconnected, invalid or not a scalar."""
+    """The bench value of a monitor's update; None if the PV is disconnected, invalid, not a scalar or too long."""
     if isinstance(value, Exception) or getattr(value, "severity", 0) >= _INVALID:
         return None
-    raw = value.raw
+    raw: Any = value.raw
+    plain: Any
     if raw.getID().startswith("epics:nt/NTEnum"):
         choices, index = raw["value.choices"], raw["value.index"]
-        return str(choices[index]) if 0 <= index < len(choices) else None
-    plain = raw["value"]
-    if isinstance(plain, bool | str):
+        plain = str(choices[index]) if 0 <= index < len(choices) else None
+    else:
+        plain = raw["value"]
+    if isinstance(plain, bool):
         return plain
+    if isinstance(plain, str):
+        return plain if len(plain) <= MAX_TEXT_LENGTH else None
     return float(plain) if isinstance(plain, int | float) and np.isfinite(plain) else None
