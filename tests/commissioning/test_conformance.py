@@ -308,6 +308,8 @@ CAMERAS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
     "saturation too low": ({"state": setting(saturation_dn=2000)}, {"settings' range": WRONG}),
     "a period in us": ({"state": setting(period_ns=10_000, exposure_ns=5_000)}, {"settings' period": WRONG}),
     "NaN": ({"state": setting(bias_dn=float("nan"))}, {"settings' values": WRONG}),
+    "no saturation": ({"state": setting(saturation_dn=float("inf"))}, {"settings' values": WRONG}),
+    "a bit depth of -1": ({"state": setting(bit_depth=2**32 - 1)}, {"settings' values": WRONG}),
     "no answer": ({"answer": lambda _: []}, {"settings on request": WARNING}),
     "no health": ({"health": lambda _: None}, {"health": WARNING}),
     "another's health": ({"health": setting(process="mycam")}, {"health": WARNING}),
@@ -384,6 +386,16 @@ MIRRORS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
     "unspecified status": (
         {"state": setting(status=0)},
         {"status": WRONG, "dead-man": WRONG, "longest command": WARNING} | UNTRIED,
+    ),
+    "an unknown status": (
+        {"state": setting(status=7)},
+        {"status": WRONG, "dead-man": WRONG, "longest command": WARNING} | UNTRIED,
+    ),
+    "a frame_sequence of -1": ({"state": setting(frame_sequence=2**64 - 1)}, {"state": WRONG} | UNTRIED),
+    "impossible heights": ({"state": shaped(lambda shape: shape + np.float32(3e38))}, {"grid": WRONG} | UNTRIED),
+    "impossible heights once commanded": (
+        {"state": shaped(lambda shape: np.where(np.abs(shape) > 1, np.float32(3e38), shape))},
+        {"applied": WRONG} | UNTRIED,
     ),
     "its own time": ({"state": lambda one: stamped(3 * MS)(one, 0)}, {"time": WARNING}),
     "no modal command": ({"state": lambda one: one.ClearField("command_nm") or one}, {"modal command": WARNING}),

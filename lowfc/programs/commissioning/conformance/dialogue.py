@@ -105,9 +105,12 @@ class Dialogue(Collected):
         return self._commanded_nm if found is None else found
 
     def surface_nm(self, state: wire.MirrorState | None) -> Single | None:
-        """Actuators (rows, columns) of a state; None without a state, or unless finite and of the configured size."""
-        found = None if state is None else actuators(state)
-        good = found is not None and found.shape == self.expected.grid and bool(np.isfinite(found).all())
+        """Actuators (rows, columns) of a state, nm; None without a state.
+
+        None also if it is of another size than configured, not finite, or beyond the full stroke from flat.
+        """
+        found, most_nm = None if state is None else actuators(state), 2 * self.expected.limits.stroke_nm
+        good = found is not None and found.shape == self.expected.grid and bool((np.abs(found) <= most_nm).all())
         return found if good else None
 
     def begin(self, shape_nm: Single, last_sequence: int) -> None:

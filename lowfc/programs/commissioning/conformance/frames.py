@@ -151,7 +151,7 @@ def _light(camera: Camera) -> Check | None:
         got = f"brightest pixel {highest} DN, bias {state.bias_dn:g} DN"
         return warning(got, "no light: is the shutter open and the star on the sensor?")
     full = np.mean([np.mean(one >= highest) for one in camera.pixels])
-    if highest == int(state.saturation_dn) and full > _FULL:
+    if highest <= state.saturation_dn < highest + 1 and full > _FULL:
         got = f"{100 * full:.0f} % of the pixels at {highest} DN"
         return warning(got, "shorten the exposure: saturated pixels measure nothing")
     return ok(f"brightest pixel {highest} DN")

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 
 from lowfc.arrays import Mask, Single
-from lowfc.contract.messages import from_timestamp, wire
+from lowfc.contract.messages import SEQUENCES, from_timestamp, wire
 from lowfc.device.mirror_protection import MAX_VALID_NS
 from lowfc.programs.commissioning.checks import Check, Status, judged, ok, warning, wrong
 from lowfc.programs.commissioning.conformance.dialogue import ANSWER_S, MODAL_NM, Dialogue, Show
@@ -71,6 +71,9 @@ def _idle(mirror: Dialogue) -> Iterator[Check]:
         got = f"{mirror.unreadable} states are not a lowfc.v1.MirrorState"
         yield wrong(got, "encode the message as declared")._replace(name="state", expected=expected)
         return
+    if states and (sequence := states[-1].frame_sequence) >= SEQUENCES:
+        advice = "report the frame_sequence of the applied command, 0 before the first one"
+        yield wrong(f"frame_sequence {sequence}", advice)._replace(name="state", expected=expected)
     check, rate_hz = ok(f"{len(states) / IDLE_S:.0f} a second"), len(states) / IDLE_S
     if not states:
         advice = "publish it: a starting controller waits one second for the mirror's shape, then assumes flat"
@@ -93,6 +96,9 @@ def _grid(mirror: Dialogue, state: wire.MirrorState) -> Check:
     odd = np.count_nonzero(~np.isfinite(np.frombuffer(state.actuators, "<f4")))
     if odd:
         return wrong(f"{odd} not finite", "report 0, not NaN, for a missing actuator")
+    if mirror.surface_nm(state) is None:
+        advice = "report nm of surface from flat; mirror.stroke_nm of the configuration is the full range"
+        return wrong(f"actuators beyond the full stroke of {2 * mirror.expected.limits.stroke_nm:g} nm", advice)
     return ok(got)
 
 
@@ -124,8 +130,9 @@ def _next_command(mirror: Dialogue, base_nm: Single, seconds: float) -> Iterator
     settled = [state for _, state in mirror.states if state.frame_sequence == last.frame_sequence]
     expected = f"the commanded surface within one driver step, {mirror.expected.step_nm:.3g} nm"
     yield _applied(mirror, base_nm, commanded_nm, settled[-1])._replace(name="applied", expected=expected)
-    got, advice = wire.MirrorStatus.Name(last.status).removeprefix("MIRROR_STATUS_"), "while a command is in force"
-    yield judged("status", "FOLLOWING", last.status == _FOLLOWING, got, f"report FOLLOWING {advice}")
+    names = {number: name.removeprefix("MIRROR_STATUS_") for name, number in wire.MirrorStatus.items()}
+    got, advice = names.get(last.status, str(last.status)), "report FOLLOWING while a command is in force"
+    yield judged("status", "FOLLOWING", last.status == _FOLLOWING, got, advice)
     others, expected = len(answers) - same_time, "timestamp of the applied command"
     age_ms, advice = (from_timestamp(last.timestamp) - line.now_ns()) / 1e6, "copy the command's timestamp: it joins "
     got = f"{others} of {len(answers)} differ, the last {age_ms:.3g} ms from now"

@@ -39,7 +39,7 @@ def _settings(camera: Camera) -> Check:
 def _values(camera: Camera) -> Check | None:
     if (state := camera.settings) is None:
         return None
-    values, highest = {field: float(getattr(state, field)) for field in _FIELDS}, 2.0**state.bit_depth - 1
+    values, highest = {field: float(getattr(state, field)) for field in _FIELDS}, _highest_dn(state)
     impossible = [f"{field} {value:g}" for field, value in values.items() if not isfinite(value) or value < 0]
     impossible += [f"{field} 0" for field in _ABOVE_ZERO if values[field] == 0]
     if not from_timestamp(state.timestamp):
@@ -59,6 +59,11 @@ def _values(camera: Camera) -> Check | None:
         got = f"exposure {exposure_ms:g} ms, period {period_ms:g} ms"
         return warning(got, "an exposure longer than the period sees two mirror shapes")
     return ok(f"exposure {exposure_ms:g} of {period_ms:g} ms, saturation {state.saturation_dn:g} DN")
+
+
+def _highest_dn(state: wire.CameraState) -> float:
+    """Largest value of the converter; a pixel has 16 bits, whatever the camera states."""
+    return 2.0 ** min(state.bit_depth, _MAX_BITS) - 1
 
 
 @SETTINGS.check("settings kept", "constant: a change opens the loop")
@@ -89,7 +94,7 @@ def _size(camera: Camera) -> Check | None:
 def _range(camera: Camera) -> Check | None:
     if (state := camera.settings) is None or not camera.frames:
         return None
-    top = min(state.saturation_dn, 2.0**state.bit_depth - 1)
+    top = min(state.saturation_dn, _highest_dn(state))
     got = f"brightest pixel {camera.brightest_dn} DN, largest possible {top:g} DN"
     if camera.brightest_dn > top > 0:
         return wrong(got, "raise saturation_dn (DN, bias included) to the largest pixel value, or bit_depth")
