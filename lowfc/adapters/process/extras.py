@@ -12,5 +12,5 @@ def install_advice(extra: str) -> str:
         required = metadata.requires("lowfc") or []
     except metadata.PackageNotFoundError:  # a checkout on the path that is not installed
         return f"{pip} -e '.[{extra}]' in its checkout"
-    names = [one.partition(";")[0].strip() for one in required if re.search(rf"extra == .{extra}.", one)]
+    names = [one.partition(";")[0].strip() for one in required if re.search(rf"extra == ['\"]{extra}['\"]", one)]
     return " ".join([pip, *(f"'{name}'" for name in names)])
