@@ -39,7 +39,9 @@ MIN_FRAME_AGE_NS, MIN_FRAME_TIMEOUT_NS = 20_000_000, 50_000_000
 MAX_FAULTS = 20
 """Most faults of a file that an error explains."""
 _MAX_KEY_LENGTH = 100  # characters of an unknown key that are compared with the known ones
-_ALTERNATIVE = re.compile(r"\.(?:constrained-\w+|literal\[[^]]*\])")  # appended by pydantic to a key of two types
+_ALTERNATIVE = re.compile(
+    r"\.(?:constrained-\w+|literal\[[^]]*\])|(?<=\.value)\.(?:bool|float)"
+)  # appended by pydantic to a key of two types
 
 
 Milliseconds = Annotated[float, Field(ge=0, le=1e9)]

@@ -136,6 +136,12 @@ def test_an_invalid_value_is_reported_in_one_line_with_key_and_value(tmp_path: P
     assert "\n" not in message
 
 
+def test_each_fault_of_a_value_of_several_types_names_its_key() -> None:
+    lines = error_of(None, {"interlocks": [{"name": "mask", "action": "hold", "value": [1]}]}).splitlines()
+    assert len(lines) == 3
+    assert {line.partition(" = ")[0] for line in lines} == {"interlocks.0.value"}
+
+
 @pytest.mark.parametrize("key", ["router", "listen"])
 @pytest.mark.parametrize(
     ("address", "message"),

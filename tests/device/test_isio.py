@@ -413,6 +413,14 @@ def test_the_stroke_limit_applies_to_the_sum_of_channels() -> None:
     assert not status.limits_hit
 
 
+def test_a_prefix_that_gives_no_name_of_a_stream_is_refused_at_the_start(folder: Path) -> None:
+    bus, clock = MemoryBus(MemoryHub(), "operator", FakeClock()), FakeClock()
+    for prefix in ("a/b", "x" * 72):
+        with pytest.raises(StreamError, match="a stream's name has 1 to 79 characters without '/'"):
+            bridge.StepStreams(bus, clock, prefix)
+    assert list(folder.iterdir()) == []
+
+
 def test_a_refused_report_of_other_channels_is_repeated_every_two_seconds(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

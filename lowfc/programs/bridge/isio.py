@@ -73,7 +73,11 @@ class StepStreams:
     """Writes each step of the control law into streams."""
 
     def __init__(self, bus: Bus, clock: Clock, prefix: str) -> None:
-        """Write into the streams PREFIX_error, PREFIX_command, PREFIX_residual and PREFIX_flux."""
+        """Write into the streams PREFIX_error, PREFIX_command, PREFIX_residual and PREFIX_flux.
+
+        StreamError if these cannot be names of streams.
+        """
+        stream_path(f"{prefix}_residual")  # the longest name
         self._ring = bus.ring(STEP, WAITING)
         self._clock = clock
         self._prefix = prefix
