@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
@@ -21,7 +22,7 @@ from lowfc.adapters.process.clock import boot_file
 from lowfc.adapters.process.host import Host, Synchronisation, Timex
 from lowfc.adapters.process.trial import Trial, lateness_ns, try_out
 from lowfc.contract.configuration import Configuration, Realtime, load
-from lowfc.contract.errors import ConfigurationError
+from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.programs.commissioning.checks import Check, note, ok
 from lowfc.programs.commissioning.doctor import command, permissions, room, timing
 from lowfc.programs.commissioning.doctor.facts import Facts, gather, ranges
@@ -421,6 +422,10 @@ def test_real_time_rights_are_shown_applied_and_removed(tmp_path: Path, monkeypa
     (tmp_path / next(iter(permissions.FILES))).write_text("somebody's own\n")
     with pytest.raises(ConfigurationError, match="own"):
         permissions.apply(tmp_path, "me")
+    for fault in (OSError("Read-only file system: '/etc'"), LookupError("no such group: 'lowfc'")):
+        monkeypatch.setattr(permissions, "apply", Mock(side_effect=fault))
+        failed = lowfc("doctor", "--apply").exception
+        assert (type(failed), str(failed)) == (DataFileError, f"the settings cannot be changed completely: {fault}")
 
 
 def test_the_udev_rule_equals_that_of_the_services() -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lowfc.adapters.process.terminal import ConfigFile, Json, configuration
+from lowfc.contract.errors import DataFileError
 from lowfc.programs.commissioning.checks import Check, Status, put
 
 if TYPE_CHECKING:
@@ -47,7 +48,16 @@ def doctor(
 
         root = Path("/")
         user = os.environ.get("SUDO_USER", "")
-        done = permissions.undo(root) if undo else permissions.apply(root, user) if apply else [permissions.shown(root)]
+        try:
+            done = (
+                permissions.undo(root)
+                if undo
+                else permissions.apply(root, user)
+                if apply
+                else [permissions.shown(root)]
+            )
+        except (OSError, LookupError) as fault:  # a read-only folder; no group, if there is no groupadd
+            raise DataFileError(f"the settings cannot be changed completely: {fault}") from fault
         sys.stdout.write("\n".join(done) + "\n")
         return
     settings = configuration(config)
