@@ -73,6 +73,9 @@ def test_a_configuration_round_trips_through_toml(tmp_path: Path) -> None:
     assert load(write(tmp_path, config.to_toml())) == config
     many = load(None, {"mirror.stuck_nm": {str(actuator): 0.5 for actuator in range(150)}})
     assert load(write(tmp_path, commented(many))) == many, "also 150 numbers with a dot in one line"
+    options = {"tables": [{"a b": 1.5}, {"c": [[1, 2], []]}], "text": 'quoted "\n', "none": {}}
+    odd = load(None, {"drivers": {"own": options}, "recorder.on_event": "a\N{LINE SEPARATOR}b"})
+    assert load(write(tmp_path, commented(odd))) == load(write(tmp_path, odd.to_toml())) == odd
     written = tomllib.loads(config.to_toml())
     for key in KEYS:
         *sections, last = key.split(".")

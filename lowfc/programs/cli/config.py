@@ -56,10 +56,19 @@ def _tables(value: object) -> list[Section]:
 
 def _assignment(name: str, value: object) -> list[str]:
     """Lines of a key and its value; a table is written inline, so that other keys can follow it."""
-    if not isinstance(value, dict):
-        return tomli_w.dumps({name: value}).splitlines()
-    items = ", ".join(" ".join(_assignment(key, one)) for key, one in value.items())
-    return [f"{tomli_w.dumps({name: 0}).partition(' = ')[0]} = {{{items}}}"]
+    if isinstance(value, dict):
+        return [f"{name} = {_inline(value)}"]
+    return tomli_w.dumps({name: value}).rstrip("\n").split("\n")
+
+
+def _inline(value: object) -> str:
+    """A value on one line."""
+    if isinstance(value, list):
+        return f"[{', '.join(map(_inline, value))}]"
+    if isinstance(value, dict):
+        keys = (tomli_w.dumps({key: 0}).removesuffix(" = 0\n") for key in value)
+        return f"{{{', '.join(f'{key} = {_inline(one)}' for key, one in zip(keys, value.values(), strict=True))}}}"
+    return tomli_w.dumps({"x": value}).removeprefix("x = ").rstrip("\n")
 
 
 def config_show(config: ConfigFile = None) -> None:
