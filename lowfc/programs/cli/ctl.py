@@ -121,11 +121,13 @@ def _status(run: AnyRun = None, as_json: Json = False) -> None:
 
 
 def _configuration(run: AnyRun = None, as_json: Json = False) -> None:
+    import json
     import tomllib
 
     with _joined(run) as loop:
         text = loop.configuration()
-    print_result(tomllib.loads(text), f"# run {loop.run_id}\n{text.rstrip()}", as_json=as_json)
+    known = json.loads(json.dumps(tomllib.loads(text), default=str))  # dates of a driver's options as text
+    print_result(known, f"# run {loop.run_id}\n{text.rstrip()}", as_json=as_json)
 
 
 def _step(frames: Frames, run: AnyRun = None, as_json: Json = False) -> None:
