@@ -222,6 +222,19 @@ def test_the_kernel_in_use_is_an_event_and_numpy_without_numba(monkeypatch: pyte
     assert "numba" in events[-1][1]["advice"]
 
 
+def test_a_host_that_forbids_executable_memory_uses_numpy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def refused() -> None:
+        raise PermissionError(13, "cannot allocate executable memory")
+
+    monkeypatch.setattr(compiled, "kernel", getattr(compiled.kernel, "__wrapped__", compiled.kernel))
+    monkeypatch.setattr(compiled, "_compiled", refused)
+    events: list[tuple[str, str]] = []
+    config = load(None, {"realtime.kernel": "fused"})
+    result = settings_under(Latch([tmp_path / "latch"]), config, lambda name, advice: events.append((name, advice)))
+    assert (result.kernel.name, events[0][0]) == ("numpy", "KERNEL_MISSING")
+    assert "executable" in events[0][1]
+
+
 def test_several_threads_give_the_same_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
     size = Size(side=100, modes=13, mirror_side=8)
     calibration, frames = random_calibration(size, configuration(size, RATE_HZ))

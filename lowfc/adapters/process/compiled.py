@@ -27,19 +27,24 @@ def available() -> bool:
 
 def missing() -> str:
     """Advice if the fused step cannot be compiled."""
+    if available():
+        return "this host forbids compiling at run time: allow memory that is writable and executable"
     return f"the fused step needs numba: {install_advice('fast')}"
 
 
 @cache
 def kernel(name: str, threads: int = 1) -> Kernel:
-    """Return the kernel of that name, compiled; numpy's if numba is not installed.
+    """Return the kernel of that name, compiled; numpy's if that is not possible.
 
     The first call on a host compiles for some seconds; later ones load the cached result. The threads share the pass
     over a large frame; their number does not change the result.
     """
     if name != FUSED or not available():
         return NUMPY
-    measure, respond, measure_blocks = _compiled()
+    try:
+        measure, respond, measure_blocks = _compiled()
+    except PermissionError:  # of SELinux, or of a unit with MemoryDenyWriteExecute
+        return NUMPY
     return Kernel(FUSED, measure if threads == 1 else Pool(measure, measure_blocks, threads).measure, respond)
 
 
