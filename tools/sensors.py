@@ -136,7 +136,8 @@ def render(results: Results) -> str:
         "the same photons over the band of 20 %, in four wavelengths; then with the shear of the beam as an additional "
         f'fitted parameter. "Shear, nm" is the wavefront error, nm rms over the circle, from a shear of '
         f"{100 * SHEAR:g} % of the diameter that is not fitted. The twin's time is for one frame on one thread. "
-        "The last columns are open loop -> closed loop: true wavefront over the open pupil, and true tilt, "
+        "The last columns are open loop -> closed loop for two disturbances: true wavefront over the open pupil, and "
+        "true tilt, "
         f"in the second half of {DURATION_S} simulated seconds at "
         f"{RATE_HZ} Hz with gains of 0.5 for tilt and 0.05 for the rest, in FILE."
     )
