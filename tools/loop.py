@@ -150,7 +150,7 @@ LOG_COLUMNS = {
 RECORDER_COLUMNS = {
     "recorder at": "{offered_hz:.0f} Hz",
     "processor time": "{cpu_percent:.0f} %",
-    "over copying the payloads": "{ratio:.0f} x",
+    "times that of copying the payloads": "{ratio:.0f} x",
     "messages": "{messages_published}",
     "lost": "{messages_lost}",
     "longest time to write": "{longest_wait_ms:.0f} ms",
