@@ -54,7 +54,7 @@ DECLARED: tuple[Declaration, ...] = (
         "Set integrator gains, or have them chosen automatically; gains that make the loop unstable are refused.",
         "gain 0.4 --modes 2,3",
         _MODES,
-        ("values", f"{_ONE_OR_EACH}; none for automatic gains"),
+        ("values", f"{_ONE_OR_EACH}; none with `text`"),
         ("text", "`auto` for automatic gains"),
     ),
     _declared("leak", "Set integrator leaks.", "leak 0.01", _MODES, ("values", _ONE_OR_EACH)),
@@ -82,8 +82,8 @@ DECLARED: tuple[Declaration, ...] = (
     ),
     _declared(
         "play",
-        "Play a probe sequence, one row of a table per frame from the answered frame on, unknown to the control law; "
-        "it ends by itself.",
+        "Play a probe sequence, one row of a table per frame, beginning with the frame in the answer, unknown to the "
+        "control law; it ends by itself.",
         "",
         ("text", "`mirror` or `offset`"),
         ("table", "float32, frames x columns: factors of the shapes, or nm rms of wavefront of each mode"),
