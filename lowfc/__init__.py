@@ -2,7 +2,7 @@
 
 Names for your own programs, each imported on first use:
 
-- `Client`, `running`: connection to a running loop; names of the runs on this host
+- `Client`, `running`: connection to a running loop; names of the user's runs on this host
 - `Configuration`, `load_configuration`: configuration; load it from a file
 - `Calibration`, `load_calibration`: calibration; load it from a file
 - `LogReader`, `read_history`: read a log; read all of its steps as columns

@@ -7,7 +7,7 @@ from lowfc.contract.messages import Role
 
 
 def running() -> list[str]:
-    """Names of the runs on this host whose controller is listening; directories of killed runs do not count."""
+    """Names of this user's runs on this host whose controller is listening; a killed run does not count."""
     return [name for name, roles in live_runs().items() if Role.CONTROLLER in roles]
 
 

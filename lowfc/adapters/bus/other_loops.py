@@ -25,7 +25,7 @@ def none_here() -> str:
     origin = f"from {_FOLDER}" if os.environ.get(_FOLDER) else f"{_FOLDER} is not set"
     message = (
         f"no loop of user {_name(os.geteuid())} is running here: {runtime_path()} was searched ({origin}); loops of "
-        f"other users, or started with another {_FOLDER}, are not seen"
+        f"other users, or started with another {_FOLDER}, cannot be reached"
     )
     more = [f"and {len(found) - _MOST} more"] if len(found) > _MOST else []
     return "; ".join([message, *(text for text, _ in found[:_MOST]), *more])
