@@ -223,8 +223,8 @@ def _transport(tls: dict[str, object], sending: dict[str, Any]) -> dict[str, Any
         "link": {
             "protocols": ["tls"],  # the only permitted protocol
             "tls": tls,
-            # A link that is silent for the lease is closed, and restored as soon as possible. Messages sent in the
-            # meantime wait in it and arrive stale.
+            # A link that is silent for the lease is closed, and restored as soon as possible. Messages sent while it is
+            # silent wait, and arrive stale if it recovers before that.
             "tx": {**sending, "lease": _LEASE_MS, "keep_alive": 4},
         },
         "shared_memory": {"enabled": False},

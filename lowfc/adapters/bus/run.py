@@ -96,7 +96,7 @@ class Links:
         return tuple(role for role in self.ports if role.partition("-")[0] == Role.MIRROR)
 
     def claim_start(self, role: str, start_s: int) -> int:
-        """Claim the start of a role's process for its sequences: `start_s`, or later if this run has used it already.
+        """Claim the start time that a role's process puts into its sequences: `start_s`, or later if already claimed.
 
         A process that is killed and restarted within one second must not repeat its sequences. If the run's directory
         cannot be written, the start is `start_s`, so that an operator can still request `safe`.
@@ -158,8 +158,8 @@ def open_run(
         base: parent of its directory; the user's runtime directory when None.
         listeners: additional roles with a port, if this call creates the run: a launcher must listen to receive from a
             viewer, which only connects.
-        network: router of the run, if this call creates it; None: that of the existing run. A launcher's run stays on
-            its host.
+        network: router of the run, if this call creates it. An existing run must have the same one, unless this is None
+            or a launcher created the run, which then stays on its host.
 
     Raises:
         BusError: the name is invalid, or the run exists without one of `mirrors`, or with another network.
@@ -299,7 +299,7 @@ def _read(path: Path) -> Links:
 
 
 def free_ports(count: int) -> list[int]:
-    """Return unused loopback TCP ports below the host's ephemeral range.
+    """Return unused loopback TCP ports below the host's ephemeral range, or in it if there is no room below.
 
     An ephemeral port may be taken by any outgoing connection before its role listens; a connection retried to such a
     port without a listener may even be assigned the port itself and connect to itself.

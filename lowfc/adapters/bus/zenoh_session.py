@@ -1,4 +1,4 @@
-"""Zenoh's configuration for each role: direct links on one host, a router across hosts. All settings were measured."""
+"""Zenoh's configuration for each role: peers on one host, a router across hosts; settings chosen by measurement."""
 
 from typing import Any
 
@@ -54,9 +54,9 @@ def session_config(links: Links, role: str, *, monitor: bool = False) -> dict[st
             "exit_on_failure": False,
             "retry": {
                 "period_init_ms": 50,
-                # A new process connects to all others that listen. Attempts to reach an absent one (such as the
-                # recorder) five times a second each delayed a frame. A role without a port cannot be reached: it must
-                # attempt often itself.
+                # A new process connects to all others that listen. Each attempt to reach an absent one (such as the
+                # recorder) delays a frame, so they are rare. A role without a port cannot be reached: it must attempt
+                # often itself.
                 "period_max_ms": 4000 if role in links.ports else 200,
                 "period_increase_factor": 2,
             },
