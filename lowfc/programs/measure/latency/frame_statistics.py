@@ -44,7 +44,7 @@ ALONE = {
 }
 """Names and labels of the host's reference times."""
 RATIOS = {"ratio": ("step_us", ""), "ratio_hot": ("hot_step_us", " of those back to back")}
-"""Ratios of frame to command to half an echo plus the step named here, and what is added to the step's label."""
+"""Ratios of frame to command, over half an echo plus the step named here; and what is added to the step's label."""
 RATIOS_AT = ("p50", "p99")
 COUNTS = {
     "frames": "frames",

@@ -9,7 +9,7 @@ from lowfc.control.kernel.tables import KERNELS
 from lowfc.programs.measure.latency import stalls
 from lowfc.programs.measure.latency.frame_statistics import ALONE, COUNTS, RATIOS, RATIOS_AT, edges_us
 
-OVER = "over_echo_and_step"
+RATIO_ROW = "over_echo_and_step"
 COMPARED = ("p50", "p99", "p99_9")
 
 Repeats = Sequence[Mapping[str, Any]]
@@ -19,11 +19,11 @@ def together(repeats: Repeats) -> dict[str, Any]:
     """Results of all repeats.
 
     Returns:
-        latency_us and spread_us by span: for each percentile the median (max: the largest), and the lowest and highest
-        over the repeats; the same, with and without _spread, for echo_us{round_trip}, step_us, hot_step_us, timer_us,
-        ratio (p50 and p99; see `RATIOS`) and ratio_hot (with the step back to back); histogram{edges_us, counts by
-        span}; over_time of each repeat; `COUNTS` and reasons; memory_mb, the largest of each process (live loop only);
-        repeats, the percentiles of each; and stalls (`Stalls`) if they were traced.
+        latency_us, by span: for each percentile its median over the repeats (max: the largest). spread_us, by span: the
+        lowest and highest. Likewise echo_us{round_trip}, step_us, hot_step_us, timer_us, ratio and ratio_hot (p50 and
+        p99; see `RATIOS`), each with its spread, such as step_us_spread. histogram{edges_us, counts by span}; over_time
+        of each repeat; `COUNTS` and reasons; rate_hz, the median; memory_mb, the largest of each process (live loop
+        only); repeats, the percentiles of each; and stalls (`Stalls`) if they were traced.
     """
     spans = [span for span in repeats[0]["latency_us"] if all(span in one["latency_us"] for one in repeats)]
     each = {span: [one["latency_us"][span] for one in repeats] for span in spans}
@@ -82,7 +82,7 @@ def spread_of(repeats: Sequence[Mapping[str, float]]) -> dict[str, list[float]]:
 
 
 def ratio(repeat: Mapping[str, Any], at: str, name: str = "ratio") -> float:
-    """Ratio of frame to command to half the round trip of the bare echo plus one control step alone."""
+    """Latency from frame to command, over the sum of half a bare echo's round trip and one control step alone."""
     reference_us: float = repeat["echo_us"][at] / 2 + repeat[RATIOS[name][0]][at]
     return float(repeat["latency_us"]["frame_to_command"][at] / reference_us)
 
@@ -104,7 +104,9 @@ def compare(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, An
         for at in COMPARED
     ]
     if before["ratio"] and after["ratio"]:
-        pairs += [(OVER, at, "", [(one["ratio"][at], one["ratio_spread"][at]) for one in both]) for at in RATIOS_AT]
+        pairs += [
+            (RATIO_ROW, at, "", [(one["ratio"][at], one["ratio_spread"][at]) for one in both]) for at in RATIOS_AT
+        ]
     single = min(len(one["repeats"]) for one in both) < 2
     return {
         "rows": [_row(*pair, single=single) for pair in pairs],

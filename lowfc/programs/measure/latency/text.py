@@ -7,9 +7,9 @@ from typing import Any
 
 from lowfc.programs.measure.latency.frame_statistics import ALONE, COUNTS, LOOP_SPANS, PERCENTILES, RATIOS, SPANS
 from lowfc.programs.measure.latency.stalls import Stalls
-from lowfc.programs.measure.latency.summary import OVER
+from lowfc.programs.measure.latency.summary import RATIO_ROW
 
-_COMPARED = SPANS | {OVER: "over echo and step"}
+_COMPARED = SPANS | {RATIO_ROW: "over echo and step"}
 _ALWAYS = ("frames", "frames_without_command", "warm_up_frames", "messages_lost")
 """Counts shown even if they are 0."""
 _HOST = ("processor", "processors", "kernel", "python", "clock_source", "load")
