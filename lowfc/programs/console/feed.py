@@ -48,7 +48,7 @@ class Reading(NamedTuple):
         verdict: verdict, tiles and facts of the view.
         frame: newest frame; None before the first.
         command_nm: modal command of the last step, (modes,).
-        requests: requests received since the previous reading, without periodic ones.
+        requests: requests received since the previous reading, without those that are not shown.
         residual_nm: residual, nm rms of wavefront, one value per second; NaN if unknown.
         light: flux over that of the calibration, one value per second; NaN if unknown.
     """
@@ -76,7 +76,7 @@ class Feed:
         self._bus, self._run_id, self._clock = bus, run_id, clock
         sizes = {topic: _RING_SIZES.get(topic, 1 if topic.latest_only else 100) for topic in _TOPICS}
         self._rings = {topic: bus.ring(topic, sizes[topic]) for topic in _TOPICS}
-        self._queried: deque[Sample] = deque()
+        self._query_results: deque[Sample] = deque()
         self._accumulator = Accumulator(clock.now_ns() if clock.lockstep else None)
         self._watcher = Watcher()
         self._config: Configuration | None = None
@@ -96,7 +96,7 @@ class Feed:
         now_s, host_ns = time.monotonic(), self._clock.host_ns()
         behind_s, self._read_s = max(0.0, now_s - self._read_s - 0.5), now_s
         requests = [_request(sample) for sample in self._rings[REQUEST].drain()]
-        arrived = [self._queried.popleft() for _ in range(len(self._queried))]
+        arrived = [self._query_results.popleft() for _ in range(len(self._query_results))]
         for topic, ring in self._rings.items():
             if topic is not REQUEST:
                 arrived += ring.drain()
@@ -122,7 +122,7 @@ class Feed:
             judge(state, per_mas),
             self._frame,
             self._command_nm,
-            [one for one in requests if one is not None and not _periodic(one)],
+            [one for one in requests if one is not None and not _hidden(one)],
             [residual for residual, _ in self._trend],
             [light for _, light in self._trend],
         )
@@ -139,7 +139,7 @@ class Feed:
         self._queried_s = time.monotonic()
 
         def query() -> None:
-            self._queried.extend(sample for _, sample in states(self._bus, SHOWN))
+            self._query_results.extend(sample for _, sample in states(self._bus, SHOWN))
             try:
                 self._config = configuration_of(Client(self._run_id, bus=self._bus))
             except LowfcError:  # no controller yet: it is queried once it sends Health
@@ -148,7 +148,7 @@ class Feed:
         threading.Thread(target=query, name="query", daemon=True).start()
 
 
-def _periodic(request: wire.Request) -> bool:
+def _hidden(request: wire.Request) -> bool:
     """Whether a request is not shown: it changes nothing, or sets automatic gains, which an event reports."""
     return request.name in _HIDDEN_REQUESTS or (
         request.name == "gain" and request.text == AUTO and bool(request.values)
