@@ -1,9 +1,9 @@
 """Reference image and response matrix from frames with known pokes, and their errors.
 
 Each cycle of pokes, or piece of a dither, yields one response: H = cov(frames, z) cov(seen, z)^-1, where `seen` is the
-mirror's shape in each exposure and z the instrument. In open loop both are the poke. In closed loop, `seen` is the sum
-of the poke and the loop's command, which follows noise and disturbance; z is the poke alone, which does not, so that
-the loop's reaction does not bias the response. The standard error comes from the scatter of the cycles.
+mirror's shape in each exposure and z the instrumental variable. In open loop both are the poke. In closed loop, `seen`
+is the sum of the poke and the loop's command, which follows noise and disturbance; z is the poke alone, which does not,
+so that the loop's reaction does not bias the response. The standard error comes from the scatter of the cycles.
 
 R is built from a reconstructor R_a that is independent of these frames: R = (R_a H)^-1 R_a, see `regularised`.
 """
@@ -149,9 +149,9 @@ def cycle_response(
         fractions: (frames, pixels), from `normalised`.
         flux_dn: (frames,) flux of each frame.
         seen: (frames, modes) modes of the mirror in each exposure, nm of wavefront.
-        instruments: (frames, modes) the poke alone in each exposure; `seen` itself in open loop.
+        instruments: (frames, modes) instrumental variables: the poke alone in each exposure; `seen` in open loop.
         used: (frames,) 1 for a usable frame, else 0.
-        slowest: Frequency in cycles per frame below which the pokes are not used, since most of the disturbance is
+        slowest: Frequency, cycles per frame; the slower part of the pokes is not used, since most of the disturbance is
             there.
 
     Raises:
@@ -199,33 +199,33 @@ def measured(sums: Sums) -> Measured:
     return Measured(response, sums.initial, row_error(kept), reference, sums.flux_dn / n, n)
 
 
-def without_outliers(answers: Array) -> Array:
+def without_outliers(products: Array) -> Array:
     """Products R_a H (cycles, modes, modes), without unit, with outliers clipped near the median.
 
     A transient of the wavefront then affects one cycle, not the mean.
     """
-    median = np.median(answers, axis=0)
+    median = np.median(products, axis=0)
     # 1.48: standard deviation over median deviation; per row, since all its elements have the same noise
-    scale = 1.48 * np.median(np.abs(answers - median), axis=(0, 2))[:, None]
-    return np.clip(answers, median - _OUTLIER * scale, median + _OUTLIER * scale)
+    scale = 1.48 * np.median(np.abs(products - median), axis=(0, 2))[:, None]
+    return np.clip(products, median - _OUTLIER * scale, median + _OUTLIER * scale)
 
 
-def row_error(answers: Array) -> Array:
+def row_error(products: Array) -> Array:
     """Standard error (modes,) of the elements of each row of R H, for the R built from all cycles.
 
     It comes from the scatter of the cycles and so includes all disturbances: photon noise, read noise, vibration.
 
     Args:
-        answers: (cycles, modes, modes) R_a H of each cycle, without unit.
+        products: (cycles, modes, modes) R_a H of each cycle, without unit.
 
     Returns:
         Infinite for a single cycle, or if the pokes do not tell the modes apart.
     """
-    n, modes, _ = answers.shape
-    mean = answers.mean(axis=0)
+    n, modes, _ = products.shape
+    mean = products.mean(axis=0)
     if n < 2 or not np.linalg.cond(mean) < WORST_CONDITION:
         return np.full(modes, np.inf)
-    scatter = np.linalg.solve(mean, answers - mean)
+    scatter = np.linalg.solve(mean, products - mean)
     return np.asarray(np.sqrt((scatter**2).sum(axis=0).mean(axis=1) / (n - 1) / n))
 
 
@@ -285,15 +285,15 @@ class Check(NamedTuple):
         return largest + _MAX_ELEMENT_ERRORS * float(self.error.max())
 
 
-def check(answers: Array, expected: Array, error: Array) -> Check:
+def check(products: Array, expected: Array, error: Array) -> Check:
     """Cross-talk of a reconstructor, from cycles that were not used for it.
 
     Args:
-        answers: (cycles, modes, modes) R H of each cycle, without unit.
+        products: (cycles, modes, modes) R H of each cycle, without unit.
         expected: (modes, modes) R H without errors: the identity, unless combinations of modes are suppressed.
         error: (modes,) standard error of the elements of each row in one cycle.
     """
-    talk = np.median(answers, axis=0) - expected  # a transient of the wavefront affects only one cycle
-    noise = _MEDIAN_NOISE * error / np.sqrt(len(answers))
+    talk = np.median(products, axis=0) - expected  # a transient of the wavefront affects only one cycle
+    noise = _MEDIAN_NOISE * error / np.sqrt(len(products))
     power = float((talk**2).mean() - (noise**2).mean())
-    return Check(float(np.sqrt(max(power, 0.0))), float(np.abs(talk).max()), noise, len(answers))
+    return Check(float(np.sqrt(max(power, 0.0))), float(np.abs(talk).max()), noise, len(products))
