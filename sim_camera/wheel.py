@@ -37,7 +37,8 @@ class Wheel:
     Attributes:
         start_hz: speed at time 0, revolutions per second.
         course: ramp, walk or run-down (friction proportional to the speed).
-        change: rate of change of the speed: Hz per second, for a walk Hz per root second; 0 for a constant speed.
+        change: rate of change of the speed: Hz per second (run-down: the decrease at time 0), for a walk Hz per root
+            second; 0 for a constant speed.
         amplitude_nm: (harmonics, modes) complex: amplitude and phase at high speed, nm of wavefront rms.
         wander: frequencies (waves,) and amplitudes (waves, 1) in Hz of a random walk of the speed.
     """
@@ -75,7 +76,7 @@ class Wheel:
         return np.asarray((self._heights(time_s) * self._phases(time_s) @ self.amplitude_nm).real)
 
     def lines(self) -> tuple[Array, Array]:
-        """Frequencies (harmonics,) at time 0, in Hz, and the variance of each mode at each (harmonics, modes), nm^2."""
+        """Frequencies (harmonics,) at time 0, Hz, and the variance of each in each mode (harmonics, modes), nm^2."""
         variance_nm2 = np.abs(self._heights(np.zeros(1)).T * self.amplitude_nm) ** 2 / 2
         return np.array(ORDERS) * self.start_hz, variance_nm2
 

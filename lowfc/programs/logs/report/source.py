@@ -22,7 +22,7 @@ Results = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class InForce:
-    """A controller: gain and leak (modes,) of the integrator, delay, and the linear law in use instead of it.
+    """A control law in force: gain and leak (modes,) of the integrator, delay, and the linear law in use instead of it.
 
     Attributes:
         first: step from which on it is in force; comparisons ignore it.
@@ -64,20 +64,22 @@ class Run:
         return np.searchsorted(firsts, np.arange(self.history.steps.sequence.size), side="right").astype(np.int64) - 1
 
     def seconds(self, host_ns: npt.ArrayLike) -> Array:
-        """Convert host times to frame time, seconds since the first step, by the frames published then.
+        """Convert host times to frame time, seconds since the first step.
 
-        In lockstep frame time is simulated; otherwise only the start time is subtracted.
+        The frames' publish times are interpolated. In lockstep frame time is simulated; otherwise it is only shifted.
         """
         history, host = self.history, np.asarray(host_ns, dtype=np.int64)
         rows = rows_of(history.frame_sequence, history.steps.sequence)
-        published, shown = history.frame_publish_ns[rows >= 0], history.steps.time_ns[rows[rows >= 0]]
+        published, frame_ns = history.frame_publish_ns[rows >= 0], history.steps.time_ns[rows[rows >= 0]]
         if not published.size:
             return np.asarray((host - history.span_ns[0]) * 1e-9, dtype=np.float64)
         order = np.argsort(published, kind="stable")
-        published, shown = published[order], shown[order]
-        inside = np.interp((host - published[0]) * 1e-9, (published - published[0]) * 1e-9, (shown - shown[0]) * 1e-9)
+        published, frame_ns = published[order], frame_ns[order]
+        inside = np.interp(
+            (host - published[0]) * 1e-9, (published - published[0]) * 1e-9, (frame_ns - frame_ns[0]) * 1e-9
+        )
         outside = np.minimum(host - published[0], 0) + np.maximum(host - published[-1], 0)
-        return np.asarray(inside + outside * 1e-9 + (shown[0] - self.begun_ns) * 1e-9, dtype=np.float64)
+        return np.asarray(inside + outside * 1e-9 + (frame_ns[0] - self.begun_ns) * 1e-9, dtype=np.float64)
 
     @property
     def begun_ns(self) -> int:

@@ -1,4 +1,4 @@
-"""Panel of power spectra: pseudo-open-loop, measured error, and the prediction from the law's rejection."""
+"""Panel of power spectra: pseudo-open-loop, measured error, and the prediction from an integrator's rejection."""
 
 from math import ceil, floor, log10
 
@@ -26,7 +26,7 @@ _SEGMENT = 1024
 _MAX_DECADES = 2
 """Decades by which a scale may exceed the range of the data before it shrinks."""
 _MAX_LABELS = 6
-_STATE = (WIDTH - 34.0, BOX_HEIGHT - 12.0)
+_STATE_POSITION = (WIDTH - 34.0, BOX_HEIGHT - 12.0)
 _LEAST = 1e-12
 """Lowest power drawn, as a fraction of the highest; lower values are drawn there."""
 _NAMES, _COLOURS = ("pseudo-open-loop", "measured error", "rejection² x open"), (GREY, GREEN, YELLOW)
@@ -68,7 +68,7 @@ class Spectra(Panel):
                 self._fit(stream, axes, rate_hz, np.concatenate(powers))
             axes.draw(stream, np.log10(frequency_hz), [np.log10(power) for power in powers], _COLOURS, _WIDTHS)
             text = f"loop {_MODES.get(steady.mode, 'unknown')}{state}"
-            stream.log(f"{axes.path}/state", labels([_STATE], [text]))
+            stream.log(f"{axes.path}/state", labels([_STATE_POSITION], [text]))
 
     def _fit(self, stream: rr.RecordingStream, axes: Axes, rate_hz: float, power: Array) -> None:
         """Fit the axes: they grow at once, and shrink only if they are far too large."""
