@@ -9,8 +9,21 @@ import pytest
 
 from lowfc.adapters.logs.history import History, read_history
 from lowfc.adapters.logs.reader import LogReader
-from lowfc.contract.messages import CAMERA_STATE, EVENT, MIRROR_STATE, STEP, TIMING, TRUTH, Message, Topic, wire
-from tests.support.report_log import SyntheticLog
+from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.messages import (
+    CALIBRATION,
+    CAMERA_STATE,
+    EVENT,
+    MIRROR_STATE,
+    STEP,
+    TIMING,
+    TRUTH,
+    Message,
+    Topic,
+    wire,
+)
+from tests.support.report_log import TOYS, SyntheticLog
+from tests.support.toy import NOLL, calibration
 
 STEPS = 20
 
@@ -50,6 +63,25 @@ def test_an_invalid_step_is_left_out_of_every_column(tmp_path: Path, change: Cal
     assert {len(getattr(steps, column)) for column in steps.__slots__} == {STEPS - 1}
     assert np.isfinite(steps.error_nm).all()
     assert len(history.truths.sequence) == len(history.mirror.sequence) == STEPS
+
+
+def test_the_attached_calibration_replaces_a_lost_message(tmp_path: Path) -> None:
+    night = SyntheticLog()
+    night.frames(STEPS)
+    whole = history_of(night, tmp_path / "whole.mcap")
+    night.samples = [one for one in night.samples if not CALIBRATION.matches(one.key)]
+    history = read_history(LogReader(night.write(tmp_path / "x.mcap", attached=TOYS)))
+    assert whole.calibration is not None
+    assert history.calibration is not None
+    assert history.calibration.id == whole.calibration.id
+    np.testing.assert_equal(history.steps.error_nm, whole.steps.error_nm)
+    assert history.remarks == [f"{history.log.path}: the message of its calibration is lost; the attached one is used"]
+    other = identified(calibration(NOLL, 2.0))  # no controller reported to use it
+    for name, attached in (("none", None), ("other", other)):
+        history = read_history(LogReader(night.write(tmp_path / f"{name}.mcap", attached=attached)))
+        assert history.calibration is None
+        assert (len(history.steps.sequence), history.excluded_messages) == (0, STEPS)
+        assert not history.remarks
 
 
 def test_a_repeated_reason_sets_one_bit(tmp_path: Path) -> None:

@@ -254,7 +254,19 @@ def test_a_log_without_a_step_still_has_a_page(tmp_path: Path, empty: bool) -> N
     made = report_of(read_run(night.write(tmp_path / "x.mcap", config=not empty)))
     assert made.results["verdict"]["level"] == "bad"
     assert made.results["verdict"]["because"] == "this log has no control steps"
-    assert "This log has no control steps" in page(made)
+    assert "Without control steps that can be read" in page(made)
+
+
+@pytest.mark.usefixtures("without_drawings")
+def test_a_report_says_that_the_calibration_of_its_steps_is_missing(tmp_path: Path) -> None:
+    night = SyntheticLog()
+    night.frames(20)
+    night.samples = [one for one in night.samples if one.key != CALIBRATION.key]
+    made = report_of(read_run(night.write(tmp_path / "x.mcap")))
+    texts = {check["name"]: check["text"] for check in made.results["verdict"]["checks"]}
+    assert texts["loop"] == "this log has no calibration, without which its 20 control steps cannot be read"
+    assert texts["commands"] == "this log has no calibration, without which its steps cannot be read"
+    assert "has no control steps" not in page(made)
 
 
 @pytest.mark.usefixtures("without_drawings")

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.files import calibration_file
 from lowfc.adapters.logs.writer import Attachment, LogWriter
 from lowfc.arrays import Pixels, Single
 from lowfc.contract.codecs import codec
@@ -153,12 +154,21 @@ class SyntheticLog:
         self.samples.append(Sample(key, payload, sequence, sent_ns, sent_ns + 50_000))
 
     def write(
-        self, path: Path, *, finish: bool = True, config: bool = True, toml: str | None = None, **more: str
+        self,
+        path: Path,
+        *,
+        finish: bool = True,
+        config: bool = True,
+        toml: str | None = None,
+        attached: Calibration | None = None,
+        **more: str,
     ) -> Path:
         """Write the log, finished (with `more` in the recorder's account) or as left by a recorder that died."""
         content = (Configuration().to_toml() if toml is None else toml).encode()
-        attached = [Attachment("config.toml", "application/toml", content)] if config else []
-        log = LogWriter(path, START * 10**9, METADATA, attached)
+        attachments = [Attachment("config.toml", "application/toml", content)] if config else []
+        if attached is not None:
+            attachments.append(Attachment("calibration.fits", "application/fits", calibration_file.to_bytes(attached)))
+        log = LogWriter(path, START * 10**9, METADATA, attachments)
         for number, sample in enumerate(self.samples):
             log.write(sample)
             if not finish and number % 100 == 99:

@@ -72,13 +72,13 @@ def save(calibration: Calibration, path: Path) -> None:
     write_whole(path, to_bytes(calibration))
 
 
-def load(path: Path) -> Calibration:
-    """Read a FITS file and check its identity.
+def load(path: Path, content: bytes | None = None) -> Calibration:
+    """Read a FITS file, or its `content` that `path` names in errors, and check its identity.
 
     Raises:
         DataFileError: the file is missing, damaged or holds something else.
     """
-    calibration = fits_file.load(path, (KIND,), "calibration file", _read)
+    calibration = fits_file.load(path, (KIND,), "calibration file", _read, content=content)
     fits_file.require_identity(path, calibration.identity(), calibration.id)
     return calibration
 

@@ -59,11 +59,12 @@ def to_bytes(primary: fits.PrimaryHDU, extensions: list[fits.ImageHDU]) -> bytes
 
 
 @contextlib.contextmanager
-def opened(path: Path) -> Iterator[fits.HDUList]:
-    """Open a file for reading; raises one of `DAMAGED` if it is incomplete."""
+def opened(path: Path, content: bytes | None = None) -> Iterator[fits.HDUList]:
+    """Open a file, or its `content`, for reading; raises one of `DAMAGED` if it is incomplete."""
     with (
         warnings.catch_warnings(),
-        input_file.opened(path, MAX_BYTES) as stream,  # closes the file if astropy raises
+        # closes the file if astropy raises
+        input_file.opened(path, MAX_BYTES) if content is None else io.BytesIO(content) as stream,
     ):
         warnings.simplefilter("error", AstropyWarning)  # astropy only warns of a truncated file
         if stream.read(2) == b"PK":  # astropy raises AttributeError
@@ -73,7 +74,14 @@ def opened(path: Path) -> Iterator[fits.HDUList]:
             yield hdus
 
 
-def load(path: Path, kinds: tuple[str, ...], what: str, parse: Callable[[fits.HDUList], T], advice: str = "") -> T:
+def load(
+    path: Path,
+    kinds: tuple[str, ...],
+    what: str,
+    parse: Callable[[fits.HDUList], T],
+    advice: str = "",
+    content: bytes | None = None,
+) -> T:
     """Read one of lowfc's own files with `parse`.
 
     Args:
@@ -82,12 +90,13 @@ def load(path: Path, kinds: tuple[str, ...], what: str, parse: Callable[[fits.HD
         what: description of the file, for errors.
         parse: decodes the open file; raises one of `DAMAGED` if its content is invalid.
         advice: instruction to make such a file, for errors.
+        content: content of the file, if it is not read from `path`, which then names it in errors.
 
     Raises:
         DataFileError: the file is missing, damaged or holds something else.
     """
     try:
-        with opened(path) as hdus:
+        with opened(path, content) as hdus:
             found = hdus[0].header.get("KIND")
             if found not in kinds:
                 raise ValueError(f"KIND in its header must be {kinds[0]!r}, found {found!r}")

@@ -3,6 +3,7 @@
 Everything known about a frame is one row; read the images from the log.
 """
 
+import contextlib
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
@@ -97,7 +98,9 @@ class History:
     Attributes:
         log: reader, read to its end: metadata, attachments, whether the log is complete.
         configuration: configuration of the recorded loop; None if there is no readable one.
-        remarks: sentences on parts of the configuration that this version cannot use; each names the log.
+        remarks: sentences on parts of the configuration that this version cannot use, and on the calibration if its
+            message is lost; each names the log.
+        calibration: the last one; if its message is lost, the attached one, if a controller reported to use it.
         controllers: states of the controllers, in order.
         frame_sequence, frame_publish_ns: sequence and publish time of every frame in the log.
         command_publish_ns: publish time of every mirror command in the log.
@@ -197,7 +200,8 @@ def read_history(log: LogReader) -> History:
     for message in log:
         rows.take(message)
     rows.finish()
-    history.configuration, history.remarks = attached_configuration(log)
+    history.configuration, remarks = attached_configuration(log)
+    history.remarks += remarks
     return history
 
 
@@ -214,6 +218,19 @@ def attached_configuration(log: LogReader) -> tuple[Configuration | None, list[s
     except ConfigurationError as error:
         return None, [f"{log.path}: its {name} cannot be used: {error}"]
     return found, [f"{log.path}: its {name}: {remark}" for remark in remarks]
+
+
+def attached_calibration(log: LogReader, calibration_id: str) -> Calibration | None:
+    """The calibration of this identity, if it is attached to a log and can be read."""
+    from lowfc.adapters.files import calibration_file  # its astropy takes 0.15 s to import
+
+    for name, content in log.attachments.items():
+        if name.endswith(".fits"):
+            with contextlib.suppress(DataFileError):
+                calibration = calibration_file.load(log.path / name, content)
+                if calibration.id == calibration_id:
+                    return calibration
+    return None
 
 
 class _Rows:
@@ -259,6 +276,8 @@ class _Rows:
             return
         body = topic.message.FromString(message.payload)
         if isinstance(body, wire.ControlStep):
+            if not self._steps.modes and len(body.command_nm):
+                self._set_modes(len(body.command_nm))  # the message of the calibration is lost
             history.excluded_messages += not self._steps.add(body)
             self._stepped.add(sequence=body.frame_sequence)
         elif isinstance(body, wire.Truth):
@@ -300,7 +319,10 @@ class _Rows:
 
     def _calibrate(self, calibration: wire.Calibration) -> None:
         self._calibration = calibration
-        modes = len(calibration.noll)
+        self._set_modes(len(calibration.noll))
+
+    def _set_modes(self, modes: int) -> None:
+        """Leave out the rows so far if they have another number of modes."""
         if modes != self._steps.modes:
             self._history.excluded_messages += len(self._steps)
             self._steps, self._truths = StepRows(modes), TruthRows(modes)
@@ -317,12 +339,25 @@ class _Rows:
         history = self._history
         history.frame_sequence, history.frame_publish_ns = map(self._frames.values, ("sequence", "publish_ns"))
         history.command_publish_ns = self._commands.values("publish_ns")
+        history.calibration = self._last_calibration()
+        self._set_modes(len(history.calibration.noll) if history.calibration is not None else 0)
         history.stepped_sequence = self._stepped.values("sequence")
         history.steps, history.truths = self._steps.values(), self._truths.values()
         for name in ("sequence", "publish_time_ns", "stroke_nm", "limits"):
             setattr(history.mirror, name, self._mirror.values(name))
         history.timed_sequence, history.stages_ns = self._timings.values()
-        try:
-            history.calibration = None if self._calibration is None else decode_calibration(self._calibration)
-        except ValueError as error:
-            raise DataFileError(f"{history.log.path}: {error}") from None
+
+    def _last_calibration(self) -> Calibration | None:
+        history = self._history
+        if self._calibration is not None:
+            try:
+                return decode_calibration(self._calibration)
+            except ValueError as error:
+                raise DataFileError(f"{history.log.path}: {error}") from None
+        calibration_id = history.controller.calibration_id if history.controller is not None else ""
+        found = attached_calibration(history.log, calibration_id) if calibration_id else None
+        if found is not None:
+            history.remarks.append(
+                f"{history.log.path}: the message of its calibration is lost; the attached one is used"
+            )
+        return found

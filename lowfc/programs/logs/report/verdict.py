@@ -1,5 +1,8 @@
 """Verdict on a run, in a few lines."""
 
+from collections.abc import Mapping
+
+from lowfc.contract.messages import CALIBRATION, STEP
 from lowfc.control.loop.wording import counted
 from lowfc.programs.logs.report.source import Results
 
@@ -8,7 +11,6 @@ GOOD, LOOK, BAD, UNKNOWN = "good", "look", "bad", "unknown"
 _MANY_WITHOUT_COMMAND = 0.01
 _MANY_LATE = 0.01
 _MUCH_STROKE = 0.9
-_NO_LOOP = "this log has no control steps"
 
 
 def verdict(results: Results) -> Results:
@@ -57,11 +59,21 @@ def _modes(results: Results) -> Results:
     steps = results["mode_steps"]
     total = sum(steps.values())
     if not total:
-        return _check("loop", BAD, _NO_LOOP)
+        return _check("loop", BAD, _why_no_loop(results["log"]["messages_by_topic"]))
     shares = ", ".join(f"{name} {count / total:.1%}" for name, count in steps.items())
     if steps.get("safe"):
         return _check("loop", BAD, shares)
     return _check("loop", GOOD if steps.get("closed") else UNKNOWN, shares)
+
+
+def _why_no_loop(messages: Mapping[str, int]) -> str:
+    """Reason why a report has no steps, from the number of messages by topic key."""
+    count = messages.get(STEP.key, 0)
+    if not count:
+        return "this log has no control steps"
+    if CALIBRATION.key not in messages:
+        return f"this log has no calibration, without which its {counted(count, 'control step')} cannot be read"
+    return f"this log has {counted(count, 'control step')}, none of which fits its calibration"
 
 
 def _residual(results: Results) -> Results:
@@ -92,6 +104,8 @@ def _commands(results: Results) -> Results:
     if not recorded:
         return _check("commands", UNKNOWN, "this log has no frames")
     if results["run"]["calibration"] is None:
+        if results["log"]["messages_by_topic"].get(STEP.key) and not results["mode_steps"]:
+            return _check("commands", UNKNOWN, "this log has no calibration, without which its steps cannot be read")
         return _check("commands", UNKNOWN, "this log has no calibration, without which frames lead to no command")
     if not without:
         return _check("commands", GOOD, f"all {recorded} frames led to a command")
