@@ -100,6 +100,11 @@ def test_the_verdict_has_the_losses_of_the_log_and_not_of_earlier_ones(
     assert (log.detail, log.level) == (detail, Level.GOOD if "nothing" in detail else Level.WARNING)
 
 
+def test_the_verdict_on_a_log_of_a_fraction_of_a_second_has_its_losses(shown: Shown) -> None:
+    drawn(Path(__file__).parents[1] / "golden" / "0.1" / "night.mcap")
+    assert tile(shown[-1], "FRAMES").detail.startswith("of 163 frames: 1 lost, ")
+
+
 def test_the_final_verdict_covers_the_whole_log(tmp_path: Path, shown: Shown) -> None:
     made = night(750)
     made.frames(50, dark=range(50))

@@ -427,7 +427,7 @@ def test_latencies_are_those_of_the_last_second() -> None:
     ]
     controller = wire.Health(topics=[wire.TopicCount(topic=FRAME.key, received=90, skipped=7, missing=3)])
     recorder = wire.Health(recording=wire.Recording(lost=5))
-    health = {Role.CONTROLLER: LastHealth(0, controller), Role.RECORDER: LastHealth(0, recorder)}
+    health = {Role.CONTROLLER: LastHealth(0, controller, controller), Role.RECORDER: LastHealth(0, recorder, recorder)}
     for number, timings in enumerate(batches):
         drawn(panel, tape, number * 100_000_000, timings=timings, health=health)
     times_ns, found = tape.column(latency.WHOLE.path)

@@ -74,10 +74,11 @@ class Wavefronts(NamedTuple):
 
 
 class LastHealth(NamedTuple):
-    """A process's last Health, and when it was sent (host clock)."""
+    """A process's last Health, when it was sent (host clock), and the first one of the process since its start."""
 
     time_ns: int
     health: wire.Health
+    first: wire.Health
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,7 +277,9 @@ class Accumulator:
             _added(self._timings, wire.ControlTiming.FromString(payload))
         elif topic is HEALTH:
             name, health = self._names.health(key, payload)
-            self._health[name] = LastHealth(publish_time_ns, health)
+            before = self._health.get(name)
+            first = before.first if before is not None and before.first.pid == health.pid else health
+            self._health[name] = LastHealth(publish_time_ns, health, first)
         elif topic is EVENT:
             self._events.append(Log.FromString(payload))
         else:

@@ -236,15 +236,17 @@ class Watcher:
         return _Sample(snapshot.host_ns, counts, squares, steps.sequence, steps.time_ns, durations_ns)
 
     def _grown(self, snapshot: Snapshot) -> dict[str, int]:
-        """Increase of the processes' counts since the last snapshot; none for a restarted process."""
+        """Increase of the processes' counts since the last snapshot, or since the first Health of a new process."""
         grown: dict[str, int] = {}
         for name, (role, count_in) in _COUNTERS.items():
             last = snapshot.health.get(role)
             if last is None:
                 continue
             count = count_in(last.health)
-            pid, before = self._last_counts.get(name, (last.health.pid, count))
-            if pid == last.health.pid and count > before:
+            pid, before = self._last_counts.get(name, (-1, 0))
+            if pid != last.health.pid:
+                before = count_in(last.first)
+            if count > before:
                 grown[name] = count - before
             self._last_counts[name] = (last.health.pid, count)
         return grown
