@@ -20,6 +20,7 @@ from lowfc.contract.messages import (
     TRUTH,
     Log,
     Role,
+    Topic,
     timestamp,
     wire,
 )
@@ -183,6 +184,20 @@ def test_unreadable_messages_and_unknown_values_do_not_affect_other_panels() -> 
     tape = rendered(accumulator.snapshot(samples[-1].publish_time_ns))
     assert accumulator.unreadable == 2, "only the newest picture of a topic is decoded"
     assert wavefront.ERROR.path in tape.rows
+
+
+@pytest.mark.parametrize("seconds", [10**12, -(10**12), 6 * 10**9])
+@pytest.mark.parametrize("topic", [EVENT, CONTROLLER_STATE, STEP, TRUTH])
+def test_a_message_of_a_time_out_of_range_is_left_out(topic: Topic, seconds: int) -> None:
+    samples = night().samples
+    last = next(one for one in reversed(samples) if topic.matches(one.key))
+    message = topic.message.FromString(last.payload)
+    time = message.mode_timestamp if topic is CONTROLLER_STATE else message.timestamp
+    time.seconds = seconds
+    wrong = last._replace(sequence=last.sequence + 1, payload=message.SerializeToString())
+    accumulator = accumulated([*samples, wrong])
+    assert accumulator.unreadable == 1
+    rendered(accumulator.snapshot(samples[-1].publish_time_ns))
 
 
 def test_a_panel_that_fails_is_left_out_for_a_while() -> None:

@@ -31,7 +31,7 @@ from lowfc.contract.messages import (
     Message,
     RawImage,
     Topic,
-    from_timestamp,
+    checked_time_ns,
     topic_of,
     wire,
 )
@@ -265,12 +265,14 @@ class Accumulator:
         """Read a message of a topic that keeps them all; another number of modes restarts the rows."""
         if topic is STEP:
             step = wire.ControlStep.FromString(payload)
+            time_ns = checked_time_ns(step.timestamp)
             if not self._steps.add(step):
                 self._steps = _added(StepRows(len(step.command_nm)), step)
             if WRONG_TIME.isdisjoint(step.reasons):
-                self._set_data_time(from_timestamp(step.timestamp), publish_time_ns)
+                self._set_data_time(time_ns, publish_time_ns)
         elif topic is TRUTH:
             truth = wire.Truth.FromString(payload)
+            checked_time_ns(truth.timestamp)
             if not self._truths.add(truth):
                 self._truths = _added(TruthRows(len(truth.residual_nm)), truth)
         elif topic is TIMING:
@@ -281,9 +283,13 @@ class Accumulator:
             first = before.first if before is not None and before.first.pid == health.pid else health
             self._health[name] = LastHealth(publish_time_ns, health, first)
         elif topic is EVENT:
-            self._events.append(Log.FromString(payload))
+            event = Log.FromString(payload)
+            checked_time_ns(event.timestamp)
+            self._events.append(event)
         else:
             state = topic.message.FromString(payload)
+            if isinstance(state, wire.ControllerState):
+                checked_time_ns(state.mode_timestamp)
             self._states[topic] = decode_calibration(state) if isinstance(state, wire.Calibration) else state
 
     def _set_data_time(self, data_ns: int, publish_time_ns: int) -> None:
