@@ -291,9 +291,12 @@ def test_a_frame_of_a_camera_whose_clock_is_ahead_does_not_move_the_time_line(tm
     made.put(FRAME, image(np.zeros((8, 8), np.uint16), ahead_ns, "sensor"))
     made.put(STEP, step)
     made.frames(300)
-    done, _ = drawn(made.write(tmp_path / "night.mcap"))
+    done, tape = drawn(made.write(tmp_path / "night.mcap"))
     begin_ns, end_ns = done.span_ns
     assert (end_ns - begin_ns) * 1e-9 == pytest.approx(done.log_s, abs=0.1)
+    drawn_ns = [time_ns or 0 for logged in tape.logged.values() for time_ns, _ in logged]
+    drawn_ns += [int(times_ns.max(initial=0)) for rows in tape.rows.values() for times_ns, _ in rows]
+    assert max(drawn_ns) < end_ns + 10**9  # no picture or row at the time of the camera's clock
 
 
 def test_the_largest_stroke_of_a_log_is_that_of_every_mirror_state(tmp_path: Path, shown: Shown) -> None:

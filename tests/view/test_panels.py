@@ -21,6 +21,7 @@ from lowfc.contract.messages import (
     Log,
     Role,
     Topic,
+    image,
     timestamp,
     wire,
 )
@@ -239,6 +240,13 @@ def test_a_complete_snapshot_has_every_picture_since_the_previous_complete_one()
     np.testing.assert_array_equal(complete.frame, incomplete.frame)
     assert (complete.frame_ns, complete.mirror) == (incomplete.frame_ns, incomplete.mirror)
     assert accumulator.snapshot(0).frame is None
+
+
+def test_a_frame_of_a_camera_whose_clock_is_ahead_is_drawn_at_the_time_of_the_view() -> None:
+    made = night()
+    made.put(FRAME, image(np.zeros((6, 7), np.uint16), made.now_ns + 3600 * 10**9, "sensor"))
+    snapshot = snapshot_of(made.samples)
+    assert snapshot.frame_ns == snapshot.time_ns < made.now_ns + 10**9
 
 
 def test_a_malformed_step_is_left_out_and_counted() -> None:

@@ -9,7 +9,7 @@ from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.bus.names import Names
-from lowfc.adapters.logs.columns import StepRows, Steps, TimingRows, TruthRows, Truths
+from lowfc.adapters.logs.columns import StepRows, Steps, TimingRows, TruthRows, Truths, bits_of
 from lowfc.arrays import Long, Mask, Pixels, Sequences, Single
 from lowfc.contract.codecs.calibration_codec import decode_calibration
 from lowfc.contract.codecs.codec import decode_frame
@@ -46,9 +46,9 @@ PICTURES_HZ = 30.0
 PICTURES_PER_COMPLETE = 8
 """Snapshots per complete one. Curves grow four times a second, because many rows cost hardly more than one."""
 
-WRONG_TIME = frozenset((Rejection.OUT_OF_ORDER.value, Rejection.REPEATED.value, Rejection.AHEAD.value))
+_WRONG_TIME = frozenset((Rejection.OUT_OF_ORDER.value, Rejection.REPEATED.value, Rejection.AHEAD.value))
 """Numbers of the reasons for refusing a frame whose time is not that of its exposure, or not in order."""
-
+_WRONG_TIME_BITS = bits_of(_WRONG_TIME)
 _KNOWN_EVENTS = 5000
 _UNREADABLE = (BadMessageError, DecodeError, KeyError, OverflowError, ValueError)
 
@@ -113,7 +113,8 @@ class Snapshot:
         host_ns: time of the host clock, as are `sent_ns` (last message of each topic) and `LastHealth`.
         steps, truths, timings, events: new rows and events; timings are the durations of the controller's stages.
         frame, mirror, surface: newest frame (DN, at `frame_ns`), state and surface over the pupil (nm); None without a
-            new one since the last snapshot, or since the last complete one if this is `complete`.
+            new one since the last snapshot, or since the last complete one if this is `complete`. If there is a
+            controller, `frame_ns` is at most `time_ns`, because the camera's clock may be ahead.
         calibration, camera, controller, health: the latest of each; None before the first.
         complete: whether all new data are included; otherwise only the newest pictures, and rows and events wait.
         behind_s: delay of this snapshot.
@@ -153,6 +154,11 @@ class Snapshot:
     def stroke_nm(self) -> float:
         """Limit of an actuator's deviation from flat; 0 if the controller has not reported it."""
         return self.controller.settings.stroke_nm if self.controller is not None else 0.0
+
+    @property
+    def in_time(self) -> Mask:
+        """Whether the time of each step is that of an exposure, so that it can be drawn at that time."""
+        return np.asarray(self.steps.reasons & _WRONG_TIME_BITS == 0)
 
     @property
     def used(self) -> Mask:
@@ -217,8 +223,11 @@ class Accumulator:
     ) -> Snapshot:
         """Return the data since the last snapshot; `host_ns` is the present host time. See `Snapshot`."""
         frame: Frame | None = self._newest_of(FRAME, _frame, complete=complete)
-        if frame is not None and STEP not in self._sent_ns:
-            self._set_data_time(frame.time_ns, self._sent_ns[FRAME])
+        frame_ns = frame.time_ns if frame is not None else 0
+        if STEP in self._sent_ns:
+            frame_ns = min(frame_ns, self._time_ns(host_ns))
+        elif frame is not None:
+            self._set_data_time(frame_ns, self._sent_ns[FRAME])
         new = StepRows(0), TruthRows(0), TimingRows(), list[Log]()
         if complete:
             new = self._steps, self._truths, self._timings, self._events
@@ -232,7 +241,7 @@ class Accumulator:
             truths=truths.values(),
             timings=timings.values()[1],
             frame=frame.pixels if frame is not None else None,
-            frame_ns=frame.time_ns if frame is not None else 0,
+            frame_ns=frame_ns,
             mirror=self._newest_of(MIRROR_STATE, wire.MirrorState.FromString, complete=complete),
             surface=self._newest_of(SURFACE, _surface, complete=complete),
             events=events,
@@ -268,7 +277,7 @@ class Accumulator:
             time_ns = checked_time_ns(step.timestamp)
             if not self._steps.add(step):
                 self._steps = _added(StepRows(len(step.command_nm)), step)
-            if WRONG_TIME.isdisjoint(step.reasons):
+            if _WRONG_TIME.isdisjoint(step.reasons):
                 self._set_data_time(time_ns, publish_time_ns)
         elif topic is TRUTH:
             truth = wire.Truth.FromString(payload)

@@ -54,7 +54,7 @@ class Loop(Panel):
 
     def draw(self, stream: rr.RecordingStream, snapshot: Snapshot) -> None:
         """Add the new data."""
-        steps, state = snapshot.steps, snapshot.controller
+        steps, used, state = snapshot.steps.at(snapshot.in_time), snapshot.used[snapshot.in_time], snapshot.controller
         if not self._mode and state is not None and state.mode in _NAMES and state.HasField("mode_timestamp"):
             since_ns = from_timestamp(state.mode_timestamp)
             if not steps.time_ns.size or since_ns < steps.time_ns[0]:  # before the start of the view
@@ -64,7 +64,7 @@ class Loop(Panel):
         if snapshot.calibration is not None:
             percent = 100 * steps.flux_dn / snapshot.calibration.flux_dn
             for plot, values in ((FLUX, percent), (SATURATED, steps.saturated_pixels)):
-                plot.add(stream, steps.time_ns, np.where(snapshot.used, values, np.nan))
+                plot.add(stream, steps.time_ns, np.where(used, values, np.nan))
         for event in snapshot.events:
             time_ns = from_timestamp(event.timestamp)
             clock = datetime.fromtimestamp(time_ns * 1e-9, UTC).strftime(

@@ -7,11 +7,11 @@ from math import isnan
 
 import numpy as np
 
-from lowfc.adapters.logs.columns import Steps, bits_of
+from lowfc.adapters.logs.columns import Steps
 from lowfc.control.durations import Durations
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.wording import counted
-from lowfc.programs.view.snapshot import WRONG_TIME, LogEnd, Snapshot
+from lowfc.programs.view.snapshot import LogEnd, Snapshot
 from lowfc.programs.view.verdicts.camera_verdict import DIM, FEW, REFUSED
 from lowfc.programs.view.verdicts.facts import facts
 from lowfc.programs.view.verdicts.run_state import RunState
@@ -21,7 +21,6 @@ from lowfc.programs.view.verdicts.verdict import LIMITS, MANY_LATE, stroke
 from lowfc.programs.view.verdicts.watcher import FRAMES_SILENT_S, PERIODS
 from lowfc.programs.view.verdicts.wavefront_verdict import GOOD_FACTOR, WORSE, shaped
 
-_WITH_WRONG_TIME = bits_of(WRONG_TIME)
 _MODES = {mode.value: mode for mode in LoopMode}
 _NAMES = {LoopMode.OPEN: "open", LoopMode.SAFE: "safe", LoopMode.IDLE: "idle", None: "without frames"}
 
@@ -42,7 +41,7 @@ class LogVerdict:
         self._means.feed(snapshot)
         steps, wavefronts = snapshot.steps, snapshot.wavefronts(true=self._means.true)
         if steps.time_ns.size:
-            self._add_modes(steps.at(steps.reasons & _WITH_WRONG_TIME == 0), snapshot.period_ns)
+            self._add_modes(steps.at(snapshot.in_time), snapshot.period_ns)
             closed = np.isin(wavefronts.sequence, steps.sequence[steps.mode == LoopMode.CLOSED.value])
             self._closed.add_wavefronts(wavefronts.at(closed), true=self._means.true)
         for duration_ns in snapshot.timings["frame_to_command"].tolist():
