@@ -6,7 +6,8 @@ times are new, so that no message counts as late. Deadlines are absolute: timing
 
 import contextlib
 import time
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from rich.progress import BarColumn, TextColumn
 from lowfc.adapters.bus.bus import Publisher, Sample, name_in
 from lowfc.adapters.bus.run import Run, open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
+from lowfc.adapters.logs.history import LAST_NS
 from lowfc.adapters.logs.parts import WholeLog, titled
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.recovery import faults, in_words, missing_end_text
@@ -26,10 +28,13 @@ from lowfc.adapters.process.service import Service
 from lowfc.contract.errors import ConfigurationError, DataFileError, nearest
 from lowfc.contract.messages import COMMAND, HEALTH, MIRROR_STATE, Role, topic_of
 from lowfc.control.durations import Durations
+from lowfc.control.loop.wording import counted
 from lowfc.programs.logs.publish.selection import Selection, role_of
 
 BEHIND_NS = 1_000_000
 """Delay after which a message is counted as behind."""
+LONG_WAIT_NS = 10_000_000_000
+"""Wait for the next message from which on it is announced."""
 
 _MAX_SLEEP_NS = 100_000_000
 _PROGRESS_NS = 200_000_000
@@ -99,15 +104,21 @@ class Player:
         self._first_log_ns = self._last_log_ns = 0
         self._begun_ns = self._sent_ns = 0
         self._initial_keys: set[str] = set()
+        self._impossible = 0
+        self._announce: Callable[[str], None] = lambda text: None
 
     def play(self, logs: Sequence[Path], console: Console) -> dict[str, Any]:
         """Publish logs one after the other; return what was published, and the timing errors."""
         log, progress_due_ns = WholeLog(logs, skip_damaged=True), 0
+        self._announce = partial(console.print, highlight=False)
         with passing_bar(console, TextColumn("{task.description}"), BarColumn()) as bar:
             task = bar.add_task(titled(log.paths))
             for message in log:
                 if not self._service.running:
                     break
+                if message.receive_time_ns > LAST_NS:
+                    self._impossible += 1
+                    continue
                 self._play(message)
                 if self._sent_ns >= progress_due_ns:
                     progress_due_ns = self._sent_ns + _PROGRESS_NS
@@ -122,6 +133,7 @@ class Player:
             "messages": self._errors.count + len(self._initial_keys),
             "published": {key: one.published for key, one in sorted(self._publishers.items()) if one is not None},
             "left_out": dict(sorted(self._excluded.items())),
+            "messages_of_impossible_time": self._impossible,
             "span_s": (self._last_log_ns - self._first_log_ns) * 1e-9,
             "took_s": (self._sent_ns - self._begun_ns) * 1e-9,
             "timing_error_us": {"p50": p50_ns / 1e3, "p99": p99_ns / 1e3, "max": self._errors.max_ns / 1e3},
@@ -155,6 +167,9 @@ class Player:
             self._first_log_ns = self._last_log_ns
             self._begun_ns = self._sent_ns = self._clock.host_ns()
         due_ns = self._begun_ns + round((self._last_log_ns - self._first_log_ns) / self._speed)
+        if (wait_ns := due_ns - self._clock.host_ns()) > LONG_WAIT_NS:
+            when = _utc(self._last_log_ns)
+            self._announce(f"the next message, of {when}, follows in {wait_ns / 1e9:.0f} s; Ctrl-C ends it")
         self._sleep_until(due_ns)
         if not self._service.running:
             return
@@ -197,6 +212,9 @@ def render(results: dict[str, Any]) -> str:
     lines += faults(results["damaged"], results["no_end"])
     lines += [f"the log has        {selection}" for selection in results["selection"]]
     lines += [f"left out           {key}: {why}" for key, why in results["left_out"].items()]
+    if results["messages_of_impossible_time"]:
+        count = counted(results["messages_of_impossible_time"], "message")
+        lines.append(f"left out           {count} with a log time after the year 2262")
     return "\n".join(lines)
 
 
