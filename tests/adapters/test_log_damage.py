@@ -227,15 +227,25 @@ def test_a_summary_without_checksum_is_used_up_to_a_damaged_record(
         assert list(file.index()) == []
 
 
-def test_of_two_files_in_one_the_first_is_read_and_the_second_reported(source: Path) -> None:
-    size = source.stat().st_size
-    source.write_bytes(2 * source.read_bytes())
+@pytest.mark.parametrize("cut", [0, 500])
+def test_of_two_logs_in_one_file_the_first_is_read_and_the_second_reported(source: Path, cut: int) -> None:
+    first = source.read_bytes()
+    second = first[: len(first) - cut]  # as of a recorder that was killed
+    source.write_bytes(first + second)
     reader = LogReader(source, skip_damaged=True)
     assert identity(list(reader)) == SENT
     (damage,) = reader.damage
-    assert damage.position + damage.length == 2 * size
-    assert damage.length > size
-    assert damage.why.endswith("another file was appended")
+    assert (damage.position, damage.length) == (len(first), len(second))
+    command = f"`tail -c +{len(first) + 1} {source.name} > second.mcap`"
+    assert damage.why == f"it is another log, appended to this one; {command} copies it"
+
+
+def test_another_file_after_a_log_is_damage(source: Path) -> None:
+    log = source.read_bytes()
+    source.write_bytes(log + b"no log" + log[-8:])
+    reader = LogReader(source, skip_damaged=True)
+    assert identity(list(reader)) == SENT
+    assert [damage.why for damage in reader.damage] == ["the summary is damaged, or another file was appended"]
 
 
 def test_a_message_index_of_an_impossible_length_is_damage_for_a_sparse_reader_too(source: Path) -> None:

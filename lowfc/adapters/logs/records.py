@@ -153,7 +153,10 @@ class LogFile:
                 if opcode == Opcode.DATA_END and length == 4 and self._summary in (None, end):
                     if intact and int.from_bytes(body, "little") not in (0, crc):
                         yield Damage(at, 0, _CHANGED)
-                    if self.finished and self._summary is None:
+                    if self._summary is None and (second := self._appended(end)):
+                        copy = f"`tail -c +{second + 1} {self.path.name} > second.mcap` copies it"
+                        yield Damage(second, self.size - second, f"it is another log, appended to this one; {copy}")
+                    elif self.finished and self._summary is None:
                         yield Damage(end, self.size - end, "the summary is damaged, or another file was appended")
                     self.complete = self._summary is not None
                     return
@@ -170,6 +173,14 @@ class LogFile:
                 if part is not None:
                     yield part
                 at = end
+
+    def _appended(self, at: int) -> int | None:
+        """First byte of a log that follows the end of this one; None without one after `at`."""
+        while len(block := self._read(at, _BLOCK_BYTES)) >= 2 * len(MAGIC):
+            if (found := block.find(2 * MAGIC)) >= 0:
+                return at + found + len(MAGIC)
+            at += len(block) - 2 * len(MAGIC) + 1
+        return None
 
     def _find_summary(self) -> int | None:
         """First byte of the summary; None unless its checksum is correct."""
