@@ -219,7 +219,12 @@ def test_the_estimate_of_disk_space_follows_rate_and_selection(tmp_path: Path) -
     growth = bytes_per_s(config, configured_selection(config))
     assert 3e6 < growth < 5e6
     assert estimate(config).startswith(f"recording into {tmp_path}: about {growth * 3600 / 1e9:.0f} GB an hour; ")
-    assert estimate(config).endswith(" h, at 250 Hz")
+    assert estimate(config).endswith(" h, at 250 Hz and 80 x 80 pixels, the simulated camera's")
+    camera = wire.CameraState(rows=160, columns=120)
+    assert estimate(config, camera).endswith(" h, at 250 Hz and 160 x 120 pixels")
+    more = bytes_per_s(config, configured_selection(config), camera) - growth
+    assert more == pytest.approx((160 * 120 - 80 * 80) * 2 * 0.6 * 250)
+    assert estimate(config, wire.CameraState()) == estimate(config)
     assert bytes_per_s(load(None, keys | {"camera.rate_hz": 500.0}), EVERYTHING) > 1.8 * growth
     fewer = load(None, keys | {"recorder.every": 10, "recorder.topics": [FRAME.key, "lowfc/mirror/{name}/state"]})
     assert bytes_per_s(fewer, configured_selection(fewer)) < 0.5 * growth

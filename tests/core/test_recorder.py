@@ -114,6 +114,16 @@ def test_states_published_before_the_recorder_started_are_first_in_the_log_and_o
     assert summary.lost == {}
 
 
+@pytest.mark.parametrize("state", [wire.CameraState(rows=6, columns=7), None, b"\xff"])
+def test_the_camera_is_known_before_the_first_log_begins(bench: Bench, state: wire.CameraState | bytes | None) -> None:
+    if state is not None:
+        payload = state if isinstance(state, bytes) else state.SerializeToString()
+        bench.camera.publisher(CAMERA_STATE).put(payload)
+    bench.start()
+    bench.stop()
+    assert bench.cameras == [state if isinstance(state, wire.CameraState) else None]
+
+
 def test_every_lost_message_is_counted(bench: Bench) -> None:
     frames, steps = bench.camera.publisher(FRAME), bench.controller.publisher(STEP)
 

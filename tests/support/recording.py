@@ -7,7 +7,7 @@ from lowfc.adapters.bus.bus import Publisher, Sample
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.service import Service
-from lowfc.contract.messages import EVENT, Log, Topic
+from lowfc.contract.messages import EVENT, Log, Topic, wire
 from lowfc.programs.core.recording.recorder import Recorder
 from lowfc.programs.core.recording.summary import Summary
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
@@ -24,6 +24,7 @@ class Bench:
         self.summary: Summary | None = None
         self.thread = threading.Thread(target=self._record, daemon=True)
         self.events: list[str] = []
+        self.cameras: list[wire.CameraState | None] = []  # known to the recorder before its first log
         self.camera = self.join("camera")
         self.camera.bus.subscribe(EVENT, lambda sample: self.events.append(Log.FromString(sample.payload).message))
         self.controller = self.join("controller")
@@ -48,7 +49,7 @@ class Bench:
         return self.summary
 
     def _record(self) -> None:
-        self.summary = self.recorder.run()
+        self.summary = self.recorder.run(self.cameras.append)
 
 
 def put(publisher: Publisher, count: int) -> list[bytes]:

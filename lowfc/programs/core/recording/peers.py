@@ -1,10 +1,13 @@
 """State of the other processes of a run for the recorder: their Health, and the states that each log starts with."""
 
+import contextlib
 from concurrent.futures import Future, ThreadPoolExecutor
+
+from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus.bus import Bus, Sample, name_in, states
 from lowfc.contract.envelope import start_of
-from lowfc.contract.messages import HEALTH, TOPICS, wire
+from lowfc.contract.messages import CAMERA_STATE, HEALTH, TOPICS, wire
 
 
 class Peers:
@@ -37,6 +40,13 @@ class Peers:
         if kept is None or kept.sequence <= sample.sequence:
             self.newest[sample.key] = sample
         return kept is None or kept.sequence < sample.sequence
+
+    def camera(self) -> wire.CameraState | None:
+        """The camera's newest state; None if there is none, or if it cannot be read."""
+        sample = self.newest.get(CAMERA_STATE.key)
+        with contextlib.suppress(DecodeError):
+            return wire.CameraState.FromString(sample.payload) if sample is not None else None
+        return None
 
     def already_received(self, sample: Sample) -> bool:
         """Whether a query returned this message before the bus delivered it; true once per message."""

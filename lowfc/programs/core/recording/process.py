@@ -16,7 +16,7 @@ from lowfc.contract.codecs.input_file import user_path
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.events import Level
-from lowfc.contract.messages import Role
+from lowfc.contract.messages import Role, wire
 from lowfc.programs.core.recording.alarm import Alarm
 from lowfc.programs.core.recording.recorder import Recorder
 from lowfc.programs.core.recording.summary import Summary
@@ -36,7 +36,6 @@ def record(run: Run, config: Configuration, calibration: Path | None) -> Summary
     limits, selection = log_limits(config), configured_selection(config)
     if short := shortage(user_path(log.folder), limits.min_free_bytes):
         raise DataFileError(short)
-    sys.stderr.write(f"{estimate(config)}\n")
     # Every value, also the defaults that a user's file omits.
     attachments = [Attachment("config.toml", "application/toml", config.to_toml().encode())]
     attachments += [] if calibration is None else [_attached(calibration, "application/fits")]
@@ -55,14 +54,18 @@ def record(run: Run, config: Configuration, calibration: Path | None) -> Summary
             limits=limits,
             granted=granted,
             selection=selection,
-            expected_bytes_per_s=bytes_per_s(config, selection),
             awaited=_launched(run),
         )
         recorder.catch_signals()
         recorder.service.announces = True
         if log.on_event:
             Alarm(recorder.service, log.on_event, Level[log.on_event_level.upper()], log.on_event_every_s)
-        return recorder.run()
+
+        def settled(camera: wire.CameraState | None) -> None:
+            recorder.expected_bytes_per_s = bytes_per_s(config, selection, camera)
+            sys.stderr.write(f"{estimate(config, camera)}\n")
+
+        return recorder.run(settled)
     finally:
         bus.close()
 

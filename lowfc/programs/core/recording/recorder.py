@@ -7,7 +7,7 @@ which are counted, but never delays the control loop. A disk error ends the reco
 import signal
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from functools import partial
 from pathlib import Path
@@ -45,7 +45,7 @@ _DONE = {"start": "recording into", "stop": "recording stopped:"}
 
 
 class Recorder:
-    """Records the messages of a run into logs."""
+    """Records the messages of a run into logs; `expected_bytes_per_s` is their growth until it has been measured."""
 
     def __init__(
         self,
@@ -74,7 +74,7 @@ class Recorder:
         self._account = LossAccount()
         self._selection = selection
         self._folder, self._min_free_bytes = folder, limits.min_free_bytes
-        self._expected_bytes_per_s = expected_bytes_per_s
+        self.expected_bytes_per_s = expected_bytes_per_s
         self._series = LogSeries(folder, clock, {**metadata, **selection.metadata}, attachments, limits)
         self._peers = Peers(bus)
         self._paused = self._stopping = self._skip_drain = False
@@ -99,10 +99,14 @@ class Recorder:
             if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:  # as nohup leaves it
                 signal.signal(number, self._signalled)
 
-    def run(self) -> Summary:
-        """Record until stopped; DataFileError if the first log cannot be opened."""
+    def run(self, settled: Callable[[wire.CameraState | None], None] = lambda camera: None) -> Summary:
+        """Record until stopped; DataFileError if the first log cannot be opened.
+
+        `settled` is called before the first log begins, with the camera's state if there is one.
+        """
         self._settle()
         self._peers.query()  # fills `newest`, with which the log begins
+        settled(self._peers.camera())
         self._begin()
         self._begun_ns = self._clock.host_ns()
         self.service.awaited = lambda: "" if self.service.last_health else "any other process"
@@ -291,7 +295,7 @@ class Recorder:
 
     def _estimate(self) -> str:
         """Sentence on the disk space used, from the growth so far or as expected; empty if unknown."""
-        growth = self._series.bytes_per_s or self._expected_bytes_per_s
+        growth = self._series.bytes_per_s or self.expected_bytes_per_s
         return growth_in_words(growth, self._folder, self._min_free_bytes) if growth else ""
 
     def _flushed(self) -> None:

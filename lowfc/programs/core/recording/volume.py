@@ -7,7 +7,7 @@ from lowfc.adapters.logs.selection import Selection, selection
 from lowfc.adapters.logs.series import existing
 from lowfc.contract.codecs.input_file import user_path
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.messages import COMMAND, FRAME, MIRROR_STATE, STEP, SURFACE, TRUTH, Rate, Topic
+from lowfc.contract.messages import COMMAND, FRAME, MIRROR_STATE, STEP, SURFACE, TRUTH, Rate, Topic, wire
 from lowfc.optics.chain.sensor import Sensor
 
 _FLOAT_BYTES, _COUNT_BYTES = 4, 2
@@ -17,11 +17,15 @@ _COMPRESSED_FRACTION = {FRAME: 0.6, COMMAND: 0.9, MIRROR_STATE: 0.55}
 """Size of a payload after LZ4 relative to before, measured with the simulated camera at V = 2; 1 for other topics."""
 
 
-def payload_bytes(config: Configuration) -> dict[Topic, int]:
-    """Array bytes in one message of each large topic, from the sizes of camera and mirror."""
+def payload_bytes(config: Configuration, camera: wire.CameraState | None = None) -> dict[Topic, int]:
+    """Array bytes in one message of each large topic, from the sizes of camera and mirror.
+
+    Without the camera's state, frames are those of the simulated camera.
+    """
+    pixels = _frame_pixels(camera) or Sensor.pixels**2
     actuators, modes = config.mirror.rows * config.mirror.columns, config.sensor.modes
     return {
-        FRAME: Sensor.pixels**2 * _COUNT_BYTES,
+        FRAME: pixels * _COUNT_BYTES,
         COMMAND: actuators * _FLOAT_BYTES,
         MIRROR_STATE: actuators * _FLOAT_BYTES,
         SURFACE: _SURFACE_PIXELS**2 * _FLOAT_BYTES,
@@ -30,11 +34,11 @@ def payload_bytes(config: Configuration) -> dict[Topic, int]:
     }
 
 
-def bytes_per_s(config: Configuration, recorded: Selection) -> float:
+def bytes_per_s(config: Configuration, recorded: Selection, camera: wire.CameraState | None = None) -> float:
     """Growth of a log, bytes per second: compressed message size times rate, summed over the topics."""
     return sum(
         (size * _COMPRESSED_FRACTION.get(topic, 1.0) + _MESSAGE_BYTES) * _rate_hz(topic, config, recorded)
-        for topic, size in payload_bytes(config).items()
+        for topic, size in payload_bytes(config, camera).items()
     )
 
 
@@ -43,12 +47,15 @@ def configured_selection(config: Configuration) -> Selection:
     return selection(config.recorder.every, config.recorder.topics)
 
 
-def estimate(config: Configuration) -> str:
-    """Sentence on the disk space that a recording will use."""
+def estimate(config: Configuration, camera: wire.CameraState | None = None) -> str:
+    """Sentence on the disk space that a recording will use, and on the rate and frame size that this rests on."""
     recorded = configured_selection(config)
     min_free_bytes = config.recorder.min_free_mb * 1e6
-    growth = growth_in_words(bytes_per_s(config, recorded), user_path(config.recorder.folder), min_free_bytes)
-    return f"recording into {config.recorder.folder}: {growth}, at {config.camera.rate_hz:g} Hz" + (
+    growth = growth_in_words(bytes_per_s(config, recorded, camera), user_path(config.recorder.folder), min_free_bytes)
+    size = f"{Sensor.pixels} x {Sensor.pixels} pixels, the simulated camera's"
+    if camera is not None and _frame_pixels(camera):
+        size = f"{camera.rows} x {camera.columns} pixels"
+    return f"recording into {config.recorder.folder}: {growth}, at {config.camera.rate_hz:g} Hz and {size}" + (
         f" ({recorded.description})" if recorded.description else ""
     )
 
@@ -58,6 +65,11 @@ def growth_in_words(growth_bytes_per_s: float, folder: Path, min_free_bytes: flo
     free_bytes = shutil.disk_usage(existing(folder)).free
     lasts_h = max(0.0, free_bytes - min_free_bytes) / growth_bytes_per_s / 3600
     return f"about {_size(growth_bytes_per_s * 3600)} an hour; {_size(free_bytes)} free, enough for {lasts_h:.1f} h"
+
+
+def _frame_pixels(camera: wire.CameraState | None) -> int:
+    """Pixels of a frame; 0 if not known."""
+    return camera.rows * camera.columns if camera is not None else 0
 
 
 def _rate_hz(topic: Topic, config: Configuration, recorded: Selection) -> float:
