@@ -12,14 +12,16 @@ import numpy as np
 import pytest
 from textual.events import Key
 
+from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.files import calibration_file, law_file
 from lowfc.adapters.process.clock import HostClock
 from lowfc.client import Answer
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.events import EVENTS
-from lowfc.contract.messages import EVENT, wire
+from lowfc.contract.messages import EVENT, REQUEST, wire
 from lowfc.control.laws.linear_law import integrator_block, law_from_blocks
+from lowfc.programs.console import feed
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from tests.console.live_run import RUN, LiveRun
 from tests.support.loops import until
@@ -481,3 +483,11 @@ def test_pictures_and_sparklines_have_a_fixed_size() -> None:
         assert np.allclose(small, 4.0)
     lines = halves(np.zeros((4, 3, 3), np.uint8))
     assert [line.plain for line in lines] == ["▀▀▀"] * 2
+
+
+@pytest.mark.parametrize(("seconds", "shown"), [(1_800_000_000, True), (10**12, False)])
+def test_a_request_of_an_impossible_time_is_not_shown(seconds: int, *, shown: bool) -> None:
+    request = wire.Request(name="note")
+    request.timestamp.seconds = seconds
+    sample = Sample(REQUEST.key, request.SerializeToString(), 1, 1, 1)
+    assert (feed._request(sample) is not None) is shown

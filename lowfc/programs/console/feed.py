@@ -15,8 +15,8 @@ from lowfc.adapters.process.clock import Clock
 from lowfc.arrays import Pixels, Single
 from lowfc.client import Client, configuration_of
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.errors import LowfcError
-from lowfc.contract.messages import EVENT, REQUEST, STEP, SURFACE, TRUTH, Role, wire
+from lowfc.contract.errors import BadMessageError, LowfcError
+from lowfc.contract.messages import EVENT, REQUEST, STEP, SURFACE, TRUTH, Role, checked_time_ns, wire
 from lowfc.control.loop.wording import AUTO
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.view.snapshot import SHOWN, Accumulator
@@ -157,6 +157,8 @@ def _hidden(request: wire.Request) -> bool:
 
 def _request(sample: Sample) -> wire.Request | None:
     try:
-        return wire.Request.FromString(sample.payload)
-    except DecodeError:
+        request = wire.Request.FromString(sample.payload)
+        checked_time_ns(request.timestamp)
+    except (DecodeError, BadMessageError):
         return None
+    return request
