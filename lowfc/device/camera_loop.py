@@ -127,19 +127,22 @@ class CameraLoop:
     def _follow_numbers(self, exposure: Exposure, settings: CameraSettings) -> None:
         """Count frames that the camera lost; restart the publisher if the camera's numbers restart.
 
-        ValueError if the number is that of the last frame.
+        ValueError if the number is that of the last frame, or if `lost` is negative.
         """
-        lost, now_ns = exposure.lost, self._service.clock.host_ns()
-        if exposure.number is not None and self._number is not None:
-            step = (exposure.number - self._number) % settings.number_wrap
+        lost, now_ns = int(exposure.lost), self._service.clock.host_ns()
+        if lost < 0:
+            raise ValueError(f"lost is {lost}, expected the number of frames lost before this one, 0 or more")
+        number = None if exposure.number is None else int(exposure.number)  # numpy's integers overflow
+        if number is not None and self._number is not None:
+            step = (number - self._number) % settings.number_wrap
             if step == 0:
-                raise ValueError(f"it returned frame number {exposure.number} twice")
+                raise ValueError(f"it returned frame number {number} twice")
             most = MAX_LOST_FRAMES + MAX_RATE_RATIO * (now_ns - self._number_ns) // settings.period_ns
             if step > most:
                 self._restart()
             else:
                 lost += step - 1
-        self._number, self._number_ns = exposure.number, now_ns
+        self._number, self._number_ns = number, now_ns
         if lost:
             self._frames.published += lost
             self._frames.skipped += lost

@@ -69,9 +69,10 @@ def exposed(*exposures: Callable[[], Any], frames: int, settings: CameraSettings
         (good(pixels=np.full((3, 4), np.nan)), "float64"),
         (good(end_ns=1 << 62), "in the future"),
         (good(end_ns=float("nan")), "NaN"),
+        (good(lost=-1), "lost is -1"),
         (lambda: "nothing", "AttributeError"),
     ],
-    ids=["raises", "shape", "NaN", "future", "NaN time", "nonsense"],
+    ids=["raises", "shape", "NaN", "future", "NaN time", "negative loss", "nonsense"],
 )
 def test_camera_failures_are_reported_once_counted_and_retried(bad: Callable[[], Any], message: str) -> None:
     recovered = [good()] * 251  # more than 1 s at 250 Hz
@@ -129,7 +130,7 @@ def test_exposure_times_are_converted_from_the_clock_in_the_settings(monkeypatch
         assert times == [MS, 8 * MS], "the second frame is timed at its reception"
 
 
-def numbered(*numbers: int) -> Listener:
+def numbered(*numbers: int | np.uint16) -> Listener:
     return exposed(*[good(number=number) for number in numbers], frames=len(numbers))
 
 
@@ -138,7 +139,7 @@ def counts(listener: Listener) -> list[int]:
 
 
 def test_frame_numbers_are_unwrapped_and_gaps_count_as_lost_frames() -> None:
-    listener = numbered(65_533, 65_534, 1, 2, 5)
+    listener = numbered(65_533, np.uint16(65_534), np.uint16(1), 2, 5)
     assert counts(listener) == [0, 1, 4, 5, 8]
     assert len({start_of(sample.sequence) for sample in listener.samples[FRAME]}) == 1
     last = next(one for one in listener.messages(HEALTH)[-1].topics if one.topic == FRAME.key)
