@@ -101,10 +101,18 @@ def table(config: Configuration, kind: Kind, name: str) -> dict[str, Any]:
     for other in {name, name.rpartition(":")[2]} - {expected}:
         if other in config.drivers:
             raise ConfigurationError(f"the options of {name} are in [drivers.{expected}], got [drivers.{other}]")
-    found = config.drivers.get(expected, {})
-    if found and set(found) <= set(KINDS):
+    found = config.drivers.get(expected) or _nested(config.drivers, expected)
+    if found and set(found) <= set(KINDS) and all(isinstance(part, dict) for part in found.values()):
         return dict(found.get(kind, {}))
     return found
+
+
+def _nested(tables: dict[str, Any], name: str) -> dict[str, Any]:
+    """The table of a dotted name, as TOML reads [drivers.package.module]; empty if there is none."""
+    found: Any = tables
+    for part in name.split("."):
+        found = found.get(part) if isinstance(found, dict) else None
+    return found if isinstance(found, dict) else {}
 
 
 def options(driver: Any, found: dict[str, Any], words: Sequence[str] = ()) -> DriverOptions:
@@ -163,7 +171,8 @@ def _parsed(words: Sequence[str]) -> dict[str, Any]:
             raise ConfigurationError(f"options of a driver are --name value, got {' '.join([key, *rest])!r}")
         value = value if equals else rest.pop(0)
         try:
-            found[key[2:].replace("-", "_")] = tomllib.loads(f"x = {value}")["x"] if value[:1] in "[{" else value
+            is_toml = value[:1] in ("[", "{")
+            found[key[2:].replace("-", "_")] = tomllib.loads(f"x = {value}")["x"] if is_toml else value
         except tomllib.TOMLDecodeError:
             raise ConfigurationError(f"{key}: {value!r} is not a list or a table as in TOML") from None
     return found

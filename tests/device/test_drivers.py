@@ -128,6 +128,12 @@ def test_options_come_from_configuration_and_command_line() -> None:
     assert plugins.opened("camera", "both:Class", config, (), Ramp).level == 4
     found = plugins.options(Ramp, {"level": 3}, ("--level", "5", "--ports=[1, 2]"))
     assert (found.level, found.ports) == (5, (1, 2))
+    assert plugins._parsed(("--total", "", "--stream=")) == {"total": "", "stream": ""}
+    nested = load(None, {"drivers": {"package": {"module": {"level": 6}}}})
+    assert plugins.opened("camera", "package.module:Class", nested, (), Ramp).level == 6
+    for kind in plugins.KINDS:
+        serial = {"camera": "an option, not the part for cameras"}
+        assert plugins.table(load(None, {"drivers.basler": serial}), kind, "basler") == serial
     for table, words, why in [
         ({"levle": 1}, (), "there is no 'levle'; there are level, ports"),
         ({"level": "7"}, (), "level = '7'"),
