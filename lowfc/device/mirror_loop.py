@@ -53,7 +53,7 @@ _NONE: Single = np.zeros(0, np.float32)
 def protection_of(driver: Mirror, config: Configuration) -> MirrorProtection:
     """Limits of a mirror: the tighter of its driver's and those of [mirror].
 
-    ConfigurationError if its grid is not that of [mirror].
+    ConfigurationError if its grid is not that of [mirror], or if its steps are not below every limit.
     """
     own, configured = driver.geometry, geometry(config)
     if (own.rows, own.columns) != (configured.rows, configured.columns):
@@ -66,6 +66,12 @@ def protection_of(driver: Mirror, config: Configuration) -> MirrorProtection:
         min(own.slew_nm, configured.slew_nm),
         min(own.neighbour_nm, configured.neighbour_nm),
     )
+    least_nm = min(limits.stroke_nm, limits.slew_nm, limits.neighbour_nm) - 2 * limits.margin_nm
+    if not 0 <= own.step_nm < least_nm:
+        raise ConfigurationError(
+            f"the mirror's smallest step is {own.step_nm:g} nm, expected 0 or more and below {least_nm:g} nm, so that "
+            "rounding stays within the stroke, slew and neighbour limits"
+        )
     return MirrorProtection((own.rows, own.columns), limits, own.step_nm, config.mirror.on_command_timeout == "flat")
 
 
@@ -79,7 +85,7 @@ class MirrorLoop:
         self._service = service
         self._protection = protection_of(driver, config)
         self._settle = getattr(driver, "settle", None)
-        self._beside = getattr(driver, "beside", _NO_EXTRAS.beside)
+        self._beside = getattr(driver, "beside", None)
         getattr(driver, "join", _NO_EXTRAS.join)(service)
         self._fill_extra = getattr(driver, "fill", _NO_EXTRAS.fill)
         self.watch = DriverWatch(service, PATIENCE_S, self._hang)
@@ -159,8 +165,9 @@ class MirrorLoop:
         refused: Reason | None = Rejection.NO_MIRROR
         if not self._returning:
             with contextlib.suppress(_LostError):
+                others_nm = None if self._beside is None else self._call(self._beside)
                 self._status, refused = apply_command(
-                    self._protection, before, command, clock.now_ns(), self._drive, self._beside()
+                    self._protection, before, command, clock.now_ns(), self._drive, others_nm
                 )
         self._refused = refused
         self._publish(self._status.time_ns or clock.now_ns())
@@ -202,10 +209,10 @@ class MirrorLoop:
             if found_nm is not None:
                 found_nm = single(found_nm)
                 flat = found_nm.reshape(-1)
-                if found_nm.shape != self._protection.grid or not np.isfinite(np.vdot(flat, flat)):
-                    raise ValueError(
-                        f"it is at {found_nm.shape} actuators, expected {self._protection.grid} of finite nm"
-                    )
+                if found_nm.shape != self._protection.grid:
+                    raise ValueError(f"it returned {found_nm.shape} actuators, expected {self._protection.grid}")
+                if not np.isfinite(np.vdot(flat, flat)):
+                    raise ValueError("it returned positions that are NaN or infinite, expected nm of surface")
             if self.watch.returned():
                 self.watch.worked()
                 return found_nm

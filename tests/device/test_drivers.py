@@ -2,6 +2,7 @@
 
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -120,6 +121,10 @@ def test_the_tighter_of_driver_and_configured_limits_applies() -> None:
     assert protection_of(driver, CONFIG).limits.slew_nm == 30.0
     with pytest.raises(ConfigurationError, match=r"4 x 5 actuators; .* say 34 x 34"):
         protection_of(driver, Configuration())
+    for step_nm in (-1.0, 1000.0, float("nan")):
+        driver.geometry = replace(driver.geometry, step_nm=step_nm)
+        with pytest.raises(ConfigurationError, match=f"smallest step is {step_nm:g} nm"):
+            protection_of(driver, CONFIG)
 
 
 def test_options_come_from_configuration_and_command_line() -> None:

@@ -218,7 +218,7 @@ class Bench:
     [
         (lambda _: 1 / 0, "ZeroDivisionError"),
         (lambda shape: shape[1:], "(3, 5)"),
-        (lambda shape: shape * np.float32(np.nan), "finite"),
+        (lambda shape: shape * np.float32(np.nan), "NaN or infinite"),
     ],
     ids=["raises", "shape", "NaN"],
 )
@@ -293,6 +293,15 @@ def test_a_mirror_that_fails_at_the_start_is_retried() -> None:
     bench.tick()
     assert bench.command(30.0).refused == 0
     assert mirror.heights_nm == [0.0, 0.0, 30.0]
+
+
+@pytest.mark.parametrize("fault", [lambda: 1 / 0, lambda: np.full((4, 5), np.nan)], ids=["raises", "NaN"])
+def test_a_fault_in_the_shape_of_other_programs_is_a_failure_of_the_driver(fault: Callable[[], Any]) -> None:
+    mirror = Mirror()
+    mirror.beside = fault  # type: ignore[attr-defined]
+    bench = Bench(mirror)
+    assert bench.command(30.0).refused == Rejection.NO_MIRROR
+    assert bench.listener.events() == ["STARTED", "DRIVER_FAILED", "COMMAND_REFUSED"]
 
 
 def test_a_mirror_starts_from_the_position_that_its_driver_reads() -> None:
