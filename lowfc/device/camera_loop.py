@@ -8,7 +8,7 @@ from lowfc.arrays import Pixels
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.messages import CAMERA_STATE, FRAME, image, wire
 from lowfc.device.driver import Camera, CameraExtras, CameraSettings, Exposure, camera_state
-from lowfc.device.watch import DriverWatch
+from lowfc.device.watch import DriverWatch, opening
 
 WAIT_S = 30.0
 """Time that the first frame waits for the processes that need it."""
@@ -60,12 +60,13 @@ class CameraLoop:
             LowfcError: the driver reports a fault that a user has to correct.
         """
         service = self._service
-        service.require(wait_for, WAIT_S, "the camera will not start without")
-        service.awaited = lambda: "" if service.work else "the camera's first frame"
-        service.state = "running"
-        getattr(self._driver, "start", _NO_EXTRAS.start)()
         step = getattr(self._driver, "step", _NO_EXTRAS.step) if service.clock.lockstep else _NO_EXTRAS.step
         with self.watch.over(self._driver.close):
+            service.require(wait_for, WAIT_S, "the camera will not start without")
+            service.awaited = lambda: "" if service.work else "the camera's first frame"
+            service.state = "running"
+            with opening("the camera cannot be started"):
+                getattr(self._driver, "start", _NO_EXTRAS.start)()
             while service.running and service.work != self._limit:
                 frame = self._next_frame()
                 if frame is not None:

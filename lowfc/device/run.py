@@ -18,7 +18,7 @@ from lowfc.device.camera_loop import CameraLoop
 from lowfc.device.driver import Camera, Mirror
 from lowfc.device.mirror_loop import MirrorLoop
 from lowfc.device.plugins import Kind, load, options_help
-from lowfc.device.watch import opening
+from lowfc.device.watch import closed_on_fault, opening
 
 
 def command_of(kind: Kind, name: str | None = None) -> type[TyperCommand]:
@@ -64,9 +64,10 @@ def run_camera(
     Raises:
         BusError: the run has a camera already, or one of `wait_for` did not appear.
     """
-    service = join(config, run, Role.CAMERA, config.realtime.camera_cpus)
+    with closed_on_fault(driver.close):
+        service = join(config, run, Role.CAMERA, config.realtime.camera_cpus)
     with closing(service.bus):  # a callback on zenoh's threads must not outlive the interpreter
-        with opening("the camera's settings cannot be read"):
+        with closed_on_fault(driver.close), opening("the camera's settings cannot be read"):
             loop = CameraLoop(driver, service, config, frames)
         service.catch_signals()
         loop.run(wait_for)
@@ -91,10 +92,11 @@ def camera_beside(driver: Camera, config: Configuration, service: Service) -> It
     """
     if config.lockstep:
         raise ConfigurationError("in lockstep the camera is a process of its own: leave out --camera, or lockstep")
-    camera = join_beside(config, service, Role.CAMERA)
+    with closed_on_fault(driver.close):
+        camera = join_beside(config, service, Role.CAMERA)
     faults: list[Exception] = []
     with closing(camera.bus):
-        with opening("the camera's settings cannot be read"):
+        with closed_on_fault(driver.close), opening("the camera's settings cannot be read"):
             loop = CameraLoop(driver, camera, config)
 
         def read() -> None:
@@ -124,9 +126,10 @@ def run_mirror(driver: Mirror, config: Configuration, run: str) -> None:
         BusError: the run has this mirror already.
         ConfigurationError: the driver's grid is not that of [mirror].
     """
-    service = join(config, run, mirror_role(config.mirror.name), config.realtime.mirror_cpus)
+    with closed_on_fault(driver.close):
+        service = join(config, run, mirror_role(config.mirror.name), config.realtime.mirror_cpus)
     with closing(service.bus):
-        with opening("the mirror's geometry cannot be read"):
+        with closed_on_fault(driver.close), opening("the mirror's geometry cannot be read"):
             loop = MirrorLoop(driver, service, config)
         service.catch_signals()
         loop.run()

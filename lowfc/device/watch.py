@@ -4,7 +4,7 @@ import re
 import threading
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from lowfc.adapters.process.service import Service
@@ -17,6 +17,8 @@ RECOVERED_NS = 1_000_000_000
 """A driver counts as recovered after this time without failure."""
 REPEAT_NS = 10_000_000_000
 """Period at which a persistent fault is reported again."""
+CLOSE_S = 5.0
+"""Timeout of closing a driver, if longer than that of its calls."""
 _HERE = Path(__file__).parent
 
 
@@ -41,6 +43,17 @@ def opening(what: str) -> Iterator[None]:
         raise
     except Exception as fault:
         raise ConfigurationError(f"{what}: {described(fault)}") from fault
+
+
+@contextmanager
+def closed_on_fault(close: Callable[[], None]) -> Iterator[None]:
+    """Close a driver if the block, which precedes its loop, raises; a fault of `close` is not reported then."""
+    try:
+        yield
+    except BaseException:
+        with suppress(Exception):
+            close()
+        raise
 
 
 class DriverWatch:
@@ -72,11 +85,15 @@ class DriverWatch:
         try:
             yield
         finally:
-            self._closed.set()
+            self.timeout_s = max(self.timeout_s, CLOSE_S)
+            self.begin()
             try:
                 close()
+                self.returned()
             except Exception as fault:
                 self.failed(fault)
+            finally:
+                self._closed.set()
 
     def begin(self) -> None:
         """Note that a call begins."""

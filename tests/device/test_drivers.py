@@ -283,6 +283,16 @@ def test_a_fault_in_the_first_settings_gives_one_sentence() -> None:
         ),
     ):
         thread.submit(run_camera, camera, CONFIG, "unset").result()
+    assert camera.closed
+
+
+def test_a_camera_that_cannot_be_started_gives_one_sentence_and_is_closed() -> None:
+    camera = Ramp(Ramp.Options(), CONFIG)
+    camera.start = lambda: 1 / 0  # type: ignore[attr-defined]
+    loop = CameraLoop(camera, Listener(MemoryHub(), FakeClock()).service("camera"), CONFIG)
+    with pytest.raises(ConfigurationError, match=r"cannot be started: ZeroDivisionError: .* \(test_drivers.py, line"):
+        loop.run()
+    assert camera.closed
 
 
 def test_lockstep_refuses_a_camera_in_the_controllers_process() -> None:

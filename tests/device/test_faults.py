@@ -114,6 +114,21 @@ def test_a_hanging_camera_is_reported_while_it_hangs() -> None:
     assert loop.watch.failures == 1
 
 
+def test_a_close_that_hangs_is_reported() -> None:
+    hub, clock = MemoryHub(), FakeClock()
+    listener = Listener(hub, clock)
+    camera = Camera(clock, good())
+    loop = CameraLoop(camera, listener.service("camera"), CONFIG, 1)
+
+    def close() -> None:
+        for _ in range(52):
+            loop.watch.check()
+
+    camera.close = close  # type: ignore[method-assign]
+    loop.run()
+    assert listener.events() == ["STARTED", "DRIVER_HANGS", "STOPPED"]
+
+
 def test_expose_returning_none_is_not_a_failure() -> None:
     assert exposed(lambda: None, lambda: None, good(), frames=1).events() == ["STARTED", "STOPPED"]
 
