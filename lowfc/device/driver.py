@@ -7,6 +7,8 @@ raises, and the loop counts the fault, reports it in an event and tries again. A
 """
 
 from dataclasses import dataclass, field, fields
+from math import isfinite
+from numbers import Integral
 from typing import Literal, NamedTuple, Protocol
 
 from lowfc.adapters.bus.bus import Publisher
@@ -105,8 +107,27 @@ class CameraSettings:
 _PUBLISHED = tuple(one.name for one in fields(CameraSettings) if one.name in wire.CameraState.DESCRIPTOR.fields_by_name)
 
 
+_LEAST = {
+    "rows": 1,
+    "columns": 1,
+    "exposure_ns": 0,
+    "period_ns": 1,
+    "bit_depth": 1,
+    "region_row": 0,
+    "region_column": 0,
+    "number_wrap": 1,
+}
+"""Whole numbers among the settings, with their lowest values."""
+
+
 def camera_state(settings: CameraSettings, time_ns: int) -> wire.CameraState:
-    """Message of a camera's settings."""
+    """Message of a camera's settings; ValueError if one cannot be true."""
+    for name, least in _LEAST.items():
+        if not isinstance(value := getattr(settings, name), Integral) or value < least:
+            raise ValueError(f"{name} of the settings is {value!r}, expected a whole number of {least} or more")
+    for name in ("gain_e_per_dn", "bias_dn", "read_noise_e", "saturation_dn", "em_gain"):
+        if (number := getattr(settings, name)) is not None and not isfinite(number):
+            raise ValueError(f"{name} of the settings is {number}, expected a finite number")
     state = wire.CameraState(timestamp=timestamp(time_ns), **fields_of(settings, _PUBLISHED))
     if settings.saturation_dn is None:
         state.saturation_dn = 2**settings.bit_depth - 1

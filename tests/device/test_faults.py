@@ -1,6 +1,7 @@
 """Drivers that fail, hang or return invalid data: reported, counted and retried; a mirror goes flat first."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import count
 from typing import Any
 
@@ -15,6 +16,7 @@ from lowfc.contract.messages import CAMERA_STATE, COMMAND, FRAME, HEALTH, MIRROR
 from lowfc.control.loop.safety import Rejection
 from lowfc.device import CameraSettings, Exposure, Single, geometry
 from lowfc.device.camera_loop import CameraLoop
+from lowfc.device.driver import camera_state
 from lowfc.device.mirror_loop import MirrorLoop
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.listener import Listener
@@ -127,6 +129,19 @@ def test_a_close_that_hangs_is_reported() -> None:
     camera.close = close  # type: ignore[method-assign]
     loop.run()
     assert listener.events() == ["STARTED", "DRIVER_HANGS", "STOPPED"]
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ({"period_ns": 1e9 / 250}, "period_ns of the settings is 4000000.0, expected a whole number"),
+        ({"number_wrap": 0}, "number_wrap of the settings is 0, expected a whole number of 1 or more"),
+        ({"read_noise_e": float("nan")}, "read_noise_e of the settings is nan, expected a finite number"),
+    ],
+)
+def test_settings_that_cannot_be_true_are_named(setting: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        camera_state(replace(SETTINGS, **setting), 0)
 
 
 def test_expose_returning_none_is_not_a_failure() -> None:
