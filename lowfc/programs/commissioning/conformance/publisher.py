@@ -32,7 +32,7 @@ def _envelope(device: Collected) -> Check | None:
         return ok(f"on all of {len(messages)} messages") if messages else None
     sizes = sorted({"none" if one is None else f"{len(one)} bytes" for one in bare})
     got = f"{len(bare)} of {len(messages)} messages with {', '.join(sizes)}"
-    return wrong(got, "attach it to every message; its bytes are in docs/howto/hardware.md")
+    return wrong(got, "attach it to every message; its bytes are in docs/reference/device_messages.md")
 
 
 @PUBLISHER.check("sequence", "start of the publisher in unix seconds << 32 | count of its messages from 0")
@@ -57,7 +57,9 @@ def _sequence(device: Collected) -> Check | None:
     if gaps:
         got = f"{sum(gaps)} missing, in {len(gaps)} gaps of {len(steps)} steps"
         if len(gaps) > len(steps) // 10:
-            return wrong(got, "count only the messages of this topic")
+            return wrong(
+                got, "count only the messages of this topic; if FRAMES_LOST reports lost frames, find their cause"
+            )
         return warning(got, "were they never published, or lost because this host is busy?")
     if len({start_of(sequence) for sequence in sequences}) > 1:
         return warning("the publisher restarted during the check", "repeat the check while it runs")
