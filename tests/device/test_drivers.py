@@ -243,6 +243,15 @@ def test_doctor_checks_the_requirements_of_a_driver(monkeypatch: pytest.MonkeyPa
     assert [check.advice for check in checks[1:3]] == ["", "switch it on"]
 
 
+def test_doctor_checks_a_mirror_of_a_module_and_a_fault_in_its_requirements(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Follower, "needs", lambda options: 1 / 0, raising=False)
+    checks = list(device_checks(f"{__name__}:Follower", CONFIG))
+    assert [f"{check.name.split()[0]} {check.status}" for check in checks] == ["mirror ok", "mirror wrong"]
+    assert "requirements cannot be checked: ZeroDivisionError" in checks[1].got
+    (unset,) = device_checks(f"{__name__}:Sized", CONFIG)
+    assert f"[drivers.{__name__}]" in unset.advice
+
+
 class Unset(Ramp):
     def settings(self) -> CameraSettings:
         raise RuntimeError("no link")

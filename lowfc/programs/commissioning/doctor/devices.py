@@ -5,13 +5,13 @@ from collections.abc import Iterator
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import ConfigurationError
 from lowfc.device import plugins
+from lowfc.device.watch import opening
 from lowfc.programs.commissioning.checks import Check, judged, ok, wrong
 
 
 def device_checks(name: str, config: Configuration) -> Iterator[Check]:
     """Check each requirement of the camera and mirror driver of this name, without opening the driver."""
-    kinds = [kind for kind in plugins.KINDS if name in plugins.installed(kind)]
-    for kind in kinds or plugins.KINDS[:1]:
+    for kind in _kinds(name):
         what = f"{kind} {name}"
         try:
             driver = plugins.load(kind, name)
@@ -21,10 +21,32 @@ def device_checks(name: str, config: Configuration) -> Iterator[Check]:
         try:
             options = plugins.options(driver, plugins.table(config, kind, name))
         except ConfigurationError as fault:
-            advice = f"set it in [drivers.{name}] of a configuration, and give that file with --config FILE"
+            advice = (
+                f"set it in [drivers.{plugins.section(name)}] of a configuration, and give that file with --config FILE"
+            )
             yield wrong(str(fault), advice)._replace(name=what)
             continue
         yield ok(f"{driver.__module__}:{driver.__qualname__}")._replace(name=what)
-        for need in getattr(driver, "needs", lambda _: ())(options):
+        try:
+            with opening("its requirements cannot be checked"):
+                needs = list(getattr(driver, "needs", lambda _: ())(options))
+        except ConfigurationError as fault:
+            yield wrong(str(fault), "correct its method `needs`, or what that calls")._replace(name=what)
+            continue
+        for need in needs:
             found = need.found
             yield judged(f"{what}: {need.what}", "", bool(found), found or "not found", need.advice)
+
+
+def _kinds(name: str) -> list[plugins.Kind]:
+    """Kinds of driver that are installed under this name, or that a class in a module or file is; at least one."""
+    found = [kind for kind in plugins.KINDS if name in plugins.installed(kind)]
+    return found or [kind for kind in plugins.KINDS if _loads(kind, name)] or [*plugins.KINDS[:1]]
+
+
+def _loads(kind: plugins.Kind, name: str) -> bool:
+    try:
+        plugins.load(kind, name)
+    except ConfigurationError:
+        return False
+    return True
