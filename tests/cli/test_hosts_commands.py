@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from lowfc.adapters.bus import certificates, routed
+from lowfc.adapters.bus.access import ROUTER, roles
 from lowfc.adapters.bus.run import open_run, runtime_base
 from lowfc.adapters.process.clock_offset import AT_ONCE, PERIOD_S, RECENT
 from lowfc.contract.configuration import Network
@@ -57,6 +58,19 @@ def test_a_run_is_made_with_the_mirror_of_the_role() -> None:
     )
     assert "run 'default' has no role 'cam'" in str(lowfc("config", "zenoh", "--role", "cam", "--make").exception)
     assert runs() == ["default"]
+
+
+@pytest.mark.usefixtures("own_runtime")
+def test_the_roles_of_a_run_with_a_router_are_those_of_its_certificates() -> None:
+    open_run("bench", network=NETWORK)
+    certified = roles(["mirror-dm"])
+    for role in certified:
+        assert lowfc("config", "zenoh", "--role", role, "--run", "bench").exit_code == 0
+    refused = lowfc("config", "zenoh", "--role", "launcher", "--run", "bench").exception
+    assert f"run 'bench' has no role 'launcher'; its roles are {', '.join(certified)}" in str(refused)
+    documented = re.search(r"Roles are (.*?)\.", DOCUMENT.read_text(), re.DOTALL)
+    assert documented
+    assert set(re.findall(r"`(.*?)`", documented[1])) == {ROUTER, *certified}
 
 
 @pytest.mark.usefixtures("toml")

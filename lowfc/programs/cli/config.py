@@ -8,6 +8,7 @@ from typing import Annotated
 import tomli_w
 import typer
 
+from lowfc.adapters.bus.access import roles
 from lowfc.adapters.bus.run import DEFAULT_RUN, open_run, run_path
 from lowfc.adapters.bus.zenoh_session import session_config
 from lowfc.adapters.process.clock import HostClock
@@ -111,8 +112,10 @@ def config_zenoh(
         joined = open_run(run or DEFAULT_RUN if make else the_known_run(run), ())
     except BusError as fault:
         raise fault if make else BusError(f"{fault}; --make creates a run that does not exist") from None
-    known = sorted({*joined.links.ports, "bench", "operator", "launcher"})
+    links = joined.links
+    local = sorted({*links.ports, "bench", "operator", "launcher"})
+    known = roles(links.mirrors) if links.network.router else local
     if role not in known:
         raise BusError(f"run {joined.run_id!r} has no role {role!r}; its roles are {', '.join(known)}")
     HostClock()  # writes the file that the zenoh configuration refers to
-    typer.echo(json.dumps(session_config(joined.links, role), indent=2))
+    typer.echo(json.dumps(session_config(links, role), indent=2))
