@@ -16,20 +16,19 @@ from lowfc.control.calibration.calibration import Calibration
 from tests.support import toy
 
 
-def calibration() -> Calibration:
+def calibration(flux_dn: float = 1234.5678901234) -> Calibration:
     """The toy's calibration with bad pixels and noise in some arrays."""
     made, rng = toy.calibration(), np.random.default_rng(3)
     arrays = {
         name: single(rng.standard_normal(getattr(made, name).shape)) for name in ("reference", "response", "dark")
     }
     good = single(rng.random(made.good.size) > 0.2)
-    return calibration_codec.identified(
-        replace(made, good=good, flux_dn=1234.5678901234, operator_hash="0a" * 32, **arrays)
-    )
+    return calibration_codec.identified(replace(made, good=good, flux_dn=flux_dn, operator_hash="0a" * 32, **arrays))
 
 
-def test_a_saved_calibration_is_loaded_bit_for_bit(tmp_path: Path) -> None:
-    saved, path = calibration(), tmp_path / "night.fits"
+@pytest.mark.parametrize("flux_dn", [1234.5678901234, 0.0026589626685784786, 2.6589626685784786e-123])
+def test_a_saved_calibration_is_loaded_bit_for_bit(tmp_path: Path, flux_dn: float) -> None:
+    saved, path = calibration(flux_dn), tmp_path / "night.fits"
     save(saved, path)
     found = load(path)
     for part in fields(Calibration):
@@ -45,7 +44,7 @@ def test_a_saved_calibration_is_loaded_bit_for_bit(tmp_path: Path) -> None:
 
 
 def test_the_file_is_fits_with_named_extensions_and_units() -> None:
-    with fits.open(io.BytesIO(to_bytes(calibration()))) as units:
+    with fits.open(io.BytesIO(to_bytes(calibration(2.6589626685784786e-123)))) as units:
         units.verify("exception")
         names = {unit.name: unit.header.get("BUNIT") for unit in units[1:]}
         assert names == {

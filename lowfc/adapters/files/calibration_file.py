@@ -40,16 +40,16 @@ def to_bytes(calibration: Calibration) -> bytes:
     header["OPERATOR"] = calibration.operator_hash
     header["ESTIMATE"] = (calibration.estimator, "how R was made")
     header["NOLL"] = (" ".join(map(str, calibration.noll)), "Noll index of each mode")
-    header["WAVELEN"] = (calibration.wavelength_nm, "[nm] wavelength")
+    header.append(fits_file.number("WAVELEN", calibration.wavelength_nm, "[nm] wavelength"))
     header["ROWS"] = (calibration.shape[0], "rows of the frame")
     header["COLUMNS"] = (calibration.shape[1], "columns of the frame")
     header["MIRROWS"] = (calibration.grid[0], "rows of the mirror")
     header["MIRCOLS"] = (calibration.grid[1], "columns of the mirror")
-    header["FLUX"] = (calibration.flux_dn, "[adu] expected sum of the good pixels")
-    header["SATURATE"] = (calibration.saturation_dn, "[adu] highest value of a pixel")
+    header.append(fits_file.number("FLUX", calibration.flux_dn, "[adu] expected sum of the good pixels"))
+    header.append(fits_file.number("SATURATE", calibration.saturation_dn, "[adu] highest value of a pixel"))
     if (camera := calibration.camera) is not None:
         for card, attribute, description in _CAMERA:
-            header[card] = (getattr(camera, attribute), description)
+            header.append(fits_file.number(card, getattr(camera, attribute), description))
         header["CAMROW"] = (camera.region[0], "first row read")
         header["CAMCOL"] = (camera.region[1], "first column read")
     arrays = {name: getattr(calibration, attribute) for name, attribute, _, _ in _EXTENSIONS}

@@ -42,6 +42,14 @@ def primary_hdu(kind: str) -> fits.PrimaryHDU:
     return primary
 
 
+def number(keyword: str, value: float, description: str) -> fits.Card:
+    """Make a card of a number that reads back unchanged; astropy shortens it to 20 characters."""
+    card = fits.Card(keyword, value, description)
+    if fits.Card.fromstring(str(card)).value == value:
+        return card
+    return fits.Card.fromstring(f"{keyword:8}= {repr(float(value)).upper()} / {description}")
+
+
 def extension(name: str, array: npt.NDArray[np.generic], description: str, unit: str | None = None) -> fits.ImageHDU:
     """Make a named extension from an array, with its description and unit."""
     hdu = fits.ImageHDU(array, name=name)

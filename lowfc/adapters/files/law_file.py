@@ -31,8 +31,8 @@ def to_bytes(law: LinearLaw) -> bytes:
     header["NAME"] = (law.name, "what kind of law it is")
     header["SIGNAL"] = (law.signal, "y: the error, or pseudo-open-loop modes")
     header["NOLL"] = (" ".join(map(str, law.noll)), "Noll index of each mode")
-    header["DELAY"] = (law.delay_frames, "[frames] delay it was made for")
-    header["RATE"] = (law.rate_hz, "[Hz] frame rate it was made for")
+    header.append(fits_file.number("DELAY", law.delay_frames, "[frames] delay it was made for"))
+    header.append(fits_file.number("RATE", law.rate_hz, "[Hz] frame rate it was made for"))
     return fits_file.to_bytes(
         primary,
         [
