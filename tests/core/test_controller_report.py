@@ -91,7 +91,10 @@ def test_summary_and_status_show_the_time_not_closed() -> None:
         watch = Watch({"controller": wire.Health(**health)}, [])
         return summary_text(summary(watch, record=False)).splitlines()[0].split(maxsplit=1)[1]
 
-    results = summary(Watch({}, []), record=False)
+    without_frames = summary_text(summary(Watch({}, []), record=False))
+    assert [line.split()[-1] for line in without_frames.splitlines()[-3:]] == ["frame", "-", "-"]
+    camera = wire.Health(topics=[wire.TopicCount(topic=FRAME.key, published=1)])
+    results = summary(Watch({"camera": camera}, []), record=False)
     assert "over the open pupil, second half of the run" in summary_text(results)
     not_closed = {"not_closed_ns": 3 * SECOND, "not_closed_cause": "the camera does not fit"}
     assert first(mode=wire.LOOP_MODE_CLOSED) == "closed"
@@ -156,7 +159,8 @@ def test_the_first_line_of_the_status_shows_loop_recording_and_warnings() -> Non
 
 def test_added_contrast_is_shown_for_a_flat_mirror_and_the_present_one() -> None:
     recent = wire.WavefrontFigures(added_contrast_flat=7e-10, added_contrast=-4e-11)
-    camera = wire.Health(recent_wavefront=recent, wavefront=recent)
+    published = wire.TopicCount(topic=FRAME.key, published=1)
+    camera = wire.Health(recent_wavefront=recent, wavefront=recent, topics=[published])
     message = controller_state(loaded(USUAL), USUAL, (START + 12) * SECOND)
     watch = Watch({"camera": camera}, [])
     expected = "added to the dark zone's contrast: flat mirror +7.0e-10, residual -4.0e-11"

@@ -147,11 +147,27 @@ def _contrast(results: dict[str, Any]) -> list[str]:
     return [f"contrast           {own}{contrast_in_words(with_this_mirror(added), most_of(results), beyond)}"]
 
 
+def _wavefront_lines(results: dict[str, Any]) -> list[str]:
+    """The lines with the true wavefront and the contrast; without a frame there are no values."""
+    if not results["frames_published"]:
+        return ["wavefront          no frame"]
+    return [
+        f"wavefront          residual {results['residual_rms_nm']:.2f} of {results['disturbance_rms_nm']:.2f} nm rms "
+        "over the open pupil, second half of the run, "
+        + _when(results, "residual_rms_nm", f"{results['instants_per_frame']} instants per frame; "),
+        f"tilt per axis      residual {results['tilt_residual_mas']:.2f} of "
+        f"{results['tilt_disturbance_mas']:.2f} mas rms, second half, " + _when(results, "tilt_residual_mas"),
+        *_contrast(results),
+    ]
+
+
 def summary_text(results: dict[str, Any]) -> str:
     """The summary of a run as text."""
     command, mirror = (results["latency_us"][name] for name in ("frame_to_command", "frame_to_mirror"))
 
     def percentiles(values: dict[str, float]) -> str:
+        if not values["max"]:
+            return "-"
         return "   ".join(f"{name.replace('_', '.')} {value:.0f} us" for name, value in values.items())
 
     lines = [
@@ -161,12 +177,7 @@ def summary_text(results: dict[str, Any]) -> str:
         f"{results['frames_skipped']} skipped, {results['frames_missing']} missing",
         f"commands           {results['commands_applied']} applied, {results['commands_late']} after the start of the "
         "next exposure",
-        f"wavefront          residual {results['residual_rms_nm']:.2f} of {results['disturbance_rms_nm']:.2f} nm rms "
-        "over the open pupil, second half of the run, "
-        + _when(results, "residual_rms_nm", f"{results['instants_per_frame']} instants per frame; "),
-        f"tilt per axis      residual {results['tilt_residual_mas']:.2f} of "
-        f"{results['tilt_disturbance_mas']:.2f} mas rms, second half, " + _when(results, "tilt_residual_mas"),
-        *_contrast(results),
+        *_wavefront_lines(results),
         f"frame to command   {percentiles(command)}",
         f"frame to mirror    {percentiles(mirror)}",
     ]
