@@ -140,7 +140,7 @@ def zero_point(config: Configuration, text: str) -> tuple[str, Wavefront]:
     Returns:
         The wavefront's name in a calibration, and the function that computes it.
     """
-    if "=" not in text:
+    if "=" not in text and Path(text).suffix:
         shape = shape_of(config, "--at", text)
         return ("a shape", lambda _, mirror: wavefront_nm(mirror, shape).astype(np.float64))
     modes_nm = _modes(text)
