@@ -459,6 +459,7 @@ def test_a_loop_with_such_a_calibration_converges_to_that_wavefront() -> None:
 def test_an_invalid_wavefront_for_at_is_an_error(config: Configuration, tmp_path: Path) -> None:
     assert zero_point(config, " 4=15, 7 = -1e1")[0] == "4=15,7=-10"
     for text, why in {
+        "4:15": "as in 4=15,7=-10, or a file; got '4:15'",
         "4=": "as in 4=15,7=-10, or a file; got '4='",
         "4=15,": "or a file; got ''",
         "focus=15": "got 'focus=15'",
