@@ -158,9 +158,14 @@ def _the_rest(night: Night) -> None:
         loop.record(True)
         until(lambda: loop.processes()["controller"].mode == wire.LOOP_MODE_CLOSED)
         until(lambda: not loop.processes()["recorder"].recording.stopped)
-    words = (("ctl", "note", "here", "--run", night.name[:-1]), ("runs", "--json"), ("hosts",))
-    for name, arguments in zip(("beginning", "runs", "hosts"), words, strict=True):
+    for name, arguments in (("beginning", ("ctl", "note", "here", "--run", night.name[:-1])), ("hosts", ("hosts",))):
         night.outputs[name] = lowfc(*arguments).stdout
+
+    def recorder_answered() -> bool:
+        night.outputs["runs"] = lowfc("runs", "--json").stdout
+        return '"recording": "none"' not in night.outputs["runs"]
+
+    until(recorder_answered)  # a Health that comes late is missing in the list
     for command in ("lowfc ctl status --json", "lowfc ctl note once --json", "lowfc ctl configuration --json"):
         night.ctl(command)
     night.outputs["refused"] = str(lowfc("ctl", "gain", "-0.1", "--modes", "2", "--run", night.name).exception)
