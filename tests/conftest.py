@@ -1,5 +1,6 @@
 """Fixtures of all tests: private runtime directories and caches, and no silent skips where none are allowed."""
 
+import contextlib
 import os
 from collections.abc import Iterator
 from functools import cache
@@ -47,7 +48,8 @@ class _Scheduling(LoadFileScheduling):
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Leave the processors to an exclusive test on another worker."""
     if "PYTEST_XDIST_WORKER" in os.environ and not _exclusive(item.path):
-        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+        with contextlib.suppress(OSError):  # a container may forbid it
+            os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
 
 
 @cache
