@@ -15,7 +15,7 @@ from lowfc.control.laws.integrator import Integrator
 from lowfc.control.laws.linear_law import LinearLaw, at_rest, integrator, predict_and_update, respond
 from lowfc.control.laws.stability import delay_weights
 from lowfc.control.loop.inputs import COUNT_BITS
-from lowfc.control.loop.safety import Rejection
+from lowfc.control.loop.safety import NOT_NEW
 
 Controller = Callable[[Any, Single, Single], tuple[Any, Single]]
 """(state, error_nm, pol_nm) to (state, command_nm); the state is None at first, the arrays are (modes,) float32."""
@@ -24,7 +24,7 @@ MAX_DELAY_FRAMES = 5
 """Longest plausible delay of a working loop, frames."""
 _STILL_NM = 0.01
 _FEWEST = 20
-_NOT_NEW = 1 << Rejection.REPEATED | 1 << Rejection.OUT_OF_ORDER | 1 << Rejection.AHEAD
+_NOT_NEW = sum(1 << reason for reason in NOT_NEW)
 
 
 def driven_by(law: LinearLaw, limit_nm: Single | None = None) -> Controller:

@@ -41,7 +41,7 @@ from lowfc.control.loop.loading import (
 )
 from lowfc.control.loop.requests import answer
 from lowfc.control.loop.reservation import lease_checked
-from lowfc.control.loop.safety import Limit, LoopMode, Reason, Rejection
+from lowfc.control.loop.safety import NOT_NEW, Limit, LoopMode, Reason, Rejection
 from lowfc.control.loop.state import ActiveLoop, Settings, State
 
 UNMEASURED = frozenset({Rejection.NO_CALIBRATION, Rejection.WRONG_SIZE})
@@ -229,7 +229,7 @@ def _refuse(
                 loop = end_probe(loop, frame.sequence, _acted(hit), events)
             _limit_events(state.limits_hit, hit, events)
             reasons = (reason, *hit)
-        elif reason not in (Rejection.REPEATED, Rejection.OUT_OF_ORDER, Rejection.AHEAD):  # these are not new exposures
+        elif reason not in NOT_NEW:
             loop = loop.missed(1)
         held_nm = loop.history_nm[0]
     state = state._replace(

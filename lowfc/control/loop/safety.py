@@ -53,6 +53,10 @@ class Rejection(IntEnum):
     HELD = 13
 
 
+NOT_NEW = frozenset((Rejection.OUT_OF_ORDER, Rejection.REPEATED, Rejection.AHEAD))
+"""Reasons for refusing a frame that is no new exposure, or whose time is not that of its exposure."""
+
+
 class Limit(IntEnum):
     """The limit that changed a command, or why a command was refused; numbered as on the wire."""
 

@@ -9,7 +9,7 @@ from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.bus.names import Names
-from lowfc.adapters.logs.columns import StepRows, Steps, TimingRows, TruthRows, Truths, bits_of
+from lowfc.adapters.logs.columns import StepRows, Steps, TimingRows, TruthRows, Truths
 from lowfc.arrays import Long, Mask, Pixels, Sequences, Single
 from lowfc.contract.codecs.calibration_codec import decode_calibration
 from lowfc.contract.codecs.codec import decode_frame
@@ -36,8 +36,9 @@ from lowfc.contract.messages import (
     wire,
 )
 from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.laws.what_if import exposed
 from lowfc.control.loop.inputs import Frame
-from lowfc.control.loop.safety import Rejection
+from lowfc.control.loop.safety import NOT_NEW
 
 SHOWN = (FRAME, STEP, TRUTH, TIMING, MIRROR_STATE, SURFACE, CALIBRATION, CAMERA_STATE, CONTROLLER_STATE, EVENT, HEALTH)
 """Topics that a view shows."""
@@ -46,9 +47,6 @@ PICTURES_HZ = 30.0
 PICTURES_PER_COMPLETE = 8
 """Snapshots per complete one. Curves grow four times a second, because many rows cost hardly more than one."""
 
-_WRONG_TIME = frozenset((Rejection.OUT_OF_ORDER.value, Rejection.REPEATED.value, Rejection.AHEAD.value))
-"""Numbers of the reasons for refusing a frame whose time is not that of its exposure, or not in order."""
-_WRONG_TIME_BITS = bits_of(_WRONG_TIME)
 _KNOWN_EVENTS = 5000
 _UNREADABLE = (BadMessageError, DecodeError, KeyError, OverflowError, ValueError)
 
@@ -158,7 +156,7 @@ class Snapshot:
     @property
     def in_time(self) -> Mask:
         """Whether the time of each step is that of an exposure, so that it can be drawn at that time."""
-        return np.asarray(self.steps.reasons & _WRONG_TIME_BITS == 0)
+        return exposed(self.steps.reasons)
 
     @property
     def used(self) -> Mask:
@@ -277,7 +275,7 @@ class Accumulator:
             time_ns = checked_time_ns(step.timestamp)
             if not self._steps.add(step):
                 self._steps = _added(StepRows(len(step.command_nm)), step)
-            if _WRONG_TIME.isdisjoint(step.reasons):
+            if NOT_NEW.isdisjoint(step.reasons):
                 self._set_data_time(time_ns, publish_time_ns)
         elif topic is TRUTH:
             truth = wire.Truth.FromString(payload)
