@@ -239,7 +239,7 @@ def test_record_start_names_the_request(tmp_path: Path) -> None:
 
 def test_the_answer_to_record_start_contains_the_estimate_of_disk_space(tmp_path: Path) -> None:
     bench = Bench(tmp_path / "logs")
-    bench.start(expected_bytes_per_s=1e6)
+    bench.start(bytes_per_s=1e6)
     operator = bench.join("operator")
     answers = []
     for name in ("stop", "start"):

@@ -32,9 +32,16 @@ class Bench:
     def join(self, name: str) -> Service:
         return Service(name, "night", self.clock, MemoryBus(self.hub, name, self.clock))
 
-    def start(self, **more: object) -> None:
+    def start(self, bytes_per_s: float = 0.0, **more: object) -> None:
+        def expected(camera: wire.CameraState | None) -> float:
+            self.cameras.append(camera)
+            return bytes_per_s
+
         bus = MemoryBus(self.hub, "recorder", self.clock)
-        self.recorder = Recorder(bus, self.clock, "night", self.folder, metadata={"lowfc": {"run": "night"}}, **more)
+        metadata = {"lowfc": {"run": "night"}}
+        self.recorder = Recorder(
+            bus, self.clock, "night", self.folder, metadata=metadata, expected_bytes_per_s=expected, **more
+        )
         self.thread.start()
         for service in (self.camera, self.controller):
             service.state = "ready"
@@ -49,7 +56,7 @@ class Bench:
         return self.summary
 
     def _record(self) -> None:
-        self.summary = self.recorder.run(self.cameras.append)
+        self.summary = self.recorder.run()
 
 
 def put(publisher: Publisher, count: int) -> list[bytes]:

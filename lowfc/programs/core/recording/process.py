@@ -36,6 +36,11 @@ def record(run: Run, config: Configuration, calibration: Path | None) -> Summary
     limits, selection = log_limits(config), configured_selection(config)
     if short := shortage(user_path(log.folder), limits.min_free_bytes):
         raise DataFileError(short)
+
+    def announced(camera: wire.CameraState | None) -> float:
+        sys.stderr.write(f"{estimate(config, camera)}\n")
+        return bytes_per_s(config, selection, camera)
+
     # Every value, also the defaults that a user's file omits.
     attachments = [Attachment("config.toml", "application/toml", config.to_toml().encode())]
     attachments += [] if calibration is None else [_attached(calibration, "application/fits")]
@@ -54,18 +59,14 @@ def record(run: Run, config: Configuration, calibration: Path | None) -> Summary
             limits=limits,
             granted=granted,
             selection=selection,
+            expected_bytes_per_s=announced,
             awaited=_launched(run),
         )
         recorder.catch_signals()
         recorder.service.announces = True
         if log.on_event:
             Alarm(recorder.service, log.on_event, Level[log.on_event_level.upper()], log.on_event_every_s)
-
-        def settled(camera: wire.CameraState | None) -> None:
-            recorder.expected_bytes_per_s = bytes_per_s(config, selection, camera)
-            sys.stderr.write(f"{estimate(config, camera)}\n")
-
-        return recorder.run(settled)
+        return recorder.run()
     finally:
         bus.close()
 

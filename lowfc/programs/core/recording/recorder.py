@@ -45,7 +45,7 @@ _DONE = {"start": "recording into", "stop": "recording stopped:"}
 
 
 class Recorder:
-    """Records the messages of a run into logs; `expected_bytes_per_s` is their growth until it has been measured."""
+    """Records the messages of a run into logs."""
 
     def __init__(
         self,
@@ -59,13 +59,14 @@ class Recorder:
         limits: Limits = STANDARD,
         granted: Granted = NOTHING,
         selection: Selection = EVERYTHING,
-        expected_bytes_per_s: float = 0.0,
+        expected_bytes_per_s: Callable[[wire.CameraState | None], float] = lambda camera: 0.0,
         awaited: AbstractSet[str] = frozenset(),
     ) -> None:
         """Subscribe to everything; `run` starts the recording. Each log starts with `metadata` and `attachments`.
 
         Recording starts once each of the `awaited` processes has sent Health, or after a timeout. By default these are
-        all on the bus; across hosts it is any one, because the bus counts only the router.
+        all on the bus; across hosts it is any one, because the bus counts only the router. `expected_bytes_per_s` is
+        called before the first log begins, with the camera's state if there is one: growth until it has been measured.
         """
         self._awaited = awaited
         self._bus = bus
@@ -74,7 +75,7 @@ class Recorder:
         self._account = LossAccount()
         self._selection = selection
         self._folder, self._min_free_bytes = folder, limits.min_free_bytes
-        self.expected_bytes_per_s = expected_bytes_per_s
+        self._expect, self._expected_bytes_per_s = expected_bytes_per_s, 0.0
         self._series = LogSeries(folder, clock, {**metadata, **selection.metadata}, attachments, limits)
         self._peers = Peers(bus)
         self._paused = self._stopping = self._skip_drain = False
@@ -99,14 +100,11 @@ class Recorder:
             if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:  # as nohup leaves it
                 signal.signal(number, self._signalled)
 
-    def run(self, settled: Callable[[wire.CameraState | None], None] = lambda camera: None) -> Summary:
-        """Record until stopped; DataFileError if the first log cannot be opened.
-
-        `settled` is called before the first log begins, with the camera's state if there is one.
-        """
+    def run(self) -> Summary:
+        """Record until stopped; DataFileError if the first log cannot be opened."""
         self._settle()
         self._peers.query()  # fills `newest`, with which the log begins
-        settled(self._peers.camera())
+        self._expected_bytes_per_s = self._expect(self._peers.camera())
         self._begin()
         self._begun_ns = self._clock.host_ns()
         self.service.awaited = lambda: "" if self.service.last_health else "any other process"
@@ -295,7 +293,7 @@ class Recorder:
 
     def _estimate(self) -> str:
         """Sentence on the disk space used, from the growth so far or as expected; empty if unknown."""
-        growth = self._series.bytes_per_s or self.expected_bytes_per_s
+        growth = self._series.bytes_per_s or self._expected_bytes_per_s
         return growth_in_words(growth, self._folder, self._min_free_bytes) if growth else ""
 
     def _flushed(self) -> None:
