@@ -319,9 +319,12 @@ def checked_sequence(sequence: int) -> int:
     return sequence
 
 
+_FLOAT = np.dtype("<f4")
+
+
 def floats(data: bytes, *shape: int) -> Single:
     """Array of this shape from a message's little-endian float32; ValueError if the number of values differs."""
-    return np.frombuffer(data, dtype="<f4").reshape(shape)
+    return np.frombuffer(data, _FLOAT).reshape(shape)
 
 
 def fields_of(source: object, names: Iterable[str]) -> dict[str, Any]:

@@ -27,6 +27,7 @@ from lowfc.contract.messages import (
     timestamp,
     wire,
 )
+from lowfc.control.cache_warmup import CacheWarmup
 from lowfc.control.loop.safety import Limits, Reason, Rejection
 from lowfc.device.driver import Mirror, MirrorExtras, geometry
 from lowfc.device.mirror_protection import Command, MirrorProtection, Status, apply_command, tick
@@ -90,6 +91,9 @@ class MirrorLoop:
         self._fill_extra = getattr(driver, "fill", _NO_EXTRAS.fill)
         self.watch = DriverWatch(service, PATIENCE_S, self._hang)
         self._turn = threading.Lock()
+        warms_up = config.realtime.cache_warmup and not config.lockstep
+        self._warmup = CacheWarmup(config.period_ns) if warms_up else None
+        self._last_payload: bytes | None = None
         self._pause = Mailbox()  # never receives a message; a signal ends a wait on it at any time
         service.on_stop(self._pause.wake)
         self._applied_ns = 0
@@ -131,7 +135,11 @@ class MirrorLoop:
         service = self._service
         with self.watch.over(self._close):
             while service.running:
-                self._pause.take(TICK_NS * 1e-9)
+                wait_ns = None if self._warmup is None else self._warmup.wait_ns(service.clock.host_ns())
+                self._pause.take(min(TICK_NS if wait_ns is None else wait_ns, TICK_NS) * 1e-9)
+                if self._warmup is not None and self._warmup.due(service.clock.host_ns()):
+                    self._warm_up()
+                    continue
                 free = self._turn.acquire(timeout=TICK_NS * 1e-9)
                 if free:
                     try:
@@ -176,11 +184,24 @@ class MirrorLoop:
             self._service.event("COMMAND_REFUSED", reason=refused.name)
         if refused is None:
             self._applied_ns = clock.host_ns()
+            if self._warmup is not None:
+                self._last_payload = sample.payload
+                self._warmup.frame_received(sample.receive_time_ns)
+                self._pause.wake()  # `run` then waits until the next warm-up is due
         if not before.following and before.frame_sequence and refused is None:
             self._service.event("COMMAND_BACK")
         for reason in self._status.limits_hit:
             if reason not in before.limits_hit:
                 self._service.event("LIMIT_HIT", reason=reason.name)
+
+    def _warm_up(self) -> None:
+        """Repeat the last command without moving the mirror and discard the result; see `CacheWarmup`."""
+        with self._turn:
+            if self._last_payload is None:
+                return
+            command, now_ns = command_of(self._last_payload, self._start_check), self._service.clock.now_ns()
+            status, refused = apply_command(self._protection, self._status, command, now_ns, lambda same_nm, _: same_nm)
+            state_of(status, now_ns, refused).SerializeToString()
 
     def _drive(self, actuators_nm: Single, elapsed_ns: float) -> Single:
         """Call the driver to move; a real mirror is called only with a new command."""
@@ -257,15 +278,9 @@ class MirrorLoop:
             self._publish(now_ns)
 
     def _publish(self, time_ns: int) -> None:
-        status, state = self._status, state_of(self._status, time_ns)
+        status = self._status
+        self._states.put(state_of(status, time_ns, self._refused, known=self._known).SerializeToString())
         now_ns = self._service.clock.now_ns()  # a command's time cannot be trusted
-        if not self._known:
-            state.ClearField("actuators")
-            state.status = wire.MIRROR_STATUS_EXPIRED
-        state.channels.extend(sorted(status.channels))
-        state.safe = bool(status.safe)
-        state.refused = self._refused.value if self._refused is not None else 0  # type: ignore[assignment]  # numbered alike
-        self._states.put(state.SerializeToString())
         self._state_due_ns = now_ns + IDLE_STATE_NS
         if now_ns >= self._picture_due_ns and self._known:
             picture = np.asarray(self._y_factors @ status.surface_nm @ self._x_factors.T, np.float32)
@@ -282,18 +297,22 @@ class MirrorLoop:
         self._fill_extra(health)
 
 
-def state_of(status: Status, time_ns: int) -> wire.MirrorState:
-    """Message of a mirror's state, without channels, safe mode and the last refusal."""
-    following = wire.MIRROR_STATUS_FOLLOWING if status.following else wire.MIRROR_STATUS_EXPIRED
+def state_of(status: Status, time_ns: int, refused: Reason | None = None, *, known: bool = True) -> wire.MirrorState:
+    """Message of a mirror's state; `refused`: why the last command was; `known`: whether its position is known."""
+    rows, columns = status.surface_nm.shape
+    following = wire.MIRROR_STATUS_FOLLOWING if status.following and known else wire.MIRROR_STATUS_EXPIRED
     return wire.MirrorState(
         timestamp=timestamp(time_ns),
         frame_sequence=status.frame_sequence,
-        status=following if status.received_ns else wire.MIRROR_STATUS_WAITING,
-        rows=status.surface_nm.shape[0],
-        columns=status.surface_nm.shape[1],
-        actuators=status.surface_nm.tobytes(),
+        status=following if status.received_ns or not known else wire.MIRROR_STATUS_WAITING,
+        rows=rows,
+        columns=columns,
+        actuators=status.surface_nm.tobytes() if known else b"",
         command_nm=status.command_nm.tolist(),
         limits_hit=[reason.value for reason in status.limits_hit],  # type: ignore[misc]  # numbered alike
+        channels=sorted(status.channels),
+        safe=bool(status.safe),
+        refused=0 if refused is None else refused.value,  # type: ignore[arg-type]  # numbered alike
     )
 
 

@@ -47,8 +47,7 @@ class MirrorProtection:
         return Limits(limits.stroke_nm - step, limits.slew_nm - step, limits.neighbour_nm - step)
 
 
-@dataclass(frozen=True, slots=True)
-class Command:
+class Command(NamedTuple):
     """A command as received.
 
     Attributes:

@@ -128,12 +128,12 @@ def test_a_message_in_transit_during_the_switch_is_delivered_once(tmp_path: Path
         pytest.fail,
     )
     one, other = (Sample(FRAME.key, b"", sequence, 1, 1) for sequence in (1, 2))
-    reader._by_socket(one)
+    reader.take(Envelope(1, 1).encode(), b"", 1)
     reader._by_bus(one)
     reader._leave()
     assert left == [True]
     reader._by_bus(other)
-    reader._by_socket(other)
+    reader.take(Envelope(2, 1).encode(), b"", 1)
     reader.close()
     assert got == [1, 2]
 

@@ -345,13 +345,13 @@ def careless(what: str) -> Callable[..., Command]:
     def change(decoded: Command, command: wire.MirrorCommand, status: Status) -> Command:
         actuators_nm = decoded.actuators_nm
         if what == "bytes" and actuators_nm is None:
-            return replace(decoded, actuators_nm=np.resize(np.frombuffer(command.actuators, np.float32), (6, 7)))
+            return decoded._replace(actuators_nm=np.resize(np.frombuffer(command.actuators, np.float32), (6, 7)))
         if what == "grid" and actuators_nm is not None:
-            return replace(decoded, actuators_nm=np.resize(actuators_nm, (6, 7)))
+            return decoded._replace(actuators_nm=np.resize(actuators_nm, (6, 7)))
         if what == "finite" and actuators_nm is not None:
-            return replace(decoded, actuators_nm=np.nan_to_num(actuators_nm, nan=0.0, posinf=0.0))
+            return decoded._replace(actuators_nm=np.nan_to_num(actuators_nm, nan=0.0, posinf=0.0))
         if what == "order":
-            return replace(decoded, frame_sequence=max(decoded.frame_sequence, status.frame_sequence))
+            return decoded._replace(frame_sequence=max(decoded.frame_sequence, status.frame_sequence))
         return decoded
 
     return change

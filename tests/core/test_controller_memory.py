@@ -42,13 +42,13 @@ from lowfc.contract.messages import (
     wire,
 )
 from lowfc.contract.published import Published
+from lowfc.control import cache_warmup
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.linear_law import integrator
 from lowfc.control.loop.safety import LoopMode
 from lowfc.device import DriverOptions
 from lowfc.device.driver import CameraSettings, camera_state
 from lowfc.device.mirror_loop import MirrorLoop
-from lowfc.programs.core import cache_warmup
 from lowfc.programs.core.controller import Controller
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from sim_camera.driver import scene as configured_scene

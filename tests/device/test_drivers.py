@@ -116,6 +116,21 @@ def test_commands_are_limited_and_the_mirror_goes_flat_after_the_command_timeout
     assert listener.events()[-1] == "COMMAND_EXPIRED"
 
 
+def test_a_warm_up_of_the_mirror_neither_calls_its_driver_nor_changes_or_publishes_anything() -> None:
+    hub, clock = MemoryHub(), FakeClock()
+    listener = Listener(hub, clock, MIRROR_STATE)
+    driver = Follower(DriverOptions(), CONFIG)
+    loop = MirrorLoop(driver, listener.service("mirror-dm"), CONFIG)
+    message = wire.MirrorCommand(frame_sequence=5, rows=GRID[0], columns=GRID[1], valid_for_ns=100 * MS)
+    message.actuators = np.full(GRID, 20.0, np.float32).tobytes()
+    loop._warm_up()  # before the first command
+    MemoryBus(hub, "controller", clock).publisher(COMMAND, "dm").put(message.SerializeToString())
+    before, applied, published = loop._status, len(driver.applied), len(listener.messages(MIRROR_STATE))
+    loop._warm_up()
+    assert loop._status is before
+    assert (len(driver.applied), len(listener.messages(MIRROR_STATE))) == (applied, published)
+
+
 def test_the_tighter_of_driver_and_configured_limits_applies() -> None:
     driver = Follower(DriverOptions(), load(None, {"mirror.rows": 4, "mirror.columns": 5, "mirror.slew_nm": 30.0}))
     assert protection_of(driver, CONFIG).limits.slew_nm == 30.0

@@ -30,7 +30,7 @@ def mirror(**changes: object) -> Device:
 
 def command(actuators_nm: Single | None, index: int = 1, **changes: object) -> Command:
     valid = Command("lowfc", index, START_NS + index * MS, 200 * MS, actuators_nm, np.array([1, 2], np.float32))
-    return replace(valid, **changes)
+    return valid._replace(**changes)
 
 
 def even(height_nm: float) -> Single:
@@ -79,7 +79,7 @@ def test_safe_mode_is_stored_by_channel() -> None:
 
 def test_command_with_a_time_in_the_far_future_still_times_out_to_flat() -> None:
     device = mirror(settling_ns=50_000.0)
-    ahead = replace(command(even(100.0)), time_ns=1 << 62)
+    ahead = command(even(100.0))._replace(time_ns=1 << 62)
     status, _ = apply_command(device, initial(device), ahead, START_NS)
     for number in range(1, 5):
         status = tick(device, status, START_NS + MAX_VALID_NS + number * 10 * MS)

@@ -144,7 +144,11 @@ class DirectReader:
     def take(self, envelope: bytes, payload: bytes, now_ns: int) -> None:
         """Forward a message received at `now_ns`, on the calling thread: the socket's, or that of a writer here."""
         try:
-            self._by_socket(Sample(self._key, payload, *Envelope.decode_checked(envelope), now_ns))
+            sample = Sample(self._key, payload, *Envelope.decode_checked(envelope), now_ns)
+            with self._turn:
+                if self._first < 0:
+                    self._first = sample.sequence
+                self._forward(sample)
         except Exception as fault:
             self._failed(fault)
         self._leave()
@@ -165,12 +169,6 @@ class DirectReader:
             forwarded = self._forward(sample)
             if not forwarded and not self._shared and 0 <= self._first <= sample.sequence:
                 self._both = True  # received over both paths: the bus can be unsubscribed
-
-    def _by_socket(self, sample: Sample) -> None:
-        with self._turn:
-            if self._first < 0:
-                self._first = sample.sequence
-            self._forward(sample)
 
     def _forward(self, sample: Sample) -> bool:
         """Forward a message unless it is a copy or late."""

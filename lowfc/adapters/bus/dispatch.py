@@ -58,21 +58,18 @@ class Dispatch(Arrivals):
     def put(self, sample: Sample) -> None:
         """Dispatch or skip a message; called on the receive threads, one at a time."""
         with self._turn:
-            self._put(sample)
-
-    def _put(self, sample: Sample) -> None:
-        handler: Callable[[Sample], None] | None = self._handler
-        if self._period_ns is not None:
-            queued = sample.receive_time_ns - self._done_ns <= REST_NS
-            self._in_a_row = self._in_a_row + 1 if queued else 1
-            age_ns = sample.receive_time_ns - sample.publish_time_ns
-            if self._in_a_row > MAX_IN_A_ROW:
-                handler = None
-            elif age_ns >= (self._period_ns if queued else self._old_ns):
-                handler = self._superseded
-        if handler is None:
-            self._skipped += 1
-        else:
-            handler(sample)
-        self.count(sample)
-        self._done_ns = self._now_ns()
+            handler: Callable[[Sample], None] | None = self._handler
+            if self._period_ns is not None:
+                queued = sample.receive_time_ns - self._done_ns <= REST_NS
+                self._in_a_row = self._in_a_row + 1 if queued else 1
+                age_ns = sample.receive_time_ns - sample.publish_time_ns
+                if self._in_a_row > MAX_IN_A_ROW:
+                    handler = None
+                elif age_ns >= (self._period_ns if queued else self._old_ns):
+                    handler = self._superseded
+            if handler is None:
+                self._skipped += 1
+            else:
+                handler(sample)
+            self.count(sample)
+            self._done_ns = self._now_ns()

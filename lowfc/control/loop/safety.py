@@ -12,9 +12,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from lowfc.arrays import Single
 from lowfc.control.loop.wording import mode_word
-
-Actuators = npt.NDArray[np.float32]
 
 MARGIN_NM = 1e-3
 """Least distance kept from stroke and slew limit, and half of it from the neighbour limit, so that float32 rounding
@@ -118,11 +117,11 @@ class Limits:
 class Limited(NamedTuple):
     """A limited command: (rows, columns) float32, nm of surface, and the limits that changed it."""
 
-    actuators_nm: Actuators
+    actuators_nm: Single
     reasons: tuple[Reason, ...]
 
 
-def limit(limits: Limits, previous_nm: Actuators, requested_nm: Actuators) -> Limited:
+def limit(limits: Limits, previous_nm: Single, requested_nm: Single) -> Limited:
     """Return the command nearest to `requested_nm` that may follow `previous_nm`.
 
     Both are (rows, columns) float32, nm of surface; the previous one is finite, as a result of this function. Stroke,
@@ -156,7 +155,7 @@ def limit(limits: Limits, previous_nm: Actuators, requested_nm: Actuators) -> Li
     return Limited(kept if kept.dtype == np.float32 else kept.astype(np.float32), tuple(reasons))
 
 
-def _shorten(limits: Limits, previous_nm: Actuators, kept_nm: Actuators) -> Actuators:
+def _shorten(limits: Limits, previous_nm: Single, kept_nm: Single) -> Single:
     """Go from `previous_nm` towards `kept_nm` as far as neighbours allow; if already beyond, shrink the shape.
 
     It stops half a margin further inside than `limit` requires, so that rounding does not block the mirror there.
@@ -180,7 +179,7 @@ def _shorten(limits: Limits, previous_nm: Actuators, kept_nm: Actuators) -> Actu
     return previous_nm + np.float32(fraction) * (kept_nm - previous_nm)
 
 
-def _range_nm(actuators_nm: Actuators) -> tuple[float, float]:
+def _range_nm(actuators_nm: Single) -> tuple[float, float]:
     """Lowest and highest value; not finite if any value is not."""
     flat = actuators_nm.ravel()  # both functions propagate NaN
     return flat.item(flat.argmin()), flat.item(flat.argmax())

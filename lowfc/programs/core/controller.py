@@ -33,6 +33,7 @@ from lowfc.contract.messages import (
     TIMING,
     wire,
 )
+from lowfc.control.cache_warmup import CacheWarmup
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.durations import Durations
 from lowfc.control.loop.advance import advance
@@ -42,7 +43,6 @@ from lowfc.control.loop.requests import CONFIGURATION, MAX_REPLY_LENGTH, prepare
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import State
 from lowfc.programs.core.bench_values import BenchValues
-from lowfc.programs.core.cache_warmup import CacheWarmup
 from lowfc.programs.core.camera_reports import CameraReports
 from lowfc.programs.core.controller_report import (
     Arrays,

@@ -2,7 +2,7 @@
 
 import pytest
 
-from lowfc.programs.core.cache_warmup import LATEST_NS, LEAD_NS, MIN_PERIOD_NS, CacheWarmup
+from lowfc.control.cache_warmup import LATEST_NS, LEAD_NS, MIN_PERIOD_NS, CacheWarmup
 
 PERIOD_NS = 1_000_000
 START_NS = 5_000_000_000
