@@ -1,4 +1,4 @@
-"""Cache warm-up: the last step of controller or mirror is repeated shortly before the next, to cache its code and data."""
+"""Cache warm-up: the last step is repeated shortly before the next, so that its code and data are cached."""
 
 LEAD_NS = 300_000
 """Time from the warm-up to the next frame: short enough to keep the caches warm, with a margin for late wake-ups."""

@@ -20,7 +20,7 @@ from lowfc.adapters.bus.direct_link import DirectCall, DirectReader, DirectWrite
 from lowfc.adapters.bus.routed import RouterWatch, open_by_router, require_certificate
 from lowfc.adapters.bus.run import Links, mirror_role
 from lowfc.adapters.bus.zenoh_fault import plain
-from lowfc.adapters.bus.zenoh_session import session_config
+from lowfc.adapters.bus.zenoh_session import keep_thread_state, session_config
 from lowfc.adapters.process.clock import Clock
 from lowfc.adapters.process.clock_offset import ClockAsker, ClockOffset
 from lowfc.contract.envelope import Envelope, sequence_of
@@ -245,6 +245,7 @@ class ZenohBus:
 
         def received(sample: zenoh.Sample) -> None:
             now_ns = host_ns()
+            keep_thread_state()
             try:
                 handler(read(sample, now_ns, known_key))
             except Exception as fault:  # zenoh would only print it; count it here

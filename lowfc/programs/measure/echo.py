@@ -17,7 +17,7 @@ from zenoh.handlers import Callback
 
 from lowfc.adapters.bus.run import Run, open_run
 from lowfc.adapters.bus.zenoh_bus import declare_publisher
-from lowfc.adapters.bus.zenoh_session import session_config
+from lowfc.adapters.bus.zenoh_session import keep_thread_state, session_config
 from lowfc.adapters.files.whole_file import being_written
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.join import prepare
@@ -85,6 +85,7 @@ def _ask(config: Configuration, run: Run, payloads: Payloads, seconds: float) ->
 
     def received(sample: zenoh.Sample) -> None:
         now_ns = clock.host_ns()
+        keep_thread_state()
         assert sample.attachment is not None  # noqa: S101  # sent by `answer`
         index, time_ns = Envelope.decode_checked(sample.attachment.to_bytes())
         sample.payload.to_bytes()
@@ -125,6 +126,7 @@ def _answer(config: Configuration, run: Run, command: bytes) -> None:
     publisher = declare_publisher(session, COMMAND, COMMAND.at(config.mirror.name))
 
     def received(sample: zenoh.Sample) -> None:
+        keep_thread_state()
         if sample.payload.to_bytes():
             publisher.put(command, attachment=sample.attachment)
         else:
