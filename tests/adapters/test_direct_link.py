@@ -116,26 +116,63 @@ def test_switching_to_the_direct_link_loses_and_repeats_nothing(ends: Ends) -> N
     assert "direct-link" in ends.threads
 
 
-def test_a_message_in_transit_during_the_switch_is_delivered_once(tmp_path: Path) -> None:
-    got: list[int] = []
-    left: list[bool] = []
-    reader = direct_link.DirectReader(
-        tmp_path / "socket",
-        FRAME.key,
-        lambda sample: got.append(sample.sequence),
-        lambda handler: lambda: left.append(True),
-        time.time_ns,
-        pytest.fail,
-    )
-    one, other = (Sample(FRAME.key, b"", sequence, 1, 1) for sequence in (1, 2))
-    reader.take(Envelope(1, 1).encode(), b"", 1)
-    reader._by_bus(one)
-    reader._leave()
-    assert left == [True]
-    reader._by_bus(other)
-    reader.take(Envelope(2, 1).encode(), b"", 1)
-    reader.close()
-    assert got == [1, 2]
+class ReaderOnTwoPaths:
+    """A reader whose messages the test brings by socket and bus, and what it forwarded."""
+
+    def __init__(self, path: Path) -> None:
+        self.got: list[int] = []
+        self.left = 0
+        self.reader = direct_link.DirectReader(
+            path, FRAME.key, self._receive, self._subscribe, time.time_ns, pytest.fail
+        )
+
+    def _receive(self, sample: Sample) -> None:
+        self.got.append(sample.sequence)
+
+    def _subscribe(self, _: Callable[[Sample], None]) -> Callable[[], None]:
+        def leave() -> None:
+            self.left += 1
+
+        return leave
+
+    def socket(self, sequence: int, time_ns: int) -> None:
+        self.reader.take(Envelope(sequence, time_ns).encode(), b"", 1)
+
+    def bus(self, sequence: int, time_ns: int) -> None:
+        self.reader._by_bus(Sample(FRAME.key, b"", sequence, time_ns, 1))
+
+
+@pytest.fixture
+def reader(tmp_path: Path) -> Iterator[ReaderOnTwoPaths]:
+    found = ReaderOnTwoPaths(tmp_path / "socket")
+    yield found
+    found.reader.close()
+
+
+def test_a_message_in_transit_during_the_switch_is_delivered_once(reader: ReaderOnTwoPaths) -> None:
+    reader.socket(1, 1)
+    reader.bus(1, 1)
+    reader.reader._leave()
+    assert reader.left == 1
+    reader.bus(2, 2)
+    reader.socket(2, 2)
+    assert reader.got == [1, 2]
+
+
+@pytest.mark.parametrize("direct_only", [False, True])
+def test_messages_that_a_publisher_repeats_or_reorders_are_delivered_as_they_were_published(
+    reader: ReaderOnTwoPaths, direct_only: bool
+) -> None:
+    """The controller must see the fault of such a camera."""
+    reader.socket(10, 1)
+    if direct_only:
+        reader.bus(10, 1)
+        reader.reader._leave()
+    for time_ns, sequence in enumerate((12, 11, 11, 3), start=2):
+        reader.socket(sequence, time_ns)
+        if not direct_only:
+            reader.bus(sequence, time_ns)
+    assert reader.got == [10, 12, 11, 11, 3]
 
 
 def test_reader_and_writer_reconnect_after_restarts_and_the_bus_serves_without_a_writer(

@@ -95,8 +95,9 @@ class DirectReader:
 
     A copy is recognised by its envelope; the sequence alone is not enough, as two publishers may have started in the
     same second. The bus is unsubscribed while the only publisher of a topic uses the socket; its messages that arrive
-    over the bus after a newer one from the socket are dropped as late. On a topic with several publishers the bus stays
-    subscribed, and a message that only the bus carried may come after a newer one.
+    over the bus after a newer one from the socket are dropped as late. The socket keeps the publisher's order, so what
+    it brings out of order, or twice, was published so, and its handler must see it. On a topic with several publishers
+    the bus stays subscribed, and a message that only the bus carried may come after a newer one.
     """
 
     def __init__(
@@ -148,7 +149,9 @@ class DirectReader:
             with self._turn:
                 if self._first < 0:
                     self._first = sample.sequence
-                self._forward(sample)
+                surely_new = self._leave_bus is None and sample.sequence > self._newest
+                if surely_new or not self._is_copy(sample):
+                    self._forward(sample)
         except Exception as fault:
             self._failed(fault)
         self._leave()
@@ -166,25 +169,26 @@ class DirectReader:
 
     def _by_bus(self, sample: Sample) -> None:
         with self._turn:
-            forwarded = self._forward(sample)
-            if not forwarded and not self._shared and 0 <= self._first <= sample.sequence:
+            late = not self._shared and self._first >= 0 and sample.sequence <= self._newest
+            if not late and not self._is_copy(sample):
+                self._forward(sample)
+            elif not self._shared and 0 <= self._first <= sample.sequence:
                 self._both = True  # received over both paths: the bus can be unsubscribed
 
-    def _forward(self, sample: Sample) -> bool:
-        """Forward a message unless it is a copy or late."""
-        late = not self._shared and self._first >= 0 and sample.sequence <= self._newest
-        if self._closed or late:
-            return False
-        if self._leave_bus is not None:  # a copy may arrive by the other path
-            envelope = sample.sequence, sample.publish_time_ns
-            if envelope in self._recent or envelope in self._before:
-                return False
-            self._recent.add(envelope)
-            if len(self._recent) == _RECENT:
-                self._before, self._recent = self._recent, set()
-        self._newest = sample.sequence
-        self._handler(sample)
-        return True
+    def _is_copy(self, sample: Sample) -> bool:
+        """Whether the other path brought this message; if not, remember it."""
+        envelope = sample.sequence, sample.publish_time_ns
+        if envelope in self._recent or envelope in self._before:
+            return True
+        self._recent.add(envelope)
+        if len(self._recent) == _RECENT:
+            self._before, self._recent = self._recent, set()
+        return False
+
+    def _forward(self, sample: Sample) -> None:
+        if not self._closed:
+            self._newest = max(self._newest, sample.sequence)
+            self._handler(sample)
 
     def _leave(self) -> None:
         """Unsubscribe from the bus once messages arrive over both paths; called after each message of the socket."""
