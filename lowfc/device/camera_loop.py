@@ -6,6 +6,7 @@ from lowfc.adapters.process.realtime import let_send
 from lowfc.adapters.process.service import Service
 from lowfc.arrays import Pixels
 from lowfc.contract.configuration import Configuration
+from lowfc.contract.envelope import COUNT_BITS
 from lowfc.contract.messages import CAMERA_STATE, FRAME, image, wire
 from lowfc.device.driver import Camera, CameraExtras, CameraSettings, Exposure, camera_state
 from lowfc.device.watch import DriverWatch, opening
@@ -71,7 +72,7 @@ class CameraLoop:
                 frame = self._next_frame()
                 if frame is not None:
                     self._publish(*frame)
-                    step()
+                    self.watch.call(step)
                 elif service.clock.host_ns() < self.watch.retry_ns:
                     service.clock.sleep_until_ns(min(self.watch.retry_ns, service.clock.now_ns() + REST_NS))
                 self._report_lost()
@@ -107,7 +108,7 @@ class CameraLoop:
             self._service.clock.sleep_until_ns(end_ns)
         envelope = self._puts.put(payload)
         let_send()
-        self._sent(envelope)
+        self.watch.call(self._sent, envelope)
         self._last_put_ns = envelope.publish_time_ns
         self._first_put_ns = self._first_put_ns or envelope.publish_time_ns
         self._service.work += 1
@@ -128,11 +129,13 @@ class CameraLoop:
     def _follow_numbers(self, exposure: Exposure, settings: CameraSettings) -> None:
         """Count frames that the camera lost; restart the publisher if the camera's numbers restart.
 
-        ValueError if the number is that of the last frame, or if `lost` is negative.
+        ValueError if the number is that of the last frame, or if `lost` is no possible number of frames.
         """
         lost, now_ns = int(exposure.lost), self._service.clock.host_ns()
-        if lost < 0:
-            raise ValueError(f"lost is {lost}, expected the number of frames lost before this one, 0 or more")
+        if not 0 <= lost < 1 << COUNT_BITS:
+            raise ValueError(
+                f"lost is {lost}, expected the number of frames lost before this one, below 2^{COUNT_BITS}"
+            )
         number = None if exposure.number is None else int(exposure.number)  # numpy's integers overflow
         if number is not None and self._number is not None:
             step = (number - self._number) % settings.number_wrap
@@ -177,7 +180,7 @@ class CameraLoop:
         if (elapsed_ns := self._last_put_ns - self._first_put_ns) > 0:
             health.mean_rate_hz = (self._service.work - 1) * 1e9 / elapsed_ns
         health.driver_failures = self.watch.failures
-        self._fill_extra(health)
+        self.watch.call(self._fill_extra, health)
 
 
 def _checked(pixels: Pixels, settings: CameraSettings) -> Pixels:

@@ -294,7 +294,7 @@ class MirrorLoop:
         health.command_expired = bool(status.received_ns) and not status.following
         health.limits_hit.extend(reason.value for reason in status.limits_hit)  # type: ignore[misc]
         health.driver_failures = self.watch.failures
-        self._fill_extra(health)
+        self.watch.call(self._fill_extra, health)
 
 
 def state_of(status: Status, time_ns: int, refused: Reason | None = None, *, known: bool = True) -> wire.MirrorState:

@@ -78,7 +78,9 @@ def faults(config: Configuration, folder: Path) -> list[str]:
     for name in config.drivers:
         kinds = [kind for kind in KINDS if name in installed(kind)]
         in_file = any((here / f"{name}.py").is_file() for here in (folder, Path.cwd()))
-        if not kinds and not in_file and importlib.util.find_spec(name.partition(".")[0]) is None:
+        module = name.partition(".")[0]
+        importable = module in sys.modules or importlib.util.find_spec(module) is not None
+        if not kinds and not in_file and not importable:
             known = {*installed("camera"), *installed("mirror")}
             found.append(
                 f"drivers.{name}: no installed driver or module has that name{nearest(name, known)}, and there is no "

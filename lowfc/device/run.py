@@ -67,7 +67,7 @@ def run_camera(
     with closed_on_fault(driver.close):
         service = join(config, run, Role.CAMERA, config.realtime.camera_cpus)
     with closing(service.bus):  # a callback on zenoh's threads must not outlive the interpreter
-        with closed_on_fault(driver.close), opening("the camera's settings cannot be read"):
+        with closed_on_fault(driver.close), opening("the camera cannot be started"):
             loop = CameraLoop(driver, service, config, frames)
         service.catch_signals()
         loop.run(wait_for)
@@ -96,7 +96,7 @@ def camera_beside(driver: Camera, config: Configuration, service: Service) -> It
         camera = join_beside(config, service, Role.CAMERA)
     faults: list[Exception] = []
     with closing(camera.bus):
-        with closed_on_fault(driver.close), opening("the camera's settings cannot be read"):
+        with closed_on_fault(driver.close), opening("the camera cannot be started"):
             loop = CameraLoop(driver, camera, config)
 
         def read() -> None:
@@ -129,7 +129,7 @@ def run_mirror(driver: Mirror, config: Configuration, run: str) -> None:
     with closed_on_fault(driver.close):
         service = join(config, run, mirror_role(config.mirror.name), config.realtime.mirror_cpus)
     with closing(service.bus):
-        with closed_on_fault(driver.close), opening("the mirror's geometry cannot be read"):
+        with closed_on_fault(driver.close), opening("the mirror cannot be started"):
             loop = MirrorLoop(driver, service, config)
         service.catch_signals()
         loop.run()

@@ -113,13 +113,23 @@ class DriverWatch:
             self._service.event("DRIVER_BACK", count=self._series)
             self._series, self._kind = 0, ""
 
+    def call(self, method: Callable[..., None], *arguments: object) -> None:
+        """Call an optional method of the driver; a fault is counted and reported, and delays no other call."""
+        try:
+            method(*arguments)
+        except Exception as fault:
+            self._report(fault)
+
     def failed(self, fault: Exception) -> None:
         """Note that a call raised or returned an invalid result; a `LowfcError`, for the user, is raised again."""
         self._in_call = self.hangs = False
-        if isinstance(fault, LowfcError):
-            raise fault
+        self._report(fault)
         self.retry_ns = self._service.clock.host_ns() + PAUSES_NS[min(self._consecutive, len(PAUSES_NS) - 1)]
         self._consecutive += 1
+
+    def _report(self, fault: Exception) -> None:
+        if isinstance(fault, LowfcError):
+            raise fault
         self._count()
         why = described(fault)
         kind = re.sub(r"\d+", "", why)  # a message that differs only in its numbers is the same fault

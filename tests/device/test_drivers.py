@@ -303,7 +303,8 @@ def test_a_fault_in_the_first_settings_gives_one_sentence() -> None:
     with (
         ThreadPoolExecutor(1) as thread,  # its scheduling class ends with it
         pytest.raises(
-            ConfigurationError, match=r"settings cannot be read: RuntimeError: no link \(test_drivers.py, line \d+\)"
+            ConfigurationError,
+            match=r"the camera cannot be started: RuntimeError: no link \(test_drivers.py, line \d+\)",
         ),
     ):
         thread.submit(run_camera, camera, CONFIG, "unset").result()
@@ -316,6 +317,18 @@ def test_a_camera_that_cannot_be_started_gives_one_sentence_and_is_closed() -> N
     loop = CameraLoop(camera, Listener(MemoryHub(), FakeClock()).service("camera"), CONFIG)
     with pytest.raises(ConfigurationError, match=r"cannot be started: ZeroDivisionError: .* \(test_drivers.py, line"):
         loop.run()
+    assert camera.closed
+
+
+def test_a_fault_in_an_optional_method_is_counted_and_reported_and_stops_nothing() -> None:
+    camera, listener = Ramp(Ramp.Options(), CONFIG), Listener(MemoryHub(), FakeClock(), FRAME)
+    camera.sent = lambda _: 1 / 0  # type: ignore[attr-defined]
+    camera.fill = lambda _: {}["temperature"]  # type: ignore[attr-defined]
+    loop = CameraLoop(camera, listener.service("camera"), CONFIG, frames=3)
+    loop.run()
+    assert len(listener.messages(FRAME)) == 3
+    assert loop.watch.failures > 3
+    assert {"DRIVER_FAILED"} < set(listener.events())
     assert camera.closed
 
 

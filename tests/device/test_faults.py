@@ -72,9 +72,10 @@ def exposed(*exposures: Callable[[], Any], frames: int, settings: CameraSettings
         (good(end_ns=1 << 62), "in the future"),
         (good(end_ns=float("nan")), "NaN"),
         (good(lost=-1), "lost is -1"),
+        (good(lost=1 << 32), "lost is 4294967296"),
         (lambda: "nothing", "AttributeError"),
     ],
-    ids=["raises", "shape", "NaN", "future", "NaN time", "negative loss", "nonsense"],
+    ids=["raises", "shape", "NaN", "future", "NaN time", "negative loss", "impossible loss", "nonsense"],
 )
 def test_camera_failures_are_reported_once_counted_and_retried(bad: Callable[[], Any], message: str) -> None:
     recovered = [good()] * 251  # more than 1 s at 250 Hz

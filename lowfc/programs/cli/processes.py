@@ -1,7 +1,7 @@
 """The commands of a loop's own processes: `lowfc controller` and `lowfc record`."""
 
 import json
-from contextlib import closing, nullcontext
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Annotated
 
@@ -48,7 +48,7 @@ def controller(
     from lowfc.adapters.process.latch import Latch, latch_files
     from lowfc.contract.messages import Role
     from lowfc.control.kernel.tables import FUSED
-    from lowfc.device.plugins import opened
+    from lowfc.device import plugins
     from lowfc.device.run import camera_beside
     from lowfc.programs.commissioning.analytic import analytic
     from lowfc.programs.core.controller import Controller
@@ -56,7 +56,7 @@ def controller(
     signalled: list[int] = []  # signals received before the controller exists
     signal.signal(signal.SIGUSR1, lambda number, _: signalled.append(number))
     settings = configuration(config)
-    driver = None if camera is None else opened("camera", camera, settings)
+    driver = None if camera is None else plugins.load("camera", camera)  # opened last: nothing else can fail then
     found = None
     if calibration is None:
         found = analytic(settings, Console(stderr=True))
@@ -77,8 +77,11 @@ def controller(
         process.safe_by_signal()
     service.fill = process.fill
     service.catch_signals()
-    own_camera = nullcontext() if driver is None else camera_beside(driver, settings, service)
-    with closing(service.bus), own_camera:  # a callback on zenoh's threads must not outlive the interpreter
+    with closing(service.bus), ExitStack() as stack:  # a callback on zenoh's threads must not outlive the interpreter
+        if camera is not None:
+            stack.enter_context(
+                camera_beside(plugins.opened("camera", camera, settings, driver=driver), settings, service)
+            )
         process.run()
 
 
