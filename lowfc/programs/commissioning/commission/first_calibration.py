@@ -136,7 +136,7 @@ def linear_nm(player: Player, config: Configuration, delay: Delay, default_nm: f
     worst = int((off - _SURE * error).argmax())
     chosen_nm = default_nm / 2 if off[worst] > MAX_NOT_LINEAR + _SURE * error[worst] else default_nm
     player.report(
-        f"the gains at {top_nm:.3g} nm and at half of that agree within {off[worst]:.1%} (+- {error[worst]:.1%}; "
+        f"the gains at {top_nm:.3g} nm and at half of that differ by {off[worst]:.1%} (+- {error[worst]:.1%}; "
         f"Z{first.noll[worst]}): {chosen_nm:.3g} nm in each mode"
     )
     return chosen_nm
