@@ -1,5 +1,6 @@
 """Hostile files: any file named on a command line or in a configuration leads to a one-line error."""
 
+import gzip
 import io
 import lzma
 import os
@@ -160,11 +161,11 @@ def npz() -> bytes:
     return content.getvalue()
 
 
-def xz_damaged_in_the_middle() -> bytes:
+def damaged_in_the_middle(compress: Callable[[bytes], bytes]) -> bytes:
     content = io.BytesIO()
     fits.PrimaryHDU(np.random.default_rng(1).normal(size=(34, 34))).writeto(content)
-    damaged = bytearray(lzma.compress(content.getvalue()))
-    damaged[len(damaged) // 2] ^= 0xFF
+    damaged = bytearray(compress(content.getvalue()))
+    damaged[len(damaged) // 2] ^= 0x10
     return bytes(damaged)
 
 
@@ -173,7 +174,8 @@ def xz_damaged_in_the_middle() -> bytes:
     [
         (npz(), "it is a zip archive, such as .npz"),
         (b"\x1f\x8b\x08" + bytes(7) + b"\xff" * 50, "invalid block type"),
-        (xz_damaged_in_the_middle(), "Internal error"),
+        (damaged_in_the_middle(lzma.compress), "Internal error"),
+        (damaged_in_the_middle(gzip.compress), "CRC check failed"),
     ],
 )
 def test_archives_and_damaged_compressed_files_are_refused(tmp_path: Path, content: bytes, expected: str) -> None:

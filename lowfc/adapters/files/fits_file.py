@@ -1,6 +1,7 @@
 """lowfc's own FITS files: named extensions with checksums; damaged files are refused."""
 
 import contextlib
+import gzip
 import io
 import lzma
 import warnings
@@ -75,9 +76,15 @@ def opened(path: Path, content: bytes | None = None) -> Iterator[fits.HDUList]:
         input_file.opened(path, MAX_BYTES) if content is None else io.BytesIO(content) as stream,
     ):
         warnings.simplefilter("error", AstropyWarning)  # astropy only warns of a truncated file
-        if stream.read(2) == b"PK":  # astropy raises AttributeError
+        magic = stream.read(2)
+        if magic == b"PK":  # astropy raises AttributeError
             raise ValueError("it is a zip archive, such as .npz, and not a FITS file")
         stream.seek(0)
+        if magic == b"\x1f\x8b":  # astropy does not read as far as the checksum
+            with gzip.GzipFile(fileobj=stream) as unpacked:
+                while unpacked.read(1 << 20):
+                    pass
+            stream.seek(0)
         with fits.open(stream, mode="readonly", memmap=False) as hdus:
             yield hdus
 
