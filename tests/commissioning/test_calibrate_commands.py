@@ -243,6 +243,15 @@ def test_work_before_the_first_cycle_does_not_affect_the_time_to_go() -> None:
     assert lines == ["hadamard cycle: 50%, about 15 s to go"]
 
 
+def test_progress_of_several_tasks_in_turn_has_the_time_to_go_of_each() -> None:
+    lines, times = list[str](), iter(np.arange(0.0, 100.0, 5.0))
+    count = spoken(lines.append, lambda: float(next(times)))
+    for what in ("first", "second"):
+        for done in range(4):
+            count(what, done, 4)
+    assert lines == ["first: 50%, about 10 s to go", "second: 25%, about 15 s to go", "second: 75%, about 5 s to go"]
+
+
 def test_the_reference_is_the_present_image(loop: InProcessLoop) -> None:
     found = json_of("reference", "--frames", "200", "--out", "there.fits")
     shift = dict(zip(found["noll"], found["reference_shift_nm"], strict=True))

@@ -1,4 +1,4 @@
-"""Progress bars that disappear at the end."""
+"""Progress: bars that disappear at the end, or lines without a terminal."""
 
 import contextlib
 import time
@@ -28,7 +28,13 @@ def passing_bar(console: Console, *columns: ProgressColumn) -> Progress:
 
 @contextlib.contextmanager
 def counting_bar(console: Console, *columns: ProgressColumn) -> Iterator[Counted]:
-    """One bar for several tasks in turn, with `columns` beside its description; it appears with the first progress."""
+    """One bar for several tasks in turn, with `columns` beside its description; it appears with the first progress.
+
+    Without a terminal: lines, see `spoken`.
+    """
+    if not console.is_terminal:
+        yield spoken(lambda line: console.print(line, markup=False, highlight=False, soft_wrap=True))
+        return
     with passing_bar(console, TextColumn("{task.description}"), BarColumn(), *columns) as bar:
         tasks: list[TaskID] = []
 
@@ -38,6 +44,11 @@ def counting_bar(console: Console, *columns: ProgressColumn) -> Iterator[Counted
             bar.update(tasks[0], description=what, completed=done, total=total)
 
         yield count
+
+
+def percentage_bar(console: Console) -> contextlib.AbstractContextManager[Counted]:
+    """As `counting_bar`, in per cent of the whole."""
+    return counting_bar(console, TextColumn("{task.percentage:.0f} %"), TimeRemainingColumn())
 
 
 def reading_bar(console: Console) -> contextlib.AbstractContextManager[Counted]:
@@ -54,7 +65,9 @@ def spoken(say: Callable[[str], None], clock: Callable[[], float] = time.monoton
         nonlocal before, begun, spoken_at
         now = clock()
         if before < 0:
-            before, spoken_at = done, now
+            spoken_at = now
+        if before < 0 or done < before:  # the first task, or another one
+            before = done
         if done == before:  # exclude the time before the first progress from the rate
             begun = now
         elif now - spoken_at >= _EVERY_S:

@@ -14,7 +14,7 @@ from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.files.whole_file import being_written, require_folder
 from lowfc.adapters.logs.records import LogFile
 from lowfc.adapters.process.join import clock_of
-from lowfc.adapters.process.progress import passing_bar
+from lowfc.adapters.process.progress import reading_bar
 from lowfc.adapters.viewer.rerun_viewer import RerunViewer
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.messages import Role
@@ -123,11 +123,8 @@ def memory_remarks(log_bytes: int, target: Target) -> list[str]:
 
 def _draw(logs: list[Path], config: Configuration | None, stream: rr.RecordingStream, target: Target) -> Drawn:
     total = sum(log.stat().st_size for log in logs if log.exists())
-    with passing_bar(Console(stderr=True)) as bar:
-        task = bar.add_task("drawing", total=total)
-        drawn = draw_logs(
-            logs, config, lambda own: Renderer(own, stream), lambda done: bar.update(task, completed=done)
-        )
+    with reading_bar(Console(stderr=True)) as count:
+        drawn = draw_logs(logs, config, lambda own: Renderer(own, stream), lambda done: count("drawing", done, total))
     target.show_all(stream, drawn.span_ns)
     drawn.remarks += memory_remarks(total, target)
     for remark in drawn.remarks:

@@ -1,19 +1,18 @@
 """The tasks of `lowfc calibrate` on a running loop or files; each returns its result."""
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from rich.console import Console
-from rich.progress import TextColumn, TimeRemainingColumn
 
 from lowfc.adapters.files import calibration_file, factory
 from lowfc.adapters.files.array_file import read_array
 from lowfc.adapters.files.mirror_maps import shape_of
 from lowfc.adapters.files.whole_file import require_folder
-from lowfc.adapters.process.progress import Counted, counting_bar, spoken
+from lowfc.adapters.process.progress import percentage_bar
 from lowfc.adapters.process.terminal import configuration
 from lowfc.arrays import Array, single
 from lowfc.client import Client, configuration_of
@@ -71,7 +70,7 @@ def poked(request: CalibrationRequest, run: str | None, *, load: bool) -> Calibr
     with contextlib.ExitStack() as stack:
         loop = stack.enter_context(Client(run))
         computed = analytic(configuration_of(loop), console)
-        progress = stack.enter_context(shown_progress(console, report))
+        progress = stack.enter_context(percentage_bar(console))
         lease = stack.enter_context(loop.reserved(f"lowfc calibrate --method {request.method}"))
         progress = lease.expecting(progress, configuration_of(loop).camera.rate_hz)
         calibrator = Calibrator(loop, request, report, progress, computed)
@@ -92,16 +91,6 @@ def poked(request: CalibrationRequest, run: str | None, *, load: bool) -> Calibr
             raise
     result.not_loaded = load and not result.recommended
     return result
-
-
-@contextlib.contextmanager
-def shown_progress(console: Console, report: Callable[[str], None]) -> Iterator[Counted]:
-    """Progress bar on a terminal, otherwise a line every 10 s."""
-    if not console.is_terminal:
-        yield spoken(report)
-        return
-    with counting_bar(console, TextColumn("{task.percentage:.0f} %"), TimeRemainingColumn()) as count:
-        yield count
 
 
 def computed(

@@ -46,9 +46,10 @@ def commission(
     from rich.console import Console
 
     from lowfc.adapters.files.whole_file import require_folder
+    from lowfc.adapters.process.progress import percentage_bar
     from lowfc.client import Client, configuration_of
     from lowfc.programs.commissioning.analytic import analytic
-    from lowfc.programs.commissioning.calibrate.tasks import reporter, shown_progress
+    from lowfc.programs.commissioning.calibrate.tasks import reporter
     from lowfc.programs.commissioning.commission.commissioning import Commission, Commissioning
 
     if dark is not None and no_dark:
@@ -68,7 +69,7 @@ def commission(
     def confirm(what: str) -> None:
         typer.confirm(what, default=True, abort=True, err=True)
 
-    with Client(run) as loop, loop.reserved("lowfc commission") as lease, shown_progress(console, report) as shown:
+    with Client(run) as loop, loop.reserved("lowfc commission") as lease, percentage_bar(console) as shown:
         config = configuration_of(loop)
         progress = lease.expecting(shown, config.camera.rate_hz)
         found, text = Commissioning(loop, config, analytic(config, console), options, report, progress, confirm).run()
