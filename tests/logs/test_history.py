@@ -10,10 +10,12 @@ import pytest
 from lowfc.adapters.logs.history import History, read_history
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.envelope import sequence_of
 from lowfc.contract.messages import (
     CALIBRATION,
     CAMERA_STATE,
     EVENT,
+    HEALTH,
     MIRROR_STATE,
     STEP,
     TIMING,
@@ -23,7 +25,7 @@ from lowfc.contract.messages import (
     wire,
 )
 from tests.support.report_log import TOYS, SyntheticLog
-from tests.support.toy import NOLL, calibration
+from tests.support.toy import NOLL, START, calibration
 
 STEPS = 20
 
@@ -62,7 +64,14 @@ def test_an_invalid_step_is_left_out_of_every_column(tmp_path: Path, change: Cal
     assert history.excluded_messages == 1
     assert {len(getattr(steps, column)) for column in steps.__slots__} == {STEPS - 1}
     assert np.isfinite(steps.error_nm).all()
-    assert len(history.truths.sequence) == len(history.mirror.sequence) == STEPS
+    assert len(history.truths.sequence) == len(history.mirror.sequence) == len(history.stepped_sequence) == STEPS
+
+
+def test_late_commands_after_a_restart_of_the_camera_are_counted(tmp_path: Path) -> None:
+    night = SyntheticLog()
+    for start_s, count, late in ((START, 0, 40), (START, 1, 43), (START + 60, 0, 4), (START + 60, 1, 6)):
+        night.put(HEALTH, wire.Health(process="camera", commands_late=late), sequence_of(start_s, count), "camera")
+    assert history_of(night, tmp_path / "x.mcap").commands_late == 3 + 6
 
 
 def test_the_attached_calibration_replaces_a_lost_message(tmp_path: Path) -> None:
@@ -98,6 +107,7 @@ def test_a_repeated_reason_sets_one_bit(tmp_path: Path) -> None:
     [
         (MIRROR_STATE, lambda state: state.limits_hit.append(70)),
         (MIRROR_STATE, lambda state: state.limits_hit.append(-3)),
+        (MIRROR_STATE, lambda state: setattr(state, "actuators", b"\0\0\xc0\x7f" * (state.rows * state.columns))),
         (TRUTH, lambda truth: truth.residual_nm.append(1.0)),
         (TIMING, lambda timing: timing.compute_ns.append(1)),
         (TIMING, lambda timing: timing.ClearField("frame_sequence")),
@@ -116,6 +126,7 @@ def test_an_invalid_message_is_left_out_of_every_column(
         extremes = ("highest_nm", "lowest_nm")
         lengths = {len(getattr(columns, column)) for column in columns.__slots__ if column not in extremes}
         assert lengths == {count - (kind is topic)}
+    assert np.isfinite(history.mirror.highest_nm - history.mirror.lowest_nm).all()
     assert {len(stage) for stage in history.stages_ns.values()} == {len(history.timed_sequence)}
     assert len(history.timed_sequence) == STEPS - (topic is TIMING)
     assert len(history.steps.sequence) == STEPS

@@ -1,6 +1,6 @@
 """History of a run as columns: all content of a log except the images, for reports, exports and what-ifs.
 
-Everything known about a frame is one row; read the images from the log.
+The columns of a topic have one row per message; `History.again` reads the images.
 """
 
 import contextlib
@@ -111,11 +111,11 @@ class History:
         requests: operators' requests, with the answers.
         events: (log time in ns, message) of each event.
         health: last Health of each process, by name.
-        commands_late: commands that the camera counted as late from its first Health in the log to its last, over all
-            of its starts; None without two Healths of one start.
+        commands_late: commands that the camera counted as late from its first Health in the log to its last,
+            restarts included; None without two of them.
         counts: number of messages, by topic key.
         published: laws and played tables, by identity.
-        span_ns: log times of the first message that is no state, and of the last; (0, 0) without one.
+        span_ns: log times of the first message that is not retained, and of the last message; (0, 0) without one.
     """
 
     log: LogReader
@@ -159,7 +159,7 @@ class History:
 
     @property
     def under_calibration(self) -> Mask:
-        """Steps (steps,) after the last load of another calibration than the log's last one."""
+        """Whether each step (steps,) came after the last change of calibration in the log."""
         steps, states = self.steps, self.controllers
         own = ("", self.calibration.id if self.calibration is not None else "")
         others = [number for number, state in enumerate(states) if state.calibration_id not in own]
@@ -191,7 +191,7 @@ class History:
 
 
 def read_history(log: LogReader) -> History:
-    """Read a log to its end with a new reader.
+    """Read a log to its end; `log` has not been read yet.
 
     Raises:
         DataFileError: as for `LogReader`, or the log's calibration cannot be read.
@@ -245,7 +245,7 @@ class _Rows:
         self._timings = TimingRows()
         self._mirror = Columns(sequence="Q", publish_time_ns="q", stroke_nm="f", limits="q")
         self._steps, self._truths = StepRows(0), TruthRows(0)
-        self._late = (-1, 0)
+        self._late: tuple[int, int] | None = None
 
     def take(self, message: Sample) -> None:
         """Add one message of the log."""
@@ -258,13 +258,13 @@ class _Rows:
             self._decode(message)
         except (KeyError, DecodeError):
             return  # unreadable for the loop as well
-        except OverflowError:
-            history.excluded_messages += 1  # valid in protobuf, but never sent by the loop
+        except OverflowError:  # valid in protobuf, but never sent by the loop
+            history.excluded_messages += 1
 
     def _decode(self, message: Sample) -> None:
         topic, history = topic_of(message.key), self._history
         first_ns, last_ns = history.span_ns
-        if first_ns or not topic.queryable:  # states requested at the log's start may be hours old
+        if first_ns or not topic.queryable:  # retained messages at the log's start may be hours old
             history.span_ns = (first_ns or message.receive_time_ns, max(last_ns, message.receive_time_ns))
         if topic is FRAME:
             self._frames.add(sequence=message.sequence, publish_ns=message.publish_time_ns)
@@ -278,8 +278,8 @@ class _Rows:
         if isinstance(body, wire.ControlStep):
             if not self._steps.modes and len(body.command_nm):
                 self._set_modes(len(body.command_nm))  # the message of the calibration is lost
-            history.excluded_messages += not self._steps.add(body)
             self._stepped.add(sequence=body.frame_sequence)
+            history.excluded_messages += not self._steps.add(body)
         elif isinstance(body, wire.Truth):
             self._truths.add(body)
         elif isinstance(body, wire.MirrorState):
@@ -305,6 +305,9 @@ class _Rows:
         surface = actuators(state)
         if surface is None:
             return
+        if not np.isfinite(surface).all():
+            self._history.excluded_messages += 1
+            return
         self._mirror.add(
             sequence=state.frame_sequence,
             publish_time_ns=publish_time_ns,
@@ -328,10 +331,11 @@ class _Rows:
             self._steps, self._truths = StepRows(modes), TruthRows(modes)
 
     def _count_late(self, start_s: int, count: int) -> None:
-        """Add the camera's late commands since its previous Health; its count begins at its start."""
-        before_s, before = self._late
-        if start_s == before_s:
-            self._history.commands_late = (self._history.commands_late or 0) + max(0, count - before)
+        """Add the camera's late commands since its previous Health; a restarted camera counts from 0."""
+        if self._late is not None:
+            before_s, before = self._late
+            since = count - before if start_s == before_s else count
+            self._history.commands_late = (self._history.commands_late or 0) + max(0, since)
         self._late = start_s, count
 
     def finish(self) -> None:
