@@ -9,10 +9,16 @@ from lowfc.control.loop.interlocks import Value
 
 
 def bench_message(name: str, value: Value, time_ns: int) -> bytes:
-    """BenchValue of a device's value at this time; ConfigurationError if its name or the value is invalid."""
+    """Encode a device's value, measured at this time, as a BenchValue.
+
+    Raises:
+        ConfigurationError: its name or the value is invalid.
+    """
     if not re.fullmatch(BENCH_NAME, name):
-        raise ConfigurationError(f"a bench value's name has up to 64 of A-Z, a-z, 0-9, _ and -, got {name[:80]!r}")
+        raise ConfigurationError(
+            f"a bench value's name begins with a letter and has up to 64 of A-Z, a-z, 0-9, _ and -, got {name[:80]!r}"
+        )
     try:
-        return encode_bench_value(float(value) if type(value) is int else value, time_ns)
-    except BadMessageError as fault:
+        return encode_bench_value(value, time_ns)
+    except (BadMessageError, OverflowError, UnicodeEncodeError) as fault:
         raise ConfigurationError(f"bench value {name}: {fault}") from None

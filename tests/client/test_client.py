@@ -548,7 +548,9 @@ def test_a_bench_value_arrives_unchanged(controller: FakeController, loop: Clien
         loop.bench("mask", value)
     loop.bench("another", value)
     assert [decode_bench_value(one.payload) for one in received] == [value, value]
-    for name, wrong in (("a b", True), ("mask", float("nan")), ("mask", "x" * 201)):
+    invalid: list[tuple[str, Value]] = [("a b", True), ("1st", True)]
+    invalid += [("mask", wrong) for wrong in (float("nan"), 10**400, "x" * 201, "\ud800")]
+    for name, wrong in invalid:
         with pytest.raises(ConfigurationError, match=name):
             loop.bench(name, wrong)
 
