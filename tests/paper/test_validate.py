@@ -262,10 +262,12 @@ def test_rows_are_formatted_as_text_markdown_and_json():
     rows = [
         Row("sensor", "scatter", "mas", 0.123456, 0.36, 0.004, 0.12, 0.1, 2, "pinv", "Dim."),
         Row("a | b", "condition number", "", float("inf"), assumption="Dim."),
+        Row("sensor", "electrons", "e-", 999.7, error=12.0),
     ]
     table = {"table": "t", "title": "T", "trials": 9, "seed": 8, "plot": "t.png", "rows": [plain(row) for row in rows]}
     text, document = to_text(table), to_markdown([table])
     assert "0.123 ± 0.004" in text
+    assert "1000 ± 10" in text
     assert text.count("Dim.") == 1
     assert "| a / b |  |  | condition number |  | inf |" in document
     assert "![T](pictures/paper/t.png)" in document
