@@ -19,17 +19,18 @@ class Account(Result):
     Attributes:
         frames: number of steps checked; `commands`, `states` and `requests` likewise.
         unchecked_because: number of steps that could not be checked, by reason.
-        inputs_missing: number of controller inputs missing from the log, from the input number of a later state.
+        inputs_missing: number of controller inputs missing from the log, found by the input number of a later state.
         commands_missing: number of commands that the replay sends but the log does not have.
         steps: number of steps in the log.
         different: number of messages that differ by more than the tolerance; `first_difference` is the first of them,
             `largest_difference_nm` the largest difference of a number in nm.
-        other_kernel: kernel of the replay if it is not the log's; otherwise empty.
+        other_kernel: kernel of the replay if it differs from the log's; otherwise empty.
         rules_changed: number of inputs that this version handles differently on purpose, by rule.
         version: lowfc version of the first log; `host_differs` has the versions and processor features that differ.
         log_s: time from the first frame to the last; `speed` is `log_s` over the time of the replay.
-        complete: whether every log has its end and summary; `finished` is whether its recorder ended it, `no_end` the
-            reason if not, `damaged` lists the parts left out.
+        complete: whether every log has its end and summary.
+        finished: whether the recorder ended every log; `no_end` is the reason if not.
+        damaged: parts of the logs that were left out.
         runs: names of the runs in the logs.
         stopped: reasons why a recording ended early.
         recorded_on: versions and host in the first log.
@@ -70,12 +71,12 @@ class Account(Result):
     @computed_field  # type: ignore[prop-decorator]
     @property
     def identical(self) -> bool:
-        """Whether steps and commands were checked by the log's own arithmetic, and nothing differed."""
+        """Whether steps and commands were checked with the log's own kernel, and nothing differed."""
         same = not self.different and not self.other_kernel
         return self.frames > 0 and same and (self.commands > 0 or not self.commands_missing)
 
     def add(self, later: "Account") -> None:
-        """Add the account of the next segment, whose worker has read the logs further."""
+        """Add the account of the next segment; its worker has read further, so its state of the logs is the newer."""
         for name, field in type(self).model_fields.items():
             if field.annotation in (int, Counter[str]) or name == "log_s":
                 setattr(self, name, getattr(self, name) + getattr(later, name))
@@ -106,7 +107,7 @@ class Account(Result):
 
     def head(self) -> Sequence[str]:
         """Verdict, and counts of what was checked."""
-        frames = f"{self.frames} frames"
+        frames = counted(self.frames, "frame")
         if not self.frames:
             verdict = "nothing could be replayed"
         elif self.other_kernel:
