@@ -1,4 +1,4 @@
-"""Chaos cases: gains, calibrations, safe mode and clocks."""
+"""Chaos cases: gains, laws, calibrations, safe mode, interlocks and clocks."""
 
 import contextlib
 import time
@@ -25,10 +25,11 @@ from lowfc.programs.reliability.chaos.bench import CaseFailedError, ChaosBench
 from lowfc.programs.reliability.chaos.case import LOST, WHILE_FRAMES, case, no_mounts, no_other_clock, read_only
 from lowfc.programs.reliability.chaos.processes import killed
 
-JUST_BELOW = 0.9
+STABLE_FRACTION = 0.9
+"""Fraction of the limiting gain: the loop is stable and nearly oscillates."""
 
 
-@case("gain", "the highest accepted gain, then one above, which is refused")
+@case("gain", "a gain above the stability limit, which is refused; then 90 % of the limit")
 def _highest_gain(bench: ChaosBench) -> None:
     client, limiting = bench.client(), limiting_gain(settings(bench.config).delay_frames)
     try:
@@ -37,7 +38,7 @@ def _highest_gain(bench: ChaosBench) -> None:
         pass
     else:
         raise CaseFailedError(f"a gain of {1.01 * limiting:.3g} was accepted, although {limiting:.3g} is unstable")
-    client.gain(JUST_BELOW * limiting)
+    client.gain(STABLE_FRACTION * limiting)
     bench.frames(WHILE_FRAMES)
     client.gain(FIXED_GAINS["control.gain"])
     client.gain(FIXED_GAINS["control.tilt_gain"], modes=[2, 3])
@@ -108,7 +109,7 @@ def _foreign_calibration(bench: ChaosBench) -> None:
 
 @case(
     "damaged-calibration",
-    "the controller refuses a calibration file with NaN at its start, then starts with a good one",
+    "a controller whose calibration file has a NaN ends at its start; then it is started with a good file",
     expected=("STARTED controller",),
     statuses={Role.CONTROLLER: 2},
 )
@@ -139,14 +140,14 @@ def _restart_in_safe_mode(bench: ChaosBench) -> None:
     killed(Role.CONTROLLER)(bench)
 
 
-MASK = {"name": "mask", "value": True, "action": "hold", "max_age_s": 1.0, "when_old": "passes"}
+INTERLOCK = {"name": "mask", "value": True, "action": "hold", "max_age_s": 1.0, "when_old": "passes"}
 FLIPS, FLOOD, FLOOD_HZ = 40, 4000, 2000
 
 
 @case(
     "interlock",
-    "an interlock changes at random and receives 2,000 values a second; then its publisher dies while it acts",
-    config={"interlocks": [MASK]},
+    "an interlock's value changes at random times, then arrives 2,000 times a second; the last one acts until it is old",
+    config={"interlocks": [INTERLOCK]},
     expected=("INTERLOCK_ACTS", "INTERLOCK_CLEARED"),
 )
 def _interlock(bench: ChaosBench) -> None:
@@ -212,7 +213,7 @@ def _other_clock(bench: ChaosBench, seconds: int) -> None:
 
 case(
     "clock-ahead",
-    "a camera whose clock is an hour ahead replaces the camera",
+    "a camera whose clock is an hour ahead replaces the camera for a while",
     expected=("CAMERA_RESTARTED",),
     allowed=LOST,
     lacks=no_other_clock,
