@@ -1,13 +1,15 @@
 """Steps of a dark hole in one process: the loop undoes those that do not shift the sensor's zero point."""
 
 from collections.abc import Iterator
+from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import pytest
 
 from lowfc.contract.configuration import load
+from lowfc.contract.errors import RequestRefusedError
 from lowfc.control.loop.inputs import Step
 from lowfc.programs.paper import dark_hole
 from lowfc.programs.paper.dark_hole import PLAIN, SHIFTED
@@ -52,6 +54,18 @@ class LoggedLoop(InProcessLoop):
                 residual_nm=np.array([truth.residual_nm for truth in truths]),
             ),
         )
+
+
+def test_a_refused_step_ends_the_run_with_its_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(_: str) -> NoReturn:
+        raise RequestRefusedError("an actuator is too far from flat")
+
+    (tmp_path / "silent.py").write_text("import time\nprint('begun', flush=True)\ntime.sleep(20)\n")
+    monkeypatch.setattr(dark_hole, "COMMAND", "silent")
+    monkeypatch.setattr(dark_hole, "running", lambda: (dark_hole.RUN,))
+    monkeypatch.setattr(dark_hole, "Client", refused)
+    with pytest.raises(RuntimeError, match="too far from flat; output of the loop"):
+        dark_hole.dark_hole(tmp_path, 1.0)
 
 
 def test_the_loop_undoes_only_the_steps_that_do_not_shift_its_zero_point(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,20 +15,22 @@ from lowfc.adapters.logs.history import History, read_history
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.arrays import Array, Mask
 from lowfc.client import Client, running
-from lowfc.contract.errors import BusError
+from lowfc.contract.errors import LowfcError
 from lowfc.control.loop.command_channels import FLAT
 
 STEPS = 20
 SEED = 5
-SETTLE, WINDOW = 100, 300
-"""`SETTLE`: frames after each step. `WINDOW`: further frames after the last step, and after the shape is removed."""
+SETTLE = 100
+"""Frames after each step."""
+WINDOW = 300
+"""Further frames after the last step, and frames after the shape is removed."""
 STEPS_COMBINED = 5
-"""Number of steps combined into one on the channel that does not shift the zero point. The loop undoes nearly all of
-its shape, so fewer steps suffice to measure that fraction."""
+"""Number of steps combined into one on the channel that does not shift the zero point: the loop undoes nearly all of
+them, so fewer suffice to measure that fraction."""
 SHIFTED, PLAIN = "dark-hole", FLAT
 """Channels that shift the sensor's zero point, and that do not."""
 GAINS = "[control]\ntilt_gain = 0.5\ngain = 0.05\n"
-"""Gains of the loop, on which the fraction depends."""
+"""Gains of the loop; the fraction depends on them."""
 COMMAND = "lowfc sim-loop --lockstep --rate 1000 --disturbance bench --star-magnitude -2"
 RUN = "dark-hole"
 PATIENCE_S = 60.0
@@ -75,7 +77,8 @@ def dark_hole(
         folder: folder of the log.
         step_rms_nm: rms of each step, nm of surface.
         toml: configuration.
-        base_nm: (rows, columns) nm, constant shape on the channel without a zero-point shift.
+        base_nm: (rows, columns) nm of surface, the configured flat map: the other channel is `flat`, and the steps are
+            added to it.
         seed: seed of the simulation; the configuration's if None.
     """
     (folder / "run.toml").write_text(f"{GAINS}{toml}")
@@ -89,7 +92,7 @@ def dark_hole(
                 time.sleep(0.05)
             with Client(RUN) as loop:
                 marks, channel_modes_nm = apply_steps(loop, step_rms_nm, np.asarray(base_nm))
-        except BusError as error:
+        except LowfcError as error:
             process.send_signal(signal.SIGINT)
             raise RuntimeError(f"{error}; output of the loop: {process.communicate(timeout=PATIENCE_S)}") from error
         process.send_signal(signal.SIGINT)
@@ -101,9 +104,11 @@ def dark_hole(
 
 
 def apply_steps(loop: Client, step_rms_nm: float, base_nm: Array) -> tuple[dict[str, list[int]], Array]:
-    """First frame of each step and of the removal, by channel, and the modes of the channel's shape without `base_nm`.
+    """Apply the steps on a closed loop.
 
-    The modes (1 + steps, modes) are as the sensor sees them: before the first step, then after each.
+    Returns:
+        The first frame of each step and of the removal, by channel; and the modes (1 + steps, modes) of the channel's
+        shape without `base_nm`, as the sensor sees them: before the first step, then after each.
     """
     marks: dict[str, list[int]] = {}
 
@@ -135,16 +140,16 @@ def channel_results(history: History, marks: dict[str, list[int]], channel_modes
     sequences, command = history.steps.sequence, history.steps.command_nm
     known = np.isfinite(truths.disturbance_nm[:, 0])
 
-    def until(end: int, frames: int) -> Mask:
+    def before(end: int, frames: int) -> Mask:
         return np.asarray(known & (sequences < end) & (sequences >= end - frames))
 
     found = {}
     for name, changed_at in marks.items():
-        ends = [until(end, 3 * SETTLE // 4) for end in changed_at]
+        ends = [before(end, 3 * SETTLE // 4) for end in changed_at]
         reaction_nm = command + truths.disturbance_nm
         reaction = np.array([reaction_nm[end].mean(axis=0, dtype=np.float64) for end in ends])
         residual_nm = [
-            np.sqrt(truths.residual_nm[until(end, WINDOW)].var(axis=0, dtype=np.float64).sum())
+            np.sqrt(truths.residual_nm[before(end, WINDOW)].var(axis=0, dtype=np.float64).sum())
             for end in (changed_at[0], changed_at[-1])
         ]
         found[name] = ChannelResult(
