@@ -30,21 +30,21 @@ from lowfc.programs.view.panels.wavefront import Wavefront
 from lowfc.programs.view.snapshot import PICTURES_HZ, PICTURES_PER_COMPLETE, Accumulator, Snapshot
 
 RETRY_NS = 5_000_000_000
-"""Time after which a panel that failed is created again."""
+"""Time from a panel's failure until it is created again."""
 
 
 class Renderer:
     """All panels of a view.
 
-    An unforeseen message disables only the panel that fails on it, and only for a while: the panel is left out, with a
-    line in the view's log, and created again after `RETRY_NS`.
+    A panel that fails to draw a snapshot is left out, with a line in the view's log, and created again after
+    `RETRY_NS`; the other panels continue.
     """
 
     def __init__(self, config: Configuration, stream: rr.RecordingStream) -> None:
         self._stream = stream
         self._remarks: list[str] = []
         nm_per_mas = tilt_nm_per_mas(config.star.diameter_m)
-        made: list[Callable[[], Panel]] = [
+        self._makers: list[Callable[[], Panel]] = [
             partial(Tiles, nm_per_mas),
             Sensor,
             Mirror,
@@ -56,12 +56,11 @@ class Renderer:
             Spectra,
         ]
         try:
-            made.append(partial(Science, coronagraph_from(config.sensor), config.star.wavelength_nm))
+            self._makers.append(partial(Science, coronagraph_from(config.sensor), config.star.wavelength_nm))
         except LowfcError as error:
             self._remarks.append(f"no science camera: {error}")
-        self._makers = made
-        self._panels = [self._started(make) for make in made]
-        self._again_ns = [0] * len(made)
+        self._panels: list[Panel | None] = [self._started(make) for make in self._makers]
+        self._retry_ns = [0] * len(self._makers)
 
     @property
     def panels(self) -> list[Panel]:
@@ -71,29 +70,32 @@ class Renderer:
     def draw(self, snapshot: Snapshot) -> None:
         """Draw a snapshot."""
         for number, panel in enumerate(self._panels):
-            if panel is None and snapshot.time_ns >= self._again_ns[number]:
+            if panel is None and snapshot.time_ns >= self._retry_ns[number]:
                 panel = self._panels[number] = self._started(self._makers[number])
             if panel is not None and (snapshot.complete or panel.pictures):
                 try:
                     panel.draw(self._stream, snapshot)
                 except Exception as fault:
                     self._remarks.append(f"{type(panel).__name__} is left out of the view for a while: {fault!r}")
-                    self._panels[number], self._again_ns[number] = None, snapshot.time_ns + RETRY_NS
+                    self._panels[number], self._retry_ns[number] = None, snapshot.time_ns + RETRY_NS
         for remark in self._remarks:
             at(self._stream, snapshot.time_ns)
             self._stream.log(f"{LOG}/view", rr.TextLog(remark, level=rr.TextLogLevel.ERROR))
         self._remarks.clear()
 
-    def _started(self, make: Callable[[], Panel]) -> Panel | None:
+    def _started(self, make: Callable[[], Panel]) -> Panel:
         panel = make()
         panel.begin(self._stream)
         return panel
 
 
 class RenderThread(threading.Thread):
-    """Draws new messages, thirty times a second, until it is abandoned or ends with a `fault`.
+    """Draws new messages, thirty times a second, until it is abandoned or fails.
 
-    `drawn_s`: end of the last drawing, by time.monotonic().
+    Attributes:
+        drawn_s: end of the last drawing, by time.monotonic().
+        snapshots: number of snapshots drawn.
+        fault: why it failed; None while it has not.
     """
 
     def __init__(
