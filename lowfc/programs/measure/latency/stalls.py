@@ -15,18 +15,18 @@ from lowfc.programs.cli.result import Result, result_field
 from lowfc.programs.measure.latency.frame_statistics import WARM_UP_S, Frames, percentiles
 
 Cause = Literal["host", "loop", "unknown"]
-"""Cause of a stall: the loop if one of its processes waited for a processor or pages, and no bare loop did."""
+"""Cause of a stall: the loop if one of its processes waited for a processor or pages, and the host is not the cause."""
 
-_SHORTEST = 0.25
-"""Fraction of a period: shorter waits do not explain a stall."""
+_MIN_PERIODS = 0.25
+"""Shortest delay that explains a stall, in frame periods."""
 _FAULT_US = 1.0
 """Approximate time to map a page."""
 _SPANS = {"frame_to_receive": "frame to receive", "wakeup": "waking", "compute": "computing", "publish": "publishing"}
-_SHOWN = 20
+_MAX_SHOWN = 20
 
 
 class Trace(NamedTuple):
-    """Records of the bare loop beside one process, (wakings,); the counts are those of `host.Counts`."""
+    """Columns (wakings,) of the bare loop beside one process; counts as in `lowfc.adapters.process.host.Counts`."""
 
     due_ns: Long
     woke_ns: Long
@@ -39,9 +39,9 @@ class Trace(NamedTuple):
 
 
 class Counted(Result):
-    """Changes of the counts from the last waking of a bare loop before a stall to the first after it, inclusive.
+    """Changes of the counts from the last waking of a bare loop before a stall to the first after it.
 
-    `bare_late_us` is its largest wake-up latency; the others are those of `host.Counts`, of the process beside it.
+    `bare_late_us` is the bare loop's largest wake-up latency in this time, both wakings included.
     """
 
     bare_late_us: float
@@ -54,7 +54,7 @@ class Counted(Result):
 
 
 class Stall(Result):
-    """One frame that stalled; `counted` by process."""
+    """One frame that stalled; `counted` has the changes of the counts of each process."""
 
     second: float = result_field("at, s", form=".3f")
     frame_to_command_us: float | None = result_field("frame to command, us", form=".0f")
@@ -90,14 +90,14 @@ class Stalls(Result):
 
     def text(self) -> str:
         """Counts, the bare loops, and the first stalls."""
-        more = len(self.stalls) - _SHOWN
-        shown = super(Stalls, self.model_copy(update={"stalls": self.stalls[:_SHOWN]})).text()
+        more = len(self.stalls) - _MAX_SHOWN
+        shown = super(Stalls, self.model_copy(update={"stalls": self.stalls[:_MAX_SHOWN]})).text()
         return shown + (f"\nand {more} more" if more > 0 else "")
 
 
 def signs_of(counted: Counted, period_us: float) -> tuple[list[str], list[str]]:
-    """Text of the evidence against the host and against the loop; delays too short for a stall are ignored."""
-    long_us = _SHORTEST * period_us
+    """Evidence against the host, and against the loop; delays too short for a stall are ignored."""
+    long_us = _MIN_PERIODS * period_us
     host = {
         f"bare loop {counted.bare_late_us:.0f} us late": counted.bare_late_us >= long_us,
         f"{counted.stolen_ms:.0f} ms stolen": counted.stolen_ms > 0,
@@ -112,7 +112,7 @@ def signs_of(counted: Counted, period_us: float) -> tuple[list[str], list[str]]:
 
 
 def stalls_of(frames: Frames, period_ns: int, traces: Mapping[str, Trace]) -> Stalls:
-    """The stalls among these frames, the warm-up left out; `traces` by the process beside which each was taken."""
+    """The stalls among these frames, the warm-up left out; `traces` by the process of each bare loop."""
     command_us = frames.spans_us["frame_to_command"]
     counted = frames.put_ns - frames.put_ns[:1] >= round(WARM_UP_S * 1e9)
     slow = counted & (~frames.commanded | (command_us * 1e3 > period_ns))
