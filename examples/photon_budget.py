@@ -1,4 +1,4 @@
-"""Flux, and noise of one frame in tilt and in the other modes, against V magnitude.
+"""Electrons of one frame, and its noise in tilt and in the other modes, against V magnitude.
 
 Example: python examples/photon_budget.py 2 5
 """
@@ -22,9 +22,9 @@ def budget(magnitudes: Sequence[float]) -> Iterator[str]:
     yield f"{config.sensor.kind}, {config.camera.rate_hz:g} frames per second: noise of one frame"
     yield "    V   electrons   tilt, mas rms per axis   other modes, nm rms"
     for magnitude in magnitudes:
-        at = config.model_copy(update={"star": config.star.model_copy(update={"magnitude": magnitude})})
-        calibration = factory.analytic_calibration(at, optics, on_nodes)
-        noise_nm = factory.frame_noise_nm(at, calibration)
+        with_star = config.model_copy(update={"star": config.star.model_copy(update={"magnitude": magnitude})})
+        calibration = factory.analytic_calibration(with_star, optics, on_nodes)
+        noise_nm = factory.frame_noise_nm(with_star, calibration)
         tilt_mas, others_nm = (np.sqrt(np.mean(part**2)) for part in (noise_nm[:2] / nm_per_mas, noise_nm[2:]))
         light_e = calibration.flux_dn * config.camera.gain_e_per_dn
         yield f"{magnitude:5.1f}   {light_e:9.0f}   {tilt_mas:22.2f}   {others_nm:19.2f}"

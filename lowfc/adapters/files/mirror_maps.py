@@ -11,7 +11,7 @@ from lowfc.contract.errors import ConfigurationError, DataFileError
 
 
 def read_shape(path: Path) -> Single:
-    """Read the shape of a mirror (rows, columns), nm of surface: first image of a FITS file, or array of a .npy file.
+    """Read the shape of a mirror (rows, columns), nm of surface: the first image of a FITS file, or a .npy file.
 
     Raises:
         DataFileError: the file is missing, damaged or holds something else.
@@ -52,7 +52,7 @@ def flat_nm(config: Configuration) -> Single | None:
 
 
 def shape_of(config: Configuration, key: str, file: str) -> Single:
-    """Read a shape (rows, columns) of the configured mirror, nm of surface; `key` is the file's key, for errors.
+    """Read one value per actuator (rows, columns), such as a shape in nm of surface; `key` names the file in errors.
 
     Raises:
         ConfigurationError: the file is missing, damaged or does not fit the mirror.

@@ -31,7 +31,7 @@ class Limits:
 
 
 STANDARD = Limits()
-_STEADY_S = 10.0  # after the start of a recording its growth is that of the loop
+_STEADY_S = 10.0  # before, the metadata and attachments at the start of the log would falsify its growth
 
 
 class LogSeries:
@@ -40,7 +40,7 @@ class LogSeries:
     A full file is finished on a separate thread, as the disk may need seconds to store it.
 
     Attributes:
-        files: paths of the files so far, with their present names.
+        files: paths of the files so far: final names, or names with ".part" of those that could not be finished.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class LogSeries:
         """Begin a file of a new or of the present recording with the messages `first`, on which later ones depend.
 
         Raises:
-            DataFileError: the file cannot be created.
+            DataFileError: the file cannot be created, or the disk refuses; see `give_up`.
         """
         now_ns = self._clock.host_ns()
         path = log_path(self._folder, now_ns)
@@ -128,10 +128,10 @@ class LogSeries:
         return True
 
     def flush(self) -> None:
-        """Flush the file, and raise the fault of finishing the previous one.
+        """Flush the file.
 
         Raises:
-            DataFileError: the disk refuses; see `give_up`.
+            DataFileError: the disk refuses, also if the previous file could not be finished; see `give_up`.
         """
         if self._log is not None:
             self._log.flush()
@@ -142,12 +142,12 @@ class LogSeries:
         """Sentence if the disk is too full to continue; empty otherwise.
 
         Raises:
-            DataFileError: the folder does not exist.
+            DataFileError: the folder cannot be accessed.
         """
         return shortage(self._folder, self._limits.min_free_bytes)
 
     def end(self, totals: Mapping[str, str], *, wait: bool = True) -> None:
-        """Finish the open file with its "recording" metadata; without `wait`, in parallel with the next one.
+        """Finish the open file, with `totals` as its "recording" metadata; without `wait`, on the separate thread.
 
         Raises:
             DataFileError: the disk refuses; see `give_up`.
@@ -161,7 +161,7 @@ class LogSeries:
             self._await_finished()
 
     def remove(self) -> None:
-        """Remove the finished files, which are empty.
+        """Remove the files, all finished; the caller knows that they hold no messages of other processes.
 
         Raises:
             DataFileError: the disk refuses.

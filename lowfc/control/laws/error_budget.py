@@ -17,7 +17,7 @@ from lowfc.control.laws.margins import noise_gain, noise_transfer, rejection
 from lowfc.control.laws.spectra import Spectrum, TimeSeries, floor_nm2_hz, spectrum
 
 ROWS_PER_REGRESSOR = 10
-"""Frames for each regressor below which a fit mostly explains noise."""
+"""Least number of frames per regressor; with fewer a fit mostly explains noise."""
 CERTAIN = 2.0
 """Standard errors above which a difference of two variances counts as detected."""
 
@@ -49,7 +49,7 @@ class SensorNoise:
 
     @property
     def total_nm(self) -> Array:
-        """Both (modes,)."""
+        """Standard deviation (modes,) from both."""
         return np.hypot(self.photon_nm, self.read_nm)
 
 
@@ -61,9 +61,9 @@ def sensor_noise(
     Args:
         matrix: (modes, pixels) R, nm per flux fraction.
         reference: (pixels,) I0, flux fractions.
-        flux_e: Electrons on the good pixels, before multiplication.
-        read_noise_e: Noise of a pixel other than photon noise, as electrons before multiplication.
-        excess: Factor by which a multiplication register raises the photon variance: 2, or 1 without one.
+        flux_e: electrons on the good pixels, before multiplication.
+        read_noise_e: noise of a pixel other than photon noise, as electrons before multiplication.
+        excess: factor by which a multiplication register raises the photon variance: 2, or 1 without one.
     """
     photon = noise_nm(matrix, reference, flux_e, 0.0)
     both = noise_nm(matrix, reference, flux_e, read_noise_e)
@@ -71,20 +71,20 @@ def sensor_noise(
 
 
 def white_noise(law: LinearLaw, noise_nm: Array) -> Term:
-    """Residual from the white noise of a frame (modes,)."""
+    """Residual from noise of the modes (modes,) that is independent from frame to frame."""
     return Term(noise_nm**2 * noise_gain(law))
 
 
 def lag(law: LinearLaw, disturbance: Spectrum, mean_nm: Array, timing: Timing) -> Term:
-    """Residual of a disturbance known at the start of each exposure, by spectrum and mean (modes,).
+    """Residual of a disturbance, by the spectrum and the mean (modes,) of its values at the start of each exposure.
 
-    With a `timing` that counts whole periods it is the residual over all time.
+    It is a mean over the periods, or over the starts of exposures if `timing.held` is 0.
     """
     return Term(disturbance.variance_nm2(_passed(law, disturbance, timing)) + _steady_nm2(law, mean_nm))
 
 
 def lag_under_noise(law: LinearLaw, measured: Spectrum, mean_nm: Array, timing: Timing) -> Term:
-    """The same (modes,) for a disturbance measured with noise: the floor of its spectrum is subtracted."""
+    """The same for a disturbance measured in the exposures: white noise, the floor of its spectrum, is subtracted."""
     exposed = np.abs(mean_over(_omega(law, measured), timing.exposure)) ** 2
     passed = _passed(law, measured, timing) / exposed[:, None]
     floor = floor_nm2_hz(measured)
@@ -97,7 +97,7 @@ def _omega(law: LinearLaw, found: Spectrum) -> Array:
 
 
 def _passed(law: LinearLaw, found: Spectrum, timing: Timing) -> Array:
-    """Residual spectrum (frequencies, modes)."""
+    """Residual power (frequencies, modes) of a disturbance of power 1 at each frequency of a spectrum."""
     return residual_power(law, _omega(law, found), timing)
 
 
@@ -120,15 +120,15 @@ def measurement_error(
 
     The part of m that follows linearly from a constant, the true residual and the command is cross-talk: a response
     other than the calibration's, or light from outside the modes (a static screen, mirror print-through). The rest,
-    less the noise (modes,) expected in a frame, is nonlinearity. m's noise is later than residual and command, so it
-    does not bias the fit; the noise that the fit explains by chance is subtracted.
+    less the noise (modes,) expected in a frame, is nonlinearity. A frame's noise is independent of the residual and the
+    command in it, so it does not bias the fit; the noise that the fit explains by chance is subtracted.
 
     Args:
-        law: Of the loop; its delay is the true one.
-        error: Measured modes of each frame.
-        residual: True modes of the same frames.
-        seen: Modal command that each of them saw.
-        noise_nm: Standard deviation of one frame's modes.
+        law: law of the loop, with the true delay.
+        error: modal error of each frame.
+        residual: true residual of the same frames.
+        seen: modal command seen in each of them.
+        noise_nm: standard deviation of one frame's modes.
 
     Returns:
         None if there are too few frames for the fit or a spectrum.
