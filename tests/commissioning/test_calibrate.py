@@ -94,7 +94,7 @@ def calibrated(loop: InProcessLoop, method: str, cycles: int) -> tuple[Calibrati
     ],
 )
 def test_a_measured_calibration_reads_the_true_modes(method: str, delay: float, modes: int, lost: bool) -> None:
-    """Lost frames do not affect the others."""
+    """Lost frames do not bias the calibration."""
     config = configured(camera__delay_frames=delay, sensor__modes=modes)
     loop = InProcessLoop(config, lose=lambda index: lost and index > 300 and index % 41 == 0)
     if method == "in-loop":

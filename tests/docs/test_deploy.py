@@ -82,10 +82,10 @@ def program(words: list[str]) -> str:
         return str(name)
 
 
-@pytest.fixture(scope="module")
-def units(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture
+def units(tmp_path: Path) -> Path:
     """The units with the paths of the programs installed here."""
-    folder = tmp_path_factory.mktemp("units") / "systemd"
+    folder = tmp_path / "units" / "systemd"
     shutil.copytree(DEPLOY / "systemd", folder)
     for path in folder.glob("*.service"):
         path.write_text(path.read_text().replace(INSTALLED, f"{Path(sys.executable).parent}/"))
@@ -107,11 +107,9 @@ def test_systemd_accepts_the_units(units: Path) -> None:
     names = [*UNITS, "lowfc.target"]
     done = analyze(units, *verify, *names)
     assert (done.returncode, done.stdout + done.stderr) == (0, "")
-    wrong = units / COMMON
-    original = wrong.read_text()
-    wrong.write_text(original.replace("ProtectSystem=", "ProtectSystme="))  # the check fails on a typing error
-    assert "ProtectSystme" in analyze(units, *verify, *names).stderr
-    wrong.write_text(original)
+    common = units / COMMON
+    common.write_text(common.read_text().replace("ProtectSystem=", "ProtectSystme="))
+    assert "ProtectSystme" in analyze(units, *verify, *names).stderr, "the check misses a typing error"
 
 
 @needs_systemd
@@ -212,9 +210,8 @@ def test_the_shipped_configuration_file_has_the_defaults() -> None:
 
 def test_the_containers_run_the_commands_of_the_units() -> None:
     services = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]
-    units = {"controller": "controller", "recorder": "recorder", "viewer": "viewer"}
     for name, service in services.items():
-        unit = f"lowfc-{units.get(name, f'sim-{name}')}.service"
+        unit = f"lowfc-{f'sim-{name}' if name in ('camera', 'mirror') else name}.service"
         assert service["command"] == command(unit)
         assert program(service["command"])
         assert service["cap_drop"] == ["ALL"]
@@ -278,7 +275,7 @@ def advance_or_hang(*arguments):
 process.advance = advance_or_hang
 main()
 """
-"""A controller whose control law does not return while a file exists."""
+"""A controller whose step does not return while a file exists."""
 
 
 class Supervised:
@@ -317,7 +314,7 @@ def test_processes_notify_ready_watchdog_and_stopping(tmp_path: Path) -> None:
         until(lambda: re.fullmatch(r"running, open, \d+ Hz", controller.manager.status()))
 
         def quiet() -> bool:
-            """Whether the controller sends no WATCHDOG=1 while the mirror sends five: for longer than its period."""
+            """Whether the controller sends no WATCHDOG=1 while the mirror, with the same period, sends five."""
             time.sleep(0.05)  # receive what was sent before
             before, others = controller.manager.beats, mirror.manager.beats
             until(lambda: mirror.manager.beats >= others + 5)
@@ -350,8 +347,8 @@ def test_processes_notify_ready_watchdog_and_stopping(tmp_path: Path) -> None:
 def test_a_watchdog_of_another_process_and_a_missing_manager_are_ignored(tmp_path: Path) -> None:
     variables = {"NOTIFY_SOCKET": str(tmp_path / "nobody"), "WATCHDOG_USEC": "1000000"}
     assert Supervisor(variables | {"WATCHDOG_PID": str(os.getpid())}).period_ns == 500_000_000
-    no_wait = variables | {"WATCHDOG_USEC": "0"}
-    for environment in ({"WATCHDOG_USEC": "1000000"}, variables | {"WATCHDOG_PID": str(os.getppid())}, no_wait):
+    no_timeout = variables | {"WATCHDOG_USEC": "0"}
+    for environment in ({"WATCHDOG_USEC": "1000000"}, variables | {"WATCHDOG_PID": str(os.getppid())}, no_timeout):
         unsupervised = Supervisor(environment)
         assert unsupervised.period_ns is None
         unsupervised.ready()

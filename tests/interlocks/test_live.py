@@ -43,7 +43,7 @@ OPTIONS = ("--config", "night.toml", "--run", "flipped", "--duration", "600")
 
 @pytest.mark.exclusive
 def test_interlocks_with_changing_flooding_and_missing_values(tmp_path: Path) -> None:
-    """The first frame after a value obeys it; a flood loses no frame; old values count as missing."""
+    """Values act within a period, a flood of values loses no frame, and an old value acts as a missing one."""
     (tmp_path / "night.toml").write_text(CONFIG)
     process = start(tmp_path, "sim-loop", "--json", *OPTIONS)
     try:
@@ -108,7 +108,7 @@ def _closed(loop: Client) -> bool:
 
 
 def _steps_follow_the_inputs(log: Path) -> None:
-    """Every step agrees with the interlock inputs before it; a missing value acts from its maximum age on."""
+    """Every step agrees with the interlock inputs before it; a value acts as missing from its maximum age on."""
     types = {STEP.key: wire.ControlStep, CONTROL_INPUT.key: wire.ControlInput}
     inputs = [types[one.key].FromString(one.payload) for one in LogReader(log, topics=[STEP, CONTROL_INPUT])]
     changes = held = opened = age_ns = 0
