@@ -17,7 +17,7 @@ from lowfc.adapters.bus.bus import Publisher, Query, Sample
 from lowfc.adapters.bus.names import MAX_NAMES
 from lowfc.adapters.logs import writer
 from lowfc.adapters.logs.reader import LogReader
-from lowfc.adapters.logs.series import Limits
+from lowfc.adapters.logs.series import LogLimits
 from lowfc.adapters.logs.writer import UNFINISHED, Attachment
 from lowfc.contract.envelope import count_of, sequence_of
 from lowfc.contract.messages import CALIBRATION, COMMAND, EVENT, FRAME, HEALTH, RECORD_KEY, STEP, Topic, wire
@@ -122,7 +122,7 @@ def test_a_disk_error_ends_the_recording_but_not_the_process(
 
 def test_a_nearly_full_disk_leaves_a_complete_log(bench: Bench, small_disk: Path) -> None:
     bench.folder = small_disk / "logs"
-    bench.start(limits=Limits(min_free_bytes=1_500_000))
+    bench.start(limits=LogLimits(min_free_bytes=1_500_000))
     frames = bench.camera.publisher(FRAME)
     put_until(frames, lambda: event_published(bench, "RECORDING_FAILED"))
     assert bench.thread.is_alive()
@@ -288,7 +288,8 @@ def test_each_log_of_a_run_can_be_read_alone(bench: Bench) -> None:
     lost = ("recorder", CALIBRATION.key, 1)
     bench.hub.lose = lambda role, key, envelope: (role, key, count_of(envelope.sequence)) == lost
     bench.start(
-        limits=Limits(longest_s=0.2, min_free_bytes=0), attachments=[Attachment("a.toml", "application/toml", b"[a]")]
+        limits=LogLimits(longest_s=0.2, min_free_bytes=0),
+        attachments=[Attachment("a.toml", "application/toml", b"[a]")],
     )
     peers = bench.recorder._peers
     until(lambda: len(peers._states) == 3 and not peers._new_processes and peers._answers is None)

@@ -8,7 +8,7 @@ import pytest
 
 from lowfc.adapters.files.whole_file import write_whole
 from lowfc.adapters.logs.recovery import recover
-from lowfc.adapters.logs.series import Limits, LogSeries
+from lowfc.adapters.logs.series import LogLimits, LogSeries
 from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.configuration import load
 from lowfc.contract.errors import ConfigurationError
@@ -29,7 +29,7 @@ def mode_of(path: Path) -> int:
 
 @pytest.mark.parametrize("mode", [None, 0o600, 0o664])
 def test_every_log_of_a_series_has_the_configured_mode(tmp_path: Path, umask: int, mode: int | None) -> None:
-    limits = Limits() if mode is None else Limits(file_mode=mode)
+    limits = LogLimits() if mode is None else LogLimits(file_mode=mode)
     series = LogSeries(tmp_path / "logs", HostClock(), {}, [], limits)
     for _ in range(2):
         series.begin([])

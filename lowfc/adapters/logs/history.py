@@ -1,6 +1,6 @@
 """History of a run as columns: all content of a log except the images, for reports, exports and what-ifs.
 
-The columns of a topic have one row per message; `History.again` reads the images.
+The columns of a topic have one row per message; `History.reader` reads the images.
 """
 
 import contextlib
@@ -183,8 +183,8 @@ class History:
         instants = np.where(rows < 0, 0, known.instants[rows])
         return Truths(self.steps.sequence, self.steps.time_ns, **values, instants=instants)
 
-    def again(self, topic: Topic) -> WholeLog:
-        """Reader of the same log for the messages of one topic that the history does not hold."""
+    def reader(self, topic: Topic) -> WholeLog:
+        """New reader of the log for one topic, such as the images, which the history does not hold."""
         log = WholeLog(self.log.paths, topics=(topic,), skip_damaged=True)
         log.progress = self.log.progress
         return log
@@ -196,10 +196,10 @@ def read_history(log: LogReader) -> History:
     Raises:
         DataFileError: as for `LogReader`, or the log's calibration cannot be read.
     """
-    rows = _Rows(history := History(log))
+    builder = _HistoryBuilder(history := History(log))
     for message in log:
-        rows.take(message)
-    rows.finish()
+        builder.add(message)
+    builder.finish()
     history.configuration, remarks = attached_configuration(log)
     history.remarks += remarks
     return history
@@ -233,8 +233,8 @@ def attached_calibration(log: LogReader, calibration_id: str) -> Calibration | N
     return None
 
 
-class _Rows:
-    """Growing columns of a history; content that is not a column is stored in the history directly."""
+class _HistoryBuilder:
+    """Fills a history message by message: columns grow here, all other content is stored in the history directly."""
 
     def __init__(self, history: History) -> None:
         self._history = history
@@ -247,7 +247,7 @@ class _Rows:
         self._steps, self._truths = StepRows(0), TruthRows(0)
         self._late: tuple[int, int] | None = None
 
-    def take(self, message: Sample) -> None:
+    def add(self, message: Sample) -> None:
         """Add one message of the log."""
         history = self._history
         if max(message.receive_time_ns, message.publish_time_ns) > LAST_NS:

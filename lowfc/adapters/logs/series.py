@@ -14,7 +14,7 @@ from lowfc.contract.errors import DataFileError
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class LogLimits:
     """Limits of a log file, and free space to leave on the disk.
 
     Attributes:
@@ -30,7 +30,7 @@ class Limits:
     file_mode: int = FILE_MODE
 
 
-STANDARD = Limits()
+STANDARD = LogLimits()
 _STEADY_S = 10.0  # before, the metadata and attachments at the start of the log would falsify its growth
 
 
@@ -49,7 +49,7 @@ class LogSeries:
         clock: Clock,
         metadata: Mapping[str, Mapping[str, str]],
         attachments: Sequence[Attachment],
-        limits: Limits,
+        limits: LogLimits,
     ) -> None:
         self.files: list[Path] = []
         self._folder = folder
@@ -225,7 +225,7 @@ def shortage(folder: Path, min_free_bytes: int) -> str:
         return ""
     return (
         f"the disk of {folder} has {free_bytes / 1e6:.0f} MB free, and recorder.min_free_mb is "
-        f"{min_free_bytes / 1e6:.0f}; free some space, record elsewhere (recorder.folder) or lower it"
+        f"{min_free_bytes / 1e6:.0f}; free some space, record elsewhere (recorder.folder) or lower recorder.min_free_mb"
     )
 
 

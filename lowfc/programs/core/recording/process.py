@@ -6,7 +6,7 @@ from pathlib import Path
 
 from lowfc.adapters.bus.run import Run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
-from lowfc.adapters.logs.series import Limits, shortage
+from lowfc.adapters.logs.series import LogLimits, shortage
 from lowfc.adapters.logs.writer import Attachment
 from lowfc.adapters.process.join import clock_of
 from lowfc.adapters.process.provenance import provenance
@@ -71,10 +71,10 @@ def record(run: Run, config: Configuration, calibration: Path | None) -> Summary
         bus.close()
 
 
-def log_limits(config: Configuration) -> Limits:
+def log_limits(config: Configuration) -> LogLimits:
     """Size and duration of a log, free disk space to leave, and file mode."""
     log = config.recorder
-    return Limits(round(log.largest_mb * 1e6), log.longest_s, round(log.min_free_mb * 1e6), int(log.file_mode, 8))
+    return LogLimits(round(log.largest_mb * 1e6), log.longest_s, round(log.min_free_mb * 1e6), int(log.file_mode, 8))
 
 
 def _launched(run: Run) -> AbstractSet[str]:

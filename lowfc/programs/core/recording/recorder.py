@@ -18,7 +18,7 @@ from lowfc.adapters.bus.bus import ALL, UNREADABLE, Bus, Query, Sample
 from lowfc.adapters.bus.names import MAX_HEALTH_LOGS
 from lowfc.adapters.logs.loss_account import LossAccount
 from lowfc.adapters.logs.selection import EVERYTHING, Selection
-from lowfc.adapters.logs.series import STANDARD, Limits, LogSeries
+from lowfc.adapters.logs.series import STANDARD, LogLimits, LogSeries
 from lowfc.adapters.logs.writer import Attachment
 from lowfc.adapters.process.clock import Clock
 from lowfc.adapters.process.realtime import NOTHING, Granted
@@ -56,7 +56,7 @@ class Recorder:
         *,
         metadata: Mapping[str, Mapping[str, str]],
         attachments: Sequence[Attachment] = (),
-        limits: Limits = STANDARD,
+        limits: LogLimits = STANDARD,
         granted: Granted = NOTHING,
         selection: Selection = EVERYTHING,
         expected_bytes_per_s: Callable[[wire.CameraState | None], float] = lambda camera: 0.0,

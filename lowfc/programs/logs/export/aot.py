@@ -220,7 +220,7 @@ def _copy_commands(path: Path, image: fits.ImageHDU, history: History, calibrati
     row_of = {int(one): row for row, one in reversed(list(enumerate(sequence)))}
     rows = fits_cube(path, image, shape)
     rows[:] = np.nan
-    for message in history.again(COMMAND):
+    for message in history.reader(COMMAND):
         try:
             command = wire.MirrorCommand.FromString(message.payload)
         except DecodeError:

@@ -84,7 +84,7 @@ def _copy_frames(
     sequence, time_ns = np.zeros(count, np.uint64), np.zeros(count, np.int64)
     shape: tuple[int, ...] | None = None
     row = -1
-    for row, message in enumerate(itertools.islice(history.again(FRAME), count)):
+    for row, message in enumerate(itertools.islice(history.reader(FRAME), count)):
         number = count_of(message.sequence)
         try:
             frame = decode_frame(message.payload, message.sequence, 0)

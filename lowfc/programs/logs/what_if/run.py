@@ -157,7 +157,7 @@ class LoggedRun:
         error_nm = np.full_like(steps.error_nm, np.nan)
         estimator = Estimator.of(calibration)
         rows = {sequence: row for row, sequence in enumerate(steps.sequence.tolist()) if self.used[row]}
-        for message in self.history.again(FRAME):
+        for message in self.history.reader(FRAME):
             row = rows.get(message.sequence)
             pixels = decode_frame(message.payload, message.sequence, 0).pixels if row is not None else None
             if pixels is not None and pixels.shape == calibration.shape:

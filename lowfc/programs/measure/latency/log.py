@@ -34,7 +34,7 @@ def log_statistics(files: LogFiles, progress: Callable[[int, int], None]) -> tup
     host |= {"granted": list(controller.realtime_granted), "refused": list(controller.realtime_refused)}
     if any(health.router_round_trip_ns for health in history.health.values()):
         round_trips_ns: dict[str, int] = defaultdict(int)
-        for message in history.again(HEALTH):
+        for message in history.reader(HEALTH):
             if (name := name_in(HEALTH, message.key)).partition("-")[0] in _LOOP:
                 trip_ns = wire.Health.FromString(message.payload).router_round_trip_ns
                 round_trips_ns[name] = max(round_trips_ns[name], trip_ns)
