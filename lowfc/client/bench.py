@@ -2,6 +2,8 @@
 
 import re
 
+import numpy as np
+
 from lowfc.contract.codecs.bench_codec import encode_bench_value
 from lowfc.contract.errors import BadMessageError, ConfigurationError
 from lowfc.contract.sections import BENCH_NAME
@@ -19,6 +21,6 @@ def bench_message(name: str, value: Value, time_ns: int) -> bytes:
             f"a bench value's name begins with a letter and has up to 64 of A-Z, a-z, 0-9, _ and -, got {name[:80]!r}"
         )
     try:
-        return encode_bench_value(value, time_ns)
+        return encode_bench_value(value.item() if isinstance(value, np.generic) else value, time_ns)
     except (BadMessageError, OverflowError, UnicodeEncodeError) as fault:
         raise ConfigurationError(f"bench value {name}: {fault}") from None

@@ -540,14 +540,16 @@ def test_held_holds_the_loop_and_releases_it(controller: FakeController, loop: C
     assert hold.lease_id == release.lease_id != permission.lease_id
 
 
-@pytest.mark.parametrize("value", [True, 3, 2.5, "parked"])
+@pytest.mark.parametrize("value", [True, 3, 2.5, "parked", np.True_])
 def test_a_bench_value_arrives_unchanged(controller: FakeController, loop: Client, value: Value) -> None:
     received: list[Sample] = []
     controller.bus.subscribe(BENCH, received.append, "mask")
     for _ in range(2):
         loop.bench("mask", value)
     loop.bench("another", value)
-    assert [decode_bench_value(one.payload) for one in received] == [value, value]
+    decoded = [decode_bench_value(one.payload) for one in received]
+    assert decoded == [value, value]
+    assert isinstance(decoded[0], bool) is (value in (True, np.True_))
     invalid: list[tuple[str, Value]] = [("a b", True), ("1st", True)]
     invalid += [("mask", wrong) for wrong in (float("nan"), 10**400, "x" * 201, "\ud800")]
     for name, wrong in invalid:

@@ -84,7 +84,10 @@ def lag(law: LinearLaw, disturbance: Spectrum, mean_nm: Array, timing: Timing) -
 
 
 def lag_under_noise(law: LinearLaw, measured: Spectrum, mean_nm: Array, timing: Timing) -> Term:
-    """The same for a disturbance measured in the exposures: white noise, the floor of its spectrum, is subtracted."""
+    """The same for a disturbance (mean (modes,)) measured in the exposures, with white noise.
+
+    The noise, the floor of its spectrum, is subtracted.
+    """
     exposed = np.abs(mean_over(_omega(law, measured), timing.exposure)) ** 2
     passed = _passed(law, measured, timing) / exposed[:, None]
     floor = floor_nm2_hz(measured)
