@@ -141,7 +141,7 @@ class RenderThread(threading.Thread):
             now_s = time.monotonic()
             behind_s, began_s = max(0.0, now_s - began_s - 1 / PICTURES_HZ), now_s  # waiting messages may be that old
             if complete := now_s >= complete_due_s:
-                complete_due_s = now_s + (PICTURES_PER_COMPLETE - 0.5) / PICTURES_HZ  # by time, before the rings overflow
+                complete_due_s = now_s + (PICTURES_PER_COMPLETE - 0.5) / PICTURES_HZ  # before the rings overflow
             arrived = [self._earlier.popleft() for _ in range(len(self._earlier))]
             for topic, ring in self._rings.items():
                 if complete or topic.latest_only:  # rows are cheaper in large batches
