@@ -3,6 +3,7 @@
 import itertools
 import json
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -393,3 +394,12 @@ def test_closing_a_session_leaves_a_slow_reader_only_complete_messages(reader: R
     received, whole, _ = reader.drained()
     assert received == whole
     assert whole > 15  # content of queue and socket
+
+
+def test_a_session_ends_soon_beside_a_process_that_is_stopped(run: Run) -> None:
+    """As `lowfc ctl safe` while a camera's process is stopped: the host accepts connections in its name."""
+    with socket.create_server(("127.0.0.1", run.links.ports["camera"])):
+        operator = ZenohBus(run.links, "operator", HostClock())
+        begun_s = time.monotonic()
+        operator.close()
+    assert time.monotonic() - begun_s < 6.0

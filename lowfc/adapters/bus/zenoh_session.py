@@ -14,6 +14,7 @@ _SOCKET = "unixsock-stream"
 _DISPLAY_HZ = 40.0  # a viewer draws 30 images a second, each from a new message
 _BATCH_BYTES = 65535  # zenoh's default
 _SMALL_BATCH_BYTES = 16384  # of a monitor, which keeps messages: each holds its receive buffer
+_OPEN_MS = 2000  # a closing session waits this long for a process that is stopped; zenoh's default is 10 s
 _SPARE_BUFFERS = 1024  # otherwise zenoh allocates and clears one for every message
 _PRIORITIES = ("real_time", "interactive_high", "interactive_low", "data_high", "data", "data_low", "background")
 
@@ -79,6 +80,7 @@ def session_config(links: Links, role: str, *, monitor: bool = False) -> dict[st
         # Opening waits `delay` ms for missing links; running processes are connected within a few ms.
         "scouting": scouting,
         "transport": {
+            "unicast": {"open_timeout": _OPEN_MS},
             "auth": {
                 "usrpwd": {
                     "user": links.user,
