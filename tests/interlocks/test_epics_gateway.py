@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -16,7 +17,7 @@ from lowfc.adapters.process.clock import HostClock
 from lowfc.client import Answer, Client
 from lowfc.contract.codecs.bench_codec import decode_bench_value
 from lowfc.contract.errors import BusError, RequestRefusedError
-from lowfc.contract.messages import BENCH, CONTROLLER_STATE, FRAME, HEALTH, image, wire
+from lowfc.contract.messages import BENCH, CONTROLLER_STATE, FRAME, HEALTH, RECORD_KEY, REQUEST_KEY, image, wire
 from lowfc.contract.sections import Gateway
 from lowfc.programs.gateway import command
 from lowfc.programs.gateway.epics import EpicsGateway
@@ -24,6 +25,7 @@ from lowfc.programs.gateway.variables import Kind, Put, Variable
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from tests.support.loops import lowfc
 
+TIMEOUT_S = 5.0
 CONFIG = Gateway(prefix="night:", port=5075, bench={"mask": "BENCH:MASK"})
 
 
@@ -213,10 +215,14 @@ def signals() -> Iterator[None]:
 def test_the_command_serves_a_run_until_it_is_stopped(
     pvs: Variables, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Stopped by SIGTERM when the first frame is posted."""
-    hub, bench, plain = MemoryHub(), list[Sample](), pvs.Shared.post
+    """Stopped by SIGTERM when the first frame is posted; meanwhile `safe` does not wait for the end of a log."""
+    hub, bench, plain, finished = MemoryHub(), list[Sample](), pvs.Shared.post, threading.Event()
     controller = MemoryBus(hub, "controller", HostClock())
     controller.subscribe(BENCH, bench.append)
+    reply = wire.Request(accepted=True).SerializeToString()
+    controller.queryable(REQUEST_KEY.format(name="*"), lambda query: query.reply(reply))
+    controller.queryable(RECORD_KEY.format(name="*"), lambda query: finished.wait(TIMEOUT_S) and query.reply(reply))
+    stop, safe = Operation(True), Operation(True)
     states = controller.publisher(CONTROLLER_STATE)
     health, frames = controller.publisher(HEALTH, "controller"), controller.publisher(FRAME)
 
@@ -226,6 +232,17 @@ def test_the_command_serves_a_run_until_it_is_stopped(
 
     def watch(*arguments: Any) -> Any:
         made = command_watch(*arguments)
+        puts = [
+            threading.Thread(target=pvs[f"lowfc:{name}"].handler.put, args=(None, operation))
+            for name, operation in (("record_stop", stop), ("safe", safe))
+        ]
+        for one in puts:
+            one.start()
+        puts[1].join(TIMEOUT_S)
+        assert (stop.ended, safe.ended) == ([], [""])
+        finished.set()
+        puts[0].join(TIMEOUT_S)
+        assert stop.ended == [""]
         states.put(wire.ControllerState(mode=wire.LOOP_MODE_CLOSED).SerializeToString())
         health.put(wire.Health(process="controller", pid=7, rate_hz=250).SerializeToString())
         frames.put(image(np.ones((2, 3), np.uint16), 1, "toy").SerializeToString())

@@ -43,12 +43,10 @@ def epics(run: AnyRun = None, config: ConfigFile = None) -> None:
     with contextlib.ExitStack() as stack:
         bus = ZenohBus(links, Role.OPERATOR, clock, monitor=True)
         stack.callback(bus.close)
-        loop, lock = Client(links.run_id, bus=bus), threading.Lock()
-        offered, changed = tuple(variables()), threading.Event()
+        loop, offered, changed = Client(links.run_id, bus=bus), tuple(variables()), threading.Event()
 
         def request(put: Put, value: Any) -> None:
-            with lock:
-                put(loop, value)
+            put(Client(links.run_id, bus=bus), value)  # on a thread of the server: `safe` waits for no other put
 
         gateway = EpicsGateway(known.gateway, offered, request, changed.set)
         stack.callback(gateway.close)
