@@ -89,6 +89,12 @@ def test_the_configuration_of_the_router_is_shown_without_creating_its_run(toml:
     assert runs() == []
 
 
+def test_a_list_of_hosts_without_a_link_to_the_router_creates_no_run(toml: Path) -> None:
+    done = lowfc("hosts", "--config", toml, "--run", "bench")
+    assert "the router accepts no process without it" in str(done.exception)
+    assert runs() == []
+
+
 def test_the_numbers_of_the_document_are_those_of_the_code() -> None:
     text = " ".join(DOCUMENT.read_text().split())
     retry = routed.client_session(NETWORK, "camera", {})["connect"]["retry"]

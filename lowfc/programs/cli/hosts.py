@@ -135,10 +135,10 @@ def hosts(
 
     Example: lowfc hosts --config lowfc.toml --run bench
     """
-    from contextlib import closing
+    from contextlib import ExitStack
 
     from lowfc.adapters.bus.routed import ending_certificates
-    from lowfc.adapters.bus.run import open_run
+    from lowfc.adapters.bus.run import open_run, run_path
     from lowfc.adapters.bus.zenoh_bus import ZenohBus
     from lowfc.adapters.process.clock import HostClock
     from lowfc.client import Client, running
@@ -149,8 +149,13 @@ def hosts(
     if not settings.network.router or (run is None and running()):
         run = the_known_run(run)
     run = run or DEFAULT_RUN  # with a router, all processes of the run may be on other hosts
-    links = open_run(run, (settings.mirror.name,), network=settings.network).links
-    with closing(ZenohBus(links, Role.OPERATOR, HostClock())) as bus:
+    with ExitStack() as stack:
+        base = None
+        if not run_path(run).is_dir():  # a list creates no run
+            base = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lowfc-")))
+        links = open_run(run, (settings.mirror.name,), base, network=settings.network).links
+        bus = ZenohBus(links, Role.OPERATOR, HostClock())
+        stack.callback(bus.close)
         time.sleep(CONNECT_S)
         found = Client(run, bus=bus).processes()
     if not found:
