@@ -320,6 +320,15 @@ def test_a_request_with_more_leaks_than_modes_is_refused_without_computing_their
     assert limiting_gain.cache_info().misses == before
 
 
+def test_a_mode_that_a_request_names_twice_has_one_value() -> None:
+    for name in ("gain", "limit", "offset"):
+        _, (one, two) = feed(
+            DEFAULTS, loaded(DEFAULTS), ask(name, 0.1, modes=(2, 2)), ask(name, 0.1, 0.2, modes=(2, 2))
+        )
+        assert one.reply.accepted
+        answered(two, False, "got 2")
+
+
 def test_the_first_step_after_closing_is_gain_times_error() -> None:
     state, _ = feed(DEFAULTS, running(), ask("open"), *(frame(count, SOME) for count in range(6, 20)), ask("close"))
     before = state.loop.history_nm[0]

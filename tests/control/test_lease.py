@@ -226,7 +226,7 @@ def test_the_remark_on_gains_begins_above_the_highest_gain() -> None:
 def test_removing_a_channel_and_a_missing_one() -> None:
     state = loaded(DEFAULTS)
     after, reply = replied(state, "channel", text="dark-hole")
-    assert (reply.accepted, reply.text) == (True, "there is no channel 'dark-hole' to remove; there are none")
+    assert (reply.accepted, reply.text) == (False, "there is no channel 'dark-hole' to remove; there are none")
     assert after.loop.command_channels is None
     shape = Request(1, "channel", text="dark-hole", actuators_nm=np.full(GRID, 2.0, np.float32).reshape(-1))
     state, _ = advance(DEFAULTS, state, shape)

@@ -79,7 +79,7 @@ def _chosen(loop: ActiveLoop, request: Request) -> Mask:
 
 
 def _modes(noll: tuple[int, ...], request: Request) -> tuple[int, ...]:
-    modes = request.modes or noll
+    modes = tuple(dict.fromkeys(request.modes)) or noll  # each once
     unknown = sorted(set(modes) - set(noll))
     if unknown:
         raise ValueError(f"Noll modes {unknown} are not controlled; there are {noll[0]} to {noll[-1]}")
@@ -162,7 +162,7 @@ def remark(settings: Settings, loop: ActiveLoop, request: Request) -> str:
         unit = " nm" if request.name == "limit" else ""
         return f": a mode with a {request.name} of 0{unit} is not corrected"
     if request.name == "limit":
-        noll = request.modes or loop.calibration.noll
+        noll = _modes(loop.calibration.noll, request)
         columns = loop.to_actuators[:, [loop.calibration.noll.index(mode) for mode in noll]]
         stroke_nm = settings.limits.stroke_nm
         reach_nm = stroke_nm / np.maximum(np.abs(columns).max(axis=0), np.finfo(np.float32).tiny)

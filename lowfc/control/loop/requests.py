@@ -206,7 +206,7 @@ def _channel(settings: Settings, state: State, request: Request) -> Handled:
     channels = loop.channels_or_empty().with_channel(request.text, shape_nm, loop.to_modes)
     if not request.actuators_nm.size and loop.channels_or_empty().channel(request.text) is None:
         names = ", ".join(one.name for one in loop.channels_or_empty().channels)
-        return state, f"there is no channel {request.text!r} to remove; there are {names or 'none'}"
+        raise ValueError(f"there is no channel {request.text!r} to remove; there are {names or 'none'}")
     commanded = (one.shape_nm for one in channels.channels if one.commanded)
     _check_shape(settings.limits, sum(commanded, np.zeros(grid, np.float32)))
     rms_nm = float(np.sqrt(np.mean(np.square(shape_nm, dtype=np.float64))))

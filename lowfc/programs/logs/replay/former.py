@@ -13,6 +13,7 @@ from lowfc.contract.messages import wire
 M = TypeVar("M", bound=Message)
 
 CAMERA_RULE = "the camera's settings are compared with the calibration's, not its bias with the dark"
+CHANNEL_RULE = "only a channel that exists is removed"
 CLOSE_RULE = "the loop is not closed while frames are refused, or on a camera that does not fit the calibration"
 CLEAR_RULE = "clear forgets the newest frame sequence"
 GAIN_RULE = "gain and leak of a mode are checked together, and only controlled modes have automatic gains"
@@ -21,6 +22,7 @@ LOAD_RULE = "a calibration loaded in safe mode adopts nothing"
 _REQUEST_RULES = {
     **dict.fromkeys(("close", "step", "law"), CLOSE_RULE),
     **dict.fromkeys(("gain", "leak"), GAIN_RULE),
+    "channel": CHANNEL_RULE,
     "clear": CLEAR_RULE,
     "load": LOAD_RULE,
 }
