@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 
+from lowfc.client.arguments import INVALID
 from lowfc.contract.codecs.bench_codec import encode_bench_value
 from lowfc.contract.errors import BadMessageError, ConfigurationError
 from lowfc.contract.sections import BENCH_NAME
@@ -21,6 +22,7 @@ def bench_message(name: str, value: Value, time_ns: int) -> bytes:
             f"a bench value's name begins with a letter and has up to 64 of A-Z, a-z, 0-9, _ and -, got {name[:80]!r}"
         )
     try:
-        return encode_bench_value(value.item() if isinstance(value, np.generic) else value, time_ns)
-    except (BadMessageError, OverflowError, UnicodeEncodeError) as fault:
+        plain = value.item() if isinstance(value, np.generic) else value  # numpy's `True` is true, not 1
+        return encode_bench_value(plain, time_ns)
+    except (BadMessageError, *INVALID) as fault:
         raise ConfigurationError(f"bench value {name}: {fault}") from None

@@ -1,6 +1,7 @@
 """An operator's requests to a running loop, from Python."""
 
 import contextlib
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -18,12 +19,14 @@ from lowfc.adapters.bus.run import DEFAULT_RUN, open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.host import by_this_process, program_name
+from lowfc.arrays import Single
 from lowfc.client.answer import Answer
+from lowfc.client.arguments import INVALID, floats
 from lowfc.client.bench import bench_message
 from lowfc.client.lease import Lease, new_identity
 from lowfc.client.mirror_watch import MirrorWatch
 from lowfc.client.requests import BY_NAME
-from lowfc.client.runs import starting, the_run
+from lowfc.client.runs import absence, the_run
 from lowfc.client.stream import SILENT_S, WAITING, Frame, Stream, frame_of, step_of
 from lowfc.contract.codecs.calibration_codec import camera_settings, decode_calibration, encode_calibration
 from lowfc.contract.codecs.codec import most_bytes
@@ -53,7 +56,6 @@ from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.interlocks import Value
 from lowfc.control.loop.wording import AUTO
 
-Single = npt.NDArray[np.float32]
 Modes = int | Sequence[int]
 M = TypeVar("M", bound=Message)
 
@@ -154,8 +156,8 @@ class Client:
 
         The sensor's zero point shifts with it, so that the loop does not undo it, except for the channel "flat".
         """
-        shape = np.zeros(0, np.float32) if actuators_nm is None else np.asarray(actuators_nm, np.float32)
-        if shape.size and shape.shape != self.mirror_grid():
+        shape = floats("channel", () if actuators_nm is None else actuators_nm)
+        if actuators_nm is not None and shape.shape != self.mirror_grid():
             got = f"got an array of shape {shape.shape}"
             raise RequestRefusedError(f"channel refused: the mirror has actuators of shape {self.mirror_grid()}, {got}")
         return self.ask("channel", text=name, actuators_nm=shape)
@@ -167,8 +169,8 @@ class Client:
             basis_nm: (shapes, actuators) or (shapes, rows, columns), nm of surface.
             table: (frames, shapes), factors of the shapes in each frame, starting with the frame of the answer.
         """
-        basis, factors = np.asarray(basis_nm, np.float32), np.asarray(table, np.float32)
-        basis = basis.reshape(len(basis), -1) if basis.ndim == 3 else basis
+        basis, factors = floats("play", basis_nm), floats("play", table)
+        basis = basis.reshape(len(basis), math.prod(basis.shape[1:])) if basis.ndim == 3 else basis
         if basis.ndim != 2 or factors.ndim != 2 or factors.shape[1] != len(basis):
             raise RequestRefusedError(
                 "play refused: it takes shapes (shapes, actuators) and a table (frames, shapes), got arrays of shape "
@@ -178,7 +180,7 @@ class Client:
 
     def play_offset(self, table_nm: npt.ArrayLike) -> Answer:
         """Play a probe sequence of the loop's target: (frames, modes), nm rms of wavefront, added frame by frame."""
-        table = np.asarray(table_nm, np.float32)
+        table = floats("play", table_nm)
         if table.ndim != 2:
             raise RequestRefusedError(f"play refused: it takes a table (frames, modes), got an array of {table.shape}")
         return self.ask("play", text=OFFSET, table=table)
@@ -346,7 +348,7 @@ class Client:
                 lease_id=(self._lease.id if self._lease is not None else 0) if lease_id is None else lease_id,
                 requester=self._requester,
             )
-        except (ValueError, TypeError) as fault:
+        except INVALID as fault:
             raise RequestRefusedError(f"{name} refused: {fault}") from None
         if calibration is not None:
             message.calibration.MergeFromString(encode_calibration(calibration, 0))
@@ -372,9 +374,7 @@ class Client:
                     "the log and `lowfc ctl status` show whether the request was carried out"
                 )
             if now_s >= deadline_s:
-                if starting(self.run_id, role):
-                    raise BusError(f"run {self.run_id!r} is starting, and its {role} is not there yet: try again")
-                raise BusError(f"no {role} is there in run {self.run_id!r}: start one, as with `{_COMMANDS[role]}`")
+                raise BusError(absence(self.run_id, role))
             time.sleep(0.05)
 
     def _get_message(self, topic: Topic, kind: type[M], role: Role) -> M:
@@ -393,6 +393,3 @@ class Client:
             raise RequestRefusedError(f"{name} refused: {message.reply} (run {self.run_id})")
         state = message.state if message.HasField("state") else None
         return Answer(True, message.reply, message.frame_sequence, message.text, state, self.run_id)
-
-
-_COMMANDS = {Role.CONTROLLER: "lowfc controller", Role.RECORDER: "lowfc record", Role.CAMERA: "sim-camera"}

@@ -5,6 +5,8 @@ from lowfc.adapters.bus.run import open_run, run_path, runtime_base
 from lowfc.contract.errors import BusError, DataFileError, nearest
 from lowfc.contract.messages import Role
 
+_COMMANDS = {Role.CONTROLLER: "lowfc controller", Role.RECORDER: "lowfc record", Role.CAMERA: "sim-camera"}
+
 
 def running() -> list[str]:
     """Names of this user's runs on this host whose controller is listening; a killed run does not count."""
@@ -48,10 +50,16 @@ def waiting_message(name: str) -> str:
     return f"waiting for run {name!r}, which has no other process on this host yet; {there}"
 
 
-def starting(name: str, role: Role) -> bool:
-    """Whether `lowfc sim-loop` has started this run but its process of this role is not listening yet."""
+def absence(name: str, role: Role) -> str:
+    """Message about a run's process to which there is no link: it is starting, stopped or absent."""
     roles = live_runs().get(name, set())
-    return Role.LAUNCHER in roles and role not in roles
+    if role in roles and not open_run(name, ()).links.network.router:  # across hosts, only the router is seen
+        return (
+            f"the {role} of run {name!r} does not answer, but its port is in use: it is starting, hangs or is stopped"
+        )
+    if Role.LAUNCHER in roles:
+        return f"run {name!r} is starting, and its {role} is not there yet: try again"
+    return f"no {role} is there in run {name!r}: start one, as with `{_COMMANDS[role]}`"
 
 
 def live_runs(required: str | None = None) -> dict[str, set[str]]:

@@ -22,7 +22,7 @@ from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.process.clock import HostClock
 from lowfc.client import Answer, Client, Frame, Stream, client, configuration_of, running, the_run
 from lowfc.client.requests import DECLARED
-from lowfc.client.runs import starting, waiting_message
+from lowfc.client.runs import absence, waiting_message
 from lowfc.client.stream import WAITING, frame_of, step_of
 from lowfc.contract.codecs import codec
 from lowfc.contract.codecs.bench_codec import decode_bench_value
@@ -221,10 +221,14 @@ def test_a_refusal_raises_with_the_controllers_reply(controller: FakeController,
         (lambda loop: loop.gain(0.4, modes=2.5), "gain refused: "),
         (lambda loop: loop.gain(0.4, modes="2"), "gain refused: "),
         (lambda loop: loop.gain(0.4, modes=[2, None]), "gain refused: "),
+        (lambda loop: loop.gain(10**400), "gain refused: int too large"),
+        (lambda loop: loop.channel("a", "file.fits"), "channel refused: could not convert"),
+        (lambda loop: loop.channel("a", []), r"got an array of shape \(0,\)"),
         (lambda loop: loop.channel("a", SHAPE.T), r"the mirror has actuators of shape \(4, 5\), got .* \(5, 4\)"),
         (lambda loop: loop.channel("a", SHAPE.ravel()), r"got an array of shape \(20,\)"),
         (lambda loop: loop.play(np.stack([SHAPE]), [[1, 2]]), r"got arrays of shape \(1, 20\) and \(1, 2\)"),
         (lambda loop: loop.play(SHAPE, [1, 2, 3, 4]), r"\(4, 5\) and \(4,\)"),
+        (lambda loop: loop.play([[1, 2], [3]], [[1, 2]]), "play refused: "),
         (lambda loop: loop.play_offset([1, 2, 3]), r"takes a table \(frames, modes\)"),
         (lambda loop: loop.play_offset(np.zeros((3_000_000, 3))), "at most 16,000,000 bytes, got 36,000,0"),
     ],
@@ -318,14 +322,18 @@ def test_a_wait_for_an_empty_run_reports_the_other_runs(listen: Callable[..., No
     assert waiting_message("bnch").endswith("on this host yet; running: bench (did you mean 'bench'?)")
 
 
-def test_a_run_started_by_sim_loop_counts_as_starting(listen: Callable[..., None]) -> None:
+def test_the_message_about_an_absent_process_says_whether_it_is_starting_or_stopped(
+    listen: Callable[..., None],
+) -> None:
     open_run("night", listeners=(Role.LAUNCHER,))
     listen("night", "launcher", "recorder")
-    assert starting("night", Role.CONTROLLER)
-    assert not starting("night", Role.RECORDER)
+    assert (
+        absence("night", Role.CONTROLLER) == "run 'night' is starting, and its controller is not there yet: try again"
+    )
+    assert "the recorder of run 'night' does not answer, but its port is in use" in absence("night", Role.RECORDER)
     listen("bench", "camera")
-    assert not starting("bench", Role.CONTROLLER), "not started by sim-loop"
-    assert not starting("noon", Role.CONTROLLER)
+    for run in ("bench", "noon"):  # not started by sim-loop
+        assert absence(run, Role.CONTROLLER).startswith(f"no controller is there in run '{run}': start one")
 
 
 def test_an_unambiguous_beginning_of_a_name_selects_a_run(listen: Callable[..., None]) -> None:
@@ -540,7 +548,7 @@ def test_held_holds_the_loop_and_releases_it(controller: FakeController, loop: C
     assert hold.lease_id == release.lease_id != permission.lease_id
 
 
-@pytest.mark.parametrize("value", [True, 3, 2.5, "parked", np.True_])
+@pytest.mark.parametrize("value", [True, np.bool_(True), 3, np.int64(3), 2.5, "parked"])
 def test_a_bench_value_arrives_unchanged(controller: FakeController, loop: Client, value: Value) -> None:
     received: list[Sample] = []
     controller.bus.subscribe(BENCH, received.append, "mask")
@@ -549,9 +557,9 @@ def test_a_bench_value_arrives_unchanged(controller: FakeController, loop: Clien
     loop.bench("another", value)
     decoded = [decode_bench_value(one.payload) for one in received]
     assert decoded == [value, value]
-    assert isinstance(decoded[0], bool) is (value in (True, np.True_))
+    assert isinstance(decoded[0], bool) is (isinstance(value, bool | np.bool_))
     invalid: list[tuple[str, Value]] = [("a b", True), ("1st", True)]
-    invalid += [("mask", wrong) for wrong in (float("nan"), 10**400, "x" * 201, "\ud800")]
+    invalid += [("mask", wrong) for wrong in (float("nan"), 10**400, [1], "x" * 201, "\ud800")]
     for name, wrong in invalid:
         with pytest.raises(ConfigurationError, match=name):
             loop.bench(name, wrong)
@@ -589,6 +597,7 @@ def test_an_invalid_number_is_quoted_in_the_error() -> None:
         assert done.exit_code == 2
         assert "'0,3' is not a number: write 0.3" in done.output
     assert "'1.5' is not a whole number" in lowfc("ctl", "step", "1.5").output
+    assert isinstance(lowfc("ctl", "gain", "auto", "0.3").exception, ConfigurationError)
 
 
 def test_the_status_shows_the_whole_state() -> None:

@@ -93,6 +93,9 @@ def _of_modes(name: str) -> _Command:
 
 
 def _gain(values: Gains, modes: Modes = None, run: AnyRun = None, as_json: Json = False) -> None:
+    if AUTOMATIC in values and len(values) > 1:
+        raise ConfigurationError(f"gain requires numbers or `{AUTOMATIC}`, not both")
+
     def ask(loop: "Client") -> "Answer":
         if values == [AUTOMATIC]:
             return loop.automatic_gain(noll_of(modes))
@@ -256,5 +259,5 @@ def _joined(run: str | None) -> "Client":
 def _ask(run: str | None, as_json: bool, ask: "Callable[[Client], Answer]") -> None:
     with _joined(run) as loop:
         answer = ask(loop)
-    result = {name: getattr(answer, name) for name in ("run", "accepted", "reply", "frame", "frame_sequence")}
-    print_result(result, answer.sentence, as_json=as_json)
+        result = {name: getattr(answer, name) for name in ("run", "accepted", "reply", "frame", "frame_sequence")}
+        print_result(result, answer.sentence, as_json=as_json)  # before the end of the connection, which may take long

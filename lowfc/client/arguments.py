@@ -1,0 +1,18 @@
+"""Numbers of a request, from the arguments of a program."""
+
+import numpy as np
+import numpy.typing as npt
+
+from lowfc.arrays import Single
+from lowfc.contract.errors import RequestRefusedError
+
+INVALID = (ValueError, TypeError, OverflowError)
+"""Errors of numpy and protobuf for an argument that is not of the required type."""
+
+
+def floats(name: str, values: npt.ArrayLike) -> Single:
+    """The numbers of a request as an array; RequestRefusedError if some are no numbers."""
+    try:
+        return np.asarray(values, np.float32)
+    except INVALID as fault:
+        raise RequestRefusedError(f"{name} refused: {fault}") from None
