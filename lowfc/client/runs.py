@@ -57,6 +57,8 @@ def absence(name: str, role: Role) -> str:
         return (
             f"the {role} of run {name!r} does not answer, but its port is in use: it is starting, hangs or is stopped"
         )
+    if Role.LAUNCHER in roles and role is Role.RECORDER:
+        return f"run {name!r} has no {role}: it is starting, or was started with --no-record"
     if Role.LAUNCHER in roles:
         return f"run {name!r} is starting, and its {role} is not there yet: try again"
     return f"no {role} is there in run {name!r}: start one, as with `{_COMMANDS[role]}`"

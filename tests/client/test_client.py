@@ -331,6 +331,9 @@ def test_the_message_about_an_absent_process_says_whether_it_is_starting_or_stop
         absence("night", Role.CONTROLLER) == "run 'night' is starting, and its controller is not there yet: try again"
     )
     assert "the recorder of run 'night' does not answer, but its port is in use" in absence("night", Role.RECORDER)
+    open_run("dusk", listeners=(Role.LAUNCHER,))
+    listen("dusk", "launcher", "controller")
+    assert "was started with --no-record" in absence("dusk", Role.RECORDER)
     listen("bench", "camera")
     for run in ("bench", "noon"):  # not started by sim-loop
         assert absence(run, Role.CONTROLLER).startswith(f"no controller is there in run '{run}': start one")

@@ -235,12 +235,16 @@ def test_auto_is_for_gains_only(run: LiveRun) -> None:
     operate(run, scenario)
 
 
-def test_safe_is_requested_by_s_by_its_button_and_by_f12_in_a_form(run: LiveRun) -> None:
+def test_safe_is_requested_by_s_by_its_button_by_f12_in_a_form_and_by_s_in_the_help(run: LiveRun) -> None:
     async def scenario(screen: Screen) -> None:
         for press in (lambda: screen.pilot.press("S"), lambda: screen.pilot.click("#safe")):
             before = len(run.requests)
             await press()
             await screen.until(lambda before=before: [one.name for one in run.requests[before:]] == ["safe"])
+        before = len(run.requests)
+        await screen.pilot.press("question_mark", "s")
+        await screen.until(lambda: [one.name for one in run.requests[before:]] == ["safe"])
+        await screen.until(lambda: len(screen.app.screen_stack) == 1)
         await screen.pilot.press("n")
         await screen.until(lambda: len(screen.app.screen_stack) == 2)
         before = len(run.requests)

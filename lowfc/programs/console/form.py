@@ -13,7 +13,7 @@ from textual.message import Message
 from textual.screen import ModalScreen
 from textual.widgets import Button, Input, Label, Static
 
-from lowfc.programs.console.actions import Action
+from lowfc.programs.console.actions import SAFE, Action
 
 HELP = (
     "Top line: verdict, with the reason below it. Bars: command of each mode, nm, between its limits. Press a key or "
@@ -74,12 +74,18 @@ class Help(ModalScreen[None]):
     """The keys and buttons."""
 
     BINDINGS: ClassVar[list[BindingType]] = [
-        (key, "dismiss", "leave") for key in ("escape", "question_mark", "q", "enter")
+        *((key, "dismiss", "leave") for key in ("escape", "question_mark", "q", "enter")),
+        *((key, "safe", "safe") for key in ("s", "S")),
     ]
 
     def __init__(self, rows: Iterable[tuple[str, str, str]]) -> None:
         super().__init__()
         self._rows = list(rows)
+
+    async def action_safe(self) -> None:
+        """Leave the help, and do what the button SAFE does."""
+        self.dismiss()
+        await self.app.run_action(f"press({SAFE.name!r})")
 
     def compose(self) -> ComposeResult:
         """Lay out the help."""
