@@ -86,6 +86,13 @@ max_age_s = 2.0
 """
 
 
+class Text(str):
+    """A text as p4p has it."""
+
+    def __str__(self) -> str:
+        return f"Thu Jan  1 00:00:00 1970 {self!r}"
+
+
 def test_requests_with_numbers_or_a_text_are_variables_with_unique_names() -> None:
     offered = {one.name: one for one in variables()}
     assert len(offered) == len(list(variables()))
@@ -99,7 +106,7 @@ def test_requests_with_numbers_or_a_text_are_variables_with_unique_names() -> No
     for name, value, arguments in (
         ("gain", [0.2], {"values": [0.2]}),
         ("step", [7.0], {"values": [7.0]}),
-        ("permit", "the mask", {"text": "the mask"}),
+        ("permit", Text("the mask"), {"text": "the mask"}),
         ("close", True, {}),
     ):
         put = offered[name].put

@@ -112,7 +112,7 @@ def _request(one: Declaration) -> Variable | None:
         starts = name == "start"
         name, kind, put = f"record_{name}", Kind.BOOLEAN, lambda loop, value: loop.record(starts)
     elif "text" in fields and "modes" not in fields:  # for `gain`, the numbers rather than the text
-        kind, put = Kind.TEXT, lambda loop, value: loop.ask(one.name, text=str(value))
+        kind, put = Kind.TEXT, lambda loop, value: loop.ask(one.name, text=value)
     elif "values" in fields:
         kind, put = Kind.NUMBERS, lambda loop, value: loop.ask(one.name, values=value)
     else:
