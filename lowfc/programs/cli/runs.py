@@ -50,6 +50,8 @@ def _lines(rows: list[dict[str, Any]]) -> list[str]:
     lines = []
     for row in rows:
         mode = "no controller" if row["mode"] is None else mode_word(row["mode"])
+        if row["mode"] == "starting":  # its controller has not reported yet
+            mode += " or not answering"
         if row["holding"]:
             mode += f" (command held: {row['holding']})"
         rate = "" if row["rate_hz"] is None else f" at {row['rate_hz']:.0f} Hz, up {row['uptime_s']:.0f} s"
