@@ -208,3 +208,15 @@ def test_a_starting_loop_is_listed_and_makes_an_unnamed_request_ambiguous(
     assert not (own_runtime / "lowfc" / "night").exists()
     with pytest.raises(BusError, match="created by processes started by hand"):
         sim_loop.sim_loop(load(None), 1.0, record=False, name="other")
+
+
+def test_an_interruption_before_the_first_process_leaves_no_run(
+    own_runtime: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object) -> ZenohBus:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sim_loop, "ZenohBus", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        sim_loop.sim_loop(load(None), 1.0, record=False, name="night")
+    assert not (own_runtime / "lowfc" / "night").exists()

@@ -50,14 +50,18 @@ def sim_loop(
     """
     console = Console(stderr=True)
     require_screen(show)
-    run = _new_run(config, name)
-    console.print(f"run {run.run_id}", highlight=False)
-    if record:
-        console.print(estimate(config), highlight=False, markup=False, soft_wrap=True)
     watch = Watch({}, [])
     children: list[Child] = []
-    bus = ZenohBus(run.links, Role.LAUNCHER, HostClock())  # its listener marks the run as starting
+    run = _new_run(config, name)
+    ends = contextlib.ExitStack()
     try:
+        ends.callback(run.remove)
+        ends.callback(stop_all, children)
+        console.print(f"run {run.run_id}", highlight=False)
+        if record:
+            console.print(estimate(config), highlight=False, markup=False, soft_wrap=True)
+        bus = ZenohBus(run.links, Role.LAUNCHER, HostClock())  # its listener marks the run as starting
+        ends.callback(bus.close)
         bus.subscribe(HEALTH, watch.add_health)
         bus.subscribe(EVENT, watch.add_event)
         prepare(config, run, console)
@@ -70,9 +74,7 @@ def sim_loop(
         log = watch.of(Role.RECORDER).recording.file
         raise ProcessDiedError(f"{fault}\nrecorded until then: {log}" if log else str(fault)) from fault
     finally:
-        bus.close()
-        stop_all(children)
-        run.remove()
+        ends.close()
     return {"run": run.run_id} | summary(watch, record, config.camera.rate_hz if config.lockstep else None)
 
 
