@@ -94,7 +94,7 @@ def _of_modes(name: str) -> _Command:
 
 def _gain(values: Gains, modes: Modes = None, run: AnyRun = None, as_json: Json = False) -> None:
     if AUTOMATIC in values and len(values) > 1:
-        raise ConfigurationError(f"gain requires numbers or `{AUTOMATIC}`, not both")
+        raise ConfigurationError(f"gain takes numbers, or `{AUTOMATIC}` alone")
 
     def ask(loop: "Client") -> "Answer":
         if values == [AUTOMATIC]:
