@@ -11,7 +11,7 @@ INVALID = (ValueError, TypeError, OverflowError)
 
 
 def floats(name: str, values: npt.ArrayLike) -> Single:
-    """The values (...) of a request as float32, of any shape; RequestRefusedError if some are not numbers."""
+    """Values of any shape, in their unit, as float32; RequestRefusedError if some are not numbers."""
     try:
         return np.asarray(values, np.float32)
     except INVALID as fault:
