@@ -198,7 +198,7 @@ def test_a_permit_can_be_released_and_ended_by_open() -> None:
     setup = under(Action.WARN)
     held, _ = permit(setup, running(setup), 5.0)
     _, outputs = applied(setup, held, "gain", values=(0.1,))
-    answered(outputs, False, "reserved for moving the mask")
+    answered(outputs, False, "reserved for moving the mask (for at most 5 s more)")
     state, outputs = applied(setup, held, "release", lease_id=MOVER)
     _, all_outputs = feed(setup, state, frame(6, SOME))
     assert all_outputs[-1].step.reasons == ()
