@@ -1,4 +1,4 @@
-"""`lowfc --help`, and the text and JSON of a typed result."""
+"""`lowfc --help`, the text and JSON of a typed result, and the lines of `lowfc runs`."""
 
 import re
 import subprocess
@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from lowfc.programs.cli.ctl import ctl_app
 from lowfc.programs.cli.main import COMMANDS, app
 from lowfc.programs.cli.result import Result, result_field
+from lowfc.programs.cli.runs import _lines
 
 
 def test_every_command_is_listed_under_its_heading_with_its_whole_description() -> None:
@@ -108,3 +109,13 @@ def test_text_and_json_of_a_result_have_the_same_fields() -> None:
         "noise_nm": [1, 12.25],
         "modes": [{"noll": 2, "gain": 0.5}, {"noll": 11, "gain": None}],
     }
+
+
+def test_a_process_of_a_run_that_does_not_answer_is_not_called_absent() -> None:
+    processes = [{"process": name, "state": "starting", "pid": None} for name in ("controller", "recorder")]
+    row = {"run": "bench", "mode": "starting", "holding": None, "rate_hz": None, "uptime_s": None}
+    row |= {"processes": processes, "recording": "none", "log": None}
+    assert _lines([row]) == [
+        "bench  starting or not answering; controller, recorder; its recorder is starting or not answering"
+    ]
+    assert _lines([row | {"processes": processes[:1]}])[0].endswith("controller; not recording")
