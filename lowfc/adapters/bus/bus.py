@@ -112,7 +112,7 @@ class Bus(Protocol):
         ...
 
     def get(self, key: str, payload: bytes = b"", timeout_s: float = 1.0) -> list[Sample]:
-        """Query a key and return the answers; an empty list if no process answers."""
+        """Query a key and return the answers, none if no process answers; BusError if the bus was closed."""
         ...
 
     def peers(self) -> int:

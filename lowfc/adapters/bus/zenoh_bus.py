@@ -292,17 +292,20 @@ class ZenohBus:
             except Exception as fault:
                 self.faults.add(f"{self.role}: answer to", key, fault)
 
-        self._session.get(
-            key,
-            Callback(answered, done.set, indirect=False),
-            payload=payload,
-            timeout=timeout_s,
-            priority=priority,
-            target=zenoh.QueryTarget.ALL,
-            consolidation=zenoh.ConsolidationMode.NONE,
-            # A request waits for room in the queue, or a large one would be lost; queries of late joiners are empty.
-            congestion_control=zenoh.CongestionControl.BLOCK if payload else zenoh.CongestionControl.DROP,
-        )
+        try:
+            self._session.get(
+                key,
+                Callback(answered, done.set, indirect=False),
+                payload=payload,
+                timeout=timeout_s,
+                priority=priority,
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                # A request waits for room in the queue, or a large one would be lost; other queries are empty.
+                congestion_control=zenoh.CongestionControl.BLOCK if payload else zenoh.CongestionControl.DROP,
+            )
+        except zenoh.ZError as fault:  # the key is invalid, or the session was closed
+            raise BusError(f"{key} cannot be queried: {plain(fault)}") from None
         done.wait(timeout_s + 1.0)
         return list(answers)
 
@@ -329,7 +332,7 @@ class ZenohBus:
         rest of the stream. A query of the lowest priority is sent last: its answer shows that all was sent.
         """
         if self.role in self._links.ports:
-            with contextlib.suppress(zenoh.ZError):  # already closed
+            with contextlib.suppress(BusError):  # already closed
                 self.get(HEALTH.at(ALL), timeout_s=FLUSH_S, priority=zenoh.Priority.BACKGROUND)
         for close in self._closers:
             close()
