@@ -208,6 +208,14 @@ def test_an_unwise_value_is_granted_with_a_remark(name: str, value: float, remar
     assert (":" in reply.text) == bool(remark)
 
 
+def test_the_remark_on_limits_names_the_mode_that_the_stroke_limits_first() -> None:
+    state = loaded(DEFAULTS)
+    twice = state.loop.to_actuators * np.float32([1, 2, 1])
+    reach_nm = DEFAULTS.limits.stroke_nm / np.abs(twice[:, 1]).max()
+    _, reply = replied(state._replace(loop=state.loop._replace(to_actuators=twice)), "limit", 1e9)
+    assert reply.text.endswith(f": above {reach_nm:.3g} nm the stroke of 700 nm limits mode 3 first")
+
+
 def test_an_offset_of_a_mode_without_gain_has_a_remark() -> None:
     state, _ = replied(loaded(DEFAULTS), "gain", 0.0, modes=(3,))
     for mode, remark in ((3, "Z3 would not follow at a gain of 0"), (4, "")):

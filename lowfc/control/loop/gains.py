@@ -168,7 +168,7 @@ def remark(settings: Settings, loop: ActiveLoop, request: Request) -> str:
         reach_nm = stroke_nm / np.maximum(np.abs(columns).max(axis=0), np.finfo(np.float32).tiny)
         beyond = np.flatnonzero(np.asarray(request.values) > reach_nm)
         if beyond.size:
-            first = int(beyond[0])
+            first = int(beyond[reach_nm[beyond].argmin()])
             return f": above {reach_nm[first]:.3g} nm the stroke of {stroke_nm:g} nm limits mode {noll[first]} first"
     return ""
 
