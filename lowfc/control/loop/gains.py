@@ -82,7 +82,7 @@ def _modes(noll: tuple[int, ...], request: Request) -> tuple[int, ...]:
     modes = tuple(dict.fromkeys(request.modes)) or noll  # each once
     unknown = sorted(set(modes) - set(noll))
     if unknown:
-        raise ValueError(f"Noll modes {unknown} are not controlled; there are {noll[0]} to {noll[-1]}")
+        raise ValueError(f"Noll modes {unknown} are not controlled; there are {', '.join(map(str, noll))}")
     return modes
 
 

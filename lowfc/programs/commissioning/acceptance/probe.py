@@ -166,7 +166,7 @@ def chosen(requested: Sequence[int], noll: Sequence[int]) -> tuple[int, ...]:
     """The requested Noll indices, by default all; AcceptanceError if the loop does not control one of them."""
     unknown = sorted(set(requested) - set(noll))
     if unknown:
-        raise AcceptanceError(f"Noll modes {unknown} are not controlled; the loop controls {noll[0]} to {noll[-1]}")
+        raise AcceptanceError(f"Noll modes {unknown} are not controlled; the loop controls {', '.join(map(str, noll))}")
     return tuple(requested or noll)
 
 
