@@ -14,7 +14,7 @@ from lowfc.adapters.image_stream.channels import OtherChannels, channel_names
 from lowfc.adapters.image_stream.stream import StreamError
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import ConfigurationError, RequestRefusedError
-from lowfc.contract.messages import COMMAND, MIRROR_STATE, wire
+from lowfc.contract.messages import COMMAND, CONTROLLER_STATE, MIRROR_STATE, wire
 from lowfc.control.loop.safety import Limit
 from lowfc.device.drivers.isio import mirror as mirror_module
 from lowfc.device.drivers.isio.camera import IsioCamera
@@ -443,3 +443,18 @@ def test_a_refused_report_of_other_channels_is_repeated_every_two_seconds(
         now_s = tick * 0.1
         others.pass_on()
     assert asked_s == [0.0, 2.0, 4.0, 6.0]
+
+
+def test_a_shape_of_other_channels_is_removed_only_if_the_controller_has_one(folder: Path) -> None:
+    asked: list[object] = []
+    client: Any = SimpleNamespace(mirror_grid=lambda: GRID, channel=lambda *arguments: asked.append(arguments))
+    hub = MemoryHub()
+    states = MemoryBus(hub, "controller", FakeClock()).publisher(CONTROLLER_STATE)
+    channel(folder, "dm00disp01", make=True).write(np.zeros(GRID, np.float32))
+    others = bridge.ExternalChannels(client, MemoryBus(hub, "operator", FakeClock()), ["dm00disp01"], 1000.0)
+    others.pass_on()
+    assert asked == []
+    known = wire.Channel(name="external", actuators=np.ones(GRID, np.float32).tobytes())
+    states.put(wire.ControllerState(channels=[known]).SerializeToString())
+    others.pass_on()
+    assert asked == [("external", None)]

@@ -119,7 +119,7 @@ class ExternalChannels:
         self._others = OtherChannels(names, client.mirror_grid())
         self._shape: Single | None = None
         self._requested = b""
-        self._known: bytes | None = None  # the controller's channel as last reported; None if unknown
+        self._known = b""  # the controller's channel as last reported; its state has one that was there before
         self._next_request_s = 0.0
         self._fault = ""
 
