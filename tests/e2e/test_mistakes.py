@@ -16,7 +16,7 @@ from lowfc.adapters.files import calibration_file
 from lowfc.adapters.logs.writer import LogWriter
 from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.configuration import Configuration, load
-from lowfc.contract.errors import BusError, LowfcError
+from lowfc.contract.errors import BusError, DataFileError, LowfcError
 from lowfc.contract.messages import Role
 from lowfc.programs.launch import sim_loop
 from tests.support.in_process_loop import SMALL_MIRROR
@@ -210,12 +210,15 @@ def test_a_starting_loop_is_listed_and_makes_an_unnamed_request_ambiguous(
         sim_loop.sim_loop(load(None), 1.0, record=False, name="other")
 
 
-def test_an_interruption_before_the_first_process_leaves_no_run(
+def test_an_interruption_or_a_fault_before_the_first_process_leaves_no_run(
     own_runtime: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupted(*_: object) -> ZenohBus:
         raise KeyboardInterrupt
 
+    (open_run("night", listeners=(Role.LAUNCHER,)).path / "config.toml").mkdir()
+    with pytest.raises(DataFileError, match=r"config.toml cannot be written"):
+        sim_loop.sim_loop(load(None), 1.0, record=False, name="night")
     monkeypatch.setattr(sim_loop, "ZenohBus", interrupted)
     with pytest.raises(KeyboardInterrupt):
         sim_loop.sim_loop(load(None), 1.0, record=False, name="night")

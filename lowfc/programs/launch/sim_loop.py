@@ -15,6 +15,7 @@ from rich.live import Live
 from lowfc.adapters.bus.run import Run, free_ports, mirror_role, new_run_id, open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.files import calibration_file
+from lowfc.adapters.files.whole_file import write_whole
 from lowfc.adapters.process.child import Child
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.terminal import INTERRUPTED
@@ -94,7 +95,7 @@ def _new_run(config: Configuration, name: str | None) -> Run:
 def prepare(config: Configuration, run: Run, console: Console) -> None:
     """Write calibration and configuration to the run's directory."""
     calibration_file.save(analytic(config, console), run.path / "calibration.fits")
-    (run.path / "config.toml").write_text(config.to_toml(), encoding="utf-8")
+    write_whole(run.path / "config.toml", config.to_toml().encode())
 
 
 def children_of(config: Configuration, run: Run, duration_s: float | None, record: bool) -> list[Child]:
