@@ -560,7 +560,7 @@ def test_a_bench_value_arrives_unchanged(controller: FakeController, loop: Clien
     loop.bench("another", value)
     decoded = [decode_bench_value(one.payload) for one in received]
     assert decoded == [value, value]
-    assert isinstance(decoded[0], bool) is (isinstance(value, bool | np.bool_))
+    assert isinstance(decoded[0], bool) is isinstance(value, bool | np.bool_)
     invalid: list[tuple[str, Value]] = [("a b", True), ("1st", True)]
     invalid += [("mask", wrong) for wrong in (float("nan"), 10**400, [1], "x" * 201, "\ud800")]
     for name, wrong in invalid:
