@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from lowfc.adapters.files.whole_file import write_whole
+from lowfc.adapters.files.whole_file import require_folder, write_whole
 from lowfc.adapters.logs.recovery import recover
 from lowfc.adapters.logs.series import LogLimits, LogSeries
 from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.configuration import load
-from lowfc.contract.errors import ConfigurationError
+from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.programs.core.recording.process import log_limits
 from tests.support.mutated_logs import small_log
 
@@ -55,6 +55,15 @@ def test_a_written_file_obeys_the_umask_and_the_mode_of_its_source(tmp_path: Pat
     write_whole(tmp_path / "night.html", b"", source)
     assert mode_of(tmp_path / "plot.png") == 0o666 & ~umask
     assert mode_of(tmp_path / "night.html") == 0o640 & ~umask
+
+
+def test_a_log_is_not_replaced_by_another_file(tmp_path: Path) -> None:
+    log = small_log(tmp_path / "calibration.fits", finished=True)
+    before = log.read_bytes()
+    for refusing in (lambda: require_folder(log), lambda: write_whole(log, b"SIMPLE")):
+        with pytest.raises(DataFileError, match="is a log, which is never overwritten"):
+            refusing()
+    assert log.read_bytes() == before
 
 
 def test_the_recorder_uses_the_configured_mode() -> None:

@@ -15,15 +15,16 @@ from lowfc.contract.errors import ConfigurationError, DataFileError
 def being_written(path: Path, source: Path | None = None, mode: int = 0o666) -> Iterator[Path]:
     """Yield a temporary file that is renamed to `path` on success and removed on failure.
 
-    A directory, device or pipe at `path` is not replaced. The permissions are `mode` without the umask's bits, and at
-    most those of `source`, its origin.
+    A log, a directory, device or pipe at `path` is not replaced. The permissions are `mode` without the umask's bits,
+    and at most those of `source`, its origin.
 
     Raises:
-        DataFileError: the file cannot be written.
+        DataFileError: the file cannot be written, or is a log.
     """
     try:
         if not path.name or (path.exists() and not path.is_file()):
             raise OSError(errno.EINVAL, "not a regular file")
+        _refuse_log(path, source)
         most = source.stat().st_mode & mode if source is not None and source.exists() else mode
         part = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
         descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, most)
@@ -53,12 +54,28 @@ def require_folder(*files: Path | None) -> None:
     """Check that files can be written later; None is skipped.
 
     Raises:
-        DataFileError: A file's folder does not exist.
+        DataFileError: A file's folder does not exist, or the file is a log.
         ConfigurationError: Two files are the same.
     """
     written = [file for file in files if file is not None]
     for file in written:
         if not file.parent.is_dir():
             raise DataFileError(f"{file} cannot be written: there is no directory {file.parent}")
+        _refuse_log(file)
     if len({file.resolve() for file in written}) < len(written):
         raise ConfigurationError(f"these must be different files: {', '.join(map(str, written))}")
+
+
+def _refuse_log(path: Path, source: Path | None = None) -> None:
+    """Refuse to overwrite `source` or any log, whatever its name."""
+    if not path.is_file():
+        return
+    from mcap.writer import MCAP0_MAGIC  # slow
+
+    try:
+        with path.open("rb") as file:
+            is_log = file.read(len(MCAP0_MAGIC)) == MCAP0_MAGIC
+    except OSError as fault:
+        raise DataFileError(f"{path} is not overwritten: cannot read whether it is a log: {fault.strerror}") from fault
+    if is_log or (source is not None and source.exists() and path.samefile(source)):
+        raise DataFileError(f"{path} is a log, which is never overwritten; choose another name")

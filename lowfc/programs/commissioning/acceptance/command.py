@@ -134,7 +134,6 @@ def _carry_out(
     from lowfc.client import Client
     from lowfc.programs.commissioning.acceptance.live import Live
     from lowfc.programs.commissioning.acceptance.probe import logged_responses
-    from lowfc.programs.logs.overwrite_check import refuse_log
 
     required = configuration(config).acceptance if config is not None else None
     require_folder(plot)
@@ -144,8 +143,6 @@ def _carry_out(
         if run is not None:
             raise ConfigurationError("a log and a running loop (--run) exclude each other: use one")
         log = WholeLog(the_one(logs), skip_damaged=True)
-        if plot is not None:
-            refuse_log(plot, log.path)
         history = read_history(log)
         for remark in history.remarks:
             sys.stderr.write(f"warning: {remark}\n")

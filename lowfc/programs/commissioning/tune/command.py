@@ -40,7 +40,6 @@ def tune(
     from lowfc.client import Client
     from lowfc.programs.commissioning.tune.data import telemetry_from_log, telemetry_from_run
     from lowfc.programs.commissioning.tune.result import picture, result_of, tuned
-    from lowfc.programs.logs.overwrite_check import refuse_log
 
     if bool(logs) == (live is not None):
         raise ConfigurationError("give one LOG, or observe a running loop with --live SECONDS")
@@ -48,9 +47,6 @@ def tune(
     require_folder(out, plot)
     if logs:
         reader = WholeLog(the_one(logs), skip_damaged=True)
-        for file in (out, plot):
-            if file is not None:
-                refuse_log(file, reader.path)
         with reading_bar(console) as count:
             reader.progress = partial(count, "reading")
             telemetry = telemetry_from_log(reader)

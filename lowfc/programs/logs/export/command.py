@@ -95,13 +95,12 @@ def export_log(
     console: "Console",
 ) -> dict[str, Any]:
     """Export a log; return the results that `--json` prints."""
-    from lowfc.adapters.files.whole_file import being_written
+    from lowfc.adapters.files.whole_file import being_written, require_folder
     from lowfc.adapters.logs.history import read_history
     from lowfc.adapters.logs.parts import WholeLog
     from lowfc.adapters.logs.recovery import in_words, missing_end_text
     from lowfc.adapters.logs.writer import stem_of
     from lowfc.adapters.process.progress import reading_bar
-    from lowfc.programs.logs.overwrite_check import refuse_log
 
     if frames and to is Format.CSV:
         raise ConfigurationError("a CSV file cannot hold frames: use --to npz, fits or aot, or omit --frames")
@@ -109,8 +108,8 @@ def export_log(
     reader = WholeLog(log, skip_damaged=True)
     out = out if out is not None else reader.path.parent / (stem_of(reader.path) + _ENDINGS[to])
     files = [out] + ([out.with_suffix(".frames.npy")] if frames and to is Format.NPZ else [])
+    require_folder(*files)
     for file in files:
-        refuse_log(file, reader.path)
         if file.exists() and not force:
             raise DataFileError(f"{file} already exists; use another name (--out), or replace it with --force")
     with contextlib.ExitStack() as held:

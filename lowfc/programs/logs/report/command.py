@@ -48,7 +48,6 @@ def _report(log: "Parts", out: Path | None, as_json: bool) -> None:
     from lowfc.adapters.logs.parts import titled
     from lowfc.adapters.logs.writer import stem_of
     from lowfc.adapters.process.progress import counting_bar
-    from lowfc.programs.logs.overwrite_check import refuse_log
     from lowfc.programs.logs.report.page import page, require_page
     from lowfc.programs.logs.report.results import report_of
     from lowfc.programs.logs.report.source import read_run
@@ -56,7 +55,6 @@ def _report(log: "Parts", out: Path | None, as_json: bool) -> None:
     target = out if out is not None or as_json else log[0].with_name(f"{stem_of(log[0])}.html")
     require_folder(target)
     if target is not None:
-        refuse_log(target, log[0])
         require_page()
     with counting_bar(Console(stderr=True), TimeElapsedColumn()) as count:
         run = read_run(log, partial(count, f"reading {titled(log)}"))
