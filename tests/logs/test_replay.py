@@ -433,6 +433,22 @@ def test_logs_in_another_order_than_recorded_are_refused(
         workers.replay_files([newer, log], 0.0, jobs, lambda done: None)
 
 
+def test_two_lockstep_runs_with_the_same_sequences_are_replayed_apart(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    paths = []
+    for run, gain in (("a", 0.1), ("b", 0.2)):
+        made = report_log.SyntheticLog()
+        made.request("gain", (gain,))
+        made.frames(200)
+        hour_ns = len(paths) * 3600 * 10**9
+        made.samples = [one._replace(receive_time_ns=one.receive_time_ns + hour_ns) for one in made.samples]
+        monkeypatch.setattr(report_log, "METADATA", {"lowfc": {"run": run}})
+        paths.append(made.write(tmp_path / f"{run}.mcap"))
+    found = workers.replay_files(paths, 0.0, 1, lambda done: None)
+    assert (found.frames, found.unchecked, found.first_difference, found.runs) == (400, 0, None, ["a", "b"])
+
+
 def test_a_damaged_log_is_replayed_except_for_the_damage(log: Path, tmp_path: Path) -> None:
     damaged = bytearray(log.read_bytes())
     with log.open("rb") as stream:

@@ -35,10 +35,13 @@ class Repeated:
     def __init__(self) -> None:
         self._newest: dict[tuple[str, int], int] = {}
         self._before: dict[tuple[str, int], int] = {}
+        self._run = ""
 
-    def next_file(self) -> None:
-        """Begin the next file."""
-        self._before = dict(self._newest)
+    def next_file(self, run: str) -> None:
+        """Begin the next file; a lockstep run has the sequences of another one without repeating its messages."""
+        if run != self._run:
+            self._newest.clear()
+        self._run, self._before = run, dict(self._newest)
 
     def __call__(self, message: Sample) -> bool:
         """Whether this message was in a previous file."""
@@ -87,7 +90,7 @@ class WholeLog(LogReader):
             part = LogReader(path, skip_damaged=self._skip_damaged, **self._options)
             self.parts.append(part)
             self.schemas, self.channels = part.schemas, part.channels
-            repeated.next_file()
+            repeated.next_file(metadata_at_start(path).get("lowfc", {}).get("run", ""))
             try:
                 for message in part:
                     if len(self.described) != len(described) + len(part.described):

@@ -16,6 +16,7 @@ from lowfc.contract.envelope import start_of
 from lowfc.contract.messages import COMMAND, CONTROL_INPUT, CONTROLLER_STATE, FRAME, REQUEST, STEP, topic_of
 from lowfc.programs.logs.replay.account import Account
 from lowfc.programs.logs.replay.controller_replay import PATIENCE_NS, WHOLE, Context, ControllerReplay, Segment
+from lowfc.programs.logs.replay.frames import Frames
 
 TOPICS = (FRAME, STEP, COMMAND, CONTROL_INPUT, CONTROLLER_STATE, REQUEST, *published.TOPICS)
 """Topics that a replay reads."""
@@ -28,12 +29,21 @@ class Replay:
         """Differences up to `tolerance_nm` are ignored: for a log of another processor, or another `kernel`."""
         self.context = Context(tolerance_nm, segment, kernel=kernel)
         self._controllers: dict[int, ControllerReplay] = {}
+        self._run = ""
         self._last_ns = self._begun_ns = self._ended_ns = 0
 
     @property
     def duration_s(self) -> float:
         """Time from the first frame of the segment to its last, by their log times."""
         return (self._ended_ns - self._begun_ns) * 1e-9
+
+    def begin_file(self, run: str) -> None:
+        """Begin a file; a lockstep run has the sequences of another one, whose controllers and frames are forgotten."""
+        if run != self._run:
+            self.finish()
+            self._controllers.clear()
+            self.context.frames = Frames()
+        self._run = run
 
     def take(self, message: Sample) -> None:
         """Add the next message."""
