@@ -241,7 +241,7 @@ def test_a_longer_delay_is_measured_on_a_running_loop(report_periods: float, del
     run = telemetry_from_run(SteppedLoop(closed_loop(disturbance_nm, delay_frames), report_periods), 60.0)
     assert run.timing.delay == delay_frames
     assert run.pol.joined() == pytest.approx(disturbance_nm[-run.pol.frames :], abs=1e-4)
-    warned = "the controller assumed a delay of 1 frames, but measured from the times of frames and mirror it is 2.00"
+    warned = "the controller assumed a delay of 1 frame, but measured from the times of frames and mirror it is 2.00"
     assert [warning.startswith(warned) for warning in run.warnings] == [True] * (delay_frames - 1)
 
 

@@ -251,7 +251,7 @@ def test_frames_that_are_not_in_the_log_are_counted(
     monkeypatch.setattr(run, "measured_again", lambda *_: found)
     results = what_if(run, requested("estimator=pinv"))
     assert results["frames_compared"] == FRAMES - SETTLING - 5
-    assert "the log lacks 5 frames that were used" in results["warnings"][0]
+    assert "the log lacks 5 used frames" in results["warnings"][0]
 
 
 def test_commands_are_converted_to_modes_of_another_scale(runs: dict[str, LoggedRun], tmp_path: Path) -> None:

@@ -104,7 +104,7 @@ def run(names: Sequence[str], context: Context, plots: Path | None = None) -> li
         try:
             plots.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise DataFileError(f"the folder {plots} cannot be created: {error}") from error
+            raise DataFileError(f"the folder {plots} cannot be created: {error.strerror}") from error
     with counting_bar(Console(stderr=True), MofNCompleteColumn(), TimeElapsedColumn()) as count, threadpool_limits(1):
 
         def progress(what: str, done: int, total: int) -> None:

@@ -187,8 +187,8 @@ def _delay_warnings(assumed: float, seen: SeenCommands, measured: float | None, 
     if seen.delay_frames == assumed:
         return []
     return [
-        f"the controller assumed a delay of {assumed:g} frames, but measured from {source} it is {measured:.2f}: the "
-        f"law is made for {seen.delay_frames:g} frames; set control.delay_frames"
+        f"the controller assumed a delay of {counted(assumed, 'frame')}, but measured from {source} it is "
+        f"{measured:.2f}: the law is made for {counted(seen.delay_frames, 'frame')}; set control.delay_frames"
     ]
 
 

@@ -99,7 +99,7 @@ def what_if(run: LoggedRun, what: WhatIf) -> dict[str, Any]:
         "added_contrast": contrast,
         "warnings": [
             *_log_warnings(run),
-            *([f"the log lacks {counted(int(lost), 'frame')} that were used: the what-if holds there"] if lost else []),
+            *([f"the log lacks {counted(int(lost), 'used frame')}: the what-if holds there"] if lost else []),
             *_range_warnings(run.calibration, columns),
             *([] if user_step else _automatic_warnings(what, noll)),
             *([] if user_step else _law_warnings(run, new_law, command_nm[rows])),
