@@ -379,6 +379,7 @@ def test_a_calibration_can_be_computed_at_another_wavefront(loop: InProcessLoop)
         ("--json reference", "--json is before `reference`"),
         ("--method poke --config test.toml", "--config requires --method analytic"),
         ("--at 4=15", "--at requires --method analytic"),
+        ("--method analytic --resume --snr 50", "--snr is for pokes, but --method analytic computes: omit it"),
     ],
 )
 def test_an_option_without_effect_is_refused(loop: InProcessLoop, words: str, why: str) -> None:

@@ -91,6 +91,9 @@ def calibrate(
         snr = MIN_SNR
     request = CalibrationRequest(method, out, snr, cycles, amplitude, resume, truncate, tikhonov)
     if method == "analytic":
+        for option in ("--snr", "--amplitude", "--cycles", "--resume"):
+            if option in options:
+                raise ConfigurationError(f"{option} is for pokes, but --method analytic computes: omit it")
         print_result(tasks.computed(config, request, at, run if load else None, load=load), as_json=as_json)
         return
     for option in ("--config", "--at"):
