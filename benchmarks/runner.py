@@ -46,6 +46,8 @@ def run(name: str, benchmark: Benchmark, words: Sequence[str]) -> int:
     benchmark.options(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args(words)
+    if not 0.01 <= options.seconds <= 1e5 or getattr(options, "repeats", 1) < 1:
+        parser.error("--seconds must be 0.01 to 100000, --repeats at least 1")
     where = host()
     with passing_bar(Console(stderr=True)) as bar:
         task = bar.add_task(name, total=None)

@@ -31,6 +31,13 @@ def by_heading(lines: runner.Lines) -> list[dict[str, str]]:
     return [dict(reversed(list(zip(lines[0], line, strict=True)))) for line in lines[1:]]
 
 
+@pytest.mark.parametrize("words", ["--seconds 0", "--seconds nan", "--repeats 0"])
+def test_nothing_is_measured_in_no_time(capsys: pytest.CaptureFixture[str], words: str) -> None:
+    with pytest.raises(SystemExit):
+        runner.run("kernels", kernels, words.split())
+    assert "--seconds must be 0.01 to 100000, --repeats at least 1" in capsys.readouterr().err
+
+
 # The control step
 
 
