@@ -363,6 +363,14 @@ def test_a_growing_log_is_read_up_to_its_size_at_opening(tmp_path: Path) -> None
     assert (reader.complete, reader.finished, reader.damage) == (False, False, [])
 
 
+@pytest.mark.parametrize("size", [3, 8, 20])
+def test_a_log_cut_off_at_its_beginning_is_not_finished(tmp_path: Path, size: int) -> None:
+    path = LogWriter(tmp_path / "a.mcap", START_NS, METADATA, ATTACHMENTS).finish({})
+    path.write_bytes(path.read_bytes()[:size])
+    assert list(reader := LogReader(path)) == []
+    assert (reader.complete, reader.finished) == (False, False)
+
+
 def test_a_log_is_never_overwritten(tmp_path: Path) -> None:
     paths = []
     for _ in range(3):

@@ -94,7 +94,7 @@ class LogFile:
         if not self.size:
             self._file.close()
             raise DataFileError(f"{path} is empty: nothing was recorded")
-        self.finished = self._read(max(0, self.size - len(MAGIC)), len(MAGIC)) == MAGIC
+        self.finished = self.size > len(MAGIC) and self._read(self.size - len(MAGIC), len(MAGIC)) == MAGIC
         self._by_lowfc = self._is_by_lowfc()
         self._summary = self._find_summary()
         self._bytes_to_try = _TRIES * self.size
