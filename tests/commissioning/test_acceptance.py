@@ -171,19 +171,21 @@ def test_the_noise_floor_matches_photon_and_read_noise() -> None:
     config = configured(disturbance__preset="bench", camera__instants=8)
     loop = InProcessLoop(config)
     responses, calibration = responses_of(loop, noise, 3.0), loop.calibration()
-    found = noise.judge(responses, REQUIRED, config, calibration)
+    found = noise.judge(responses, REQUIRED, config)
     assert found.passed, found.text()
     for mode in found.modes:
         assert mode.open_nm == pytest.approx(mode.expected_nm, rel=0.2)
         assert mode.closed_nm == pytest.approx(mode.expected_nm, rel=0.2)
         assert 0 < mode.residual_floor_nm < mode.closed_nm
     brighter = configured(star__magnitude=-2.0)
-    failed = noise.judge(responses, REQUIRED, brighter, replace(calibration, flux_dn=4 * calibration.flux_dn))
+    four_times = replace(calibration, flux_dn=4 * calibration.flux_dn)
+    lit = [replace(one, loop=replace(one.loop, calibration=four_times)) for one in responses]
+    failed = noise.judge(lit, REQUIRED, brighter)
     assert not failed.passed
     assert "FAILED" in failed.text()
     assert drawn(noise, found).startswith(b"\x89PNG")
     with pytest.raises(AcceptanceError, match="closed-loop recording"):
-        noise.judge(responses[:1], REQUIRED, config, calibration)
+        noise.judge(responses[:1], REQUIRED, config)
 
 
 def test_a_note_announces_the_probe_sequences_of_a_test_in_a_log() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from lowfc.adapters.files import factory
 from lowfc.arrays import Array, Single
-from lowfc.contract.codecs.state_codec import controller_state, decode_state
+from lowfc.contract.codecs.state_codec import calibration_in_use, controller_state, decode_state
 from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.map_reconstructor import map_reconstructor, noise_covariance_nm2
@@ -141,6 +141,9 @@ def test_modes_not_corrected_reduce_the_noise_of_the_others(faint: Bench) -> Non
     uncorrected = active_loop.weighting.prior_nm2 > 0
     assert 0 < uncorrected.sum() < uncorrected.size
     np.testing.assert_array_equal(uncorrected, active_loop.integrator.gain == 0)
+    state = controller_state(faint.state, faint.settings, 0)
+    in_use = calibration_in_use(state, active_loop.calibration).reconstructor
+    np.testing.assert_array_equal(in_use, active_loop.estimator.rows[:-1])
     original, reweighted = (
         np.diag(
             noise_covariance_nm2(

@@ -238,6 +238,19 @@ def test_the_state_of_the_log_is_in_the_verdict(
     assert made.results["verdict"]["because"] == ("" if level == "good" else check["text"])
 
 
+def test_the_noise_is_that_of_the_reconstructor_in_use(tmp_path: Path) -> None:
+    run = read_run(uneventful(SyntheticLog(), 600).write(tmp_path / "x.mcap"))
+    before, state = closed_loop.noise_of(run.history, slice(None)), run.history.controllers[-1]
+    state.prior_nm2.extend([0.0, 0.0, 0.01])  # automatic gains leave the last mode uncorrected
+    state.weighting_flux_dn = TOYS.flux_dn
+    state.camera_expected.gain_e_per_dn = 1.0
+    after = closed_loop.noise_of(run.history, slice(None))
+    assert before is not None
+    assert after is not None
+    assert (after.total_nm[:2] < 0.99 * before.total_nm[:2]).any()
+    assert after.total_nm[2] == before.total_nm[2]
+
+
 def test_only_the_end_of_a_very_long_stretch_is_analysed(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(closed_loop, "MAX_STEPS", 400)
     stretch = results(good)["closed_stretch"]

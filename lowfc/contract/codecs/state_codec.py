@@ -1,6 +1,7 @@
 """Encode and decode the controller's state and settings; a controller restored from them continues identically."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
@@ -12,6 +13,7 @@ from lowfc.contract.codecs.codec import wire_mode, wire_reasons
 from lowfc.contract.codecs.law_codec import command_channels_of, gains_of, law_header, law_of, put_command_channels
 from lowfc.contract.messages import fields_of, floats, from_timestamp, timestamp, wire
 from lowfc.control.calibration.calibration import Calibration
+from lowfc.control.calibration.map_reconstructor import map_reconstructor
 from lowfc.control.kernel.tables import NUMPY, Kernel
 from lowfc.control.laws import linear_law
 from lowfc.control.laws.linear_law import LinearLaw
@@ -85,6 +87,16 @@ def controller_state(state: State, settings: Settings, time_ns: int) -> wire.Con
         message.command_history_nm.extend(np.concatenate(loop.history_nm).tolist())
         message.actuators = loop.actuators_nm.tobytes()
     return message
+
+
+def calibration_in_use(message: wire.ControllerState, calibration: Calibration) -> Calibration:
+    """The calibration with the reconstructor in use, which automatic gains weight for the modes not corrected."""
+    prior_nm2 = np.array(message.prior_nm2, np.float32)
+    if message.calibration_id != calibration.id or prior_nm2.size != len(calibration.noll):
+        return calibration
+    camera = camera_settings(message.camera_expected) if message.HasField("camera_expected") else calibration.camera
+    rows = map_reconstructor(calibration, prior_nm2, message.weighting_flux_dn, camera)
+    return replace(calibration, reconstructor=rows)
 
 
 def decode_state(

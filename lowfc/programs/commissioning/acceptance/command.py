@@ -149,14 +149,14 @@ def _carry_out(
         responses = logged_responses(history, test.KIND)
         if history.configuration is None or history.calibration is None:
             raise DataFileError(f"{log.path}: has no configuration, so the requirements are unknown")
-        config_in_use, calibration = history.configuration, history.calibration
+        config_in_use = history.configuration
     else:
         with Client(run) as client, counting_bar(Console(stderr=True), TimeRemainingColumn()) as count:
             live = Live(client, partial(count, test.KIND))
-            config_in_use, calibration = live.configuration, live.calibration
+            config_in_use = live.configuration
             with client.reserved("lowfc acceptance"), live.restored():
                 responses = play(live, required or config_in_use.acceptance)
-    instrument = (config_in_use, calibration) if by_instrument else ()
+    instrument = (config_in_use,) if by_instrument else ()
     result = test.judge(responses, required or config_in_use.acceptance, *instrument)
     if plot is not None and figure is not None:
         test.draw(result.json_object(), figure)

@@ -16,6 +16,7 @@ from lowfc.adapters.logs.history import History
 from lowfc.arrays import Array, Long, Single
 from lowfc.contract.codecs import codec
 from lowfc.contract.codecs.law_codec import driving, gains_of
+from lowfc.contract.codecs.state_codec import calibration_in_use
 from lowfc.contract.errors import DataFileError, LowfcError
 from lowfc.contract.messages import wire
 from lowfc.control.calibration.calibration import Calibration
@@ -72,12 +73,13 @@ class AcceptanceResult(Result):
 
 @dataclass(frozen=True, slots=True)
 class Loop:
-    """The measured loop: control law, modes, configured delay and frame rate."""
+    """The measured loop: law, modes, configured delay, frame rate, calibration with the reconstructor in use."""
 
     law: Integrator | LinearLaw
     noll: tuple[int, ...]
     delay_frames: float
     rate_hz: float
+    calibration: Calibration
 
     @property
     def linear(self) -> LinearLaw:
@@ -243,4 +245,5 @@ def loop_of(
     state: wire.ControllerState, calibration: Calibration, rate_hz: float, laws: Mapping[str, LinearLaw]
 ) -> Loop:
     """The loop that a controller state describes; `laws` contains its linear law, if it has one."""
-    return Loop(driving(state, laws) or gains_of(state), calibration.noll, state.delay_frames, rate_hz)
+    law, in_use = driving(state, laws) or gains_of(state), calibration_in_use(state, calibration)
+    return Loop(law, calibration.noll, state.delay_frames, rate_hz, in_use)

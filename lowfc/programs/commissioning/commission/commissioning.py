@@ -258,7 +258,8 @@ class Commissioning:
         state, noll, rate_hz = self._state(), self._computed.noll, self._config.camera.rate_hz
         integrator, law = gains_of(state), driving(state, self._loop.laws())
         if law is not None:
-            settling = SETTLING_FRAMES + FADING_FRAMES + Loop(law, noll, state.delay_frames, rate_hz).settling_frames()
+            loop = Loop(law, noll, state.delay_frames, rate_hz, self._computed)
+            settling = SETTLING_FRAMES + FADING_FRAMES + loop.settling_frames()
             return driven_by(law, integrator.limit_nm), settling, []
         automatic = np.array(state.automatic or [False] * len(noll), bool)
         integrator = replace(integrator, gain=np.where(automatic, np.float32(CHECK_GAIN), integrator.gain))

@@ -13,6 +13,7 @@ from lowfc.adapters.logs.reader import LogReader
 from lowfc.arrays import Array, Mask, Single
 from lowfc.client import Client, MirrorWatch, configuration_of
 from lowfc.contract.codecs.law_codec import driving, gains_of
+from lowfc.contract.codecs.state_codec import calibration_in_use
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BusError, DataFileError
 from lowfc.contract.messages import wire
@@ -93,7 +94,7 @@ def telemetry_from_log(log: LogReader) -> Telemetry:
         usable,
         None if run.true_nm is None else run.true_nm[1],
         config,
-        run.calibration,
+        run.calibration if history.controller is None else calibration_in_use(history.controller, run.calibration),
         warnings,
     )
 
@@ -152,7 +153,7 @@ def telemetry_from_run(loop: Client, seconds: float, progress: Callable[[float],
         usable,
         None,
         config,
-        calibration,
+        calibration_in_use(states[-1], calibration),
         [*_delay_warnings(assumed, seen, measured, "the times of frames and mirror"), *lost],
     )
 

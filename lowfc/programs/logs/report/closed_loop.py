@@ -7,6 +7,7 @@ import numpy as np
 
 from lowfc.adapters.logs.history import History
 from lowfc.arrays import Array, Mask
+from lowfc.contract.codecs.state_codec import calibration_in_use
 from lowfc.control.laws import margins
 from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.error_budget import SensorNoise, sensor_noise
@@ -224,23 +225,30 @@ def _band_rms(frequency_hz: Array, power: Array, low_hz: float, high_hz: float) 
 
 
 def noise_of(history: History, rows: slice) -> SensorNoise | None:
-    """Sensor noise of one frame at the flux of these steps; None if the log lacks camera or calibration."""
+    """Sensor noise of one frame at the flux of these steps, through the reconstructor in use at their end.
+
+    None if the log lacks camera or calibration.
+    """
     camera, calibration = history.camera, history.calibration
     flux_dn = history.steps.flux_dn[rows]
     flux_dn = flux_dn[flux_dn > 0]
     if camera is None or calibration is None or not flux_dn.size or not camera.gain_e_per_dn:
         return None
-    charge_e = 0.0
+    charge_e, in_use = 0.0, calibration
     if history.configuration is not None:
         if not history.configuration.camera.noise:
             nothing = np.zeros(len(calibration.noll))
             return SensorNoise(nothing, nothing)
         charge_e = history.configuration.dark_e
+    end = history.steps.sequence[rows][-1]
+    for state in history.controllers:
+        if state.frame_sequence <= end:
+            in_use = calibration_in_use(state, calibration)
     em_gain = max(camera.em_gain, 1.0)
     excess = 2.0 if em_gain > 1 else 1.0
     readout_e2 = camera.read_noise_e**2 + camera.gain_e_per_dn**2 / 12  # after the EM gain; rounding to whole DN
     return sensor_noise(
-        calibration.reconstructor.astype(float),
+        in_use.reconstructor.astype(float),
         calibration.reference.astype(float),
         float(flux_dn.mean()) * camera.gain_e_per_dn / em_gain,
         float(np.sqrt(readout_e2 / em_gain**2 + excess * charge_e)),
