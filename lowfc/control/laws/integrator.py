@@ -42,7 +42,8 @@ class Integrator:
             ("limit_nm", self.limit_nm, 0, np.inf),
         ):
             if not (np.isfinite(array).all() and (array >= low).all() and (array <= high).all()):
-                raise ValueError(f"every {name} must be between {low} and {high}, got {array.tolist()}")
+                expected = f"between {low} and {high}" if np.isfinite(high) else f"finite and at least {low}"
+                raise ValueError(f"every {name} must be {expected}, got {array.tolist()}")
         object.__setattr__(self, "kept", np.where(self.uncorrected, np.minimum(1 - self.leak, RELAXING), 1 - self.leak))
         object.__setattr__(self, "rows", single([self.gain, self.kept, self.limit_nm]))
 
