@@ -496,12 +496,12 @@ def test_missing_packages_are_reported_before_the_log_is_read(
     assert json.loads(lowfc("report", good, "--json").stdout)["log"]["file"] == "x.mcap", "the results need neither"
 
 
-@pytest.mark.parametrize("name", ["night.mcap", "other.mcap.part", "link.html"])
-def test_a_report_never_overwrites_a_log(tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize("name", ["night.mcap", "other.mcap.part", "link.html", "other.fits"])
+def test_a_report_overwrites_no_log_and_has_the_name_of_a_page(tmp_path: Path, name: str) -> None:
     log = uneventful(SyntheticLog(), 3).write(tmp_path / "night.mcap")
     before = log.read_bytes()
     (tmp_path / "link.html").hardlink_to(log)
     done = lowfc("report", str(log), "--out", str(tmp_path / name))
     assert isinstance(done.exception, DataFileError)
     assert log.read_bytes() == before
-    assert not (tmp_path / "other.mcap.part").exists()
+    assert {path.name for path in tmp_path.iterdir()} == {"night.mcap", "link.html"}

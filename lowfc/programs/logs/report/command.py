@@ -14,7 +14,7 @@ from lowfc.contract.printable import LINES, printable
 if TYPE_CHECKING:
     from lowfc.adapters.logs.parts import Parts
 
-_LOGS = (".mcap", ".part")
+_ENDINGS = (".html", ".htm")
 
 
 def report(
@@ -33,8 +33,8 @@ def report(
     from lowfc.adapters.logs.parts import one_by_one
 
     found = one_by_one(logs, out, as_json=as_json)
-    if out is not None and out.suffix in _LOGS:
-        raise DataFileError(f"{out} has the name of a log; use --out FILE.html")
+    if out is not None and out.suffix not in _ENDINGS:  # a report replaces an earlier one, and nothing else
+        raise DataFileError(f"a report is an HTML page: use --out FILE.html, not {out}")
     for log in found:
         _report(log, out, as_json)
 
