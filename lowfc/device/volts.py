@@ -41,7 +41,7 @@ class VoltMap:
         grid = (config.mirror.rows, config.mirror.columns)
 
         def read(key: str, file: str, default: Array) -> Array:
-            return shape_of(config, f"option {key}", file).astype(float) if file else default
+            return shape_of(config, f"option {key}", file, units=()).astype(float) if file else default
 
         zero = read("zero_map", options.zero_map, np.full(grid, options.zero))
         gain = read("gain_map", options.gain_map, np.ones(grid))

@@ -184,6 +184,18 @@ def test_archives_and_damaged_compressed_files_are_refused(tmp_path: Path, conte
     assert expected in error_of(lambda: check_files(load(None, {"mirror.flat": str(path)})))
 
 
+def test_a_shape_in_another_unit_is_refused_and_a_map_without_units_is_not(tmp_path: Path) -> None:
+    path, image = tmp_path / "map.fits", fits.PrimaryHDU(np.ones((34, 34)))
+    image.header["BUNIT"] = "um"
+    image.writeto(path)
+    text = error_of(lambda: check_files(load(None, {"mirror.flat": str(path)})))
+    assert "its values are in um (BUNIT), expected nm" in text
+    check_files(load(None, {"mirror.active": str(path)}))
+    image.header["BUNIT"] = "nm"
+    image.writeto(path, overwrite=True)
+    check_files(load(None, {"mirror.flat": str(path)}))
+
+
 def test_fits_images_and_pupils_with_a_huge_header_are_refused(tmp_path: Path) -> None:
     cards = ("SIMPLE  = T", "BITPIX  = -32", "NAXIS   = 2", "NAXIS1  = 4000000", "NAXIS2  = 4000000", "END")
     fields = (card.partition(" = ") for card in cards)

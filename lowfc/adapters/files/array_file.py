@@ -10,21 +10,25 @@ from numpy.lib.format import read_array as read_npy
 from lowfc.adapters.files import fits_file
 from lowfc.contract.codecs import input_file
 from lowfc.contract.errors import DataFileError
+from lowfc.contract.printable import printable
 
 
-def read_array(path: Path, what: str, dimensions: tuple[int, ...]) -> npt.NDArray[np.generic]:
+def read_array(
+    path: Path, what: str, dimensions: tuple[int, ...], units: tuple[str, ...] = ()
+) -> npt.NDArray[np.generic]:
     """Read the array of a file.
 
     Args:
         path: path of the file.
         what: description of the expected content, for errors.
         dimensions: permitted numbers of dimensions.
+        units: permitted units of a FITS image that states one; empty for any.
 
     Raises:
         DataFileError: the file is missing, damaged or holds something else.
     """
     try:
-        array = _npy(path) if path.suffix == ".npy" else _fits(path)
+        array, unit = (_npy(path), "") if path.suffix == ".npy" else _fits(path)
     except FileNotFoundError:
         raise DataFileError(f"{path}: there is no such file") from None
     except fits_file.DAMAGED as error:
@@ -32,6 +36,8 @@ def read_array(path: Path, what: str, dimensions: tuple[int, ...]) -> npt.NDArra
         raise DataFileError(f"{path}: neither a FITS image nor a numpy array (.npy): {why}") from None
     if array.ndim not in dimensions or not array.size or array.dtype.kind not in "biuf":
         raise DataFileError(f"{path}: {what} of numbers, got {array.shape} of {array.dtype}")
+    if units and unit and unit not in units:
+        raise DataFileError(f"{path}: its values are in {printable(unit)} (BUNIT), expected {units[0]}: convert them")
     return array
 
 
@@ -43,6 +49,6 @@ def _npy(path: Path) -> npt.NDArray[np.generic]:
             raise ValueError(f"its header cannot be read: {error}") from None
 
 
-def _fits(path: Path) -> npt.NDArray[np.generic]:
+def _fits(path: Path) -> tuple[npt.NDArray[np.generic], str]:
     with fits_file.opened(path) as units:
         return fits_file.first_image(units)

@@ -135,16 +135,16 @@ def single(hdus: fits.HDUList, name: str) -> Single:
     return np.ascontiguousarray(data, dtype=np.float32)
 
 
-def first_image(hdus: fits.HDUList) -> npt.NDArray[np.generic]:
-    """Read the first image or cube.
+def first_image(hdus: fits.HDUList) -> tuple[npt.NDArray[np.generic], str]:
+    """Read the first image or cube, and its unit (BUNIT), empty if it is not given.
 
     Raises:
         ValueError: there is none.
     """
-    found = next((hdu.data for hdu in hdus if hdu.is_image and hdu.data is not None), None)
+    found = next((hdu for hdu in hdus if hdu.is_image and hdu.data is not None), None)
     if found is None:
         raise ValueError("there is no image in it")
-    return np.asarray(found)
+    return np.asarray(found.data), str(found.header.get("BUNIT", "")).strip()
 
 
 def require_identity(path: Path, found: str, stated: str) -> None:

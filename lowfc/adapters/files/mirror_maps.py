@@ -9,8 +9,10 @@ from lowfc.contract.codecs.input_file import user_path
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import ConfigurationError, DataFileError
 
+_NM = ("nm", "nanometer", "nanometers")
 
-def read_shape(path: Path) -> Single:
+
+def read_shape(path: Path, units: tuple[str, ...] = _NM) -> Single:
     """Read the shape of a mirror (rows, columns), nm of surface: the first image of a FITS file, or a .npy file.
 
     Raises:
@@ -18,7 +20,7 @@ def read_shape(path: Path) -> Single:
     """
     from lowfc.adapters.files.array_file import read_array  # astropy is slow to import
 
-    shape = read_array(path, "a mirror's shape is an array (rows, columns)", (2,))
+    shape = read_array(path, "a mirror's shape is an array (rows, columns)", (2,), units)
     return single(shape)
 
 
@@ -30,7 +32,7 @@ def active_actuators(config: Configuration) -> Mask | None:
     """
     if not config.mirror.active:
         return None
-    found = shape_of(config, "mirror.active", config.mirror.active)
+    found = shape_of(config, "mirror.active", config.mirror.active, units=())
     if not np.isin(found, (0, 1)).all():
         raise ConfigurationError(f"mirror.active = {config.mirror.active!r}: every value must be 0 or 1")
     if not found.any():
@@ -51,14 +53,16 @@ def flat_nm(config: Configuration) -> Single | None:
     return found if active is None else np.where(active, found, np.float32(0))
 
 
-def shape_of(config: Configuration, key: str, file: str) -> Single:
+def shape_of(config: Configuration, key: str, file: str, units: tuple[str, ...] = _NM) -> Single:
     """Read one value per actuator (rows, columns), such as a shape in nm of surface; `key` names the file in errors.
+
+    If `units` are given, a FITS file that states another unit is refused.
 
     Raises:
         ConfigurationError: the file is missing, damaged or does not fit the mirror.
     """
     try:
-        found = read_shape(user_path(file))
+        found = read_shape(user_path(file), units)
     except DataFileError as fault:
         raise ConfigurationError(f"{key}: {fault}") from None
     grid = (config.mirror.rows, config.mirror.columns)
