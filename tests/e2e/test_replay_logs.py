@@ -34,7 +34,7 @@ def lossy(self, payload, *more):
     if self.topic is not FRAME or self.published % 100 != 57:
         return put(self, payload, *more)
     self.published += 1
-    return Envelope(sequence_of(self._start_s, self.published - 1), self._host_ns())
+    return Envelope(sequence_of(self._bus.start_s, self.published - 1), self._host_ns())
 
 ZenohPublisher.put = lossy
 main()
@@ -101,7 +101,8 @@ def steps_of(*logs: Path) -> int:
 def test_operators_a_restart_dropped_frames_and_rotation(night: Night, tmp_path: Path) -> None:
     night.start("mirror-dm", "controller", "recorder")
     night.start("camera")
-    night.loop.close_loop()
+    for _ in night.loop.steps(1, patience_s=20.0):
+        night.loop.close_loop()
     for gain in (0.2, 0.4):
         night.loop.gain(gain)
         time.sleep(0.3)
