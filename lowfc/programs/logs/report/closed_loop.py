@@ -234,16 +234,15 @@ def noise_of(history: History, rows: slice) -> SensorNoise | None:
     flux_dn = flux_dn[flux_dn > 0]
     if camera is None or calibration is None or not flux_dn.size or not camera.gain_e_per_dn:
         return None
-    charge_e, in_use = 0.0, calibration
+    charge_e = 0.0
     if history.configuration is not None:
         if not history.configuration.camera.noise:
             nothing = np.zeros(len(calibration.noll))
             return SensorNoise(nothing, nothing)
         charge_e = history.configuration.dark_e
     end = history.steps.sequence[rows][-1]
-    for state in history.controllers:
-        if state.frame_sequence <= end:
-            in_use = calibration_in_use(state, calibration)
+    states = [state for state in history.controllers if state.frame_sequence <= end]
+    in_use = calibration_in_use(states[-1], calibration) if states else calibration
     em_gain = max(camera.em_gain, 1.0)
     excess = 2.0 if em_gain > 1 else 1.0
     readout_e2 = camera.read_noise_e**2 + camera.gain_e_per_dn**2 / 12  # after the EM gain; rounding to whole DN
