@@ -215,7 +215,8 @@ def signals() -> Iterator[None]:
 def test_the_command_serves_a_run_until_it_is_stopped(
     pvs: Variables, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Stopped by SIGTERM when the first frame is posted; meanwhile `safe` does not wait for the end of a log."""
+    """The run starts again at once; `safe` does not wait for the end of a log; the first frame posted stops it all."""
+    buses: list[MemoryBus] = []
     hub, bench, plain, finished = MemoryHub(), list[Sample](), pvs.Shared.post, threading.Event()
     controller = MemoryBus(hub, "controller", HostClock())
     controller.subscribe(BENCH, bench.append)
@@ -228,10 +229,13 @@ def test_the_command_serves_a_run_until_it_is_stopped(
 
     def make_bus(links: object, role: str, clock: HostClock, *, monitor: bool) -> MemoryBus:
         assert monitor
-        return MemoryBus(hub, role, clock)
+        buses.append(MemoryBus(hub, role, clock))
+        return buses[-1]
 
     def watch(*arguments: Any) -> Any:
         made = command_watch(*arguments)
+        if len(buses) == 1:
+            return made
         puts = [
             threading.Thread(target=pvs[f"lowfc:{name}"].handler.put, args=(None, operation))
             for name, operation in (("record_stop", stop), ("safe", safe))
@@ -261,7 +265,9 @@ def test_the_command_serves_a_run_until_it_is_stopped(
     monkeypatch.setattr(command, "ZenohBus", make_bus)
     monkeypatch.setattr(command, "the_run", lambda run: run)
     monkeypatch.setattr(
-        command, "open_run", lambda *_: SimpleNamespace(path=tmp_path, links=SimpleNamespace(run_id="bench"))
+        command,
+        "open_run",
+        lambda run, _: SimpleNamespace(run_id=run, path=tmp_path, links=None, restarted=lambda: len(buses) == 1),
     )
     done = lowfc("gateway", "epics", "--run", "bench")
     assert done.exit_code == 0, done.output

@@ -116,11 +116,18 @@ class Links:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """One run and its directory."""
+    """One run and its directory, made at `created_ns` (the file system's time)."""
 
     run_id: str
     path: Path
     links: Links
+    created_ns: int
+
+    def restarted(self) -> bool:
+        """Whether a later run of this name has replaced this one, so that a process must join again."""
+        with contextlib.suppress(FileNotFoundError):
+            return (self.path / _LINKS).stat().st_ctime_ns != self.created_ns
+        return False
 
     def remove(self) -> None:
         """Delete the directory; for the process that created the run, when all others have ended."""
@@ -190,7 +197,7 @@ def open_run(
                 f"run {run_id!r} has no {role!r} (it has {', '.join(sorted(links.ports))}); "
                 "start another run, or stop this one and start it with that mirror"
             )
-    return Run(run_id, path, links)
+    return Run(run_id, path, links, (path / _LINKS).stat().st_ctime_ns)
 
 
 def run_path(run_id: str, base: Path | None = None) -> Path:

@@ -36,8 +36,7 @@ def _show_console(run_id: str) -> bool:
     from lowfc.programs.console.app import RESTARTED, Console
 
     joined = open_run(run_id, ())
-    links, config = joined.path / "links.json", joined.path / "config.toml"
-    created_ns = links.stat().st_ctime_ns
+    config = joined.path / "config.toml"
     clock = clock_of(load(config if config.exists() else None))
     bus = ZenohBus(joined.links, Role.OPERATOR, clock, monitor=True)
     try:
@@ -45,7 +44,7 @@ def _show_console(run_id: str) -> bool:
             bus,
             run_id,
             clock,
-            restarted=lambda: links.exists() and links.stat().st_ctime_ns != created_ns,
+            restarted=joined.restarted,
             terminal_gone=lambda: not sys.stdin.isatty(),
         )
         for number in (signal.SIGTERM, signal.SIGINT):  # textual's threads would outlive an exception
