@@ -10,7 +10,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from lowfc.programs.cli.ctl import ctl_app
+from lowfc.programs.cli.ctl import bench_value, ctl_app
 from lowfc.programs.cli.main import COMMANDS, app
 from lowfc.programs.cli.result import Result, result_field
 from lowfc.programs.cli.runs import _lines
@@ -87,6 +87,11 @@ class Found(Result):
     noise_nm: list[float] = result_field("noise", "nm", ".1f", column=True)
     modes: list[Mode] = result_field("modes")
     missing: float | None = result_field("missing", default=None)
+
+
+@pytest.mark.parametrize(("word", "value"), [("True", True), ("FALSE", False), ("2.5e1", 25.0), ("truer", "truer")])
+def test_a_bench_value_is_a_truth_value_a_number_or_a_text(word: str, value: object) -> None:
+    assert (type(bench_value(word)), bench_value(word)) == (type(value), value)
 
 
 def test_text_and_json_of_a_result_have_the_same_fields() -> None:

@@ -52,6 +52,16 @@ def whole(word: str) -> int:
         raise typer.BadParameter(f"{word!r} is not a whole number: write 50") from None
 
 
+def bench_value(word: str) -> bool | float | str:
+    """Parse a bench value: true or false in any case, a number, or else a text."""
+    if word.lower() in ("true", "false"):
+        return word.lower() == "true"
+    try:
+        return float(word)
+    except ValueError:
+        return word
+
+
 _EACH = "One value for all modes, or one for each mode."
 Values = Annotated[list[float], typer.Argument(help=_EACH, parser=number)]
 Gains = Annotated[list[str], typer.Argument(help=f"{_EACH[:-1]}; or {AUTOMATIC}.", parser=gain_word)]
@@ -169,11 +179,7 @@ def bench(name: BenchName, value: BenchValue, run: AnyRun = None, as_json: Json 
     """
     from lowfc.programs.cli.status import interlocks, json_object
 
-    booleans: dict[str, bool | float | str] = {"true": True, "false": False}
-    try:
-        parsed = booleans[value] if value in booleans else float(value)
-    except ValueError:
-        parsed = value
+    parsed = bench_value(value)
     with _joined(run) as loop:
         loop.status()  # a controller that has replied receives bench values, too
         loop.bench(name, parsed)
