@@ -54,6 +54,24 @@ def test_an_image_that_was_logged_is_on_the_screen(headless: RerunViewer, tmp_pa
 
 
 @on_screen
+def test_a_picture_is_taken_although_the_viewer_abandons_a_query(
+    headless: RerunViewer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain, faults = RerunViewer._ask, [ViewerError("deadline expired"), ViewerError("dropped the request")]
+
+    def ask(viewer: RerunViewer, question: Any) -> Any:
+        if faults:
+            raise faults.pop()
+        return plain(viewer, question)
+
+    stream = _two_colours(headless)
+    monkeypatch.setattr(RerunViewer, "_ask", ask)
+    assert headless.screenshot()
+    assert not faults
+    stream.disconnect()
+
+
+@on_screen
 def test_a_headless_viewer_is_reached_from_this_host_only(headless: RerunViewer) -> None:
     assert listening(headless.pid) == {("127.0.0.1", headless.port)}
 

@@ -173,7 +173,7 @@ class RerunViewer:
             DataFileError: the file cannot be written.
         """
         deadline_s = time.monotonic() + timeout_s
-        while not ((state := self.state()).recordings and state.views and not state.loading):
+        while not ((state := self._ask_again(_state, deadline_s)).recordings and state.views and not state.loading):
             if time.monotonic() > deadline_s:
                 raise ViewerError(
                     f"the viewer has {len(state.recordings)} recordings, {len(state.views)} views and "
@@ -185,7 +185,7 @@ class RerunViewer:
         while not picture or (picture != before and time.monotonic() < deadline_s):
             if picture:
                 time.sleep(_REDRAW_S)
-            before, picture = picture, self._ask(lambda client: client.take_screenshot())
+            before, picture = picture, self._ask_again(lambda client: client.take_screenshot(), deadline_s)
         if path is not None:
             with being_written(path) as part:
                 part.write_bytes(picture)
@@ -193,7 +193,7 @@ class RerunViewer:
 
     def state(self) -> "ViewerState":
         """Recordings, views and pending loads of the viewer; ViewerError if it does not answer."""
-        return self._ask(lambda client: client.get_state())
+        return self._ask(_state)
 
     def _start(self) -> None:
         self._child.start()
@@ -239,6 +239,16 @@ class RerunViewer:
         except ViewerError:
             return False
 
+    def _ask_again(self, question: "Callable[[ViewerClient], Answer]", deadline_s: float) -> Answer:
+        """Query the viewer, again after a failure until the deadline: on a loaded host it abandons queries."""
+        while True:
+            try:
+                return self._ask(question)
+            except ViewerError:
+                if not self.alive or time.monotonic() > deadline_s:
+                    raise
+            time.sleep(_POLL_S)
+
     def _ask(self, question: "Callable[[ViewerClient], Answer]") -> Answer:
         """Query the viewer on a separate thread, which is abandoned if the viewer hangs."""
         answers: list[Answer] = []
@@ -259,8 +269,13 @@ class RerunViewer:
             return answers[0]
         if not self.alive:
             raise ViewerError(self.exit_description())
-        what = f"answers with {faults[0]}" if faults else f"does not answer within {_CALL_S:g} s"
+        fault = str(faults[0]).partition("\n")[0] if faults else ""  # metadata follow
+        what = f"answers with {fault}" if faults else f"does not answer within {_CALL_S:g} s"
         raise ViewerError(f"the viewer on {self.url} {what}; stop it and start it again")
+
+
+def _state(client: "ViewerClient") -> "ViewerState":
+    return client.get_state()
 
 
 _REINSTALL = "install it again: pip install --force-reinstall rerun-sdk"
