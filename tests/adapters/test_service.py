@@ -8,7 +8,7 @@ import pytest
 
 from lowfc import __version__
 from lowfc.adapters.process.realtime import Granted
-from lowfc.adapters.process.service import HEALTH_PERIOD_NS, WAITING_NS, Service
+from lowfc.adapters.process.service import HEALTH_PERIOD_NS, PRINTED, PRINTED_NS, WAITING_NS, Service
 from lowfc.contract.messages import COMMAND, EVENT, FRAME, HEALTH, from_timestamp, wire
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.listener import Listener
@@ -102,6 +102,23 @@ def test_events_are_published_and_warnings_printed(
     assert from_timestamp(listener.messages(EVENT)[-1].timestamp) == clock.now_ns()
     printed = capsys.readouterr().err
     assert printed == "controller: REALTIME_REFUSED the host refused SCHED_FIFO: a longer tail\n"
+
+
+def test_a_flood_of_warnings_is_in_the_log_whole_and_on_the_terminal_in_part(
+    hub: MemoryHub, clock: FakeClock, capsys: pytest.CaptureFixture[str]
+) -> None:
+    listener = Listener(hub, clock, HEALTH)
+    controller = service(hub, clock, "controller")
+    for number in range(2 * PRINTED):
+        controller.event("FRAMES_MISSING", count=1, number=number)
+    controller.event("CLOCK_OFF", ahead_ms=200)
+    clock.advance(PRINTED_NS)
+    controller.event("FRAMES_MISSING", count=1, number=99)
+    assert len(listener.event_texts("FRAMES_MISSING")) == 2 * PRINTED + 1
+    printed = capsys.readouterr().err.splitlines()
+    assert [line.split()[1] for line in printed] == [*["FRAMES_MISSING"] * (PRINTED + 1), "CLOCK_OFF", "FRAMES_MISSING"]
+    assert printed[PRINTED] == "controller: FRAMES_MISSING recurs: more within 10 s are in the log only"
+    assert "before frame 99" in printed[-1]
 
 
 def test_processes_are_connected_when_each_has_received_the_others_health(hub: MemoryHub, clock: FakeClock) -> None:

@@ -29,6 +29,8 @@ from lowfc.control.loop.wording import counted
 HEALTH_PERIOD_NS = 500_000_000
 WAITING_NS = 2_000_000_000
 """A ready process that waits longer than this for others reports their names."""
+PRINTED, PRINTED_NS = 10, 10_000_000_000
+"""Most warnings of one kind on standard error in this time; all are in the log."""
 WORK: dict[str, str] = {Role.CAMERA: "frame", Role.CONTROLLER: "frame", Role.MIRROR: "command"}
 """Counters of the processes of the loop; other processes have their own summary."""
 ProcessState = Literal["starting", "ready", "running", "stopping", "stopped"]
@@ -84,6 +86,7 @@ class Service:
         self._wakers: list[Callable[[], None]] = []
         self._event_lock = threading.Lock()
         self._last_warning: Log | None = None
+        self._warned: dict[str, tuple[int, int]] = {}
         self._supervisor = supervisor or Supervisor()
         self._started_ns = self._beaten_ns = clock.host_ns()
         self._worked = 0
@@ -216,14 +219,24 @@ class Service:
         self.state = "stopped"
 
     def event(self, event: str, **details: object) -> None:
-        """Publish an event of the table; warnings and worse go to standard error too. Callable from any thread."""
+        """Publish an event of the table; callable from any thread.
+
+        Warnings and worse are also printed on standard error, of a flood of warnings only the first.
+        """
         kind = EVENTS[event]
         log = kind.log(self.name, self.clock.now_ns(), **details)
         with self._event_lock:
             self._events.put(log.SerializeToString())
         if kind.level >= Level.WARNING:
-            self._last_warning = log
-            self._print(log.message)
+            self._last_warning, now_ns = log, self.clock.host_ns()
+            since_ns, count = self._warned.get(event, (now_ns, 0))
+            if now_ns - since_ns >= PRINTED_NS:
+                since_ns, count = now_ns, 0
+            self._warned[event] = since_ns, count + 1
+            if count < PRINTED or kind.level > Level.WARNING:
+                self._print(log.message)
+            elif count == PRINTED:
+                self._print(f"{event} recurs: more within {PRINTED_NS // 10**9} s are in the log only")
 
     def _announce(self, what: str) -> None:
         if self.announces:
