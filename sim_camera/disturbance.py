@@ -1,8 +1,9 @@
-"""The wavefront's disturbance: a pure function of the seed and of time.
+"""The wavefront's disturbance: a pure function of the seed, the frame rate and the frame's number.
 
 Every preset is a sum of sine waves with seeded phases (a spectral model of drift and jitter), damped lines, a square
-wave and a static screen, and its spectrum is known exactly. A damped line is a rotating vector whose length and phase
-wander (an Ornstein-Uhlenbeck process). It is drawn frame by frame: a frame requires all frames before it.
+wave and a static screen; the spectrum of waves, lines and wheels is known exactly. A damped line is a rotating vector
+whose length and phase wander (an Ornstein-Uhlenbeck process). It is drawn frame by frame: a frame requires all frames
+before it.
 """
 
 from dataclasses import dataclass, replace
@@ -223,7 +224,7 @@ def _sum_of_waves(disturbance: Disturbance, time_s: Array) -> Array:
 
 
 def variances_nm2(disturbance: Disturbance, per_line: int = 401) -> tuple[Array, Array]:
-    """Frequencies (n,) in Hz and the variance at each (n, modes), nm^2.
+    """Frequencies (n,) in Hz of waves, damped lines and wheels, and the variance at each (n, modes), nm^2.
 
     A damped line is represented by quantiles of its power, a wheel by its harmonics at time 0.
     """

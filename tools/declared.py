@@ -31,8 +31,9 @@ from tools.shared import ROOT, markdown
 
 API = ("client", "device", "optics", "design", "control")
 """Packages of the Python API."""
-_MESSAGES = 4  # field numbers in the descriptors, of which the paths of comments consist
+_MESSAGES = 4  # numbers of `message_type` and `field` in descriptors: protoc addresses comments by them
 _FIELDS = 2
+_UNCOMMENTED = {"timestamp": "Time of the reported quantity"}
 _TAKEOVER = (
     ("frames for which a new law observes", SETTLING_FRAMES),
     ("frames of the cross-fade to a new law", FADING_FRAMES),
@@ -42,18 +43,18 @@ _TUNING = (
     ("tilt of an open loop above which it is flagged, mas rms per axis", OPTICAL_GAIN_MAS),
     ("minimum gain margin of an integrator", MIN_GAIN_MARGIN),
     ("minimum phase margin of an integrator, deg", MIN_PHASE_MARGIN_DEG),
-    ("minimum integrator gain", LOWEST_GAIN),
+    ("integrator gain of a mode whose drift is below the noise", LOWEST_GAIN),
     *_TAKEOVER,
 )
 _GUARD = (
     ("duration of a block, s, unless the minimum number of frames takes longer", guard.BLOCK_S),
     ("minimum number of frames of a block", guard.FEWEST),
     ("consecutive worse blocks before the integrator takes over", guard.WORSE_BLOCKS),
-    ("law is worse if its mean squared error over the integrator's exceeds", guard.WORSE),
-    ("loop amplifies if its mean squared error over the long-term mean square exceeds", guard.AMPLIFIED),
+    ("law is worse: mean squared error / that of the integrator, above", guard.WORSE),
+    ("loop amplifies: mean squared error / long-term mean square, above", guard.AMPLIFIED),
     ("time constant of the long-term mean square, s", guard.LONG_TERM_S),
     ("duration of a cross-fade, s", guard.FADED_S),
-    ("law is far better if its mean squared error over the integrator's is below", guard.BETTER),
+    ("law is far better: mean squared error / that of the integrator, below", guard.BETTER),
     ("time for which the law must be far better, at first, s", guard.BETTER_S),
     ("takeovers after which only an operator reactivates the law", guard.MAX_TAKEOVERS),
 )
@@ -67,7 +68,7 @@ _ACCEPTANCE = (
 )
 _OPERATING = (
     *_TAKEOVER,
-    ("frames or steps that wait for a Python program, at most", stream.WAITING),
+    ("frames or steps queued for a Python program, at most", stream.WAITING),
     ("size of a request, at most, MB", MAX_BYTES / 1e6),
 )
 
@@ -83,7 +84,7 @@ def packages() -> str:
 
 
 def offered(package: str) -> str:
-    """Exported names of a package of the Python API, or its modules, with their first sentences."""
+    """Exported names of a package of the Python API, or its modules, with the first paragraph of their docstrings."""
     top = import_module(package)
     if hasattr(top, "__all__"):
         found = [(name, _about(getattr(top, name))) for name in top.__all__]
@@ -146,7 +147,7 @@ def fields(message: str) -> str:
     for place, field in enumerate(file.message_type[index].field):
         kind = field.type_name.rpartition(".")[2] or type(field).Type.Name(field.type).removeprefix("TYPE_").lower()
         many = "repeated " if field.label == type(field).LABEL_REPEATED else ""
-        comment = comments.get((_MESSAGES, index, _FIELDS, place)) or "Time of the reported quantity"
+        comment = comments.get((_MESSAGES, index, _FIELDS, place)) or _UNCOMMENTED[field.name]
         rows.append((f"`{field.name}`", many + kind, field.number, comment))
     return markdown(("field", "type", "number", ""), rows)
 

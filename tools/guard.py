@@ -71,7 +71,7 @@ LawOf = Callable[[Configuration, Array, ModalBench], tuple[LinearLaw, Array]]
 
 
 def identified_law(config: Configuration, covariance_nm2: Array, bench: ModalBench) -> tuple[LinearLaw, Array]:
-    """Integrator and gains identified from a log, as by an operator."""
+    """LQG law and integrator gains identified from a log, as by an operator."""
     bench.settle(1_000)
     bench.run(_IDENTIFY)
     run, timing = bench.pol(), timing_of(config)
@@ -79,7 +79,7 @@ def identified_law(config: Configuration, covariance_nm2: Array, bench: ModalBen
 
 
 def known_law(config: Configuration, covariance_nm2: Array, bench: ModalBench) -> tuple[LinearLaw, Array]:
-    """Integrator and gains from the simulation's exact lines, without identification."""
+    """LQG law and integrator gains from the simulation's exact lines, without identification."""
     width = LINE_WIDTH if config.disturbance.preset == "reaction-wheel" else LINE_WIDTH / 1000
     variances_nm2 = (np.array(LINES_MAS) * bench.nm_per_mas) ** 2
     lines = tuple(Line(hz, width * hz, nm2) for hz, nm2 in zip(LINES_HZ, variances_nm2.tolist(), strict=True))

@@ -1,4 +1,4 @@
-"""Tables of docs/measured/reliability.md: faults injected into the loop, hours of it, damaged inputs.
+"""Tables of docs/measured/reliability.md: injected faults, long runs, damaged inputs.
 
 Example:
     python -m tools.reliability --seed 1              # run the chaos cases missing from the table, with this seed
@@ -100,7 +100,7 @@ def render_chaos(results: Results) -> str:
 
 
 def _recovery(found: str) -> str:
-    """The finding of the rule `recovery` without its words; release 0.1 wrote "safed"."""
+    """Residual before and after, from the finding of the rule `recovery`; release 0.1 wrote "safed"."""
     return found.removeprefix("residual ").split(" nm,")[0].replace("safed", "safe")
 
 
@@ -108,7 +108,8 @@ def _rows(by_name: dict[str, list[Results]]) -> list[Sequence[object]]:
     rows: list[Sequence[object]] = []
     for name, cases in by_name.items():
         ended = counts(cases)
-        why = f", {ended['skipped']} skipped ({cases[0]['skipped']})" if ended["skipped"] else ""
+        reason = next((case["skipped"] for case in cases if case["skipped"]), "")
+        why = f", {ended['skipped']} skipped ({reason})" if reason else ""
         found = [case["findings"].get("recovery", {}).get("found", "-") for case in cases]
         recovered = "; ".join(_recovery(text) for text in found)
         description = CASES[name].description if name in CASES else cases[0]["sentence"]
@@ -179,9 +180,9 @@ def render_fuzz(results: Results) -> str:
     head = ("reader", "inputs", "error raised", "crashes", "hangs", "memory growth, MB")
     rows, totals = [], [0, 0, 0]
     for one in results["targets"]:
-        counted = one["inputs"], len(one["crashes"]), len(one["hangs"])
-        totals = [total + more for total, more in zip(totals, counted, strict=True)]
-        rows.append((one["name"], counted[0], one["refused"], *counted[1:], f"{one['grown_bytes'] / 1e6:.0f}"))
+        numbers = one["inputs"], len(one["crashes"]), len(one["hangs"])
+        totals = [total + more for total, more in zip(totals, numbers, strict=True)]
+        rows.append((one["name"], numbers[0], one["refused"], *numbers[1:], f"{one['grown_bytes'] / 1e6:.0f}"))
     inputs, crashes, hangs = totals
     return (
         f"{inputs} inputs, {crashes} crashes, {hangs} hangs, in {results['seconds'] / 60:.0f} minutes.\n\n"

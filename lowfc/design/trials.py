@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lowfc.arrays import Array
-from lowfc.optics.chain.zernike import noll_to_nm
+from lowfc.optics.chain.zernike import noll_to_orders
 
 LITERAL_WAVES = (0.04, 0.016)
 """Bounds of Sect. 3.1 for radial degrees 1 and 2, and above; interpreted as uniform between minus and plus these."""
@@ -16,7 +16,7 @@ _BLOCK = 100  # wavefronts in memory at once
 
 def bounds_waves(nolls: Sequence[int], low: float, high: float) -> Array:
     """Bound (modes,) of each coefficient in waves rms: `low` for radial degrees 1 and 2, `high` above."""
-    return np.array([low if noll_to_nm(noll)[0] <= 2 else high for noll in nolls])
+    return np.array([low if noll_to_orders(noll)[0] <= 2 else high for noll in nolls])
 
 
 def random_wavefronts(rng: np.random.Generator, count: int, nolls: Sequence[int], low: float, high: float) -> Array:

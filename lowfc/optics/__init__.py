@@ -1,1 +1,1 @@
-"""Diffraction from the telescope pupil to the sensor image: pure functions of arrays."""
+"""Diffraction from the telescope pupil to sensor and science image, detectors, the digital twin: pure functions."""

@@ -278,6 +278,12 @@ def test_a_finished_commissioning_cannot_be_resumed(commissioned: tuple[Bench, d
         bench.commission(resume=True)
 
 
+@pytest.mark.parametrize("options", [(), ("--resume",)])
+def test_without_a_terminal_nobody_is_asked_to_block_the_star(options: tuple[str, ...], tmp_path: Path) -> None:
+    refused = lowfc("commission", "--out", str(tmp_path / "calibration.fits"), *options).exception
+    assert "without a terminal nobody can be asked" in str(refused)
+
+
 def test_the_operator_is_asked_to_block_and_unblock_the_star(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     with pytest.raises(CalibrationError, match="was it not blocked for the dark"):

@@ -81,7 +81,12 @@ OF_THE_HOST = [
 ]
 DMI = ("sys/class/dmi/id/sys_vendor", "sys/class/dmi/id/product_name")
 DYNAMIC = {"proc/version": "Linux version 6.1.0 (gcc) #1 SMP PREEMPT_DYNAMIC Thu"}
-NAMED = {"realtime.camera_cpus": [4], "realtime.controller_cpus": [5], "realtime.mirror_cpus": [6]}
+NAMED: dict[str, object] = {
+    "realtime.camera_cpus": [4],
+    "realtime.controller_cpus": [5],
+    "realtime.mirror_cpus": [6],
+    "realtime.recorder_cpus": [0],  # not one of the isolated: the recorder can wait
+}
 UNASKED = load(None, {"realtime.priority": 0, "realtime.recorder_priority": 0, "realtime.lock_memory": False})
 
 

@@ -5,7 +5,15 @@ import pytest
 from scipy.special import j0, j1
 
 from lowfc.adapters.files.sensors import load_pupil
-from lowfc.optics.chain.coronagraph import DARK_ZONE, Wedge, contrast, contrast_curve, mean_contrast, wedge_samples
+from lowfc.optics.chain.coronagraph import (
+    DARK_ZONE,
+    LyotStop,
+    Wedge,
+    contrast,
+    contrast_curve,
+    mean_contrast,
+    wedge_samples,
+)
 from lowfc.optics.chain.grid import image_axis, pupil_axis
 from lowfc.optics.chain.pupil import circle
 from lowfc.optics.chain.science_camera import ScienceCamera
@@ -166,3 +174,5 @@ def test_science_camera_refuses_inconsistent_inputs(shaped, camera):
         ScienceCamera(shaped[:100], NOLLS_14, NM)
     with pytest.raises(ValueError, match="must have modes"):
         ScienceCamera(shaped, (), NM)
+    with pytest.raises(ValueError, match="multiple of 4 samples across, got 126"):
+        ScienceCamera(shaped[:126, :126], NOLLS_14, NM, lyot=LyotStop(np.ones((8, 8)), np.ones((126, 126))))

@@ -72,7 +72,7 @@ class Recorder(MemoryBus):
 
 
 class ToyBench(ChaosBench):
-    """The bench of one case; `time` and `clock` replace those of the case, so that its waiting exposes frames."""
+    """The bench of one case in simulated time: while a case waits, frames are exposed (see `replace_time`)."""
 
     def __init__(self, config: Configuration, folder: Path, rng: random.Random, fault: dict[str, Any] | None) -> None:
         self.config, self.folder, self.rng, self.outcome = config, folder, rng, Outcome(folder, config)
@@ -133,7 +133,7 @@ class ToyBench(ChaosBench):
         self._sleep(self.rng.uniform(shortest_s, longest_s))
 
     def kill(self, name: str) -> None:
-        self._latch.close()  # it has had time
+        self._latch.close()  # its thread has had time to write
         self._services.pop(name).bus.close()
         self.outcome.ended.append(Ended(name, -signal.SIGKILL, 0.0, True))
 

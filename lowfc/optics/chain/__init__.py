@@ -1,1 +1,1 @@
-"""Light from the pupil to the sensor's pixels: pupils, masks, propagation."""
+"""Light from the pupil to the sensor's pixels and the science image: pupils, masks, propagation."""

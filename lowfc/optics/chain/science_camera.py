@@ -19,9 +19,9 @@ _LYOT_SQUARE = 4  # pupil samples across a cell
 class ScienceCamera:
     """Contrast of a coronagraph, in single precision, from modal wavefronts.
 
-    The field is summed over the open samples of the pupil only. If the pupil consists of equal 2 x 2 squares of
-    samples, as the package's shaped pupil does, the wavefront is evaluated at the centre of each square; the kernel
-    stays exact. The pupil of a Lyot coronagraph is averaged over squares of 4 x 4.
+    The field is summed over the open samples of the pupil only. If the four samples of every 2 x 2 square are equal,
+    as in the package's shaped pupil, the wavefront is evaluated once for each square, at its centre; the Fourier kernel
+    is still summed over all four. The pupil of a Lyot coronagraph is averaged over squares of 4 x 4.
 
     Attributes:
         samples: Samples across the square image, at the positions of `grid.image_axis`.
@@ -49,10 +49,15 @@ class ScienceCamera:
             lyot: Mask and stop of a Lyot coronagraph; None for a shaped pupil alone.
 
         Raises:
-            ValueError: The pupil is not square or transmits no light, or there are no modes.
+            ValueError: The pupil is not square, transmits no light, or is not a multiple of 4 samples across with a
+                Lyot stop; or there are no modes.
         """
         if pupil.ndim != 2 or pupil.shape[0] != pupil.shape[1] or not pupil.any():
             raise ValueError(f"a pupil must be square and let light through, got shape {pupil.shape}")
+        if lyot is not None and len(pupil) % _LYOT_SQUARE:
+            raise ValueError(
+                f"the pupil of a Lyot coronagraph must be a multiple of {_LYOT_SQUARE} samples across, got {len(pupil)}"
+            )
         if not noll:
             raise ValueError("a wavefront must have modes, got none")
         self.samples = 2 * half_width * samples_per

@@ -41,7 +41,7 @@ _NAMES = (
 
 def mode_name(noll: int) -> str:
     """Optical name of a mode, such as "focus"; "Zernike 22" and so on above radial degree 5."""
-    noll_to_nm(noll)
+    noll_to_orders(noll)
     return _NAMES[noll - 1] if noll <= len(_NAMES) else f"Zernike {noll}"
 
 
@@ -51,7 +51,7 @@ def mode_group(noll: int) -> str:
     return name.rsplit(" ", 1)[0] if name.endswith((" x", " y", " 0", " 45")) and noll <= len(_NAMES) else name
 
 
-def noll_to_nm(noll: int) -> tuple[int, int]:
+def noll_to_orders(noll: int) -> tuple[int, int]:
     """Radial degree n and azimuthal order m of a Noll index; m < 0 is the sine.
 
     Raises:
@@ -69,7 +69,7 @@ def zernike(noll: int, x: ArrayLike, y: ArrayLike) -> Array:
     """One polynomial at (x, y) in pupil radii, not cut off outside the circle."""
     x = np.asarray(x, dtype=np.float64)
     y = np.asarray(y, dtype=np.float64)
-    n, signed_m = noll_to_nm(noll)
+    n, signed_m = noll_to_orders(noll)
     m = abs(signed_m)
     r2 = x**2 + y**2
     radial = np.zeros(np.broadcast_shapes(x.shape, y.shape))

@@ -26,10 +26,13 @@ def commission(
     snr: Annotated[
         float | None,
         typer.Option(
-            min=1, max=1e4, help="Signal-to-noise ratio to reach in the noisiest mode; default: 50, with --cycles 20."
+            min=1, max=1e4, help="Signal-to-noise ratio to reach in each mode; default: 50, or 20 with --cycles."
         ),
     ] = None,
-    cycles: Annotated[int | None, typer.Option(min=MIN_CYCLES, help="Cycles of the response.")] = None,
+    cycles: Annotated[
+        int | None,
+        typer.Option(min=MIN_CYCLES, help="Push-pull cycles of the response; default: until --snr is reached."),
+    ] = None,
     resume: Resume = False,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
     close: Annotated[bool, typer.Option("--close", help="Close the loop at the end.")] = False,
@@ -39,7 +42,7 @@ def commission(
 
     Camera, mirror and controller must be running (`lowfc controller --calibration none`); the light must be on the
     sensor. Steps: camera, dark and bad pixels, reference image, delay, orientation and sign, poke amplitude, response,
-    verdict, prediction, closed loop. Afterwards the mirror returns to its shape.
+    verdict, prediction, closed loop. After each probe sequence the mirror returns to the shape that it had.
 
     Example: lowfc commission --run bench --out calibration.fits --close
     """
@@ -50,11 +53,12 @@ def commission(
     from lowfc.client import Client, configuration_of
     from lowfc.programs.commissioning.analytic import analytic
     from lowfc.programs.commissioning.calibrate.tasks import reporter
-    from lowfc.programs.commissioning.commission.commissioning import Commission, Commissioning
+    from lowfc.programs.commissioning.commission.commissioning import Commission, Commissioning, first_of
 
     if dark is not None and no_dark:
         raise ConfigurationError("--dark FILE and --no-dark exclude each other: use one")
-    if dark is None and not no_dark and not resume and not sys.stdin.isatty():
+    resumes = resume and (first_of(out).exists() or out.exists())
+    if dark is None and not no_dark and not resumes and not sys.stdin.isatty():
         raise ConfigurationError(
             "without a terminal nobody can be asked to block the star for a dark: give dark frames with --dark FILE, "
             "or use the camera's bias with --no-dark"

@@ -67,7 +67,7 @@ def _processors(facts: Facts) -> Check:
     if missing := named and named - facts.tried.cpus:
         return warning(
             f"{detail}; the configuration names {ranges(missing)}",
-            "correct realtime.camera_cpus, controller_cpus and mirror_cpus",
+            "correct realtime.camera_cpus, controller_cpus, mirror_cpus and recorder_cpus",
             "the kernel moves the loop between processors; expect a longer tail",
         )
     if len(usable | named) < len(PROCESSES):
@@ -92,12 +92,13 @@ def _isolation(facts: Facts) -> Check:
         return warning("none", advice, cost)
     without_tick = ranges(isolated & facts.host.cpus("nohz_full")) or "none"
     detail = f"{ranges(isolated)}; of these without a timer tick: {without_tick}"
-    named = facts.named_cpus
+    section = facts.config.realtime
+    named = {*section.camera_cpus, *section.controller_cpus, *section.mirror_cpus}
     if named and named <= isolated:
         return ok(detail)
     return warning(
         f"{detail}; the configuration names {ranges(named) or 'none'}",
-        "name the isolated ones in realtime.*_cpus",
+        "name isolated ones in realtime.camera_cpus, controller_cpus and mirror_cpus",
         f"unused; {cost}",
     )
 

@@ -1,4 +1,4 @@
-"""Replay: the live loop's `advance` is applied to a log, and every step, command, answer and state is compared.
+"""Replay of a log: its messages go to one `ControllerReplay` for each start of the controller.
 
 A log numbers the inputs of its controller. From a complete state on, the inputs are applied one by one, and the results
 are compared with the log byte by byte. If an input is missing from the log, the replay waits for the next state and
@@ -38,7 +38,7 @@ class Replay:
         return (self._ended_ns - self._begun_ns) * 1e-9
 
     def begin_file(self, run: str) -> None:
-        """Begin a file; a lockstep run has the sequences of another one, whose controllers and frames are forgotten."""
+        """Begin a file; of another run, whose sequences may be the same, controllers and frames are forgotten."""
         if run != self._run:
             self.finish()
             self._controllers.clear()

@@ -9,7 +9,7 @@ import numpy as np
 from lowfc.arrays import Array
 from lowfc.design.estimators import iterated
 from lowfc.design.trials import LITERAL_WAVES, bounds_waves, expected_r_squared, r_squared, random_wavefronts
-from lowfc.optics.chain.zernike import NOLLS_14, noll_to_nm
+from lowfc.optics.chain.zernike import NOLLS_14, noll_to_orders
 from lowfc.programs.paper import plots
 from lowfc.programs.paper.cases import Case, Context, Prepared, Row, assuming, prepared
 from lowfc.programs.paper.figures.exposure import (
@@ -24,7 +24,7 @@ from lowfc.programs.paper.figures.exposure import (
 )
 from lowfc.programs.paper.tables.reconstruction import ITERATIONS, Ensemble, Input, ensemble, fits, inputs, label
 
-DEGREES = np.array([noll_to_nm(noll)[0] for noll in NOLLS_14])
+DEGREES = np.array([noll_to_orders(noll)[0] for noll in NOLLS_14])
 AMPLITUDES = np.array([0.005 * step for step in range(1, 31)])
 """Amplitudes of the pure modes of Fig. 8(a), waves rms."""
 _MODE_TICKS = [str(noll) for noll in NOLLS_14]

@@ -7,7 +7,7 @@ import rerun.blueprint as rrb
 
 from lowfc.arrays import Long, Whole
 from lowfc.control.laws.integrator import TIP_TILT
-from lowfc.optics.chain.zernike import mode_name, noll_to_nm
+from lowfc.optics.chain.zernike import mode_name, noll_to_orders
 from lowfc.programs.view.draw.colours import BLUE, GREEN, GREY, ORANGE, PINK, RED, YELLOW, distinct
 from lowfc.programs.view.draw.plots import Plot
 from lowfc.programs.view.panels.panel import Panel
@@ -75,7 +75,7 @@ class Wavefront(Panel):
         kind = "true" if true else "measured"
         flat = f"with a flat mirror, {kind if true else 'pseudo-open-loop'}"
         RMS.name(stream, {flat: GREY, f"residual, {kind}": GREEN})
-        degrees = np.array([noll_to_nm(index)[0] for index in noll])
+        degrees = np.array([noll_to_orders(index)[0] for index in noll])
         found = sorted(set(degrees.tolist()))
         self._groups = [np.flatnonzero(degrees == degree) for degree in found]
         group_names = [_GROUPS.get(degree, f"radial degree {degree}") for degree in found]

@@ -25,11 +25,11 @@ Counts = Counter[Reason | str]
 class Liveness(Enum):
     """Whether a process runs, judged by its messages."""
 
-    NEVER = auto()
+    NEVER = auto()  # no message yet
     STARTING = auto()
     RUNNING = auto()
-    STOPPED = auto()
-    SILENT = auto()
+    STOPPED = auto()  # on request
+    SILENT = auto()  # no message for longer than it can be: hung or killed
 
 
 class Process(NamedTuple):
@@ -60,15 +60,15 @@ class RunState:
         snapshot: last snapshot.
         mode: loop mode; None before the first message about it. `why` is the cause of its last change.
         running_s: time since the first message.
-        rate_hz: rate of the frames of the steps; None with less than two steps.
+        rate_hz: frame rate, from the times of the steps; None with less than two steps.
         controller, camera, mirror, recorder: liveness of the processes; with several mirrors that of the worst.
-        frame_silent_s, step_silent_s: time without a frame or step; None if the frame rate explains it.
+        frame_silent_s, step_silent_s: time without a frame or step; None up to 1 s or ten frame periods.
         recent, now, totals: counts of each reason, of "steps", and of "skipped", "missing", "late" and "lost", in
             `RECENT_S`, in `NOW_S` and since the start.
         flux: light on the newest frame as a fraction of the calibration's; None without both.
         saturated: number of good pixels at full well in the newest frame.
         wavefront: rms of the last second; once the controller was stopped, of its last second with a step. `latest` is
-            the rms of the end of that second. Both are `true` in a simulation, otherwise measured.
+            the rms of the last 0.3 s. With `true`, both are the simulation's true wavefront, otherwise measured.
         comparison: residual of the loop, and of the best gains.
         latency_us: p50 and p99 from frame to command in the same second.
         mirror_state: last state of the mirror; None before the first.
