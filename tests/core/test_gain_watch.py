@@ -13,7 +13,7 @@ from lowfc.contract.codecs.state_codec import calibration_in_use, controller_sta
 from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.map_reconstructor import map_reconstructor, noise_covariance_nm2
-from lowfc.control.laws.automatic_gain import GainBank, TiltCrossTalk
+from lowfc.control.laws.automatic_gain import TOGETHER, GainBank, TiltCrossTalk
 from lowfc.control.laws.integrator import RELAXING, TIP_TILT
 from lowfc.control.laws.linear_law import integrator
 from lowfc.control.loop.advance import advance
@@ -229,16 +229,16 @@ def test_a_state_decoded_before_gains_are_measured_has_the_same_law() -> None:
 def test_tilt_cross_talk_uses_the_tilt_on_the_sensor_including_the_offset(monkeypatch: pytest.MonkeyPatch) -> None:
     """The square of a tilt offset is in the image, but the loop's error excludes the offset."""
     tilts_nm: list[Single] = []
-    add_frame = TiltCrossTalk.add_frame
+    add_frames = TiltCrossTalk.add_frames
 
     def spied(self: TiltCrossTalk, tilt_nm: Single, open_nm: Array | Single) -> Array:
-        tilts_nm.append(tilt_nm)
-        return add_frame(self, tilt_nm, open_nm)
+        tilts_nm.append(tilt_nm[-1].copy())
+        return add_frames(self, tilt_nm, open_nm)
 
-    monkeypatch.setattr(TiltCrossTalk, "add_frame", spied)
+    monkeypatch.setattr(TiltCrossTalk, "add_frames", spied)
     loop = bench(2.0)
     loop.ask("offset", modes=(2,), values=(40.0,))
-    loop.run(20)
+    loop.run(2 * TOGETHER)
     error_nm = loop.steps[-1].error_nm
     np.testing.assert_allclose(tilts_nm[-1], error_nm[:2] + np.float32([40, 0]), atol=1e-3)
 

@@ -36,6 +36,8 @@ SUSPECTED = 2.0
 the gain removes."""
 MARGIN = 5.0
 """Factor of the measured cross-talk that a gain must tolerate: beyond its range a sensor underestimates tilt."""
+TOGETHER = 16
+"""Frames whose statistics are summed in one go: for a single one, the calls of numpy cost more than the arithmetic."""
 _REGRESSORS = 5
 """Tip, tilt, their squares and their product."""
 
@@ -96,6 +98,10 @@ class GainBank:
         self._at_rest = VirtualIntegrators.at_rest(gain, kept, limit_nm, weights)
         self._windows = windows
         self._closed = self._throughout = False
+        self._waiting = 0  # frames in the arrays below that have not been summed
+        self._errors_nm = np.zeros((TOGETHER, *gain.shape), np.float32)
+        self._loop_nm = np.zeros((TOGETHER, kept.size), np.float32)
+        self._tilts_nm = np.zeros((TOGETHER, 2), np.float32)
         self.use_reconstructor(np.eye(kept.size))
         self.restart()
 
@@ -111,6 +117,7 @@ class GainBank:
 
         The cross-talk of tilt is fitted in the latter, which do not change: an R for fewer modes mixes it into them.
         """
+        self._add_up()
         self._of_own, self._to_own = of_own, np.linalg.inv(of_own)
 
     def begin_first_window(self) -> None:
@@ -123,27 +130,22 @@ class GainBank:
 
         A bank of other modes also needs tip and tilt (2,), as the sensor saw them.
         """
-        if tilt_nm is not None:
-            self._tilt += self._cross_talk.add_frame(tilt_nm, self._to_own @ open_nm)
-        self._loops, errors_nm = self._loops.advanced(open_nm)
-        squares = np.square(errors_nm)
-        self._power += squares[0]
-        if self._before_nm is not None:
-            self._changes += np.square(errors_nm[0] - self._before_nm) / 2
-            self._changes_counted += 1
-        self._before_nm = errors_nm[0]
-        self._mean += errors_nm[0]
-        squares -= squares[0].copy()
-        self._spread += np.square(squares)
-        self._sums[:-1] += squares
-        self._sums[-1] += np.square(error_nm) - np.square(open_nm)
         if closed is not self._closed and not self.first:
+            self._add_up()
             self._clear(self._windows[1])
         self._throughout = self._throughout and closed
         self._closed = closed
+        self._loops, self._errors_nm[self._waiting] = self._loops.advanced(open_nm)
+        self._loop_nm[self._waiting] = error_nm
+        if tilt_nm is not None:
+            self._tilts_nm[self._waiting] = tilt_nm
+        self._waiting += 1
         self._frames += 1
         if self._frames < self._block:
+            if self._waiting == TOGETHER:
+                self._add_up()
             return False
+        self._add_up()
         self._blocks.append(self._sums / self._frames)
         self._powers.append(self._power / self._frames)
         self._changed.append(self._changes / max(self._changes_counted, 1))
@@ -180,6 +182,7 @@ class GainBank:
 
     def held(self, frames: int) -> None:
         """Advance by frames without measurements: changes across them are not used."""
+        self._add_up()
         self._loops, self._before_nm = self._loops.held(frames), None
         self._cross_talk.held()
 
@@ -275,6 +278,27 @@ class GainBank:
         nearest = np.argmin(np.abs(np.log(np.maximum(gain, 1e-9)) - np.log(self.rows[1:, None])), axis=0) + 1
         return np.where(gain < self.rows[1] / 2, 0, nearest)
 
+    def _add_up(self) -> None:
+        """Add the waiting frames to the sums of the block."""
+        if not self._waiting:
+            return
+        errors_nm, open_nm = self._errors_nm[: self._waiting], self._errors_nm[: self._waiting, 0]
+        self._tilt += self._cross_talk.add_frames(self._tilts_nm[: self._waiting], open_nm @ self._to_own.T)
+        before = open_nm[:0] if self._before_nm is None else self._before_nm
+        changes_nm = np.diff(open_nm, axis=0, prepend=before)
+        self._changes += np.square(changes_nm).sum(axis=0) / 2
+        self._changes_counted += len(changes_nm)
+        self._before_nm = open_nm[-1:].copy()
+        squares = np.square(errors_nm)
+        power = squares[:, :1].copy()
+        squares -= power
+        self._power += power[:, 0].sum(axis=0)
+        self._mean += open_nm.sum(axis=0)
+        self._spread += np.square(squares).sum(axis=0)
+        self._sums[:-1] += squares.sum(axis=0)
+        self._sums[-1] += (np.square(self._loop_nm[: self._waiting]) - power[:, 0]).sum(axis=0)
+        self._waiting = 0
+
     def _clear(self, window: int) -> None:
         self._block = max(window // BLOCKS, 1)
         self._longest = self._block * LONGEST
@@ -288,7 +312,7 @@ class GainBank:
         self._begin_block()
 
     def _begin_block(self) -> None:
-        self._frames = self._changes_counted = 0
+        self._frames = self._changes_counted = self._waiting = 0
         self._sums = np.zeros((self.rows.size + 1, self._at_rest.kept.size))
         self._spread = np.zeros((self.rows.size, self._at_rest.kept.size))
         self._power, self._changes, self._mean = np.zeros((3, self._at_rest.kept.size))
@@ -323,21 +347,20 @@ class TiltCrossTalk:
         self._changes = 0
         self._before: Array | None = None
 
-    def add_frame(self, tilt_nm: Single, open_nm: Array | Single) -> Array:
-        """Add tip and tilt (2,), as the sensor saw them in one frame, and the open loop of the others (modes,), nm.
+    def add_frames(self, tilt_nm: Single, open_nm: Array | Single) -> Array:
+        """Add consecutive frames: tip and tilt (frames, 2) as the sensor saw them, the others (frames, modes), nm.
 
         Returns:
-            (regressors,) of the frame, whose mean is the argument of `mean_nm`.
+            (regressors,) summed over the frames, whose mean is the argument of `mean_nm`.
         """
-        x, y = tilt_nm.tolist()
-        row = np.concatenate([(x, y, x * x, x * y, y * y), open_nm])
-        if self._before is not None:
-            change = row - self._before
-            self._products += change[:_REGRESSORS, None] * change
-            self._powers += np.square(change[_REGRESSORS:])
-            self._changes += 1
-        self._before = row
-        return np.asarray(row[:_REGRESSORS])
+        x, y = tilt_nm.T.astype(float)
+        rows = np.column_stack([x, y, x * x, x * y, y * y, open_nm])
+        changes = np.diff(rows, axis=0, prepend=rows[:0] if self._before is None else self._before)
+        self._products += changes[:, :_REGRESSORS].T @ changes
+        self._powers += np.square(changes[:, _REGRESSORS:]).sum(axis=0)
+        self._changes += len(changes)
+        self._before = rows[-1:]
+        return np.asarray(rows[:, :_REGRESSORS].sum(axis=0))
 
     def held(self) -> None:
         """Skip frames without measurements: changes across them are not used."""
