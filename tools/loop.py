@@ -68,7 +68,7 @@ SHORT_COLUMNS = {
 
 
 SHORT_NOTE = f"""\
-The sensor is `{KEYS["sensor.sam"]}`; the star has V = {KEYS["star.magnitude"]:g}. Latency is from sending the frame
+Mask `{KEYS["sensor.sam"]}` (not the default), star of V = {KEYS["star.magnitude"]:g}. Latency is from sending the frame
 to sending the command; read-out is not included. The jitter is drawn frame by frame, so its realisation differs
 between rates. [Performance](docs/measured/performance.md) has all runs and the method."""
 
