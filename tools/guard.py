@@ -181,7 +181,7 @@ def render(results: Results) -> str:
     )
     cost = results["cost_us"]
     complete = all(len(found) == len(SEEDS) for found in results["good"].values())
-    partly = "" if complete else f" Of the {len(SEEDS)} runs of the command for each V, the others were not yet measured."
+    partly = "" if complete else f" Of the {len(SEEDS)} runs for each V the others were not yet measured."
     return (
         f"{rows}\nTrue tilt from 1 s to 3 s after the lines moved, V = 0, 1 kHz. Laws are LQG, "
         f"identified from {_IDENTIFY / RATE_HZ:g} s of the closed loop; the integrator has the best gains for the same "
