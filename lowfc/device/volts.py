@@ -45,9 +45,11 @@ class VoltMap:
 
         zero = read("zero_map", options.zero_map, np.full(grid, options.zero))
         gain = read("gain_map", options.gain_map, np.ones(grid))
-        order = read("order", options.order, np.arange(zero.size, dtype=float).reshape(grid)).ravel().astype(int)
+        order = read("order", options.order, np.arange(zero.size, dtype=float).reshape(grid)).ravel()
+        if (order % 1).any() or order.max() >= 1 << 16:
+            raise ConfigurationError("option order: every value must be a whole number below 65536")
         self._wired = np.flatnonzero(order >= 0)
-        self._channel = order[self._wired]
+        self._channel = order[self._wired].astype(int)
         self.channels = int(self._channel.max(initial=-1)) + 1 if channels is None else channels
         if len(set(self._channel)) < len(self._channel) or self._channel.max(initial=-1) >= self.channels:
             raise ConfigurationError(f"option order: each actuator needs its own channel below {self.channels}")
