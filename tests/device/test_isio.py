@@ -243,8 +243,9 @@ def test_a_recreated_channel_that_cannot_be_used_fails_commands_until_it_can(fol
 class Sum(threading.Thread):
     """Stand-in for the process that sums the channels: clips the sum, then subtracts its mean."""
 
-    def __init__(self, folder: Path, limit: float) -> None:
+    def __init__(self, folder: Path, limit: float, delay_s: float = 0.0) -> None:
         super().__init__(daemon=True)
+        self.delay_s = delay_s
         self.total = channel(folder, "dm00disp", make=True)
         self.others = channel(folder, "dm00disp00", make=True)
         self.own, self.limit, self.running = channel(folder), limit, True
@@ -254,6 +255,7 @@ class Sum(threading.Thread):
     def run(self) -> None:
         while self.running:
             if self.own.wait(4, 0.01):
+                time.sleep(self.delay_s)
                 total = np.clip(self.own.pixels[0] + self.others.pixels[0], -self.limit, self.limit)
                 self.total.write(total - total.mean())
 
@@ -281,6 +283,19 @@ def test_the_reached_position_comes_from_the_sum_of_channels(folder: Path, monke
     time.sleep(0.02)
     with pytest.raises(RuntimeError, match="'dm00disp' has not followed 'dm00disp03'"):
         driver.apply(shape_nm(1))
+
+
+def test_a_sum_that_is_always_late_follows(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mirror_module, "SUM_SILENT_S", 0.1)
+    channel(folder, make=True)
+    summing = Sum(folder, 0.5, delay_s=0.01)
+    driver, _ = mirror()
+    for seed in range(5):
+        assert driver.apply(shape_nm(seed)) is None
+        time.sleep(0.05)
+    assert summing.total.count == 5
+    summing.running = False
+    summing.join()
 
 
 def test_a_sum_that_is_absent_although_expected_counts_as_not_following(

@@ -59,7 +59,7 @@ class IsioMirror:
         self._total: Stream | None = None
         self._total_expected = bool(options.total)
         self._searched_s = -_SEARCH_S
-        self._unanswered_s = math.inf
+        self._unanswered_s, self._sum_count = math.inf, 0
 
     def join(self, service: Service) -> None:
         """Keep the process's service for events."""
@@ -93,7 +93,7 @@ class IsioMirror:
             self._unanswered_s = math.inf
             return self._reached(total, actuators_nm)
         if self._total_expected:
-            self._check_silence(total, written_s)
+            self._check_silence(total, before, written_s)
         return None
 
     def close(self) -> None:
@@ -137,9 +137,13 @@ class IsioMirror:
             time.sleep(_POLL_S)
         return total.count != before
 
-    def _check_silence(self, total: Stream | None, written_s: float) -> None:
-        """RuntimeError if the sum has not followed for `SUM_SILENT_S`, so that the mirror counts as not following."""
-        self._unanswered_s = min(self._unanswered_s, written_s)
+    def _check_silence(self, total: Stream | None, before: int, written_s: float) -> None:
+        """RuntimeError if the sum has not followed for `SUM_SILENT_S`, so that the mirror counts as not following.
+
+        A sum that was updated `before` this command, but after the last one, follows, although late.
+        """
+        self._unanswered_s = min(self._unanswered_s, written_s) if before == self._sum_count else written_s
+        self._sum_count = before
         if time.monotonic() - self._unanswered_s <= SUM_SILENT_S:
             return
         if total is None:
