@@ -9,7 +9,7 @@ raises, and the loop counts the fault, reports it in an event and tries again. A
 from dataclasses import dataclass, field, fields
 from math import isfinite
 from numbers import Integral
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol, get_args
 
 from lowfc.adapters.bus.bus import Publisher
 from lowfc.adapters.files.factory import detector, mirror_limits
@@ -44,6 +44,9 @@ class Need(NamedTuple):
     what: str
     found: str
     advice: str
+
+
+Clock = Literal["monotonic", "realtime", "run"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +85,7 @@ class CameraSettings:
     em_gain: float = 1.0
     region_row: int = 0
     region_column: int = 0
-    clock: Literal["monotonic", "realtime", "run"] = "monotonic"
+    clock: Clock = "monotonic"
     number_wrap: int = 1 << 64
     time_ns: int | None = field(default=None, compare=False)
 
@@ -128,6 +131,8 @@ def camera_state(settings: CameraSettings, time_ns: int) -> wire.CameraState:
     for name in ("gain_e_per_dn", "bias_dn", "read_noise_e", "saturation_dn", "em_gain"):
         if (number := getattr(settings, name)) is not None and not isfinite(number):
             raise ValueError(f"{name} of the settings is {number}, expected a finite number")
+    if settings.clock not in get_args(Clock):
+        raise ValueError(f"clock of the settings is {settings.clock!r}, expected {', '.join(get_args(Clock))}")
     state = wire.CameraState(timestamp=timestamp(time_ns), **fields_of(settings, _PUBLISHED))
     if settings.saturation_dn is None:
         state.saturation_dn = 2**settings.bit_depth - 1

@@ -52,6 +52,9 @@ def load(kind: Kind, name: str) -> Any:
     missing = [method for method in METHODS[kind] if isinstance(driver, type) and not hasattr(driver, method)]
     if missing:
         raise ConfigurationError(f"the driver {name!r} is no {kind}: it has no {' and no '.join(missing)}")
+    model = getattr(driver, "Options", DriverOptions)
+    if not (isinstance(model, type) and issubclass(model, DriverOptions)):
+        raise ConfigurationError(f"the driver {name!r}: derive its class Options from lowfc.device.DriverOptions")
     return driver
 
 

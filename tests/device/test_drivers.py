@@ -277,6 +277,11 @@ class Unopened(Ramp):
         raise ValueError("serial 7 is not there")
 
 
+class Unchecked(Ramp):
+    class Options:
+        level: int = 7
+
+
 class Half:
     """A driver without the required methods."""
 
@@ -289,6 +294,7 @@ class Half:
     [
         ("nowhere/half.py:Half", "there is no file nowhere/half.py"),
         (f"{__name__}:Sized", "frame_rows is missing: --frame-rows VALUE, or frame_rows in"),
+        (f"{__name__}:Unchecked", "derive its class Options from lowfc.device.DriverOptions"),
         (f"{__name__}:Half", "is no camera: it has no settings and no close"),
         (f"{__name__}:Unopened", r"cannot be opened: ValueError: serial 7 is not there \(test_drivers.py, line \d+\)"),
     ],
