@@ -59,6 +59,18 @@ def test_a_missing_package_gives_install_advice(monkeypatch: pytest.MonkeyPatch,
     assert "install " in need.advice
 
 
+@pytest.mark.parametrize("place", ["", " : OutOfRangeException thrown in node 'Gain' (file 'x.h', line 1)"])
+def test_the_reason_of_a_refusing_basler_camera_is_given(place: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse() -> None:
+        raise RuntimeError(f"Cannot set 'Gain'.{place}")
+
+    stub = SimpleNamespace(DeviceInfo=refuse, GenericException=RuntimeError)
+    for module in ("pylon", "genicam"):
+        monkeypatch.setitem(sys.modules, f"pypylon.{module}", stub)
+    with pytest.raises(ConfigurationError, match=r"^Basler camera the first found: Cannot set 'Gain'\.$"):
+        BaslerCamera(GenicamOptions(rows=8, columns=8), CONFIG)
+
+
 def test_settings_default_to_the_configuration() -> None:
     settings = GenicamOptions(rows=8, columns=9, region_row=3, pixel_format="Mono10", rate_hz=500.0).settings(CONFIG)
     assert (settings.rows, settings.columns, settings.region_row, settings.region_column) == (8, 9, 3, 0)

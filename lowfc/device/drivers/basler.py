@@ -1,6 +1,7 @@
 """Driver of Basler cameras, through the vendor's package pypylon."""
 
 import importlib
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -46,7 +47,8 @@ class BaslerCamera:
             self._set(options)
         except importlib.import_module("pypylon.genicam").GenericException as fault:
             which = options.camera or "the first found"
-            raise ConfigurationError(f"Basler camera {which}: {str(fault).rpartition(' : ')[0]}") from None
+            why = re.split(r" : \w+ thrown", str(fault))[0]  # without the place in the library
+            raise ConfigurationError(f"Basler camera {which}: {why}") from None
 
     @classmethod
     def needs(cls, options: GenicamOptions) -> list[Need]:
