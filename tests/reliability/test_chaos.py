@@ -2,10 +2,12 @@
 
 import json
 import random
+import shutil
 import signal
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -323,6 +325,15 @@ def test_an_unexpected_error_fails_only_its_case_and_its_traceback_is_kept() -> 
         ("error: KeyError: 'odd'", "chaos-logs/odd-1"),
         ("requires a mount (not here)", None),
     ]
+
+
+@pytest.mark.usefixtures("without_loop")
+def test_a_log_that_cannot_be_moved_stays_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shutil.move", Mock(side_effect=OSError("no space left")))
+    good, odd = json.loads(run("--case", "good", "--case", "odd", "--json", status=1))["cases"]
+    assert (good["passed"], good["log"], odd["passed"]) == (True, None, False)
+    assert 'raise KeyError("odd")' in Path(odd["log"], "error.txt").read_text()
+    shutil.rmtree(odd["log"])
 
 
 @pytest.mark.usefixtures("without_loop")

@@ -1,5 +1,6 @@
 """The command `lowfc chaos`: inject faults into the real processes and check the loop's response."""
 
+import contextlib
 import os
 import random
 import shutil
@@ -95,12 +96,14 @@ def run_case(case: "Case", seed: int, keep: Path | None) -> dict[str, Any]:
         row["findings"] = {"error": {"held": False, "found": _in_one_line(error, folder)}}
     finally:
         if keep is not None or (row["findings"] and not row["passed"]):
-            kept = (keep or FAILED_LOGS) / f"{case.name}-{seed}"
-            kept.parent.mkdir(parents=True, exist_ok=True)
-            shutil.rmtree(kept, ignore_errors=True)
-            shutil.move(folder, kept)
-            row["log"] = str(kept)
-        shutil.rmtree(folder, ignore_errors=True)
+            row["log"] = str(folder)
+            with contextlib.suppress(OSError):  # a disk that is full meanwhile: the log stays where it is
+                kept = (keep or FAILED_LOGS) / f"{case.name}-{seed}"
+                kept.parent.mkdir(parents=True, exist_ok=True)
+                shutil.rmtree(kept, ignore_errors=True)
+                row["log"] = str(shutil.move(folder, kept))
+        else:
+            shutil.rmtree(folder, ignore_errors=True)
     return row | {"seconds": time.monotonic() - begun_s, "detail": "; ".join(_wrong(row)) or _recovery(row)}
 
 
