@@ -21,15 +21,15 @@ from lowfc.control.loop.inputs import Command as Commanded
 from lowfc.control.loop.inputs import Frame, Input, Load, Outputs, PendingEvent, Request, Step
 from lowfc.control.loop.state import Settings, State
 from lowfc.device import DriverOptions
-from lowfc.device.mirror_protection import Command, apply_command
+from lowfc.device.mirror_loop import protection_of
+from lowfc.device.mirror_protection import Command, Status, apply_command
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.core.gain_watch import GainWatch
 from sim_camera.disturbance import LINES_HZ, Disturbance
 from sim_camera.driver import ignore, scene
 from sim_camera.path import MirrorPath
 from sim_camera.scene import Truth
-from sim_dm.device import initial
-from sim_dm.driver import SimulatedMirror, device
+from sim_dm.driver import SimulatedMirror
 
 RATE_HZ = 1000.0
 
@@ -101,7 +101,6 @@ class Bench:
         self.events: list[tuple[int, PendingEvent]] = []
         begin = Load(0, first, "bench") if isinstance(first, Calibration) else first
         self._state = advance(self._settings, State(), begin)[0]
-        self._protection = device(self.world)
         self.start_mirror()
         self._weights = delay_weights(self.world.camera.delay_frames).astype(np.float32)
         self._shapes = [self._status.surface_nm] * len(self._weights)
@@ -111,7 +110,10 @@ class Bench:
 
     def start_mirror(self) -> None:
         """Replace the mirror by a new, flat one."""
-        self._mirror, self._status = SimulatedMirror(DriverOptions(), self.world), initial(self._protection)
+        self._mirror = SimulatedMirror(DriverOptions(), self.world)
+        self._protection = protection_of(self._mirror, self.world)
+        flat = np.zeros(self._protection.grid, np.float32)
+        self._status = Status(flat, self._mirror.apply(flat))
 
     def new_record(self) -> None:
         """Begin a new record."""

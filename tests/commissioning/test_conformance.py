@@ -4,7 +4,6 @@ import json
 import socket
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -44,10 +43,8 @@ from lowfc.programs.commissioning.conformance.frames import camera_checks
 from lowfc.programs.commissioning.conformance.line import Line, Received
 from lowfc.programs.commissioning.conformance.mirror import mirror_checks
 from lowfc.testing.clock import FakeClock
-from sim_dm.device import initial
-from sim_dm.driver import device
 from tests.support.loops import lowfc, until
-from tests.support.safety_checks import apply_command, tick
+from tests.support.safety_checks import Simulated
 
 MS = 1_000_000
 LATENCY_NS = 100_000
@@ -158,9 +155,8 @@ class Mirror(Device):
 
     def __init__(self, **changes: Any) -> None:
         super().__init__(**changes)
-        self.device = device(CONFIG)
-        self.device = replace(self.device, **changes.get("device", {}))
-        self.status = initial(self.device)
+        self.mirror = Simulated(CONFIG, **changes.get("protection", {}))
+        self.status = self.mirror.initial
         self._published_ns = 0
         self._received = 0
 
@@ -173,7 +169,7 @@ class Mirror(Device):
         except DecodeError:
             return
         decoded = self.changed("command", command_of(payload), command, self.status)
-        self.status, refused = apply_command(self.device, self.status, decoded, now_ns)
+        self.status, refused = self.mirror.apply_command(self.status, decoded, now_ns)
         if refused is None:
             self._publish(self.status.time_ns, now_ns)
         elif self.changes.get("renews"):
@@ -181,7 +177,7 @@ class Mirror(Device):
 
     def iterate(self, now_ns: int) -> None:
         super().iterate(now_ns)
-        self.status = self.changed("tick", tick)(self.device, self.status, now_ns)
+        self.status = self.changed("tick", self.mirror.tick)(self.status, now_ns)
         if now_ns - self._published_ns >= 100 * MS and not self.changes.get("silent"):
             self._publish(now_ns, now_ns)
 
@@ -407,12 +403,12 @@ MIRRORS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
     "any length": ({"command": careless("bytes")}, {"short command refused": WRONG} | UNTRIED),
     "any order": ({"command": careless("order")}, {"old command refused": WRONG, "clear": WARNING} | UNTRIED),
     "no dead-man": (
-        {"tick": lambda one: lambda device, status, now_ns: status},
+        {"tick": lambda one: lambda status, now_ns: status},
         {"dead-man": WRONG, "longest command": WARNING} | UNTRIED,
     ),
     "a refused command extends the timeout": ({"renews": True}, {"dead-man": WRONG} | UNTRIED),
     "expired at once": (
-        {"tick": lambda one: lambda device, status, now_ns: one(device, status._replace(valid_for_ns=MS), now_ns)},
+        {"tick": lambda one: lambda status, now_ns: one(status._replace(valid_for_ns=MS), now_ns)},
         {"dead-man": WRONG} | UNTRIED,
     ),
     "command_nm set while it relaxes": (
@@ -423,10 +419,10 @@ MIRRORS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
         },
         {"relaxing": WRONG} | UNTRIED,
     ),
-    "no limits": ({"device": {"limits": WIDE}}, {"stroke": WRONG, "slew": WRONG, "neighbours": WRONG}),
-    "no stroke limit": ({"device": {"limits": Limits(10_000.0, 150.0, 500.0)}}, {"stroke": WRONG}),
-    "no neighbour limit": ({"device": {"limits": Limits(750.0, 150.0, 10_000.0)}}, {"neighbours": WRONG}),
-    "a shorter stroke": ({"device": {"limits": Limits(400.0, 150.0, 500.0)}}, {"stroke": WARNING}),
+    "no limits": ({"protection": {"limits": WIDE}}, {"stroke": WRONG, "slew": WRONG, "neighbours": WRONG}),
+    "no stroke limit": ({"protection": {"limits": Limits(10_000.0, 150.0, 500.0)}}, {"stroke": WRONG}),
+    "no neighbour limit": ({"protection": {"limits": Limits(750.0, 150.0, 10_000.0)}}, {"neighbours": WRONG}),
+    "a shorter stroke": ({"protection": {"limits": Limits(400.0, 150.0, 500.0)}}, {"stroke": WARNING}),
     "limits_hit empty": (
         {"state": lambda one: one.ClearField("limits_hit") or one},
         {"stroke": WARNING, "slew": WARNING, "neighbours": WARNING},
@@ -436,11 +432,10 @@ MIRRORS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
 
 
 def test_a_correct_mirror_passes_and_returns_to_its_shape() -> None:
-    mirror = Mirror()
+    mirror = Mirror(protection={"flatten": False})
     start = np.full((6, 7), 40, np.float32)
-    command = Command("lowfc", 5, mirror.device.settling_ns and 1, 10**10, start, np.zeros(2, np.float32))
-    mirror.status, _ = apply_command(replace(mirror.device, flatten=False), mirror.status, command, mirror.now_ns())
-    mirror.device = replace(mirror.device, flatten=False)
+    command = Command("lowfc", 5, 1, 10**10, start, np.zeros(2, np.float32))
+    mirror.status, _ = mirror.mirror.apply_command(mirror.status, command, mirror.now_ns())
     dialogue = Dialogue(mirror, Expected(CONFIG))
     assert found(mirror_checks(dialogue, 0.2, lambda _: None)) == {}
     np.testing.assert_allclose(mirror.status.surface_nm, start, atol=0.03)
@@ -483,8 +478,8 @@ def test_an_interrupted_check_returns_the_mirror_to_its_shape() -> None:
 def test_configured_dead_and_stuck_actuators_are_no_fault() -> None:
     config = load(None, {**SMALL, "mirror.dead": [9, 17], "mirror.stuck_nm": {"24": 30.0}})
     free = Mirror()
-    free.device = device(config)
-    free.status = initial(free.device)
+    free.mirror = Simulated(config)
+    free.status = free.mirror.initial
     assert found(mirror_checks(Dialogue(free, Expected(config)), 0.2, lambda _: None)) == {}
 
 

@@ -14,8 +14,10 @@ from lowfc.contract.configuration import Configuration, keys, load
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.network import Section
 from lowfc.contract.sections import IMPERFECTIONS, InterlockSection
+from lowfc.device import DriverOptions
+from lowfc.device.mirror_loop import protection_of
 from lowfc.programs.cli.config import commented
-from sim_dm.driver import device
+from sim_dm.driver import SimulatedMirror
 from tools.world import CASES
 
 KEYS = keys()
@@ -40,7 +42,8 @@ def test_the_defaults_are_valid_for_every_component() -> None:
     mirror(config)
     mirror_limits(config)
     settings(config)
-    assert device(config).tighter.stroke_nm > config.safety.stroke_nm
+    protection = protection_of(SimulatedMirror(DriverOptions(), config), config)
+    assert protection.tighter.stroke_nm > config.safety.stroke_nm
 
 
 def test_every_key_has_a_description() -> None:

@@ -40,7 +40,6 @@ BELOW_ALL = "lowfc.arrays"
 PURE_LAYERS = ("lowfc.arrays", "lowfc.optics", "lowfc.control", "lowfc.design")
 PURE_MODULES = (
     "lowfc.device.mirror_protection",
-    "sim_dm.device",
     "sim_dm.actuators",
     "sim_camera.path",
     "sim_camera.pixels",
@@ -188,7 +187,7 @@ def test_every_folder_is_a_package_of_at_most_sixteen_modules() -> None:
         ("lowfc.control.laws.integrator", "from lowfc.contract import codec", False),
         ("lowfc.control.laws.integrator", "from lowfc.optics.twin.twin import Twin", False),
         ("lowfc.contract.codecs.codec", "def later():\n    from lowfc.adapters.process.clock import HostClock", False),
-        ("lowfc.adapters.bus.bus", "import sim_dm.device", False),
+        ("lowfc.adapters.bus.bus", "import sim_dm.driver", False),
         ("lowfc.client.client", "from lowfc.programs.cli import status", False),
         ("sim_dm.driver", "from sim_camera import bench", False),
         ("lowfc.adapters.bus.bus", "from . import clock", False),

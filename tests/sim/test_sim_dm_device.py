@@ -1,7 +1,5 @@
 """The simulated mirror enforces its own limits, command timeout and checks for any commands."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,10 +9,8 @@ from hypothesis.extra import numpy as hnp
 from lowfc.arrays import Single
 from lowfc.contract.configuration import load
 from lowfc.control.loop.safety import Limit, Limits, Reason, Rejection, neighbour_difference_nm
-from lowfc.device.mirror_protection import MAX_VALID_NS, Command, Status
-from sim_dm.device import Device, initial
-from sim_dm.driver import device as device_of
-from tests.support.safety_checks import apply_command, tick, violations
+from lowfc.device.mirror_protection import MAX_VALID_NS, Command, MirrorProtection, Status
+from tests.support.safety_checks import Simulated, violations
 
 GRID = (4, 5)
 LIMITS = Limits(750.0, 150.0, 500.0)
@@ -23,9 +19,10 @@ START_NS = 1_700_000_000_000_000_000
 MS = 1_000_000
 
 
-def mirror(**changes: object) -> Device:
-    none_fixed = np.full(GRID, np.nan, np.float32)
-    return replace(Device(GRID, LIMITS, STEP_NM, True, 0.0, none_fixed), **changes)
+def mirror(**keys: object) -> Simulated:
+    """A mirror without settling; `keys` are others of [mirror]."""
+    keys = {"rows": GRID[0], "columns": GRID[1], "settling_us": 0.0} | keys
+    return Simulated(load(None, {f"mirror.{key}": value for key, value in keys.items()}))
 
 
 def command(actuators_nm: Single | None, index: int = 1, **changes: object) -> Command:
@@ -37,52 +34,53 @@ def even(height_nm: float) -> Single:
     return np.full(GRID, height_nm, np.float32)
 
 
-def follow(device: Device, status: Status, *heights_nm: float) -> Status:
+def follow(device: Simulated, status: Status, *heights_nm: float) -> Status:
     for height_nm in heights_nm:
         index = status.frame_sequence + 1
-        status, refused = apply_command(device, status, command(even(height_nm), index), START_NS + index * MS)
+        status, refused = device.apply_command(status, command(even(height_nm), index), START_NS + index * MS)
         assert refused is None
     return status
 
 
 def test_clear_id_resets_the_newest_sequence_of_the_mirror() -> None:
     device = mirror()
-    status, _ = apply_command(device, initial(device), command(even(5.0), (1 << 63)), START_NS)
-    late, refused = apply_command(device, status, command(even(9.0), 3), START_NS)
+    status, _ = device.apply_command(device.initial, command(even(5.0), (1 << 63)), START_NS)
+    late, refused = device.apply_command(status, command(even(9.0), 3), START_NS)
     assert (refused, late) == (Rejection.OUT_OF_ORDER, status)
-    status, refused = apply_command(device, status, command(even(9.0), 3, clear_id=77), START_NS)
+    status, refused = device.apply_command(status, command(even(9.0), 3, clear_id=77), START_NS)
     assert (refused, status.frame_sequence) == (None, 3)
-    assert apply_command(device, status, command(even(9.0), 2, clear_id=77), START_NS)[1] is Rejection.OUT_OF_ORDER, (
+    assert device.apply_command(status, command(even(9.0), 2, clear_id=77), START_NS)[1] is Rejection.OUT_OF_ORDER, (
         "once for each clear"
     )
-    assert apply_command(device, status, command(even(9.0), 2, clear_id=78), START_NS)[1] is None
+    assert device.apply_command(status, command(even(9.0), 2, clear_id=78), START_NS)[1] is None
 
 
 def test_mirror_accepts_sixteen_channels() -> None:
-    device, status = mirror(), initial(mirror())
+    device = mirror()
+    status = device.initial
     for number in range(16):
-        status, refused = apply_command(device, status, command(even(1.0), channel=f"c{number}"), START_NS)
+        status, refused = device.apply_command(status, command(even(1.0), channel=f"c{number}"), START_NS)
         assert refused is None
-    assert apply_command(device, status, command(even(1.0), channel="another"), START_NS) == (status, Limit.CHANNEL)
-    assert apply_command(device, status, command(even(1.0), channel="c3"), START_NS)[1] is None
-    assert apply_command(device, initial(device), command(even(1.0), channel="x" * 33), START_NS)[1] is Limit.CHANNEL
+    assert device.apply_command(status, command(even(1.0), channel="another"), START_NS) == (status, Limit.CHANNEL)
+    assert device.apply_command(status, command(even(1.0), channel="c3"), START_NS)[1] is None
+    assert device.apply_command(device.initial, command(even(1.0), channel="x" * 33), START_NS)[1] is Limit.CHANNEL
 
 
 def test_safe_mode_is_stored_by_channel() -> None:
     device = mirror()
-    status, _ = apply_command(device, initial(device), command(even(1.0), safe=True), START_NS)
-    status, _ = apply_command(device, status, command(even(1.0), channel="other"), START_NS)
+    status, _ = device.apply_command(device.initial, command(even(1.0), safe=True), START_NS)
+    status, _ = device.apply_command(status, command(even(1.0), channel="other"), START_NS)
     assert status.safe == {"lowfc"}
-    assert tick(device, status, START_NS + 10 * MAX_VALID_NS).safe == {"lowfc"}
-    assert apply_command(device, status, command(even(1.0), 2), START_NS)[0].safe == frozenset()
+    assert device.tick(status, START_NS + 10 * MAX_VALID_NS).safe == {"lowfc"}
+    assert device.apply_command(status, command(even(1.0), 2), START_NS)[0].safe == frozenset()
 
 
 def test_command_with_a_time_in_the_far_future_still_times_out_to_flat() -> None:
-    device = mirror(settling_ns=50_000.0)
+    device = mirror(settling_us=50.0)
     ahead = command(even(100.0))._replace(time_ns=1 << 62)
-    status, _ = apply_command(device, initial(device), ahead, START_NS)
+    status, _ = device.apply_command(device.initial, ahead, START_NS)
     for number in range(1, 5):
-        status = tick(device, status, START_NS + MAX_VALID_NS + number * 10 * MS)
+        status = device.tick(status, START_NS + MAX_VALID_NS + number * 10 * MS)
     assert not status.following
     assert not status.surface_nm.any()
 
@@ -106,54 +104,55 @@ commands = st.lists(
 @given(script=commands, bits=st.sampled_from([8, 10, 16, 24]))
 def test_surface_stays_within_the_limits_for_any_commands(script: list[object], bits: int) -> None:
     """Also after rounding to the driver's steps, and when the command has expired."""
-    device = mirror(step_nm=1500 / 2**bits)
-    status, now_ns = initial(device), START_NS
+    device = mirror(driver_bits=bits)
+    status, now_ns = device.initial, START_NS
     for index, entry in enumerate(script):
         now_ns += MS
         if isinstance(entry, int):
             now_ns += entry
-            after = tick(device, status, now_ns)
+            after = device.tick(status, now_ns)
         else:
-            after, _ = apply_command(device, status, command(entry, index + 1), now_ns)
+            after, _ = device.apply_command(status, command(entry, index + 1), now_ns)
         assert violations(LIMITS, status.surface_nm, after.surface_nm) == []
         status = after
 
 
 @pytest.mark.parametrize("bits", [8, 16])
 def test_a_command_is_rounded_to_the_drivers_steps(bits: int) -> None:
-    device = mirror(step_nm=1500 / 2**bits)
+    device = mirror(driver_bits=bits)
     shape_nm = np.linspace(-100, 100, 20, dtype=np.float32).reshape(GRID)
-    status, _ = apply_command(device, initial(device), command(shape_nm), START_NS)
-    steps = status.surface_nm / device.step_nm
+    status, _ = device.apply_command(device.initial, command(shape_nm), START_NS)
+    step_nm = 1500 / 2**bits
+    steps = status.surface_nm / step_nm
     assert np.abs(steps - np.round(steps)).max() < 1e-3
-    assert np.abs(status.surface_nm - shape_nm).max() <= device.step_nm * 0.501
+    assert np.abs(status.surface_nm - shape_nm).max() <= step_nm * 0.501
     assert len(np.unique(status.surface_nm)) > 10
 
 
 def test_mirror_at_the_neighbour_limit_does_not_oscillate() -> None:
     """Rounding must not exceed the limit by itself, which would make the mirror fall back towards flat."""
-    device = mirror(step_nm=1500 / 2**8)
+    device = mirror(driver_bits=8)
     shape_nm = even(0)
     shape_nm[:2] = 740
     shape_nm[2:] = -740
-    status = initial(device)
+    status = device.initial
     for index in range(1, 60):
-        status, _ = apply_command(device, status, command(shape_nm, index), START_NS + index * MS)
+        status, _ = device.apply_command(status, command(shape_nm, index), START_NS + index * MS)
         if index == 30:
             settled = status.surface_nm
-    assert neighbour_difference_nm(status.surface_nm) > LIMITS.neighbour_nm - 3 * device.step_nm
+    assert neighbour_difference_nm(status.surface_nm) > LIMITS.neighbour_nm - 3 * 1500 / 2**8
     assert np.array_equal(status.surface_nm, settled)
 
 
 def test_limits_of_the_mirror_are_reported_and_drop_the_modal_command() -> None:
     device = mirror()
-    status, _ = apply_command(device, initial(device), command(even(100)), START_NS)
+    status, _ = device.apply_command(device.initial, command(even(100)), START_NS)
     assert status.limits_hit == ()
     assert status.command_nm.tolist() == [1, 2]
-    status, _ = apply_command(device, status, command(even(900), 2), START_NS + MS)
+    status, _ = device.apply_command(status, command(even(900), 2), START_NS + MS)
     assert status.limits_hit == (Limit.STROKE, Limit.SLEW)
     assert status.command_nm.size == 0
-    status, _ = apply_command(device, status, command(even(300), 3), START_NS + 2 * MS)
+    status, _ = device.apply_command(status, command(even(300), 3), START_NS + 2 * MS)
     assert status.limits_hit == ()
 
 
@@ -170,16 +169,16 @@ def test_limits_of_the_mirror_are_reported_and_drop_the_modal_command() -> None:
 )
 def test_invalid_command_changes_nothing_and_does_not_restart_the_timeout(invalid: Command, reason: Reason) -> None:
     device = mirror()
-    before = follow(device, initial(device), 10, 20, 30, 40, 50)
-    after, refused = apply_command(device, before, invalid, START_NS + 100 * MS)
+    before = follow(device, device.initial, 10, 20, 30, 40, 50)
+    after, refused = device.apply_command(before, invalid, START_NS + 100 * MS)
     assert refused is reason
     assert after is before
 
 
 def test_repeated_command_renews_the_timeout() -> None:
     device = mirror()
-    status = follow(device, initial(device), 10)
-    after, refused = apply_command(device, status, command(even(10), 1), START_NS + 150 * MS)
+    status = follow(device, device.initial, 10)
+    after, refused = device.apply_command(status, command(even(10), 1), START_NS + 150 * MS)
     assert refused is None
     assert after.received_ns == START_NS + 150 * MS
     assert np.array_equal(after.surface_nm, status.surface_nm)
@@ -192,123 +191,121 @@ def test_repeated_command_renews_the_timeout() -> None:
 )
 def test_command_expires_just_after_its_validity(valid_ns: int, held_ns: int) -> None:
     device = mirror()
-    status, _ = apply_command(device, initial(device), command(even(50), valid_for_ns=valid_ns), START_NS)
-    held = tick(device, status, START_NS + held_ns)
+    status, _ = device.apply_command(device.initial, command(even(50), valid_for_ns=valid_ns), START_NS)
+    held = device.tick(status, START_NS + held_ns)
     assert held.following
     assert np.array_equal(held.surface_nm, status.surface_nm)
-    expired = tick(device, held, START_NS + held_ns + 1)
+    expired = device.tick(held, START_NS + held_ns + 1)
     assert not expired.following
     assert not expired.surface_nm.any()
 
 
 def test_command_expires_if_the_clock_goes_back() -> None:
     device = mirror()
-    status, _ = apply_command(device, initial(device), command(even(50)), START_NS)
-    gone_back = tick(device, status, START_NS - 1)
+    status, _ = device.apply_command(device.initial, command(even(50)), START_NS)
+    gone_back = device.tick(status, START_NS - 1)
     assert not gone_back.following
     assert gone_back.time_ns >= status.time_ns
 
 
 def test_expired_mirror_relaxes_to_flat_within_the_slew_limit_and_follows_again() -> None:
     device = mirror()
-    status = follow(device, initial(device), 100, 200, 300, 400, 500)
+    status = follow(device, device.initial, 100, 200, 300, 400, 500)
     now_ns = START_NS + 1_000 * MS
     heights = []
     for _ in range(6):
-        status = tick(device, status, now_ns)
+        status = device.tick(status, now_ns)
         now_ns += 10 * MS
         heights.append(float(status.surface_nm.max()))
     assert heights[0] == pytest.approx(350, abs=0.1)
     assert heights[3:] == [0, 0, 0]
     assert status.channels == {}
-    status, refused = apply_command(device, status, command(even(100), 700), now_ns)
+    status, refused = device.apply_command(status, command(even(100), 700), now_ns)
     assert refused is None
     assert status.following
     assert status.surface_nm.max() == pytest.approx(100, abs=STEP_NM)
 
 
 def test_expired_mirror_holds_its_shape_if_configured() -> None:
-    device = mirror(flatten=False)
-    status = follow(device, initial(device), 50)
-    expired = tick(device, status, START_NS + 1_000 * MS)
+    device = mirror(on_command_timeout="hold")
+    status = follow(device, device.initial, 50)
+    expired = device.tick(status, START_NS + 1_000 * MS)
     assert not expired.following
     assert np.array_equal(expired.surface_nm, status.surface_nm)
 
 
 def test_mirror_is_flat_before_the_first_command() -> None:
-    status = tick(mirror(), initial(mirror()), START_NS)
+    device = mirror()
+    status = device.tick(device.initial, START_NS)
     assert (status.following, status.surface_nm.any()) == (False, False)
 
 
 def test_channels_are_summed_and_the_sum_is_limited() -> None:
     device = mirror()
-    status = initial(device)
+    status = device.initial
     for index, (channel, height_nm) in enumerate((("lowfc", 60), ("offset", -20), ("lowfc", 80)), start=1):
-        status, _ = apply_command(
-            device, status, command(even(height_nm), index, channel=channel), START_NS + index * MS
-        )
+        given = command(even(height_nm), index, channel=channel)
+        status, _ = device.apply_command(status, given, START_NS + index * MS)
     assert status.surface_nm.max() == pytest.approx(60, abs=STEP_NM)
     assert sorted(status.channels) == ["lowfc", "offset"]
-    status, _ = apply_command(device, status, command(even(3e38), 4, channel="lowfc"), START_NS + 4 * MS)
-    status, _ = apply_command(device, status, command(even(3e38), 5, channel="offset"), START_NS + 5 * MS)
+    status, _ = device.apply_command(status, command(even(3e38), 4, channel="lowfc"), START_NS + 4 * MS)
+    status, _ = device.apply_command(status, command(even(3e38), 5, channel="offset"), START_NS + 5 * MS)
     assert status.limits_hit == (Limit.NOT_FINITE,)
     assert np.abs(status.surface_nm).max() <= LIMITS.stroke_nm
 
 
 def test_dead_and_stuck_actuators_stay_where_they_are() -> None:
-    fixed = np.full(GRID, np.nan, np.float32)
-    fixed[0, 0], fixed[1, 1] = 0, 123
-    device = mirror(fixed_nm=fixed)
-    status = initial(device)
+    device = mirror(dead=[0], stuck_nm={"6": 123.0})
+    status = device.initial
     assert status.surface_nm[1, 1] == 123
     status = follow(device, status, 100)
     assert status.surface_nm[0, 0] == 0
     assert status.surface_nm[1, 1] == 123
     assert status.surface_nm[2, 2] == pytest.approx(100, abs=STEP_NM)
     for _ in range(5):
-        status = tick(device, status, START_NS + 1_000 * MS)
+        status = device.tick(status, START_NS + 1_000 * MS)
     assert np.count_nonzero(status.surface_nm) == 1
     assert status.surface_nm[1, 1] == 123
 
 
 def test_settling_is_a_first_order_response() -> None:
     """One time constant after a command the surface has moved by 1 - 1/e."""
-    device = mirror(settling_ns=1e6)
-    status, _ = apply_command(device, initial(device), command(even(0), 1), START_NS)
-    status, _ = apply_command(device, status, command(even(100), 2), START_NS)
+    device = mirror(settling_us=1000.0)
+    status, _ = device.apply_command(device.initial, command(even(0), 1), START_NS)
+    status, _ = device.apply_command(status, command(even(100), 2), START_NS)
     assert status.surface_nm.max() == pytest.approx(100 * (1 - np.exp(-1)), abs=STEP_NM)
-    status = tick(device, status, status.time_ns + 2 * MS)
+    status = device.tick(status, status.time_ns + 2 * MS)
     assert status.surface_nm.max() == pytest.approx(100 * (1 - np.exp(-3)), abs=STEP_NM)
-    status = tick(device, status, status.time_ns + 21 * MS)
+    status = device.tick(status, status.time_ns + 21 * MS)
     assert status.surface_nm.max() == pytest.approx(100, abs=STEP_NM)
 
 
 def test_command_with_an_older_time_does_not_move_the_surface_back() -> None:
-    device = mirror(settling_ns=1e6)
-    status = follow(device, initial(device), 0, 100)
-    again, _ = apply_command(device, status, command(even(100), 2, time_ns=0), START_NS)
+    device = mirror(settling_us=1000.0)
+    status = follow(device, device.initial, 0, 100)
+    again, _ = device.apply_command(status, command(even(100), 2, time_ns=0), START_NS)
     assert np.array_equal(again.surface_nm, status.surface_nm)
 
 
 def test_commands_of_the_same_frame_move_the_surface_within_the_slew() -> None:
     """Frame timeout: the controller relaxes the mirror with commands that all have the last frame's time."""
-    device = mirror(settling_ns=1e6)
-    status = follow(device, initial(device), 100, 200, 300)
+    device = mirror(settling_us=1000.0)
+    status = follow(device, device.initial, 100, 200, 300)
     for number, height_nm in enumerate((200, 100, 0), start=1):
         before = status.surface_nm
         now_ns = status.received_ns + 10 * MS
-        status, _ = apply_command(device, status, command(even(height_nm), 3, time_ns=status.commanded_ns), now_ns)
+        status, _ = device.apply_command(status, command(even(height_nm), 3, time_ns=status.commanded_ns), now_ns)
         assert status.surface_nm.max() == pytest.approx(height_nm, abs=1), number
         assert np.abs(status.surface_nm - before).max() <= LIMITS.slew_nm
 
 
 def test_apply_command_does_not_modify_its_arguments() -> None:
     device = mirror()
-    status = follow(device, initial(device), 10)
+    status = follow(device, device.initial, 10)
     driven, surface, channels = status.driven_nm.copy(), status.surface_nm.copy(), dict(status.channels)
     given = command(even(700), 2, channel="other")
-    apply_command(device, status, given, START_NS)
-    tick(device, status, START_NS + 10_000 * MS)
+    device.apply_command(status, given, START_NS)
+    device.tick(status, START_NS + 10_000 * MS)
     assert np.array_equal(status.driven_nm, driven)
     assert np.array_equal(status.surface_nm, surface)
     assert status.channels == channels
@@ -317,16 +314,12 @@ def test_apply_command_does_not_modify_its_arguments() -> None:
 
 def test_driver_step_too_coarse_for_the_slew_limit_is_refused() -> None:
     with pytest.raises(ValueError, match="slew_nm"):
-        _ = mirror(limits=Limits(750.0, 5.0, 500.0), step_nm=1500 / 2**8).tighter
+        _ = MirrorProtection(GRID, Limits(750.0, 5.0, 500.0), 1500 / 2**8, flatten=True).tighter
 
 
 def test_the_mirror_of_a_configuration() -> None:
-    config = load(None, {"mirror.dead": [0, 35], "mirror.stuck_nm": {"40": -70.0}, "mirror.on_command_timeout": "hold"})
-    made = device_of(config)
-    assert made.grid == (34, 34)
-    assert (made.limits.stroke_nm, made.limits.slew_nm, made.limits.neighbour_nm) == (750, 150, 500)
-    assert made.step_nm == 1500 / 2**16
-    assert made.settling_ns == 50_000
-    assert not made.flatten
-    assert np.argwhere(np.isfinite(made.fixed_nm)).tolist() == [[0, 0], [1, 1], [1, 6]]
-    assert made.fixed_nm[1, 6] == -70
+    keys = {"mirror.dead": [0, 35], "mirror.stuck_nm": {"35": 9.0, "40": -70.0}, "mirror.on_command_timeout": "hold"}
+    made = Simulated(load(None, keys))
+    assert made.protection == MirrorProtection((34, 34), LIMITS, STEP_NM, flatten=False)
+    assert np.argwhere(made.initial.surface_nm).tolist() == [[1, 1], [1, 6]]
+    assert made.initial.surface_nm[1, [1, 6]].tolist() == [9, -70]

@@ -1,15 +1,17 @@
-"""Properties of `limit`, hand-chosen cases, and the simulated mirror behind its protection as pure functions."""
+"""Properties of `limit`, hand-chosen cases, and the simulated mirror behind its protection."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lowfc.arrays import Single
+from lowfc.contract.configuration import Configuration
 from lowfc.control.loop.safety import Limited, Limits, Reason
-from lowfc.device import mirror_protection
-from lowfc.device.mirror_protection import Command, Move, Status
-from sim_dm.device import Device, responded, rounded
+from lowfc.device import DriverOptions
+from lowfc.device.mirror_loop import protection_of
+from lowfc.device.mirror_protection import Command, Status, apply_command, tick
+from sim_dm.driver import SimulatedMirror
 
 LIMITS = Limits(stroke_nm=700.0, slew_nm=100.0, neighbour_nm=400.0)
 
@@ -116,16 +118,21 @@ def check_kept(limit: Callable[[Limits, Single, Single], Limited], case: Case) -
         assert worst < 0.01, f"{case.name}: {worst} nm from the expected shape\n{shape}"
 
 
-def apply_command(device: Device, status: Status, command: Command, now_ns: int) -> tuple[Status, Reason | None]:
-    return mirror_protection.apply_command(device, status, command, now_ns, _move(device, status))
+class Simulated:
+    """The simulated mirror of a configuration behind its protection, of which `changes` are other values.
 
+    Attributes:
+        initial: status before the first command.
+    """
 
-def tick(device: Device, status: Status, now_ns: int) -> Status:
-    return mirror_protection.tick(device, status, now_ns, _move(device, status))
+    def __init__(self, config: Configuration, **changes: object) -> None:
+        driver = SimulatedMirror(DriverOptions(), config)
+        self.protection = replace(protection_of(driver, config), **changes)
+        self._settle, flat = driver.settle, np.zeros(self.protection.grid, np.float32)
+        self.initial = Status(flat, driver.settle(flat, np.inf))
 
+    def apply_command(self, status: Status, command: Command, now_ns: int) -> tuple[Status, Reason | None]:
+        return apply_command(self.protection, status, command, now_ns, self._settle)
 
-def _move(device: Device, status: Status) -> Move:
-    def move(driven_nm: Single, elapsed_ns: float) -> Single:
-        return responded(device, rounded(device, driven_nm), status.surface_nm, elapsed_ns)
-
-    return move
+    def tick(self, status: Status, now_ns: int) -> Status:
+        return tick(self.protection, status, now_ns, self._settle)

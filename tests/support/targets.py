@@ -44,15 +44,15 @@ from lowfc.programs.core.controller import Controller
 from lowfc.programs.view.snapshot import SHOWN, Accumulator
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
-from sim_dm.device import Device, initial
 from sim_dm.driver import SimulatedMirror
 from tests.support.controller_inputs import CALIBRATION, INTERLOCKS
 from tests.support.mutated_logs import damaged, mutated, rewritten, small_log
 from tests.support.report_log import SyntheticLog
-from tests.support.safety_checks import apply_command, tick, violations
+from tests.support.safety_checks import Simulated, violations
 from tests.support.toy import GRID, NOLL, calibration, frame, loaded, settings
 
 NORMAL = settings(interlocks=INTERLOCKS)
+CONFIG = load(None, {"mirror.rows": GRID[0], "mirror.columns": GRID[1], "realtime.cache_warmup": False})
 
 
 @dataclass(frozen=True)
@@ -129,11 +129,10 @@ class Processes:
     """The real controller and mirror on a memory bus: no message may stop them."""
 
     def __init__(self) -> None:
-        config = load(None, {"mirror.rows": GRID[0], "mirror.columns": GRID[1], "realtime.cache_warmup": False})
         self.hub, self.clock, self.number = MemoryHub(), FakeClock(), 0
         self.services = [Service(name, "fuzz", self.clock, MemoryBus(self.hub, name, self.clock)) for name in ROLES]
-        self.mirror = MirrorLoop(SimulatedMirror(DriverOptions(), config), self.services[1], config)
-        self.controller = Controller(config, self.services[0], CALIBRATION, "a test", Latch(()))
+        self.mirror = MirrorLoop(SimulatedMirror(DriverOptions(), CONFIG), self.services[1], CONFIG)
+        self.controller = Controller(CONFIG, self.services[0], CALIBRATION, "a test", Latch(()))
         self.controller._adopted = True
         camera = MemoryBus(self.hub, "camera", self.clock)
         self.frames, self.settings_of = camera.publisher(FRAME), camera.publisher(CAMERA_STATE)
@@ -278,11 +277,10 @@ def _advance_from(what: object, state: State) -> None:
 
 
 def _apply(data: bytes) -> None:
-    device = Device(GRID, NORMAL.limits, 0.01, True, 5e4, np.full(GRID, np.nan, np.float32))
-    status = initial(device)
-    after, _ = apply_command(device, status, command_of(data), 10)
-    assert violations(device.limits, status.driven_nm, after.driven_nm) == []
-    tick(device, after, 10**9)
+    mirror = Simulated(CONFIG)
+    after, _ = mirror.apply_command(mirror.initial, command_of(data), 10)
+    assert violations(mirror.protection.limits, mirror.initial.driven_nm, after.driven_nm) == []
+    mirror.tick(after, 10**9)
 
 
 def _shown(data: bytes) -> None:
