@@ -1,7 +1,5 @@
 """Contrast that the simulated wavefront adds to the dark zone, from full science images and from the quadratic form."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from lowfc.arrays import Single
@@ -9,25 +7,6 @@ from lowfc.optics.chain.added_contrast import ModalContrast
 
 IMAGES = 200
 """Full images averaged for each value; fewer in a short run."""
-
-
-@dataclass(frozen=True, slots=True)
-class AddedContrast:
-    """Means over `science_images` instants of a run's second half; the names are those of the message's fields.
-
-    Attributes:
-        added_contrast_flat: contrast added by the disturbance, as with a flat mirror, from full images.
-        added_contrast: contrast added by the residual, from full images.
-        science_images: number of full images.
-        quadratic_added_contrast: contrast added by the residual, from the quadratic form, at the same instants.
-        dark_zone_contrast: contrast of the coronagraph itself, with a flat wavefront.
-    """
-
-    added_contrast_flat: float
-    added_contrast: float
-    science_images: int
-    quadratic_added_contrast: float
-    dark_zone_contrast: float
 
 
 class Contrast:
@@ -58,20 +37,24 @@ class Contrast:
             np.einsum("nj,nj->j", modes_nm @ self._form, modes_nm) / np.float32(len(modes_nm)), np.float32
         )
 
-    def measure(self) -> AddedContrast | None:
-        """Compute full images at up to `IMAGES` instants of the second half; None before the first frame."""
+    def measure(self) -> dict[str, float]:
+        """Means at up to `IMAGES` instants of the second half, by their names in the message; empty before a frame.
+
+        The contrast added with a flat mirror and by the residual, and the coronagraph's own, are from full images;
+        `quadratic_added_contrast` is from the quadratic form.
+        """
         half = self._kept[len(self._kept) // 2 :]
         chosen = [half[int(place)] for place in np.linspace(0, len(half) - 1, min(IMAGES, len(half)))]
         if not chosen:
-            return None
+            return {}
         by_image = self._modal.by_image
         dark_zone = by_image(np.zeros_like(chosen[0][0]))
         disturbance, residual = (np.mean([by_image(pair[which]) for pair in chosen]) - dark_zone for which in (0, 1))
         quadratic = self.quadratic(np.array([residual_nm for _, residual_nm in chosen])).sum()
-        return AddedContrast(
-            added_contrast_flat=float(disturbance),
-            added_contrast=float(residual),
-            science_images=len(chosen),
-            quadratic_added_contrast=float(quadratic),
-            dark_zone_contrast=dark_zone,
-        )
+        return {
+            "added_contrast_flat": float(disturbance),
+            "added_contrast": float(residual),
+            "science_images": len(chosen),
+            "quadratic_added_contrast": float(quadratic),
+            "dark_zone_contrast": dark_zone,
+        }

@@ -2,7 +2,7 @@
 
 import threading
 from collections import deque
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,7 +25,7 @@ from lowfc.control.laws.stability import delay_weights
 from lowfc.device import CameraSettings, DriverOptions, Exposure, Puts
 from lowfc.optics.detector.detector import saturation_dn
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
-from sim_camera.contrast import AddedContrast, Contrast
+from sim_camera.contrast import Contrast
 from sim_camera.disturbance import Disturbance, preset_disturbance, with_sources
 from sim_camera.faulty import FaultyFrames, read_fault
 from sim_camera.lateness import Lateness
@@ -170,7 +170,7 @@ class SimulatedCamera:
         recent = max(1, round(RECENT_S * config.camera.rate_hz))
         nm_per_mas = tilt_nm_per_mas(config.star.diameter_m)
         self._statistics = WavefrontAccumulator(config.noll, nm_per_mas, recent, len(self._scene.instants))
-        self._measured: AddedContrast | None = None
+        self._measured: dict[str, float] = {}
 
     def join(self, service: Service) -> None:
         """Declare the publisher of the truth and subscribe to the mirror."""
@@ -243,19 +243,17 @@ class SimulatedCamera:
         """Publish the last truth and compute the contrast of the run."""
         self._drain()
         self._publish_truth()
-        self._measured = self._contrast.measure() if self._contrast is not None else None
+        self._measured = self._contrast.measure() if self._contrast is not None else {}
 
     def fill(self, health: wire.Health) -> None:
         """Add latency and wavefront to a Health."""
         health.commands_late = self._lateness.total
         if self._frame_to_mirror.count:
             health.frame_to_mirror.CopyFrom(latency(self._frame_to_mirror))
-        if (wavefront := self._statistics.wavefront()) is not None:
-            health.wavefront.CopyFrom(wire.WavefrontFigures(**asdict(wavefront)))
-            if self._measured is not None:
-                health.wavefront.MergeFrom(wire.WavefrontFigures(**asdict(self._measured)))
-        if (recent := self._statistics.recent()) is not None:
-            health.recent_wavefront.CopyFrom(wire.WavefrontFigures(**asdict(recent)))
+        if wavefront := self._statistics.wavefront():
+            health.wavefront.CopyFrom(wire.WavefrontFigures(**(wavefront | self._measured)))
+        if recent := self._statistics.recent():
+            health.recent_wavefront.CopyFrom(wire.WavefrontFigures(**recent))
 
     def _start_ns(self) -> int:
         return self._origin_ns + self._index * self._config.period_ns

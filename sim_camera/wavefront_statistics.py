@@ -1,6 +1,6 @@
 """Rms of the true wavefront over the second half of a run of unknown length, and over its most recent frames."""
 
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,32 +15,15 @@ BLOCK = 500
 MAX_BLOCKS = 256
 """Blocks stored; then pairs are merged, so that memory does not grow with the length of the run."""
 
-
-@dataclass(frozen=True, slots=True)
-class WavefrontStatistics:
-    """Root mean squares over frames: nm over the open pupil, mas per axis.
-
-    The first four are taken at the starts of exposures; the continuous ones over all time, from `instants` samples
-    of each period; zero if not computed.
-    """
-
-    disturbance_rms_nm: float
-    residual_rms_nm: float
-    tilt_disturbance_mas: float
-    tilt_residual_mas: float
-    instants: int = 0
-    continuous_disturbance_rms_nm: float = 0.0
-    continuous_residual_rms_nm: float = 0.0
-    continuous_tilt_disturbance_mas: float = 0.0
-    continuous_tilt_residual_mas: float = 0.0
-    added_contrast_flat: float = 0.0
-    added_contrast: float = 0.0
-    costliest_modes: str = ""
-    costliest_share: float = 0.0
+_RMS = "disturbance_rms_nm", "residual_rms_nm", "tilt_disturbance_mas", "tilt_residual_mas"
 
 
 class WavefrontAccumulator:
-    """Block sums over frames of the contrast added by each mode, and of the squared wavefront."""
+    """Block sums over frames of the contrast added by each mode, and of the squared wavefront.
+
+    Statistics are by their names in the message: rms in nm over the open pupil, and mas per axis, at the starts of
+    exposures; continuous ones over all time, from `instants` samples of each period, absent if not computed.
+    """
 
     def __init__(self, noll: tuple[int, ...], nm_per_mas: float, recent: int = 1, instants: int = 0) -> None:
         """Start without frames.
@@ -80,11 +63,10 @@ class WavefrontAccumulator:
             self._blocks = [[one + other for one, other in zip(*pair, strict=True)] for pair in pairs]
             self._block *= 2
 
-    def wavefront(self) -> WavefrontStatistics | None:
+    def wavefront(self) -> dict[str, Any]:
         """Statistics over the second half of the complete blocks, or over all frames before the first is complete.
 
-        Returns:
-            None before the first frame.
+        Empty before the first frame, as are those of `recent`.
         """
         if self._blocks:
             half = self._blocks[len(self._blocks) // 2 :]
@@ -92,24 +74,24 @@ class WavefrontAccumulator:
         elif self._count:
             mean = np.array(self._sums) / self._count
         else:
-            return None
+            return {}
         return self._statistics(mean)
 
-    def recent(self) -> WavefrontStatistics | None:
-        """Statistics over the most recent frames; None before the first frame."""
+    def recent(self) -> dict[str, Any]:
+        """Statistics over the most recent frames."""
         found = self._recent[: self._frames]
-        return self._statistics(found.mean(axis=0)) if len(found) else None
+        return self._statistics(found.mean(axis=0)) if len(found) else {}
 
     def _squares(self, wavefront: Wavefront) -> tuple[float, ...]:
         disturbance_nm, residual_nm = wavefront.disturbance_nm[self._tilts], wavefront.residual_nm[self._tilts]
         pupil_nm2 = wavefront.disturbance_rms_nm**2, wavefront.residual_rms_nm**2
         return (*pupil_nm2, float(disturbance_nm @ disturbance_nm), float(residual_nm @ residual_nm))
 
-    def _statistics(self, mean: npt.NDArray[np.float64]) -> WavefrontStatistics:
+    def _statistics(self, mean: npt.NDArray[np.float64]) -> dict[str, Any]:
         flat, added, squares = mean[0], mean[1 : 1 + len(self._noll)], mean[1 + len(self._noll) :]
         per = np.array([1, 1, *[self._tilts.stop * self._nm_per_mas**2] * 2])
         rms = np.sqrt(squares.reshape(-1, 4) / per).ravel().tolist()
-        costliest_modes = costliest(by_group(self._noll, added)) if flat else ("", 0.0)
-        contrast = float(flat), float(added.sum()), *costliest_modes
-        values = [*rms[:4], self._instants, *(rms[4:] or [0.0] * 4), *contrast]
-        return WavefrontStatistics(**dict(zip(WavefrontStatistics.__annotations__, values, strict=True)))
+        found = dict(zip((*_RMS, *(f"continuous_{name}" for name in _RMS)), rms, strict=False))
+        found |= {"instants": self._instants, "added_contrast_flat": float(flat), "added_contrast": float(added.sum())}
+        modes, share = costliest(by_group(self._noll, added)) if flat else ("", 0.0)
+        return found | {"costliest_modes": modes, "costliest_share": share}
