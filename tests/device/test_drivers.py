@@ -10,8 +10,7 @@ import pytest
 
 from lowfc.contract.configuration import load
 from lowfc.contract.errors import ConfigurationError
-from lowfc.contract.messages import CAMERA_STATE, COMMAND, FRAME, MIRROR_STATE, wire
-from lowfc.control.loop.safety import Limit
+from lowfc.contract.messages import CAMERA_STATE, FRAME
 from lowfc.device import (
     CameraClock,
     CameraSettings,
@@ -25,12 +24,12 @@ from lowfc.device import (
     run_camera,
 )
 from lowfc.device.camera_loop import CameraLoop
-from lowfc.device.mirror_loop import MirrorLoop, protection_of
+from lowfc.device.mirror_loop import protection_of
 from lowfc.device.run import camera_beside
 from lowfc.programs.commissioning.doctor.devices import device_checks
 from lowfc.testing.clock import FakeClock
 from lowfc.testing.listener import Listener
-from lowfc.testing.memory_bus import MemoryBus, MemoryHub
+from lowfc.testing.memory_bus import MemoryHub
 from tests.support.loops import lowfc
 
 GRID = (4, 5)
@@ -62,17 +61,14 @@ class Ramp:
 
 
 class Follower:
-    """Mirror that records its commands."""
+    """Mirror that does nothing."""
 
     def __init__(self, options: DriverOptions, config: Configuration) -> None:
         self.geometry = geometry(config)
-        self.applied: list[Single] = []
 
-    def apply(self, actuators_nm: Single) -> None:
-        self.applied.append(actuators_nm)
+    def apply(self, actuators_nm: Single) -> None: ...
 
-    def close(self) -> None:
-        self.applied.append(np.zeros(0, np.float32))
+    def close(self) -> None: ...
 
 
 def test_a_camera_publishes_what_its_driver_returns() -> None:
@@ -87,48 +83,6 @@ def test_a_camera_publishes_what_its_driver_returns() -> None:
     assert (state.rows, state.columns, state.saturation_dn, state.exposure_ns) == (3, 4, 4095, 2 * MS)
     assert driver.closed
     assert listener.events() == ["STARTED", "STOPPED"]
-
-
-def test_commands_are_limited_and_the_mirror_goes_flat_after_the_command_timeout() -> None:
-    hub, clock = MemoryHub(), FakeClock()
-    listener = Listener(hub, clock, MIRROR_STATE)
-    driver = Follower(DriverOptions(), CONFIG)
-    loop = MirrorLoop(driver, listener.service("mirror-dm"), CONFIG)
-    assert not driver.applied.pop().any(), "driven to flat at the start: its position is unknown"
-    commands = MemoryBus(hub, "controller", clock).publisher(COMMAND, "dm")
-
-    def command(height_nm: float, grid: tuple[int, int] = GRID) -> None:
-        message = wire.MirrorCommand(frame_sequence=5, rows=grid[0], columns=grid[1], valid_for_ns=100 * MS)
-        message.actuators = np.full(grid, height_nm, np.float32).tobytes()
-        commands.put(message.SerializeToString())
-
-    command(200.0)
-    assert driver.applied[-1].max() == pytest.approx(150.0, abs=0.1), "the slew limit of [mirror]"
-    command(200.0, (5, 4))
-    command(float("nan"))
-    assert len(driver.applied) == 1
-    assert [state.refused for state in listener.messages(MIRROR_STATE)] == [0, Limit.WRONG_GRID, Limit.NOT_FINITE]
-    clock.advance(101 * MS)
-    loop._idle()
-    assert not driver.applied[-1].any()
-    loop._idle()
-    assert len(driver.applied) == 2, "a mirror at rest gets no further call"
-    assert listener.events()[-1] == "COMMAND_EXPIRED"
-
-
-def test_a_warm_up_of_the_mirror_neither_calls_its_driver_nor_changes_or_publishes_anything() -> None:
-    hub, clock = MemoryHub(), FakeClock()
-    listener = Listener(hub, clock, MIRROR_STATE)
-    driver = Follower(DriverOptions(), CONFIG)
-    loop = MirrorLoop(driver, listener.service("mirror-dm"), CONFIG)
-    message = wire.MirrorCommand(frame_sequence=5, rows=GRID[0], columns=GRID[1], valid_for_ns=100 * MS)
-    message.actuators = np.full(GRID, 20.0, np.float32).tobytes()
-    loop._warm_up()  # before the first command
-    MemoryBus(hub, "controller", clock).publisher(COMMAND, "dm").put(message.SerializeToString())
-    before, applied, published = loop._status, len(driver.applied), len(listener.messages(MIRROR_STATE))
-    loop._warm_up()
-    assert loop._status is before
-    assert (len(driver.applied), len(listener.messages(MIRROR_STATE))) == (applied, published)
 
 
 def test_the_tighter_of_driver_and_configured_limits_applies() -> None:

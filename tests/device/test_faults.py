@@ -1,4 +1,4 @@
-"""Drivers that fail, hang or return invalid data: reported, counted and retried; a mirror goes flat first."""
+"""Drivers in their loops; those that fail, hang or return invalid data are reported, counted and retried."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -13,7 +13,7 @@ from lowfc.contract.configuration import load
 from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.messages import CAMERA_STATE, COMMAND, FRAME, HEALTH, MIRROR_STATE, wire
-from lowfc.control.loop.safety import Rejection
+from lowfc.control.loop.safety import Limit, Rejection
 from lowfc.device import CameraSettings, Exposure, Single, geometry
 from lowfc.device.camera_loop import CameraLoop
 from lowfc.device.driver import camera_state
@@ -230,9 +230,9 @@ class Bench:
         self._commands = MemoryBus(hub, "controller", self.clock).publisher(COMMAND, "dm")
         self._numbers: Iterator[int] = count(1)
 
-    def command(self, height_nm: float) -> wire.MirrorState:
-        message = wire.MirrorCommand(frame_sequence=next(self._numbers), rows=4, columns=5, valid_for_ns=10**9)
-        message.actuators = np.full((4, 5), height_nm, np.float32).tobytes()
+    def command(self, height_nm: float, grid: tuple[int, int] = (4, 5)) -> wire.MirrorState:
+        message = wire.MirrorCommand(frame_sequence=next(self._numbers), rows=grid[0], columns=grid[1])
+        message.valid_for_ns, message.actuators = 10**9, np.full(grid, height_nm, np.float32).tobytes()
         self._commands.put(message.SerializeToString())
         return self.state()
 
@@ -243,6 +243,32 @@ class Bench:
 
     def state(self) -> Any:
         return self.listener.messages(MIRROR_STATE)[-1]
+
+
+def test_commands_are_limited_and_the_mirror_goes_flat_after_the_command_timeout() -> None:
+    mirror = Mirror()
+    bench = Bench(mirror)
+    assert mirror.heights_nm == [0.0], "driven to flat at the start: its position is unknown"
+    bench.command(200.0)
+    assert mirror.heights_nm[1:] == [150.0], "the slew limit of [mirror]"
+    assert bench.command(200.0, (5, 4)).refused == Limit.WRONG_GRID
+    assert bench.command(float("nan")).refused == Limit.NOT_FINITE
+    assert len(mirror.heights_nm) == 2
+    bench.tick(1001)
+    bench.tick()
+    assert mirror.heights_nm[2:] == [0.0], "a mirror at rest gets no further call"
+    assert bench.listener.events()[-1] == "COMMAND_EXPIRED"
+
+
+def test_a_warm_up_of_the_mirror_neither_calls_its_driver_nor_changes_or_publishes_anything() -> None:
+    mirror = Mirror()
+    bench = Bench(mirror)
+    bench.loop._warm_up()  # before the first command
+    bench.command(20.0)
+    before, published = bench.loop._status, len(bench.listener.messages(MIRROR_STATE))
+    bench.loop._warm_up()
+    assert bench.loop._status is before
+    assert (mirror.heights_nm, len(bench.listener.messages(MIRROR_STATE))) == ([0.0, 20.0], published)
 
 
 @pytest.mark.parametrize(
