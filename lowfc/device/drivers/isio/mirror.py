@@ -27,10 +27,8 @@ SUM_SILENT_S = 0.5
 SAME_NM = 0.05
 """Largest difference between commanded and reached shape, nm, that float32 rounding in micrometres explains."""
 _POLL_S = 50e-6
-_SEARCH_S = 1.0
-"""Period of the search for an absent sum."""
-_EXPECTED_SEARCH_S = 0.1
-"""The same for one that is expected: recreated, it must be found well within `SUM_SILENT_S`."""
+_SEARCH_S = 0.1
+"""Period of the search for an absent sum: recreated, it must be found well within `SUM_SILENT_S`."""
 
 
 class IsioMirror:
@@ -123,8 +121,7 @@ class IsioMirror:
         if self._total is not None and self._total.current():
             return self._total
         self._total, now_s = None, time.monotonic()
-        period_s = _EXPECTED_SEARCH_S if self._total_expected else _SEARCH_S
-        if self._total_name and now_s - self._searched_s >= period_s:
+        if self._total_name and now_s - self._searched_s >= _SEARCH_S:
             self._searched_s = now_s
             self._total = opened(stream_path(self._total_name), self._grid)
             self._total_expected |= self._total is not None
