@@ -114,7 +114,7 @@ class CameraLoop:
         self._service.work += 1
 
     def _end_ns(self, exposure: Exposure, settings: CameraSettings) -> int:
-        """End of an exposure by the run's clock; ValueError if it is in the future."""
+        """End of an exposure by the run's clock; ValueError if it is in the future, or before 1970."""
         clock = self._service.clock
         if exposure.end_ns is None:
             return clock.now_ns()
@@ -122,8 +122,9 @@ class CameraLoop:
         if self._simulated:
             return end_ns
         end_ns += clock.offset_ns if settings.clock == "monotonic" else clock.ahead_ns()
-        if (ahead_ns := end_ns - clock.host_ns()) > AHEAD_NS:
-            raise ValueError(f"end_ns is {ahead_ns * 1e-9:.3f} s in the future of the {settings.clock} clock")
+        ahead_ns = end_ns - clock.host_ns()
+        if ahead_ns > AHEAD_NS or end_ns < 0:
+            raise ValueError(f"end_ns is {ahead_ns * 1e-9:.3f} s ahead of the {settings.clock} clock")
         return end_ns
 
     def _follow_numbers(self, exposure: Exposure, settings: CameraSettings) -> None:

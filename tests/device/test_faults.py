@@ -69,13 +69,14 @@ def exposed(*exposures: Callable[[], Any], frames: int, settings: CameraSettings
         (raising(OSError("the cable")), "OSError: the cable"),
         (good(pixels=GOOD[1:]), "shape (2, 4)"),
         (good(pixels=np.full((3, 4), np.nan)), "float64"),
-        (good(end_ns=1 << 62), "in the future"),
+        (good(end_ns=1 << 62), "s ahead of the monotonic clock"),
+        (good(end_ns=-(1 << 99)), "end_ns is -"),
         (good(end_ns=float("nan")), "NaN"),
         (good(lost=-1), "lost is -1"),
         (good(lost=1 << 32), "lost is 4294967296"),
         (lambda: "nothing", "AttributeError"),
     ],
-    ids=["raises", "shape", "NaN", "future", "NaN time", "negative loss", "impossible loss", "nonsense"],
+    ids=["raises", "shape", "NaN", "future", "past", "NaN time", "negative loss", "impossible loss", "nonsense"],
 )
 def test_camera_failures_are_reported_once_counted_and_retried(bad: Callable[[], Any], message: str) -> None:
     recovered = [good()] * 251  # more than 1 s at 250 Hz

@@ -94,7 +94,7 @@ class Buffers:
             "get_image_height": 2,
             "get_image_width": 3,
             "get_image_data": data,
-            "get_system_timestamp": 1000 + number,
+            "get_system_timestamp": time.time_ns(),
             "get_frame_id": number,
         }
         return SimpleNamespace(**{name: lambda value=value: value for name, value in methods.items()})
