@@ -64,13 +64,14 @@ def disturbance_of(config: Configuration) -> Disturbance:
             section.jitter_mas * nm_per_mas,
             section.shear,
         )
+        if not section.wheel_hz:
+            return found
+        speeds_hz = section.wheel_hz, section.wheel_hz + section.second_wheel_hz
+        rms_nm = np.where(np.isin(config.noll, TIP_TILT), section.wheel_mas * nm_per_mas, 0.0)
+        count = 2 if section.second_wheel_hz else 1
+        spinning = wheels(config.seed, speeds_hz[:count], rms_nm, section.wheel_course, section.wheel_change)
     except ValueError as error:
         raise ConfigurationError(f"disturbance: {error}") from None
-    if not section.wheel_hz:
-        return found
-    speeds_hz = (section.wheel_hz, section.wheel_hz + section.second_wheel_hz)[: 2 if section.second_wheel_hz else 1]
-    rms_nm = np.where(np.isin(config.noll, TIP_TILT), section.wheel_mas * nm_per_mas, 0.0)
-    spinning = wheels(config.seed, speeds_hz, rms_nm, section.wheel_course, section.wheel_change)
     return replace(found, wheels=spinning)
 
 
