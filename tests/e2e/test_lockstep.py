@@ -15,9 +15,9 @@ from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.messages import topic_of, wire
 from lowfc.contract.sections import SENSORS
 from lowfc.optics.chain.sensor import light_budget
-from sim_camera.prediction import tilt_residual_mas
 from tests.support.loops import children, loop, lowfc, output_of, payloads, recorded_bytes, run, start, until
 from tools.measure import measured
+from tools.prediction import tilt_residual_mas
 
 GENTLE = """
 [camera]
