@@ -1,11 +1,13 @@
 """Find drivers by name: an entry point of an installed package, "module:Class", or "folder/file.py:Class"."""
 
 import importlib.util
+import json
 import sys
 import tomllib
 from collections.abc import Sequence
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
+from types import NoneType
 from typing import Any, Literal, get_args
 
 from pydantic import ValidationError
@@ -128,7 +130,7 @@ def options(driver: Any, found: dict[str, Any], words: Sequence[str] = ()) -> Dr
     model: type[DriverOptions] = getattr(driver, "Options", DriverOptions)
     values, faults = _parsed(words), []
     try:
-        validated = model.model_validate(found)
+        validated = model.model_validate_json(json.dumps(found, default=str))  # TOML too has no tuples, paths or enums
     except ValidationError as error:  # options missing here may be among the words
         faults = [one for one in error.errors() if not (values and one["type"] == "missing")]
     if values and not faults:
@@ -147,8 +149,11 @@ def options_help(driver: Any) -> list[tuple[str, str]]:
     model: type[DriverOptions] = getattr(driver, "Options", DriverOptions)
     descriptions = model.descriptions()
     for key, info in model.model_fields.items():
-        words = [str(word) for word in get_args(info.annotation) if isinstance(word, str)]
-        kind = "|".join(words) or getattr(info.annotation, "__name__", str(info.annotation)).removesuffix(" | None")
+        annotation = info.annotation
+        if get_args(annotation)[1:] == (NoneType,):
+            annotation = get_args(annotation)[0]
+        words = [word for word in get_args(annotation) if isinstance(word, str)]
+        kind = "|".join(words) or getattr(annotation, "__name__", str(annotation))
         default = "required" if info.is_required() else f"default: {info.get_default(call_default_factory=True)}"
         shown = "" if default.endswith((": ", "None")) else f"  [{default}]"
         found.append((f"--{key.replace('_', '-')} <{kind}>", f"{descriptions[key]}{shown}"))

@@ -100,8 +100,9 @@ def test_options_come_from_configuration_and_command_line() -> None:
     config = load(None, {"drivers.ramp.level": 3, "drivers.both.camera": {"level": 4}, "drivers.both.mirror": {}})
     assert plugins.opened("camera", "ramp", config, (), Ramp).level == 3
     assert plugins.opened("camera", "both:Class", config, (), Ramp).level == 4
-    found = plugins.options(Ramp, {"level": 3}, ("--level", "5", "--ports=[1, 2]"))
-    assert (found.level, found.ports) == (5, (1, 2))
+    for table, words in (({"level": 3}, ("--level", "5", "--ports=[1, 2]")), ({"level": 5, "ports": [1, 2]}, ())):
+        found = plugins.options(Ramp, table, words)
+        assert (found.level, found.ports) == (5, (1, 2))
     assert plugins._parsed(("--total", "", "--stream=")) == {"total": "", "stream": ""}
     nested = load(None, {"drivers": {"package": {"module": {"level": 6}}}})
     assert plugins.opened("camera", "package.module:Class", nested, (), Ramp).level == 6
@@ -174,6 +175,7 @@ class Sized(Ramp):
 
 
 OWN = '''
+from typing import Literal
 from lowfc.device import DriverOptions
 
 class Own:
@@ -182,6 +184,7 @@ class Own:
         """Brightest pixel."""
         serial: str
         wait_s: float | None = None
+        mode: Literal["slow", "fast"] | None = None
 
     settings = expose = apply = close = None
 '''
@@ -192,11 +195,11 @@ def test_the_help_lists_the_drivers_options(kind: str, tmp_path: Path, monkeypat
     monkeypatch.setattr(sys, "path", [*sys.path])
     (tmp_path / "own_driver.py").write_text(OWN)
     words = [kind, "--run", "bench", f"{tmp_path}/own_driver.py:Own", "--help"]
-    *_, heading, peak, serial, wait = lowfc(*words).output.rstrip().splitlines()
+    *_, heading, peak, serial, wait, mode = lowfc(*words).output.rstrip().splitlines()
     assert heading == f"Options of the driver {words[3]}:"
     assert " ".join(peak.split()) == "--peak-dn <int> Brightest pixel. [default: 8000]"
     assert serial.split() == ["--serial", "<str>", "[required]"]
-    assert wait.split() == ["--wait-s", "<float>"]
+    assert (wait.split(), mode.split()) == (["--wait-s", "<float>"], ["--mode", "<slow|fast>"])
     assert "Options of the driver" not in lowfc(kind, "--help").output
     assert "--rows <int>" in lowfc("camera", "sim", "-h").output
 
