@@ -25,8 +25,9 @@ from lowfc.optics.detector.detector import saturation_dn
 class DriverOptions(Section):
     """Base class of a driver's options: derive from it in the driver's class, under the name `Options`.
 
-    A docstring below a field is its help. Unknown keys are refused; values are not converted and do not change. They
-    come from `[drivers.NAME]` of the configuration and from the command line: `--frame-rate 100` sets `frame_rate`.
+    A docstring below a field is its help. Unknown keys and other types are refused (a tuple or path is a list or text
+    in TOML); values do not change. They come from `[drivers.NAME]` of the configuration and from the command line:
+    `--frame-rate 100` sets `frame_rate`.
     """
 
 

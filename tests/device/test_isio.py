@@ -197,15 +197,6 @@ def test_a_channel_written_by_another_process_is_refused(folder: Path) -> None:
     assert np.allclose(other.pixels[0] * 1000, shape_nm(2), atol=1e-4)
 
 
-def test_a_recreated_channel_is_adopted(folder: Path) -> None:
-    driver, events = mirror()
-    driver.apply(shape_nm(1))
-    again = channel(folder, make=True)
-    driver.apply(shape_nm(2))
-    assert again.count == 1
-    assert events.names == ["STREAM_RENEWED"]
-
-
 def test_a_channel_that_is_being_created_is_awaited(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = folder / "dm00disp03.im.shm"
     driver, events = mirror()
@@ -226,6 +217,7 @@ def test_a_channel_that_is_being_created_is_awaited(folder: Path, monkeypatch: p
 
 def test_a_recreated_channel_that_cannot_be_used_fails_commands_until_it_can(folder: Path) -> None:
     driver, events = mirror()
+    driver.apply(shape_nm(1))
     PlainStream.make(folder / "dm00disp03.im.shm", GRID[1] + 1, GRID[0], FLOAT32)
     with pytest.raises(RuntimeError, match=f"{GRID[1] + 1} x {GRID[0]} pixels of float32"):
         driver.apply(shape_nm(1))
