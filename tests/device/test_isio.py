@@ -35,33 +35,25 @@ UINT16, INT32, FLOAT32 = 3, 6, 9
 AT_NS = 1_700_000_000_000_000_000
 
 
-class Events(list[tuple[str, dict[str, object]]]):
-    """Stand-in for the driver's service: records its events."""
-
-    def event(self, name: str, **details: object) -> None:
-        self.append((name, details))
-
-    @property
-    def names(self) -> list[str]:
-        return [name for name, _ in self]
-
-
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("MILK_SHM_DIR", str(tmp_path))
     return tmp_path
 
 
-def camera(**options: Any) -> tuple[IsioCamera, Events]:
-    driver, events = IsioCamera(IsioCamera.Options(stream="camnsv", **options), CONFIG), Events()
-    driver.join(events)  # type: ignore[arg-type]
-    return driver, events
+def joined(driver: Any) -> tuple[Any, Listener]:
+    """A driver in a run, and the listener to its events."""
+    listener = Listener(MemoryHub(), FakeClock())
+    driver.join(listener.service("driver"))
+    return driver, listener
 
 
-def mirror(**options: Any) -> tuple[IsioMirror, Events]:
-    driver, events = IsioMirror(IsioMirror.Options(stream="dm00disp03", **options), CONFIG), Events()
-    driver.join(events)  # type: ignore[arg-type]
-    return driver, events
+def camera(**options: Any) -> tuple[IsioCamera, Listener]:
+    return joined(IsioCamera(IsioCamera.Options(stream="camnsv", **options), CONFIG))
+
+
+def mirror(**options: Any) -> tuple[IsioMirror, Listener]:
+    return joined(IsioMirror(IsioMirror.Options(stream="dm00disp03", **options), CONFIG))
 
 
 def shape_nm(seed: int) -> np.ndarray:
@@ -162,8 +154,8 @@ def test_a_silent_or_recreated_stream_is_reported_once(folder: Path, monkeypatch
     assert exposure is not None
     assert exposure.pixels.shape == (ROWS - 2, COLUMNS)
     assert driver.settings().rows == ROWS - 2
-    assert events.names == ["STREAM_SILENT", "STREAM_SILENT", "STREAM_RENEWED"]
-    assert "in the middle of an image" in str(events[1][1]["why"])
+    assert events.events()[1:] == ["STREAM_SILENT", "STREAM_SILENT", "STREAM_RENEWED"]
+    assert "in the middle of an image" in events.event_texts("STREAM_SILENT")[1]
     driver.close()
 
 
@@ -212,7 +204,7 @@ def test_a_channel_that_is_being_created_is_awaited(folder: Path, monkeypatch: p
     driver.apply(shape_nm(1))
     creation.join()
     assert channel(folder).count == 1
-    assert events.names == ["STREAM_RENEWED"]
+    assert events.events()[1:] == ["STREAM_RENEWED"]
 
 
 def test_a_recreated_channel_that_cannot_be_used_fails_commands_until_it_can(folder: Path) -> None:
@@ -229,7 +221,7 @@ def test_a_recreated_channel_that_cannot_be_used_fails_commands_until_it_can(fol
     again = channel(folder, make=True)
     driver.apply(shape_nm(1))
     assert again.count == 1
-    assert events.names == ["STREAM_RENEWED"]
+    assert events.events()[1:] == ["STREAM_RENEWED"]
 
 
 class Sum(threading.Thread):

@@ -6,11 +6,11 @@ from typing import cast
 import numpy as np
 import pytest
 
-from lowfc.adapters.process.service import Service
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import ConfigurationError
-from lowfc.contract.messages import EVENT, MIRROR_STATE, Log, wire
+from lowfc.contract.messages import MIRROR_STATE, wire
 from lowfc.testing.clock import FakeClock
+from lowfc.testing.listener import Listener
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from sim_camera.driver import SimulatedCamera
 from sim_camera.lateness import WINDOW, Lateness
@@ -92,14 +92,10 @@ def test_occasional_late_commands_are_not_habitual() -> None:
 
 def test_camera_reports_each_change_of_habitual_lateness() -> None:
     hub, clock, config = MemoryHub(), FakeClock(), Configuration()
-    events: list[str] = []
-    MemoryBus(hub, "operator", clock).subscribe(
-        EVENT, lambda sample: events.append(Log.FromString(sample.payload).message)
-    )
-    service = Service("camera", "night", clock, MemoryBus(hub, "camera", clock))
+    listener = Listener(hub, clock)
     optics = cast("Scene", SimpleNamespace(shape=(80, 80), instants=()))
     camera = SimulatedCamera(SimulatedCamera.Options(), config, optics)
-    camera.join(service)
+    camera.join(listener.service("camera"))
     states = MemoryBus(hub, "mirror-dm", clock).publisher(MIRROR_STATE, config.mirror.name)
     shape = np.zeros((config.mirror.rows, config.mirror.columns), np.float32)
 
@@ -112,7 +108,7 @@ def test_camera_reports_each_change_of_habitual_lateness() -> None:
     camera._last_frame = 1 << 32
     for sequence in range(1, 2 * WINDOW):
         put(sequence)  # without frames of these sequences, as in the conformance test of a mirror
-    assert (camera._lateness.total, events[1:]) == (0, [])
+    assert (camera._lateness.total, listener.events()) == (0, ["STARTED"])
     camera._newest_state = sequence = 0
     for late in (False, True, False, True):
         for _ in range(2 * WINDOW):
@@ -120,8 +116,7 @@ def test_camera_reports_each_change_of_habitual_lateness() -> None:
             camera._last_frame = sequence + late
             camera._published_ns[sequence % len(camera._published_ns)] = sequence, 0
             put(sequence)
-    names = [event.split()[0] for event in events if event.startswith("COMMANDS_")]
-    assert names == ["COMMANDS_LATE", "COMMANDS_IN_TIME", "COMMANDS_LATE"]
+    assert listener.events()[1:] == ["COMMANDS_LATE", "COMMANDS_IN_TIME", "COMMANDS_LATE"]
     assert camera._lateness.total == 4 * WINDOW
 
 
@@ -133,7 +128,7 @@ def test_region_is_read_at_the_centre_of_the_sensor() -> None:
     settings = camera.settings()
     region = settings.region_row, settings.rows, settings.region_column, settings.columns
     assert region == (8, 64, 15, 50)
-    camera.join(Service("camera", "night", clock, MemoryBus(MemoryHub(), "camera", clock)))
+    camera.join(Listener(MemoryHub(), clock).service("camera"))
     camera.start()
     exposure = camera.expose()
     assert exposure is not None
