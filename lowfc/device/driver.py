@@ -283,4 +283,4 @@ class MirrorExtras:
         raise NotImplementedError
 
     def fill(self, health: wire.Health) -> None:
-        """Add fields to the Health message, twice a second."""
+        """Add fields to the Health message, twice a second; called on another thread, also while `apply` runs."""
