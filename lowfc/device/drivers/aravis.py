@@ -89,6 +89,10 @@ class AravisCamera:
         camera.set_range_check_policy(self._aravis.RangeCheckPolicy.ENABLE)
         camera.set_pixel_format_from_string(options.pixel_format)
         camera.set_region(options.region_column, options.region_row, options.columns, options.rows)
+        if camera.is_exposure_auto_available():
+            camera.set_exposure_time_auto(self._aravis.Auto.OFF)
+        if camera.is_gain_auto_available():
+            camera.set_gain_auto(self._aravis.Auto.OFF)
         camera.set_exposure_time(settings.exposure_ns * 1e-3)
         if options.gain is not None:
             camera.set_gain(options.gain)

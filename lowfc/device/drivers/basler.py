@@ -89,6 +89,7 @@ class BaslerCamera:
         camera.OffsetX.Value = camera.OffsetY.Value = 0  # otherwise the size may not fit
         camera.Width.Value, camera.Height.Value = options.columns, options.rows
         camera.OffsetX.Value, camera.OffsetY.Value = options.region_column, options.region_row
+        self._write(("ExposureAuto", "GainAuto"), "Off")
         self._write(_EXPOSURES, settings.exposure_ns * 1e-3)
         if options.gain is not None:
             camera.Gain.Value = options.gain
@@ -105,7 +106,7 @@ class BaslerCamera:
         exposure_ns = round(self._read(_EXPOSURES)[0] * 1e3)
         self._settings = replace(settings, exposure_ns=exposure_ns, period_ns=period_ns)
 
-    def _write(self, names: tuple[str, ...], value: float) -> None:
+    def _write(self, names: tuple[str, ...], value: float | str) -> None:
         for node in (getattr(self._camera, name) for name in names):
             if node.IsWritable():
                 node.Value = value
