@@ -13,7 +13,7 @@ from google.protobuf.message import DecodeError
 from lowfc.adapters.bus.bus import Bus
 from lowfc.adapters.bus.run import open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
-from lowfc.adapters.image_stream.channels import OtherChannels, channel_names
+from lowfc.adapters.image_stream.channels import OtherChannels, channel_names, fits
 from lowfc.adapters.image_stream.stream import Stream, StreamAbsentError, StreamError, stream_path
 from lowfc.adapters.process.clock import Clock, HostClock
 from lowfc.adapters.process.realtime import lower_priority
@@ -150,13 +150,15 @@ class ExternalChannels:
 
 
 def _made(name: str, columns: int) -> Stream:
-    """A stream of one row for this process to write: an existing one of that size, or a new one."""
+    """A stream of one row for this process to write: an existing one, created again if it has another size."""
     path = stream_path(name)
     with contextlib.suppress(StreamAbsentError):
         stream = Stream(path)
         if pid := stream.other_writer():
             raise StreamError(f"process {pid} writes stream {name!r}: stop it first, or use another --prefix")
-        if stream.layout.shape == (1, 1, columns) and stream.layout.dtype == np.float32:
+        if not fits(stream, (1, stream.layout.shape[2])):
+            raise StreamError(f"stream {name!r} is of another program ({path}): use another --prefix")
+        if stream.layout.shape[2] == columns:
             return stream
         path.unlink(missing_ok=True)
     return Stream.create(path, (1, columns), np.float32)
