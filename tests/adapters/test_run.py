@@ -5,6 +5,7 @@ import os
 import socket
 import subprocess
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -13,7 +14,7 @@ import pytest
 from lowfc.adapters.bus.bus import ALL, Query
 from lowfc.adapters.bus.run import free_ports, mirror_role, new_run_id, open_run, own_directory, runtime_base
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
-from lowfc.adapters.files.whole_file import write_whole
+from lowfc.adapters.files.whole_file import require_folder, write_whole
 from lowfc.adapters.process import latch as latch_module
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.latch import Latch, latch_files
@@ -280,9 +281,11 @@ def test_a_failed_write_leaves_the_old_file_only(tmp_path: Path, monkeypatch) ->
     for content in (b"former", b"first"):
         write_whole(path, content)
     os.mkfifo(tmp_path / "pipe")
-    for special in (tmp_path / "pipe", Path(), Path("/"), tmp_path):
-        with pytest.raises(DataFileError, match=f"^{special} cannot be written: not a regular file"):
-            write_whole(special, b"")
+    wrong = [(special, "not a regular file") for special in (tmp_path / "pipe", Path(), Path("/"), tmp_path)]
+    for file, why in (*wrong, (tmp_path / ("x" * 300), "File name too long")):
+        for refusing in (require_folder, partial(write_whole, content=b"")):
+            with pytest.raises(DataFileError, match=f"^{file} cannot be written: {why}"):
+                refusing(file)
     (tmp_path / "pipe").unlink()
     with pytest.raises(DataFileError, match="nowhere/file cannot be written: No such file"):
         write_whole(tmp_path / "nowhere" / "file", b"")

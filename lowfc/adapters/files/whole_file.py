@@ -22,9 +22,7 @@ def being_written(path: Path, source: Path | None = None, mode: int = 0o666) -> 
         DataFileError: the file cannot be written, or is a log.
     """
     try:
-        if not path.name or (path.exists() and not path.is_file()):
-            raise OSError(errno.EINVAL, "not a regular file")
-        _refuse_log(path, source)
+        _require_replaceable(path, source)
         most = source.stat().st_mode & mode if source is not None and source.exists() else mode
         part = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
         descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, most)
@@ -51,25 +49,30 @@ def write_whole(path: Path, content: bytes, source: Path | None = None, mode: in
 
 
 def require_folder(*files: Path | None) -> None:
-    """Check that files can be written later; None is skipped.
+    """Check that files can be written later, as by `being_written`; None is skipped.
 
     Raises:
-        DataFileError: A file's folder does not exist, or the file is a log.
+        DataFileError: A file's folder does not exist, or the file cannot be replaced.
         ConfigurationError: Two files are the same.
     """
     written = [file for file in files if file is not None]
     for file in written:
-        if not file.parent.is_dir():
-            raise DataFileError(f"{file} cannot be written: there is no directory {file.parent}")
-        _refuse_log(file)
+        try:
+            if not file.parent.is_dir():
+                raise DataFileError(f"{file} cannot be written: there is no directory {file.parent}")
+            _require_replaceable(file)
+        except OSError as error:
+            raise DataFileError(f"{file} cannot be written: {error.strerror}") from error
     if len({file.resolve() for file in written}) < len(written):
         raise ConfigurationError(f"these must be different files: {', '.join(map(str, written))}")
 
 
-def _refuse_log(path: Path, source: Path | None = None) -> None:
-    """Refuse to overwrite `source` or any log, whatever its name."""
-    if not path.is_file():
+def _require_replaceable(path: Path, source: Path | None = None) -> None:
+    """Refuse to replace `source`, any log, whatever its name, and anything that is not a regular file."""
+    if path.name and not path.exists():
         return
+    if not path.is_file():
+        raise OSError(errno.EINVAL, "not a regular file")
     from mcap.writer import MCAP0_MAGIC  # slow
 
     try:
