@@ -13,7 +13,7 @@ from lowfc.adapters.bus.bus import Ring, Sample
 from lowfc.adapters.logs.sequence_gaps import Gaps
 from lowfc.contract.codecs import codec
 from lowfc.contract.envelope import count_of, start_of
-from lowfc.contract.errors import BusError
+from lowfc.contract.errors import BadMessageError, BusError
 from lowfc.contract.messages import from_timestamp, wire
 from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import LoopMode, reason_of
@@ -101,8 +101,11 @@ class Stream(Generic[T]):
 
 
 def frame_of(sample: Sample) -> Frame | None:
-    """Decode a frame; None if it holds no complete image."""
-    frame = codec.decode_frame(sample.payload, sample.sequence, 0)
+    """Decode a frame; None if it is not valid, or holds no complete image."""
+    try:
+        frame = codec.decode_frame(sample.payload, sample.sequence, 0)
+    except BadMessageError:
+        return None
     return None if frame.pixels is None else Frame(frame.sequence, frame.time_ns, frame.pixels)
 
 

@@ -467,11 +467,13 @@ def test_frames_arrive_in_order_as_arrays() -> None:
 
 
 def test_lost_frames_are_counted_but_not_restarts_or_duplicates() -> None:
-    broken = frame_sample(9)._replace(payload=b"\xff")
+    early = image(np.zeros((3, 4), np.uint16), -1, "camera").SerializeToString()
     again = [frame_sample(count, 1_700_000_060) for count in (0, 2)]
-    frames = stream(frame_sample(5), frame_sample(8), broken, frame_sample(10), *again, count=5)
-    assert len(list(frames)) == 5
-    assert frames.lost == 2 + 1 + 1
+    for payload in (b"\xff", early):
+        broken = frame_sample(9)._replace(payload=payload)
+        frames = stream(frame_sample(5), frame_sample(8), broken, frame_sample(10), *again, count=5)
+        assert len(list(frames)) == 5
+        assert frames.lost == 2 + 1 + 1
     before = frame_sample(2, 1_699_999_000)
     frames = stream(*map(frame_sample, (5, 7, 7, 6)), before, *map(frame_sample, (8, 8, 11, 10)), count=9)
     assert [frame.number for frame in frames] == [5, 7, 7, 6, 2, 8, 8, 11, 10]
