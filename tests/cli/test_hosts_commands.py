@@ -3,6 +3,8 @@
 import inspect
 import json
 import re
+import socket
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -10,9 +12,12 @@ import pytest
 from lowfc.adapters.bus import certificates, routed
 from lowfc.adapters.bus.access import ROUTER, roles
 from lowfc.adapters.bus.run import open_run, runtime_base
+from lowfc.adapters.bus.zenoh_bus import ZenohBus
+from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.clock_offset import AT_ONCE, PERIOD_S, RECENT
 from lowfc.contract.configuration import Network
 from lowfc.contract.errors import BusError
+from lowfc.contract.messages import Role
 from lowfc.programs.cli.hosts import certs
 from tests.e2e.test_hosts import SHIFTS_NS
 from tests.support.loops import lowfc
@@ -71,6 +76,20 @@ def test_the_roles_of_a_run_with_a_router_are_those_of_its_certificates() -> Non
     documented = re.search(r"Roles are (.*?)\.", DOCUMENT.read_text(), re.DOTALL)
     assert documented
     assert set(re.findall(r"`(.*?)`", documented[1])) == {ROUTER, *certified}
+
+
+@pytest.mark.usefixtures("own_runtime")
+def test_a_run_that_cannot_be_joined_hides_no_other() -> None:
+    bench = ZenohBus(open_run("bench").links, Role.CAMERA, HostClock())
+    with socket.create_server(("127.0.0.1", 0)) as router, closing(bench):
+        address = f"tls/127.0.0.1:{router.getsockname()[1]}"
+        open_run("across", network=NETWORK.model_copy(update={"router": address}))
+        listed = json.loads(lowfc("runs", "--json").stdout)
+        text = lowfc("runs").stdout
+    assert [one["run"] for one in listed["runs"]] == ["bench"]
+    (why,) = listed["not_joined"].values()
+    assert "ca.pem cannot be read" in why
+    assert text.splitlines()[1] == f"across  cannot be joined: {why}"
 
 
 @pytest.mark.usefixtures("toml")

@@ -14,10 +14,17 @@ def runs(as_json: Json = False) -> None:
     from lowfc.adapters.bus.other_loops import none_here
     from lowfc.adapters.bus.run import runtime_path
     from lowfc.client.runs import live_runs
+    from lowfc.contract.errors import LowfcError
 
-    rows = [_row(name, roles) for name, roles in live_runs().items()]
-    results = {"runs": rows, "searched": str(runtime_path())}
-    print_result(results, "\n".join(_lines(rows)) if rows else none_here(), as_json=as_json)
+    rows, not_joined = [], {}
+    for name, roles in live_runs().items():
+        try:
+            rows.append(_row(name, roles))
+        except LowfcError as fault:  # it has just ended, or this host has no certificate of an operator
+            not_joined[name] = str(fault)
+    results = {"runs": rows, "not_joined": not_joined, "searched": str(runtime_path())}
+    lines = [*_lines(rows), *(f"{name}  cannot be joined: {why}" for name, why in not_joined.items())]
+    print_result(results, "\n".join(lines) or none_here(), as_json=as_json)
 
 
 def _row(name: str, roles: set[str]) -> dict[str, Any]:
