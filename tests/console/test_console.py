@@ -104,13 +104,13 @@ BUTTONS: dict[str, tuple[tuple[str, ...], dict[str, object]]] = {
     "gain": (("0.25", "2,3"), {"name": "gain", "modes": [2, 3], "values": [0.25]}),
     "leak": (("0.01", ""), {"name": "leak", "modes": []}),
     "limit": (("40", "4"), {"name": "limit", "modes": [4], "values": [40.0]}),
-    "law": (("law.fits",), {"name": "law"}),
+    "law": (("~/law.fits",), {"name": "law"}),
     "no law": ((), {"name": "law"}),
     "offset": (("5", "4"), {"name": "offset", "modes": [4], "values": [5.0]}),
-    "channel": (("dark-hole", "shape.npy"), {"name": "channel", "text": "dark-hole"}),
+    "channel": (("dark-hole", "~/shape.npy"), {"name": "channel", "text": "dark-hole"}),
     "reset": ((), {"name": "reset"}),
     "stop": ((), {"name": "stop"}),
-    "load": (("calibration.fits",), {"name": "load"}),
+    "load": (("~/calibration.fits",), {"name": "load"}),
     "note": (("seeing 0.8",), {"name": "note", "text": "seeing 0.8"}),
     "record": (("HD 209458", "Ann"), {"name": "note", "text": "target: HD 209458; observer: Ann"}),
     "end log": ((), {}),
@@ -132,10 +132,10 @@ def test_the_key_of_every_button_sends_its_request(
     from lowfc.programs.console.actions import ALL_ACTIONS
 
     assert {*BUTTONS, *TASKS} == set(ALL_ACTIONS)
-    monkeypatch.chdir(tmp_path)
-    np.save("shape.npy", np.full(GRID, 3.0))
-    law_file.save(LAW, Path("law.fits"))
-    calibration_file.save(identified(calibration()), Path("calibration.fits"))
+    monkeypatch.setenv("HOME", str(tmp_path))
+    np.save(tmp_path / "shape.npy", np.full(GRID, 3.0))
+    law_file.save(LAW, tmp_path / "law.fits")
+    calibration_file.save(identified(calibration()), tmp_path / "calibration.fits")
 
     async def scenario(screen: Screen) -> None:
         for name in ORDER:
@@ -367,10 +367,12 @@ def test_tasks_are_commands_with_the_options_of_their_form(run: LiveRun, monkeyp
     operate(run, scenario)
 
 
-def test_load_in_the_form_of_a_task_is_yes_or_no() -> None:
+def test_a_task_has_a_home_directory_for_a_tilde_and_loads_its_result_by_yes_or_no() -> None:
     from lowfc.programs.console.actions import ALL_ACTIONS
 
     dark = ALL_ACTIONS["dark"]
+    out = str(Path.home() / "dark.fits")
+    assert dark.command({"frames": "9", "out": "~/dark.fits"}, RUN)[3:7] == ["--frames", "9", "--out", out]
     for answer, expected in (("y", ["--load"]), ("Yes", ["--load"]), ("n", []), ("NO", []), ("", [])):
         assert dark.command({"load": answer}, RUN) == [*dark.task, *expected, "--run", RUN]
     with pytest.raises(ConfigurationError, match="load is yes or no, got 'yep': write yes, y, no or n"):

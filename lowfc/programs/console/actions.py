@@ -3,11 +3,11 @@
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from lowfc.client import Answer, Client
 from lowfc.client.requests import BY_NAME
+from lowfc.contract.codecs.input_file import user_path
 from lowfc.contract.errors import ConfigurationError, RequestRefusedError
 from lowfc.control.loop.wording import AUTO
 from lowfc.programs.cli.modes import noll_of
@@ -41,7 +41,8 @@ class Action(NamedTuple):
 
     def command(self, values: Values, run: str) -> list[str]:
         """Arguments of `lowfc` for the task."""
-        options = [word for name, value in values.items() if value and name != LOAD for word in (f"--{name}", value)]
+        given = {name: str(user_path(value)) for name, value in values.items() if value and name != LOAD}
+        options = [word for name, value in given.items() for word in (f"--{name}", value)]
         answer = values.get(LOAD, "").lower()
         if answer not in ("y", "yes", "n", "no", ""):
             raise ConfigurationError(f"load is yes or no, got {answer!r}: write yes, y, no or n; empty is no")
@@ -55,19 +56,19 @@ LOAD = "load"
 def _shape(text: str) -> Any:
     from lowfc.adapters.files.mirror_maps import read_shape  # imports astropy, needed only for files
 
-    return read_shape(Path(text)) if text else None
+    return read_shape(user_path(text)) if text else None
 
 
 def _law(text: str) -> Any:
     from lowfc.adapters.files import law_file
 
-    return law_file.load(Path(text)) if text else None
+    return law_file.load(user_path(text)) if text else None
 
 
 def _calibration(text: str) -> Any:
     from lowfc.adapters.files import calibration_file
 
-    return calibration_file.load(Path(text))
+    return calibration_file.load(user_path(text))
 
 
 _READERS: dict[str, tuple[str, Callable[[str], Any]]] = {
