@@ -105,6 +105,7 @@ def test_unknown_runs_arguments_and_files_are_named(tmp_path: Path, own_runtime:
     _refused(tmp_path, "ctl", "gain", "often", expected="'often' is not a number")
     _refused(tmp_path, "config", "check", "none.toml", expected="none.toml")
     _refused(tmp_path, "sim-lop", expected="sim-lop")
+    _refused(tmp_path, *SHORT, "--sensor", "", expected="unknown sensor ''")
 
 
 def _flip(content: bytes) -> bytes:

@@ -47,7 +47,7 @@ def sim_loop(
         "camera.rate_hz": rate,
         "disturbance.preset": disturbance,
         "seed": seed,
-        **({f"sensor.{key}": value for key, value in sensor_keys(sensor).items()} if sensor else {}),
+        **({f"sensor.{key}": value for key, value in sensor_keys(sensor).items()} if sensor is not None else {}),
         "star.magnitude": star_magnitude,
         "lockstep": lockstep or None,
         "control.start_mode": "open" if open_loop else None,
