@@ -121,12 +121,13 @@ def test_the_output_of_a_child_is_kept_if_it_has_a_file(tmp_path: Path) -> None:
 
 
 def test_the_end_of_a_child_and_a_missing_program_are_reported(tmp_path: Path) -> None:
-    child = Child("one", ["sleep", "600"], tmp_path / "stderr")
-    child.start()
-    child.process.kill()
-    child.process.wait(PATIENCE_S)
-    assert child.exit_description() == "one was killed by SIGKILL"
-    child.stop(PATIENCE_S)
+    for number, name in ((9, "SIGKILL"), (40, "signal 40")):
+        child = Child("one", ["sleep", "600"], tmp_path / "stderr")
+        child.start()
+        child.process.send_signal(number)
+        child.process.wait(PATIENCE_S)
+        assert child.exit_description() == f"one was killed by {name}"
+        child.stop(PATIENCE_S)
     with pytest.raises(FileNotFoundError, match="no-such-program"):
         Child("one", ["no-such-program"], tmp_path / "stderr").start()
 

@@ -85,5 +85,6 @@ class Child:
         """One line on how the process ended."""
         status = self.status
         if status is not None and status < 0:
-            return f"{self.name} was killed by {signal.Signals(-status).name}"
+            names = {one.value: one.name for one in signal.Signals}  # without most real-time signals
+            return f"{self.name} was killed by {names.get(-status, f'signal {-status}')}"
         return f"{self.name} ended with exit status {status}"
