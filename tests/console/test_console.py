@@ -21,7 +21,16 @@ from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import EVENT, REQUEST, wire
 from lowfc.control.laws.linear_law import integrator_block, law_from_blocks
-from lowfc.programs.console import feed
+from lowfc.programs.console import app as application
+from lowfc.programs.console import feed, panels
+from lowfc.programs.console.actions import ALL_ACTIONS
+from lowfc.programs.console.app import Console
+from lowfc.programs.console.feed import Reading
+from lowfc.programs.console.gains import Gains
+from lowfc.programs.console.history import History
+from lowfc.programs.console.panels import _PIXELS, halves, reduced, sparkline
+from lowfc.programs.console.phrases import phrased
+from lowfc.programs.console.task import Task
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub
 from tests.console.live_run import RUN, LiveRun
 from tests.support.loops import until
@@ -55,8 +64,6 @@ def _no_wait_for_idle(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @contextlib.asynccontextmanager
 async def console(run: LiveRun) -> AsyncIterator["Screen"]:
-    from lowfc.programs.console.app import Console
-
     bus = run.bus("operator")
     app = Console(bus, RUN, run.clock)
     async with app.run_test(size=(100, 30)) as pilot:
@@ -129,8 +136,6 @@ TASKS = {
 def test_the_key_of_every_button_sends_its_request(
     run: LiveRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from lowfc.programs.console.actions import ALL_ACTIONS
-
     assert {*BUTTONS, *TASKS} == set(ALL_ACTIONS)
     monkeypatch.setenv("HOME", str(tmp_path))
     np.save(tmp_path / "shape.npy", np.full(GRID, 3.0))
@@ -195,8 +200,6 @@ def test_a_refused_request_shows_its_reason_and_turns_its_button_red(run: LiveRu
 def test_a_form_stays_open_at_the_answer_to_an_earlier_request_of_its_button(
     run: LiveRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from lowfc.programs.console.actions import ALL_ACTIONS
-
     answered = threading.Event()
 
     def slow(*_: object) -> Answer:
@@ -292,8 +295,6 @@ def test_a_gain_knob_scales_the_gains_of_all_modes_or_of_one_radial_order(run: L
 
 
 def test_a_calibration_with_fewer_modes_leaves_a_knob_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
-    from lowfc.programs.console.gains import Gains
-
     turned: list[Gains.Turned] = []
     knobs = Gains()
     monkeypatch.setattr(knobs, "post_message", turned.append)
@@ -323,8 +324,6 @@ def test_keys_typed_while_a_form_opens_are_entered_in_it(run: LiveRun) -> None:
 
 
 def test_a_repeated_event_has_one_line_with_its_count() -> None:
-    from lowfc.programs.console.history import History
-
     history = History()
     for number in range(40):
         name, details = (("LIMIT_HIT", {"reason": "SLEW"}), ("LIMIT_CLEARED", {"reason": "SLEW"}))[number % 2]
@@ -338,8 +337,6 @@ def test_a_repeated_event_has_one_line_with_its_count() -> None:
 
 
 def test_texts_name_keys_for_commands_and_ranges_for_long_lists() -> None:
-    from lowfc.programs.console.phrases import phrased
-
     assert phrased("`lowfc ctl clear` first, when it is safe") == "clear (key k) first, when it is safe"
     assert phrased("`lowfc ctl record start` goes on") == "record start (key r) goes on"
     assert phrased("`lowfc ctl permit` and `lowfc tune`") == "`lowfc ctl permit` and `lowfc tune`"
@@ -348,11 +345,8 @@ def test_texts_name_keys_for_commands_and_ranges_for_long_lists() -> None:
 
 
 def test_tasks_are_commands_with_the_options_of_their_form(run: LiveRun, monkeypatch: pytest.MonkeyPatch) -> None:
-    from lowfc.programs.console import app
-    from lowfc.programs.console.actions import ALL_ACTIONS
-
     started: list[list[str]] = []
-    monkeypatch.setattr(app, "Task", lambda name, words: started.append(words) or FinishedTask(name))
+    monkeypatch.setattr(application, "Task", lambda name, words: started.append(words) or FinishedTask(name))
 
     async def scenario(screen: Screen) -> None:
         for name, words in TASKS.items():
@@ -368,8 +362,6 @@ def test_tasks_are_commands_with_the_options_of_their_form(run: LiveRun, monkeyp
 
 
 def test_a_task_has_a_home_directory_for_a_tilde_and_loads_its_result_by_yes_or_no() -> None:
-    from lowfc.programs.console.actions import ALL_ACTIONS
-
     dark = ALL_ACTIONS["dark"]
     out = str(Path.home() / "dark.fits")
     assert dark.command({"frames": "9", "out": "~/dark.fits"}, RUN)[3:7] == ["--frames", "9", "--out", out]
@@ -387,8 +379,6 @@ class FinishedTask:
 
 
 def test_a_task_runs_in_its_own_session_and_reports_its_end() -> None:
-    from lowfc.programs.console.task import Task
-
     cases = (["--version"], 0, "t: done; 0."), (["no-such"], 2, "t failed: ")
     for arguments, status, status_line in cases:
         task = Task("t", arguments)
@@ -447,26 +437,21 @@ def test_a_disconnected_console_reports_it_and_hides_the_values(run: LiveRun, mo
 
 
 def test_a_console_without_its_terminal_ends() -> None:
-    from lowfc.programs.console.app import READ_PERIOD_S, Console
-
     gone, clock = threading.Event(), HostClock()
     app = Console(MemoryBus(MemoryHub(), "operator", clock), RUN, clock, terminal_gone=gone.is_set)
 
     async def scenario() -> None:
         async with app.run_test(size=(100, 30)) as pilot:
-            await pilot.pause(2 * READ_PERIOD_S)
+            await pilot.pause(2 * application.READ_PERIOD_S)
             assert app.is_running
             gone.set()
-            await pilot.pause(3 * READ_PERIOD_S)
+            await pilot.pause(3 * application.READ_PERIOD_S)
             assert app.return_code == 0
 
     asyncio.run(scenario())
 
 
 def test_verdict_and_tiles_have_the_text_of_the_view() -> None:
-    from lowfc.programs.console import panels
-    from lowfc.programs.console.feed import Reading
-
     stage = Stage()
     stage.begin()
     stage.flux = 0.01
@@ -479,8 +464,6 @@ def test_verdict_and_tiles_have_the_text_of_the_view() -> None:
 
 
 def test_pictures_and_sparklines_have_a_fixed_size() -> None:
-    from lowfc.programs.console.panels import _PIXELS, halves, reduced, sparkline
-
     assert sparkline([1.0, float("nan"), 0.5, 0.0], 3) == " █▁"
     assert sparkline([], 3) == ""
     for shape in ((6, 7), (34, 34), (1, 300)):
