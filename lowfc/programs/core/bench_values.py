@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterable
 from math import inf
 
-from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.process.service import Service
 from lowfc.contract.codecs.bench_codec import decode_bench_value
 from lowfc.contract.errors import BadMessageError
@@ -59,8 +58,11 @@ class _Slot:
     def report(self, now_ns: int) -> BenchReport | None:
         """The newest value and its age; None without a value."""
         sample = self.mailbox.take(0.0)
-        if sample is not None and self._read(sample):
-            self._received_ns = now_ns
+        if sample is not None:
+            try:
+                self._value, self._received_ns = decode_bench_value(sample.payload), now_ns
+            except BadMessageError as fault:
+                self._unreadable(sample.key, fault)
         if self._value is None:
             return None
         age_ns = now_ns - self._received_ns
@@ -68,11 +70,3 @@ class _Slot:
             (max_age_ns for max_age_ns in self._ages_ns if max_age_ns >= age_ns), inf
         )
         return BenchReport(now_ns, self.name, self._value, age_ns)
-
-    def _read(self, sample: Sample) -> bool:
-        try:
-            self._value = decode_bench_value(sample.payload)
-        except BadMessageError as fault:
-            self._unreadable(sample.key, fault)
-            return False
-        return True

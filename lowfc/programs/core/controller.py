@@ -296,10 +296,12 @@ class Controller:
                 self._gain_requests.append(request)
                 self._camera.wake()
 
-    def _carry_out_internal(self, request: Request, lock: AbstractContextManager[object] | None = None) -> None:
+    def _carry_out_internal(self, request: Request, lock: AbstractContextManager[object] | None = None) -> Reply:
         """Carry out an internal request and publish it like an operator's."""
-        reply, _, number = self._carry_out(prepared(self._settings, request), lock)
+        request = prepared(self._settings, request)
+        reply, _, number = self._carry_out(request, lock)
         self._requests.put(codec.encode_request(request, reply, number, None))
+        return reply
 
     def safe_by_signal(self) -> None:
         """Request safe mode from a signal handler; the main thread carries it out."""
@@ -345,17 +347,11 @@ class Controller:
     def _send_start_requests(self) -> None:
         """Request the configured mirror shapes and control law, as an operator would."""
         for request in self._start_up.requests(self._state, self._service.clock.now_ns()):
-            request = prepared(self._settings, request)
-            self._arrays.publish(request)
-            outputs = self._advance(request)
-            assert outputs.reply is not None  # noqa: S101  # every request has an answer
-            self._requests.put(codec.encode_request(request, outputs.reply, self._state.input_number, None))
-            self._publish(outputs)
-            if not outputs.reply.accepted and request.name == "law" and misfit(self._state):
-                self._service.event("LAW_NOT_IN_FORCE", why=outputs.reply.text)  # the loop stays open
-                continue
-            if not outputs.reply.accepted:
-                self._start_up.refused(request, outputs.reply.text)
+            reply = self._carry_out_internal(request, lock=contextlib.nullcontext())
+            if not reply.accepted and request.name == "law" and misfit(self._state):
+                self._service.event("LAW_NOT_IN_FORCE", why=reply.text)  # the loop stays open
+            elif not reply.accepted:
+                self._start_up.refused(request, reply.text)
                 break
 
     def _advance(self, input_: Input) -> Outputs:

@@ -63,10 +63,8 @@ class MirrorReports:
         self._due_ns = now_ns + CHECK_PERIOD_NS
         if self._reports:
             self._received_ns = now_ns
-            before, self._health_fault = (
-                self._health_fault,
-                _fault_in(self._reports.popleft()) if state.commanded else "",
-            )
+            before, report = self._health_fault, self._reports.popleft()
+            self._health_fault = _fault_in(report) if state.commanded else ""
             if self._health_fault == before or not self._health_fault:
                 self._fault = self._health_fault
             if not self._fault and state.loop is not None:
