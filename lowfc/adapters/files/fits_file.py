@@ -135,18 +135,6 @@ def single(hdus: fits.HDUList, name: str) -> Single:
     return np.ascontiguousarray(data, dtype=np.float32)
 
 
-def first_image(hdus: fits.HDUList) -> tuple[npt.NDArray[np.generic], str]:
-    """Read the first image or cube, and its unit (BUNIT), empty if it is not given.
-
-    Raises:
-        ValueError: there is none.
-    """
-    found = next((hdu for hdu in hdus if hdu.is_image and hdu.data is not None), None)
-    if found is None:
-        raise ValueError("there is no image in it")
-    return np.asarray(found.data), str(found.header.get("BUNIT", "")).strip()
-
-
 def require_identity(path: Path, found: str, stated: str) -> None:
     """Check that the identity stated in a file is that of its content.
 
