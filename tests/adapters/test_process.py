@@ -104,20 +104,15 @@ def test_a_child_ends_when_its_parent_is_killed(tmp_path: Path) -> None:
     until(lambda: not command_line(pid))
 
 
-def test_a_child_is_the_program_itself_in_its_own_session(tmp_path: Path) -> None:
-    program = "import os, sys, time; sys.stderr.write(repr((os.getpid(), os.getsid(0), os.environ['WORD'])))"
-    child = Child("one", [sys.executable, "-c", program], tmp_path / "stderr", {**os.environ, "WORD": "received"})
+def test_a_child_is_the_program_itself_in_its_own_session_and_its_output_is_kept(tmp_path: Path) -> None:
+    program = "import os, sys; print('done'); sys.stderr.write(repr((os.getpid(), os.getsid(0), os.environ['WORD'])))"
+    environment, out = {**os.environ, "WORD": "received"}, tmp_path / "stdout"
+    child = Child("one", [sys.executable, "-c", program], tmp_path / "stderr", environment, stdout_path=out)
     child.start()
     child.process.wait(PATIENCE_S)
     assert (child.status, child.stderr_tail()) == (0, repr((child.process.pid, child.process.pid, "received")))
+    assert out.read_text() == "done\n"
     child.stop(PATIENCE_S)
-
-
-def test_the_output_of_a_child_is_kept_if_it_has_a_file(tmp_path: Path) -> None:
-    child = Child("one", ["echo", "done"], tmp_path / "stderr", stdout_path=tmp_path / "stdout")
-    child.start()
-    child.process.wait(PATIENCE_S)
-    assert (tmp_path / "stdout").read_text() == "done\n"
 
 
 def test_the_end_of_a_child_and_a_missing_program_are_reported(tmp_path: Path) -> None:
