@@ -1,7 +1,6 @@
 """The recorder: every message on the bus is in the log, or counted in it as missing."""
 
 import threading
-from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -137,18 +136,14 @@ def test_every_lost_message_is_counted(bench: Bench) -> None:
     put(steps, 5)  # none arrives
     summary = bench.stop()
     assert summary.lost == {FRAME.key: 4, STEP.key: 5}
-    loss_events = [event for event in bench.events if event.startswith("MESSAGES_LOST")]
-    counts: Counter[str] = Counter()
-    for event in loss_events:
-        _, count, *_, topic = event.split()
-        counts[topic] += int(count)
-    assert counts == summary.lost
+    assert bench.losses() == summary.lost
     missing = {count.topic: count.missing for count in bench.camera.last_health["recorder"].topics if count.missing}
     assert missing == summary.lost
     (path,) = summary.files
     reader = LogReader(path)
-    recorded = [Log.FromString(m.payload).message for m in reader if m.key == EVENT.key]
-    assert [event for event in recorded if event.startswith("MESSAGES_LOST")] == loss_events
+    recorded, published = [Log.FromString(m.payload).message for m in reader if m.key == EVENT.key], bench.events
+    losses = [[one for one in events if one.startswith("MESSAGES_LOST")] for events in (recorded, published)]
+    assert losses[0] == losses[1]
     assert reader.metadata["recording"] == {
         "messages": str(summary.messages),
         "messages_lost": "9",
@@ -194,22 +189,25 @@ def test_a_late_message_is_removed_from_the_losses() -> None:
     assert (account.lost(), account.news()) == ({FRAME.key: 3}, {FRAME.key: 1}), "two were reported already"
 
 
+def reconcile(account: LossAccount, published: int, state: str = "", missing: int = 0, start_s: int = 100) -> None:
+    """Reconcile with a Health of the camera, which published and missed so many frames."""
+    message = wire.Health(process="camera", state=state)
+    message.topics.add(topic=FRAME.key, published=published, missing=missing)
+    message.topics.add(topic=STEP.key, received=9)
+    message.topics.add(topic="lowfc/nothing", published=9)
+    account.reconcile(entry(HEALTH, 0, start_s, key=HEALTH.at("camera"))[1], message)
+
+
 def test_frames_that_the_camera_missed_before_publishing_are_not_losses() -> None:
     account = LossAccount()
-
-    def health(published: int, missing: int) -> None:
-        message = wire.Health(process="camera")
-        message.topics.add(topic=FRAME.key, published=published, missing=missing)
-        account.reconcile(entry(HEALTH, 0, key=HEALTH.at("camera"))[1], message)
-
     account.enter(*entry(FRAME, 50), recorded=True)
-    health(51, 7)  # missed before the first frame received
+    reconcile(account, 51, missing=7)  # missed before the first frame received
     account.enter(*entry(FRAME, 53), recorded=True)
-    health(54, 9)
+    reconcile(account, 54, missing=9)
     assert (account.lost(), account.news()) == ({}, {})
     account.enter(*entry(FRAME, 56), recorded=True)
     assert account.news() == {}, "the camera may still report that it missed them"
-    health(57, 10)
+    reconcile(account, 57, missing=10)
     assert (account.news(), account.news()) == ({FRAME.key: 1}, {}), "one was lost on the bus"
 
 
@@ -221,9 +219,7 @@ def test_duplicates_neither_count_as_losses_nor_hide_them() -> None:
     account.enter(*entry(FRAME, 4), recorded=True)
     account.revert()
     for published, lost in ((7, 1), (8, 1), (9, 2)):
-        message = wire.Health(process="camera", state="stopped")
-        message.topics.add(topic=FRAME.key, published=published)
-        account.reconcile(entry(HEALTH, 0)[1], message)
+        reconcile(account, published, "stopped")
         assert account.lost() == {FRAME.key: lost}, (
             "frame 3 was not received; more than seven published are further losses"
         )
@@ -232,21 +228,13 @@ def test_duplicates_neither_count_as_losses_nor_hide_them() -> None:
 
 def test_the_last_health_of_each_start_determines_its_losses() -> None:
     account = LossAccount()
-
-    def health(published: int, state: str, start_s: int = 100) -> None:
-        message = wire.Health(process="camera", state=state)
-        message.topics.add(topic=FRAME.key, published=published)
-        message.topics.add(topic=STEP.key, received=9)
-        message.topics.add(topic="lowfc/nothing", published=9)
-        account.reconcile(entry(HEALTH, 0, start_s)[1], message)
-
-    health(40, "running")  # messages before its first Health are not lost
-    health(90, "running")  # messages may still arrive
+    reconcile(account, 40, "running")  # messages before its first Health are not lost
+    reconcile(account, 90, "running")  # messages may still arrive
     assert account.lost() == {}
-    health(100, "stopped")
+    reconcile(account, 100, "stopped")
     assert account.lost() == {FRAME.key: 60}
     account.enter(*entry(FRAME, 2, start_s=101), recorded=True)
-    health(5, "stopped", start_s=101)
+    reconcile(account, 5, "stopped", start_s=101)
     assert account.lost() == {FRAME.key: 62}
 
 

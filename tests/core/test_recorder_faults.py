@@ -5,7 +5,6 @@ import shutil
 import subprocess
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -70,12 +69,7 @@ def check_account(bench: Bench, summary: Summary, frames: Publisher) -> int:
     assert (health.state, health.recording.lost) == ("stopped", sum(summary.lost.values()))
     (count,) = (count for count in health.topics if count.topic == FRAME.key)
     assert (count.received, count.missing) == (recorded, lost)
-    events: Counter[str] = Counter()
-    for event in bench.events:
-        if event.startswith("MESSAGES_LOST"):
-            _, number, *_, topic = event.split()
-            events[topic] += int(number)
-    assert events[FRAME.key] == lost
+    assert bench.losses()[FRAME.key] == lost
     return lost
 
 

@@ -1,6 +1,7 @@
 """A recorder, a camera and a controller on a memory bus."""
 
 import threading
+from collections import Counter
 from pathlib import Path
 
 from lowfc.adapters.bus.bus import Publisher, Sample
@@ -54,6 +55,15 @@ class Bench:
         self.thread.join(PATIENCE_S)
         assert self.summary is not None
         return self.summary
+
+    def losses(self) -> Counter[str]:
+        """Messages reported as lost by events, by topic."""
+        counts: Counter[str] = Counter()
+        for event in self.events:
+            if event.startswith("MESSAGES_LOST"):
+                _, count, *_, topic = event.split()
+                counts[topic] += int(count)
+        return counts
 
     def _record(self) -> None:
         self.summary = self.recorder.run()
