@@ -61,11 +61,8 @@ SIMULATED = ("sim-camera --run bench --config bench.toml", "sim-dm --run bench -
 
 
 @pytest.fixture
-def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def bench(tmp_path: Path, own_runtime: Path) -> Path:
     """A folder with the examples, and runs of its own."""
-    runtime = tmp_path / "run"
-    runtime.mkdir(mode=0o700)
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
     shutil.copytree(ROOT / "examples", tmp_path / "examples")
     (tmp_path / "bench.toml").write_text(BENCH)
     return tmp_path
@@ -154,10 +151,10 @@ def test_the_simulated_devices_and_a_camera_in_plain_zenoh_keep_the_contract(ben
 
 
 @pytest.mark.slow
-def test_the_camera_of_the_tutorial_passes_conformance(bench: Path) -> None:
+def test_the_camera_of_the_tutorial_passes_conformance(bench: Path, own_runtime: Path) -> None:
     (bench / "counting.py").write_text(block("python", (ROOT / "docs/tutorials/your_camera.md").read_text()))
     with going_on(bench, COUNTING[0]):
-        until(lambda: (bench / "run/lowfc/counting").exists())
+        until(lambda: (own_runtime / "lowfc/counting").exists())
         conformance(bench, COUNTING[1])
     assert "2 ok" in command(bench, DOCTOR)
 

@@ -124,10 +124,8 @@ def _adopted_nm(state: State, flat_nm: Single) -> Single | None:
     shapes = [one.shape_nm for one in loop.command_channels.channels if one.name == ADOPTED]
     if not shapes:
         return None
-    without_modes = [
-        shape - loop.to_actuators @ (loop.inverse @ shape) for shape in (shapes[0].reshape(-1), flat_nm.reshape(-1))
-    ]
-    adopted, flat = without_modes
+    flattened = shapes[0].reshape(-1), flat_nm.reshape(-1)
+    adopted, flat = (shape - loop.to_actuators @ (loop.inverse @ shape) for shape in flattened)
     return shapes[0] if float(adopted @ flat) > LIKENESS * float(flat @ flat) else None
 
 
@@ -135,13 +133,10 @@ def _flat_within_limits(config: Configuration) -> Single | None:
     found = flat_nm(config)
     if found is not None:
         acting = limit(factory.settings(config).limits, found, found).reasons
-        reasons = [
-            reason for reason in acting if reason is not Limit.SLEW
-        ]  # the flat map is approached within the slew limit
-        if reasons:
+        names = [reason.name.lower() for reason in acting if reason is not Limit.SLEW]  # it is approached within slew
+        if names:
             raise ConfigurationError(
-                f"mirror.flat = {config.mirror.flat!r}: beyond the limits of [safety]: "
-                f"{', '.join(reason.name.lower() for reason in reasons)}"
+                f"mirror.flat = {config.mirror.flat!r}: beyond the limits of [safety]: {', '.join(names)}"
             )
     return found
 
