@@ -44,6 +44,7 @@ def layout(**changes: object) -> str:
         ("[sensor]\nsam = 'sam27d07_bal15'", "sam27d07_bal14"),
         ("[sensor]\nsam = 'nowhere.json'", "nowhere.json"),
         ("[mirror]\ndead = [99999]", "actuator '99999'"),
+        (f"[recorder]\nfolder = '{'x' * 300}'", "x cannot be accessed: File name too long"),
     ],
 )
 def test_an_invalid_configuration_is_refused(tmp_path: Path, config: str, expected: str) -> None:

@@ -230,6 +230,9 @@ def shortage(folder: Path, min_free_bytes: int) -> str:
 
 
 def existing(folder: Path) -> Path:
-    """The folder, or its nearest existing parent."""
+    """The folder, or its nearest existing parent; DataFileError if it cannot be accessed."""
     there = folder.absolute()
-    return next(one for one in (there, *there.parents) if one.exists())
+    try:
+        return next(one for one in (there, *there.parents) if one.exists())
+    except OSError as fault:
+        raise DataFileError(f"{folder} cannot be accessed: {fault.strerror}") from fault
