@@ -3,6 +3,7 @@
 import time
 from collections import deque
 from collections.abc import Callable
+from math import inf
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -53,7 +54,7 @@ class Stream(Generic[T]):
         self._ring = ring
         self._decode = decode
         self._what = what
-        self._remaining = -1 if count is None else count
+        self._remaining = inf if count is None else count
         self._patience_s = patience_s
         self._gaps: dict[int, Gaps] = {}
         self._damaged = 0
@@ -70,7 +71,7 @@ class Stream(Generic[T]):
 
     def __next__(self) -> T:
         """The next message; BusError if none arrives in time."""
-        while self._remaining:
+        while self._remaining > 0:
             self._fill()
             sample = self._waiting.popleft()
             count = count_of(sample.sequence)

@@ -94,11 +94,12 @@ def test_a_run_that_cannot_be_joined_hides_no_other() -> None:
 
 @pytest.mark.usefixtures("toml")
 @pytest.mark.parametrize("words", [("record",), ("config", "zenoh", "--role", "camera"), ("sim-loop",)], ids=" ".join)
-def test_too_long_a_name_of_a_run_is_refused(words: tuple[str, ...]) -> None:
-    fault = lowfc(*words, "--run", "x" * 300).exception
-    assert isinstance(fault, BusError)
-    assert len(str(fault)) < 300
-    assert "a run's name is up to 48 of" in str(fault)
+def test_too_long_or_empty_a_name_of_a_run_is_refused(words: tuple[str, ...]) -> None:
+    for name in ("x" * 300, ""):
+        fault = lowfc(*words, "--run", name).exception
+        assert isinstance(fault, BusError)
+        assert len(str(fault)) < 300
+        assert "a run's name is up to 48 of" in str(fault)
 
 
 def test_the_configuration_of_the_router_is_shown_without_creating_its_run(toml: Path) -> None:

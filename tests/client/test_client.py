@@ -464,6 +464,7 @@ def test_frames_arrive_in_order_as_arrays() -> None:
     assert [frame.pixels[0, 0] for frame in found] == [5, 6, 7, 8]
     assert [(frame.number, frame.time_ns) for frame in found] == [(5, 5000), (6, 6000), (7, 7000), (8, 8000)]
     assert (found[0].pixels.shape, found[0].pixels.dtype) == ((3, 4), np.uint16)
+    assert list(stream(frame_sample(5), count=-1)) == []
 
 
 def test_lost_frames_are_counted_but_not_restarts_or_duplicates() -> None:

@@ -81,7 +81,7 @@ def sim_loop(
 
 def _new_run(config: Configuration, name: str | None) -> Run:
     """Open a run that no other launcher uses; a directory left by a killed launcher is reused."""
-    run = open_run(name or new_run_id(), (config.mirror.name,), listeners=(Role.LAUNCHER,))
+    run = open_run(new_run_id() if name is None else name, (config.mirror.name,), listeners=(Role.LAUNCHER,))
     if living := run.links.live():
         raise BusError(f"run {run.run_id!r} is already running ({', '.join(sorted(living))}): use another name")
     if Role.LAUNCHER not in run.links.ports:
