@@ -12,7 +12,6 @@ from rich.console import Console
 from lowfc.contract.codecs.state_codec import controller_state
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.messages import FRAME, timestamp, wire
-from lowfc.control.loop.advance import advance
 from lowfc.control.loop.camera import CameraSettings
 from lowfc.control.loop.inputs import Request, Step
 from lowfc.control.loop.safety import LoopMode
@@ -20,7 +19,7 @@ from lowfc.programs.cli import status
 from lowfc.programs.core.controller_report import LastSecond, NotClosed, Offload
 from lowfc.programs.launch.status import screen, status_line, summary_text
 from lowfc.programs.launch.watch import Watch, summary
-from tests.support.toy import DARK_DN, SATURATION_DN, SHAPE, START, frame, loaded, settings
+from tests.support.toy import DARK_DN, SATURATION_DN, SHAPE, START, feed, frame, loaded, settings
 
 USUAL = settings()
 CAMERA = CameraSettings(START * 10**9, SHAPE, DARK_DN, SATURATION_DN)
@@ -45,24 +44,21 @@ PROCESSES = {
 
 
 def test_the_time_not_closed_is_summed_and_has_its_cause() -> None:
-    account, state = NotClosed(), loaded(USUAL)
-    assert account.note(state, 0) == (0, "")
-    for one in (CAMERA, frame(1)):
-        state, _ = advance(USUAL, state, one)
+    account = NotClosed()
+    assert account.note(loaded(USUAL), 0) == (0, "")
+    state, _ = feed(USUAL, loaded(USUAL), CAMERA, frame(1))
     assert account.note(state, 1 * SECOND) == (0, ""), "closed since its first frame"
-    state, _ = advance(USUAL, state, replace(CAMERA, bias_dn=DARK_DN + 300))
+    state, _ = feed(USUAL, state, replace(CAMERA, bias_dn=DARK_DN + 300))
     assert account.note(state, 2 * SECOND)[0] == 0
     total_ns, cause = account.note(state, 5 * SECOND)
     assert (total_ns, "bias_dn is 400" in cause) == (3 * SECOND, True)
 
 
 def test_every_cause_of_a_loop_that_was_not_closed_is_named() -> None:
-    account, state = NotClosed(), loaded(USUAL)
-    for one in (CAMERA, frame(1)):
-        state, _ = advance(USUAL, state, one)
+    account, (state, _) = NotClosed(), feed(USUAL, loaded(USUAL), CAMERA, frame(1))
     account.note(state, 0)
     for number, name in enumerate(("open", "close", "pause", "close", "open", "close"), 1):
-        state, _ = advance(USUAL, state, Request(number * SECOND, name))
+        state, _ = feed(USUAL, state, Request(number * SECOND, name))
         account.note(state, number * SECOND)
         cause = account.note(state, number * SECOND + 1)[1]
     assert cause == "operator asked to open (2 times); operator asked to pause (1 time)"
@@ -105,28 +101,22 @@ def test_summary_and_status_show_the_time_not_closed() -> None:
         first(mode=wire.LOOP_MODE_SAFE, **not_closed) == "in safe mode, not closed for 3.0 s: the camera does not fit"
     )
     assert first() == "no controller reported", "no time counts before the loop has started"
-    state = loaded(USUAL)
-    for one in (CAMERA, frame(1), replace(CAMERA, bias_dn=DARK_DN + 300)):
-        state, _ = advance(USUAL, state, one)
+    state, _ = feed(USUAL, loaded(USUAL), CAMERA, frame(1), replace(CAMERA, bias_dn=DARK_DN + 300))
     message = controller_state(state, USUAL, (START + 12) * SECOND)
     mirror = wire.Health(command_refused=wire.REASON_OUT_OF_ORDER)
     _, *lines = status.text(status.json_object(message, {"mirror-dm": mirror})).splitlines()
     assert lines[0].split(maxsplit=1)[1].startswith("open for 12 s (the camera does not fit the calibration: bias_dn")
     assert lines[1].split(maxsplit=1)[1] == "refuses commands: OUT_OF_ORDER"
-    held = status.text(status.json_object(message, {"controller": wire.Health(holding="no frame comes")})).splitlines()[
-        1
-    ]
+    holding = {"controller": wire.Health(holding="no frame comes")}
+    held = status.text(status.json_object(message, holding)).splitlines()[1]
     assert " open for 12 s (" in held
     assert held.endswith("), command held: no frame comes"), "12 s is the time open, not the time without frames"
-    assert status.json_object(message, {"mirror-x": wire.Health(command_expired=True)})["mirrors"]["mirror-x"][
-        "expired"
-    ]
+    expired = {"mirror-x": wire.Health(command_expired=True)}
+    assert status.json_object(message, expired)["mirrors"]["mirror-x"]["expired"]
 
 
 def test_the_first_line_of_the_status_shows_loop_recording_and_warnings() -> None:
-    state = loaded(USUAL)
-    for one in (CAMERA, frame(1)):
-        state, _ = advance(USUAL, state, one)
+    state, _ = feed(USUAL, loaded(USUAL), CAMERA, frame(1))
 
     def first(**changes: Any) -> str:
         message = controller_state(state, USUAL, (START + 12) * SECOND)
@@ -151,7 +141,7 @@ def test_the_first_line_of_the_status_shows_loop_recording_and_warnings() -> Non
         ("close", "closed"),
         ("safe", "in safe mode"),
     ):
-        state, outputs = advance(USUAL, state, Request((START + 2) * SECOND, name))
+        state, (outputs,) = feed(USUAL, state, Request((START + 2) * SECOND, name))
         assert outputs.reply.accepted
         assert first().startswith(f"{word} ·")
         assert status.json_object(controller_state(state, USUAL, 0))["paused"] == (word == "paused")
