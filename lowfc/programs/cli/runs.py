@@ -2,8 +2,17 @@
 
 from typing import Any
 
+from lowfc.adapters.bus.other_loops import none_here
+from lowfc.adapters.bus.run import runtime_path
 from lowfc.adapters.process.terminal import Json
+from lowfc.client import Client
+from lowfc.client.runs import live_runs
+from lowfc.contract.errors import LowfcError
+from lowfc.contract.messages import Role
+from lowfc.control.loop.wording import mode_word
 from lowfc.programs.cli.output import print_result
+from lowfc.programs.cli.status import NO_HEALTH, recording_state
+from lowfc.programs.launch.watch import mode_name
 
 
 def runs(as_json: Json = False) -> None:
@@ -11,11 +20,6 @@ def runs(as_json: Json = False) -> None:
 
     Example: lowfc runs
     """
-    from lowfc.adapters.bus.other_loops import none_here
-    from lowfc.adapters.bus.run import runtime_path
-    from lowfc.client.runs import live_runs
-    from lowfc.contract.errors import LowfcError
-
     rows, not_joined = [], {}
     for name, roles in live_runs().items():
         try:
@@ -29,11 +33,6 @@ def runs(as_json: Json = False) -> None:
 
 def _row(name: str, roles: set[str]) -> dict[str, Any]:
     """State of a run from the Health of its processes; a process that has not sent one yet is starting."""
-    from lowfc.client import Client
-    from lowfc.contract.messages import Role
-    from lowfc.programs.cli.status import NO_HEALTH, recording_state
-    from lowfc.programs.launch.watch import mode_name
-
     with Client(name) as loop:
         found = loop.processes()
     controller, recorder = found.get(Role.CONTROLLER, NO_HEALTH), found.get(Role.RECORDER, NO_HEALTH)
@@ -52,9 +51,6 @@ def _row(name: str, roles: set[str]) -> dict[str, Any]:
 
 
 def _lines(rows: list[dict[str, Any]]) -> list[str]:
-    from lowfc.contract.messages import Role
-    from lowfc.control.loop.wording import mode_word
-
     lines = []
     for row in rows:
         mode = "no controller" if row["mode"] is None else mode_word(row["mode"])
