@@ -13,13 +13,9 @@ def program(name: str, arguments: list[str], stderr_path: Path) -> Child:
 
 
 def start_all(children: list[Child]) -> None:
-    """Start all; if one cannot be started, stop the others."""
-    try:
-        for child in children:
-            child.start()
-    except OSError:
-        stop_all(children)
-        raise
+    """Start all; if one cannot be started, the caller stops the others, as at its own end."""
+    for child in children:
+        child.start()
 
 
 def stop_all(children: list[Child], timeout_s: float = 5.0) -> None:
