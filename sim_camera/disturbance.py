@@ -12,7 +12,7 @@ import numpy as np
 
 from lowfc.arrays import Array, Complex, Single
 from lowfc.control.laws.integrator import TIP_TILT
-from lowfc.optics.chain.zernike import noll_to_nm
+from lowfc.optics.chain.zernike import noll_to_orders
 from sim_camera.wheel import ORDERS, Wheel, walk
 
 BLOCK = 8
@@ -369,7 +369,7 @@ def screen(seed: int, samples: int, spacing: float) -> Array:
 
 def _thermal_nm(noll: tuple[int, ...]) -> Array:
     """Rms of the thermal drift of each mode, by radial degree."""
-    return np.array([_THERMAL_NM.get(noll_to_nm(index)[0], 1.0) for index in noll])
+    return np.array([_THERMAL_NM.get(noll_to_orders(index)[0], 1.0) for index in noll])
 
 
 def _drift(rng: np.random.Generator, rms_nm: Array, band_hz: tuple[float, float]) -> tuple[Array, Complex]:
