@@ -466,6 +466,7 @@ def test_a_damaged_log_is_replayed_except_for_the_damage(log: Path, tmp_path: Pa
     text = lowfc("replay", tmp_path / "damaged.mcap").stdout
     assert "unchecked" in text
     assert "damaged" in text
+    assert "damaged            left out: at byte" in lowfc("latency", tmp_path / "damaged.mcap").stdout
 
 
 def test_a_finished_log_with_a_damaged_summary_is_not_called_cut_off(log: Path, tmp_path: Path) -> None:

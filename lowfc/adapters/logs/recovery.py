@@ -128,6 +128,12 @@ def missing_end_text(paths: Sequence[Path], *, finished: bool) -> str:
     return "the log has no end: it was cut off, as when its recorder is killed"
 
 
+def missing_parts(reader: LogReader) -> dict[str, Any]:
+    """Missing parts of a log that was read to its end, for JSON: `no_end` is empty for a finished log."""
+    no_end = missing_end_text(reader.paths, finished=reader.finished)
+    return {"finished": reader.finished, "no_end": no_end, "damaged": [in_words(one) for one in reader.damage]}
+
+
 def faults(damaged: Sequence[str], no_end: str) -> list[str]:
     """Lines of text on missing parts of a log."""
     lines = [f"truncated          {no_end}"] if no_end else []

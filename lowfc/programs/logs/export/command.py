@@ -98,7 +98,7 @@ def export_log(
     from lowfc.adapters.files.whole_file import being_written, require_folder
     from lowfc.adapters.logs.history import read_history
     from lowfc.adapters.logs.parts import WholeLog
-    from lowfc.adapters.logs.recovery import in_words, missing_end_text
+    from lowfc.adapters.logs.recovery import missing_parts
     from lowfc.adapters.logs.writer import stem_of
     from lowfc.adapters.process.progress import reading_bar
 
@@ -128,9 +128,7 @@ def export_log(
         "frames": len(history.frame_sequence) if frames else 0,
         "steps_left_out": history.excluded_messages,
         "selection": reader.selection.description,
-        "finished": reader.finished,
-        "no_end": missing_end_text(reader.paths, finished=reader.finished),
-        "damaged": [in_words(one) for one in reader.damage],
+        **missing_parts(reader),
         "remarks": history.remarks,
     }
 

@@ -20,7 +20,7 @@ from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.logs.history import LAST_NS
 from lowfc.adapters.logs.parts import WholeLog, titled
 from lowfc.adapters.logs.reader import LogReader
-from lowfc.adapters.logs.recovery import faults, in_words, missing_end_text
+from lowfc.adapters.logs.recovery import faults, missing_parts
 from lowfc.adapters.process.clock import HostClock
 from lowfc.adapters.process.progress import passing_bar
 from lowfc.adapters.process.realtime import Granted, set_up
@@ -138,9 +138,7 @@ class Player:
             "took_s": (self._sent_ns - self._begun_ns) * 1e-9,
             "timing_error_us": {"p50": p50_ns / 1e3, "p99": p99_ns / 1e3, "max": self._errors.max_ns / 1e3},
             "messages_behind": self._behind,
-            "finished": log.finished,
-            "no_end": missing_end_text(log.paths, finished=log.finished),
-            "damaged": [in_words(one) for one in log.damage],
+            **missing_parts(log),
             "selection": [log.selection.description] if log.selection.description else [],
             "interrupted": not self._service.running,
         }

@@ -172,8 +172,8 @@ def _of_log(names: list[Path]) -> dict[str, Any]:
 
     log = the_one(names)
     with reading_bar(Console(stderr=True)) as count:
-        results, host = log_statistics(log, partial(count, f"reading {titled(log)}"))
-    return together([results]) | {"settings": {"log": str(log[0])}, "host": host}
+        results, about = log_statistics(log, partial(count, f"reading {titled(log)}"))
+    return together([results]) | about
 
 
 def _compare(files: tuple[Path, Path]) -> dict[str, Any]:

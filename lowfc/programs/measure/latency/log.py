@@ -7,6 +7,7 @@ from typing import Any
 from lowfc.adapters.bus.bus import name_in
 from lowfc.adapters.logs.history import read_history
 from lowfc.adapters.logs.parts import LogFiles, WholeLog
+from lowfc.adapters.logs.recovery import missing_parts
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import HEALTH, Role, wire
 from lowfc.programs.measure.latency.frame_statistics import controller_counts, join, repeat_statistics
@@ -15,11 +16,11 @@ _LOOP = frozenset({Role.CAMERA, Role.CONTROLLER, Role.MIRROR})
 
 
 def log_statistics(files: LogFiles, progress: Callable[[int, int], None]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Latency statistics of a log, as of one repeat of a benchmark, and the host that its metadata describes.
+    """Latency statistics of a log, as of one repeat of a benchmark, and its path, missing parts and host.
 
     For a loop on several hosts, `clock_error_us` is the largest error of a latency between two hosts.
     """
-    log = WholeLog(files)
+    log = WholeLog(files, skip_damaged=True)
     log.progress = progress
     history = read_history(log)
     mirror = history.mirror.sequence, history.mirror.publish_time_ns
@@ -39,4 +40,5 @@ def log_statistics(files: LogFiles, progress: Callable[[int, int], None]) -> tup
                 trip_ns = wire.Health.FromString(message.payload).router_round_trip_ns
                 round_trips_ns[name] = max(round_trips_ns[name], trip_ns)
         host["clock_error_us"] = sum(sorted(round_trips_ns.values())[-2:]) / 2e3
-    return statistics | controller_counts(controller), host
+    about = {"settings": {"log": str(log.path)}, **missing_parts(log), "host": host}
+    return statistics | controller_counts(controller), about

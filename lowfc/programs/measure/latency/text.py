@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from lowfc.adapters.logs.recovery import faults
 from lowfc.programs.measure.latency.frame_statistics import ALONE, COUNTS, LOOP_SPANS, PERCENTILES, RATIOS, SPANS
 from lowfc.programs.measure.latency.stalls import Stalls
 from lowfc.programs.measure.latency.summary import RATIO_ROW
@@ -124,6 +125,8 @@ def _remarks(results: Mapping[str, Any]) -> list[str]:
     if results.get("memory_mb"):
         lines.append("memory: " + ", ".join(f"{name} {mb:.0f} MB" for name, mb in results["memory_mb"].items()))
     lines.append(_what(results))
+    if results["settings"].get("log"):
+        lines += faults(results["damaged"], results["no_end"])
     host = results["host"]
     lines.append(", ".join(f"{name} {host[name]}" for name in _HOST if host.get(name)))
     if "clock_error_us" in host:
