@@ -101,6 +101,7 @@ def what_if(run: LoggedRun, what: WhatIf) -> dict[str, Any]:
             *_log_warnings(run),
             *([f"the log lacks {counted(int(lost), 'used frame')}: the what-if holds there"] if lost else []),
             *_range_warnings(run.calibration, columns),
+            *_weighting_warnings(run, calibration, None if user_step else new_law),
             *([] if user_step else _automatic_warnings(what, noll)),
             *([] if user_step else _law_warnings(run, new_law, command_nm[rows])),
         ],
@@ -295,6 +296,17 @@ def _range_warnings(calibration: Calibration, columns: dict[str, Array]) -> list
     return [
         f"beyond the sensor's linear range of {limit_nm:.1f} nm rms per mode: {', '.join(beyond)}; the results are "
         "only approximate"
+    ]
+
+
+def _weighting_warnings(run: LoggedRun, calibration: Calibration, law: Integrator | None) -> list[str]:
+    weighted = run.uncorrected
+    if not weighted.any() or (calibration is run.calibration and law is not None and not law.gain[weighted].any()):
+        return []
+    names = ", ".join(mode_name(index) for index in np.array(run.calibration.noll)[weighted].tolist())
+    return [
+        f"automatic gains weighted the logged reconstructor for modes that they do not correct ({names}): the what-if "
+        "measures with the same weights, also if it corrects such a mode"
     ]
 
 

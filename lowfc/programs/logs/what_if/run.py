@@ -1,6 +1,7 @@
 """Input of a what-if: exposures of the logged run, the measured delay, and the command seen by each exposure."""
 
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ from lowfc.adapters.logs.history import History
 from lowfc.arrays import Mask, Sequences, Single, Whole
 from lowfc.contract.codecs.codec import decode_frame
 from lowfc.contract.codecs.law_codec import gains_of
+from lowfc.contract.codecs.state_codec import calibration_in_use
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import FRAME, floats, wire
@@ -113,6 +115,15 @@ class LoggedRun:
         self.delay_frames, self.weights, self.seen_nm, self.torn = self.seen
 
     @property
+    def uncorrected(self) -> Mask:
+        """Modes (modes,) for which automatic gains weighted the reconstructor at the end of the run."""
+        state = self.history.controller
+        modes = len(self.calibration.noll)
+        if state is None or state.calibration_id != self.calibration.id or len(state.prior_nm2) != modes:
+            return np.zeros(modes, np.bool_)
+        return np.array(state.prior_nm2) > 0
+
+    @property
     def timing(self) -> Timing:
         """Times of the exposures and of the mirror's moves.
 
@@ -147,7 +158,10 @@ class LoggedRun:
         return rows, settling, over
 
     def measured_again(self, calibration: Calibration) -> Single:
-        """Errors (steps, modes) measured in the used frames with another calibration, in a second pass."""
+        """Errors (steps, modes) measured in the used frames with another calibration, in a second pass.
+
+        Its reconstructor is weighted like that of the logged run at its end, see `uncorrected`.
+        """
         steps, log = self.steps, self.history.log
         if not log.selection.has_every_frame:
             raise DataFileError(
@@ -155,6 +169,10 @@ class LoggedRun:
                 "cannot be tried, other gains, leaks and limits can"
             )
         error_nm = np.full_like(steps.error_nm, np.nan)
+        if self.uncorrected.any():
+            state = deepcopy(self.history.controllers[-1])
+            state.calibration_id = calibration.id
+            calibration = calibration_in_use(state, calibration)
         estimator = Estimator.of(calibration)
         rows = {sequence: row for row, sequence in enumerate(steps.sequence.tolist()) if self.used[row]}
         for message in self.history.reader(FRAME):
