@@ -47,6 +47,8 @@ _ALTERNATIVE = re.compile(
 Milliseconds = Annotated[float, Field(ge=0, le=1e9)]
 Cpus = list[Annotated[int, Field(ge=0, lt=8192)]]  # the kernel's largest number of processors
 Gain = Annotated[float, Field(ge=0, le=4)]
+MAX_LIMIT_NM = 1e9
+ModalLimit = Annotated[float, Field(gt=0, le=MAX_LIMIT_NM)]
 FIXED_GAINS = {"control.tilt_gain": 0.5, "control.gain": 0.05}
 """For runs that must not depend on automatic gains, such as timing measurements."""
 
@@ -74,9 +76,9 @@ class Control(Section):
     """Integrator leak of tip and tilt."""
     leak: float = Field(0.0, ge=0, le=1)
     """Integrator leak of the other modes."""
-    tilt_limit_nm: Positive = 150.0
+    tilt_limit_nm: ModalLimit = 150.0
     """Largest modal command of tip and tilt, wavefront rms."""
-    limit_nm: Positive = 50.0
+    limit_nm: ModalLimit = 50.0
     """Largest modal command of the other modes, wavefront rms."""
     max_frame_age_ms: Milliseconds = 0.0
     """Age above which a frame is refused; 0: 20 ms or two frame periods, whichever is longer."""

@@ -509,7 +509,8 @@ def test_options_are_parsed() -> None:
         ("", "nothing to change: give --set KEY=VALUE"),
         ("estimator=best", "estimator must be weighted or pinv, got 'best'"),
         *((text, "every .* must be between") for text in ("gain=5", "leak=2", "gain=nan")),
-        *((text, "every limit_nm must be finite and at least 0") for text in ("limit_nm=-1", "limit_nm=inf")),
+        ("limit_nm=-1", "every limit_nm must be finite and at least 0"),
+        *((f"limit_nm={text}", f"limit_nm must be at most 1e.09, got {text}") for text in ("inf", "3e38")),
     ],
 )
 def test_invalid_options_are_refused(text: str, message: str) -> None:

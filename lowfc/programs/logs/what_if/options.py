@@ -12,7 +12,7 @@ import numpy as np
 
 from lowfc.adapters.files.factory import settings
 from lowfc.arrays import Mask, Single
-from lowfc.contract.configuration import Configuration, load
+from lowfc.contract.configuration import MAX_LIMIT_NM, Configuration, load
 from lowfc.contract.errors import ConfigurationError, nearest
 from lowfc.control.calibration.calibration import ESTIMATORS
 from lowfc.control.laws.integrator import TIP_TILT, Integrator
@@ -142,6 +142,9 @@ def user_controller(where: str) -> Controller:
 
 def _number(key: str, value: str) -> float:
     try:
-        return float(value)
+        number = float(value)
     except ValueError:
         raise ConfigurationError(f"--set: {key} must be a number, got {value!r}") from None
+    if abs(number) > MAX_LIMIT_NM:  # it may overflow in single precision
+        raise ConfigurationError(f"--set: {key} must be at most {MAX_LIMIT_NM:g}, got {value}")
+    return number
