@@ -227,14 +227,21 @@ def test_a_summary_without_checksum_is_used_up_to_a_damaged_record(
         assert list(file.index()) == []
 
 
-@pytest.mark.parametrize("cut", [0, 500])
-def test_of_two_logs_in_one_file_the_first_is_read_and_the_second_reported(source: Path, cut: int) -> None:
-    first = source.read_bytes()
-    second = first[: len(first) - cut]  # as of a recorder that was killed
+@pytest.mark.parametrize("cuts", [(0, 0), (0, 500), (40_000, 0), (40_000, 500), (60_000, 100_000)])
+def test_of_two_logs_in_one_file_the_first_is_read_and_the_second_reported(
+    tmp_path: Path, source: Path, cuts: tuple[int, int]
+) -> None:
+    """One that was cut, as of a recorder that was killed, is not read on with the channels of the other."""
+    first = (whole := source.read_bytes())[: len(whole) - cuts[0]]
+    second = rewritten(source, tmp_path / "second.mcap", {}).read_bytes()
+    second = second[: len(second) - cuts[1]]
+    source.write_bytes(first)
+    expected = identity(list(LogReader(source)))
     source.write_bytes(first + second)
     reader = LogReader(source, skip_damaged=True)
-    assert identity(list(reader)) == SENT
-    (damage,) = reader.damage
+    assert identity(list(reader)) == expected
+    damage = reader.damage[-1]
+    assert len(reader.damage) == 1 + bool(cuts[0])
     assert (damage.position, damage.length) == (len(first), len(second))
     command = f"`tail -c +{len(first) + 1} {source.name} > second.mcap`"
     assert damage.why == f"it is another log, appended to this one; {command} copies it"

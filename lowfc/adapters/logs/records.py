@@ -40,6 +40,7 @@ _FOOTER_BYTES = HEAD.size + 20 + len(MAGIC)
 _BLOCK_BYTES = 1 << 20
 _EXPECTED = {Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METADATA, Opcode.DATA_END}
 _CHANGED = "its parts are intact, but some are missing, out of order, or changed in between"
+_BEGIN = MAGIC + bytes([Opcode.HEADER])
 _OF_CHUNKS = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE}
 _FIRST_BLOCK_BYTES = 1 << 12
 _TRIES = 4  # limit of bytes read in search of chunks, in file sizes: a malicious file must not read for ever
@@ -130,8 +131,8 @@ class LogFile:
             DataFileError: the file cannot be read.
         """
         magic = self._read(0, len(MAGIC))
-        at, crc, intact = len(MAGIC), zlib.crc32(magic), MAGIC.startswith(magic)
-        if not intact:
+        at, crc, intact = len(MAGIC), zlib.crc32(magic), (begins := MAGIC.startswith(magic))
+        if not begins:
             yield Damage(0, len(magic), "it does not begin like an MCAP file")
         while at < self.size:
             head = self._read(at, HEAD.size)
@@ -153,9 +154,8 @@ class LogFile:
                 if opcode == Opcode.DATA_END and length == 4 and self._summary in (None, end):
                     if intact and int.from_bytes(body, "little") not in (0, crc):
                         yield Damage(at, 0, _CHANGED)
-                    if self._summary is None and (second := self._appended(end)):
-                        copy = f"`tail -c +{second + 1} {self.path.name} > second.mcap` copies it"
-                        yield Damage(second, self.size - second, f"it is another log, appended to this one; {copy}")
+                    if self._summary is None and (second := self._appended(end - len(MAGIC), self.size)):
+                        yield second
                     elif self.finished and self._summary is None:
                         yield Damage(end, self.size - end, "the summary is damaged, or another file was appended")
                     self.complete = self._summary is not None
@@ -164,6 +164,12 @@ class LogFile:
                 part = self._part(opcode, body, at)
             except UnsoundError as fault:
                 resumed = self._resume(at, end)
+                # The channels of another log have other ids.
+                if begins and (second := self._appended(max(1, at - len(MAGIC)), resumed)):
+                    if at < second.position:
+                        yield Damage(at, second.position - at, str(fault))
+                    yield second
+                    return
                 if resumed == self.size < end and not self.finished:
                     return  # the last record is truncated
                 intact = False
@@ -174,12 +180,14 @@ class LogFile:
                     yield part
                 at = end
 
-    def _appended(self, at: int) -> int | None:
-        """First byte of a log that follows the end of this one; None without one after `at`."""
-        while len(block := self._read(at, _BLOCK_BYTES)) >= 2 * len(MAGIC):
-            if (found := block.find(2 * MAGIC)) >= 0:
-                return at + found + len(MAGIC)
-            at += len(block) - 2 * len(MAGIC) + 1
+    def _appended(self, at: int, end: int) -> Damage | None:
+        """Another log that begins between two positions, up to the end of the file; None without one."""
+        for begin in range(at, end, _BLOCK_BYTES):
+            block = self._read(begin, min(_BLOCK_BYTES, end - begin) + len(MAGIC))
+            if (found := block.find(_BEGIN)) >= 0:
+                copy = f"`tail -c +{begin + found + 1} {self.path.name} > second.mcap` copies it"
+                why = f"it is another log, appended to this one; {copy}"
+                return Damage(begin + found, self.size - begin - found, why)
         return None
 
     def _find_summary(self) -> int | None:
@@ -249,6 +257,8 @@ class LogFile:
         Raises:
             UnsoundError: the record is damaged or not permitted here.
         """
+        if opcode not in (Opcode.CHUNK, Opcode.ATTACHMENT) and _BEGIN in body:
+            raise UnsoundError("a record is cut off")
         match opcode:
             case Opcode.CHUNK:
                 try:
