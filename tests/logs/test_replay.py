@@ -433,20 +433,26 @@ def test_logs_in_another_order_than_recorded_are_refused(
         workers.replay_files([newer, log], 0.0, jobs, lambda done: None)
 
 
+@pytest.mark.parametrize("other", ["b", "a"])
 def test_two_lockstep_runs_with_the_same_sequences_are_replayed_apart(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, other: str
 ) -> None:
-    paths = []
-    for run, gain in (("a", 0.1), ("b", 0.2)):
+    """Also those of one name, `sim-loop --lockstep --run a`."""
+    paths: list[Path] = []
+    for run, gain in (("a", 0.1), (other, 0.2)):
         made = report_log.SyntheticLog()
         made.request("gain", (gain,))
         made.frames(200)
         hour_ns = len(paths) * 3600 * 10**9
-        made.samples = [one._replace(receive_time_ns=one.receive_time_ns + hour_ns) for one in made.samples]
-        monkeypatch.setattr(report_log, "METADATA", {"lowfc": {"run": run}})
-        paths.append(made.write(tmp_path / f"{run}.mcap"))
+        made.samples = [
+            one._replace(publish_time_ns=one.publish_time_ns + hour_ns, receive_time_ns=one.receive_time_ns + hour_ns)
+            for one in made.samples
+        ]
+        part = {"of": f"night-{len(paths)}", "number": "1"}
+        monkeypatch.setattr(report_log, "METADATA", {"lowfc": {"run": run}, "part": part})
+        paths.append(made.write(tmp_path / f"{len(paths)}.mcap"))
     found = workers.replay_files(paths, 0.0, 1, lambda done: None)
-    assert (found.frames, found.unchecked, found.first_difference, found.runs) == (400, 0, None, ["a", "b"])
+    assert (found.frames, found.unchecked, found.first_difference, found.runs) == (400, 0, None, sorted({"a", other}))
 
 
 def test_a_damaged_log_is_replayed_except_for_the_damage(log: Path, tmp_path: Path) -> None:

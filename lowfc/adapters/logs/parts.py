@@ -3,6 +3,7 @@
 import contextlib
 import re
 from collections.abc import Generator, Iterator, Sequence
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -30,27 +31,29 @@ _NAMED = re.compile(r"(\d{8}T\d{6}Z)(?:-(\d+))?(-[a-z].*)?\.mcap(\.part)?", re.A
 
 
 class Repeated:
-    """Detects messages that a file of a log repeats from the previous one at its start: calibrations and states."""
+    """Detects messages that a file of a log repeats from the previous one at its start: calibrations and states.
+
+    A lockstep run has the sequences of another one, but publishes them later.
+    """
 
     def __init__(self) -> None:
-        self._newest: dict[tuple[str, int], int] = {}
-        self._before: dict[tuple[str, int], int] = {}
-        self._run = ""
+        self._newest: dict[tuple[str, int], tuple[int, int]] = {}
+        self._before: dict[tuple[str, int], tuple[int, int]] = {}
 
-    def next_file(self, run: str) -> None:
-        """Begin the next file; a lockstep run has the sequences of another one without repeating its messages."""
-        if run != self._run:
-            self._newest.clear()
-        self._run, self._before = run, dict(self._newest)
+    def next_file(self) -> None:
+        """Begin the next file."""
+        self._before = dict(self._newest)
 
     def __call__(self, message: Sample) -> bool:
         """Whether this message was in a previous file."""
         with contextlib.suppress(KeyError):
             if topic_of(message.key).queryable:
                 publisher = message.key, start_of(message.sequence)  # a topic may have several publishers
-                if message.sequence <= self._before.get(publisher, -1):
+                sequence, publish_ns = self._before.get(publisher, (-1, -1))
+                if message.sequence <= sequence and message.publish_time_ns <= publish_ns:
                     return True
-                self._newest[publisher] = max(message.sequence, self._newest.get(publisher, -1))
+                newest = message.sequence, message.publish_time_ns
+                self._newest[publisher] = max(newest, self._newest.get(publisher, newest), key=itemgetter(1))
         return False
 
 
@@ -90,7 +93,7 @@ class WholeLog(LogReader):
             part = LogReader(path, skip_damaged=self._skip_damaged, **self._options)
             self.parts.append(part)
             self.schemas, self.channels = part.schemas, part.channels
-            repeated.next_file(metadata_at_start(path).get("lowfc", {}).get("run", ""))
+            repeated.next_file()
             try:
                 for message in part:
                     if len(self.described) != len(described) + len(part.described):

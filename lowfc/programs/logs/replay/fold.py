@@ -6,11 +6,12 @@ counts the steps that it could not check.
 """
 
 import contextlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 from google.protobuf.message import DecodeError
 
 from lowfc.adapters.bus.bus import Sample
+from lowfc.adapters.logs.writer import PART
 from lowfc.contract import published
 from lowfc.contract.envelope import start_of
 from lowfc.contract.messages import COMMAND, CONTROL_INPUT, CONTROLLER_STATE, FRAME, REQUEST, STEP, topic_of
@@ -29,7 +30,7 @@ class Replay:
         """Differences up to `tolerance_nm` are ignored: for a log of another processor, or another `kernel`."""
         self.context = Context(tolerance_nm, segment, kernel=kernel)
         self._controllers: dict[int, ControllerReplay] = {}
-        self._run = ""
+        self._recording = "", ""
         self._last_ns = self._begun_ns = self._ended_ns = 0
 
     @property
@@ -37,13 +38,14 @@ class Replay:
         """Time from the first frame of the segment to its last, by their log times."""
         return (self._ended_ns - self._begun_ns) * 1e-9
 
-    def begin_file(self, run: str) -> None:
-        """Begin a file; of another run, whose sequences may be the same, controllers and frames are forgotten."""
-        if run != self._run:
+    def begin_file(self, metadata: Mapping[str, Mapping[str, str]]) -> None:
+        """Begin a file; controllers and frames of another recording are forgotten, as lockstep runs share sequences."""
+        recording = metadata.get("lowfc", {}).get("run", ""), metadata.get(PART, {}).get("of", "")
+        if recording != self._recording:
             self.finish()
             self._controllers.clear()
             self.context.frames = Frames()
-        self._run = run
+        self._recording = recording
 
     def take(self, message: Sample) -> None:
         """Add the next message."""

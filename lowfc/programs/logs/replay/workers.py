@@ -109,7 +109,7 @@ def _replay_segment(
                 if part is not log.parts[-1]:
                     part = log.parts[-1]
                     _refuse_thinned(part)
-                    run.begin_file(part.metadata.get("lowfc", {}).get("run", ""))
+                    run.begin_file(part.metadata)
                     run.context.former = _former(part)
                 run.take(message)
                 if number % _PROGRESS_EVERY == 0:
