@@ -54,6 +54,7 @@ def history_of(night: SyntheticLog, path: Path) -> History:
         lambda step: setattr(step.timestamp, "seconds", -(10**12)),
         lambda step: step.error_nm.append(1.0),
         lambda step: step.pol_nm.pop(),
+        lambda step: setattr(step, "flux_dn", np.inf),
     ],
 )
 def test_an_invalid_step_is_left_out_of_every_column(tmp_path: Path, change: Callable[[Any], object]) -> None:
@@ -109,6 +110,7 @@ def test_a_repeated_reason_sets_one_bit(tmp_path: Path) -> None:
         (MIRROR_STATE, lambda state: state.limits_hit.append(-3)),
         (MIRROR_STATE, lambda state: setattr(state, "actuators", b"\0\0\xc0\x7f" * (state.rows * state.columns))),
         (TRUTH, lambda truth: truth.residual_nm.append(1.0)),
+        (TRUTH, lambda truth: truth.residual_nm.__setitem__(1, -np.inf)),
         (TIMING, lambda timing: timing.compute_ns.append(1)),
         (TIMING, lambda timing: timing.ClearField("frame_sequence")),
     ],

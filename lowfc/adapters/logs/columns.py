@@ -174,8 +174,12 @@ class _Rows(Generic[T]):
         return {}
 
     def values(self) -> T:
-        """Return all rows as arrays."""
-        return self._made(**{name: self._columns.values(name) for name in self._made.__annotations__})
+        """Return the rows as arrays, without those with an infinite value, as the loop never sends it."""
+        columns = {name: self._columns.values(name) for name in self._made.__annotations__}
+        rows = np.ones(len(self), np.bool_)
+        for values in columns.values():
+            rows &= ~np.isinf(values).any(axis=tuple(range(1, values.ndim)))
+        return self._made(**columns if rows.all() else {name: values[rows] for name, values in columns.items()})
 
 
 class StepRows(_Rows[Steps]):

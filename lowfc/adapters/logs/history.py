@@ -347,6 +347,8 @@ class _HistoryBuilder:
         self._set_modes(len(history.calibration.noll) if history.calibration is not None else 0)
         history.stepped_sequence = self._stepped.values("sequence")
         history.steps, history.truths = self._steps.values(), self._truths.values()
+        for rows, kept in ((self._steps, history.steps), (self._truths, history.truths)):
+            history.excluded_messages += len(rows) - len(kept.sequence)
         for name in ("sequence", "publish_time_ns", "stroke_nm", "limits"):
             setattr(history.mirror, name, self._mirror.values(name))
         history.timed_sequence, history.stages_ns = self._timings.values()

@@ -231,12 +231,13 @@ class Accumulator:
             new = self._steps, self._truths, self._timings, self._events
             self._steps, self._truths = StepRows(self._steps.modes), TruthRows(self._truths.modes)
             self._timings, self._events = TimingRows(), []
-        steps, truths, timings, events = new
+        steps, truths, timings, events = new[0].values(), new[1].values(), *new[2:]
+        self.unreadable += len(new[0]) - len(steps.sequence) + len(new[1]) - len(truths.sequence)
         return Snapshot(
             time_ns=self._time_ns(host_ns),
             host_ns=host_ns,
-            steps=steps.values(),
-            truths=truths.values(),
+            steps=steps,
+            truths=truths,
             timings=timings.values()[1],
             frame=frame.pixels if frame is not None else None,
             frame_ns=frame_ns,

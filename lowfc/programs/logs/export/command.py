@@ -141,7 +141,8 @@ def render(results: dict[str, Any]) -> str:
     lines = [f"recorded           {results['selection']}"] if results["selection"] else []
     lines += [f"{', '.join(results['files'])}: {results['steps']} steps of {results['modes']} modes{frames}"]
     if results["steps_left_out"]:
-        lines.append(f"left out           {results['steps_left_out']} steps measured with a calibration of other modes")
+        what = "with the modes of another calibration or impossible values"
+        lines.append(f"left out           {results['steps_left_out']} steps {what}")
     lines += faults(results["damaged"], results["no_end"])
     lines += [f"configuration      {remark}" for remark in results["remarks"]]
     return "\n".join(lines)
