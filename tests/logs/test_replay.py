@@ -17,7 +17,7 @@ from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.process import compiled
 from lowfc.adapters.process.provenance import provenance
 from lowfc.contract.codecs import codec
-from lowfc.contract.codecs.calibration_codec import encode_calibration
+from lowfc.contract.codecs.calibration_codec import encode_calibration, identified
 from lowfc.contract.codecs.law_codec import wire_law, wire_play
 from lowfc.contract.codecs.state_codec import controller_state
 from lowfc.contract.envelope import sequence_of
@@ -44,21 +44,22 @@ from lowfc.control.loop.inputs import Frame, Input, Load, Request
 from lowfc.control.loop.requests import prepared
 from lowfc.control.loop.safety import Limit
 from lowfc.control.loop.state import Settings, State
+from lowfc.programs.logs.replay import former, workers
 from lowfc.programs.logs.replay import frames as frames_of_log
-from lowfc.programs.logs.replay import workers
 from lowfc.programs.logs.replay.account import Account
 from lowfc.programs.logs.replay.controller_replay import PATIENCE_NS, Segment
-from lowfc.programs.logs.replay.fold import replay
+from lowfc.programs.logs.replay.fold import Replay, replay
 from lowfc.programs.logs.replay.frames import Frames
 from tests.support import controller_inputs, report_log
 from tests.support.controller_inputs import TIGHT, inputs
 from tests.support.loops import lowfc
-from tests.support.toy import NOLL, frame, settings
+from tests.support.toy import NOLL, calibration, frame, settings
 
 START_S = 1_767_225_600
 STATE_EVERY = 12
 STEPS = 1000
 EXAMPLES = 40
+SHAPE = np.full(20, 3, np.float32)
 
 
 class Night:
@@ -77,30 +78,31 @@ class Night:
         self.start_s += 1
         self._start()
 
-    def apply(self, input_: Input) -> None:
+    def apply(self, input_: Input, logged: Request | None = None) -> None:
+        """Apply an input and log it; as a former version did with another rule if `logged` differs from it."""
         self.now_ns += 1_000_000
         if isinstance(input_, Frame):
             self._frame(input_)
         if isinstance(input_, Request):
             input_ = prepared(self.loop_settings, input_)
             if input_.law is not None:
-                self._put(LAW, wire_law(input_.law, input_.time_ns).SerializeToString())
+                self.put(LAW, wire_law(input_.law, input_.time_ns).SerializeToString())
             if input_.played is not None:
-                self._put(PLAY, wire_play(input_.played, input_.time_ns).SerializeToString())
+                self.put(PLAY, wire_play(input_.played, input_.time_ns).SerializeToString())
         self.state, outputs = advance(self.loop_settings, self.state, input_)
         number = self.state.input_number
         if outputs.command is not None:
-            self._put(COMMAND, codec.encode_command(outputs.command, 200, "lowfc", number), "dm")
+            self.put(COMMAND, codec.encode_command(outputs.command, 200, "lowfc", number), "dm")
         if outputs.step is not None:
-            self._put(STEP, codec.encode_step(outputs.step, number))
+            self.put(STEP, codec.encode_step(outputs.step, number))
         if isinstance(input_, Request):
             assert outputs.reply is not None
             shown = (
                 controller_state(self.state, self.loop_settings, input_.time_ns) if input_.name == "status" else None
             )
-            self._put(REQUEST, codec.encode_request(input_, outputs.reply, number, shown))
+            self.put(REQUEST, codec.encode_request(logged or input_, outputs.reply, number, shown))
         elif not isinstance(input_, Frame) and number > self._last_number:
-            self._put(CONTROL_INPUT, codec.encode_input(input_, number))
+            self.put(CONTROL_INPUT, codec.encode_input(input_, number))
         self._last_number = number
         if outputs.changed or number % STATE_EVERY == 0:
             self._put_state()
@@ -110,12 +112,12 @@ class Night:
 
     def _start(self) -> None:
         self.state, self._last_number = State(), 0
-        self._put(CALIBRATION, encode_calibration(controller_inputs.CALIBRATION, self.now_ns))
+        self.put(CALIBRATION, encode_calibration(controller_inputs.CALIBRATION, self.now_ns))
         self.apply(Load(self.now_ns, controller_inputs.CALIBRATION, "a test"))
 
     def _put_state(self) -> None:
         message = controller_state(self.state, self.loop_settings, self.now_ns)
-        self._put(CONTROLLER_STATE, message.SerializeToString())
+        self.put(CONTROLLER_STATE, message.SerializeToString())
 
     def _frame(self, input_: Frame) -> None:
         message = RawImage(timestamp=timestamp(input_.time_ns))
@@ -124,7 +126,7 @@ class Night:
         payload = message.SerializeToString()
         self.messages.append(Sample(FRAME.key, payload, input_.sequence, self.now_ns, self.now_ns))
 
-    def _put(self, topic: Topic, payload: bytes, name: str = "") -> None:
+    def put(self, topic: Topic, payload: bytes, name: str = "") -> None:
         key = topic.at(name)
         count = self._counts.get((key, self.start_s), 0)
         self._counts[key, self.start_s] = count + 1
@@ -141,7 +143,7 @@ def night(input_list: list[Input], **changes: object) -> Night:
 
 @pytest.mark.skipif(not compiled.available(), reason="needs the extra `fast`")
 def test_a_log_of_the_fused_kernel_is_replayed_bit_by_bit_with_it_and_with_a_difference_by_numpy() -> None:
-    channel = Request(0, "channel", text="dark-hole", actuators_nm=np.full(20, 3, np.float32))
+    channel = Request(0, "channel", text="dark-hole", actuators_nm=SHAPE)
     law = Request(0, "law", law=integrator([0.3] * 3, [0.0] * 3, NOLL, 2.5, 1000.0))
     input_list = [*frames(60, 1), channel, *frames(100, 61), law, *frames(400, 161)]
     made = night(input_list, kernel=compiled.kernel("fused"), delay_frames=2.5, interlocks=())
@@ -305,6 +307,35 @@ def test_a_recording_that_begins_in_the_middle_of_a_run_lacks_no_input() -> None
     assert account.identical
     assert list(account.unchecked_because) == ["recorded before the first complete state of the controller"]
     assert account.inputs_missing == 0
+
+
+OTHER = identified(calibration(NOLL, 2.0))
+
+
+@pytest.mark.parametrize(
+    ("rule", "logged", "applied"),
+    [
+        (former.GAIN_RULE, Request(0, "gain", values=(0.2,)), Request(0, "gain", values=(0.3,))),
+        (former.GAIN_RULE, Request(0, "leak", values=(0.2,)), Request(0, "leak", values=(0.3,))),
+        (former.CHANNEL_RULE, *(Request(0, "channel", text=name, actuators_nm=SHAPE) for name in "ab")),
+        (former.LOAD_RULE, *(Request(0, "load", calibration=one) for one in (controller_inputs.CALIBRATION, OTHER))),
+    ],
+)
+def test_an_input_of_a_former_version_whose_rule_has_changed_is_named_and_replay_continues(
+    rule: str, logged: Request, applied: Request
+) -> None:
+    made = night([Request(0, "open"), *frames(30)], interlocks=())
+    made.put(CALIBRATION, encode_calibration(OTHER, made.now_ns))
+    made.apply(applied, logged)
+    for one in frames(30, 31):
+        made.apply(one)
+    run = Replay()
+    run.context.former = former.FormerVersion({})
+    for message in made.messages:
+        run.take(message)
+    account = run.finish()
+    assert (account.frames, account.different, account.rules_changed) == (60, 0, {rule: 1})
+    assert replay(made.messages).different  # of this version
 
 
 def tampered(made: Night, topic: Topic, number: int, change: str) -> Account:
