@@ -1,51 +1,18 @@
 """Thinned copies of logs, with the same selection rules as in a recorder."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from mcap.records import Attachment, Metadata
 
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.logs.log_copy import LogCopy, new_log
 from lowfc.adapters.logs.parts import Parts, WholeLog, metadata_at_start
-from lowfc.adapters.logs.recovery import RECOVERY, account, faults, in_words, missing_end_text
+from lowfc.adapters.logs.recovery import RECOVERY, account, missing_parts
 from lowfc.adapters.logs.selection import SELECTION, Selection
 from lowfc.adapters.logs.writer import PART, stem_of
 from lowfc.contract.messages import topic_of
-
-
-@dataclass(frozen=True, slots=True)
-class Thinned:
-    """Result of thinning a log.
-
-    Attributes:
-        file: path of the copy.
-        selection: description of its selection.
-        messages, bytes: number of messages and size of the copy.
-        messages_before, bytes_before: number of messages and size of the log.
-        finished: whether the log had been finished.
-        no_end: why the log has no end; empty if finished.
-        damaged: descriptions of the parts of the log that could not be read.
-    """
-
-    file: str
-    selection: str
-    messages: int
-    bytes: int
-    messages_before: int
-    bytes_before: int
-    finished: bool
-    no_end: str
-    damaged: list[str]
-
-    def __str__(self) -> str:
-        """The result as text."""
-        lines = [
-            f"{self.file}: {self.messages} of {self.messages_before} messages, "
-            f"{self.bytes / 1e6:.1f} of {self.bytes_before / 1e6:.1f} MB; {self.selection or 'nothing was left out'}"
-        ]
-        return "\n".join([*lines, *faults(self.damaged, self.no_end)])
 
 
 def thinned_path(source: Path, requested: Selection) -> Path:
@@ -53,8 +20,10 @@ def thinned_path(source: Path, requested: Selection) -> Path:
     return source.with_name(f"{stem_of(source)}-every-{requested.interval_frames}.mcap")
 
 
-def thin(log: Parts, out: Path, requested: Selection, progress: Callable[[int, int], None] | None = None) -> Thinned:
-    """Write a thinned log from all files of a log; its metadata has the selection.
+def thin(
+    log: Parts, out: Path, requested: Selection, progress: Callable[[int, int], None] | None = None
+) -> dict[str, Any]:
+    """Write a thinned log from all files of a log, with its selection in the metadata; return the results for JSON.
 
     Raises:
         DataFileError: a file is not a log, `out` exists already, or it cannot be written.
@@ -86,14 +55,12 @@ def thin(log: Parts, out: Path, requested: Selection, progress: Callable[[int, i
         if not reader.complete or reader.damage or reader.unreadable:
             copy.note(RECOVERY, account(reader, copy.messages))
         copy.finish()
-    return Thinned(
-        str(out),
-        combined.description,
-        copy.messages,
-        out.stat().st_size,
-        messages,
-        reader.size,
-        reader.finished,
-        missing_end_text(log, finished=reader.finished),
-        [in_words(one) for one in reader.damage],
-    )
+    return {
+        "file": str(out),
+        "selection": combined.description,
+        "messages": copy.messages,
+        "bytes": out.stat().st_size,
+        "messages_before": messages,
+        "bytes_before": reader.size,
+        **missing_parts(reader),
+    }

@@ -1,7 +1,6 @@
 """The command `lowfc export`: convert a log for other tools."""
 
 import contextlib
-import dataclasses
 from collections.abc import Callable
 from enum import StrEnum
 from functools import partial
@@ -79,7 +78,7 @@ def export(
             chosen = selection(decimate, topics or ())
             with reading_bar(console) as count:
                 done = thin(log, out or thinned_path(log[0], chosen), chosen, partial(count, "copying"))
-            print_result(dataclasses.asdict(done), str(done), as_json=as_json)
+            print_result(done, render_copy(done), as_json=as_json)
         else:
             results = export_log(log, to or Format.FITS, out, frames=frames, force=force, console=console)
             print_result(results, render(results), as_json=as_json)
@@ -146,6 +145,18 @@ def render(results: dict[str, Any]) -> str:
     lines += faults(results["damaged"], results["no_end"])
     lines += [f"configuration      {remark}" for remark in results["remarks"]]
     return "\n".join(lines)
+
+
+def render_copy(results: dict[str, Any]) -> str:
+    """Summary of a smaller log as text."""
+    from lowfc.adapters.logs.recovery import faults
+
+    copied = (
+        f"{results['file']}: {results['messages']} of {results['messages_before']} messages, "
+        f"{results['bytes'] / 1e6:.1f} of {results['bytes_before'] / 1e6:.1f} MB; "
+        f"{results['selection'] or 'nothing was left out'}"
+    )
+    return "\n".join([copied, *faults(results["damaged"], results["no_end"])])
 
 
 def _writer(to: Format, *, with_frames: bool) -> "Callable[[list[Path], History], None]":
