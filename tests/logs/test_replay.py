@@ -2,8 +2,10 @@
 
 import json
 from collections import Counter
+from collections.abc import Iterable
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -44,11 +46,12 @@ from lowfc.control.loop.inputs import Frame, Input, Load, Request
 from lowfc.control.loop.requests import prepared
 from lowfc.control.loop.safety import Limit
 from lowfc.control.loop.state import Settings, State
-from lowfc.programs.logs.replay import former, workers
 from lowfc.programs.logs.replay import frames as frames_of_log
+from lowfc.programs.logs.replay import workers
 from lowfc.programs.logs.replay.account import Account
 from lowfc.programs.logs.replay.controller_replay import PATIENCE_NS, Segment
-from lowfc.programs.logs.replay.fold import Replay, replay
+from lowfc.programs.logs.replay.fold import Replay
+from lowfc.programs.logs.replay.former import CHANNEL_RULE, GAIN_RULE, LOAD_RULE, FormerVersion
 from lowfc.programs.logs.replay.frames import Frames
 from tests.support import controller_inputs, report_log
 from tests.support.controller_inputs import TIGHT, inputs
@@ -132,6 +135,19 @@ class Night:
         self._counts[key, self.start_s] = count + 1
         sequence = sequence_of(self.start_s, count)
         self.messages.append(Sample(key, payload, sequence, self.now_ns, self.now_ns))
+
+
+def replay(
+    messages: Iterable[Sample], tolerance_nm: float = 0.0, former: FormerVersion | None = None, **options: Any
+) -> Account:
+    """Replay messages, those of a former version as its log does."""
+    run = Replay(tolerance_nm, **options)
+    run.context.former = former
+    for message in messages:
+        run.take(message)
+        if run.done:
+            break
+    return run.finish()
 
 
 def night(input_list: list[Input], **changes: object) -> Night:
@@ -315,10 +331,10 @@ OTHER = identified(calibration(NOLL, 2.0))
 @pytest.mark.parametrize(
     ("rule", "logged", "applied"),
     [
-        (former.GAIN_RULE, Request(0, "gain", values=(0.2,)), Request(0, "gain", values=(0.3,))),
-        (former.GAIN_RULE, Request(0, "leak", values=(0.2,)), Request(0, "leak", values=(0.3,))),
-        (former.CHANNEL_RULE, *(Request(0, "channel", text=name, actuators_nm=SHAPE) for name in "ab")),
-        (former.LOAD_RULE, *(Request(0, "load", calibration=one) for one in (controller_inputs.CALIBRATION, OTHER))),
+        (GAIN_RULE, Request(0, "gain", values=(0.2,)), Request(0, "gain", values=(0.3,))),
+        (GAIN_RULE, Request(0, "leak", values=(0.2,)), Request(0, "leak", values=(0.3,))),
+        (CHANNEL_RULE, *(Request(0, "channel", text=name, actuators_nm=SHAPE) for name in "ab")),
+        (LOAD_RULE, *(Request(0, "load", calibration=one) for one in (controller_inputs.CALIBRATION, OTHER))),
     ],
 )
 def test_an_input_of_a_former_version_whose_rule_has_changed_is_named_and_replay_continues(
@@ -329,11 +345,7 @@ def test_an_input_of_a_former_version_whose_rule_has_changed_is_named_and_replay
     made.apply(applied, logged)
     for one in frames(30, 31):
         made.apply(one)
-    run = Replay()
-    run.context.former = former.FormerVersion({})
-    for message in made.messages:
-        run.take(message)
-    account = run.finish()
+    account = replay(made.messages, former=FormerVersion({}))
     assert (account.frames, account.different, account.rules_changed) == (60, 0, {rule: 1})
     assert replay(made.messages).different  # of this version
 

@@ -6,7 +6,7 @@ counts the steps that it could not check.
 """
 
 import contextlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 
 from google.protobuf.message import DecodeError
 
@@ -86,15 +86,3 @@ class Replay:
         if start_s not in self._controllers:
             self._controllers[start_s] = ControllerReplay(self.context, message.receive_time_ns)
         return self._controllers[start_s]
-
-
-def replay(
-    messages: Iterable[Sample], tolerance_nm: float = 0.0, segment: Segment = WHOLE, kernel: str = ""
-) -> Account:
-    """Replay a log's messages from beginning to end, or a segment of them."""
-    run = Replay(tolerance_nm, segment, kernel)
-    for message in messages:
-        run.take(message)
-        if run.done:
-            break
-    return run.finish()
