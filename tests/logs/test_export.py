@@ -20,14 +20,16 @@ from rich.console import Console
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.recovery import in_words
 from lowfc.arrays import Array
-from lowfc.contract.codecs.calibration_codec import identified
+from lowfc.contract.codecs.calibration_codec import identified, wire_camera
 from lowfc.contract.codecs.codec import decode_frame
+from lowfc.contract.codecs.state_codec import calibration_in_use
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.envelope import count_of
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.messages import (
     CALIBRATION,
     COMMAND,
+    CONTROLLER_STATE,
     FRAME,
     MIRROR_STATE,
     STEP,
@@ -37,6 +39,7 @@ from lowfc.contract.messages import (
     Topic,
     from_timestamp,
     image,
+    wire,
 )
 from lowfc.programs.logs.export.command import Format, export_log, render
 from tests.support import toy
@@ -211,12 +214,19 @@ def test_aot(log: Path, tmp_path: Path) -> None:
     assert json.loads(system.config) == Configuration().model_dump()
 
 
-def test_the_gains_of_an_integrator_that_a_linear_law_replaces_are_not_in_aot(tmp_path: Path) -> None:
+def test_aot_has_the_weighted_reconstructor_and_no_gains_that_a_linear_law_replaces(tmp_path: Path) -> None:
     night = a_night()
     night.law(0.1)
+    state = wire.ControllerState.FromString(payloads_of(night, CONTROLLER_STATE)[-1])
+    state.prior_nm2[:], state.weighting_flux_dn = [0, 0, 16], toy.FLUX_DN
+    state.camera_expected.CopyFrom(wire_camera(toy.CAMERA))
+    night.put(CONTROLLER_STATE, state)
     export_log(night.write(tmp_path / "x.mcap"), Format.AOT, path := tmp_path / "x.fits", frames=False, console=QUIET)
     (loop,) = aotpy.AOSystem.read_from_file(path).loops
     assert (loop.delay, loop.time_filter_num, loop.time_filter_den) == (1.25, None, None)
+    weighted = calibration_in_use(state, CALIBRATED).reconstructor[:, None, GOOD]
+    np.testing.assert_array_equal(loop.measurements_to_modes.data, weighted)
+    assert np.abs(weighted[:2, 0] - CALIBRATED.reconstructor[:2, GOOD]).max() > 0.1
 
 
 @pytest.mark.parametrize("to", list(Format))

@@ -16,7 +16,8 @@ AOT describes a telescope with a Shack-Hartmann or pyramid sensor. A log is mapp
       modal_coefficients  measured modal error, nm rms of wavefront; NaN if the frame was refused
       commands            surface at each actuator as sent, m; NaN if the log has no command for this frame
       modes               Zernike polynomials in Noll's order, over the circle
-      measurements_to_modes, modes_to_measurements, modes_to_commands: R, H and MODES2ACT
+      measurements_to_modes, modes_to_measurements, modes_to_commands: R (at the end of the log, as automatic gains
+                          weighted it), H and MODES2ACT
       time_filter_num, _den: the integrator g / (z - (1 - leak)) of each mode, at the end of the log
       delay               from mid-exposure to the middle of the command's period: delay_frames + (1 - exposure /
                           period) / 2
@@ -41,6 +42,7 @@ from lowfc.adapters.files.fits_file import header_text
 from lowfc.adapters.logs.history import History
 from lowfc.arrays import Single
 from lowfc.contract.codecs.codec import actuators
+from lowfc.contract.codecs.state_codec import calibration_in_use
 from lowfc.contract.envelope import count_of
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import COMMAND, wire
@@ -156,7 +158,7 @@ class _System:
             timestamps=(steps.time_ns / 1e9).tolist(),
             frame_numbers=[float(count_of(int(sequence))) for sequence in steps.sequence],
         )
-        good = self._good
+        good, in_use = self._good, calibration if state is None else calibration_in_use(state, calibration)
         loop = aotpy.ControlLoop(
             uid="loop",
             input_sensor=sensor,
@@ -166,7 +168,7 @@ class _System:
             framerate=self._history.rate_hz,
             modes=aotpy.Image("MODES", _modes(calibration.noll)),
             modal_coefficients=aotpy.Image("MODAL ERROR", steps.error_nm, "nm", time=clock),
-            measurements_to_modes=aotpy.Image("R", calibration.reconstructor[:, None, good], "nm"),
+            measurements_to_modes=aotpy.Image("R", in_use.reconstructor[:, None, good], "nm"),
             modes_to_measurements=aotpy.Image("H", calibration.response[good][:, None, :], "nm-1"),
             modes_to_commands=aotpy.Image("MODES2ACT", calibration.modes_to_actuators * np.float32(_NM), "m nm-1"),
         )
