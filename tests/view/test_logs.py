@@ -327,10 +327,14 @@ def test_a_log_of_a_simulated_run_is_drawn_without_a_runtime_directory(
 def test_logs_of_two_runs_are_not_drawn_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     logs = [night(120).write(tmp_path / f"{name}.mcap") for name in "ab"]
     assert drawn(*logs)[0].snapshots > 0
+    lockstep = night(120)
+    lockstep.samples = [one._replace(publish_time_ns=one.publish_time_ns + 10**9) for one in lockstep.samples]
+    others = [lockstep.write(tmp_path / "c.mcap")]
     monkeypatch.setitem(report_log.METADATA["lowfc"], "run", "another")
-    other = night(120).write(tmp_path / "c.mcap")
-    with pytest.raises(DataFileError, match="one run at a time"):
-        drawn(logs[0], other)
+    others.append(night(120).write(tmp_path / "d.mcap"))
+    for other in others:
+        with pytest.raises(DataFileError, match="one run at a time"):
+            drawn(logs[0], other)
 
 
 # Events from before the start of the view.

@@ -15,7 +15,7 @@ from lowfc.adapters.logs.writer import PART
 from lowfc.adapters.process.clock import SIMULATED_START_NS
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
-from lowfc.contract.messages import MIRROR_STATE, topic_of, wire
+from lowfc.contract.messages import FRAME, MIRROR_STATE, topic_of, wire
 from lowfc.control.loop.wording import counted
 from lowfc.programs.view.renderer import Renderer
 from lowfc.programs.view.snapshot import PICTURES_HZ, PICTURES_PER_COMPLETE, SHOWN, Accumulator, LogEnd
@@ -52,6 +52,7 @@ def draw_logs(
     drawn, accumulator = Drawn(), Accumulator()
     renderer: Renderer | None = None
     due_ns = first_ns = last_ns = earlier_bytes = 0
+    newest_frame = last_frame = -1, 0  # sequence and publish time, so far and in the logs before
     damaged, no_end, run, host = 0, "", "", ""
     stroke_nm: float | None = None
     lost: dict[str, int] = {}  # by recording; the account of its last file is that of all
@@ -75,11 +76,19 @@ def draw_logs(
                     raise DataFileError(
                         f"{log} is of run {run!r}, and the log before it of {previous_run!r}: show one run at a time"
                     )
+            topic = topic_of(message.key)
+            if topic is FRAME:
+                sent = message.sequence, message.publish_time_ns
+                if sent[0] <= last_frame[0] and sent[1] > last_frame[1]:
+                    raise DataFileError(
+                        f"{log} repeats frame numbers of the log before it, as another lockstep run: show one run at a "
+                        "time"
+                    )
+                newest_frame = max(newest_frame, sent)
             if message.receive_time_ns > LAST_NS:
                 accumulator.unreadable += 1
                 continue
             accumulator.add(message)
-            topic = topic_of(message.key)
             if topic is MIRROR_STATE:
                 with contextlib.suppress(DecodeError):
                     used_nm = stroke_used_nm(wire.MirrorState.FromString(message.payload))
@@ -96,7 +105,7 @@ def draw_logs(
                 due_ns = last_ns + _PERIOD_NS
             if number % _STRIDE == 0:
                 progress(earlier_bytes + reader.position)
-        earlier_bytes += reader.size
+        earlier_bytes, last_frame = earlier_bytes + reader.size, newest_frame
         damaged += len(reader.damage)
         drawn.remarks += [f"{log.name}: left out {in_words(damage)}" for damage in reader.damage]
         if missing := missing_end_text([log], finished=reader.finished):
