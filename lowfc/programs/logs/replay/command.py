@@ -31,7 +31,7 @@ def _host_differs(there: dict[str, str]) -> dict[str, tuple[str, str]]:
 def replay_log(
     logs: Logs,
     tolerance: Annotated[
-        float, typer.Option(min=0, help="Largest difference to ignore, nm: for a log from another processor.")
+        float, typer.Option(min=0, max=1e9, help="Largest difference to ignore, nm: for a log from another processor.")
     ] = 0.0,
     jobs: Annotated[
         int | None, typer.Option(min=1, help="Largest number of processes; default: one per processor.")
