@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import os
 import struct
 from itertools import pairwise
 from pathlib import Path
@@ -29,6 +30,9 @@ from tests.support.mutated_logs import (
     MISPLACED,
     MUTATIONS,
     boundaries,
+    changed,
+    chunks_of,
+    flipped,
     identity,
     mutations,
     small_log,
@@ -54,8 +58,8 @@ def test_a_damaged_log_yields_no_false_message_and_no_silent_loss(tmp_path: Path
     data = small_log(tmp_path / "whole.mcap", finished=finished).read_bytes()
     assert len(boundaries(data)) > 50
     path, delivered = tmp_path / "mutated.mcap", 0
-    for number, kind, changed in mutations(data, range(finished, MUTATIONS, 2)):
-        path.write_bytes(changed)
+    for number, kind, content in mutations(data, range(finished, MUTATIONS, 2)):
+        path.write_bytes(content)
         case = f"mutation {number}: {kind}"
         strictly, refusal = read_of(LogReader(path))
         reader = LogReader(path, skip_damaged=True)
@@ -189,11 +193,11 @@ def test_only_the_damaged_chunk_of_a_rewritten_log_is_lost(
     tmp_path: Path, source: Path, compression: CompressionType, at: int, finished: bool
 ) -> None:
     path = rewritten(source, tmp_path / "rewritten.mcap", {"compression": compression})
-    data = bytearray(path.read_bytes())
-    chunks = [(a, b) for a, b in pairwise(boundaries(data)) if data[a] == Opcode.CHUNK]
+    chunks = chunks_of(path)
     assert len(chunks) > 10
-    data[chunks[5][0] + at] ^= 0xFF
-    path.write_bytes(data if finished else data[: chunks[-1][1]])
+    if not finished:
+        os.truncate(path, chunks[-1][1])
+    changed(path, chunks[5][0] + at, b"\xff")
     reader = LogReader(path, skip_damaged=True)
     read = identity(list(reader))
     assert set(SENT).issuperset(read)
@@ -218,10 +222,8 @@ def test_a_summary_without_checksum_is_used_up_to_a_damaged_record(
     tmp_path: Path, source: Path, opcode: Opcode, at: int, new: bytes
 ) -> None:
     path = rewritten(source, tmp_path / "rewritten.mcap", NO_CRCS)
-    data = bytearray(path.read_bytes())
-    begin = next(one for one in boundaries(data) if data[one] == opcode)
-    data[begin + at : begin + at + len(new)] = new
-    path.write_bytes(data)
+    data = path.read_bytes()
+    changed(path, next(one for one in boundaries(data) if data[one] == opcode) + at, new)
     assert sorted(identity(list(LogReader(path)))) == sorted(SENT)
     with LogFile(path) as file:
         assert list(file.index()) == []
@@ -256,10 +258,9 @@ def test_another_file_after_a_log_is_damage(source: Path) -> None:
 
 
 def test_a_message_index_of_an_impossible_length_is_damage_for_a_sparse_reader_too(source: Path) -> None:
-    data = bytearray(source.read_bytes())
+    data = source.read_bytes()
     begin = next(one for one in boundaries(data) if data[one] == Opcode.MESSAGE_INDEX)
-    data[begin + 1 : begin + 9] = (1 << 63).to_bytes(8, "little")
-    source.write_bytes(data)
+    changed(source, begin + 1, (1 << 63).to_bytes(8, "little"))
     reader = LogReader(source, topics=(STEP,), sparse=True, skip_damaged=True)
     assert sum(1 for _ in reader)
     assert [one.why for one in reader.damage] == ["a record has an impossible length"]
@@ -269,13 +270,11 @@ def test_unchunked_messages_are_covered_by_the_data_checksum_and_read_up_to_a_tr
     tmp_path: Path, source: Path
 ) -> None:
     path = rewritten(source, tmp_path / "rewritten.mcap", NO_CHUNKS | {"enable_data_crcs": True})
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 1
-    path.write_bytes(data)
+    flipped(path, middle := path.stat().st_size // 2)
     reader = LogReader(path, skip_damaged=True)
     assert len(list(reader)) == len(SENT)
     assert [one.why.partition(",")[0] for one in reader.damage] == ["its parts are intact"]
-    path.write_bytes(data[: len(data) // 2])
+    os.truncate(path, middle)
     reader = LogReader(path)
     read = identity(list(reader))
     assert len(SENT) / 4 < len(read) < len(SENT)

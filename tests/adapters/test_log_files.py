@@ -9,7 +9,6 @@ from typing import Any
 import lz4.frame
 import pytest
 from mcap.data_stream import RecordBuilder
-from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Attachment as AttachmentRecord
 from mcap.records import Channel, Chunk, McapRecord, Message, Metadata, Schema
@@ -30,7 +29,9 @@ from tests.support.mutated_logs import (
     METADATA,
     START_NS,
     START_S,
-    boundaries,
+    changed,
+    chunks_of,
+    flipped,
     identity,
     small_log,
     small_samples,
@@ -106,23 +107,6 @@ def test_a_truncated_log_yields_its_complete_chunks(tmp_path: Path) -> None:
     assert found == sorted(found)
     assert (found[0], found[-1]) == (0, len(SENT))
     assert len(set(found)) > 3
-
-
-def chunks_of(path: Path) -> list[tuple[int, int]]:
-    starts = boundaries(data := path.read_bytes())
-    return [(a, b) for a, b in pairwise(starts) if data[a] == Opcode.CHUNK]
-
-
-def changed(path: Path, at: int, new: bytes) -> Path:
-    data = bytearray(path.read_bytes())
-    assert data[at : at + len(new)] != new
-    data[at : at + len(new)] = new
-    path.write_bytes(data)
-    return path
-
-
-def flipped(path: Path, at: int, bit: int = 0) -> Path:
-    return changed(path, at, bytes([path.read_bytes()[at] ^ 1 << bit]))
 
 
 def crafted(path: Path, *records: McapRecord) -> Path:

@@ -44,6 +44,7 @@ from lowfc.contract.messages import (
 from lowfc.programs.logs.export.command import Format, export_log, render
 from tests.support import toy
 from tests.support.loops import lowfc
+from tests.support.mutated_logs import flipped
 from tests.support.report_log import METADATA, SyntheticLog
 
 STEPS, REFUSED, WITHOUT_COMMAND, WITHOUT_TRUTH = 30, 4, 7, 9
@@ -248,9 +249,7 @@ def test_damage_is_reported_with_its_place_and_reason(tmp_path: Path) -> None:
     night = SyntheticLog()
     night.frames(1500)
     log = night.write(tmp_path / "night.mcap")
-    content = bytearray(log.read_bytes())
-    content[len(content) // 3] ^= 0xFF
-    log.write_bytes(content)
+    flipped(log, log.stat().st_size // 3)
     results = export_log(log, Format.NPZ, tmp_path / "out.npz", console=QUIET)
     reader = LogReader(log, skip_damaged=True)
     assert sum(1 for _ in reader)

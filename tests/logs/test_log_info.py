@@ -13,6 +13,7 @@ from lowfc.contract.errors import DataFileError
 from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import CALIBRATION, CONTROLLER_STATE, EVENT, FRAME, HEALTH, STEP, Message, wire
 from tests.support.loops import lowfc
+from tests.support.mutated_logs import flipped
 
 START_S = 1_767_225_600  # 2026-01-01T00:00:00Z
 START_NS = START_S * 10**9
@@ -123,7 +124,7 @@ def test_the_text_has_the_same_numbers(log: Path) -> None:
 
 
 def test_truncated_and_damaged_logs_are_reported(log: Path) -> None:
-    data = bytearray(log.read_bytes())
+    data = log.read_bytes()
     log.write_bytes(data[:-500])
     recover(log, recovered := log.with_name("recovered.mcap"))
     text = lowfc("info", recovered).stdout
@@ -132,8 +133,8 @@ def test_truncated_and_damaged_logs_are_reported(log: Path) -> None:
     assert done.exit_code == 0
     assert "truncated" in done.stdout
     assert json.loads(lowfc("info", log, "--json").stdout)["state"] == "truncated"
-    data[data.index(b"[loop]")] ^= 1
     log.write_bytes(data)
+    flipped(log, data.index(b"[loop]"))
     done = lowfc("info", log)
     assert done.exit_code == 0
     assert "damaged; `lowfc recover` saves the intact messages" in done.stdout

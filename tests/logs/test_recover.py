@@ -12,7 +12,7 @@ from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.recovery import recover, recovered_path
 from lowfc.contract.errors import DataFileError
 from tests.support.loops import lowfc
-from tests.support.mutated_logs import ATTACHMENTS, identity, mutations, small_log, small_samples
+from tests.support.mutated_logs import ATTACHMENTS, flipped, identity, mutations, small_log, small_samples
 from tests.support.other_readers import foxglove, rerun
 
 MUTATIONS = 120  # of complete and of unfinished logs together
@@ -109,10 +109,7 @@ def test_an_unfinished_log_is_completed(tmp_path: Path) -> None:
 
 def test_parts_left_out_are_reported(tmp_path: Path) -> None:
     path = small_log(tmp_path / "night.mcap")
-    data = bytearray(path.read_bytes())
-    middle = len(data) // 2
-    data[middle] ^= 1
-    path.write_bytes(data)
+    flipped(path, middle := path.stat().st_size // 2)
     out = tmp_path / "else" / "saved.mcap"
     out.parent.mkdir()
     done = lowfc("recover", path, "--out", out)

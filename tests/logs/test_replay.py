@@ -1,6 +1,7 @@
 """Replay confirms identical results, reports differences, and counts the steps that it cannot check."""
 
 import json
+import shutil
 from collections import Counter
 from collections.abc import Iterable
 from itertools import pairwise
@@ -12,7 +13,6 @@ import pytest
 from hypothesis import given
 from hypothesis import settings as effort
 from hypothesis import strategies as st
-from mcap.reader import make_reader
 
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.logs.reader import LogReader
@@ -56,6 +56,7 @@ from lowfc.programs.logs.replay.frames import Frames
 from tests.support import controller_inputs, report_log
 from tests.support.controller_inputs import TIGHT, inputs
 from tests.support.loops import lowfc
+from tests.support.mutated_logs import chunks_of, flipped
 from tests.support.toy import NOLL, calibration, frame, settings
 
 START_S = 1_767_225_600
@@ -499,30 +500,24 @@ def test_two_lockstep_runs_with_the_same_sequences_are_replayed_apart(
 
 
 def test_a_damaged_log_is_replayed_except_for_the_damage(log: Path, tmp_path: Path) -> None:
-    damaged = bytearray(log.read_bytes())
-    with log.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None
-    chunk = summary.chunk_indexes[len(summary.chunk_indexes) // 2]
-    damaged[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 0x40
-    (tmp_path / "damaged.mcap").write_bytes(damaged)
-    found = workers.replay_files([tmp_path / "damaged.mcap"], 0.0, 1, lambda done: None)
-    steps = len(list(LogReader(tmp_path / "damaged.mcap", topics=[STEP], skip_damaged=True)))
+    log = Path(shutil.copy(log, tmp_path))
+    chunks = chunks_of(log)
+    flipped(log, sum(chunks[len(chunks) // 2]) // 2)
+    found = workers.replay_files([log], 0.0, 1, lambda done: None)
+    steps = len(list(LogReader(log, topics=[STEP], skip_damaged=True)))
     assert found.identical
     assert len(found.damaged) == 1
     assert found.frames + found.unchecked == steps < STEPS
     assert found.inputs_missing == STEPS - steps
-    text = lowfc("replay", tmp_path / "damaged.mcap").stdout
+    text = lowfc("replay", log).stdout
     assert "unchecked" in text
     assert "damaged" in text
-    assert "damaged            left out: at byte" in lowfc("latency", tmp_path / "damaged.mcap").stdout
+    assert "damaged            left out: at byte" in lowfc("latency", log).stdout
 
 
 def test_a_finished_log_with_a_damaged_summary_is_not_called_cut_off(log: Path, tmp_path: Path) -> None:
-    content = bytearray(log.read_bytes())
-    content[-100] ^= 0x40
-    (tmp_path / "night.mcap").write_bytes(content)
-    found = json.loads(lowfc("replay", tmp_path / "night.mcap", "--json").stdout)
+    log = flipped(Path(shutil.copy(log, tmp_path)), -100)
+    found = json.loads(lowfc("replay", log, "--json").stdout)
     assert (found["identical"], found["frames"]) == (True, STEPS)
     assert (found["complete"], found["no_end"]) == (False, "")
 

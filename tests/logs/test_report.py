@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -25,6 +26,7 @@ from lowfc.programs.logs.report.results import report_of
 from lowfc.programs.logs.report.source import read_run
 from tests.support import report_log
 from tests.support.loops import lowfc
+from tests.support.mutated_logs import flipped
 from tests.support.report_log import READ_NOISE_E, TOYS, SyntheticLog
 from tests.support.theory import noise_gain, rejection
 
@@ -194,10 +196,7 @@ def good(good_night: SyntheticLog, tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 def damaged(good: Path, folder: Path) -> Path:
-    content = bytearray(good.read_bytes())
-    content[len(content) // 2] ^= 0xFF
-    (folder / "x.mcap").write_bytes(content)
-    return folder / "x.mcap"
+    return flipped(Path(shutil.copy(good, folder)), good.stat().st_size // 2)
 
 
 def cut_off(good: Path, folder: Path) -> Path:

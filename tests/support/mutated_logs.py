@@ -9,6 +9,7 @@ from random import Random
 import numpy as np
 from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.message import Message
+from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from lowfc.adapters.bus.bus import Sample
@@ -71,6 +72,27 @@ def boundaries(data: bytes) -> list[int]:
     while found[-1] + 9 <= len(data) - len(MAGIC) * data.endswith(MAGIC):
         found.append(found[-1] + 9 + struct.unpack_from("<Q", data, found[-1] + 1)[0])
     return found
+
+
+def chunks_of(path: Path) -> list[tuple[int, int]]:
+    """First byte and end of each chunk of a log."""
+    starts = boundaries(data := path.read_bytes())
+    return [(a, b) for a, b in pairwise(starts) if data[a] == Opcode.CHUNK]
+
+
+def changed(path: Path, at: int, new: bytes) -> Path:
+    """Replace bytes of a file; `at` may be negative, from its end."""
+    data = bytearray(path.read_bytes())
+    at %= len(data)
+    assert data[at : at + len(new)] != new
+    data[at : at + len(new)] = new
+    path.write_bytes(data)
+    return path
+
+
+def flipped(path: Path, at: int, bit: int = 0) -> Path:
+    """Flip a bit of a file."""
+    return changed(path, at, bytes([path.read_bytes()[at] ^ 1 << bit]))
 
 
 def mutated(data: bytes, number: int) -> tuple[str, bytes]:

@@ -9,7 +9,6 @@ import pytest
 import rerun.blueprint as rrb
 
 from lowfc.adapters.logs.reader import LogReader
-from lowfc.adapters.logs.records import LogFile
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import (
@@ -37,6 +36,7 @@ from lowfc.programs.view.verdicts import span_means
 from lowfc.programs.view.verdicts.span_means import SpanMeans
 from lowfc.programs.view.verdicts.tile import Level, Verdict
 from tests.support import report_log
+from tests.support.mutated_logs import chunks_of, flipped
 from tests.support.report_log import SyntheticLog
 from tests.support.stage import Tape, accumulated, snapshot_of, tile, values_of
 
@@ -260,14 +260,11 @@ def test_a_damaged_log_is_drawn_and_the_remark_names_the_place_the_reason_and_th
     tmp_path: Path, shown: Shown
 ) -> None:
     log = night(1500).write(tmp_path / "night.mcap")
-    content = bytearray(log.read_bytes())
-    with LogFile(log) as file:
-        _, chunk, *_ = file.index()
-    content[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 0xFF
-    log.write_bytes(content)
+    _, (begin, end), *_ = chunks_of(log)
+    flipped(log, (begin + end) // 2)
     [remark] = drawn(log)[0].remarks
     assert (tile(shown[-1], "LOG").value, tile(shown[-1], "LOG").level) == ("DAMAGED", Level.WARNING)
-    place = rf"left out at byte {chunk.chunk_start_offset}, \d+ bytes"
+    place = rf"left out at byte {begin}, \d+ bytes"
     reason = "(the checksum of a chunk is wrong|a chunk cannot be decompressed)"
     assert re.fullmatch(rf"night\.mcap: {place}: {reason}; 0\.\d+ s between the messages around it", remark)
 
