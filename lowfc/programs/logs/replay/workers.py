@@ -110,7 +110,8 @@ def _replay_segment(
                     part = log.parts[-1]
                     _refuse_thinned(part)
                     run.begin_file(part.metadata)
-                    run.context.former = _former(part)
+                    former = part.metadata.get("lowfc", {}).get("lowfc", __version__) != __version__
+                    run.context.former = FormerVersion(part.schemas) if former else None
                 run.take(message)
                 if number % _PROGRESS_EVERY == 0:
                     progress(log.position)
@@ -135,11 +136,3 @@ def _refuse_thinned(reader: LogReader) -> None:
             f"{reader.path} cannot be replayed, because it does not have every frame ({reader.selection.description}): "
             "steps are recomputed from the frames; use `lowfc what-if` or `lowfc report`"
         )
-
-
-def _former(reader: LogReader) -> FormerVersion | None:
-    """Fields to compare in a log of another version; None for a log of this version."""
-    version = reader.metadata.get("lowfc", {}).get("lowfc", __version__)
-    if version == __version__:
-        return None
-    return FormerVersion(reader.schemas)
