@@ -24,6 +24,7 @@ from lowfc.programs.logs.report import closed_loop, drawings
 from lowfc.programs.logs.report.page import NOT_HERE, page
 from lowfc.programs.logs.report.results import report_of
 from lowfc.programs.logs.report.source import read_run
+from lowfc.programs.logs.report.verdict import verdict
 from tests.support import report_log
 from tests.support.loops import lowfc
 from tests.support.mutated_logs import flipped
@@ -248,6 +249,13 @@ def test_the_noise_is_that_of_the_reconstructor_in_use(tmp_path: Path) -> None:
     assert after is not None
     assert (after.total_nm[:2] < 0.99 * before.total_nm[:2]).any()
     assert after.total_nm[2] == before.total_nm[2]
+
+
+def test_a_limit_of_mirror_and_controller_has_the_larger_count(good: Path) -> None:
+    found = results(good)
+    found["mirror"] |= {"limits_at_mirror": {"stroke": 50, "slew": 2}, "limits_at_controller": {"stroke": 1, "slew": 3}}
+    check = next(check for check in verdict(found)["checks"] if check["name"] == "mirror")
+    assert check["text"] == "limits acted: stroke 50, slew 3"
 
 
 def test_only_the_end_of_a_very_long_stretch_is_analysed(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:

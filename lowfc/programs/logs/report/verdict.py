@@ -1,5 +1,6 @@
 """Verdict on a run, in a few lines."""
 
+from collections import Counter
 from collections.abc import Mapping
 
 from lowfc.contract.messages import CALIBRATION, STEP
@@ -137,7 +138,7 @@ def _frames(results: Results) -> Results:
 
 def _mirror(results: Results) -> Results:
     mirror = results["mirror"]
-    limits = {**mirror["limits_at_mirror"], **mirror["limits_at_controller"]}
+    limits = Counter(mirror["limits_at_mirror"]) | Counter(mirror["limits_at_controller"])  # the larger of both
     if limits:
         return _check("mirror", LOOK, f"limits acted: {_listed(limits)}")
     share = mirror["stroke_most_share"]
