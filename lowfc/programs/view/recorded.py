@@ -14,6 +14,7 @@ from lowfc.adapters.logs.recovery import in_words, missing_end_text
 from lowfc.adapters.logs.writer import PART
 from lowfc.adapters.process.clock import SIMULATED_START_NS
 from lowfc.contract.configuration import Configuration
+from lowfc.contract.envelope import start_of
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import FRAME, MIRROR_STATE, topic_of, wire
 from lowfc.control.loop.wording import counted
@@ -79,7 +80,8 @@ def draw_logs(
             topic = topic_of(message.key)
             if topic is FRAME:
                 sent = message.sequence, message.publish_time_ns
-                if sent[0] <= last_frame[0] and sent[1] > last_frame[1]:
+                same_start = start_of(sent[0]) == start_of(max(last_frame[0], 0))
+                if same_start and sent[0] <= last_frame[0] and sent[1] > last_frame[1]:
                     raise DataFileError(
                         f"{log} repeats frame numbers of the log before it, as another lockstep run: show one run at a "
                         "time"
