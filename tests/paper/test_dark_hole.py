@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lowfc.contract.configuration import load
-from lowfc.contract.errors import RequestRefusedError
+from lowfc.contract.errors import LowfcError, RequestRefusedError
 from lowfc.control.loop.inputs import Step
 from lowfc.programs.paper import dark_hole
 from lowfc.programs.paper.dark_hole import PLAIN, SHIFTED
@@ -56,16 +56,28 @@ class LoggedLoop(InProcessLoop):
         )
 
 
-def test_a_refused_step_ends_the_run_with_its_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("fault", "expected"),
+    [
+        (RequestRefusedError("an actuator is too far from flat"), "too far from flat; output of the loop: begun"),
+        (KeyboardInterrupt(), None),
+    ],
+)
+def test_a_refused_step_or_an_interrupt_ends_the_loop_with_its_output(
+    fault: BaseException, expected: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def refused(_: str) -> NoReturn:
-        raise RequestRefusedError("an actuator is too far from flat")
+        raise fault
 
-    (tmp_path / "silent.py").write_text("import time\nprint('begun', flush=True)\ntime.sleep(20)\n")
+    begin = "import os, pathlib, time; pathlib.Path('pid').write_text(str(os.getpid())); print('begun', flush=True)"
+    (tmp_path / "silent.py").write_text(f"{begin}\npathlib.Path('ready').touch(); time.sleep(20)\n")
     monkeypatch.setattr(dark_hole, "COMMAND", "silent")
-    monkeypatch.setattr(dark_hole, "running", lambda: (dark_hole.RUN,))
+    monkeypatch.setattr(dark_hole, "running", lambda: ["run"] * (tmp_path / "ready").exists())
+    monkeypatch.setattr(dark_hole, "new_run_id", lambda: "run")
     monkeypatch.setattr(dark_hole, "Client", refused)
-    with pytest.raises(RuntimeError, match="too far from flat; output of the loop"):
+    with pytest.raises(LowfcError if expected else KeyboardInterrupt, match=expected):
         dark_hole.dark_hole(tmp_path, 1.0)
+    assert not Path("/proc", (tmp_path / "pid").read_text()).exists()
 
 
 def test_the_loop_undoes_only_the_steps_that_do_not_shift_its_zero_point(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from lowfc.adapters.bus.run import new_run_id
 from lowfc.adapters.logs.history import History, read_history
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.arrays import Array, Mask
@@ -32,7 +33,6 @@ SHIFTED, PLAIN = "dark-hole", FLAT
 GAINS = "[control]\ntilt_gain = 0.5\ngain = 0.05\n"
 """Gains of the loop; the fraction depends on them."""
 COMMAND = "lowfc sim-loop --lockstep --rate 1000 --disturbance bench --star-magnitude -2"
-RUN = "dark-hole"
 PATIENCE_S = 60.0
 
 
@@ -80,25 +80,29 @@ def dark_hole(
         base_nm: (rows, columns) nm of surface, the configured flat map: the other channel is `flat`, and the steps are
             added to it.
         seed: seed of the simulation; the configuration's if None.
+
+    Raises:
+        LowfcError: the loop did not start, failed, or refused a step.
     """
     (folder / "run.toml").write_text(f"{GAINS}{toml}")
-    words = [sys.executable, "-m", *COMMAND.split(), "--run", RUN, "--config", "run.toml", "--json"]
+    run, failure = new_run_id(), ""
+    words = [sys.executable, "-m", *COMMAND.split(), "--run", run, "--config", "run.toml", "--json"]
     words += [] if seed is None else ["--seed", str(seed)]
     pipe = subprocess.PIPE
     with subprocess.Popen(words, cwd=folder, text=True, stdout=pipe, stderr=pipe) as process:  # noqa: S603  # our own
         try:
             deadline_s = time.monotonic() + PATIENCE_S
-            while RUN not in running() and time.monotonic() < deadline_s and process.poll() is None:
+            while run not in running() and time.monotonic() < deadline_s and process.poll() is None:
                 time.sleep(0.05)
-            with Client(RUN) as loop:
+            with Client(run) as loop:
                 marks, channel_modes_nm = apply_steps(loop, step_rms_nm, np.asarray(base_nm))
         except LowfcError as error:
+            failure = f"{error}; "
+        finally:
             process.send_signal(signal.SIGINT)
-            raise RuntimeError(f"{error}; output of the loop: {process.communicate(timeout=PATIENCE_S)}") from error
-        process.send_signal(signal.SIGINT)
-        out, complaints = process.communicate(timeout=PATIENCE_S)
-    if process.returncode:
-        raise RuntimeError(complaints)
+            out, complaints = process.communicate(timeout=PATIENCE_S)
+    if failure or process.returncode:
+        raise LowfcError(f"{failure}output of the loop: {out}{complaints}")
     log = folder / json.loads(out)["log"]
     return DarkHoleRun(channel_results(read_history(LogReader(log)), marks, channel_modes_nm), log)
 
