@@ -10,10 +10,11 @@ import pytest
 from typer.testing import CliRunner
 
 from lowfc.adapters.process.terminal import new_app
+from lowfc.contract.configuration import load
 from lowfc.contract.errors import LowfcError
 from lowfc.design.tolerance import KINDS
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
-from lowfc.programs.paper.cases import Context, Row, plain
+from lowfc.programs.paper.cases import Context, Prepared, Row, plain, section_of
 from lowfc.programs.paper.commands import ADDITIONAL, validate
 from lowfc.programs.paper.dark_hole import SHIFTED, ChannelResult
 from lowfc.programs.paper.report import CASES, PICTURES, to_page, to_text
@@ -150,8 +151,9 @@ class Loops:
         (*_, lowfc), (name, *words, as_json) = command[:3], command[3:]
         assert (lowfc, as_json) == ("lowfc", "--json")
         options = dict(pairwise(words))
-        settings = (cwd / options["--config"]).read_text() if "--config" in options else ""
-        self.commands.append((name, options.get("--disturbance", ""), "law" in settings))
+        config = load(cwd / options["--config"] if "--config" in options else None)
+        assert name == "tune" or config.sensor == section_of(LIGHT)
+        self.commands.append((name, options.get("--disturbance", ""), bool(config.control.law)))
         found = {"log": "a.mcap", "tilt_disturbance_mas": 14.0, "tilt_residual_mas": self.residual_mas}
         return SimpleNamespace(returncode=0, stdout=json.dumps(found))
 
@@ -188,11 +190,33 @@ def test_loops_are_judged_by_the_published_pointing(monkeypatch):
     assert loops.commands == [*driven[0], *driven[1], ("sim-loop", "bench", False)]
 
 
+@pytest.mark.parametrize("name", ["aplc", "sam18_sized", "clowfs:2", "bowtie:sam18_sized", "masks/a.json:b"])
+def test_a_loop_has_every_sensor_of_the_command_line(name, tmp_path):
+    (tmp_path / "run.toml").write_text(anchors._sensor_toml(name))
+    keys, loaded = (one.model_dump() for one in (section_of(name), load(tmp_path / "run.toml").sensor))
+    assert loaded == keys | {"sam": str(Path(name).resolve()) if ".json" in name else keys["sam"]}
+
+
+def test_only_requested_sensors_are_anchored_and_simulated(monkeypatch):
+    def table4(context):
+        quantity = "std of x tilt, 1 mas, own photometry"
+        return [Row(name, quantity, "mas", 0.1, modes=2, estimator="weighted") for name in context.sensors]
+
+    monkeypatch.setattr(anchors, "_pointing", lambda context, name: [])
+    monkeypatch.setattr(anchors.pointing, "table4", table4)
+    monkeypatch.setattr(tolerance, "DriftTrial", lambda *_: SimpleNamespace(residual_nm2=lambda *_: np.zeros(14)))
+    monkeypatch.setattr(Prepared, "twin", None)
+    few = Context(trials=2, sensors=("zwfs",))
+    rows = anchors.anchors(few)
+    assert {row.name for row in (*rows, *tolerance._checked(few))} == {"zwfs"}
+    assert all("verdict" not in row.quantity for row in rows), "without a published value"
+
+
 def test_a_loop_that_fails_is_an_error_with_its_reason(monkeypatch, tmp_path):
     failed = SimpleNamespace(returncode=2, stderr="error: no such sensor\n")
     monkeypatch.setattr(anchors.subprocess, "run", lambda *_, **__: failed)
-    with pytest.raises(LowfcError, match=r"`lowfc sim-loop .*--sensor sam .*` ended with 2: error: no such sensor$"):
-        anchors._sim_loop("sam", "bench", tmp_path, "gains.toml", 1.0, 1)
+    with pytest.raises(LowfcError, match=r"`lowfc sim-loop .* bench .*` ended with 2: error: no such sensor$"):
+        anchors._sim_loop("bench", tmp_path, "gains.toml", 1.0, 1)
 
 
 @pytest.mark.slow

@@ -14,11 +14,11 @@ from typing import Any, TypeVar
 import numpy as np
 
 from lowfc.adapters.files.layouts import layout_names
-from lowfc.adapters.files.sensors import coronagraph_from, sensor_from, sensor_named
+from lowfc.adapters.files.sensors import coronagraph_from, sensor_from
 from lowfc.adapters.files.twin_cache import load_or_build
 from lowfc.arrays import Array, Mask
 from lowfc.contract.errors import ConfigurationError
-from lowfc.contract.sections import SENSORS, SensorSection
+from lowfc.contract.sections import SensorSection, sensor_keys
 from lowfc.control.calibration.calibration import normalise_flux, reconstructor
 from lowfc.design.estimators import Fit, fit
 from lowfc.design.trials import gram
@@ -41,8 +41,10 @@ def no_progress(what: str, done: int, total: int) -> None:
 class Prepared:
     """A sensor at the paper's sampling, with the quantities that the tables use, computed on first use."""
 
-    def __init__(self, name: str, sensor: Sensor) -> None:
-        self.name, self.sensor = name, sensor
+    def __init__(self, name: str, section: SensorSection, sensor: Sensor | None = None) -> None:
+        """Build the sensor of a section, or take another one behind the section's coronagraph."""
+        self.name, self.section = name, section
+        self.sensor = sensor_from(section) if sensor is None else sensor
         self._own = threading.local()
 
     @cached_property
@@ -107,8 +109,8 @@ class Prepared:
 
     @cached_property
     def coronagraph(self) -> Coronagraph:
-        """Optics of the science image; a sensor that is not one of `SENSORS` is behind the shaped pupil."""
-        return coronagraph_from(SensorSection.model_validate(SENSORS.get(self.name, {})))
+        """Optics of the science image."""
+        return coronagraph_from(self.section)
 
     @cached_property
     def twin(self) -> Twin:
@@ -182,21 +184,21 @@ def sparse_apertures() -> tuple[str, ...]:
 
 @lru_cache(maxsize=64)
 def prepared(name: str) -> Prepared:
-    """A sensor by name, cached in the process.
+    """A sensor by its name, see `section_of`, cached in the process."""
+    return Prepared(name, section_of(name))
 
-    Args:
-        name: a name of `lowfc.adapters.files.sensors.sensor_named`; clowfs:MM with its defocus; or bowtie:LAYOUT.
-    """
+
+def section_of(name: str) -> SensorSection:
+    """[sensor] for one of `SENSORS`, a layout, clowfs:MM with its defocus, or bowtie:LAYOUT."""
     kind, _, detail = name.partition(":")
     if kind == "clowfs" and detail:
         try:
-            section = SensorSection(kind="clowfs", defocus_mm=float(detail))
+            return SensorSection(kind="clowfs", defocus_mm=float(detail))
         except ValueError:
             raise ConfigurationError(f"{name}: after the colon comes the defocus in mm, 1 to 50") from None
-        return Prepared(name, sensor_from(section))
-    if kind == "bowtie" and detail:
-        return Prepared(name, sensor_from(SensorSection(focal_mask="bowtie", sam=detail)))
-    return Prepared(name, sensor_named(name))
+    return SensorSection.model_validate(
+        {"focal_mask": "bowtie", "sam": detail} if kind == "bowtie" and detail else sensor_keys(name)
+    )
 
 
 @dataclass(frozen=True)

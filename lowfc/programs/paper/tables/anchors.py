@@ -15,6 +15,7 @@ import numpy as np
 from lowfc.adapters.logs.history import History, read_history
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.arrays import Array
+from lowfc.contract.codecs.input_file import user_path
 from lowfc.contract.errors import LowfcError
 from lowfc.control.laws.continuous import Timing
 from lowfc.control.laws.kalman import lqg
@@ -25,7 +26,7 @@ from lowfc.design.tolerance import best_gain, drift_residual_nm2
 from lowfc.design.trials import noisy_e
 from lowfc.optics.chain.zernike import NOLLS_14, mode_name
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
-from lowfc.programs.paper.cases import Context, Row, prepared
+from lowfc.programs.paper.cases import Context, Row, prepared, section_of
 from lowfc.programs.paper.dark_hole import SHIFTED, STEPS, dark_hole
 from lowfc.programs.paper.plots import Line as Curve
 from lowfc.programs.paper.plots import curves, draw
@@ -82,15 +83,18 @@ def anchors(context: Context) -> list[Row]:
     """Rows of every anchor, with a verdict if there is a published value."""
     names = context.names(*LOOP_SENSORS)
     rows = [row for found in map(partial(_pointing, context), names) for row in found]
-    rows += _hicat(context)
+    if "sam" in context.names("sam"):
+        rows += _hicat(context)
     rows += _table4(context)
     rows += [row for name in names for row in _hundred_seconds(context, name)]
     return rows + [row for name in context.names(*tolerance.SENSORS_COMPARED) for row in _against_magnitude(name)]
 
 
 def _with_verdict(row: Row, allowed: float | None = None) -> list[Row]:
-    """A row and its verdict against the published or the allowed value; by `predicted` if there is one."""
+    """A row and its verdict against the allowed or the published value, if there is one; by `predicted` if there is."""
     best, ours = row.paper if allowed is None else allowed, row.measured if row.predicted is None else row.predicted
+    if best is None:
+        return [row]
     assert isinstance(ours, float)  # noqa: S101  # these are
     assert isinstance(best, float)  # noqa: S101
     verdict = REACHED if ours <= best else NOT_REACHED
@@ -116,14 +120,15 @@ def _pointing(context: Context, name: str) -> list[Row]:
     made = partial(Row, name, unit="mas", modes=len(NOLLS_14))
     with tempfile.TemporaryDirectory() as text:
         folder = Path(text)
-        (folder / "gains.toml").write_text(GAINS)
+        sensor = _sensor_toml(name)
+        (folder / "gains.toml").write_text(f"{GAINS}{sensor}")
         for preset in ("reaction-wheel", "reaction-wheel-ideal"):
             context.progress(f"anchors {name}, {preset}", len(rows), 12)
-            loop = (name, preset, folder)
+            loop = (preset, folder)
             observed = _history(folder / _sim_loop(*loop, "gains.toml", OBSERVED_S, context.seed)["log"])
             law = folder / f"{preset}.fits"
             _lowfc(folder, "tune", str(observed.log.path), "--controller", "lqg", "--out", str(law))
-            (folder / "law.toml").write_text(f'{GAINS}law = "{law}"\n')
+            (folder / "law.toml").write_text(f'{GAINS}law = "{law}"\n{sensor}')
             run = _sim_loop(*loop, "law.toml", CLOSED_S, context.seed + 1000)
             limit = _quantum_pointing_nm(observed, name) / nm_per_mas
             driven = partial(made, estimator="LQG")
@@ -140,7 +145,7 @@ def _pointing(context: Context, name: str) -> list[Row]:
             if preset == "reaction-wheel":
                 rows += _with_verdict(_means(driven, _history(folder / run["log"]), "sky"))
         context.progress(f"anchors {name}, bench", 9, 12)
-        run = _sim_loop(name, "bench", folder, "gains.toml", CLOSED_S, context.seed)
+        run = _sim_loop("bench", folder, "gains.toml", CLOSED_S, context.seed)
         rows += _with_verdict(
             _means(partial(made, estimator="integrator"), _history(folder / run["log"]), "laboratory")
         )
@@ -186,7 +191,7 @@ def _hicat(context: Context) -> list[Row]:
 
 def _table4(context: Context) -> list[Row]:
     """Rows of the paper's Table 4 by its own definition: tip and tilt fitted, 1 mas, 0.05 s of V = 4.83."""
-    names = ("sam", "sam18_sized", "clowfs_tuned", "zwfs_tuned")
+    names = context.names("sam", "sam18_sized", "clowfs_tuned", "zwfs_tuned")
     rows = pointing.table4(replace(context, sensors=names))
     scatter = "std of x tilt, 1 mas, own photometry"
     chosen = [row for row in rows if (row.quantity, row.modes, row.estimator) == (scatter, 2, "weighted")]
@@ -268,8 +273,16 @@ def plot(context: Context, path: Path) -> None:
     draw(path, [panel], AGAINST_V, wide=True)
 
 
-def _sim_loop(name: str, preset: str, folder: Path, config: str, duration_s: float, seed: int) -> dict[str, Any]:
-    words = ("--rate", f"{RATE_HZ:g}", "--sensor", name, "--disturbance", preset, "--star-magnitude", f"{MAGNITUDE:g}")
+def _sensor_toml(name: str) -> str:
+    """[sensor] of a configuration file that is used in another folder."""
+    keys = section_of(name).model_dump(exclude_unset=True)
+    if keys.get("sam", "").partition(":")[0].endswith(".json"):
+        keys["sam"] = str(Path.cwd() / user_path(keys["sam"]))
+    return "\n".join(["[sensor]", *(f"{key} = {json.dumps(value)}" for key, value in keys.items()), ""])
+
+
+def _sim_loop(preset: str, folder: Path, config: str, duration_s: float, seed: int) -> dict[str, Any]:
+    words = ("--rate", f"{RATE_HZ:g}", "--disturbance", preset, "--star-magnitude", f"{MAGNITUDE:g}")
     timed = ("--lockstep", "--duration", f"{duration_s:g}", "--seed", str(seed), "--config", config)
     return _lowfc(folder, "sim-loop", *words, *timed)
 

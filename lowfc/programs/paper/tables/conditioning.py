@@ -1,12 +1,12 @@
 """Sect. 4: conditioning of the modes behind an open circle, bars, and holes of several sizes."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from lowfc.adapters.files.layouts import load_layout
-from lowfc.adapters.files.sensors import sensor_from
 from lowfc.contract.sections import SensorSection
 from lowfc.control.calibration.calibration import condition_number
 from lowfc.design.fisher import cramer_rao, quantum_information, variance_e
@@ -14,7 +14,7 @@ from lowfc.design.paper import STAR, TABLE4_EXPOSURE_S, TABLE4_READ_NOISE_E
 from lowfc.optics.chain import sam as sams
 from lowfc.optics.chain.band import gauss_legendre
 from lowfc.optics.chain.relay import ApertureMask
-from lowfc.optics.chain.sensor import Sensor, reference, response
+from lowfc.optics.chain.sensor import reference, response
 from lowfc.optics.detector.photometry import electrons
 from lowfc.programs.paper.cases import Context, Prepared, Row, prepared, sparse_apertures
 from lowfc.programs.paper.tables.pointing import NM_PER_MAS
@@ -66,7 +66,7 @@ def conditioning(context: Context) -> list[Row]:
 
 def _bar(width: float, angle_deg: float) -> Prepared:
     section = SensorSection(kind="bar", bar_width=width, bar_angle_deg=angle_deg)
-    return Prepared(f"bar of {100 * width:g} % at {angle_deg:g} deg", sensor_from(section))
+    return Prepared(f"bar of {100 * width:g} % at {angle_deg:g} deg", section)
 
 
 def _with_holes(diameter: float) -> Prepared | Row:
@@ -78,9 +78,9 @@ def _with_holes(diameter: float) -> Prepared | Row:
         sams.check(shrunk)
     except ValueError:
         return Row(name, "condition number", "", None, modes=14, assumption="These holes would overlap.")
-    sensor = sensor_from()
+    sensor = prepared("sam").sensor
     relay = ApertureMask(sams.transmission(shrunk, len(sensor.pupil)))
-    return Prepared(name, Sensor(sensor.pupil, sensor.focal_mask, relay, sensor.wavelength_nm))
+    return Prepared(name, SensorSection(), replace(sensor, relay=relay))
 
 
 def _rows(kind: str, mask: Prepared) -> Iterator[Row]:

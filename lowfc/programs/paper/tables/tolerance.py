@@ -12,7 +12,7 @@ import numpy as np
 from lowfc.adapters.files.sensors import coronagraph_from
 from lowfc.arrays import Array
 from lowfc.contract.errors import ConfigurationError
-from lowfc.contract.sections import SENSORS, SensorSection, sensor_keys
+from lowfc.contract.sections import SensorSection
 from lowfc.control.calibration.calibration import noise_nm2
 from lowfc.control.laws.vibration import Line
 from lowfc.design.drift_trial import DriftTrial
@@ -100,12 +100,8 @@ def contrasts(pupil: str, focal_radius: float) -> Contrasts:
 
 def contrasts_of(name: str) -> Contrasts:
     """Contrast of the modes behind a sensor's coronagraph."""
-    section = _section(name)
+    section = prepared(name).section
     return contrasts(section.pupil, section.focal_radius)
-
-
-def _section(name: str) -> SensorSection:
-    return SensorSection.model_validate(sensor_keys(name) if name in SENSORS else {})
 
 
 def light_e(magnitude: float) -> float:
@@ -146,7 +142,7 @@ def tolerance(context: Context) -> list[Row]:
 
     rows = [row for found in context.map("tolerance", rows_of, names) for row in found]
     rows += _checked(context)
-    return rows + [row for name in names if _section(name).pupil == "shaped" for row in pair_rows(name)]
+    return rows + [row for name in names if prepared(name).section.pupil == "shaped" for row in pair_rows(name)]
 
 
 def _tolerated(name: str, lines: dict[Kind, Callable[[Array], Array]]) -> Iterator[Row]:
@@ -184,8 +180,8 @@ def _tolerated(name: str, lines: dict[Kind, Callable[[Array], Array]]) -> Iterat
 
 
 def _checked(context: Context) -> list[Row]:
-    """Rows of the twelve simulated points."""
-    cases = list(product(CHECKED_SENSORS, CHECKED_MAGNITUDES, CHECKED_MODES))
+    """Rows of the simulated points, six for each sensor."""
+    cases = list(product(context.names(*CHECKED_SENSORS), CHECKED_MAGNITUDES, CHECKED_MODES))
 
     def simulated(case: tuple[str, float, int]) -> Row:
         name, magnitude, noll = case
