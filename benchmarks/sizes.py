@@ -16,6 +16,7 @@ from lowfc.adapters.files import calibration_file, factory
 from lowfc.adapters.process.realtime import spread
 from lowfc.contract.codecs.calibration_codec import identified
 from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
+from lowfc.contract.errors import ConfigurationError
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.optics.detector.detector import saturation_dn
 from lowfc.programs.measure.frame_source import FRAMES_FILE
@@ -38,6 +39,10 @@ class Size:
     side: int = 80
     modes: int = 20
     mirror_side: int = 34
+
+    def __post_init__(self) -> None:
+        if self.side < 1 or self.modes < 1:
+            raise ConfigurationError(f"a loop has at least one pixel and one mode, got {self}")
 
     @property
     def pixels(self) -> int:

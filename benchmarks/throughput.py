@@ -45,8 +45,8 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 def measure(options: argparse.Namespace, report: Report) -> Result:
     """Find the highest rate of each loop: loops (results of `find`), seconds and rates_hz."""
-    if not (0 < options.lowest <= options.highest and options.step > 1):
-        raise ConfigurationError("--lowest must be above 0 and at most --highest, and --step above 1")
+    if not (0 < options.lowest <= options.highest < math.inf and options.step > 1):
+        raise ConfigurationError("--lowest must be above 0 and at most --highest, which is finite; --step above 1")
     rates = grid(options.lowest, options.highest, options.step)
     loops = {}
     for name in options.loop or LOOPS:

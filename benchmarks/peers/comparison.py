@@ -100,6 +100,9 @@ def measure(options: argparse.Namespace, report: Report) -> Result:
     chosen = [one for one in IMPLEMENTATIONS if any(word in one.name for word in options.only or [""])]
     if not chosen:
         raise ConfigurationError(f"--only: none of {'; '.join(one.name for one in IMPLEMENTATIONS)}")
+    if options.warm_up < 0:
+        raise ConfigurationError(f"--warm-up must be at least 0, got {options.warm_up}")
+    configuration(SIZE, options.rate_hz)  # refuses an impossible rate
     absent = {one.name: why for one in chosen if (why := missing(one, options))}
     present = [one for one in chosen if one.name not in absent]
     realtime = set_up(None, None, lock_memory=False, disable_cpu_idle=True)  # for all, as long as this process lives

@@ -38,6 +38,21 @@ def test_nothing_is_measured_in_no_time(capsys: pytest.CaptureFixture[str], word
     assert "--seconds must be 0.01 to 100000, --repeats at least 1" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("benchmark", "words", "message"),
+    [
+        (curves, "--pixels 16 --modes 0", "at least one pixel and one mode"),
+        (throughput, "--highest inf", "--highest, which is finite"),
+        (comparison, "--warm-up -1", "--warm-up must be at least 0"),
+        (comparison, "--rate nan", "camera.rate_hz"),
+        (comparison, "--only nothing", "--only: none of"),
+    ],
+)
+def test_impossible_options_are_refused(benchmark: runner.Benchmark, words: str, message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message):
+        runner.run("one", benchmark, words.split())
+
+
 # The control step
 
 
