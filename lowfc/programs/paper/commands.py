@@ -81,9 +81,9 @@ def validate(
     if sensor and fixed:
         typer.echo(f"{', '.join(fixed)}: for the paper's own sensors only, --sensor has no effect there", err=True)
     found = run(chosen, context, plots if docs is None else docs / PICTURES)
+    sys.stdout.write((to_json(found) if as_json else "\n\n".join(map(to_text, found))) + "\n")
     if docs is not None and pages:
         for table in found:
             write_page(docs, table)
     elif docs is not None:
         write_document(docs, found)
-    sys.stdout.write((to_json(found) if as_json else "\n\n".join(map(to_text, found))) + "\n")

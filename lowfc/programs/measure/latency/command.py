@@ -104,9 +104,9 @@ def latency(
         if trace and simulated:
             raise ConfigurationError("--trace requires prepared frames: omit --trace or --camera simulated")
         results = _measure(LatencyOptions(settings, duration, repeats, simulated, record, view, kernels, trace))
+    print_result(results, table(results), as_json=as_json)
     if plot is not None:
         write_whole(plot, picture(results))
-    print_result(results, table(results), as_json=as_json)
 
 
 def _refuse_others(context: typer.Context, what: str, *used: str) -> None:
