@@ -15,6 +15,7 @@ from lowfc.design.fisher import quantum_information
 from lowfc.design.paper import PEAK_E, STAR, TABLE3_READ_NOISE_E, TABLE4_EXPOSURE_S, TABLE4_READ_NOISE_E
 from lowfc.design.trials import expected_rms, gram
 from lowfc.optics.chain.added_contrast import contrast_form, without_negative
+from lowfc.optics.chain.coronagraph import Coronagraph
 from lowfc.optics.chain.zernike import NOLLS_14
 from lowfc.optics.detector.photometry import electrons, tilt_nm_per_mas
 
@@ -59,7 +60,7 @@ class PupilForms:
         """The forms of a pupil (n, n) and its 20 modes (20, n, n)."""
         return cls(
             gram(modes[:, pupil > 0.5]),
-            without_negative(contrast_form(pupil, NOLLS_14, WAVELENGTH_NM)),
+            without_negative(contrast_form(Coronagraph(pupil), NOLLS_14, WAVELENGTH_NM)),
             quantum_information(pupil, modes[:HELD], WAVELENGTH_NM),
         )
 

@@ -25,6 +25,7 @@ from lowfc.control.laws.stability import delay_weights, limiting_gain
 from lowfc.control.laws.what_if import as_logged, counterfactual, rms
 from lowfc.control.loop.safety import Limit, LoopMode, Rejection
 from lowfc.optics.chain.added_contrast import contrast_form
+from lowfc.optics.chain.coronagraph import Coronagraph
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.cli.contrast import added_contrast, added_contrast_in_words
 from lowfc.programs.logs.what_if.compare import LINEAR_WAVES, render, what_if
@@ -160,7 +161,7 @@ def test_added_contrast_of_shaped_pupil_and_lyot_coronagraph() -> None:
 
     contrast = found()
     assert contrast is not None
-    expected = 0.01 * contrast_form(factory.sensor(Configuration(), print).pupil, (11,), 550.0).item()
+    expected = 0.01 * contrast_form(Coronagraph(factory.sensor(Configuration(), print).pupil), (11,), 550.0).item()
     assert (contrast["was"], contrast["what if"], contrast["other"]) == (0, pytest.approx(expected), None)
     assert contrast["by_group"]["what if"]["spherical"] == pytest.approx(expected)
     assert added_contrast_in_words(contrast) == (

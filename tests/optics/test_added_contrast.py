@@ -1,58 +1,52 @@
 """Contrast added by a wavefront: the quadratic form against full science images, and its range of validity."""
 
-from functools import cache
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 
-from lowfc.adapters.files import factory
 from lowfc.arrays import Array
-from lowfc.contract.configuration import Configuration
 from lowfc.optics.chain.added_contrast import ModalContrast, by_group, contrast_form, costliest, without_negative
 from lowfc.optics.chain.coronagraph import DARK_ZONE, Coronagraph, mean_contrast
-from lowfc.optics.chain.grid import pupil_axis
-from lowfc.optics.chain.zernike import zernikes
+from lowfc.optics.chain.sensor import Sensor
 from sim_camera.contrast import IMAGES, Contrast
 
 NOLL, WAVELENGTH_NM = tuple(range(2, 16)), 550.0
+ByImage = Callable[[Array], float]
 
 
 @pytest.fixture(scope="module")
-def pupil() -> Array:
-    return factory.sensor(Configuration(), print).pupil
+def shaped(sensor: Sensor) -> Coronagraph:
+    return Coronagraph(sensor.pupil)
 
 
 @pytest.fixture(scope="module")
-def form(pupil: Array) -> Array:
-    return contrast_form(pupil, NOLL, WAVELENGTH_NM)
+def form(shaped: Coronagraph) -> Array:
+    return contrast_form(shaped, NOLL, WAVELENGTH_NM)
 
 
-@cache
-def modes_at(samples: int) -> Array:
-    """The modes (modes, samples, samples) of a pupil."""
-    radius = 2 * pupil_axis(samples)
-    return zernikes(NOLL, radius, radius[:, None])
+@pytest.fixture(scope="module")
+def by_image(shaped: Coronagraph, modes: Array) -> ByImage:
+    def added(modes_nm: Array) -> float:
+        flat, aberrated = (
+            mean_contrast(shaped, np.tensordot(one, modes[: len(NOLL)], 1), WAVELENGTH_NM, DARK_ZONE, 2)
+            for one in (0 * modes_nm, modes_nm)
+        )
+        return aberrated - flat
 
-
-def by_image(pupil: Array, modes_nm: Array) -> float:
-    shapes = modes_at(len(pupil))
-    flat, aberrated = (
-        mean_contrast(pupil, np.tensordot(one, shapes, 1), WAVELENGTH_NM, DARK_ZONE, 2)
-        for one in (0 * modes_nm, modes_nm)
-    )
-    return aberrated - flat
+    return added
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_quadratic_form_matches_full_images_for_small_wavefronts(pupil: Array, form: Array, seed: int) -> None:
+def test_quadratic_form_matches_full_images_for_small_wavefronts(by_image: ByImage, form: Array, seed: int) -> None:
     modes_nm = 0.3 * np.random.default_rng(seed).choice([-1.0, 1.0], len(NOLL))
-    assert modes_nm @ form @ modes_nm == pytest.approx(by_image(pupil, modes_nm), rel=0.01)
+    assert modes_nm @ form @ modes_nm == pytest.approx(by_image(modes_nm), rel=0.01)
 
 
 @pytest.mark.parametrize(("tilt_nm", "error"), [(1.0, 0.0), (10.0, -0.27), (40.0, -0.92)])
-def test_quadratic_form_underestimates_large_tilt(pupil: Array, form: Array, tilt_nm: float, error: float) -> None:
+def test_quadratic_form_underestimates_large_tilt(by_image: ByImage, form: Array, tilt_nm: float, error: float) -> None:
     modes_nm = tilt_nm * np.eye(len(NOLL))[0]
-    assert modes_nm @ form @ modes_nm / by_image(pupil, modes_nm) - 1 == pytest.approx(error, abs=0.01)
+    assert modes_nm @ form @ modes_nm / by_image(modes_nm) - 1 == pytest.approx(error, abs=0.01)
 
 
 def test_spherical_adds_tens_of_thousands_of_times_more_contrast_than_tilt(form: Array) -> None:
@@ -67,13 +61,13 @@ def test_form_without_negative_eigenvalues_differs_little(form: Array) -> None:
     assert np.linalg.norm(loss - form) < 1e-3 * np.linalg.norm(form)
 
 
-def test_contrast_is_summed_by_group_and_large_tilt_is_beyond_quadratic(pupil: Array) -> None:
+def test_contrast_is_summed_by_group_and_large_tilt_is_beyond_quadratic(shaped: Coronagraph, by_image: ByImage) -> None:
     """The cross term of two modes is included in the sum: half of it for each."""
-    modal, coma, tilt = ModalContrast(Coronagraph(pupil), NOLL, WAVELENGTH_NM), NOLL.index(8), NOLL.index(2)
+    modal, coma, tilt = ModalContrast(shaped, NOLL, WAVELENGTH_NM), NOLL.index(8), NOLL.index(2)
     shape = np.zeros(len(NOLL))
     shape[[coma, coma - 1, tilt]] = 0.3
     each = modal.by_mode(np.outer(shape, shape))
-    assert each.sum() == pytest.approx(by_image(pupil, shape), rel=0.01)
+    assert each.sum() == pytest.approx(by_image(shape), rel=0.01)
     groups = by_group(NOLL, each)
     assert groups["coma"] == pytest.approx(each[coma] + each[coma - 1])
     assert costliest(groups) == ("coma", pytest.approx(groups["coma"] / each.sum()))
@@ -81,14 +75,14 @@ def test_contrast_is_summed_by_group_and_large_tilt_is_beyond_quadratic(pupil: A
     assert modal.is_beyond_quadratic(20**2 * np.diag(np.eye(len(NOLL))[tilt]))
 
 
-def test_added_contrast_of_a_run_is_that_of_its_second_half(pupil: Array) -> None:
-    contrast = Contrast(ModalContrast(Coronagraph(pupil), NOLL, WAVELENGTH_NM))
+def test_added_contrast_of_a_run_is_that_of_its_second_half(shaped: Coronagraph, by_image: ByImage) -> None:
+    contrast = Contrast(ModalContrast(shaped, NOLL, WAVELENGTH_NM))
     assert contrast.measure() == {}
     modes_nm = 0.3 * np.eye(len(NOLL), dtype=np.float32)[NOLL.index(11)]
     for frame in range(5000):  # the residual is ten times larger in the first 2000 frames
         contrast.add(2 * modes_nm, (10 if frame < 2000 else 1) * modes_nm)
     found = contrast.measure()
     assert found["science_images"] == IMAGES
-    expected = by_image(pupil, modes_nm.astype(float))
+    expected = by_image(modes_nm.astype(float))
     assert (found["added_contrast"], found["quadratic_added_contrast"]) == pytest.approx((expected, expected), rel=0.02)
     assert found["added_contrast_flat"] == pytest.approx(4 * expected, rel=0.02)

@@ -7,6 +7,7 @@ from scipy.special import j0, j1
 from lowfc.adapters.files.sensors import load_pupil
 from lowfc.optics.chain.coronagraph import (
     DARK_ZONE,
+    Coronagraph,
     LyotStop,
     Wedge,
     contrast,
@@ -26,18 +27,18 @@ NM = 550.0
 
 @pytest.fixture(scope="module")
 def shaped():
-    return load_pupil()
+    return Coronagraph(load_pupil())
 
 
 @pytest.fixture(scope="module")
 def flat(shaped):
-    return np.zeros(shaped.shape)
+    return np.zeros(shaped.pupil.shape)
 
 
 def test_open_circle_gives_an_airy_pattern():
     x = image_axis(64, 8)
     r = np.pi * np.hypot(x[:, None], x)
-    found = contrast(circle(512), np.zeros((512, 512)), NM, 64, samples_per=8)
+    found = contrast(Coronagraph(circle(512)), np.zeros((512, 512)), NM, 64, samples_per=8)
     np.testing.assert_allclose(found, (2 * j1(r) / r) ** 2, atol=2e-4)  # the sampled circle has a staircase edge
 
 
@@ -61,10 +62,9 @@ def test_a_tilt_moves_the_star(shaped):
     assert abs(x[row] - 0.5) <= 0.125
 
 
-def test_mean_contrast_and_curve_agree_with_the_full_image(shaped, flat):
+def test_mean_contrast_and_curve_agree_with_the_full_image(shaped, flat, modes):
     ring = Wedge(4.5, 5.5)
-    radii = 2 * pupil_axis(512)
-    opd_nm = NM / 30 * zernikes((4, 7), radii, radii[:, None]).sum(axis=0)
+    opd_nm = NM / 30 * (modes[2] + modes[5])
     image = contrast(shaped, opd_nm, NM, 160)
     mean = mean_contrast(shaped, opd_nm, NM, ring)
     assert mean == pytest.approx(image[wedge_samples(ring, 160, 160)].mean(), rel=1e-9)
@@ -117,12 +117,6 @@ TILT_NM = 14 * tilt_nm_per_mas(2.0)
 
 
 @pytest.fixture(scope="module")
-def modes():
-    radii = 2 * pupil_axis(512)
-    return zernikes(NOLLS_14, radii, radii[:, None])
-
-
-@pytest.fixture(scope="module")
 def camera(shaped):
     return ScienceCamera(shaped, NOLLS_14, NM, HALF_WIDTH, SAMPLES_PER)
 
@@ -146,7 +140,7 @@ CASES = {
 @pytest.mark.parametrize("name", CASES)
 def test_fast_science_image_agrees_with_the_exact_image_to_one_percent(shaped, modes, camera, name):
     """Each sample to 1 % of itself and 1 % of the flat wavefront's contrast, the mean to 0.2 %."""
-    opd_nm = np.tensordot(CASES[name], modes, 1)
+    opd_nm = np.tensordot(CASES[name], modes[:14], 1)
     exact = contrast(shaped, opd_nm, NM, camera.samples, samples_per=SAMPLES_PER)
     found = camera.image(CASES[name])
     dark = wedge_samples(Wedge(4.0, HALF_WIDTH), camera.samples, camera.samples, SAMPLES_PER)
@@ -157,7 +151,7 @@ def test_fast_science_image_agrees_with_the_exact_image_to_one_percent(shaped, m
 
 
 def test_pupil_without_equal_squares_is_not_averaged():
-    pupil = circle(64)
+    pupil = Coronagraph(circle(64))
     modes_nm = np.array([20.0, -35.0, 12.0])
     radii = 2 * pupil_axis(64)
     opd_nm = np.tensordot(modes_nm, zernikes((2, 5, 8), radii, radii[:, None]), 1)
@@ -171,8 +165,8 @@ def test_science_camera_refuses_inconsistent_inputs(shaped, camera):
     with pytest.raises(ValueError, match=r"ends 12 lambda/D"):
         camera.mean_contrast(camera.image(np.zeros(14)), Wedge(4.0, 20.0))
     with pytest.raises(ValueError, match="square"):
-        ScienceCamera(shaped[:100], NOLLS_14, NM)
+        ScienceCamera(Coronagraph(shaped.pupil[:100]), NOLLS_14, NM)
     with pytest.raises(ValueError, match="must have modes"):
         ScienceCamera(shaped, (), NM)
     with pytest.raises(ValueError, match="multiple of 4 samples across, got 126"):
-        ScienceCamera(shaped[:126, :126], NOLLS_14, NM, lyot=LyotStop(np.ones((8, 8)), np.ones((126, 126))))
+        ScienceCamera(Coronagraph(np.ones((126, 126)), lyot=LyotStop(np.ones((8, 8)), np.ones((126, 126)))), NOLLS_14, NM)

@@ -322,7 +322,8 @@ def drawn(panel: Panel, tape: Tape, after_ns: int, **changes: Any) -> None:
 
 def mean_of(pupil: Any, modes_nm: Any) -> float:
     radii = 2 * pupil_axis(len(pupil))
-    return mean_contrast(pupil, np.tensordot(modes_nm, zernikes(NOLL, radii, radii[:, None]), 1), NM, Wedge(4.0, 6.0))
+    opd_nm = np.tensordot(modes_nm, zernikes(NOLL, radii, radii[:, None]), 1)
+    return mean_contrast(Coronagraph(pupil), opd_nm, NM, Wedge(4.0, 6.0))
 
 
 def test_contrast_is_the_mean_over_the_newest_wavefronts() -> None:

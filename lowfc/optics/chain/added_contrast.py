@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from lowfc.arrays import Array, Complex, Single
-from lowfc.optics.chain.coronagraph import DARK_ZONE, Coronagraph, LyotStop, Wedge, wedge_samples
+from lowfc.optics.chain.coronagraph import Coronagraph, wedge_samples
 from lowfc.optics.chain.fourier import kernel
 from lowfc.optics.chain.grid import pupil_axis
 from lowfc.optics.chain.science_camera import ScienceCamera
@@ -33,10 +33,9 @@ class ModalContrast:
 
     def __init__(self, coronagraph: Coronagraph, noll: tuple[int, ...], wavelength_nm: float) -> None:
         """Compute the form and prepare the images."""
-        pupil, self._zone, lyot = coronagraph.pupil, coronagraph.dark_zone, coronagraph.lyot
-        self.noll, self.form = noll, contrast_form(pupil, noll, wavelength_nm, self._zone, lyot)
-        half_width = int(np.ceil(self._zone.outer))
-        self._camera = ScienceCamera(pupil, noll, wavelength_nm, half_width, _SAMPLES_PER, lyot)
+        self.noll, self.form = noll, contrast_form(coronagraph, noll, wavelength_nm)
+        self._zone = coronagraph.dark_zone
+        self._camera = ScienceCamera(coronagraph, noll, wavelength_nm, int(np.ceil(self._zone.outer)), _SAMPLES_PER)
 
     def by_image(self, modes_nm: Array | Single) -> float:
         """Mean contrast of the dark zone with a wavefront (modes,), including that of the coronagraph itself."""
@@ -71,22 +70,15 @@ def costliest(groups: Mapping[str, float]) -> tuple[str, float]:
     return name, most / (sum(groups.values()) or 1.0)
 
 
-def contrast_form(
-    pupil: Array,
-    noll: tuple[int, ...],
-    wavelength_nm: float,
-    wedge: Wedge = DARK_ZONE,
-    lyot: LyotStop | None = None,
-) -> Array:
-    """Quadratic form Q (modes, modes), per nm^2: a wavefront a (modes,) adds the mean contrast a' Q a in a wedge.
+def contrast_form(coronagraph: Coronagraph, noll: tuple[int, ...], wavelength_nm: float) -> Array:
+    """Quadratic form Q (modes, modes), per nm^2: a wavefront a (modes,) adds the mean contrast a' Q a in the dark zone.
 
     Args:
-        pupil: (n, n) amplitude transmission.
+        coronagraph: The optics.
         noll: Noll index of each mode; a is nm rms over the circle.
         wavelength_nm: The wavelength.
-        wedge: Part of the focal plane.
-        lyot: Mask and stop of a Lyot coronagraph; None for a shaped pupil alone.
     """
+    pupil, wedge, lyot = coronagraph.pupil, coronagraph.dark_zone, coronagraph.lyot
     side = 2 * int(np.ceil(wedge.outer * _SAMPLES_PER))
     inside = wedge_samples(wedge, side, side, _SAMPLES_PER)
     to_focus = kernel(side, _SAMPLES_PER, len(pupil), 1.0)
@@ -95,7 +87,7 @@ def contrast_form(
     shapes = zernikes(noll, radius[columns], radius[rows])
 
     def image(field: Array) -> Complex:
-        return np.asarray(to_focus @ (field if lyot is None else lyot.behind(field.astype(np.complex128))) @ to_focus.T)
+        return np.asarray(to_focus @ coronagraph.behind(field) @ to_focus.T)
 
     def moved(shape: Array) -> Complex:
         field = np.zeros_like(pupil)
@@ -106,8 +98,7 @@ def contrast_form(
     back = to_focus.T @ (image(pupil).conj() * inside) @ to_focus  # the sum over the wedge, brought back to the pupil
     back = back if lyot is None else lyot.transposed(back)
     second = (shapes * (pupil * back.real)[rows, columns]) @ shapes.T
-    peak = pupil if lyot is None else pupil * lyot.stop
-    scale = (2 * np.pi / wavelength_nm / peak.sum()) ** 2 / np.count_nonzero(inside)
+    scale = (2 * np.pi / wavelength_nm / coronagraph.peak) ** 2 / np.count_nonzero(inside)
     return np.asarray(scale * ((fields @ fields.conj().T).real - second))
 
 

@@ -51,7 +51,7 @@ class LyotStop:
     stop: Array
     samples_per: int = 8
 
-    def behind(self, field: Complex) -> Complex:
+    def behind(self, field: Array | Complex) -> Complex:
         """Field (n, n) after the stop for a pupil field before the mask: the field minus the blocked part (Babinet)."""
         return np.asarray(self.stop * (field - self._blocked(field)))
 
@@ -60,7 +60,7 @@ class LyotStop:
         stopped = self.stop * field
         return np.asarray(stopped - self._blocked(stopped.conj()).conj())
 
-    def _blocked(self, field: Complex) -> Complex:
+    def _blocked(self, field: Array | Complex) -> Complex:
         focal = to_image(np.asarray(field, np.complex128), len(self.opaque), self.samples_per, 1.0)
         return to_pupil(focal * self.opaque, len(field), self.samples_per, 1.0)
 
@@ -72,45 +72,51 @@ class Coronagraph:
     Attributes:
         pupil: (n, n) amplitude transmission.
         dark_zone: Region in which contrast is evaluated.
-        lyot: Mask and stop of a Lyot coronagraph; None for a shaped pupil alone.
     """
 
     pupil: Array
     dark_zone: Wedge = DARK_ZONE
     lyot: LyotStop | None = None
 
+    @property
+    def peak(self) -> float:
+        """Amplitude at the centre of the star's image with a flat wavefront, off the mask."""
+        return float((self.pupil if self.lyot is None else self.pupil * self.lyot.stop).sum())
+
+    def behind(self, field: Array | Complex) -> Array | Complex:
+        """Field (n, n) in front of the science camera for a field after the pupil's mask."""
+        return field if self.lyot is None else self.lyot.behind(field)
+
 
 def contrast(
-    pupil: Array,
+    coronagraph: Coronagraph,
     opd_nm: Array,
     wavelength_nm: float,
     columns: int,
     rows: int | None = None,
     samples_per: int = 4,
-    lyot: LyotStop | None = None,
 ) -> Array:
     """Contrast (rows, columns) at the centre of the science focal plane, sampled on `image_axis` in both directions.
 
     Args:
-        pupil: (n, n) amplitude transmission.
-        opd_nm: Wavefront (n, n).
+        coronagraph: The optics.
+        opd_nm: Wavefront (n, n), sampled like the pupil.
         wavelength_nm: The wavelength.
         columns: Samples along x.
         rows: Samples along y; as many as columns when None.
         samples_per: Samples per lambda / D; two suffice for means, since the intensity's band is 1 D to either side.
-        lyot: Mask and stop of a Lyot coronagraph; None for a shaped pupil alone.
 
     Raises:
         ValueError: The wavefront is not sampled like the pupil.
     """
+    pupil = coronagraph.pupil
     if opd_nm.shape != pupil.shape:
         raise ValueError(f"a wavefront must be sampled like the pupil, {pupil.shape}, got {opd_nm.shape}")
     in_x = kernel(columns, samples_per, len(pupil), 1.0)
     in_y = kernel(columns if rows is None else rows, samples_per, len(pupil), 1.0)
     field = pupil * np.exp((2j * np.pi / wavelength_nm) * opd_nm)
-    peak = pupil if lyot is None else pupil * lyot.stop
-    image = in_y @ (field if lyot is None else lyot.behind(field)) @ in_x.T
-    return np.asarray((image.real**2 + image.imag**2) / np.sum(peak) ** 2)
+    image = in_y @ coronagraph.behind(field) @ in_x.T
+    return np.asarray((image.real**2 + image.imag**2) / coronagraph.peak**2)
 
 
 def wedge_samples(wedge: Wedge, columns: int, rows: int, samples_per: int = 4) -> Mask:
@@ -122,44 +128,37 @@ def wedge_samples(wedge: Wedge, columns: int, rows: int, samples_per: int = 4) -
 
 
 def mean_contrast(
-    pupil: Array,
-    opd_nm: Array,
-    wavelength_nm: float,
-    wedge: Wedge,
-    samples_per: int = 4,
-    lyot: LyotStop | None = None,
+    coronagraph: Coronagraph, opd_nm: Array, wavelength_nm: float, wedge: Wedge, samples_per: int = 4
 ) -> float:
     """Mean contrast in a wedge; arguments and shapes as for `contrast`."""
     columns, rows = _extent(wedge, samples_per)
-    image = contrast(pupil, opd_nm, wavelength_nm, columns, rows, samples_per, lyot)
+    image = contrast(coronagraph, opd_nm, wavelength_nm, columns, rows, samples_per)
     return float(image[wedge_samples(wedge, columns, rows, samples_per)].mean())
 
 
 def contrast_curve(
-    pupil: Array,
+    coronagraph: Coronagraph,
     opd_nm: Array,
     wavelength_nm: float,
     edges: Array,
     wedge: Wedge = DARK_ZONE,
     samples_per: int = 4,
-    lyot: LyotStop | None = None,
 ) -> Array:
     """Contrast (rings,) averaged in azimuth within a wedge's opening, Fig. 1(c); other arguments as for `contrast`.
 
     Args:
-        pupil: Amplitude transmission.
+        coronagraph: The optics.
         opd_nm: Wavefront.
         wavelength_nm: The wavelength.
         edges: (rings + 1,) radii between the rings, in lambda / D, spaced by at least one sample.
         wedge: Only its opening is used.
         samples_per: Samples per lambda / D.
-        lyot: Mask and stop of a Lyot coronagraph; None for a shaped pupil alone.
     """
     sector = Wedge(0.0, float(edges[-1]), wedge.half_opening_deg)
     columns, rows = _extent(sector, samples_per)
     inside = wedge_samples(sector, columns, rows, samples_per)
     radius = np.hypot(image_axis(rows, samples_per)[:, None], image_axis(columns, samples_per))[inside]
-    values = contrast(pupil, opd_nm, wavelength_nm, columns, rows, samples_per, lyot)[inside]
+    values = contrast(coronagraph, opd_nm, wavelength_nm, columns, rows, samples_per)[inside]
     count, _ = np.histogram(radius, edges)
     total, _ = np.histogram(radius, edges, weights=values)
     return np.asarray(total / count)

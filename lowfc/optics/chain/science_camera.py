@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lowfc.arrays import Array, Single, Whole
-from lowfc.optics.chain.coronagraph import LyotStop, Wedge, wedge_samples
+from lowfc.optics.chain.coronagraph import Coronagraph, LyotStop, Wedge, wedge_samples
 from lowfc.optics.chain.fourier import kernel
 from lowfc.optics.chain.grid import pupil_axis
 from lowfc.optics.chain.zernike import zernikes
@@ -31,27 +31,26 @@ class ScienceCamera:
 
     def __init__(
         self,
-        pupil: Array,
+        coronagraph: Coronagraph,
         noll: Sequence[int],
         wavelength_nm: float,
         half_width: int = 12,
         samples_per: int = 4,
-        lyot: LyotStop | None = None,
     ) -> None:
         """Prepare the kernels.
 
         Args:
-            pupil: (n, n) amplitude transmission.
+            coronagraph: The optics.
             noll: Noll index of each mode.
             wavelength_nm: The wavelength.
             half_width: Half of the image's width, in lambda / D.
             samples_per: Samples per lambda / D.
-            lyot: Mask and stop of a Lyot coronagraph; None for a shaped pupil alone.
 
         Raises:
             ValueError: The pupil is not square, transmits no light, or is not a multiple of 4 samples across with a
                 Lyot stop; or there are no modes.
         """
+        pupil, lyot = coronagraph.pupil, coronagraph.lyot
         if pupil.ndim != 2 or pupil.shape[0] != pupil.shape[1] or not pupil.any():
             raise ValueError(f"a pupil must be square and let light through, got shape {pupil.shape}")
         if lyot is not None and len(pupil) % _LYOT_SQUARE:
@@ -68,9 +67,8 @@ class ScienceCamera:
         cells = _averaged(pupil, square)
         used = np.flatnonzero(cells.any(axis=1)), np.flatnonzero(cells.any(axis=0))
         summed = exact.reshape(self.samples, len(cells), square).sum(axis=2)
-        peak = (pupil if lyot is None else pupil * lyot.stop).sum()
         self._lyot = None if lyot is None else _Lyot.of(lyot, square, used)
-        self._in_y = (summed[:, used[0]] / peak).astype(np.complex64)
+        self._in_y = (summed[:, used[0]] / coronagraph.peak).astype(np.complex64)
         self._in_x = summed[:, used[1]].T.astype(np.complex64)
         cells = cells[np.ix_(*used)]
         rows, columns = np.nonzero(cells)

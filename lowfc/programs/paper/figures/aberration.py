@@ -174,19 +174,16 @@ def plot_fig7(context: Context, path: Path) -> None:
 
 
 def _image(ready: Prepared, modes_nm: Array, samples_per: int) -> Array:
-    optics, columns = ready.coronagraph, 2 * _VIEW * samples_per
-    opd_nm, wavelength_nm = ready.opd_nm(modes_nm), ready.sensor.wavelength_nm
-    return contrast(optics.pupil, opd_nm, wavelength_nm, columns, samples_per=samples_per, lyot=optics.lyot)
+    columns, wavelength_nm = 2 * _VIEW * samples_per, ready.sensor.wavelength_nm
+    return contrast(ready.coronagraph, ready.opd_nm(modes_nm), wavelength_nm, columns, samples_per=samples_per)
 
 
 def _contrast(ready: Prepared, modes_nm: Array) -> float:
-    optics, opd_nm = ready.coronagraph, ready.opd_nm(modes_nm)
-    return mean_contrast(optics.pupil, opd_nm, ready.sensor.wavelength_nm, _RING, lyot=optics.lyot)
+    return mean_contrast(ready.coronagraph, ready.opd_nm(modes_nm), ready.sensor.wavelength_nm, _RING)
 
 
 def _curve(ready: Prepared, modes_nm: Array) -> Array:
-    optics, opd_nm = ready.coronagraph, ready.opd_nm(modes_nm)
-    return contrast_curve(optics.pupil, opd_nm, ready.sensor.wavelength_nm, _CURVE_EDGES, lyot=optics.lyot)
+    return contrast_curve(ready.coronagraph, ready.opd_nm(modes_nm), ready.sensor.wavelength_nm, _CURVE_EDGES)
 
 
 CASES = {

@@ -52,9 +52,8 @@ def _maps() -> tuple[Array, Array, Mask]:
 
 def _image(modes_nm: Array, samples: int) -> Array:
     ready = prepared("sam")
-    return contrast(
-        ready.sensor.pupil, ready.opd_nm(modes_nm), ready.sensor.wavelength_nm, samples, samples_per=_SAMPLES_PER
-    )
+    wavelength_nm = ready.sensor.wavelength_nm
+    return contrast(ready.coronagraph, ready.opd_nm(modes_nm), wavelength_nm, samples, samples_per=_SAMPLES_PER)
 
 
 def zero_point_nm(name: str) -> Array:

@@ -76,8 +76,7 @@ class Science(Panel):
         noll = snapshot.calibration.noll
         if self._camera is None or noll != self._noll:  # wavefronts of other modes are dropped
             self._noll = noll
-            pupil, lyot = self._coronagraph.pupil, self._coronagraph.lyot
-            self._camera = ScienceCamera(pupil, noll, self._wavelength_nm, _HALF_WIDTH, _SAMPLES_PER, lyot)
+            self._camera = ScienceCamera(self._coronagraph, noll, self._wavelength_nm, _HALF_WIDTH, _SAMPLES_PER)
             self._flat = self._camera.mean_contrast(self._camera.image(np.zeros(len(noll))), self._wedge)
             self._clear()
         for source, wavefronts in self._wavefronts.items():
