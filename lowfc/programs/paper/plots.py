@@ -5,7 +5,7 @@ from importlib import import_module
 from math import ceil
 from pathlib import Path
 from textwrap import fill
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
@@ -76,17 +76,14 @@ def picture(
     """An image (rows, columns) with a colour bar; NaN is grey. `half_width` is in the unit of the axes."""
 
     def panel(figure: "Figure", axes: "Axes") -> None:
-        low, high, w = *bounds, half_width
-        options: dict[str, Any] = {"vmin": low, "vmax": high}
-        if scale == "log":
-            options = {"norm": import_module("matplotlib.colors").LogNorm(low, high)}
+        colours, w = import_module("matplotlib.colors"), half_width
         image = axes.imshow(
-            np.maximum(values, low) if scale == "log" else values,
+            np.maximum(values, bounds[0]) if scale == "log" else values,
             cmap=_MAPS[scale],
+            norm=(colours.LogNorm if scale == "log" else colours.Normalize)(*bounds),
             origin="lower",
             extent=(-w, w, -w, w),
             interpolation="nearest",
-            **options,
         )
         axes.set_facecolor("0.75")
         _label(axes, title, *labels)

@@ -97,20 +97,8 @@ def _with_verdict(row: Row, allowed: float | None = None) -> list[Row]:
         return [row]
     assert isinstance(ours, float)  # noqa: S101  # these are
     assert isinstance(best, float)  # noqa: S101
-    verdict = REACHED if ours <= best else NOT_REACHED
-    return [
-        row,
-        replace(
-            row,
-            quantity=f"verdict, {row.quantity}",
-            unit="",
-            measured=verdict,
-            paper=None,
-            error=None,
-            predicted=None,
-            limit=None,
-        ),
-    ]
+    verdict = Row(row.name, f"verdict, {row.quantity}", "", REACHED if ours <= best else NOT_REACHED)
+    return [row, replace(verdict, modes=row.modes, estimator=row.estimator, assumption=row.assumption)]
 
 
 def _pointing(context: Context, name: str) -> list[Row]:

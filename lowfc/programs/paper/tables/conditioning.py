@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 
 from lowfc.adapters.files.layouts import load_layout
+from lowfc.arrays import Array
 from lowfc.contract.sections import SensorSection
 from lowfc.control.calibration.calibration import condition_number
 from lowfc.design.fisher import cramer_rao, quantum_information, variance_e
@@ -110,28 +111,20 @@ def _rows(kind: str, mask: Prepared) -> Iterator[Row]:
 
 def _noise_rows(mask: Prepared, light_e: float) -> Iterator[Row]:
     """The noise of 14 modes, and its quantum limit."""
-    limit = np.diag(
-        np.linalg.inv(quantum_information(mask.sensor.pupil, mask.modes[:14], mask.sensor.wavelength_nm, light_e))
-    )
-    bounded = partial(Row, mask.name, modes=14, estimator="Cramer-Rao bound")
-    modes, band = mask.modes[:14], gauss_legendre(mask.sensor.wavelength_nm, count=4)
-    for quantity in ("noise", "noise, 20 % band"):
-        if quantity == "noise":
-            I0, H = mask.I0, mask.H[:, :14]
-        else:  # not computed for a mask that cannot distinguish the modes at the central wavelength
-            I0, H = reference(mask.sensor, band).ravel(), response(mask.sensor, modes, band)
-        try:
-            bound = np.diag(cramer_rao(H * light_e, variance_e(I0 * light_e, 0.0)))
-        except ValueError:
-            return
-        quantum = float(np.sqrt(limit.sum())) if quantity == "noise" else None
-        yield bounded(
-            quantity=quantity,
-            unit="nm",
-            measured=float(np.sqrt(bound.sum())),
-            limit=quantum,
-            assumption=f"{NOISE}\n{QUANTUM}" if quantum else NOISE,
-        )
-        if quantum:
-            share = float(np.median(limit / bound))
-            yield bounded(quantity="share of the quantum limit", unit="", measured=share, limit=1.0, assumption=SHARE)
+    sensor, modes = mask.sensor, mask.modes[:14]
+    band = gauss_legendre(sensor.wavelength_nm, count=4)
+
+    def bound_nm2(I0: Array, H: Array) -> Array:
+        return np.diag(cramer_rao(H * light_e, variance_e(I0 * light_e, 0.0)))
+
+    try:
+        bound = bound_nm2(mask.I0, mask.H[:, :14])
+    except ValueError:  # the mask cannot distinguish the modes
+        return
+    limit = np.diag(np.linalg.inv(quantum_information(sensor.pupil, modes, sensor.wavelength_nm, light_e)))
+    in_band = bound_nm2(reference(sensor, band).ravel(), response(sensor, modes, band))
+    noise, least, broad = (float(np.sqrt(each.sum())) for each in (bound, limit, in_band))
+    row = partial(Row, mask.name, modes=14, estimator="Cramer-Rao bound")
+    yield row("noise", "nm", noise, limit=least, assumption=f"{NOISE}\n{QUANTUM}")
+    yield row("share of the quantum limit", "", float(np.median(limit / bound)), limit=1.0, assumption=SHARE)
+    yield row("noise, 20 % band", "nm", broad, assumption=NOISE)
