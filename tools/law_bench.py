@@ -19,7 +19,7 @@ from lowfc.control.laws.tuning import Tuned, best_gains, identified, tune_integr
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.inputs import Command as Commanded
 from lowfc.control.loop.inputs import Frame, Input, Load, Outputs, PendingEvent, Request, Step
-from lowfc.control.loop.state import Settings, State
+from lowfc.control.loop.state import State
 from lowfc.device import DriverOptions
 from lowfc.device.mirror_loop import protection_of
 from lowfc.device.mirror_protection import Command, Status, apply_command
@@ -72,7 +72,12 @@ class Bench:
         nm_per_mas: nm rms of wavefront per milliarcsecond of tilt.
         frames_refused: number of frames that the controller did not use.
         events: frame number and event of the controller, since the start.
+        settings: settings of the controller.
+        state: state of the controller.
+        watch: comparison of gains and detection of harm; None for neither.
     """
+
+    watch: GainWatch | None = None
 
     def __init__(
         self,
@@ -89,23 +94,23 @@ class Bench:
             disturbance: replaces the configuration's.
             world: configuration of optics, detector and mirror, if it differs from `config`.
         """
-        self.config, self.world = config, config if world is None else world
-        self.nm_per_mas = tilt_nm_per_mas(config.star.diameter_m)
-        self.frames_refused = 0
+        self._begin(config, Load(0, first, "bench") if isinstance(first, Calibration) else first)
+        self.watch = GainWatch(self.settings, config.control.on_harm, factory.contrast_of(config).form)
+        self.world = config if world is None else world
         self._other_disturbance = disturbance
         self.scene = scene(self.world, disturbance)
-        self._settings = factory.settings(config)
-        self._watch: GainWatch | None = GainWatch(
-            self._settings, config.control.on_harm, factory.contrast_of(config).form
-        )
-        self.events: list[tuple[int, PendingEvent]] = []
-        begin = Load(0, first, "bench") if isinstance(first, Calibration) else first
-        self._state = advance(self._settings, State(), begin)[0]
         self.start_mirror()
         self._weights = delay_weights(self.world.camera.delay_frames).astype(np.float32)
         self._shapes = [self._status.surface_nm] * len(self._weights)
         self._path = MirrorPath(self._status.surface_nm, self.world.camera.delay_frames - 1)
-        self._index = 0
+
+    def _begin(self, config: Configuration, first: Input) -> None:
+        """Start the controller."""
+        self.config, self.frames_refused, self._index = config, 0, 0
+        self.nm_per_mas = tilt_nm_per_mas(config.star.diameter_m)
+        self.events: list[tuple[int, PendingEvent]] = []
+        self.settings = factory.settings(config)
+        self.state = advance(self.settings, State(), first)[0]
         self.new_record()
 
     def start_mirror(self) -> None:
@@ -119,25 +124,6 @@ class Bench:
         """Begin a new record."""
         self.steps: list[Step] = []
         self.truths: list[Truth] = []
-
-    @property
-    def state(self) -> State:
-        """State of the controller."""
-        return self._state
-
-    @property
-    def settings(self) -> Settings:
-        """Settings of the controller."""
-        return self._settings
-
-    @property
-    def closing_harm(self) -> str:
-        """Harm that closing would do, in words; empty for none."""
-        return "" if self._watch is None else self._watch.closing_harm
-
-    def added_contrast(self) -> tuple[float, Array] | None:
-        """Contrast that the open loop adds to the dark zone, and that of each mode (modes,) now, as measured."""
-        return None if self._watch is None else self._watch.added_contrast()
 
     def star(self, magnitude: float) -> None:
         """Point at another star."""
@@ -171,7 +157,7 @@ class Bench:
 
     def take(self, input_: Input) -> Outputs:
         """Give the controller an input."""
-        self._state, outputs = advance(self._settings, self._state, input_)
+        self.state, outputs = advance(self.settings, self.state, input_)
         return outputs
 
     def frame(self, pixels: Pixels, start: int = 1 << 32) -> Frame:
@@ -208,12 +194,11 @@ class Bench:
     def _watched(self, outputs: Outputs) -> None:
         """Apply the requests of the gain watch, as the controller does."""
         events = list(outputs.events)
-        if outputs.step is not None and self._watch is not None:
-            found = self._watch.observe(outputs.step, self._state)
+        if outputs.step is not None and self.watch is not None:
+            found = self.watch.observe(outputs.step, self.state)
             events += found.events
             for request in found.requests:
-                self._state, others = advance(self._settings, self._state, request)
-                events += others.events
+                events += self.take(request).events
         self.events += [(self._index - 1, event) for event in events]
 
     def pol(self) -> TimeSeries:

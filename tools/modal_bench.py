@@ -9,15 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from lowfc.adapters.files import factory
 from lowfc.arrays import Array, Pixels, Single
 from lowfc.contract.configuration import Configuration
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.stability import delay_weights
-from lowfc.control.loop.advance import advance
 from lowfc.control.loop.inputs import Frame, Load
-from lowfc.control.loop.state import State
-from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.core.gain_watch import GainWatch
 from sim_camera.disturbance import BLOCK, Disturbance, Sampler
 from sim_camera.driver import disturbance_of
@@ -77,20 +73,14 @@ class ModalBench(Bench):
             disturbance: replaces the configuration's.
             watch: whether to compare gains and detect harm, which takes a third of the time.
         """
-        self.config, self.frames_refused = config, 0
-        self.nm_per_mas = tilt_nm_per_mas(config.star.diameter_m)
+        self._begin(config, Load(0, _differential_calibration(config.noll), "bench"))
+        self.watch = GainWatch(self.settings, config.control.on_harm) if watch else None
         self._disturbance = disturbance_of(config) if disturbance is None else disturbance
-        self._settings = factory.settings(config)
-        self._watch = GainWatch(self._settings, config.control.on_harm) if watch else None
-        self.events = []
-        self._state = advance(self._settings, State(), Load(0, _differential_calibration(config.noll), "bench"))[0]
         self._sampler = self._sampled()
         self._mix = np.linalg.cholesky(covariance_nm2).T.astype(np.float32)
         self._noise = np.random.Generator(np.random.SFC64(np.random.SeedSequence([config.seed, 3])))
         self._weights = delay_weights(config.camera.delay_frames).astype(np.float32)
         self._mirror_shapes_nm = [np.zeros(len(config.noll), np.float32)] * len(self._weights)
-        self._index = 0
-        self.new_record()
 
     def new_record(self) -> None:
         """Begin a new record."""
@@ -126,9 +116,7 @@ class ModalBench(Bench):
             modes_nm = self._sampler.at(self._index)
             pixels = _encoded(modes_nm[:2].mean(axis=0) + mirror_nm + noise_nm[count % _NOISE_BLOCK])
             time_ns = 10**18 + self._index * self.config.period_ns
-            self._state, outputs = advance(
-                self._settings, self._state, Frame((1 << 32) + self._index, time_ns, 0, pixels)
-            )
+            outputs = self.take(Frame((1 << 32) + self._index, time_ns, 0, pixels))
             self._index += 1
             self._watched(outputs)
             newest_nm = self._mirror_shapes_nm[0]

@@ -251,22 +251,22 @@ def test_added_contrast_is_measured_in_open_and_closed_loop() -> None:
         truths = [getattr(truth.continuous, name) for truth in loop.truths[-frames:]]
         return float(form @ np.mean(np.square(truths), axis=0))
 
-    assert loop.added_contrast() is None
+    assert loop.watch.added_contrast() is None
     loop.run(333, record=False)
     loop.run(667)
-    uncorrected, by_mode = loop.added_contrast()
+    uncorrected, by_mode = loop.watch.added_contrast()
     assert uncorrected == pytest.approx(true("disturbance_nm", 667), rel=0.3)
     assert 0.5 < by_mode.sum() / true("residual_nm", 500) < 2  # the noise of one frame is some ten times the residual
     loop.ask("open")
     loop.run(1)
-    _, opened_by_mode = loop.added_contrast()
+    _, opened_by_mode = loop.watch.added_contrast()
     assert opened_by_mode.sum() == pytest.approx(uncorrected)
 
 
 def test_manual_gains_are_kept_and_harm_is_reported_before_and_after_closing() -> None:
     loop = bench(6.5, **FIXED_GAINS | {"control.start_mode": "open"})
     loop.run(500, record=False)
-    assert "closing adds" in loop.closing_harm
+    assert "closing adds" in loop.watch.closing_harm
     loop.ask("close")
     loop.run(250, record=False)
     loop.run(600)

@@ -169,4 +169,6 @@ def test_science_camera_refuses_inconsistent_inputs(shaped, camera):
     with pytest.raises(ValueError, match="must have modes"):
         ScienceCamera(shaped, (), NM)
     with pytest.raises(ValueError, match="multiple of 4 samples across, got 126"):
-        ScienceCamera(Coronagraph(np.ones((126, 126)), lyot=LyotStop(np.ones((8, 8)), np.ones((126, 126)))), NOLLS_14, NM)
+        ScienceCamera(
+            Coronagraph(np.ones((126, 126)), lyot=LyotStop(np.ones((8, 8)), np.ones((126, 126)))), NOLLS_14, NM
+        )
