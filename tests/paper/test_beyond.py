@@ -7,15 +7,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from lowfc.adapters.process.terminal import new_app
 from lowfc.contract.configuration import load
 from lowfc.contract.errors import LowfcError
 from lowfc.design.tolerance import KINDS
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.paper.cases import Context, Prepared, Row, plain, section_of
-from lowfc.programs.paper.commands import ADDITIONAL, validate
+from lowfc.programs.paper.commands import ADDITIONAL
 from lowfc.programs.paper.dark_hole import SHIFTED, ChannelResult
 from lowfc.programs.paper.report import CASES, PICTURES, to_page, to_text
 from lowfc.programs.paper.tables import anchors, star_pair, tolerance
@@ -63,16 +61,6 @@ def test_every_anchor_has_a_verdict_and_no_noise_is_below_the_quantum_limit():
     for row in rows:
         if row["limit"] is not None and row["error"] is None and row["unit"] != "mas":  # computed, without scatter
             assert row["measured"] >= row["limit"]
-
-
-def test_docs_is_refused_for_parts_of_a_page(tmp_path):
-    app = new_app("Test.")
-    app.command("validate")(validate)
-    app.command("other")(lambda: None)
-    for words in (["tolerance", "table1"], ["anchors", "--sensor", "sam"]):
-        ran = CliRunner().invoke(app, ["validate", *words, "--docs", str(tmp_path)])
-        assert ran.exit_code
-        assert "--docs writes complete pages" in str(ran.exception)
 
 
 def agree(rows: list[Row], name: str) -> int:

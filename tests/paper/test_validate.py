@@ -193,6 +193,8 @@ def test_the_command_prints_one_json_object():
         (("tolerance", "--sensor", "open"), "tolerance: sensor open, 14 modes: the sensor cannot tell"),
         (("table1", "--docs", "."), "use it with all"),
         (("all", "--docs", ".", "--sensor", "sam"), "use it with all"),
+        (("tolerance", "table1", "--docs", "."), "--docs writes complete pages"),
+        (("anchors", "--sensor", "sam", "--docs", "."), "--docs writes complete pages"),
     ],
 )
 def test_user_errors_are_one_line(words, message):
