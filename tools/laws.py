@@ -125,17 +125,14 @@ def optimum_mas(config: Configuration, calibration: Calibration, *, robust: bool
     disturbance, timing = disturbance_of(config), timing_of(config)
     frequency_hz, variance_nm2 = variances_nm2(disturbance)
     noise_nm = frame_noise_nm(config, calibration)[:2]
-    best = []
-    for axis in (0, 1):
-        power = variance_nm2[:, axis]
+
+    def best_nm2(axis: int) -> float:
+        power, variance = variance_nm2[:, axis], float(noise_nm[axis] ** 2)
         known = tuple(
             Line(line.frequency_hz, line.width_hz, float(line.rms_nm[axis] ** 2)) for line in disturbance.lines
         )
-        variance = float(noise_nm[axis] ** 2)
 
-        def residual(
-            drift: Any, axis: int = axis, power: Any = power, known: Any = known, variance: float = variance
-        ) -> float:
+        def residual(drift: Any) -> float:
             step, cutoff_hz = 10.0 ** np.asarray(drift)
             model = Model(step, cutoff_hz, known, variance, RATE_HZ)
             block = within_margins(model, timing) if robust else lqg_block(model, timing)
@@ -149,8 +146,9 @@ def optimum_mas(config: Configuration, calibration: Calibration, *, robust: bool
         (step, corner), ((least, most), (lowest, _)) = found.x, _DRIFT_BOUNDS
         if min(step - least, most - step, corner - lowest) < 0.05:
             raise RuntimeError(f"no minimum within {_DRIFT_BOUNDS}: ended at {found.x}")
-        best.append(found.fun)
-    return float(np.sqrt(np.mean(best)) / tilt_nm_per_mas(config.star.diameter_m))
+        return float(found.fun)
+
+    return float(np.sqrt(np.mean([best_nm2(0), best_nm2(1)])) / tilt_nm_per_mas(config.star.diameter_m))
 
 
 def render(results: Results) -> str:

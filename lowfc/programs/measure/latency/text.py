@@ -93,27 +93,26 @@ def _row(name: str, values: Mapping[str, float]) -> str:
     return f"{name:<22}" + "".join(f"{values[at]:>9.1f}" for at in PERCENTILES)
 
 
-def _ratio(value: float) -> str:
-    return f"{value:.2f}" if value >= 0.01 else f"{value:.1g}"
+def _ratios(results: Mapping[str, Any], name: str) -> list[str]:
+    """Each percentile of a ratio, with its range."""
+
+    def text(value: float) -> str:
+        return f"{value:.2f}" if value >= 0.01 else f"{value:.1g}"
+
+    spread = results[f"{name}_spread"].items()
+    return [f"{at} {text(results[name][at])} ({text(low)} to {text(high)})" for at, (low, high) in spread]
 
 
 def _remarks(results: Mapping[str, Any]) -> list[str]:
     lines = []
     for name, (_, suffix) in RATIOS.items():
         if results[name]:
-            spread = results[f"{name}_spread"]
-            parts = [
-                f"{at} {_ratio(results[name][at])} ({_ratio(low)} to {_ratio(high)})"
-                for at, (low, high) in spread.items()
-            ]
-            lines.append(f"frame to command over half a bare echo and one control step{suffix}: {', '.join(parts)}")
+            ratios = ", ".join(_ratios(results, name))
+            lines.append(f"frame to command over half a bare echo and one control step{suffix}: {ratios}")
     if results.get("kernel_ratio"):
-        spread, numpy_us = results["kernel_ratio_spread"], results["numpy_us"]
-        parts = [
-            f"{at} {results['kernel_ratio'][at]:.2f} ({low:.2f} to {high:.2f}) of {numpy_us[at]:.1f} us"
-            for at, (low, high) in spread.items()
-        ]
-        lines.append(f"all results: fused step; ratio of its frame to command to numpy's, in turns: {', '.join(parts)}")
+        each = zip(_ratios(results, "kernel_ratio"), results["kernel_ratio_spread"], strict=True)
+        ratios = ", ".join(f"{ratio} of {results['numpy_us'][at]:.1f} us" for ratio, at in each)
+        lines.append(f"all results: fused step; ratio of its frame to command to numpy's, in turns: {ratios}")
     counts = {name: results.get(name) for name in COUNTS}
     shown = [name for name, count in counts.items() if count or (name in _ALWAYS and count is not None)]
     lines.append(", ".join(f"{counts[name]} {COUNTS[name]}" for name in shown))
