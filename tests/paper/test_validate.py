@@ -177,8 +177,9 @@ def test_the_command_prints_one_json_object():
     assert (table["table"], table["trials"], table["seed"]) == ("table1", 7, 3)
     assert set(table["rows"][0]) >= {"name", "modes", "estimator", "quantity", "unit"}
     assert set(table["rows"][0]) >= {"paper", "measured", "error", "predicted", "limit", "assumption"}
-    several = json.loads(lowfc("validate", "table2", "table1", "--sensor", SAM, "--json").stdout)
+    several = json.loads(lowfc("validate", "table2", "table1", "--sensor", SAM, "--sensor", SAM, "--json").stdout)
     assert [table["table"] for table in several["tables"]] == ["table1", "table2"]
+    assert len({key(row) for row in several["tables"][1]["rows"]}) == len(several["tables"][1]["rows"])
 
 
 @pytest.mark.parametrize(

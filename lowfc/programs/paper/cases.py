@@ -34,10 +34,6 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-def no_progress(what: str, done: int, total: int) -> None:
-    """Report no progress."""
-
-
 class Prepared:
     """A sensor at the paper's sampling, with the quantities that the tables use, computed on first use."""
 
@@ -276,7 +272,7 @@ class Context:
     seed: int = 1
     jobs: int = 1
     sensors: tuple[str, ...] | None = None
-    progress: Callable[[str, int, int], None] = no_progress
+    progress: Callable[[str, int, int], object] = lambda *_: None
 
     def names(self, *own: str) -> tuple[str, ...]:
         """The requested sensors, or a table's own."""

@@ -76,7 +76,7 @@ def validate(
     from lowfc.programs.paper.cases import Context
     from lowfc.programs.paper.report import PICTURES, run, to_json, to_text, write_document, write_page
 
-    context = Context(trials, seed, jobs or len(os.sched_getaffinity(0)), tuple(sensor) if sensor else None)
+    context = Context(trials, seed, jobs or len(os.sched_getaffinity(0)), tuple(dict.fromkeys(sensor or ())) or None)
     fixed = [name for name in chosen if name in OF_THE_PAPER]
     if sensor and fixed:
         typer.echo(f"{', '.join(fixed)}: for the paper's own sensors only, --sensor has no effect there", err=True)

@@ -181,7 +181,9 @@ def _tolerated(name: str, lines: dict[Kind, Callable[[Array], Array]]) -> Iterat
 
 def _checked(context: Context) -> list[Row]:
     """Rows of the simulated points, six for each sensor."""
-    cases = list(product(context.names(*CHECKED_SENSORS), CHECKED_MAGNITUDES, CHECKED_MODES))
+    names = context.names(*CHECKED_SENSORS)
+    twins = {name: prepared(name).twin for name in names}  # built before the threads use them
+    cases = list(product(names, CHECKED_MAGNITUDES, CHECKED_MODES))
 
     def simulated(case: tuple[str, float, int]) -> Row:
         name, magnitude, noll = case
@@ -189,7 +191,7 @@ def _checked(context: Context) -> list[Row]:
         noise = float(np.diag(frame_noise_nm2(name, magnitude))[mode])
         drift = tolerated_drift(of_contrast.variance_nm2(mode, CHECKED_CONTRAST), noise, EXPOSURE)
         frames = int(np.ceil(_FRAMES_PER_TRIAL * context.trials / drift.gain))
-        trial = DriftTrial(prepared(name).twin, NOLLS_14, light_e(magnitude), READ_NOISE_E, EXPOSURE)
+        trial = DriftTrial(twins[name], NOLLS_14, light_e(magnitude), READ_NOISE_E, EXPOSURE)
         only = np.eye(len(NOLLS_14))[mode]
         rng = context.rng("tolerance", name, round(magnitude), noll)
         residual_nm2 = trial.residual_nm2(drift.step_nm2 * only, drift.gain * only, frames, rng)
