@@ -409,6 +409,7 @@ def test_files_that_are_no_results_or_logs_are_errors(tmp_path: Path) -> None:
     for content, expected in (
         ("{", "not JSON"),
         ("[]", "no latency_us"),
+        ("[" * 100_000, "not JSON"),
         ('{"latency_us": {}}', "ratio"),
         (listed, "at least one is not"),
     ):

@@ -194,7 +194,7 @@ def _result(file: Path) -> dict[str, Any]:
         found = json.loads(file.read_text(encoding="utf-8"))
     except OSError as fault:
         raise DataFileError(f"{file} cannot be read: {fault.strerror}") from None
-    except ValueError as fault:  # not UTF-8, or not JSON
+    except (ValueError, RecursionError) as fault:  # not UTF-8, or not JSON
         raise DataFileError(f"{file} must be a result of `lowfc latency --json`, but is not JSON: {fault}") from None
     if not isinstance(found, dict) or "latency_us" not in found:
         raise DataFileError(f"{file} must be a result of `lowfc latency --json`, but has no latency_us")
