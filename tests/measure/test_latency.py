@@ -320,18 +320,9 @@ def runs() -> set[Path]:
 def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:
     folder = tmp_path_factory.mktemp("latency")
     (folder / "loop.toml").write_text(f'[recorder]\nfolder = "{folder}"\nmin_free_mb = 0\n')
-    words = (
-        "--duration",
-        str(SECONDS),
-        "--rate",
-        str(RATE_HZ),
-        "--trace",
-        "--record",
-        "--config",
-        folder / "loop.toml",
-    )
     before = runs()
-    done = lowfc("latency", *words, "--plot", folder / "latency.png", "--json")
+    words = f"--duration {SECONDS} --rate {RATE_HZ} --trace --record --json".split()
+    done = lowfc("latency", *words, "--config", folder / "loop.toml", "--plot", folder / "latency.png")
     assert done.exit_code == 0, (done.output, done.exception)
     assert runs() == before
     (folder / "a.json").write_text(done.stdout)
