@@ -227,11 +227,6 @@ class Row:
     estimator: str | None = None
     assumption: str | None = None
 
-    @property
-    def key(self) -> tuple[str, int | None, str | None, str]:
-        """Key of the row, unique in its table."""
-        return self.name, self.modes, self.estimator, self.quantity
-
 
 ORDER = (
     *("name", "modes", "estimator", "quantity", "unit"),
