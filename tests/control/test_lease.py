@@ -172,9 +172,13 @@ def test_an_expired_lease_ends_before_the_next_request() -> None:
     assert names([outputs]) == ["LEASE_ENDED"]
 
 
-def test_a_lease_outlives_a_camera_restart() -> None:
-    state, _ = feed(DEFAULTS, held(1.0), frame(1, SOME, sequence=frame_sequence(1, start=1_800_000_000)))
-    assert not state.conditions.lease.ended
+@pytest.mark.parametrize("frames", [0, 3])
+def test_a_lease_keeps_its_number_of_frames_when_the_camera_starts(frames: int) -> None:
+    start = 1_800_000_000
+    *lasting, last = (frame(count, SOME, sequence=frame_sequence(count, start)) for count in range(1, 1003))
+    state, all_outputs = feed(DEFAULTS, held(1.0, frames), *lasting)
+    assert "LEASE_ENDED" not in names(all_outputs)
+    assert "LEASE_ENDED" in names(feed(DEFAULTS, state, last)[1])
 
 
 def replied(

@@ -145,23 +145,28 @@ def _arrive(state: State, frame: Frame, events: list[PendingEvent]) -> tuple[Sta
             number = frame.sequence & ((1 << COUNT_BITS) - 1)
             events.append(PendingEvent("FRAMES_MISSING", {"count": missing, "number": number}))
             loop = loop.missed(missing) if loop is not None else None
-    elif state.frame_sequence:
+        return state, loop
+    if state.frame_sequence:
         events.append(PendingEvent("CAMERA_RESTARTED", {}))
-        state = _awaiting_camera(state, frame)
         if loop is not None and loop.play is not None:
             loop = loop.stopped(0)  # its frames were counted by the previous start of the camera
             events.append(PendingEvent("PLAY_ENDED", {"why": "the camera restarted"}))
-    else:  # after a clear, this may be another start of the camera
-        state = _awaiting_camera(state, frame)
-    return state, loop
+    return _camera_started(state, frame), loop
 
 
-def _awaiting_camera(state: State, frame: Frame) -> State:
-    """The state, awaiting camera settings unless the known ones may belong to the camera's current start."""
-    camera = state.conditions.camera
-    if camera is None or camera.start_s in (0, frame.sequence >> COUNT_BITS):
-        return state
-    return state._replace(conditions=state.conditions._replace(camera_awaited=True))
+def _camera_started(state: State, frame: Frame) -> State:
+    """The state at the first frame, of the run or of another start of the camera; a lease keeps its remaining frames.
+
+    Camera settings are awaited unless the known ones may belong to this start.
+    """
+    conditions = state.conditions
+    camera, held = conditions.camera, conditions.lease
+    if camera is not None and camera.start_s not in (0, frame.sequence >> COUNT_BITS):
+        conditions = conditions._replace(camera_awaited=True)
+    if held is not None and not held.ended and held.same_start(state.frame_sequence):
+        last_sequence = frame.sequence + held.last_sequence - state.frame_sequence
+        conditions = conditions._replace(lease=held._replace(last_sequence=last_sequence))
+    return state._replace(conditions=conditions)
 
 
 def _newest(state: State, loop: ActiveLoop | None, frame: Frame) -> State:

@@ -33,7 +33,8 @@ class Lease(NamedTuple):
         id: identity in the holder's requests; above 0.
         holder: the holder and its purpose, for people.
         until_ns: end by the controller's clock, unless it is renewed.
-        last_sequence: last frame for which it is in force; 0 if the frame rate is unknown.
+        last_sequence: last frame for which it is in force; before the first frame, the number of frames; 0 if the frame
+            rate is unknown.
         ended: cause of its end; empty while it is in force.
         holds: whether it is a permit: a closed loop holds its command while it is in force.
     """
@@ -52,8 +53,11 @@ class Lease(NamedTuple):
 
     def over(self, time_ns: int, frame_sequence: int) -> bool:
         """Whether it was not renewed in time, by the clock or by frames."""
-        same_camera = frame_sequence >> COUNT_BITS == self.last_sequence >> COUNT_BITS
-        return time_ns > self.until_ns or (same_camera and 0 < self.last_sequence < frame_sequence)
+        return time_ns > self.until_ns or (self.same_start(frame_sequence) and self.last_sequence < frame_sequence)
+
+    def same_start(self, frame_sequence: int) -> bool:
+        """Whether its frames are counted by the start of the camera that took this frame."""
+        return self.last_sequence > 0 and frame_sequence >> COUNT_BITS == self.last_sequence >> COUNT_BITS
 
     def reserved(self, time_ns: int) -> str:
         """Message that the loop is reserved."""

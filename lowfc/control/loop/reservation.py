@@ -97,8 +97,7 @@ def _extended(settings: Settings, state: State, request: Request) -> Lease:
         raise ValueError("a lease needs an identity above 0, got 0")
     if not (0 < len(holder) <= MAX_HOLDER and holder.isprintable()):
         raise ValueError(f"a lease names its holder in 1 to {MAX_HOLDER} printable characters, got {holder[:40]!r}")
-    sequence, rate_hz = state.frame_sequence, settings.rate_hz
-    last_sequence = sequence + ceil(duration_s * rate_hz) if sequence and rate_hz else 0
+    last_sequence = state.frame_sequence + ceil(duration_s * settings.rate_hz) if settings.rate_hz else 0
     return Lease(request.lease_id, holder, request.time_ns + round(duration_s * 1e9), last_sequence)
 
 
