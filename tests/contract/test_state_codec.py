@@ -1,20 +1,21 @@
 """Encoded states, inputs and calibrations are decoded without loss."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
 from lowfc.contract.codecs import codec
-from lowfc.contract.codecs.calibration_codec import decode_calibration, encode_calibration
+from lowfc.contract.codecs.calibration_codec import decode_calibration, encode_calibration, identified
 from lowfc.contract.codecs.state_codec import controller_state, decode_state
 from lowfc.contract.messages import wire
 from lowfc.control.loop.advance import advance
-from lowfc.control.loop.inputs import CameraSettings, Load, MirrorReport, MirrorShape, Report, Tick
+from lowfc.control.loop.inputs import CameraSettings, Load, MirrorReport, MirrorShape, Report, Request, Tick
 from lowfc.control.loop.interlocks import BenchReport
 from lowfc.control.loop.state import State
+from lowfc.control.loop.wording import AUTO
 from tests.support.controller_inputs import CALIBRATION
-from tests.support.toy import frame, loaded, settings
+from tests.support.toy import CAMERA, feed, frame, loaded, settings
 
 
 def test_a_state_without_a_calibration_round_trips() -> None:
@@ -30,10 +31,18 @@ def test_a_state_with_the_wrong_calibration_is_refused() -> None:
         decode_state(message, None)
     with pytest.raises(ValueError, match="is missing"):
         decode_state(message, CALIBRATION)
-    message.calibration_id = CALIBRATION.id
-    del message.gain[0]
+
+
+@pytest.mark.parametrize("field", ["gain", "prior_nm2"])
+def test_a_state_with_too_few_modes_is_refused(field: str) -> None:
+    calibration = identified(replace(CALIBRATION, camera=CAMERA))
+    setup = settings(auto_gain=(True, True))
+    gains = Request(0, "gain", values=(0.1, 0.1, 0.0), text=AUTO, prior_nm2=(0.0, 0.0, 4.0), flux_dn=1e5)
+    state, _ = feed(setup, State(), Load(0, calibration, "a file"), gains)
+    message = controller_state(state, setup, 1)
+    del getattr(message, field)[0]
     with pytest.raises(ValueError, match=r"must have the same length|does not have 3 modes"):
-        decode_state(message, CALIBRATION)
+        decode_state(message, calibration)
 
 
 @pytest.mark.parametrize(

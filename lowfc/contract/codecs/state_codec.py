@@ -124,8 +124,9 @@ def decode_state(
         law = gains_of(message)
         history = np.array(message.command_history_nm, np.float32).reshape(len(loop.history_nm), -1)
         actuators = floats(message.actuators, *calibration.grid)
-        if law.gain.shape != loop.integrator.gain.shape or history.shape[1] != len(calibration.noll):
-            raise ValueError(f"the controller's state does not have {len(calibration.noll)} modes")
+        modes, prior_nm2 = len(calibration.noll), np.array(message.prior_nm2, np.float32)
+        if {law.gain.size, history.shape[1], prior_nm2.size or modes} != {modes}:
+            raise ValueError(f"the controller's state does not have {modes} modes")
         law_runner = None
         if message.HasField("law"):
             x = np.array(message.law_state, np.float32)
@@ -140,10 +141,9 @@ def decode_state(
             command_channels=command_channels_of(message, loop.channels_or_empty(), loop.to_modes, plays),
             history_nm=tuple(history),
             actuators_nm=actuators,
-            automatic=np.array(message.automatic or [False] * len(calibration.noll), bool),
+            automatic=np.array(message.automatic or [False] * modes, bool),
         ).with_gains(law)
-        if message.prior_nm2:
-            prior_nm2 = np.array(message.prior_nm2, np.float32)
+        if prior_nm2.size:
             loop = loop.with_weighting(Weighting(prior_nm2, message.weighting_flux_dn))
     state = State(
         mode=LoopMode(message.mode),
