@@ -17,6 +17,7 @@ LOWEST_GAIN = 0.01
 SETTLING = 5.0
 """Time constants of the slowest mode after which a loop counts as settled."""
 
+_LONGEST_DELAY = 1000  # frames; of a damaged file or message it could exceed the memory
 _BISECTIONS = 50
 """Bisections of a 4096th of pi, to double precision; importing scipy.optimize would delay every command by 0.3 s."""
 
@@ -34,10 +35,10 @@ def delay_weights(delay_frames: float) -> Array:
     wholly with it; a fraction f of a frame sees (1 - f) of the newer and f of the older command.
 
     Raises:
-        ValueError: the delay is below 1 frame or not finite.
+        ValueError: the delay is below 1 or above 1000 frames, or not a number.
     """
-    if not (np.isfinite(delay_frames) and delay_frames >= 1):
-        raise ValueError(f"a delay is at least 1 frame, got {delay_frames}")
+    if not 1 <= delay_frames <= _LONGEST_DELAY:
+        raise ValueError(f"a delay is at least 1 frame and at most {_LONGEST_DELAY}, got {delay_frames}")
     whole = int(np.floor(delay_frames))
     fraction = delay_frames - whole
     weights = np.zeros(whole + (fraction > 0))
