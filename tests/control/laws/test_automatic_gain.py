@@ -22,11 +22,20 @@ def bank(delay_frames: float = 1.0, windows: tuple[int, int] = (1000, 500), mode
     return GainBank(ONES[:modes], 1e6 * ONES[:modes], weights, delay_frames, windows)
 
 
-def verdicts(bank_: GainBank, open_nm: Array, gain: Array, noise_nm2: float) -> list[Verdict]:
-    """Verdicts of an open loop whose gains follow them."""
+def verdicts(
+    bank_: GainBank,
+    open_nm: Array,
+    gain: Array,
+    noise_nm2: float,
+    tilt_nm: Array | None = None,
+    *,
+    closed: bool = False,
+) -> list[Verdict]:
+    """Verdicts of a loop whose gains follow them."""
     found = []
-    for one in open_nm.astype(np.float32):
-        if bank_.add_frame(one, one, closed=False) and bank_.complete:
+    for index, one in enumerate(open_nm.astype(np.float32)):
+        seen = None if tilt_nm is None else single(tilt_nm[index])
+        if bank_.add_frame(one, one, seen, closed=closed) and bank_.complete:
             found.append(bank_.verdict(gain, noise_nm2 * np.ones(one.size)))
             gain = found[-1].gain
     return found
@@ -136,24 +145,15 @@ def _vibrating(frames: int, seed: int) -> tuple[Array, Array]:
 def test_a_mode_with_only_tilt_cross_talk_gets_no_gain(closed: bool) -> None:
     """Otherwise the loop would put their mean, 2.7 nm, on the mirror."""
     tilt_nm, modes_nm = _vibrating(1000, 12)
-    gains = []
-    for seen in (tilt_nm, None):
-        bank_, gain = bank(), np.zeros(MODES, np.float32)
-        for index, one in enumerate(modes_nm):
-            if bank_.add_frame(one, one, None if seen is None else seen[index], closed=closed) and bank_.complete:
-                gains.append(bank_.verdict(gain, ONES.astype(float)).gain[4])
-    assert gains[0] == 0
-    assert gains[1] > 0
+    assert verdicts(bank(), modes_nm, 0 * ONES, 1.0, tilt_nm, closed=closed)[0].gain[4] == 0
+    assert verdicts(bank(), modes_nm, 0 * ONES, 1.0, closed=closed)[0].gain[4] > 0
 
 
 def test_the_reported_change_excludes_the_cross_talk_margin() -> None:
     """Of a true 20 nm with 2.7 nm of cross-talk, the loop leaves the cross-talk."""
     tilt_nm, modes_nm = _vibrating(1000, 19)
     modes_nm[:, 4] += 20
-    bank_, gain = bank(), np.full(MODES, 0.1, np.float32)
-    for one, seen in zip(modes_nm, tilt_nm, strict=True):
-        bank_.add_frame(one, one, seen, closed=False)
-    found = bank_.verdict(gain, ONES.astype(float))
+    [found] = verdicts(bank(), modes_nm, np.full(MODES, 0.1, np.float32), 1.0, tilt_nm)
     assert found.change_nm2[4] == pytest.approx(2.7**2 - 20**2, rel=0.05)
 
 
@@ -161,14 +161,9 @@ def test_past_tilt_cross_talk_is_forgotten() -> None:
     """Squares of tilt are averaged over the blocks of the window, like the modes."""
     tilt_nm, modes_nm = _vibrating(200, 20)
     rng = np.random.default_rng(21)
-    bank_, gain = bank(windows=(100, 10)), np.zeros(MODES, np.float32)
-    for one, seen in zip(modes_nm, tilt_nm, strict=True):
-        if bank_.add_frame(one, one, seen, closed=False) and bank_.complete:
-            gain = bank_.verdict(gain, ONES.astype(float)).gain
-    for one, seen in zip(rng.normal(0, 1, (2000, MODES)), rng.normal(0, 1, (2000, 2)), strict=True):
-        bank_.add_frame(single(one), single(one), single(seen), closed=False)
-        if bank_.complete:
-            found = bank_.verdict(gain, ONES.astype(float))
+    bank_ = bank(windows=(100, 10))
+    gain = verdicts(bank_, modes_nm, 0 * ONES, 1.0, tilt_nm)[-1].gain
+    found = verdicts(bank_, rng.normal(0, 1, (2000, MODES)), gain, 1.0, rng.normal(0, 1, (2000, 2)))[-1]
     assert found.power_nm2[4] == pytest.approx(1, abs=0.3)
 
 
@@ -187,10 +182,7 @@ def test_tilt_cross_talk_does_not_favour_a_gain() -> None:
     """A true -2.72 nm hides behind 2.7 nm of cross-talk: no loop measures it."""
     tilt_nm, modes_nm = _vibrating(1000, 23)
     modes_nm[:, 4] -= 2.72
-    bank_ = bank()
-    for one, seen in zip(modes_nm, tilt_nm, strict=True):
-        bank_.add_frame(one, one, seen, closed=False)
-    assert bank_.verdict(np.zeros(MODES, np.float32), ONES.astype(float)).gain[4] == 0
+    assert verdicts(bank(), modes_nm, 0 * ONES, 1.0, tilt_nm)[0].gain[4] == 0
 
 
 def test_tilt_cross_talk_follows_a_change_of_the_reconstructor() -> None:
@@ -201,16 +193,12 @@ def test_tilt_cross_talk_follows_a_change_of_the_reconstructor() -> None:
     mixed = (modes_nm @ of_own.T).astype(np.float32)
     gains = []
     for updated in (True, False):
-        bank_, gain = bank(windows=(200, 1000)), np.zeros(MODES, np.float32)
-        for one, seen in zip(modes_nm[:5000], tilt_nm[:5000], strict=True):
-            if bank_.add_frame(one, one, seen, closed=True) and bank_.complete:
-                bank_.verdict(gain, ONES.astype(float))
+        bank_ = bank(windows=(200, 1000))
+        verdicts(bank_, modes_nm[:5000], 0 * ONES, 1.0, tilt_nm[:5000], closed=True)
         bank_.begin_first_window()
         if updated:
             bank_.use_reconstructor(of_own)
-        for one, seen in zip(mixed[5000:], tilt_nm[5000:], strict=True):
-            bank_.add_frame(one, one, seen, closed=True)
-        gains.append(bank_.verdict(gain, ONES.astype(float)).gain[7])
+        gains.append(verdicts(bank_, mixed[5000:], 0 * ONES, 1.0, tilt_nm[5000:], closed=True)[0].gain[7])
     assert gains[0] == 0
     assert gains[1] > 0
 
@@ -218,10 +206,7 @@ def test_tilt_cross_talk_follows_a_change_of_the_reconstructor() -> None:
 def test_a_drift_is_corrected_in_spite_of_tilt_cross_talk() -> None:
     tilt_nm, modes_nm = _vibrating(1000, 13)
     modes_nm += drift(1000, 0.3, 0.0, 14).astype(np.float32)
-    bank_ = bank()
-    for one, seen in zip(modes_nm, tilt_nm, strict=True):
-        bank_.add_frame(one, one, seen, closed=False)
-    assert (bank_.verdict(np.zeros(MODES, np.float32), ONES.astype(float)).gain > 0.01).mean() > 0.9
+    assert (verdicts(bank(), modes_nm, 0 * ONES, 1.0, tilt_nm)[0].gain > 0.01).mean() > 0.9
 
 
 def test_drifts_and_common_noise_are_not_tilt_cross_talk() -> None:
