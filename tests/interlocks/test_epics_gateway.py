@@ -15,6 +15,7 @@ import pytest
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.process.clock import HostClock
 from lowfc.client import Answer, Client
+from lowfc.client.bench import bench_message
 from lowfc.contract.codecs.bench_codec import decode_bench_value
 from lowfc.contract.errors import BusError, RequestRefusedError
 from lowfc.contract.messages import BENCH, CONTROLLER_STATE, FRAME, HEALTH, RECORD_KEY, REQUEST_KEY, image, wire
@@ -98,9 +99,8 @@ def received(value: Any, kind: str = "epics:nt/NTScalar:1.0", severity: int = 0,
     return SimpleNamespace(raw=Raw({"value": value, **fields}), severity=severity)
 
 
-def choice(index: int) -> Any:
-    fields = {"value.choices": ["parked", "moving"], "value.index": index}
-    return received(None, "epics:nt/NTEnum:1.0", **fields)
+def choice(index: int, *choices: str) -> Any:
+    return received(None, "epics:nt/NTEnum:1.0", **{"value.choices": choices, "value.index": index})
 
 
 def variable(name: str, kind: Kind, put: Put | None = None) -> Variable:
@@ -180,8 +180,10 @@ def test_a_put_is_a_request_and_fails_with_its_refusal(pvs: Variables) -> None:
         (received(True), True),
         (received(2), 2.0),
         (received("parked"), "parked"),
-        (choice(1), "moving"),
-        (choice(2), None),
+        (received("x" * 201), None),
+        (choice(1, "parked", "moving"), "moving"),
+        (choice(2, "parked", "moving"), None),
+        (choice(0, "x" * 201), None),
         (received(np.nan), None),
         (received([1, 2]), None),
         (received(2.0, severity=3), None),
@@ -195,6 +197,7 @@ def test_a_monitored_variable_is_a_bench_value_while_it_is_valid(update: Any, va
     pvs.monitors["BENCH:MASK"](update)
     assert changes == [{"mask": "before"}, {} if value is None else {"mask": value}]
     assert [type(one) for one in served.bench.values()] == ([] if value is None else [type(value)])
+    assert all(bench_message("mask", one, 0) for one in served.bench.values())
 
 
 def test_a_port_in_use_is_an_error_with_the_address(pvs: Variables) -> None:

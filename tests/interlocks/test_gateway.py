@@ -6,7 +6,6 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
 
@@ -15,11 +14,9 @@ import pytest
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.bus.run import free_ports
 from lowfc.client import running
-from lowfc.client.bench import bench_message
 from lowfc.client.requests import DECLARED
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.messages import CONTROLLER_STATE, HEALTH, STEP, wire
-from lowfc.programs.gateway.epics import _value_of
 from lowfc.programs.gateway.variables import Kind, variables
 from lowfc.programs.gateway.watch import Watch
 from lowfc.testing.clock import FakeClock
@@ -123,36 +120,6 @@ def test_missing_p4p_is_reported_with_install_advice(monkeypatch: pytest.MonkeyP
     assert isinstance(fault, ConfigurationError)
     assert "needs p4p" in str(fault)
     assert "pip install" in str(fault)
-
-
-class PV(dict[str, Any]):
-    """Raw content of an update of a PV."""
-
-    def getID(self) -> str:  # as in p4p
-        return "epics:nt/NTEnum:1.0" if "value.index" in self else "epics:nt/NTScalar:1.0"
-
-
-@pytest.mark.parametrize(
-    ("raw", "value"),
-    [
-        ({"value": "parked"}, "parked"),
-        ({"value": "x" * 201}, None),
-        ({"value": True}, True),
-        ({"value": 3}, 3.0),
-        ({"value": float("nan")}, None),
-        ({"value": [1.0]}, None),
-        ({"value.index": 1, "value.choices": ["in", "out"]}, "out"),
-        ({"value.index": 0, "value.choices": ["x" * 201]}, None),
-        ({"value.index": 2, "value.choices": ["in", "out"]}, None),
-    ],
-)
-def test_only_what_an_interlock_can_read_becomes_a_bench_value(raw: dict[str, Any], value: object) -> None:
-    found = _value_of(SimpleNamespace(raw=PV(raw), severity=0))
-    assert (found, type(found)) == (value, type(value))
-    if found is not None:
-        assert bench_message("mask", found, 0)
-    assert _value_of(SimpleNamespace(raw=PV(raw), severity=3)) is None
-    assert _value_of(ConnectionError("disconnected")) is None
 
 
 class DeafBus(MemoryBus):
