@@ -1,7 +1,5 @@
 """From modal errors to the next command: the reference in numpy, and the fused step for normal frames."""
 
-from typing import NamedTuple
-
 import numpy as np
 
 from lowfc.arrays import Single
@@ -14,22 +12,6 @@ from lowfc.control.loop.safety import Limit, LoopMode, Reason, limit
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES, ActiveLoop, LawRunner, Settings, State
 
 
-class Response(NamedTuple):
-    """Result of a frame; errors (modes,) are nm of wavefront rms.
-
-    Attributes:
-        loop: the loop after the frame.
-        reasons: limits that acted on the command.
-        returning_to_zero: whether the modal command is still returning to zero.
-    """
-
-    error_nm: Single
-    pol_nm: Single
-    loop: ActiveLoop
-    reasons: tuple[Reason, ...]
-    returning_to_zero: bool
-
-
 def respond(
     settings: Settings,
     state: State,
@@ -39,13 +21,18 @@ def respond(
     events: list[PendingEvent],
     *,
     fused: bool,
-) -> Response:
-    """Respond to the modal errors (modes,) of a frame; `fused` if the fused step computed them."""
+) -> tuple[Single, Single, ActiveLoop, tuple[Reason, ...], bool]:
+    """Respond to the modal errors (modes,) of a frame; `fused` if the fused step computed them.
+
+    Returns:
+        Error and pseudo-open-loop modes (modes,), nm of wavefront rms; the loop after the frame; the limits that acted
+        on the command; and whether the modal command is still returning to zero.
+    """
     tables = loop.estimator.tables
     results = _fused(settings, state, loop, tables, measured_nm) if fused and tables is not None else None
     if results is None:
         error_nm, pol_nm, loop = _pseudo_open_loop(state, loop, measured_nm, sequence, events)
-        return Response(error_nm, pol_nm, *next_command(settings, state, loop, error_nm, sequence))
+        return error_nm, pol_nm, *next_command(settings, state, loop, error_nm, sequence)
     error_nm, pol_nm, command_nm, x, actuators_nm = results
     law = loop.law_runner
     if law is not None:
@@ -54,8 +41,8 @@ def respond(
         pol_from_target_nm = pol_nm if target_nm is None else pol_nm - target_nm
         loop = _update_guard(state, loop, advanced, error_nm, pol_from_target_nm, events)
         if loop.law_runner is not None and not loop.law_runner.alone():  # its guard switched controllers in this frame
-            return Response(error_nm, pol_nm, *next_command(settings, state, loop, error_nm, sequence))
-    return Response(error_nm, pol_nm, loop.with_command(command_nm, actuators_nm), (), False)
+            return error_nm, pol_nm, *next_command(settings, state, loop, error_nm, sequence)
+    return error_nm, pol_nm, loop.with_command(command_nm, actuators_nm), (), False
 
 
 def _fused(
