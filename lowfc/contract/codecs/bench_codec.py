@@ -75,14 +75,7 @@ def report_of(message: wire.BenchReport) -> BenchReport:
 
 def wire_interlock(one: Interlock) -> wire.Interlock:
     """Message of an interlock."""
-    return wire.Interlock(
-        name=one.name,
-        test=one.test,
-        value=wire_value(one.value),
-        action=one.action,
-        max_age_ns=one.max_age_ns,
-        acts_when_old=one.acts_when_old,
-    )
+    return wire.Interlock(**one._asdict() | {"value": wire_value(one.value)})
 
 
 def interlock_of(message: wire.Interlock) -> Interlock:
@@ -93,7 +86,7 @@ def interlock_of(message: wire.Interlock) -> Interlock:
 
 def wire_acting(one: Acting) -> wire.ActingInterlock:
     """Message of an acting interlock."""
-    return wire.ActingInterlock(number=one.number, action=one.action, why=one.why)
+    return wire.ActingInterlock(**one._asdict())
 
 
 def acting_of(message: wire.ActingInterlock) -> Acting:
