@@ -193,7 +193,7 @@ def test_no_probe_sequence_starts_before_the_first_frame() -> None:
     assert not loop.ask("play", text=MIRROR, table=table, actuators_nm=dark_hole(5.0).reshape(-1)).accepted
 
 
-@pytest.mark.parametrize("end", ["stop", "safe", "close", "limit", "restart"])
+@pytest.mark.parametrize("end", ["stop", "safe", "close", "limit", "restart", "load"])
 def test_events_that_end_a_probe_sequence(end: str) -> None:
     setup = replace(DEFAULTS, limits=Limits(700.0, 100.0, 400.0))
     loop = ToyLoop(setup, LoopMode.OPEN)
@@ -206,10 +206,12 @@ def test_events_that_end_a_probe_sequence(end: str) -> None:
     assert np.allclose(loop.surfaces[-1], 6.0)
     if end == "restart":
         loop.take(Frame(frame_sequence(1, START + 5), 0, 0, TOY.pixels((0, 0, 0))))
+    elif end == "load":
+        assert loop.take(Request(0, end, calibration=replace(calibration(scale=1.01), id="other"))).reply.accepted
     elif end != "limit":
         assert loop.ask(end).accepted
     loop.run(1 if end == "restart" else 12, np.zeros(3))
-    assert ("PLAY_ENDED" in loop.events) is (end in ("limit", "restart"))
+    assert ("PLAY_ENDED" in loop.events) is (end in ("limit", "restart", "load"))
     assert loop.state.loop.command_channels.play is None
     if end != "close":
         assert np.allclose(loop.surfaces[-1], 0, atol=1e-3)

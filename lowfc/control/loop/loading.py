@@ -28,8 +28,8 @@ def loaded(
     """The state with another calibration, and the events.
 
     If the mirror has the same grid, it keeps its shape: the channels stay, the rest becomes a command of the new modes,
-    and the part outside the modes becomes a channel (not in safe mode). A probe sequence ends; offset and law are kept
-    only for the same modes.
+    and the part outside the modes becomes a channel (not in safe mode). A probe sequence ends, and the next command
+    removes its last shape; offset and law are kept only for the same modes.
     """
     loop, before = ActiveLoop.at_rest(settings, calibration), state.loop
     details: dict[str, object] = {
@@ -40,11 +40,15 @@ def loaded(
     }
     events = [PendingEvent("CALIBRATION_LOADED", details)]
     if before is not None and before.actuators_nm.shape == calibration.grid:
+        before = end_probe(before, state.frame_sequence, "a calibration was loaded", events)
         shape_nm = before.actuators_nm
         same = before.calibration.noll == calibration.noll
         if before.command_channels is not None:
             shape_nm = shape_nm - before.command_channels.sum_nm
-            command_channels = loop.channels_or_empty().at(before.command_channels.channels, loop.to_modes)
+            if before.play is not None:  # the next command removes its last shape
+                shape_nm = (before.to_actuators @ before.history_nm[0]).reshape(calibration.grid)
+            command_channels = loop.channels_or_empty()._replace(play=before.play)
+            command_channels = command_channels.at(before.command_channels.channels, loop.to_modes)
             if same:
                 command_channels = command_channels._replace(offset_nm=before.command_channels.offset_nm)
             loop = loop._replace(command_channels=command_channels.settled())
