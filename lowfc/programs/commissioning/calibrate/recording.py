@@ -11,7 +11,7 @@ import numpy.typing as npt
 from lowfc.arrays import Array, Long, Mask, Pixels, Whole
 from lowfc.client import Client, Frame, MirrorWatch
 from lowfc.contract.envelope import start_of
-from lowfc.contract.errors import BusError, CalibrationError, LowfcError
+from lowfc.contract.errors import CalibrationError, LowfcError
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.delay_fit import Delay, NotSeenError, measure_delay
 from lowfc.control.calibration.poke_plan import Plan, seen, usable
@@ -115,37 +115,30 @@ def play(loop: Client, basis_nm: npt.NDArray[np.floating], table: npt.NDArray[np
         end = last + 1 + AFTERWARDS
         images: list[Frame] = []
         recorded: list[Step] = []
-        try:
-            image, step = next(frames), next(steps)
-            mode = None
-            while image.sequence < end or step.frame_sequence < end or mirror.frame_sequence < last:
-                if image.sequence <= step.frame_sequence:
-                    if first <= image.sequence:
-                        images.append(image)
-                    image = next(frames)
-                else:
-                    if first <= step.frame_sequence:
-                        mode = _check(loop, step, mode, over=step.frame_sequence > last)
-                        _check_devices(mirror, step.frame_sequence, first)
-                        recorded.append(step)
-                        _check_refused(recorded)
-                        if len(recorded) % CHECKED == 0:
-                            loop.check_lease()
-                    step = next(steps)
-            _check_devices(mirror, step.frame_sequence, first)
-        except StopIteration:
-            raise BusError("frames stopped: is the camera still running?") from None
+        image, step = next(frames), next(steps)
+        mode = None
+        while image.sequence < end or step.frame_sequence < end or mirror.frame_sequence < last:
+            if image.sequence <= step.frame_sequence:
+                if first <= image.sequence:
+                    images.append(image)
+                image = next(frames)
+            else:
+                if first <= step.frame_sequence:
+                    mode = _check(loop, step, mode, over=step.frame_sequence > last)
+                    _check_devices(mirror, step.frame_sequence, first)
+                    recorded.append(step)
+                    _check_refused(recorded)
+                    if len(recorded) % CHECKED == 0:
+                        loop.check_lease()
+                step = next(steps)
+        _check_devices(mirror, step.frame_sequence, first)
         loop.check_lease()
     return _recording(images, recorded, first)
 
 
 def watch(loop: Client, count: int) -> Pixels:
     """The next `count` frames (count, rows, columns), DN; BusError if they stop."""
-    stream = loop.frames(count)
-    received = [np.asarray(image.pixels) for image in stream]
-    if len(received) < count:
-        raise BusError(f"frames stopped after {len(received)} of {count}: is the camera still running?")
-    return np.array(received)
+    return np.array([image.pixels for image in loop.frames(count)])
 
 
 def check_size(shape: tuple[int, ...], before: Calibration) -> None:
@@ -161,19 +154,13 @@ def check_size(shape: tuple[int, ...], before: Calibration) -> None:
 @contextlib.contextmanager
 def _streams(loop: Client) -> Iterator[tuple[Iterator[Frame], Iterator[Step]]]:
     """Frames and steps from now on; an error ends the probe sequence."""
-    frames, steps = loop.frames(), loop.steps()
-    done = False
-    try:
-        yield frames, steps
-        done = True
-    finally:
-        for stream in (frames, steps):
-            close = getattr(stream, "close", None)
-            if close is not None:
-                close()
-        if not done:
+    with contextlib.closing(loop.frames()) as frames, contextlib.closing(loop.steps()) as steps:
+        try:
+            yield frames, steps
+        except BaseException:
             with contextlib.suppress(LowfcError):  # the first error is the one raised
                 loop.stop()
+            raise
 
 
 def _check(loop: Client, step: Step, before: LoopMode | None, *, over: bool) -> LoopMode:
