@@ -61,9 +61,9 @@ def loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> InProcessLoop:
 
 @pytest.fixture
 def noiseless_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> InProcessLoop:
-    """The same for tests that do not depend on noise: a frame takes half the time."""
+    """The same without noise, so that a frame takes half the time, and with a slew limit that shrinks the pokes."""
     monkeypatch.chdir(tmp_path)
-    config = load(None, CONFIG | {"control.max_identical_frames": 0})
+    config = load(None, CONFIG | {"control.max_identical_frames": 0, "safety.slew_nm": 5.0})
     made = InProcessLoop(config, world=load(None, STATIC | {"camera.noise": False}))
     connect(made, monkeypatch)
     return made

@@ -18,7 +18,7 @@ from lowfc.control.calibration.alignment import Alignment, Geometry, align, onto
 from lowfc.control.calibration.calibration import Calibration, normalise_flux
 from lowfc.programs.cli.result import Result, result_field
 from lowfc.programs.commissioning.analytic import analytic
-from lowfc.programs.commissioning.calibrate.pokes import AMPLITUDE_NM, sequence
+from lowfc.programs.commissioning.calibrate.pokes import AMPLITUDE_NM, largest_nm, sequence
 from lowfc.programs.commissioning.calibrate.recording import Player, check_size, watch
 from lowfc.programs.commissioning.calibrate.result import compute_reconstructor
 from lowfc.programs.commissioning.calibrate.tasks import reporter, write
@@ -61,7 +61,8 @@ def aligned(out: Path, run: str | None, frames: int, *, load: bool) -> AlignResu
             raise CalibrationError(str(error)) from None
         calibration = on_sensor(config, computed, found.geometry, flux_dn, before)
         mode = int(np.argmax(np.linalg.norm(calibration.response, axis=0)))
-        poke = Player(loop, calibration, reporter(console)).first_poke(mode, sequence(AMPLITUDE_NM["poke"]))
+        amplitude_nm = min(AMPLITUDE_NM["poke"], float(largest_nm(config, calibration)[mode]))
+        poke = Player(loop, calibration, reporter(console)).first_poke(mode, sequence(amplitude_nm))
         if poke.response @ calibration.response[:, mode] < 0:
             found = replace(found, geometry=found.geometry.rotated_180())
             calibration = on_sensor(config, computed, found.geometry, flux_dn, before)
