@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from lowfc.arrays import Single
-from lowfc.contract.configuration import Acceptance
+from lowfc.contract.configuration import Configuration
 from lowfc.control.calibration.excitation import build_staircase
 from lowfc.control.calibration.linearity import captured
 from lowfc.control.laws.integrator import TIP_TILT, Integrator
@@ -46,13 +46,13 @@ class CaptureResult(AcceptanceResult):
     modes: list[CaptureMode] = result_field("modes")
 
 
-def play(live: Live, modes: Sequence[int], required: Acceptance) -> list[ProbeResponse]:
+def play(live: Live, *, modes: Sequence[int]) -> list[ProbeResponse]:
     """Add shapes of each mode to the mirror in closed loop, in steps of growing amplitude, until one is not corrected.
 
     Each shape is ramped up and down at the slew limit, in a frame or two: for the loop this equals closing on a static
     error. After a shape that was not corrected, the command is reset to zero.
     """
-    plan = [trials for noll in chosen(modes, live.loop.noll) if (trials := _trials(live, noll, required))]
+    plan = [trials for noll in chosen(modes, live.loop.noll) if (trials := _trials(live, noll))]
     live.expect(sum(len(table) for trials in plan for _, table, _ in trials))
     found = []
     for trials in plan:
@@ -66,7 +66,7 @@ def play(live: Live, modes: Sequence[int], required: Acceptance) -> list[ProbeRe
     return found
 
 
-def _trials(live: Live, noll: int, required: Acceptance) -> list[tuple[dict[str, Any], Single, Single]]:
+def _trials(live: Live, noll: int) -> list[tuple[dict[str, Any], Single, Single]]:
     """Trials of a mode, smallest amplitude first: announcement, staircase and shape; empty if its gain is zero."""
     row, law = live.loop.noll.index(noll), live.loop.law
     if isinstance(law, Integrator) and not law.gain[row]:
@@ -78,7 +78,7 @@ def _trials(live: Live, noll: int, required: Acceptance) -> list[tuple[dict[str,
     shape = live.calibration.modes_to_actuators[:, row][None]
     step_nm = live.configuration.safety.slew_nm / 2 / float(np.abs(shape).max())
     trials = []
-    for level_nm in (np.outer(SIZES, (1.0, -1.0)).ravel() * _required_nm(required, noll)).tolist():
+    for level_nm in (np.outer(SIZES, (1.0, -1.0)).ravel() * _required_nm(live.configuration, noll)).tolist():
         stairs, starts = build_staircase([0.0, level_nm], hold, step_nm)
         zero_start, level_start = starts.tolist()
         what = {
@@ -103,7 +103,7 @@ def removed(trial: ProbeResponse) -> bool:
     return captured(trial.filled(trial.error_nm), commands, row, trial.what["level_nm"], before, after)
 
 
-def judge(trials: Sequence[ProbeResponse], required: Acceptance) -> CaptureResult:
+def judge(trials: Sequence[ProbeResponse], configuration: Configuration) -> CaptureResult:
     """Evaluate the capture range of each tested mode."""
     if not trials:
         raise AcceptanceError("all gains are zero: no mode has a capture range")
@@ -114,7 +114,7 @@ def judge(trials: Sequence[ProbeResponse], required: Acceptance) -> CaptureResul
         sizes = sorted({abs(level_nm) for level_nm in converged})
         lost = [abs(level_nm) for level_nm, success in converged.items() if not success]
         good = [size for size in sizes if {size, -size} <= set(converged) and size < min([*lost, np.inf])]
-        required_nm = _required_nm(required, noll)
+        required_nm = _required_nm(configuration, noll)
         modes.append(
             CaptureMode(
                 noll=noll,
@@ -141,5 +141,6 @@ def draw(found: dict[str, Any], figure: Any) -> None:
     ax.legend()
 
 
-def _required_nm(required: Acceptance, noll: int) -> float:
+def _required_nm(configuration: Configuration, noll: int) -> float:
+    required = configuration.acceptance
     return required.capture_tilt_nm if noll in TIP_TILT else required.capture_nm

@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lowfc.adapters.process.terminal import AnyRun, Json, LogsIfAny, configuration, new_app
+from lowfc.adapters.process.terminal import AnyRun, Json, LogsIfAny, configuration, given, new_app
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.programs.cli.modes import Modes, noll_of
 from lowfc.programs.cli.result import print_result
 
 if TYPE_CHECKING:
-    from lowfc.contract.configuration import Acceptance
     from lowfc.programs.commissioning.acceptance.live import Live
     from lowfc.programs.commissioning.acceptance.probe import ProbeResponse
 
@@ -32,6 +31,7 @@ Required = Annotated[
 
 @acceptance_app.command()
 def rejection(
+    context: typer.Context,
     logs: LogsIfAny = None,
     duration: Annotated[float, typer.Option(min=0.1, max=1e5, help="Seconds of the multisine.")] = 60.0,
     rms_nm: Annotated[float, typer.Option(min=1e-3, max=1e3, help="Wavefront rms of each mode.")] = 5.0,
@@ -49,12 +49,13 @@ def rejection(
     """
     from lowfc.programs.commissioning.acceptance import rejection as test
 
-    excitation = test.Excitation(duration, rms_nm, lines, noll_of(modes), seed)
-    _carry_out(test, logs, run, config, plot, as_json, lambda live, required: test.play(live, excitation, required))
+    play = partial(test.play, duration_s=duration, rms_nm=rms_nm, lines_per_mode=lines, modes=noll_of(modes), seed=seed)
+    _carry_out(context, test, logs, run, config, plot, as_json, play)
 
 
 @acceptance_app.command()
 def linearity(
+    context: typer.Context,
     logs: LogsIfAny = None,
     hold: Annotated[int, typer.Option(min=2, help="Frames at each level.")] = 10,
     cycles: Annotated[int, typer.Option(min=2, help="Push-pull cycles of each amplitude.")] = 20,
@@ -70,12 +71,13 @@ def linearity(
     """
     from lowfc.programs.commissioning.acceptance import linearity as test
 
-    staircase = test.Staircase(hold, cycles, noll_of(modes))
-    _carry_out(test, logs, run, config, plot, as_json, lambda live, required: test.play(live, staircase, required))
+    play = partial(test.play, hold_frames=hold, cycles=cycles, modes=noll_of(modes))
+    _carry_out(context, test, logs, run, config, plot, as_json, play)
 
 
 @acceptance_app.command("capture-range")
 def capture_range(
+    context: typer.Context,
     logs: LogsIfAny = None,
     modes: Modes = None,
     config: Required = None,
@@ -89,12 +91,12 @@ def capture_range(
     """
     from lowfc.programs.commissioning.acceptance import capture as test
 
-    tested = noll_of(modes)
-    _carry_out(test, logs, run, config, plot, as_json, lambda live, required: test.play(live, tested, required))
+    _carry_out(context, test, logs, run, config, plot, as_json, partial(test.play, modes=noll_of(modes)))
 
 
 @acceptance_app.command("noise-floor")
 def noise_floor(
+    context: typer.Context,
     logs: LogsIfAny = None,
     duration: Annotated[float, typer.Option(min=0.01, max=1e5, help="Seconds in open loop and in closed loop.")] = 10.0,
     config: Required = None,
@@ -108,19 +110,18 @@ def noise_floor(
     """
     from lowfc.programs.commissioning.acceptance import noise as test
 
-    _carry_out(test, logs, run, config, plot, as_json, lambda live, _: test.play(live, duration), by_instrument=True)
+    _carry_out(context, test, logs, run, config, plot, as_json, partial(test.play, duration_s=duration))
 
 
 def _carry_out(
+    context: typer.Context,
     test: Any,
     logs: list[Path] | None,
     run: str | None,
     config: Path | None,
     plot: Path | None,
     as_json: bool,
-    play: "Callable[[Live, Acceptance], list[ProbeResponse]]",
-    *,
-    by_instrument: bool = False,
+    play: "Callable[[Live], list[ProbeResponse]]",
 ) -> None:
     """Evaluate a test from a log or run it now; plot and print the result, and exit with the verdict."""
     from rich.console import Console
@@ -135,13 +136,15 @@ def _carry_out(
     from lowfc.programs.commissioning.acceptance.live import Live
     from lowfc.programs.commissioning.acceptance.probe import logged_responses
 
-    required = configuration(config).acceptance if config is not None else None
+    if logs:
+        for option in given(context):
+            if option not in ("logs", "--config", "--plot", "--json"):
+                raise ConfigurationError(f"{option} is for a test of a running loop, but a log is evaluated: omit it")
+    required = {} if config is None else {"acceptance": configuration(config).acceptance}
     require_folder(plot)
     # an error now rather than after the test if matplotlib is missing
     figure = None if plot is None else figure_class()(figsize=(10, 5), layout="constrained")
     if logs:
-        if run is not None:
-            raise ConfigurationError("a log and a running loop (--run) exclude each other: use one")
         log = WholeLog(the_one(logs), skip_damaged=True)
         history = read_history(log)
         for remark in history.remarks:
@@ -149,15 +152,14 @@ def _carry_out(
         responses = logged_responses(history, test.KIND)
         if history.configuration is None or history.calibration is None:
             raise DataFileError(f"{log.path}: has no configuration, so the requirements are unknown")
-        config_in_use = history.configuration
+        config_in_use = history.configuration.model_copy(update=required)
     else:
         with Client(run) as client, counting_bar(Console(stderr=True), TimeRemainingColumn()) as count:
             live = Live(client, partial(count, test.KIND))
-            config_in_use = live.configuration
+            config_in_use = live.configuration = live.configuration.model_copy(update=required)
             with client.reserved("lowfc acceptance"), live.restored():
-                responses = play(live, required or config_in_use.acceptance)
-    instrument = (config_in_use,) if by_instrument else ()
-    result = test.judge(responses, required or config_in_use.acceptance, *instrument)
+                responses = play(live)
+    result = test.judge(responses, config_in_use)
     if plot is not None and figure is not None:
         test.draw(result.json_object(), figure)
         figure.suptitle(result.verdict)

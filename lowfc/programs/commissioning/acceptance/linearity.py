@@ -1,12 +1,11 @@
 """`lowfc acceptance linearity`: gain and cross-talk of each mode as a function of amplitude, with the loop open."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from lowfc.contract.configuration import Acceptance
+from lowfc.contract.configuration import Configuration
 from lowfc.control.calibration.excitation import build_staircase
 from lowfc.control.calibration.linearity import SURE, gains, levels
 from lowfc.control.loop.safety import LoopMode
@@ -26,15 +25,6 @@ KIND: Kind = "linearity"
 AMPLITUDES = (0.5, 1.0, 2.0)
 """Amplitudes tested, as multiples of the required linear range."""
 _SPARE_FRAMES = 2  # skipped in addition to the delay, while the mirror settles
-
-
-@dataclass(frozen=True, slots=True)
-class Staircase:
-    """Parameters of the staircase: frames per level, cycles per amplitude, Noll indices (empty: all)."""
-
-    hold_frames: int
-    cycles: int
-    modes: tuple[int, ...]
 
 
 class Level(Result):
@@ -81,33 +71,38 @@ class LinearityResult(AcceptanceResult):
         return [key, *noisy, *super().remarks()]
 
 
-def play(live: Live, staircase: Staircase, required: Acceptance) -> list[ProbeResponse]:
-    """Play a staircase of each mode on the mirror, with the loop open."""
+def play(live: Live, *, hold_frames: int, cycles: int, modes: Sequence[int]) -> list[ProbeResponse]:
+    """Play a staircase of each mode on the mirror, with the loop open.
+
+    Args:
+        live: The loop, and the requirements in its configuration.
+        hold_frames: Frames at each level.
+        cycles: Push-pull cycles of each amplitude.
+        modes: Noll indices; empty for all.
+    """
     skipped = int(np.ceil(live.loop.delay_frames)) + _SPARE_FRAMES
-    if staircase.hold_frames <= skipped:
-        raise AcceptanceError(
-            f"{staircase.hold_frames} frames at each level are too few: the first {skipped} do not show it yet"
-        )
+    if hold_frames <= skipped:
+        raise AcceptanceError(f"{hold_frames} frames at each level are too few: the first {skipped} do not show it yet")
     plan = []
-    for noll in chosen(staircase.modes, live.loop.noll):
+    for noll in chosen(modes, live.loop.noll):
         shape = live.calibration.modes_to_actuators[:, live.loop.noll.index(noll)][None]
         step_nm = live.configuration.safety.slew_nm / 2 / float(np.abs(shape).max())
-        levels_nm = levels(np.array(AMPLITUDES) * required.linear_nm, staircase.cycles)
-        stairs, starts = build_staircase(levels_nm, staircase.hold_frames, step_nm)
+        levels_nm = levels(np.array(AMPLITUDES) * live.configuration.acceptance.linear_nm, cycles)
+        stairs, starts = build_staircase(levels_nm, hold_frames, step_nm)
         what = {
             "noll": noll,
             "levels_nm": levels_nm.tolist(),
             "starts": (starts + skipped).tolist(),
-            "averaged": staircase.hold_frames - skipped,
+            "averaged": hold_frames - skipped,
         }
         plan.append((what, stairs.astype(np.float32)[:, None], shape))
     live.expect(sum(len(table) for _, table, _ in plan))
     return [live.play(KIND, what, LoopMode.OPEN, table, shape) for what, table, shape in plan]
 
 
-def judge(responses: Sequence[ProbeResponse], required: Acceptance) -> LinearityResult:
+def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> LinearityResult:
     """Evaluate gain and cross-talk from the probe sequences; AcceptanceError if the loop was disturbed meanwhile."""
-    modes = []
+    required, modes = configuration.acceptance, []
     for response in responses:
         response.check(LoopMode.OPEN)
         what, noll = response.what, response.loop.noll

@@ -7,7 +7,7 @@ import numpy as np
 
 from lowfc.adapters.files.factory import contrast_of, frame_noise_nm2
 from lowfc.arrays import Array
-from lowfc.contract.configuration import Acceptance, Configuration
+from lowfc.contract.configuration import Configuration
 from lowfc.control.laws import margins
 from lowfc.control.laws.spectra import SHORTEST, TimeSeries, floor_nm2_hz, spectrum
 from lowfc.control.loop.safety import LoopMode
@@ -53,7 +53,7 @@ class NoiseResult(AcceptanceResult):
         return [*contrast, *super().remarks()]
 
 
-def play(live: Live, duration_s: float) -> list[ProbeResponse]:
+def play(live: Live, *, duration_s: float) -> list[ProbeResponse]:
     """Record the loop without a probe: open, then closed, each for `duration_s`."""
     frames = max(round(duration_s * live.loop.rate_hz), SHORTEST)
     live.expect(frames * len(_LOOPS))
@@ -61,13 +61,14 @@ def play(live: Live, duration_s: float) -> list[ProbeResponse]:
     return [live.play(KIND, {"loop": name}, mode, nothing) for name, mode in _LOOPS.items()]
 
 
-def judge(responses: Sequence[ProbeResponse], required: Acceptance, configuration: Configuration) -> NoiseResult:
+def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> NoiseResult:
     """Evaluate the noise of the open-loop and of the closed-loop recording."""
     by_loop = {response.what["loop"]: response for response in responses}
     if set(by_loop) != set(_LOOPS):
         raise AcceptanceError(
             f"an open-loop and a closed-loop recording are needed, found {', '.join(by_loop) or 'none'}"
         )
+    noise_ratio = configuration.acceptance.noise_ratio
     floors, rms, expected = {}, {}, {}
     residual_nm2: dict[str, Array | None] = {}
     for name, response in by_loop.items():
@@ -84,7 +85,7 @@ def judge(responses: Sequence[ProbeResponse], required: Acceptance, configuratio
         NoiseMode(
             noll=noll,
             name=mode_name(noll),
-            passed=all(floors[name][k] <= required.noise_ratio * expected[name][k] for name in _LOOPS),
+            passed=all(floors[name][k] <= noise_ratio * expected[name][k] for name in _LOOPS),
             expected_nm=float(expected["closed"][k]),
             open_nm=float(floors["open"][k]),
             closed_nm=float(floors["closed"][k]),
@@ -97,7 +98,7 @@ def judge(responses: Sequence[ProbeResponse], required: Acceptance, configuratio
     return NoiseResult(
         test=KIND,
         passed=all(mode.passed for mode in modes),
-        noise_ratio=required.noise_ratio,
+        noise_ratio=noise_ratio,
         law=loop.name,
         frames={name: len(response.error_nm) for name, response in by_loop.items()},
         added_contrast=added_contrast(contrast_of(configuration), residual_nm2),

@@ -1,13 +1,12 @@
 """`lowfc acceptance rejection`: the loop's measured rejection and noise transfer functions compared with theory."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from lowfc.arrays import Array, Whole
-from lowfc.contract.configuration import Acceptance
+from lowfc.contract.configuration import Configuration
 from lowfc.control.calibration.excitation import lines, multisine, with_lead_in
 from lowfc.control.laws import margins
 from lowfc.control.laws.linear_law import LinearLaw
@@ -35,17 +34,6 @@ MIN_JUDGED = 0.5
 The noise transfer has no such limit: where it is small, it is below the measurement noise.
 """
 _LEAD_FRAMES = 50  # in addition to the settling time: until the bus delivers the first steps
-
-
-@dataclass(frozen=True, slots=True)
-class Excitation:
-    """Parameters of the multisine: period, rms and lines per mode, Noll indices (empty: all), seed of the phases."""
-
-    duration_s: float
-    rms_nm: float
-    lines_per_mode: int
-    modes: tuple[int, ...]
-    seed: int
 
 
 class Comparison(Result):
@@ -103,26 +91,33 @@ class RejectionResult(AcceptanceResult):
         return [*lines, *super().remarks()]
 
 
-def play(live: Live, excitation: Excitation, required: Acceptance) -> list[ProbeResponse]:
+def play(
+    live: Live, *, duration_s: float, rms_nm: float, lines_per_mode: int, modes: Sequence[int], seed: int
+) -> list[ProbeResponse]:
     """Play a multisine in closed loop.
 
     It is added to the loop's offset. With a law on pseudo-open-loop modes it is added to the mirror, because such a law
     responds to an offset differently than to a disturbance.
+
+    Args:
+        live: The loop, and the requirements in its configuration.
+        duration_s: Period of the multisine.
+        rms_nm: Rms of each mode.
+        lines_per_mode: Number of lines of each mode.
+        modes: Noll indices; empty for all.
+        seed: Seed of the phases.
     """
-    noll, rate_hz = live.loop.noll, live.loop.rate_hz
-    tested = chosen(excitation.modes, noll)
-    frames = round(excitation.duration_s * rate_hz)
+    noll, rate_hz, required = live.loop.noll, live.loop.rate_hz, live.configuration.acceptance
+    tested = chosen(modes, noll)
+    frames = round(duration_s * rate_hz)
     try:
-        bins = lines(
-            frames, len(tested), excitation.lines_per_mode, required.lowest_hz / rate_hz, required.highest_of_rate
-        )
+        bins = lines(frames, len(tested), lines_per_mode, required.lowest_hz / rate_hz, required.highest_of_rate)
     except ValueError as error:
         raise AcceptanceError(
-            f"{excitation.duration_s:g} s at {rate_hz:.4g} Hz, {len(tested)} modes, from {required.lowest_hz:g} Hz up: "
-            f"{error}"
+            f"{duration_s:g} s at {rate_hz:.4g} Hz, {len(tested)} modes, from {required.lowest_hz:g} Hz up: {error}"
         ) from None
     period = np.zeros((frames, len(noll)), np.float32)
-    period[:, [noll.index(mode) for mode in tested]] = multisine(frames, bins, excitation.rms_nm, excitation.seed)
+    period[:, [noll.index(mode) for mode in tested]] = multisine(frames, bins, rms_nm, seed)
     live.set_mode(LoopMode.CLOSED)
     table = with_lead_in(period, live.loop.settling_frames() + _LEAD_FRAMES)
     basis = None
@@ -139,11 +134,11 @@ def transfer_function(response: ProbeResponse) -> Lines:
     return measured(response.filled(response.error_nm)[-len(period) :], added)
 
 
-def judge(responses: Sequence[ProbeResponse], required: Acceptance) -> RejectionResult:
+def judge(responses: Sequence[ProbeResponse], configuration: Configuration) -> RejectionResult:
     """Compare the last multisine with theory; AcceptanceError if the loop was disturbed meanwhile."""
     response = responses[-1]
     found, rate_hz = transfer_function(response), response.loop.rate_hz
-    tolerance_db = required.rejection_db
+    tolerance_db = configuration.acceptance.rejection_db
     frequency_hz = found.frequency * rate_hz
     line_rows = np.arange(found.mode.size)
     law, delay_frames = response.loop.linear, response.loop.delay_frames
