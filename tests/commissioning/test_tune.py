@@ -199,7 +199,7 @@ PROBE = wire.Play(first_sequence=frame_sequence(3050), frames=100, id="probe")
 class SteppedLoop(StreamedLoop):
     """A loop with these steps, whose mirror reports each command so many periods after the end of the exposure.
 
-    Its state has the probe sequence once, when it is requested after 3100 steps.
+    Its state has the probe sequence once, when it is requested after 3100 steps, and from then on other gains.
     """
 
     def __init__(self, steps: list[Step], report_periods: float = 0.2, *, probed: bool = False) -> None:
@@ -217,6 +217,8 @@ class SteppedLoop(StreamedLoop):
         self.requested += 1
         if self.probed and self.requested == 1 + 31:
             answer.state.play.CopyFrom(PROBE)
+        if self.probed and self.requested > 31:
+            answer.state.gain[:] = [0.3, 0.3, 0.3]
         return answer
 
     def mirror_watch(self) -> Any:
@@ -252,6 +254,7 @@ def test_probe_sequences_on_a_running_loop_are_excluded() -> None:
     run = telemetry_from_run(SteppedLoop(closed_loop(disturbance_nm, 1), probed=True), 60.0)
     assert run.pol.frames == pytest.approx(6000 - 500 - PROBE.frames - 500, abs=10)
     assert np.abs(run.pol.joined()).max() < 20
+    assert run.law.gain == pytest.approx(0.3), "the law is the last one"
 
 
 def test_a_too_short_live_time_is_refused_at_once() -> None:

@@ -43,7 +43,7 @@ class Telemetry:
         source: path of the log, or name of the run.
         noll: Noll index of each mode.
         timing: delay and exposure of the loop, measured if possible.
-        law: the integrator's gains; `driving` is the linear law in force instead, if any.
+        law: the integrator's gains at the end; `driving` is the linear law in force instead, if any.
         closed: whether the loop was closed in these frames.
         pol: pseudo-open-loop modes (frames, modes), in pieces without gaps.
         error: modal error of the same frames (frames, modes).
@@ -148,7 +148,7 @@ def telemetry_from_run(loop: Client, seconds: float, progress: Callable[[float],
         loop.run_id,
         rate_hz,
         _timing(seen.delay_frames, config.camera.exposure_fraction, steps, watch, rate_hz),
-        (gains_of(states[0]), driving(states[0], loop.laws())),
+        (gains_of(states[-1]), driving(states[-1], loop.laws())),
         steps,
         usable,
         None,
