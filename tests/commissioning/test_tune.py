@@ -1,6 +1,7 @@
 """`lowfc tune`: results, files and errors, on a log made by the live loop's own `advance`; and law files."""
 
 import json
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache, partial
@@ -337,6 +338,12 @@ def test_a_log_that_is_too_short_is_refused(tmp_path: Path) -> None:
 def test_tune_never_overwrites_a_log(log: Path) -> None:
     with pytest.raises(DataFileError, match="is a log, which is never overwritten"):
         tune(log, "--out", log)
+
+
+def test_a_missing_package_is_reported_before_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(ConfigurationError, match=r"pip install .*matplotlib"):
+        tune("none.mcap", "--plot", "law.png")
 
 
 def test_tune_needs_either_a_log_or_a_running_loop() -> None:

@@ -33,6 +33,7 @@ def tune(
     """
     from rich.console import Console
 
+    from lowfc.adapters.files.drawing import figure_class
     from lowfc.adapters.files.law_file import save
     from lowfc.adapters.files.whole_file import require_folder, write_whole
     from lowfc.adapters.logs.parts import WholeLog, the_one
@@ -45,6 +46,8 @@ def tune(
         raise ConfigurationError("give one LOG, or observe a running loop with --live SECONDS")
     console = Console(stderr=True)
     require_folder(out, plot)
+    if plot is not None:
+        figure_class()  # an error now rather than after the work if matplotlib is missing
     if logs:
         reader = WholeLog(the_one(logs), skip_damaged=True)
         with reading_bar(console) as count:
