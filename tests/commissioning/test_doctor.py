@@ -404,6 +404,8 @@ def test_the_check_of_the_control_step_names_the_kernel(
 
 
 def test_real_time_rights_are_shown_applied_and_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(OSError, match="exit 6: no such user"):
+        permissions._run("sh", "-c", "echo no such user >&2; exit 6")
     calls: list[tuple[str, ...]] = []
     monkeypatch.setattr(permissions, "_run", lambda *words: calls.append(words) or " ".join(words))
     monkeypatch.setattr(permissions.shutil, "chown", lambda path, group: calls.append((str(group),)))
@@ -420,7 +422,8 @@ def test_real_time_rights_are_shown_applied_and_removed(tmp_path: Path, monkeypa
         assert (tmp_path / name).read_text() == text
         assert text in lowfc("doctor", "--setup").stdout
     assert device.stat().st_mode & 0o777 == 0o660
-    assert [words[0] for words in calls] == ["groupadd", "usermod", "lowfc"]
+    assert [words[0] for words in calls] == ["groupadd", "lowfc", "usermod"]
+    assert "exclude each other" in str(lowfc("doctor", "--apply", "--undo").exception)
     permissions.undo(tmp_path)
     assert not [path for path in tmp_path.rglob("*") if path.is_file() and path != device]
     assert device.stat().st_mode & 0o777 == 0o600

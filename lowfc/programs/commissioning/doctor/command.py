@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lowfc.adapters.process.terminal import ConfigFile, Json, configuration
-from lowfc.contract.errors import DataFileError
+from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.programs.commissioning.checks import Check, Status, put
 
 if TYPE_CHECKING:
@@ -43,6 +43,8 @@ def doctor(
     from lowfc.programs.commissioning.doctor.devices import device_checks
     from lowfc.programs.commissioning.doctor.facts import gather
 
+    if apply and undo:
+        raise ConfigurationError("--apply and --undo exclude each other: use one")
     if setup or apply or undo:
         from lowfc.programs.commissioning.doctor import permissions
 
@@ -56,7 +58,7 @@ def doctor(
                 if apply
                 else [permissions.shown(root)]
             )
-        except (OSError, LookupError) as fault:  # a read-only folder; no group, if there is no groupadd
+        except (OSError, LookupError) as fault:  # such as a read-only folder, or a user unknown to usermod
             raise DataFileError(f"the settings cannot be changed completely: {fault}") from fault
         sys.stdout.write("\n".join(done) + "\n")
         return

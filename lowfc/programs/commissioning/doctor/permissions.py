@@ -27,7 +27,13 @@ def shown(root: Path) -> str:
 
 
 def apply(root: Path, user: str) -> list[str]:
-    """Write the files, create the group with this user, and give it access to the device; return the actions."""
+    """Write the files, create the group with this user, and give it access to the device; return the actions.
+
+    Raises:
+        ConfigurationError: not root, or a file is not lowfc's.
+        OSError: a file cannot be written, or a command failed.
+        LookupError: the group was not created.
+    """
     _require_root("--apply")
     for name, text in FILES.items():
         file = root / name
@@ -40,12 +46,12 @@ def apply(root: Path, user: str) -> list[str]:
         file.write_text(text, encoding="utf-8")
         done.append(f"wrote {file}")
     done.append(_run("groupadd", "--prefix", str(root), "--system", "--force", GROUP))
-    if user:
-        done.append(_run("usermod", "--prefix", str(root), "--append", "--groups", GROUP, user))
     if (root / DEVICE).exists():
         shutil.chown(root / DEVICE, group=GROUP)
         (root / DEVICE).chmod(0o660)
         done.append(f"{root / DEVICE} is accessible to the group {GROUP}")
+    if user:
+        done.append(_run("usermod", "--prefix", str(root), "--append", "--groups", GROUP, user))
     return [*done, f"effective for {user or 'members of the group ' + GROUP} from the next login"]
 
 
@@ -62,7 +68,10 @@ def undo(root: Path) -> list[str]:
         shutil.chown(root / DEVICE, group=0)
         (root / DEVICE).chmod(0o600)
         done.append(f"{root / DEVICE} is accessible to root only")
-    return [*done, _run("groupdel", "--prefix", str(root), GROUP)]
+    try:
+        return [*done, _run("groupdel", "--prefix", str(root), GROUP)]
+    except OSError as fault:  # there is no such group, or it is that of the services' user
+        return [*done, str(fault)]
 
 
 def _require_root(option: str) -> None:
@@ -71,9 +80,9 @@ def _require_root(option: str) -> None:
 
 
 def _run(*words: str) -> str:
-    """Run a command of the host; return it, with its error message if it failed."""
-    program = shutil.which(words[0], path=f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin")
-    if program is None:
-        return f"{' '.join(words)}: command not found on this host; do it by hand"
+    """Run a command of the host and return it; OSError if there is none, or it failed."""
+    program = shutil.which(words[0], path=f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin") or words[0]
     run = subprocess.run([program, *words[1:]], capture_output=True, text=True, check=False)  # noqa: S603  # as shown
-    return " ".join(words) + (f": {run.stderr.strip()}" if run.returncode else "")
+    if run.returncode:
+        raise OSError(f"{' '.join(words)}: {run.stderr.strip()}")
+    return " ".join(words)
