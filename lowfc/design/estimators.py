@@ -24,7 +24,6 @@ class Fit:
         reference_e: (pixels,) I0 in electrons.
         response_e: (pixels, modes) H in electrons per nm.
         R: (modes, pixels) nm per electron.
-        kind: Kind of estimator, one of `KINDS`.
         scale_e: Electrons of the open circle's light in the exposure.
     """
 
@@ -32,7 +31,6 @@ class Fit:
     reference_e: Array
     response_e: Array
     R: Array
-    kind: str
     scale_e: float
 
 
@@ -61,7 +59,7 @@ def fit(
         ValueError: Unknown kind, or modes that this sensor cannot distinguish.
     """
     R = reconstructor(I0, H, np.ones_like(I0), scale_e, read_noise_e, kind, nuisance)
-    return Fit(tuple(nolls), I0 * scale_e, H * scale_e, R / scale_e, kind, scale_e)
+    return Fit(tuple(nolls), I0 * scale_e, H * scale_e, R / scale_e, scale_e)
 
 
 def estimate(fit: Fit, image_e: Array) -> Array:

@@ -3,7 +3,7 @@
 The fields in the relay pupil, after the focal-plane mask, do not depend on the holes: the field of the flat wavefront
 and the first-order field of each mode are propagated once (`build_optics`). Each hole adds a small product of matrices
 to every field at the sensor (`hole_fields`), so that a search that moves one hole recomputes only that hole. I0 and H,
-eqs. (6) and (12), follow from the fields (`signal`, `band_signal`); `lowfc.design.merit` computes their performance.
+eqs. (6) and (12), follow from the fields (`Mask`); `lowfc.design.merit` computes their performance.
 """
 
 from collections.abc import Callable
@@ -152,42 +152,13 @@ def hole_fields(optics: Optics, hole: Hole) -> Single:
     return np.concatenate(parts)
 
 
-def signal(optics: Optics, fields: Single, focal_mask: str) -> Signal:
-    """I0 and H at the central wavelength, for Table 3.
-
-    Args:
-        optics: The optics before the sparse aperture mask.
-        fields: (fields, samples, samples) sum of `hole_fields` over the holes, amplitude.
-        focal_mask: One of `optics.focal_masks`.
-    """
-    count = 1 + len(NOLLS_20)
-    first = count * optics.focal_masks.index(focal_mask)
-    I0, H = _image_and_response(fields[first : first + count], WAVELENGTH_NM)
-    flat = optics.at_pixels @ fields[first] @ optics.at_pixels.T
-    peak = float(np.max(flat.real**2 + flat.imag**2)) * _PIXEL
-    return Signal(I0, H, _pixels_per_sample(optics), peak)
-
-
-def band_signal(optics: Optics, fields: Single) -> Signal:
-    """I0 and H in the band, for the first focal-plane mask; amplitude fields, shapes as in `signal`."""
-    count, first = 1 + optics.band_modes, (1 + len(NOLLS_20)) * len(optics.focal_masks)
-    I0: Array = np.zeros(fields[0].size)
-    H: Array = np.zeros((fields[0].size, optics.band_modes))
-    for wavelength_nm, weight in zip(optics.band.wavelengths_nm, optics.band.weights, strict=True):
-        start = 0 if wavelength_nm == WAVELENGTH_NM else first
-        image, response = _image_and_response(fields[start : start + count], wavelength_nm)
-        I0, H = I0 + weight * image, H + weight * response
-        first += 0 if wavelength_nm == WAVELENGTH_NM else count
-    return Signal(I0, H, _pixels_per_sample(optics), float(I0.max()))
-
-
 @dataclass(frozen=True, eq=False)
 class Mask:
     """A sparse aperture mask as a `Candidate`.
 
     Attributes:
         optics: The optics before the mask.
-        fields: Sum of `hole_fields` over its holes.
+        fields: (fields, samples, samples) sum of `hole_fields` over its holes, amplitude.
     """
 
     optics: Optics
@@ -205,12 +176,26 @@ class Mask:
         return self.optics.focal_masks
 
     def central(self, row: str) -> Signal:
-        """I0 and H at the central wavelength with one focal-plane mask."""
-        return signal(self.optics, self.fields, row)
+        """I0 and H at the central wavelength with one focal-plane mask, for Table 3."""
+        count, to_pixels = 1 + len(NOLLS_20), self.optics.at_pixels
+        first = count * self.optics.focal_masks.index(row)
+        I0, H = _image_and_response(self.fields[first : first + count], WAVELENGTH_NM)
+        flat = to_pixels @ self.fields[first] @ to_pixels.T
+        peak = float(np.max(flat.real**2 + flat.imag**2)) * _PIXEL
+        return Signal(I0, H, _pixels_per_sample(self.optics), peak)
 
     def in_band(self) -> Signal:
         """I0 and H in the band with the first focal-plane mask."""
-        return band_signal(self.optics, self.fields)
+        optics, fields = self.optics, self.fields
+        count, first = 1 + optics.band_modes, (1 + len(NOLLS_20)) * len(optics.focal_masks)
+        I0: Array = np.zeros(fields[0].size)
+        H: Array = np.zeros((fields[0].size, optics.band_modes))
+        for wavelength_nm, weight in zip(optics.band.wavelengths_nm, optics.band.weights, strict=True):
+            start = 0 if wavelength_nm == WAVELENGTH_NM else first
+            image, response = _image_and_response(fields[start : start + count], wavelength_nm)
+            I0, H = I0 + weight * image, H + weight * response
+            first += 0 if wavelength_nm == WAVELENGTH_NM else count
+        return Signal(I0, H, _pixels_per_sample(optics), float(I0.max()))
 
     def nonlinearity_waves(self, modes: int) -> float:
         """A constant, the same for all masks."""

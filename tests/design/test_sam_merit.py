@@ -15,7 +15,7 @@ from lowfc.contract.sections import SensorSection
 from lowfc.design import sam_search
 from lowfc.design.goal import MERITS, Goal, merit, paper_ratios, predictions
 from lowfc.design.merit import contrast_noise, covariance_nm2, table3_waves
-from lowfc.design.sam_merit import TABLE3_NONLINEARITY_WAVES, Mask, build_optics, hole_fields, signal
+from lowfc.design.sam_merit import TABLE3_NONLINEARITY_WAVES, Mask, build_optics, hole_fields
 from lowfc.design.sam_search import BLOCK, Bounds, advance, holes, images, start
 from lowfc.optics.chain.band import monochromatic, uniform
 from lowfc.optics.chain.focal_mask import disk
@@ -31,6 +31,12 @@ RECORDED_TABLES = Path(__file__).parents[2] / "docs" / "measured" / "paper.json"
 @pytest.fixture(scope="module")
 def pupil():
     return load_pupil()
+
+
+@pytest.fixture(scope="module")
+def optics():
+    """The optics before the mask, with the sampling of a search."""
+    return build_optics(load_pupil(256))
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +128,7 @@ def test_merits_agree_with_their_definitions(optics, fields):
         "condition": predicted["condition"]["20"],
         "throughput": 1 / predicted["throughput"],
         "pareto": predicted["table3_waves"]["pinv"]["20"] ** 0.75 * tilt**0.25,
-        "contrast": contrast_noise(optics.forms, signal(optics, fields, "disk"), "pinv"),
+        "contrast": contrast_noise(optics.forms, mask.central("disk"), "pinv"),
     }
     assert set(expected) == set(MERITS)
     for name, value in expected.items():
@@ -135,7 +141,7 @@ def test_merits_agree_with_their_definitions(optics, fields):
 
 
 def test_the_weighted_estimator_is_never_worse(optics, fields):
-    disk_signal = signal(optics, fields, "disk")
+    disk_signal = Mask(optics, fields).central("disk")
     for count in (2, 14, 20):
         plain, weighted = (covariance_nm2(disk_signal, 1e6, 3.0, count, name) for name in ("pinv", "weighted"))
         assert np.linalg.eigvalsh(plain - weighted).min() > -1e-9 * np.trace(plain)
