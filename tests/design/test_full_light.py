@@ -5,11 +5,9 @@ import tomllib
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from lowfc.adapters.files.layouts import load_layout
 from lowfc.adapters.files.sensors import sensor_from, sensor_named
-from lowfc.adapters.process.terminal import new_app
 from lowfc.contract.configuration import load
 from lowfc.contract.errors import ConfigurationError
 from lowfc.contract.sections import SensorSection
@@ -24,8 +22,8 @@ from lowfc.optics.chain.sam import transmission
 from lowfc.optics.chain.sensor import pupil_radii, reference, response
 from lowfc.optics.chain.zernike import NOLLS_14, NOLLS_20, zernikes
 from lowfc.optics.detector.photometry import electrons
-from lowfc.programs.design.command import design_app
 from lowfc.programs.design.full_light_request import Spot
+from tests.support.loops import lowfc
 
 LIGHT_E = electrons(STAR, TABLE4_EXPOSURE_S)
 # Noise of 14 modes in nm, and the share of the quantum limit, from an independent calculation.
@@ -107,19 +105,14 @@ def test_sweep_finds_the_minimum_between_its_values():
 
 def test_the_command_writes_the_keys_of_the_best(tmp_path, monkeypatch):
     monkeypatch.setattr("lowfc.programs.design.full_light._POINTS", 3)
-    app = new_app("Test.")
-    app.add_typer(design_app, name="design")
     out = tmp_path / "clowfs.toml"
-    ran = CliRunner().invoke(app, ["design", "clowfs", "--defocus", "3.2:4.2", "--out", str(out), "--json"])
+    ran = lowfc("design", "clowfs", "--defocus", "3.2:4.2", "--out", out, "--json")
     assert ran.exit_code == 0, ran.output
     found = json.loads(ran.stdout)
     assert found["best"] == pytest.approx(3.7, abs=0.1)
     assert min(point["merit"] for point in found["points"]) == found["figures_of_best"]["contrast_noise"]
     assert load(out).sensor.defocus_mm == pytest.approx(found["best"], rel=1e-3)
     assert tomllib.loads(out.read_text())["sensor"]["kind"] == "clowfs"
-    wrong = CliRunner().invoke(app, ["design", "zwfs", "--spot", "0:1"])
-    assert wrong.exit_code
-    assert "spot_diameter" in str(wrong.exception)
 
 
 @pytest.mark.parametrize(
@@ -127,6 +120,7 @@ def test_the_command_writes_the_keys_of_the_best(tmp_path, monkeypatch):
     [
         (("zwfs", "--spot", "3:0.5"), "in order"),
         (("clowfs", "--defocus", "8:1.5"), "in order"),
+        (("zwfs", "--spot", "0:1"), "spot_diameter"),
         (("zwfs", "--spot", "1:100"), "spot_diameter = 100.0: must be less than or equal to 8"),
         (("zwfs", "--spot", "1:"), "--spot must be a number or LOW:HIGH, got '1:'"),
         (
@@ -138,7 +132,7 @@ def test_the_command_writes_the_keys_of_the_best(tmp_path, monkeypatch):
 )
 def test_impossible_options_are_refused_before_the_search(words, message, monkeypatch):
     monkeypatch.setattr("lowfc.programs.design.full_light.Focus", None)
-    error = CliRunner().invoke(design_app, words).exception
+    error = lowfc("design", *words).exception
     assert isinstance(error, ConfigurationError)
     assert message in str(error)
 
