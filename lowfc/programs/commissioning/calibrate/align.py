@@ -91,15 +91,11 @@ def on_sensor(
     good = before.good.astype(np.float64)
     try:
         I0, H = normalise_flux(np.maximum(I0, 0), H, good)
-        reconstruction = compute_reconstructor(config, I0, H, None, good, flux_dn, estimator=config.control.estimator)
-    except (ValueError, CalibrationError) as error:
-        raise CalibrationError(f"too little of the image falls on the sensor: {error}") from None
-    return identified(
-        replace(
+        made = replace(
             computed,
             reference=single(I0),
             response=single(H),
-            reconstructor=single(reconstruction.matrix),
+            reconstructor=np.zeros(H.T.shape, np.float32),
             good=before.good,
             dark=before.dark,
             shape=before.shape,
@@ -109,7 +105,10 @@ def on_sensor(
             operator_hash="",
             camera=before.camera,
         )
-    )
+        R = compute_reconstructor(config, made, None, estimator=config.control.estimator).matrix
+    except (ValueError, CalibrationError) as error:
+        raise CalibrationError(f"too little of the image falls on the sensor: {error}") from None
+    return identified(replace(made, reconstructor=single(R)))
 
 
 def computed_scale(config: Configuration) -> float:

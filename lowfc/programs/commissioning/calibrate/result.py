@@ -125,19 +125,15 @@ def finish_calibration(
 
 
 def compute_reconstructor(
-    config: Configuration,
-    reference: Array,
-    response: Array,
-    initial: Array | None,
-    good: Array,
-    flux_dn: float,
-    **options: Any,
+    config: Configuration, calibration: Calibration, initial: Array | None, **options: Any
 ) -> Reconstruction:
-    """R from H with the camera of a configuration; arguments as for `reconstruct`, flux in DN."""
+    """R from I0, H and flux of a calibration with the camera of a configuration; arguments as for `reconstruct`."""
     camera = factory.detector(config)
-    flux_e, read_noise_e = flux_dn * camera.gain_e_per_dn / camera.em_gain, factory.equivalent_read_noise_e(camera)
+    flux_e = calibration.flux_dn * camera.gain_e_per_dn / camera.em_gain
+    arrays = calibration.reference, calibration.response, calibration.good
+    I0, H, good = (array.astype(np.float64) for array in arrays)
     try:
-        return reconstruct(reference, response, initial, good, flux_e, read_noise_e, **options)
+        return reconstruct(I0, H, initial, good, flux_e, factory.equivalent_read_noise_e(camera), **options)
     except ValueError as error:
         raise CalibrationError(str(error)) from None
 
@@ -146,28 +142,20 @@ def measured_calibration(
     config: Configuration, before: Calibration, measured: Measured, request: CalibrationRequest
 ) -> tuple[Calibration, Reconstruction]:
     """The calibration from cycles of pokes, with dark, mask and mirror commands of the previous one."""
-    I0 = measured.reference if measured.reference is not None else before.reference.astype(np.float64)
-    reconstruction = compute_reconstructor(
-        config,
-        I0,
-        measured.response,
-        measured.initial.matrix,
-        before.good.astype(np.float64),
-        measured.flux_dn,
-        truncate=request.truncate,
-        tikhonov=request.tikhonov,
-    )
     names = dict.fromkeys([*measured.initial.estimator.split("+"), request.method])
     calibration = replace(
         before,
-        reference=single(I0),
+        reference=before.reference if measured.reference is None else single(measured.reference),
         response=single(measured.response),
-        reconstructor=single(reconstruction.matrix),
         flux_dn=measured.flux_dn,
         estimator="+".join(names),
         operator_hash="",
-        actuators_to_modes=single(_actuators_to_modes(config, before, reconstruction.matrix)),
     )
+    reconstruction = compute_reconstructor(
+        config, calibration, measured.initial.matrix, truncate=request.truncate, tikhonov=request.tikhonov
+    )
+    actuators = single(_actuators_to_modes(config, before, reconstruction.matrix))
+    calibration = replace(calibration, reconstructor=single(reconstruction.matrix), actuators_to_modes=actuators)
     return identified(calibration), reconstruction
 
 

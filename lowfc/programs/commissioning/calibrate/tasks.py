@@ -101,17 +101,9 @@ def computed(
     config = configuration(file)
     name, wavefront = ("", None) if at is None else zero_point(config, at)
     calibration = analytic(config, Console(stderr=True), wavefront)
-    quality = compute_reconstructor(
-        config,
-        calibration.reference.astype(np.float64),
-        calibration.response.astype(np.float64),
-        calibration.reconstructor.astype(np.float64) if config.control.nuisance else None,
-        calibration.good.astype(np.float64),
-        calibration.flux_dn,
-        estimator=config.control.estimator,
-        truncate=request.truncate,
-        tikhonov=request.tikhonov,
-    )
+    initial = calibration.reconstructor.astype(np.float64) if config.control.nuisance else None
+    options = {"truncate": request.truncate, "tikhonov": request.tikhonov}
+    quality = compute_reconstructor(config, calibration, initial, estimator=config.control.estimator, **options)
     if name:
         calibration = replace(calibration, estimator=f"{calibration.estimator}+at {name}")
     if request.truncate or request.tikhonov:

@@ -103,16 +103,10 @@ def poked(player: Player, config: Configuration, poke: Delay) -> Calibration:
     for number in range(CYCLES):
         plan = _poke_cycle(modes, amplitude_nm, number)
         response += player.cycle(plan, poke.delay_frames).response / CYCLES
-    good, reference = before.good.astype(np.float64), before.reference.astype(np.float64)
-    matrix = compute_reconstructor(config, reference, response, None, good, before.flux_dn).matrix
+    calibration = replace(before, response=single(response), estimator=f"{config.control.estimator}+poke{FIRST}")
+    matrix = compute_reconstructor(config, calibration, None).matrix
     player.report(f"{CYCLES} pokes of each mode by {amplitude_nm:.3g} nm")
-    calibration = replace(
-        before,
-        response=single(response),
-        reconstructor=single(matrix),
-        estimator=f"{config.control.estimator}+poke{FIRST}",
-    )
-    return identified(calibration)
+    return identified(replace(calibration, reconstructor=single(matrix)))
 
 
 def linear_nm(player: Player, config: Configuration, delay: Delay, default_nm: float) -> float:
