@@ -379,6 +379,7 @@ def test_a_calibration_can_be_computed_at_another_wavefront(loop: InProcessLoop)
         ("--json reference", "--json is before `reference`"),
         ("--method poke --config test.toml", "--config requires --method analytic"),
         ("--at 4=15", "--at requires --method analytic"),
+        ("--compare one.fits other.fits --load", "--load has no effect with --compare"),
         ("--method analytic --resume --snr 50", "--snr is for pokes, but --method analytic computes: omit it"),
     ],
 )
@@ -387,6 +388,10 @@ def test_an_option_without_effect_is_refused(loop: InProcessLoop, words: str, wh
     with pytest.raises(ConfigurationError, match=why):
         CliRunner().invoke(calibrate_app, words.split(), catch_exceptions=False)
     assert {path.name for path in Path().iterdir()} == before
+
+
+def test_fewer_cycles_than_their_scatter_needs_are_refused() -> None:
+    assert "--cycles" in CliRunner().invoke(calibrate_app, ["--cycles", "3"]).stderr
 
 
 def test_a_comparison_of_different_sensors_is_refused(loop: InProcessLoop) -> None:

@@ -7,6 +7,7 @@ import typer
 
 from lowfc.adapters.process.terminal import AnyRun, ConfigFile, Json, given, new_app
 from lowfc.contract.errors import ConfigurationError
+from lowfc.control.calibration.response_fit import MIN_CYCLES
 from lowfc.programs.cli.result import print_result
 
 calibrate_app = new_app(
@@ -17,6 +18,9 @@ Method = Literal["analytic", "poke", "hadamard", "in-loop"]
 Out = Annotated[Path, typer.Option("--out", help="Output file (FITS).")]
 Load = Annotated[bool, typer.Option("--load", help="Load the result into the loop, which must be open.")]
 Snr = Annotated[float, typer.Option(min=1, max=1e4, help="Signal-to-noise ratio to reach in the noisiest mode.")]
+Cycles = Annotated[
+    int | None, typer.Option(min=MIN_CYCLES, help="Number of cycles; --snr (then 20 by default) is required of them.")
+]
 Resume = Annotated[bool, typer.Option("--resume", help="Continue an interrupted calibration.")]
 Frames = Annotated[int, typer.Option(min=16, max=100_000, help="Number of frames to average.")]
 
@@ -36,9 +40,7 @@ def calibrate(
             help="Poke amplitude, nm rms of wavefront; default: 8 poke, 3 hadamard, 2 in-loop, half above --snr 70.",
         ),
     ] = None,
-    cycles: Annotated[
-        int | None, typer.Option(min=1, help="Number of cycles; --snr (then 20 by default) is required of them.")
-    ] = None,
+    cycles: Cycles = None,
     resume: Resume = False,
     truncate: Annotated[
         float, typer.Option(min=0, max=0.99, help="Discard singular values below this fraction of the largest.")
@@ -85,6 +87,8 @@ def calibrate(
     from lowfc.programs.commissioning.calibrate.result import comparison
 
     if compare is not None:
+        if others := [option for option in options if option not in ("--compare", "--json")]:
+            raise ConfigurationError(f"{others[0]} has no effect with --compare, which only compares: omit it")
         print_result(comparison(*map(read, compare)), as_json=as_json)
         return
     if cycles is not None and "--snr" not in options:

@@ -100,7 +100,7 @@ class Pokes:
         """Number of cycles required by photon and read noise."""
         request = self._request
         if request.cycles is not None:
-            return max(request.cycles, MIN_CYCLES)
+            return request.cycles
         frames = poke_plan.frames_for(request.snr / MARGIN, float(self._noise_nm.max()), self.amplitude_nm)
         return max(-(-frames // self.cycle(0).per_column), MIN_CYCLES)
 

@@ -8,9 +8,8 @@ import typer
 
 from lowfc.adapters.process.terminal import AnyRun, Json
 from lowfc.contract.errors import ConfigurationError, DataFileError
-from lowfc.control.calibration.response_fit import MIN_CYCLES
 from lowfc.programs.cli.output import print_result
-from lowfc.programs.commissioning.calibrate.command import Out, Resume
+from lowfc.programs.commissioning.calibrate.command import Cycles, Out, Resume
 
 
 def commission(
@@ -29,10 +28,7 @@ def commission(
             min=1, max=1e4, help="Signal-to-noise ratio to reach in each mode; default: 50, or 20 with --cycles."
         ),
     ] = None,
-    cycles: Annotated[
-        int | None,
-        typer.Option(min=MIN_CYCLES, help="Push-pull cycles of the response; default: until --snr is reached."),
-    ] = None,
+    cycles: Cycles = None,
     resume: Resume = False,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
     close: Annotated[bool, typer.Option("--close", help="Close the loop at the end.")] = False,
