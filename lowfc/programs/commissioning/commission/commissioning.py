@@ -19,12 +19,12 @@ from lowfc.contract.errors import CalibrationError, LowfcError
 from lowfc.contract.messages import wire
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.calibration.delay_fit import Delay
+from lowfc.control.laws import margins
 from lowfc.control.laws.stability import delay_weights, settling_frames
 from lowfc.control.laws.what_if import Controller, as_logged, counterfactual, driven_by, missing_before, rms
 from lowfc.control.loop.inputs import Step
 from lowfc.control.loop.safety import LoopMode
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES
-from lowfc.programs.commissioning.acceptance.probe import Loop
 from lowfc.programs.commissioning.calibrate.pokes import MIN_SNR, CalibrationRequest, Pokes
 from lowfc.programs.commissioning.calibrate.recording import CHECKED, Player, Report, watch
 from lowfc.programs.commissioning.calibrate.result import finish_calibration
@@ -255,15 +255,14 @@ class Commissioning:
 
         A linear law in force stays in force.
         """
-        state, noll, rate_hz = self._state(), self._computed.noll, self._config.camera.rate_hz
+        state, noll = self._state(), self._computed.noll
         integrator, law = gains_of(state), driving(state, self._loop.laws())
         if law is not None:
-            loop = Loop(law, noll, state.delay_frames, rate_hz, self._computed)
-            settling = SETTLING_FRAMES + FADING_FRAMES + loop.settling_frames()
+            settling = SETTLING_FRAMES + FADING_FRAMES + margins.settling_frames(law, state.delay_frames)
             return driven_by(law, integrator.limit_nm), settling, []
         automatic = np.array(state.automatic or [False] * len(noll), bool)
         integrator = replace(integrator, gain=np.where(automatic, np.float32(CHECK_GAIN), integrator.gain))
-        settling = settling_frames(integrator.gain, integrator.leak, rate_hz)
+        settling = settling_frames(integrator.gain, integrator.leak, self._config.camera.rate_hz)
         return as_logged(integrator), settling, np.array(noll)[automatic].tolist()
 
     @contextlib.contextmanager
