@@ -12,7 +12,7 @@ import numpy.typing as npt
 import pytest
 
 from lowfc.client import Answer, mirror_watch
-from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
+from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import BusError, CalibrationError, DataFileError
 from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import EVENT, wire
@@ -22,19 +22,9 @@ from lowfc.programs.commissioning.calibrate import pokes, recording
 from lowfc.programs.commissioning.calibrate.pokes import CalibrationRequest
 from lowfc.programs.commissioning.calibrate.result import measured_calibration
 from lowfc.programs.commissioning.calibrate.run import CalibrationData, Calibrator, keep, partial_of, resumed
-from tests.support.in_process_loop import SMALL_MIRROR, InProcessLoop
+from tests.support.in_process_loop import BRIGHT, InProcessLoop
 
 OUT = Path("night.fits")
-BRIGHT = (
-    FIXED_GAINS
-    | SMALL_MIRROR
-    | {
-        "sensor.sam": "sam27d10_bal14",
-        "star.magnitude": 0.0,
-        "disturbance.preset": "quiet",
-        "camera.instants": 1,  # sufficient without a disturbance
-    }
-)
 
 
 def configured(**changes: object) -> Configuration:

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from lowfc.adapters.files import calibration_file, factory
 from lowfc.adapters.process.progress import spoken
 from lowfc.contract.codecs.calibration_codec import identified
-from lowfc.contract.configuration import FIXED_GAINS, Configuration, load
+from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import CalibrationError, ConfigurationError, DataFileError, RequestRefusedError
 from lowfc.contract.messages import wire
 from lowfc.control.calibration.alignment import Geometry, align, onto
@@ -32,13 +32,8 @@ from lowfc.programs.commissioning.calibrate.align import on_sensor
 from lowfc.programs.commissioning.calibrate.command import calibrate_app
 from lowfc.programs.commissioning.calibrate.run import Calibrator
 from lowfc.programs.commissioning.calibrate.tasks import zero_point
-from tests.support.in_process_loop import SMALL_MIRROR, InProcessLoop
+from tests.support.in_process_loop import BRIGHT, SMALL_MIRROR, InProcessLoop
 
-BRIGHT = (
-    FIXED_GAINS
-    | SMALL_MIRROR
-    | {"sensor.sam": "sam27d10_bal14", "star.magnitude": 0.0, "disturbance.preset": "quiet", "camera.instants": 1}
-)
 CONFIG = BRIGHT | {"sensor.modes": 3}
 RATE_HZ, DELAY_FRAMES = 250, 240
 

@@ -17,7 +17,7 @@ from lowfc.arrays import Single
 from lowfc.client import Answer, Client, MirrorWatch
 from lowfc.client import Frame as Image
 from lowfc.contract.codecs.state_codec import controller_state
-from lowfc.contract.configuration import Configuration
+from lowfc.contract.configuration import FIXED_GAINS, Configuration
 from lowfc.contract.errors import CalibrationError, RequestRefusedError
 from lowfc.contract.messages import MIRROR_STATE, Topic, wire
 from lowfc.control.calibration.calibration import Calibration
@@ -31,6 +31,18 @@ from tools.law_bench import Bench, calibrated
 FIRST = 1 << 32
 SMALL_MIRROR = {"mirror.rows": 12, "mirror.columns": 12, "mirror.pitches_per_pupil": 10}
 """For tests that do not depend on the number of actuators: computes a calibration ten times as fast."""
+
+BRIGHT = (
+    FIXED_GAINS
+    | SMALL_MIRROR
+    | {
+        "sensor.sam": "sam27d10_bal14",
+        "star.magnitude": 0.0,
+        "disturbance.preset": "quiet",
+        "camera.instants": 1,  # sufficient without a disturbance
+    }
+)
+"""For calibrations: a bright star without a disturbance."""
 
 
 @lru_cache(maxsize=4)
