@@ -95,9 +95,11 @@ def tolerated_lines(kind: Kind, line: Line, rate_hz: float, exposure: float) -> 
     """
     timing = Timing.of(DELAY, exposure)
 
+    def model(variance: float) -> Model:
+        return Model(_MIN_DRIFT, np.inf, (replace(line, variance_nm2=variance),), 1.0, rate_hz)
+
     def residual(law: LinearLaw, variance: float) -> float:
-        model = Model(_MIN_DRIFT, np.inf, (replace(line, variance_nm2=variance),), 1.0, rate_hz)
-        return float(predicted_nm(law, [model], timing)[0] ** 2)
+        return float(predicted_nm(law, [model(variance)], timing)[0] ** 2)
 
     if kind == "integrator":  # v = A line + B noise at each gain
         laws = [integrator([gain], [0.0], (2,), DELAY, rate_hz) for gain in np.append(_GAINS, highest_gain(DELAY))]
@@ -106,8 +108,7 @@ def tolerated_lines(kind: Kind, line: Line, rate_hz: float, exposure: float) -> 
         return lambda allowed: np.asarray(np.max((allowed[..., None] - of_noise) / of_line, axis=-1))
 
     def filtered(variance: float) -> float:
-        model = Model(_MIN_DRIFT, np.inf, (replace(line, variance_nm2=variance),), 1.0, rate_hz)
-        return min(residual(lqg([model], (2,), timing), variance), variance)
+        return min(residual(lqg([model(variance)], (2,), timing), variance), variance)
 
     found = np.log([filtered(variance) for variance in _LINE_RATIOS.tolist()])
     return lambda allowed: np.asarray(np.exp(np.interp(np.log(allowed), found, np.log(_LINE_RATIOS))))

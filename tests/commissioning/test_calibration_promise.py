@@ -85,7 +85,8 @@ def outcome(method: str, preset: str, seed: int, snr: float, folder: Path, modes
 
 
 def assert_accurate(found: Outcome, snr: float) -> None:
-    """Cross-talk of at most 1.2 / snr rms and 4 / snr at the largest, with at most 1.5 times the computed noise."""
+    """A good verdict, cross-talk of at most 1.2 / snr rms and 4 / snr at the largest, at most 1.5 times the noise."""
+    assert not found.verdict.faults
     rms, largest = np.sqrt((found.talk**2).mean()), np.abs(found.talk).max()
     assert (rms * snr, largest * snr) < (1.2, np.inf)
     assert largest * snr < 4
@@ -97,9 +98,7 @@ def test_a_calibration_with_few_cycles_has_the_requested_accuracy(
     method: str, modes: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pokes, "PIECE", 256)
-    found = outcome(method, "bench", 1, 20.0, tmp_path, modes)
-    assert not found.verdict.faults
-    assert_accurate(found, 20.0)
+    assert_accurate(outcome(method, "bench", 1, 20.0, tmp_path, modes), 20.0)
 
 
 @pytest.mark.slow
@@ -109,18 +108,14 @@ def test_a_calibration_with_few_cycles_has_the_requested_accuracy(
 @pytest.mark.parametrize("method", ["hadamard", "poke", "in-loop"])
 def test_calibrations_have_the_requested_accuracy(method: str, preset: str, first: int, tmp_path: Path) -> None:
     for seed in range(first, first + BLOCK):
-        found = outcome(method, preset, seed, 30.0, tmp_path)
-        assert not found.verdict.faults
-        assert_accurate(found, 30.0)
+        assert_accurate(outcome(method, preset, seed, 30.0, tmp_path), 30.0)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 @pytest.mark.parametrize("snr", [70.0, 71.0])
 def test_the_accuracy_is_reached_at_the_default_snr_and_with_halved_amplitudes(snr: float, tmp_path: Path) -> None:
-    found = outcome("hadamard", "bench", 1, snr, tmp_path)
-    assert not found.verdict.faults
-    assert_accurate(found, snr)
+    assert_accurate(outcome("hadamard", "bench", 1, snr, tmp_path), snr)
 
 
 @pytest.mark.slow

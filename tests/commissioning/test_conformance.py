@@ -199,9 +199,8 @@ def of_camera(**changes: Any) -> dict[str, str]:
     return found(camera_checks(watch(Camera(**changes), 3.0, lambda _: None)))
 
 
-def of_mirror(*, gentle: bool = False, config: Configuration = CONFIG, **changes: Any) -> dict[str, str]:
-    dialogue = Dialogue(Mirror(**changes), Expected(config))
-    return found(mirror_checks(dialogue, 0.2, lambda _: None, gentle=gentle))
+def of_mirror(mirror: Mirror, config: Configuration = CONFIG, **options: Any) -> dict[str, str]:
+    return found(mirror_checks(Dialogue(mirror, Expected(config)), 0.2, **{"show": lambda _: None, **options}))
 
 
 def setting(**values: Any) -> Callable[..., Any]:
@@ -436,8 +435,7 @@ def test_a_correct_mirror_passes_and_returns_to_its_shape() -> None:
     start = np.full((6, 7), 40, np.float32)
     command = Command("lowfc", 5, 1, 10**10, start, np.zeros(2, np.float32))
     mirror.status, _ = mirror.mirror.apply_command(mirror.status, command, mirror.now_ns())
-    dialogue = Dialogue(mirror, Expected(CONFIG))
-    assert found(mirror_checks(dialogue, 0.2, lambda _: None)) == {}
+    assert of_mirror(mirror) == {}
     np.testing.assert_allclose(mirror.status.surface_nm, start, atol=0.03)
     assert 5 < mirror.status.frame_sequence < 5000  # below the sequences of a camera, which are not refused later
 
@@ -445,14 +443,14 @@ def test_a_correct_mirror_passes_and_returns_to_its_shape() -> None:
 @pytest.mark.parametrize("fault", MIRRORS)
 def test_a_fault_of_a_mirror_is_found(fault: str) -> None:
     changes, expected = MIRRORS[fault]
-    assert of_mirror(**changes) == expected
+    assert of_mirror(Mirror(**changes)) == expected
 
 
 def test_gentle_does_not_test_the_limits() -> None:
     mirror = Mirror()
     highest_nm: list[float] = []
     mirror.changes["state"] = shaped(lambda shape: highest_nm.append(float(np.abs(shape).max())) or shape)
-    assert found(mirror_checks(Dialogue(mirror, Expected(CONFIG)), 0.2, lambda _: None, gentle=True)) == UNTRIED
+    assert of_mirror(mirror, gentle=True) == UNTRIED
     assert 0 < max(highest_nm) < 0.051 * CONFIG.mirror.slew_nm
 
 
@@ -470,7 +468,7 @@ def test_an_interrupted_check_returns_the_mirror_to_its_shape() -> None:
         return state
 
     with pytest.raises(KeyboardInterrupt):
-        list(mirror_checks(Dialogue(mirror, Expected(CONFIG)), 0.2, interrupted))
+        of_mirror(mirror, show=interrupted)
     assert mirror.status.following
     np.testing.assert_allclose(mirror.status.surface_nm, 0, atol=0.03)
 
@@ -480,7 +478,7 @@ def test_configured_dead_and_stuck_actuators_are_no_fault() -> None:
     free = Mirror()
     free.mirror = Simulated(config)
     free.status = free.mirror.initial
-    assert found(mirror_checks(Dialogue(free, Expected(config)), 0.2, lambda _: None)) == {}
+    assert of_mirror(free, config) == {}
 
 
 def test_the_report_has_advice_for_failed_checks(capsys: pytest.CaptureFixture[str]) -> None:
