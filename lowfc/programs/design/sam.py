@@ -3,7 +3,7 @@
 import hashlib
 import shlex
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from functools import cache, lru_cache
 from pathlib import Path
@@ -18,6 +18,7 @@ from lowfc.adapters.files.drawing import figure_class
 from lowfc.adapters.files.sensors import load_pupil
 from lowfc.adapters.process.progress import counting_bar
 from lowfc.contract.errors import ConfigurationError, LowfcError
+from lowfc.control.loop.wording import counted
 from lowfc.design.goal import predictions
 from lowfc.design.paper import TABLE4_MODES
 from lowfc.design.sam_merit import FOCAL_MASKS, Hole, Mask, Optics, Single, build_optics, hole_fields
@@ -202,7 +203,10 @@ def render(result: dict[str, Any]) -> str:
             for estimator, tilts in predicted["table4_mas"].items():
                 fits = "  ".join(f"{modes} modes x {x:.3f} y {y:.3f}" for modes, (x, y) in tilts.items())
                 lines.append(f"    Table 4  {estimator:<9} {fits} mas")
-            lines.append(f"    {noise_line(predicted)}")
+            lines.append(
+                f"    noise of 14 modes {predicted['noise_nm']:.3g} nm, which adds {predicted['contrast_noise']:.2e} "
+                f"to the contrast; {predicted['quantum_share']:.1%} of the quantum limit"
+            )
     lines.append(
         "predicted; in Table 4 the weighted estimator attains the Cramer-Rao bound, 'bound' is that of Table 3"
     )
@@ -242,15 +246,7 @@ def _predictions(focal_mask: str, holes_: tuple[Hole, ...]) -> dict[str, Any]:
     return predictions(Mask(optics, fields))
 
 
-def noise_line(predicted: Mapping[str, Any]) -> str:
-    """Text of the noise of a sensor for one exposure of Table 4's star."""
-    return (
-        f"noise of 14 modes {predicted['noise_nm']:.3g} nm, which adds {predicted['contrast_noise']:.2e} to the "
-        f"contrast; {predicted['quantum_share']:.1%} of the quantum limit"
-    )
-
-
 def _described(found: Sequence[Hole]) -> str:
     low, high = min(hole[2] for hole in found), max(hole[2] for hole in found)
     size = f"{low:.1%}" if low == high else f"{low:.1%} to {high:.1%}"
-    return f"{len(found)} holes of {size.replace('.0%', '%')}"
+    return f"{counted(len(found), 'hole')} of {size.replace('.0%', '%')}"
