@@ -95,6 +95,7 @@ class Commissioning:
         self._report, self._progress, self._confirm = report, progress, confirm
         self._results: dict[str, Any] = {}
         self._delay: Delay | None = None
+        self._kept: Path | None = None  # the file of the provisional calibration, once this one uses it
         self._advice = ""  # after an early end, once the calibration is loaded
 
     def run(self) -> tuple[dict[str, Any], str]:
@@ -111,16 +112,16 @@ class Commissioning:
         try:
             return self._carry_out(first_file)
         except BaseException:
-            self._report(self._how_to_continue(before, first_file))
+            self._report(self._how_to_continue(before))
             raise
 
-    def _how_to_continue(self, before: Calibration | None, first_file: Path) -> str:
+    def _how_to_continue(self, before: Calibration | None) -> str:
         """Text after a commissioning that ended early: the calibration in use, and how to continue."""
         if self._advice:
             return self._advice
-        if not first_file.is_file():
+        if self._kept is None:
             return "no calibration was changed"
-        text = f"the completed steps are kept in {first_file}: the same command with --resume continues"
+        text = f"the completed steps are kept in {self._kept}: the same command with --resume continues"
         with contextlib.suppress(LowfcError):
             if before is not None:
                 self._loop.check_lease()
@@ -146,6 +147,8 @@ class Commissioning:
         else:
             first = self._first()
             calibration_file.save(first, first_file)
+            partial_of(options.out).unlink(missing_ok=True)  # cycles of a former commissioning
+        self._kept = first_file
         self._loop.load(first)
         player = Player(self._loop, first, self._report)
         delay = self._delay if self._delay is not None else first_delay(player, config)
