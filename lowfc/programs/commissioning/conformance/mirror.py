@@ -360,4 +360,4 @@ def _peak(moving: Mask) -> tuple[Single, tuple[int, list[int]]]:
 
 
 def _highest_nm(mirror: Dialogue, surface_nm: Single) -> float:
-    return float(np.abs(surface_nm[mirror.expected.moving]).max())
+    return float(np.abs(surface_nm[mirror.expected.moving]).max(initial=0))
