@@ -11,6 +11,8 @@ from lowfc.contract.envelope import start_of
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import EVENT, MIRROR_STATE, Log, wire
 
+INTERRUPTIONS = ("COMMAND_EXPIRED ", "NO_FRAMES ")
+"""Starts of the events after which the mirror is no longer where a probe sequence puts it."""
 _POLL_S = 0.002
 
 
@@ -20,7 +22,8 @@ class MirrorWatch:
     Attributes:
         frame_sequence: frame of the newest command that every known mirror has applied.
         applied: frames of the last applied commands, each with the time of the mirror's report, ns of the host's clock.
-        interruption: clause that describes why a mirror did not follow commands meanwhile; empty if it always did.
+        interruption: clause that describes why a mirror did not follow commands meanwhile, or got none because frames
+            stopped, which ends a probe sequence; empty if neither happened.
     """
 
     def __init__(self, bus: Bus) -> None:
@@ -68,5 +71,6 @@ class MirrorWatch:
                 event = Log.FromString(sample.payload)
             except DecodeError:
                 continue
-            if event.message.startswith("COMMAND_EXPIRED "):
-                self.interruption = f"{event.name} was without commands for too long ({event.message})"
+            if event.message.startswith(INTERRUPTIONS):
+                without = "frames" if event.message.startswith("NO_FRAMES ") else "commands"
+                self.interruption = f"{event.name} was without {without} for too long ({event.message})"

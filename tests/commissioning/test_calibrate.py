@@ -243,7 +243,12 @@ def restart_camera(loop: InProcessLoop) -> None:
 
 
 def test_a_sequence_during_a_device_restart_is_stopped_at_once_and_repeated() -> None:
-    faults = {1: (kill_mirror, InProcessLoop.start_mirror), 3: (expire, ignore), 5: (restart_camera, ignore)}
+    faults = {
+        1: (kill_mirror, InProcessLoop.start_mirror),
+        3: (expire, ignore),
+        5: (restart_camera, ignore),
+        7: (InProcessLoop.silence_camera, ignore),
+    }
     loop, reports = FaultyLoop(faults), list[str]()
     calibrator = calibrator_of(loop, "hadamard", report=reports.append)
     with calibrator.required_mode():
@@ -255,11 +260,12 @@ def test_a_sequence_during_a_device_restart_is_stopped_at_once_and_repeated() ->
             "again: the mirror 'dm' restarted during the pokes",
             r"repeated: mirror-dm was .* \(COMMAND_EXPIRED .* relaxing to flat\) during the pokes",
             "repeated: the camera restarted during the pokes",
+            r"repeated: controller was without frames .* \(NO_FRAMES .* 60 ms; holding the command\) during the pokes",
         ),
         strict=True,
     ):
         assert re.search(why, report)
-    assert (len(loop.begun), loop.stops) == (1 + 4 + 3, 3)
+    assert (len(loop.begun), loop.stops) == (1 + 4 + 4, 4)
     for play in faults:
         assert loop.begun[play] < loop.begun[play - 1] + 80, "the sequence did not stop at the fault"
     assert np.abs(cross_talk(loop.calibration().reconstructor, data.measured.response)).max() < 0.05

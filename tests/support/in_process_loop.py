@@ -19,11 +19,12 @@ from lowfc.client import Frame as Image
 from lowfc.contract.codecs.state_codec import controller_state
 from lowfc.contract.configuration import FIXED_GAINS, Configuration
 from lowfc.contract.errors import CalibrationError, RequestRefusedError
-from lowfc.contract.messages import MIRROR_STATE, Topic, wire
+from lowfc.contract.events import EVENTS
+from lowfc.contract.messages import EVENT, MIRROR_STATE, Topic, wire
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.loop.camera import CameraSettings
-from lowfc.control.loop.inputs import MirrorShape, Request, Step
+from lowfc.control.loop.inputs import MirrorShape, Request, Step, Tick
 from lowfc.device import driver
 from lowfc.testing.memory_bus import MemoryBus, MemoryHub, MemoryRing
 from tools.law_bench import Bench, calibrated
@@ -128,6 +129,12 @@ class InProcessLoop(Client):
             self._states.put(wire.MirrorState(frame_sequence=frame.sequence).SerializeToString())
         for kind, waiting in self._listeners:
             waiting.append(Image(frame.sequence, frame.time_ns, pixels) if kind == "frames" else outputs.step)
+
+    def silence_camera(self) -> None:
+        """Let the controller find that no frame came within its frame timeout, before the next one."""
+        for event in self._bench.take(Tick(0, 60_000_000)).events:
+            message = EVENTS[event.name].log("controller", 0, **event.details)
+            self.mirror_bus.publisher(EVENT).put(message.SerializeToString())
 
     def residual_nm(self, first: int, last: int | None = None) -> npt.NDArray[np.float64]:
         """True residual modes (frames, modes) in the exposures of the slice `first:last`."""

@@ -101,7 +101,7 @@ class Live:
         basis = np.zeros((modes, 0), np.float32) if basis is None else basis
         self.set_mode(mode)
         before, frames = self._state(), len(table)
-        steps = self.client.steps()
+        steps, watch = self.client.steps(), self.client.mirror_watch()
         first = self.client.note(ANNOUNCEMENT + json.dumps({"test": kind, **what, "frames": frames})).frame_sequence
         if table.shape[1]:
             answer = self.client.play(basis, table) if basis.size else self.client.play_offset(table)
@@ -122,6 +122,9 @@ class Live:
         after = self._state()
         if [getattr(before, name) for name in _LAW] != [getattr(after, name) for name in _LAW]:
             raise AcceptanceError("gains or control law changed during the measurement: measure again")
+        watch.read()
+        if table.shape[1] and watch.interruption:
+            raise AcceptanceError(f"{watch.interruption} during the measurement: measure again")
         loop = loop_of(before, self.calibration, self.loop.rate_hz, self.client.laws())
         target = "" if not table.shape[1] else MIRROR if basis.size else OFFSET
         return probe_response(what, loop, target, table, basis, first, steps_as_columns(recorded, modes))

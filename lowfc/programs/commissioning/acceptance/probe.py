@@ -14,11 +14,12 @@ import numpy.typing as npt
 from lowfc.adapters.logs.columns import Steps, count_reasons
 from lowfc.adapters.logs.history import History
 from lowfc.arrays import Array, Long, Single
+from lowfc.client.mirror_watch import INTERRUPTIONS
 from lowfc.contract.codecs import codec
 from lowfc.contract.codecs.law_codec import driving, gains_of
 from lowfc.contract.codecs.state_codec import calibration_in_use
 from lowfc.contract.errors import DataFileError, LowfcError
-from lowfc.contract.messages import wire
+from lowfc.contract.messages import from_timestamp, wire
 from lowfc.control.calibration.calibration import Calibration
 from lowfc.control.laws import margins
 from lowfc.control.laws.integrator import Integrator
@@ -185,6 +186,12 @@ def logged_responses(history: History, kind: Kind) -> list[ProbeResponse]:
         for other in history.requests:
             if other.accepted and other.name in _CHANGES and first < other.frame_sequence < first + frames:
                 raise DataFileError(f"{path}: request {other.name!r} changed the loop during the measurement")
+        sequence = history.steps.sequence
+        times_ns = history.steps.time_ns[(sequence >= first) & (sequence < first + frames)]
+        for _, event in history.events:
+            interrupted = play and event.message.startswith(INTERRUPTIONS)
+            if interrupted and times_ns.size and times_ns[0] <= from_timestamp(event.timestamp) <= times_ns[-1]:
+                raise DataFileError(f"{path}: {event.message}, during the measurement")
         before = [one for one in history.controllers if one.frame_sequence < first and len(one.gain) == modes]
         if not before:
             raise DataFileError(f"{path}: does not contain the state of the controller before the test")
