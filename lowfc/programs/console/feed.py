@@ -27,8 +27,8 @@ from lowfc.programs.view.verdicts.watcher import Watcher
 
 DISCONNECTED_S = 1.5
 """Time without a message after which the console is disconnected: each process sends Health twice a second."""
-TREND_S = 60
-"""Span of the sparklines, one value per second."""
+TREND_S = 34
+"""Span of the sparklines, one column per second."""
 _RING_SIZES = {EVENT: 200, REQUEST: 200, STEP: 4000, TRUTH: 50}  # messages; 50 truths per reading suffice for an rms
 _TOPICS = (*(topic for topic in SHOWN if topic is not SURFACE), REQUEST)
 _PRELOADED, _PRELOAD_S = ("lowfc.control.laws.tuning", "scipy.signal"), 4.0

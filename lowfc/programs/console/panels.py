@@ -15,7 +15,7 @@ from lowfc.contract.envelope import count_of
 from lowfc.contract.events import Level as Severity
 from lowfc.contract.messages import Log, from_timestamp, wire
 from lowfc.contract.printable import printable
-from lowfc.programs.console.feed import Reading
+from lowfc.programs.console.feed import TREND_S, Reading
 from lowfc.programs.console.phrases import phrased
 from lowfc.programs.view.draw.colours import GREY, ORANGE, RED, YELLOW, Colour, Rgb, diverging, sequential
 from lowfc.programs.view.verdicts.run_state import Liveness
@@ -111,14 +111,14 @@ def halves(colours: Rgb) -> list[Text]:
 
 
 def sparks(reading: Reading) -> list[Text]:
-    """Sparklines of residual and light over the last minute."""
+    """Sparklines of residual and light."""
     wavefront, flux = reading.state.wavefront, reading.light[-1] if reading.light else float("nan")
     kind = "true" if reading.state.true else "measured"
     residual = "?" if wavefront is None else f"{rounded(wavefront.residual_nm)} nm {kind}"
     light = "?" if np.isnan(flux) else f"{100 * flux:.0f} %"
     rows = ("residual", reading.residual_nm, residual), ("light", reading.light, light)
     return [
-        Text.assemble((f"{name:10}", DIM), (f"{sparkline(values, 34):>34}", style(ORANGE)), f" {last}")
+        Text.assemble((f"{name:10}", DIM), (f"{sparkline(values, TREND_S):>{TREND_S}}", style(ORANGE)), f" {last}")
         for name, values, last in rows
     ]
 
