@@ -90,7 +90,6 @@ LOOP = "lowfc sim-loop --rate 1000 --duration 20 --disturbance reaction-wheel --
 VALIDATE = ("lowfc validate table4 photometry --trials 20",)
 DESIGN = (
     "lowfc design spc --cells 32 --outer 8 --out pupil.npz",
-    "lowfc design sam --steps 200 --out mask.json",
     "lowfc design sam --steps 200 --merit contrast --out mask.json",
     "lowfc design zwfs --out zwfs.toml",
     "lowfc design clowfs --defocus 2:5 --out clowfs.toml",

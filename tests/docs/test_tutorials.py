@@ -25,7 +25,7 @@ CHAOS = "lowfc chaos --case frames-dark --keep bad"
 BASLER = "lowfc conformance camera --run basler --config basler.toml"
 _LIVE = re.compile(
     r"^lowfc (ctl|console|runs|chaos|validate|bench|view|config|camera|conformance|controller|record)\b|^sim-|^rerun|"
-    r"--run |--web|--compare|^lowfc sim-loop --rate|--config lowfc|spc|--steps 200"
+    r"--run |--web|--compare|^lowfc sim-loop --rate|--config lowfc|spc"
 )
 _ALONE = re.compile(r"lowfc (?!sim-loop)")
 
