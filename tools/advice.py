@@ -39,7 +39,7 @@ ADVICE: dict[str, Advice] = {
         "`lowfc ctl load FILE`, `lowfc calibrate` or `lowfc commission`; frames are not used until then.",
     ),
     "CAMERA_CHANGED": Advice(
-        "size, bias or saturation of the camera's frames differ from the calibration; a closed loop opens.",
+        "size, region, bias, saturation or gain of the camera differ from the calibration; a closed loop opens.",
         "restore the camera's settings, or load a calibration made with the present ones.",
     ),
     "MODE_CHANGED": Advice("the loop mode changed, for the named reason.", "nothing, if the reason is a request."),
@@ -189,7 +189,7 @@ ADVICE: dict[str, Advice] = {
         "the shell command of `recorder.on_event` failed or took more than 60 s.",
         "run the command by hand and correct it.",
     ),
-    "VIEW_STUCK": Advice("the viewer accepts no data.", "close its window, or wait: it restarts by itself."),
+    "VIEW_STUCK": Advice("the viewer's window reads no data.", "close it if it hangs, and start `lowfc view` again."),
     "VIEW_RENEWED": Advice(
         "the viewer hung or exceeded its memory limit.", "reload the page in a browser; a window returns by itself."
     ),
