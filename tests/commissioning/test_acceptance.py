@@ -121,7 +121,7 @@ def test_a_disturbed_measurement_is_refused(multisine: tuple[InProcessLoop, Prob
         Live(loop, lambda *_: None)
     silent = InProcessLoop(configured(), lose=lambda index: index == 60 and silent.silence_camera())
     with pytest.raises(AcceptanceError, match="NO_FRAMES no frame for 60 ms"):
-        responses_of(silent, linearity, linearity.Staircase(7, 3, (2,)), REQUIRED)
+        responses_of(silent, linearity, hold_frames=7, cycles=3, modes=(2,))
 
 
 def test_linearity_passes_the_simulated_sensor_and_fails_noise_or_a_halved_gain() -> None:
