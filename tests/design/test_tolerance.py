@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from lowfc.contract.sections import SensorSection
 from lowfc.control.laws.continuous import Timing, residual_power
 from lowfc.control.laws.linear_law import integrator
 from lowfc.control.laws.margins import noise_gain
@@ -83,7 +84,7 @@ def test_star_colour_does_not_shift_the_zero_point_of_an_aperture_mask():
 def coarse(monkeypatch):
     """Make one Zernike sensor of 16 x 16 pixels the only one of the check by simulation."""
     sensor = Sensor(circle(64), phase_spot(samples_per=4), PupilImage(), samples_per=4, pixels=16)
-    made = Prepared("coarse", sensor)
+    made = Prepared("coarse", SensorSection(), sensor)
     made.twin = build(sensor, TwinSpec(nodes=24, order=6, rank=40, guards=4))
     monkeypatch.setattr(tolerance, "prepared", lambda name: made)
     monkeypatch.setattr(tolerance, "CHECKED_SENSORS", ("coarse",))

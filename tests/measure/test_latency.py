@@ -409,7 +409,7 @@ def test_files_that_are_no_results_or_logs_are_errors(tmp_path: Path) -> None:
         assert isinstance(fault, DataFileError)
         assert expected in str(fault)
     assert isinstance(lowfc("latency", tmp_path / "none.mcap").exception, DataFileError)
-    assert "it is a directory" in str(lowfc("latency", "--plot", tmp_path).exception)  # before it measures
+    assert "not a regular file" in str(lowfc("latency", "--plot", tmp_path).exception)  # before it measures
 
 
 @pytest.mark.parametrize(

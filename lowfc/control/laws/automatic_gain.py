@@ -302,12 +302,8 @@ class GainBank:
     def _clear(self, window: int) -> None:
         self._block = max(window // BLOCKS, 1)
         self._longest = self._block * LONGEST
-        self._blocks: list[Array] = []
-        self._powers: list[Array] = []
-        self._changed: list[Array] = []
-        self._means: list[Array] = []
-        self._tilts: list[Array] = []
-        self._spreads: list[Array] = []
+        self._kept = tuple(list[Array]() for _ in range(6))
+        self._blocks, self._powers, self._changed, self._means, self._tilts, self._spreads = self._kept
         self._throughout = True
         self._begin_block()
 
@@ -318,17 +314,14 @@ class GainBank:
         self._power, self._changes, self._mean = np.zeros((3, self._at_rest.kept.size))
         self._tilt = np.zeros(_REGRESSORS)
 
-    def _kept(self) -> tuple[list[Array], ...]:
-        return self._blocks, self._powers, self._changed, self._means, self._tilts, self._spreads
-
     def _lengthen(self) -> None:
         """Continue with blocks of twice the length; the longest window drops its older half."""
         if 2 * self._block > self._longest:
-            for values in self._kept():
+            for values in self._kept:
                 del values[: BLOCKS // 2]
             return
         self._block *= 2
-        for values in self._kept():
+        for values in self._kept:
             values[:] = list(np.array(values).reshape(BLOCKS // 2, 2, *values[0].shape).mean(axis=1))
 
 
