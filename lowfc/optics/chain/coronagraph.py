@@ -72,6 +72,7 @@ class Coronagraph:
     Attributes:
         pupil: (n, n) amplitude transmission.
         dark_zone: Region in which contrast is evaluated.
+        lyot: Mask and stop of a Lyot coronagraph; None for a shaped pupil alone.
     """
 
     pupil: Array
