@@ -163,6 +163,7 @@ def test_ctrl_c_during_startup_prints_no_traceback(tmp_path: Path) -> None:
         (("replay", "night.mcap.part"), "it is finished now: night.mcap"),
         (("replay", "night.mcap", "night.mcap"), "are the same part of one log"),
         (("replay", "pipe"), "pipe cannot be read: not a regular file"),
+        *(((name, ""), ". cannot be read: not a regular file") for name in ("info", "recover", "report")),
         (("replay", "circle"), "circle cannot be read: Too many levels of symbolic links"),
         (("config", "check", "/dev/zero"), "/dev/zero: not a readable TOML file: not a regular file"),
         (("config", "check", "brackets.toml"), "nested too deeply"),

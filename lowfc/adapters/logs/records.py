@@ -89,7 +89,7 @@ class LogFile:
             self._file = input_file.opened(path, input_file.UNBOUNDED)
             self.size = self._file.seek(0, io.SEEK_END)
         except OSError as fault:
-            finished = path.with_name(path.name.removesuffix(UNFINISHED))
+            finished = Path(str(path).removesuffix(UNFINISHED))
             hint = f"; it is finished now: {finished}" if finished != path and finished.exists() else ""
             raise DataFileError(f"{path} cannot be read: {fault.strerror}{hint}") from fault
         if not self.size:

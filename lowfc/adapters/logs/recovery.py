@@ -60,7 +60,7 @@ class Recovery:
 
 def recovered_path(source: Path) -> Path:
     """Default path of the recovered log, next to the original."""
-    return source.with_name(f"{stem_of(source)}-recovered.mcap")
+    return source.parent / f"{stem_of(source)}-recovered.mcap"
 
 
 def recover(source: Path, out: Path, progress: Callable[[int, int], None] | None = None) -> Recovery:

@@ -17,7 +17,7 @@ from lowfc.contract.messages import topic_of
 
 def thinned_path(source: Path, requested: Selection) -> Path:
     """Default path of the thinned copy, next to the log."""
-    return source.with_name(f"{stem_of(source)}-every-{requested.interval_frames}.mcap")
+    return source.parent / f"{stem_of(source)}-every-{requested.interval_frames}.mcap"
 
 
 def thin(

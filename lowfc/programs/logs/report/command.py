@@ -52,7 +52,7 @@ def _report(log: "Parts", out: Path | None, as_json: bool) -> None:
     from lowfc.programs.logs.report.results import report_of
     from lowfc.programs.logs.report.source import read_run
 
-    target = out if out is not None or as_json else log[0].with_name(f"{stem_of(log[0])}.html")
+    target = out if out is not None or as_json else log[0].parent / f"{stem_of(log[0])}.html"
     require_folder(target)
     if target is not None:
         require_page()
