@@ -81,15 +81,19 @@ def test_an_existing_stream_is_adopted_unless_another_process_writes_it(folder: 
         Run().step(command_nm=[1, 2])
 
 
-@pytest.mark.parametrize("busy", [False, True])
-def test_other_channels_are_reported_to_the_loop(busy: bool, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It ends after ten rounds; a busy controller answers from the sixth on, another one starts in the fourth."""
+@pytest.mark.parametrize("case", ["", "busy", "late", "again"])
+def test_other_channels_are_reported_to_the_loop(case: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It ends after ten rounds; a busy controller answers from the sixth on, another one starts in the fourth.
+
+    A late controller starts in the fourth only; a run that is started again in the fourth is joined again.
+    """
     hub, clock, received = MemoryHub(), FakeClock(AT_NS), list[wire.Request]()
     controller = MemoryBus(hub, "controller", clock)
     controller.publisher(CALIBRATION).put(encode_calibration(identified(calibration()), 0))
     states = controller.publisher(CONTROLLER_STATE)
     started = wire.ControllerState(mirror_rows=GRID[0], mirror_columns=GRID[1]).SerializeToString()
-    states.put(started)
+    if case != "late":
+        states.put(started)
 
     def answer(query: Query) -> None:
         received.append(wire.Request.FromString(query.payload))
@@ -100,9 +104,10 @@ def test_other_channels_are_reported_to_the_loop(busy: bool, folder: Path, monke
     turbulence.write(np.full(GRID, 0.02, np.float32))
     stream(folder, "dm00disp03", GRID[1], GRID[0], make=True).write(np.full(GRID, 9, np.float32))  # the loop's own
     plain, rounds = bridge.Client.channel, 0
+    restarts = iter([False] * 4 + [case == "again"])
 
     def channel(client: bridge.Client, name: str, shape_nm: Any) -> Any:
-        if busy and rounds < 5:
+        if case == "busy" and rounds < 5:
             raise BusError("busy")
         return plain(client, name, shape_nm)
 
@@ -110,7 +115,7 @@ def test_other_channels_are_reported_to_the_loop(busy: bool, folder: Path, monke
         nonlocal rounds
         rounds += 1
         clock.advance(10**9)
-        if rounds == 4:
+        if rounds == 4 and case != "again":
             states.put(started)
         if rounds == 7:
             states.put(b"\xff")
@@ -121,7 +126,9 @@ def test_other_channels_are_reported_to_the_loop(busy: bool, folder: Path, monke
     monkeypatch.setattr(bridge.Client, "channel", channel)
     monkeypatch.setattr(bridge, "time", SimpleNamespace(monotonic=lambda: clock.now_ns() * 1e-9, sleep=pause))
     monkeypatch.setattr(bridge, "the_known_run", lambda run: run)
-    monkeypatch.setattr(bridge, "open_run", lambda *_: SimpleNamespace(links=None))
+    monkeypatch.setattr(
+        bridge, "open_run", lambda *_: SimpleNamespace(links=None, restarted=lambda: next(restarts, False))
+    )
     monkeypatch.setattr(bridge, "ZenohBus", lambda _, role, clock, **__: MemoryBus(hub, role, clock))
     monkeypatch.setattr(bridge, "lower_priority", lambda: None)
     done = lowfc("bridge", "isio", "--run", "bench", "--beside", "dm00disp03", "--nm-per-unit", "2000")
@@ -129,14 +136,16 @@ def test_other_channels_are_reported_to_the_loop(busy: bool, folder: Path, monke
     shapes = [np.frombuffer(request.actuators, np.float32) for request in received]
     assert {request.text for request in received} == {"external"}
     *reported, removed = shapes
-    assert len(reported) == (1 if busy else 2), "to each controller"
+    assert len(reported) == (1 if case in ("busy", "late") else 2), "to each controller"
     for shape in reported:
         assert shape == pytest.approx(np.full(GRID[0] * GRID[1], 40.0))
     assert removed.size == 0
-    assert done.stderr.count("dm00disp01 not reported to the loop: busy") == busy
+    assert done.stderr.count("dm00disp01 not reported to the loop: busy") == (case == "busy")
+    assert done.stderr.count("not reported to the loop: no controller") == (case == "late")
 
 
-def test_the_loops_own_channel_must_have_a_number() -> None:
-    fault = lowfc("bridge", "isio", "--beside", "dm00").exception
+@pytest.mark.parametrize("options", [["dm00"], ["dm00disp03", "--external", "dm00disp03"]])
+def test_the_loops_own_channel_has_a_number_and_is_not_external(options: list[str]) -> None:
+    fault = lowfc("bridge", "isio", "--beside", *options).exception
     assert isinstance(fault, ConfigurationError)
     assert "--external" in str(fault)

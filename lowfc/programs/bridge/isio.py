@@ -17,7 +17,6 @@ from lowfc.adapters.image_stream.channels import OtherChannels, channel_names, f
 from lowfc.adapters.image_stream.stream import Stream, StreamAbsentError, StreamError, stream_path
 from lowfc.adapters.process.clock import Clock, HostClock
 from lowfc.adapters.process.realtime import lower_priority
-from lowfc.arrays import Single
 from lowfc.client import Client
 from lowfc.client.runs import the_known_run
 from lowfc.client.stream import step_of
@@ -55,14 +54,27 @@ def bridge_isio(
         raise ConfigurationError(
             f"--beside must be a channel such as dm00disp03, got {beside!r}; give other channels with --external"
         )
+    if beside in names:
+        raise ConfigurationError(f"{beside} is the loop's own channel (--beside): leave out --external {beside}")
     lower_priority()
-    run_id, clock = the_known_run(run), HostClock()
-    bus = ZenohBus(open_run(run_id, ()).links, Role.OPERATOR, clock, monitor=True)
-    with contextlib.closing(bus), contextlib.suppress(KeyboardInterrupt):
+    run_id, how = the_known_run(run), "as"
+    with contextlib.suppress(KeyboardInterrupt):
+        while True:
+            _serve(run_id, how, prefix, names, nm_per_unit)
+            how = "was started again and is joined; it is in the"
+
+
+def _serve(run_id: str, how: str, prefix: str, names: Sequence[str], nm_per_unit: float) -> None:
+    """Join a run and exchange its steps and channels until it is started again."""
+    joined, clock = open_run(run_id, ()), HostClock()
+    bus = ZenohBus(joined.links, Role.OPERATOR, clock, monitor=True)
+    with contextlib.closing(bus):
         steps = StepStreams(bus, clock, prefix)
         others = ExternalChannels(Client(run_id, bus=bus), bus, names, nm_per_unit) if names else None
-        sys.stderr.write(f"run {run_id!r} as streams {prefix}_error, _command, _residual and _flux; Ctrl-C ends it\n")
-        while True:
+        sys.stderr.write(
+            f"run {run_id!r} {how} streams {prefix}_error, _command, _residual and _flux; Ctrl-C ends it\n"
+        )
+        while not joined.restarted():
             steps.pass_on()
             if others is not None:
                 others.pass_on()
@@ -116,9 +128,10 @@ class ExternalChannels:
         self._client = client
         self._states = bus.ring(CONTROLLER_STATE, 1)
         self._nm_per_unit = np.float32(nm_per_unit)
-        self._others = OtherChannels(names, client.mirror_grid())
-        self._shape: Single | None = None
-        self._requested = b""
+        for name in names:
+            stream_path(name)  # StreamError if this cannot be a name
+        self._names = names
+        self._others: OtherChannels | None = None  # until a controller reports the grid
         self._known = b""  # the controller's channel as last reported; its state has one that was there before
         self._next_request_s = 0.0
         self._fault = ""
@@ -129,24 +142,31 @@ class ExternalChannels:
             with contextlib.suppress(DecodeError):
                 channels = wire.ControllerState.FromString(sample.payload).channels
                 self._known = next((one.actuators for one in channels if one.name == EXTERNAL), b"")
-        shape, now_s = self._others.sum(), time.monotonic()
-        if shape is not self._shape:
-            self._shape, self._requested = shape, (shape * self._nm_per_unit).tobytes() if shape.any() else b""
-        if self._requested == self._known or now_s < self._next_request_s:
+        if (now_s := time.monotonic()) < self._next_request_s:
             return
-        self._next_request_s, fault = now_s + _REQUESTS_S, ""
-        shape_nm = np.frombuffer(self._requested, np.float32).reshape(shape.shape) if self._requested else None
+        fault = ""
         try:
-            self._client.channel(EXTERNAL, shape_nm)
-            self._known = self._requested
+            if self._report():
+                self._next_request_s = now_s + _REQUESTS_S
         except LowfcError as error:
             fault = str(error)
-            if isinstance(error, RequestRefusedError):
-                self._next_request_s = now_s + _REFUSED_S
+            self._next_request_s = now_s + (_REFUSED_S if isinstance(error, RequestRefusedError) else _REQUESTS_S)
         if fault and fault != self._fault:
-            names = ", ".join(self._others.names)
+            names = ", ".join(self._others.names) if self._others else "other channels"
             sys.stderr.write(f"{names} not reported to the loop: {printable(fault)}\n")
         self._fault = fault
+
+    def _report(self) -> bool:
+        """Report the shape if the controller has another one; return whether it was reported."""
+        if self._others is None:
+            self._others = OtherChannels(self._names, self._client.mirror_grid())
+        shape = self._others.sum()
+        requested = (shape * self._nm_per_unit).tobytes() if shape.any() else b""
+        if requested == self._known:
+            return False
+        self._client.channel(EXTERNAL, shape * self._nm_per_unit if requested else None)
+        self._known = requested
+        return True
 
 
 def _made(name: str, columns: int) -> Stream:
