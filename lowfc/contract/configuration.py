@@ -33,6 +33,7 @@ from lowfc.contract.sections import (
     Star,
 )
 from lowfc.control.kernel.tables import KernelName
+from lowfc.control.loop.safety import Limits
 
 MIN_FRAME_AGE_NS, MIN_FRAME_TIMEOUT_NS = 20_000_000, 50_000_000
 """Minimum of max_frame_age_ms and of frame_timeout_ms if the configuration does not set them."""
@@ -224,9 +225,17 @@ class Configuration(Section):
                 f"safety.stroke_nm is {self.safety.stroke_nm:g} nm either way, but mirror.stroke_nm gives only "
                 f"{self.mirror.stroke_nm / 2:g} nm either way"
             )
+        for key, section, stroke_nm in (
+            ("safety", self.safety, self.safety.stroke_nm),
+            ("mirror", self.mirror, self.mirror.stroke_nm / 2),
+        ):
+            try:
+                limits = Limits(stroke_nm, section.slew_nm, section.neighbour_nm)
+            except ValueError as fault:
+                raise ValueError(f"{key}.{fault}") from None
         step_nm = self.mirror.stroke_nm / 2**self.mirror.driver_bits
         for name in ("slew_nm", "neighbour_nm"):
-            if getattr(self.mirror, name) < step_nm + 0.01:
+            if getattr(self.mirror, name) <= step_nm + max(0.01, 2 * limits.margin_nm):
                 raise ValueError(
                     f"mirror.{name} is {getattr(self.mirror, name):g} nm, but one step of a driver of "
                     f"{self.mirror.driver_bits} bits is {step_nm:g} nm already"

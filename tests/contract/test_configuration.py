@@ -206,6 +206,8 @@ def test_each_error_has_its_own_line(tmp_path: Path) -> None:
         ({"mirror.dead": [-1]}, ("-1", "1155")),
         ({"mirror.stuck_nm": {"2000": 1.0}}, ("2000", "1155")),
         ({"mirror.driver_bits": 8, "mirror.slew_nm": 3.0}, ("mirror.slew_nm", "8 bits", "5.859")),
+        ({"mirror.stroke_nm": 1e9, "mirror.driver_bits": 24}, ("mirror.slew_nm", "above 1024 nm")),
+        ({"mirror.stroke_nm": 2e6, "mirror.slew_nm": 31.0}, ("mirror.slew_nm", "16 bits", "30.5")),
         ({"disturbance.static_nm": {"focus": 3.0}}, ("focus", "Noll")),
         ({"disturbance.static_nm": {"1": 3.0}}, ("'1'", "Noll")),
     ],
