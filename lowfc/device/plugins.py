@@ -30,26 +30,26 @@ def installed(kind: Kind) -> dict[str, EntryPoint]:
 def load(kind: Kind, name: str) -> Any:
     """Import the class of a driver; ConfigurationError if there is none of that name or the import fails."""
     module, colon, attribute = name.rpartition(":")
-    if colon:
-        if module.endswith(".py") and not Path(module).is_file():
-            raise ConfigurationError(f"the driver {name!r} cannot be loaded: there is no file {module}")
-        names = [section(name)] if module.endswith(".py") else module.split(".")
-        if not all(one.isidentifier() for one in (*names, *attribute.split("."))):
-            raise ConfigurationError(
-                f"the driver {name!r} cannot be loaded: file and class have names of letters, digits and _, as in "
-                "folder/my_camera.py:MyCamera: rename the file or the class"
-            )
-        # `python -P` excludes the current folder
-        sys.path.insert(0, str(Path(module).resolve().parent if module.endswith(".py") else Path.cwd()))
-        point = EntryPoint(name, f"{section(name)}:{attribute}", f"lowfc.{kind}s")
-    elif name in (known := installed(kind)):
-        point = known[name]
-    else:
-        raise ConfigurationError(
-            f"no driver of a {kind} is called {name!r}{nearest(name, known)}; there are {', '.join(sorted(known))}, or "
-            "write module:Class or file.py:Class"
-        )
     with opening(f"the driver {name!r} cannot be loaded"):
+        if colon:
+            if module.endswith(".py") and not Path(module).is_file():
+                raise ConfigurationError(f"the driver {name!r} cannot be loaded: there is no file {module}")
+            names = [section(name)] if module.endswith(".py") else module.split(".")
+            if not all(one.isidentifier() for one in (*names, *attribute.split("."))):
+                raise ConfigurationError(
+                    f"the driver {name!r} cannot be loaded: file and class have names of letters, digits and _, as in "
+                    "folder/my_camera.py:MyCamera: rename the file or the class"
+                )
+            # `python -P` excludes the current folder
+            sys.path.insert(0, str(Path(module).resolve().parent if module.endswith(".py") else Path.cwd()))
+            point = EntryPoint(name, f"{section(name)}:{attribute}", f"lowfc.{kind}s")
+        elif name in (known := installed(kind)):
+            point = known[name]
+        else:
+            raise ConfigurationError(
+                f"no driver of a {kind} is called {name!r}{nearest(name, known)}; there are "
+                f"{', '.join(sorted(known))}, or write module:Class or file.py:Class"
+            )
         driver = point.load()
     missing = [method for method in METHODS[kind] if isinstance(driver, type) and not hasattr(driver, method)]
     if missing:
@@ -79,13 +79,12 @@ def opened(kind: Kind, name: str, config: Configuration, words: Sequence[str] = 
 
 def faults(config: Configuration, folder: Path) -> list[str]:
     """List the faults of the sections [drivers.NAME] of a configuration in a folder, one sentence each."""
-    found = []
+    found, files = [], {one.stem for here in (folder, Path.cwd()) for one in here.glob("*.py")}
     for name in config.drivers:
         kinds = [kind for kind in KINDS if name in installed(kind)]
-        in_file = any((here / f"{name}.py").is_file() for here in (folder, Path.cwd()))
         module = name.partition(".")[0]
         importable = module in sys.modules or importlib.util.find_spec(module) is not None
-        if not kinds and not in_file and not importable:
+        if not kinds and name not in files and not importable:
             known = {*installed("camera"), *installed("mirror")}
             found.append(
                 f"drivers.{name}: no installed driver or module has that name{nearest(name, known)}, and there is no "

@@ -250,6 +250,7 @@ class Half:
     ("name", "message"),
     [
         ("nowhere/half.py:Half", "there is no file nowhere/half.py"),
+        (f"{'a' * 300}.py:Half", "File name too long"),
         (f"{__name__}:Sized", "frame_rows is missing: --frame-rows VALUE, or frame_rows in"),
         (f"{__name__}:Unchecked", "derive its class Options from lowfc.device.DriverOptions"),
         (f"{__name__}:Half", "is no camera: it has no settings and no close"),
