@@ -114,6 +114,33 @@ def test_gige_frame_numbers_wrap_to_one_and_buffers_are_returned() -> None:
     assert stream.pushed == 4
 
 
+@pytest.mark.parametrize("kind", [AravisCamera, BaslerCamera])
+def test_a_disconnected_camera_is_opened_again(kind: Any) -> None:
+    driver, opened = object.__new__(kind), list[str]()
+
+    def again(name: str) -> None:
+        opened.append(name)
+        if len(opened) < 3:
+            raise OSError("no such device")
+
+    silent = SimpleNamespace(IsValid=lambda: False)
+    driver._camera = SimpleNamespace(
+        IsCameraDeviceRemoved=lambda: not opened,
+        RetrieveResult=lambda *_: silent,
+        StartGrabbing=lambda _: opened.append("started"),
+        start_acquisition=lambda: opened.append("started"),
+    )
+    driver._pylon = SimpleNamespace(GrabStrategy_LatestImages=0, TimeoutHandling_Return=1)
+    driver._open, driver._serial, driver._name, driver._stream = again, "7", "7", Buffers()
+    if kind is AravisCamera:
+        driver._lose(None)  # the library's signal
+    for _ in range(2):
+        with pytest.raises(OSError, match="no such device"):
+            driver.expose()
+    assert driver.expose() is driver.expose() is None
+    assert opened == ["7", "7", "7", "started"]
+
+
 @pytest.fixture
 def emulated(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pylon's emulation of a camera."""

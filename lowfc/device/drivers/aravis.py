@@ -29,19 +29,13 @@ class AravisCamera:
     """Camera driver; frames with missing packets are dropped and appear as gaps in the camera's frame numbers."""
 
     Options = GenicamOptions
+    _lost = False
 
     def __init__(self, options: GenicamOptions, config: Configuration) -> None:
         """Open and configure the camera."""
-        self._aravis = aravis = _aravis()
-        self._settings = options.settings(config)
+        self._aravis, self._options, self._settings = _aravis(), options, options.settings(config)
         try:
-            self._camera = aravis.Camera.new(options.camera or None)
-            self._set(options)
-            self._stream = self._camera.create_stream(None, None)
-            if self._camera.is_gv_device():  # a resent packet would arrive too late
-                self._stream.set_property("packet-resend", aravis.GvStreamPacketResend.NEVER)
-            for _ in range(_BUFFERS):
-                self._stream.push_buffer(aravis.Buffer.new_allocate(self._camera.get_payload()))
+            self._open(options.camera)
         except importlib.import_module("gi.repository.GLib").Error as fault:
             raise ConfigurationError(f"camera {options.camera or '(the first found)'}: {fault.message}") from None
 
@@ -66,7 +60,14 @@ class AravisCamera:
         return self._settings
 
     def expose(self) -> Exposure | None:
-        """Next complete frame; its time is the arrival of its first packet, just after the exposure."""
+        """Next complete frame; its time is the arrival of its first packet, just after the exposure.
+
+        A camera that was disconnected is opened again.
+        """
+        if self._lost:
+            self._open(self._name)
+            self.start()
+            self._lost = False
         buffer = self._stream.timeout_pop_buffer(WAIT_MS * 1000)
         if buffer is None:
             return None
@@ -82,7 +83,22 @@ class AravisCamera:
 
     def close(self) -> None:
         """Stop the acquisition."""
-        self._camera.stop_acquisition()
+        if not self._lost:
+            self._camera.stop_acquisition()
+
+    def _open(self, name: str) -> None:
+        self._camera = camera = self._aravis.Camera.new(name or None)
+        self._name = name or camera.get_device_id()
+        camera.get_device().connect("control-lost", self._lose)
+        self._set(self._options)
+        self._stream = camera.create_stream(None, None)
+        if camera.is_gv_device():  # a resent packet would arrive too late
+            self._stream.set_property("packet-resend", self._aravis.GvStreamPacketResend.NEVER)
+        for _ in range(_BUFFERS):
+            self._stream.push_buffer(self._aravis.Buffer.new_allocate(camera.get_payload()))
+
+    def _lose(self, device: Any) -> None:
+        self._lost = True
 
     def _set(self, options: GenicamOptions) -> None:
         camera, settings = self._camera, self._settings

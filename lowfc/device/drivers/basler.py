@@ -33,18 +33,13 @@ class BaslerCamera:
     """Camera driver; lost and failed frames appear as gaps in the camera's frame numbers."""
 
     Options = GenicamOptions
+    _lost = False
 
     def __init__(self, options: GenicamOptions, config: Configuration) -> None:
         """Open and configure the camera."""
-        self._pylon = pylon = _pylon()
-        self._settings = options.settings(config)
+        self._pylon, self._options, self._settings = _pylon(), options, options.settings(config)
         try:
-            info = pylon.DeviceInfo()
-            if options.camera:
-                info.SetSerialNumber(options.camera)
-            self._camera = pylon.InstantCamera(pylon.TlFactory.GetInstance().CreateFirstDevice(info))
-            self._camera.Open()
-            self._set(options)
+            self._open(options.camera)
         except importlib.import_module("pypylon.genicam").GenericException as fault:
             which = options.camera or "the first found"
             why = re.split(r" : \w+ thrown", str(fault))[0]  # without the place in the library
@@ -70,7 +65,12 @@ class BaslerCamera:
         return self._settings
 
     def expose(self) -> Exposure | None:
-        """Next complete frame."""
+        """Next complete frame; a camera that was disconnected is opened again."""
+        if self._lost or self._camera.IsCameraDeviceRemoved():
+            self._lost = True
+            self._open(self._serial)
+            self.start()
+            self._lost = False
         result = self._camera.RetrieveResult(WAIT_MS, self._pylon.TimeoutHandling_Return)
         if not result.IsValid():
             return None
@@ -82,6 +82,15 @@ class BaslerCamera:
     def close(self) -> None:
         """Release the camera."""
         self._camera.Close()
+
+    def _open(self, serial: str) -> None:
+        info, factory = self._pylon.DeviceInfo(), self._pylon.TlFactory.GetInstance()
+        if serial:
+            info.SetSerialNumber(serial)
+        self._camera = camera = self._pylon.InstantCamera(factory.CreateFirstDevice(info))
+        self._serial = serial or camera.GetDeviceInfo().GetSerialNumber()
+        camera.Open()
+        self._set(self._options)
 
     def _set(self, options: GenicamOptions) -> None:
         camera, settings = self._camera, self._settings
