@@ -16,9 +16,10 @@ from lowfc import __version__
 from lowfc.adapters.logs.parts import WholeLog
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.records import LogFile
+from lowfc.adapters.logs.writer import declaration
 from lowfc.contract import published
 from lowfc.contract.errors import ConfigurationError, DataFileError
-from lowfc.contract.messages import FRAME
+from lowfc.contract.messages import FRAME, STEP
 from lowfc.programs.logs.replay.account import Account
 from lowfc.programs.logs.replay.controller_replay import PATIENCE_NS, WHOLE, Segment
 from lowfc.programs.logs.replay.fold import TOPICS, Replay
@@ -110,8 +111,7 @@ def _replay_segment(
                     part = log.parts[-1]
                     _refuse_thinned(part)
                     run.begin_file(part.metadata)
-                    former = part.metadata.get("lowfc", {}).get("lowfc", __version__) != __version__
-                    run.context.former = FormerVersion(part.schemas) if former else None
+                    run.context.former = FormerVersion(part.schemas) if _is_former(part) else None
                 run.take(message)
                 if number % _PROGRESS_EVERY == 0:
                     progress(log.position)
@@ -128,6 +128,14 @@ def _replay_segment(
     stopped = [(name, metadata.get("recording", {}).get("stopped")) for name, metadata in about]
     account.stopped = [f"{name}: {why}" for name, why in stopped if why]
     return account
+
+
+def _is_former(reader: LogReader) -> bool:
+    """Whether another version recorded a log, by its messages if the beginning with the version is lost."""
+    if version := reader.metadata.get("lowfc", {}).get("lowfc"):
+        return version != __version__
+    present = declaration(STEP.message).SerializeToString()
+    return any(one.name.startswith("lowfc.") and one.data != present for one in reader.schemas.values())
 
 
 def _refuse_thinned(reader: LogReader) -> None:
