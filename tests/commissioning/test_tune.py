@@ -81,6 +81,8 @@ def test_each_law_is_tuned_from_a_closed_loop(
     assert tip.predicted_nm < tip.achieved_nm
     assert (found.closed, found.achieved_from, best.law.name) == (True, "truth", controller)
     check_stable(best.law, found.delay_frames)
+    continuous = replace(telemetry, continuous_nm=np.array(telemetry.noll, float))
+    assert all(mode.achieved_nm == mode.noll for mode in result_of(continuous, best, gains, controller).modes)
 
 
 def test_the_command_writes_the_law_and_draws_it(

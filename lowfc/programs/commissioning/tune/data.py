@@ -47,7 +47,8 @@ class Telemetry:
         closed: whether the loop was closed in these frames.
         pol: pseudo-open-loop modes (frames, modes), in pieces without gaps.
         error: modal error of the same frames (frames, modes).
-        true_nm2: mean products of the true residual over these frames (modes, modes); None if unknown.
+        true_nm2: mean products of the true residual over these frames (modes, modes), at the start of each exposure;
+            None if unknown. `continuous_nm`: its rms (modes,) over all time; None if unknown.
         nm_per_mas: wavefront rms of a tilt of 1 mas; None if the telescope's diameter is unknown.
         contrast: contrast added by the modes, with `noise_nm2`, the computed covariance (modes, modes) of one frame's
             noise; None without a science image.
@@ -64,6 +65,7 @@ class Telemetry:
     pol: TimeSeries
     error: TimeSeries
     true_nm2: Array | None
+    continuous_nm: Array | None
     nm_per_mas: float | None
     contrast: ModalContrast | None
     noise_nm2: Array | None
@@ -92,7 +94,7 @@ def telemetry_from_log(log: LogReader) -> Telemetry:
         (run.law, driving(history.controller, history.published.laws)),
         steps,
         usable,
-        None if run.true_nm is None else run.true_nm[1],
+        (None if run.true_nm is None else run.true_nm[1], run.continuous_rms_nm),
         config,
         run.calibration if history.controller is None else calibration_in_use(history.controller, run.calibration),
         warnings,
@@ -151,7 +153,7 @@ def telemetry_from_run(loop: Client, seconds: float, progress: Callable[[float],
         (gains_of(states[-1]), driving(states[-1], loop.laws())),
         steps,
         usable,
-        None,
+        (None, None),
         config,
         calibration_in_use(states[-1], calibration),
         [*_delay_warnings(assumed, seen, measured, "the times of frames and mirror"), *lost],
@@ -225,7 +227,7 @@ def _telemetry(
     laws: tuple[Integrator, LinearLaw | None],
     steps: Steps,
     usable: Mask,
-    true_nm: Single | None,
+    true: tuple[Single | None, Single | None],
     config: Configuration | None,
     calibration: Calibration,
     warnings: Sequence[str],
@@ -244,7 +246,7 @@ def _telemetry(
             f"sequence of good frames has {_longest(pol)}"
         )
     contrast = contrast_of(config) if config is not None and config.noll == calibration.noll else None
-    used_nm = None if true_nm is None or not np.isfinite(true_nm[rows]).all() else true_nm[rows].astype(float)
+    true_nm, rms_nm = (None if each is None or not np.isfinite(each[rows]).all() else each[rows] for each in true)
     return Telemetry(
         source=source,
         noll=calibration.noll,
@@ -255,7 +257,8 @@ def _telemetry(
         closed=closed,
         pol=pol,
         error=time_series(steps.sequence[rows], steps.error_nm[rows]),
-        true_nm2=None if used_nm is None else used_nm.T @ used_nm / len(used_nm),
+        true_nm2=None if true_nm is None else true_nm.T.astype(float) @ true_nm / len(true_nm),
+        continuous_nm=None if rms_nm is None else np.sqrt(np.mean(rms_nm.astype(float) ** 2, axis=0)),
         nm_per_mas=tilt_nm_per_mas(config.star.diameter_m) if config is not None else None,
         contrast=contrast,
         noise_nm2=frame_noise_nm2(config, calibration) if config is not None and contrast is not None else None,

@@ -126,9 +126,8 @@ def result_of(run: Telemetry, best: Tuned, gains: Gains, controller: str) -> Tun
     integrator_nm = tune_integrator(best.models, gains, run.noll, leak, run.timing).predicted_nm
     now_nm = predicted_nm(now, best.models, run.timing) if margins.margins(now, run.timing.delay).stable else None
     achieved_nm = _achieved_nm(run, gains.noise_nm)
-    if (
-        achieved_nm is not None and now_nm is not None
-    ):  # frames sample the residual; the law's residual between them is added
+    if achieved_nm is not None and now_nm is not None and run.continuous_nm is None:
+        # The frames give the residual of what the exposures see; theory adds the rest.
         sampled_nm = predicted_nm(now, best.models, Timing.sampled(run.timing.delay))
         achieved_nm = np.sqrt(np.maximum(achieved_nm**2 + now_nm**2 - sampled_nm**2, 0.0))
     columns = {
@@ -230,9 +229,11 @@ def _added_contrast(run: Telemetry, best: Tuned, now: LinearLaw, closed_nm: Arra
 
 
 def _achieved_nm(run: Telemetry, noise_nm: Array) -> Array | None:
-    """Rms (modes,) of the residual in the frames: the true one if known, or the error minus the noise."""
+    """Rms (modes,) of the true residual, over all time if known; otherwise of the error minus the noise."""
     if not run.closed:
         return None
+    if run.continuous_nm is not None:
+        return run.continuous_nm
     if run.true_nm2 is not None:
         return np.asarray(np.sqrt(np.diag(run.true_nm2)))
     squares = np.mean(run.error.joined() ** 2, axis=0)

@@ -81,7 +81,8 @@ class LoggedRun:
 
     Attributes:
         steps: these steps; `missing`: (steps,) number of exposures without a step before each.
-        true_nm: disturbance and residual (steps, modes), NaN where unknown; None without any.
+        true_nm: disturbance and residual (steps, modes) at the start of each exposure, NaN where unknown; None without
+            any. `continuous_rms_nm`: rms residual (steps, modes) over each period; None if the log does not have it.
         calibration: calibration of the log.
         used: (steps,) whether the frame was used.
         law: last law of the run.
@@ -103,6 +104,7 @@ class LoggedRun:
         self.steps = history.steps.at(rows)
         true = history.true
         self.true_nm = None if true is None else (true.disturbance_nm[rows], true.residual_nm[rows])
+        self.continuous_rms_nm = true.modes_residual_rms_nm[rows] if true is not None and true.continuous else None
         self.used: Mask = used[rows]
         self.missing = missing_before(self.steps.sequence)
         self.played = _played(self.steps.sequence, history.requests, history.published.plays)
