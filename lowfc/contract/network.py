@@ -4,8 +4,12 @@ import ast
 import inspect
 from collections.abc import Iterator
 from itertools import pairwise
+from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+Text = Annotated[str, Field(pattern=r"^[^\x00]*$")]
+"""Text of the operating system, such as a path or a command, in which NUL cannot be."""
 
 
 class Section(BaseModel):
@@ -44,7 +48,7 @@ class Network(Section):
 
     router: str = Field("", pattern=r"^(tls/.+:[0-9]{1,5})?$")
     """Where the router listens, such as "tls/bench.example.org:7447"; empty for none."""
-    certificates: str = ""
+    certificates: Text = ""
     """Folder with ca.pem and, for each role on this host, ROLE.pem and ROLE.key, made by `lowfc certs`."""
     listen: str = Field("", pattern=r"^(tls/.+:[0-9]{1,5})?$")
     """Address on which the router listens, if it differs from `router`."""
