@@ -204,6 +204,17 @@ def test_a_trace_has_the_counters_of_the_kernel_and_page_faults_are_counted() ->
         Counters(own, 0, set())
 
 
+def test_the_stolen_time_of_the_last_of_many_processors_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lines = [f"cpu{number} {' '.join(['1000000000'] * 7)} {number} 0 0" for number in range(512)]
+    stat = tmp_path / "stat"
+    stat.write_text("\n".join(["cpu  1 1 1 1 1 1 1 9 0 0", *lines]))
+    monkeypatch.setattr("lowfc.adapters.process.host._STAT", stat)
+    stolen_ns = Counters(os.getpid(), os.getpid(), {511}).read().stolen_ns
+    assert stolen_ns == 511 * 1_000_000_000 // os.sysconf("SC_CLK_TCK")
+
+
 def test_evidence_of_a_stall_is_against_the_host_or_the_loop() -> None:
     nothing: Any = dict.fromkeys(Counted.model_fields, 0)
     cases: list[tuple[dict[str, float], tuple[list[str], list[str]]]] = [

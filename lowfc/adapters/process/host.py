@@ -17,7 +17,8 @@ import psutil
 
 CPUS = "sys/devices/system/cpu"
 _STA_UNSYNC, _STA_NANO, _TIME_ERROR = 0x40, 0x2000, 5
-_MOST = 1 << 14  # bytes; of /proc/stat, the lines of 200 processors
+_STAT = Path("/proc/stat")
+_MOST = 1 << 14  # bytes read of a file; of /proc/stat, beyond the beginning of the processor's line
 
 
 class Synchronisation(NamedTuple):
@@ -147,7 +148,8 @@ class Counters:
         """Open the files of a thread on these processors (all when empty); OSError if there is no such thread."""
         folder = f"/proc/{process}/task/{thread}"
         self._cpu = f"cpu{next(iter(cpus))} " if len(cpus) == 1 else "cpu "
-        names = "/proc/stat", f"{folder}/schedstat", f"{folder}/status", f"/proc/{process}/stat"
+        self._stat_bytes = _STAT.read_text().index(self._cpu) + _MOST
+        names = _STAT, f"{folder}/schedstat", f"{folder}/status", f"/proc/{process}/stat"
         self._stat, self._waits, self._switches, self._faults = (os.open(name, os.O_RDONLY) for name in names)
         group = _quota_file()
         self._group = os.open(group, os.O_RDONLY) if group is not None else None
@@ -155,7 +157,7 @@ class Counters:
 
     def read(self) -> Counts:
         """Return the present counts; OSError if the process has ended."""
-        stat = _content(self._stat)
+        stat = _content(self._stat, self._stat_bytes)
         stolen = stat[stat.index(self._cpu) :].split(maxsplit=9)[8]
         waited_ns = _content(self._waits).split()[1]
         preempted = _content(self._switches).rpartition("nonvoluntary_ctxt_switches:")[2]
@@ -191,8 +193,8 @@ def _quota_file() -> Path | None:
     return None
 
 
-def _content(file: int) -> str:
-    return os.pread(file, _MOST, 0).decode()
+def _content(file: int, size: int = _MOST) -> str:
+    return os.pread(file, size, 0).decode()
 
 
 def resident_bytes(process: int | None = None) -> int:
