@@ -166,7 +166,13 @@ def test_errors_name_the_file_or_option_at_fault(tmp_path: Path) -> None:
         make(tmp_path / "none", (ROUTER,), [])
     with pytest.raises(ConfigurationError, match=r"without port; got 'host:7447'"):
         make(tmp_path / "none", (ROUTER,), ["host:7447"])
+    with pytest.raises(ConfigurationError, match="none has no authority whose certificates could be renewed"):
+        make(tmp_path / "none", (ROUTER,), ["host"], renew=True)
     assert not (tmp_path / "none").exists()
+    make(tmp_path / "old", (ROUTER,), ["host", "10.0.0.1"])
+    assert make(tmp_path / "old", (ROUTER,), ["10.0.0.1"]) == []
+    with pytest.raises(ConfigurationError, match=r"not for other, 10\.0\.0\.2: renew it"):
+        make(tmp_path / "old", (ROUTER,), ["host", "other", "10.0.0.2"])
     with pytest.raises(DataFileError, match=r"no certificates can be written in .*xxx: File name too long"):
         make(tmp_path / ("x" * 300), ("camera",), [])
     make(tmp_path / "half", ("camera",), [])
@@ -208,3 +214,8 @@ def test_the_command_makes_a_certificate_for_every_role(tmp_path: Path) -> None:
     )
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
     handshake(folder, folder, "mirror-tip")
+    (folder / "mirror-dm.pem").unlink()
+    before = {file: file.read_bytes() for file in folder.glob("*.pem")}
+    assert lowfc("certs", folder, "--renew", "--router", "localhost").exit_code == 0
+    assert {file.stem for file, content in before.items() if file.read_bytes() != content} == roles - {"mirror-dm"}
+    assert not (folder / "mirror-dm.pem").exists()

@@ -49,7 +49,8 @@ def make_certificates(
         Files of the new certificates.
 
     Raises:
-        ConfigurationError: there is no address for the router's certificate, or an invalid one.
+        ConfigurationError: there is no address for the router's certificate, an invalid one, or one that the existing
+            certificate does not have; or there is nothing to renew.
         DataFileError: the folder holds other files, or cannot be written.
     """
     names = [_general_name(address) for address in addresses]
@@ -58,6 +59,12 @@ def make_certificates(
         if ROUTER in missing and not names:
             raise ConfigurationError(
                 "the router's certificate needs its address: give the name by which others reach it"
+            )
+        if renew and not (folder / CA).exists():
+            raise ConfigurationError(f"{folder} has no authority whose certificates could be renewed")
+        if ROUTER not in missing and (lacking := [one.value for one in names if one not in _names(folder)]):
+            raise ConfigurationError(
+                f"the router's certificate is not for {', '.join(map(str, lacking))}: renew it, with all its addresses"
             )
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         key, authority = _authority(folder)
@@ -95,6 +102,15 @@ def _authority(folder: Path) -> tuple[EllipticCurvePrivateKey, x509.Certificate]
     if not isinstance(key, EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
         raise DataFileError(f"{key_file} is not the key of {certificate_file}; make all anew in an empty folder")
     return key, certificate
+
+
+def _names(folder: Path) -> list[x509.GeneralName]:
+    """Addresses of the router's present certificate."""
+    file = folder / f"{ROUTER}.pem"
+    with contextlib.suppress(ValueError, x509.ExtensionNotFound):
+        found = x509.load_pem_x509_certificate(file.read_bytes()).extensions
+        return list(found.get_extension_for_class(x509.SubjectAlternativeName).value)
+    raise DataFileError(f"{file} is not a router's certificate; remove it to have a new one made")
 
 
 def _own_key(folder: Path, role: str) -> EllipticCurvePrivateKey:

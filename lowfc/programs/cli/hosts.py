@@ -51,7 +51,9 @@ def certs(
     router: Annotated[
         list[str] | None, typer.Option(help="Host name or IP address of the router; repeat for several.")
     ] = None,
-    mirror: Annotated[list[str] | None, typer.Option(help="Name of a mirror; repeat for several. Default: dm.")] = None,
+    mirror: Annotated[
+        list[str] | None, typer.Option(help="Name of a mirror; repeat for several. Default: dm, or the present ones.")
+    ] = None,
     days: Annotated[int, typer.Option(min=1, max=3650, help="How long the certificates are valid.")] = 825,
     renew: Annotated[bool, typer.Option("--renew", help="Renew existing certificates; they keep their keys.")] = False,
 ) -> None:
@@ -72,7 +74,8 @@ def certs(
             f"making certificates requires the package cryptography, which is missing ({fault}): "
             f"{install_advice('deploy')}"
         ) from None
-    mirrors = [load(None, {"mirror.name": name}).mirror.name for name in mirror or ["dm"]]
+    present = sorted(file.stem.removeprefix("mirror-") for file in folder.glob("mirror-*.pem"))
+    mirrors = [load(None, {"mirror.name": name}).mirror.name for name in mirror or present or ["dm"]]
     names = (ROUTER, *roles(map(mirror_role, mirrors)))
     made = make_certificates(folder, names, router or [], days, renew=renew)
     for file in made:
