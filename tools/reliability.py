@@ -48,8 +48,7 @@ def measure_again(results: Results, seed: int, names: Sequence[str]) -> None:
     if missing := list(names) or [name for name in CASES if name not in kept]:
         about = host()
         found = _run(" ".join(f"--case {name}" for name in missing), seed)["cases"]
-        results.setdefault("later", {}).update(dict.fromkeys((case["name"] for case in found), about))
-        kept |= {case["name"]: case for case in found}
+        kept |= {case["name"]: {**case, "host": about} for case in found}
     run["cases"] = list(kept.values())
     run |= counts(run["cases"])
 
@@ -90,12 +89,13 @@ def render_chaos(results: Results) -> str:
     parts += [*_stalls(by_name), *_consoles(by_name.get("console", []))]
     again = ", ".join(f"`{name}`" for name in results.get("measured_again", ()))
     parts.append(f"Measured again after a change of the case itself: {again}." if again else "")
-    hosts: dict[str, list[str]] = {}
-    for name, about in results.get("later", {}).items():
-        hosts.setdefault(host_in_words(about), []).append(f"`{name}`")
-    parts += [
-        f"Measured {about} by `python -m tools.reliability`: {', '.join(names)}." for about, names in hosts.items()
-    ]
+    hosts: dict[str, dict[str, list[int]]] = {}
+    for run in runs:
+        for case in (case for case in run["cases"] if "host" in case):
+            hosts.setdefault(host_in_words(case["host"]), {}).setdefault(case["name"], []).append(run["seed"])
+    for about, found in hosts.items():
+        names = (f"`{name}` (seeds {', '.join(map(str, seeds))})" for name, seeds in found.items())
+        parts.append(f"Measured {about} by `python -m tools.reliability`: {', '.join(names)}.")
     return "\n".join(parts)
 
 
@@ -194,7 +194,7 @@ def render_fuzz(results: Results) -> str:
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", metavar="CASE", help="case of `lowfc chaos`; default: all without a result")
+    parser.add_argument("names", nargs="*", choices=tuple(CASES), metavar="CASE", help="case of `lowfc chaos`; default: all without a result")
     parser.add_argument("--seed", type=int, choices=SEEDS, required=True)
     options = parser.parse_args()
     results = json.loads(CASES_FILE.read_text())
