@@ -160,12 +160,11 @@ def test_the_router_forwards_exactly_what_the_table_of_topics_allows(hosts: Host
     }
     assert len(expected) > 30
 
-    def all_received() -> bool:
+    def put() -> None:
         for publisher, by in zip(publishers, roles_of, strict=True):
             publisher.put(by.encode())
-        return expected <= received
 
-    until(all_received)
+    until(lambda: expected <= received, each=put)
     time.sleep(0.2)
     assert {one for one in received if one[0] != one[2]} == expected  # own messages are delivered locally
     bus["controller"].queryable("lowfc/request/*", lambda query: query.reply(b"done"))
@@ -187,12 +186,7 @@ def test_message_times_are_converted_to_the_receiving_hosts_clock(hosts: Hosts) 
     arrived: list[Sample] = []
     recorder.subscribe(FRAME, arrived.append)
     frames = camera.publisher(FRAME)
-
-    def received() -> bool:
-        frames.put(b"frame")
-        return len(arrived) > 3
-
-    until(received)
+    until(lambda: len(arrived) > 3, each=lambda: frames.put(b"frame"))
     for bus, shift_ns in ((camera, 3 * second_ns), (recorder, -7 * second_ns)):
         assert bus.offset.best is not None
         assert abs(bus.offset.offset_ns + shift_ns) < second_ns  # accuracy: tests/e2e/test_hosts.py
@@ -236,22 +230,17 @@ def test_a_wrong_or_missing_certificate_is_reported_before_a_session_opens(hosts
 
 
 def test_a_lost_router_is_reported_with_the_reason(hosts: Hosts, capfd: pytest.CaptureFixture[str]) -> None:
-    stderr = ""
+    stderr: list[str] = []
 
-    def reports(text: str) -> Callable[[], bool]:
-        def check() -> bool:
-            nonlocal stderr
-            stderr += capfd.readouterr().err
-            return text in stderr
-
-        return check
+    def await_report(text: str) -> None:
+        until(lambda: text in "".join(stderr), each=lambda: stderr.append(capfd.readouterr().err))
 
     router = hosts.join(ROUTER)
     hosts.join("camera")
     router.close()
-    until(reports(f"camera: no link to the router at tls/127.0.0.1:{hosts.port}: Connection refused\n"))
+    await_report(f"camera: no link to the router at tls/127.0.0.1:{hosts.port}: Connection refused\n")
     hosts.join(ROUTER)
-    until(reports("camera: the router is back\n"))
+    await_report("camera: the router is back\n")
 
 
 def test_there_is_no_wait_for_an_unreachable_router_or_after_a_repeated_refusal(

@@ -78,17 +78,9 @@ def test_a_put_reaches_every_subscriber_of_its_key(pair: tuple[Bus, Bus]) -> Non
     for received, topic, *name in ((all_mirrors, COMMAND), (dm, COMMAND, "dm"), (tip, COMMAND, "tip"), (frames, FRAME)):
         controller.subscribe(topic, received.append, *name)
     publisher = operator.publisher(COMMAND, "dm")
-
-    def put() -> bool:
-        publisher.put(b"body", publish_time_ns=3)
-        return bool(all_mirrors and dm)
-
-    until(put)
-    assert (all_mirrors[0].key, all_mirrors[0].payload, all_mirrors[0].publish_time_ns) == (
-        COMMAND.at("dm"),
-        b"body",
-        3,
-    )
+    until(lambda: all_mirrors and dm, each=lambda: publisher.put(b"body", publish_time_ns=3))
+    first = all_mirrors[0]
+    assert (first.key, first.payload, first.publish_time_ns) == (COMMAND.at("dm"), b"body", 3)
     assert not tip
     assert not frames
 
@@ -144,12 +136,7 @@ def test_a_failing_handler_affects_no_other_and_is_printed_once(
     controller.subscribe(COMMAND, box.put)
     controller.queryable("lowfc/request/*", fail)
     publisher = operator.publisher(COMMAND, "dm")
-
-    def put() -> bool:
-        publisher.put(b"")
-        return box.received >= 3
-
-    until(put)  # the link is up, so the query arrives too
+    until(lambda: box.received >= 3, each=lambda: publisher.put(b""))  # the link is up, so the query arrives too
     assert operator.get("lowfc/request/open", timeout_s=0.5) == []
     assert controller.faults.counts["controller: handler of lowfc/mirror/*/command"] >= 3
     assert controller.faults.counts["controller: queryable of lowfc/request/open"] == 1
@@ -195,13 +182,12 @@ def test_sessions_without_the_password_receive_and_send_nothing(run: Run, join: 
             intruder.declare_subscriber(FRAME.key, overheard.append)
         join(run, "viewer").subscribe(FRAME, received.put)  # after the intruders, with the right password
 
-        def exchange() -> bool:
+        def exchange() -> None:
             frames.put(b"frame")
             for intruder in intruders:
                 intruder.put(COMMAND.at("dm"), b"command", attachment=Envelope(1, 1).encode())
-            return received.received > 20
 
-        until(exchange)
+        until(lambda: received.received > 20, each=exchange)
     assert (overheard, forgeries.received) == ([], 0)
 
 
@@ -283,25 +269,17 @@ def test_a_monitor_receives_every_row_and_images_at_display_rate(run: Run, join:
         drained[FRAME] += images.drain()
         drained[TRUTH] += rows.drain()
 
-    def connected() -> bool:
+    def put() -> Envelope:
         frames.put(b"picture")
-        truths.put(b"row")
-        drain()
-        return bool(drained[FRAME] and drained[TRUTH] and recorded.received)
+        return truths.put(b"row")
 
-    until(connected)
+    until(lambda: drained[FRAME] and drained[TRUTH] and recorded.received, each=lambda: (put(), drain()))
     first = {topic: len(samples) for topic, samples in drained.items()}
     before = recorded.received
     for _ in range(250):
-        frames.put(b"picture")
-        last = truths.put(b"row")
+        last = put()
         time.sleep(0.002)
-
-    def received_last() -> bool:
-        drain()
-        return drained[TRUTH][-1].sequence == last.sequence and recorded.received >= before + 250
-
-    until(received_last)
+    until(lambda: drained[TRUTH][-1].sequence == last.sequence and recorded.received >= before + 250, each=drain)
     assert len(drained[TRUTH]) - first[TRUTH] >= 250
     assert 5 < len(drained[FRAME]) - first[FRAME] < 125
 
@@ -354,7 +332,7 @@ class Reader:
 @pytest.fixture
 def reader(run: Run, join: Join) -> Iterator[Reader]:
     made = Reader(run, join(run, "camera"))
-    until(made.connected)
+    until(lambda: made.drained()[0] > 0, each=made.put)
     yield made
     made.process.kill()
     made.process.communicate()
@@ -363,24 +341,14 @@ def reader(run: Run, join: Join) -> Iterator[Reader]:
 def test_a_stopped_subscriber_does_not_delay_the_others(reader: Reader, run: Run, join: Join) -> None:
     box = Mailbox()
     join(run, "controller").subscribe(FRAME, box.put)
-
-    def received() -> bool:
-        reader.put()
-        return bool(box.take(0.01))
-
-    until(received)
+    until(lambda: box.take(0.01), each=reader.put)
     reader.process.send_signal(signal.SIGSTOP)
     for _ in range(1500):  # 19 MB, more than the link buffers; a blocking put would close it
         reader.put()
         assert box.take(PATIENCE_S)
     reader.process.send_signal(signal.SIGCONT)
     last = reader.put()
-
-    def caught_up() -> bool:
-        reader.put()
-        return reader.drained()[2] > last
-
-    until(caught_up)
+    until(lambda: reader.drained()[2] > last, each=reader.put)
     received_number, whole, _ = reader.drained()
     assert received_number == whole < reader.frames.published
 

@@ -193,12 +193,7 @@ def test_reader_and_writer_reconnect_after_restarts_and_the_bus_serves_without_a
     camera.close()
     monkeypatch.setattr(direct_link.DirectWriter, "send", lambda *_: None)  # as a publisher without this library
     frames = ends.bus("camera").publisher(FRAME)
-
-    def received() -> bool:
-        frames.put(b"")
-        return ends.threads[-1:] not in ([], ["direct-link"])
-
-    until(received)
+    until(lambda: ends.threads[-1:] not in ([], ["direct-link"]), each=lambda: frames.put(b""))
 
 
 def test_a_message_too_large_for_the_socket_arrives_over_the_bus(ends: Ends) -> None:
@@ -206,13 +201,7 @@ def test_a_message_too_large_for_the_socket_arrives_over_the_bus(ends: Ends) -> 
     controller.subscribe(FRAME, ends.receive)
     frames = camera.publisher(FRAME)
     large = 17 << 20
-
-    def received() -> bool:
-        frames.put(bytes(large))
-        time.sleep(0.05)
-        return ends.sizes[-1:] == [large]
-
-    until(received)
+    until(lambda: ends.sizes[-1:] == [large], each=lambda: (frames.put(bytes(large)), time.sleep(0.05)))
     assert ends.threads[-1] != "direct-link"
 
 
@@ -275,12 +264,13 @@ class Commanded:
 
     def until_both_paths(self) -> None:
         def both() -> bool:
-            self.controller.put(b"controller")
-            self.operator.put(b"operator")
-            time.sleep(0.01)
             return "direct-link" in self.threads and any(one.payload == b"operator" for one in self.received)
 
-        until(both)
+        until(both, each=self.put)
+
+    def put(self) -> None:
+        self.controller.put(b"controller")
+        self.operator.put(b"operator")
 
 
 def test_a_mirror_receives_each_command_once_and_the_controllers_over_the_direct_link(ends: Ends) -> None:
@@ -288,8 +278,7 @@ def test_a_mirror_receives_each_command_once_and_the_controllers_over_the_direct
     mirror.until_both_paths()
     begun = len(mirror.received)
     for _ in range(100):
-        mirror.controller.put(b"controller")
-        mirror.operator.put(b"operator")
+        mirror.put()
         time.sleep(0.001)
     last = mirror.controller.published - 1, mirror.operator.published - 1
 

@@ -532,13 +532,7 @@ def test_a_line_receives_messages_without_an_envelope_and_queries() -> None:
             until(line.peers)
             until(lambda: [one.payload for one in line.ask(CAMERA_STATE.key)] == [b"settings"])
             got: list[Received] = []
-
-            def received() -> bool:
-                session.put(FRAME.key, b"frame")
-                got.extend(line.received())
-                return bool(got)
-
-            until(received)
+            until(lambda: got.extend(line.received()) or got, each=lambda: session.put(FRAME.key, b"frame"))
             assert got[0][:3] == (FRAME.key, b"frame", None)
         finally:
             line.close()

@@ -470,10 +470,5 @@ def test_refused_commands_do_not_reset_the_command_timeout(
         other = rig.bus("other").publisher(COMMAND, "dm")
         nonsense = wire.MirrorCommand(
             rows=GRID[0], columns=GRID[1], actuators=actuators, frame_sequence=2**63, valid_for_ns=10**9
-        )
-
-        def expired() -> bool:
-            other.put(nonsense.SerializeToString())
-            return "COMMAND_EXPIRED" in rig.events()
-
-        until(expired)
+        ).SerializeToString()
+        until(lambda: "COMMAND_EXPIRED" in rig.events(), each=lambda: other.put(nonsense))

@@ -45,12 +45,11 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 def put_until(frames: Publisher, happened: Callable[[], bool]) -> None:
     """Put incompressible frames until `happened`, then ten more."""
 
-    def put_and_check() -> bool:
+    def put_four() -> None:
         for _ in range(4):
             frames.put(np.random.default_rng(frames.published).bytes(12_800))
-        return happened()
 
-    until(put_and_check)
+    until(happened, each=put_four)
     put(frames, 10)
 
 

@@ -119,11 +119,7 @@ def test_the_log_is_complete_after_any_signal(bench: Bench, signals: tuple[signa
 
 @pytest.mark.parametrize("bench", [("--longest-s", 1, "--json")], indirect=True)
 def test_record_rotates_logs_and_reports_messages_and_losses(bench: Bench) -> None:
-    def put_until_rotated() -> bool:
-        bench.put()
-        return len(list(bench.folder.iterdir())) > 1
-
-    until(put_until_rotated)
+    until(lambda: len(list(bench.folder.iterdir())) > 1, each=bench.put)
     bench.frames.published += 3  # three counts are skipped: lost messages
     bench.put()
     out, errors = bench.stop(signal.SIGTERM)

@@ -149,9 +149,15 @@ def interrupt(process: "subprocess.Popen[str]", timeout_s: float = 20) -> tuple[
     return process.communicate(timeout=timeout_s)
 
 
-def until(condition: Callable[[], object], timeout_s: float = 30.0) -> None:
+def until(
+    condition: Callable[[], object], timeout_s: float = 30.0, *, each: Callable[[], object] = lambda: None
+) -> None:
+    """Wait for a condition, with a call of `each` before it is checked."""
     deadline_s = time.monotonic() + timeout_s
-    while not condition():
+    while True:
+        each()
+        if condition():
+            return
         assert time.monotonic() < deadline_s, "timeout"
         time.sleep(0.01)
 

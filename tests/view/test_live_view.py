@@ -147,12 +147,8 @@ def test_a_late_view_requests_the_calibration(scenes: Scenes) -> None:
     assert topic_of(CALIBRATION.key).queryable
     scene = scenes()
     step = next(one.payload for one in scene.night.samples if one.key == STEP.key)
-
-    def drawn() -> bool:
-        scene.publishers[STEP.key].put(step)  # repeatedly: steps before the calibration are not drawn
-        return scene.drawn(1)
-
-    until(drawn)
+    # repeatedly: steps before the calibration are not drawn
+    until(lambda: scene.drawn(1), each=lambda: scene.publishers[STEP.key].put(step))
 
 
 def test_a_late_view_shows_earlier_events_once(scenes: Scenes, tmp_path: Path) -> None:
