@@ -5,6 +5,7 @@ import socket
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import zenoh
@@ -246,16 +247,11 @@ def test_a_lost_router_is_reported_with_the_reason(hosts: Hosts, capfd: pytest.C
 def test_there_is_no_wait_for_an_unreachable_router_or_after_a_repeated_refusal(
     hosts: Hosts, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def unknown(*_: object) -> None:
-        raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
-
-    def refuse(config: object) -> None:
-        raise zenoh.ZError("this and that")
-
     hosts.join(ROUTER)
     monkeypatch.setattr(routed, "_ALERT_S", 0.01)
-    monkeypatch.setattr("lowfc.adapters.bus.routed.zenoh.open", refuse)
+    monkeypatch.setattr("lowfc.adapters.bus.routed.zenoh.open", Mock(side_effect=zenoh.ZError("this and that")))
     with monkeypatch.context() as patch:
+        unknown = Mock(side_effect=socket.gaierror(socket.EAI_NONAME, "Name or service not known"))
         patch.setattr("lowfc.adapters.bus.routed.socket.create_connection", unknown)
         with pytest.raises(BusError, match=r"nowhere\.invalid.*cannot be reached .*resolve it"):
             hosts.join("camera", network=hosts.network(host="nowhere.invalid"))

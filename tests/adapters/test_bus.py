@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import zenoh
@@ -127,11 +128,7 @@ def test_a_failing_handler_affects_no_other_and_is_printed_once(
     pair: tuple[Bus, Bus], capfd: pytest.CaptureFixture[str]
 ) -> None:
     controller, operator = pair
-    box = Mailbox()
-
-    def fail(_: object) -> None:
-        raise RuntimeError("handler broke")
-
+    box, fail = Mailbox(), Mock(side_effect=RuntimeError("handler broke"))
     controller.subscribe(COMMAND, fail)
     controller.subscribe(COMMAND, box.put)
     controller.queryable("lowfc/request/*", fail)

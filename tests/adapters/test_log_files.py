@@ -5,6 +5,7 @@ import zlib
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import lz4.frame
 import pytest
@@ -372,10 +373,8 @@ def test_a_log_is_never_overwritten(tmp_path: Path) -> None:
 
 
 def test_a_log_that_cannot_be_begun_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(file: object, data: bytes) -> int:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(writer._File, "write", refuse)
+    full = OSError(errno.ENOSPC, "No space left on device")
+    monkeypatch.setattr(writer._File, "write", Mock(side_effect=full))
     with pytest.raises(DataFileError, match=r"No space left on device\) after 0 bytes; .*; the file was removed"):
         LogWriter(tmp_path / "a.mcap", START_NS, {})
     assert not list(tmp_path.iterdir())

@@ -9,6 +9,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from importlib import metadata
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import zenoh
@@ -253,11 +254,7 @@ def test_processes_are_spread_over_the_available_processors() -> None:
 def test_install_advice_lists_the_packages_of_an_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     assert install_advice("deploy") == f"{sys.executable} -m pip install 'cryptography>=44'"
     assert install_advice("epics") == f"{sys.executable} -m pip install 'p4p>=4.3'", "without those of epics-test"
-
-    def missing(name: str) -> list[str]:
-        raise metadata.PackageNotFoundError(name)
-
-    monkeypatch.setattr(metadata, "requires", missing)
+    monkeypatch.setattr(metadata, "requires", Mock(side_effect=metadata.PackageNotFoundError))
     assert install_advice("plots").endswith("pip install -e '.[plots]' in its checkout")
 
 

@@ -23,6 +23,7 @@ from lowfc.contract.messages import REQUEST_KEY, Role, wire
 from tests.support.loops import lowfc, until
 
 pytestmark = pytest.mark.usefixtures("own_runtime")
+FULL_DISK = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
 
 
 def test_a_run_has_ports_a_secret_and_private_files() -> None:
@@ -89,12 +90,11 @@ def test_a_run_that_cannot_be_made_is_an_error_and_leaves_nothing(
     (base / "taken").touch()
     with pytest.raises(DataFileError, match=r"taken cannot be made: Not a directory"):
         open_run("taken")
-    full = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
-    monkeypatch.setattr(Path, "write_text", full)
+    monkeypatch.setattr(Path, "write_text", FULL_DISK)
     with pytest.raises(DataFileError, match=r"night cannot be made: No space left on device"):
         open_run("night")
     assert [path.name for path in base.iterdir()] == ["taken"]
-    monkeypatch.setattr(os, "link", full)
+    monkeypatch.setattr(os, "link", FULL_DISK)
     with pytest.raises(DataFileError, match=r"clock-.* cannot be read or made: No space left on device"):
         HostClock()
 
@@ -289,11 +289,7 @@ def test_a_failed_write_leaves_the_old_file_only(tmp_path: Path, monkeypatch) ->
     (tmp_path / "pipe").unlink()
     with pytest.raises(DataFileError, match="nowhere/file cannot be written: No such file"):
         write_whole(tmp_path / "nowhere" / "file", b"")
-
-    def full(self: Path, target: Path) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(Path, "replace", full)
+    monkeypatch.setattr(Path, "replace", FULL_DISK)
     with pytest.raises(DataFileError, match=r"file cannot be written: No space left on device"):
         write_whole(path, b"second")
     assert path.read_bytes() == b"first"

@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import numpy.typing as npt
@@ -272,10 +273,7 @@ def test_a_sequence_during_a_device_restart_is_stopped_at_once_and_repeated() ->
 
 
 def test_ctrl_c_restores_the_mirror_and_keeps_the_completed_cycles() -> None:
-    def interrupt(_: InProcessLoop) -> None:
-        raise KeyboardInterrupt
-
-    loop = FaultyLoop({3: (interrupt, ignore)}, disturbance__static_nm={"4": 5.0})
+    loop = FaultyLoop({3: (Mock(side_effect=KeyboardInterrupt), ignore)}, disturbance__static_nm={"4": 5.0})
     loop.close_loop()
     loop.run(50)
     loop.open_loop()

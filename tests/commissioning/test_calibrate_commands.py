@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -91,13 +92,10 @@ def frames_to_go(stderr: str) -> float:
 def test_a_resumed_calibration_is_written_loaded_and_reported_when_complete(
     noiseless_loop: InProcessLoop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def stop(*_: object) -> None:
-        raise KeyboardInterrupt
-
     loop = noiseless_loop
     check = Calibrator.check
     begun = DELAY_FRAMES + 2 * 8  # frames for measuring the delay, before the first report of the time to go
-    monkeypatch.setattr(Calibrator, "check", stop)
+    monkeypatch.setattr(Calibrator, "check", Mock(side_effect=KeyboardInterrupt))
     before = loop.calibration()
     words = ["--method", "hadamard", "--cycles", "4", "--out", "night.fits", "--load"]
     done = CliRunner().invoke(calibrate_app, words)

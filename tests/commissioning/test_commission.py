@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -258,13 +259,9 @@ def test_a_failed_commissioning_restores_the_previous_calibration(
 ) -> None:
     bench, _ = commissioned
     before = bench.loop.calibration().id
-
-    def give_up() -> None:
-        raise KeyboardInterrupt
-
     partial_of(bench.out).touch()
     for step, why in ("[6/10] poke", "the previous calibration is in use again"), ("[3/10]", "no calibration was"):
-        bench.actions = {step: give_up}
+        bench.actions = {step: Mock(side_effect=KeyboardInterrupt)}
         with pytest.raises(KeyboardInterrupt):
             bench.commission()
         assert bench.loop.calibration().id == before

@@ -105,11 +105,7 @@ def trial(refused: dict[str, tuple[str, str]] | None = None, cpus: int = 8, **la
 
 def machine(root: Path, changes: dict[str, object]) -> Host:
     """The suitable host with some files and readings changed; None removes one."""
-    host = Host(root)
-
-    def unreadable() -> None:
-        raise OSError("not readable")
-
+    host, unreadable = Host(root), Mock(side_effect=OSError("not readable"))
     for what, value in {**METAL, **changes}.items():
         if "/" not in what:
             setattr(host, what, unreadable if value is None else lambda value=value: value)

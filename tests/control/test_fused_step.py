@@ -3,6 +3,7 @@
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -223,11 +224,9 @@ def test_the_kernel_in_use_is_an_event_and_numpy_without_numba(monkeypatch: pyte
 
 
 def test_a_host_that_forbids_executable_memory_uses_numpy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    def refused() -> None:
-        raise PermissionError(13, "cannot allocate executable memory")
-
+    refused = PermissionError(13, "cannot allocate executable memory")
     monkeypatch.setattr(compiled, "kernel", getattr(compiled.kernel, "__wrapped__", compiled.kernel))
-    monkeypatch.setattr(compiled, "_compiled", refused)
+    monkeypatch.setattr(compiled, "_compiled", Mock(side_effect=refused))
     events: list[tuple[str, str]] = []
     config = load(None, {"realtime.kernel": "fused"})
     result = settings_under(Latch([tmp_path / "latch"]), config, lambda name, advice: events.append((name, advice)))

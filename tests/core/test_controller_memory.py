@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import numpy.typing as npt
@@ -421,11 +422,7 @@ def test_an_exception_in_frame_processing_ends_the_controller(
     """If the bus's thread only counted it, the loop would stop silently."""
     monkeypatch.setattr("lowfc.programs.core.controller.MIRROR_PATIENCE_S", 0.01)
     hub, _, controller = alone(calibration, Latch([tmp_path / "safe"]), configured(lockstep=False))
-
-    def broken(*_: object) -> None:
-        raise ArithmeticError("one and one is three")
-
-    monkeypatch.setattr(controller, "_frame", broken)
+    monkeypatch.setattr(controller, "_frame", Mock(side_effect=ArithmeticError("one and one is three")))
     frames = MemoryBus(hub, "camera", HostClock()).publisher(FRAME)
     late = threading.Timer(0.2, frames.put, [b""])
     late.start()

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from importlib import resources
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -194,10 +195,7 @@ def test_too_few_rounds_give_advice(tmp_path):
     [(NotSolvedError("the solver failed"), ConfigurationError), (ValueError("a bug"), ValueError)],
 )
 def test_only_solver_failures_become_configuration_errors(tmp_path, monkeypatch, failure, reported):
-    def fail(*_):
-        raise failure
-
-    monkeypatch.setattr(shaped_pupil, "maximise", fail)
+    monkeypatch.setattr(shaped_pupil, "maximise", Mock(side_effect=failure))
     error = lowfc("design", "spc", "--out", tmp_path / "spc.npz").exception
     assert type(error) is reported
     assert str(error) == str(failure)

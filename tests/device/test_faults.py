@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import count
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -48,13 +49,6 @@ def good(**fields: Any) -> Callable[[], Exposure]:
     return lambda: Exposure(**{"pixels": GOOD} | fields)
 
 
-def raising(fault: Exception) -> Callable[[], Any]:
-    def fail() -> Any:
-        raise fault
-
-    return fail
-
-
 def exposed(*exposures: Callable[[], Any], frames: int, settings: CameraSettings = SETTINGS) -> Listener:
     hub, clock = MemoryHub(), FakeClock()
     listener = Listener(hub, clock, FRAME, CAMERA_STATE, HEALTH)
@@ -66,7 +60,7 @@ def exposed(*exposures: Callable[[], Any], frames: int, settings: CameraSettings
 @pytest.mark.parametrize(
     ("bad", "message"),
     [
-        (raising(OSError("the cable")), "OSError: the cable"),
+        (Mock(side_effect=OSError("the cable")), "OSError: the cable"),
         (good(pixels=GOOD[1:]), "shape (2, 4)"),
         (good(pixels=np.full((3, 4), np.nan)), "float64"),
         (good(end_ns=1 << 62), "s ahead of the monotonic clock"),
@@ -90,7 +84,7 @@ def test_camera_failures_are_reported_once_counted_and_retried(bad: Callable[[],
 def test_a_failing_camera_is_retried_after_increasing_pauses() -> None:
     hub, clock = MemoryHub(), FakeClock()
     listener = Listener(hub, clock, FRAME)
-    camera = Camera(clock, *[raising(OSError("the cable"))] * 9, good())
+    camera = Camera(clock, *[Mock(side_effect=OSError("the cable"))] * 9, good())
     begun_ns = clock.now_ns()
     CameraLoop(camera, listener.service("camera"), CONFIG, 1).run()
     assert clock.now_ns() - begun_ns == pytest.approx(7.8e9 + 2 * 4e9, abs=0.1e9)
@@ -99,7 +93,7 @@ def test_a_failing_camera_is_retried_after_increasing_pauses() -> None:
 
 def test_a_configuration_error_of_a_driver_ends_the_process() -> None:
     with pytest.raises(ConfigurationError, match="another layout"):
-        exposed(raising(ConfigurationError("another layout")), frames=1)
+        exposed(Mock(side_effect=ConfigurationError("another layout")), frames=1)
 
 
 def test_a_hanging_camera_is_reported_while_it_hangs() -> None:

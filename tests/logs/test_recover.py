@@ -3,6 +3,7 @@
 import json
 from collections import Counter
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from mcap.reader import make_reader
@@ -154,11 +155,7 @@ def test_a_failed_recovery_leaves_no_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: BaseException
 ) -> None:
     part = small_log(tmp_path / "night.mcap", finished=False)
-
-    def fail(*_: object) -> None:
-        raise fault
-
-    monkeypatch.setattr(recovery, "account", fail)  # after all messages are written
+    monkeypatch.setattr(recovery, "account", Mock(side_effect=fault))  # after all messages are written
     with pytest.raises((KeyboardInterrupt, DataFileError)) as caught:
         recover(part, tmp_path / "new.mcap")
     assert isinstance(caught.value, KeyboardInterrupt) or "cannot be written: No space left" in str(caught.value)

@@ -3,7 +3,8 @@
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NoReturn
+from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -66,15 +67,12 @@ class LoggedLoop(InProcessLoop):
 def test_a_refused_step_or_an_interrupt_ends_the_loop_with_its_output(
     fault: BaseException, expected: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refused(_: str) -> NoReturn:
-        raise fault
-
     begin = "import os, pathlib, time; pathlib.Path('pid').write_text(str(os.getpid())); print('begun', flush=True)"
     (tmp_path / "silent.py").write_text(f"{begin}\npathlib.Path('ready').touch(); time.sleep(20)\n")
     monkeypatch.setattr(dark_hole, "COMMAND", "silent")
     monkeypatch.setattr(dark_hole, "running", lambda: ["run"] * (tmp_path / "ready").exists())
     monkeypatch.setattr(dark_hole, "new_run_id", lambda: "run")
-    monkeypatch.setattr(dark_hole, "Client", refused)
+    monkeypatch.setattr(dark_hole, "Client", Mock(side_effect=fault))
     with pytest.raises(LowfcError if expected else KeyboardInterrupt, match=expected):
         dark_hole.dark_hole(tmp_path, 1.0)
     assert not Path("/proc", (tmp_path / "pid").read_text()).exists()

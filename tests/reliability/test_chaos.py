@@ -283,16 +283,11 @@ def without_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             found.notes.append(str(error))
         return found
 
-    def faulty(bench: object) -> None:
-        raise KeyError("odd")
-
-    def interrupted(bench: object) -> None:
-        raise KeyboardInterrupt
-
+    faulty = Mock(side_effect=KeyError("odd"))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("lowfc.programs.reliability.chaos.command._run", act_only)
     monkeypatch.setattr("lowfc.programs.reliability.chaos.rules.judge", judge_notes)
-    acts = {"good": lambda bench: None, "odd": faulty, "stopped": interrupted, "last": lambda bench: None}
+    acts = {"good": Mock(), "odd": faulty, "stopped": Mock(side_effect=KeyboardInterrupt), "last": Mock()}
     cases = {name: replace(CASE, name=name, act=act) for name, act in acts.items()}
     cases["lacking"] = replace(CASE, name="lacking", act=faulty, lacks=lambda: "requires a mount (not here)")
     monkeypatch.setattr("lowfc.programs.reliability.chaos.cases.CASES", cases)
@@ -364,10 +359,7 @@ def test_a_folder_that_cannot_hold_logs_is_refused_before_the_first_case(tmp_pat
 
 @pytest.mark.usefixtures("own_runtime")
 def test_an_interrupt_while_a_case_is_prepared_leaves_no_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("lowfc.programs.reliability.chaos.bench.prepare", interrupted)
+    monkeypatch.setattr("lowfc.programs.reliability.chaos.bench.prepare", Mock(side_effect=KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         _run(CASE, tmp_path, random.Random(1))  # noqa: S311  # nothing secret
     assert [path for path in runtime_base().iterdir() if path.is_dir()] == []
