@@ -321,10 +321,6 @@ class Reader:
         self.process.stdin.flush()
         return [int(word) for word in self.process.stdout.readline().split()]
 
-    def connected(self) -> bool:
-        self.put()
-        return self.drained()[0] > 0
-
 
 @pytest.fixture
 def reader(run: Run, join: Join) -> Iterator[Reader]:

@@ -51,12 +51,10 @@ class Ends:
 
     def until_direct_only(self, publisher: ZenohPublisher) -> None:
         """Publish until messages arrive over the direct link only."""
-
-        def only() -> bool:
-            publisher.put(b"")
-            return self.threads[-5:] == ["direct-link"] * 5 and len(self.threads) > 20
-
-        until(only)
+        until(
+            lambda: self.threads[-5:] == ["direct-link"] * 5 and len(self.threads) > 20,
+            each=lambda: publisher.put(b""),
+        )
         del self.received[:-1], self.threads[:], self.sizes[:]
 
     def close(self) -> None:

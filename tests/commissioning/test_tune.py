@@ -50,9 +50,7 @@ def tune(*words: object) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    night = SyntheticLog()
-    night.request("close")
-    night.frames(3000)
+    night = SyntheticLog().request("close").frames(3000)
     return night.write(tmp_path_factory.mktemp("night") / "night.mcap")
 
 
@@ -97,9 +95,7 @@ def test_the_command_writes_the_law_and_draws_it(
 
 def test_probe_sequences_affect_neither_the_tuning_nor_the_delay(tmp_path: Path) -> None:
     """During a probe sequence on the mirror, the true wavefront does not follow the loop's commands alone."""
-    night = SyntheticLog()
-    night.request("close")
-    night.frames(100)
+    night = SyntheticLog().request("close").frames(100)
     shape = night.calibration.modes_to_actuators[:, 0]
     table = 20 * np.sin(2 * np.pi * 31 * np.arange(500) * PERIOD_NS * 1e-9).astype(np.float32)[:, None]
     night.request("play", text="mirror", actuators_nm=shape, table=table)
@@ -112,10 +108,7 @@ def test_probe_sequences_affect_neither_the_tuning_nor_the_delay(tmp_path: Path)
 
 
 def test_an_open_loop_with_much_tilt_is_flagged(tmp_path: Path) -> None:
-    night = SyntheticLog()
-    night.request("open")
-    night.frames(2150)
-    path = night.write(tmp_path / "open.mcap")
+    path = SyntheticLog().request("open").frames(2150).write(tmp_path / "open.mcap")
     found = tune(path)
     assert not found["closed"]
     assert found["modes"][0]["achieved_nm"] is None
@@ -328,9 +321,7 @@ def test_the_previous_law_is_restored_without_an_answer_or_the_error_says_that_i
 
 
 def test_a_log_that_is_too_short_is_refused(tmp_path: Path) -> None:
-    night = SyntheticLog()
-    night.request("close")
-    night.frames(700)
+    night = SyntheticLog().request("close").frames(700)
     with pytest.raises(
         DataFileError, match="tuning requires at least 2048 consecutive frames, 2 s; the longest sequence of good"
     ):

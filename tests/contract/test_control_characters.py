@@ -79,8 +79,7 @@ def test_configuration_errors_are_escaped() -> None:
 def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A log whose recorder did not escape anything."""
     monkeypatch.setattr(report_log, "METADATA", {"lowfc": {"host": HOSTILE, "numpy": HOSTILE}})
-    night = SyntheticLog()
-    night.frames(200)
+    night = SyntheticLog().frames(200)
     night.put(EVENT, Log(level=3, name=HOSTILE, message=HOSTILE))  # type: ignore[arg-type]
     night.put(EVENT, Log(level=2, name="controller", message=f"MODE_CHANGED loop open -> closed: {HOSTILE}"))  # type: ignore[arg-type]
     night.put(REQUEST, wire.Request(name=HOSTILE, accepted=True, reply=HOSTILE))

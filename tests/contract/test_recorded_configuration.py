@@ -79,8 +79,7 @@ def test_the_number_of_remarks_is_limited() -> None:
 def test_an_unreadable_configuration_is_a_remark(tmp_path: Path, toml: str) -> None:
     with pytest.raises(ConfigurationError, match="not a readable TOML file"):
         recorded(toml.encode())
-    night = SyntheticLog()
-    night.frames(5)
+    night = SyntheticLog().frames(5)
     log = night.write(tmp_path / "night.mcap", toml=toml)
     history = read_history(LogReader(log))
     assert history.configuration is None

@@ -45,9 +45,7 @@ EVERY, FRAMES = 10, 1200
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    night = SyntheticLog()
-    night.request("close")
-    night.frames(FRAMES)
+    night = SyntheticLog().request("close").frames(FRAMES)
     night.health("camera", topics=[wire.TopicCount(topic=FRAME.key, published=FRAMES)], state="stopped")
     return night.write(tmp_path_factory.mktemp("night") / "night.mcap")
 

@@ -53,11 +53,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def results(folder: Path) -> dict[str, Any]:
     """Results of a run with a request and a warning in it, from the command that writes the page too."""
-    night = SyntheticLog()
-    night.request("open")
-    night.frames(150)
-    night.request("close")
-    night.frames(900, lost={300})
+    night = SyntheticLog().request("open").frames(150).request("close").frames(900, lost={300})
     log = night.write(folder / "night.mcap")
     found: dict[str, Any] = json.loads(output_of(folder, f"lowfc report {log} --json --out report.html"))
     return found

@@ -183,8 +183,7 @@ def _runs(pid: int) -> bool:
 @pytest.fixture(scope="module")
 def night(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A log with messages of most topics."""
-    made = SyntheticLog()
-    made.frames(100)
+    made = SyntheticLog().frames(100)
     made.put(SURFACE, image(np.random.default_rng(1).normal(size=(6, 9)).astype(np.float32), made.now_ns, "dm"))
     made.health("recorder", state="running")
     return made.write(tmp_path_factory.mktemp("log") / "night.mcap")

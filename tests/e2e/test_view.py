@@ -114,9 +114,7 @@ def test_the_loop_continues_when_its_view_is_killed(tmp_path: Path) -> None:
 
 
 def test_a_log_without_an_end_is_saved_as_a_valid_rrd_file(tmp_path: Path) -> None:
-    night = SyntheticLog()
-    night.frames(300)
-    log = night.write(tmp_path / "cut.mcap", finish=False)
+    log = SyntheticLog().frames(300).write(tmp_path / "cut.mcap", finish=False)
     done = run(tmp_path, "view", str(log), "--save", "cut.rrd", "--json")
     assert done.returncode == 0, done.stderr
     assert "no end" in done.stderr

@@ -56,10 +56,7 @@ CALIBRATED = identified(replace(toy.calibration(), good=GOOD.astype(np.float32))
 
 def a_night() -> SyntheticLog:
     """An open and 29 closed steps, one of them refused; a command and a truth are missing; the camera is restarted."""
-    night = SyntheticLog(calibration=CALIBRATED)
-    night.request("open")
-    night.frames(1)
-    night.request("close")
+    night = SyntheticLog(calibration=CALIBRATED).request("open").frames(1).request("close")
     night.frames(STEPS // 2 - 1, dark={REFUSED - 1})
     night.start_camera()
     night.request("gain", (9.0,))  # refused
@@ -246,8 +243,7 @@ def test_a_truncated_log_without_truth_and_with_an_accent_in_its_name_is_exporte
 
 
 def test_damage_is_reported_with_its_place_and_reason(tmp_path: Path) -> None:
-    night = SyntheticLog()
-    night.frames(1500)
+    night = SyntheticLog().frames(1500)
     log = night.write(tmp_path / "night.mcap")
     flipped(log, log.stat().st_size // 3)
     results = export_log(log, Format.NPZ, tmp_path / "out.npz", console=QUIET)

@@ -58,8 +58,7 @@ def history_of(night: SyntheticLog, path: Path) -> History:
     ],
 )
 def test_an_invalid_step_is_left_out_of_every_column(tmp_path: Path, change: Callable[[Any], object]) -> None:
-    night = SyntheticLog()
-    night.frames(STEPS)
+    night = SyntheticLog().frames(STEPS)
     change_one(night, STEP, change)
     steps = (history := history_of(night, tmp_path / "x.mcap")).steps
     assert history.excluded_messages == 1
@@ -76,8 +75,7 @@ def test_late_commands_after_a_restart_of_the_camera_are_counted(tmp_path: Path)
 
 
 def test_the_attached_calibration_replaces_a_lost_message(tmp_path: Path) -> None:
-    night = SyntheticLog()
-    night.frames(STEPS)
+    night = SyntheticLog().frames(STEPS)
     whole = history_of(night, tmp_path / "whole.mcap")
     night.samples = [one for one in night.samples if not CALIBRATION.matches(one.key)]
     history = read_history(LogReader(night.write(tmp_path / "x.mcap", attached=TOYS)))
@@ -95,8 +93,7 @@ def test_the_attached_calibration_replaces_a_lost_message(tmp_path: Path) -> Non
 
 
 def test_a_repeated_reason_sets_one_bit(tmp_path: Path) -> None:
-    night = SyntheticLog()
-    night.frames(STEPS)
+    night = SyntheticLog().frames(STEPS)
     change_one(night, STEP, lambda step: step.reasons.extend([62, 62, 5]))
     history = history_of(night, tmp_path / "x.mcap")
     assert history.excluded_messages == 0
@@ -118,8 +115,7 @@ def test_a_repeated_reason_sets_one_bit(tmp_path: Path) -> None:
 def test_an_invalid_message_is_left_out_of_every_column(
     tmp_path: Path, topic: Topic, change: Callable[[Any], object]
 ) -> None:
-    night = SyntheticLog()
-    night.frames(STEPS)
+    night = SyntheticLog().frames(STEPS)
     before = history_of(night, tmp_path / "before.mcap")
     change_one(night, topic, change)
     history = history_of(night, tmp_path / "x.mcap")
@@ -135,8 +131,7 @@ def test_an_invalid_message_is_left_out_of_every_column(
 
 
 def test_a_message_with_an_impossible_time_is_left_out(tmp_path: Path) -> None:
-    night = SyntheticLog()
-    night.frames(STEPS)
+    night = SyntheticLog().frames(STEPS)
     night.put(EVENT, wire.Tick(), late_ns=(1 << 63) - night.now_ns)
     history = history_of(night, tmp_path / "x.mcap")
     assert history.excluded_messages == 1

@@ -49,9 +49,7 @@ def recorded(folder: Path, samples: Sequence[Sample], files: int, *, finish: boo
 
 @pytest.fixture(scope="module")
 def samples() -> list[Sample]:
-    night = SyntheticLog()
-    night.request("close")
-    night.frames(FRAMES, lost=[100, 101])
+    night = SyntheticLog().request("close").frames(FRAMES, lost=[100, 101])
     return night.samples
 
 

@@ -449,9 +449,7 @@ def test_frames_are_kept_within_a_limit_of_memory(monkeypatch: pytest.MonkeyPatc
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    made = report_log.SyntheticLog()
-    made.frames(STEPS)
-    return made.write(tmp_path_factory.mktemp("night") / "night.mcap")
+    return report_log.SyntheticLog().frames(STEPS).write(tmp_path_factory.mktemp("night") / "night.mcap")
 
 
 def test_several_processes_give_the_account_of_one(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -484,9 +482,7 @@ def test_two_lockstep_runs_with_the_same_sequences_are_replayed_apart(
     """Also those of one name, `sim-loop --lockstep --run a`."""
     paths: list[Path] = []
     for run, gain in (("a", 0.1), (other, 0.2)):
-        made = report_log.SyntheticLog()
-        made.request("gain", (gain,))
-        made.frames(200)
+        made = report_log.SyntheticLog().request("gain", (gain,)).frames(200)
         hour_ns = len(paths) * 3600 * 10**9
         made.samples = [
             one._replace(publish_time_ns=one.publish_time_ns + hour_ns, receive_time_ns=one.receive_time_ns + hour_ns)
@@ -523,8 +519,7 @@ def test_a_finished_log_with_a_damaged_summary_is_not_called_cut_off(log: Path, 
 
 
 def test_a_forged_command_and_another_host_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    made = report_log.SyntheticLog()
-    made.frames(STEPS)
+    made = report_log.SyntheticLog().frames(STEPS)
     place = [index for index, sample in enumerate(made.samples) if COMMAND.matches(sample.key)][700]
     command = wire.MirrorCommand.FromString(made.samples[place].payload)
     surface = np.frombuffer(command.actuators, np.float32).copy()

@@ -43,10 +43,7 @@ def results(log: Path) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def eventful(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """A log with the loop open and closed, frames lost and dark, gains changed, controller and camera restarted."""
-    night = SyntheticLog()
-    night.health("camera", commands_late=40, state="ready")
-    night.request("open")
-    night.frames(300)
+    night = SyntheticLog().health("camera", commands_late=40, state="ready").request("open").frames(300)
     night.request("close")
     night.frames(1500, lost={200, 201, 202, 203, 204, 700}, dark={800})
     night.request("gain", (0.2,))
@@ -279,8 +276,7 @@ def test_a_log_without_a_step_still_has_a_page(tmp_path: Path, empty: bool) -> N
 
 @pytest.mark.usefixtures("without_drawings")
 def test_a_report_says_that_the_calibration_of_its_steps_is_missing(tmp_path: Path) -> None:
-    night = SyntheticLog()
-    night.frames(20)
+    night = SyntheticLog().frames(20)
     night.samples = [one for one in night.samples if one.key != CALIBRATION.key]
     made = report_of(read_run(night.write(tmp_path / "x.mcap")))
     texts = {check["name"]: check["text"] for check in made.results["verdict"]["checks"]}
@@ -330,8 +326,7 @@ def test_without_truth_the_terms_that_need_it_are_missing_and_not_zero(
 
 
 def test_a_log_of_an_open_loop_has_neither_spectra_nor_budget(tmp_path: Path) -> None:
-    night = SyntheticLog()
-    night.request("open")
+    night = SyntheticLog().request("open")
     found = results(uneventful(night, 300).write(tmp_path / "x.mcap"))
     assert found["closed_stretch"] is None
     assert found["spectra"] == found["error_budget"] == {"why_not": "the loop was not closed in this log"}
@@ -354,8 +349,7 @@ def test_a_loop_without_a_calibration_has_no_residual(tmp_path: Path) -> None:
 
 
 def test_frames_before_a_calibration_of_other_modes_led_to_commands_too(tmp_path: Path) -> None:
-    night = SyntheticLog()
-    night.frames(100)
+    night = SyntheticLog().frames(100)
     night.put(CALIBRATION, wire.Calibration(noll=[2, 3]))  # refused, so that the one in use is published again
     night.put(CALIBRATION, encode_calibration(night.calibration, night.now_ns))
     night.frames(100)
@@ -375,8 +369,7 @@ def test_the_stretch_is_of_the_last_calibration_loaded(tmp_path: Path) -> None:
 
 
 def test_a_loop_closed_under_an_unknown_law_is_not_called_open(tmp_path: Path) -> None:
-    night = SyntheticLog()
-    night.frames(300)
+    night = SyntheticLog().frames(300)
     night.samples = [sample for sample in night.samples if sample.key != CONTROLLER_STATE.key]
     found = results(night.write(tmp_path / "x.mcap"))
     assert found["mode_steps"] == {"closed": 300}
@@ -386,9 +379,7 @@ def test_a_loop_closed_under_an_unknown_law_is_not_called_open(tmp_path: Path) -
 
 
 def test_a_closed_loop_without_a_good_frame_has_neither_spectra_nor_budget(tmp_path: Path) -> None:
-    night = SyntheticLog()
-    night.frames(200, dark=range(200))
-    found = results(night.write(tmp_path / "x.mcap"))
+    found = results(SyntheticLog().frames(200, dark=range(200)).write(tmp_path / "x.mcap"))
     assert found["closed_stretch"]["frames"] == 0
     assert "has 0 frames" in found["spectra"]["why_not"]
     assert {term["missing"] for term in found["error_budget"]["terms"]} == {True}
@@ -398,8 +389,7 @@ def test_a_closed_loop_without_a_good_frame_has_neither_spectra_nor_budget(tmp_p
 
 @pytest.mark.parametrize("logged", [True, False])
 def test_theory_is_that_of_the_linear_law_in_use(tmp_path: Path, logged: bool) -> None:
-    night = SyntheticLog()
-    night.frames(300)
+    night = SyntheticLog().frames(300)
     night.law(0.05, logged=logged)
     night.frames(2000)
     made = report_of(read_run(night.write(tmp_path / "x.mcap")))
@@ -421,8 +411,7 @@ def test_theory_is_that_of_the_linear_law_in_use(tmp_path: Path, logged: bool) -
 def test_the_last_frames_may_have_their_command_after_the_log(
     tmp_path: Path, lost: int, without: int, at_the_end: int
 ) -> None:
-    night = SyntheticLog()
-    night.frames(200, lost=range(200 - lost, 200))
+    night = SyntheticLog().frames(200, lost=range(200 - lost, 200))
     found = results(night.write(tmp_path / "x.mcap"))["timing"]["frames"]
     assert (found["without_command"], found["at_the_end"]) == (without, at_the_end)
 

@@ -124,8 +124,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, LoggedRun]:
     other = {"gain": (0.2, 0.3), "leak": (0.01, 0.01), "delay_frames": 2.0}
     toml = load(None, {"sensor.modes": 10}).to_toml()  # with 10 modes no contrast is computed, which is slow
     for name, changes in (("default", {}), ("other", other)):
-        night = SyntheticLog(**changes)
-        night.frames(FRAMES)
+        night = SyntheticLog(**changes).frames(FRAMES)
         made[name] = LoggedRun(read_history(LogReader(night.write(folder / f"{name}.mcap", toml=toml))))
     return made
 

@@ -3,7 +3,7 @@
 from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -95,7 +95,7 @@ class SyntheticLog:
         self._camera_start += 60
         self._count = 0
 
-    def frames(self, number: int, *, lost: Collection[int] = (), dark: Collection[int] = ()) -> None:
+    def frames(self, number: int, *, lost: Collection[int] = (), dark: Collection[int] = ()) -> Self:
         """Append frames; those in `lost` never reach the controller, those in `dark` have no light."""
         for index in range(number):
             self.now_ns += PERIOD_NS
@@ -119,14 +119,16 @@ class SyntheticLog:
             if index not in lost:
                 exposed = Frame(sequence, self.now_ns, 100_000, frame)
                 self._take(advance(self.settings, self._state, exposed), DELAY_NS + 1000 * (self._count % 50))
+        return self
 
-    def request(self, name: str, values: tuple[float, ...] = (), modes: tuple[int, ...] = (), **fields: Any) -> None:
+    def request(self, name: str, values: tuple[float, ...] = (), modes: tuple[int, ...] = (), **fields: Any) -> Self:
         request = Request(self.now_ns, name, modes, values, **fields)
         before = self._state
         after, outputs = advance(self.settings, before, request)
         assert outputs.reply is not None
         self.put(REQUEST, codec.encode_request(request, outputs.reply, after.input_number, None))
         self._take((after, outputs))
+        return self
 
     def law(self, gain: float, *, logged: bool = True) -> None:
         """Load an integrator of one gain as a linear law named pi; its matrices are in the log only if `logged`."""
@@ -138,8 +140,9 @@ class SyntheticLog:
     def event(self, name: str, **details: object) -> None:
         self.put(EVENT, EVENTS[name].log("controller", self.now_ns, **details))
 
-    def health(self, process: str, **fields: object) -> None:
+    def health(self, process: str, **fields: object) -> Self:
         self.put(HEALTH, wire.Health(process=process, **fields), name=process)
+        return self
 
     def put(
         self, topic: Topic, message: Message | bytes, sequence: int | None = None, name: str = "dm", late_ns: int = 0

@@ -359,10 +359,7 @@ def _logs(folder: Path) -> list[Target]:
     whole = tuple(
         small_log(folder / f"log{finished}.mcap", finished=finished).read_bytes() for finished in (True, False)
     )
-    night = SyntheticLog()
-    night.frames(30)
-    night.request("gain", (0.3,))
-    night.frames(20)
+    night = SyntheticLog().frames(30).request("gain", (0.3,)).frames(20)
     run = (night.write(folder / "night.mcap").read_bytes(),)
 
     def recovered(path: Path) -> None:

@@ -65,8 +65,7 @@ class Scene:
 
     def __init__(self, show: Show | None = Show.WEB, stuck: int = 0) -> None:
         self.hub, self.clock = MemoryHub(), HostClock()
-        self.night = SyntheticLog()
-        self.night.frames(50)
+        self.night = SyntheticLog().frames(50)
         self.events: list[str] = []
         self.source = MemoryBus(self.hub, "controller", self.clock)
         self.source.subscribe(EVENT, lambda sample: self.events.append(Log.FromString(sample.payload).message))

@@ -61,12 +61,6 @@ def drawn(*logs: Path, config: Configuration | None = None) -> tuple[Drawn, Tape
     return draw_logs(logs, config or Configuration(), lambda own: Renderer(own, tape)), tape
 
 
-def night(frames: int) -> SyntheticLog:
-    made = SyntheticLog()
-    made.frames(frames)
-    return made
-
-
 @pytest.mark.parametrize(
     ("finish", "value", "level"), [(True, "FINISHED", Level.GOOD), (False, "NO END", Level.WARNING)]
 )
@@ -106,7 +100,7 @@ def test_the_verdict_on_a_log_of_a_fraction_of_a_second_has_its_losses(shown: Sh
 
 
 def test_the_final_verdict_covers_the_whole_log(tmp_path: Path, shown: Shown) -> None:
-    made = night(750)
+    made = SyntheticLog().frames(750)
     made.frames(50, dark=range(50))
     made.request("safe")
     made.frames(200)
@@ -125,9 +119,7 @@ def test_the_final_verdict_covers_the_whole_log(tmp_path: Path, shown: Shown) ->
 
 
 def test_a_log_of_a_loop_that_did_harm_needs_attention(tmp_path: Path, shown: Shown) -> None:
-    made = SyntheticLog(gain=(1.95, 1.95))
-    made.frames(300)
-    drawn(made.write(tmp_path / "night.mcap"))
+    drawn(SyntheticLog(gain=(1.95, 1.95)).frames(300).write(tmp_path / "night.mcap"))
     assert shown[-1].level is tile(shown[-1], "WAVEFRONT").level is Level.WARNING
     assert re.search(r"residual \S+ nm rms, worse than \S+ nm with a flat mirror", shown[-1].headline)
 
@@ -136,7 +128,7 @@ def test_the_time_of_a_slow_loop_and_of_a_frame_with_a_wrong_clock_is_counted(
     tmp_path: Path, shown: Shown, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(report_log, "PERIOD_NS", 2_000_000_000)
-    made = night(10)
+    made = SyntheticLog().frames(10)
     step = next(wire.ControlStep.FromString(one.payload) for one in made.samples if one.key == STEP.key)
     step.timestamp.CopyFrom(timestamp(0))
     step.reasons.append(Rejection.OUT_OF_ORDER.value)
@@ -145,8 +137,7 @@ def test_the_time_of_a_slow_loop_and_of_a_frame_with_a_wrong_clock_is_counted(
     drawn(made.write(tmp_path / "night.mcap"))
     assert (tile(shown[-1], "LOOP").value, tile(shown[-1], "LOOP").detail) == ("CLOSED", "closed 38 s")
     assert tile(shown[-1], "FRAMES").detail == "of 21 frames: 0 lost, 1 refused (1 out of order)"
-    made = SyntheticLog()
-    made.frames(1)
+    made = SyntheticLog().frames(1)
     drawn(made.write(tmp_path / "frame.mcap"))
     assert tile(shown[-1], "FRAMES").value == "0.5 Hz"
     made = SyntheticLog()
@@ -178,8 +169,7 @@ def test_a_log_with_late_or_slow_commands_needs_attention(
 
 
 def test_a_log_without_steps_has_no_verdict_on_the_loop(tmp_path: Path, shown: Shown) -> None:
-    made = SyntheticLog()
-    made.health("recorder", state="running")
+    made = SyntheticLog().health("recorder", state="running")
     drawn(made.write(tmp_path / "night.mcap", messages_lost="3"))
     assert shown[-1].headline.startswith("Log without a step of the controller. The recorder lost 3 messages")
     made.samples = [one for one in made.samples if one.key != EVENT.key]
@@ -189,7 +179,7 @@ def test_a_log_without_steps_has_no_verdict_on_the_loop(tmp_path: Path, shown: S
 
 
 def test_the_trend_of_a_night_has_a_limited_number_of_spans() -> None:
-    averages, snapshot = SpanMeans(), snapshot_of(night(200).samples)
+    averages, snapshot = SpanMeans(), snapshot_of(SyntheticLog().frames(200).samples)
     averages.feed(snapshot)
     _, rms_nm = averages.wavefront()
     squares = np.stack([snapshot.truths.residual_rms_nm, snapshot.truths.disturbance_rms_nm], axis=1).astype(float) ** 2
@@ -225,7 +215,7 @@ def test_a_log_larger_than_the_memory_of_the_viewer_gives_a_remark() -> None:
 
 
 def test_every_view_of_the_layout_has_data_and_the_plots_span_the_whole_log(tmp_path: Path) -> None:
-    made = night(120)
+    made = SyntheticLog().frames(120)
     made.health("controller")
     made.put(SURFACE, image(np.eye(8, dtype=np.float32), made.now_ns, "dm"))
     made.frames(1380)
@@ -259,7 +249,7 @@ def views(part: rrb.Container | rrb.View) -> list[rrb.View]:
 def test_a_damaged_log_is_drawn_and_the_remark_names_the_place_the_reason_and_the_lost_time(
     tmp_path: Path, shown: Shown
 ) -> None:
-    log = night(1500).write(tmp_path / "night.mcap")
+    log = SyntheticLog().frames(1500).write(tmp_path / "night.mcap")
     _, (begin, end), *_ = chunks_of(log)
     flipped(log, (begin + end) // 2)
     [remark] = drawn(log)[0].remarks
@@ -270,7 +260,7 @@ def test_a_damaged_log_is_drawn_and_the_remark_names_the_place_the_reason_and_th
 
 
 def test_a_log_begins_with_its_first_frame_and_not_with_an_older_calibration(tmp_path: Path, shown: Shown) -> None:
-    made = night(100)
+    made = SyntheticLog().frames(100)
     calibration = next(one for one in made.samples if one.key == CALIBRATION.key)
     earlier_ns = calibration.receive_time_ns - 3600 * 10**9
     made.samples = [calibration._replace(receive_time_ns=earlier_ns), *made.samples]
@@ -280,7 +270,7 @@ def test_a_log_begins_with_its_first_frame_and_not_with_an_older_calibration(tmp
 
 
 def test_a_frame_of_a_camera_whose_clock_is_ahead_does_not_move_the_time_line(tmp_path: Path) -> None:
-    made = night(300)
+    made = SyntheticLog().frames(300)
     ahead_ns = made.now_ns + 3600 * 10**9
     step = next(wire.ControlStep.FromString(one.payload) for one in made.samples if one.key == STEP.key)
     step.timestamp.CopyFrom(timestamp(ahead_ns))
@@ -297,7 +287,7 @@ def test_a_frame_of_a_camera_whose_clock_is_ahead_does_not_move_the_time_line(tm
 
 
 def test_the_largest_stroke_of_a_log_is_that_of_every_mirror_state(tmp_path: Path, shown: Shown) -> None:
-    made = night(300)
+    made = SyntheticLog().frames(300)
     number = [place for place, one in enumerate(made.samples) if MIRROR_STATE.matches(one.key)][101]
     state = wire.MirrorState.FromString(made.samples[number].payload)
     state.actuators = np.full(state.rows * state.columns, -350, "<f4").tobytes()
@@ -307,7 +297,7 @@ def test_the_largest_stroke_of_a_log_is_that_of_every_mirror_state(tmp_path: Pat
 
 
 def test_a_message_of_an_impossible_time_is_left_out(tmp_path: Path) -> None:
-    made = night(10)
+    made = SyntheticLog().frames(10)
     made.samples.append(made.samples[-1]._replace(receive_time_ns=1 << 63))
     done, _ = drawn(made.write(tmp_path / "night.mcap"))
     assert (done.remarks, done.log_s < 1) == (["1 message could not be read"], True)
@@ -317,18 +307,18 @@ def test_a_log_of_a_simulated_run_is_drawn_without_a_runtime_directory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "missing"))
-    done, _ = drawn(night(120).write(tmp_path / "night.mcap"), config=Configuration(lockstep=True))
+    done, _ = drawn(SyntheticLog().frames(120).write(tmp_path / "night.mcap"), config=Configuration(lockstep=True))
     assert done.snapshots > 0
 
 
 def test_logs_of_two_runs_are_not_drawn_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    logs = [night(120).write(tmp_path / f"{name}.mcap") for name in "ab"]
+    logs = [SyntheticLog().frames(120).write(tmp_path / f"{name}.mcap") for name in "ab"]
     assert drawn(*logs)[0].snapshots > 0
-    lockstep = night(120)
+    lockstep = SyntheticLog().frames(120)
     lockstep.samples = [one._replace(publish_time_ns=one.publish_time_ns + 10**9) for one in lockstep.samples]
     others = [lockstep.write(tmp_path / "c.mcap")]
     monkeypatch.setitem(report_log.METADATA["lowfc"], "run", "another")
-    others.append(night(120).write(tmp_path / "d.mcap"))
+    others.append(SyntheticLog().frames(120).write(tmp_path / "d.mcap"))
     for other in others:
         with pytest.raises(DataFileError, match="one run at a time"):
             drawn(logs[0], other)
@@ -343,7 +333,7 @@ def recorder_of(log: Path, host: str = "") -> wire.Health:
 
 @pytest.mark.parametrize("finish", [True, False])
 def test_earlier_events_are_read_from_the_log_finished_or_not(tmp_path: Path, finish: bool) -> None:
-    made = night(100)
+    made = SyntheticLog().frames(100)
     made.request("note", text="new star")
     made.frames(100)
     made.event("RECORDING_STOPPED", why="operator asked")
@@ -369,7 +359,7 @@ def test_a_view_without_the_log_reports_that_events_are_missing(recorder: wire.H
 
 
 def test_only_chunks_with_events_are_read(tmp_path: Path) -> None:
-    log = night(1000).write(tmp_path / "night.mcap")
+    log = SyntheticLog().frames(1000).write(tmp_path / "night.mcap")
     complete, sparse = (LogReader(log, topics=(EVENT,), sparse=sparse) for sparse in (False, True))
     assert list(complete) == list(sparse)
     assert len(sparse._chunks) < len(complete._chunks) / 2

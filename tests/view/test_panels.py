@@ -48,9 +48,7 @@ FRAMES = 120
 
 
 def night(*, truth: bool = True) -> SyntheticLog:
-    made = SyntheticLog(truth=truth)
-    made.frames(FRAMES)
-    return made
+    return SyntheticLog(truth=truth).frames(FRAMES)
 
 
 def rendered(snapshot: Snapshot) -> Tape:
@@ -155,8 +153,7 @@ def test_the_mode_band_begins_at_the_last_change_before_the_view() -> None:
 
 
 def test_the_flux_of_refused_frames_is_a_gap() -> None:
-    made = SyntheticLog()
-    made.frames(100, dark=range(40, 60))
+    made = SyntheticLog().frames(100, dark=range(40, 60))
     tape = Tape()
     loop.Loop().draw(tape, snapshot_of(made.samples))
     for plot in (loop.FLUX, loop.SATURATED):

@@ -322,8 +322,7 @@ def test_a_loop_that_corrects_little_is_neutral_and_so_is_its_headline() -> None
 
 def test_the_residual_of_the_best_gains_is_computed_from_the_measured_loop(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lowfc.programs.view.verdicts.watcher.COMPARISON_PERIOD_NS", 1_000_000_000)
-    night = SyntheticLog(truth=False)
-    night.frames(3000)
+    night = SyntheticLog(truth=False).frames(3000)
     accumulator, watcher = Accumulator(), Watcher()
     for number, one in enumerate(night.samples, 1):
         accumulator.add(one)
