@@ -26,7 +26,7 @@ from lowfc.programs.commissioning.commission.commissioning import Commission, Co
 from lowfc.programs.commissioning.commission.first_calibration import linear_nm
 from lowfc.programs.commissioning.conformance.settings import AGREEMENTS, Agreement, agreement_checks
 from tests.support.in_process_loop import InProcessLoop, computed
-from tests.support.loops import lowfc
+from tests.support.loops import lowfc, refusal
 from tests.support.theory import LAWS
 
 TOML = """
@@ -341,9 +341,7 @@ def test_a_difference_of_camera_and_configuration_is_found(one: Agreement) -> No
 def test_an_existing_calibration_is_replaced_only_with_force(own_runtime: Path) -> None:
     out = own_runtime / "calibration.fits"
     out.write_text("mine")
-    done = lowfc("commission", "--no-dark", "--out", out)
-    assert isinstance(done.exception, DataFileError)
-    assert "already exists" in str(done.exception)
+    assert "already exists" in refusal("commission", "--no-dark", "--out", out, kind=DataFileError)
     for way in ("--force", "--resume"):
         done = lowfc("commission", "--no-dark", "--out", out, way)
         assert isinstance(done.exception, BusError), "it continues to the connection, which fails without a loop"

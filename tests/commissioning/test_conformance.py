@@ -43,7 +43,7 @@ from lowfc.programs.commissioning.conformance.frames import camera_checks
 from lowfc.programs.commissioning.conformance.line import Line, Received
 from lowfc.programs.commissioning.conformance.mirror import mirror_checks
 from lowfc.testing.clock import FakeClock
-from tests.support.loops import lowfc, until
+from tests.support.loops import lowfc, refusal, until
 from tests.support.safety_checks import Simulated
 
 MS = 1_000_000
@@ -498,7 +498,7 @@ def test_the_report_has_advice_for_failed_checks(capsys: pytest.CaptureFixture[s
 @pytest.mark.usefixtures("own_runtime")
 def test_conformance_refuses_runs_that_it_cannot_check(tmp_path: Path) -> None:
     def complaint(*words: object) -> str:
-        return str(lowfc("conformance", *words).exception)
+        return refusal("conformance", *words)
 
     assert "lowfc config zenoh --role camera" in complaint("camera")
     assert "lowfc config zenoh --role mirror-dm" in complaint("mirror")

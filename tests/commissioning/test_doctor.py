@@ -27,7 +27,7 @@ from lowfc.programs.commissioning.checks import Check, note, ok
 from lowfc.programs.commissioning.doctor import command, permissions, room, timing
 from lowfc.programs.commissioning.doctor.facts import Facts, gather, ranges
 from lowfc.programs.core.recording.volume import bytes_per_s
-from tests.support.loops import lowfc, until
+from tests.support.loops import lowfc, refusal, until
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "howto" / "doctor.md"
 CHECKS = {**timing.CHECKS.functions, **room.CHECKS.functions}
@@ -419,7 +419,7 @@ def test_real_time_rights_are_shown_applied_and_removed(tmp_path: Path, monkeypa
         assert text in lowfc("doctor", "--setup").stdout
     assert device.stat().st_mode & 0o777 == 0o660
     assert [words[0] for words in calls] == ["groupadd", "lowfc", "usermod"]
-    assert "exclude each other" in str(lowfc("doctor", "--apply", "--undo").exception)
+    assert "exclude each other" in refusal("doctor", "--apply", "--undo")
     permissions.undo(tmp_path)
     assert not [path for path in tmp_path.rglob("*") if path.is_file() and path != device]
     assert device.stat().st_mode & 0o777 == 0o600

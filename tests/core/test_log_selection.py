@@ -1,8 +1,6 @@
 """Recordings and copies with every Nth frame and mirror state: contents, and which commands can read them."""
 
-import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -34,7 +32,7 @@ from lowfc.programs.logs.survey import survey
 from lowfc.programs.logs.what_if.compare import what_if
 from lowfc.programs.logs.what_if.options import WhatIf, requested
 from lowfc.programs.logs.what_if.run import LoggedRun
-from tests.support.loops import lowfc
+from tests.support.loops import json_of, lowfc, refusal
 from tests.support.recording import Bench, bodies_of, logged, put
 from tests.support.report_log import SyntheticLog
 
@@ -152,9 +150,7 @@ def test_replay_refuses_a_log_without_all_frames_in_one_sentence(small: Path) ->
 def test_replay_needs_frames_but_no_other_optional_topic(whole: Path) -> None:
     out = whole.with_name("frames.mcap")
     thin((whole,), out, selection(1, [FRAME.key]))
-    done = lowfc("replay", out, "--json")
-    assert done.exit_code == 0, done.exception
-    assert json.loads(done.stdout)["frames"] == FRAMES
+    assert json_of("replay", out)["frames"] == FRAMES
 
 
 def test_what_if_gives_the_same_result_from_a_smaller_copy(whole: Path, small: Path, tmp_path: Path) -> None:
@@ -172,11 +168,7 @@ def test_what_if_gives_the_same_result_from_a_smaller_copy(whole: Path, small: P
 
 @pytest.mark.usefixtures("without_drawings")
 def test_a_report_of_a_smaller_copy_has_the_same_results(whole: Path, small: Path) -> None:
-    found: list[dict[str, Any]] = []
-    for log in (whole, small):
-        done = lowfc("report", log, "--json", *(["--out", log.with_suffix(".html")] if log is small else []))
-        assert done.exit_code == 0, done.exception
-        found.append(json.loads(done.stdout))
+    found = [json_of("report", whole), json_of("report", small, "--out", small.with_suffix(".html"))]
     for part in ("residual", "spectra", "error_budget", "closed_stretch", "light", "laws", "requests"):
         assert found[0][part] == found[1][part], part
     levels = [{check["name"]: check["level"] for check in one["verdict"]["checks"]} for one in found]
@@ -188,9 +180,10 @@ def test_a_report_of_a_smaller_copy_has_the_same_results(whole: Path, small: Pat
 
 def test_an_export_contains_the_frames_of_a_smaller_copy(small: Path, tmp_path: Path) -> None:
     out = tmp_path / "small.npz"
-    done = lowfc("export", small, "--to", "npz", "--frames", "--out", out, "--json")
-    assert done.exit_code == 0, done.exception
-    assert json.loads(done.stdout)["selection"] == "1 in 10 frames and mirror states"
+    assert (
+        json_of("export", small, "--to", "npz", "--frames", "--out", out)["selection"]
+        == "1 in 10 frames and mirror states"
+    )
     with np.load(out) as found:
         arrays = dict(found)
     assert (len(arrays["sequence"]), len(arrays["frame_sequence"])) == (FRAMES, FRAMES // EVERY)
@@ -206,9 +199,7 @@ def test_an_export_contains_the_frames_of_a_smaller_copy(small: Path, tmp_path: 
     ],
 )
 def test_contradictory_export_options_are_refused(whole: Path, words: list[str]) -> None:
-    done = lowfc("export", whole, *words)
-    assert isinstance(done.exception, ConfigurationError)
-    assert "use one" in str(done.exception)
+    assert "use one" in refusal("export", whole, *words, kind=ConfigurationError)
 
 
 def test_the_estimate_of_disk_space_follows_rate_and_selection(tmp_path: Path) -> None:
@@ -230,9 +221,7 @@ def test_the_estimate_of_disk_space_follows_rate_and_selection(tmp_path: Path) -
 
 
 def test_record_start_names_the_request(tmp_path: Path) -> None:
-    done = lowfc("record", "start")
-    assert isinstance(done.exception, ConfigurationError)
-    assert "`lowfc ctl record start`" in str(done.exception)
+    assert "`lowfc ctl record start`" in refusal("record", "start", kind=ConfigurationError)
 
 
 def test_the_answer_to_record_start_contains_the_estimate_of_disk_space(tmp_path: Path) -> None:

@@ -1,6 +1,5 @@
 """Sensors that use all light from the focal-plane mask, their optimisation, and the quantum limit of all sensors."""
 
-import json
 import tomllib
 
 import numpy as np
@@ -23,7 +22,7 @@ from lowfc.optics.chain.sensor import pupil_radii, reference, response
 from lowfc.optics.chain.zernike import NOLLS_14, NOLLS_20, zernikes
 from lowfc.optics.detector.photometry import electrons
 from lowfc.programs.design.full_light_request import Spot
-from tests.support.loops import lowfc
+from tests.support.loops import json_of, refusal
 
 LIGHT_E = electrons(STAR, TABLE4_EXPOSURE_S)
 # Noise of 14 modes in nm, and the share of the quantum limit, from an independent calculation.
@@ -106,9 +105,7 @@ def test_sweep_finds_the_minimum_between_its_values():
 def test_the_command_writes_the_keys_of_the_best(tmp_path, monkeypatch):
     monkeypatch.setattr("lowfc.programs.design.full_light._POINTS", 3)
     out = tmp_path / "clowfs.toml"
-    ran = lowfc("design", "clowfs", "--defocus", "3.2:4.2", "--out", out, "--json")
-    assert ran.exit_code == 0, ran.output
-    found = json.loads(ran.stdout)
+    found = json_of("design", "clowfs", "--defocus", "3.2:4.2", "--out", out)
     assert found["best"] == pytest.approx(3.7, abs=0.1)
     assert min(point["merit"] for point in found["points"]) == found["figures_of_best"]["contrast_noise"]
     assert load(out).sensor.defocus_mm == pytest.approx(found["best"], rel=1e-3)
@@ -132,9 +129,7 @@ def test_the_command_writes_the_keys_of_the_best(tmp_path, monkeypatch):
 )
 def test_impossible_options_are_refused_before_the_search(words, message, monkeypatch):
     monkeypatch.setattr("lowfc.programs.design.full_light.Focus", None)
-    error = lowfc("design", *words).exception
-    assert isinstance(error, ConfigurationError)
-    assert message in str(error)
+    assert message in refusal("design", *words, kind=ConfigurationError)
 
 
 def test_the_default_weight_is_one_half():

@@ -27,7 +27,7 @@ from lowfc.programs.design import sam_executors as executors
 from lowfc.programs.design.sam_executors import InProcessExecutor, open_executor
 from lowfc.programs.design.sam_files import read_state
 from lowfc.programs.design.sam_request import Search
-from tests.support.loops import lowfc, until
+from tests.support.loops import json_of, lowfc, refusal, until
 
 RECORDED = {
     name: entry["command"] for name, entry in json.loads(SHIPPED.read_text())["layouts"].items() if "command" in entry
@@ -185,9 +185,9 @@ def test_the_command_does_not_overwrite_an_interrupted_search(tmp_path, monkeypa
     state = tmp_path / "mask.json.state.json"
     program.write_state(state, search_with(), program.pupil_digest(), program.begin(search_with()))
     before = state.read_bytes()
-    ran = lowfc("design", "sam", "--out", "mask.json")
-    assert isinstance(ran.exception, ConfigurationError)
-    assert f"continue with --resume {state.name}, or delete it" in str(ran.exception)
+    assert f"continue with --resume {state.name}, or delete it" in refusal(
+        "design", "sam", "--out", "mask.json", kind=ConfigurationError
+    )
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == {state: before}
     assert isinstance(lowfc("design", "sam", "--resume", state.name, "--out", state.name).exception, ConfigurationError)
     assert state.read_bytes() == before
@@ -236,11 +236,8 @@ def test_front_is_written_and_plotted(tmp_path):
 
 def test_command_is_recorded_and_reproduces_the_layout(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    ran = lowfc(
-        "design", "sam", "--merit", "condition", "--holes", 5, "--steps", 30, "--symmetry", "x", "--jobs", 1, "--json"
-    )
-    assert ran.exit_code == 0, ran.output
-    result = json.loads(ran.stdout)
+    search = ["--merit", "condition", "--holes", 5, "--steps", 30, "--symmetry", "x", "--jobs", 1]
+    result = json_of("design", "sam", *search)
     assert list(result["layouts"][0]["focal_masks"]) == ["disk", "bowtie"]
     first = json.loads((tmp_path / "sam.json").read_text())["layouts"]["sam"]
     assert (first["merit"], first["seed"], first["command"]) == ("condition", 1, result["command"])

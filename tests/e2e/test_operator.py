@@ -26,7 +26,7 @@ from lowfc.control.laws.linear_law import integrator_block, law_from_blocks
 from lowfc.control.loop.requests import REQUESTS
 from lowfc.control.loop.safety import Limits
 from lowfc.programs.cli.ctl import ctl_app
-from tests.support.loops import FIXED, children, interrupt, lowfc, payloads, run, start, until
+from tests.support.loops import FIXED, children, interrupt, lowfc, payloads, refusal, run, start, until
 from tests.support.safety_checks import violations
 
 pytestmark = pytest.mark.exclusive
@@ -168,7 +168,7 @@ def _the_rest(night: Night) -> None:
     until(recorder_answered)  # a Health that comes late is missing in the list
     for command in ("lowfc ctl status --json", "lowfc ctl note once --json", "lowfc ctl configuration --json"):
         night.ctl(command)
-    night.outputs["refused"] = str(lowfc("ctl", "gain", "-0.1", "--modes", "2", "--run", night.name).exception)
+    night.outputs["refused"] = refusal("ctl", "gain", "-0.1", "--modes", "2", "--run", night.name)
     with Client(night.name) as loop:
         list(loop.steps(250))  # so that the last log holds the controller's state, which comes once a second
 

@@ -43,7 +43,7 @@ from lowfc.contract.messages import (
 )
 from lowfc.programs.logs.export.command import Format, export_log, render
 from tests.support import toy
-from tests.support.loops import lowfc
+from tests.support.loops import json_of, lowfc, refusal
 from tests.support.mutated_logs import flipped
 from tests.support.report_log import METADATA, SyntheticLog
 
@@ -307,9 +307,9 @@ def test_an_export_is_next_to_the_log_with_its_permissions_and_replaced_only_by_
     assert done.output.startswith(f"{out}: {STEPS} steps")
     assert out.stat().st_mode & 0o777 == 0o600
     out.write_text("mine")
-    assert "--force" in str(lowfc("export", log).exception)
+    assert "--force" in refusal("export", log)
     assert out.read_text() == "mine"
-    assert json.loads(lowfc("export", log, "--force", "--json").stdout)["steps"] == STEPS
+    assert json_of("export", log, "--force")["steps"] == STEPS
     assert fits.getheader(out)["LOG"] == "night.mcap"
 
 

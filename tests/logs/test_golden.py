@@ -6,7 +6,6 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
-from typing import Any
 
 import pytest
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
@@ -19,7 +18,7 @@ from lowfc.contract.errors import ConfigurationError
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.inputs import Load, Request
 from lowfc.control.loop.state import State
-from tests.support.loops import lowfc, run
+from tests.support.loops import json_of, refusal, run
 
 WIRE = Path(__file__).parents[2] / "lowfc" / "contract" / "wire"
 FOLDER = Path(__file__).parents[1] / "golden" / "0.1"
@@ -27,13 +26,6 @@ FORMER_KEY = next(old for old, new in former_names.KEYS.items() if new.endswith(
 NIGHT, KILLED = FOLDER / "night.mcap", FOLDER / "killed.mcap"
 CALIBRATION_ID = "88418bc31223bb21a6b588e0b43a360fda6133511792fa03b8c6af46764afa20"
 LAW_ID = "15560553d408bce3394be8a5123a916a091b94f0a6f0d423cc89d546b4e967f3"
-
-
-def json_of(*words: object, status: int = 0) -> dict[str, Any]:
-    done = lowfc(*words, "--json")
-    assert done.exit_code == status, (done.output, done.exception)
-    found: dict[str, Any] = json.loads(done.stdout)
-    return found
 
 
 @pytest.mark.parametrize(
@@ -108,7 +100,7 @@ def test_a_log_of_0_1_is_drawn(tmp_path: Path) -> None:
     ],
 )
 def test_commands_that_need_a_longer_log_say_so(words: list[object], message: str) -> None:
-    assert message in str(lowfc(*words).exception)
+    assert message in refusal(*words)
 
 
 def test_the_log_of_0_1_has_every_kind_of_input() -> None:

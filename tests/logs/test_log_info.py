@@ -1,6 +1,5 @@
 """`lowfc info` reports what was written into a log."""
 
-import json
 from pathlib import Path
 
 import pytest
@@ -12,7 +11,7 @@ from lowfc.contract.envelope import sequence_of
 from lowfc.contract.errors import DataFileError
 from lowfc.contract.events import EVENTS
 from lowfc.contract.messages import CALIBRATION, CONTROLLER_STATE, EVENT, FRAME, HEALTH, STEP, Message, wire
-from tests.support.loops import lowfc
+from tests.support.loops import json_of, lowfc
 from tests.support.mutated_logs import flipped
 
 START_S = 1_767_225_600  # 2026-01-01T00:00:00Z
@@ -62,9 +61,7 @@ def log(tmp_path: Path) -> Path:
 
 
 def test_info_reports_what_was_written(log: Path) -> None:
-    done = lowfc("info", log, "--json")
-    assert done.exit_code == 0, done.output
-    found = json.loads(done.stdout)
+    found = json_of("info", log)
     frame = found["topics"].pop(FRAME.key)
     assert not any(line["restarts"] for line in found["topics"].values()), "only the camera restarted"
     assert {key: line["messages"] for key, line in found.pop("topics").items()} == {
@@ -132,14 +129,14 @@ def test_truncated_and_damaged_logs_are_reported(log: Path) -> None:
     done = lowfc("info", log)
     assert done.exit_code == 0
     assert "truncated" in done.stdout
-    assert json.loads(lowfc("info", log, "--json").stdout)["state"] == "truncated"
+    assert json_of("info", log)["state"] == "truncated"
     log.write_bytes(data)
     flipped(log, data.index(b"[loop]"))
     done = lowfc("info", log)
     assert done.exit_code == 0
     assert "damaged; `lowfc recover` saves the intact messages" in done.stdout
     assert "the checksum of an attachment is wrong" in done.stdout
-    found = json.loads(lowfc("info", log, "--json").stdout)
+    found = json_of("info", log)
     assert (found["state"], len(found["damage"]), found["attachments"]) == ("damaged", 1, {})
 
 
@@ -147,13 +144,13 @@ def test_a_log_that_is_being_recorded_is_reported_and_not_recovered(tmp_path: Pa
     log = LogWriter(tmp_path / "20270101T000000Z.mcap", START_NS, {"lowfc": {"run": "night"}})
     done = lowfc("info", log.part)
     assert "being recorded; `lowfc ctl record stop` finishes it" in done.stdout
-    assert json.loads(lowfc("info", log.part, "--json").stdout)["state"] == "recording"
+    assert json_of("info", log.part)["state"] == "recording"
     assert "it is being recorded" in missing_end_text([log.part], finished=False)
     with pytest.raises(DataFileError, match="is being recorded, and nothing is lost: `lowfc ctl record stop`"):
         recover(log.part, recovered_path(log.part))
     assert list(tmp_path.iterdir()) == [log.part]
     log.abandon()  # as if killed
-    assert json.loads(lowfc("info", log.part, "--json").stdout)["state"] == "truncated"
+    assert json_of("info", log.part)["state"] == "truncated"
     assert "it was cut off" in missing_end_text([log.part], finished=False)
     assert recover(log.part, recovered_path(log.part)).recovered == recovered_path(log.part)
 
@@ -168,5 +165,5 @@ def test_a_log_that_is_finished_while_it_is_read_is_not_called_truncated(tmp_pat
 def test_an_empty_log_is_summarised(tmp_path: Path) -> None:
     path = LogWriter(tmp_path / "a.mcap", START_NS, {}).finish({"recording": {"stopped": "the disk is full"}})
     assert "recording stopped: the disk is full" in lowfc("info", path).stdout
-    found = json.loads(lowfc("info", path, "--json").stdout)
+    found = json_of("info", path)
     assert (found["start"], found["duration_s"], found["messages"], found["state"]) == (None, None, 0, "complete")

@@ -1,6 +1,5 @@
 """`last`, and several files of one recording as one log, in every command that reads logs."""
 
-import json
 import os
 from collections.abc import Callable, Sequence
 from functools import cache
@@ -19,9 +18,9 @@ from lowfc.adapters.logs.writer import Attachment, LogWriter
 from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.envelope import sequence_of
-from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError
+from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.messages import BENCH, CALIBRATION, CONTROLLER_STATE, FRAME, topic_of, wire
-from tests.support.loops import lowfc
+from tests.support.loops import json_of, lowfc, refusal
 from tests.support.report_log import METADATA, SyntheticLog
 from tests.support.toy import START
 
@@ -171,21 +170,15 @@ def test_every_command_gives_the_same_results_for_ten_files_as_for_one(
     ten_files_and_one: Callable[[bool], Path], monkeypatch: pytest.MonkeyPatch, words: list[str]
 ) -> None:
     monkeypatch.chdir(ten_files_and_one(words[0] == "tune"))  # which needs some two thousand frames
-    results = []
-    for log in (LAST, f"one/{LAST}"):
-        done = lowfc(words[0], log, *words[1:], "--json")
-        assert done.exit_code == 0, (done.output, done.exception)
-        results.append(without_files(json.loads(done.stdout)))
-    assert results[0] == results[1]
+    ten, one = (without_files(json_of(words[0], log, *words[1:])) for log in (LAST, f"one/{LAST}"))
+    assert ten == one
 
 
 def test_acceptance_reads_several_files(folder: Path, samples: list[Sample]) -> None:
     """The log has no such test; the error is about the log and not about one of its files."""
     files = recorded(folder, samples[:1500], 3)
     for words in ([LAST], [str(path) for path in files]):
-        done = lowfc("acceptance", "rejection", *words)
-        assert isinstance(done.exception, LowfcError)
-        assert "contains no `lowfc acceptance rejection`" in str(done.exception)
+        assert "contains no `lowfc acceptance rejection`" in refusal("acceptance", "rejection", *words)
 
 
 ONE_BY_ONE = [["info"], ["report"], ["export", "--to", "csv", "--force"], ["recover"]]
@@ -201,9 +194,9 @@ def test_several_logs_are_processed_one_by_one(folder: Path, words: list[str]) -
     assert several.exit_code == 0, several.exception
     assert several.stdout.replace("\n", "") == "".join(alone).replace("\n", "")
     for more in [["--json"], *([["--out", "c"]] if words != ["info"] else [])]:
-        done = lowfc(*words, first, second, *more)
-        assert isinstance(done.exception, ConfigurationError)
-        assert f"name one log, not 2 ({Path(first).name}, {Path(second).name})" in str(done.exception)
+        assert f"name one log, not 2 ({Path(first).name}, {Path(second).name})" in refusal(
+            *words, first, second, *more, kind=ConfigurationError
+        )
 
 
 @pytest.mark.parametrize("words", [*ONE_BY_ONE, ["replay"], ["what-if", "--set", "gain=1"]], ids=lambda words: words[0])

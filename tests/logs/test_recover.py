@@ -1,6 +1,5 @@
 """`lowfc recover`: the intact part of a damaged log becomes a complete log for every reader."""
 
-import json
 from collections import Counter
 from pathlib import Path
 from unittest.mock import Mock
@@ -12,7 +11,7 @@ import lowfc.adapters.logs.recovery as recovery
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.recovery import recover, recovered_path
 from lowfc.contract.errors import DataFileError
-from tests.support.loops import lowfc
+from tests.support.loops import json_of, lowfc
 from tests.support.mutated_logs import ATTACHMENTS, flipped, identity, mutations, small_log, small_samples
 from tests.support.other_readers import foxglove, rerun
 
@@ -82,10 +81,8 @@ def test_rerun_reads_recovered_logs_completely(recovered: dict[Path, Counter[str
 def test_an_unfinished_log_is_completed(tmp_path: Path) -> None:
     part = small_log(tmp_path / "night.mcap", finished=False)
     before = part.read_bytes()
-    done = lowfc("recover", part, "--json")
-    assert done.exit_code == 0, done.output
     new = tmp_path / "night-recovered.mcap"
-    assert json.loads(done.stdout) == {
+    assert json_of("recover", part) == {
         "log": str(part),
         "bytes": len(before),
         "finished": False,
@@ -125,7 +122,7 @@ def test_parts_left_out_are_reported(tmp_path: Path) -> None:
     list(account)
     assert account.metadata["recovery"]["source"] == "night.mcap"
     assert "left out " + account.metadata["recovery"]["left_out 1"] == first
-    damage = json.loads(lowfc("recover", path, "--json").stdout)["damage"]
+    damage = json_of("recover", path)["damage"]
     assert len(damage) == 1
     assert damage[0]["position"] < middle < damage[0]["position"] + damage[0]["length"]
 
@@ -134,7 +131,7 @@ def test_an_intact_log_is_not_recovered(tmp_path: Path) -> None:
     path = small_log(tmp_path / "night.mcap")
     done = lowfc("recover", path)
     assert (done.exit_code, done.stdout) == (0, f"{path} is intact; there is nothing to recover\n")
-    assert json.loads(lowfc("recover", path, "--json").stdout)["recovered"] is None
+    assert json_of("recover", path)["recovered"] is None
     assert [path.name for path in tmp_path.iterdir()] == ["night.mcap"]
     part = path.rename(tmp_path / "night.mcap.part")  # its recorder died before renaming it
     assert lowfc("recover", part).stdout == f"{part} is intact; only rename it to night.mcap\n"

@@ -1,6 +1,5 @@
 """Replay confirms identical results, reports differences, and counts the steps that it cannot check."""
 
-import json
 import shutil
 from collections import Counter
 from collections.abc import Iterable
@@ -55,7 +54,7 @@ from lowfc.programs.logs.replay.former import CHANNEL_RULE, GAIN_RULE, LOAD_RULE
 from lowfc.programs.logs.replay.frames import Frames
 from tests.support import controller_inputs, report_log
 from tests.support.controller_inputs import TIGHT, inputs
-from tests.support.loops import lowfc
+from tests.support.loops import json_of, lowfc
 from tests.support.mutated_logs import chunks_of, flipped
 from tests.support.toy import NOLL, calibration, frame, settings
 
@@ -513,7 +512,7 @@ def test_a_damaged_log_is_replayed_except_for_the_damage(log: Path, tmp_path: Pa
 
 def test_a_finished_log_with_a_damaged_summary_is_not_called_cut_off(log: Path, tmp_path: Path) -> None:
     log = flipped(Path(shutil.copy(log, tmp_path)), -100)
-    found = json.loads(lowfc("replay", log, "--json").stdout)
+    found = json_of("replay", log)
     assert (found["identical"], found["frames"]) == (True, STEPS)
     assert (found["complete"], found["no_end"]) == (False, "")
 

@@ -26,7 +26,7 @@ from lowfc.programs.logs.report.results import report_of
 from lowfc.programs.logs.report.source import read_run
 from lowfc.programs.logs.report.verdict import verdict
 from tests.support import report_log
-from tests.support.loops import lowfc
+from tests.support.loops import json_of, lowfc
 from tests.support.mutated_logs import flipped
 from tests.support.report_log import READ_NOISE_E, TOYS, SyntheticLog
 from tests.support.theory import noise_gain, rejection
@@ -420,9 +420,7 @@ def test_the_command_prints_one_object_or_writes_one_page(tmp_path: Path) -> Non
     night = uneventful(SyntheticLog(), 3)
     night.put(REQUEST, wire.Request(name="gain", values=[np.nan, np.inf, 0.5]))
     log = night.write(tmp_path / "night.mcap")
-    printed = lowfc("report", str(log), "--json")
-    assert printed.exit_code == 0, printed.output
-    found = json.loads(printed.stdout)
+    found = json_of("report", str(log))
     assert found["run"]["steps"] == 3
     assert found["requests"][-1]["values"] == [None, None, 0.5], "JSON has no number for some"
     assert "has 3 frames" in found["spectra"]["why_not"]
@@ -489,7 +487,7 @@ def test_missing_packages_are_reported_before_the_log_is_read(
     assert re.search(r"-m pip install .*'jinja2", str(done.exception))
     monkeypatch.undo()
     monkeypatch.setitem(sys.modules, module, None)
-    assert json.loads(lowfc("report", good, "--json").stdout)["log"]["file"] == "x.mcap", "the results need neither"
+    assert json_of("report", good)["log"]["file"] == "x.mcap", "the results need neither"
 
 
 @pytest.mark.parametrize("name", ["night.mcap", "other.mcap.part", "link.html", "other.fits"])

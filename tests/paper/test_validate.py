@@ -29,7 +29,7 @@ from lowfc.programs.paper.report import (
 from lowfc.programs.paper.tables import anchors, conditioning
 from lowfc.programs.paper.tables.reconstruction import ESTIMATORS, WITH_NUISANCES
 from lowfc.programs.paper.tables.tables import TABLES
-from tests.support.loops import lowfc
+from tests.support.loops import json_of, lowfc
 
 DOCS = Path(__file__).parents[2] / "docs" / "measured"
 SAM = "sam27d07_bal14"
@@ -172,13 +172,11 @@ def test_another_seed_gives_other_draws_that_agree(few):
 
 
 def test_the_command_prints_one_json_object():
-    one = lowfc("validate", "table1", "--json", "--trials", "7", "--seed", "3")
-    assert one.exit_code == 0, one.output
-    table = json.loads(one.stdout)
+    table = json_of("validate", "table1", "--trials", 7, "--seed", 3)
     assert (table["table"], table["trials"], table["seed"]) == ("table1", 7, 3)
     assert set(table["rows"][0]) >= {"name", "modes", "estimator", "quantity", "unit"}
     assert set(table["rows"][0]) >= {"paper", "measured", "error", "predicted", "limit", "assumption"}
-    several = json.loads(lowfc("validate", "table2", "table1", "--sensor", SAM, "--sensor", SAM, "--json").stdout)
+    several = json_of("validate", "table2", "table1", "--sensor", SAM, "--sensor", SAM)
     assert [table["table"] for table in several["tables"]] == ["table1", "table2"]
     assert len({key(row) for row in several["tables"][1]["rows"]}) == len(several["tables"][1]["rows"])
 

@@ -17,6 +17,7 @@ from click.testing import Result
 from mcap.reader import make_reader
 from typer.testing import CliRunner
 
+from lowfc.contract.errors import LowfcError
 from lowfc.programs.cli.main import app
 
 STILL = """
@@ -53,6 +54,20 @@ def run(folder: Path, *arguments: str, config: str = "", timeout_s: float = 120)
 def lowfc(*words: object) -> Result:
     """Run `lowfc` with these words in this process; an error that ended it is its `exception`."""
     return CliRunner().invoke(app, [*map(str, words)])
+
+
+def json_of(*words: object, status: int = 0) -> Any:
+    """JSON printed by `lowfc` with these words and --json, run in this process."""
+    done = lowfc(*words, "--json")
+    assert done.exit_code == status, (done.output, done.exception)
+    return json.loads(done.stdout)
+
+
+def refusal(*words: object, kind: type[LowfcError] = LowfcError) -> str:
+    """Text of the error with which `lowfc` refuses these words, run in this process."""
+    error = lowfc(*words).exception
+    assert isinstance(error, kind), error
+    return str(error)
 
 
 def output_of(folder: Path, line: str) -> str:
