@@ -7,43 +7,35 @@ import signal
 import socket
 import subprocess
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
 from lowfc.adapters.bus.run import Run, open_run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
-from lowfc.adapters.files import calibration_file
 from lowfc.adapters.logs.writer import LogWriter
 from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.configuration import Configuration, load
 from lowfc.contract.errors import BusError, DataFileError, LowfcError
 from lowfc.contract.messages import Role
 from lowfc.programs.launch import sim_loop
-from tests.support.in_process_loop import SMALL_MIRROR
-from tests.support.loops import LOWFC, lowfc, run, until
-from tools.law_bench import calibrated
+from tests.support.loops import LOWFC, json_of, lowfc, run, until
 
 SHORT = ["sim-loop", "--duration", "0.1"]
 
-LAYOUT = {"hole_diameter": 0.1, "holes": [[0.0, 0.2], [0.2, -0.1], [-0.2, -0.1]]}
 
-
-def layout(**changes: object) -> str:
-    return json.dumps({"layouts": {"mine": LAYOUT | changes}})
+def layout(holes: list[list[float]]) -> str:
+    return json.dumps({"layouts": {"mine": {"hole_diameter": 0.1, "holes": holes}}})
 
 
 @pytest.mark.parametrize(
     ("config", "expected"),
     [
         ("[control]\ntilt_gian = 0.3", "unknown key 'control.tilt_gian'; the nearest known one is 'control.tilt_gain'"),
-        ("[camera]\nrate = 100", "nearest known one is 'camera.rate_hz'"),
-        ("[camera]\nrate_hz = -1", "camera.rate_hz = -1"),
         ("[safety]\nstroke_nm = 900.0", "safety.stroke_nm is 900 nm either way"),
-        ("[disturbance]\npreset = 'noise'", "reaction-wheel"),
         ("[camera\nrate_hz = 1", "not a readable TOML file"),
         ("[sensor]\nsam = 'sam27d07_bal15'", "sam27d07_bal14"),
         ("[sensor]\nsam = 'nowhere.json'", "nowhere.json"),
-        ("[mirror]\ndead = [99999]", "actuator '99999'"),
         (f"[recorder]\nfolder = '{'x' * 300}'", "x cannot be accessed: File name too long"),
     ],
 )
@@ -51,22 +43,13 @@ def test_an_invalid_configuration_is_refused(tmp_path: Path, config: str, expect
     _refused(tmp_path, *SHORT, config=config, expected=expected)
 
 
-@pytest.mark.parametrize(
-    ("content", "expected"),
-    [
-        (layout(holes=[[0.0, 0.2], [0.05, 0.2]]), "overlap"),
-        (layout(holes=[[0.0, 0.48], [0.2, -0.1]]), "outside"),
-        (layout(holes=[[0.0, "x"]]), "layout mine"),
-        ("{", "JSON"),
-    ],
-)
-def test_an_invalid_layout_is_refused(tmp_path: Path, content: str, expected: str) -> None:
-    (tmp_path / "mask.json").write_text(content)
-    _refused(tmp_path, *SHORT, "--sensor", "mask.json:mine", expected=expected)
+def test_an_invalid_layout_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "mask.json").write_text(layout([[0.0, 0.2], [0.05, 0.2]]))
+    _refused(tmp_path, *SHORT, "--sensor", "mask.json:mine", expected="overlap")
 
 
 def test_an_even_symmetric_layout_is_warned_about(tmp_path: Path) -> None:
-    (tmp_path / "mask.json").write_text(layout(holes=[[0.3, 0.1], [-0.3, -0.1], [0.1, -0.3], [-0.1, 0.3]]))
+    (tmp_path / "mask.json").write_text(layout([[0.3, 0.1], [-0.3, -0.1], [0.1, -0.3], [-0.1, 0.3]]))
     done = run(tmp_path, *SHORT, "--sensor", "mask.json:mine")
     assert (done.returncode, done.stdout) == (2, "")
     assert "even" in done.stderr.partition("warning: ")[2]
@@ -75,13 +58,10 @@ def test_an_even_symmetric_layout_is_warned_about(tmp_path: Path) -> None:
 
 
 def test_an_invalid_calibration_is_refused(tmp_path: Path) -> None:
-    missing = ["controller", "--run", "mistakes", "--calibration", "none.fits"]
-    _refused(tmp_path, *missing, expected="there is no such calibration file")
-    found = calibrated(load(None, SMALL_MIRROR))
-    whole = calibration_file.to_bytes(found)
-    for name, content in (("cut", whole[: len(whole) // 2]), ("text", b"hello"), ("flipped", _flip(whole))):
-        (tmp_path / f"{name}.fits").write_bytes(content)
-        _refused(tmp_path, *missing[:-1], f"{name}.fits", expected=f"{name}.fits")
+    words = ["controller", "--run", "mistakes", "--calibration"]
+    _refused(tmp_path, *words, "none.fits", expected="there is no such calibration file")
+    (tmp_path / "text.fits").write_bytes(b"hello")
+    _refused(tmp_path, *words, "text.fits", expected="text.fits")
 
 
 def test_a_port_in_use_is_named(tmp_path: Path) -> None:
@@ -107,11 +87,6 @@ def test_unknown_runs_arguments_and_files_are_named(tmp_path: Path, own_runtime:
     _refused(tmp_path, "config", "check", "none.toml", expected="none.toml")
     _refused(tmp_path, "sim-lop", expected="sim-lop")
     _refused(tmp_path, *SHORT, "--sensor", "", expected="unknown sensor ''")
-
-
-def _flip(content: bytes) -> bytes:
-    middle = len(content) // 2
-    return content[:middle] + bytes([content[middle] ^ 0x10]) + content[middle + 1 :]
 
 
 def _refused(folder: Path, *words: str, expected: str, config: str = "") -> str:
@@ -193,7 +168,7 @@ def test_a_starting_loop_is_listed_and_makes_an_unnamed_request_ambiguous(
     def meanwhile(config: Configuration, run: Run, console: object) -> None:
         with contextlib.closing(ZenohBus(open_run("other").links, Role.CONTROLLER, HostClock())):
             done = lowfc("ctl", "open")
-            listed = json.loads(lowfc("runs", "--json").stdout)["runs"]
+            listed = json_of("runs")["runs"]
             found.extend([str(done.exception), [(one["run"], one["mode"]) for one in listed]])
         done = lowfc("sim-loop", "--run", "night")
         assert "run 'night' is already running" in str(done.exception)
@@ -216,13 +191,10 @@ def test_a_starting_loop_is_listed_and_makes_an_unnamed_request_ambiguous(
 def test_an_interruption_or_a_fault_before_the_first_process_leaves_no_run(
     own_runtime: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def interrupted(*_: object) -> ZenohBus:
-        raise KeyboardInterrupt
-
     (open_run("night", listeners=(Role.LAUNCHER,)).path / "config.toml").mkdir()
     with pytest.raises(DataFileError, match=r"config.toml cannot be written"):
         sim_loop.sim_loop(load(None), 1.0, record=False, name="night")
-    monkeypatch.setattr(sim_loop, "ZenohBus", interrupted)
+    monkeypatch.setattr(sim_loop, "ZenohBus", Mock(side_effect=KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         sim_loop.sim_loop(load(None), 1.0, record=False, name="night")
     assert not (own_runtime / "lowfc" / "night").exists()
