@@ -1,11 +1,11 @@
 """A clock that only the test advances."""
 
-from lowfc.adapters.process.clock import SIMULATED_START_NS
+from lowfc.adapters.process.clock import SIMULATED_START_NS, HostClock
 
 _NS = 1_000_000_000
 
 
-class FakeClock:
+class FakeClock(HostClock):
     """Clock for tests: host and run have the same time, which only `advance` and `sleep_until_ns` change."""
 
     offset_ns = 0
@@ -15,11 +15,11 @@ class FakeClock:
         self.time_ns = start_ns
         self.start_s = start_ns // _NS
 
-    def now_ns(self) -> int:
+    def host_ns(self) -> int:
         """Present time."""
         return self.time_ns
 
-    host_ns = now_ns
+    now_ns = host_ns
 
     def ahead_ns(self) -> int:
         """Return 0: there is no separate wall clock."""

@@ -7,7 +7,6 @@ host's time, so that latencies can be measured.
 
 import time
 from pathlib import Path
-from typing import Protocol
 
 from lowfc.adapters.bus.run import runtime_base, runtime_path, write_once
 from lowfc.contract.errors import DataFileError
@@ -22,38 +21,14 @@ _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 _NS = 1_000_000_000
 
 
-class Clock(Protocol):
-    """Clock of a process.
+class HostClock:
+    """The host's clock: CLOCK_MONOTONIC plus this boot's offset.
 
     Attributes:
         lockstep: whether the time is simulated and set explicitly.
         start_s: Unix time of the process's start, s; the upper half of its sequences.
         offset_ns: offset to add to CLOCK_MONOTONIC for time since the epoch.
     """
-
-    lockstep: bool
-    start_s: int
-    offset_ns: int
-
-    def now_ns(self) -> int:
-        """Time of the run, nanoseconds since the epoch."""
-        ...
-
-    def host_ns(self) -> int:
-        """Time of the host, for envelopes and durations; the same as `now_ns` unless in lockstep."""
-        ...
-
-    def ahead_ns(self) -> int:
-        """Present lead of the host's time over its wall clock."""
-        ...
-
-    def sleep_until_ns(self, deadline_ns: int) -> None:
-        """Return when `now_ns` has reached the deadline."""
-        ...
-
-
-class HostClock:
-    """The host's clock: CLOCK_MONOTONIC plus this boot's offset; see `Clock`."""
 
     lockstep = False
 
@@ -63,7 +38,7 @@ class HostClock:
         self.start_s = self.now_ns() // _NS
 
     def host_ns(self) -> int:
-        """Time of the host."""
+        """Time of the host, for envelopes and durations; the same as `now_ns`, that of the run, unless in lockstep."""
         return time.monotonic_ns() + self.offset_ns
 
     now_ns = host_ns
@@ -76,6 +51,10 @@ class HostClock:
         """Sleep until `deadline_ns`; return at once if it has passed."""
         while (left_ns := deadline_ns - self.now_ns()) > 0:
             time.sleep(left_ns * 1e-9)
+
+
+Clock = HostClock
+"""The clock of any process; in lockstep a `SimulatedClock`."""
 
 
 class SimulatedClock(HostClock):
