@@ -14,15 +14,11 @@ from lowfc.adapters.files.factory import frame_noise_nm2
 from lowfc.arrays import Array
 from lowfc.contract.configuration import Configuration
 from lowfc.control.laws.integrator import TIP_TILT, Integrator
-from lowfc.control.laws.kalman import lqg
 from lowfc.control.laws.linear_law import LinearLaw, at_rest
-from lowfc.control.laws.stability import LOWEST_GAIN, highest_gain
 from lowfc.control.laws.tuning import best_gains
-from lowfc.control.laws.vibration import Line, Model
 from lowfc.control.loop.guard import Group, LawGuard
 from lowfc.control.loop.wording import counted
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
-from sim_camera.disturbance import LINE_WIDTH, LINES_HZ, LINES_MAS
 from sim_camera.driver import disturbance_of
 from tools.law_bench import RATE_HZ, calibrated, configured, timing_of, tuned
 from tools.modal_bench import ModalBench
@@ -37,15 +33,27 @@ MINUTES = 10.0
 _IDENTIFY, _SETTLE, _BEFORE, _CHUNK = 48_000, 12_000, 2_000, 10_000
 
 
+LawOf = Callable[[Configuration, Array, ModalBench], tuple[LinearLaw, Array]]
+"""A law and integrator gains (modes,) from a configuration, the covariance of a frame's noise, and an open loop."""
+
+
+def identified_law(config: Configuration, covariance_nm2: Array, bench: ModalBench) -> tuple[LinearLaw, Array]:
+    """LQG law and integrator gains identified from a log, as by an operator."""
+    bench.settle(1_000)
+    bench.run(_IDENTIFY)
+    run, timing = bench.pol(), timing_of(config)
+    return tuned(run, config)["lqg"].law, best_gains(run, RATE_HZ, timing, np.zeros(len(config.noll))).gain
+
+
 class Case:
     """A star and a disturbance, with a law and the best gains for them."""
 
-    def __init__(self, preset: str, magnitude: float, law_of: "LawOf | None" = None) -> None:
+    def __init__(self, preset: str, magnitude: float, law_of: LawOf = identified_law) -> None:
         self.keys: dict[str, Any] = {"disturbance.preset": preset, "star.magnitude": magnitude}
         config = configured(**self.keys)
         self.covariance_nm2: Array = frame_noise_nm2(config, calibrated(config))
         bench = ModalBench(config, self.covariance_nm2, watch=False)
-        self.law, self.gains = (law_of or identified_law)(config, self.covariance_nm2, bench)
+        self.law, self.gains = law_of(config, self.covariance_nm2, bench)
 
     def configured(self, seed: int, **changed: Any) -> Configuration:
         """The configuration of a run."""
@@ -64,31 +72,6 @@ class Case:
         bench.run(_SETTLE, record=False)
         bench.ask("close")
         return bench
-
-
-LawOf = Callable[[Configuration, Array, ModalBench], tuple[LinearLaw, Array]]
-"""A law and integrator gains (modes,) from a configuration, the covariance of a frame's noise, and an open loop."""
-
-
-def identified_law(config: Configuration, covariance_nm2: Array, bench: ModalBench) -> tuple[LinearLaw, Array]:
-    """LQG law and integrator gains identified from a log, as by an operator."""
-    bench.settle(1_000)
-    bench.run(_IDENTIFY)
-    run, timing = bench.pol(), timing_of(config)
-    return tuned(run, config)["lqg"].law, best_gains(run, RATE_HZ, timing, np.zeros(len(config.noll))).gain
-
-
-def known_law(config: Configuration, covariance_nm2: Array, bench: ModalBench) -> tuple[LinearLaw, Array]:
-    """LQG law and integrator gains from the simulation's exact lines, without identification."""
-    width = LINE_WIDTH if config.disturbance.preset == "reaction-wheel" else LINE_WIDTH / 1000
-    variances_nm2 = (np.array(LINES_MAS) * bench.nm_per_mas) ** 2
-    lines = tuple(Line(hz, width * hz, nm2) for hz, nm2 in zip(LINES_HZ, variances_nm2.tolist(), strict=True))
-    models, gains = [], []
-    for mode, noise_nm2 in zip(config.noll, np.diag(covariance_nm2).tolist(), strict=True):
-        tilt = mode in TIP_TILT
-        models.append(Model(0.01 if tilt else 1e-4, 5.0 if tilt else np.inf, lines if tilt else (), noise_nm2, RATE_HZ))
-        gains.append(highest_gain(config.camera.delay_frames) if tilt else LOWEST_GAIN)
-    return lqg(models, config.noll, timing_of(config)), np.array(gains)
 
 
 def moved(case: Case, factor: float, seed: int, *, guard: bool = True, law: bool = True) -> tuple[float, list[float]]:

@@ -9,17 +9,23 @@ import pytest
 from lowfc.adapters.files.factory import frame_noise_nm2
 from lowfc.arrays import Array
 from lowfc.contract.codecs.state_codec import controller_state, decode_state
+from lowfc.contract.configuration import Configuration
+from lowfc.control.laws.integrator import TIP_TILT
+from lowfc.control.laws.kalman import lqg
 from lowfc.control.laws.linear_law import LinearLaw, integrator
+from lowfc.control.laws.stability import LOWEST_GAIN, highest_gain
+from lowfc.control.laws.vibration import Line, Model
 from lowfc.control.loop.advance import advance
 from lowfc.control.loop.guard import BETTER_S, LAW_RETURNS, MAX_TAKEOVERS, WORSE_BLOCKS, Group, Spans
 from lowfc.control.loop.inputs import Request
 from lowfc.control.loop.safety import Limit
 from lowfc.control.loop.state import FADING_FRAMES, SETTLING_FRAMES, Settings, State
 from lowfc.programs.cli import status
+from sim_camera.disturbance import LINE_WIDTH, LINES_HZ, LINES_MAS
 from tests.support.in_process_loop import SMALL_MIRROR
 from tests.support.toy import NOLL, calibration, feed, frame, live, loaded, names, settings
-from tools.guard import MOVED, SEEDS, Case, identified_law, known_law, moved, undisturbed
-from tools.law_bench import Bench, calibrated, configured
+from tools.guard import MOVED, SEEDS, Case, identified_law, moved, undisturbed
+from tools.law_bench import Bench, calibrated, configured, timing_of
 from tools.modal_bench import ModalBench
 
 RATE_HZ = 1000.0
@@ -30,6 +36,19 @@ SPANS = Spans.at(RATE_HZ)
 RNG = np.random.default_rng(1)
 NOISE_NM = 2 * RNG.standard_normal((3_000, len(NOLL)))
 SWAY_NM = 20 * np.sin(2 * np.pi * 7 / RATE_HZ * np.arange(3_000)[:, None] + [0, 1, 2])
+
+
+def known_law(config: Configuration, covariance_nm2: Array, bench: ModalBench) -> tuple[LinearLaw, Array]:
+    """LQG law and integrator gains from the simulation's exact lines, without identification."""
+    width = LINE_WIDTH if config.disturbance.preset == "reaction-wheel" else LINE_WIDTH / 1000
+    variances_nm2 = (np.array(LINES_MAS) * bench.nm_per_mas) ** 2
+    lines = tuple(Line(hz, width * hz, nm2) for hz, nm2 in zip(LINES_HZ, variances_nm2.tolist(), strict=True))
+    models, gains = [], []
+    for mode, noise_nm2 in zip(config.noll, np.diag(covariance_nm2).tolist(), strict=True):
+        tilt = mode in TIP_TILT
+        models.append(Model(0.01 if tilt else 1e-4, 5.0 if tilt else np.inf, lines if tilt else (), noise_nm2, RATE_HZ))
+        gains.append(highest_gain(config.camera.delay_frames) if tilt else LOWEST_GAIN)
+    return lqg(models, config.noll, timing_of(config)), np.array(gains)
 
 
 def gains(*gain: float, leak: tuple[float, ...] = (0.0, 0.0, 0.0)) -> LinearLaw:
