@@ -12,12 +12,6 @@ def program(name: str, arguments: list[str], stderr_path: Path) -> Child:
     return Child(name, [sys.executable, "-P", *arguments], stderr_path)
 
 
-def start_all(children: list[Child]) -> None:
-    """Start all; if one cannot be started, the caller stops the others, as at its own end."""
-    for child in children:
-        child.start()
-
-
 def stop_all(children: list[Child], timeout_s: float = 5.0) -> None:
     """Stop all, one after the other, in the order of the list."""
     for child in children:

@@ -25,7 +25,7 @@ from lowfc.contract.errors import BusError, LowfcError
 from lowfc.contract.messages import EVENT, HEALTH, Role
 from lowfc.programs.commissioning.analytic import analytic
 from lowfc.programs.core.recording.volume import estimate
-from lowfc.programs.launch.processes import program, start_all, stop_all
+from lowfc.programs.launch.processes import program, stop_all
 from lowfc.programs.launch.status import screen, status_line
 from lowfc.programs.launch.watch import Watch, summary
 
@@ -69,7 +69,8 @@ def sim_loop(
         children += children_of(config, run, duration_s, record)
         if show is not None:
             children.insert(len(children) - record, _view(run, show, console))  # the recorder ends last
-        start_all(children)
+        for child in children:
+            child.start()
         _supervise(config, children, watch, console, duration_s)
     except ProcessDiedError as fault:
         log = watch.of(Role.RECORDER).recording.file

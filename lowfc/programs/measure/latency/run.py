@@ -27,7 +27,7 @@ from lowfc.adapters.process.terminal import INTERRUPTED
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import FRAME, HEALTH, MIRROR_STATE, TIMING, Role, wire
-from lowfc.programs.launch.processes import program, start_all, stop_all
+from lowfc.programs.launch.processes import program, stop_all
 from lowfc.programs.launch.sim_loop import children_of, deferred_signals, died, prepare
 from lowfc.programs.launch.watch import Watch
 from lowfc.programs.measure import bare_loop, echo
@@ -230,7 +230,8 @@ def _run(
     with (
         deferred_signals() as interrupted
     ):  # while a process forks, Python may swallow an exception of a signal handler
-        start_all(children)
+        for child in children:
+            child.start()
         started()
         while any(child.status is None for child in awaited) and not interrupted():
             for child in children:

@@ -26,7 +26,7 @@ from lowfc.client import Client
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import LowfcError
 from lowfc.contract.messages import HEALTH, STEP, TRUTH, Role, topic_of, wire
-from lowfc.programs.launch.processes import program, start_all
+from lowfc.programs.launch.processes import program
 from lowfc.programs.launch.sim_loop import children_of, prepare
 
 _POLL_S = 0.02
@@ -124,7 +124,8 @@ class ChaosBench:
         """Write the run's files, start the processes, and wait until the loop has settled."""
         prepare(self.config, self.run, Console(stderr=True, quiet=True))
         self._started += self.children.values()
-        start_all(self._started)
+        for child in self._started:
+            child.start()
         self.bus = ZenohBus(self.run.links, Role.LAUNCHER, HostClock())
         for topic in (HEALTH, STEP, TRUTH):
             self.bus.subscribe(topic, self._receive)
