@@ -7,13 +7,11 @@ from pathlib import Path
 from typing import IO
 
 from mcap.records import Attachment, Metadata
-from mcap.writer import CompressionType, Writer
 
-from lowfc import __version__
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.files.whole_file import being_written
 from lowfc.adapters.logs.reader import LogReader
-from lowfc.adapters.logs.writer import CHUNK_BYTES
+from lowfc.adapters.logs.writer import begun_writer
 from lowfc.contract.envelope import count_of, start_of
 from lowfc.contract.errors import DataFileError
 
@@ -29,10 +27,7 @@ class LogCopy:
         self.messages = 0
         self._channels: dict[tuple[str, int], int] = {}
         self._schemas: dict[tuple[str, bytes], int] = {}
-        self._writer = Writer(
-            file, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4, enable_crcs=True, enable_data_crcs=True
-        )
-        self._writer.start(profile="", library=f"lowfc {__version__}")
+        self._writer = begun_writer(file)
 
     def note(self, name: str, entries: dict[str, str]) -> None:
         """Add metadata."""

@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from io import BufferedWriter, FileIO
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import IO, TYPE_CHECKING, cast
 
 from google.protobuf.descriptor import FileDescriptor
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
@@ -114,15 +114,8 @@ class LogWriter:
         except OSError as fault:
             raise DataFileError(f"{self.part} cannot be created: {fault.strerror}") from fault
         self._file = BufferedWriter(self._raw)
-        self._writer = Writer(
-            self._file,
-            chunk_size=CHUNK_BYTES,
-            compression=CompressionType.LZ4,
-            enable_crcs=True,
-            enable_data_crcs=True,
-        )
         try:
-            self._writer.start(profile="", library=f"lowfc {__version__}")
+            self._writer = begun_writer(self._file)
             self._describe(metadata)
             for attachment in attachments:
                 self._writer.add_attachment(
@@ -244,6 +237,15 @@ class LogWriter:
                 name=name, encoding="protobuf", data=declaration(topic.message).SerializeToString()
             )
         return self._schemas[name]
+
+
+def begun_writer(file: IO[bytes]) -> Writer:
+    """MCAP's writer of a log with all checksums, after its header."""
+    writer = Writer(
+        file, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4, enable_crcs=True, enable_data_crcs=True
+    )
+    writer.start(profile="", library=f"lowfc {__version__}")
+    return writer
 
 
 def being_recorded(path: Path) -> bool:
