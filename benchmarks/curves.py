@@ -244,11 +244,7 @@ _DRAWN = (
 
 
 def picture(result: Result) -> bytes:
-    """PNG: a panel for each curve, all with the same time scale.
-
-    Raises:
-        ConfigurationError: matplotlib is not installed.
-    """
+    """PNG: a panel for each curve, all with the same time scale; ConfigurationError if matplotlib is not installed."""
     from lowfc.adapters.files.drawing import figure_class, png
 
     drawn = {name: points for name, points in result["curves"].items() if points}

@@ -138,11 +138,7 @@ class SimulatedCamera:
         """File (JSON) of a fault to inject into the frames; empty for none."""
 
     def __init__(self, options: Options, config: Configuration, optics: Scene | None = None) -> None:
-        """Build the optics, unless `optics` is given.
-
-        Raises:
-            ConfigurationError: the region is larger than the sensor.
-        """
+        """Build the optics, unless `optics` is given; ConfigurationError if the region is larger than the sensor."""
         self._config = config
         self._scene = scene(config) if optics is None else optics
         row, rows = _middle("rows", options.rows, self._scene.shape[0])

@@ -84,11 +84,7 @@ class Chain:
 
 
 def start(bounds: Bounds, seed: int, index: int, steps: int) -> Chain:
-    """Start a chain at a random layout.
-
-    Raises:
-        ValueError: The holes could not be placed.
-    """
+    """Start a chain at a random layout; ValueError if the holes could not be placed."""
     rng = np.random.default_rng([seed, index])
     for _ in range(_PACKINGS):
         orbits = _packed(rng, bounds)

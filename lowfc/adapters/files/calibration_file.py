@@ -64,11 +64,7 @@ def to_bytes(calibration: Calibration) -> bytes:
 
 
 def save(calibration: Calibration, path: Path) -> None:
-    """Write a FITS file.
-
-    Raises:
-        DataFileError: the file cannot be written.
-    """
+    """Write a FITS file; DataFileError if the file cannot be written."""
     write_whole(path, to_bytes(calibration))
 
 

@@ -136,11 +136,7 @@ def single(hdus: fits.HDUList, name: str) -> Single:
 
 
 def require_identity(path: Path, found: str, stated: str) -> None:
-    """Check that the identity stated in a file is that of its content.
-
-    Raises:
-        DataFileError: the identities differ.
-    """
+    """Check that the identity stated in a file is that of its content; DataFileError if the identities differ."""
     if found != stated:
         raise DataFileError(
             f"{path}: damaged: the identity of its content is {found[:12]}, but its header states {stated[:12]}; "

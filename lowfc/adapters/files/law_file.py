@@ -43,11 +43,7 @@ def to_bytes(law: LinearLaw) -> bytes:
 
 
 def save(law: LinearLaw, path: Path) -> None:
-    """Write a FITS file.
-
-    Raises:
-        DataFileError: the file cannot be written.
-    """
+    """Write a FITS file; DataFileError if the file cannot be written."""
     write_whole(path, to_bytes(law))
 
 

@@ -258,11 +258,7 @@ class TimingRows:
 
 
 def bits_of(reasons: Iterable[int]) -> int:
-    """Combine reasons as bits `1 << reason`.
-
-    Raises:
-        OverflowError: a reason is out of range.
-    """
+    """Combine reasons as bits `1 << reason`; OverflowError if a reason is out of range."""
     bits = 0
     for reason in reasons:
         if not 0 <= reason < _BITS:

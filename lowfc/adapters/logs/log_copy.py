@@ -96,11 +96,7 @@ class LogCopy:
 
 
 def refuse_existing(path: Path) -> None:
-    """Refuse to write a log to a file that exists.
-
-    Raises:
-        DataFileError: the file exists.
-    """
+    """Refuse to write a log to a file that exists; DataFileError if the file exists."""
     if path.exists():
         raise DataFileError(f"{path} already exists; a log is never overwritten; name another one with --out")
 

@@ -168,11 +168,7 @@ def titled(paths: Parts) -> str:
 
 
 def metadata_at_start(path: Path) -> dict[str, dict[str, str]]:
-    """Metadata before the messages of a log, by name.
-
-    Raises:
-        DataFileError: the log cannot be read.
-    """
+    """Metadata before the messages of a log, by name; DataFileError if the log cannot be read."""
     found: dict[str, dict[str, str]] = {}
     with LogFile(path) as file:
         for part in file.parts():

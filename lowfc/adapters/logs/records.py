@@ -77,11 +77,7 @@ class LogFile:
     """
 
     def __init__(self, path: Path) -> None:
-        """Open the log at `path`.
-
-        Raises:
-            DataFileError: the file cannot be read.
-        """
+        """Open the log at `path`; DataFileError if the file cannot be read."""
         self.path = path
         self.complete = False
         self.unread = ""
@@ -335,11 +331,7 @@ _Record = TypeVar("_Record", Attachment, ChunkIndex, Header, Metadata, Schema, S
 
 
 def parsed(kind: type[_Record], body: bytes) -> _Record:
-    """Decode a record of this kind.
-
-    Raises:
-        UnsoundError: the body is not such a record.
-    """
+    """Decode a record of this kind; UnsoundError if the body is not such a record."""
     stream = ReadDataStream(io.BytesIO(body))
     try:
         record: _Record = kind.read(stream)

@@ -183,11 +183,7 @@ def _slow(times: Whole, frames: int, slowest: float) -> Array:
 
 
 def measured(sums: Sums) -> Measured:
-    """Response, standard error and reference from all cycles.
-
-    Raises:
-        ValueError: there is no cycle.
-    """
+    """Response, standard error and reference from all cycles; ValueError if there is no cycle."""
     n = sums.cycles
     if n < 1:
         raise ValueError("no cycle was measured")

@@ -24,11 +24,7 @@ def lease(settings: Settings, state: State, request: Request) -> tuple[State, st
 
 
 def renew(settings: Settings, state: State, request: Request) -> tuple[State, str]:
-    """Extend a lease that is in force.
-
-    Raises:
-        ValueError: it is not in force, with the cause of its end.
-    """
+    """Extend a lease that is in force; ValueError if it is not in force, with the cause of its end."""
     before = state.conditions.lease
     if before is None or before.id != request.lease_id:
         raise ValueError("this lease is not in force: the controller restarted, or another lease was granted")

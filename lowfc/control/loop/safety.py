@@ -74,11 +74,7 @@ REASONS: tuple[Reason, ...] = (*Rejection, *Limit)
 
 
 def reason_of(number: int) -> Reason:
-    """The reason with this number on the wire.
-
-    Raises:
-        ValueError: there is none.
-    """
+    """The reason with this number on the wire; ValueError if there is none."""
     return Rejection(number) if number < Limit.MODAL_LIMIT else Limit(number)
 
 
