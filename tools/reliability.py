@@ -194,7 +194,13 @@ def render_fuzz(results: Results) -> str:
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", choices=tuple(CASES), metavar="CASE", help="case of `lowfc chaos`; default: all without a result")
+    parser.add_argument(
+        "names",
+        nargs="*",
+        choices=tuple(CASES),
+        metavar="CASE",
+        help="case of `lowfc chaos`; default: all without a result",
+    )
     parser.add_argument("--seed", type=int, choices=SEEDS, required=True)
     options = parser.parse_args()
     results = json.loads(CASES_FILE.read_text())
