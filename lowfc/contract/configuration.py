@@ -226,12 +226,9 @@ class Configuration(Section):
                 f"safety.stroke_nm is {self.safety.stroke_nm:g} nm either way, but mirror.stroke_nm gives only "
                 f"{self.mirror.stroke_nm / 2:g} nm either way"
             )
-        for key, section, stroke_nm in (
-            ("safety", self.safety, self.safety.stroke_nm),
-            ("mirror", self.mirror, self.mirror.stroke_nm / 2),
-        ):
+        for key, section, share in ("safety", self.safety, 1.0), ("mirror", self.mirror, 0.5):
             try:
-                limits = Limits(stroke_nm, section.slew_nm, section.neighbour_nm)
+                limits = Limits(share * section.stroke_nm, section.slew_nm, section.neighbour_nm)
             except ValueError as fault:
                 raise ValueError(f"{key}.{fault}") from None
         step_nm = self.mirror.stroke_nm / 2**self.mirror.driver_bits

@@ -271,10 +271,8 @@ class MirrorLoop:
         if before.following and not self._status.following and not self._returning:
             action = "relaxing to flat" if self._protection.flatten else "holding the shape"
             self._service.event("COMMAND_EXPIRED", command_timeout_ms=before.valid_for_ns / 1e6, action=action)
-        moved = (
-            self._status.surface_nm is not before.surface_nm and (self._status.surface_nm != before.surface_nm).any()
-        )
-        if moved or now_ns >= self._state_due_ns:
+        moved = self._status.surface_nm is not before.surface_nm  # at rest it is the same array
+        if (moved and (self._status.surface_nm != before.surface_nm).any()) or now_ns >= self._state_due_ns:
             self._publish(now_ns)
 
     def _publish(self, time_ns: int) -> None:

@@ -60,10 +60,7 @@ class AravisCamera:
         return self._settings
 
     def expose(self) -> Exposure | None:
-        """Next complete frame; its time is the arrival of its first packet, just after the exposure.
-
-        A camera that was disconnected is opened again.
-        """
+        """Next complete frame, timed at its first packet, just after the exposure; a lost camera is opened again."""
         if self._lost:
             self._open(self._name)
             self.start()

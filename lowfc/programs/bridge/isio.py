@@ -57,28 +57,20 @@ def bridge_isio(
     if beside in names:
         raise ConfigurationError(f"{beside} is the loop's own channel (--beside): leave out --external {beside}")
     lower_priority()
-    run_id, how = the_known_run(run), "as"
+    run_id, clock = the_known_run(run), HostClock()
     with contextlib.suppress(KeyboardInterrupt):
         while True:
-            _serve(run_id, how, prefix, names, nm_per_unit)
-            how = "was started again and is joined; it is in the"
-
-
-def _serve(run_id: str, how: str, prefix: str, names: Sequence[str], nm_per_unit: float) -> None:
-    """Join a run and exchange its steps and channels until it is started again."""
-    joined, clock = open_run(run_id, ()), HostClock()
-    bus = ZenohBus(joined.links, Role.OPERATOR, clock, monitor=True)
-    with contextlib.closing(bus):
-        steps = StepStreams(bus, clock, prefix)
-        others = ExternalChannels(Client(run_id, bus=bus), bus, names, nm_per_unit) if names else None
-        sys.stderr.write(
-            f"run {run_id!r} {how} streams {prefix}_error, _command, _residual and _flux; Ctrl-C ends it\n"
-        )
-        while not joined.restarted():
-            steps.pass_on()
-            if others is not None:
-                others.pass_on()
-            time.sleep(_POLL_S)
+            joined = open_run(run_id, ())
+            with contextlib.closing(ZenohBus(joined.links, Role.OPERATOR, clock, monitor=True)) as bus:
+                steps = StepStreams(bus, clock, prefix)
+                others = ExternalChannels(Client(run_id, bus=bus), bus, names, nm_per_unit) if names else None
+                streams = f"{prefix}_error, _command, _residual and _flux"
+                sys.stderr.write(f"run {run_id!r} as streams {streams}; Ctrl-C ends it\n")
+                while not joined.restarted():
+                    steps.pass_on()
+                    if others is not None:
+                        others.pass_on()
+                    time.sleep(_POLL_S)
 
 
 class StepStreams:
@@ -146,8 +138,13 @@ class ExternalChannels:
             return
         fault = ""
         try:
-            if self._report():
-                self._next_request_s = now_s + _REQUESTS_S
+            if self._others is None:
+                self._others = OtherChannels(self._names, self._client.mirror_grid())
+            shape = self._others.sum()
+            requested = (shape * self._nm_per_unit).tobytes() if shape.any() else b""
+            if requested != self._known:
+                self._client.channel(EXTERNAL, shape * self._nm_per_unit if requested else None)
+                self._known, self._next_request_s = requested, now_s + _REQUESTS_S
         except LowfcError as error:
             fault = str(error)
             self._next_request_s = now_s + (_REFUSED_S if isinstance(error, RequestRefusedError) else _REQUESTS_S)
@@ -155,18 +152,6 @@ class ExternalChannels:
             names = ", ".join(self._others.names) if self._others else "other channels"
             sys.stderr.write(f"{names} not reported to the loop: {printable(fault)}\n")
         self._fault = fault
-
-    def _report(self) -> bool:
-        """Report the shape if the controller has another one; return whether it was reported."""
-        if self._others is None:
-            self._others = OtherChannels(self._names, self._client.mirror_grid())
-        shape = self._others.sum()
-        requested = (shape * self._nm_per_unit).tobytes() if shape.any() else b""
-        if requested == self._known:
-            return False
-        self._client.channel(EXTERNAL, shape * self._nm_per_unit if requested else None)
-        self._known = requested
-        return True
 
 
 def _made(name: str, columns: int) -> Stream:

@@ -6,14 +6,7 @@ import time
 import numpy as np
 from pydantic import Field
 
-from lowfc.adapters.image_stream.channels import (
-    OtherChannels,
-    channel_names,
-    channel_of,
-    opened,
-    sum_name,
-    whole,
-)
+from lowfc.adapters.image_stream.channels import OtherChannels, channel_names, channel_of, opened, sum_name, whole
 from lowfc.adapters.image_stream.stream import Stream, StreamError, stream_path
 from lowfc.adapters.process.service import Service
 from lowfc.arrays import Single

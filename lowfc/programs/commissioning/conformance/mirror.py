@@ -284,10 +284,7 @@ def _timeout(mirror: Dialogue, base_nm: Single, raised_by_nm: float) -> Iterator
     yield judged("longest command", expected, bounded, "EXPIRED", advice, late, warning)
     arrivals = [message.receive_time_ns for message, _ in mirror.since(sent_ns)]
     longest_s = max((later - earlier for earlier, later in pairwise(arrivals)), default=MAX_VALID_NS) / 1e9
-    expected, got = (
-        "ten states a second also without commands",
-        f"longest time without one {longest_s:.2g} s",
-    )
+    expected, got = ("ten states a second also without commands", f"longest time without one {longest_s:.2g} s")
     advice, severity = "publish the state ten times a second, also when idle", wrong if longest_s > 1.0 else warning
     yield judged("silence", expected, longest_s <= 0.25, got, advice, severity=severity)
 
