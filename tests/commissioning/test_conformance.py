@@ -4,6 +4,7 @@ import json
 import socket
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -260,10 +261,7 @@ CAMERAS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
     "seconds": ({"attach": put_at(lambda t: t // 10**9)}, {"publish time": WRONG}),
     "a monotonic clock": ({"attach": put_at(lambda t: t - OFFSET_NS)}, {"publish time": WRONG}),
     "another clock": ({"attach": put_at(lambda t: t - 35 * MS)}, {"publish time": WRONG}),
-    "a clock that steps": (
-        {"attach": put_at(lambda t: t - t % (25 * MS))},
-        {"publish time": WRONG},
-    ),
+    "a clock that steps": ({"attach": put_at(lambda t: t - t % (25 * MS))}, {"publish time": WRONG}),
     "no frame time": ({"frame": lambda frame, _: frame.ClearField("timestamp") or frame}, {"frame time": WRONG}),
     "a frame time ahead": ({"frame": stamped(20 * MS)}, {"frame time": WRONG}),
     "a frame time an hour ago": ({"frame": stamped(-3600 * 1000 * MS)}, {"frame time": WRONG}),
@@ -291,10 +289,7 @@ CAMERAS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
     "big-endian pixels": ({"pixels": lambda one, i: one.byteswap()}, {"byte order": WRONG, "settings' range": WRONG}),
     "left-aligned pixels": ({"pixels": lambda one, i: one * 16}, {"byte order": WRONG, "settings' range": WRONG}),
     "no settings": ({"state": lambda *_: None}, {"settings": WRONG}),
-    "undecodable settings": (
-        {"state": lambda *_: b"\xff\xff\xff"},
-        {"settings": WRONG, "settings on request": WRONG},
-    ),
+    "undecodable settings": ({"state": lambda *_: b"\xff\xff\xff"}, {"settings": WRONG, "settings on request": WRONG}),
     "settings once": ({"state": lambda state, i: state if i == 0 else None}, {"settings": WARNING}),
     "empty settings": ({"state": lambda *_: wire.CameraState()}, {"settings' values": WRONG, "settings' size": WRONG}),
     "settings that change": ({"state": growing}, {"settings kept": WARNING}),
@@ -354,38 +349,27 @@ def careless(what: str) -> Callable[..., Command]:
 
 WIDE = Limits(10_000.0, 10_000.0, 10_000.0)
 UNTRIED = {"limits": WARNING}
+NEVER_EXPIRED = {"dead-man": WRONG, "longest command": WARNING} | UNTRIED
 MIRRORS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
     "silent and deaf": ({"silent": True, "deaf": True}, {"idle state": WRONG, "answers": WRONG} | UNTRIED),
     "no answers": ({"deaf": True}, {"answers": WRONG} | UNTRIED),
     "one command in three unanswered": ({"drops": 3}, {"answers": WRONG} | UNTRIED),
-    "silent when idle": (
-        {"silent": True},
-        {"idle state": WRONG, "dead-man": WRONG, "longest command": WARNING, "silence": WRONG} | UNTRIED,
-    ),
+    "silent when idle": ({"silent": True}, {"idle state": WRONG, "silence": WRONG} | NEVER_EXPIRED),
     "no envelope": ({"attach": lambda *_: None}, {"envelope": WRONG}),
     "a count without start": ({"attach": lambda s, t: envelope(s & 0xFFFF, t)}, {"sequence": WRONG}),
     "another clock": ({"attach": put_at(lambda t: t - 35 * MS)}, {"publish time": WRONG}),
     "undecodable state": ({"state": lambda _: b"\xff\xff\xff"}, {"state": WRONG} | UNTRIED),
     "another grid": ({"state": setting(rows=7, columns=6)}, {"grid": WRONG} | UNTRIED),
     "doubles": ({"state": lambda one: setting(actuators=2 * one.actuators)(one)}, {"grid": WRONG} | UNTRIED),
-    "NaN for a missing actuator": (
-        {"state": shaped(lambda shape: one_dead(shape, np.nan))},
-        {"grid": WRONG} | UNTRIED,
-    ),
+    "NaN for a missing actuator": ({"state": shaped(lambda shape: one_dead(shape, np.nan))}, {"grid": WRONG} | UNTRIED),
     "wavefront instead of surface": ({"state": shaped(lambda shape: 2 * shape)}, {"applied": WRONG} | UNTRIED),
     "um instead of nm": ({"state": shaped(lambda shape: shape / 1000)}, {"applied": WRONG} | UNTRIED),
     "upside down": ({"state": shaped(lambda shape: shape[::-1])}, {"applied": WRONG} | UNTRIED),
     "wrong sign": ({"state": shaped(lambda shape: -shape)}, {"applied": WRONG} | UNTRIED),
     "another order": ({"state": shaped(lambda shape: shape.reshape(7, 6).T)}, {"applied": WRONG} | UNTRIED),
     "a dead actuator": ({"state": shaped(one_dead)}, {"applied": WARNING}),
-    "unspecified status": (
-        {"state": setting(status=0)},
-        {"status": WRONG, "dead-man": WRONG, "longest command": WARNING} | UNTRIED,
-    ),
-    "an unknown status": (
-        {"state": setting(status=7)},
-        {"status": WRONG, "dead-man": WRONG, "longest command": WARNING} | UNTRIED,
-    ),
+    "unspecified status": ({"state": setting(status=0)}, {"status": WRONG} | NEVER_EXPIRED),
+    "an unknown status": ({"state": setting(status=7)}, {"status": WRONG} | NEVER_EXPIRED),
     "a frame_sequence of -1": ({"state": setting(frame_sequence=2**64 - 1)}, {"state": WRONG} | UNTRIED),
     "impossible heights": ({"state": shaped(lambda shape: shape + np.float32(3e38))}, {"grid": WRONG} | UNTRIED),
     "impossible heights once commanded": (
@@ -401,10 +385,7 @@ MIRRORS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
     "any grid": ({"command": careless("grid")}, {"wrong grid refused": WRONG} | UNTRIED),
     "any length": ({"command": careless("bytes")}, {"short command refused": WRONG} | UNTRIED),
     "any order": ({"command": careless("order")}, {"old command refused": WRONG, "clear": WARNING} | UNTRIED),
-    "no dead-man": (
-        {"tick": lambda one: lambda status, now_ns: status},
-        {"dead-man": WRONG, "longest command": WARNING} | UNTRIED,
-    ),
+    "no dead-man": ({"tick": lambda one: lambda status, now_ns: status}, NEVER_EXPIRED),
     "a refused command extends the timeout": ({"renews": True}, {"dead-man": WRONG} | UNTRIED),
     "expired at once": (
         {"tick": lambda one: lambda status, now_ns: one(status._replace(valid_for_ns=MS), now_ns)},
@@ -527,23 +508,16 @@ def test_a_line_receives_messages_without_an_envelope_and_queries() -> None:
     links = open_run("bench").links
     with zenoh.open(zenoh.Config.from_json5(json.dumps(session_config(links, Role.CAMERA)))) as session:
         session.declare_queryable(CAMERA_STATE.key, lambda query: query.reply(CAMERA_STATE.key, b"settings"))
-        line = Line(links, Role.OPERATOR)
-        try:
+        with closing(Line(links, Role.OPERATOR)) as line:
             until(line.peers)
             until(lambda: [one.payload for one in line.ask(CAMERA_STATE.key)] == [b"settings"])
             got: list[Received] = []
             until(lambda: got.extend(line.received()) or got, each=lambda: session.put(FRAME.key, b"frame"))
             assert got[0][:3] == (FRAME.key, b"frame", None)
-        finally:
-            line.close()
 
 
 @pytest.mark.usefixtures("own_runtime")
 def test_only_one_process_may_have_the_role_controller() -> None:
     links = open_run("bench").links
-    line = Line(links, Role.CONTROLLER)
-    try:
-        with pytest.raises(BusError, match="is one running"):
-            Line(links, Role.CONTROLLER)
-    finally:
-        line.close()
+    with closing(Line(links, Role.CONTROLLER)), pytest.raises(BusError, match="is one running"):
+        Line(links, Role.CONTROLLER)

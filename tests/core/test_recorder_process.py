@@ -6,6 +6,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -85,21 +86,12 @@ def bench(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Bench]:
     hang_up = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # tests under nohup would leave it ignored
     found = Bench(tmp_path, *getattr(request, "param", ()))
     signal.signal(signal.SIGHUP, hang_up)
-    try:
+    with closing(found):
         until(lambda: found.recorder_is("ready"))
         yield found
-    finally:
-        found.close()
 
 
-@pytest.mark.parametrize(
-    "signals",
-    [
-        (signal.SIGHUP,),
-        (signal.SIGINT, signal.SIGTERM),
-        (signal.SIGKILL,),
-    ],
-)
+@pytest.mark.parametrize("signals", [(signal.SIGHUP,), (signal.SIGINT, signal.SIGTERM), (signal.SIGKILL,)])
 def test_the_log_is_complete_after_any_signal(bench: Bench, signals: tuple[signal.Signals, ...]) -> None:
     bench.put_many(50)
     killed = signal.SIGKILL in signals

@@ -264,13 +264,9 @@ def test_a_driver_that_cannot_be_opened_gives_one_sentence(name: str, message: s
 
 def test_a_fault_in_the_first_settings_gives_one_sentence() -> None:
     camera = Unset(Unset.Options(), CONFIG)
-    with (
-        ThreadPoolExecutor(1) as thread,  # its scheduling class ends with it
-        pytest.raises(
-            ConfigurationError,
-            match=r"the camera cannot be started: RuntimeError: no link \(test_drivers.py, line \d+\)",
-        ),
-    ):
+    message = r"the camera cannot be started: RuntimeError: no link \(test_drivers.py, line \d+\)"
+    # the scheduling class of a thread of its own ends with it
+    with ThreadPoolExecutor(1) as thread, pytest.raises(ConfigurationError, match=message):
         thread.submit(run_camera, camera, CONFIG, "unset").result()
     assert camera.closed
 

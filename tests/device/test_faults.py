@@ -49,12 +49,19 @@ def good(**fields: Any) -> Callable[[], Exposure]:
     return lambda: Exposure(**{"pixels": GOOD} | fields)
 
 
+class CameraBench:
+    def __init__(self, *exposures: Callable[[], Any], frames: int = 1, settings: CameraSettings = SETTINGS) -> None:
+        self.clock = FakeClock()
+        self.listener = Listener(MemoryHub(), self.clock, FRAME, CAMERA_STATE, HEALTH)
+        self.camera = Camera(self.clock, *exposures, settings=settings)
+        self.loop = CameraLoop(self.camera, self.listener.service("camera"), CONFIG, frames)
+
+
 def exposed(*exposures: Callable[[], Any], frames: int, settings: CameraSettings = SETTINGS) -> Listener:
-    hub, clock = MemoryHub(), FakeClock()
-    listener = Listener(hub, clock, FRAME, CAMERA_STATE, HEALTH)
-    CameraLoop(Camera(clock, *exposures, settings=settings), listener.service("camera"), CONFIG, frames).run()
-    assert len(listener.messages(FRAME)) == frames
-    return listener
+    bench = CameraBench(*exposures, frames=frames, settings=settings)
+    bench.loop.run()
+    assert len(bench.listener.messages(FRAME)) == frames
+    return bench.listener
 
 
 @pytest.mark.parametrize(
@@ -82,13 +89,11 @@ def test_camera_failures_are_reported_once_counted_and_retried(bad: Callable[[],
 
 
 def test_a_failing_camera_is_retried_after_increasing_pauses() -> None:
-    hub, clock = MemoryHub(), FakeClock()
-    listener = Listener(hub, clock, FRAME)
-    camera = Camera(clock, *[Mock(side_effect=OSError("the cable"))] * 9, good())
-    begun_ns = clock.now_ns()
-    CameraLoop(camera, listener.service("camera"), CONFIG, 1).run()
-    assert clock.now_ns() - begun_ns == pytest.approx(7.8e9 + 2 * 4e9, abs=0.1e9)
-    assert listener.events().count("DRIVER_FAILED") == 2  # repeated after 10 s
+    bench = CameraBench(*[Mock(side_effect=OSError("the cable"))] * 9, good())
+    begun_ns = bench.clock.now_ns()
+    bench.loop.run()
+    assert bench.clock.now_ns() - begun_ns == pytest.approx(7.8e9 + 2 * 4e9, abs=0.1e9)
+    assert bench.listener.events().count("DRIVER_FAILED") == 2  # repeated after 10 s
 
 
 def test_a_configuration_error_of_a_driver_ends_the_process() -> None:
@@ -97,34 +102,28 @@ def test_a_configuration_error_of_a_driver_ends_the_process() -> None:
 
 
 def test_a_hanging_camera_is_reported_while_it_hangs() -> None:
-    hub, clock = MemoryHub(), FakeClock()
-    listener = Listener(hub, clock, FRAME)
-
     def hang() -> Exposure:
         for _ in range(11):
-            loop.watch.check()
-        assert listener.events() == ["STARTED", "DRIVER_HANGS"]
+            bench.loop.watch.check()
+        assert bench.listener.events() == ["STARTED", "DRIVER_HANGS"]
         return Exposure(GOOD)
 
-    loop = CameraLoop(Camera(clock, good(), hang, *[good()] * 260), listener.service("camera"), CONFIG, 262)
-    loop.run()
-    assert listener.events() == ["STARTED", "DRIVER_HANGS", "DRIVER_BACK", "STOPPED"]
-    assert loop.watch.failures == 1
+    bench = CameraBench(good(), hang, *[good()] * 260, frames=262)
+    bench.loop.run()
+    assert bench.listener.events() == ["STARTED", "DRIVER_HANGS", "DRIVER_BACK", "STOPPED"]
+    assert bench.loop.watch.failures == 1
 
 
 def test_a_close_that_hangs_is_reported() -> None:
-    hub, clock = MemoryHub(), FakeClock()
-    listener = Listener(hub, clock)
-    camera = Camera(clock, good())
-    loop = CameraLoop(camera, listener.service("camera"), CONFIG, 1)
+    bench = CameraBench(good())
 
     def close() -> None:
         for _ in range(52):
-            loop.watch.check()
+            bench.loop.watch.check()
 
-    camera.close = close  # type: ignore[method-assign]
-    loop.run()
-    assert listener.events() == ["STARTED", "DRIVER_HANGS", "STOPPED"]
+    bench.camera.close = close  # type: ignore[method-assign]
+    bench.loop.run()
+    assert bench.listener.events() == ["STARTED", "DRIVER_HANGS", "STOPPED"]
 
 
 @pytest.mark.parametrize(
@@ -188,17 +187,14 @@ def test_restarted_frame_numbers_are_a_new_start_even_twice_in_a_second() -> Non
 
 
 def test_a_changed_region_is_published_before_its_first_frame() -> None:
-    hub, clock = MemoryHub(), FakeClock()
-    listener = Listener(hub, clock, FRAME, CAMERA_STATE)
-
     def cropped() -> Exposure:
-        camera.now = CameraSettings(2, 4, 2 * MS, 4 * MS)
+        bench.camera.now = CameraSettings(2, 4, 2 * MS, 4 * MS)
         return Exposure(GOOD[1:])
 
-    camera = Camera(clock, good(), cropped)
-    CameraLoop(camera, listener.service("camera"), CONFIG, 2).run()
-    assert [state.rows for state in listener.messages(CAMERA_STATE)] == [3, 3, 2]
-    assert listener.events() == ["STARTED", "STOPPED"]
+    bench = CameraBench(good(), cropped, frames=2)
+    bench.loop.run()
+    assert [state.rows for state in bench.listener.messages(CAMERA_STATE)] == [3, 3, 2]
+    assert bench.listener.events() == ["STARTED", "STOPPED"]
 
 
 class Mirror:

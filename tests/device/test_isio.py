@@ -262,9 +262,9 @@ def test_the_reached_position_comes_from_the_sum_of_channels(folder: Path, monke
     summing.running = False
     summing.join()
     monkeypatch.setattr(mirror_module, "SUM_WAIT_S", 0.001)
-    monkeypatch.setattr(mirror_module, "SUM_SILENT_S", 0.01)
+    monkeypatch.setattr(mirror_module, "SUM_SILENT_S", 0.5)
     assert driver.apply(shape_nm(1)) is None  # within SUM_SILENT_S a late sum is tolerated
-    time.sleep(0.02)
+    time.sleep(0.6)
     with pytest.raises(RuntimeError, match="'dm00disp' has not followed 'dm00disp03'"):
         driver.apply(shape_nm(1))
 

@@ -124,13 +124,8 @@ def test_a_disconnected_camera_is_opened_again(kind: Any) -> None:
             raise OSError("no such device")
 
     silent = SimpleNamespace(IsValid=lambda: False)
-    driver._camera = SimpleNamespace(
-        IsCameraDeviceRemoved=lambda: not opened,
-        RetrieveResult=lambda *_: silent,
-        StartGrabbing=lambda _: opened.append("started"),
-        start_acquisition=lambda: opened.append("started"),
-    )
-    driver._pylon = SimpleNamespace(GrabStrategy_LatestImages=0, TimeoutHandling_Return=1)
+    driver._camera = SimpleNamespace(IsCameraDeviceRemoved=lambda: not opened, RetrieveResult=lambda *_: silent)
+    driver._pylon, driver.start = SimpleNamespace(TimeoutHandling_Return=1), lambda: opened.append("started")
     driver._open, driver._serial, driver._name, driver._stream = again, "7", "7", Buffers()
     if kind is AravisCamera:
         driver._lose(None)  # the library's signal

@@ -5,8 +5,7 @@ import re
 import shlex
 import shutil
 import subprocess
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -71,21 +70,12 @@ def bench(tmp_path: Path, own_runtime: Path) -> Path:
 def started(folder: Path, line: str) -> "subprocess.Popen[str]":
     program, *rest = shlex.split(line)
     return subprocess.Popen(
-        [PROGRAMS / program, *rest],
-        cwd=folder,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
+        [PROGRAMS / program, *rest], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
 
 
-@contextmanager
-def listening() -> Iterator[ZenohBus]:
-    bus = ZenohBus(open_run("bench").links, Role.OPERATOR, HostClock())
-    try:
-        yield bus
-    finally:
-        bus.close()
+def listening() -> closing[ZenohBus]:
+    return closing(ZenohBus(open_run("bench").links, Role.OPERATOR, HostClock()))
 
 
 def wait_for_devices(bus: ZenohBus) -> None:
