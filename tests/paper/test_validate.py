@@ -8,6 +8,7 @@ from unittest.mock import Mock
 
 import pytest
 
+from lowfc.adapters.files.layouts import SHIPPED
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.programs.paper import commands, report
 from lowfc.programs.paper.cases import DEFAULT_SAM, Case, Context, Row, plain, sparse_apertures
@@ -179,6 +180,12 @@ def test_the_command_prints_one_json_object():
     several = json_of("validate", "table2", "table1", "--sensor", SAM, "--sensor", SAM)
     assert [table["table"] for table in several["tables"]] == ["table1", "table2"]
     assert len({key(row) for row in several["tables"][1]["rows"]}) == len(several["tables"][1]["rows"])
+
+
+def test_a_layout_of_a_file_is_compared_with_the_paper(tmp_path, few):
+    (tmp_path / "mask.json").write_text(SHIPPED.read_text())
+    (own,) = run(["table2"], Context(FEW, sensors=(f"{tmp_path}/mask.json:{SAM}",)))
+    assert [row["paper"] for row in own["rows"]] == [row["paper"] for row in few["table2"]["rows"]]
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from lowfc.adapters.files.sensors import coronagraph_from, sensor_from
 from lowfc.adapters.files.twin_cache import load_or_build
 from lowfc.arrays import Array, Mask
 from lowfc.contract.errors import ConfigurationError
-from lowfc.contract.sections import SensorSection, sensor_keys
+from lowfc.contract.sections import SENSORS, SensorSection, sensor_keys
 from lowfc.control.calibration.calibration import normalise_flux, reconstructor
 from lowfc.design.estimators import Fit, fit
 from lowfc.design.trials import gram
@@ -42,6 +42,12 @@ class Prepared:
         self.name, self.section = name, section
         self.sensor = sensor_from(section) if sensor is None else sensor
         self._own = threading.local()
+
+    @property
+    def paper_name(self) -> str:
+        """The paper's sensor with which it is compared, if there is one: "sam" for every layout."""
+        kind = self.name.partition(":")[0]
+        return kind if kind in SENSORS else "sam"
 
     @cached_property
     def modes(self) -> Array:

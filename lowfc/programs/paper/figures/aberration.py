@@ -140,7 +140,7 @@ def fig7(context: Context) -> list[Row]:
             root = np.linalg.cholesky(bound_nm2(case.ready))
             drawn = context.rng("focus and coma", "limit").standard_normal((_LIMIT_DRAWS, MODES)) @ root.T
             limit = float(residual_pv(basis, drawn).mean()) / wavelength_nm
-            paper = _PAPER_PV_WAVES if name.startswith("sam") else None
+            paper = _PAPER_PV_WAVES if case.ready.paper_name == "sam" else None
             for key, residuals_nm in case.residuals_nm.items():
                 mean, error = mean_and_error(residual_pv(basis, residuals_nm) / wavelength_nm)
                 fitted = partial(Row, f"{name}, coma Z{coma}", modes=MODES, estimator=key)

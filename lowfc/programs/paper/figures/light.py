@@ -28,13 +28,13 @@ def fig2(context: Context) -> list[Row]:
     """Fraction of the light that passes each plane, Fig. 2 and Sect. 3.3."""
     rows = []
     for name in context.names("sam"):
-        budget = prepared(name).budget
-        relay = PAPER_RELAY_MASK if name.startswith("sam") else None
+        ready = prepared(name)
+        budget, relay = ready.budget, PAPER_RELAY_MASK if ready.paper_name == "sam" else None
         rows += [
             Row(name, "shaped pupil / open circle", "", budget.pupil, PAPER_PUPIL),
             Row(name, "reflected by the focal-plane mask / light on it", "", budget.focal_mask, PAPER_FOCAL_MASK),
             Row(name, "sensor / reflected by the focal-plane mask", "", budget.sensor, relay),
-            Row(name, "brightest pixel / light on the sensor", "", budget.peak, PAPER_PEAK.get(name)),
+            Row(name, "brightest pixel / light on the sensor", "", budget.peak, PAPER_PEAK.get(ready.paper_name)),
         ]
     return assuming(
         rows,
@@ -68,10 +68,10 @@ def fig3(context: Context) -> list[Row]:
     rows = []
     for name in context.names("sam", "bowtie"):
         ready = prepared(name)
-        mask, reflected = np.abs(ready.sensor.focal_mask) ** 2, PAPER_FOCAL_MASK if name == "sam" else None
+        mask, reflected = np.abs(ready.sensor.focal_mask) ** 2, PAPER_FOCAL_MASK if ready.paper_name == "sam" else None
         radius = len(mask) / (2.0 * ready.sensor.samples_per)
         rows += [
-            Row(name, "outer radius", "lambda/D", radius, {"sam": 4.0, "bowtie": 10.0}.get(name)),
+            Row(name, "outer radius", "lambda/D", radius, {"sam": 4.0, "bowtie": 10.0}.get(ready.paper_name)),
             Row(name, "reflecting area", "(lambda/D)^2", float(mask.sum()) / ready.sensor.samples_per**2),
             Row(name, "reflected / light on it", "", ready.budget.focal_mask, reflected),
         ]
@@ -104,7 +104,7 @@ def fig4(context: Context) -> list[Row]:
                 "peak of |I - I0| over peak of I0",
                 "",
                 float(np.abs(differential(ready, noll)).max()),
-                PAPER_TABLE2[noll] if name.startswith("sam") else None,
+                PAPER_TABLE2[noll] if ready.paper_name == "sam" else None,
             )
             for noll in _CHANGED
         ]
@@ -141,10 +141,10 @@ def fig10(context: Context) -> list[Row]:
         ready = prepared(name)
         for axis in (0, 1):
             what, (flat_e, change_e) = f"{name}, tilt {'xy'[axis]}", _tilted_e(ready, axis)
-            signal_e = float(np.ptp(change_e))
+            signal_e, paper = float(np.ptp(change_e)), PAPER_SIGNAL.get(ready.paper_name)
             ratio = np.abs(change_e) / np.sqrt(variance_e(flat_e + change_e, TABLE4_READ_NOISE_E))
             rows += [
-                Row(what, "P-V change over peak", "", signal_e / float(flat_e.max()), PAPER_SIGNAL.get(name)),
+                Row(what, "P-V change over peak", "", signal_e / float(flat_e.max()), paper),
                 Row(what, "P-V change", "e-", signal_e),
                 Row(what, "largest signal-to-noise ratio of a pixel", "", float(ratio.max())),
                 Row(what, "signal-to-noise ratio of the image", "", float(np.sqrt(np.sum(ratio**2)))),

@@ -91,9 +91,10 @@ def fig6(context: Context) -> list[Row]:
     """Coefficient of determination of each mode, Fig. 6 and eq. (15)."""
     rows = []
     for name, values in _r_squared(context).items():
-        limits = _r_squared_limit(prepared(name))
+        ready = prepared(name)
+        limits = _r_squared_limit(ready)
         fitted = partial(Row, unit="", modes=MODES, estimator=PINV)
-        paper = _PAPER_R2.get(name, (None, None))
+        paper = _PAPER_R2.get(ready.paper_name, (None, None))
         rows += [
             fitted(name, "least R^2", measured=float(values.min()), paper=paper[0], limit=float(limits.min())),
             fitted(name, "mean R^2", measured=float(values.mean()), paper=paper[1], limit=float(limits.mean())),
@@ -187,7 +188,7 @@ def fig8(context: Context) -> list[Row]:
     """Deviation of pure modes from linearity, Fig. 8(a), and errors of one random wavefront, Fig. 8(b)."""
     names = context.names("sam", "clowfs", "zwfs")
     rows = [row for name in names for row in _range_rows(context, name)]
-    paper = _PAPER_ERROR_WAVES if names[0].startswith("sam") else None
+    paper = _PAPER_ERROR_WAVES if prepared(names[0]).paper_name == "sam" else None
     one = partial(Row, names[0], modes=MODES, assumption=f"One wavefront and one exposure. {BRIGHT} {FULL_CHAIN}")
     for literal, bounds in ((False, "matched"), (True, "literal")):
         truth, estimates = _one_wavefront(context, names[0], literal)
@@ -204,7 +205,7 @@ def _range_rows(context: Context, name: str) -> Iterator[Row]:
         "accurate to about 1e-5; deviation: fraction by which a mode's own estimate differs from its amplitude."
     )
     at = {"lambda/20": int(np.argmin(np.abs(AMPLITUDES - 0.05))), "lambda/10": int(np.argmin(np.abs(AMPLITUDES - 0.1)))}
-    linear = dict(zip(at, _PAPER_LINEAR.get(name, (None, None)), strict=True))
+    linear = dict(zip(at, _PAPER_LINEAR.get(prepared(name).paper_name, (None, None)), strict=True))
     for iterations, estimates in zip(ITERATIONS, _pure_modes(context, name), strict=True):
         deviation = deviations(estimates)
         fitted = partial(Row, modes=MODES, estimator=label("pinv", iterations), assumption=assumption)

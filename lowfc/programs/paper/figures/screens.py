@@ -72,7 +72,7 @@ def fig9(context: Context) -> list[Row]:
             }
             for k, quantity in enumerate(("reconstructed", "residual")):
                 limit = float(values[_BEST][:, k].mean()) if quantity == "residual" else None
-                paper = _PAPER_WAVES[quantity] if name.startswith("sam") else None
+                paper = _PAPER_WAVES[quantity] if ready.paper_name == "sam" else None
                 for key in (*_ESTIMATORS, _BEST):
                     mean, error = mean_and_error(values[key][:, k])
                     fitted = partial(Row, f"{name}, {extent}", modes=MODES, estimator=key)

@@ -57,11 +57,7 @@ def conditioning(context: Context) -> list[Row]:
     masks += [("sensor", prepared(name)) for name in context.names(*sparse_apertures(), *OTHERS)]
     holes = [_with_holes(diameter) for diameter in HOLES]
     masks += [("holes", each) for each in holes if isinstance(each, Prepared)]
-
-    def measure(mask: tuple[str, Prepared]) -> list[Row]:
-        return list(_rows(*mask))
-
-    rows = [row for found in context.map("conditioning", measure, masks) for row in found]
+    rows = [row for found in context.map("conditioning", lambda mask: [*_rows(*mask)], masks) for row in found]
     return rows + [each for each in holes if isinstance(each, Row)]
 
 

@@ -130,11 +130,6 @@ def _realisations(
     return dict(zip(linear, np.array(found).transpose(1, 0, 2), strict=True))
 
 
-def _paper_mas(name: str, modes: int, mas: int) -> float | None:
-    kind = "sam" if name.startswith("sam") else name.partition(":")[0]
-    return TABLE4_MAS.get(kind, {}).get(mas) if modes == 2 else None
-
-
 def _rows(
     sensor: Prepared,
     exposure: Exposure,
@@ -152,7 +147,7 @@ def _rows(
         yield fitted(
             quantity=f"std of {direction} tilt, {mas} mas, {exposure.name}",
             measured=float(scatter[axis]),
-            paper=_paper_mas(sensor.name, modes, mas) if direction == "x" else None,
+            paper=TABLE4_MAS.get(sensor.paper_name, {}).get(mas) if modes == 2 and direction == "x" else None,
             error=float(scatter[axis] / np.sqrt(2.0 * (trials - 1))),
             predicted=float(predicted[axis]),
             limit=float(bound[axis]),
@@ -171,7 +166,7 @@ def _rows(
 def _dimmed_rows(sensor: Prepared, exposure: Exposure, tilted: Array) -> Iterator[Row]:
     """Predictions with the throughput of the paper's pupil."""
     linear = fits(sensor, exposure, 1)
-    what, paper = f"predicted std of x tilt, 1 mas, {exposure.name}", _paper_mas(sensor.name, 2, 1)
+    what, paper = f"predicted std of x tilt, 1 mas, {exposure.name}", TABLE4_MAS.get(sensor.paper_name, {}).get(1)
     for kind in KINDS:
         std, limit = predicted_mas(linear[2, kind], tilted * exposure.scale_e), bound_mas(linear[2, kind])
         fitted = partial(Row, sensor.name, modes=2, estimator=kind, assumption=exposure.assumption)

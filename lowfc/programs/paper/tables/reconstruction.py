@@ -25,12 +25,7 @@ EVEN = (
 )
 
 INPUT_PV_WAVES = {14: 0.097, 20: 0.11}
-PAPER_WAVES = {
-    "sam": TABLE3_WAVES["disk"],
-    "bowtie": TABLE3_WAVES["bowtie"],
-    f"bowtie:{DEFAULT_SAM}": TABLE3_WAVES["bowtie"],
-    "clowfs": TABLE3_WAVES["clowfs"],
-}
+PAPER_WAVES = TABLE3_WAVES | {"sam": TABLE3_WAVES["disk"]}
 
 NOISE = (
     "40,000 e- in the brightest pixel of the sensor's own flat image (which favours masks with low throughput: compare "
@@ -166,8 +161,7 @@ def _input_rows(sensor: Prepared, modes: int, wavefronts: Input, found: Ensemble
 
 
 def _residual_rows(sensor: Prepared, modes: int, wavefronts: Input, found: Ensemble) -> Iterator[Row]:
-    own = TABLE3_WAVES["disk"] if sensor.name.startswith("sam") else {}
-    paper = PAPER_WAVES.get(sensor.name, own).get(modes, (None, None))
+    paper = PAPER_WAVES.get(sensor.paper_name, {}).get(modes, (None, None))
     for estimator, estimates_nm in found.estimates_nm.items():
         residuals_nm = found.truth_nm - estimates_nm
         assumption = "\n".join((wavefronts.assumption, NOISE, *((EVEN,) if estimator == WITH_NUISANCES else ())))

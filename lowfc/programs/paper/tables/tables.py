@@ -63,18 +63,14 @@ def table2(context: Context) -> list[Row]:
 
 def _peaks(context: Context, name: str) -> Iterator[Row]:
     sensor = prepared(name)
-
-    def peak(noll: int) -> float:
-        return float(np.abs(differential(sensor, noll)).max())
-
-    found = context.map(f"table2 {name}", peak, NOLLS_14)
+    found = context.map(f"table2 {name}", lambda noll: float(np.abs(differential(sensor, noll)).max()), NOLLS_14)
     assumption = (
         "lambda/30 rms with the full exp(i phi). (I - I0) / I0 is taken as the peak of |I - I0| over the peak of I0: "
         "the ratio of single pixels has no bound, because I0 has dark pixels."
     )
     for noll, value in zip(NOLLS_14, found, strict=True):
         what, paper = f"peak differential intensity of Z{noll}, {mode_name(noll)}", PAPER_TABLE2[noll]
-        yield Row(name, what, "", value, paper if name.startswith("sam") else None, assumption=assumption)
+        yield Row(name, what, "", value, paper if sensor.paper_name == "sam" else None, assumption=assumption)
 
 
 TABLES: dict[str, Case] = {
