@@ -195,10 +195,12 @@ def test_only_solver_failures_become_configuration_errors(tmp_path, monkeypatch,
     assert str(error) == str(failure)
 
 
-def test_unwritable_file_is_reported_before_the_design(tmp_path):
-    assert "there is no directory" in refusal(
-        "design", "spc", "--out", tmp_path / "nowhere" / "spc.npz", kind=DataFileError
-    )
+@pytest.mark.parametrize(
+    ("out", "reported", "message"),
+    [("nowhere/spc.npz", DataFileError, "there is no directory"), ("spc.fits", ConfigurationError, "must end in .npz")],
+)
+def test_unusable_file_is_reported_before_the_design(tmp_path, out, reported, message):
+    assert message in refusal("design", "spc", "--out", tmp_path / out, kind=reported)
 
 
 def test_ctrl_c_stops_within_a_program_and_leaves_no_file(tmp_path):

@@ -75,6 +75,8 @@ def design_spc(request: Request, out: Path, plot: Path | None, console: Console)
     """
     if plot is not None:
         figure_class()
+    if out.suffix != ".npz":
+        raise ConfigurationError(f"--out must end in .npz, the only type read as a pupil file; got {out}")
     require_folder(out, plot)
     with console.status("solving linear programs"):
         rounds = _interruptibly(lambda: _rounds(request, console))
