@@ -99,7 +99,7 @@ def test_interrupted_search_writes_its_best_and_resumes(uninterrupted, tmp_path)
     text = program.render(result)
     assert f"--resume {result['resume']}" in text
     assert "reproduced" not in text
-    search, chains = program.resumed(tmp_path / "state.json")
+    search, chains = read_state(tmp_path / "state.json", program.pupil_digest())
     assert search == search_with()
     again, out = run(search, tmp_path, InProcessExecutor(), chains)
     assert (out.read_text(), again["merits"], again["interrupted"]) == (
@@ -137,7 +137,7 @@ def test_lost_workers_are_reported_and_the_search_resumes(uninterrupted, tmp_pat
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(LowfcError, match=r"workers were lost .*abruptly.*\); continue with --resume .*state\.json"):
         run(search_with(), tmp_path, Broken(2))
-    search, chains = program.resumed(tmp_path / "state.json")
+    search, chains = read_state(tmp_path / "state.json", program.pupil_digest())
     _, out = run(search, tmp_path, InProcessExecutor(), chains)
     assert out.read_text() == uninterrupted[1]
 
@@ -165,8 +165,10 @@ def runs(pid):
         return False
 
 
-def test_dead_processes_are_distinguished_from_errors_in_the_search(tmp_path, monkeypatch):
+def test_workers_ignore_ctrl_c_and_their_death_is_no_error_in_the_search(tmp_path, monkeypatch):
     with open_executor(2, None) as executor:
+        assert signal.SIGINT in executor.submit(signal.pthread_sigmask, signal.SIG_BLOCK, ()).result()
+        assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
         future = executor.submit(os._exit, 1)
         assert executors.is_lost(future.exception())
     monkeypatch.setattr(program, "advance", lambda *_: 1 / 0)

@@ -7,8 +7,9 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from pathlib import Path
 
 _TAIL_LINES = 6
@@ -88,3 +89,14 @@ class Child:
             names = {one.value: one.name for one in signal.Signals}  # without most real-time signals
             return f"{self.name} was killed by {names.get(-status, f'signal {-status}')}"
         return f"{self.name} ended with exit status {status}"
+
+
+@contextlib.contextmanager
+def interrupt_blocked() -> Iterator[None]:
+    """Block Ctrl-C until the end of the context, and for good in the processes started in it, from their first line."""
+    resource_tracker.ensure_running()  # its start unblocks Ctrl-C
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -58,9 +58,9 @@ def sam(
 
     Example: lowfc design sam --diameter 0.05:0.2 --holes 8:30 --chains 4 --out mask.json
     """
-    from lowfc.programs.design.sam import begin, design_sam, render, resumed
+    from lowfc.programs.design.sam import begin, design_sam, pupil_digest, render
     from lowfc.programs.design.sam_executors import open_executor
-    from lowfc.programs.design.sam_files import check_files
+    from lowfc.programs.design.sam_files import check_files, read_state
 
     if jobs is not None and scheduler is not None:
         raise ConfigurationError("--jobs and --scheduler exclude each other: use one")
@@ -69,7 +69,7 @@ def sam(
         for option in given(context):
             if option in of_search:
                 raise ConfigurationError(f"--resume continues the search of {resume}: omit {option}")
-        search, found = resumed(resume)
+        search, found = read_state(resume, pupil_digest())
     else:
         found = begin(search)
     out = out if out is not None else Path(f"{search.name}.json")

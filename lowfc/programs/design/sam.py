@@ -29,7 +29,6 @@ from lowfc.programs.design.sam_executors import is_lost
 from lowfc.programs.design.sam_files import (
     Point,
     front,
-    read_state,
     write_front,
     write_layouts,
     write_plot,
@@ -46,11 +45,6 @@ def begin(search: Search) -> list[Chain]:
         return [start(search.bounds, search.seed, i, search.steps) for i in range(search.chains)]
     except ValueError as error:
         raise ConfigurationError(str(error)) from error
-
-
-def resumed(state: Path) -> tuple[Search, list[Chain]]:
-    """Read the search and its chains from a state file."""
-    return read_state(state, pupil_digest())
 
 
 def design_sam(

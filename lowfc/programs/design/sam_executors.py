@@ -3,7 +3,6 @@
 import logging
 import multiprocessing
 import os
-import signal
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
@@ -11,6 +10,7 @@ from importlib import import_module
 from threading import Thread
 from typing import Any
 
+from lowfc.adapters.process.child import interrupt_blocked
 from lowfc.adapters.process.extras import install_advice
 from lowfc.contract.errors import ConfigurationError
 
@@ -30,6 +30,15 @@ class InProcessExecutor(Executor):
         return future
 
 
+class Pool(ProcessPoolExecutor):
+    """Local processes, started by `submit`; only the search's own process handles Ctrl-C."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Submit the call, as in the base class."""
+        with interrupt_blocked():
+            return super().submit(fn, *args, **kwargs)
+
+
 @contextmanager
 def open_executor(jobs: int, scheduler: str | None) -> Iterator[Executor]:
     """Open the executor for this number of processes, or of the Dask scheduler if its address is given."""
@@ -39,8 +48,7 @@ def open_executor(jobs: int, scheduler: str | None) -> Iterator[Executor]:
     elif jobs == 1:
         yield InProcessExecutor()
     else:
-        context = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(jobs, context, _begin_worker)
+        pool = Pool(jobs, multiprocessing.get_context("spawn"), _begin_worker)
         try:
             yield pool
         finally:
@@ -48,8 +56,7 @@ def open_executor(jobs: int, scheduler: str | None) -> Iterator[Executor]:
 
 
 def _begin_worker() -> None:
-    """Ignore Ctrl-C, which the search handles, and end with the search, even if that is killed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """End with the search, even if that is killed."""
     Thread(target=_end_with_parent, daemon=True).start()
 
 

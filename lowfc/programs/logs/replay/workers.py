@@ -4,7 +4,6 @@ import contextlib
 import gc
 import multiprocessing
 import os
-import signal
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
@@ -17,6 +16,7 @@ from lowfc.adapters.logs.parts import WholeLog
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.logs.records import LogFile
 from lowfc.adapters.logs.writer import declaration
+from lowfc.adapters.process.child import interrupt_blocked
 from lowfc.contract import published
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.contract.messages import FRAME, STEP
@@ -55,9 +55,9 @@ def replay_files(
         edges = [0, *(ends_ns[len(ends_ns) * segment // count] for segment in range(1, count)), WHOLE.until_ns]
         segments = [Segment(from_ns, until_ns) for from_ns, until_ns in pairwise(edges)]
         accounts = []
-        # Only the parent handles Ctrl-C; it ends its workers.
-        context = multiprocessing.get_context("spawn")
-        with context.Pool(min(jobs, count), signal.signal, (signal.SIGINT, signal.SIG_IGN)) as pool:
+        with interrupt_blocked():  # only the parent handles Ctrl-C; it ends its workers
+            workers = multiprocessing.get_context("spawn").Pool(min(jobs, count))
+        with workers as pool:
             for account in pool.imap(partial(_replay_segment, paths, tolerance_nm, kernel), segments):
                 accounts.append(account)
                 progress(size * len(accounts) // count)
