@@ -1,37 +1,21 @@
 """The dark zone of a shaped pupil's image: one quadrant, since the others are mirror images; lengths in lambda / D."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from lowfc.arrays import Array, Mask
+from lowfc.optics.chain.coronagraph import Wedge
 
 FINE_STEP = 0.1
 """Spacing of the points at which the contrast of a mask is checked."""
 
 
-@dataclass(frozen=True)
-class DarkZone:
-    """A sector of a ring.
-
-    Attributes:
-        inner: Inner radius.
-        outer: Outer radius.
-        half_angle_deg: Largest angle from the x axis.
-    """
-
-    inner: float
-    outer: float
-    half_angle_deg: float
-
-
-def fine_grid(zone: DarkZone) -> tuple[Array, Mask]:
+def fine_grid(zone: Wedge) -> tuple[Array, Mask]:
     """Coordinates (n,) from the star outward, and a mask (n, n), [row = y, column = x], of the points in the zone."""
     axis = _axis(FINE_STEP, zone.outer)
     return axis, _inside(zone, axis)
 
 
-def first_points(zone: DarkZone, step: float) -> Array:
+def first_points(zone: Wedge, step: float) -> Array:
     """Points (n, 2), x and y, of a square grid in the zone, and along its edges, where the field is largest."""
     axis = _axis(step, zone.outer)
     y, x = np.nonzero(_inside(zone, axis))
@@ -39,9 +23,9 @@ def first_points(zone: DarkZone, step: float) -> Array:
     return np.unique(np.round(found, 9), axis=0)
 
 
-def edge_points(zone: DarkZone, step: float) -> Array:
+def edge_points(zone: Wedge, step: float) -> Array:
     """Points (n, 2), x and y, along the zone's edges: the inner arc, the ray, and the outer arc back."""
-    reach = float(np.deg2rad(zone.half_angle_deg))
+    reach = float(np.deg2rad(zone.half_opening_deg))
     upward = np.linspace(0.0, reach, int(np.ceil(zone.inner * reach / step)) + 1)
     ray = np.linspace(zone.inner, zone.outer, int(np.ceil((zone.outer - zone.inner) / step)) + 1)
     downward = np.linspace(reach, 0.0, int(np.ceil(zone.outer * reach / step)) + 1)
@@ -54,8 +38,8 @@ def _axis(step: float, outer: float) -> Array:
     return np.arange(int(np.floor(outer / step + 1e-9)) + 1, dtype=np.float64) * step
 
 
-def _inside(zone: DarkZone, axis: Array) -> Mask:
+def _inside(zone: Wedge, axis: Array) -> Mask:
     x, y, rounding = axis, axis[:, None], 1e-9
     radius, angle_deg = np.hypot(x, y), np.rad2deg(np.arctan2(y, x))
     within = (radius >= zone.inner - rounding) & (radius <= zone.outer + rounding)
-    return np.asarray(within & (angle_deg <= zone.half_angle_deg + rounding))
+    return np.asarray(within & (angle_deg <= zone.half_opening_deg + rounding))

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from lowfc.arrays import Array, Mask, Whole
-from lowfc.design.dark_zone import FINE_STEP, DarkZone, edge_points, fine_grid, first_points
+from lowfc.design.dark_zone import FINE_STEP, edge_points, fine_grid, first_points
 from lowfc.design.linear_program import maximise
+from lowfc.optics.chain.coronagraph import Wedge
 from lowfc.optics.chain.focal_mask import disk
 from lowfc.optics.chain.fourier import to_image
 from lowfc.optics.chain.grid import OPEN_AREA, SAMPLES, pupil_axis
@@ -86,10 +87,10 @@ class Request:
             raise ValueError(f"at least one round is needed, got {self.rounds}")
 
     @property
-    def zone(self) -> DarkZone:
+    def zone(self) -> Wedge:
         """The part of the dark zone without its mirror images."""
         most_deg = 45.0 if self.symmetry == "octant" else 90.0
-        return DarkZone(self.inner, self.outer, min(self.half_angle_deg, most_deg))
+        return Wedge(self.inner, self.outer, min(self.half_angle_deg, most_deg))
 
 
 @dataclass(frozen=True, eq=False)

@@ -72,11 +72,6 @@ def least_distance(reach: float, samples_per: int) -> float:
     return reach / (samples_per - spare)
 
 
-def pitch(relay: Relay, samples: int, samples_per: int) -> float:
-    """Spacing of the samples on the detector, in lambda0 / D; in D for a `PupilImage`."""
-    return relay.width / samples if isinstance(relay, PupilImage) else 1.0 / samples_per
-
-
 @lru_cache(maxsize=16)
 def direct_kernel(
     relay: Defocus | PupilImage, samples: int, focal_samples: int, samples_per: int, scale: float

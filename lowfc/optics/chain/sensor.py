@@ -9,7 +9,7 @@ from lowfc.arrays import Array, Complex
 from lowfc.optics.chain.band import Band, monochromatic
 from lowfc.optics.chain.fourier import to_image, to_pupil
 from lowfc.optics.chain.grid import OPEN_AREA, image_axis, pupil_axis
-from lowfc.optics.chain.relay import ApertureMask, Defocus, Relay, direct_kernel, least_distance, pitch
+from lowfc.optics.chain.relay import ApertureMask, Defocus, PupilImage, Relay, direct_kernel, least_distance
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ class Sensor:
     @property
     def pitch(self) -> float:
         """Spacing of the detector samples, in lambda0 / D; in D for a `PupilImage`."""
-        return pitch(self.relay, self.samples, self.samples_per)
+        return self.relay.width / self.samples if isinstance(self.relay, PupilImage) else 1.0 / self.samples_per
 
 
 @dataclass(frozen=True)
