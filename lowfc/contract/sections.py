@@ -61,7 +61,7 @@ class Star(Section):
     """The star and the telescope: Sect. 3.3."""
 
     magnitude: float = Field(2.0, ge=-2, le=20)
-    """Apparent V magnitude."""
+    """Apparent V magnitude. The zero point, 1.005e8 photons per s, m^2 and nm, does not change with the wavelength."""
     diameter_m: float = Field(2.0, gt=0, le=100)
     """Diameter of the open circular aperture."""
     wavelength_nm: float = Field(550.0, ge=100, le=30_000)
