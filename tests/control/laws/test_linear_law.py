@@ -148,6 +148,26 @@ def test_a_pi_law_holds_its_command_while_frames_are_missing() -> None:
 
 
 @pytest.mark.parametrize(
+    ("gain", "delay_frames", "moved"), [(0.5, 1.0, 1e-5), (0.5, 1.5, 1e-5), (0.5, 2.0, 1e-5), (1.11, 1.0, 0.3)]
+)
+def test_an_integrator_of_pol_holds_its_command_while_frames_are_missing(
+    gain: float, delay_frames: float, moved: float
+) -> None:
+    law = integrators([(gain, 0.0)], "pol", delay_frames)
+    check_stable(law, delay_frames)
+    x, command = at_rest(law), np.zeros(1, np.float32)
+    for pol in (5, 3, 4):
+        x = predict_and_update(law, x, np.array([pol], np.float32), command)
+        command = respond(law, x)
+    commands = [command]
+    for _ in range(20):
+        x = predict(law, x, commands[-1])
+        commands.append(respond(law, x))
+    np.testing.assert_allclose(commands[-2:], [commands[0]] * 2, rtol=moved)
+    np.testing.assert_allclose(commands[-1], commands[-2], rtol=1e-5)
+
+
+@pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"signal": "errors"}, "signal of a law must be one of error, pol"),
