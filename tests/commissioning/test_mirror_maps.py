@@ -61,6 +61,13 @@ def complaint(overrides: dict[str, Any]) -> str:
     return str(caught.value)
 
 
+@pytest.mark.parametrize("key", ["control.tilt_gain", "control.gain"])
+def test_gains_with_which_the_loop_is_unstable_are_refused(key: str) -> None:
+    assert complaint({key: 1.0, "control.delay_frames": 2.0}).startswith(f"{key}: gain must be at least 0 and below 1")
+    with pytest.raises(ConfigurationError, match="got 3"):
+        StartUp(load(None, {key: 3.0}))
+
+
 @pytest.mark.parametrize("name", ["map.npy", "map.fits"])
 @pytest.mark.parametrize("kind", [np.float64, np.float32, np.int16, ">f4"])
 def test_a_map_is_read_from_fits_and_numpy_files(tmp_path: Path, name: str, kind: npt.DTypeLike) -> None:

@@ -1,5 +1,6 @@
 """Requests for gains, leaks and limits of the integrator, and for offsets, from people or automatic gains."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -113,20 +114,20 @@ def _changed(integrator: Integrator, noll: tuple[int, ...], delay_frames: float,
         raise ValueError(f"limit must be at least 0 nm, got {lowest:g}")
     chosen = np.isin(noll, _modes(noll, request))
     if request.name == "gain":
-        _check_stable(values[chosen], integrator.leak[chosen], delay_frames)
+        check_gains(values[chosen].tolist(), integrator.leak[chosen].tolist(), delay_frames)
     if request.name == "leak":
-        _check_stable(integrator.gain[chosen], values[chosen], delay_frames)
+        check_gains(integrator.gain[chosen].tolist(), values[chosen].tolist(), delay_frames)
     changed: dict[str, Any] = {attribute: values}
     return replace(integrator, **changed)
 
 
-def _check_stable(gains: Single, leaks: Single, delay_frames: float) -> None:
+def check_gains(gains: Iterable[float], leaks: Iterable[float], delay_frames: float) -> None:
     """Refuse gains (modes,) that are negative, or with which the loop is unstable at these leaks (modes,).
 
     Raises:
         ValueError: a gain is refused.
     """
-    for gain, leak in zip(gains.tolist(), leaks.tolist(), strict=True):
+    for gain, leak in zip(gains, leaks, strict=True):
         limiting = limiting_gain(delay_frames, leak)
         if not 0 <= gain < np.float32(limiting):
             with_leak = f" and a leak of {leak:g}" if leak else ""

@@ -1,4 +1,4 @@
-"""Files named in the configuration: read, checked, and requested of the controller at its start."""
+"""Files and gains of the configuration: checked, and requested of the controller at its start."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -18,6 +18,7 @@ from lowfc.control.kernel.tables import NUMPY
 from lowfc.control.laws.linear_law import LinearLaw
 from lowfc.control.laws.margins import check_law
 from lowfc.control.loop.command_channels import ADOPTED, FLAT
+from lowfc.control.loop.gains import check_gains
 from lowfc.control.loop.inputs import Request
 from lowfc.control.loop.loading import ADOPTED_NM
 from lowfc.control.loop.safety import Limit, LoopMode, limit
@@ -28,12 +29,13 @@ LIKENESS = 0.5
 
 
 def check_files(config: Configuration) -> None:
-    """Open every file that a configuration names; ConfigurationError lists those that cannot be used, one per line."""
+    """Open every file that a configuration names, and check its gains; ConfigurationError has one line per fault."""
     checks: tuple[Callable[[Configuration], object], ...] = (
         lambda config: factory.sensor(config, lambda _: None),
         active_actuators,
         _flat_within_limits,
         _law_of_modes,
+        _stable_gains,
     )
     faults = []
     for check in checks:
@@ -84,6 +86,7 @@ class StartUp:
     def __init__(self, config: Configuration) -> None:
         self._file, self._flat_nm = config.mirror.flat, _flat_within_limits(config)
         self._law_file, self._law = config.control.law, law(config)
+        _stable_gains(config)
 
     def requests(self, state: State, time_ns: int) -> list[Request]:
         """The requests, in this order, once the mirror's shape is known.
@@ -139,6 +142,15 @@ def _flat_within_limits(config: Configuration) -> Single | None:
                 f"mirror.flat = {config.mirror.flat!r}: beyond the limits of [safety]: {', '.join(names)}"
             )
     return found
+
+
+def _stable_gains(config: Configuration) -> None:
+    settings = factory.settings(config)
+    for key, gain, leak in zip(("tilt_gain", "gain"), settings.gain, settings.leak, strict=True):
+        try:
+            check_gains([gain], [leak], settings.delay_frames)
+        except ValueError as fault:
+            raise ConfigurationError(f"control.{key}: {fault}") from None
 
 
 def _law_of_modes(config: Configuration) -> None:
