@@ -67,8 +67,8 @@ class Calibration:
                 raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
             if not np.isfinite(array).all():
                 raise ValueError(f"{name} holds values that are not finite")
-        if not self.flux_dn > 0:
-            raise ValueError(f"flux_dn must be above 0, got {self.flux_dn}")
+        if not 0 < self.flux_dn < np.inf:
+            raise ValueError(f"flux_dn must be above 0 and finite, got {self.flux_dn}")
 
     @property
     def provisional(self) -> bool:

@@ -197,6 +197,7 @@ def test_only_good_pixels_count_as_saturated() -> None:
         ({"dark": np.full(PIXELS, np.nan, np.float32)}, "dark holds values that are not finite"),
         ({"flux_dn": 0.0}, "flux_dn"),
         ({"flux_dn": np.nan}, "flux_dn"),
+        ({"flux_dn": np.inf}, "flux_dn"),
     ],
 )
 def test_an_inconsistent_calibration_is_refused(change: dict[str, object], message: str) -> None:
