@@ -29,6 +29,7 @@ _LOGS = "Logs (MCAP), finished or not; all files of a recording are one log. `la
 Logs = Annotated[list[Path], typer.Argument(help=_LOGS, metavar="LOG...", readable=False, show_default=False)]
 _IfAny = partial(typer.Argument, metavar="[LOG...]", readable=False, show_default=False)
 LogsIfAny = Annotated[list[Path] | None, _IfAny(help=f"{_LOGS} Without one: the running loop.")]
+LogsOrLive = Annotated[list[Path] | None, _IfAny(help=f"{_LOGS} Without one: --live.")]
 LogsOrMeasure = Annotated[list[Path] | None, _IfAny(help=f"{_LOGS} Without one: a loop started for this measurement.")]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="Configuration file (TOML).", show_default=False)]
 

@@ -98,7 +98,9 @@ def calibrate(
         for option in ("--snr", "--amplitude", "--cycles", "--resume"):
             if option in options:
                 raise ConfigurationError(f"{option} is for pokes, but --method analytic computes: omit it")
-        print_result(tasks.computed(config, request, at, run if load else None, load=load), as_json=as_json)
+        if "--run" in options and not load:
+            raise ConfigurationError("--run has no effect with --method analytic unless --load is given: omit it")
+        print_result(tasks.computed(config, request, at, run, load=load), as_json=as_json)
         return
     for option in ("--config", "--at"):
         if option in options:
@@ -114,6 +116,7 @@ def calibrate(
 
 @calibrate_app.command()
 def dark(
+    context: typer.Context,
     out: Out = Path("calibration.fits"),
     run: AnyRun = None,
     frames: Frames = 400,
@@ -134,6 +137,8 @@ def dark(
     """
     from lowfc.programs.commissioning.calibrate.tasks import darkened
 
+    if file is not None and "--frames" in given(context):
+        raise ConfigurationError("--frames has no effect with --file, whose frames are all used: omit it")
     if file is None and not star_blocked:
         typer.confirm("block the star; is it dark?", default=True, abort=True, err=True)
     print_result(darkened(out, run, frames, file, load=load), as_json=as_json)

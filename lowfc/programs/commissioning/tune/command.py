@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from lowfc.adapters.process.terminal import AnyRun, Json, LogsIfAny
+from lowfc.adapters.process.terminal import AnyRun, Json, LogsOrLive
 from lowfc.contract.errors import ConfigurationError, DataFileError, LowfcError, RequestRefusedError
 from lowfc.programs.cli.result import print_result
 
@@ -18,7 +18,7 @@ Kind = Literal["integrator", "pi-notch", "lqg"]
 
 
 def tune(
-    logs: LogsIfAny = None,
+    logs: LogsOrLive = None,
     controller: Annotated[Kind, typer.Option(help="Kind of law.")] = "integrator",
     live: Annotated[float | None, typer.Option(min=1.0, help="Observe a running loop for this many seconds.")] = None,
     out: Annotated[Path | None, typer.Option(help="Write the law to this file (FITS).")] = None,
@@ -44,6 +44,8 @@ def tune(
 
     if bool(logs) == (live is not None):
         raise ConfigurationError("give one LOG, or observe a running loop with --live SECONDS")
+    if run is not None and logs and not apply:
+        raise ConfigurationError("--run has no effect with a LOG unless --apply is given: omit it")
     console = Console(stderr=True)
     require_folder(out, plot)
     if plot is not None:
