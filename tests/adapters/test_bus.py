@@ -10,7 +10,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import Mock
@@ -84,6 +84,22 @@ def test_a_put_reaches_every_subscriber_of_its_key(pair: tuple[Bus, Bus]) -> Non
     assert (first.key, first.payload, first.publish_time_ns) == (COMMAND.at("dm"), b"body", 3)
     assert not tip
     assert not frames
+
+
+def test_no_link_blocks_its_process_while_it_is_closed(run: Run, join: Join) -> None:
+    buses = [join(run, role) for role in ("controller", "camera")]
+    until(lambda: all(bus.peers() for bus in buses))
+
+    def lingering() -> list[int]:
+        found = []
+        for descriptor in (int(path.name) for path in Path("/proc/self/fd").iterdir()):
+            with suppress(OSError):
+                one = socket.socket(fileno=descriptor)
+                found += [descriptor] * one.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER)
+                one.detach()
+        return found
+
+    until(lambda: not lingering())
 
 
 def test_a_query_returns_the_last_message_with_its_envelope(pair: tuple[Bus, Bus]) -> None:

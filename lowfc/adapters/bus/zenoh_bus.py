@@ -20,7 +20,7 @@ from lowfc.adapters.bus.direct_link import DirectCall, DirectReader, DirectWrite
 from lowfc.adapters.bus.routed import RouterWatch, open_by_router, require_certificate
 from lowfc.adapters.bus.run import Links, mirror_role
 from lowfc.adapters.bus.zenoh_fault import plain
-from lowfc.adapters.bus.zenoh_session import keep_thread_state, session_config
+from lowfc.adapters.bus.zenoh_session import close_links_at_once, keep_thread_state, session_config
 from lowfc.adapters.process.clock import Clock
 from lowfc.adapters.process.clock_offset import ClockAsker, ClockOffset
 from lowfc.contract.envelope import Envelope, sequence_of
@@ -182,6 +182,7 @@ class ZenohBus:
         config = zenoh.Config.from_json5(json.dumps(session_config(links, role, monitor=monitor)))
         if links.network.router and role != ROUTER:
             self._session = open_by_router(config, links.network, role)
+            close_links_at_once(self._session)
             self._join_hosts()
             return
         try:
@@ -193,6 +194,7 @@ class ZenohBus:
             raise BusError(
                 f"{role} of run {links.run_id!r} {where} Stop that process, or start another run ({plain(fault)})"
             ) from None
+        close_links_at_once(self._session)
         if role == ROUTER:
             self.queryable(CLOCK_KEY, lambda query: query.reply(b""))
 

@@ -1,8 +1,15 @@
 """Zenoh's configuration for each role: peers on one host, a router across hosts; settings chosen by measurement."""
 
+import contextlib
 import ctypes
+import socket
+import struct
 import threading
+from pathlib import Path
 from typing import Any
+
+import zenoh
+from zenoh.handlers import Callback
 
 from lowfc.adapters.bus.access import ROUTER
 from lowfc.adapters.bus.bus import ALL
@@ -30,6 +37,27 @@ def keep_thread_state() -> None:
     if not hasattr(_kept, "thread"):
         ctypes.pythonapi.PyGILState_Ensure()
         _kept.thread = True
+
+
+def close_links_at_once(session: zenoh.Session) -> None:
+    """Turn SO_LINGER off on each link of a session as it is made; the kernel still sends what was written.
+
+    Zenoh sets 10 s. Closing the link of a process that is stopped would block the thread that receives, and no
+    request would be answered for as long.
+    """
+
+    def changed(event: zenoh.LinkEvent) -> None:
+        if event.link.src.startswith(_SOCKET):  # closed without a wait
+            return
+        for descriptor in (int(path.name) for path in Path("/proc/self/fd").iterdir()):
+            with contextlib.suppress(OSError):  # not a socket, or closed since
+                found = socket.socket(fileno=descriptor)
+                try:
+                    found.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 0, 0))
+                finally:
+                    found.detach()
+
+    session.info.declare_link_events_listener(Callback(changed, indirect=False), history=True)
 
 
 def session_config(links: Links, role: str, *, monitor: bool = False) -> dict[str, Any]:
