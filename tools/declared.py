@@ -1,6 +1,7 @@
-"""Tables from the code: topics, messages, keys, requests, and the limits of the commands."""
+"""Tables from the code: topics, messages, requests, events, and the limits of the commands."""
 
 import ast
+import re
 from collections.abc import Callable, Iterable
 from functools import partial
 from importlib import import_module
@@ -13,7 +14,9 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from lowfc.client import requests, stream
 from lowfc.contract.codecs.codec import MAX_BYTES
 from lowfc.contract.configuration import Acceptance
+from lowfc.contract.events import EVENTS, Event, Level
 from lowfc.contract.messages import CAMERA_STATE, COMMAND, EVENT, FRAME, HEALTH, MIRROR_STATE, SURFACE, Role, Topic
+from lowfc.contract.wire import lowfc_pb2
 from lowfc.control.calibration import linearity
 from lowfc.control.laws import transfer_function
 from lowfc.control.laws.stability import LOWEST_GAIN, MIN_GAIN_MARGIN, MIN_PHASE_MARGIN_DEG
@@ -27,6 +30,7 @@ from lowfc.programs.commissioning.conformance.settings import AGREEMENTS
 from lowfc.programs.commissioning.tune.result import OPTICAL_GAIN_MAS
 from lowfc.programs.console.actions import ACTIONS, SAFE
 from tools import continuous
+from tools.advice import ADVICE, REASONS
 from tools.shared import ROOT, markdown
 
 API = ("client", "device", "optics", "design", "control")
@@ -163,9 +167,32 @@ def buttons() -> str:
     return "\n".join(["| key | button | what it does |", "|---|---|---|", *rows]) + "\n"
 
 
+def events(*levels: Level) -> str:
+    """Every event of these levels: text, cause, remedy."""
+    return "\n".join(_event(one) for one in EVENTS.values() if one.level in levels)
+
+
+def _event(event: Event) -> str:
+    why, what = ADVICE[event.name]
+    shown = re.sub(r"\{(\w+)[^}]*\}", r"{\1}", event.description)
+    return (
+        f"### {event.name}\n\n`{event.level.name} {event.name} {shown.replace('`', '')}`\n\n"
+        f"Why: {why}\n\nWhat to do: {what}\n"
+    )
+
+
+def reasons() -> str:
+    """Every reason of a refused frame or command, and every limit."""
+    names = [one.name.removeprefix("REASON_") for one in lowfc_pb2.Reason.DESCRIPTOR.values[1:]]
+    return markdown(("reason", "why", "what to do"), ((f"`{name}`", *REASONS[name]) for name in names))
+
+
 DECLARED: dict[str, Callable[[], str]] = {
     "requests": requests.table,
     "buttons": buttons,
+    "reasons": reasons,
+    "warnings": partial(events, Level.ERROR, Level.WARNING),
+    "information": partial(events, Level.INFO),
     "packages": packages,
     "requirements": requirements,
     "continuous": continuous.table,

@@ -16,7 +16,6 @@ from typer.main import get_command
 
 import lowfc.programs
 from lowfc.contract.configuration import Configuration
-from lowfc.contract.events import EVENTS, Event, Level
 from lowfc.contract.former_names import FIELDS, KEYS, LAW_EXTENSIONS, VALUES
 from lowfc.contract.messages import TOPICS
 from lowfc.contract.network import Section
@@ -24,7 +23,6 @@ from lowfc.contract.sections import InterlockSection
 from lowfc.contract.wire import lowfc_pb2
 from lowfc.programs.cli.main import app
 from lowfc.programs.cli.result import Result
-from tools.advice import ADVICE, REASONS
 from tools.declared import API, fields, one_line
 from tools.shared import markdown
 
@@ -140,26 +138,6 @@ def _subclasses(kind: type[Result]) -> set[type[Result]]:
     return {one for one in below if one.model_fields}
 
 
-def events(*levels: Level) -> str:
-    """Every event of these levels: text, cause, remedy."""
-    return "\n".join(_event(one) for one in EVENTS.values() if one.level in levels)
-
-
-def _event(event: Event) -> str:
-    why, what = ADVICE[event.name]
-    shown = re.sub(r"\{(\w+)[^}]*\}", r"{\1}", event.description)
-    return (
-        f"### {event.name}\n\n`{event.level.name} {event.name} {shown.replace('`', '')}`\n\n"
-        f"Why: {why}\n\nWhat to do: {what}\n"
-    )
-
-
-def reasons() -> str:
-    """Every reason of a refused frame or command, and every limit."""
-    names = [one.name.removeprefix("REASON_") for one in lowfc_pb2.Reason.DESCRIPTOR.values[1:]]
-    return markdown(("reason", "why", "what to do"), ((f"`{name}`", *REASONS[name]) for name in names))
-
-
 def upgrade() -> str:
     """The names of release 0.1 and their successors."""
     tables = {
@@ -196,9 +174,6 @@ BUILT: dict[str, Callable[[], str]] = {
     "topics": topics,
     "messages": messages,
     "json": json_objects,
-    "events that want something": partial(events, Level.ERROR, Level.WARNING),
-    "events that tell": partial(events, Level.INFO),
-    "reasons": reasons,
     "former names": upgrade,
     **{f"api {one}": partial(api, f"lowfc.{one}") for one in API},
 }
