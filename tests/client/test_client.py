@@ -604,6 +604,9 @@ def test_an_invalid_number_is_quoted_in_the_error() -> None:
         assert "'0,3' is not a number: write 0.3" in done.output
     assert "'1.5' is not a whole number" in lowfc("ctl", "step", "1.5").output
     assert isinstance(lowfc("ctl", "gain", "auto", "0.3").exception, ConfigurationError)
+    bench = ("ctl", "bench", "--run", "none-such", "celsius")
+    assert "no option and no value: '-x'" in lowfc(*bench, "-x").output
+    assert isinstance(lowfc(*bench, "-40").exception, BusError | DataFileError), "a negative value is no option"
 
 
 def test_the_status_shows_the_whole_state() -> None:
@@ -723,7 +726,8 @@ def test_a_log_that_cannot_be_created_is_refused_and_can_be_requested_again(benc
 
 
 def test_contrast_is_estimated_for_a_real_camera_and_true_for_a_simulated_one() -> None:
-    measured = wire.Health(recent_wavefront={"added_contrast_flat": 2e-9, "added_contrast": 3e-11})
+    guess = {"added_contrast_flat": 2e-9, "added_contrast": 3e-11}
+    measured = wire.Health(last_second={"frames": 9}, recent_wavefront=guess)
     true = wire.Health(recent_wavefront={"added_contrast_flat": 4e-9, "added_contrast": 5e-11})
     processes = {Role.CAMERA: wire.Health(), Role.CONTROLLER: measured}
     real, simulated = (json_object(wire.ControllerState(), processes | more) for more in ({}, {Role.CAMERA: true}))

@@ -273,7 +273,7 @@ def test_gain_and_leak_are_set_for_all_some_or_each_mode(name: str) -> None:
         (ask("gain", 0.1, modes=(7,)), "[7] are not controlled"),
         (Request(0, "gain", (3, 99), text="auto"), "[99] are not controlled; there are 2, 3, 4"),
         (ask("gain", float("nan")), "finite, got nan"),
-        (ask("step", 0.0), "1 or more; got 0"),
+        (ask("step", 0.0), "from 1 to 4294967296; got 0"),
         (ask("gain", float("inf")), "finite"),
         (ask("gain", -0.1), "at least 0"),
         (ask("gain", 2.0), "unstable"),

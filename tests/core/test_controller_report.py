@@ -157,6 +157,9 @@ def test_added_contrast_is_shown_for_a_flat_mirror_and_the_present_one() -> None
     assert expected in status.text(status.json_object(message, {"camera": camera}))
     assert expected in summary_text(summary(watch, record=False))
     assert "  contrast -4.0e-11 of +7.0e-10  " in status_line(watch, 5.0)
+    for frames in (50, 0):  # without frames the controller's estimate is an old one
+        controller = wire.Health(recent_wavefront=recent, last_second=wire.LoopFigures(frames=frames))
+        assert (expected in status.text(status.json_object(message, {"controller": controller}))) == bool(frames)
 
 
 def test_statistics_of_the_last_second_exclude_older_and_refused_frames() -> None:

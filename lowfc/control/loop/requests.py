@@ -162,7 +162,7 @@ def _step(settings: Settings, state: State, request: Request) -> Handled:
     frames = request.values[0] if len(request.values) == 1 else 0.0
     if not (1 <= frames <= MAX_STEPS and frames == int(frames)):
         given = " ".join(map("{:g}".format, request.values)) or "none"
-        raise ValueError(f"step takes one whole number of frames, 1 or more; got {given}")
+        raise ValueError(f"step takes one whole number of frames from 1 to {MAX_STEPS}; got {given}")
     state = in_mode(state, _granted(state, "close"), request.time_ns, asked_by(state.conditions.lease, request))
     return state._replace(steps_left=int(frames)), f"loop closed for {counted(int(frames), 'frame')}"
 

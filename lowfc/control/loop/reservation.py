@@ -88,7 +88,8 @@ def _extended(settings: Settings, state: State, request: Request) -> Lease:
     holder, values = request.text.strip(), request.values
     duration_s = values[0] if len(values) == 1 else 0.0
     if not 0 < duration_s <= MAX_S:
-        raise ValueError(f"a lease takes one duration above 0 and of at most {MAX_S:g} s, got {list(values)}")
+        given = " ".join(map("{:g}".format, values)) or "none"
+        raise ValueError(f"{request.name} takes one duration above 0 and of at most {MAX_S:g} s; got {given}")
     if not request.lease_id:
         raise ValueError("a lease needs an identity above 0, got 0")
     if not (0 < len(holder) <= MAX_HOLDER and holder.isprintable()):

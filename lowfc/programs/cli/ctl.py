@@ -59,6 +59,8 @@ def bench_value(word: str) -> bool | float | str:
     try:
         return float(word)
     except ValueError:
+        if word.startswith("-"):  # see `ignore_unknown_options`
+            raise typer.BadParameter(f"no option and no value: {word!r}") from None
         return word
 
 
@@ -243,7 +245,7 @@ for _name, _request in BY_NAME.items():
             help=f"{_request.description}\n\nExample: lowfc ctl {_request.example}",
             context_settings={"ignore_unknown_options": "values" in _fields},  # -5 is a value, not an option
         )(_command)
-ctl_app.command()(bench)
+ctl_app.command(context_settings={"ignore_unknown_options": True})(bench)
 for _measurement in (dark, reference):
     ctl_app.command(help=str(_measurement.__doc__).replace("lowfc calibrate", "lowfc ctl"))(_measurement)
 

@@ -47,7 +47,8 @@ def json_object(
     camera = processes.get(Role.CAMERA, NO_HEALTH)
     simulated = wavefront(camera.recent_wavefront) if camera.HasField("recent_wavefront") else None
     contrast = simulated
-    if (simulated is None or simulated["added_contrast"] is None) and controller.HasField("recent_wavefront"):
+    measured = controller.HasField("recent_wavefront") and last_second.frames  # otherwise it is an old one
+    if measured and (simulated is None or simulated["added_contrast"] is None):
         contrast = wavefront(controller.recent_wavefront)
     return {
         "run": run,
