@@ -10,30 +10,28 @@ from typing import NamedTuple
 import numpy as np
 from google.protobuf.message import DecodeError
 
-from lowfc.adapters.bus.bus import Bus, Sample, states
+from lowfc.adapters.bus.bus import Bus, Sample
 from lowfc.adapters.process.clock import Clock
 from lowfc.arrays import Pixels, Single
 from lowfc.client import Client, configuration_of
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BadMessageError, LowfcError
-from lowfc.contract.messages import EVENT, REQUEST, STEP, SURFACE, TRUTH, Role, checked_time_ns, wire
+from lowfc.contract.messages import EVENT, REQUEST, STEP, SURFACE, TRUTH, checked_time_ns, wire
 from lowfc.control.loop.wording import AUTO
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
-from lowfc.programs.view.snapshot import SHOWN, Accumulator
+from lowfc.programs.view.monitor import Monitor
+from lowfc.programs.view.snapshot import SHOWN, Snapshot
 from lowfc.programs.view.verdicts.run_state import RunState
 from lowfc.programs.view.verdicts.tile import Verdict
 from lowfc.programs.view.verdicts.verdict import judge
-from lowfc.programs.view.verdicts.watcher import Watcher
 
 DISCONNECTED_S = 1.5
 """Time without a message after which the console is disconnected: each process sends Health twice a second."""
 TREND_S = 34
 """Span of the sparklines, one column per second."""
-_RING_SIZES = {EVENT: 200, REQUEST: 200, STEP: 4000, TRUTH: 50}  # messages; 50 truths per reading suffice for an rms
-_TOPICS = (*(topic for topic in SHOWN if topic is not SURFACE), REQUEST)
+_RING_SIZES = {EVENT: 200, STEP: 4000, TRUTH: 50}  # messages; 50 truths per reading suffice for an rms
 _PRELOADED, _PRELOAD_S = ("lowfc.control.laws.tuning", "scipy.signal"), 4.0
 """Slow imports, done in a thread after this time: the first values do not need them, a later verdict does."""
-_QUERY_AGAIN_S = 5.0  # until a controller that did not answer is queried again
 _TREND_STEP_NS = 1_000_000_000
 _HIDDEN_REQUESTS = frozenset(("status", "configuration", "renew"))
 """Periodic requests that change nothing."""
@@ -68,24 +66,19 @@ class Reading(NamedTuple):
         return self.silent_s is not None and self.silent_s < DISCONNECTED_S
 
 
-class Feed:
-    """Receives as a monitor: messages wait in rings that keep the newest, so that the loop never waits for it."""
+class Feed(Monitor):
+    """Readings of the run; the configuration, too, is queried."""
 
     def __init__(self, bus: Bus, run_id: str, clock: Clock) -> None:
         """Subscribe."""
-        self._bus, self._run_id, self._clock = bus, run_id, clock
-        sizes = {topic: _RING_SIZES.get(topic, 1 if topic.latest_only else 100) for topic in _TOPICS}
-        self._rings = {topic: bus.ring(topic, sizes[topic]) for topic in _TOPICS}
-        self._query_results: deque[Sample] = deque()
-        self._accumulator = Accumulator(clock.now_ns() if clock.lockstep else None)
-        self._watcher = Watcher()
+        super().__init__(bus, clock, [topic for topic in SHOWN if topic is not SURFACE], _RING_SIZES)
+        self._run_id, self._requests = run_id, bus.ring(REQUEST, 200)
         self._config: Configuration | None = None
-        self._queried_processes: set[tuple[str, int]] = set()
         self._frame: Pixels | None = None
         self._command_nm = np.zeros(0, np.float32)
         self._trend: deque[tuple[float, float]] = deque(maxlen=TREND_S)
         self._point_ns = 0
-        self._read_s = self._queried_s = time.monotonic()
+        self._read_s = time.monotonic()
         self._query()
         preload = threading.Timer(_PRELOAD_S, lambda: [import_module(name) for name in _PRELOADED])
         preload.daemon = True
@@ -95,21 +88,9 @@ class Feed:
         """Process the messages received since the last call."""
         now_s, host_ns = time.monotonic(), self._clock.host_ns()
         behind_s, self._read_s = max(0.0, now_s - self._read_s - 0.5), now_s
-        requests = [_request(sample) for sample in self._rings[REQUEST].drain()]
-        arrived = [self._query_results.popleft() for _ in range(len(self._query_results))]
-        for topic, ring in self._rings.items():
-            if topic is not REQUEST:
-                arrived += ring.drain()
-        for sample in arrived:
-            self._accumulator.add(sample)
-        snapshot = self._accumulator.snapshot(host_ns, behind_s=behind_s)
-        processes = {(name, one.health.pid) for name, one in snapshot.health.items()}
-        incomplete = Role.CONTROLLER in snapshot.health and (snapshot.calibration is None or self._config is None)
-        if not processes <= self._queried_processes or (incomplete and now_s - self._queried_s > _QUERY_AGAIN_S):
-            self._queried_processes = processes
-            self._query()
-        self._watcher.feed(snapshot)
-        state = self._watcher.state()
+        requests = [_request(sample) for sample in self._requests.drain()]
+        snapshot = self.snapshot(host_ns, behind_s)
+        state = self.watcher.state()
         self._frame = self._frame if snapshot.frame is None else snapshot.frame
         if snapshot.steps.mode.size:
             self._command_nm = snapshot.steps.command_nm[-1]
@@ -134,18 +115,21 @@ class Feed:
             light = state.flux if state.frame_silent_s is None else None
             self._trend.append((nan if residual_nm is None else residual_nm, nan if light is None else light))
 
-    def _query(self) -> None:
-        """Query the states published earlier, in a thread: a frozen process delays the answer."""
-        self._queried_s = time.monotonic()
+    def _complete(self, found: Snapshot) -> bool:
+        return None not in (found.calibration, self._config)
 
-        def query() -> None:
-            self._query_results.extend(sample for _, sample in states(self._bus, SHOWN))
+    def _query(self) -> None:
+        """Query in a thread: a frozen process delays the answer."""
+        query = super()._query
+
+        def queries() -> None:
+            query()
             try:
                 self._config = configuration_of(Client(self._run_id, bus=self._bus))
             except LowfcError:  # no controller yet: it is queried once it sends Health
                 return
 
-        threading.Thread(target=query, name="query", daemon=True).start()
+        threading.Thread(target=queries, name="query", daemon=True).start()
 
 
 def _hidden(request: wire.Request) -> bool:

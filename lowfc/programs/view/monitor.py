@@ -1,0 +1,60 @@
+"""The newest messages of a run, read several times a second by a console or a gateway."""
+
+from collections import deque
+from collections.abc import Iterable, Mapping
+
+from lowfc.adapters.bus.bus import Bus, Sample, states
+from lowfc.adapters.process.clock import Clock
+from lowfc.contract.messages import Role, Topic
+from lowfc.programs.view.snapshot import SHOWN, Accumulator, Snapshot
+from lowfc.programs.view.verdicts.watcher import Watcher
+
+_WAITING = 2000
+_PATIENCE_S = 0.2
+_QUERY_AGAIN_NS = 5_000_000_000  # until a controller that did not answer is queried again
+
+
+class Monitor:
+    """Receives as a monitor: messages wait in rings that keep the newest, so that the loop never waits for it.
+
+    Attributes:
+        watcher: state of the run, from which the verdict is made.
+        newest: newest message of each topic.
+    """
+
+    def __init__(self, bus: Bus, clock: Clock, topics: Iterable[Topic], sizes: Mapping[Topic, int]) -> None:
+        """Subscribe; `sizes` of rings in messages, if not the default."""
+        self.watcher, self.newest = Watcher(), dict[Topic, Sample]()
+        self._bus, self._clock = bus, clock
+        self._rings = {
+            topic: bus.ring(topic, sizes.get(topic, 1 if topic.latest_only else _WAITING)) for topic in topics
+        }
+        self._accumulator = Accumulator(clock.now_ns() if clock.lockstep else None)
+        self._answers: deque[Sample] = deque()
+        self._known: set[tuple[str, int]] = set()
+        self._queried_ns = 0
+
+    def snapshot(self, now_ns: int, behind_s: float = 0.0) -> Snapshot:
+        """The messages since the last call; the published states of new processes are queried for the next."""
+        while self._answers:
+            self._accumulator.add(self._answers.popleft())
+        for topic, ring in self._rings.items():
+            for sample in ring.drain():
+                self._accumulator.add(sample)
+                self.newest[topic] = sample
+        found = self._accumulator.snapshot(now_ns, behind_s=behind_s)
+        there = {(name, one.health.pid) for name, one in found.health.items()}
+        incomplete = Role.CONTROLLER in found.health and not self._complete(found)
+        if not there <= self._known or (incomplete and now_ns - self._queried_ns > _QUERY_AGAIN_NS):
+            self._known, self._queried_ns = there, now_ns
+            self._query()
+        self.watcher.feed(found)
+        return found
+
+    def _complete(self, found: Snapshot) -> bool:
+        """Whether the controller's states are known."""
+        return None not in (found.calibration, found.controller)
+
+    def _query(self) -> None:
+        """Query the states published earlier."""
+        self._answers.extend(sample for _, sample in states(self._bus, SHOWN, _PATIENCE_S))
