@@ -77,6 +77,8 @@ class CameraLoop:
                     service.clock.sleep_until_ns(min(self.watch.retry_ns, service.clock.now_ns() + REST_NS))
                 self._report_lost()
                 service.beat()
+        self._lost_due_ns = 0  # those of the last half second, too
+        self._report_lost()
         service.finish()
 
     def _next_frame(self) -> tuple[Pixels, int] | None:
