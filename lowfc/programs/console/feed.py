@@ -16,11 +16,11 @@ from lowfc.arrays import Pixels, Single
 from lowfc.client import Client, configuration_of
 from lowfc.contract.configuration import Configuration
 from lowfc.contract.errors import BadMessageError, LowfcError
-from lowfc.contract.messages import EVENT, REQUEST, STEP, SURFACE, TRUTH, checked_time_ns, wire
+from lowfc.contract.messages import REQUEST, checked_time_ns, wire
 from lowfc.control.loop.wording import AUTO
 from lowfc.optics.detector.photometry import tilt_nm_per_mas
 from lowfc.programs.view.monitor import Monitor
-from lowfc.programs.view.snapshot import SHOWN, Snapshot
+from lowfc.programs.view.snapshot import Snapshot
 from lowfc.programs.view.verdicts.run_state import RunState
 from lowfc.programs.view.verdicts.tile import Verdict
 from lowfc.programs.view.verdicts.verdict import judge
@@ -29,7 +29,6 @@ DISCONNECTED_S = 1.5
 """Time without a message after which the console is disconnected: each process sends Health twice a second."""
 TREND_S = 34
 """Span of the sparklines, one column per second."""
-_RING_SIZES = {EVENT: 200, STEP: 4000, TRUTH: 50}  # messages; 50 truths per reading suffice for an rms
 _PRELOADED, _PRELOAD_S = ("lowfc.control.laws.tuning", "scipy.signal"), 4.0
 """Slow imports, done in a thread after this time: the first values do not need them, a later verdict does."""
 _TREND_STEP_NS = 1_000_000_000
@@ -71,7 +70,7 @@ class Feed(Monitor):
 
     def __init__(self, bus: Bus, run_id: str, clock: Clock) -> None:
         """Subscribe."""
-        super().__init__(bus, clock, [topic for topic in SHOWN if topic is not SURFACE], _RING_SIZES)
+        super().__init__(bus, clock)
         self._run_id, self._requests = run_id, bus.ring(REQUEST, 200)
         self._config: Configuration | None = None
         self._frame: Pixels | None = None

@@ -2,14 +2,11 @@
 
 from typing import NamedTuple
 
-from lowfc.adapters.bus.bus import Bus
-from lowfc.adapters.process.clock import Clock
 from lowfc.arrays import Pixels
 from lowfc.client.stream import step_of
 from lowfc.contract.messages import STEP, Role, wire
 from lowfc.control.loop.inputs import Step
 from lowfc.programs.view.monitor import Monitor
-from lowfc.programs.view.snapshot import SHOWN
 from lowfc.programs.view.verdicts.tile import Verdict
 from lowfc.programs.view.verdicts.verdict import judge
 
@@ -31,9 +28,7 @@ class RunView(NamedTuple):
 class Watch(Monitor):
     """Receives as a monitor, through ring buffers that do not burden the loop."""
 
-    def __init__(self, bus: Bus, clock: Clock) -> None:
-        super().__init__(bus, clock, SHOWN, {})
-        self._step: Step | None = None
+    _step: Step | None = None
 
     def update(self) -> RunView:
         """Process the messages since the last call."""

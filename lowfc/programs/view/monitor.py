@@ -1,15 +1,14 @@
 """The newest messages of a run, read several times a second by a console or a gateway."""
 
 from collections import deque
-from collections.abc import Iterable, Mapping
 
 from lowfc.adapters.bus.bus import Bus, Sample, states
 from lowfc.adapters.process.clock import Clock
-from lowfc.contract.messages import Role, Topic
+from lowfc.contract.messages import EVENT, STEP, SURFACE, TRUTH, Role, Topic
 from lowfc.programs.view.snapshot import SHOWN, Accumulator, Snapshot
 from lowfc.programs.view.verdicts.watcher import Watcher
 
-_WAITING = 2000
+_RING_SIZES = {EVENT: 200, STEP: 4000, TRUTH: 50}  # messages; 50 truths per reading suffice for an rms
 _PATIENCE_S = 0.2
 _QUERY_AGAIN_NS = 5_000_000_000  # until a controller that did not answer is queried again
 
@@ -22,12 +21,14 @@ class Monitor:
         newest: newest message of each topic.
     """
 
-    def __init__(self, bus: Bus, clock: Clock, topics: Iterable[Topic], sizes: Mapping[Topic, int]) -> None:
-        """Subscribe; `sizes` of rings in messages, if not the default."""
+    def __init__(self, bus: Bus, clock: Clock) -> None:
+        """Subscribe."""
         self.watcher, self.newest = Watcher(), dict[Topic, Sample]()
         self._bus, self._clock = bus, clock
         self._rings = {
-            topic: bus.ring(topic, sizes.get(topic, 1 if topic.latest_only else _WAITING)) for topic in topics
+            topic: bus.ring(topic, 1 if topic.latest_only else _RING_SIZES.get(topic, 100))
+            for topic in SHOWN
+            if topic is not SURFACE
         }
         self._accumulator = Accumulator(clock.now_ns() if clock.lockstep else None)
         self._answers: deque[Sample] = deque()
