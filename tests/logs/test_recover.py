@@ -95,7 +95,7 @@ def test_an_unfinished_log_is_completed(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["night-recovered.mcap", "night.mcap.part"]
     old, copy = LogReader(part), LogReader(new)
     assert identity(list(copy)) == identity(list(old)) == identity(small_samples())
-    assert copy.described[:-1] == old.described
+    assert copy.records[:-1] == old.records
     assert copy.attachments == {attachment.name: attachment.data for attachment in ATTACHMENTS}
     assert copy.metadata.keys() == {"lowfc", "recovery"}
     for reader in (old, copy):  # except for the numbers, which each file assigns

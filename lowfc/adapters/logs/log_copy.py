@@ -20,20 +20,20 @@ class LogCopy:
     """A new log to which files are copied in turn.
 
     Attributes:
-        messages: number of messages written so far.
+        messages, read: numbers of messages written so far, and of those read from the files.
     """
 
     def __init__(self, file: IO[bytes]) -> None:
-        self.messages = 0
+        self.messages = self.read = 0
         self._channels: dict[tuple[str, int], int] = {}
         self._schemas: dict[tuple[str, bytes], int] = {}
         self._writer = begun_writer(file)
 
-    def note(self, name: str, entries: dict[str, str]) -> None:
+    def add_metadata(self, name: str, entries: dict[str, str]) -> None:
         """Add metadata."""
         self._writer.add_metadata(name, entries)
 
-    def take(
+    def add_file(
         self,
         reader: LogReader,
         *,
@@ -49,17 +49,18 @@ class LogCopy:
         """
         done = 0
         for message in reader:
-            self._describe(reader.described[done:], include_record)
-            done = len(reader.described)
+            self._add_records(reader.records[done:], include_record)
+            done = len(reader.records)
+            self.read += 1
             if include(message):
-                self._add(reader, message)
-        self._describe(reader.described[done:], include_record)
+                self._add_message(reader, message)
+        self._add_records(reader.records[done:], include_record)
 
     def finish(self) -> None:
         """Write the index."""
         self._writer.finish()  # type: ignore[no-untyped-call]
 
-    def _describe(
+    def _add_records(
         self, records: Sequence[Metadata | Attachment], include_record: Callable[[Metadata | Attachment], bool]
     ) -> None:
         """Copy metadata and attachments."""
@@ -71,7 +72,7 @@ class LogCopy:
                     record.create_time, record.log_time, record.name, record.media_type, record.data
                 )
 
-    def _add(self, reader: LogReader, message: Sample) -> None:
+    def _add_message(self, reader: LogReader, message: Sample) -> None:
         name = message.key, start_of(message.sequence)
         if name not in self._channels:
             channel = reader.channels[name]

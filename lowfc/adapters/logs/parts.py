@@ -86,7 +86,7 @@ class WholeLog(LogReader):
         with contextlib.ExitStack() as held:
             files = [held.enter_context(LogFile(path)) for path in self.paths]
         self.size, self.finished = sum(file.size for file in files), all(file.finished for file in files)
-        described: list[Metadata | Attachment] = []
+        earlier: list[Metadata | Attachment] = []
         repeated = Repeated()
         behind = 0
         for path, file in zip(self.paths, files, strict=True):
@@ -96,8 +96,8 @@ class WholeLog(LogReader):
             repeated.next_file()
             try:
                 for message in part:
-                    if len(self.described) != len(described) + len(part.described):
-                        self.described = described + part.described
+                    if len(self.records) != len(earlier) + len(part.records):
+                        self.records = earlier + part.records
                     if self.position != behind + part.position:
                         self.position = behind + part.position
                         if self.progress is not None:
@@ -105,7 +105,7 @@ class WholeLog(LogReader):
                     if not repeated(message):
                         yield message
             finally:  # also if the caller stops reading
-                self.described = described = described + part.described
+                self.records = earlier = earlier + part.records
                 for damage in part.damage:
                     damage.why += f" ({path.name})"
                 self.damage += part.damage

@@ -31,7 +31,7 @@ class LogReader:
         paths: files of the log; here only `path`.
         size: size of the log when reading began, bytes.
         position: number of bytes read so far.
-        described: metadata and attachments read so far, in order; with the first message, those at the start.
+        records: metadata and attachments read so far, in order; with the first message, those at the start.
         schemas: schemas declared so far, by id.
         channels: channels declared so far, by key and start of the publisher.
         damage: damaged stretches that were left out.
@@ -68,7 +68,7 @@ class LogReader:
         self.paths: tuple[Path, ...] = (path,)
         self.size = 0
         self.position = 0
-        self.described: list[Metadata | Attachment] = []
+        self.records: list[Metadata | Attachment] = []
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[tuple[str, int], Channel] = {}
         self.damage: list[Damage] = []
@@ -90,12 +90,12 @@ class LogReader:
     @property
     def metadata(self) -> dict[str, dict[str, str]]:
         """Metadata read so far, by name."""
-        return {record.name: record.metadata for record in self.described if isinstance(record, Metadata)}
+        return {record.name: record.metadata for record in self.records if isinstance(record, Metadata)}
 
     @property
     def attachments(self) -> dict[str, bytes]:
         """Attachments read so far, by name."""
-        return {record.name: record.data for record in self.described if isinstance(record, Attachment)}
+        return {record.name: record.data for record in self.records if isinstance(record, Attachment)}
 
     @property
     def selection(self) -> Selection:
@@ -123,12 +123,12 @@ class LogReader:
                     case Damage():
                         self._leave_out(part)
                     case _:
-                        self.described.append(part)
+                        self.records.append(part)
             self.position = self.size
             self.complete = file.complete
         if file.unread and not self._has_chunks:
             raise self._error(0, "")
-        if self.damage and not (self.damage[0].position or self.described or self._chunks):
+        if self.damage and not (self.damage[0].position or self.records or self._chunks):
             raise DataFileError(f"{self.path} is not an MCAP file")
 
     def _needs(self, end_ns: int, channels: Collection[int]) -> bool:

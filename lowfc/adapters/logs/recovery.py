@@ -88,10 +88,10 @@ def recover(source: Path, out: Path, progress: Callable[[int, int], None] | None
     reader.progress = progress
     with new_log(out, source) as file:
         copy = LogCopy(file)
-        copy.take(reader)
-        if not copy.messages and not reader.described:
+        copy.add_file(reader)
+        if not copy.messages and not reader.records:
             raise DataFileError(f"{source}: no part of it is intact, so there is nothing to recover")
-        copy.note(RECOVERY, account(reader, copy.messages))
+        copy.add_metadata(RECOVERY, account(reader, copy.messages))
         copy.finish()
     return Recovery(source, reader.size, reader.finished, out, copy.messages, reader.unreadable, reader.damage)
 

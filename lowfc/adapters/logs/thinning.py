@@ -1,5 +1,6 @@
 """Thinned copies of logs, with the same selection rules as in a recorder."""
 
+import contextlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -29,17 +30,14 @@ def thin(
         DataFileError: a file is not a log, `out` exists already, or it cannot be written.
     """
     combined = Selection.of(metadata_at_start(log[0])).within(requested)
-    reader, messages = WholeLog(log, skip_damaged=True), 0
+    reader = WholeLog(log, skip_damaged=True)
     reader.progress = progress
     copied_names = {PART, SELECTION}  # the copy has its own
 
     def include(message: Sample) -> bool:
-        nonlocal messages
-        messages += 1
-        try:
+        with contextlib.suppress(KeyError):  # a topic unknown to this version
             return combined.keeps(topic_of(message.key), message.sequence, message.payload)
-        except KeyError:
-            return True  # a topic unknown to this version
+        return True
 
     def include_record(record: Metadata | Attachment) -> bool:
         """Whether to copy a record; of a later file only its account, which replaces the previous one."""
@@ -50,17 +48,17 @@ def thin(
     with new_log(out, log[0]) as file:
         copy = LogCopy(file)
         for name, entries in combined.metadata.items():
-            copy.note(name, entries)
-        copy.take(reader, include=include, include_record=include_record)
+            copy.add_metadata(name, entries)
+        copy.add_file(reader, include=include, include_record=include_record)
         if not reader.complete or reader.damage or reader.unreadable:
-            copy.note(RECOVERY, account(reader, copy.messages))
+            copy.add_metadata(RECOVERY, account(reader, copy.messages))
         copy.finish()
     return {
         "file": str(out),
         "selection": combined.description,
         "messages": copy.messages,
         "bytes": out.stat().st_size,
-        "messages_before": messages,
+        "messages_before": copy.read,
         "bytes_before": reader.size,
         **missing_parts(reader),
     }

@@ -80,7 +80,7 @@ def draw_logs(
             topic = topic_of(message.key)
             if topic is FRAME:
                 sent = message.sequence, message.publish_time_ns
-                same_start = start_of(sent[0]) == start_of(max(last_frame[0], 0))
+                same_start = start_of(sent[0]) == start_of(last_frame[0])
                 if same_start and sent[0] <= last_frame[0] and sent[1] > last_frame[1]:
                     raise DataFileError(
                         f"{log} repeats frame numbers of the log before it, as another lockstep run: show one run at a "
