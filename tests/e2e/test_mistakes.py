@@ -135,6 +135,7 @@ def test_ctrl_c_during_startup_prints_no_traceback(tmp_path: Path) -> None:
     [
         (("info", "empty.mcap"), "empty.mcap is empty: nothing was recorded"),
         (("recover", "header.mcap"), "no part of it is intact, so there is nothing to recover"),
+        (("export", "header.mcap", "--decimate", "2"), "header.mcap has no messages: there is nothing to copy"),
         (("replay", "night.mcap.part"), "it is finished now: night.mcap"),
         (("replay", "night.mcap", "night.mcap"), "are the same part of one log"),
         (("replay", "pipe"), "pipe cannot be read: not a regular file"),

@@ -9,10 +9,11 @@ from mcap.records import Attachment, Metadata
 
 from lowfc.adapters.bus.bus import Sample
 from lowfc.adapters.logs.log_copy import LogCopy, new_log
-from lowfc.adapters.logs.parts import Parts, WholeLog, metadata_at_start
+from lowfc.adapters.logs.parts import Parts, WholeLog, metadata_at_start, titled
 from lowfc.adapters.logs.recovery import RECOVERY, account, missing_parts
 from lowfc.adapters.logs.selection import SELECTION, Selection
 from lowfc.adapters.logs.writer import PART, stem_of
+from lowfc.contract.errors import DataFileError
 from lowfc.contract.messages import topic_of
 
 
@@ -27,7 +28,7 @@ def thin(
     """Write a thinned log from all files of a log, with its selection in the metadata; return the results for JSON.
 
     Raises:
-        DataFileError: a file is not a log, `out` exists already, or it cannot be written.
+        DataFileError: a file is not a log, or has no messages, `out` exists already, or it cannot be written.
     """
     combined = Selection.of(metadata_at_start(log[0])).within(requested)
     reader = WholeLog(log, skip_damaged=True)
@@ -50,6 +51,8 @@ def thin(
         for name, entries in combined.metadata.items():
             copy.add_metadata(name, entries)
         copy.add_file(reader, include=include, include_record=include_record)
+        if not copy.read:
+            raise DataFileError(f"{titled(log)} has no messages: there is nothing to copy")
         if not reader.complete or reader.damage or reader.unreadable:
             copy.add_metadata(RECOVERY, account(reader, copy.messages))
         copy.finish()
