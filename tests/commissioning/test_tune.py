@@ -344,6 +344,8 @@ def test_tune_needs_either_a_log_or_a_running_loop() -> None:
         tune()
     with pytest.raises(ConfigurationError, match="give one LOG"):
         tune("x.mcap", "--live", 3.0)
+    with pytest.raises(ConfigurationError, match="--run has no effect"):
+        tune("x.mcap", "--run", "bench")
 
 
 @pytest.mark.parametrize("name", LAWS)

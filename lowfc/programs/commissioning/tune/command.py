@@ -44,8 +44,8 @@ def tune(
 
     if bool(logs) == (live is not None):
         raise ConfigurationError("give one LOG, or observe a running loop with --live SECONDS")
-    if run is not None and logs and not apply:
-        raise ConfigurationError("--run has no effect with a LOG unless --apply is given: omit it")
+    if logs and run is not None and not apply:
+        raise ConfigurationError("--run has no effect on a LOG without --apply: omit it")
     console = Console(stderr=True)
     require_folder(out, plot)
     if plot is not None:
