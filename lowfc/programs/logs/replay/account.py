@@ -129,7 +129,7 @@ class Account(Result):
     def remarks(self) -> Sequence[str]:
         """Remarks on what could not be checked, what differs, and the speed."""
         missing = ((self.inputs_missing, "input"), (self.commands_missing, "command"))
-        since = f"since {self.version}"
+        since = f"since {self.version or 'a former version'}"
         lines = [f"rule changed       {counted(n, 'input')} {since}: {rule}" for rule, n in self.rules_changed.items()]
         lines += [f"unchecked          {counted(n, 'step')} {why}" for why, n in self.unchecked_because.items()]
         lines += [f"missing            the log lacks {counted(n, what)} of the controller" for n, what in missing if n]
