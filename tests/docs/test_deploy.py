@@ -152,6 +152,7 @@ def test_the_units_match_the_programs_and_the_configuration() -> None:
         assert unit["Restart"] == ["on-failure"]
         controls = command(name)[:2] == ["lowfc", "controller"]  # compiles the fused step, if configured
         assert ("MemoryDenyWriteExecute" in unit) != controls
+        assert f"NUMBA_CACHE_DIR=/var/cache/{unit['CacheDirectory'][0]}/numba" in unit["Environment"]
         assert unit["WantedBy"] == unit["PartOf"] == ["lowfc.target"]
         priority = {"lowfc-recorder.service": realtime.recorder_priority, "lowfc-viewer.service": 0}.get(
             name, realtime.priority
