@@ -10,6 +10,8 @@ import pytest
 from xdist.remote import Producer
 from xdist.scheduler import LoadFileScheduling
 
+from lowfc.adapters.bus.run import Run, new_run_id, open_run
+
 NO_SKIPS = os.environ.get("LOWFC_NO_SKIPS") == "1"
 ROOT = Path(__file__).parent
 FIRST = frozenset(ROOT / name for name in ("optics", "control", "paper", "design", "contract", "sim"))
@@ -73,6 +75,13 @@ def _private_cache(pytestconfig: pytest.Config) -> None:
     """Cache optical models separately from the user's, in a folder shared by all workers and later sessions."""
     assert pytestconfig.cache is not None
     os.environ["XDG_CACHE_HOME"] = str(pytestconfig.cache.mkdir("home"))
+
+
+@pytest.fixture
+def run() -> Iterator[Run]:
+    made = open_run(new_run_id())
+    yield made
+    made.remove()
 
 
 @pytest.fixture(autouse=True)

@@ -45,11 +45,6 @@ def _runtime(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @pytest.fixture
-def run() -> Run:
-    return open_run(new_run_id())
-
-
-@pytest.fixture
 def join() -> Iterator[Join]:
     buses: list[ZenohBus] = []
 

@@ -14,7 +14,7 @@ import pytest
 from rich.console import Console
 
 from lowfc.adapters.bus.bus import Sample
-from lowfc.adapters.bus.run import Run, new_run_id, open_run
+from lowfc.adapters.bus.run import Run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.logs.reader import LogReader
 from lowfc.adapters.process.clock import HostClock
@@ -54,13 +54,6 @@ def logged(log: Path) -> dict[str, list[Sample]]:
         found[message.key].append(message)
     assert len(found[FRAME.key]) > 80
     return found
-
-
-@pytest.fixture
-def run() -> Iterator[Run]:
-    made = open_run(new_run_id())
-    yield made
-    made.remove()
 
 
 class Tool:

@@ -2,7 +2,6 @@
 
 import io
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from lowfc.adapters.bus.run import Run, new_run_id, open_run
+from lowfc.adapters.bus.run import Run
 from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.messages import STEP
 from lowfc.programs.logs.publish.player import Player, render
@@ -20,13 +19,6 @@ from tests.support.report_log import SyntheticLog
 from tests.support.toy import START
 
 STEPS = 5
-
-
-@pytest.fixture
-def run() -> Iterator[Run]:
-    made = open_run(new_run_id())
-    yield made
-    made.remove()
 
 
 def published(run: Run, path: Path, last_ns: int) -> tuple[dict[str, Any], str]:

@@ -22,7 +22,7 @@ from google.protobuf.message_factory import GetMessageClass
 from websockets.sync.client import connect
 
 from lowfc.adapters.bus.bus import ALL
-from lowfc.adapters.bus.run import new_run_id, open_run
+from lowfc.adapters.bus.run import Run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.process.clock import HostClock
 from lowfc.contract.errors import BusError, ConfigurationError
@@ -206,8 +206,7 @@ def test_the_port_is_on_loopback_only_and_errors_have_one_line(
 
 
 @pytest.mark.exclusive
-def test_the_process_serves_a_real_run(tmp_path: Path) -> None:
-    run = open_run(new_run_id())
+def test_the_process_serves_a_real_run(tmp_path: Path, run: Run) -> None:
     process = start(tmp_path, "view", "--foxglove", "--port", 0, "--run", run.run_id)
     bus = ZenohBus(run.links, Role.CONTROLLER, HostClock())
     received: list[str] = []
@@ -236,5 +235,4 @@ def test_the_process_serves_a_real_run(tmp_path: Path) -> None:
         process.kill()
         process.wait()
         bus.close()
-        run.remove()
     assert (process.returncode, stderr) == (0, "")
