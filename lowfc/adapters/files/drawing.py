@@ -3,8 +3,7 @@
 import io
 from typing import Any
 
-from lowfc.adapters.process.extras import install_advice
-from lowfc.contract.errors import ConfigurationError
+from lowfc.adapters.process.extras import required
 
 
 def figure_class() -> Any:
@@ -13,12 +12,8 @@ def figure_class() -> Any:
     Raises:
         ConfigurationError: matplotlib is not installed.
     """
-    try:
+    with required("plots require matplotlib", "plots"):
         from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ConfigurationError(
-            f"plots need matplotlib, which is not installed ({error}); install it with: {install_advice('plots')}"
-        ) from None
     return Figure
 
 

@@ -2,7 +2,11 @@
 
 import re
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import metadata
+
+from lowfc.contract.errors import ConfigurationError
 
 
 def install_advice(extra: str) -> str:
@@ -14,3 +18,12 @@ def install_advice(extra: str) -> str:
         return f"{pip} -e '.[{extra}]' in its checkout"
     names = [one.partition(";")[0].strip() for one in required if re.search(rf"extra == ['\"]{extra}['\"]", one)]
     return " ".join([pip, *(f"'{name}'" for name in names)])
+
+
+@contextmanager
+def required(what: str, extra: str) -> Iterator[None]:
+    """Import packages of an extra; ConfigurationError, which begins with `what` and has advice, if one is missing."""
+    try:
+        yield
+    except ImportError as fault:
+        raise ConfigurationError(f"{what}, which is missing ({fault}); install: {install_advice(extra)}") from None

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lowfc.adapters.process.extras import install_advice
+from lowfc.adapters.process.extras import install_advice, required
 from lowfc.device import CameraSettings, Configuration, ConfigurationError, Exposure, Need
 from lowfc.device.drivers.genicam import WAIT_MS, GenicamOptions
 
@@ -21,12 +21,8 @@ _QUEUED = 2
 
 
 def _pylon() -> Any:
-    try:
+    with required("the driver basler requires the package pypylon", "basler"):
         return importlib.import_module("pypylon.pylon")
-    except ImportError as fault:
-        raise ConfigurationError(
-            f"the driver basler needs the package pypylon ({fault}): {install_advice('basler')}"
-        ) from None
 
 
 class BaslerCamera:

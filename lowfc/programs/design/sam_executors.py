@@ -11,7 +11,7 @@ from threading import Thread
 from typing import Any
 
 from lowfc.adapters.process.child import interrupt_blocked
-from lowfc.adapters.process.extras import install_advice
+from lowfc.adapters.process.extras import required
 from lowfc.contract.errors import ConfigurationError
 
 DASK_TIMEOUT_S = 10.0
@@ -76,9 +76,8 @@ def is_lost(error: BaseException) -> bool:
 @contextmanager
 def _dask(address: str) -> Iterator[Executor]:
     try:
-        client: Any = import_module("distributed").Client(address, timeout=DASK_TIMEOUT_S)
-    except ImportError:
-        raise ConfigurationError(f"--scheduler needs Dask: {install_advice('cluster')}") from None
+        with required("--scheduler requires Dask", "cluster"):
+            client: Any = import_module("distributed").Client(address, timeout=DASK_TIMEOUT_S)
     except (OSError, ValueError) as error:
         raise ConfigurationError(f"no Dask scheduler answers at {address!r}: {error}") from error
     for name in ("distributed", "distributed.client"):  # a lost scheduler is reported by us, without a traceback

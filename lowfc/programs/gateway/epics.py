@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from lowfc.adapters.process.extras import install_advice
-from lowfc.contract.errors import BusError, ConfigurationError, LowfcError
+from lowfc.adapters.process.extras import required
+from lowfc.contract.errors import BusError, LowfcError
 from lowfc.contract.sections import Gateway
 from lowfc.control.loop.interlocks import MAX_TEXT_LENGTH, Value
 from lowfc.programs.gateway.variables import Kind, Put, Variable
@@ -22,16 +22,11 @@ Ask = Callable[[Put, Any], object]
 
 def protocol() -> Any:
     """The package p4p with the modules used; ConfigurationError if it is not installed."""
-    try:
+    with required("lowfc gateway epics needs p4p", "epics"):
         import p4p
         import p4p.client.thread
         import p4p.nt
         import p4p.server.thread
-    except ImportError as error:
-        advice = install_advice("epics")
-        raise ConfigurationError(
-            f"lowfc gateway epics needs p4p, which is not installed ({error}); install it with: {advice}"
-        ) from None
     return p4p
 
 

@@ -18,9 +18,9 @@ from lowfc.adapters.bus.run import Run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.logs.writer import declaration
 from lowfc.adapters.process.clock import Clock
-from lowfc.adapters.process.extras import install_advice
+from lowfc.adapters.process.extras import required
 from lowfc.adapters.process.service import Service
-from lowfc.contract.errors import BusError, ConfigurationError
+from lowfc.contract.errors import BusError
 from lowfc.contract.messages import TOPICS, Role, Topic
 
 if TYPE_CHECKING:
@@ -50,13 +50,8 @@ class FoxgloveBridge:
             BusError: the port is in use.
             ConfigurationError: foxglove-sdk is not installed.
         """
-        try:
+        with required("--foxglove requires foxglove-sdk", "foxglove"):
             import foxglove
-        except ImportError as error:
-            raise ConfigurationError(
-                f"--foxglove requires foxglove-sdk, which is missing ({error}); install it with: "
-                f"{install_advice('foxglove')}"
-            ) from None
         logging.getLogger("foxglove").setLevel(logging.CRITICAL)  # a client that disconnects is not an error
         self._foxglove: Any = foxglove
         self._context = self._foxglove.Context()

@@ -7,8 +7,7 @@ from typing import Any
 import tomli_w
 
 from lowfc.adapters.files.drawing import figure_class
-from lowfc.adapters.process.extras import install_advice
-from lowfc.contract.errors import ConfigurationError
+from lowfc.adapters.process.extras import required
 from lowfc.contract.printable import LINES, printable
 from lowfc.programs.cli.contrast import added_contrast_in_words
 from lowfc.programs.logs.report.drawings import drawings
@@ -62,13 +61,8 @@ def _finalized(value: Any) -> Any:
 
 
 def _environment() -> Any:
-    try:
+    with required("the HTML page, unlike --json, requires jinja2", "plots"):
         from jinja2 import Environment, StrictUndefined
-    except ImportError as error:
-        raise ConfigurationError(
-            f"the HTML page requires jinja2, which is missing ({error}); install it with: {install_advice('plots')}, "
-            "or print the results with --json"
-        ) from None
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, finalize=_finalized
     )
