@@ -215,7 +215,5 @@ def test_the_command_makes_a_certificate_for_every_role(tmp_path: Path) -> None:
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
     handshake(folder, folder, "mirror-tip")
     (folder / "mirror-dm.pem").unlink()
-    before = {file: file.read_bytes() for file in folder.glob("*.pem")}
-    assert lowfc("certs", folder, "--renew", "--router", "localhost").exit_code == 0
-    assert {file.stem for file, content in before.items() if file.read_bytes() != content} == roles - {"mirror-dm"}
-    assert not (folder / "mirror-dm.pem").exists()
+    done = lowfc("certs", folder, "--renew", "--router", "localhost")
+    assert {Path(file).stem for file in done.stdout.split()} == roles - {"mirror-dm"}

@@ -30,6 +30,7 @@ CA_DAYS = 3650
 DAYS = 825
 """Default validity of a role's certificate, days."""
 
+_UNUSED = ("content_commitment", "data_encipherment", "key_agreement", "encipher_only", "decipher_only")
 _BACKDATED = datetime.timedelta(hours=1)  # hosts' clocks differ
 
 
@@ -49,8 +50,7 @@ def make_certificates(
         Files of the new certificates.
 
     Raises:
-        ConfigurationError: there is no address for the router's certificate, an invalid one, or one that the existing
-            certificate does not have; or there is nothing to renew.
+        ConfigurationError: an address is missing, invalid, or not in the router's certificate; nothing can be renewed.
         DataFileError: the folder holds other files, or cannot be written.
     """
     names = [_general_name(address) for address in addresses]
@@ -131,17 +131,8 @@ def _own_key(folder: Path, role: str) -> EllipticCurvePrivateKey:
 def _builder(name: str, own: EllipticCurvePrivateKey, days: int, *, authority: bool = False) -> x509.CertificateBuilder:
     """Certificate builder for a key, without issuer and extended key usage."""
     now = datetime.datetime.now(datetime.UTC)
-    usage = x509.KeyUsage(
-        digital_signature=not authority,
-        key_cert_sign=authority,
-        crl_sign=authority,
-        content_commitment=False,
-        key_encipherment=False,
-        data_encipherment=False,
-        key_agreement=False,
-        encipher_only=False,
-        decipher_only=False,
-    )
+    signs = {"digital_signature": not authority, "key_cert_sign": authority, "crl_sign": authority}
+    usage = x509.KeyUsage(**signs, key_encipherment=False, **dict.fromkeys(_UNUSED, False))
     return (
         x509.CertificateBuilder()
         .subject_name(_name(name))
@@ -160,10 +151,8 @@ def _name(common: str) -> x509.Name:
 
 
 def _general_name(address: str) -> x509.GeneralName:
-    try:
+    with contextlib.suppress(ValueError):
         return x509.IPAddress(ipaddress.ip_address(address))
-    except ValueError:
-        pass
     if not address or not address.isascii() or not set(address) <= _IN_A_NAME:
         raise ConfigurationError(f"the router's address is a host's name or IP address, without port; got {address!r}")
     return x509.DNSName(address)
