@@ -131,7 +131,7 @@ def rewritten(source: Path, out: Path, options: dict[str, Any]) -> Path:
         copy = LogCopy(io.BytesIO())
         copy._writer = Writer(stream, chunk_size=8192, **{k: v for k, v in options.items() if k != "library"})
         copy._writer.start(library=options.get("library", "another tool"))
-        copy.take(LogReader(source))
+        copy.add_file(LogReader(source))
         copy.finish()
     return out
 

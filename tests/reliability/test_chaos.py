@@ -283,7 +283,9 @@ def without_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             found.notes.append(str(error))
         return found
 
-    faulty = Mock(side_effect=KeyError("odd"))
+    def faulty(bench: object) -> None:
+        raise KeyError("odd")
+
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("lowfc.programs.reliability.chaos.command._run", act_only)
     monkeypatch.setattr("lowfc.programs.reliability.chaos.rules.judge", judge_notes)
