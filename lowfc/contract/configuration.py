@@ -226,17 +226,19 @@ class Configuration(Section):
                 f"safety.stroke_nm is {self.safety.stroke_nm:g} nm either way, but mirror.stroke_nm gives only "
                 f"{self.mirror.stroke_nm / 2:g} nm either way"
             )
+        margin_nm = 0.0
         for key, section, share in ("safety", self.safety, 1.0), ("mirror", self.mirror, 0.5):
             try:
-                limits = Limits(share * section.stroke_nm, section.slew_nm, section.neighbour_nm)
+                margin_nm = Limits(share * section.stroke_nm, section.slew_nm, section.neighbour_nm).margin_nm
             except ValueError as fault:
                 raise ValueError(f"{key}.{fault}") from None
         step_nm = self.mirror.stroke_nm / 2**self.mirror.driver_bits
+        least_nm = step_nm + max(0.01, 2 * margin_nm)
         for name in ("slew_nm", "neighbour_nm"):
-            if getattr(self.mirror, name) <= step_nm + max(0.01, 2 * limits.margin_nm):
+            if getattr(self.mirror, name) <= least_nm:
                 raise ValueError(
-                    f"mirror.{name} is {getattr(self.mirror, name):g} nm, but one step of a driver of "
-                    f"{self.mirror.driver_bits} bits is {step_nm:g} nm already"
+                    f"mirror.{name} must be above {least_nm:g} nm, one step of a driver of {self.mirror.driver_bits} "
+                    f"bits ({step_nm:g} nm) with the margin for rounding; got {getattr(self.mirror, name):g} nm"
                 )
         if 0 < self.control.delay_frames < 1:
             raise ValueError(

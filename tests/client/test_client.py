@@ -605,7 +605,7 @@ def test_an_invalid_number_is_quoted_in_the_error() -> None:
     assert "'1.5' is not a whole number" in lowfc("ctl", "step", "1.5").output
     assert isinstance(lowfc("ctl", "gain", "auto", "0.3").exception, ConfigurationError)
     bench = ("ctl", "bench", "--run", "none-such", "celsius")
-    assert "no option and no value: '-x'" in lowfc(*bench, "-x").output
+    assert "'-x' is neither an option of this command nor a number" in lowfc(*bench, "-x").output
     assert isinstance(lowfc(*bench, "-40").exception, BusError | DataFileError), "a negative value is no option"
 
 

@@ -79,8 +79,16 @@ def test_each_law_is_tuned_from_a_closed_loop(
     assert tip.predicted_nm < tip.achieved_nm
     assert (found.closed, found.achieved_from, best.law.name) == (True, "truth", controller)
     check_stable(best.law, found.delay_frames)
-    continuous = replace(telemetry, continuous_nm=np.array(telemetry.noll, float))
+    continuous = replace(telemetry, continuous_rms_nm=np.array(telemetry.noll, float))
     assert all(mode.achieved_nm == mode.noll for mode in result_of(continuous, best, gains, controller).modes)
+
+
+def test_the_true_residual_over_all_time_is_read_from_the_log(tmp_path: Path) -> None:
+    night = SyntheticLog()
+    night.instants = 4
+    run = telemetry_from_log(LogReader(night.request("close").frames(2100).write(tmp_path / "night.mcap")))
+    assert run.true_nm2 is not None
+    np.testing.assert_allclose(run.continuous_rms_nm, 2 * np.sqrt(np.diag(run.true_nm2)), rtol=1e-5)
 
 
 def test_the_command_writes_the_law_and_draws_it(

@@ -58,6 +58,7 @@ class SyntheticLog:
         """Start a loop with `changes` to its settings."""
         self.samples: list[Sample] = []
         self.truth = truth
+        self.instants = 0  # of a period, at which the continuous truth, twice that at the exposure's start, was sampled
         self.now_ns = START * 10**9
         self.calibration = calibration
         self.settings = settings(**({"gain": (0.4, 0.2)} | changes))
@@ -115,6 +116,10 @@ class SyntheticLog:
                     disturbance_rms_nm=rms[0],
                     residual_rms_nm=rms[1],
                 )
+                if self.instants:
+                    truth.instants = self.instants
+                    truth.continuous_disturbance_nm.extend(2 * wave_nm)
+                    truth.continuous_residual_nm.extend(2 * residual_nm)
                 self.put(TRUTH, truth)
             if index not in lost:
                 exposed = Frame(sequence, self.now_ns, 100_000, frame)

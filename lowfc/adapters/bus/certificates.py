@@ -42,7 +42,7 @@ def make_certificates(
     Args:
         folder: folder of the authority; created with access for this user only.
         roles: roles to make certificates for, including the router's.
-        addresses: names and IP addresses by which other hosts reach the router.
+        addresses: names and IP addresses by which other hosts reach the router; if empty, a renewal keeps the present.
         days: validity of the certificates, days.
         renew: also renew existing certificates, with their present keys; the authority is never renewed.
 
@@ -56,6 +56,8 @@ def make_certificates(
     names = [_general_name(address) for address in addresses]
     try:
         missing = [role for role in roles if renew or not (folder / f"{role}.pem").exists()]
+        if renew and not names and (folder / f"{ROUTER}.pem").exists():
+            names = _names(folder)
         if ROUTER in missing and not names:
             raise ConfigurationError(
                 "the router's certificate needs its address: give the name by which others reach it"

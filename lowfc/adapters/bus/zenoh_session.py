@@ -40,20 +40,21 @@ def keep_thread_state() -> None:
 
 
 def close_links_at_once(session: zenoh.Session) -> None:
-    """Turn SO_LINGER off on each link of a session as it is made; the kernel still sends what was written.
+    """Turn SO_LINGER off on the TCP sockets of this process after each new link of a session.
 
     Zenoh sets 10 s. Closing the link of a process that is stopped would block the thread that receives, and no
-    request would be answered for as long.
+    request would be answered for as long. The kernel still sends what was written.
     """
 
     def changed(event: zenoh.LinkEvent) -> None:
-        if event.link.src.startswith(_SOCKET):  # closed without a wait
+        if event.kind != zenoh.SampleKind.PUT or event.link.src.startswith(_SOCKET):  # closed without a wait
             return
         for descriptor in (int(path.name) for path in Path("/proc/self/fd").iterdir()):
             with contextlib.suppress(OSError):  # not a socket, or closed since
                 found = socket.socket(fileno=descriptor)
                 try:
-                    found.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 0, 0))
+                    if found.family in (socket.AF_INET, socket.AF_INET6):
+                        found.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 0, 0))
                 finally:
                     found.detach()
 

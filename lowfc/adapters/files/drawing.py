@@ -3,7 +3,7 @@
 import io
 from typing import Any
 
-from lowfc.adapters.process.extras import required
+from lowfc.adapters.process.extras import package_required
 
 
 def figure_class() -> Any:
@@ -12,7 +12,7 @@ def figure_class() -> Any:
     Raises:
         ConfigurationError: matplotlib is not installed.
     """
-    with required("plots require matplotlib", "plots"):
+    with package_required("plots require matplotlib", "plots"):
         from matplotlib.figure import Figure
     return Figure
 

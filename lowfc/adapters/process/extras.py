@@ -21,8 +21,8 @@ def install_advice(extra: str) -> str:
 
 
 @contextmanager
-def required(what: str, extra: str) -> Iterator[None]:
-    """Import packages of an extra; ConfigurationError, which begins with `what` and has advice, if one is missing."""
+def package_required(what: str, extra: str) -> Iterator[None]:
+    """Turn an ImportError in the block into a ConfigurationError: `what`, which is missing; install: the extra."""
     try:
         yield
     except ImportError as fault:

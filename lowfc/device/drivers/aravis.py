@@ -62,9 +62,12 @@ class AravisCamera:
     def expose(self) -> Exposure | None:
         """Next complete frame, timed at its first packet, just after the exposure; a lost camera is opened again."""
         if self._lost:
-            self._open(self._name)
-            self.start()
-            self._lost = False
+            try:
+                self._open(self._name)
+                self.start()
+            except BaseException:
+                self._lost = True
+                raise
         buffer = self._stream.timeout_pop_buffer(WAIT_MS * 1000)
         if buffer is None:
             return None
@@ -85,7 +88,7 @@ class AravisCamera:
 
     def _open(self, name: str) -> None:
         self._camera = camera = self._aravis.Camera.new(name or None)
-        self._name = name or camera.get_device_id()
+        self._name, self._lost = name or camera.get_device_id(), False  # before the signal, which may come at once
         camera.get_device().connect("control-lost", self._lose)
         self._set(self._options)
         self._stream = camera.create_stream(None, None)

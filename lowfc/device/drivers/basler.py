@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lowfc.adapters.process.extras import install_advice, required
+from lowfc.adapters.process.extras import install_advice, package_required
 from lowfc.device import CameraSettings, Configuration, ConfigurationError, Exposure, Need
 from lowfc.device.drivers.genicam import WAIT_MS, GenicamOptions
 
@@ -21,7 +21,7 @@ _QUEUED = 2
 
 
 def _pylon() -> Any:
-    with required("the driver basler requires the package pypylon", "basler"):
+    with package_required("the driver basler requires the package pypylon", "basler"):
         return importlib.import_module("pypylon.pylon")
 
 

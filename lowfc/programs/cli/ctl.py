@@ -60,8 +60,15 @@ def bench_value(word: str) -> bool | float | str:
         return float(word)
     except ValueError:
         if word.startswith("-"):  # see `ignore_unknown_options`
-            raise typer.BadParameter(f"no option and no value: {word!r}") from None
+            raise typer.BadParameter(f"{word!r} is neither an option of this command nor a number") from None
         return word
+
+
+def bench_name(word: str) -> str:
+    """Refuse a misspelt option; see `ignore_unknown_options`."""
+    if word.startswith("-"):
+        raise typer.BadParameter(f"{word!r} is not an option of this command")
+    return word
 
 
 _EACH = "One value for all modes, or one for each mode."
@@ -75,7 +82,8 @@ Purpose = Annotated[str, typer.Argument(help="What will be moved.")]
 Hold = Annotated[
     float | None, typer.Option(help="Hold the loop for this many seconds; `open` ends the hold.", parser=number)
 ]
-BenchName = Annotated[str, typer.Argument(help="Name of the value, as in [[interlocks]] of the configuration.")]
+_NAME = "Name of the value, as in [[interlocks]] of the configuration."
+BenchName = Annotated[str, typer.Argument(help=_NAME, parser=bench_name)]
 BenchValue = Annotated[str, typer.Argument(help="true, false, a number or a text.")]
 Channel = Annotated[str, typer.Argument(help="Name of the channel; `flat` does not shift the sensor's zero point.")]
 Shape = Annotated[Path | None, typer.Argument(help="FITS or .npy array (rows, columns), nm of surface.")]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lowfc.adapters.process.extras import required
+from lowfc.adapters.process.extras import package_required
 from lowfc.adapters.process.terminal import DEFAULT_RUN, AnyRun, ConfigFile, Json, RunId, configuration
 from lowfc.contract.errors import BusError, ConfigurationError
 from lowfc.programs.cli.result import Result, print_result, result_field
@@ -67,7 +67,7 @@ def certs(
     from lowfc.adapters.bus.run import mirror_role
     from lowfc.contract.configuration import load
 
-    with required("making certificates requires the package cryptography", "deploy"):
+    with package_required("making certificates requires the package cryptography", "deploy"):
         from lowfc.adapters.bus.certificates import make_certificates
     present = sorted(file.stem.removeprefix("mirror-") for file in folder.glob("mirror-*.pem"))
     mirrors = [load(None, {"mirror.name": name}).mirror.name for name in mirror or present or ["dm"]]

@@ -11,7 +11,7 @@ from threading import Thread
 from typing import Any
 
 from lowfc.adapters.process.child import interrupt_blocked
-from lowfc.adapters.process.extras import required
+from lowfc.adapters.process.extras import package_required
 from lowfc.contract.errors import ConfigurationError
 
 DASK_TIMEOUT_S = 10.0
@@ -76,7 +76,7 @@ def is_lost(error: BaseException) -> bool:
 @contextmanager
 def _dask(address: str) -> Iterator[Executor]:
     try:
-        with required("--scheduler requires Dask", "cluster"):
+        with package_required("--scheduler requires Dask", "cluster"):
             client: Any = import_module("distributed").Client(address, timeout=DASK_TIMEOUT_S)
     except (OSError, ValueError) as error:
         raise ConfigurationError(f"no Dask scheduler answers at {address!r}: {error}") from error

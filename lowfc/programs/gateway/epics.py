@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lowfc.adapters.process.extras import required
+from lowfc.adapters.process.extras import package_required
 from lowfc.contract.errors import BusError, LowfcError
 from lowfc.contract.sections import Gateway
 from lowfc.control.loop.interlocks import MAX_TEXT_LENGTH, Value
@@ -22,7 +22,7 @@ Ask = Callable[[Put, Any], object]
 
 def protocol() -> Any:
     """The package p4p with the modules used; ConfigurationError if it is not installed."""
-    with required("lowfc gateway epics needs p4p", "epics"):
+    with package_required("lowfc gateway epics needs p4p", "epics"):
         import p4p
         import p4p.client.thread
         import p4p.nt

@@ -45,9 +45,11 @@ class Prepared:
 
     @property
     def paper_name(self) -> str:
-        """The paper's sensor with which it is compared, if there is one: "sam" for every layout."""
+        """The paper's sensor with which it is compared, if there is one: "sam" for every layout, also behind a mask."""
         kind = self.name.partition(":")[0]
-        return kind if kind in SENSORS else "sam"
+        if kind not in SENSORS:
+            return "sam"
+        return kind if kind == "bowtie" else self.name  # not a CLOWFS with another defocus
 
     @cached_property
     def modes(self) -> Array:

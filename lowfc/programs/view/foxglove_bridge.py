@@ -18,7 +18,7 @@ from lowfc.adapters.bus.run import Run
 from lowfc.adapters.bus.zenoh_bus import ZenohBus
 from lowfc.adapters.logs.writer import declaration
 from lowfc.adapters.process.clock import Clock
-from lowfc.adapters.process.extras import required
+from lowfc.adapters.process.extras import package_required
 from lowfc.adapters.process.service import Service
 from lowfc.contract.errors import BusError
 from lowfc.contract.messages import TOPICS, Role, Topic
@@ -50,7 +50,7 @@ class FoxgloveBridge:
             BusError: the port is in use.
             ConfigurationError: foxglove-sdk is not installed.
         """
-        with required("--foxglove requires foxglove-sdk", "foxglove"):
+        with package_required("--foxglove requires foxglove-sdk", "foxglove"):
             import foxglove
         logging.getLogger("foxglove").setLevel(logging.CRITICAL)  # a client that disconnects is not an error
         self._foxglove: Any = foxglove

@@ -8,7 +8,7 @@ from lowfc.contract.messages import EVENT, STEP, SURFACE, TRUTH, Role, Topic
 from lowfc.programs.view.snapshot import SHOWN, Accumulator, Snapshot
 from lowfc.programs.view.verdicts.watcher import Watcher
 
-_RING_SIZES = {EVENT: 200, STEP: 4000, TRUTH: 50}  # messages; 50 truths per reading suffice for an rms
+_RING_SIZES = {EVENT: 200, STEP: 4000, TRUTH: 200}  # messages; the newest 200 truths per reading suffice for an rms
 _PATIENCE_S = 0.2
 _QUERY_AGAIN_NS = 5_000_000_000  # until a controller that did not answer is queried again
 

@@ -47,8 +47,8 @@ class Telemetry:
         closed: whether the loop was closed in these frames.
         pol: pseudo-open-loop modes (frames, modes), in pieces without gaps.
         error: modal error of the same frames (frames, modes).
-        true_nm2: mean products of the true residual over these frames (modes, modes), at the start of each exposure;
-            None if unknown. `continuous_nm`: its rms (modes,) over all time; None if unknown.
+        true_nm2: mean products of the true residual at the start of each exposure (modes, modes); None if unknown.
+        continuous_rms_nm: rms of the true residual over all time (modes,); None if unknown.
         nm_per_mas: wavefront rms of a tilt of 1 mas; None if the telescope's diameter is unknown.
         contrast: contrast added by the modes, with `noise_nm2`, the computed covariance (modes, modes) of one frame's
             noise; None without a science image.
@@ -65,7 +65,7 @@ class Telemetry:
     pol: TimeSeries
     error: TimeSeries
     true_nm2: Array | None
-    continuous_nm: Array | None
+    continuous_rms_nm: Array | None
     nm_per_mas: float | None
     contrast: ModalContrast | None
     noise_nm2: Array | None
@@ -258,7 +258,7 @@ def _telemetry(
         pol=pol,
         error=time_series(steps.sequence[rows], steps.error_nm[rows]),
         true_nm2=None if true_nm is None else true_nm.T.astype(float) @ true_nm / len(true_nm),
-        continuous_nm=None if rms_nm is None else np.sqrt(np.mean(rms_nm.astype(float) ** 2, axis=0)),
+        continuous_rms_nm=None if rms_nm is None else np.sqrt(np.mean(rms_nm.astype(float) ** 2, axis=0)),
         nm_per_mas=tilt_nm_per_mas(config.star.diameter_m) if config is not None else None,
         contrast=contrast,
         noise_nm2=frame_noise_nm2(config, calibration) if config is not None and contrast is not None else None,

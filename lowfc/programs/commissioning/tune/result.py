@@ -126,7 +126,7 @@ def result_of(run: Telemetry, best: Tuned, gains: Gains, controller: str) -> Tun
     integrator_nm = tune_integrator(best.models, gains, run.noll, leak, run.timing).predicted_nm
     now_nm = predicted_nm(now, best.models, run.timing) if margins.margins(now, run.timing.delay).stable else None
     achieved_nm = _achieved_nm(run, gains.noise_nm)
-    if achieved_nm is not None and now_nm is not None and run.continuous_nm is None:
+    if achieved_nm is not None and now_nm is not None and run.continuous_rms_nm is None:
         # The frames give the residual of what the exposures see; theory adds the rest.
         sampled_nm = predicted_nm(now, best.models, Timing.sampled(run.timing.delay))
         achieved_nm = np.sqrt(np.maximum(achieved_nm**2 + now_nm**2 - sampled_nm**2, 0.0))
@@ -167,7 +167,7 @@ def result_of(run: Telemetry, best: Tuned, gains: Gains, controller: str) -> Tun
         delay_frames=run.timing.delay,
         closed=run.closed,
         frames=run.pol.frames,
-        achieved_from=None if achieved_nm is None else "error less noise" if run.true_nm2 is None else "truth",
+        achieved_from=None if achieved_nm is None else "truth" if _has_truth(run) else "error less noise",
         tilt_mas=tilt_mas,
         added_contrast=_added_contrast(run, best, now, achieved_nm),
         gain_margin=_finite(float(best.margins.gain_margin.min())),
@@ -228,12 +228,16 @@ def _added_contrast(run: Telemetry, best: Tuned, now: LinearLaw, closed_nm: Arra
     )
 
 
+def _has_truth(run: Telemetry) -> bool:
+    return not (run.true_nm2 is None and run.continuous_rms_nm is None)
+
+
 def _achieved_nm(run: Telemetry, noise_nm: Array) -> Array | None:
     """Rms (modes,) of the true residual, over all time if known; otherwise of the error minus the noise."""
     if not run.closed:
         return None
-    if run.continuous_nm is not None:
-        return run.continuous_nm
+    if run.continuous_rms_nm is not None:
+        return run.continuous_rms_nm
     if run.true_nm2 is not None:
         return np.asarray(np.sqrt(np.diag(run.true_nm2)))
     squares = np.mean(run.error.joined() ** 2, axis=0)

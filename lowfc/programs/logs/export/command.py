@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lowfc.adapters.logs.selection import selection
-from lowfc.adapters.process.extras import required
+from lowfc.adapters.process.extras import package_required
 from lowfc.adapters.process.terminal import Json, Logs
 from lowfc.contract.errors import ConfigurationError, DataFileError
 from lowfc.programs.cli.output import print_result
@@ -162,7 +162,7 @@ def render_copy(results: dict[str, Any]) -> str:
 def _writer(to: Format, *, with_frames: bool) -> "Callable[[list[Path], History], None]":
     """The writer of a format: a function of the output files and the log's history."""
     if to is Format.AOT:
-        with required("--to aot requires aotpy", "aot"):
+        with package_required("--to aot requires aotpy", "aot"):
             from lowfc.programs.logs.export.aot import write_aot
         return partial(write_aot, with_frames=with_frames)
     from lowfc.programs.logs.export import files

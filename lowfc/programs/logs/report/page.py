@@ -7,7 +7,7 @@ from typing import Any
 import tomli_w
 
 from lowfc.adapters.files.drawing import figure_class
-from lowfc.adapters.process.extras import required
+from lowfc.adapters.process.extras import package_required
 from lowfc.contract.printable import LINES, printable
 from lowfc.programs.cli.contrast import added_contrast_in_words
 from lowfc.programs.logs.report.drawings import drawings
@@ -61,7 +61,7 @@ def _finalized(value: Any) -> Any:
 
 
 def _environment() -> Any:
-    with required("the HTML page, unlike --json, requires jinja2", "plots"):
+    with package_required("the HTML page, unlike --json, requires jinja2", "plots"):
         from jinja2 import Environment, StrictUndefined
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, finalize=_finalized

@@ -82,7 +82,8 @@ class LoggedRun:
     Attributes:
         steps: these steps; `missing`: (steps,) number of exposures without a step before each.
         true_nm: disturbance and residual (steps, modes) at the start of each exposure, NaN where unknown; None without
-            any. `continuous_rms_nm`: rms residual (steps, modes) over each period; None if the log does not have it.
+            any.
+        continuous_rms_nm: rms of the true residual (steps, modes) over each period; None if the log does not have it.
         calibration: calibration of the log.
         used: (steps,) whether the frame was used.
         law: last law of the run.

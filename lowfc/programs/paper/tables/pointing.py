@@ -130,6 +130,10 @@ def _realisations(
     return dict(zip(linear, np.array(found).transpose(1, 0, 2), strict=True))
 
 
+def _paper_name(sensor: Prepared) -> str:
+    return sensor.paper_name.partition(":")[0]  # a CLOWFS of any defocus: one is fitted to this table
+
+
 def _rows(
     sensor: Prepared,
     exposure: Exposure,
@@ -147,7 +151,7 @@ def _rows(
         yield fitted(
             quantity=f"std of {direction} tilt, {mas} mas, {exposure.name}",
             measured=float(scatter[axis]),
-            paper=TABLE4_MAS.get(sensor.paper_name, {}).get(mas) if modes == 2 and direction == "x" else None,
+            paper=TABLE4_MAS.get(_paper_name(sensor), {}).get(mas) if modes == 2 and direction == "x" else None,
             error=float(scatter[axis] / np.sqrt(2.0 * (trials - 1))),
             predicted=float(predicted[axis]),
             limit=float(bound[axis]),
@@ -166,7 +170,7 @@ def _rows(
 def _dimmed_rows(sensor: Prepared, exposure: Exposure, tilted: Array) -> Iterator[Row]:
     """Predictions with the throughput of the paper's pupil."""
     linear = fits(sensor, exposure, 1)
-    what, paper = f"predicted std of x tilt, 1 mas, {exposure.name}", TABLE4_MAS.get(sensor.paper_name, {}).get(1)
+    what, paper = f"predicted std of x tilt, 1 mas, {exposure.name}", TABLE4_MAS.get(_paper_name(sensor), {}).get(1)
     for kind in KINDS:
         std, limit = predicted_mas(linear[2, kind], tilted * exposure.scale_e), bound_mas(linear[2, kind])
         fitted = partial(Row, sensor.name, modes=2, estimator=kind, assumption=exposure.assumption)
