@@ -4,9 +4,12 @@ import contextlib
 import io
 import itertools
 import json
+import os
 import re
 import shlex
+import signal
 import sys
+import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -284,3 +287,24 @@ def test_the_night_is_replayed_to_the_bit(night: Night) -> None:
     frames = night.results["frames_processed"]
     assert isinstance(frames, int)
     assert commands > 0.6 * frames, "all but those before the second log's first state"
+
+
+@pytest.mark.slow
+def test_requests_are_answered_while_a_process_is_stopped_for_longer_than_its_links_last(tmp_path: Path) -> None:
+    """Closing such a link once blocked the controller's receiving thread for ten seconds."""
+    process = start(tmp_path, "sim-loop", "--run", "stopped", "--rate", "50", "--no-record")
+    try:
+        until(lambda: "sim_dm" in children(process.pid) and "stopped" in running())
+        with Client("stopped") as loop:
+            until(lambda: loop.status().state.frames_used)  # type: ignore[union-attr]
+            mirror = children(process.pid)["sim_dm"]
+            os.kill(mirror, signal.SIGSTOP)
+            try:
+                for _ in range(120):
+                    assert loop.status().accepted
+                    time.sleep(0.2)
+            finally:
+                os.kill(mirror, signal.SIGCONT)
+    finally:
+        process.kill()
+        process.communicate()

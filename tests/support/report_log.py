@@ -118,6 +118,7 @@ class SyntheticLog:
                 )
                 if self.instants:
                     truth.instants = self.instants
+                    truth.sensed_residual_nm.extend(residual_nm)
                     truth.continuous_disturbance_nm.extend(2 * wave_nm)
                     truth.continuous_residual_nm.extend(2 * residual_nm)
                 self.put(TRUTH, truth)
