@@ -19,7 +19,7 @@ from lowfc.contract.codecs import input_file
 from lowfc.contract.errors import ConfigurationError, brief
 from lowfc.contract.former_names import renamed_keys
 from lowfc.contract.network import Network as Network
-from lowfc.contract.network import Text
+from lowfc.contract.network import WithoutNul
 from lowfc.contract.printable import printable
 from lowfc.contract.sections import (
     IMPERFECTIONS,
@@ -142,7 +142,7 @@ class Acceptance(Section):
 class Recorder(Section):
     """The log."""
 
-    folder: Text = "logs"
+    folder: WithoutNul = "logs"
     """Where log files are written."""
     file_mode: str = Field("0640", pattern=r"^06[0246]{2}$")
     """Permissions of a log file, octal: 0640 readable by its group, 0600 by its owner only; the umask also applies."""
@@ -156,7 +156,7 @@ class Recorder(Section):
     """Record every Nth frame and mirror state; steps and commands are always complete. Replay requires 1."""
     topics: list[str] = Field(default_factory=list)
     """Topics or patterns to record among frames, mirror state, mirror surface, truth and timing; empty for all."""
-    on_event: Text = ""
+    on_event: WithoutNul = ""
     """Shell command that the recorder runs on events, described by the variables LOWFC_EVENT, LOWFC_TEXT, LOWFC_LEVEL,
     LOWFC_PROCESS, LOWFC_TIME, LOWFC_RUN and LOWFC_OTHERS; empty for none."""
     on_event_level: Literal["info", "warning", "error"] = "error"

@@ -6,10 +6,17 @@ from collections.abc import Iterator
 from itertools import pairwise
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
-Text = Annotated[str, Field(pattern=r"^[^\x00]*$")]
-"""Text of the operating system, such as a path or a command, in which NUL cannot be."""
+
+def _without_nul(text: str) -> str:
+    if "\0" in text:
+        raise ValueError("must not contain NUL")
+    return text
+
+
+WithoutNul = Annotated[str, AfterValidator(_without_nul)]
+"""A path, command or address, in which the operating system accepts no NUL."""
 
 
 class Section(BaseModel):
@@ -48,7 +55,7 @@ class Network(Section):
 
     router: str = Field("", pattern=r"^(tls/[^\x00]+:[0-9]{1,5})?$")
     """Where the router listens, such as "tls/bench.example.org:7447"; empty for none."""
-    certificates: Text = ""
+    certificates: WithoutNul = ""
     """Folder with ca.pem and, for each role on this host, ROLE.pem and ROLE.key, made by `lowfc certs`."""
     listen: str = Field("", pattern=r"^(tls/[^\x00]+:[0-9]{1,5})?$")
     """Address on which the router listens, if it differs from `router`."""

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import Field, model_validator
 
 from lowfc.contract.network import Section as Section
-from lowfc.contract.network import Text
+from lowfc.contract.network import WithoutNul
 
 Preset = Literal["quiet", "bench", "thermal", "reaction-wheel", "reaction-wheel-ideal", "step", "kolmogorov"]
 PRESETS: tuple[str, ...] = get_args(Preset)
@@ -47,11 +47,11 @@ class Gateway(Section):
 
     prefix: str = Field("lowfc:", pattern=r"^[A-Za-z0-9_:.-]{1,40}$")
     """Prefix of the names of all offered variables."""
-    listen: Text = "127.0.0.1"
+    listen: WithoutNul = "127.0.0.1"
     """Address on which it serves; default: loopback only."""
     port: int = Field(5075, ge=1, le=65534)
     """TCP port; searches are answered on the next UDP port."""
-    search: Text = "127.0.0.1"
+    search: WithoutNul = "127.0.0.1"
     """Addresses searched for variables of other servers, separated by spaces."""
     bench: dict[Annotated[str, Field(pattern=BENCH_NAME)], str] = Field(default_factory=dict)
     """Variables of other servers that become bench values: name of the value = name of the variable."""

@@ -64,7 +64,7 @@ def to_bytes(calibration: Calibration) -> bytes:
 
 
 def save(calibration: Calibration, path: Path) -> None:
-    """Write a FITS file; DataFileError if the file cannot be written."""
+    """Write a FITS file; DataFileError if that fails."""
     write_whole(path, to_bytes(calibration))
 
 

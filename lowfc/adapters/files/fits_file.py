@@ -136,7 +136,7 @@ def single(hdus: fits.HDUList, name: str) -> Single:
 
 
 def require_identity(path: Path, found: str, stated: str) -> None:
-    """Check that the identity stated in a file is that of its content; DataFileError if the identities differ."""
+    """Raise DataFileError if the identity stated in a file is not that of its content."""
     if found != stated:
         raise DataFileError(
             f"{path}: damaged: the identity of its content is {found[:12]}, but its header states {stated[:12]}; "

@@ -43,7 +43,7 @@ def to_bytes(law: LinearLaw) -> bytes:
 
 
 def save(law: LinearLaw, path: Path) -> None:
-    """Write a FITS file; DataFileError if the file cannot be written."""
+    """Write a FITS file; DataFileError if that fails."""
     write_whole(path, to_bytes(law))
 
 

@@ -97,7 +97,7 @@ class LogCopy:
 
 
 def refuse_existing(path: Path) -> None:
-    """Refuse to write a log to a file that exists; DataFileError if the file exists."""
+    """Raise DataFileError if the file, to which a log is to be written, exists."""
     if path.exists():
         raise DataFileError(f"{path} already exists; a log is never overwritten; name another one with --out")
 

@@ -68,6 +68,8 @@ class Reading(NamedTuple):
 class Feed(Monitor):
     """Readings of the run; the configuration, too, is queried."""
 
+    _patience_s = 1.0  # in a thread of its own
+
     def __init__(self, bus: Bus, run_id: str, clock: Clock) -> None:
         """Subscribe."""
         super().__init__(bus, clock)

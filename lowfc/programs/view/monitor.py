@@ -9,7 +9,6 @@ from lowfc.programs.view.snapshot import SHOWN, Accumulator, Snapshot
 from lowfc.programs.view.verdicts.watcher import Watcher
 
 _RING_SIZES = {EVENT: 200, STEP: 4000, TRUTH: 200}  # messages; the newest 200 truths per reading suffice for an rms
-_PATIENCE_S = 0.2
 _QUERY_AGAIN_NS = 5_000_000_000  # until a controller that did not answer is queried again
 
 
@@ -20,6 +19,9 @@ class Monitor:
         watcher: state of the run, from which the verdict is made.
         newest: newest message of each topic.
     """
+
+    _patience_s = 0.2
+    """Of a query of one topic."""
 
     def __init__(self, bus: Bus, clock: Clock) -> None:
         """Subscribe."""
@@ -58,4 +60,4 @@ class Monitor:
 
     def _query(self) -> None:
         """Query the states published earlier."""
-        self._answers.extend(sample for _, sample in states(self._bus, SHOWN, _PATIENCE_S))
+        self._answers.extend(sample for _, sample in states(self._bus, SHOWN, self._patience_s))
