@@ -140,10 +140,10 @@ class ExternalChannels:
         try:
             if self._others is None:
                 self._others = OtherChannels(self._names, self._client.mirror_grid())
-            shape = self._others.sum()
-            requested = (shape * self._nm_per_unit).tobytes() if shape.any() else b""
+            shape_nm = self._others.sum() * self._nm_per_unit
+            requested = shape_nm.tobytes() if shape_nm.any() else b""
             if requested != self._known:
-                self._client.channel(EXTERNAL, shape * self._nm_per_unit if requested else None)
+                self._client.channel(EXTERNAL, shape_nm if requested else None)
                 self._known, self._next_request_s = requested, now_s + _REQUESTS_S
         except LowfcError as error:
             fault = str(error)
