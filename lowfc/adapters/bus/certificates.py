@@ -30,7 +30,6 @@ CA_DAYS = 3650
 DAYS = 825
 """Default validity of a role's certificate, days."""
 
-_UNUSED = ("content_commitment", "data_encipherment", "key_agreement", "encipher_only", "decipher_only")
 _BACKDATED = datetime.timedelta(hours=1)  # hosts' clocks differ
 
 
@@ -133,8 +132,17 @@ def _own_key(folder: Path, role: str) -> EllipticCurvePrivateKey:
 def _builder(name: str, own: EllipticCurvePrivateKey, days: int, *, authority: bool = False) -> x509.CertificateBuilder:
     """Certificate builder for a key, without issuer and extended key usage."""
     now = datetime.datetime.now(datetime.UTC)
-    signs = {"digital_signature": not authority, "key_cert_sign": authority, "crl_sign": authority}
-    usage = x509.KeyUsage(**signs, key_encipherment=False, **dict.fromkeys(_UNUSED, False))
+    usage = x509.KeyUsage(
+        digital_signature=not authority,
+        key_cert_sign=authority,
+        crl_sign=authority,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        encipher_only=False,
+        decipher_only=False,
+    )
     return (
         x509.CertificateBuilder()
         .subject_name(_name(name))
