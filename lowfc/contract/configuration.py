@@ -44,6 +44,7 @@ _MAX_KEY_LENGTH = 100  # characters of an unknown key that are compared with the
 _ALTERNATIVE = re.compile(
     r"\.(?:constrained-\w+|literal\[[^]]*\])|(?<=\.value)\.(?:bool|float)"
 )  # appended by pydantic to a key of two types
+_SHOULD = re.compile("^(?:Input|String|List|Tuple) should")
 
 
 Milliseconds = Annotated[float, Field(ge=0, le=1e9)]
@@ -358,12 +359,12 @@ def keys(section: type[BaseModel] = Configuration, prefix: str = "") -> dict[str
 
 
 def _nearest(key: str, known: Sequence[str]) -> str:
-    """The known key most similar to a wrong one, or else a key with a similar name in another section."""
+    """Suffix that names the known key most similar to a wrong one, or one of a similar name in another section."""
     names = {one.rpartition(".")[2]: one for one in reversed(known)}
-    nearest = difflib.get_close_matches(key, known, 1, 0.0)
     elsewhere = difflib.get_close_matches(key.rpartition(".")[2], names, 1, 0.75)
     similar = difflib.get_close_matches(key, known, 1, 0.8)
-    return next(iter(similar or [names[one] for one in elsewhere] or nearest))
+    found = similar or [names[one] for one in elsewhere] or difflib.get_close_matches(key, known, 1)
+    return f"; the nearest known one is {found[0]!r}" if found else ""
 
 
 def explain(detail: Any) -> str:
@@ -374,6 +375,6 @@ def explain(detail: Any) -> str:
     if detail["type"] == "extra_forbidden":
         known = [*keys(), *Configuration.model_fields, *keys(InterlockSection, "interlocks.")]
         plain = ".".join(part for part in detail["loc"] if isinstance(part, str))
-        return f"unknown key {brief(key)}; the nearest known one is {_nearest(plain[:_MAX_KEY_LENGTH], known)!r}"
-    message = detail["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
+        return f"unknown key {brief(key)}{_nearest(plain[:_MAX_KEY_LENGTH], known)}"
+    message = _SHOULD.sub("must", detail["msg"].removeprefix("Value error, "))
     return printable(f"{key[:_MAX_KEY_LENGTH]} = {brief(detail['input'])}: {message[:300]}" if key else message)

@@ -96,7 +96,6 @@ def test_a_configuration_round_trips_through_toml(tmp_path: Path) -> None:
         ("[contol]\ngain = 0.5", "contol", "control"),
         ("lock_step = true", "lock_step", "lockstep"),
         ("gian = 0.5", "gian", "control.gain"),
-        ("[loop]\ngain = 0.5", "loop", "lockstep"),
         ("[control]\nrate_hz = 500", "control.rate_hz", "camera.rate_hz"),
         ("[mirror]\nzzz = 1", "mirror.zzz", "mirror"),
     ],

@@ -25,7 +25,7 @@ OTHER = "[camera]\nrate_hz = 300.0\nshutter = 'rolling'\n[control]\nleak = 7.0\n
 REMARKS = [
     "unknown key 'camera.shutter'; the nearest known one is 'camera.noise'; it is ignored",
     "control.leak = 7.0: must be less than or equal to 1; the default is used",
-    "unknown key 'weather'; the nearest known one is 'realtime'; it is ignored",
+    "unknown key 'weather'; it is ignored",
 ]
 
 

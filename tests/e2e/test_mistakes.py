@@ -43,6 +43,19 @@ def test_an_invalid_configuration_is_refused(tmp_path: Path, config: str, expect
     _refused(tmp_path, *SHORT, config=config, expected=expected)
 
 
+@pytest.mark.parametrize(
+    ("config", "expected"),
+    [
+        ("[sensor]\nkind = 'open'", "cannot tell the modes apart"),
+        ("[camera]\nfull_well_e = 100", "the star saturates the sensor"),
+        ("[recorder]\ntopics = ['x']", "no topic matches 'x'"),
+    ],
+)
+def test_check_refuses_what_a_run_would_refuse(tmp_path: Path, config: str, expected: str) -> None:
+    (tmp_path / "lowfc.toml").write_text(config)
+    _refused(tmp_path, "config", "check", "lowfc.toml", expected=expected)
+
+
 def test_an_invalid_layout_is_refused(tmp_path: Path) -> None:
     (tmp_path / "mask.json").write_text(layout([[0.0, 0.2], [0.05, 0.2]]))
     _refused(tmp_path, *SHORT, "--sensor", "mask.json:mine", expected="overlap")

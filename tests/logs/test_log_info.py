@@ -100,7 +100,7 @@ def test_info_reports_what_was_written(log: Path) -> None:
             "recording": {"messages": "203", "messages_lost": "4"},
         },
         "attachments": {"config.toml": 7},
-        "remarks": [f"{log}: its config.toml: unknown key 'loop'; the nearest known one is 'lockstep'; it is ignored"],
+        "remarks": [f"{log}: its config.toml: unknown key 'loop'; it is ignored"],
     }
 
 

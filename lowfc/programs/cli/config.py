@@ -80,18 +80,33 @@ def config_show(config: ConfigFile = None) -> None:
     typer.echo(commented(configuration(config)))
 
 
-def config_check(config: Annotated[Path, typer.Argument(help="Configuration file (TOML).")]) -> None:
-    """Check a configuration file and the files it names; on errors exit with status 2 and one line per error.
+def config_check(
+    config: Annotated[Path, typer.Argument(help="Configuration file (TOML).")],
+    calibration: Annotated[
+        Path | None, typer.Option(help="Calibration file of the run; default: one is computed, as the run would.")
+    ] = None,
+) -> None:
+    """Check a configuration file, the files it names and its calibration; on errors exit with status 2.
 
     Example: lowfc config check lowfc.toml
     """
+    from rich.console import Console
+
+    from lowfc.adapters.files.calibration_file import load as load_calibration
     from lowfc.device.plugins import faults
+    from lowfc.programs.commissioning.analytic import analytic
+    from lowfc.programs.core.recording.volume import configured_selection
     from lowfc.programs.core.start_up import check_files
 
     settings = configuration(config)
     check_files(settings)
+    configured_selection(settings)
     if wrong := faults(settings, config.parent):
         raise ConfigurationError("\n".join(f"{config}: {one}" for one in wrong))
+    if calibration is None:
+        analytic(settings, Console(stderr=True))
+    else:
+        load_calibration(calibration)
     typer.echo(f"{config}: fine")
 
 
